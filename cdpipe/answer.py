@@ -1,0 +1,192 @@
+"""The answer of a method on disk: what `detect` writes and `score` reads, whoever made it.
+
+    answer.json   format, status, method, config, seconds, evidence, before_T_after, radius_m, objects (session, kind,
+                  region, score, partner of each)
+    answer.npz    region_centres_map (R, 3), region_scores (R,), region_pairs (R, 2), region_is_reported (R,),
+                  keyframe_scores (Kb,), before_keyframe_scans (Kb,), after_keyframe_scans (Ka,),
+                  object_returns (M, 2) int32 with object_return_offsets (O + 1,),
+                  object_points_map (P, 3) with object_point_offsets (O + 1,), and figure_<name> (R,) each
+
+A refused or failed case is an answer.json with its status and error, and no answer.npz. Another program's answer may
+leave out object_returns and give object_points_odom with object_point_odom_offsets instead: points in the odom frame of the
+session that holds the object, each standing for 0.1 m around it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cdpipe.errors import InputError
+from cdpipe.geometry import Float64Array, Int32Array, Int64Array
+from cdpipe.session import load_arrays
+from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport
+
+FORMAT = "tunnelcd-answer"
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """A stored answer.
+
+    Attributes:
+        status: "ok", "merge_refused" or "failed".
+        error: Why it is not ok, or "".
+        method: Name of the preset or of the foreign method.
+        report: The answer itself; None when the status is not ok.
+        seconds: Seconds per stage.
+        evidence: What the merge measured.
+        points_odom: Per object, the (P, 3) odom points of a foreign answer that names no returns; None otherwise.
+    """
+
+    status: str
+    error: str
+    method: str
+    report: ChangeReport | None
+    seconds: Mapping[str, float]
+    evidence: Mapping[str, float]
+    points_odom: tuple[Float64Array, ...] | None = None
+
+
+def write_answer(folder: Path, method: str, report: ChangeReport) -> None:
+    """Write a whole answer into `folder`, which may exist; answer.json comes last and marks it complete."""
+    folder.mkdir(parents=True, exist_ok=True)
+    regions, objects = report.regions, report.objects
+    arrays = {
+        "region_centres_map": regions.centres_map,
+        "region_scores": regions.scores,
+        "region_pairs": regions.pairs,
+        "region_is_reported": regions.is_reported,
+        "keyframe_scores": regions.keyframe_scores,
+        "before_keyframe_scans": report.keyframe_scans[0],
+        "after_keyframe_scans": report.keyframe_scans[1],
+        "object_returns": _stacked([item.returns for item in objects], (0, 2), np.int32),
+        "object_return_offsets": _offsets([item.returns for item in objects]),
+        "object_points_map": _stacked([item.points_map for item in objects], (0, 3), np.float64),
+        "object_point_offsets": _offsets([item.points_map for item in objects]),
+        **{f"figure_{name}": values for name, values in report.figures.items()},
+    }
+    np.savez_compressed(folder / "answer.npz", allow_pickle=False, **arrays)
+    document = {
+        "status": "ok",
+        "error": "",
+        "method": method,
+        "before_T_after": report.before_T_after.tolist(),
+        "radius_m": regions.radius_m,
+        "seconds": dict(report.seconds),
+        "evidence": dict(report.evidence),
+        "config": dict(report.config),
+        "objects": [
+            {"session": o.session, "kind": o.kind, "region": o.region, "score": o.score, "partner": o.partner}
+            for o in objects
+        ],
+    }
+    _write_json(folder, document)
+
+
+def write_failure(
+    folder: Path, method: str, status: str, error: str, evidence: Mapping[str, float], config: Mapping[str, Any]
+) -> None:
+    """Write the record of a case that gave no answer."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "answer.npz").unlink(missing_ok=True)
+    document = {"status": status, "error": error, "method": method, "seconds": {}, "evidence": dict(evidence)}
+    _write_json(folder, {**document, "config": dict(config)})
+
+
+def read_answer(folder: Path) -> Answer:
+    """Read an answer.
+
+    Raises:
+        InputError: It is missing, damaged or inconsistent; the text names the file and the field.
+    """
+    path = folder / "answer.json"
+    if not path.is_file():
+        raise InputError(f"{path}: missing: expected an answer written by `tunnelcd detect` or by another method")
+    try:
+        document = json.loads(path.read_text())
+        if (document["format"], document["format_version"]) != (FORMAT, FORMAT_VERSION):
+            raise InputError(f"{path}: expected format {FORMAT} {FORMAT_VERSION}")
+        if document["status"] != "ok":
+            return Answer(
+                document["status"], document["error"], document["method"], None, document["seconds"],
+                document["evidence"],
+            )  # fmt: skip
+        arrays = load_arrays(folder / "answer.npz")
+        report, points_odom = _report(document, arrays)
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError, IndexError) as error:
+        raise InputError(f"{path}: damaged or incomplete: {error!r}") from error
+    return Answer("ok", "", document["method"], report, report.seconds, report.evidence, points_odom)
+
+
+def _report(
+    document: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]
+) -> tuple[ChangeReport, tuple[Float64Array, ...] | None]:
+    metas = document["objects"]
+    points_map = _split(arrays, "object_points_map", "object_point_offsets", len(metas))
+    points_odom = None
+    if "object_returns" in arrays:
+        returns = _split(arrays, "object_returns", "object_return_offsets", len(metas))
+    else:
+        points_odom = tuple(_split(arrays, "object_points_odom", "object_point_odom_offsets", len(metas)))
+        returns = [np.zeros((0, 2), dtype=np.int32)] * len(metas)
+    objects = tuple(
+        ChangedObject(
+            session=meta["session"],
+            kind=meta["kind"],
+            region=meta["region"],
+            returns=found,
+            points_map=points,
+            score=meta["score"],
+            partner=meta["partner"],
+        )
+        for meta, found, points in zip(metas, returns, points_map, strict=True)
+    )
+    regions = ChangeRegions(
+        centres_map=arrays["region_centres_map"],
+        radius_m=document["radius_m"],
+        scores=arrays["region_scores"],
+        pairs=arrays["region_pairs"],
+        is_reported=arrays["region_is_reported"],
+        keyframe_scores=arrays["keyframe_scores"],
+    )
+    report = ChangeReport(
+        before_T_after=np.asarray(document["before_T_after"], dtype=np.float64),
+        evidence=document["evidence"],
+        regions=regions,
+        objects=objects,
+        seconds=document["seconds"],
+        figures={name[7:]: values for name, values in arrays.items() if name.startswith("figure_")},
+        keyframe_scans=(arrays["before_keyframe_scans"], arrays["after_keyframe_scans"]),
+        config=document["config"],
+    )
+    return report, points_odom
+
+
+def _write_json(folder: Path, document: Mapping[str, Any]) -> None:
+    partial = folder / ".answer.json.partial"
+    partial.write_text(json.dumps({"format": FORMAT, "format_version": FORMAT_VERSION, **document}, indent=1))
+    partial.replace(folder / "answer.json")
+
+
+def _stacked(arrays: Sequence[npt.NDArray[Any]], empty: tuple[int, int], dtype: type) -> npt.NDArray[Any]:
+    return np.concatenate(arrays) if arrays else np.zeros(empty, dtype=dtype)
+
+
+def _offsets(arrays: Sequence[npt.NDArray[Any]]) -> Int64Array:
+    return np.concatenate([[0], np.cumsum([len(array) for array in arrays])]).astype(np.int64)
+
+
+def _split(arrays: Mapping[str, npt.NDArray[Any]], values: str, offsets: str, n: int) -> list[Int32Array] | list[Any]:
+    bounds = arrays[offsets]
+    if len(bounds) != n + 1:
+        raise ValueError(f"{offsets} has {len(bounds)} entries for {n} objects")
+    return [arrays[values][a:b] for a, b in pairwise(bounds)]

@@ -1,0 +1,140 @@
+"""Every setting of the pipeline: one pydantic model, one dotted key each; a preset is a named set of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from cdpipe.errors import InputError
+from cdpipe.yamlfile import Document, Settings, read_yaml, suggestion, validated, with_settings
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class MapConfig(Settings):
+    """How scans become a thinned map and keyframes."""
+
+    voxel_m: Positive = Field(0.2, description="cell of the thinned map")
+    max_range_m: Positive = Field(60.0, description="returns beyond are not mapped")
+    keyframe_spacing_m: Positive = Field(1.0, description="path between keyframes")
+
+
+class DescriptorConfig(Settings):
+    """Which descriptor every keyframe gets while mapping."""
+
+    method: Literal["3deg", "untrained"] = Field("3deg", description="trained weights, or the same network untrained")
+
+
+class MergeConfig(Settings):
+    """FRAME: closest descriptor pairs, yaw from w, GICP then VGICP of the spheres around the pair, acceptance."""
+
+    n_candidates: Count = Field(6, description="descriptor pairs tried")
+    sphere_radius_m: Positive = Field(10.0, description="submap around each pair (FRAME: 10 m)")
+    voxel_m: Positive = Field(0.4, description="thinning of the spheres before registration")
+    gicp_correspondence_m: Positive = Field(3.0, description="FRAME: 3 m")
+    vgicp_correspondence_m: Positive = Field(1.0, description="FRAME: 1 m")
+    inlier_m: Positive = Field(0.3, description="a point this near the other map is an inlier")
+    min_inlier_share: Share = Field(0.9, description="accept at least this share of inliers in the sphere")
+    min_hessian_ratio: Share = Field(0.01, description="smallest to largest translational eigenvalue: degeneracy")
+    refine_map: bool = Field(False, description="one more GICP over the whole overlap (not in the paper)")
+
+
+class QueryConfig(Settings):
+    """From descriptors to changed regions: inverted query, threshold, suppression."""
+
+    reading: Literal["nearest", "paired"] = Field(
+        "nearest", description="A: nearest in descriptor space; B: the same place after alignment"
+    )
+    radius_m: Positive = Field(4.5, description="radius of a region's sphere (paper: 4.5 and 10)")
+    threshold: float = Field(0.0, description="score from which a region is reported; calibrated on validation seeds")
+    n_regions: Count | None = Field(None, description="report this many regions instead of using the threshold")
+    suppression: Positive = Field(1.0, description="candidates nearer than this many radii to a better one are dropped")
+    max_pair_m: Positive = Field(5.0, description="keyframes farther apart are not the same place")
+
+
+class ExtractConfig(Settings):
+    """Point-to-voxel comparison inside a region."""
+
+    method: Literal["voxel"] = Field("voxel", description="occupancy voxels of the other session")
+    voxel_m: Positive = Field(0.65, description="voxel size (paper: 0.65)")
+    min_points: Count = Field(1, description="points that make a voxel occupied")
+    origin_m: float = Field(0.0, description="offset of the grid along every axis")
+
+
+class OutlierConfig(Settings):
+    """Statistical outlier removal on the new points, (mu - lambda sigma, mu + lambda sigma)."""
+
+    neighbours: Count = Field(8, description="k")
+    sigmas: Positive = Field(1.0, description="lambda")
+
+
+class ClusterConfig(Settings):
+    """New points into objects."""
+
+    radius_m: Positive = Field(0.5, description="points nearer than this are one object")
+    min_points: Count = Field(8, description="smaller clusters are dropped")
+
+
+class PipelineConfig(Settings):
+    """All settings of one method."""
+
+    method: Literal["descriptor", "voxel-diff", "random-regions"] = Field(
+        "descriptor", description="the paper's pipeline, a whole-map rival, or a control"
+    )
+    seed: Annotated[int, Field(ge=0)] = Field(0, description="for methods that draw at random")
+    map: MapConfig = MapConfig()
+    descriptor: DescriptorConfig = DescriptorConfig()
+    merge: MergeConfig = MergeConfig()
+    query: QueryConfig = QueryConfig()
+    extract: ExtractConfig = ExtractConfig()
+    outlier: OutlierConfig = OutlierConfig()
+    cluster: ClusterConfig = ClusterConfig()
+
+
+def preset_names() -> list[str]:
+    """Return the names of the shipped presets."""
+    return sorted(entry.name.removesuffix(".yaml") for entry in _presets().iterdir() if entry.name.endswith(".yaml"))
+
+
+def load_config(preset: str = "tunnelcd", settings: Iterable[str] = ()) -> PipelineConfig:
+    """Read a preset (a shipped name or the path of a .yaml file) and write `a.b=value` settings over it.
+
+    Raises:
+        InputError: The preset is unknown, or keys or values are wrong; all mistakes at once.
+    """
+    return validated(PipelineConfig, with_settings(_preset_document(preset), settings))
+
+
+def settings_table() -> list[tuple[str, Any, str]]:
+    """Return (key, default, meaning) of every setting, for documentation."""
+    rows: list[tuple[str, Any, str]] = []
+    for name, info in PipelineConfig.model_fields.items():
+        if isinstance(info.default, Settings):
+            rows += [
+                (f"{name}.{key}", inner.default, inner.description or "")
+                for key, inner in type(info.default).model_fields.items()
+            ]
+        else:
+            rows.append((name, info.default, info.description or ""))
+    return rows
+
+
+def _preset_document(preset: str) -> Document:
+    if preset.endswith((".yaml", ".yml")):
+        return read_yaml(Path(preset))
+    names = preset_names()
+    if preset not in names:
+        raise InputError(f"preset {preset!r} is unknown{suggestion(preset, names)} (known: {', '.join(names)})")
+    file = _presets() / f"{preset}.yaml"
+    return read_yaml(Path(f"{preset}.yaml"), file.read_text())
+
+
+def _presets() -> Traversable:
+    return resources.files("cdpipe") / "presets"

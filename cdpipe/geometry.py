@@ -1,0 +1,90 @@
+"""Poses, rotations and the array checks that every border of the project uses.
+
+A pose `dst_T_src` is a (4, 4) float64 rigid transform: `p_dst = dst_T_src @ p_src`. x is forward, z up, right-handed.
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+Float64Array = npt.NDArray[np.float64]
+Float32Array = npt.NDArray[np.float32]
+Int64Array = npt.NDArray[np.int64]
+Int32Array = npt.NDArray[np.int32]
+BoolArray = npt.NDArray[np.bool_]
+
+
+def stream(seed: int, *purpose: str) -> np.random.Generator:
+    """Return the generator for one purpose, e.g. `stream(7, "after", "lidar-noise")`."""
+    return np.random.default_rng([seed, *(zlib.crc32(word.encode()) for word in purpose)])
+
+
+def require_shape(name: str, array: npt.NDArray[Any], shape: tuple[int | None, ...]) -> None:
+    """Raise `ValueError` unless `array` has `shape`; `None` stands for any length."""
+    if array.ndim == len(shape) and all(want in (None, got) for want, got in zip(shape, array.shape, strict=True)):
+        return
+    wanted = ", ".join("N" if want is None else str(want) for want in shape)
+    raise ValueError(f"{name} must be ({wanted}), got {array.shape}")
+
+
+def require_poses(name: str, poses: npt.NDArray[Any]) -> None:
+    """Raise `ValueError` unless `poses` is (N, 4, 4), finite and rigid to 1e-6."""
+    require_shape(name, poses, (None, 4, 4))
+    finite = np.isfinite(poses).all(axis=(1, 2))
+    if not finite.all():
+        raise ValueError(f"{name}[{int(np.argmin(finite))}] is not finite")
+    rotations = poses[:, :3, :3]
+    defect = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    rigid = (defect < 1e-6) & (np.linalg.det(rotations) > 0) & (poses[:, 3] == (0, 0, 0, 1)).all(axis=1)
+    if not rigid.all():
+        raise ValueError(f"{name}[{int(np.argmin(rigid))}] is not a rigid transform")
+
+
+def make_pose(rotation: npt.ArrayLike | None = None, translation: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Float64Array:
+    """Return a (4, 4) pose from a (3, 3) rotation (identity by default) and a translation in metres."""
+    pose = np.eye(4)
+    if rotation is not None:
+        pose[:3, :3] = rotation
+    pose[:3, 3] = translation
+    return pose
+
+
+def yaw_pose(yaw_rad: float, translation: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Float64Array:
+    """Return the (4, 4) pose that turns by `yaw_rad` about z and then translates."""
+    return make_pose(Rotation.from_euler("z", yaw_rad).as_matrix(), translation)
+
+
+def invert(poses: Float64Array) -> Float64Array:
+    """Return the inverse of one (4, 4) pose or of a stack (..., 4, 4)."""
+    inverse = np.zeros_like(poses)
+    rotations = np.swapaxes(poses[..., :3, :3], -1, -2)
+    inverse[..., :3, :3] = rotations
+    inverse[..., :3, 3] = -(rotations @ poses[..., :3, 3:])[..., 0]
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def transform(dst_T_src: Float64Array, points: Float64Array) -> Float64Array:
+    """Return (N, 3) points of frame src in frame dst."""
+    return points @ dst_T_src[:3, :3].T + dst_T_src[:3, 3]
+
+
+def rotation_angle_rad(pose: Float64Array) -> float:
+    """Return the angle of a pose's rotation, in [0, pi]."""
+    return float(Rotation.from_matrix(pose[:3, :3]).magnitude())
+
+
+def yaw_rad(pose: Float64Array) -> float:
+    """Return the heading of a pose: the angle of its x axis in the x-y plane."""
+    return float(np.arctan2(pose[1, 0], pose[0, 0]))
+
+
+def travelled_m(poses: Float64Array) -> Float64Array:
+    """Return the (N,) path length from the first of (N, 4, 4) poses to each of them, metres."""
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])

@@ -1,0 +1,244 @@
+"""What passes between the stages. Every class is frozen and rejects arrays of the wrong shape."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+import numpy as np
+
+from cdpipe.geometry import (
+    BoolArray,
+    Float32Array,
+    Float64Array,
+    Int32Array,
+    Int64Array,
+    require_poses,
+    require_shape,
+)
+
+Kind = Literal["added", "removed", "moved", "reshaped"]
+SessionName = Literal["before", "after"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedScan:
+    """One LiDAR revolution with the pose the robot believed it had.
+
+    Attributes:
+        index: Position of the scan in its session.
+        points_sensor: (N, 3) float64 returns, metres, deskewed into the sensor frame at the revolution's pose.
+        odom_T_sensor: (4, 4) float64 pose that maps sensor points into the session's odom frame.
+        stamps_ns: (N,) int64 time of each return since the start of the session.
+        pixels: (N,) int32 where each return came from: row * W + column, or the row of the file it was read from.
+    """
+
+    index: int
+    points_sensor: Float64Array
+    odom_T_sensor: Float64Array
+    stamps_ns: Int64Array
+    pixels: Int32Array
+
+    def __post_init__(self) -> None:
+        require_shape("points_sensor", self.points_sensor, (None, 3))
+        require_shape("odom_T_sensor", self.odom_T_sensor, (4, 4))
+        require_shape("stamps_ns", self.stamps_ns, (len(self.points_sensor),))
+        require_shape("pixels", self.pixels, (len(self.points_sensor),))
+
+
+class ScanSource(Protocol):
+    """A session as the pipeline sees it, whatever it was recorded with."""
+
+    @property
+    def name(self) -> str:
+        """What to call it in messages."""
+
+    @property
+    def odom_T_sensor(self) -> Float64Array:
+        """(S, 4, 4) pose of each scan."""
+
+    def scan(self, index: int) -> PosedScan:
+        """Read one scan."""
+
+    def scans(self) -> Iterator[PosedScan]:
+        """Read all scans in order."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointMap:
+    """A thinned map and, for each of its points, the returns it stands for.
+
+    Attributes:
+        points: (N, 3) float64 mean of the returns of each occupied cell, the session's odom frame, metres.
+        voxel_m: Cell size of the thinning.
+        odom_T_sensor: (S, 4, 4) pose of every scan.
+        keyframe_scans: (K,) int64 index of the scan of each keyframe.
+        return_points: (M,) int32 map point of each return, in scan order.
+        return_pixels: (M,) int32 pixel of each return within its scan.
+        scan_offsets: (S + 1,) int64; the returns of scan s are scan_offsets[s]:scan_offsets[s + 1].
+    """
+
+    points: Float64Array
+    voxel_m: float
+    odom_T_sensor: Float64Array
+    keyframe_scans: Int64Array
+    return_points: Int32Array
+    return_pixels: Int32Array
+    scan_offsets: Int64Array
+
+    def __post_init__(self) -> None:
+        require_shape("points", self.points, (None, 3))
+        require_poses("odom_T_sensor", self.odom_T_sensor)
+        require_shape("keyframe_scans", self.keyframe_scans, (None,))
+        require_shape("return_pixels", self.return_pixels, self.return_points.shape)
+        require_shape("scan_offsets", self.scan_offsets, (len(self.odom_T_sensor) + 1,))
+
+    @property
+    def odom_T_keyframe(self) -> Float64Array:
+        """(K, 4, 4) pose of each keyframe."""
+        return self.odom_T_sensor[self.keyframe_scans]
+
+    def returns_of(self, point_mask: BoolArray) -> Int32Array:
+        """Return the (R, 2) (scan, pixel) of every return behind the marked map points."""
+        chosen = np.flatnonzero(point_mask[self.return_points])
+        scans = np.searchsorted(self.scan_offsets, chosen, side="right") - 1
+        return np.column_stack([scans, self.return_pixels[chosen]]).astype(np.int32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DescriptorSet:
+    """Descriptors of one session's keyframes, as stored while mapping.
+
+    Attributes:
+        q: (K, D) float32 place vectors, unit length, unchanged by a turn of the sensor.
+        w: (K, D) float32 orientation vectors, or None for descriptors that have none.
+        keyframe_scans: (K,) int64 scan of each keyframe.
+        name: Which descriptor.
+        checkpoint: Digest of the weights, or "" where there are none.
+    """
+
+    q: Float32Array
+    w: Float32Array | None
+    keyframe_scans: Int64Array
+    name: str
+    checkpoint: str
+
+    def __post_init__(self) -> None:
+        require_shape("q", self.q, (None, None))
+        if self.w is not None:
+            require_shape("w", self.w, (len(self.q), None))
+        require_shape("keyframe_scans", self.keyframe_scans, (len(self.q),))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MappedSession:
+    """What a robot brings home: its thinned map and the descriptors of its keyframes."""
+
+    map: PointMap
+    descriptors: DescriptorSet
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MergedMaps:
+    """Both maps in the before session's odom frame, from here on called `map`.
+
+    Attributes:
+        before: The before map; its odom frame is the map frame.
+        after: The after map, still in its own odom frame.
+        before_T_after: (4, 4) pose of the after session's odom frame in the map frame.
+        evidence: What was measured about the alignment, by name.
+        is_accepted: Whether the evidence suffices.
+        reason: Why not, or "".
+    """
+
+    before: PointMap
+    after: PointMap
+    before_T_after: Float64Array
+    evidence: Mapping[str, float]
+    is_accepted: bool
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        require_poses("before_T_after", self.before_T_after[None])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChangeRegions:
+    """Every candidate sphere, best first, and the score of every before keyframe.
+
+    Attributes:
+        centres_map: (R, 3) sphere centres, map frame, metres.
+        radius_m: Radius of all of them.
+        scores: (R,) change score, falling; larger means changed more surely.
+        pairs: (R, 2) int64 before and after keyframe of each.
+        is_reported: (R,) whether the threshold (or the fixed number) let it through.
+        keyframe_scores: (K,) score of every before keyframe, NaN where the after session never came near.
+    """
+
+    centres_map: Float64Array
+    radius_m: float
+    scores: Float64Array
+    pairs: Int64Array
+    is_reported: BoolArray
+    keyframe_scores: Float64Array
+
+    def __post_init__(self) -> None:
+        n = len(self.scores)
+        require_shape("centres_map", self.centres_map, (n, 3))
+        require_shape("pairs", self.pairs, (n, 2))
+        require_shape("is_reported", self.is_reported, (n,))
+        if (np.diff(self.scores) > 0).any():
+            raise ValueError("scores must fall: best candidate first")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChangedObject:
+    """One object that is in one session and not in the other.
+
+    Attributes:
+        session: The session whose returns it is made of.
+        kind: What happened to it.
+        region: Index of the region it was found in, -1 for methods without regions.
+        returns: (M, 2) int32 (scan, pixel) of its returns.
+        points_map: (P, 3) its thinned points, map frame, metres.
+        score: Larger means surer.
+        partner: Index of the other half of a moved object in the report, or -1.
+    """
+
+    session: SessionName
+    kind: Kind
+    region: int
+    returns: Int32Array
+    points_map: Float64Array
+    score: float
+    partner: int = -1
+
+    def __post_init__(self) -> None:
+        require_shape("returns", self.returns, (None, 2))
+        require_shape("points_map", self.points_map, (None, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChangeReport:
+    """The whole answer for one pair of sessions.
+
+    Attributes:
+        before_T_after: (4, 4) the merge that was used.
+        evidence: What the merge measured.
+        regions: All candidates.
+        objects: What was cut out of the reported regions.
+        seconds: Wall-clock seconds per stage (`t_merge_s`, `t_cd_s`, `t_oe_s`, `t_descriptor_s`).
+        figures: (R,) value of each row of the paper's Table II per region, by column name; NaN where not reported.
+        keyframe_scans: Scans of the before and of the after keyframes that `regions.pairs` index.
+        config: The effective settings.
+    """
+
+    before_T_after: Float64Array
+    evidence: Mapping[str, float]
+    regions: ChangeRegions
+    objects: tuple[ChangedObject, ...]
+    seconds: Mapping[str, float]
+    figures: Mapping[str, Float64Array]
+    keyframe_scans: tuple[Int64Array, Int64Array]
+    config: Mapping[str, object] = field(default_factory=dict)

@@ -1,0 +1,134 @@
+"""The truth of a simulated pair, stored apart from the sessions so that they can be handed out without it.
+
+    PAIR/truth/changes.json          the changes, the scenario as drawn, family, seed
+    PAIR/before/truth/poses.npz      world_T_sensor (S, 4, 4) float64, at the middle column of each revolution
+    PAIR/before/truth/00000.npz      per chunk: instance (s, H, W) int16, change (s, H, W) int16
+    PAIR/after/truth/...             likewise
+
+`instance`: -1 no return, 0 walls and floor, n the n-th prop (1-based). `change`: 0, or the id of the change the return
+belongs to. For a change of group "partial" (moved by less than its own length, or reshaped) only returns farther than
+0.1 m from the other session's true surface belong to it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from cdpipe.errors import InputError
+from cdpipe.geometry import Float64Array
+from cdpipe.session import load_arrays
+
+Int16Array = npt.NDArray[np.int16]
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One object added to or removed from the tunnel between the sessions.
+
+    Attributes:
+        id: 1-based, unique in the pair.
+        name: The prop's name.
+        prop_kind: What it is, e.g. "chair".
+        kind: added, removed, moved (one half of a move) or reshaped.
+        session: The session that holds its returns.
+        partner: Id of the other half of a move, or None.
+        group: "full", or "partial" for short moves and reshaped props.
+        instance: Value of its returns in `instance`.
+        world_T_object: (4, 4) pose as nested lists.
+        hull_volume_m3: Volume of its convex hull.
+        n_returns: Returns that belong to the change.
+        n_cells: Cells of 0.1 m (that session's odom frame) they fill.
+        n_ghost_rays: Rays of the other session that end in it or pass through it, were it there.
+        is_observable: At least 10 cells and 10 ghost rays.
+        why_not: The rule that failed, or "".
+    """
+
+    id: int
+    name: str
+    prop_kind: str
+    kind: Literal["added", "removed", "moved", "reshaped"]
+    session: Literal["before", "after"]
+    partner: int | None
+    group: Literal["full", "partial"]
+    instance: int
+    world_T_object: list[list[float]]
+    hull_volume_m3: float
+    n_returns: int
+    n_cells: int
+    n_ghost_rays: int
+    is_observable: bool
+    why_not: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairTruth:
+    """Everything known about a pair, beside the per-return labels.
+
+    Attributes:
+        family: Scenario family.
+        seed: The seed it was drawn with.
+        score_radius_m: The family's distance within which a region finds a change.
+        changes: All changes, observable or not.
+        scenario: The scenario as drawn.
+    """
+
+    family: str
+    seed: int
+    score_radius_m: float
+    changes: tuple[Change, ...]
+    scenario: dict[str, Any]
+
+
+def write_pair_truth(pair: Path, truth: PairTruth) -> None:
+    """Write `PAIR/truth/changes.json`."""
+    (pair / "truth").mkdir(parents=True, exist_ok=True)
+    document = asdict(truth)
+    (pair / "truth" / "changes.json").write_text(json.dumps(document, indent=1))
+
+
+def read_pair_truth(pair: Path) -> PairTruth:
+    """Read `PAIR/truth/changes.json`.
+
+    Raises:
+        InputError: The pair has no truth, or it is damaged.
+    """
+    path = pair / "truth" / "changes.json"
+    if not path.is_file():
+        raise InputError(f"{path}: missing: only simulated pairs have truth to score against")
+    try:
+        document = json.loads(path.read_text())
+        changes = tuple(Change(**change) for change in document.pop("changes"))
+        return PairTruth(changes=changes, **document)
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: damaged: {error}") from error
+
+
+def write_labels(session: Path, index: int, instance: Int16Array, change: Int16Array) -> None:
+    """Write the labels of one chunk, both (s, H, W)."""
+    (session / "truth").mkdir(exist_ok=True)
+    np.savez(session / "truth" / f"{index:05d}.npz", allow_pickle=False, instance=instance, change=change)
+
+
+def write_true_poses(session: Path, world_T_sensor: Float64Array) -> None:
+    """Write the (S, 4, 4) true poses of one session."""
+    (session / "truth").mkdir(exist_ok=True)
+    np.savez(session / "truth" / "poses.npz", allow_pickle=False, world_T_sensor=world_T_sensor)
+
+
+def read_true_poses(session: Path) -> Float64Array:
+    """Read the (S, 4, 4) true poses of one session."""
+    return np.asarray(load_arrays(session / "truth" / "poses.npz")["world_T_sensor"], dtype=np.float64)
+
+
+def read_labels(session: Path, n_chunks: int) -> Iterator[tuple[Int16Array, Int16Array]]:
+    """Yield (instance, change) of every chunk, each (s, H, W) int16."""
+    for index in range(n_chunks):
+        arrays = load_arrays(session / "truth" / f"{index:05d}.npz")
+        yield arrays["instance"], arrays["change"]
