@@ -8,8 +8,8 @@
                   object_points_map (P, 3) with object_point_offsets (O + 1,), and figure_<name> (R,) each
 
 A refused or failed case is an answer.json with its status and error, and no answer.npz. Another program's answer may
-leave out object_returns and give object_points_odom with object_point_odom_offsets instead: points in the odom frame of the
-session that holds the object, each standing for 0.1 m around it.
+leave out object_returns and give object_points_odom with object_point_odom_offsets instead: points in the odom frame of
+the session that holds the object, each standing for 0.1 m around it.
 """
 
 from __future__ import annotations
@@ -117,9 +117,13 @@ def read_answer(folder: Path) -> Answer:
             raise InputError(f"{path}: expected format {FORMAT} {FORMAT_VERSION}")
         if document["status"] != "ok":
             return Answer(
-                document["status"], document["error"], document["method"], None, document["seconds"],
+                document["status"],
+                document["error"],
+                document["method"],
+                None,
+                document["seconds"],
                 document["evidence"],
-            )  # fmt: skip
+            )
         arrays = load_arrays(folder / "answer.npz")
         report, points_odom = _report(document, arrays)
     except (json.JSONDecodeError, KeyError, TypeError, ValueError, IndexError) as error:

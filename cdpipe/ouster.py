@@ -87,7 +87,7 @@ class SensorMetadata:
         encoder = self._encoder_rad()
         ring = np.stack([np.cos(encoder), np.sin(encoder), np.zeros_like(encoder)], axis=-1) * self.beam_origin_m
         in_sensor = transform(self.sensor_T_lidar, ring)
-        return np.array(np.broadcast_to(in_sensor, (self.height, self.width, 3)))
+        return np.array(np.broadcast_to(in_sensor, (self.height, self.width, 3)), dtype=np.float64)
 
     def project(self, ranges_m: Float64Array) -> Float64Array:
         """Return the (..., H, W, 3) points of staggered ranges (..., H, W), sensor frame, metres.
@@ -101,7 +101,7 @@ class SensorMetadata:
 
     def column_offsets_ns(self) -> Float64Array:
         """Return the (W,) time of each column after the start of its revolution, nanoseconds."""
-        return np.arange(self.width) * (1e9 / self.rate_hz / self.width)
+        return np.arange(self.width, dtype=np.float64) * (1e9 / self.rate_hz / self.width)
 
     def to_json(self) -> dict[str, Any]:
         """Return the metadata under Ouster's own (flat) key names."""
@@ -186,7 +186,7 @@ def parse_metadata(document: dict[str, Any], source: str, mode: str | None = Non
         )
     # 32-beam units of the first generation list 64 beams and leave the absent ones at zero.
     absent = (altitude == 0.0) & (azimuth == 0.0)
-    if 2 * absent.sum() == len(altitude):
+    if len(altitude) == 64 and absent.sum() == 32:
         altitude, azimuth = altitude[~absent], azimuth[~absent]
     if len(altitude) == 0 or (np.diff(altitude) >= 0).any():
         raise InputError(f"{source}: beam_altitude_angles must fall from the top beam to the bottom one")

@@ -220,7 +220,7 @@ def load_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
         InputError: The file is missing, cut short or not an npz of plain arrays.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except FileNotFoundError as error:
         raise InputError(f"{path}: missing") from error

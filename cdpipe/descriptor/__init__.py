@@ -1,0 +1,19 @@
+"""Learned descriptors of places; the only part of cdpipe that needs torch."""
+
+from cdpipe.descriptor.describe import (
+    describe_scan,
+    describe_scans,
+    load_descriptors,
+    save_descriptors,
+    use_threads,
+)
+from cdpipe.descriptor.network import relative_yaws_rad
+
+__all__ = [
+    "describe_scan",
+    "describe_scans",
+    "load_descriptors",
+    "relative_yaws_rad",
+    "save_descriptors",
+    "use_threads",
+]

@@ -1,0 +1,103 @@
+"""Descriptors of a session's keyframes, as a robot would compute and keep them while mapping."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from cdpipe.config import DescriptorConfig
+from cdpipe.descriptor.network import (
+    PlaceNetwork,
+    checkpoint_bytes,
+    digest,
+    initial_network,
+    trained_network,
+)
+from cdpipe.descriptor.range_image import range_image
+from cdpipe.errors import InputError
+from cdpipe.geometry import Float32Array, Int64Array
+from cdpipe.session import load_arrays
+from cdpipe.types import DescriptorSet, PosedScan, ScanSource
+
+_BATCH = 32
+
+
+def describe_scan(scan: PosedScan, config: DescriptorConfig) -> tuple[Float32Array, Float32Array]:
+    """Return q (64,) and w (64,) of one scan."""
+    network, _ = _network(config.method)
+    q, w = _apply(network, range_image(scan.points_sensor)[None])
+    return q[0], w[0]
+
+
+def describe_scans(source: ScanSource, keyframe_scans: Int64Array, config: DescriptorConfig) -> DescriptorSet:
+    """Describe the given scans of a session.
+
+    Args:
+        source: The session.
+        keyframe_scans: (K,) indices of the scans that are keyframes, rising.
+        config: Which descriptor.
+    """
+    network, checkpoint = _network(config.method)
+    parts = []
+    for start in range(0, len(keyframe_scans), _BATCH):
+        batch = keyframe_scans[start : start + _BATCH]
+        images = np.stack([range_image(source.scan(int(index)).points_sensor) for index in batch])
+        parts.append(_apply(network, images))
+    q = np.concatenate([part[0] for part in parts])
+    w = np.concatenate([part[1] for part in parts])
+    return DescriptorSet(q, w, keyframe_scans, config.method, checkpoint)
+
+
+def save_descriptors(folder: Path, descriptors: DescriptorSet) -> Path:
+    """Store descriptors beside a session, in `folder/descriptors/<name>.npz`, and return the file."""
+    path = folder / "descriptors" / f"{descriptors.name}.npz"
+    partial = path.with_suffix(".partial.npz")
+    try:
+        path.parent.mkdir(exist_ok=True)
+        orientation = {} if descriptors.w is None else {"w": descriptors.w}
+        np.savez(
+            partial,
+            allow_pickle=False,
+            checkpoint=np.array(descriptors.checkpoint),
+            q=descriptors.q,
+            keyframe_scans=descriptors.keyframe_scans,
+            **orientation,
+        )
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot write there: {error.strerror}") from error
+    return path
+
+
+def load_descriptors(folder: Path, config: DescriptorConfig) -> DescriptorSet | None:
+    """Read stored descriptors; None where there are none, or none of the present checkpoint."""
+    path = folder / "descriptors" / f"{config.method}.npz"
+    if not path.is_file():
+        return None
+    arrays = load_arrays(path)
+    checkpoint = str(arrays["checkpoint"])
+    if checkpoint != _network(config.method)[1]:
+        return None
+    return DescriptorSet(arrays["q"], arrays.get("w"), arrays["keyframe_scans"], config.method, checkpoint)
+
+
+def use_threads(n_threads: int) -> None:
+    """Fix the number of threads the network runs on, so that every run of a case is equal."""
+    torch.set_num_threads(n_threads)
+
+
+@cache
+def _network(method: str) -> tuple[PlaceNetwork, str]:
+    if method == "untrained":
+        network = initial_network()
+        return network, digest(checkpoint_bytes(network))
+    return trained_network()
+
+
+def _apply(network: PlaceNetwork, images: Float32Array) -> tuple[Float32Array, Float32Array]:
+    with torch.inference_mode():
+        q, w = network(torch.from_numpy(images))
+    return q.numpy().astype(np.float32), w.numpy().astype(np.float32)

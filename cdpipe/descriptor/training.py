@@ -1,0 +1,183 @@
+"""How the place descriptor is trained: triplets with the hardest negative of the batch on q, yaw classification on w.
+
+The triplet loss is 3DEG's (arXiv 2210.07285, section III). Its yaw loss compares (cos, sin) of a regressed angle; ours
+is the cross-entropy of the circular correlation of the two w, which does not average the two ends of a tunnel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cdpipe.descriptor.network import DIMENSIONS, PlaceNetwork, initial_network, yaw_correlation
+from cdpipe.descriptor.range_image import COLUMNS
+from cdpipe.geometry import BoolArray, Float32Array, Float64Array, Int64Array, require_shape, stream
+
+_MARGIN = 0.3
+_YAW_TEMPERATURE = 12.0
+_YAW_SPREAD_RAD = np.deg2rad(5.0)
+SAME_PLACE_M = 2.0
+OTHER_PLACE_M = 8.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceData:
+    """Keyframes with true poses; sessions of one tunnel share a world frame.
+
+    Attributes:
+        images_m: (N, ROWS, COLUMNS) float16 or float32 range images, metres.
+        positions: (N, 3) float64 sensor positions, world frame, metres.
+        headings_rad: (N,) float64 yaw of the sensor in the world frame.
+        tunnels: (N,) int64 which tunnel.
+        sessions: (N,) int64 0 before, 1 after.
+    """
+
+    images_m: Float32Array
+    positions: Float64Array
+    headings_rad: Float64Array
+    tunnels: Int64Array
+    sessions: Int64Array
+
+    def __post_init__(self) -> None:
+        n = len(self.images_m)
+        require_shape("positions", self.positions, (n, 3))
+        for name in ("headings_rad", "tunnels", "sessions"):
+            require_shape(name, getattr(self, name), (n,))
+
+    def subset(self, mask: BoolArray) -> PlaceData:
+        """Return the marked keyframes."""
+        return PlaceData(
+            self.images_m[mask], self.positions[mask], self.headings_rad[mask], self.tunnels[mask], self.sessions[mask]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingConfig:
+    """What a training run depends on, beside its data."""
+
+    seed: int = 0
+    steps: int = 1500
+    tunnels_per_batch: int = 8
+    anchors_per_tunnel: int = 4
+    learning_rate: float = 2e-3
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceScores:
+    """How well places and headings are recognised.
+
+    Attributes:
+        recall_at_1: Share of after keyframes whose nearest before descriptor, within its tunnel, lies within 3 m.
+        yaw_error_deg: Median absolute yaw error between true neighbours, best of the correlation's peaks.
+        yaw_flip_share: Share of those errors over 90 deg.
+    """
+
+    recall_at_1: float
+    yaw_error_deg: float
+    yaw_flip_share: float
+
+
+def train(data: PlaceData, config: TrainingConfig, on_step: Callable[[int, float, float], None]) -> PlaceNetwork:
+    """Train a network from its seeded start; `on_step(step, place_loss, yaw_loss)` is called after every step."""
+    network = initial_network(config.seed).train()
+    optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.learning_rate, total_steps=config.steps)
+    draw = stream(config.seed, "train-descriptor")
+    partners = _partners(data)
+    for step in range(config.steps):
+        anchors = _anchors(data, partners, config, draw)
+        positives = np.array([draw.choice(partners[anchor]) for anchor in anchors])
+        chosen = np.concatenate([anchors, positives])
+        images, headings = _turned(data, chosen, draw)
+        q, w = network(images)
+        place_loss = _triplet_loss(q, _is_other_place(data, anchors, chosen))
+        yaw_loss = _yaw_loss(w, headings)
+        optimiser.zero_grad()
+        (place_loss + 0.3 * yaw_loss).backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
+        optimiser.step()
+        schedule.step()
+        on_step(step, place_loss.item(), yaw_loss.item())
+    return network.eval()
+
+
+def evaluate(network: PlaceNetwork, data: PlaceData) -> PlaceScores:
+    """Score a network on tunnels it has not seen; every tunnel needs both sessions."""
+    draw = stream(0, "evaluate-descriptor")
+    images, headings = _turned(data, np.arange(len(data.positions)), draw)
+    with torch.inference_mode():
+        parts = [network(batch) for batch in torch.split(images, 64)]
+    q = torch.cat([part[0] for part in parts]).numpy()
+    w = torch.cat([part[1] for part in parts])
+    hits: list[bool] = []
+    errors: list[float] = []
+    for tunnel in np.unique(data.tunnels):
+        before = np.flatnonzero((data.tunnels == tunnel) & (data.sessions == 0))
+        after = np.flatnonzero((data.tunnels == tunnel) & (data.sessions == 1))
+        apart = np.linalg.norm(data.positions[after, None] - data.positions[None, before], axis=2)
+        for row in np.flatnonzero(apart.min(axis=1) <= 3.0):
+            found = int(np.argmax(q[before] @ q[after[row]]))
+            hits.append(bool(apart[row, found] <= 3.0))
+            near = int(np.argmin(apart[row]))
+            peak = int(yaw_correlation(w[before[near]][None], w[after[row]][None]).argmax())
+            error = peak * 2 * np.pi / DIMENSIONS - float(headings[after[row]] - headings[before[near]])
+            errors.append(abs(float(np.rad2deg(np.angle(np.exp(1j * error))))))
+    return PlaceScores(float(np.mean(hits)), float(np.median(errors)), float(np.mean(np.array(errors) > 90)))
+
+
+def _partners(data: PlaceData) -> list[Int64Array]:
+    """For each keyframe, those of the same tunnel and place; itself only where there is no other."""
+    partners: list[Int64Array] = [np.array([index]) for index in range(len(data.positions))]
+    for tunnel in np.unique(data.tunnels):
+        members = np.flatnonzero(data.tunnels == tunnel)
+        apart = np.linalg.norm(data.positions[members, None] - data.positions[None, members], axis=2)
+        for row, member in enumerate(members):
+            near = members[(apart[row] <= SAME_PLACE_M) & (members != member)]
+            if len(near):
+                partners[member] = near
+    return partners
+
+
+def _anchors(
+    data: PlaceData, partners: list[Int64Array], config: TrainingConfig, draw: np.random.Generator
+) -> Int64Array:
+    tunnels = np.unique(data.tunnels)
+    chosen = draw.choice(tunnels, size=min(config.tunnels_per_batch, len(tunnels)), replace=False)
+    return np.concatenate(
+        [draw.choice(np.flatnonzero(data.tunnels == tunnel), size=config.anchors_per_tunnel) for tunnel in chosen]
+    )
+
+
+def _turned(data: PlaceData, chosen: Int64Array, draw: np.random.Generator) -> tuple[Tensor, Float64Array]:
+    """Turn every image by a random angle; a shift to the right by k columns is a sensor turned by -k columns."""
+    shifts = draw.integers(0, COLUMNS, size=len(chosen))
+    columns = (np.arange(COLUMNS)[None, :] - shifts[:, None]) % COLUMNS
+    images = np.take_along_axis(data.images_m[chosen].astype(np.float32), columns[:, None, :], axis=2)
+    return torch.from_numpy(images), data.headings_rad[chosen] - shifts * 2 * np.pi / COLUMNS
+
+
+def _is_other_place(data: PlaceData, anchors: Int64Array, chosen: Int64Array) -> Tensor:
+    apart = np.linalg.norm(data.positions[anchors, None] - data.positions[None, chosen], axis=2)
+    other_tunnel = data.tunnels[anchors, None] != data.tunnels[None, chosen]
+    return torch.from_numpy(other_tunnel | (apart > OTHER_PLACE_M))
+
+
+def _triplet_loss(q: Tensor, is_negative: Tensor) -> Tensor:
+    anchors = q[: len(is_negative)]
+    distances = torch.cdist(anchors, q)
+    positive = (anchors - q[len(is_negative) :]).square().sum(dim=1).add(1e-9).sqrt()
+    hardest = distances.masked_fill(~is_negative, float("inf")).amin(dim=1)
+    return torch.relu(positive - hardest + _MARGIN).mean()
+
+
+def _yaw_loss(w: Tensor, headings_rad: Float64Array) -> Tensor:
+    n = len(w) // 2
+    scores = _YAW_TEMPERATURE * yaw_correlation(w[:n], w[n:])
+    bins = np.arange(DIMENSIONS) * 2 * np.pi / DIMENSIONS
+    off = np.angle(np.exp(1j * (bins[None, :] - (headings_rad[n:] - headings_rad[:n])[:, None])))
+    target = np.exp(-0.5 * (off / _YAW_SPREAD_RAD) ** 2)
+    target /= target.sum(axis=1, keepdims=True)
+    return torch.nn.functional.cross_entropy(scores, torch.from_numpy(target.astype(np.float32)))

@@ -1,0 +1,148 @@
+"""Makes the data of the scan descriptor, trains it, and writes checkpoint and model card.
+
+Run as `python -m eval.descriptor_training --data DIR --out DIR`; the data is made once and kept in DIR.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import shutil
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import Progress
+from scenarios.library import load_scenario
+from sim.simulate import simulate_pair
+
+from cdpipe.descriptor import use_threads
+from cdpipe.descriptor.network import checkpoint_bytes, digest, initial_network
+from cdpipe.descriptor.range_image import range_image
+from cdpipe.descriptor.training import PlaceData, PlaceScores, TrainingConfig, evaluate, train
+from cdpipe.geometry import travelled_m, yaw_rad
+from cdpipe.session import load_arrays
+from eval.adapters import pipeline_input
+from sim.truth import read_true_poses
+
+KEYFRAME_SPACING_M = 1.0
+FAMILIES = ("narrow", "wide")
+FIRST_VALIDATION_SEED = 10000
+
+
+def make_tunnel(family: str, seed: int, path: Path) -> None:
+    """Simulate one pair and keep the range images and true poses of its keyframes in an npz file."""
+    pair = path.with_suffix(".pair")
+    shutil.rmtree(pair, ignore_errors=True)
+    simulate_pair(load_scenario(family, seed), seed, pair)
+    images, positions, headings, sessions = [], [], [], []
+    for number, session in enumerate(("before", "after")):
+        source = pipeline_input(pair, session)
+        world_T_sensor = read_true_poses(pair / session)
+        metres = np.floor(travelled_m(world_T_sensor) / KEYFRAME_SPACING_M)
+        for index in np.unique(metres, return_index=True)[1]:
+            images.append(range_image(source.scan(int(index)).points_sensor))
+            positions.append(world_T_sensor[index, :3, 3])
+            headings.append(yaw_rad(world_T_sensor[index]))
+            sessions.append(number)
+    partial = path.with_suffix(".partial.npz")
+    np.savez(
+        partial,
+        allow_pickle=False,
+        images_m=np.array(images, dtype=np.float16),
+        positions=np.array(positions),
+        headings_rad=np.array(headings),
+        sessions=np.array(sessions, dtype=np.int64),
+    )
+    partial.replace(path)
+    shutil.rmtree(pair)
+
+
+def load_data(folder: Path, seeds: Iterable[int]) -> tuple[PlaceData, str]:
+    """Read the tunnels of both families and the given seeds, making those that are missing; return their digest too."""
+    folder.mkdir(parents=True, exist_ok=True)
+    wanted = [(family, seed) for seed in seeds for family in FAMILIES]
+    tunnels = []
+    hasher = hashlib.sha256()
+    with Progress(console=Console(stderr=True)) as progress:
+        for family, seed in progress.track(wanted, description="tunnels"):
+            path = folder / f"{family}-{seed}.npz"
+            if not path.is_file():
+                make_tunnel(family, seed, path)
+            arrays = load_arrays(path)
+            arrays["tunnels"] = np.full(len(arrays["sessions"]), len(tunnels))
+            hasher.update(arrays["images_m"].tobytes())
+            tunnels.append(arrays)
+    fields = PlaceData.__dataclass_fields__
+    return PlaceData(**{name: np.concatenate([t[name] for t in tunnels]) for name in fields}), hasher.hexdigest()[:16]
+
+
+def main(
+    data: Annotated[Path, typer.Option(help="where simulated keyframes are kept")],
+    out: Annotated[Path, typer.Option(help="folder for 3deg.safetensors and 3deg.json")],
+    train_tunnels: int = 30,
+    validation_tunnels: int = 8,
+    steps: int = 1500,
+    seed: int = 0,
+    threads: int = 2,
+) -> None:
+    """Train the scan descriptor on families narrow and wide; validation seeds only judge it."""
+    use_threads(threads)
+    training, data_digest = load_data(data, range(train_tunnels))
+    validation, _ = load_data(data, range(FIRST_VALIDATION_SEED, FIRST_VALIDATION_SEED + validation_tunnels))
+    config = TrainingConfig(seed=seed, steps=steps)
+    start = time.perf_counter()
+    losses: list[tuple[float, float]] = []
+    with Progress(console=Console(stderr=True)) as progress:
+        task = progress.add_task("training", total=steps)
+
+        def on_step(step: int, place_loss: float, yaw_loss: float) -> None:
+            losses.append((place_loss, yaw_loss))
+            recent = np.mean(losses[-50:], axis=0)
+            progress.update(task, completed=step + 1, description=f"place {recent[0]:.3f} yaw {recent[1]:.3f}")
+
+        network = train(training, config, on_step)
+    seconds = time.perf_counter() - start
+    content = checkpoint_bytes(network)
+    card = {
+        "descriptor": "3deg (re-implementation of arXiv 2210.07285)",
+        "checkpoint": digest(content),
+        "data": {
+            "families": list(FAMILIES),
+            "train_seeds": f"0:{train_tunnels}",
+            "n_keyframes": len(training.positions),
+            "digest": data_digest,
+        },
+        "validation": {
+            "seeds": f"{FIRST_VALIDATION_SEED}:{FIRST_VALIDATION_SEED + validation_tunnels}",
+            "n_keyframes": len(validation.positions),
+            "trained": _scores(evaluate(network, validation)),
+            "untrained": _scores(evaluate(initial_network(), validation)),
+        },
+        "settings": {name: getattr(config, name) for name in config.__dataclass_fields__},
+        "last_losses": {
+            "place": float(np.mean(losses[-100:], axis=0)[0]),
+            "yaw": float(np.mean(losses[-100:], axis=0)[1]),
+        },
+        "command": "python -m eval.descriptor_training " + " ".join(sys.argv[1:]),
+        "device": f"{platform.machine()} CPU, {threads} threads",
+        "seconds": round(seconds, 1),
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "3deg.safetensors").write_bytes(content)
+    (out / "3deg.json").write_text(json.dumps(card, indent=1) + "\n")
+    Console().print_json(json.dumps(card))
+
+
+def _scores(scores: PlaceScores) -> dict[str, float]:
+    return {name: round(getattr(scores, name), 4) for name in scores.__slots__}
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,76 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpipe.answer import read_answer, write_answer, write_failure
+from cdpipe.errors import InputError
+from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport
+
+
+def _report() -> ChangeReport:
+    regions = ChangeRegions(
+        centres_map=np.array([[1.0, 2, 3], [4, 5, 6]]),
+        radius_m=4.5,
+        scores=np.array([0.9, 0.1]),
+        pairs=np.array([[0, 1], [2, 3]]),
+        is_reported=np.array([True, False]),
+        keyframe_scores=np.array([0.9, np.nan, 0.1]),
+    )
+    objects = tuple(
+        ChangedObject("after", "added", 0, np.full((n, 2), n, dtype=np.int32), np.full((n, 3), float(n)), 0.5)
+        for n in (3, 0, 2)
+    )
+    return ChangeReport(
+        before_T_after=np.eye(4),
+        evidence={"overlap": 0.9},
+        regions=regions,
+        objects=objects,
+        seconds={"t_cd_s": 0.25},
+        figures={"v_oe_m3": np.array([0.3, np.nan])},
+        keyframe_scans=(np.array([0, 4, 8]), np.array([0, 5])),
+        config={"method": "descriptor"},
+    )
+
+
+def test_an_answer_survives_the_disk(tmp_path: Path) -> None:
+    write_answer(tmp_path / "a", "paper", _report())
+    answer = read_answer(tmp_path / "a")
+    assert (answer.status, answer.method, answer.seconds) == ("ok", "paper", {"t_cd_s": 0.25})
+    assert answer.report is not None
+    assert [len(item.returns) for item in answer.report.objects] == [3, 0, 2]
+    np.testing.assert_array_equal(answer.report.objects[2].points_map, np.full((2, 3), 2.0))
+    np.testing.assert_array_equal(answer.report.regions.keyframe_scores, [0.9, np.nan, 0.1])
+    np.testing.assert_array_equal(answer.report.figures["v_oe_m3"], [0.3, np.nan])
+
+
+def test_a_failure_replaces_an_older_answer(tmp_path: Path) -> None:
+    write_answer(tmp_path, "paper", _report())
+    write_failure(tmp_path, "paper", "merge_refused", "no overlap", {"inlier_share": 0.2}, {})
+    answer = read_answer(tmp_path)
+    assert (answer.status, answer.error, answer.report) == ("merge_refused", "no overlap", None)
+    assert not (tmp_path / "answer.npz").exists()
+
+
+def test_a_foreign_answer_may_name_points(tmp_path: Path) -> None:
+    write_answer(tmp_path, "other", _report())
+    arrays = dict(np.load(tmp_path / "answer.npz"))
+    del arrays["object_returns"], arrays["object_return_offsets"]
+    arrays["object_points_odom"] = np.ones((4, 3))
+    arrays["object_point_odom_offsets"] = np.array([0, 1, 1, 4])
+    np.savez(tmp_path / "answer.npz", **arrays)
+    answer = read_answer(tmp_path)
+    assert answer.points_odom is not None
+    assert [len(points) for points in answer.points_odom] == [1, 0, 3]
+
+
+def test_damage_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"answer\.json: missing"):
+        read_answer(tmp_path)
+    write_answer(tmp_path, "paper", _report())
+    document = json.loads((tmp_path / "answer.json").read_text())
+    document["objects"].pop()
+    (tmp_path / "answer.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="object_point_offsets has 4 entries for 2 objects"):
+        read_answer(tmp_path)

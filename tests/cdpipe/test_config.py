@@ -1,0 +1,32 @@
+import pytest
+
+from cdpipe.config import PipelineConfig, load_config, preset_names, settings_table
+from cdpipe.errors import InputError
+
+
+def test_every_shipped_preset_is_valid() -> None:
+    assert {"paper", "paper-topn", "paper-paired", "voxel-diff", "random-regions", "tunnelcd"} <= set(preset_names())
+    for name in preset_names():
+        assert isinstance(load_config(name), PipelineConfig)
+
+
+def test_paper_preset_holds_the_published_settings() -> None:
+    config = load_config("paper", ["query.radius_m=10"])
+    assert (config.query.reading, config.query.radius_m, config.extract.voxel_m) == ("nearest", 10.0, 0.65)
+
+
+def test_mistakes_come_with_suggestions() -> None:
+    with pytest.raises(InputError) as caught:
+        load_config("paper", ["extract.voxel=0.4", "query.reading=pairs"])
+    text = str(caught.value)
+    assert 'extract.voxel = 0.4: unknown key; did you mean "voxel_m"?' in text
+    assert "query.reading = 'pairs'" in text
+    assert 'did you mean "paired"?' in text
+    with pytest.raises(InputError, match='did you mean "paper"'):
+        load_config("papr")
+
+
+def test_every_setting_has_a_meaning() -> None:
+    rows = settings_table()
+    assert ("extract.voxel_m", 0.65) in [row[:2] for row in rows]
+    assert all(meaning for _, _, meaning in rows)

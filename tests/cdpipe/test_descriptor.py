@@ -1,0 +1,117 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from cdpipe.config import DescriptorConfig
+from cdpipe.descriptor import describe_scans, load_descriptors, relative_yaws_rad, save_descriptors
+from cdpipe.descriptor.network import DIMENSIONS, initial_network, yaw_correlation
+from cdpipe.descriptor.range_image import COLUMNS, ELEVATION_RAD, ROWS, range_image
+from cdpipe.descriptor.training import PlaceData, TrainingConfig, evaluate, train
+from cdpipe.types import PosedScan
+
+
+def test_a_point_falls_where_its_angles_say() -> None:
+    # straight up the x axis: middle row, first column; 90 deg to the left: a quarter of the columns further
+    image = range_image(np.array([[5.0, 1e-6, -1e-6], [1e-6, 3.0, -1e-6], [4.0, 1e-6, -1e-6]]))
+    assert image[ROWS // 2, 0] == pytest.approx(4.0)  # the nearer of two
+    assert image[ROWS // 2, COLUMNS // 4 - 1] == pytest.approx(3.0)
+    assert (image > 0).sum() == 2
+    steep = ELEVATION_RAD * 1.05
+    assert not range_image(np.array([[np.cos(steep), 0.0, np.sin(steep)]])).any()
+    assert range_image(np.zeros((0, 3))).shape == (ROWS, COLUMNS)
+
+
+def test_a_turned_sensor_keeps_q_and_shifts_w() -> None:
+    network = initial_network()
+    images = torch.rand(2, ROWS, COLUMNS, generator=torch.Generator().manual_seed(1)) * 20
+    turned = torch.roll(images, 2 * COLUMNS // DIMENSIONS * 5, dims=2)
+    with torch.inference_mode():
+        (q, w), (q_turned, w_turned) = network(images), network(turned)
+    np.testing.assert_allclose(q, q_turned, atol=1e-5)
+    np.testing.assert_allclose(torch.roll(w, 10, dims=1), w_turned, atol=1e-5)
+    # the scene moved counter-clockwise, so the sensor turned clockwise
+    assert np.rad2deg(relative_yaws_rad(w[0].numpy(), w_turned[0].numpy(), n=1)) == pytest.approx(-56.25, abs=1e-3)
+
+
+def test_correlation_equals_its_definition() -> None:
+    a, b = torch.randn(2, 1, DIMENSIONS, generator=torch.Generator().manual_seed(2))
+    slow = [float((a[0] * torch.roll(b[0], s)).sum()) for s in range(DIMENSIONS)]
+    np.testing.assert_allclose(yaw_correlation(a, b)[0], slow, atol=1e-5)
+
+
+class _Source:
+    name = "test"
+    odom_T_sensor = np.stack([np.eye(4)] * 3)
+
+    def scan(self, index: int) -> PosedScan:
+        points = np.random.default_rng(index).normal(size=(500, 3)) * (8, 3, 1)
+        return PosedScan(index, points, np.eye(4), np.zeros(500, dtype=np.int64), np.arange(500, dtype=np.int32))
+
+
+@pytest.mark.parametrize("method", ["3deg", "untrained"])
+def test_descriptors_are_unit_vectors_and_survive_the_disk(tmp_path: Path, method: str) -> None:
+    config = DescriptorConfig(method=method)
+    made = describe_scans(_Source(), np.array([0, 2]), config)
+    np.testing.assert_allclose(np.linalg.norm(made.q, axis=1), 1.0, atol=1e-5)
+    assert load_descriptors(tmp_path, config) is None
+    save_descriptors(tmp_path, made)
+    read = load_descriptors(tmp_path, config)
+    assert read is not None
+    np.testing.assert_array_equal(read.q, made.q)
+    np.testing.assert_array_equal(read.w, made.w)
+    assert (read.name, read.checkpoint) == (method, made.checkpoint)
+
+
+def _rooms(n_tunnels: int) -> PlaceData:
+    """Places of a made-up tunnel: an image that slides with x, seen twice from 0.3 m apart."""
+    images, positions, tunnels, sessions = [], [], [], []
+    for tunnel in range(n_tunnels):
+        walls = np.random.default_rng(tunnel).uniform(2, 12, size=(ROWS, COLUMNS * 3))
+        for session in (0, 1):
+            for place in range(8):
+                start = place * 60 + 3 * session
+                images.append(walls[:, start : start + COLUMNS])
+                positions.append((place * 10.0 + 0.3 * session, 0.0, 0.0))
+                tunnels.append(tunnel)
+                sessions.append(session)
+    n = len(images)
+    return PlaceData(
+        np.array(images, np.float32), np.array(positions), np.zeros(n), np.array(tunnels), np.array(sessions)
+    )
+
+
+def test_training_lowers_both_losses_and_repeats_by_seed() -> None:
+    data = _rooms(3)
+    config = TrainingConfig(seed=1, steps=25, tunnels_per_batch=3, anchors_per_tunnel=3)
+    losses: list[tuple[float, float]] = []
+    network = train(data, config, lambda step, place, yaw: losses.append((place, yaw)))
+    assert np.mean(losses[-5:], axis=0)[0] < np.mean(losses[:5], axis=0)[0]
+    assert np.mean(losses[-5:], axis=0)[1] < np.mean(losses[:5], axis=0)[1]
+    again = train(data, config, lambda *_: None)
+    for one, other in zip(network.parameters(), again.parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=0)
+
+
+def test_scores_of_a_perfect_and_a_blind_network() -> None:
+    data = _rooms(2)
+
+    class Perfect(torch.nn.Module):
+        """Looks the place up by its image, turned or not."""
+
+        def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            spectrum = torch.fft.rfft(images.mean(dim=1)).abs()
+            w = images.reshape(len(images), ROWS, DIMENSIONS, -1).mean(dim=(1, 3))
+            return torch.nn.functional.normalize(spectrum - spectrum.mean(dim=1, keepdim=True), dim=1), w
+
+    perfect = evaluate(Perfect(), data)
+    assert perfect.recall_at_1 > 0.9
+    assert perfect.yaw_error_deg < 6.0
+
+    class Blind(torch.nn.Module):
+        def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            return torch.ones(len(images), 4) / 2, torch.zeros(len(images), DIMENSIONS)
+
+    # every before keyframe looks alike, the first is taken: 1 of 8 places is right
+    assert evaluate(Blind(), data).recall_at_1 == pytest.approx(1 / 8)
