@@ -19,8 +19,6 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import Progress
-from scenarios.library import load_scenario
-from sim.simulate import simulate_pair
 
 from cdpipe.descriptor import use_threads
 from cdpipe.descriptor.network import checkpoint_bytes, digest, initial_network
@@ -29,6 +27,8 @@ from cdpipe.descriptor.training import PlaceData, PlaceScores, TrainingConfig, e
 from cdpipe.geometry import travelled_m, yaw_rad
 from cdpipe.session import load_arrays
 from eval.adapters import pipeline_input
+from scenarios.library import load_scenario
+from sim.simulate import simulate_pair
 from sim.truth import read_true_poses
 
 KEYFRAME_SPACING_M = 1.0

@@ -1,6 +1,7 @@
 """Learned descriptors of places; the only part of cdpipe that needs torch."""
 
 from cdpipe.descriptor.describe import (
+    checkpoint_digest,
     describe_scan,
     describe_scans,
     load_descriptors,
@@ -10,6 +11,7 @@ from cdpipe.descriptor.describe import (
 from cdpipe.descriptor.network import relative_yaws_rad
 
 __all__ = [
+    "checkpoint_digest",
     "describe_scan",
     "describe_scans",
     "load_descriptors",

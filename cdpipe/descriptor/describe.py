@@ -84,6 +84,11 @@ def load_descriptors(folder: Path, config: DescriptorConfig) -> DescriptorSet | 
     return DescriptorSet(arrays["q"], arrays.get("w"), arrays["keyframe_scans"], config.method, checkpoint)
 
 
+def checkpoint_digest(config: DescriptorConfig) -> str:
+    """Return the digest of the weights that descriptors made with `config` carry."""
+    return _network(config.method)[1]
+
+
 def use_threads(n_threads: int) -> None:
     """Fix the number of threads the network runs on, so that every run of a case is equal."""
     torch.set_num_threads(n_threads)

@@ -1,0 +1,59 @@
+"""Change detection between two sessions, on one screen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from time import perf_counter
+
+from cdpipe.config import PipelineConfig
+from cdpipe.descriptor import describe_scans
+from cdpipe.errors import MergeFailedError
+from cdpipe.extract import extract_objects
+from cdpipe.mapping import build_map
+from cdpipe.merge import merge_maps
+from cdpipe.query import find_regions
+from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, MergedMaps, ScanSource
+
+
+def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
+    """Do what a robot does while it drives: thin its map and describe its keyframes.
+
+    Raises:
+        InputError: A scan cannot be used; the text names the file.
+    """
+    thin_map = build_map(source, config.map)
+    return MappedSession(thin_map, describe_scans(source, thin_map.keyframe_scans, config.descriptor))
+
+
+def detect_changes(before: MappedSession, after: MappedSession, config: PipelineConfig) -> ChangeReport:
+    """Merge two mapped sessions and report what changed between them.
+
+    Raises:
+        MergeFailedError: The sessions could not be aligned with enough evidence; it carries what was measured.
+    """
+    start = perf_counter()
+    merged = merge_maps(before, after, config.merge)
+    t_merge_s = perf_counter() - start
+    if not merged.is_accepted:
+        raise MergeFailedError(f"the sessions cannot be merged: {merged.reason}", merged.evidence)
+    report = compare(merged, before.descriptors, after.descriptors, config)
+    return replace(report, seconds={"t_merge_s": t_merge_s, **report.seconds})
+
+
+def compare(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig) -> ChangeReport:
+    """Find the changed regions of two merged maps and cut the objects out of them."""
+    start = perf_counter()
+    regions = find_regions(merged, before, after, config.query)
+    queried = perf_counter()
+    objects, figures = extract_objects(merged, regions, config)
+    extracted = perf_counter()
+    return ChangeReport(
+        before_T_after=merged.before_T_after,
+        evidence=merged.evidence,
+        regions=regions,
+        objects=objects,
+        seconds={"t_cd_s": queried - start, "t_oe_s": extracted - queried},
+        figures=figures,
+        keyframe_scans=(before.keyframe_scans, after.keyframe_scans),
+        config=config.model_dump(),
+    )

@@ -1,0 +1,107 @@
+"""From scans to a thinned map in one pass; memory grows with the map and by eight bytes a return."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import numpy as np
+
+from cdpipe.config import MapConfig
+from cdpipe.errors import InputError
+from cdpipe.geometry import Float64Array, Int32Array, Int64Array, transform, travelled_m
+from cdpipe.sphere import column_keys
+from cdpipe.types import PointMap, PosedScan, ScanSource
+from cdpipe.voxel import UniqueCells, cell_keys, max_coordinate_m
+
+_BATCH_SCANS = 64
+
+
+def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_SCANS) -> PointMap:
+    """Thin the returns of a session to one point for each occupied cell of its odom frame, and choose keyframes.
+
+    A map point is the mean of the returns of its cell. Points are ordered by 2 m columns and then by cell, which is the
+    order `cdpipe.sphere.MapIndex` wants; the order does not depend on `batch_scans`.
+
+    Args:
+        source: The session, read once from front to back.
+        config: Cell size, longest range, path between keyframes.
+        batch_scans: Scans held in memory at a time.
+
+    Raises:
+        InputError: A pose lies too far out for cells of this size, or no return is within range.
+    """
+    _require_reachable(source, config)
+    accumulator = _MapAccumulator(config)
+    scans = iter(source.scans())
+    while batch := list(islice(scans, batch_scans)):
+        accumulator.add(batch)
+    return accumulator.finish(source, keyframes(source.odom_T_sensor, config.keyframe_spacing_m))
+
+
+def keyframes(odom_T_sensor: Float64Array, spacing_m: float) -> Int64Array:
+    """Return the (K,) scans at which each further `spacing_m` of path is complete, the first scan included."""
+    travelled = travelled_m(odom_T_sensor)
+    chosen = [0]
+    for index, path_m in enumerate(travelled):
+        # a millionth of slack: paths add up from rounded steps
+        if path_m - travelled[chosen[-1]] >= spacing_m * (1 - 1e-6):
+            chosen.append(index)
+    return np.array(chosen, dtype=np.int64)
+
+
+class _MapAccumulator:
+    """Sums of the returns per cell, batch by batch."""
+
+    def __init__(self, config: MapConfig) -> None:
+        self._config = config
+        self._cells = UniqueCells()
+        self._batch_cells: list[Int64Array] = []
+        self._batch_sums: list[Float64Array] = []
+        self._return_cells: list[Int32Array] = []
+        self._return_pixels: list[Int32Array] = []
+        self._n_returns: list[int] = []
+
+    def add(self, scans: list[PosedScan]) -> None:
+        clouds = []
+        for scan in scans:
+            is_near = np.einsum("ij,ij->i", scan.points_sensor, scan.points_sensor) <= self._config.max_range_m**2
+            clouds.append(transform(scan.odom_T_sensor, scan.points_sensor[is_near]))
+            self._return_pixels.append(scan.pixels[is_near])
+            self._n_returns.append(len(clouds[-1]))
+        points = np.concatenate(clouds)
+        ids = self._cells.add(cell_keys(points, self._config.voxel_m))
+        self._return_cells.append(ids.astype(np.int32))
+        n_cells = len(self._cells)
+        sums: Float64Array = np.column_stack([np.bincount(ids, points[:, axis], n_cells) for axis in range(3)])
+        is_touched = np.bincount(ids, minlength=n_cells) > 0
+        self._batch_cells.append(np.flatnonzero(is_touched))
+        self._batch_sums.append(sums[is_touched])
+
+    def finish(self, source: ScanSource, keyframe_scans: Int64Array) -> PointMap:
+        if len(self._cells) == 0:
+            raise InputError(f"{source.name}: no return within map.max_range_m = {self._config.max_range_m} m")
+        cells, sums = np.concatenate(self._batch_cells), np.concatenate(self._batch_sums)
+        totals = np.column_stack([np.bincount(cells, sums[:, axis], len(self._cells)) for axis in range(3)])
+        points = totals / self._cells.counts[:, None]
+        order = np.lexsort((self._cells.keys, column_keys(points)))
+        rank = np.empty(len(order), dtype=np.int32)
+        rank[order] = np.arange(len(order), dtype=np.int32)
+        return_points = np.concatenate([rank[part] for part in self._return_cells])
+        return PointMap(
+            points=points[order],
+            voxel_m=self._config.voxel_m,
+            odom_T_sensor=source.odom_T_sensor,
+            keyframe_scans=keyframe_scans,
+            return_points=return_points,
+            return_pixels=np.concatenate(self._return_pixels),
+            scan_offsets=np.concatenate([[0], np.cumsum(self._n_returns)]).astype(np.int64),
+        )
+
+
+def _require_reachable(source: ScanSource, config: MapConfig) -> None:
+    farthest_m = float(np.abs(source.odom_T_sensor[:, :3, 3]).max(initial=0.0)) + config.max_range_m
+    if farthest_m >= max_coordinate_m(config.voxel_m):
+        raise InputError(
+            f"{source.name}: positions reach {farthest_m:.0f} m, cells of map.voxel_m = {config.voxel_m} m can be "
+            f"numbered up to {max_coordinate_m(config.voxel_m):.0f} m: subtract a common offset from the trajectory"
+        )

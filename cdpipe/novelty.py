@@ -1,0 +1,108 @@
+"""What is new in one cloud beside another: point-to-voxel comparison, outlier removal, clusters (paper, section IV)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from cdpipe.config import ClusterConfig, ExtractConfig, OutlierConfig
+from cdpipe.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.voxel import cell_keys
+
+_MAX_DENSE_CELLS = 1 << 22
+
+
+def new_points_mask(points: Float64Array, reference_points: Float64Array, config: ExtractConfig) -> BoolArray:
+    """Mark the points that lie in no occupied voxel of the reference.
+
+    The grid is that of the frame, with a corner at `origin_m` on every axis, so it does not depend on the points. A
+    voxel is occupied when it holds at least `min_points` reference points.
+
+    Args:
+        points: (N, 3) points, metres.
+        reference_points: (M, 3) points of the other session, same frame; they should reach a voxel beyond `points`.
+        config: Voxel size, points to occupy, origin.
+
+    Returns:
+        (N,) mask, True for what is new.
+    """
+    if len(points) == 0 or len(reference_points) == 0:
+        return np.ones(len(points), dtype=np.bool_)
+    low = np.floor((points.min(axis=0) - config.origin_m) / config.voxel_m)
+    high = np.floor((points.max(axis=0) - config.origin_m) / config.voxel_m)
+    shape = high - low + 1
+    if shape.prod() > _MAX_DENSE_CELLS:
+        return _new_by_keys(points, reference_points, config)
+    return _new_by_grid(points, reference_points, low, shape.astype(np.int64), config)
+
+
+def inlier_mask(points: Float64Array, config: OutlierConfig) -> BoolArray:
+    """Mark the points whose neighbourhood is about as dense as the rest of the cloud.
+
+    The interval (mu - lambda sigma, mu + lambda sigma) of the mean distance to the k nearest neighbours, section IV.
+    The paper gives neither lambda nor k. Clouds of k points or fewer are too small to judge and kept whole.
+
+    Args:
+        points: (N, 3) points, metres.
+        config: k, and lambda.
+
+    Returns:
+        (N,) mask, True for the points to keep.
+    """
+    if len(points) <= config.neighbours:
+        return np.ones(len(points), dtype=np.bool_)
+    distances, _ = cKDTree(points).query(points, k=config.neighbours + 1)
+    spacing = np.asarray(distances)[:, 1:].mean(axis=1)
+    # closed, with room for rounding: in an even cloud sigma is 0 and nothing is an outlier
+    reach = config.sigmas * spacing.std() + 1e-9 * spacing.mean()
+    return np.asarray(np.abs(spacing - spacing.mean()) <= reach)
+
+
+def cluster_labels(points: Float64Array, config: ClusterConfig) -> Int64Array:
+    """Label the connected groups of points, neighbours being within `radius_m` of each other.
+
+    Returns:
+        (N,) labels from 0 in falling size (equal sizes: in the order of their first points); -1 for points of groups
+        smaller than `min_points`.
+    """
+    n = len(points)
+    if n == 0:
+        return np.zeros(0, dtype=np.int64)
+    pairs = cKDTree(points).query_pairs(config.radius_m, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    _, groups = connected_components(graph, directed=False)
+    sizes = np.bincount(groups)
+    first = np.unique(groups, return_index=True)[1]
+    order = np.lexsort((first, -sizes))
+    labels = np.full(len(sizes), -1, dtype=np.int64)
+    big = order[sizes[order] >= config.min_points]
+    labels[big] = np.arange(len(big))
+    return labels[groups]
+
+
+def _new_by_grid(
+    points: Float64Array, reference_points: Float64Array, low: Float64Array, shape: Int64Array, config: ExtractConfig
+) -> BoolArray:
+    """Look points up in a dense table over their own bounding box."""
+
+    def flat(cells: Float64Array) -> Int64Array:
+        index = cells.astype(np.int64)
+        return np.asarray((index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2])
+
+    reference = np.floor((reference_points - config.origin_m) / config.voxel_m) - low
+    reference = reference[((reference >= 0) & (reference < shape)).all(axis=1)]
+    if config.min_points == 1:
+        is_occupied = np.zeros(int(shape.prod()), dtype=np.bool_)
+        is_occupied[flat(reference)] = True
+    else:
+        is_occupied = np.bincount(flat(reference), minlength=int(shape.prod())) >= config.min_points
+    return ~is_occupied[flat(np.floor((points - config.origin_m) / config.voxel_m) - low)]
+
+
+def _new_by_keys(points: Float64Array, reference_points: Float64Array, config: ExtractConfig) -> BoolArray:
+    """Look points up among sorted keys: for clouds whose box is too large for a table."""
+    cells, counts = np.unique(cell_keys(reference_points, config.voxel_m, config.origin_m), return_counts=True)
+    occupied = cells[counts >= config.min_points]
+    return ~np.isin(cell_keys(points, config.voxel_m, config.origin_m), occupied)

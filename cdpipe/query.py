@@ -1,0 +1,122 @@
+"""From descriptors to changed regions: the inverted query of the paper, in both readings, threshold and suppression.
+
+The paper asks for the keyframes whose descriptors differ most between the sessions, `argmax f(Q_t,i, Q_t+1,j)`, and
+does not say how i and j are paired. Reading A ("nearest"): j's nearest neighbour in descriptor space, as in their
+FRAME code; the two may be different places. Reading B ("paired"): the keyframe at the same place after alignment.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from cdpipe.config import QueryConfig
+from cdpipe.geometry import BoolArray, Float64Array, Int64Array, transform
+from cdpipe.types import ChangeRegions, DescriptorSet, MergedMaps
+
+
+def find_regions(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> ChangeRegions:
+    """Score every keyframe of both sessions by descriptor distance to its partner, and rank the places.
+
+    Every keyframe is a candidate at its own position: those of the after session queried among the before session's
+    descriptors and, inverted, those of the before session among the after session's. In reading B, keyframes without a
+    partner within `max_pair_m` are no candidates.
+
+    Args:
+        merged: Accepted or not; only its poses are used.
+        before: Descriptors of the before session; `pairs[:, 0]` indexes its keyframes.
+        after: Descriptors of the after session; `pairs[:, 1]` indexes its keyframes.
+        config: Reading, radius, threshold, suppression.
+    """
+    before_positions = merged.before.odom_T_sensor[before.keyframe_scans, :3, 3]
+    after_odom = merged.after.odom_T_sensor[after.keyframe_scans, :3, 3]
+    after_positions = transform(merged.before_T_after, after_odom)
+    gap_b, near_a = _nearest(before_positions, after_positions)
+    gap_a, near_b = _nearest(after_positions, before_positions)
+    is_same_place_b, is_same_place_a = gap_b <= config.max_pair_m, gap_a <= config.max_pair_m
+
+    if config.reading == "nearest":
+        score_b, partner_of_b = _nearest(before.q, after.q)
+        score_a, partner_of_a = _nearest(after.q, before.q)
+        is_candidate_b, is_candidate_a = np.isfinite(score_b), np.isfinite(score_a)
+    else:
+        partner_of_b, partner_of_a = near_a, near_b
+        is_candidate_b, is_candidate_a = is_same_place_b, is_same_place_a
+        score_b = _distances(before, after, partner_of_b, is_candidate_b)
+        score_a = _distances(after, before, partner_of_a, is_candidate_a)
+
+    keyframe_scores = np.where(is_same_place_b, score_b, np.nan)
+    np.maximum.at(keyframe_scores, near_b[is_same_place_a], score_a[is_same_place_a])
+
+    pairs_a = np.column_stack([partner_of_a, np.arange(len(score_a))])
+    pairs_b = np.column_stack([np.arange(len(score_b)), partner_of_b])
+    return rank_regions(
+        centres_map=np.concatenate([after_positions[is_candidate_a], before_positions[is_candidate_b]]),
+        scores=np.concatenate([score_a[is_candidate_a], score_b[is_candidate_b]]),
+        pairs=np.concatenate([pairs_a[is_candidate_a], pairs_b[is_candidate_b]]),
+        keyframe_scores=keyframe_scores,
+        config=config,
+    )
+
+
+def rank_regions(
+    centres_map: Float64Array,
+    scores: Float64Array,
+    pairs: Int64Array,
+    keyframe_scores: Float64Array,
+    config: QueryConfig,
+) -> ChangeRegions:
+    """Order candidates by score, drop those too near to a better one, and mark what is reported.
+
+    Args:
+        centres_map: (N, 3) sphere centres, map frame, metres.
+        scores: (N,) larger means changed more surely; NaN is no candidate. Of equal scores the first comes first.
+        pairs: (N, 2) before and after keyframe of each.
+        keyframe_scores: (K,) passed on.
+        config: Radius, suppression distance, and threshold or number of regions.
+    """
+    order = np.argsort(-scores, kind="stable")
+    order = order[~np.isnan(scores[order])]
+    kept = order[_survivors(centres_map[order], config.suppression * config.radius_m)]
+    if config.n_regions is None:
+        is_reported = scores[kept] >= config.threshold
+    else:
+        is_reported = np.arange(len(kept)) < config.n_regions
+    return ChangeRegions(
+        centres_map=centres_map[kept],
+        radius_m=config.radius_m,
+        scores=scores[kept],
+        pairs=pairs[kept].astype(np.int64),
+        is_reported=is_reported,
+        keyframe_scores=keyframe_scores,
+    )
+
+
+def _survivors(centres: Float64Array, distance_m: float) -> BoolArray:
+    """Mark, going from best to worst, every centre that is not nearer than `distance_m` to one marked before."""
+    is_kept = np.ones(len(centres), dtype=np.bool_)
+    for index, centre in enumerate(centres):
+        if is_kept[index]:
+            is_kept[index + 1 :] &= np.linalg.norm(centres[index + 1 :] - centre, axis=1) >= distance_m
+    return is_kept
+
+
+def _nearest(points: npt.NDArray[Any], others: npt.NDArray[Any]) -> tuple[Float64Array, Int64Array]:
+    """Return distance and index of the nearest of `others` for each point; infinity and 0 where there are none."""
+    if len(others) == 0 or len(points) == 0:
+        return np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64)
+    distances, indices = cKDTree(others.astype(np.float64)).query(points.astype(np.float64))
+    return np.asarray(distances, dtype=np.float64), np.asarray(indices, dtype=np.int64)
+
+
+def _distances(
+    queries: DescriptorSet, others: DescriptorSet, partners: Int64Array, is_paired: BoolArray
+) -> Float64Array:
+    """Return the descriptor distance of each query to its partner, NaN where it has none."""
+    distances = np.full(len(queries.q), np.nan)
+    chosen = queries.q[is_paired].astype(np.float64) - others.q[partners[is_paired]]
+    distances[is_paired] = np.linalg.norm(chosen, axis=1)
+    return distances

@@ -1,0 +1,196 @@
+"""Opening a recorded session of either kind: a session folder of ours, or PLY scans with a TUM trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cdpipe.deskew import deskew
+from cdpipe.errors import InputError
+from cdpipe.geometry import Float64Array, Int64Array, make_pose
+from cdpipe.ply import read_ply_points
+from cdpipe.session import ScanChunk, Session, chunk_path, is_session, read_session
+from cdpipe.types import PosedScan, ScanSource
+
+_UNIT_TOLERANCE = 1e-3
+_TUM_LINE = "stamp tx ty tz qx qy qz qw"
+
+
+def open_scans(path: Path) -> ScanSource:
+    """Open a folder of scans.
+
+    Args:
+        path: A session folder (cdpipe.session), or a folder of `*.ply` scans, taken in the order of their names, with
+            one trajectory `*.txt` or `*.tum`: one line `stamp tx ty tz qx qy qz qw` for each scan, in the same order.
+            PLY points are in the sensor frame of their pose, metres, deskewed already; `pixels` are rows of the file.
+
+    Raises:
+        InputError: The folder is missing or holds neither, or its trajectory does not fit its scans. Mistakes inside a
+            single scan are raised when it is read.
+    """
+    if not path.is_dir():
+        raise InputError(f"{path}: no such folder: expected a session, or a folder of PLY scans with a TUM trajectory")
+    return RecordedScans(read_session(path)) if is_session(path) else _open_ply_scans(path)
+
+
+class RecordedScans:
+    """The scans of a session folder, deskewed with its own odometry. The chunk read last is kept."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._chunk_index = -1
+        self._chunk: ScanChunk | None = None
+
+    @property
+    def name(self) -> str:
+        """The session's folder."""
+        return str(self._session.path)
+
+    @property
+    def odom_T_sensor(self) -> Float64Array:
+        """(S, 4, 4) pose of each revolution."""
+        return self._session.odom_T_sensor
+
+    def scan(self, index: int) -> PosedScan:
+        """Read one revolution.
+
+        Raises:
+            InputError: Its chunk is damaged, its column poses are not rigid, or nothing returned.
+        """
+        chunk_index, row = divmod(index, self._session.chunk_scans)
+        if self._chunk is None or chunk_index != self._chunk_index:
+            self._chunk, self._chunk_index = self._session.chunk(chunk_index), chunk_index
+        where = f"{chunk_path(self._session.path, chunk_index)}: scan {index}"
+        column_poses = self._chunk.column_poses[row].astype(np.float64)
+        _require_unit_poses(column_poses, lambda column: f"{where}, column {column}")
+        range_mm = self._chunk.range_mm[row]
+        is_hit = range_mm > 0
+        if not is_hit.any():
+            raise InputError(f"{where} holds no return: remove the scan and its pose from the recording")
+        points = deskew(self._session.sensor.project(range_mm / 1000.0), column_poses)
+        stamps = np.broadcast_to(self._chunk.column_stamps_ns[row], is_hit.shape)
+        return PosedScan(
+            index=index,
+            points_sensor=points[is_hit],
+            odom_T_sensor=self.odom_T_sensor[index],
+            stamps_ns=stamps[is_hit],
+            pixels=np.flatnonzero(is_hit).astype(np.int32),
+        )
+
+    def scans(self) -> Iterator[PosedScan]:
+        """Read all revolutions in order; each chunk is read once."""
+        return (self.scan(index) for index in range(len(self.odom_T_sensor)))
+
+
+class PlyScans:
+    """Scans in PLY files, each with one pose."""
+
+    def __init__(self, folder: Path, files: list[Path], odom_T_sensor: Float64Array, stamps_ns: Int64Array) -> None:
+        self._folder = folder
+        self._files = files
+        self._odom_T_sensor = odom_T_sensor
+        self._stamps_ns = stamps_ns
+
+    @property
+    def name(self) -> str:
+        """The folder."""
+        return str(self._folder)
+
+    @property
+    def odom_T_sensor(self) -> Float64Array:
+        """(S, 4, 4) pose of each scan."""
+        return self._odom_T_sensor
+
+    def scan(self, index: int) -> PosedScan:
+        """Read one file.
+
+        Raises:
+            InputError: It is not a PLY scan, is empty, or holds a point that is not finite.
+        """
+        path = self._files[index]
+        points = read_ply_points(path)
+        if len(points) == 0:
+            raise InputError(f"{path}: holds no point: remove the scan and its line of the trajectory")
+        is_finite = np.isfinite(points).all(axis=1)
+        if not is_finite.all():
+            raise InputError(
+                f"{path}: vertex {int(np.argmin(is_finite))} is not finite ({np.count_nonzero(~is_finite)} are not): "
+                "remove them from the file"
+            )
+        return PosedScan(
+            index=index,
+            points_sensor=points,
+            odom_T_sensor=self._odom_T_sensor[index],
+            stamps_ns=np.full(len(points), self._stamps_ns[index]),
+            pixels=np.arange(len(points), dtype=np.int32),
+        )
+
+    def scans(self) -> Iterator[PosedScan]:
+        """Read all scans in order."""
+        return (self.scan(index) for index in range(len(self._files)))
+
+
+def _open_ply_scans(folder: Path) -> PlyScans:
+    files = sorted(folder.glob("*.ply"))
+    if not files:
+        raise InputError(
+            f"{folder}: no scans in it: expected session.json (a session of ours), or *.ply scans with a TUM trajectory"
+        )
+    trajectories = sorted([*folder.glob("*.txt"), *folder.glob("*.tum")])
+    if len(trajectories) != 1:
+        found = ", ".join(file.name for file in trajectories) or "none"
+        raise InputError(
+            f"{folder}: expected exactly one trajectory (*.txt or *.tum, lines {_TUM_LINE}), found {found}"
+        )
+    stamps_ns, odom_T_sensor = _read_tum(trajectories[0])
+    if len(odom_T_sensor) != len(files):
+        raise InputError(
+            f"{trajectories[0]}: {len(odom_T_sensor)} poses for {len(files)} *.ply scans: one line for each scan is "
+            "needed, in the order of the file names"
+        )
+    return PlyScans(folder, files, odom_T_sensor, stamps_ns)
+
+
+def _read_tum(path: Path) -> tuple[Int64Array, Float64Array]:
+    """Return stamps from the first one on (S,) and poses (S, 4, 4)."""
+    rows, numbers = [], []
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text: {error}") from error
+    for number, line in enumerate(lines, start=1):
+        text = line.strip()
+        if not text or text.startswith("#"):
+            continue
+        try:
+            row = [float(word) for word in text.split()]
+        except ValueError:
+            row = []
+        if len(row) != 8:
+            raise InputError(f"{path}:{number}: expected eight numbers, {_TUM_LINE}; got {text[:60]!r}")
+        rows.append(row)
+        numbers.append(number)
+    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
+    _require_unit_poses(table[:, 1:], lambda index: f"{path}:{numbers[index]}")
+    if not np.isfinite(table[:, 0]).all():
+        raise InputError(f"{path}:{numbers[int(np.argmin(np.isfinite(table[:, 0])))]}: the stamp is not finite")
+    stamps_ns = np.round((table[:, 0] - table[:1, 0]) * 1e9).astype(np.int64)
+    poses = [make_pose(Rotation.from_quat(row[4:]).as_matrix(), row[1:4]) for row in table]
+    return stamps_ns, np.array(poses).reshape(-1, 4, 4)
+
+
+def _require_unit_poses(poses: Float64Array, where: Callable[[int], str]) -> None:
+    """Check (N, 7) poses x, y, z, qx, qy, qz, qw."""
+    is_finite = np.isfinite(poses).all(axis=1)
+    if not is_finite.all():
+        raise InputError(f"{where(int(np.argmin(is_finite)))}: the pose is not finite: mend it or leave the scan out")
+    norms = np.linalg.norm(poses[:, 3:], axis=1)
+    is_unit = np.abs(norms - 1.0) < _UNIT_TOLERANCE
+    if not is_unit.all():
+        index = int(np.argmin(is_unit))
+        raise InputError(
+            f"{where(index)}: the quaternion's length is {norms[index]:.6g}, expected 1: the order is qx qy qz qw"
+        )

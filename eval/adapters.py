@@ -1,0 +1,21 @@
+"""Where a simulated session becomes the pipeline's input: the only such place, so truth cannot leak into a method."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cdpipe.readers import open_scans
+from cdpipe.types import ScanSource, SessionName
+
+
+def pipeline_input(pair: Path, session: SessionName) -> ScanSource:
+    """Open one session of a simulated pair as the pipeline sees it: scans and the robot's own poses, never truth.
+
+    Args:
+        pair: Folder of the pair; truth lies in its `truth` folders and is not opened.
+        session: "before" or "after".
+
+    Raises:
+        InputError: The session is missing or damaged.
+    """
+    return open_scans(pair / session)

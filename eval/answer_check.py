@@ -1,0 +1,129 @@
+"""Checks an answer against the sessions it speaks about before anything is scored; foreign answers come as they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from cdpipe.answer import Answer
+from cdpipe.errors import InputError
+from cdpipe.geometry import Float64Array, Int64Array, require_poses, require_shape
+from cdpipe.types import ChangedObject, ChangeRegions, Kind, SessionName
+from eval.ground_truth import SESSIONS, GroundTruth, SessionTruth
+
+
+def check_answer(answer: Answer, truth: GroundTruth, folder: Path) -> None:
+    """Raise `InputError`, naming the folder and the field, unless an ok answer can be scored against this pair.
+
+    Raises:
+        InputError: A number is NaN, an index lies outside of its session, or a return is named twice.
+    """
+    report = answer.report
+    if report is None:
+        return
+    try:
+        require_poses("before_T_after", report.before_T_after[None])
+        for session, scans in zip(SESSIONS, report.keyframe_scans, strict=True):
+            _check_scans(f"{session}_keyframe_scans", scans, len(truth.sessions[session].odom_T_sensor))
+        _check_regions(report.regions, len(report.keyframe_scans[0]), len(truth.before.odom_T_sensor))
+        for name, values in report.figures.items():
+            require_shape(f"figure_{name}", values, (len(report.regions.scores),))
+        for index, item in enumerate(report.objects):
+            _check_object(f"objects[{index}]", item, len(report.objects), len(report.regions.scores))
+        for session in SESSIONS:
+            _check_returns(session, report.objects, truth.sessions[session])
+            _check_points(session, report.objects, answer.points_odom)
+    except ValueError as error:
+        raise InputError(f"{folder}: not an answer to this pair: {error}") from error
+
+
+def _check_regions(regions: ChangeRegions, n_keyframes: int, n_scans: int) -> None:
+    for name, values in (("region_centres_map", regions.centres_map), ("region_scores", regions.scores)):
+        _require_finite(name, values)
+    if not (np.isfinite(regions.radius_m) and regions.radius_m > 0):
+        raise ValueError(f"radius_m = {regions.radius_m}: expected a length in metres")
+    n_scored = n_keyframes or n_scans
+    if len(regions.keyframe_scores) not in (0, n_scored):
+        raise ValueError(
+            f"keyframe_scores has {len(regions.keyframe_scores)} entries: expected one for each of the {n_scored} "
+            "before keyframes, or none"
+        )
+
+
+def _check_scans(name: str, scans: Int64Array, n_scans: int) -> None:
+    if scans.ndim != 1 or not np.issubdtype(scans.dtype, np.integer):
+        raise ValueError(f"{name} must be a list of whole numbers, got {scans.dtype} {scans.shape}")
+    if len(scans) and not (scans.min() >= 0 and scans.max() < n_scans):
+        raise ValueError(f"{name} names scans {scans.min()} to {scans.max()}, the session has 0 to {n_scans - 1}")
+
+
+def _check_object(where: str, item: ChangedObject, n_objects: int, n_regions: int) -> None:
+    for name, value, known in (("session", item.session, SessionName), ("kind", item.kind, Kind)):
+        if value not in get_args(known):
+            raise ValueError(f"{where}.{name} = {value!r}: expected one of {', '.join(get_args(known))}")
+    if not -1 <= item.partner < n_objects:
+        raise ValueError(f"{where}.partner = {item.partner}: there are {n_objects} objects; -1 means none")
+    if not -1 <= item.region < n_regions:
+        raise ValueError(f"{where}.region = {item.region}: there are {n_regions} regions; -1 means none")
+    _require_finite(f"{where}: object_points_map", item.points_map)
+
+
+def _check_returns(session: SessionName, objects: tuple[ChangedObject, ...], truth: SessionTruth) -> None:
+    n_scans, n_pixels = truth.universe.n_scans, truth.universe.n_pixels
+    taken = []
+    for index, item in enumerate(objects):
+        if item.session != session:
+            continue
+        if not np.issubdtype(item.returns.dtype, np.integer):
+            raise ValueError(f"objects[{index}]: object_returns must be whole numbers, got {item.returns.dtype}")
+        if len(item.returns) == 0:
+            continue
+        if not ((item.returns >= 0).all() and (item.returns < (n_scans, n_pixels)).all()):
+            bad = item.returns[((item.returns < 0) | (item.returns >= (n_scans, n_pixels))).any(axis=1)][0]
+            raise ValueError(
+                f"objects[{index}] names return (scan {bad[0]}, pixel {bad[1]}), outside of the {session} session's "
+                f"{n_scans} scans of {n_pixels} pixels"
+            )
+        taken.append(item.returns[:, 0].astype(np.int64) * n_pixels + item.returns[:, 1])
+    if not taken:
+        return
+    keys, counts = np.unique(np.concatenate(taken), return_counts=True)
+    if (counts > 1).any():
+        scan, pixel = divmod(int(keys[counts > 1][0]), n_pixels)
+        raise ValueError(
+            f"object_returns name return (scan {scan}, pixel {pixel}) of the {session} session twice: "
+            "a return belongs to one object at most"
+        )
+
+
+def _check_points(
+    session: SessionName, objects: tuple[ChangedObject, ...], points_odom: tuple[Float64Array, ...] | None
+) -> None:
+    if points_odom is None:
+        return
+    owners, all_points = [], []
+    for index, (item, points) in enumerate(zip(objects, points_odom, strict=True)):
+        require_shape(f"objects[{index}]: object_points_odom", points, (None, 3))
+        _require_finite(f"objects[{index}]: object_points_odom", points)
+        if item.session == session:
+            distinct = np.unique(points, axis=0)
+            owners.append(np.full(len(distinct), index))
+            all_points.append(distinct)
+    if not all_points:
+        return
+    _, first, counts = np.unique(np.concatenate(all_points), axis=0, return_index=True, return_counts=True)
+    if (counts > 1).any():
+        owner = int(np.concatenate(owners)[first[counts > 1][0]])
+        raise ValueError(
+            f"objects[{owner}] shares a point of object_points_odom with another object: one owner at most"
+        )
+
+
+def _require_finite(name: str, values: Float64Array) -> None:
+    if not np.isfinite(values).all():
+        raise ValueError(
+            f"{name}: entry {int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))} "
+            "is not a finite number"
+        )

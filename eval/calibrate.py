@@ -1,0 +1,69 @@
+"""Sets the threshold of every method to the same false-alarm rate: 5 % of unchanged validation pairs alarm.
+
+Run as `python -m eval.calibrate RUN`, where RUN is the folder of `tunnelcd run calibrate`. The thresholds are printed
+and written to RUN/thresholds.csv; they go into the presets by hand, so that no preset changes behind anyone's back.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import pandas as pd
+import typer
+
+from cdpipe.errors import InputError
+from cdpipe.geometry import Float64Array
+
+ALARM_SHARE = 0.05
+
+
+def alarm_threshold(best_scores: Float64Array, alarm_share: float = ALARM_SHARE) -> float:
+    """Return the smallest threshold, rounded up to four digits, that at most `alarm_share` of the pairs reach.
+
+    Args:
+        best_scores: (P,) best candidate's score of every unchanged pair; -inf for a pair without candidates.
+        alarm_share: Share of pairs that may alarm.
+    """
+    if len(best_scores) == 0 or np.isnan(best_scores).any():
+        raise ValueError("best_scores must hold a number for each of at least one pair")
+    allowed = int(alarm_share * len(best_scores))
+    silent_best = np.sort(best_scores)[::-1][allowed]
+    if np.isinf(silent_best):
+        return 0.0
+    digits = 4 - int(np.floor(np.log10(max(abs(float(silent_best)), 1e-12)))) - 1
+    threshold = float(np.ceil(silent_best * 10.0**digits) / 10.0**digits)
+    return threshold if threshold > silent_best else float(round(threshold + 10.0**-digits, digits))
+
+
+def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
+    """Return one row per variant: threshold, pairs, pairs that alarm at it, refused pairs.
+
+    Raises:
+        InputError: A pair has changes, so that its alarms would not be false.
+    """
+    changed = results.loc[results["n_changes"] > 0, "scenario"].unique()
+    if len(changed):
+        raise InputError(f"{', '.join(changed)}: has changes: calibration needs unchanged pairs")
+    best = regions.groupby(["variant", "scenario", "seed"])["score"].max()
+    rows = []
+    for variant, cases in results.groupby("variant", sort=False):
+        ok = cases[cases["status"] == "ok"]
+        keys = [(variant, scenario, seed) for scenario, seed in zip(ok["scenario"], ok["seed"], strict=True)]
+        scores = np.array([best.get(key, -np.inf) for key in keys], dtype=np.float64)
+        threshold = alarm_threshold(scores)
+        n_alarms = int((scores >= threshold).sum())
+        rows.append((variant, threshold, len(ok), n_alarms, len(cases) - len(ok)))
+    return pd.DataFrame(rows, columns=["variant", "threshold", "n_pairs", "n_alarms", "n_refused"])
+
+
+def main(run: Annotated[Path, typer.Argument(help="folder of `tunnelcd run calibrate`")]) -> None:
+    """Print and write the thresholds of a calibration run."""
+    table = thresholds(pd.read_csv(run / "results.csv"), pd.read_csv(run / "regions.csv"))
+    table.to_csv(run / "thresholds.csv", index=False)
+    typer.echo(table.to_string(index=False))
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,303 @@
+"""The command line. Heavy imports stand inside the commands, so that --help and completion are instant.
+
+Exit codes: 0 done, 2 the input is at fault (one line each on standard error), 1 a bug (a traceback), 130 interrupted.
+"""
+
+# ruff: noqa: PLC0415 - heavy imports stand inside the commands, see above
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from typer.core import TyperGroup
+
+from eval.progress import Bars, RunProgress, Silent
+from eval.provenance import fix_threads
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from eval.plan import Plan
+
+
+class _Funnel(TyperGroup):
+    """Turns what a user can cause into one line and an exit code; anything else stays a traceback."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command."""
+        from cdpipe.errors import TunnelcdError
+
+        try:
+            return super().invoke(ctx)
+        except TunnelcdError as error:
+            for line in str(error).splitlines():
+                sys.stderr.write(f"error: {line}\n")
+            raise typer.Exit(2) from error
+        except KeyboardInterrupt as error:
+            sys.stderr.write("interrupted; finished cells are kept, the same command goes on from there\n")
+            raise typer.Exit(130) from error
+
+
+app = typer.Typer(
+    cls=_Funnel,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="A benchmark for change detection between two LiDAR sessions of a tunnel.",
+)
+
+OutFolder = Annotated[Path, typer.Option("--out", help="output folder, new or empty", show_default=False)]
+RunOut = Annotated[Path, typer.Option("--out", help="run folder: new, empty, or to be continued", show_default=False)]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="no progress, no tables")]
+Preset = Annotated[str, typer.Option("--preset", help="shipped preset, or a .yaml file")]
+SetSettings = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="a setting; repeatable")]
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line and exit."""
+    fix_threads()
+    app(args=None if argv is None else list(argv), prog_name="tunnelcd")
+
+
+@app.command()
+def demo(out: RunOut, quiet: Quiet = False) -> None:
+    """Both paper sites end to end: simulate, detect, score, report."""
+    from eval.page import write_page
+    from eval.plan import load_plan
+
+    _run(load_plan("paper"), out, force=False, limit=None, quiet=quiet)
+    page = write_page(out)
+    typer.echo(f"page: {page}")
+
+
+@app.command()
+def simulate(
+    scenario: Annotated[str, typer.Argument(help="name from `list`, or a .yaml file")],
+    out: OutFolder,
+    seed: Annotated[int, typer.Option(min=0, help="draws every distribution and all noise")] = 0,
+    settings: SetSettings = None,
+    quiet: Quiet = False,
+) -> None:
+    """Make one pair of sessions with truth: DIR/before, DIR/after, DIR/truth."""
+    from eval.output import new_folder
+    from scenarios.library import load_scenario
+    from sim.simulate import simulate_pair
+
+    drawn = load_scenario(scenario, seed, settings or ())
+    with new_folder(out) as partial, _progress(quiet) as progress:
+        pair = partial / "pair"
+        simulate_pair(drawn, seed, pair, on_progress=progress.stage)
+        for part in list(pair.iterdir()):
+            part.rename(partial / part.name)
+        pair.rmdir()
+    _say(quiet, f"{out}: before, after, truth of {scenario}, seed {seed}")
+
+
+@app.command()
+def describe(
+    session: Annotated[Path, typer.Argument(help="session folder, or PLY scans with a TUM trajectory")],
+    preset: Preset = "tunnelcd",
+    settings: SetSettings = None,
+    quiet: Quiet = False,
+) -> None:
+    """Compute a session's descriptors and store them beside it, as a robot would while mapping."""
+    from cdpipe.config import load_config
+    from eval.single import describe_session
+
+    descriptors, path = describe_session(session, load_config(preset, settings or ()))
+    _say(quiet, f"{path}: {len(descriptors.q)} keyframes, {descriptors.name} {descriptors.checkpoint}")
+
+
+@app.command()
+def detect(
+    before: Annotated[Path, typer.Argument(help="session folder, or PLY scans with a TUM trajectory")],
+    after: Annotated[Path, typer.Argument(help="the later session")],
+    out: OutFolder,
+    preset: Preset = "tunnelcd",
+    settings: SetSettings = None,
+    quiet: Quiet = False,
+) -> None:
+    """Find what changed between two sessions, simulated or recorded; needs no truth."""
+    from cdpipe.config import load_config
+    from eval.output import new_folder
+    from eval.single import detect_pair, object_table, region_table, write_detection
+
+    config = load_config(preset, settings or ())
+    with new_folder(out) as partial, _status(quiet) as on_stage:
+        report = detect_pair(before, after, config, on_stage)
+        write_detection(partial, preset, report)
+    if quiet:
+        return
+    _table("regions (map frame = the before session's odometry)", region_table(report))
+    _table("objects", object_table(report))
+    times = ", ".join(f"{name[2:-2]} {seconds:.3f} s" for name, seconds in report.seconds.items())
+    typer.echo(f"{out}: answer.json, answer.npz, regions.csv, objects.csv, objects.ply ({times})")
+
+
+@app.command()
+def score(
+    folder: Annotated[Path, typer.Argument(help="a run folder; or a simulated pair, with the answer as second folder")],
+    answer: Annotated[
+        Path | None, typer.Argument(help="one answer to score against the pair", show_default=False)
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Score stored answers against the truth again; nothing is run."""
+    if answer is not None:
+        from eval.scoring import score_pair
+
+        _row(score_pair(folder, answer).row)
+        return
+    from eval.rescoring import rescore
+    from eval.runfolder import open_run_folder
+
+    run = open_run_folder(folder)
+    with _progress(quiet) as progress:
+        n_scored = rescore(run, progress)
+    _results(run.path, quiet)
+    _say(quiet, f"{folder}: {n_scored} answers scored again, tables rewritten")
+
+
+@app.command("run")
+def run_command(
+    plan: Annotated[str, typer.Argument(help="name from `list`, or a .yaml file")],
+    out: RunOut,
+    seeds: Annotated[str | None, typer.Option(metavar="A:B", help="instead of the plan's; B excluded")] = None,
+    settings: SetSettings = None,
+    grid: Annotated[
+        list[str] | None,
+        typer.Option("--grid", metavar="KEY=V1,V2", help="run every variant at each value; repeatable"),
+    ] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="do at most this many cells")] = None,
+    force: Annotated[bool, typer.Option("--force", help="redo finished cells, simulation included")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Run a plan: scenarios x seeds x variants. Finished cells are kept and skipped."""
+    from eval.plan import changed_plan, load_plan
+
+    chosen = changed_plan(load_plan(plan), seeds=seeds, settings=settings or (), grid=grid or ())
+    _run(chosen, out, force=force, limit=limit, quiet=quiet)
+
+
+@app.command()
+def report(folder: Annotated[Path, typer.Argument(help="a run folder")]) -> None:
+    """Write one offline page with tables, plots and pictures of a run."""
+    from eval.page import write_page
+    from eval.runfolder import open_run_folder
+
+    typer.echo(f"page: {write_page(open_run_folder(folder).path)}")
+
+
+@app.command("list")
+def list_command() -> None:
+    """Name the scenarios, plans, presets and sensor profiles there are."""
+    from cdpipe.config import preset_names
+    from cdpipe.ouster import profile_names
+    from eval.plan import plan_names
+    from scenarios.library import scenario_names
+
+    groups = {
+        "scenarios": scenario_names(),
+        "plans": plan_names(),
+        "presets": preset_names(),
+        "sensor profiles": profile_names(),
+    }
+    for title, names in groups.items():
+        typer.echo(f"{title}:")
+        for name in names:
+            typer.echo(f"  {name}")
+
+
+@app.command()
+def check(files: Annotated[list[str], typer.Argument(help="scenario, plan or preset: a name or a .yaml file")]) -> None:
+    """Validate scenarios, plans and presets without running anything."""
+    from cdpipe.errors import InputError
+    from eval.checking import check_file
+
+    mistakes: list[str] = []
+    for file in files:
+        try:
+            typer.echo(f"{file}: {check_file(file)}, no mistakes")
+        except InputError as error:
+            mistakes += str(error).splitlines()
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+
+
+def _run(plan: Plan, out: Path, *, force: bool, limit: int | None, quiet: bool) -> None:
+    from eval.runfolder import start_run_folder
+    from eval.runner import run_plan
+
+    run = start_run_folder(out)
+    with _progress(quiet) as progress:
+        outcome = run_plan(plan, run, command=sys.argv, force=force, limit=limit, progress=progress)
+    _results(out, quiet)
+    left = f", {outcome.n_left} left by --limit" if outcome.n_left else ""
+    _say(quiet, f"{out}: {outcome.n_done} cells done, {outcome.n_kept} kept from earlier{left}")
+
+
+_SHOWN = (
+    "scenario", "seed", "variant", "status", "region_recall", "region_precision", "region_recall_at_k", "n_regions",
+    "object_iou_point", "object_f1_25", "merge_error_m", "t_total_s",
+)  # fmt: skip
+
+
+def _results(folder: Path, quiet: bool) -> None:
+    if quiet:
+        return
+    import pandas as pd
+
+    results = pd.read_csv(folder / "results.csv")
+    _table("results", results[[name for name in _SHOWN if name in results.columns]])
+
+
+def _table(title: str, frame: pd.DataFrame) -> None:
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    for name in frame.columns:
+        table.add_column(str(name), overflow="fold")
+    for row in frame.itertuples(index=False):
+        table.add_row(*(_cell(value) for value in row))
+    console = Console(soft_wrap=True) if not sys.stdout.isatty() else Console()
+    console.print(table)
+
+
+def _row(row: dict[str, Any]) -> None:
+    width = max(map(len, row))
+    for name, value in row.items():
+        typer.echo(f"{name:<{width}}  {_cell(value)}")
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return "-" if math.isnan(value) else f"{value:.4g}"
+    return str(value)
+
+
+def _say(quiet: bool, text: str) -> None:
+    if not quiet:
+        typer.echo(text)
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[RunProgress]:
+    if quiet:
+        yield Silent()
+    else:
+        with Bars() as bars:
+            yield bars
+
+
+@contextmanager
+def _status(quiet: bool) -> Iterator[Callable[[str], None]]:
+    if quiet:
+        yield lambda stage: None
+    else:
+        with Console(stderr=True).status("") as status:
+            yield status.update

@@ -1,0 +1,76 @@
+"""Output folders that appear whole or not at all."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from cdpipe.errors import InputError
+
+
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Yield a hidden empty folder that becomes `path` when the block ends well, and is removed when it does not.
+
+    Raises:
+        InputError: `path` is a file or a folder with something in it, or cannot be made.
+    """
+    path = path.absolute()
+    partial = path.with_name(f".{path.name}.partial")
+    made = _missing_parents(path)
+    try:
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            what = "is not empty" if path.is_dir() else "is a file"
+            raise InputError(f"{path}: {what}: name a new or empty folder for the output")
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir()
+        if path.exists():
+            probe = path / partial.name
+            probe.touch()
+            probe.unlink()
+    except OSError as error:
+        _remove_empty(made)
+        raise unwritable(path, error) from error
+    try:
+        yield partial
+        if path.exists():
+            path.rmdir()
+        partial.replace(path)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        _remove_empty(made)
+        raise
+
+
+def make_writable(path: Path) -> None:
+    """Make a folder unless it exists, and try whether a file can be made in it.
+
+    Raises:
+        InputError: The path is a file, or nothing can be written there.
+    """
+    probe = path / ".tunnelcd.partial"
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def unwritable(path: Path, error: OSError) -> InputError:
+    """Return the error that says why an output folder cannot be used."""
+    return InputError(f"{path}: cannot write there ({error.strerror}): name a folder you may write to")
+
+
+def _missing_parents(path: Path) -> list[Path]:
+    """Return the ancestors that do not exist, deepest first."""
+    return [parent for parent in path.parents if not parent.exists()]
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    for folder in folders:
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()

@@ -1,0 +1,173 @@
+"""One offline page about a run, with tables and pictures like the paper's, and its tables as CSV and LaTeX beside it.
+
+The page reads a run folder and runs nothing. Everything it shows is inside the file: no script, no font and no picture
+is fetched. What a folder lacks is named on the page; only a folder without results.csv is refused.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from cdpipe.config import settings_table
+from cdpipe.errors import InputError
+from eval.figures import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
+from eval.page_columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
+from eval.page_paper import time_table, volume_table
+from eval.page_run import RunData, first_seed, named_variants, of, read_document, read_run, scenarios, text
+from eval.page_site import draw_site
+from eval.page_story import story
+from eval.page_tables import (
+    Cell,
+    Table,
+    grid_tables,
+    results_table,
+    to_csv,
+    to_latex,
+    unchanged_table,
+)
+
+POINT_COLOURS = (
+    (BLUE, "right"), (BLACK, "missed"), (VERMILLION, "wrong"), (ORANGE, "part of another answered object"),
+    (CONTEXT, "surroundings"),
+)  # fmt: skip
+
+
+def write_page(run: Path) -> Path:
+    """Write `index.html` and the tables table1, table2 (.csv, .tex) and results.tex into a run folder.
+
+    Args:
+        run: The folder; results.csv must be there, anything else may be missing.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        InputError: There are no results, or the folder cannot be written.
+    """
+    data = read_run(run)
+    tables = {"results": results_table(data), "table1": time_table(data), "table2": volume_table(data)}
+    files = {"results.tex": to_latex(tables["results"])}
+    for name in ("table1", "table2"):
+        files[f"{name}.csv"] = to_csv(tables[name])
+        files[f"{name}.tex"] = to_latex(tables[name])
+    files["index.html"] = _render(_content(data, tables))
+    for name, content in files.items():
+        _write(run / name, content)
+    return run / "index.html"
+
+
+def _content(data: RunData, tables: Mapping[str, Table]) -> dict[str, Any]:
+    sites = [draw_site(data, scenario) for scenario in scenarios(data, unchanged=False)]
+    grids = grid_tables(data)
+    unchanged = unchanged_table(data)
+    missing = [*data.missing, *(line for site in sites for line in site.missing)]
+    missing += [] if sites else ["no scenario with changes was run."]
+    missing += [] if unchanged.rows else ["no unchanged pair was run, so false alarms are not measured."]
+    missing += [] if grids else ["no grid of two settings was run."]
+    return {
+        "plan": str(data.provenance.get("plan", {}).get("name", "")),
+        "sentences": story(data),
+        "machine": machine_text(data.provenance),
+        "command": str(data.provenance.get("command") or "unknown"),
+        "finished": str(data.provenance.get("finished") or "unknown"),
+        "missing": [line[0].upper() + line[1:] for line in dict.fromkeys(missing)],
+        "failures": failures(data),
+        "results": tables["results"],
+        "unchanged": unchanged,
+        "table1": tables["table1"],
+        "table2": tables["table2"],
+        "grids": grids,
+        "sites": sites,
+        "settings": settings(data),
+        "provenance": json.dumps(data.provenance, indent=2, ensure_ascii=False),
+        "columns": RESULT_COLUMNS,
+        "time_meanings": TIME_MEANINGS,
+        "point_colours": POINT_COLOURS,
+    }
+
+
+def failures(data: RunData) -> list[str]:
+    """Return one line for every case that gave no answer."""
+    return [
+        f"{row['scenario']}, seed {row['seed']}, {row['variant']}: {text(row, 'status').replace('_', ' ')}"
+        + (f": {text(row, 'error')}" if text(row, "error") else "")
+        for row in data.results
+        if text(row, "status") != "ok"
+    ]
+
+
+def machine_text(provenance: Mapping[str, Any]) -> str:
+    """Return the machine in a few words: processor, cores, memory, threads."""
+    machine = provenance.get("machine")
+    if not isinstance(machine, Mapping):
+        return "unknown"
+    threads = machine.get("threads")
+    used = threads.get("OMP_NUM_THREADS", "unknown") if isinstance(threads, Mapping) else "unknown"
+    parts = [
+        str(machine.get("cpu", "unknown processor")),
+        f"{machine.get('cores', 'unknown')} cores",
+        f"{machine.get('memory_gb', 'unknown')} GB",
+        str(machine.get("platform", "")),
+        f"OMP_NUM_THREADS {used}",
+    ]
+    return ", ".join(part for part in parts if part)
+
+
+def settings(data: RunData) -> Table:
+    """Return the effective settings of every named variant, from its answers, sites that differ side by side."""
+    found: dict[str, list[dict[str, str]]] = {}
+    for scenario in [*scenarios(data, unchanged=False), *scenarios(data, unchanged=True)]:
+        seed = first_seed(data, scenario)
+        for name in named_variants(data, scenario):
+            if of(data.results, scenario=scenario, seed=seed, variant=name):
+                document = read_document(data.folder.answer(scenario, seed, name) / "answer.json")
+                found.setdefault(name, []).append(_flat(document.get("config") or {}))
+    keys = [key for key, _, _ in settings_table()]
+    keys += sorted({key for configs in found.values() for config in configs for key in config} - set(keys))
+    rows = []
+    for key in keys:
+        values = [
+            " / ".join(dict.fromkeys(config[key] for config in configs if key in config)) or UNDEFINED
+            for configs in found.values()
+        ]
+        differs = len(set(values)) > 1
+        rows.append(("", (Cell(key), *(Cell(value, differs) for value in values))))
+    return Table(("setting", *found), tuple(rows), "Effective settings")
+
+
+def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    flat: dict[str, str] = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            flat.update(_flat(value, f"{prefix}{key}."))
+        else:
+            flat[prefix + key] = "none" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+    return flat
+
+
+def _render(content: Mapping[str, Any]) -> str:
+    folder = resources.files("eval") / "templates"
+    sources = {name: (folder / name).read_text(encoding="utf-8") for name in ("page.html", "page.css")}
+    environment = jinja2.Environment(
+        loader=jinja2.DictLoader(sources),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("page.html").render(content)
+
+
+def _write(path: Path, content: str) -> None:
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        partial.write_text(content, encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,153 @@
+"""How the columns of results.csv are shown: heading, format, which direction is better, what they mean."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+EN_DASH = "\u2013"
+THIN_SPACE = "\u2009"
+UNDEFINED = EN_DASH
+
+
+def share(value: float) -> str:
+    """Write two decimals, for shares and rates."""
+    return UNDEFINED if math.isnan(value) else f"{value:.2f}"
+
+
+def fine(value: float) -> str:
+    """Write three decimals, for errors in metres and degrees."""
+    return UNDEFINED if math.isnan(value) else f"{value:.3f}"
+
+
+def significant(value: float) -> str:
+    """Write three significant digits without an exponent, for seconds and volumes."""
+    if math.isnan(value):
+        return UNDEFINED
+    if abs(value) >= 100:
+        return f"{value:.0f}"
+    return np.format_float_positional(value, precision=3, fractional=False, unique=False, trim="-")
+
+
+def count(value: float) -> str:
+    """Write a whole number with thin spaces between the thousands; a mean that is not whole gets one decimal."""
+    if math.isnan(value):
+        return UNDEFINED
+    return f"{value:,.0f}".replace(",", THIN_SPACE) if value == round(value) else f"{value:.1f}"
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column of results.csv.
+
+    Attributes:
+        key: Its name there.
+        heading: What stands above it on the page.
+        better: Which direction wins, or None where neither does.
+        shown: How a value is written.
+        meaning: What it is.
+        when_undefined: When it has no value.
+    """
+
+    key: str
+    heading: str
+    better: Literal["high", "low"] | None
+    shown: Callable[[float], str]
+    meaning: str
+    when_undefined: str
+
+
+_NO_CHANGE = "Undefined where the pair has no observable change."
+_NOT_OK = "Undefined where the status is not ok."
+
+RESULT_COLUMNS = (
+    Column(
+        "region_recall", "region recall", "high", share,
+        "Share of the observable changes that a reported region finds: its centre lies within the family's scoring "
+        "radius of the change's centroid.",
+        _NO_CHANGE,
+    ),
+    Column(
+        "region_precision", "region precision", "high", share,
+        "Share of true regions among the reported true and false ones; a second region on a found change counts as "
+        "neither.",
+        "Undefined where no region was reported that counts.",
+    ),
+    Column(
+        "region_recall_at_k", "recall at K", "high", share,
+        "Region recall of the K best-scored candidates, whatever the threshold says; K is the number of observable "
+        "changes.",
+        _NO_CHANGE,
+    ),
+    Column(
+        "region_auroc", "AUROC", "high", share,
+        "How well the score of each before keyframe tells those near an observable change from those far from any; "
+        "0.5 is chance.",
+        "Undefined where a pair has keyframes of one class only, or the method gives no keyframe scores.",
+    ),
+    Column(
+        "false_regions_per_100m", "false regions / 100 m", "low", share,
+        "Reported regions that find no change, per 100 m of the after drive.",
+        _NOT_OK,
+    ),
+    Column(
+        "object_iou_point", "object IoU", "high", share,
+        "Returns of the answer against returns of the truth, one per 0.1 m cell; best one-to-one match per observable "
+        "change, unmatched counts 0, mean over changes.",
+        _NO_CHANGE,
+    ),
+    Column(
+        "object_f1_50", "object F1 at 0.5", "high", share,
+        "Objects right at an IoU of at least 0.5, as the harmonic mean of their precision and recall.",
+        _NO_CHANGE,
+    ),
+    Column(
+        "kind_accuracy", "kind", "high", share,
+        "Share of the matched changes that were called added, removed, moved or reshaped rightly.",
+        "Undefined where no change was matched.",
+    ),
+    Column(
+        "merge_error_m", "merge error [m]", "low", fine,
+        "Median translation error between every after keyframe and the truly nearest before keyframe.",
+        _NOT_OK,
+    ),
+    Column(
+        "merge_error_deg", "merge error [deg]", "low", fine,
+        "The same in rotation.",
+        _NOT_OK,
+    ),
+    Column(
+        "t_total_s", "time [s]", "low", significant,
+        "Descriptors, change detection and object extraction of one pair, without the merge; one thread.",
+        _NOT_OK,
+    ),
+)  # fmt: skip
+
+UNCHANGED_COLUMNS = (
+    Column("n_regions", "regions", None, count, "Reported regions; each is a false alarm.", _NOT_OK),
+    Column("n_objects", "objects", None, count, "Objects cut out of them.", _NOT_OK),
+    *(column for column in RESULT_COLUMNS if column.key in ("false_regions_per_100m", "merge_error_m",
+                                                            "merge_error_deg", "t_total_s")),
+)  # fmt: skip
+
+TIME_MEANINGS = (
+    ("t_merge", "From maps and stored vectors to an accepted transform, once per pair.",
+     "The paper gives 0.051 s and 0.184 s."),
+    ("t_descriptor", "Work a robot does while mapping: the vectors of all keyframes of both sessions.",
+     "Not part of the paper's table."),
+    ("t_cd, t_oe per region", "Detecting changed regions, and cutting objects out of them, divided by the number of "
+     "regions.", "Undefined where no region was reported."),
+    ("t_total", "Descriptors + change detection + object extraction, per pair.", "The column `time` above."),
+    ("with merge", "The same and the merge.", ""),
+    ("as the paper", "Change detection + object extraction only.",
+     "The paper's own total holds the merge on site 1 and leaves it out on site 2, so none is quoted."),
+    ("V_sphere", "Volume of a region's sphere that is tunnel, by our definition; the paper states none.",
+     "The paper's values are 34-58 % of 4/3 π r³."),
+    ("V_OE", "Volume of what was cut out of the region.", "Undefined where nothing was cut out."),
+    ("points", "Thinned map points: of both maps, in a region's sphere, and on the objects cut out of it.",
+     "Least and greatest over the reported regions."),
+)  # fmt: skip

@@ -1,0 +1,118 @@
+"""Every change of a pair cut out of its session: the truth beside what each method answered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cdpipe.answer import Answer
+from cdpipe.geometry import BoolArray, Float64Array, Int64Array
+from eval.answer_rows import answer_rows
+from eval.figures import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
+from eval.ground_truth import GroundTruth
+from eval.object_figures import Panel, object_panels
+from eval.page_columns import share
+from eval.page_run import SHOWN_PRESETS, Row, RunData, flag, number, of, text
+from eval.universe import CELL_M
+from sim.truth import Change
+
+_CONTEXT_M = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture with its title and caption; `address` holds it."""
+
+    title: str
+    address: str
+    caption: str
+
+
+def object_pictures(
+    data: RunData, scenario: str, seed: int, answers: Mapping[str, Answer], truth: GroundTruth
+) -> list[Picture]:
+    """Draw every observable change of a pair beside what the shown presets answered."""
+    shown = {name: answers[name] for name in SHOWN_PRESETS if name in answers}
+    object_rows = {name: answer_rows(answer, truth) for name, answer in shown.items()}
+    pictures = []
+    for index, change in enumerate(truth.pair.changes):
+        if not truth.is_observable[index]:
+            continue
+        cutout = _cut_out(change, index, truth)
+        panels = [Panel("truth", f"{np.count_nonzero(cutout.is_true):,} cells", _truth_layers(cutout))]
+        for name, answer in shown.items():
+            rows = of(data.changes, scenario=scenario, seed=seed, variant=name, id=change.id)
+            panels.append(_answer_panel(name, answer, object_rows[name], rows[0] if rows else {}, change, cutout))
+        address = object_panels(panels, cutout.points[cutout.is_true], cutout.view_from)
+        pictures.append(Picture(_object_title(change), address, _object_caption(change)))
+    return pictures
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _CutOut:
+    """The rows of a universe around one change.
+
+    Attributes:
+        rows: (N,) which rows they are, rising.
+        points: (N, 3) their points, odom frame, metres.
+        is_true: (N,) which of them belong to the change.
+        view_from: (3,) where the sensor passed nearest, odom frame.
+    """
+
+    rows: Int64Array
+    points: Float64Array
+    is_true: BoolArray
+    view_from: Float64Array
+
+
+def _cut_out(change: Change, index: int, truth: GroundTruth) -> _CutOut:
+    session = truth.sessions[change.session]
+    universe, true_rows = session.universe, truth.change_rows[index]
+    true_points = universe.points_odom[true_rows]
+    low, high = true_points.min(axis=0) - _CONTEXT_M, true_points.max(axis=0) + _CONTEXT_M
+    rows = np.flatnonzero(((universe.points_odom > low) & (universe.points_odom < high)).all(axis=1))
+    sensor = session.odom_T_sensor[:, :3, 3]
+    nearest = np.argmin(np.linalg.norm(sensor - true_points.mean(axis=0), axis=1))
+    points = universe.points_odom[rows].astype(np.float64)
+    return _CutOut(rows, points, np.isin(rows, true_rows), sensor[nearest])
+
+
+def _truth_layers(cutout: _CutOut) -> tuple[tuple[Float64Array, str], ...]:
+    return (cutout.points[~cutout.is_true], CONTEXT), (cutout.points[cutout.is_true], BLUE)
+
+
+def _answer_panel(
+    name: str, answer: Answer, object_rows: Sequence[Int64Array], row: Row, change: Change, cutout: _CutOut
+) -> Panel:
+    """Colour one method's answer: right blue, missed black, wrong vermillion, part of other objects orange."""
+    matched = number(row, "matched_object")
+    objects = answer.report.objects if answer.report is not None else ()
+    is_mine, is_other = np.zeros_like(cutout.is_true), np.zeros_like(cutout.is_true)
+    for index, (item, rows) in enumerate(zip(objects, object_rows, strict=True)):
+        if item.session == change.session:
+            target = is_mine if index == matched else is_other
+            target |= np.isin(cutout.rows, rows)
+    points, is_true = cutout.points, cutout.is_true
+    layers = (
+        (points[~is_true & ~is_mine & ~is_other], CONTEXT),
+        (points[is_other & ~is_mine & ~is_true], ORANGE),
+        (points[is_true & ~is_mine], BLACK),
+        (points[is_mine & ~is_true], VERMILLION),
+        (points[is_true & is_mine], BLUE),
+    )
+    is_found = flag(row, "is_found")
+    where = "" if is_found is None else "region found, " if is_found else "region missed, "
+    called = text(row, "matched_kind") if matched >= 0 else ""
+    return Panel(name, f"{where}IoU {share(number(row, 'iou_point'))}" + (f", {called}" if called else ""), layers)
+
+
+def _object_title(change: Change) -> str:
+    where = f", its place {change.session}" if change.kind == "moved" else ""
+    return f"{change.id}  {change.prop_kind.replace('_', ' ')} “{change.name}”: {change.kind}{where}"
+
+
+def _object_caption(change: Change) -> str:
+    partly = "; partly changed" if change.group == "partial" else ""
+    return f"{change.n_returns:,} returns in {change.n_cells:,} cells of {CELL_M:g} m{partly}"

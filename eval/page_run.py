@@ -1,0 +1,221 @@
+"""A run folder as the page reads it: the tables as plain rows, what belongs to which pair, and what is not there."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cdpipe.errors import InputError
+from cdpipe.geometry import Float64Array
+from eval.runfolder import RunFolder
+
+Row = Mapping[str, Any]
+REQUIRED = ("scenario", "seed", "variant", "status")
+BASELINES = ("voxel-diff", "c2c", "random-regions")
+SHOWN_PRESETS = ("paper", "tunnelcd")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunData:
+    """The tables of a run.
+
+    Attributes:
+        folder: Where it lies.
+        results: Rows of results.csv, in file order.
+        changes: Rows of changes.csv.
+        regions: Rows of regions.csv.
+        provenance: Content of provenance.json, {} where there is none.
+        missing: What a whole run folder holds and this one does not, one sentence each.
+    """
+
+    folder: RunFolder
+    results: tuple[Row, ...]
+    changes: tuple[Row, ...]
+    regions: tuple[Row, ...]
+    provenance: Mapping[str, Any]
+    missing: tuple[str, ...]
+
+
+def read_run(run: Path) -> RunData:
+    """Read what the page needs from a run folder; everything but results.csv may be missing.
+
+    Raises:
+        InputError: There is no results.csv, it holds no row, or lacks a column that names its rows.
+    """
+    path = run / "results.csv"
+    if not path.is_file():
+        raise InputError(f"{path}: missing: name a folder made by `tunnelcd run` or `tunnelcd demo`")
+    results = _rows(path)
+    if not results:
+        raise InputError(f"{path}: holds no row: no case was finished, run the plan again")
+    absent = [name for name in REQUIRED if name not in results[0]]
+    if absent:
+        raise InputError(f"{path}: column {', '.join(absent)} is missing: expected a table written by `tunnelcd run`")
+    missing: list[str] = []
+    items = {name: _optional_rows(run / f"{name}.csv", missing) for name in ("changes", "regions")}
+    provenance = _optional_json(run / "provenance.json", missing)
+    return RunData(RunFolder(run), results, items["changes"], items["regions"], provenance, tuple(missing))
+
+
+def number(row: Row, column: str) -> float:
+    """Return a cell as a number; NaN where it is empty, absent or not a number."""
+    value = row.get(column)
+    if value is None or isinstance(value, str):
+        return math.nan
+    return float(value)
+
+
+def flag(row: Row, column: str) -> bool | None:
+    """Return a cell as a truth value; None where it is empty or absent."""
+    value = row.get(column)
+    if isinstance(value, str):
+        return {"true": True, "false": False}.get(value.strip().lower())
+    return None if value is None or math.isnan(float(value)) else bool(value)
+
+
+def text(row: Row, column: str) -> str:
+    """Return a cell as text, "" where it is empty or absent."""
+    value = row.get(column)
+    return "" if value is None or (isinstance(value, float) and math.isnan(value)) else str(value)
+
+
+def defined(rows: Iterable[Row], column: str) -> Float64Array:
+    """Return the (N,) defined values of a column."""
+    values = np.array([number(row, column) for row in rows], dtype=np.float64)
+    return values[~np.isnan(values)]
+
+
+def over_pairs(rows: Iterable[Row], column: str) -> float:
+    """Return the mean of the defined values of a column, their median for times; NaN where there is none."""
+    values = defined(rows, column)
+    if len(values) == 0:
+        return math.nan
+    return float(np.median(values) if column.startswith("t_") else values.mean())
+
+
+def of(rows: Iterable[Row], **wanted: Any) -> list[Row]:
+    """Return the rows whose cells equal what is wanted."""
+    return [row for row in rows if all(row.get(name) == value for name, value in wanted.items())]
+
+
+def scenarios(data: RunData, *, unchanged: bool) -> list[str]:
+    """Return the scenarios with changes, or those without, in the order of results.csv."""
+    names = dict.fromkeys(str(row["scenario"]) for row in data.results)
+    return [name for name in names if is_unchanged(data, name) == unchanged]
+
+
+def is_unchanged(data: RunData, scenario: str) -> bool:
+    """Tell whether nothing changed in any pair of a scenario, as far as its rows say."""
+    flags = [flag(row, "is_unchanged_pair") for row in of(data.results, scenario=scenario)]
+    known = [value for value in flags if value is not None]
+    return bool(known) and all(known)
+
+
+def named_variants(data: RunData, scenario: str) -> list[str]:
+    """Return the variants of a scenario that are no grid point, in the order of results.csv."""
+    names = dict.fromkeys(str(row["variant"]) for row in of(data.results, scenario=scenario))
+    on_grid = {name for grid in grids(data) if grid.scenario == scenario for name in grid.points.values()}
+    return [name for name in names if name not in on_grid]
+
+
+def first_seed(data: RunData, scenario: str) -> int:
+    """Return the seed of a scenario that the pictures show."""
+    return min(int(row["seed"]) for row in of(data.results, scenario=scenario))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GridOf:
+    """The points of one preset on a grid of two settings.
+
+    Attributes:
+        scenario: Where it was run.
+        preset: Over which preset.
+        keys: The two settings; rows first.
+        values: Their values, as texts, in rising order.
+        points: Name of the variant at each pair of values.
+    """
+
+    scenario: str
+    preset: str
+    keys: tuple[str, str]
+    values: tuple[tuple[str, ...], tuple[str, ...]]
+    points: Mapping[tuple[str, str], str]
+
+
+def grids(data: RunData) -> list[GridOf]:
+    """Find the grids among the variants: those of one preset that set the same two keys, each to several values."""
+    found: dict[tuple[str, str, tuple[str, str]], dict[tuple[str, str], str]] = {}
+    for row in data.results:
+        preset, settings = split_variant(str(row["variant"]))
+        if len(settings) == 2:
+            (key_a, value_a), (key_b, value_b) = settings.items()
+            points = found.setdefault((str(row["scenario"]), preset, (key_a, key_b)), {})
+            points[value_a, value_b] = str(row["variant"])
+    result = []
+    for (scenario, preset, keys), points in found.items():
+        axes = (_sorted({a for a, _ in points}), _sorted({b for _, b in points}))
+        if min(len(axis) for axis in axes) >= 2:
+            result.append(GridOf(scenario, preset, keys, axes, points))
+    return result
+
+
+def split_variant(variant: str) -> tuple[str, dict[str, str]]:
+    """Return the preset of a variant and its settings: "a[k=1,l=2]" gives "a" and {"k": "1", "l": "2"}."""
+    preset, bracket, rest = variant.partition("[")
+    if not bracket or not rest.endswith("]"):
+        return variant, {}
+    settings: dict[str, str] = {}
+    for part in rest[:-1].split(","):
+        key, _, value = part.partition("=")
+        settings[key.strip()] = value.strip()
+    return preset, settings
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """Read a JSON object; {} where it is missing or damaged."""
+    try:
+        document = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return document if isinstance(document, dict) else {}
+
+
+def _sorted(values: set[str]) -> tuple[str, ...]:
+    def order(value: str) -> tuple[int, float, str]:
+        try:
+            return 0, float(value), value
+        except ValueError:
+            return 1, 0.0, value
+
+    return tuple(sorted(values, key=order))
+
+
+def _rows(path: Path) -> tuple[Row, ...]:
+    try:
+        frame = pd.read_csv(path)
+    except pd.errors.EmptyDataError:
+        return ()
+    except (OSError, UnicodeDecodeError, pd.errors.ParserError) as error:
+        raise InputError(f"{path}: cannot be read as a table: {error}") from error
+    return tuple({str(key): value for key, value in row.items()} for row in frame.to_dict("records"))
+
+
+def _optional_rows(path: Path, missing: list[str]) -> tuple[Row, ...]:
+    if not path.is_file():
+        missing.append(f"{path.name} is not in the run folder: what it would show is left out.")
+        return ()
+    return _rows(path)
+
+
+def _optional_json(path: Path, missing: list[str]) -> Mapping[str, Any]:
+    document = read_document(path)
+    if not document:
+        missing.append(f"{path.name} is not in the run folder or damaged: machine, command and versions are unknown.")
+    return document

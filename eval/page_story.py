@@ -1,0 +1,156 @@
+"""The first paragraph of the page, made from the numbers: who wins where and by how much, rivals first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from eval.page_columns import RESULT_COLUMNS, Column, share
+from eval.page_run import BASELINES, RunData, named_variants, of, over_pairs, scenarios, text
+from eval.page_tables import alarm_text
+
+HEADLINE_COLUMNS = tuple(
+    (column, name)
+    for column in RESULT_COLUMNS
+    for key, name in (("region_recall", "region recall"), ("object_iou_point", "object IoU"))
+    if column.key == key
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Ranking:
+    """Who is best at one figure on one scenario, judged as written.
+
+    Attributes:
+        scenario: Where.
+        measure: Name of the figure.
+        winners: The variants that share the best value; none where no variant has one above 0.
+        best: That value.
+        runner_up: The best of the others, or "".
+        second: Its value.
+    """
+
+    scenario: str
+    measure: str
+    winners: tuple[str, ...]
+    best: float
+    runner_up: str
+    second: float
+
+
+def story(data: RunData) -> list[str]:
+    """Return the sentences of the first paragraph."""
+    rankings = [
+        rank(scenario, measure, scenario_means(data, scenario, column))
+        for scenario in scenarios(data, unchanged=False)
+        for column, measure in HEADLINE_COLUMNS
+    ]
+    run_baselines = {str(row["variant"]) for row in data.results if str(row["variant"]) in BASELINES}
+    return [
+        _about_baselines(rankings, run_baselines),
+        *(sentence(ranking) for ranking in rankings),
+        *_about_failures(data),
+        *_about_unchanged(data),
+        _about_size(data),
+    ]
+
+
+def scenario_means(data: RunData, scenario: str, column: Column) -> dict[str, float]:
+    """Return the mean of a column for every named variant of a scenario."""
+    return {
+        name: over_pairs(of(data.results, scenario=scenario, variant=name), column.key)
+        for name in named_variants(data, scenario)
+    }
+
+
+def rank(scenario: str, measure: str, means: Mapping[str, float]) -> Ranking:
+    """Order variants by a figure as it is written (two decimals); undefined ones take no part."""
+    written = {name: round(value, 2) for name, value in means.items() if not math.isnan(value)}
+    top = max(written.values(), default=math.nan)
+    winners = tuple(name for name, value in written.items() if value == top and value > 0)
+    others = {name: value for name, value in written.items() if name not in winners}
+    runner_up = max(others, key=lambda name: others[name]) if others else ""
+    return Ranking(scenario, measure, winners, top, runner_up, others.get(runner_up, math.nan))
+
+
+def sentence(ranking: Ranking) -> str:
+    """Say in words who is best."""
+    where = f"On {ranking.scenario}, {ranking.measure}:"
+    if math.isnan(ranking.best):
+        return f"{where} undefined for every preset."
+    if not ranking.winners:
+        return f"{where} no preset gets above 0."
+    verb = "is best with" if len(ranking.winners) == 1 else "tie at"
+    margin = ""
+    if ranking.runner_up:
+        margin = f", {share(ranking.best - ranking.second)} ahead of {ranking.runner_up} ({share(ranking.second)})"
+    return f"{where} {joined(ranking.winners)} {verb} {share(ranking.best)}{margin}."
+
+
+def joined(names: Sequence[str]) -> str:
+    """Return "a", "a and b" or "a, b and c"."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _about_baselines(rankings: Sequence[Ranking], run_baselines: set[str]) -> str:
+    if not run_baselines:
+        return "No simple baseline was run, so nothing here shows that the method is worth its effort."
+    ahead, level = [], []
+    for ranking in rankings:
+        simple = [name for name in ranking.winners if name in BASELINES]
+        what = f"{ranking.measure} on {ranking.scenario}"
+        if simple and len(simple) == len(ranking.winners):
+            ahead.append(f"{joined(simple)} in {what} ({share(ranking.best)})")
+        elif simple:
+            level.append(f"{joined(simple)} in {what} ({share(ranking.best)})")
+    parts = []
+    if ahead:
+        parts.append(f"A simple baseline beats every form of the pipeline: {'; '.join(ahead)}.")
+    if level:
+        parts.append(f"A simple baseline is as good as the best form of the pipeline: {'; '.join(level)}.")
+    if not parts:
+        names = joined([name for name in BASELINES if name in run_baselines])
+        return f"The simple baselines that were run ({names}) win neither region recall nor object IoU anywhere."
+    return " ".join(parts)
+
+
+def _about_failures(data: RunData) -> list[str]:
+    bad = [row for row in data.results if text(row, "status") != "ok"]
+    if not bad:
+        return []
+    return [
+        f"{len(bad)} of {len(data.results)} cases gave no answer (refused merge or error); they count as found nothing "
+        "and are listed below."
+    ]
+
+
+def _about_unchanged(data: RunData) -> list[str]:
+    found = []
+    for scenario in scenarios(data, unchanged=True):
+        verdicts = {
+            name: alarm_text(of(data.results, scenario=scenario, variant=name))
+            for name in named_variants(data, scenario)
+        }
+        alarmed = [name for name, verdict in verdicts.items() if "alarm" in verdict]
+        refused = [name for name, verdict in verdicts.items() if "refused" in verdict]
+        said = f"raised by {joined(alarmed)}" if alarmed else "raised by none"
+        said += f"; {joined(refused)} refused the merge or failed" if refused else ""
+        found.append(f"Where nothing changed ({scenario}), a false alarm is {said} of {len(verdicts)} presets.")
+    return found
+
+
+def _about_size(data: RunData) -> str:
+    pairs: dict[str, set[int]] = {}
+    for row in data.results:
+        pairs.setdefault(str(row["scenario"]), set()).add(int(row["seed"]))
+    seeds = sorted(set().union(*pairs.values()))
+    named = f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}"
+    n = sum(len(found) for found in pairs.values())
+    if all(len(found) == 1 for found in pairs.values()):
+        return (
+            f"n = {n} session pair{'s' if n > 1 else ''}, one per scenario ({named}): a single pair carries no "
+            "interval, and a difference between two presets on it may be chance."
+        )
+    sizes = ", ".join(f"{name}: {len(found)}" for name, found in pairs.items())
+    return f"n = {n} session pairs ({sizes}; {named}); values are means over the pairs where they are defined."

@@ -1,0 +1,314 @@
+"""What is run: scenarios x seeds x variants, read from a plan file and spread out into cells.
+
+name: smoke
+description: what the plan is for
+scenarios: [smoke/one_box]
+seeds: "20000:20002"                 # B excluded, in quotes; or a list
+variants:
+- preset: paper                    # a shipped preset or the path of a .yaml file
+set: ["extract.voxel_m=0.4"]     # part of the variant's name
+per_scenario: {paper/site2: ["query.radius_m=10"]}   # belongs to the site, not to the name
+grid:
+- variant: tunnelcd                # a preset
+scenarios: [paper/site1]         # out of the plan's
+keys: {extract.voxel_m: [0.2, 0.4], query.radius_m: [3, 4.5]}
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Annotated, Any
+
+import yaml
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+
+from cdpipe.config import PipelineConfig, load_config, preset_names
+from cdpipe.errors import InputError
+from cdpipe.yamlfile import Document, Settings, read_yaml, suggestion, validated, with_settings
+from scenarios.library import check_scenario, scenario_names
+
+
+def parse_seeds(value: Any) -> tuple[int, ...]:
+    """Return the seeds of "A:B" (B excluded), of "A", or of a list of non-negative numbers.
+
+    Raises:
+        ValueError: It is something else, or names no seed, or one twice.
+    """
+    rule = 'expected "A:B" in quotes (B excluded) or a list of seeds, all 0 or larger'
+    if isinstance(value, str):
+        match = re.fullmatch(r"(\d+)(?::(\d+))?", value.strip())
+        if match is None:
+            raise ValueError(rule)
+        first = int(match[1])
+        value = list(range(first, int(match[2]))) if match[2] else [first]
+        if not value:
+            raise ValueError(f"{rule}; this range is empty")
+    # YAML 1.1 reads an unquoted 1:40 as the number 100, so a bare number is not taken for a seed
+    if not isinstance(value, list | tuple) or not value:
+        raise ValueError(rule)
+    if not all(type(seed) is int and seed >= 0 for seed in value) or len(set(value)) < len(value):
+        raise ValueError(f"{rule}, none twice")
+    return tuple(value)
+
+
+def setting_text(key: str, value: Any) -> str:
+    """Return `key=value` as --set takes it."""
+    text = yaml.safe_dump(value, default_flow_style=True, width=10_000)
+    return f"{key}={text.removesuffix('...' + chr(10)).strip()}"
+
+
+def _known_scenario(name: str) -> str:
+    names = scenario_names()
+    if name.endswith((".yaml", ".yml")):
+        _checked(lambda: check_scenario(name))
+    elif name not in names:
+        raise ValueError(f"unknown scenario{suggestion(name, names)} (known: {', '.join(names)})")
+    return name
+
+
+def _known_preset(name: str) -> str:
+    if name.endswith((".yaml", ".yml")):
+        _checked(lambda: load_config(name))
+    elif name not in preset_names():
+        raise ValueError(f"unknown preset{suggestion(name, preset_names())} (known: {', '.join(preset_names())})")
+    return name
+
+
+def _valid_setting(setting: str) -> str:
+    _checked(lambda: validated(PipelineConfig, with_settings(Document("", {}), [setting])))
+    return setting
+
+
+def _valid_keys(keys: dict[str, tuple[Any, ...]]) -> dict[str, tuple[Any, ...]]:
+    for key, values in keys.items():
+        for value in values:
+            _valid_setting(setting_text(key, value))
+    return keys
+
+
+def _not_empty(value: Any) -> Any:
+    # pydantic's own min_length counts only the items that passed, and so repeats their mistakes
+    if isinstance(value, list | dict | tuple) and not value:
+        raise ValueError("at least one is needed")
+    return value
+
+
+def _checked(check: Callable[[], object]) -> None:
+    """Run a check of ours inside pydantic, which collects ValueErrors only."""
+    try:
+        check()
+    except InputError as error:
+        raise ValueError("; ".join(line.removeprefix(": ") for line in str(error).splitlines())) from error
+
+
+ScenarioName = Annotated[str, AfterValidator(_known_scenario)]
+PresetName = Annotated[str, AfterValidator(_known_preset)]
+Setting = Annotated[str, AfterValidator(_valid_setting)]
+NotEmpty = BeforeValidator(_not_empty)
+Values = Annotated[tuple[Any, ...], NotEmpty]
+
+
+class Variant(Settings):
+    """One method to run: a preset and what is set over it."""
+
+    preset: PresetName
+    set: tuple[Setting, ...] = ()
+    per_scenario: dict[ScenarioName, tuple[Setting, ...]] = Field(default_factory=dict)
+
+
+class Grid(Settings):
+    """Every combination of some values of some settings, over one preset."""
+
+    variant: PresetName
+    scenarios: Annotated[tuple[ScenarioName, ...], NotEmpty]
+    keys: Annotated[dict[str, Values], NotEmpty, AfterValidator(_valid_keys)]
+
+
+class Plan(Settings):
+    """What to run; `cells` spreads it out."""
+
+    name: Annotated[str, Field(min_length=1)]
+    description: str = ""
+    scenarios: Annotated[tuple[ScenarioName, ...], NotEmpty]
+    seeds: Annotated[tuple[int, ...], BeforeValidator(parse_seeds)]
+    variants: Annotated[tuple[Variant, ...], NotEmpty]
+    grid: tuple[Grid, ...] = ()
+
+    @model_validator(mode="after")
+    def _parts_fit(self) -> Plan:
+        if len(set(self.scenarios)) < len(self.scenarios):
+            raise ValueError("a scenario is listed twice")
+        for variant in self.variants:
+            for name in variant.per_scenario:
+                if name not in self.scenarios:
+                    raise ValueError(f"per_scenario of {variant.preset} names {name!r}, which is not in scenarios")
+        for grid in self.grid:
+            for name in grid.scenarios:
+                if name not in self.scenarios:
+                    raise ValueError(f"the grid of {grid.variant} names {name!r}, which is not in scenarios")
+        for scenario in self.scenarios:
+            slugs = [slug(variant_name(preset, named)) for preset, named, _ in _methods(self, scenario)]
+            for each in slugs:
+                if slugs.count(each) > 1:
+                    raise ValueError(f"variant {each} stands twice in the plan for {scenario}")
+        return self
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cell:
+    """One scenario, one seed, one variant: one row of results.csv.
+
+    Attributes:
+        scenario: Scenario name.
+        seed: Its seed.
+        preset: Name of the preset.
+        variant: Preset and the settings that name the variant.
+        config: The effective settings.
+    """
+
+    scenario: str
+    seed: int
+    preset: str
+    variant: str
+    config: PipelineConfig
+
+
+def load_plan(name_or_path: str) -> Plan:
+    """Read a shipped plan by name, or any plan by the path of its .yaml file.
+
+    Raises:
+        InputError: It is unknown or has mistakes; all of them at once, one line each.
+    """
+    if name_or_path.endswith((".yaml", ".yml")):
+        return validated(Plan, read_yaml(Path(name_or_path)))
+    names = plan_names()
+    if name_or_path not in names:
+        raise InputError(
+            f"plan {name_or_path!r} is unknown{suggestion(name_or_path, names)} "
+            f"(known: {', '.join(names)}, or the path of a .yaml file)"
+        )
+    file = _plans() / f"{name_or_path}.yaml"
+    return validated(Plan, read_yaml(Path(f"{name_or_path}.yaml"), file.read_text()))
+
+
+def plan_names() -> list[str]:
+    """Return the names of the shipped plans."""
+    return sorted(entry.name.removesuffix(".yaml") for entry in _plans().iterdir() if entry.name.endswith(".yaml"))
+
+
+def changed_plan(
+    plan: Plan, *, seeds: str | None = None, settings: Sequence[str] = (), grid: Sequence[str] = ()
+) -> Plan:
+    """Return the plan with --seeds, --set and --grid of the command line applied.
+
+    Args:
+        plan: The plan.
+        seeds: "A:B", replaces the plan's seeds.
+        settings: `key=value`, written over every variant and every grid point.
+        grid: `key=v1,v2`; every variant is run at every combination. The plan's own grids stay as they are.
+
+    Raises:
+        InputError: One of them cannot be read, or its key or value is wrong.
+    """
+    axes = [_grid_axis(text) for text in grid]
+    for setting in (*settings, *itertools.chain(*axes)):
+        try:
+            _valid_setting(setting)
+        except ValueError as error:
+            raise InputError(f"--set {setting}: {error}") from error
+    document = plan.model_dump(mode="json")
+    if seeds is not None:
+        try:
+            document["seeds"] = parse_seeds(seeds)
+        except ValueError as error:
+            raise InputError(f"--seeds {seeds}: {error}") from error
+    overridden = {_key(setting) for setting in (*settings, *itertools.chain(*axes))}
+    document["variants"] = [
+        {
+            "preset": variant.preset,
+            "set": [*_without(variant.set, overridden), *point, *settings],
+            "per_scenario": {name: _without(own, overridden) for name, own in variant.per_scenario.items()},
+        }
+        for variant in plan.variants
+        for point in itertools.product(*axes)
+    ]
+    for each in document["grid"]:
+        each["keys"].update({_key(setting): [yaml.safe_load(setting.partition("=")[2])] for setting in settings})
+    return validated(Plan, Document(f"plan {plan.name} with the settings of the command line", document))
+
+
+def cells(plan: Plan) -> list[Cell]:
+    """Return all cells: by scenario, then seed, then variant, grids last.
+
+    Raises:
+        InputError: The settings of a variant contradict each other or its preset.
+    """
+    found: list[Cell] = []
+    for scenario in plan.scenarios:
+        methods = [
+            (preset, variant_name(preset, named), load_config(preset, [*named, *silent]))
+            for preset, named, silent in _methods(plan, scenario)
+        ]
+        found += [
+            Cell(scenario, seed, _stem(preset), name, config) for seed in plan.seeds for preset, name, config in methods
+        ]
+    return found
+
+
+def variant_name(preset: str, settings: Iterable[str]) -> str:
+    """Return the preset's name, followed by its settings in brackets where there are any."""
+    joined = ",".join(settings)
+    return f"{_stem(preset)}[{joined}]" if joined else _stem(preset)
+
+
+def slug(variant: str) -> str:
+    """Return a variant's name as a folder name."""
+    return re.sub(r"[^A-Za-z0-9._=,-]", "_", variant)
+
+
+def scenario_slug(scenario: str) -> str:
+    """Return a scenario's name as a folder name."""
+    return re.sub(r"[^A-Za-z0-9._=,-]", "_", scenario.replace("/", "__"))
+
+
+def _methods(plan: Plan, scenario: str) -> list[tuple[str, tuple[str, ...], tuple[str, ...]]]:
+    """(preset, settings that make the name, settings that the site asks for) of every variant and grid point."""
+    methods = [(v.preset, v.set, v.per_scenario.get(scenario, ())) for v in plan.variants]
+    for grid in plan.grid:
+        if scenario in grid.scenarios:
+            methods += [(grid.variant, point, ()) for point in _points(grid.keys)]
+    return methods
+
+
+def _points(keys: Mapping[str, Sequence[Any]]) -> list[tuple[str, ...]]:
+    axes = [[setting_text(key, value) for value in values] for key, values in keys.items()]
+    return list(itertools.product(*axes))
+
+
+def _grid_axis(text: str) -> list[str]:
+    key, equals, values = text.partition("=")
+    if not equals or not key or not all(values.split(",")):
+        raise InputError(f"--grid {text}: expected key=v1,v2, e.g. extract.voxel_m=0.2,0.4")
+    return [f"{key}={value}" for value in values.split(",")]
+
+
+def _key(setting: str) -> str:
+    return setting.partition("=")[0]
+
+
+def _without(settings: Iterable[str], keys: set[str]) -> list[str]:
+    return [setting for setting in settings if _key(setting) not in keys]
+
+
+def _stem(preset: str) -> str:
+    return Path(preset).stem if preset.endswith((".yaml", ".yml")) else preset
+
+
+def _plans() -> Traversable:
+    return resources.files("eval") / "plans"

@@ -1,0 +1,53 @@
+"""How well a score puts positives before negatives, whatever the threshold."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import rankdata
+
+from cdpipe.geometry import BoolArray, Float64Array
+
+
+def auroc(scores: Float64Array, is_positive: BoolArray) -> float:
+    """Return the chance that a positive scores above a negative, ties counting half.
+
+    Args:
+        scores: (N,) scores; NaN ranks below every number, as a keyframe that was never compared would be reported last.
+        is_positive: (N,) which of them are positives; the others are negatives.
+
+    Returns:
+        A number in [0, 1]; NaN if either class is empty.
+    """
+    n_positive = int(np.count_nonzero(is_positive))
+    n_negative = len(is_positive) - n_positive
+    if n_positive == 0 or n_negative == 0:
+        return float("nan")
+    ranks = rankdata(_comparable(scores), method="average")
+    return float((ranks[is_positive].sum() - n_positive * (n_positive + 1) / 2) / (n_positive * n_negative))
+
+
+def average_precision(scores: Float64Array, is_positive: BoolArray) -> float:
+    """Return the sum over falling thresholds of precision times the gain in recall; equal scores enter together.
+
+    Args:
+        scores: (N,) scores; NaN ranks below every number.
+        is_positive: (N,) which of them are positives.
+
+    Returns:
+        A number in (0, 1]; NaN if either class is empty.
+    """
+    n_positive = int(np.count_nonzero(is_positive))
+    if n_positive in (0, len(is_positive)):
+        return float("nan")
+    comparable = _comparable(scores)
+    order = np.argsort(-comparable, kind="stable")
+    n_true = np.cumsum(is_positive[order])
+    # thresholds lie behind the last of each run of equal scores
+    last = np.append(np.flatnonzero(comparable[order][1:] != comparable[order][:-1]), len(order) - 1)
+    precision = n_true[last] / (last + 1)
+    recall_gain = np.diff(n_true[last], prepend=0) / n_positive
+    return float((precision * recall_gain).sum())
+
+
+def _comparable(scores: Float64Array) -> Float64Array:
+    return np.where(np.isnan(scores), -np.inf, scores)

@@ -1,0 +1,75 @@
+"""Stored answers into cells: how the runner scores, and how `tunnelcd score` scores again without running anything."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from cdpipe.answer import read_answer
+from eval.answer_check import check_answer
+from eval.ground_truth import GroundTruth, load_ground_truth
+from eval.progress import RunProgress, Silent
+from eval.runfolder import IDENTITY, ITEM_TABLES, RunFolder, write_tables
+from eval.scoring import CaseScore, score_answer
+
+
+def score_stored(truth: GroundTruth, folder: Path) -> CaseScore:
+    """Score the answer stored in a folder.
+
+    Raises:
+        InputError: It is damaged, or cannot be an answer to this pair.
+    """
+    answer = read_answer(folder)
+    check_answer(answer, truth, folder)
+    return score_answer(answer, truth)
+
+
+def cell_document(score: CaseScore, identity: Mapping[str, Any], key: str, place: Sequence[int]) -> dict[str, Any]:
+    """Return a cell's content; every item carries the columns that name its row of results.csv.
+
+    Args:
+        score: What was scored.
+        identity: scenario, seed, variant and preset, whatever the answer calls itself.
+        key: Digest of what the cell depends on.
+        place: Where its rows stand in the tables: scenario, variant.
+    """
+    names = {name: identity[name] for name in IDENTITY}
+    items = {table: [{**names, **item} for item in getattr(score, table)] for table in ITEM_TABLES}
+    return {"key": key, "order": list(place), "row": {**score.row, **identity}, **items}
+
+
+def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
+    """Score every stored answer of a run again, without running anything, and rewrite the tables.
+
+    An answer that no run made (another program's, put beside ours) becomes a variant named like its folder.
+
+    Returns:
+        How many answers were scored.
+
+    Raises:
+        InputError: An answer is damaged, or its pair has no truth.
+    """
+    progress = progress or Silent()
+    folders = list(run.answer_folders())
+    n_done = 0
+    for (slug, seed), group in groupby(folders, key=lambda folder: folder.parts[-3:-1]):
+        truth = load_ground_truth(run.path / "pairs" / slug / seed)
+        for folder in group:
+            progress.cells(f"{slug} {seed} {folder.name}", n_done, len(folders))
+            path = run.path / "cells" / slug / seed / f"{folder.name}.json"
+            stored = run.read_cell(path)
+            score = score_stored(truth, folder)
+            if stored is None:
+                names = {"scenario": slug.replace("__", "/"), "seed": int(seed)}
+                identity = {**names, "variant": folder.name, "preset": folder.name}
+                document = cell_document(score, identity, "", (len(folders), len(folders)))
+            else:
+                identity = {name: stored["row"][name] for name in (*IDENTITY, "preset")}
+                document = cell_document(score, identity, stored["key"], stored["order"])
+            run.write_cell(path, document)
+            n_done += 1
+    progress.cells("done", n_done, n_done)
+    write_tables(run)
+    return n_done

@@ -1,0 +1,174 @@
+"""A run's folder: where everything lies, what is finished, and the tables that are put together from its cells.
+
+provenance.json                                  marks a run folder; written first
+pairs/<scenario>/<seed>/{before,after,truth}     simulated pairs
+answers/<scenario>/<seed>/<variant>/             raw answers (cdpipe.answer)
+maps/<scenario>/<seed>.npz                       thinned maps for pictures
+cells/<scenario>/<seed>/<variant>.json           a finished cell: key, order, row, items
+results.csv changes.csv regions.csv objects.csv keyframes.csv summary.csv
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cdpipe.errors import InputError
+from eval.output import make_writable
+from eval.plan import scenario_slug, slug
+from eval.provenance import TOOL
+from eval.statistics import summarise
+
+IDENTITY = ("scenario", "seed", "variant")
+ITEM_TABLES = ("changes", "regions", "objects", "keyframes")
+# what readers of an empty table may ask for
+_MINIMAL_COLUMNS = {"keyframes": ("keyframe", "score", "label")}
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """The folder of one run and the places in it."""
+
+    path: Path
+
+    def pair(self, scenario: str, seed: int) -> Path:
+        """Folder of a simulated pair."""
+        return self.path / "pairs" / scenario_slug(scenario) / str(seed)
+
+    def answer(self, scenario: str, seed: int, variant: str) -> Path:
+        """Folder of a raw answer."""
+        return self.path / "answers" / scenario_slug(scenario) / str(seed) / slug(variant)
+
+    def cell(self, scenario: str, seed: int, variant: str) -> Path:
+        """File of a finished cell."""
+        return self.path / "cells" / scenario_slug(scenario) / str(seed) / f"{slug(variant)}.json"
+
+    def maps(self, scenario: str, seed: int) -> Path:
+        """File of the thinned maps of a pair."""
+        return self.path / "maps" / scenario_slug(scenario) / f"{seed}.npz"
+
+    def answer_folders(self) -> Iterator[Path]:
+        """Yield the folder of every stored answer, sorted."""
+        yield from sorted(file.parent for file in self.path.glob("answers/*/*/*/answer.json"))
+
+    def read_cell(self, path: Path) -> dict[str, Any] | None:
+        """Read a finished cell; None where there is none, or what is there was cut short."""
+        try:
+            document = json.loads(path.read_text())
+        except (FileNotFoundError, json.JSONDecodeError):
+            return None
+        whole = isinstance(document, dict) and {"key", "order", "row", *ITEM_TABLES} <= set(document)
+        return document if whole else None
+
+    def write_cell(self, path: Path, document: Mapping[str, Any]) -> None:
+        """Write a finished cell; it appears whole or not at all."""
+        write_json(path, document)
+
+    def provenance(self) -> dict[str, Any]:
+        """Read provenance.json.
+
+        Raises:
+            InputError: It is missing, damaged or another program's.
+        """
+        path = self.path / "provenance.json"
+        try:
+            document = json.loads(path.read_text())
+        except FileNotFoundError as error:
+            raise InputError(f"{self.path}: not a run folder (no provenance.json): name one made by `run`") from error
+        except (OSError, json.JSONDecodeError) as error:
+            raise InputError(f"{path}: damaged: {error}") from error
+        if not isinstance(document, dict) or document.get("tool") != TOOL:
+            raise InputError(f"{path}: not written by {TOOL}: name a run folder made by `{TOOL} run`")
+        return document
+
+    def write_provenance(self, document: Mapping[str, Any]) -> None:
+        """Write provenance.json."""
+        write_json(self.path / "provenance.json", document)
+
+
+def start_run_folder(path: Path) -> RunFolder:
+    """Take a folder to run in: a new or empty one, or one that an earlier run left.
+
+    Raises:
+        InputError: It holds something else, or cannot be written.
+    """
+    make_writable(path)
+    run = RunFolder(path)
+    if any(path.iterdir()):
+        if not (path / "provenance.json").exists():
+            raise InputError(f"{path}: not empty and not a run folder: name a new folder, or empty this one")
+        run.provenance()
+    return run
+
+
+def open_run_folder(path: Path) -> RunFolder:
+    """Open the folder of an earlier run.
+
+    Raises:
+        InputError: There is none.
+    """
+    if not path.is_dir():
+        raise InputError(f"{path}: no such run folder")
+    run = RunFolder(path)
+    run.provenance()
+    return run
+
+
+def write_tables(run: RunFolder) -> pd.DataFrame:
+    """Put results.csv, the item tables and summary.csv together from the finished cells, and return the results.
+
+    Raises:
+        InputError: No cell is finished.
+    """
+    cells = [run.read_cell(path) for path in sorted(run.path.glob("cells/*/*/*.json"))]
+    whole = [cell for cell in cells if cell is not None]
+    if not whole:
+        raise InputError(f"{run.path}: no finished cell: run a plan first")
+    whole.sort(key=lambda cell: (cell["order"][0], cell["row"]["scenario"], cell["row"]["seed"], cell["order"][1]))
+    results = pd.DataFrame([cell["row"] for cell in whole])
+    _write_csv(run.path / "results.csv", results)
+    items = {table: _items(table, whole) for table in ITEM_TABLES}
+    for table, frame in items.items():
+        _write_csv(run.path / f"{table}.csv", frame)
+    _write_csv(run.path / "summary.csv", summarise(results, keyframes=items["keyframes"]))
+    return results
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write JSON that appears whole or not at all; numpy scalars become plain numbers."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(json.dumps(document, indent=1, default=_plain))
+    partial.replace(path)
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder, if it is there."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _items(table: str, cells: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    rows = [item for cell in cells for item in cell[table]]
+    return pd.DataFrame(rows) if rows else pd.DataFrame(columns=[*IDENTITY, *_MINIMAL_COLUMNS.get(table, ())])
+
+
+def _write_csv(path: Path, frame: pd.DataFrame) -> None:
+    partial = path.with_name(f".{path.name}.partial")
+    frame.to_csv(partial, index=False)
+    partial.replace(path)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} does not fit into JSON")

@@ -1,0 +1,242 @@
+"""Runs a plan, one cell after the other; finished cells are kept, and a run that was cut off goes on where it stopped.
+
+A cell is finished when its file holds the digest of what it depends on: the scenario as drawn, the effective settings,
+the weights, and the version of the metrics. A merge that is refused and any other error of the input are rows of their
+own; a bug is not caught.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cdpipe.answer import write_answer, write_failure
+from cdpipe.config import DescriptorConfig, MapConfig
+from cdpipe.descriptor import checkpoint_digest, use_threads
+from cdpipe.errors import InputError, MergeFailedError, ScenarioError, TunnelcdError
+from eval.adapters import pipeline_input
+from eval.ground_truth import GroundTruth, load_ground_truth
+from eval.plan import Cell, Plan, cells
+from eval.progress import RunProgress, Silent
+from eval.provenance import THREADS, describe_run, digest, now
+from eval.rescoring import cell_document, score_stored
+from eval.runfolder import RunFolder, remove, write_tables
+from eval.scoring import METRICS_VERSION, CaseScore
+from eval.stages import PairStages
+from scenarios.library import load_scenario
+from scenarios.schema import Scenario
+from sim.simulate import simulate_pair
+from sim.truth import read_pair_truth
+
+
+@dataclass(frozen=True, slots=True)
+class RunOutcome:
+    """How a run ended: cells done now, kept from earlier, and left over by --limit."""
+
+    n_done: int
+    n_kept: int
+    n_left: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Todo:
+    """A cell, the digest of what it depends on, and its place in the tables (scenario, variant)."""
+
+    cell: Cell
+    key: str
+    place: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """One scenario and seed: the scenario as drawn, or why it cannot be drawn, and the cells still to be done."""
+
+    name: str
+    seed: int
+    scenario: Scenario | None
+    error: str
+    todo: tuple[_Todo, ...]
+
+
+def run_plan(
+    plan: Plan,
+    run: RunFolder,
+    *,
+    command: Sequence[str] = (),
+    force: bool = False,
+    limit: int | None = None,
+    progress: RunProgress | None = None,
+) -> RunOutcome:
+    """Run the cells of a plan that are not finished, and put the tables together.
+
+    Args:
+        plan: The plan.
+        run: The folder to run in.
+        command: The command line, for the provenance.
+        force: Start the plan's cells and pairs from nothing.
+        limit: Do at most this many cells.
+        progress: Told what is being done.
+
+    Raises:
+        InputError: A setting is wrong, or the folder cannot be written.
+    """
+    progress = progress or Silent()
+    use_threads(THREADS)
+    all_cells = cells(plan)
+    provenance = _provenance(plan, all_cells, command)
+    run.write_provenance(provenance)
+    pairs = _pairs(run, plan, all_cells, force)
+    n_todo = sum(len(pair.todo) for pair in pairs)
+    n_run = n_todo if limit is None else min(limit, n_todo)
+    n_done = 0
+    for pair in pairs:
+        todo = pair.todo[: n_run - n_done]
+        if todo:
+            _run_pair(run, pair, todo, progress, (n_done, n_run))
+        n_done += len(todo)
+    progress.cells("done", n_done, n_run)
+    write_tables(run)
+    run.write_provenance({**provenance, "finished": now()})
+    return RunOutcome(n_done, len(all_cells) - n_todo, n_todo - n_done)
+
+
+def _pairs(run: RunFolder, plan: Plan, all_cells: Sequence[Cell], force: bool) -> list[_Pair]:
+    variants = list(dict.fromkeys(cell.variant for cell in all_cells))
+    pairs = []
+    for (name, seed), group in groupby(all_cells, key=lambda cell: (cell.scenario, cell.seed)):
+        scenario, error = None, ""
+        try:
+            scenario = load_scenario(name, seed)
+        except ScenarioError as mistake:
+            error = str(mistake)
+        every = [
+            _Todo(cell, _key(cell, scenario), (plan.scenarios.index(name), variants.index(cell.variant)))
+            for cell in group
+        ]
+        todo = [each for each in every if force or not _is_finished(run, each.cell, each.key)]
+        # cells that share a map setting come one after the other, because only one setting's maps are held
+        todo.sort(key=lambda each: each.cell.config.map.model_dump_json())
+        pairs.append(_Pair(name, seed, scenario, error, tuple(todo)))
+        _remove_stale(run, pairs[-1], force)
+    return pairs
+
+
+def _is_finished(run: RunFolder, cell: Cell, key: str) -> bool:
+    stored = run.read_cell(run.cell(cell.scenario, cell.seed, cell.variant))
+    return stored is not None and stored["key"] == key and stored["row"].get("metrics_version") == METRICS_VERSION
+
+
+def _remove_stale(run: RunFolder, pair: _Pair, force: bool) -> None:
+    """Remove what is about to be redone, so that no table can hold it should the run be cut off."""
+    if force or not _is_simulated(run.pair(pair.name, pair.seed), pair.scenario, pair.seed):
+        remove(run.pair(pair.name, pair.seed))
+        remove(run.maps(pair.name, pair.seed))
+    for each in pair.todo:
+        remove(run.cell(pair.name, pair.seed, each.cell.variant))
+        remove(run.answer(pair.name, pair.seed, each.cell.variant))
+
+
+def _is_simulated(path: Path, scenario: Scenario | None, seed: int) -> bool:
+    """Tell whether a pair is there, whole, and of this very scenario."""
+    if scenario is None:
+        return False
+    try:
+        truth = read_pair_truth(path)
+    except InputError:
+        return False
+    return truth.seed == seed and digest(truth.scenario) == digest(scenario.model_dump(mode="json"))
+
+
+def _run_pair(
+    run: RunFolder, pair: _Pair, todo: Sequence[_Todo], progress: RunProgress, counts: tuple[int, int]
+) -> None:
+    """Run the cells of one pair; its maps are let go when this returns, before the next pair's are built."""
+    done, total = counts
+    progress.cells(f"{pair.name} {pair.seed}", done, total)
+    opened = _open(run, pair, progress)
+    for index, each in enumerate(todo):
+        cell = each.cell
+        progress.cells(f"{pair.name} {pair.seed} {cell.variant}", done + index, total)
+        if opened is None:
+            score = _undrawn(pair)
+        else:
+            stages, truth = opened
+            folder = run.answer(pair.name, pair.seed, cell.variant)
+            _answer(stages, cell, folder)
+            score = score_stored(truth, folder)
+        identity = {"scenario": pair.name, "seed": pair.seed, "variant": cell.variant, "preset": cell.preset}
+        path = run.cell(pair.name, pair.seed, cell.variant)
+        run.write_cell(path, cell_document(score, identity, each.key, each.place))
+
+
+def _open(run: RunFolder, pair: _Pair, progress: RunProgress) -> tuple[PairStages, GroundTruth] | None:
+    """Simulate a pair unless it is there, store its maps for pictures, and open it; None where it cannot be drawn."""
+    if pair.scenario is None:
+        return None
+    path = run.pair(pair.name, pair.seed)
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        simulate_pair(pair.scenario, pair.seed, path, on_progress=progress.stage)
+    stages = PairStages(pipeline_input(path, "before"), pipeline_input(path, "after"), progress.stage)
+    picture = run.maps(pair.name, pair.seed)
+    if not picture.exists():
+        _write_maps(picture, stages)
+    return stages, load_ground_truth(path)
+
+
+def _write_maps(path: Path, stages: PairStages) -> None:
+    try:
+        before, after = stages.maps(MapConfig())
+    except TunnelcdError:
+        return  # each cell of the pair meets the same error and records it
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.stem}.partial.npz")
+    np.savez_compressed(
+        partial,
+        allow_pickle=False,
+        before_points=before.points.astype(np.float32),
+        after_points=after.points.astype(np.float32),
+    )
+    partial.replace(path)
+
+
+def _answer(stages: PairStages, cell: Cell, folder: Path) -> None:
+    settings = cell.config.model_dump(mode="json")
+    try:
+        report = stages.answer(cell.config)
+    except MergeFailedError as error:
+        write_failure(folder, cell.variant, "merge_refused", str(error), error.evidence, settings)
+    except TunnelcdError as error:
+        write_failure(folder, cell.variant, "failed", str(error), {}, settings)
+    else:
+        write_answer(folder, cell.variant, report)
+
+
+def _undrawn(pair: _Pair) -> CaseScore:
+    """Score a case whose scenario its seed cannot draw: no world, so no truth; all but the identity is undefined."""
+    row = {"scenario": "", "family": pair.name, "seed": pair.seed, "variant": "", "preset": ""}
+    outcome = {"status": "failed", "error": pair.error, "metrics_version": METRICS_VERSION}
+    return CaseScore(row={**row, **outcome}, changes=[], regions=[], objects=[])
+
+
+def _key(cell: Cell, scenario: Scenario | None) -> str:
+    return digest(
+        {
+            "scenario": None if scenario is None else scenario.model_dump(mode="json"),
+            "seed": cell.seed,
+            "config": cell.config.model_dump(mode="json"),
+            "checkpoint": checkpoint_digest(cell.config.descriptor),
+        }
+    )
+
+
+def _provenance(plan: Plan, all_cells: Sequence[Cell], command: Sequence[str]) -> dict[str, Any]:
+    configs = {f"{cell.scenario} {cell.variant}": cell.config.model_dump(mode="json") for cell in all_cells}
+    methods = dict.fromkeys(cell.config.descriptor.method for cell in all_cells)
+    checkpoints: dict[str, str] = {method: checkpoint_digest(DescriptorConfig(method=method)) for method in methods}
+    return describe_run(plan.model_dump(mode="json"), configs, checkpoints, command)

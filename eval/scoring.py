@@ -1,0 +1,255 @@
+"""Truth against a stored answer: every column of results.csv and the rows of the item tables.
+
+The specification of every figure, with worked examples, is in eval/README.md. Nothing is run here: an answer can be
+scored again whenever the metrics change, and so can an answer that another program wrote.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from cdpipe.answer import Answer, read_answer
+from cdpipe.geometry import Float64Array, travelled_m
+from cdpipe.types import ChangedObject, ChangeReport
+from eval.answer_check import check_answer
+from eval.answer_rows import answer_rows
+from eval.ground_truth import GroundTruth, load_ground_truth
+from eval.merge_metrics import merge_columns, merge_errors
+from eval.object_metrics import ObjectMatches, kinds_right, match_objects, object_columns, unanswered_objects
+from eval.region_metrics import RegionScores, keyframes_or_all, score_regions, unanswered_regions
+
+METRICS_VERSION = 1
+FIGURES = ("v_sphere_m3", "v_oe_m3", "s_points", "oe_points")
+_NAN = float("nan")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CaseScore:
+    """The scores of one answer.
+
+    Attributes:
+        row: Its row of results.csv; scenario, variant and preset are the caller's to overwrite.
+        changes: One dict per change of the truth.
+        regions: One dict per candidate region.
+        objects: One dict per answered object.
+        keyframes: One dict per scored before keyframe: keyframe, score, label (1, 0, or -1 for left out).
+    """
+
+    row: dict[str, Any]
+    changes: list[dict[str, Any]]
+    regions: list[dict[str, Any]]
+    objects: list[dict[str, Any]]
+    keyframes: list[dict[str, Any]] = field(default_factory=list)
+
+
+def score_pair(pair: Path, answer_folder: Path) -> CaseScore:
+    """Score the answer stored in a folder against a simulated pair.
+
+    Raises:
+        InputError: The pair has no truth, a file is damaged, or the answer cannot be an answer to this pair.
+    """
+    truth = load_ground_truth(pair)
+    answer = read_answer(answer_folder)
+    check_answer(answer, truth, answer_folder)
+    return score_answer(answer, truth)
+
+
+def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
+    """Score an answer that was checked (`eval.answer_check`) against a pair's truth."""
+    after_travelled_m = travelled_m(truth.after.odom_T_sensor)
+    report = answer.report
+    if report is None:
+        regions = unanswered_regions(len(truth.pair.changes), truth.n_observable)
+        objects, object_scores = unanswered_objects(truth)
+        right = np.full(len(truth.pair.changes), np.nan)
+        errors = None
+        items: list[dict[str, Any]] = []
+    else:
+        regions = score_regions(report, truth, after_travelled_m)
+        rows = answer_rows(answer, truth)
+        objects = match_objects(report.objects, rows, truth)
+        right = kinds_right(report.objects, objects, truth)
+        object_scores = object_columns(objects, right, truth)
+        keyframes = tuple(
+            keyframes_or_all(scans, len(session.odom_T_sensor))
+            for scans, session in zip(report.keyframe_scans, (truth.before, truth.after), strict=True)
+        )
+        errors = merge_errors(truth.before, truth.after, report.before_T_after, (keyframes[0], keyframes[1]))
+        items = _object_rows(report.objects, objects, [len(of_object) for of_object in rows], truth)
+    n_regions = int(regions.columns["n_regions"])
+    row = {
+        **_identity(answer, truth),
+        **regions.columns,
+        **object_scores,
+        **merge_columns(errors),
+        **_times(answer, n_regions),
+        **_figure_means(report),
+        **_sizes(answer, truth, n_regions, float(after_travelled_m[-1])),
+    }
+    keyframe_scores = np.zeros(0) if report is None else report.regions.keyframe_scores
+    return CaseScore(
+        row=row,
+        changes=_change_rows(regions, objects, right, truth, report),
+        regions=_region_rows(report, regions, truth),
+        objects=items,
+        keyframes=[
+            {"keyframe": index, "score": float(score), "label": int(label)}
+            for index, (score, label) in enumerate(zip(keyframe_scores, regions.keyframe_labels, strict=True))
+        ],
+    )
+
+
+def _identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
+    return {
+        "scenario": truth.pair.family,
+        "family": truth.pair.family,
+        "seed": truth.pair.seed,
+        "variant": answer.method,
+        "preset": answer.method,
+        "status": answer.status,
+        "error": answer.error,
+        "metrics_version": METRICS_VERSION,
+        "n_changes": len(truth.pair.changes),
+        "n_observable": truth.n_observable,
+        "score_radius_m": truth.pair.score_radius_m,
+    }
+
+
+def _times(answer: Answer, n_regions: int) -> dict[str, float]:
+    """Return the time columns; whatever an answer does not state is NaN, and so are sums that would need it."""
+    seconds = {} if answer.report is None else answer.seconds
+    merge, descriptor, cd, oe = (
+        float(seconds.get(name, _NAN)) for name in ("t_merge_s", "t_descriptor_s", "t_cd_s", "t_oe_s")
+    )
+    n_keyframes = 0 if answer.report is None else sum(len(scans) for scans in answer.report.keyframe_scans)
+    return {
+        "t_merge_s": merge,
+        "t_descriptor_s": descriptor,
+        "t_descriptor_per_keyframe_s": descriptor / n_keyframes if n_keyframes else _NAN,
+        "t_cd_s": cd,
+        "t_cd_per_region_s": cd / n_regions if n_regions else _NAN,
+        "t_oe_s": oe,
+        "t_oe_per_region_s": oe / n_regions if n_regions else _NAN,
+        "t_total_s": descriptor + cd + oe,
+        "t_total_with_merge_s": merge + descriptor + cd + oe,
+        "t_total_paper_s": cd + oe,
+    }
+
+
+def _figure_means(report: ChangeReport | None) -> dict[str, float]:
+    return {name: _mean(_figure(report, name)[report.regions.is_reported]) if report else _NAN for name in FIGURES}
+
+
+def _figure(report: ChangeReport, name: str) -> Float64Array:
+    return np.asarray(report.figures.get(name, np.full(len(report.regions.scores), np.nan)), dtype=np.float64)
+
+
+def _sizes(answer: Answer, truth: GroundTruth, n_regions: int, after_path_m: float) -> dict[str, Any]:
+    keyframes = (None, None) if answer.report is None else answer.report.keyframe_scans
+    is_unchanged = len(truth.pair.changes) == 0
+    return {
+        **{f"map_points_{name}": float(answer.evidence.get(f"map_points_{name}", _NAN)) for name in truth.sessions},
+        **{
+            f"n_keyframes_{name}": len(scans) if scans is not None and len(scans) else _NAN
+            for name, scans in zip(truth.sessions, keyframes, strict=True)
+        },
+        "after_path_m": after_path_m,
+        "is_unchanged_pair": is_unchanged,
+        # a refused pair was neither silent nor an alarm
+        "is_alarm": n_regions > 0 if is_unchanged and answer.report is not None else _NAN,
+    }
+
+
+def _change_rows(
+    regions: RegionScores,
+    objects: ObjectMatches,
+    right: Float64Array,
+    truth: GroundTruth,
+    report: ChangeReport | None,
+) -> list[dict[str, Any]]:
+    rows = []
+    for index, change in enumerate(truth.pair.changes):
+        fields = {name: value for name, value in asdict(change).items() if name != "world_T_object"}
+        matched = int(objects.matched_object[index])
+        rows.append(
+            {
+                **fields,
+                "is_found": bool(regions.matches.best_region[index] >= 0),
+                "best_region": int(regions.matches.best_region[index]),
+                "iou_point": float(objects.iou_point[index]),
+                "iou_voxel": float(objects.iou_voxel[index]),
+                "iou_box": float(objects.iou_box[index]),
+                "matched_object": matched,
+                "matched_kind": report.objects[matched].kind if report is not None and matched >= 0 else "",
+                "is_kind_right": float(right[index]),
+                "n_truth_cells": len(truth.change_rows[index]),
+            }
+        )
+    return rows
+
+
+def _region_rows(report: ChangeReport | None, scored: RegionScores, truth: GroundTruth) -> list[dict[str, Any]]:
+    if report is None:
+        return []
+    regions = report.regions
+    figures = {name: _figure(report, name) for name in FIGURES}
+    return [
+        {
+            "region": index,
+            "score": float(regions.scores[index]),
+            "is_reported": bool(regions.is_reported[index]),
+            "outcome": scored.matches.outcomes[index],
+            **dict(zip(("x_m", "y_m", "z_m"), map(float, regions.centres_map[index]), strict=True)),
+            "found_changes": ";".join(str(truth.pair.changes[change].id) for change in scored.matches.found[index]),
+            **{name: float(values[index]) for name, values in figures.items()},
+        }
+        for index in range(len(regions.scores))
+    ]
+
+
+def _object_rows(
+    objects: tuple[ChangedObject, ...], matches: ObjectMatches, n_cells: list[int], truth: GroundTruth
+) -> list[dict[str, Any]]:
+    rows = []
+    for index, (item, outcome) in enumerate(zip(objects, matches.outcomes, strict=True)):
+        matched = int(matches.matched_change[index])
+        empty = len(item.points_map) == 0
+        low, high = (np.full(3, np.nan),) * 2 if empty else (item.points_map.min(axis=0), item.points_map.max(axis=0))
+        rows.append(
+            {
+                "object": index,
+                "session": item.session,
+                "kind": item.kind,
+                "region": item.region,
+                "score": float(item.score),
+                "n_returns": len(item.returns),
+                "n_cells": n_cells[index],
+                "matched_change": truth.pair.changes[matched].id if matched >= 0 else -1,
+                "iou_point": float(matches.iou_point[matched]) if matched >= 0 else 0.0,
+                "outcome": outcome,
+                **{f"min_{axis}_m": float(value) for axis, value in zip("xyz", low, strict=True)},
+                **{f"max_{axis}_m": float(value) for axis, value in zip("xyz", high, strict=True)},
+                "hull_volume_m3": hull_volume_m3(item.points_map),
+            }
+        )
+    return rows
+
+
+def hull_volume_m3(points: Float64Array) -> float:
+    """Return the volume of the convex hull of (N, 3) points; 0 for fewer than four or for points in one plane."""
+    if len(points) < 4:
+        return 0.0
+    try:
+        return float(ConvexHull(points).volume)
+    except QhullError:
+        return 0.0
+
+
+def _mean(values: Float64Array) -> float:
+    values = values[~np.isnan(values)]
+    return float(values.mean()) if len(values) else _NAN

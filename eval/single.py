@@ -1,0 +1,129 @@
+"""One pair of sessions through the pipeline, as `tunnelcd detect` and `describe` do it: no truth, no plan."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from cdpipe.answer import write_answer
+from cdpipe.config import PipelineConfig
+from cdpipe.descriptor import describe_scans, load_descriptors, save_descriptors
+from cdpipe.errors import InputError, MergeFailedError
+from cdpipe.mapping import build_map, keyframes
+from cdpipe.merge import merge_maps
+from cdpipe.readers import open_scans
+from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, PointMap, ScanSource
+from eval.rivals import METHODS
+
+OnStage = Callable[[str], None]
+
+
+def describe_session(folder: Path, config: PipelineConfig) -> tuple[DescriptorSet, Path]:
+    """Describe the keyframes of a session and store the vectors beside it; return them and the file.
+
+    Raises:
+        InputError: The session is damaged, or its folder cannot be written.
+    """
+    source = open_scans(folder)
+    chosen = keyframes(source.odom_T_sensor, config.map.keyframe_spacing_m)
+    descriptors = describe_scans(source, chosen, config.descriptor)
+    return descriptors, save_descriptors(folder, descriptors)
+
+
+def detect_pair(before: Path, after: Path, config: PipelineConfig, on_stage: OnStage) -> ChangeReport:
+    """Find what changed between two recorded sessions.
+
+    Stored descriptors are used where they are of the same weights and keyframes; `t_descriptor_s` then does not contain
+    them.
+
+    Raises:
+        MergeFailedError: The sessions could not be put into one frame.
+        InputError: A session is missing or damaged.
+    """
+    sources = open_scans(before), open_scans(after)
+    mapped: list[MappedSession] = []
+    t_descriptor_s = 0.0
+    for folder, source in zip((before, after), sources, strict=True):
+        on_stage(f"map {source.name}")
+        pointmap = build_map(source, config.map)
+        on_stage(f"describe {source.name}")
+        start = time.perf_counter()
+        mapped.append(MappedSession(pointmap, _descriptors(folder, source, pointmap, config)))
+        t_descriptor_s += time.perf_counter() - start
+    on_stage("merge")
+    start = time.perf_counter()
+    merged = merge_maps(mapped[0], mapped[1], config.merge)
+    t_merge_s = time.perf_counter() - start
+    if not merged.is_accepted:
+        raise MergeFailedError(f"{before} and {after} cannot be merged: {merged.reason}", merged.evidence)
+    on_stage("compare")
+    report = METHODS[config.method](merged, mapped[0].descriptors, mapped[1].descriptors, config)
+    seconds = {**report.seconds, "t_merge_s": t_merge_s, "t_descriptor_s": t_descriptor_s}
+    sizes = {f"map_points_{name}": len(each.map.points) for name, each in zip(("before", "after"), mapped, strict=True)}
+    return replace(report, seconds=seconds, evidence={**report.evidence, **sizes})
+
+
+def write_detection(folder: Path, method: str, report: ChangeReport) -> None:
+    """Write the raw answer, and beside it what people open: regions.csv, objects.csv and objects.ply."""
+    write_answer(folder, method, report)
+    region_table(report).to_csv(folder / "regions.csv", index=False)
+    object_table(report).to_csv(folder / "objects.csv", index=False)
+    _write_ply(folder / "objects.ply", report)
+
+
+def region_table(report: ChangeReport) -> pd.DataFrame:
+    """Return one row per reported region, best first; positions in the map frame, metres."""
+    regions = report.regions
+    shown = np.flatnonzero(regions.is_reported)
+    columns = {
+        "region": shown,
+        "score": regions.scores[shown],
+        **{f"{axis}_m": regions.centres_map[shown, k] for k, axis in enumerate("xyz")},
+        **{name: values[shown] for name, values in report.figures.items()},
+    }
+    return pd.DataFrame(columns)
+
+
+def object_table(report: ChangeReport) -> pd.DataFrame:
+    """Return one row per object: where it is (map frame, metres), what happened to it, how large it is."""
+    names = ["object", "session", "kind", "partner", "region", "score", "n_returns", "n_points"]
+    corners = [f"{end}_{axis}_m" for end in ("min", "max") for axis in "xyz"]
+    rows = []
+    for index, item in enumerate(report.objects):
+        points = item.points_map if len(item.points_map) else np.full((1, 3), np.nan)
+        identity = index, item.session, item.kind, item.partner, item.region, item.score
+        counts = len(item.returns), len(item.points_map)
+        rows.append((*identity, *counts, *points.min(axis=0), *points.max(axis=0)))
+    return pd.DataFrame(rows, columns=[*names, *corners])
+
+
+def _descriptors(folder: Path, source: ScanSource, pointmap: PointMap, config: PipelineConfig) -> DescriptorSet:
+    stored = load_descriptors(folder, config.descriptor)
+    if stored is not None and np.array_equal(stored.keyframe_scans, pointmap.keyframe_scans):
+        return stored
+    return describe_scans(source, pointmap.keyframe_scans, config.descriptor)
+
+
+def _write_ply(path: Path, report: ChangeReport) -> None:
+    """Write the points of all objects, map frame, each with the index of its object."""
+    vertex = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("object", "<i4")])
+    parts = []
+    for index, item in enumerate(report.objects):
+        part = np.empty(len(item.points_map), dtype=vertex)
+        part["x"], part["y"], part["z"] = item.points_map.T
+        part["object"] = index
+        parts.append(part)
+    vertices = np.concatenate(parts) if parts else np.empty(0, dtype=vertex)
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
+        "property float x\nproperty float y\nproperty float z\nproperty int object\nend_header\n"
+    )
+    try:
+        path.write_bytes(header.encode() + vertices.tobytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,211 @@
+"""The returns of one session against which objects are scored: one per 0.1 m cell of its own odom frame.
+
+Both the truth of a change and the answer of a method are subsets of these rows, so an object seen from near by, with a
+hundred returns in a cell, weighs no more than one seen from afar. Cells are fixed in the session's own odometry, so
+that a wrong merge acts only through what the method answers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from cdpipe.errors import InputError
+from cdpipe.geometry import Float32Array, Int32Array, Int64Array, require_shape, transform
+from cdpipe.readers import open_scans
+from cdpipe.session import Session, chunk_path, load_arrays, read_session
+from cdpipe.voxel import cell_keys
+from sim.truth import Int16Array, read_labels
+
+CELL_M = 0.1
+_CACHE_VERSION = 1
+_BATCH_RETURNS = 500_000
+_PENDING_ROWS = 4_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Universe:
+    """One return per occupied cell, in the order they were measured.
+
+    Attributes:
+        returns: (N,) int64 scan * n_pixels + pixel of each, rising.
+        points_odom: (N, 3) float32 deskewed points, the session's odom frame, metres.
+        change: (N,) int16 id of the change each belongs to, 0 for none.
+        instance: (N,) int16 what each hit: 0 walls and floor, n the n-th prop.
+        n_scans: Revolutions of the session.
+        n_pixels: Pixels of a revolution.
+    """
+
+    returns: Int64Array
+    points_odom: Float32Array
+    change: Int16Array
+    instance: Int16Array
+    n_scans: int
+    n_pixels: int
+
+    def __post_init__(self) -> None:
+        n = len(self.returns)
+        require_shape("points_odom", self.points_odom, (n, 3))
+        require_shape("change", self.change, (n,))
+        require_shape("instance", self.instance, (n,))
+
+    def __len__(self) -> int:
+        return len(self.returns)
+
+    def scans(self, rows: Int64Array) -> Int64Array:
+        """Return the scan of each of some rows."""
+        return self.returns[rows] // self.n_pixels
+
+    def pixels(self, rows: Int64Array) -> Int64Array:
+        """Return the pixel of each of some rows, row * W + column."""
+        return self.returns[rows] % self.n_pixels
+
+    def rows_of_change(self, change_id: int) -> Int64Array:
+        """Return the rows that belong to a change: the cells of its truth."""
+        return np.flatnonzero(self.change == change_id)
+
+    def rows_of_returns(self, returns: Int32Array) -> Int64Array:
+        """Return the rows, rising, that are among (M, 2) (scan, pixel) returns; the others share a cell with a row."""
+        wanted = returns[:, 0].astype(np.int64) * self.n_pixels + returns[:, 1]
+        if len(self) == 0:
+            return np.zeros(0, dtype=np.int64)
+        place = np.minimum(np.searchsorted(self.returns, wanted), len(self) - 1)
+        return np.unique(place[self.returns[place] == wanted])
+
+
+def load_universe(session: Path) -> Universe:
+    """Return the universe of a simulated session, from `truth/universe.npz` if that fits, else built and stored there.
+
+    Raises:
+        InputError: The session or its truth is missing or damaged.
+    """
+    opened = read_session(session)
+    path = session / "truth" / "universe.npz"
+    fingerprint = _fingerprint(opened)
+    cached = _read_cache(path, fingerprint, opened)
+    if cached is not None:
+        return cached
+    universe = build_universe(opened)
+    _write_cache(path, fingerprint, universe)
+    return universe
+
+
+def build_universe(session: Session) -> Universe:
+    """Take the first return of each 0.1 m cell, in the order of scans and, within one, of row-major pixels.
+
+    Streams over the session; memory grows with the number of cells, about 60 bytes each.
+
+    Raises:
+        InputError: The session or its truth is missing or damaged.
+    """
+    folded: list[_Rows] = []
+    pending: list[_Rows] = []
+    batch: list[_Rows] = []
+    for rows in _scan_rows(session):
+        batch.append(rows)
+        if _count(batch) < _BATCH_RETURNS:
+            continue
+        pending.append(_first_per_cell(batch))
+        batch = []
+        # folding only once as much is pending as folded keeps the sorting linear in the length of the session
+        if _count(pending) > max(_PENDING_ROWS, _count(folded)):
+            folded, pending = [_first_per_cell([*folded, *pending])], []
+    cells = _first_per_cell([*folded, *pending, *batch])
+    order = np.argsort(cells.returns)
+    return Universe(
+        returns=cells.returns[order],
+        points_odom=cells.points_odom[order],
+        change=cells.change[order],
+        instance=cells.instance[order],
+        n_scans=session.n_scans,
+        n_pixels=session.sensor.height * session.sensor.width,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    cells: Int64Array
+    returns: Int64Array
+    points_odom: Float32Array
+    change: Int16Array
+    instance: Int16Array
+
+
+def _scan_rows(session: Session) -> Iterator[_Rows]:
+    n_pixels = session.sensor.height * session.sensor.width
+    scans = open_scans(session.path).scans()
+    for index, (instance, change) in enumerate(read_labels(session.path, session.n_chunks)):
+        n_scans = min(session.chunk_scans, session.n_scans - index * session.chunk_scans)
+        for labels in (instance, change):
+            if labels.shape != (n_scans, session.sensor.height, session.sensor.width):
+                raise InputError(
+                    f"{session.path / 'truth'}: labels of chunk {index} are {labels.shape}, but the chunk holds "
+                    f"{n_scans} scans of {session.sensor.height} x {session.sensor.width}: truth of another session"
+                )
+        for scan_instance, scan_change, scan in zip(instance, change, scans, strict=False):
+            points_odom = transform(scan.odom_T_sensor, scan.points_sensor)
+            try:
+                cells = cell_keys(points_odom, CELL_M)
+            except ValueError as error:
+                raise InputError(f"{session.path}: scan {scan.index}: {error}") from error
+            yield _Rows(
+                cells=cells,
+                returns=scan.index * n_pixels + scan.pixels.astype(np.int64),
+                points_odom=points_odom.astype(np.float32),
+                change=scan_change.ravel()[scan.pixels],
+                instance=scan_instance.ravel()[scan.pixels],
+            )
+
+
+def _count(parts: Sequence[_Rows]) -> int:
+    return sum(len(part.cells) for part in parts)
+
+
+def _first_per_cell(parts: Sequence[_Rows]) -> _Rows:
+    """Keep the first row of each cell; `parts` come in the order of measurement, so the result precedes later ones."""
+    _, first = np.unique(np.concatenate([part.cells for part in parts]), return_index=True)
+    names = [item.name for item in fields(_Rows)]
+    return _Rows(**{name: np.concatenate([getattr(part, name) for part in parts])[first] for name in names})
+
+
+def _fingerprint(session: Session) -> str:
+    """Return a digest that changes when any file does that the universe was made from."""
+    hasher = hashlib.sha256(f"{_CACHE_VERSION} {CELL_M}".encode())
+    for name in ("session.json", "odometry.npz"):
+        hasher.update((session.path / name).read_bytes())
+    for index in range(session.n_chunks):
+        for path in (chunk_path(session.path, index), session.path / "truth" / f"{index:05d}.npz"):
+            if not path.is_file():
+                raise InputError(f"{path}: missing: only whole simulated sessions can be scored")
+            status = path.stat()
+            hasher.update(f"{path.name} {status.st_size} {status.st_mtime_ns}".encode())
+    return hasher.hexdigest()
+
+
+def _read_cache(path: Path, fingerprint: str, session: Session) -> Universe | None:
+    try:
+        arrays = load_arrays(path)
+        if str(arrays.pop("fingerprint")) != fingerprint:
+            return None
+        return Universe(**arrays, n_scans=session.n_scans, n_pixels=session.sensor.height * session.sensor.width)
+    except (InputError, KeyError, TypeError, ValueError):
+        return None  # absent or damaged: it is rebuilt from the session
+
+
+def _write_cache(path: Path, fingerprint: str, universe: Universe) -> None:
+    names = ("returns", "points_odom", "change", "instance")
+    partial = path.with_name(f".{path.stem}.partial.npz")
+    try:
+        np.savez(
+            partial,
+            allow_pickle=False,
+            fingerprint=np.array(fingerprint),
+            **{name: getattr(universe, name) for name in names},
+        )
+        partial.replace(path)
+    except OSError:
+        partial.unlink(missing_ok=True)  # a folder that cannot be written to is scored all the same, only slower

@@ -1,0 +1,228 @@
+"""Distributions in a scenario's YAML, and their replacement by draws of the seed.
+
+Every draw has its own generator, `stream(seed, "scenario", path)`, where path is the dotted key; items of a list stand
+in it by their `name` where they have one, else by their index. So no draw depends on any other key of the file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+
+from cdpipe.errors import ScenarioError
+from cdpipe.geometry import stream
+from cdpipe.yamlfile import Key
+
+NAMES = ("uniform", "normal", "integers", "choice")
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """A tree whose distributions were replaced.
+
+    Attributes:
+        value: The tree, of plain dicts, lists and scalars.
+        origins: For every key path of `value`, the key path it comes from in the tree that was drawn from.
+        broken: Key paths of `value` that are None because their distribution has no valid form.
+    """
+
+    value: Any
+    origins: dict[Key, Key] = field(default_factory=dict)
+    broken: set[Key] = field(default_factory=set)
+
+
+def draw(tree: Any, seed: int) -> Any:
+    """Return the tree with every distribution replaced by its draw, and repeated list items written out.
+
+    Raises:
+        ScenarioError: A distribution, `repeat`, `chance` or `one_of` has no valid form; all of them are told.
+    """
+    mistakes = form_mistakes(tree)
+    if mistakes:
+        raise ScenarioError("\n".join(f"{dotted(key)}: {rule}" for key, rule in mistakes.items()))
+    return drawing(tree, seed).value
+
+
+def drawing(tree: Any, seed: int) -> Drawing:
+    """Draw like `draw`, but remember where each value came from, and let mistakes stand as None."""
+    drawer = _Drawer(seed)
+    value = drawer.value(tree, (), (), ())
+    return Drawing(value, drawer.origins, drawer.broken)
+
+
+def form_mistakes(tree: Any, key: Key = ()) -> dict[Key, str]:
+    """Return the rule that each malformed distribution, `repeat`, `chance` or `one_of` breaks, by key path."""
+    found: dict[Key, str] = {}
+    if isinstance(tree, list):
+        for index, item in enumerate(tree):
+            found |= form_mistakes(item, (*key, index))
+            for name, rule_of in (("repeat", _repeat_rule), ("chance", _chance_rule)):
+                if isinstance(item, dict) and name in item and (rule := rule_of(item[name])):
+                    found[(*key, index, name)] = rule
+    elif isinstance(tree, dict):
+        if rule := _distribution_rule(tree):
+            found[key] = rule
+        elif "one_of" in tree and (rule := _one_of_rule(tree["one_of"])):
+            found[(*key, "one_of")] = rule
+        for name, item in tree.items():
+            found |= form_mistakes(item, (*key, name))
+    return found
+
+
+def is_distribution(tree: Any) -> bool:
+    """Tell whether a value is a mapping that names a distribution, well-formed or not."""
+    return isinstance(tree, dict) and any(name in tree for name in NAMES)
+
+
+def merged(base: Any, over: Any) -> Any:
+    """Return `base` with `over` written over it: mappings key by key, lists and distributions as a whole."""
+    if not (isinstance(base, dict) and isinstance(over, dict)) or is_distribution(base) or is_distribution(over):
+        return over
+    return {**base, **{key: merged(base[key], item) if key in base else item for key, item in over.items()}}
+
+
+def dotted(key: Key) -> str:
+    """Return a key path as `a.b.0`."""
+    return ".".join(str(part) for part in key)
+
+
+class _Drawer:
+    """One walk over a tree; `source` is a value's place there, `place` its place in the result, `path` its stream."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+        self.origins: dict[Key, Key] = {}
+        self.broken: set[Key] = set()
+
+    def value(self, tree: Any, source: Key, place: Key, path: tuple[str, ...]) -> Any:
+        self.origins[place] = source
+        if isinstance(tree, list):
+            return self._list(tree, source, place, path)
+        if not isinstance(tree, dict):
+            return tree
+        if _distribution_rule(tree):
+            self.broken.add(place)
+            return None
+        if is_distribution(tree):
+            return self._distribution(tree, source, place, path)
+        return self._mapping(tree, source, place, path)
+
+    def _generator(self, path: tuple[str, ...]) -> np.random.Generator:
+        return stream(self.seed, "scenario", ".".join(path))
+
+    def _distribution(self, tree: dict[str, Any], source: Key, place: Key, path: tuple[str, ...]) -> Any:
+        ((name, argument),) = tree.items()
+        generator = self._generator(path)
+        if name == "choice":
+            index = int(generator.integers(len(argument)))
+            return self.value(argument[index], (*source, "choice", index), place, (*path, str(index)))
+        if name == "integers":
+            return int(generator.integers(*argument))
+        return float(generator.uniform(*argument) if name == "uniform" else generator.normal(*argument))
+
+    def _mapping(self, tree: dict[str, Any], source: Key, place: Key, path: tuple[str, ...]) -> Any:
+        options: Any = tree.get("one_of")
+        chosen: Any = {}
+        if options is not None and not _one_of_rule(options):
+            index = int(self._generator((*path, "one_of")).integers(len(options)))
+            chosen = self.value(options[index], (*source, "one_of", index), place, path)
+        own = {
+            key: self.value(item, (*source, key), (*place, key), (*path, str(key)))
+            for key, item in tree.items()
+            if key != "one_of"
+        }
+        self.origins[place] = source
+        return merged(chosen, own)
+
+    def _list(self, items: list[Any], source: Key, place: Key, path: tuple[str, ...]) -> list[Any]:
+        result: list[Any] = []
+        for index, item in enumerate(items):
+            for label, copy in self._copies(item, index, path):
+                own_path = (*path, label)
+                if isinstance(copy, dict) and "chance" in copy:
+                    copy = {key: part for key, part in copy.items() if key != "chance"}  # noqa: PLW2901 - narrowed here
+                    rule = _chance_rule(item["chance"])
+                    if not rule and self._generator((*own_path, "chance")).random() >= item["chance"]:
+                        continue
+                result.append(self.value(copy, (*source, index), (*place, len(result)), own_path))
+        return result
+
+    def _copies(self, item: Any, index: int, path: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
+        """Yield the stream label and the content of each copy of a list item."""
+        name = item.get("name") if isinstance(item, dict) else None
+        label = name if isinstance(name, str) else str(index)
+        if not isinstance(item, dict) or "repeat" not in item:
+            yield label, item
+            return
+        repeat = item["repeat"]
+        if isinstance(repeat, dict) and not _repeat_rule(repeat):
+            repeat = self._distribution(repeat, (), ("repeat",), (*path, label, "repeat"))
+        once = {key: part for key, part in item.items() if key != "repeat"}
+        for number in range(1, 2 if _repeat_rule(repeat) else repeat + 1):
+            named = {"name": f"{name}-{number}"} if isinstance(name, str) else {}
+            yield f"{label}-{number}", {**once, **named}
+
+
+def _distribution_rule(tree: dict[str, Any]) -> str:
+    """Return what is wrong with a mapping that is, or seems meant as, a distribution; "" if nothing is."""
+    named = [name for name in NAMES if name in tree]
+    if not named:
+        (key, *others) = tree or [""]
+        close = get_close_matches(str(key), NAMES, n=1, cutoff=0.75)
+        is_misspelt = bool(close) and not others and isinstance(tree[key], list)
+        return f'unknown distribution; did you mean "{close[0]}"?' if is_misspelt else ""
+    if len(tree) > 1:
+        return f"a distribution has one key, one of {', '.join(NAMES)}; got {', '.join(map(str, tree))}"
+    return _ARGUMENT_RULES[named[0]](tree[named[0]])
+
+
+def _pair_rule(argument: Any, form: str, is_ordered: Callable[[float, float], bool]) -> str:
+    is_pair = isinstance(argument, list) and len(argument) == 2 and all(map(_is_number, argument))
+    return "" if is_pair and is_ordered(*argument) else f"expected {form}"
+
+
+def _integers_rule(argument: Any) -> str:
+    rule = _pair_rule(argument, "", lambda low, high: low < high)
+    is_whole = not rule and all(isinstance(part, int) for part in argument)
+    return "" if is_whole else "expected integers: [a, b] with whole a < b, b excluded"
+
+
+def _choice_rule(argument: Any) -> str:
+    return "" if isinstance(argument, list) and argument else "expected choice: [..] with at least one alternative"
+
+
+_ARGUMENT_RULES: dict[str, Callable[[Any], str]] = {
+    "uniform": lambda argument: _pair_rule(argument, "uniform: [a, b] with a <= b", lambda low, high: low <= high),
+    "normal": lambda argument: _pair_rule(
+        argument, "normal: [mean, sigma] with sigma >= 0", lambda _, sigma: sigma >= 0
+    ),
+    "integers": _integers_rule,
+    "choice": _choice_rule,
+}
+
+
+def _repeat_rule(repeat: Any) -> str:
+    if isinstance(repeat, dict) and len(repeat) == 1 and not _distribution_rule(repeat):
+        ((name, argument),) = repeat.items()
+        numbers = argument if name == "choice" else argument[:1] if name == "integers" else [None]
+        return next((rule for rule in map(_repeat_rule, numbers) if rule), "")
+    is_count = isinstance(repeat, int) and not isinstance(repeat, bool) and repeat >= 0
+    return "" if is_count else "expected a whole number >= 0, or integers or choice of such"
+
+
+def _chance_rule(chance: Any) -> str:
+    return "" if _is_number(chance) and 0 <= chance <= 1 else "expected a number from 0 to 1"
+
+
+def _one_of_rule(options: Any) -> str:
+    is_valid = isinstance(options, list) and options and all(isinstance(option, dict) for option in options)
+    return "" if is_valid else "expected a list of mappings, one of which is drawn and merged into this one"
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,219 @@
+"""Scenarios by name or file: read, extended, drawn with a seed, checked and, where asked for, frozen."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from cdpipe.errors import InputError, ScenarioError
+from cdpipe.yamlfile import Document, Key, read_yaml, suggestion, validated, with_settings
+from scenarios.distributions import Drawing, dotted, drawing, form_mistakes, is_distribution, merged
+from scenarios.references import contradictions, reference_mistakes
+from scenarios.schema import Prop, Scenario
+
+FAMILIES = Path(__file__).parent / "families"
+CHECKED_SEEDS = range(8)
+SUFFIXES = (".yaml", ".yml")
+
+# what the schema says of a dangling reference without a line of its own; references.py says it with one
+_SAID_WITH_LINES = ("which is not in tunnel.nodes", "which no drift joins", "two props are called")
+
+
+@dataclass(frozen=True, slots=True)
+class SourcedDocument(Document):
+    """A document put together from several places.
+
+    Attributes:
+        origins: "file:line", or "--set", of each key path that has one.
+    """
+
+    origins: Mapping[Key, str] = field(default_factory=dict)
+
+    def where(self, key: Key) -> str:
+        """Return the origin of a key, or of its nearest known parent."""
+        while key and key not in self.origins:
+            key = key[:-1]
+        return self.origins.get(key, self.source)
+
+
+def scenario_names() -> list[str]:
+    """Return the names of the scenarios that come with the package, e.g. `paper/site1`."""
+    return sorted(path.relative_to(FAMILIES).with_suffix("").as_posix() for path in FAMILIES.rglob("*.yaml"))
+
+
+def load_scenario(name_or_path: str, seed: int, settings: Iterable[str] = ()) -> Scenario:
+    """Return a scenario as its seed draws it.
+
+    Args:
+        name_or_path: A name of `scenario_names()`, or a YAML file.
+        seed: Not negative.
+        settings: `a.b=value` pairs written over the file before anything is drawn.
+
+    Raises:
+        ScenarioError: The name is unknown, or the file has mistakes: one line each.
+        InputError: The file cannot be read, a setting has no valid form, or the seed is negative.
+    """
+    if seed < 0:
+        raise InputError(f"seed = {seed}: expected a whole number >= 0")
+    scenario, mistakes = _scenario(_document(name_or_path, settings), seed)
+    return _checked(scenario, mistakes)
+
+
+def check_scenario(name_or_path: str) -> Scenario:
+    """Check a scenario for several seeds without simulating it, and return it as seed 0 draws it.
+
+    Raises:
+        ScenarioError: The name is unknown, or the file has mistakes, told once each whatever the seed.
+        InputError: The file cannot be read.
+    """
+    document = _document(name_or_path, ())
+    first, mistakes = _scenario(document, CHECKED_SEEDS[0])
+    for seed in CHECKED_SEEDS[1:]:
+        told = {_key_of(line) for line in mistakes}
+        mistakes += [line for line in _scenario(document, seed)[1] if _key_of(line) not in told]
+    return _checked(first, mistakes)
+
+
+def _checked(scenario: Scenario | None, mistakes: list[str]) -> Scenario:
+    if scenario is None or mistakes:
+        raise ScenarioError("\n".join(sorted(mistakes, key=_line_of)))
+    return scenario
+
+
+def _scenario(document: SourcedDocument, seed: int) -> tuple[Scenario | None, list[str]]:
+    """Draw a scenario; return it and every mistake found, both if the world only contradicts itself."""
+    mistakes = [_told(document, key, rule) for key, rule in form_mistakes(document.value).items()]
+    drawn = drawing(document.value, seed)
+    tree = dict(drawn.value)
+    is_frozen = tree.pop("frozen", False)
+    if not isinstance(is_frozen, bool):
+        mistakes.append(_told(document, ("frozen",), "expected true or false"))
+    place = SourcedDocument(document.source, tree, {}, _drawn_origins(document, drawn))
+    references = reference_mistakes(tree)
+    mistakes += [_told(place, key, rule) for key, rule in references]
+    try:
+        scenario = validated(Scenario, place)
+    except InputError as error:
+        return None, mistakes + _without_repetition(str(error).splitlines(), drawn.broken, bool(references))
+    mistakes += [_told(place, key, rule) for key, rule in contradictions(scenario)]
+    return _frozen(scenario) if is_frozen else scenario, mistakes
+
+
+def _frozen(scenario: Scenario) -> Scenario:
+    """Return the scenario with nothing changing: the world stays as the before session saw it."""
+    stay = {"change": "none", "to": None}
+    props: list[Prop] = [prop.model_copy(update=stay) for prop in scenario.props if prop.change != "added"]
+    return scenario.model_copy(update={"props": tuple(props)})
+
+
+def _drawn_origins(document: SourcedDocument, drawn: Drawing) -> dict[Key, str]:
+    return {key: document.where(source) for key, source in drawn.origins.items()}
+
+
+def _without_repetition(lines: list[str], broken: set[Key], has_references: bool) -> list[str]:
+    """Drop what the schema says of values that could not be drawn, and of references told with their lines already."""
+    names = [f": {dotted(key)} = " for key in broken]
+    silent = _SAID_WITH_LINES if has_references else ()
+    return [
+        line for line in lines if not any(name in line for name in names) and not any(rule in line for rule in silent)
+    ]
+
+
+def _told(document: SourcedDocument, key: Key, rule: str) -> str:
+    value = document.value
+    for part in key:
+        is_there = part in value if isinstance(value, dict) else isinstance(value, list) and part in range(len(value))
+        if not is_there:
+            return f"{document.where(key)}: {dotted(key)}: {rule}"
+        value = value[part]
+    text = repr(value)
+    return f"{document.where(key)}: {dotted(key)} = {text if len(text) <= 60 else text[:57] + '...'}: {rule}"
+
+
+def _key_of(line: str) -> str:
+    return line.split(" = ", maxsplit=1)[0]
+
+
+def _line_of(line: str) -> tuple[str, int]:
+    match = re.match(r"(.*?):(\d+): ", line)
+    return (match[1], int(match[2])) if match else (line, 0)
+
+
+def _document(name_or_path: str, settings: Iterable[str]) -> SourcedDocument:
+    document = _extended(_path_of(name_or_path), ())
+    settings = list(settings)
+    changed = with_settings(document, settings)
+    origins = dict(document.origins)
+    for setting in settings:
+        name = tuple(setting.partition("=")[0].split("."))
+        origins = {key: where for key, where in origins.items() if key[: len(name)] != name}
+        origins[name] = "--set"
+    return SourcedDocument(document.source, changed.value, {}, origins)
+
+
+def _path_of(name_or_path: str) -> Path:
+    names = scenario_names()
+    if name_or_path in names:
+        return _shown(FAMILIES / f"{name_or_path}.yaml")
+    path = Path(name_or_path)
+    if path.is_file():
+        return path
+    if path.suffix in SUFFIXES:
+        raise ScenarioError(f"{path}: no such file; a scenario is a YAML file or a name such as {names[0]}")
+    hint = suggestion(name_or_path, names) or f"; known are {', '.join(names)}"
+    raise ScenarioError(f'scenario "{name_or_path}": unknown{hint}')
+
+
+def _shown(path: Path) -> Path:
+    """Return the path as it is told to the user: short where it lies below the working folder."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def _family_of(path: Path) -> str:
+    resolved = path.resolve()
+    root = FAMILIES.resolve()
+    return resolved.relative_to(root).with_suffix("").as_posix() if resolved.is_relative_to(root) else path.stem
+
+
+def _extended(path: Path, children: tuple[Path, ...]) -> SourcedDocument:
+    """Read a file and write it over the one it extends; `family` is its own name unless it gives one."""
+    read = read_yaml(path)
+    if not isinstance(read.value, dict):
+        raise ScenarioError(f"{path}: expected keys and values, got {type(read.value).__name__}")
+    origins = {key: f"{path}:{line}" for key, line in read.lines.items()}
+    value: dict[Any, Any] = dict(read.value)
+    value.setdefault("family", _family_of(path))
+    base_name = value.pop("extends", None)
+    if base_name is None:
+        return SourcedDocument(str(path), value, {}, origins)
+    base = _extended(_base_path(base_name, path, origins[("extends",)], children), (*children, path))
+    kept = {key: where for key, where in base.origins.items() if not _is_replaced(key, base.value, value)}
+    return SourcedDocument(str(path), merged(base.value, value), {}, kept | origins)
+
+
+def _base_path(name: Any, path: Path, where: str, children: tuple[Path, ...]) -> Path:
+    if not isinstance(name, str):
+        raise ScenarioError(f"{where}: extends = {name!r}: expected the name of a scenario or a YAML file")
+    try:
+        beside = path.parent / name
+        base = beside if Path(name).suffix in SUFFIXES and beside.is_file() else _path_of(name)
+    except ScenarioError as error:
+        raise ScenarioError(f"{where}: extends = {name!r}: {error}") from error
+    if base.resolve() in [child.resolve() for child in (*children, path)]:
+        raise ScenarioError(f"{where}: extends = {name!r}: the files extend each other in a circle")
+    return base
+
+
+def _is_replaced(key: Key, base: Any, over: Any) -> bool:
+    """Tell whether a key path of `base` lies in something that `over` replaces as a whole."""
+    for part in key:
+        both = isinstance(base, dict) and isinstance(over, dict)
+        if not both or is_distribution(base) or is_distribution(over):
+            return True
+        if part not in over:
+            return False
+        base, over = base[part], over[part]
+    return False

@@ -1,0 +1,142 @@
+"""Triangle surfaces: the type, the primitives, and the exact distance from points to a surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from cdpipe.geometry import BoolArray, Float64Array, Int32Array, require_shape, transform
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """A triangle surface.
+
+    Attributes:
+        vertices: (N, 3) float64, metres.
+        faces: (M, 3) int32; seen from the side they face, corners run counter-clockwise.
+    """
+
+    vertices: Float64Array
+    faces: Int32Array
+
+    def __post_init__(self) -> None:
+        require_shape("vertices", self.vertices, (None, 3))
+        require_shape("faces", self.faces, (None, 3))
+
+
+def moved(mesh: Mesh, dst_T_src: Float64Array) -> Mesh:
+    """Return the mesh of frame src in frame dst."""
+    return Mesh(transform(dst_T_src, mesh.vertices), mesh.faces)
+
+
+def joined(meshes: list[Mesh]) -> Mesh:
+    """Return several meshes as one."""
+    starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces).astype(np.int32))
+
+
+def box_mesh(half_size_m: npt.ArrayLike) -> Mesh:
+    """Return a box about the origin, facing outwards, from its half edges (3,)."""
+    corners = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 3)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]
+    return Mesh(corners * np.asarray(half_size_m), np.array(faces, np.int32))
+
+
+def cylinder_mesh(radius_m: float, half_height_m: float, segments: int) -> Mesh:
+    """Return a closed cylinder about the z axis, facing outwards."""
+    angle = np.arange(segments) * (2 * np.pi / segments)
+    ring = np.stack([radius_m * np.cos(angle), radius_m * np.sin(angle)], axis=1)
+    low = np.column_stack([ring, np.full(segments, -half_height_m)])
+    high = np.column_stack([ring, np.full(segments, half_height_m)])
+    vertices = np.concatenate([low, high, [[0, 0, -half_height_m], [0, 0, half_height_m]]])
+    i = np.arange(segments)
+    j = (i + 1) % segments
+    bottom, top = np.full(segments, 2 * segments), np.full(segments, 2 * segments + 1)
+    faces = np.concatenate(
+        [
+            np.stack([i, j, segments + j], axis=1),
+            np.stack([i, segments + j, segments + i], axis=1),
+            np.stack([bottom, j, i], axis=1),
+            np.stack([top, segments + i, segments + j], axis=1),
+        ]
+    )
+    return Mesh(vertices, faces.astype(np.int32))
+
+
+def near_part(mesh: Mesh, target: Mesh, within_m: float) -> Mesh:
+    """Return the triangles of a mesh whose bounding box comes within `within_m` of the bounding box of another."""
+    low, high = target.vertices.min(axis=0) - within_m, target.vertices.max(axis=0) + within_m
+    return Mesh(mesh.vertices, mesh.faces[_touches_box(mesh.vertices[mesh.faces], low, high)])
+
+
+def is_near_surface(points: Float64Array, mesh: Mesh, within_m: float) -> BoolArray:
+    """Mark the points (N, 3) whose exact distance to the surface is at most `within_m`."""
+    is_near = np.zeros(len(points), dtype=bool)
+    if len(points) == 0:
+        return is_near
+    margin_m = within_m + 1e-6
+    triangles = mesh.vertices[mesh.faces]
+    triangles = triangles[_touches_box(triangles, points.min(axis=0) - margin_m, points.max(axis=0) + margin_m)]
+    # Small pieces have small bounding spheres, so that few candidates stand for each point.
+    triangles = _split(triangles, within_m)
+    if len(triangles) == 0:
+        return is_near
+    centres = triangles.mean(axis=1)
+    reach_m = within_m + float(np.linalg.norm(triangles - centres[:, None], axis=2).max())
+    tree = cKDTree(centres)
+    for start in range(0, len(points), 4096):
+        part = points[start : start + 4096]
+        near = tree.query_ball_point(part, reach_m)
+        counts = np.fromiter((len(found) for found in near), np.int64, len(part))
+        owner = np.repeat(np.arange(len(part)), counts)
+        candidate = np.fromiter((index for found in near for index in found), np.int64, counts.sum())
+        distance_m = point_triangle_distance(part[owner], triangles[candidate])
+        is_near[start + owner[distance_m <= within_m]] = True
+    return is_near
+
+
+def point_triangle_distance(points: Float64Array, triangles: Float64Array) -> Float64Array:
+    """Return the (N,) distance of each point (N, 3) to its own triangle (N, 3, 3), metres."""
+    a = triangles[:, 0]
+    edges = (triangles[:, 1] - a, triangles[:, 2] - a)
+    rel = points - a
+    e00, e01, e11 = (np.einsum("ij,ij->i", edges[i], edges[j]) for i, j in ((0, 0), (0, 1), (1, 1)))
+    r0, r1 = (np.einsum("ij,ij->i", edge, rel) for edge in edges)
+    area = np.maximum(e00 * e11 - e01**2, 1e-30)
+    u, v = (e11 * r0 - e01 * r1) / area, (e00 * r1 - e01 * r0) / area
+    foot = a + u[:, None] * edges[0] + v[:, None] * edges[1]
+    inside = (u >= 0) & (v >= 0) & (u + v <= 1)
+    to_plane = np.where(inside, np.linalg.norm(points - foot, axis=1), np.inf)
+    sides = [_segment_distance(points, triangles[:, i], triangles[:, (i + 1) % 3]) for i in range(3)]
+    return np.minimum.reduce([to_plane, *sides])
+
+
+def _segment_distance(points: Float64Array, start: Float64Array, end: Float64Array) -> Float64Array:
+    along = end - start
+    share = np.einsum("ij,ij->i", points - start, along) / np.maximum(np.einsum("ij,ij->i", along, along), 1e-30)
+    return np.asarray(np.linalg.norm(points - start - np.clip(share, 0.0, 1.0)[:, None] * along, axis=1))
+
+
+def _touches_box(triangles: Float64Array, low: Float64Array, high: Float64Array) -> BoolArray:
+    return np.asarray(((triangles.max(axis=1) >= low) & (triangles.min(axis=1) <= high)).all(axis=1))
+
+
+def _split(triangles: Float64Array, edge_m: float) -> Float64Array:
+    """Halve triangles at their longest edge until none is longer than `edge_m`; the surface stays the same."""
+    done = []
+    while len(triangles):
+        lengths = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2)
+        is_long = lengths.max(axis=1) > edge_m
+        done.append(triangles[~is_long])
+        triangles, longest = triangles[is_long], np.argmax(lengths[is_long], axis=1)
+        rows = np.arange(len(triangles))
+        a, b, c = (triangles[rows, (longest + shift) % 3] for shift in range(3))
+        middle = (a + b) / 2
+        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+    return np.concatenate(done) if done else triangles

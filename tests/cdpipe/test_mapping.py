@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from cdpipe.config import MapConfig
+from cdpipe.errors import InputError
+from cdpipe.geometry import make_pose, transform, yaw_pose
+from cdpipe.mapping import build_map, keyframes
+from cdpipe.types import PosedScan, ScanSource
+
+
+class RandomScans:
+    """Seven scans of random points along a curve; the last of each scan lies far out."""
+
+    name = "random"
+
+    def __init__(self, offset_m: float = 0.0) -> None:
+        self.odom_T_sensor = np.array([yaw_pose(0.3 * k, (offset_m + 0.6 * k, 0.1 * k, 0)) for k in range(7)])
+
+    def scan(self, index: int) -> PosedScan:
+        points = np.random.default_rng(index).uniform(-2, 2, (400 + index, 3))
+        points[-1] = (50.0, 0, 0)
+        rows = np.arange(len(points))
+        return PosedScan(index, points, self.odom_T_sensor[index], rows.astype(np.int64), (rows * 3).astype(np.int32))
+
+    def scans(self) -> Iterator[PosedScan]:
+        return (self.scan(index) for index in range(7))
+
+
+def brute_force(source: ScanSource, voxel_m: float, max_range_m: float) -> dict[tuple[int, ...], list[tuple]]:
+    """(scan, pixel, point) of the returns of every occupied cell."""
+    cells: dict[tuple[int, ...], list[tuple]] = {}
+    for scan in source.scans():
+        for pixel, sensor_point in zip(scan.pixels.tolist(), scan.points_sensor, strict=True):
+            if np.linalg.norm(sensor_point) <= max_range_m:
+                point = transform(scan.odom_T_sensor, sensor_point[None])[0]
+                cell = tuple(np.floor(point / voxel_m).astype(int).tolist())
+                cells.setdefault(cell, []).append((scan.index, pixel, point))
+    return cells
+
+
+@pytest.mark.parametrize("batch_scans", [1, 3, 64])
+def test_the_map_equals_a_dict_of_cells(batch_scans: int) -> None:
+    source = RandomScans()
+    point_map = build_map(source, MapConfig(voxel_m=0.5, max_range_m=10.0), batch_scans)
+    cells = brute_force(source, 0.5, 10.0)
+    assert len(point_map.points) == len(cells)
+    assert len(point_map.return_points) == sum(len(found) for found in cells.values()) == sum(399 + k for k in range(7))
+    for index, point in enumerate(point_map.points):
+        found = cells.pop(tuple(np.floor(point / 0.5).astype(int).tolist()))
+        np.testing.assert_allclose(point, np.mean([entry[2] for entry in found], axis=0), atol=1e-12)
+        mask = np.arange(len(point_map.points)) == index
+        assert point_map.returns_of(mask).tolist() == [[scan, pixel] for scan, pixel, _ in found]
+    assert not cells
+
+
+def test_batches_do_not_change_the_map() -> None:
+    config = MapConfig(voxel_m=0.5)
+    one, other = (build_map(RandomScans(), config, batch_scans) for batch_scans in (2, 64))
+    np.testing.assert_allclose(one.points, other.points, atol=1e-12)
+    np.testing.assert_array_equal(one.return_points, other.return_points)
+    again = build_map(RandomScans(), config, 2)
+    np.testing.assert_array_equal(again.points, one.points)
+
+
+def test_keyframes_by_hand() -> None:
+    # steps of 0.4 m along x: 1 m of path is complete at scans 3, 6, 9
+    poses = np.array([make_pose(translation=(0.4 * k, 0, 0)) for k in range(10)])
+    assert keyframes(poses, 1.0).tolist() == [0, 3, 6, 9]
+    # steps that divide the spacing: rounding must not delay a keyframe
+    poses = np.array([make_pose(translation=(0.1 * k, 0, 0)) for k in range(31)])
+    assert keyframes(poses, 1.0).tolist() == [0, 10, 20, 30]
+    assert keyframes(poses[:1], 1.0).tolist() == [0]
+
+
+def test_a_map_of_one_point() -> None:
+    class OneScan(RandomScans):
+        def scans(self) -> Iterator[PosedScan]:
+            point = np.array([[1.0, 2.0, 3.0]])
+            yield PosedScan(0, point, np.eye(4), np.zeros(1, np.int64), np.array([5], np.int32))
+
+    source = OneScan()
+    source.odom_T_sensor = np.eye(4)[None]
+    point_map = build_map(source, MapConfig())
+    np.testing.assert_array_equal(point_map.points, [[1.0, 2.0, 3.0]])
+    assert point_map.returns_of(np.array([True])).tolist() == [[0, 5]]
+
+
+def test_nothing_within_range_and_poses_too_far_out() -> None:
+    with pytest.raises(InputError, match=r"random: no return within map\.max_range_m = 0\.001 m"):
+        build_map(RandomScans(), MapConfig(max_range_m=0.001))
+    with pytest.raises(InputError, match=r"random: positions reach 40000\d\d m, .* subtract a common offset"):
+        build_map(RandomScans(offset_m=4_000_000.0), MapConfig())

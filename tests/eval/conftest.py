@@ -1,0 +1,108 @@
+"""A tiny pair of sessions with truth, written through the real writers: seconds of simulation are not needed to score."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpipe.geometry import invert, make_pose, yaw_pose
+from cdpipe.ouster import SensorMetadata
+from cdpipe.session import ScanChunk, SessionWriter
+from sim.truth import Change, PairTruth, write_labels, write_pair_truth, write_true_poses
+
+N_SCANS, CHUNK_SCANS, HEIGHT, WIDTH = 14, 5, 4, 64
+WALL_MM, THING_MM = 4000, 2500
+ODOM_T_WORLD = {"before": yaw_pose(0.6, (2.0, -1.0, 0.3)), "after": yaw_pose(-2.0, (-4.0, 7.0, 0.0))}
+
+SENSOR = SensorMetadata(
+    product="test",
+    serial="0",
+    mode=f"{WIDTH}x10",
+    altitude_deg=np.array([24.0, 8.0, -8.0, -24.0]),
+    azimuth_deg=np.zeros(HEIGHT),
+    beam_origin_m=0.0,
+    sensor_T_lidar=np.eye(4),
+    pixel_shift=(0,) * HEIGHT,
+)
+
+# change -> session, kind, partner, columns it is seen in, scans it is seen in
+THINGS = {
+    1: ("after", "added", None, slice(4, 14), range(2, 5)),
+    2: ("before", "moved", 3, slice(30, 40), range(8, 12)),
+    3: ("after", "moved", 2, slice(44, 54), range(9, 13)),
+}
+
+
+def true_poses() -> np.ndarray:
+    return np.stack([make_pose(translation=(1.5 * i, 0.0, 1.0)) for i in range(N_SCANS)])
+
+
+def write_session(path: Path, name: str, *, has_changes: bool) -> None:
+    """Walls 4 m away on every side of each scan, things 2.5 m away; one pixel of each scan is a miss."""
+    shape = (N_SCANS, HEIGHT, WIDTH)
+    range_mm = np.full(shape, WALL_MM, dtype=np.uint32)
+    labels = np.zeros(shape, dtype=np.int16)
+    for number, (session, _, _, columns, scans) in THINGS.items():
+        if has_changes and session == name:
+            range_mm[scans.start : scans.stop, 1:3, columns] = THING_MM
+            labels[scans.start : scans.stop, 1:3, columns] = number
+    range_mm[:, 0, 0] = 0
+    identity = np.tile(np.array([0, 0, 0, 0, 0, 0, 1], dtype=np.float32), (N_SCANS, WIDTH, 1))
+    stamps = np.zeros((N_SCANS, WIDTH), dtype=np.int64)
+    with SessionWriter(path, SENSOR, CHUNK_SCANS, {}) as writer:
+        for index, first in enumerate(range(0, N_SCANS, CHUNK_SCANS)):
+            part = slice(first, first + CHUNK_SCANS)
+            zeros = np.zeros_like(range_mm[part], dtype=np.uint8)
+            writer.add(ScanChunk(range_mm[part], zeros, stamps[part], identity[part]))
+            instance = np.where(range_mm[part] == 0, -1, labels[part]).astype(np.int16)
+            write_labels(writer.folder, index, instance, labels[part])
+        write_true_poses(writer.folder, true_poses())
+        writer.close(ODOM_T_WORLD[name] @ true_poses())
+
+
+def write_pair(pair: Path, *, has_changes: bool = True) -> Path:
+    """Write a pair with an added and a moved thing, or one without changes."""
+    pair.mkdir()
+    changes = [
+        Change(
+            id=number,
+            name=f"thing {number}",
+            prop_kind="box",
+            kind=kind,
+            session=session,
+            partner=partner,
+            group="full",
+            instance=number,
+            world_T_object=np.eye(4).tolist(),
+            hull_volume_m3=1.0,
+            n_returns=10,
+            n_cells=10,
+            n_ghost_rays=10,
+            is_observable=True,
+            why_not="",
+        )
+        for number, (session, kind, partner, _, _) in THINGS.items()
+    ]
+    for name in ("before", "after"):
+        write_session(pair / name, name, has_changes=has_changes)
+    write_pair_truth(pair, PairTruth("test", 7, 3.0, tuple(changes) if has_changes else (), {}))
+    return pair
+
+
+@pytest.fixture(name="write_tiny_pair")
+def write_tiny_pair_fixture(tmp_path: Path) -> Callable[..., Path]:
+    """Return a function that writes the tiny pair."""
+    return lambda **options: write_pair(tmp_path / "pair", **options)
+
+
+@pytest.fixture(name="tiny_pair")
+def tiny_pair_fixture(tmp_path: Path) -> Path:
+    """Return the folder of the tiny pair; its odometry does not drift."""
+    return write_pair(tmp_path / "pair")
+
+
+@pytest.fixture(name="tiny_merge")
+def tiny_merge_fixture() -> np.ndarray:
+    """Return the true before_T_after of the tiny pair."""
+    return ODOM_T_WORLD["before"] @ invert(ODOM_T_WORLD["after"])

@@ -1,0 +1,214 @@
+from pathlib import Path
+
+import pytest
+
+from cdpipe.errors import InputError
+from eval.plan import (
+    Plan,
+    cells,
+    changed_plan,
+    load_plan,
+    parse_seeds,
+    plan_names,
+    scenario_slug,
+    setting_text,
+    slug,
+    variant_name,
+)
+
+PLAN = """\
+name: two
+scenarios: [smoke/one_box, smoke/unchanged]
+seeds: "7:9"
+variants:
+  - preset: paper
+    per_scenario: {smoke/unchanged: ["query.radius_m=10"]}
+  - preset: tunnelcd
+    set: ["extract.voxel_m=0.4"]
+grid:
+  - variant: tunnelcd
+    scenarios: [smoke/one_box]
+    keys: {extract.voxel_m: [0.2, 0.3], query.radius_m: [3, 4.5]}
+"""
+
+
+def written(folder: Path, text: str) -> str:
+    path = folder / "plan.yaml"
+    path.write_text(text)
+    return str(path)
+
+
+def read(folder: Path, text: str = PLAN) -> Plan:
+    return load_plan(written(folder, text))
+
+
+def mistakes(folder: Path, text: str) -> list[str]:
+    with pytest.raises(InputError) as caught:
+        read(folder, text)
+    return [line.replace(f"{folder}/", "") for line in str(caught.value).splitlines()]
+
+
+def test_cells_by_hand(tmp_path: Path) -> None:
+    found = [(c.scenario, c.seed, c.preset, c.variant) for c in cells(read(tmp_path))]
+    grid = [
+        "tunnelcd[extract.voxel_m=0.2,query.radius_m=3]",
+        "tunnelcd[extract.voxel_m=0.2,query.radius_m=4.5]",
+        "tunnelcd[extract.voxel_m=0.3,query.radius_m=3]",
+        "tunnelcd[extract.voxel_m=0.3,query.radius_m=4.5]",
+    ]
+    plain = [("paper", "paper"), ("tunnelcd", "tunnelcd[extract.voxel_m=0.4]")]
+    one_box = [*plain, *(("tunnelcd", name) for name in grid)]
+    # 2 seeds x (2 variants + 2 x 2 grid points), then 2 seeds x 2 variants
+    assert found == [
+        *(("smoke/one_box", seed, *method) for seed in (7, 8) for method in one_box),
+        *(("smoke/unchanged", seed, *method) for seed in (7, 8) for method in plain),
+    ]
+
+
+def test_settings_of_a_site_change_the_configuration_and_not_the_name(tmp_path: Path) -> None:
+    paper = {c.scenario: c for c in cells(read(tmp_path)) if c.preset == "paper"}
+    assert {c.variant for c in paper.values()} == {"paper"}
+    assert paper["smoke/one_box"].config.query.radius_m == 4.5
+    assert paper["smoke/unchanged"].config.query.radius_m == 10
+
+
+def test_grid_points_get_their_values(tmp_path: Path) -> None:
+    config = {c.variant: c.config for c in cells(read(tmp_path))}["tunnelcd[extract.voxel_m=0.3,query.radius_m=3]"]
+    assert (config.extract.voxel_m, config.query.radius_m, config.query.reading) == (0.3, 3.0, "paired")
+
+
+def test_all_mistakes_of_a_plan_at_once_with_lines(tmp_path: Path) -> None:
+    text = """\
+name: bad
+scenarios: [smoke/one_bx, smoke/unchanged]
+seeds: 12
+variants:
+  - preset: papr
+    set: ["query.radius=3", "extract.voxel_m=-1"]
+  - presset: paper
+grid:
+  - variant: tunnelcd
+    scenarios: [smoke/unchanged]
+    keys: {extract.voxl_m: [0.2]}
+speed: 3
+"""
+    lines = mistakes(tmp_path, text)
+    expected = {
+        2: ["smoke/one_bx", 'did you mean "smoke/one_box"?'],
+        3: ["seeds = 12", '"A:B" in quotes'],
+        5: ["'papr'", 'did you mean "paper"?'],
+        6: ["query.radius", 'did you mean "radius_m"?'],
+        7: ["presset", 'did you mean "preset"?'],
+        11: ["extract.voxl_m", 'did you mean "voxel_m"?'],
+        12: ["speed = 3: unknown key"],
+    }
+    for line, words in expected.items():
+        assert any(text.startswith(f"plan.yaml:{line}:") and all(w in text for w in words) for text in lines), (
+            line,
+            lines,
+        )
+    assert any("extract.voxel_m=-1" in line and "greater than 0" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("[smoke/one_box, smoke/unchanged]", "[smoke/one_box, smoke/one_box, smoke/unchanged]", "twice"),
+        ("{smoke/unchanged: [", "{unchanged/site1: [", "not in scenarios"),
+        ("    scenarios: [smoke/one_box]", "    scenarios: [unchanged/site1]", "not in scenarios"),
+        ("[0.2, 0.3]", "[0.2, 0.2]", "stands twice"),
+        ("[0.2, 0.3]", "[]", "at least one is needed"),
+    ],
+)
+def test_parts_that_do_not_fit(tmp_path: Path, old: str, new: str, words: str) -> None:
+    assert old in PLAN
+    assert any(words in line for line in mistakes(tmp_path, PLAN.replace(old, new)))
+
+
+def test_seeds_by_hand() -> None:
+    assert parse_seeds("3:6") == (3, 4, 5)
+    assert parse_seeds("7") == (7,)
+    assert parse_seeds([900001, 0]) == (900001, 0)
+
+
+@pytest.mark.parametrize("value", ["6:6", "6:3", "-1:2", "a:b", "1:2:3", "", [], [1, 1], [-1], [1.5], [True], 12, None])
+def test_what_is_no_seeds(value: object) -> None:
+    with pytest.raises(ValueError, match='expected "A:B"'):
+        parse_seeds(value)
+
+
+def test_names_and_slugs() -> None:
+    assert variant_name("paper", ()) == "paper"
+    assert variant_name("tunnelcd", ("a.b=0.3", "c=4")) == "tunnelcd[a.b=0.3,c=4]"
+    assert slug("tunnelcd[a.b=0.3,c=4]") == "tunnelcd_a.b=0.3,c=4_"
+    assert variant_name("my/own.yaml", ()) == "own"
+    assert scenario_slug("paper/site1") == "paper__site1"
+    assert setting_text("query.n_regions", None) == "query.n_regions=null"
+    assert setting_text("a.b", 4.5) == "a.b=4.5"
+
+
+def test_command_line_replaces_seeds_and_sets_every_variant(tmp_path: Path) -> None:
+    plan = changed_plan(read(tmp_path), seeds="1:2", settings=["query.radius_m=6", "extract.voxel_m=0.5"])
+    found = cells(plan)
+    assert {c.seed for c in found} == {1}
+    # the command line wins over the plan's own set, over what it sets for a site, and over its grid
+    assert {(c.config.query.radius_m, c.config.extract.voxel_m) for c in found} == {(6.0, 0.5)}
+    assert {c.variant for c in found if c.scenario == "smoke/unchanged"} == {
+        "paper[query.radius_m=6,extract.voxel_m=0.5]",
+        "tunnelcd[query.radius_m=6,extract.voxel_m=0.5]",
+    }
+
+
+def test_command_line_grid_is_a_product_over_the_variants(tmp_path: Path) -> None:
+    text = PLAN.partition("grid:")[0]
+    plan = changed_plan(read(tmp_path, text), grid=["extract.voxel_m=0.1,0.2", "query.radius_m=3,5"])
+    variants = [c.variant for c in cells(plan) if (c.scenario, c.seed) == ("smoke/one_box", 7)]
+    assert variants == [
+        f"{preset}[extract.voxel_m={voxel},query.radius_m={radius}]"
+        for preset in ("paper", "tunnelcd")
+        for voxel in ("0.1", "0.2")
+        for radius in ("3", "5")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "words"),
+    [
+        ({"seeds": "5:5"}, "--seeds 5:5"),
+        ({"settings": ["query.radius=3"]}, 'did you mean "radius_m"?'),
+        ({"settings": ["query.radius_m"]}, "expected key=value"),
+        ({"grid": ["query.radius_m=3,,4"]}, "--grid"),
+        ({"grid": ["query.radius_m=3,x"]}, "query.radius_m=x"),
+    ],
+)
+def test_mistakes_of_the_command_line(tmp_path: Path, kwargs: dict[str, object], words: str) -> None:
+    with pytest.raises(InputError, match="--") as caught:
+        changed_plan(read(tmp_path), **kwargs)  # type: ignore[arg-type]
+    assert words in str(caught.value)
+
+
+def test_unchanged_plan_stays_equal(tmp_path: Path) -> None:
+    plan = read(tmp_path)
+    assert changed_plan(plan) == plan
+
+
+@pytest.mark.parametrize("name", plan_names())
+def test_shipped_plans_are_valid(name: str) -> None:
+    assert cells(load_plan(name))
+
+
+def test_paper_plan_holds_what_the_page_shows() -> None:
+    found = cells(load_plan("paper"))
+    presets = ["paper", "paper-topn", "paper-paired", "voxel-diff", "random-regions", "tunnelcd"]
+    for scenario in ("paper/site1", "paper/site2", "unchanged/site1"):
+        plain = [c for c in found if c.scenario == scenario and "[" not in c.variant]
+        assert sorted(c.variant for c in plain) == sorted(presets)
+        assert {c.config.query.radius_m for c in plain} == {10.0 if scenario == "paper/site2" else 4.5}
+    grid = [c for c in found if "[" in c.variant]
+    assert len({(c.config.extract.voxel_m, c.config.query.radius_m) for c in grid}) == len(grid) == 9
+    assert {(c.scenario, c.preset) for c in grid} == {("paper/site1", "tunnelcd")}
+
+
+def test_unknown_plan_names_the_nearest() -> None:
+    with pytest.raises(InputError, match='did you mean "smoke"'):
+        load_plan("smok")

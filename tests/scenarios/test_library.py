@@ -1,0 +1,262 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cdpipe.errors import InputError, ScenarioError
+from scenarios import check_scenario, load_scenario, scenario_names
+from scenarios.schema import Scenario
+
+WORLD = """\
+tunnel:
+  nodes:
+    a: [0, 0, 0]
+    b: [10, 0, 0]
+    c: [20, 5, 0]
+  drifts:
+    - nodes: [a, b, c]
+  section: {width_m: {uniform: [3, 4]}, height_m: 3}
+props:
+  - {name: came, kind: box, size_m: [1, 1, 1], place: {between: [a, b], fraction: {uniform: [0.2, 0.3]}}, change: added}
+  - {name: went, kind: box, size_m: [1, 1, 1], place: {between: [a, b], fraction: 0.7}, change: removed}
+  - name: moved
+    kind: chair
+    size_m: [1, 1, 1]
+    place: {between: [b, c], fraction: 0.2}
+    to: {between: [b, c], fraction: 0.7}
+    change: moved
+  - {name: stays, kind: barrel, size_m: [1, 1, 1], place: {between: [b, c], fraction: 0.4}}
+before: {route: [a, b, c]}
+after: {route: [a, b, c], start_m: 2}
+"""
+
+
+def written(folder: Path, text: str, name: str = "world.yaml") -> str:
+    path = folder / name
+    path.write_text(text)
+    return str(path)
+
+
+def mistakes_of(path: str) -> list[str]:
+    with pytest.raises(ScenarioError) as error:
+        check_scenario(path)
+    return [line.removeprefix(path) for line in str(error.value).splitlines()]
+
+
+def test_a_file_is_drawn_by_its_seed_and_named_after_itself(tmp_path: Path) -> None:
+    path = written(tmp_path, WORLD)
+    scenario = load_scenario(path, 3)
+    assert scenario.family == "world"
+    assert scenario == load_scenario(path, 3) != load_scenario(path, 4)
+    assert load_scenario(written(tmp_path, f"family: mine\n{WORLD}"), 3).family == "mine"
+    assert check_scenario(path).family == "mine"
+
+
+def test_settings_are_written_over_the_file_before_drawing(tmp_path: Path) -> None:
+    path = written(tmp_path, WORLD)
+    plain = load_scenario(path, 3)
+    changed = load_scenario(path, 3, ["tunnel.section.height_m={uniform: [5, 6]}", "platform.scan_spacing_m=0.4"])
+    assert 5 <= changed.tunnel.section.height_m < 6
+    assert changed.platform.scan_spacing_m == 0.4
+    assert changed.tunnel.section.width_m == plain.tunnel.section.width_m
+    assert changed.props == plain.props
+    assert load_scenario(path, 3, ["tunnel.section.width_m=3.25"]).tunnel.section.width_m == 3.25
+
+
+def test_mistakes_in_settings_are_told_as_such(tmp_path: Path) -> None:
+    path = written(tmp_path, WORLD)
+    with pytest.raises(ScenarioError, match=r"^--set: platform.speed_mps = -1: input should be greater than 0$"):
+        load_scenario(path, 0, ["platform.speed_mps=-1"])
+    with pytest.raises(ScenarioError, match=r'platform.speed = 1: unknown key; did you mean "speed_mps"\?$'):
+        load_scenario(path, 0, ["platform.speed=1"])
+    with pytest.raises(InputError, match="expected key=value"):
+        load_scenario(path, 0, ["platform"])
+
+
+def test_frozen_leaves_the_world_as_the_before_session_saw_it(tmp_path: Path) -> None:
+    path = written(tmp_path, WORLD)
+    plain, frozen = load_scenario(path, 1), load_scenario(path, 1, ["frozen=true"])
+    assert [prop.name for prop in frozen.props] == ["went", "moved", "stays"]
+    assert [prop.place for prop in frozen.props] == [prop.place for prop in plain.props[1:]]
+    assert all(prop.change == "none" and prop.to is None for prop in frozen.props)
+    assert frozen.model_copy(update={"props": plain.props}) == plain
+    assert load_scenario(path, 1, ["frozen=false"]) == plain
+    Scenario.model_validate(frozen.model_dump())
+
+
+def test_extends_merges_mappings_replaces_lists_and_keeps_the_draws(tmp_path: Path) -> None:
+    base = written(tmp_path, WORLD)
+    middle = written(tmp_path, "extends: world.yaml\ntunnel: {section: {height_m: {uniform: [4, 5]}}}\n", "middle.yaml")
+    last = written(tmp_path, "extends: middle.yaml\nprops: []\nafter: {lateral: 0.5}\n", "last.yaml")
+    plain, scenario = load_scenario(base, 2), load_scenario(last, 2)
+    assert scenario.family == "last"
+    assert scenario.props == ()
+    assert scenario.after == plain.after.model_copy(update={"lateral": 0.5})
+    assert scenario.tunnel.section.width_m == plain.tunnel.section.width_m
+    assert scenario.tunnel.section == load_scenario(middle, 2).tunnel.section
+    assert 4 <= scenario.tunnel.section.height_m < 5
+
+
+def test_a_child_may_replace_a_distribution_by_another(tmp_path: Path) -> None:
+    written(tmp_path, WORLD)
+    child = "extends: world.yaml\ntunnel: {section: {width_m: {choice: [7]}, height_m: {integers: [4, 5]}}}\n"
+    section = load_scenario(written(tmp_path, child, "child.yaml"), 0).tunnel.section
+    assert (section.width_m, section.height_m) == (7, 4)
+
+
+def test_extends_finds_shipped_scenarios_and_refuses_circles_and_unknown_names(tmp_path: Path) -> None:
+    path = written(tmp_path, "extends: smoke/one_box\nscore_radius_m: 3\n")
+    shipped = load_scenario("smoke/one_box", 0)
+    assert load_scenario(path, 0) == shipped.model_copy(update={"family": "world", "score_radius_m": 3.0})
+    written(tmp_path, "extends: b.yaml\n", "a.yaml")
+    circle = written(tmp_path, "# first line\nextends: a.yaml\n", "b.yaml")
+    with pytest.raises(ScenarioError, match=r"a.yaml:1: extends = 'b.yaml': the files extend each other in a circle"):
+        load_scenario(circle, 0)
+    unknown = written(tmp_path, "extends: smoke/onebox\n", "c.yaml")
+    with pytest.raises(ScenarioError, match=r'c.yaml:1: extends = .* did you mean "smoke/one_box"\?'):
+        load_scenario(unknown, 0)
+
+
+def test_all_mistakes_of_a_file_come_at_once_with_their_lines(tmp_path: Path) -> None:
+    path = written(
+        tmp_path,
+        """\
+score_radius: 4.5
+tunnel:
+  nodes:
+    portal: [0, 0, 0]
+    face: [10, 0, 0]
+  drifts:
+    - nodes: [portal, fase]
+  section:
+    width_m: {unifrom: [3, 4]}
+    height_m: {uniform: [4, 3]}
+    shape: horse
+props:
+  - name: box
+    kind: boks
+    size_m: [1, 1, -1]
+    place: {between: [portal, faces], fraction: 0.5}
+  - name: box
+    kind: barrel
+    repeat: {uniform: [1, 2]}
+    size_m: [1, 1, 1]
+    place: {between: [portal, face], fraction: {uniform: [2, 3]}}
+platform: {speed_mps: {normal: [-5, 0.1]}}
+before: {route: [portal, face]}
+after: {rout: [portal, face]}
+""",
+    )
+    lines = mistakes_of(path)
+    assert lines[0] == ':1: score_radius = 4.5: unknown key; did you mean "score_radius_m"?'
+    assert (
+        lines[1] == ":7: tunnel.drifts.0.nodes.1 = 'fase': no node of the tunnel is called fase; did you mean \"face\"?"
+    )
+    assert lines[2] == (
+        ":9: tunnel.section.width_m = {'unifrom': [3, 4]}: unknown distribution; did you mean \"uniform\"?"
+    )
+    assert lines[3] == ":10: tunnel.section.height_m = {'uniform': [4, 3]}: expected uniform: [a, b] with a <= b"
+    assert lines[4].startswith(":11: tunnel.section.shape = 'horse'") and '; did you mean "horseshoe"?' in lines[4]
+    assert lines[5].startswith(":14: props.0.kind = 'boks'") and lines[5].endswith('; did you mean "box"?')
+    assert lines[6] == ":15: props.0.size_m.2 = -1: input should be greater than 0"
+    assert lines[7].startswith(
+        ":16: props.0.place.between = ['portal', 'faces']: no node of the tunnel is called faces"
+    )
+    assert lines[8].startswith(":19: props.1.repeat = {'uniform': [1, 2]}: expected a whole number >= 0")
+    assert lines[9].startswith(":21: props.1.place.fraction = 2.") and lines[9].endswith("less than or equal to 1")
+    assert lines[10].startswith(":22: platform.speed_mps = -") and lines[10].endswith("greater than 0")
+    assert lines[11:] == [
+        ":24: after.route: missing, a value is required",
+        ":24: after.rout = ['portal', 'face']: unknown key; did you mean \"route\"?",
+    ]
+
+
+def test_mistakes_of_one_seed_in_a_few_are_found_by_check_and_told_once(tmp_path: Path) -> None:
+    path = written(tmp_path, WORLD.replace("height_m: 3}", "height_m: {choice: [3, 3, 3, -1]}}"))
+    assert mistakes_of(path) == [":8: tunnel.section.height_m = -1: input should be greater than 0"]
+
+
+def test_references_between_drifts_props_and_routes_are_checked(tmp_path: Path) -> None:
+    text = (
+        WORLD.replace("route: [a, b, c], start_m: 2", "route: [a, c]")
+        .replace("to: {between: [b, c]", "to: {between: [c, a]")
+        .replace("name: stays", "name: went")
+    )
+    assert mistakes_of(written(tmp_path, text)) == [
+        ":16: props.2.to.between = ['c', 'a']: no drift joins c and a",
+        ":18: props.3.name = 'went': another prop has this name",
+        ":20: after.route.1 = 'c': no drift joins a and c",
+    ]
+
+
+def test_worlds_that_cannot_be_driven_are_refused(tmp_path: Path) -> None:
+    # the route is 10 + sqrt(125) = 21.18 m
+    text = WORLD.replace("{uniform: [3, 4]}", "3.2").replace("start_m: 2", "start_m: 22, height_m: 3.5")
+    text += "platform: {clearance_m: 2}\n"
+    assert mistakes_of(written(tmp_path, text)) == [
+        ":20: after.start_m = 22: start_m and end_m leave nothing of the route, which is 21.2 m",
+        ":20: after.height_m = 3.5: the sensor would be above the roof of a drift 3.0 m high",
+        ":21: platform.clearance_m = 2: leaves the platform no room in a drift 3.2 m wide",
+    ]
+
+
+def test_a_mistake_inherited_from_a_base_points_into_the_base(tmp_path: Path) -> None:
+    base = written(tmp_path, WORLD.replace("kind: chair", "kind: stool"))
+    child = written(tmp_path, "extends: world.yaml\nscore_radius_m: -1\n", "child.yaml")
+    with pytest.raises(ScenarioError) as error:
+        check_scenario(child)
+    lines = str(error.value).splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith(f"{child}:2: score_radius_m = -1: ")
+    assert lines[1].startswith(f"{base}:13: props.2.kind = 'stool': ")
+
+
+def test_lines_survive_repeat_and_one_of(tmp_path: Path) -> None:
+    text = WORLD.replace(
+        "before:",
+        """\
+  - name: drum
+    repeat: 2
+    one_of:
+      - kind: barrel
+        size_m: [0, 1, 1]
+    place: {between: [a, b], fraction: 0.5, lateral: 3}
+before:""",
+    )
+    assert mistakes_of(written(tmp_path, text)) == [
+        ":23: props.4.size_m.0 = 0: input should be greater than 0",
+        ":23: props.5.size_m.0 = 0: input should be greater than 0",
+        ":24: props.4.place.lateral = 3: input should be less than or equal to 1",
+        ":24: props.5.place.lateral = 3: input should be less than or equal to 1",
+    ]
+
+
+@pytest.mark.parametrize("text", ["", "- 1\n- 2\n", "just words\n"])
+def test_a_file_without_keys_is_refused(tmp_path: Path, text: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(ScenarioError, match="expected keys and values"):
+        load_scenario(path, 0)
+
+
+def test_parts_of_the_wrong_type_are_mistakes_not_crashes(tmp_path: Path) -> None:
+    path = written(tmp_path, "tunnel: 3\nprops: {a: 1}\nbefore: {route: [1, 2]}\nafter: []\nfrozen: 2\nplatform:\n")
+    text = "\n".join(mistakes_of(path))
+    for key in (":1: tunnel = 3", ":2: props = ", ":3: before.route.0 = 1", ":4: after = []", ":5: frozen = 2"):
+        assert key in text
+
+
+def test_unknown_names_suggest_the_nearest() -> None:
+    with pytest.raises(ScenarioError, match=r'^scenario "paper/sit1": unknown; did you mean "paper/site1"\?$'):
+        load_scenario("paper/sit1", 0)
+    with pytest.raises(ScenarioError, match=r'did you mean "paper/site2"\?$'):
+        load_scenario("site2", 0)
+    with pytest.raises(ScenarioError, match=r'"qqq": unknown; known are .*smoke/one_box'):
+        load_scenario("qqq", 0)
+    with pytest.raises(ScenarioError, match=r"nowhere.yaml: no such file"):
+        load_scenario("nowhere.yaml", 0)
+
+
+def test_negative_seeds_are_refused() -> None:
+    with pytest.raises(InputError, match="seed = -1: expected a whole number >= 0"):
+        load_scenario(scenario_names()[0], -1)
