@@ -107,7 +107,9 @@ def _moves(objects: Sequence[ChangedObject], voxel_m: float) -> list[tuple[int, 
 
 
 def _extents_m(points: Float64Array) -> Float64Array:
-    """Return the sorted extents along the principal axes: they do not change when the object is turned."""
-    centred = points - points.mean(axis=0)
-    _, _, axes = np.linalg.svd(centred, full_matrices=False)
-    return np.sort(np.ptp(centred @ axes.T, axis=0)) if len(points) > 2 else np.zeros(3)
+    """Return the sorted edges (3,) of the evenly filled box with the same spread as the points.
+
+    Unlike the edges of the bounding box they do not change when the object is turned, nor with a stray point.
+    """
+    covariance = np.cov(points.T, bias=True) if len(points) > 1 else np.zeros((3, 3))
+    return np.sqrt(12.0 * np.linalg.eigvalsh(covariance).clip(min=0.0))

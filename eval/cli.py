@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from typer.core import TyperGroup
 
-from eval.progress import Bars, RunProgress, Silent
+from eval.progress import shown_progress
 from eval.provenance import fix_threads
 
 if TYPE_CHECKING:
@@ -89,12 +87,8 @@ def simulate(
     from sim.simulate import simulate_pair
 
     drawn = load_scenario(scenario, seed, settings or ())
-    with new_folder(out) as partial, _progress(quiet) as progress:
-        pair = partial / "pair"
-        simulate_pair(drawn, seed, pair, on_progress=progress.stage)
-        for part in list(pair.iterdir()):
-            part.rename(partial / part.name)
-        pair.rmdir()
+    with new_folder(out) as partial, shown_progress(quiet) as progress:
+        simulate_pair(drawn, seed, partial, on_progress=progress.stage)
     _say(quiet, f"{out}: before, after, truth of {scenario}, seed {seed}")
 
 
@@ -128,13 +122,14 @@ def detect(
     from eval.single import detect_pair, object_table, region_table, write_detection
 
     config = load_config(preset, settings or ())
-    with new_folder(out) as partial, _status(quiet) as on_stage:
-        report = detect_pair(before, after, config, on_stage)
+    with new_folder(out) as partial, shown_progress(quiet) as progress:
+        report = detect_pair(before, after, config, progress.stage)
         write_detection(partial, preset, report)
     if quiet:
         return
     _table("regions (map frame = the before session's odometry)", region_table(report))
-    _table("objects", object_table(report))
+    objects = object_table(report)
+    _table("objects", objects[[name for name in objects.columns if not name.startswith(("min_", "max_"))]])
     times = ", ".join(f"{name[2:-2]} {seconds:.3f} s" for name, seconds in report.seconds.items())
     typer.echo(f"{out}: answer.json, answer.npz, regions.csv, objects.csv, objects.ply ({times})")
 
@@ -157,7 +152,7 @@ def score(
     from eval.runfolder import open_run_folder
 
     run = open_run_folder(folder)
-    with _progress(quiet) as progress:
+    with shown_progress(quiet) as progress:
         n_scored = rescore(run, progress)
     _results(run.path, quiet)
     _say(quiet, f"{folder}: {n_scored} answers scored again, tables rewritten")
@@ -234,16 +229,16 @@ def _run(plan: Plan, out: Path, *, force: bool, limit: int | None, quiet: bool) 
     from eval.runner import run_plan
 
     run = start_run_folder(out)
-    with _progress(quiet) as progress:
-        outcome = run_plan(plan, run, command=sys.argv, force=force, limit=limit, progress=progress)
+    with shown_progress(quiet) as progress:
+        outcome = run_plan(plan, run, command=["tunnelcd", *sys.argv[1:]], force=force, limit=limit, progress=progress)
     _results(out, quiet)
     left = f", {outcome.n_left} left by --limit" if outcome.n_left else ""
     _say(quiet, f"{out}: {outcome.n_done} cells done, {outcome.n_kept} kept from earlier{left}")
 
 
 _SHOWN = (
-    "scenario", "seed", "variant", "status", "region_recall", "region_precision", "region_recall_at_k", "n_regions",
-    "object_iou_point", "object_f1_25", "merge_error_m", "t_total_s",
+    "region_recall", "region_precision", "region_recall_at_k", "n_regions", "object_iou_point", "object_f1_25",
+    "merge_error_m", "t_total_s",
 )  # fmt: skip
 
 
@@ -253,19 +248,25 @@ def _results(folder: Path, quiet: bool) -> None:
     import pandas as pd
 
     results = pd.read_csv(folder / "results.csv")
-    _table("results", results[[name for name in _SHOWN if name in results.columns]])
+    results["n_failed"] = results["status"] != "ok"
+    groups = results.groupby(["scenario", "variant"], sort=False)
+    counts = groups["n_failed"].agg(n="size", n_failed="sum")
+    shown = [name for name in _SHOWN if name in results.columns]
+    _table("means over pairs", counts.join(groups[shown].mean()).reset_index())
 
 
 def _table(title: str, frame: pd.DataFrame) -> None:
+    from rich import box
+    from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
     for name in frame.columns:
-        table.add_column(str(name), overflow="fold")
+        table.add_column(str(name), no_wrap=True)
     for row in frame.itertuples(index=False):
         table.add_row(*(_cell(value) for value in row))
-    console = Console(soft_wrap=True) if not sys.stdout.isatty() else Console()
-    console.print(table)
+    # wider than any table: a narrow terminal wraps the lines, where rich would cut off the numbers
+    Console(width=500).print(table)
 
 
 def _row(row: dict[str, Any]) -> None:
@@ -283,21 +284,3 @@ def _cell(value: Any) -> str:
 def _say(quiet: bool, text: str) -> None:
     if not quiet:
         typer.echo(text)
-
-
-@contextmanager
-def _progress(quiet: bool) -> Iterator[RunProgress]:
-    if quiet:
-        yield Silent()
-    else:
-        with Bars() as bars:
-            yield bars
-
-
-@contextmanager
-def _status(quiet: bool) -> Iterator[Callable[[str], None]]:
-    if quiet:
-        yield lambda stage: None
-    else:
-        with Console(stderr=True).status("") as status:
-            yield status.update

@@ -35,7 +35,7 @@ _MAX_TESTED = 250_000
 _DASHED = (0, (3, 2))
 _DISTANCE_COLOURS = LinearSegmentedColormap.from_list("distance", ["#d9d9d9", "#f0b26b", VERMILLION, "#7f1d00"])
 
-State = Literal["found", "missed", "unobservable"]
+State = Literal["found", "missed", "unobservable", "not scored"]
 Points = npt.NDArray[Any]
 
 
@@ -89,7 +89,7 @@ def distance_map(before: Points, after: Points) -> str:
     if len(after) > _MAX_TESTED:
         after = after[stream(0, "page", "subset").choice(len(after), _MAX_TESTED, replace=False)]
     tree = cKDTree(before, compact_nodes=False, balanced_tree=False)
-    distances, _ = tree.query(after, distance_upper_bound=2 * FAR_M)
+    distances = np.asarray(tree.query(after, distance_upper_bound=2 * FAR_M)[0])
     rows, columns, inside = raster.cells(after)
     farthest = np.full(raster.shape, -1.0)
     np.maximum.at(farthest, (rows, columns), np.minimum(distances[inside], FAR_M))
@@ -99,7 +99,13 @@ def distance_map(before: Points, after: Points) -> str:
     figure, axes = _map_axes(raster)
     axes.imshow(image, extent=raster.extent, origin="lower")
     bar = figure.colorbar(
-        ScalarMappable(Normalize(0.0, FAR_M), _DISTANCE_COLOURS), ax=axes, extend="max", shrink=0.7, pad=0.015
+        ScalarMappable(Normalize(0.0, FAR_M), _DISTANCE_COLOURS),
+        ax=axes,
+        extend="max",
+        location="top",
+        shrink=0.35,
+        aspect=30,
+        pad=0.02,
     )
     bar.set_label("distance to the before map [m]", fontsize=8)
     bar.ax.tick_params(labelsize=7)
@@ -134,7 +140,11 @@ def region_map(points: Points, regions: Sequence[RegionMark], radius_m: float, t
     handles: list[Any] = [
         Line2D([], [], color=RED, linewidth=1.5, label="region, finds a change"),
         Line2D([], [], color=RED, linewidth=1.5, linestyle=_DASHED, label="region, false"),
-        *(Line2D([], [], linestyle="none", label=f"change, {state}", **look) for state, look in _TRUTH_LOOKS.items()),
+        *(
+            Line2D([], [], linestyle="none", label=f"change, {state}", **look)
+            for state, look in _TRUTH_LOOKS.items()
+            if any(mark.state == state for mark in truths)
+        ),
     ]
     _legend(axes, handles)
     return data_address(figure)
@@ -144,6 +154,7 @@ _TRUTH_LOOKS: dict[State, dict[str, Any]] = {
     "found": {"marker": "o", "markersize": 7, "color": GREEN, "markeredgecolor": "white"},
     "missed": {"marker": "X", "markersize": 8, "color": BLACK, "markeredgecolor": "white"},
     "unobservable": {"marker": "D", "markersize": 6, "color": "white", "markeredgecolor": BLACK},
+    "not scored": {"marker": "s", "markersize": 6, "color": BLUE, "markeredgecolor": "white"},
 }
 
 

@@ -43,15 +43,15 @@ def object_panels(panels: Sequence[Panel], truth: Float64Array, view_from: Float
     # panels no flatter than 4:3, so that a railing and a box have the same height on the page
     lack = 0.5 * max(0.0, 0.75 * (high[0] - low[0]) - (high[1] - low[1]))
     low[1], high[1] = low[1] - lack, high[1] + lack
-    width_in = 2.5
-    height_in = float(np.clip(width_in * (high[1] - low[1]) / (high[0] - low[0]), 1.6, 3.2))
-    figure = blank_figure(width_in * len(panels), height_in + 0.62)
+    width_in = 1.9
+    height_in = float(np.clip(width_in * (high[1] - low[1]) / (high[0] - low[0]), 1.4, 2.6))
+    figure = blank_figure(width_in * len(panels), height_in + 0.55)
     for index, panel in enumerate(panels):
         axes = figure.add_subplot(1, len(panels), index + 1)
         for points, colour in panel.layers:
             shown = side(points)
             near = ((shown > low) & (shown < high)).all(axis=1)
-            size = 2.0 if colour == CONTEXT else 7.0
+            size = 1.5 if colour == CONTEXT else 5.0
             axes.scatter(shown[near, 0], shown[near, 1], s=size, c=colour, linewidths=0)
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
@@ -59,7 +59,7 @@ def object_panels(panels: Sequence[Panel], truth: Float64Array, view_from: Float
         axes.set_xticks([])
         axes.set_yticks([])
         axes.set_title(panel.title, fontsize=9, pad=4)
-        axes.set_xlabel(panel.note, fontsize=8, labelpad=4)
+        axes.set_xlabel(panel.note, fontsize=7, labelpad=4)
         for spine in axes.spines.values():
             spine.set_color("#bbbbbb")
     _scale_bar(figure.axes[0], low, high)

@@ -98,10 +98,9 @@ def match_objects(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], 
     for column, (item, of_object) in enumerate(zip(objects, rows, strict=True)):
         labels = truth.sessions[item.session].universe.change[of_object]
         for row, change in enumerate(changes):
-            if change.session == item.session:
-                n_shared[row, column] = np.count_nonzero(labels == change.id)
-                n_union = len(truth.change_rows[row]) + len(of_object) - n_shared[row, column]
-                iou[row, column] = n_shared[row, column] / n_union if n_union else 0.0
+            n_shared[row, column] = np.count_nonzero(labels == change.id)  # ids are unique in the pair, so 0 elsewhere
+            n_union = len(truth.change_rows[row]) + len(of_object) - n_shared[row, column]
+            iou[row, column] = n_shared[row, column] / n_union if n_union else 0.0
 
     matched_object = np.full(len(changes), -1, dtype=np.int64)
     matched_change = np.full(len(objects), -1, dtype=np.int64)

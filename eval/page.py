@@ -67,16 +67,16 @@ def _content(data: RunData, tables: Mapping[str, Table]) -> dict[str, Any]:
     grids = grid_tables(data)
     unchanged = unchanged_table(data)
     missing = [*data.missing, *(line for site in sites for line in site.missing)]
-    missing += [] if sites else ["no scenario with changes was run."]
-    missing += [] if unchanged.rows else ["no unchanged pair was run, so false alarms are not measured."]
-    missing += [] if grids else ["no grid of two settings was run."]
+    missing += [] if sites else ["No scenario with changes was run."]
+    missing += [] if unchanged.rows else ["No unchanged pair was run, so false alarms are not measured."]
+    missing += [] if grids else ["No grid of two settings was run."]
     return {
         "plan": str(data.provenance.get("plan", {}).get("name", "")),
         "sentences": story(data),
         "machine": machine_text(data.provenance),
         "command": str(data.provenance.get("command") or "unknown"),
         "finished": str(data.provenance.get("finished") or "unknown"),
-        "missing": [line[0].upper() + line[1:] for line in dict.fromkeys(missing)],
+        "missing": list(dict.fromkeys(missing)),
         "failures": failures(data),
         "results": tables["results"],
         "unchanged": unchanged,

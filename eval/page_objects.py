@@ -41,7 +41,7 @@ def object_pictures(
         if not truth.is_observable[index]:
             continue
         cutout = _cut_out(change, index, truth)
-        panels = [Panel("truth", f"{np.count_nonzero(cutout.is_true):,} cells", _truth_layers(cutout))]
+        panels = [Panel("truth", f"{np.count_nonzero(cutout.is_true):,} cells of {CELL_M:g} m", _truth_layers(cutout))]
         for name, answer in shown.items():
             rows = of(data.changes, scenario=scenario, seed=seed, variant=name, id=change.id)
             panels.append(_answer_panel(name, answer, object_rows[name], rows[0] if rows else {}, change, cutout))
@@ -110,9 +110,11 @@ def _answer_panel(
 
 def _object_title(change: Change) -> str:
     where = f", its place {change.session}" if change.kind == "moved" else ""
-    return f"{change.id}  {change.prop_kind.replace('_', ' ')} “{change.name}”: {change.kind}{where}"
+    kind = change.prop_kind.replace("_", " ")
+    name = "" if change.name == change.prop_kind else f" “{change.name}”"
+    return f"{change.id}. {kind[0].upper()}{kind[1:]}{name}: {change.kind}{where}"
 
 
 def _object_caption(change: Change) -> str:
-    partly = "; partly changed" if change.group == "partial" else ""
-    return f"{change.n_returns:,} returns in {change.n_cells:,} cells of {CELL_M:g} m{partly}"
+    partly = "; only part of it changed" if change.group == "partial" else ""
+    return f"{change.n_returns:,} returns in the {change.session} session{partly}"

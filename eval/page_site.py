@@ -26,6 +26,8 @@ from eval.ground_truth import GroundTruth, SessionTruth, load_ground_truth
 from eval.page_objects import Picture, object_pictures
 from eval.page_run import SHOWN_PRESETS, Row, RunData, first_seed, flag, named_variants, number, of, text
 
+_STATES: dict[bool | None, State] = {True: "found", False: "missed", None: "not scored"}
+
 
 @dataclass(frozen=True, slots=True)
 class Site:
@@ -46,16 +48,16 @@ def draw_site(data: RunData, scenario: str) -> Site:
     answers = _answers(data, scenario, seed, missing)
     maps = _maps(data.folder.maps(scenario, seed), missing)
     truth = _truth(data.folder.pair(scenario, seed), missing)
-    map_pictures = [] if maps is None else _map_pictures(maps, answers, missing)
-    region_pictures = [] if maps is None else _region_pictures(data, scenario, seed, maps[0], answers, truth)
-    object_pictures = [] if truth is None else object_pictures(data, scenario, seed, answers, truth)
-    return Site(scenario, seed, tuple(map_pictures), tuple(region_pictures), tuple(object_pictures), tuple(missing))
+    maps_drawn = [] if maps is None else _map_pictures(maps, answers, missing)
+    regions = [] if maps is None else _region_pictures(data, scenario, seed, maps[0], answers, truth)
+    objects = [] if truth is None else object_pictures(data, scenario, seed, answers, truth)
+    return Site(scenario, seed, tuple(maps_drawn), tuple(regions), tuple(objects), tuple(missing))
 
 
 def _answers(data: RunData, scenario: str, seed: int, missing: list[str]) -> dict[str, Answer]:
     """Readable answers with a report, the shown presets first."""
     variants = named_variants(data, scenario)
-    missing += [f"preset {name} was not run on {scenario}." for name in SHOWN_PRESETS if name not in variants]
+    missing += [f"Preset {name} was not run on {scenario}." for name in SHOWN_PRESETS if name not in variants]
     order = [name for name in SHOWN_PRESETS if name in variants]
     order += [name for name in variants if name not in SHOWN_PRESETS]
     found: dict[str, Answer] = {}
@@ -63,7 +65,7 @@ def _answers(data: RunData, scenario: str, seed: int, missing: list[str]) -> dic
         try:
             answer = read_answer(data.folder.answer(scenario, seed, name))
         except InputError:
-            missing.append(f"the stored answer of {name} on {scenario} cannot be read.")
+            missing.append(f"The stored answer of {name} on {scenario} cannot be read.")
             continue
         if answer.report is None:
             why = f": {answer.error}" if answer.error else ""
@@ -78,10 +80,10 @@ def _maps(path: Path, missing: list[str]) -> tuple[Points, Points] | None:
         arrays = load_arrays(path)
         maps = arrays["before_points"], arrays["after_points"]
     except (InputError, KeyError):
-        missing.append(f"the maps for pictures (maps/{path.parent.name}/{path.name}) are missing or damaged.")
+        missing.append(f"The maps for pictures (maps/{path.parent.name}/{path.name}) are missing or damaged.")
         return None
     if any(cloud.ndim != 2 or cloud.shape[1] != 3 or len(cloud) == 0 for cloud in maps):
-        missing.append(f"the maps for pictures (maps/{path.parent.name}/{path.name}) hold no points.")
+        missing.append(f"The maps for pictures (maps/{path.parent.name}/{path.name}) hold no points.")
         return None
     return maps
 
@@ -91,7 +93,7 @@ def _truth(pair: Path, missing: list[str]) -> GroundTruth | None:
         return load_ground_truth(pair)
     except InputError as error:
         missing.append(
-            f"the truth of pairs/{pair.parent.name}/{pair.name} cannot be read, so no object is shown: {error}"
+            f"The truth of pairs/{pair.parent.name}/{pair.name} cannot be read, so no change is shown: {error}"
         )
         return None
 
@@ -108,7 +110,7 @@ def _map_pictures(maps: tuple[Points, Points], answers: Mapping[str, Answer], mi
     ]
     chosen = next(((name, answer.report) for name, answer in answers.items() if answer.report is not None), None)
     if chosen is None:
-        missing.append("no answer holds a merge, so the aligned maps are not shown.")
+        missing.append("No answer holds a merge, so the aligned maps are not shown.")
         return pictures
     name, report = chosen
     aligned = transform(report.before_T_after, after.astype(np.float64))
@@ -139,17 +141,22 @@ def _region_pictures(
         rows = of(data.changes, scenario=scenario, seed=seed, variant=name)
         marks = [] if truth is None else truth_marks(truth, rows)
         regions = _region_marks(report, of(data.regions, scenario=scenario, seed=seed, variant=name))
-        states = [mark.state for mark in marks]
-        caption = (
-            f"{len(regions)} regions of {report.regions.radius_m:g} m reported, "
-            f"{sum(mark.is_false for mark in regions)} of them false; "
-            f"{states.count('found')} of {len(states) - states.count('unobservable')} observable changes found. "
-            "Numbers are those of the changes below."
-        )
+        caption = _region_caption(regions, report.regions.radius_m, [mark.state for mark in marks])
         pictures.append(
             Picture(f"Changed regions: {name}", region_map(before, regions, report.regions.radius_m, marks), caption)
         )
     return pictures
+
+
+def _region_caption(regions: Sequence[RegionMark], radius_m: float, states: Sequence[State]) -> str:
+    n_false = sum(mark.is_false for mark in regions)
+    words = [f"{len(regions)} regions of {radius_m:g} m reported, {n_false} of them false."]
+    if states and "not scored" not in states:
+        n_observable = len(states) - states.count("unobservable")
+        words.append(f"{states.count('found')} of {n_observable} observable changes found.")
+    if states:
+        words.append("Numbers are those of the changes below.")
+    return " ".join(words)
 
 
 def truth_marks(truth: GroundTruth, rows: Sequence[Row]) -> list[TruthMark]:
@@ -165,7 +172,7 @@ def truth_marks(truth: GroundTruth, rows: Sequence[Row]) -> list[TruthMark]:
         truth.pair.changes, truth.centroids_world, truth.is_observable, strict=True
     ):
         place = world_to_odom(truth.before, centroid)
-        state: State = "unobservable" if not is_observable else "found" if is_found.get(change.id) else "missed"
+        state: State = _STATES[is_found.get(change.id)] if is_observable else "unobservable"
         marks.append(TruthMark(float(place[0]), float(place[1]), str(change.id), state))
     return marks
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from eval.page_columns import RESULT_COLUMNS, Column, share
+from eval.page_columns import RESULT_COLUMNS, share
 from eval.page_run import BASELINES, RunData, named_variants, of, over_pairs, scenarios, text
 from eval.page_tables import alarm_text
 
@@ -42,24 +42,24 @@ class Ranking:
 def story(data: RunData) -> list[str]:
     """Return the sentences of the first paragraph."""
     rankings = [
-        rank(scenario, measure, scenario_means(data, scenario, column))
+        rank(scenario, measure, scenario_means(data, scenario, column.key))
         for scenario in scenarios(data, unchanged=False)
         for column, measure in HEADLINE_COLUMNS
     ]
-    run_baselines = {str(row["variant"]) for row in data.results if str(row["variant"]) in BASELINES}
+    variants = dict.fromkeys(str(row["variant"]) for row in data.results)
     return [
-        _about_baselines(rankings, run_baselines),
-        *(sentence(ranking) for ranking in rankings),
+        _about_baselines(rankings, list(variants)),
+        *(sentence(ranking) + _price(data, ranking) for ranking in rankings),
         *_about_failures(data),
         *_about_unchanged(data),
         _about_size(data),
     ]
 
 
-def scenario_means(data: RunData, scenario: str, column: Column) -> dict[str, float]:
+def scenario_means(data: RunData, scenario: str, column: str) -> dict[str, float]:
     """Return the mean of a column for every named variant of a scenario."""
     return {
-        name: over_pairs(of(data.results, scenario=scenario, variant=name), column.key)
+        name: over_pairs(of(data.results, scenario=scenario, variant=name), column)
         for name in named_variants(data, scenario)
     }
 
@@ -93,9 +93,20 @@ def joined(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def _about_baselines(rankings: Sequence[Ranking], run_baselines: set[str]) -> str:
+def _price(data: RunData, ranking: Ranking) -> str:
+    """Say how many false regions the winners of a recall report: recall alone rewards reporting everything."""
+    if ranking.measure != "region recall" or not ranking.winners:
+        return ""
+    rates = scenario_means(data, ranking.scenario, "false_regions_per_100m")
+    return f" False regions per 100 m: {', '.join(f'{name} {share(rates[name])}' for name in ranking.winners)}."
+
+
+def _about_baselines(rankings: Sequence[Ranking], variants: Sequence[str]) -> str:
+    run_baselines = [name for name in BASELINES if name in variants]
     if not run_baselines:
         return "No simple baseline was run, so nothing here shows that the method is worth its effort."
+    if len(run_baselines) == len(variants):
+        return f"Only simple baselines were run: {joined(run_baselines)}."
     ahead, level = [], []
     for ranking in rankings:
         simple = [name for name in ranking.winners if name in BASELINES]
@@ -110,7 +121,7 @@ def _about_baselines(rankings: Sequence[Ranking], run_baselines: set[str]) -> st
     if level:
         parts.append(f"A simple baseline is as good as the best form of the pipeline: {'; '.join(level)}.")
     if not parts:
-        names = joined([name for name in BASELINES if name in run_baselines])
+        names = joined(run_baselines)
         return f"The simple baselines that were run ({names}) win neither region recall nor object IoU anywhere."
     return " ".join(parts)
 
@@ -134,9 +145,10 @@ def _about_unchanged(data: RunData) -> list[str]:
         }
         alarmed = [name for name, verdict in verdicts.items() if "alarm" in verdict]
         refused = [name for name, verdict in verdicts.items() if "refused" in verdict]
-        said = f"raised by {joined(alarmed)}" if alarmed else "raised by none"
-        said += f"; {joined(refused)} refused the merge or failed" if refused else ""
-        found.append(f"Where nothing changed ({scenario}), a false alarm is {said} of {len(verdicts)} presets.")
+        words = f"{len(alarmed)} of {len(verdicts)} presets raise a false alarm"
+        words += f" ({joined(alarmed)})" if alarmed else ""
+        words += f"; {joined(refused)} refused the merge or failed" if refused else ""
+        found.append(f"Where nothing changed ({scenario}), {words}.")
     return found
 
 

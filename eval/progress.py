@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Protocol
 
@@ -66,6 +69,38 @@ class Bars:
             self._progress.reset(self._stage, description=f"  {name}", total=total)
             self._stage_name = name
         self._progress.update(self._stage, completed=done, total=total, visible=done < total)
+
+
+class Lines:
+    """One line on standard error for each cell and stage: for logs, where bars would overwrite nothing."""
+
+    def __init__(self) -> None:
+        self._last = ""
+
+    def cells(self, label: str, done: int, total: int) -> None:
+        """Write the label, once."""
+        self._write(f"[{done}/{total}] {label}")
+
+    def stage(self, name: str, done: int, total: int) -> None:
+        """Write the name, once."""
+        self._write(f"  {name}")
+
+    def _write(self, line: str) -> None:
+        if line != self._last:
+            sys.stderr.write(f"{line}\n")
+            self._last = line
+
+
+@contextmanager
+def shown_progress(quiet: bool) -> Iterator[RunProgress]:
+    """Yield bars on a terminal, lines in a log, nothing if quiet."""
+    if quiet:
+        yield Silent()
+    elif not sys.stderr.isatty():
+        yield Lines()
+    else:
+        with Bars() as bars:
+            yield bars
 
 
 class _Rate(ProgressColumn):

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import platform
+import shlex
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -77,7 +78,7 @@ def describe_run(
         "format_version": FORMAT_VERSION,
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "finished": None,
-        "command": " ".join(command),
+        "command": shlex.join(command),
         "plan": dict(plan),
         "plan_digest": digest(plan),
         "seeds": list(plan["seeds"]),

@@ -133,6 +133,8 @@ def _is_finished(run: RunFolder, cell: Cell, key: str) -> bool:
 
 def _remove_stale(run: RunFolder, pair: _Pair, force: bool) -> None:
     """Remove what is about to be redone, so that no table can hold it should the run be cut off."""
+    if not pair.todo:
+        return
     if force or not _is_simulated(run.pair(pair.name, pair.seed), pair.scenario, pair.seed):
         remove(run.pair(pair.name, pair.seed))
         remove(run.maps(pair.name, pair.seed))
@@ -158,12 +160,16 @@ def _run_pair(
     """Run the cells of one pair; its maps are let go when this returns, before the next pair's are built."""
     done, total = counts
     progress.cells(f"{pair.name} {pair.seed}", done, total)
-    opened = _open(run, pair, progress)
+    opened: tuple[PairStages, GroundTruth] | str
+    try:
+        opened = _open(run, pair, progress)
+    except ScenarioError as error:
+        opened = str(error)
     for index, each in enumerate(todo):
         cell = each.cell
         progress.cells(f"{pair.name} {pair.seed} {cell.variant}", done + index, total)
-        if opened is None:
-            score = _undrawn(pair)
+        if isinstance(opened, str):
+            score = _unmade(pair, opened)
         else:
             stages, truth = opened
             folder = run.answer(pair.name, pair.seed, cell.variant)
@@ -174,10 +180,14 @@ def _run_pair(
         run.write_cell(path, cell_document(score, identity, each.key, each.place))
 
 
-def _open(run: RunFolder, pair: _Pair, progress: RunProgress) -> tuple[PairStages, GroundTruth] | None:
-    """Simulate a pair unless it is there, store its maps for pictures, and open it; None where it cannot be drawn."""
+def _open(run: RunFolder, pair: _Pair, progress: RunProgress) -> tuple[PairStages, GroundTruth]:
+    """Simulate a pair unless it is there, store its maps for pictures, and open it.
+
+    Raises:
+        ScenarioError: The seed draws no scenario, or one whose world cannot be built.
+    """
     if pair.scenario is None:
-        return None
+        raise ScenarioError(pair.error)
     path = run.pair(pair.name, pair.seed)
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -217,10 +227,10 @@ def _answer(stages: PairStages, cell: Cell, folder: Path) -> None:
         write_answer(folder, cell.variant, report)
 
 
-def _undrawn(pair: _Pair) -> CaseScore:
-    """Score a case whose scenario its seed cannot draw: no world, so no truth; all but the identity is undefined."""
+def _unmade(pair: _Pair, error: str) -> CaseScore:
+    """Score a case whose world cannot be made: there is no truth, so all but the identity is undefined."""
     row = {"scenario": "", "family": pair.name, "seed": pair.seed, "variant": "", "preset": ""}
-    outcome = {"status": "failed", "error": pair.error, "metrics_version": METRICS_VERSION}
+    outcome = {"status": "failed", "error": error, "metrics_version": METRICS_VERSION}
     return CaseScore(row={**row, **outcome}, changes=[], regions=[], objects=[])
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,15 +11,15 @@ import pandas as pd
 
 from cdpipe.answer import write_answer
 from cdpipe.config import PipelineConfig
-from cdpipe.descriptor import describe_scans, load_descriptors, save_descriptors
+from cdpipe.descriptor import describe_scans, load_descriptors, save_descriptors, use_threads
 from cdpipe.errors import InputError, MergeFailedError
 from cdpipe.mapping import build_map, keyframes
 from cdpipe.merge import merge_maps
 from cdpipe.readers import open_scans
 from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, PointMap, ScanSource
+from eval.provenance import THREADS
 from eval.rivals import METHODS
-
-OnStage = Callable[[str], None]
+from eval.stages import OnStage
 
 
 def describe_session(folder: Path, config: PipelineConfig) -> tuple[DescriptorSet, Path]:
@@ -29,6 +28,7 @@ def describe_session(folder: Path, config: PipelineConfig) -> tuple[DescriptorSe
     Raises:
         InputError: The session is damaged, or its folder cannot be written.
     """
+    use_threads(THREADS)
     source = open_scans(folder)
     chosen = keyframes(source.odom_T_sensor, config.map.keyframe_spacing_m)
     descriptors = describe_scans(source, chosen, config.descriptor)
@@ -45,23 +45,24 @@ def detect_pair(before: Path, after: Path, config: PipelineConfig, on_stage: OnS
         MergeFailedError: The sessions could not be put into one frame.
         InputError: A session is missing or damaged.
     """
+    use_threads(THREADS)
     sources = open_scans(before), open_scans(after)
     mapped: list[MappedSession] = []
     t_descriptor_s = 0.0
     for folder, source in zip((before, after), sources, strict=True):
-        on_stage(f"map {source.name}")
+        on_stage(f"map {source.name}", 0, 1)
         pointmap = build_map(source, config.map)
-        on_stage(f"describe {source.name}")
+        on_stage(f"describe {source.name}", 0, 1)
         start = time.perf_counter()
         mapped.append(MappedSession(pointmap, _descriptors(folder, source, pointmap, config)))
         t_descriptor_s += time.perf_counter() - start
-    on_stage("merge")
+    on_stage("merge", 0, 1)
     start = time.perf_counter()
     merged = merge_maps(mapped[0], mapped[1], config.merge)
     t_merge_s = time.perf_counter() - start
     if not merged.is_accepted:
         raise MergeFailedError(f"{before} and {after} cannot be merged: {merged.reason}", merged.evidence)
-    on_stage("compare")
+    on_stage("compare", 0, 1)
     report = METHODS[config.method](merged, mapped[0].descriptors, mapped[1].descriptors, config)
     seconds = {**report.seconds, "t_merge_s": t_merge_s, "t_descriptor_s": t_descriptor_s}
     sizes = {f"map_points_{name}": len(each.map.points) for name, each in zip(("before", "after"), mapped, strict=True)}
@@ -90,16 +91,16 @@ def region_table(report: ChangeReport) -> pd.DataFrame:
 
 
 def object_table(report: ChangeReport) -> pd.DataFrame:
-    """Return one row per object: where it is (map frame, metres), what happened to it, how large it is."""
+    """Return one row per object: centroid and corners (map frame, metres), what happened to it, how large it is."""
     names = ["object", "session", "kind", "partner", "region", "score", "n_returns", "n_points"]
-    corners = [f"{end}_{axis}_m" for end in ("min", "max") for axis in "xyz"]
+    places = ["x_m", "y_m", "z_m", *(f"{end}_{axis}_m" for end in ("min", "max") for axis in "xyz")]
     rows = []
     for index, item in enumerate(report.objects):
         points = item.points_map if len(item.points_map) else np.full((1, 3), np.nan)
         identity = index, item.session, item.kind, item.partner, item.region, item.score
         counts = len(item.returns), len(item.points_map)
-        rows.append((*identity, *counts, *points.min(axis=0), *points.max(axis=0)))
-    return pd.DataFrame(rows, columns=[*names, *corners])
+        rows.append((*identity, *counts, *points.mean(axis=0), *points.min(axis=0), *points.max(axis=0)))
+    return pd.DataFrame(rows, columns=[*names, *places])
 
 
 def _descriptors(folder: Path, source: ScanSource, pointmap: PointMap, config: PipelineConfig) -> DescriptorSet:

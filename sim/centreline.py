@@ -151,7 +151,7 @@ def _meander(tunnel: Tunnel, index: int, points: Float64Array, fixed: list[int],
     """Sideways wander (N, 3) of a drift, zero at the samples `fixed` where it meets another drift."""
     if tunnel.meander_m == 0.0:
         return np.zeros_like(points)
-    along_m = np.arange(len(points)) * STEP_M
+    along_m: Float64Array = np.arange(len(points), dtype=np.float64) * STEP_M
     key = int(stream(seed, "tunnel", "meander", str(index)).integers(2**63))
     # The spline's peaks reach about 2 standard deviations; meander_m is meant as the swing.
     wander_m = np.clip(0.5 * smooth_noise((along_m,), 0.5 * tunnel.meander_length_m, key), -1.0, 1.0) * tunnel.meander_m

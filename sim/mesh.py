@@ -92,7 +92,7 @@ def is_near_surface(points: Float64Array, mesh: Mesh, within_m: float) -> BoolAr
     tree = cKDTree(centres)
     for start in range(0, len(points), 4096):
         part = points[start : start + 4096]
-        near = tree.query_ball_point(part, reach_m)
+        near = np.asarray(tree.query_ball_point(part, reach_m), dtype=object)
         counts = np.fromiter((len(found) for found in near), np.int64, len(part))
         owner = np.repeat(np.arange(len(part)), counts)
         candidate = np.fromiter((index for found in near for index in found), np.int64, counts.sum())
@@ -114,7 +114,7 @@ def point_triangle_distance(points: Float64Array, triangles: Float64Array) -> Fl
     inside = (u >= 0) & (v >= 0) & (u + v <= 1)
     to_plane = np.where(inside, np.linalg.norm(points - foot, axis=1), np.inf)
     sides = [_segment_distance(points, triangles[:, i], triangles[:, (i + 1) % 3]) for i in range(3)]
-    return np.minimum.reduce([to_plane, *sides])
+    return np.asarray(np.minimum.reduce([to_plane, *sides]))
 
 
 def _segment_distance(points: Float64Array, start: Float64Array, end: Float64Array) -> Float64Array:

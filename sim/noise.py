@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -42,7 +44,7 @@ def smooth_noise(axes_m: tuple[Float64Array, ...], length_m: float, key: int) ->
     return np.asarray(values / _VARIANCE_PER_AXIS ** (len(taps) / 2))
 
 
-def lattice_values(index: list[npt.NDArray[np.int64]], key: int) -> Float64Array:
+def lattice_values(index: Sequence[npt.NDArray[np.int64]], key: int) -> Float64Array:
     """Return numbers of mean 0 and variance 1, uniform, hashed from integer coordinates and a key."""
     state = np.full(index[0].shape, np.uint64(key & 0xFFFFFFFFFFFFFFFF))
     for coordinate in index:

@@ -90,7 +90,8 @@ def smoothed(values: Float64Array, half_m: float) -> Float64Array:
 
 def _reference(world: World, plan: SessionPlan, session: str) -> tuple[Float64Array, Float64Array]:
     """Return the route (N, 3) with rounded corners, trimmed, and the section's width (N,) along it."""
-    pieces, widths = [], []
+    pieces: list[Float64Array] = []
+    widths: list[Float64Array] = []
     for a, b in pairwise(plan.route):
         points, section = world.centreline.edge(a, b)
         pieces.append(points if not pieces else points[1:])
@@ -115,7 +116,7 @@ def _reference(world: World, plan: SessionPlan, session: str) -> tuple[Float64Ar
 def _turn_deg(before: Float64Array, after: Float64Array) -> float:
     incoming = before[-1, :2] - before[max(-8, -len(before)), :2]
     outgoing = after[min(7, len(after) - 1), :2] - before[-1, :2]
-    cosine = incoming @ outgoing / max(np.linalg.norm(incoming) * np.linalg.norm(outgoing), 1e-9)
+    cosine = incoming @ outgoing / max(float(np.linalg.norm(incoming) * np.linalg.norm(outgoing)), 1e-9)
     return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
@@ -155,7 +156,7 @@ def _strictest(bound: Float64Array, half_m: float, of: Callable[..., Any]) -> Fl
 def _obstacles(
     world: World, scenario: Scenario, session: str, line: Float64Array, headings: Float64Array, height_m: float
 ) -> list[tuple[str, Float64Array, Float64Array]]:
-    """Return for each prop in the way its name and the offsets it forbids, from (N,) to (N,), NaN where it is not near."""
+    """Return for each prop in the way its name and the offsets it forbids, (N,) to (N,), NaN where it is far."""
     clearance_m = scenario.platform.clearance_m
     left = _left(headings)
     found = []

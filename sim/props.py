@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from cdpipe.geometry import Float64Array, make_pose, stream
+from cdpipe.geometry import Float64Array, Int32Array, make_pose, stream
 from scenarios.schema import Prop
 from sim.mesh import Mesh, box_mesh, cylinder_mesh, moved
 from sim.noise import smooth_noise
@@ -125,7 +125,7 @@ def _chair(length: float, width: float, height: float) -> tuple[Solid, ...]:
 
 
 def _trolley(length: float, width: float, height: float) -> tuple[Solid, ...]:
-    """Build a hand trolley standing upright: platform in front, two wheels and the frame with its handle at the rear."""
+    """Build a hand trolley standing upright: platform in front, two wheels and a frame with a handle at the rear."""
     x, y = length / 2, width / 2
     wheel = min(0.28 * length, 0.16 * height)
     axle = wheel - x
@@ -202,17 +202,16 @@ def _on_plane(x: Float64Array, y: Float64Array, length_m: float, key: int) -> Fl
     return np.asarray(low * (1 - fy) + high * fy)
 
 
-def _polar_faces(rings: int, sectors: int) -> np.ndarray[tuple[int, int], np.dtype[np.int32]]:
+def _polar_faces(rings: int, sectors: int) -> Int32Array:
     ring, i = np.meshgrid(np.arange(rings - 1), np.arange(sectors), indexing="ij")
     j = (i + 1) % sectors
     a, b = ring * sectors + i, (ring + 1) * sectors + i
     c, d = (ring + 1) * sectors + j, ring * sectors + j
     sides = np.concatenate([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)]).reshape(-1, 3)
-    i = np.arange(sectors)
-    j = (i + 1) % sectors
+    near, far = np.arange(sectors), (np.arange(sectors) + 1) % sectors
     last, top, bottom = (rings - 1) * sectors, rings * sectors, rings * sectors + 1
-    cap = np.stack([np.full(sectors, top), i, j], axis=1)
-    base = np.stack([np.full(sectors, bottom), last + j, last + i], axis=1)
+    cap = np.stack([np.full(sectors, top), near, far], axis=1)
+    base = np.stack([np.full(sectors, bottom), last + far, last + near], axis=1)
     return np.concatenate([sides, cap, base]).astype(np.int32)
 
 

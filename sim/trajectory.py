@@ -86,7 +86,7 @@ class Trajectory:
     def column_stamps_ns(self, scans: slice) -> Int64Array:
         """Return the time (s, W) of every column since the first one of the session."""
         start_ns = (self.revolution_m[scans] - self.revolution_m[0]) / self.speed_mps * 1e9
-        return np.rint(start_ns[:, None] + self.column_offsets_ns).astype(np.int64)
+        return np.asarray(np.rint(start_ns[:, None] + self.column_offsets_ns), dtype=np.int64)
 
     @property
     def world_T_sensor(self) -> Float64Array:
@@ -139,8 +139,8 @@ def record(
     if usable_m < 0:
         raise ScenarioError(f"{session}: the path of {true.distance_m[-1]:.2f} m is shorter than one revolution")
     n_scans = 1 + int(np.floor(usable_m / platform.scan_spacing_m))
-    revolution_m = turn_m / 2 + np.arange(n_scans) * platform.scan_spacing_m
-    column_m = (np.arange(sensor.width) - sensor.width // 2) * (turn_m / sensor.width)
+    revolution_m: Float64Array = turn_m / 2 + np.arange(n_scans, dtype=np.float64) * platform.scan_spacing_m
+    column_m: Float64Array = (np.arange(sensor.width, dtype=np.float64) - sensor.width // 2) * (turn_m / sensor.width)
     estimated = estimate(true, float(revolution_m[0]), odometry, seed, session)
     return Trajectory(true, estimated, revolution_m, column_m, platform.speed_mps, sensor.column_offsets_ns())
 

@@ -6,7 +6,7 @@ of its nearest centreline sample, plus smooth noise. Junctions need no special c
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,7 +118,13 @@ class _Field:
     """The signed distance field, evaluated block by block."""
 
     def __init__(
-        self, tunnel: Tunnel, centreline: Centreline, trees: list[cKDTree], margin_m: float, sigma_m: float, seed: int
+        self,
+        tunnel: Tunnel,
+        centreline: Centreline,
+        trees: Sequence[cKDTree],
+        margin_m: float,
+        sigma_m: float,
+        seed: int,
     ) -> None:
         self._tunnel = tunnel
         self._drifts = list(zip(centreline.drifts, trees, strict=True))

@@ -13,12 +13,13 @@ from cdpipe.mapping import build_map
 from cdpipe.types import DescriptorSet, MappedSession, PosedScan, ScanSource
 
 LENGTH_M = 60.0
-HALF_WIDTH_M, HEIGHT_M = 2.5, 3.5
+HALF_WIDTHS_M, HEIGHT_M = (2.5, 3.5), 3.5  # by world
 # centre and size of what stands on the floor: one box is added, one is moved
 ADDED_BOX = ((20.0, 0.0, 0.5), (1.2, 0.9, 1.0))
 MOVED_FROM = ((12.0, 0.8, 0.35), (0.7, 0.7, 0.7))
 MOVED_TO = ((46.0, -0.9, 0.35), (0.7, 0.7, 0.7))
 AFTER_ODOM_T_WORLD = yaw_pose(0.7, (30.0, -12.0, 1.0))
+AFTER_MOUNT_RAD = 1.9  # the after session's sensor sits turned on its robot
 
 
 class CloudScans:
@@ -46,21 +47,21 @@ def bend(along_m: Float64Array, world: int) -> Float64Array:
 
 
 def tunnel_points(world: int, sample: int) -> Float64Array:
-    """Points all over a rough, bent tunnel; worlds differ in bends and roughness, samples only in where points fall."""
+    """Points all over a rough, bent tunnel; worlds differ in shape, samples in where the points fall."""
     rng = stream(sample, "tunnel points", str(world))
-    n = 150_000
+    n, half_width = 150_000, HALF_WIDTHS_M[world]
     along = rng.uniform(0, LENGTH_M, n)
-    perimeter = rng.uniform(0, 2 * (2 * HALF_WIDTH_M + HEIGHT_M), n)
+    perimeter = rng.uniform(0, 2 * (2 * half_width + HEIGHT_M), n)
     phases = stream(world, "roughness").uniform(0, 2 * np.pi, (6, 2))
     rough = sum(
         0.07 * np.sin(0.9 * (k + 1) * along + a) * np.sin(0.7 * (k + 1) * perimeter + b)
         for k, (a, b) in enumerate(phases)
     )
-    width = 2 * HALF_WIDTH_M
+    width = 2 * half_width
     corners = np.array([0, width, width + HEIGHT_M, 2 * width + HEIGHT_M, 2 * (width + HEIGHT_M)])
-    across = np.interp(perimeter, corners, [-HALF_WIDTH_M, HALF_WIDTH_M, HALF_WIDTH_M, -HALF_WIDTH_M, -HALF_WIDTH_M])
+    across = np.interp(perimeter, corners, [-half_width, half_width, half_width, -half_width, -half_width])
     up = np.interp(perimeter, corners, [0, 0, HEIGHT_M, HEIGHT_M, 0])
-    swell = 1 + rough / HALF_WIDTH_M
+    swell = 1 + rough / half_width
     across, up = across * swell, HEIGHT_M / 2 + (up - HEIGHT_M / 2) * swell
     return np.column_stack([along, bend(along, world) + across, up])
 
@@ -78,14 +79,16 @@ def box_points(
     return points * size + (along, bend(np.array(along), world) + across, up)
 
 
-def scanned(name: str, odom_T_world: Float64Array, world: int, sample: int, boxes: list) -> CloudScans:
+def scanned(
+    name: str, odom_T_world: Float64Array, world: int, sample: int, boxes: list, mount_rad: float = 0.0
+) -> CloudScans:
     """Scan a tunnel every half metre along its axis; each scan sees 6000 of the points within 12 m."""
     points = np.concatenate([tunnel_points(world, sample), *(box_points(box, world, sample) for box in boxes)])
     rng = stream(sample, "scans", str(world))
     poses, clouds = [], []
     for along in np.arange(4.0, LENGTH_M - 4.0, 0.5):
         heading = np.arctan2(bend(np.array(along + 0.1), world) - bend(np.array(along - 0.1), world), 0.2)
-        world_T_sensor = yaw_pose(heading, (along, bend(np.array(along), world), 1.5))
+        world_T_sensor = yaw_pose(heading + mount_rad, (along, bend(np.array(along), world), 1.5))
         near = np.flatnonzero(np.linalg.norm(points - world_T_sensor[:3, 3], axis=1) < 12.0)
         seen = points[rng.choice(near, 6000, replace=False)]
         seen = seen + rng.normal(0, 0.005, seen.shape)
@@ -119,7 +122,7 @@ def tunnel_before() -> MappedSession:
 @pytest.fixture(scope="session")
 def tunnel_after() -> MappedSession:
     """The after session of the same tunnel: one box added, one moved."""
-    source = scanned("after", AFTER_ODOM_T_WORLD, 0, 2, [ADDED_BOX, MOVED_TO])
+    source = scanned("after", AFTER_ODOM_T_WORLD, 0, 2, [ADDED_BOX, MOVED_TO], AFTER_MOUNT_RAD)
     return mapped(source, AFTER_ODOM_T_WORLD)
 
 

@@ -22,7 +22,7 @@ class RandomScans:
 
     def scan(self, index: int) -> PosedScan:
         points = np.random.default_rng(index).uniform(-2, 2, (400 + index, 3))
-        points[-1] = (50.0, 0, 0)
+        points[-1] = (0, 10.01, 0)
         rows = np.arange(len(points))
         return PosedScan(index, points, self.odom_T_sensor[index], rows.astype(np.int64), (rows * 3).astype(np.int32))
 
@@ -71,8 +71,8 @@ def test_keyframes_by_hand() -> None:
     poses = np.array([make_pose(translation=(0.4 * k, 0, 0)) for k in range(10)])
     assert keyframes(poses, 1.0).tolist() == [0, 3, 6, 9]
     # steps that divide the spacing: rounding must not delay a keyframe
-    poses = np.array([make_pose(translation=(0.1 * k, 0, 0)) for k in range(31)])
-    assert keyframes(poses, 1.0).tolist() == [0, 10, 20, 30]
+    poses = np.array([make_pose(translation=(0.2 * k, 0, 0)) for k in range(21)])
+    assert keyframes(poses, 0.8).tolist() == [0, 4, 8, 12, 16, 20]
     assert keyframes(poses[:1], 1.0).tolist() == [0]
 
 

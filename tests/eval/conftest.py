@@ -1,4 +1,4 @@
-"""A tiny pair of sessions with truth, written through the real writers: seconds of simulation are not needed to score."""
+"""A tiny pair of sessions with truth, written through the real writers: scoring needs no simulation."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -38,7 +38,7 @@ def true_poses() -> np.ndarray:
     return np.stack([make_pose(translation=(1.5 * i, 0.0, 1.0)) for i in range(N_SCANS)])
 
 
-def write_session(path: Path, name: str, *, has_changes: bool) -> None:
+def write_session(path: Path, name: str, *, has_changes: bool, stretch: float) -> None:
     """Walls 4 m away on every side of each scan, things 2.5 m away; one pixel of each scan is a miss."""
     shape = (N_SCANS, HEIGHT, WIDTH)
     range_mm = np.full(shape, WALL_MM, dtype=np.uint32)
@@ -58,11 +58,13 @@ def write_session(path: Path, name: str, *, has_changes: bool) -> None:
             instance = np.where(range_mm[part] == 0, -1, labels[part]).astype(np.int16)
             write_labels(writer.folder, index, instance, labels[part])
         write_true_poses(writer.folder, true_poses())
-        writer.close(ODOM_T_WORLD[name] @ true_poses())
+        believed = true_poses()
+        believed[:, 0, 3] *= stretch
+        writer.close(ODOM_T_WORLD[name] @ believed)
 
 
-def write_pair(pair: Path, *, has_changes: bool = True) -> Path:
-    """Write a pair with an added and a moved thing, or one without changes."""
+def write_pair(pair: Path, *, has_changes: bool = True, stretch: float = 1.0) -> Path:
+    """Write a pair with an added and a moved thing, or one without changes; odometry stretches the way."""
     pair.mkdir()
     changes = [
         Change(
@@ -85,7 +87,7 @@ def write_pair(pair: Path, *, has_changes: bool = True) -> Path:
         for number, (session, kind, partner, _, _) in THINGS.items()
     ]
     for name in ("before", "after"):
-        write_session(pair / name, name, has_changes=has_changes)
+        write_session(pair / name, name, has_changes=has_changes, stretch=stretch)
     write_pair_truth(pair, PairTruth("test", 7, 3.0, tuple(changes) if has_changes else (), {}))
     return pair
 

@@ -211,6 +211,13 @@ def test_the_order_of_objects_does_not_matter() -> None:
         assert shuffled == tuple(outcomes[i] for i in order)
 
 
+def test_an_iou_of_exactly_a_half_is_a_hit_at_a_half() -> None:
+    # cells 5-9 of 5-14: 5 of 10
+    columns, _ = columns_of(ground_truth([change(1)], after=TWO_THINGS), [thing()], [span(5, 10)])
+    assert columns["object_f1_50"] == columns["object_precision_50"] == 1.0
+    assert columns["object_pq"] == 0.5
+
+
 def moved_pair(is_observable: bool = True) -> GroundTruth:
     changes = [
         change(1, "before", "moved", partner=2, is_observable=is_observable),
@@ -236,6 +243,13 @@ def test_a_move_is_right_with_its_kind_and_its_partner(
     objects = [thing("before", kinds[0], partners[0]), thing("after", kinds[1], partners[1])]
     matches = match_objects(objects, [span(0, 10), span(20, 30)], truth)
     assert kinds_right(objects, matches, truth).tolist() == expected
+
+
+def test_a_move_linked_with_the_wrong_object_is_wrong() -> None:
+    truth = moved_pair()
+    objects = [thing("before", "moved", 2), thing("after", "moved", 0), thing("after", "moved", 0)]
+    matches = match_objects(objects, [span(0, 10), span(20, 30), span(35, 38)], truth)
+    assert kinds_right(objects, matches, truth).tolist() == [0.0, 1.0]
 
 
 @pytest.mark.parametrize(("kind", "expected"), [("added", 1.0), ("moved", 1.0), ("removed", 0.0), ("reshaped", 0.0)])
@@ -272,7 +286,7 @@ def test_voxel_iou_equals_sets_of_tuples() -> None:
 
 
 def test_box_iou_by_hand() -> None:
-    # with half a cell around them, corners 0 and 1.9 make a cube of 2 m, shifted by 1 m along every axis: 1 of 8 + 8 - 1
+    # with half a cell around them, corners 0 and 1.9 make a cube of 2 m; shifted by 1 m along each axis: 1 of 8 + 8 - 1
     cube = np.array([[0.0, 0.0, 0.0], [1.9, 1.9, 1.9]])
     assert box_iou(cube, cube + 1.0) == pytest.approx(1 / 15)
     assert box_iou(cube, cube) == 1.0
@@ -315,7 +329,7 @@ def test_rows_near_points_by_hand() -> None:
     near = rows_near_points(universe, [points[1:2]], radius_m=0.1001)
     assert near[0].tolist() == [0, 1, 2]
     # two objects compete for cells 2 and 3: each keeps the nearer one
-    near = rows_near_points(universe, [points[1:2] + (0.04, 0, 0), points[4:5]], radius_m=0.19)
+    near = rows_near_points(universe, [points[1:2] + np.array([0.04, 0, 0]), points[4:5]], radius_m=0.19)
     assert [rows.tolist() for rows in near] == [[0, 1, 2], [3, 4, 5]]
     assert [len(rows) for rows in rows_near_points(universe, [np.zeros((0, 3)), points[:1] + 50.0])] == [0, 0]
     assert rows_near_points(universe, []) == []

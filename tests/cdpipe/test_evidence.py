@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cdpipe.config import MergeConfig
+from cdpipe.evidence import OverlapCheck, Place, sphere_fit, why_refused
+from cdpipe.geometry import Float64Array, make_pose
+from cdpipe.types import MappedSession
+
+CONFIG = MergeConfig(sphere_radius_m=10.0, inlier_m=0.3, voxel_m=0.1)
+
+
+def floor(half_m: float = 12.0, step_m: float = 0.5) -> Float64Array:
+    axis = np.arange(-half_m, half_m + 1e-9, step_m)
+    return np.stack(np.meshgrid(axis, axis, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def shifted(points: Float64Array, x_m: float = 0.0, z_m: float = 0.0) -> Float64Array:
+    return points + np.array([x_m, 0.0, z_m])
+
+
+def place(after_points: Float64Array) -> Place:
+    return Place(floor(), after_points, np.zeros(3), np.zeros(3), 0.0)
+
+
+@pytest.mark.parametrize(("lift_m", "share"), [(0.0, 1.0), (0.29, 1.0), (0.31, 0.0)])
+def test_a_lifted_floor_fits_up_to_the_inlier_distance(lift_m: float, share: float) -> None:
+    found_share, residual_m = sphere_fit(place(floor()), make_pose(translation=(0, 0, lift_m)), CONFIG)
+    assert found_share == share
+    assert residual_m == pytest.approx(lift_m)
+
+
+def test_both_directions_count_alike() -> None:
+    # the after map has a second storey 1 m up: its points miss, those of the before map all fit
+    both = np.concatenate([floor(), shifted(floor(), z_m=1.0)])
+    n = [np.count_nonzero(np.linalg.norm(shifted(floor(), z_m=lift), axis=1) <= 9.7) for lift in (0, 1)]
+    share, _ = sphere_fit(place(both), make_pose(), CONFIG)
+    assert share == pytest.approx((n[0] / (n[0] + n[1]) + 1.0) / 2)
+
+
+def test_spheres_that_do_not_meet_have_no_inliers() -> None:
+    share, residual_m = sphere_fit(place(floor(2.0)), make_pose(translation=(300.0, 0, 0)), CONFIG)
+    assert (share, residual_m) == (0.0, np.inf)
+
+
+def test_overlap_counts_the_after_map_within_a_metre(tunnel_before: MappedSession) -> None:
+    # 22 points on a line against 11 of them: the 11 and the one at -0.9 m lie within a metre
+    line = np.column_stack([np.arange(11.0) * 2, np.zeros(11), np.zeros(11)])
+    before = replace(tunnel_before.map, points=line)
+    after = replace(tunnel_before.map, points=np.concatenate([line, shifted(line, x_m=-20.9)]))
+    assert OverlapCheck(before, after).share(make_pose()) == 12 / 22
+    assert OverlapCheck(before, after).share(make_pose(translation=(0, 0, 1.5))) == 0.0
+
+
+def test_reasons_in_plain_words() -> None:
+    config = MergeConfig(min_inlier_share=0.9, min_hessian_ratio=0.01)
+    assert why_refused({"inlier_share": 0.9, "hessian_ratio": 0.01}, config) == ""
+    assert why_refused({"inlier_share": 0.5, "hessian_ratio": 0.0}, config).startswith("only 50% of the points")
+    assert "0.0050" in why_refused({"inlier_share": 1.0, "hessian_ratio": 0.005}, config)

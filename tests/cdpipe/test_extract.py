@@ -1,0 +1,206 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import cdpipe.objects
+from cdpipe.config import ClusterConfig, ExtractConfig, OutlierConfig, PipelineConfig
+from cdpipe.extract import PointGroup, assemble_objects, extract_objects, hull_volume_m3
+from cdpipe.geometry import Float64Array, invert, make_pose, transform, yaw_pose
+from cdpipe.types import ChangedObject, ChangeRegions, MergedMaps, PointMap
+
+CONFIG = PipelineConfig(
+    extract=ExtractConfig(voxel_m=0.4),
+    outlier=OutlierConfig(sigmas=100.0),
+    cluster=ClusterConfig(radius_m=0.3, min_points=8),
+)
+# grid points lie away from the borders of the 0.4 m voxels, so that a rigid motion of the frame cannot tip them over
+_STEP = 0.1
+
+
+def lattice(low: tuple[float, ...], high: tuple[float, ...]) -> Float64Array:
+    axes = [np.arange(a + _STEP / 2, b, _STEP) if b > a else np.array([a]) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+FLOOR = lattice((-6, -6, 0.05), (6, 6, 0.05))
+BOX = lattice((1, 1, 0.4), (2, 1.8, 1.2))  # 10 x 8 x 8 points, 0.4 m above the floor
+PLATE = lattice((-3, -2, 0.8), (-2, 0, 1.0))  # 10 x 20 x 2 points
+
+
+def point_map(points: Float64Array) -> PointMap:
+    """A map of points that stand for two returns each: scan 0 and scan 1, pixel = 3 x index."""
+    n = len(points)
+    return PointMap(
+        points=points,
+        voxel_m=0.1,
+        odom_T_sensor=np.stack([np.eye(4)] * 2),
+        keyframe_scans=np.zeros(1, np.int64),
+        return_points=np.tile(np.arange(n, dtype=np.int32), 2),
+        return_pixels=np.tile(3 * np.arange(n, dtype=np.int32), 2),
+        scan_offsets=np.array([0, n, 2 * n]),
+    )
+
+
+def merged(
+    before: list[Float64Array], after: list[Float64Array], before_T_after: Float64Array | None = None
+) -> MergedMaps:
+    pose = make_pose() if before_T_after is None else before_T_after
+    cloud_after = transform(invert(pose), np.concatenate(after))
+    return MergedMaps(point_map(np.concatenate(before)), point_map(cloud_after), pose, {}, True)
+
+
+def regions(centres: list[tuple[float, float, float]], radius_m: float = 5.0, n_reported: int = 9) -> ChangeRegions:
+    n = len(centres)
+    return ChangeRegions(
+        centres_map=np.array(centres).reshape(-1, 3),
+        radius_m=radius_m,
+        scores=-np.arange(n, dtype=np.float64),
+        pairs=np.zeros((n, 2), np.int64),
+        is_reported=np.arange(n) < n_reported,
+        keyframe_scores=np.zeros(0),
+    )
+
+
+def as_set(points: Float64Array) -> set[tuple[float, ...]]:
+    return {tuple(point) for point in np.round(points, 6).tolist()}
+
+
+def summary(objects: tuple[ChangedObject, ...]) -> list[tuple[object, ...]]:
+    return [(item.session, item.kind, item.region, len(item.points_map), item.partner) for item in objects]
+
+
+def test_an_added_box_is_cut_out_exactly() -> None:
+    objects, figures = extract_objects(merged([FLOOR], [FLOOR, BOX]), regions([(0, 0, 0.5)]), CONFIG)
+    assert summary(objects) == [("after", "added", 0, 640, -1)]
+    assert as_set(objects[0].points_map) == as_set(BOX)
+    assert objects[0].score == 640.0
+    n_floor = len(FLOOR)
+    pixels = [3 * (n_floor + k) for k in range(640)]
+    assert sorted(map(tuple, objects[0].returns.tolist())) == [(scan, p) for scan in (0, 1) for p in pixels]
+    n_in_sphere = int((np.linalg.norm(np.concatenate([FLOOR, BOX]) - (0, 0, 0.5), axis=1) <= 5).sum())
+    assert figures["s_points"].tolist() == [n_in_sphere]
+    assert figures["oe_points"].tolist() == [640]
+    # hulls of lattices are boxes of the outermost points: 0.9 x 0.7 x 0.7
+    assert figures["v_oe_m3"][0] == pytest.approx(0.9 * 0.7 * 0.7)
+    assert figures["v_sphere_m3"][0] > 10
+
+
+def test_a_removed_box_is_cut_out_of_the_before_map() -> None:
+    objects, figures = extract_objects(merged([FLOOR, BOX], [FLOOR]), regions([(0, 0, 0.5)]), CONFIG)
+    assert summary(objects) == [("before", "removed", 0, 640, -1)]
+    assert figures["s_points"][0] < len(FLOOR)
+
+
+def test_moved_partners_name_each_other() -> None:
+    moved_box = transform(yaw_pose(np.pi / 2, (0.2, -3.0, 0.0)), BOX)
+    objects, _ = extract_objects(
+        merged([FLOOR, BOX], [FLOOR, PLATE, moved_box]), regions([(0, 0, 0.5)], radius_m=6.0), CONFIG
+    )
+    assert summary(objects) == [
+        ("after", "moved", 0, 640, 2),
+        ("after", "added", 0, 400, -1),
+        ("before", "moved", 0, 640, 0),
+    ]
+
+
+def test_objects_of_different_size_did_not_move() -> None:
+    objects, _ = extract_objects(merged([FLOOR, BOX], [FLOOR, PLATE]), regions([(0, 0, 0.5)]), CONFIG)
+    assert summary(objects) == [("after", "added", 0, 400, -1), ("before", "removed", 0, 640, -1)]
+
+
+def test_nothing_changed() -> None:
+    objects, figures = extract_objects(merged([FLOOR, BOX], [FLOOR, BOX]), regions([(0, 0, 0.5)]), CONFIG)
+    assert objects == ()
+    assert figures["oe_points"].tolist() == [0]
+    assert figures["v_oe_m3"].tolist() == [0]
+
+
+def test_the_border_of_the_sphere_makes_nothing_new() -> None:
+    # the before map has every second point: the partner of a point just inside often lies just outside the sphere
+    thin = FLOOR[(np.arange(len(FLOOR)) % 4) == 0]
+    for radius_m in (1.0, 2.3, 3.1, 4.4):
+        everything = CONFIG.model_copy(update={"cluster": ClusterConfig(radius_m=0.5, min_points=1)})
+        objects, _ = extract_objects(merged([thin], [FLOOR]), regions([(0.3, 0.2, 0.5)], radius_m), everything)
+        assert objects == ()
+
+
+def test_a_point_belongs_to_the_better_region_only() -> None:
+    pair = merged([FLOOR], [FLOOR, BOX])
+    objects, figures = extract_objects(pair, regions([(0, 0, 0.5), (3, 3, 0.5)]), CONFIG)
+    assert summary(objects) == [("after", "added", 0, 640, -1)]
+    assert figures["oe_points"].tolist() == [640, 0]
+    # a sphere that cuts the box: the second region gets the rest
+    objects, _ = extract_objects(pair, regions([(1.5, -3.0, 0.8), (1.5, 1.5, 0.8)], radius_m=4.4), CONFIG)
+    assert [item.region for item in objects] == [0, 1]
+    assert sum(len(item.points_map) for item in objects) == 640
+    assert as_set(np.concatenate([item.points_map for item in objects])) == as_set(BOX)
+
+
+def test_only_reported_regions_are_looked_at() -> None:
+    objects, figures = extract_objects(
+        merged([FLOOR], [FLOOR, BOX, PLATE]), regions([(-3, -3, 0.5), (3, 3, 0.5)], 4.0, n_reported=1), CONFIG
+    )
+    assert summary(objects) == [("after", "added", 0, 400, -1)]
+    for values in figures.values():
+        assert np.isnan(values).tolist() == [False, True]
+    none, figures = extract_objects(merged([FLOOR], [FLOOR]), regions([]), CONFIG)
+    assert none == ()
+    assert all(values.shape == (0,) for values in figures.values())
+
+
+def test_everything_changed_and_an_empty_region() -> None:
+    far = transform(make_pose(translation=(0, 0, 50.0)), FLOOR)
+    objects, figures = extract_objects(merged([FLOOR], [far]), regions([(0, 0, 0), (0, 0, 50), (0, 0, 25)]), CONFIG)
+    # the outlier filter may thin the rims, but nearly all of both floors is one object each
+    assert [(item.session, item.region) for item in objects] == [("before", 0), ("after", 1)]
+    assert figures["s_points"].tolist()[0::2] == [0, 0]
+    assert figures["v_sphere_m3"].tolist()[0::2] == [0, 0]
+
+
+def test_moving_both_sessions_moves_the_objects() -> None:
+    # by whole voxels and quarter turns, so that the grid of the map frame stays the same
+    g, h = yaw_pose(np.pi / 2, (40.0, -8.0, 4.0)), yaw_pose(0.83, (-7.0, 3.3, 0.1))
+    plain = merged([FLOOR, BOX], [FLOOR, PLATE])
+    centre = (0.0, 0.0, 0.5)
+    objects, figures = extract_objects(plain, regions([centre]), CONFIG)
+    moved_maps = MergedMaps(
+        replace(plain.before, points=transform(g, plain.before.points)),
+        replace(plain.after, points=transform(h, plain.after.points)),
+        g @ invert(h),
+        {},
+        True,
+    )
+    moved_centre = tuple(transform(g, np.array([centre]))[0].tolist())
+    moved_objects, moved_figures = extract_objects(moved_maps, regions([moved_centre]), CONFIG)
+    assert summary(moved_objects) == summary(objects)
+    for item, other in zip(objects, moved_objects, strict=True):
+        assert as_set(transform(g, item.points_map)) == as_set(other.points_map)
+        assert set(map(tuple, item.returns.tolist())) == set(map(tuple, other.returns.tolist()))
+    for name, values in figures.items():
+        np.testing.assert_allclose(moved_figures[name], values, rtol=1e-9)
+
+
+@pytest.mark.parametrize("block_returns", [7, 1 << 22])
+def test_objects_from_groups_of_both_maps(block_returns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cdpipe.objects, "_BLOCK_RETURNS", block_returns)
+    pair = merged([FLOOR, BOX], [FLOOR, BOX])
+    some, others = np.array([5, 7]), np.array([2, 9, 700])
+    groups = [
+        PointGroup("after", some, pair.after.points[some], -1),
+        PointGroup("before", others, pair.before.points[others], 4),
+    ]
+    first, second = assemble_objects(pair, groups)
+    assert first.returns.tolist() == [[0, 15], [0, 21], [1, 15], [1, 21]]
+    assert second.returns.tolist() == [[0, 6], [0, 27], [0, 2100], [1, 6], [1, 27], [1, 2100]]
+    assert (first.region, second.region) == (-1, 4)
+    assert assemble_objects(pair, []) == ()
+
+
+def test_hulls_by_hand_and_degenerate() -> None:
+    cube = np.array([[x, y, z] for x in (0, 2.0) for y in (0, 2.0) for z in (0, 2.0)])
+    assert hull_volume_m3(cube) == pytest.approx(8.0)
+    assert hull_volume_m3(cube[:4]) == 0.0  # four points of one face
+    assert hull_volume_m3(cube[:3]) == hull_volume_m3(cube[:0]) == 0.0

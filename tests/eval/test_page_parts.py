@@ -1,0 +1,171 @@
+import base64
+import io
+import math
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.image import imread
+
+from eval.figures import (
+    BLUE,
+    ORANGE,
+    RED,
+    RegionMark,
+    TruthMark,
+    distance_map,
+    joined_labels,
+    overlay_map,
+    region_map,
+)
+from eval.object_figures import Panel, object_panels, oblique_view
+from eval.page_columns import RESULT_COLUMNS, UNDEFINED, count, significant
+from eval.page_run import split_variant
+from eval.page_story import rank, sentence
+from eval.page_tables import best, escape_latex, heat_colour
+
+HIGH = next(column for column in RESULT_COLUMNS if column.key == "object_iou_point")
+LOW = next(column for column in RESULT_COLUMNS if column.key == "t_total_s")
+NAN = math.nan
+
+
+def pixels(address: str) -> np.ndarray:
+    return imread(io.BytesIO(base64.b64decode(address.removeprefix("data:image/png;base64,"))))[..., :3]
+
+
+def share_of(image: np.ndarray, colour: str) -> float:
+    return float((np.abs(image - np.array(to_rgb(colour))).max(axis=2) < 0.02).mean())
+
+
+def square(x_m: float, y_m: float) -> np.ndarray:
+    """A 2 m square of points every 0.05 m."""
+    steps = np.arange(0.025, 2.0, 0.05)
+    x, y = np.meshgrid(x_m + steps, y_m + steps)
+    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.00045, "0.00045"),
+        (0.0123456, "0.0123"),
+        (1.0, "1"),
+        (12.345, "12.3"),
+        (1234.5, "1234"),
+        (0.0, "0"),
+        (NAN, UNDEFINED),
+    ],
+)
+def test_seconds_have_three_digits_and_no_exponent(value: float, text: str) -> None:
+    assert significant(value) == text
+
+
+def test_counts_are_grouped_and_broken_means_keep_a_decimal() -> None:
+    assert [count(value) for value in (0.0, 1263631.0, 2.5, NAN)] == ["0", "1\u2009263\u2009631", "2.5", UNDEFINED]
+
+
+@pytest.mark.parametrize(
+    ("values", "column", "marks"),
+    [
+        ([0.1, 0.3, 0.2], HIGH, [False, True, False]),
+        ([0.1, 0.3, 0.2], LOW, [True, False, False]),
+        # 0.301 and 0.304 are both written 0.30
+        ([0.301, 0.304, 0.2], HIGH, [True, True, False]),
+        ([0.3, 0.3, 0.3], HIGH, [False, False, False]),
+        ([NAN, 0.3, NAN], HIGH, [False, False, False]),
+        ([NAN, 0.3, 0.1], HIGH, [False, True, False]),
+        ([-0.0, 0.0], HIGH, [False, False]),
+        ([], HIGH, []),
+    ],
+)
+def test_best_is_judged_as_written(values: list[float], column: object, marks: list[bool]) -> None:
+    assert best(values, column) == marks
+
+
+def test_ranking_names_ties_margins_and_nothing() -> None:
+    assert sentence(rank("here", "object IoU", {"a": 0.5, "b": 0.2, "c": NAN})) == (
+        "On here, object IoU: a is best with 0.50, 0.30 ahead of b (0.20)."
+    )
+    assert sentence(rank("here", "object IoU", {"a": 0.502, "b": 0.498, "c": 0.1})) == (
+        "On here, object IoU: a and b tie at 0.50, 0.40 ahead of c (0.10)."
+    )
+    assert (
+        sentence(rank("here", "object IoU", {"a": 0.001, "b": 0.0})) == "On here, object IoU: no preset gets above 0."
+    )
+    assert sentence(rank("here", "object IoU", {"a": NAN})) == "On here, object IoU: undefined for every preset."
+    assert sentence(rank("here", "object IoU", {"a": 1.0})) == "On here, object IoU: a is best with 1.00."
+
+
+def test_variants_are_taken_apart() -> None:
+    assert split_variant("tunnelcd[extract.voxel_m=0.3,query.radius_m=4.5]") == (
+        "tunnelcd",
+        {"extract.voxel_m": "0.3", "query.radius_m": "4.5"},
+    )
+    assert split_variant("paper-topn") == ("paper-topn", {})
+
+
+def test_latex_commands_in_names_are_harmless() -> None:
+    assert escape_latex(r"50 % of {a_b} & \c ~^#$") == (
+        r"50 \% of \{a\_b\} \& \textbackslash{}c \textasciitilde{}\textasciicircum{}\#\$"
+    )
+
+
+def test_heat_runs_from_white_to_blue() -> None:
+    assert [heat_colour(value) for value in (0.0, 1.0, 2.0, NAN)] == ["#ffffff", "#6baed6", "#6baed6", ""]
+
+
+def test_overlay_shows_each_map_in_its_colour_and_equal_areas_alike() -> None:
+    image = pixels(overlay_map(square(0, 0), square(6, 1)))
+    n_before, n_after = (share_of(image[image.shape[0] // 5 :], colour) for colour in (BLUE, ORANGE))
+    assert n_before > 0.02
+    assert n_after == pytest.approx(n_before, rel=0.1)
+
+
+def test_distances_colour_only_what_is_new() -> None:
+    before = np.concatenate([square(0, 0), square(2, 0)])
+    same, new = (
+        pixels(distance_map(before, after))
+        for after in (before, np.concatenate([before, square(1, 0) + np.array([0, 0, 1.5])]))
+    )
+    below_the_colour_bar = same.shape[0] // 3
+    assert share_of(same[below_the_colour_bar:], "#7f1d00") == 0.0
+    # 2 m of the 4 m square are covered from above
+    assert share_of(new[below_the_colour_bar:], "#7f1d00") > 0.1
+
+
+def test_regions_are_drawn_in_red_around_their_centres() -> None:
+    points = np.concatenate([square(x, 0) for x in range(0, 20, 2)])
+    none = pixels(region_map(points, [], 2.0, []))
+    one = pixels(region_map(points, [RegionMark(5.0, 1.0, False)], 2.0, [TruthMark(5.0, 1.0, "1", "found")]))
+    assert share_of(one, RED) > 2 * share_of(none, RED)
+
+
+@pytest.mark.parametrize("draw", [overlay_map, distance_map])
+def test_maps_of_one_point_can_be_drawn(draw: object) -> None:
+    assert draw(np.zeros((1, 3)), np.ones((1, 3))).startswith("data:image/png;base64,")
+
+
+def test_labels_of_neighbours_are_joined() -> None:
+    marks = [TruthMark(x, 0.0, str(index), "found") for index, x in enumerate((0.0, 0.5, 9.0))]
+    assert joined_labels(marks, 1.0) == [(0.0, 0.0, "0, 1"), (9.0, 0.0, "2")]
+
+
+def test_the_oblique_view_keeps_up_above_and_turns_with_the_eye() -> None:
+    truth = np.zeros((1, 3))
+    side = oblique_view(truth, np.array([10.0, 0.0, 0.0]))
+    up = side(np.array([[0.0, 0.0, 1.0]]))[0]
+    np.testing.assert_allclose(up, [0.0, math.cos(math.radians(25))], atol=1e-12)
+    # turning the eye and the point by 90 deg about the object changes nothing
+    turned = oblique_view(truth, np.array([0.0, 10.0, 0.0]))
+    np.testing.assert_allclose(side(np.array([[1.0, 2.0, 3.0]])), turned(np.array([[-2.0, 1.0, 3.0]])), atol=1e-12)
+
+
+def test_an_object_that_was_missed_is_drawn_black() -> None:
+    points = square(0, 0) + np.array([0.0, 0.0, 0.5])
+    nothing = np.zeros((0, 3))
+    panels = [Panel("truth", "", ((points, BLUE),)), Panel("a", "", ((points, "#1a1a1a"), (nothing, BLUE)))]
+    image = pixels(object_panels(panels, points, np.array([5.0, 0.0, 1.0])))
+    half = image.shape[1] // 2
+    assert share_of(image[:, :half], BLUE) > 0.03
+    assert share_of(image[:, half:], BLUE) == 0.0
+    assert share_of(image[:, half:], "#1a1a1a") > 0.03

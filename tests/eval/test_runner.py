@@ -1,0 +1,420 @@
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from cdpipe.answer import read_answer
+from cdpipe.config import MapConfig
+from cdpipe.errors import InputError, ScenarioError
+from cdpipe.mapping import build_map
+from cdpipe.readers import open_scans
+from eval import runner, stages
+from eval.adapters import pipeline_input
+from eval.plan import Plan, load_plan
+from eval.rescoring import rescore
+from eval.runfolder import RunFolder, open_run_folder, start_run_folder
+from eval.runner import RunOutcome, run_plan
+from scenarios.library import load_scenario
+from scenarios.schema import Scenario
+from sim.simulate import simulate_pair
+
+ONE_BOX, UNCHANGED = "smoke/one_box", "smoke/unchanged"
+VARIANTS = ["paper", "tunnelcd", "voxel-diff", "random-regions"]
+# a quarter of the returns: these tests are about what is run, not about how well
+SMALL = ("sensor.mode=512x10", "platform.scan_spacing_m=1.0")
+
+
+def load_small(name: str, seed: int) -> Scenario:
+    return load_scenario(name, seed, SMALL)
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Both smoke scenarios, thinned out and simulated once; every test works on copies."""
+    made = {}
+    for name in (ONE_BOX, UNCHANGED):
+        made[name] = tmp_path_factory.mktemp("pairs") / name.replace("/", "_")
+        simulate_pair(load_small(name, 20000), 20000, made[name])
+    return made
+
+
+@pytest.fixture
+def simulated(pairs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Let the runner copy those pairs instead of simulating; returns the list of what it asked for."""
+    asked: list[str] = []
+
+    def copy(scenario: Scenario, seed: int, out: Path, on_progress: object = None) -> None:
+        asked.append(scenario.family)
+        assert seed == 20000
+        shutil.copytree(pairs[scenario.family], out)
+
+    monkeypatch.setattr(runner, "simulate_pair", copy)
+    monkeypatch.setattr(runner, "load_scenario", load_small)
+    return asked
+
+
+def plan_of(folder: Path, *, scenarios: str = ONE_BOX, variants: str = "{preset: voxel-diff}", rest: str = "") -> Plan:
+    path = folder / "plan.yaml"
+    path.write_text(f"name: test\nscenarios: [{scenarios}]\nseeds: [20000]\nvariants: [{variants}]\n{rest}")
+    return load_plan(str(path))
+
+
+def run_in(folder: Path, plan: Plan, **options: Any) -> tuple[RunFolder, RunOutcome]:
+    run = start_run_folder(folder)
+    return run, run_plan(plan, run, **options)
+
+
+def table(run: RunFolder, name: str = "results") -> pd.DataFrame:
+    return pd.read_csv(run.path / f"{name}.csv", keep_default_na=True)
+
+
+@pytest.fixture(scope="module")
+def smoke(pairs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """The smoke plan, run once end to end."""
+
+    def copy(scenario: Scenario, seed: int, out: Path, on_progress: object) -> None:
+        shutil.copytree(pairs[scenario.family], out)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner, "simulate_pair", copy)
+        patch.setattr(runner, "load_scenario", load_small)
+        return run_in(tmp_path_factory.mktemp("smoke") / "run", load_plan("smoke"), command=["tunnelcd", "run", "a b"])[
+            0
+        ]
+
+
+@pytest.fixture
+def smoke_copy(smoke: RunFolder, tmp_path: Path) -> RunFolder:
+    shutil.copytree(smoke.path, tmp_path / "run")
+    return RunFolder(tmp_path / "run")
+
+
+def test_smoke_plan_end_to_end(smoke: RunFolder) -> None:
+    results = table(smoke)
+    assert results["status"].tolist() == ["ok"] * 8
+    # in the plan's order, not the alphabet's
+    assert list(zip(results["scenario"], results["variant"], strict=True)) == [
+        (name, variant) for name in (ONE_BOX, UNCHANGED) for variant in VARIANTS
+    ]
+    assert set(results["seed"]) == {20000}
+    assert results["n_changes"].tolist() == [1] * 4 + [0] * 4
+    assert (results["merge_error_m"] < 0.1).all()
+    # an unchanged pair has nothing to recall
+    assert results["region_recall"].notna().tolist() == [True] * 4 + [False] * 4
+    found = results.set_index(["scenario", "variant"])["region_recall"]
+    assert found[ONE_BOX, "voxel-diff"] == 1.0
+    for name in ("changes", "regions", "objects", "keyframes"):
+        items = table(smoke, name)
+        assert set(items["variant"]) <= set(VARIANTS)
+        assert {"scenario", "seed", "variant"} <= set(items.columns)
+    assert len(table(smoke, "changes")) == len(VARIANTS)
+    assert {"value", "low", "high", "n", "n_failed"} <= set(table(smoke, "summary").columns)
+
+
+def test_times_and_sizes_of_a_run(smoke: RunFolder) -> None:
+    results = table(smoke)
+    times = results[[name for name in results.columns if name.startswith("t_") and "per_" not in name]]
+    assert np.isfinite(times.to_numpy()).all()
+    for _, cases in results.groupby("scenario"):
+        # one merge and one set of descriptors serve all variants of a pair
+        assert cases["t_merge_s"].nunique() == 1
+        assert cases.set_index("variant").loc[["paper", "tunnelcd"], "t_descriptor_s"].nunique() == 1
+        assert (cases.set_index("variant").loc[["voxel-diff", "random-regions"], "t_descriptor_s"] == 0).all()
+    np.testing.assert_allclose(results["t_total_s"], results["t_descriptor_s"] + results["t_cd_s"] + results["t_oe_s"])
+    assert (results["map_points_before"] > 1000).all()
+    assert (results["n_keyframes_after"] > 10).all()
+
+
+def test_stored_maps_are_those_of_the_default_settings(smoke: RunFolder) -> None:
+    with np.load(smoke.maps(ONE_BOX, 20000)) as stored:
+        for session in ("before", "after"):
+            expected = build_map(pipeline_input(smoke.pair(ONE_BOX, 20000), session), MapConfig()).points
+            np.testing.assert_array_equal(stored[f"{session}_points"], expected.astype(np.float32))
+
+
+def test_provenance_says_what_made_the_results(smoke: RunFolder) -> None:
+    document = smoke.provenance()
+    assert document["command"] == "tunnelcd run 'a b'"
+    assert document["seeds"] == [20000]
+    assert Plan.model_validate(document["plan"]) == load_plan("smoke")
+    assert set(document["config_digests"]) == {
+        f"{name} {variant}" for name in (ONE_BOX, UNCHANGED) for variant in VARIANTS
+    }
+    assert len(set(document["config_digests"].values())) == 4
+    assert list(document["checkpoints"]) == ["3deg"]
+    assert document["checkpoints"]["3deg"]
+    assert document["finished"] >= document["started"]
+    assert document["machine"]["cores"] >= 1
+    assert document["versions"]["numpy"] == np.__version__
+
+
+def test_finished_cells_are_kept(smoke_copy: RunFolder, simulated: list[str]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in smoke_copy.path.rglob("*") if "cells" in path.parts}
+    outcome = run_plan(load_plan("smoke"), smoke_copy)
+    assert outcome == RunOutcome(n_done=0, n_kept=8, n_left=0)
+    assert simulated == []
+    assert before == {path: path.stat().st_mtime_ns for path in before}
+
+
+def test_a_cell_cut_short_is_done_again_and_no_other(smoke_copy: RunFolder, simulated: list[str]) -> None:
+    cut = smoke_copy.cell(ONE_BOX, 20000, "paper")
+    cut.write_text(cut.read_text()[:-50])
+    row = table(smoke_copy).query("scenario == @ONE_BOX and variant == 'paper'")["region_recall"].item()
+    assert run_plan(load_plan("smoke"), smoke_copy) == RunOutcome(1, 7, 0)
+    assert simulated == []
+    assert table(smoke_copy).query("scenario == @ONE_BOX and variant == 'paper'")["region_recall"].item() == row
+
+
+def test_another_version_of_the_metrics_redoes_all(
+    smoke_copy: RunFolder, simulated: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "METRICS_VERSION", -1)
+    assert run_plan(load_plan("smoke"), smoke_copy, limit=1) == RunOutcome(1, 0, 7)
+    # what is stale is in no table
+    assert len(table(smoke_copy)) == 1
+
+
+def test_limit_and_then_the_rest(tmp_path: Path, simulated: list[str]) -> None:
+    plan = plan_of(tmp_path, variants="{preset: voxel-diff}, {preset: random-regions}")
+    run, outcome = run_in(tmp_path / "run", plan, limit=1)
+    assert outcome == RunOutcome(1, 0, 1)
+    assert table(run)["variant"].tolist() == ["voxel-diff"]
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 1, 0)
+    assert table(run)["variant"].tolist() == ["voxel-diff", "random-regions"]
+    assert simulated == [ONE_BOX]
+
+
+def test_a_changed_setting_redoes_its_cells_only(tmp_path: Path, simulated: list[str]) -> None:
+    preset = tmp_path / "own.yaml"
+    preset.write_text("method: voxel-diff\n")
+    plan = plan_of(tmp_path, variants=f"{{preset: {preset}}}, {{preset: random-regions}}")
+    run, _ = run_in(tmp_path / "run", plan)
+    assert table(run)["preset"].tolist() == ["own", "random-regions"]
+    preset.write_text("method: voxel-diff\nquery: {threshold: 1000000}\n")
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 1, 0)
+    assert table(run).set_index("variant").loc["own", "n_regions"] == 0
+    assert simulated == [ONE_BOX]
+
+
+def test_force_redoes_everything(tmp_path: Path, simulated: list[str]) -> None:
+    plan = plan_of(tmp_path)
+    run_in(tmp_path / "run", plan)
+    assert run_in(tmp_path / "run", plan, force=True)[1] == RunOutcome(1, 0, 0)
+    assert simulated == [ONE_BOX, ONE_BOX]
+
+
+def test_a_pair_of_another_scenario_is_simulated_anew(
+    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = plan_of(tmp_path)
+    run_in(tmp_path / "run", plan)
+    changed = load_scenario(ONE_BOX, 20000, [*SMALL, "score_radius_m=5"])
+    monkeypatch.setattr(runner, "load_scenario", lambda name, seed: changed)
+    assert run_in(tmp_path / "run", plan)[1].n_done == 1
+    assert simulated == [ONE_BOX, ONE_BOX]
+
+
+def test_a_refused_merge_is_a_row_that_scores_0(tmp_path: Path, simulated: list[str]) -> None:
+    variants = '{preset: paper, set: ["merge.min_hessian_ratio=1"]}, {preset: voxel-diff}'
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=f"{ONE_BOX}, {UNCHANGED}", variants=variants))
+    results = table(run).set_index(["scenario", "variant"])
+    refused = "paper[merge.min_hessian_ratio=1]"
+    row = results.loc[(ONE_BOX, refused)]
+    assert row["status"] == "merge_refused"
+    assert "cannot be merged" in row["error"]
+    assert row[["region_recall", "region_recall_at_k", "object_iou_point", "object_f1_25"]].tolist() == [0, 0, 0, 0]
+    assert row[["t_merge_s", "t_total_s", "merge_error_m"]].isna().all()
+    assert results.loc[(UNCHANGED, refused), "status"] == "merge_refused"
+    assert np.isnan(results.loc[(UNCHANGED, refused), "region_recall"])
+    assert results.loc[(ONE_BOX, "voxel-diff"), "status"] == "ok"
+    answer = read_answer(run.answer(ONE_BOX, 20000, refused))
+    assert answer.report is None
+    assert "hessian_ratio" in answer.evidence
+    assert table(run, "changes").query("variant == @refused")["is_found"].tolist() == [False]
+
+
+def test_an_error_of_the_input_is_a_row_and_a_bug_is_not(
+    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(error: Exception) -> Callable[..., None]:
+        def method(*_: object) -> None:
+            raise error
+
+        return method
+
+    plan = plan_of(tmp_path, variants="{preset: random-regions}, {preset: voxel-diff}")
+    monkeypatch.setitem(stages.METHODS, "random-regions", fails(InputError("no such thing")))
+    run, _ = run_in(tmp_path / "run", plan)
+    results = table(run).set_index("variant")
+    assert results["status"].to_dict() == {"random-regions": "failed", "voxel-diff": "ok"}
+    assert results.loc["random-regions", "error"] == "no such thing"
+    assert results.loc["random-regions", "region_recall"] == 0
+    monkeypatch.setitem(stages.METHODS, "voxel-diff", fails(RuntimeError("a bug")))
+    with pytest.raises(RuntimeError, match="a bug"):
+        run_in(tmp_path / "run", plan, force=True)
+    # what was finished before the bug is kept
+    assert run.read_cell(run.cell(ONE_BOX, 20000, "random-regions")) is not None
+
+
+@pytest.mark.parametrize("stage", ["load_scenario", "simulate_pair"])
+def test_a_world_that_cannot_be_made_is_a_row_and_the_others_go_on(
+    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch, stage: str
+) -> None:
+    usual = getattr(runner, stage)
+
+    def fails_for_one(what: Any, *rest: Any, **options: Any) -> Any:
+        if ONE_BOX in (what, getattr(what, "family", "")):
+            raise ScenarioError("props stand in each other")
+        return usual(what, *rest, **options)
+
+    monkeypatch.setattr(runner, stage, fails_for_one)
+    run, outcome = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=f"{ONE_BOX}, {UNCHANGED}"))
+    assert outcome == RunOutcome(2, 0, 0)
+    results = table(run).set_index("scenario")
+    assert results["status"].to_dict() == {ONE_BOX: "failed", UNCHANGED: "ok"}
+    assert results.loc[ONE_BOX, "error"] == "props stand in each other"
+    assert np.isnan(results.loc[ONE_BOX, "region_recall"])
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, simulated: list[str]) -> None:
+    class Impatient:
+        def cells(self, label: str, done: int, total: int) -> None:
+            if done == 2:
+                raise KeyboardInterrupt
+
+        def stage(self, name: str, done: int, total: int) -> None:
+            pass
+
+    plan = plan_of(
+        tmp_path, scenarios=f"{ONE_BOX}, {UNCHANGED}", variants="{preset: voxel-diff}, {preset: random-regions}"
+    )
+    with pytest.raises(KeyboardInterrupt):
+        run_in(tmp_path / "run", plan, progress=Impatient())
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(2, 2, 0)
+
+
+def test_stages_are_shared_by_the_settings_they_depend_on(
+    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+
+    def counted(name: str) -> Callable[..., Any]:
+        usual = getattr(stages, name)
+
+        def call(*args: Any) -> Any:
+            calls.append(name)
+            return usual(*args)
+
+        return call
+
+    for name in ("build_map", "describe_scans", "merge_maps"):
+        monkeypatch.setattr(stages, name, counted(name))
+    monkeypatch.setattr(stages, "REPEATS", 1)
+    coarse = 'set: ["map.voxel_m=0.3"]'
+    # the two that share a map stand apart in the plan
+    variants = f"{{preset: voxel-diff}}, {{preset: voxel-diff, {coarse}}}, {{preset: random-regions}}"
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, variants=variants))
+    assert calls.count("build_map") == 2 * 2
+    # per map setting: one to warm up, one per session
+    assert calls.count("describe_scans") == 2 * 3
+    # per map setting: once, and once more for the clock
+    assert calls.count("merge_maps") == 2 * 2
+    assert table(run)["variant"].tolist() == ["voxel-diff", "voxel-diff[map.voxel_m=0.3]", "random-regions"]
+
+
+def test_score_runs_nothing_and_gives_the_same(smoke_copy: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*_: object, **__: object) -> None:
+        raise AssertionError("score must not run anything")
+
+    for module, name in (
+        (runner, "simulate_pair"),
+        (runner, "PairStages"),
+        (stages, "build_map"),
+        (stages, "merge_maps"),
+    ):
+        monkeypatch.setattr(module, name, forbidden)
+    before = table(smoke_copy)
+    (smoke_copy.path / "results.csv").unlink()
+    assert rescore(smoke_copy) == 8
+    pd.testing.assert_frame_equal(table(smoke_copy), before)
+    # and the cells still count as finished
+    assert run_plan(load_plan("smoke"), smoke_copy) == RunOutcome(0, 8, 0)
+
+
+def test_score_takes_in_the_answer_of_another_program(smoke_copy: RunFolder) -> None:
+    shutil.copytree(smoke_copy.answer(ONE_BOX, 20000, "voxel-diff"), smoke_copy.answer(ONE_BOX, 20000, "theirs"))
+    assert rescore(smoke_copy) == 9
+    results = table(smoke_copy).set_index(["scenario", "variant"])
+    columns = ["region_recall", "object_iou_point", "n_regions"]
+    theirs, ours = results.loc[(ONE_BOX, "theirs")], results.loc[(ONE_BOX, "voxel-diff")]
+    assert theirs[columns].tolist() == ours[columns].tolist()
+    assert (theirs["preset"], theirs["seed"]) == ("theirs", 20000)
+    assert table(smoke_copy)["variant"].iloc[-1] == "theirs"
+
+
+def test_folders_that_are_no_run(tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("x")
+    with pytest.raises(InputError, match="not empty and not a run folder"):
+        start_run_folder(tmp_path)
+    with pytest.raises(InputError, match="not a run folder"):
+        open_run_folder(tmp_path)
+    with pytest.raises(InputError, match="no such run folder"):
+        open_run_folder(tmp_path / "absent")
+    (tmp_path / "provenance.json").write_text(json.dumps({"tool": "another"}))
+    for opener in (start_run_folder, open_run_folder):
+        with pytest.raises(InputError, match="not written by tunnelcd"):
+            opener(tmp_path)
+    (tmp_path / "provenance.json").write_text("{")
+    with pytest.raises(InputError, match="damaged"):
+        open_run_folder(tmp_path)
+
+
+def test_the_pipeline_never_sees_truth(pairs: dict[str, Path], tmp_path: Path) -> None:
+    """Without its truth, and with the truth of another pair in its place, a session gives the same input."""
+    bare = tmp_path / "bare"
+    shutil.copytree(pairs[ONE_BOX], bare, ignore=shutil.ignore_patterns("truth"))
+    assert not list(bare.rglob("truth"))
+    with_truth, without = pipeline_input(pairs[ONE_BOX], "after"), pipeline_input(bare, "after")
+    np.testing.assert_array_equal(with_truth.odom_T_sensor, without.odom_T_sensor)
+    for index in (0, 17):
+        ours, theirs = with_truth.scan(index), without.scan(index)
+        for field in ("points_sensor", "odom_T_sensor", "stamps_ns", "pixels"):
+            np.testing.assert_array_equal(getattr(ours, field), getattr(theirs, field))
+    true_poses = np.load(pairs[ONE_BOX] / "after" / "truth" / "poses.npz")["world_T_sensor"]
+    assert np.abs(with_truth.odom_T_sensor - true_poses).max() > 0.1
+    assert type(with_truth) is type(open_scans(bare / "after"))
+
+
+def test_time_is_the_median_of_three_after_a_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = 0.0
+    durations = iter([0.9, 0.5, 0.1, 0.2])
+
+    def call() -> str:
+        nonlocal clock
+        clock += next(durations)
+        return "done"
+
+    monkeypatch.setattr(stages.time, "perf_counter", lambda: clock)
+    result, seconds = stages.timed(call)
+    assert result == "done"
+    assert seconds == pytest.approx(0.2)
+    assert next(durations, None) is None
+
+
+def test_a_long_call_is_timed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = 0.0
+    calls = 0
+
+    def call() -> None:
+        nonlocal clock, calls
+        clock += 1.5
+        calls += 1
+
+    monkeypatch.setattr(stages.time, "perf_counter", lambda: clock)
+    assert stages.timed(call) == (None, 1.5)
+    assert calls == 1
