@@ -42,7 +42,7 @@ class MergeConfig(Settings):
     vgicp_correspondence_m: Positive = Field(1.0, description="FRAME: 1 m")
     inlier_m: Positive = Field(0.3, description="a point this near the other map is an inlier")
     min_inlier_share: Share = Field(0.9, description="accept at least this share of inliers in the sphere")
-    min_hessian_ratio: Share = Field(0.01, description="smallest to largest translational eigenvalue: degeneracy")
+    min_hessian_ratio: Share = Field(0.006, description="smallest to largest translational eigenvalue: degeneracy")
     refine_map: bool = Field(False, description="one more GICP over the whole overlap (not in the paper)")
 
 
@@ -72,7 +72,7 @@ class OutlierConfig(Settings):
     """Statistical outlier removal on the new points, (mu - lambda sigma, mu + lambda sigma)."""
 
     neighbours: Count = Field(8, description="k")
-    sigmas: Positive = Field(1.0, description="lambda")
+    sigmas: Positive = Field(2.0, description="lambda")
 
 
 class ClusterConfig(Settings):

@@ -1,4 +1,4 @@
-"""Cutting the changed objects out of the reported regions (paper, section IV), in both directions.
+"""Cutting the changed objects out of the reported regions by point-to-voxel comparison, in both directions.
 
 Added is what the after map has in voxels the before map leaves empty; removed is the reverse; an added and a removed
 object of about the same size are one moved object.
@@ -21,6 +21,7 @@ __all__ = [
     "PointGroup",
     "assemble_objects",
     "cluster_labels",
+    "cut_out",
     "extract_objects",
     "hull_volume_m3",
     "inlier_mask",
@@ -33,7 +34,19 @@ FIGURES = ("v_sphere_m3", "v_oe_m3", "s_points", "oe_points")
 def extract_objects(
     merged: MergedMaps, regions: ChangeRegions, config: PipelineConfig
 ) -> tuple[tuple[ChangedObject, ...], dict[str, Float64Array]]:
-    """Compare both maps inside every reported region and cut out what is in one of them only.
+    """Cut the changed objects out of every reported region: `cut_out`, then `assemble_objects`.
+
+    Returns:
+        The objects, best region first, and (R,) figures by name, NaN for regions that are not reported.
+    """
+    groups, figures = cut_out(merged, regions, config)
+    return assemble_objects(merged, groups), figures
+
+
+def cut_out(
+    merged: MergedMaps, regions: ChangeRegions, config: PipelineConfig
+) -> tuple[list[PointGroup], dict[str, Float64Array]]:
+    """Compare both maps inside every reported region and group the map points that are in one of them only.
 
     A map point belongs to at most one object: the better region takes it first. The figures are the paper's Table II
     by our definition: `v_sphere_m3` volume of the convex hull of the after map's points in the sphere, `v_oe_m3` sum of
@@ -46,7 +59,7 @@ def extract_objects(
         config: `extract`, `outlier` and `cluster` are used.
 
     Returns:
-        The objects, best region first, and (R,) figures by name, NaN for regions that are not reported.
+        The groups, best region first, and (R,) figures by name, NaN for regions that are not reported.
     """
     crops = _Crops(merged, config.extract.voxel_m)
     is_taken = {
@@ -71,7 +84,7 @@ def extract_objects(
         figures["s_points"][region] = len(sphere["after"])
         figures["oe_points"][region] = sum(len(group.points_map) for group in found)
         groups += found
-    return assemble_objects(merged, groups), figures
+    return groups, figures
 
 
 def hull_volume_m3(points: Float64Array) -> float:

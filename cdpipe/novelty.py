@@ -1,4 +1,4 @@
-"""What is new in one cloud beside another: point-to-voxel comparison, outlier removal, clusters (paper, section IV)."""
+"""What is new in one cloud beside another: the paper's point-to-voxel comparison, outlier removal; clusters."""
 
 from __future__ import annotations
 

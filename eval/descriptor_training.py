@@ -9,7 +9,6 @@ import hashlib
 import json
 import platform
 import shutil
-import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -130,7 +129,10 @@ def main(
             "place": float(np.mean(losses[-100:], axis=0)[0]),
             "yaw": float(np.mean(losses[-100:], axis=0)[1]),
         },
-        "command": "python -m eval.descriptor_training " + " ".join(sys.argv[1:]),
+        "command": (
+            f"python -m eval.descriptor_training --data DATA --out OUT --train-tunnels {train_tunnels} "
+            f"--validation-tunnels {validation_tunnels} --steps {steps} --seed {seed} --threads {threads}"
+        ),
         "device": f"{platform.machine()} CPU, {threads} threads",
         "seconds": round(seconds, 1),
     }

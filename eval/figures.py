@@ -29,11 +29,15 @@ BLUE, ORANGE, GREEN, VERMILLION, BLACK = "#0072B2", "#E69F00", "#009E73", "#D55E
 RED = "#C8102E"
 BOTH, CONTEXT = "#555555", "#c4c4c4"
 FAR_M = 1.0
-_MAP_WIDTH_IN = 9.0
+_MAP_WIDTH_IN, _MAP_HEIGHT_IN = 9.0, 6.0
 _DPI = 130
 _MAX_TESTED = 250_000
 _DASHED = (0, (3, 2))
-_DISTANCE_COLOURS = LinearSegmentedColormap.from_list("distance", ["#d9d9d9", "#f0b26b", VERMILLION, "#7f1d00"])
+_DISTANCE_COLOURS = LinearSegmentedColormap.from_list(
+    # a thinned map is 0.2 m from itself: grey up to there
+    "distance",
+    [(0.0, "#d9d9d9"), (0.2, "#d4d0cb"), (0.45, "#f0b26b"), (0.7, VERMILLION), (1.0, "#7f1d00")],
+)
 
 State = Literal["found", "missed", "unobservable", "not scored"]
 Points = npt.NDArray[Any]
@@ -244,8 +248,9 @@ def blank_figure(width_in: float, height_in: float) -> Figure:
 
 def _map_axes(raster: _Raster) -> tuple[Figure, Axes]:
     rows, columns = raster.shape
-    height_in = float(np.clip(_MAP_WIDTH_IN * rows / columns, 2.0, 7.5))
-    figure = blank_figure(_MAP_WIDTH_IN, height_in + 0.8)
+    height_in = float(np.clip(_MAP_WIDTH_IN * rows / columns, 2.0, _MAP_HEIGHT_IN))
+    width_in = float(np.clip(height_in * columns / rows, 6.5, _MAP_WIDTH_IN))
+    figure = blank_figure(width_in, height_in + 0.8)
     axes = figure.add_subplot()
     axes.set_aspect("equal")
     axes.set_xlabel("x [m]", fontsize=8)

@@ -93,12 +93,16 @@ def _content(data: RunData, tables: Mapping[str, Table]) -> dict[str, Any]:
 
 
 def failures(data: RunData) -> list[str]:
-    """Return one line for every case that gave no answer."""
+    """Return one line for every pair and reason without an answer, naming the variants it met."""
+    found: dict[tuple[str, int, str], list[str]] = {}
+    for row in data.results:
+        status, error = text(row, "status"), text(row, "error")
+        if status != "ok":
+            reason = status.replace("_", " ") + (f": {error}" if error else "")
+            found.setdefault((str(row["scenario"]), int(row["seed"]), reason), []).append(str(row["variant"]))
     return [
-        f"{row['scenario']}, seed {row['seed']}, {row['variant']}: {text(row, 'status').replace('_', ' ')}"
-        + (f": {text(row, 'error')}" if text(row, "error") else "")
-        for row in data.results
-        if text(row, "status") != "ok"
+        f"{scenario}, seed {seed}, {', '.join(variants)}: {reason}"
+        for (scenario, seed, reason), variants in found.items()
     ]
 
 

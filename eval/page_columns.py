@@ -149,5 +149,5 @@ TIME_MEANINGS = (
      "The paper's values are 34-58 % of 4/3 π r³."),
     ("V_OE", "Volume of what was cut out of the region.", "Undefined where nothing was cut out."),
     ("points", "Thinned map points: of both maps, in a region's sphere, and on the objects cut out of it.",
-     "Least and greatest over the reported regions."),
+     "Least and greatest over the regions that find a change."),
 )  # fmt: skip

@@ -14,7 +14,7 @@ from eval.figures import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.ground_truth import GroundTruth
 from eval.object_figures import Panel, object_panels
 from eval.page_columns import share
-from eval.page_run import SHOWN_PRESETS, Row, RunData, flag, number, of, text
+from eval.page_run import SHOWN_PRESETS, Row, RunData, flag, named_variants, number, of, text
 from eval.universe import CELL_M
 from sim.truth import Change
 
@@ -34,18 +34,25 @@ def object_pictures(
     data: RunData, scenario: str, seed: int, answers: Mapping[str, Answer], truth: GroundTruth
 ) -> list[Picture]:
     """Draw every observable change of a pair beside what the shown presets answered."""
-    shown = {name: answers[name] for name in SHOWN_PRESETS if name in answers}
-    object_rows = {name: answer_rows(answer, truth) for name, answer in shown.items()}
+    shown = [name for name in SHOWN_PRESETS if name in named_variants(data, scenario)]
+    object_rows = {name: answer_rows(answers[name], truth) for name in shown if name in answers}
     pictures = []
     for index, change in enumerate(truth.pair.changes):
         if not truth.is_observable[index]:
             continue
         cutout = _cut_out(change, index, truth)
-        panels = [Panel("truth", f"{np.count_nonzero(cutout.is_true):,} cells of {CELL_M:g} m", _truth_layers(cutout))]
-        for name, answer in shown.items():
+        true_points, others = cutout.points[cutout.is_true], cutout.points[~cutout.is_true]
+        n_cells = f"{len(true_points):,} cells of {CELL_M:g} m"
+        panels = [Panel("truth", n_cells, ((others, CONTEXT), (true_points, BLUE)))]
+        for name in shown:
+            if name not in answers:
+                panels.append(Panel(name, "no answer", ((others, CONTEXT), (true_points, BLACK))))
+                continue
             rows = of(data.changes, scenario=scenario, seed=seed, variant=name, id=change.id)
-            panels.append(_answer_panel(name, answer, object_rows[name], rows[0] if rows else {}, change, cutout))
-        address = object_panels(panels, cutout.points[cutout.is_true], cutout.view_from)
+            panels.append(
+                _answer_panel(name, answers[name], object_rows[name], rows[0] if rows else {}, change, cutout)
+            )
+        address = object_panels(panels, true_points, cutout.view_from)
         pictures.append(Picture(_object_title(change), address, _object_caption(change)))
     return pictures
 
@@ -77,10 +84,6 @@ def _cut_out(change: Change, index: int, truth: GroundTruth) -> _CutOut:
     nearest = np.argmin(np.linalg.norm(sensor - true_points.mean(axis=0), axis=1))
     points = universe.points_odom[rows].astype(np.float64)
     return _CutOut(rows, points, np.isin(rows, true_rows), sensor[nearest])
-
-
-def _truth_layers(cutout: _CutOut) -> tuple[tuple[Float64Array, str], ...]:
-    return (cutout.points[~cutout.is_true], CONTEXT), (cutout.points[cutout.is_true], BLUE)
 
 
 def _answer_panel(

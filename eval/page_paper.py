@@ -12,11 +12,11 @@ from eval.page_run import (
     Row,
     RunData,
     defined,
-    flag,
     named_variants,
     of,
     over_pairs,
     scenarios,
+    text,
 )
 from eval.page_tables import Cell, Table
 
@@ -86,7 +86,7 @@ def time_table(data: RunData) -> Table:
 
 
 def volume_table(data: RunData) -> Table:
-    """Return Table II: least and greatest over the reported regions."""
+    """Return Table II: least and greatest over regions that find a change; the paper's rows are changed areas."""
 
     def published(site: Published) -> tuple[str, ...]:
         sizes = (count(n) for n in site.map_points)
@@ -94,10 +94,11 @@ def volume_table(data: RunData) -> Table:
 
     def ours(scenario: str, variant: str) -> tuple[str, ...]:
         group = of(data.results, scenario=scenario, variant=variant)
-        regions = [row for row in of(data.regions, scenario=scenario, variant=variant) if flag(row, "is_reported")]
+        candidates = of(data.regions, scenario=scenario, variant=variant)
+        regions = [row for row in candidates if text(row, "outcome") in ("true", "duplicate")]
         sizes = (_whole(over_pairs(group, f"map_points_{name}")) for name in ("before", "after"))
-        volumes = (_range(regions, group, column, significant) for column in ("v_sphere_m3", "v_oe_m3"))
-        points = (_range(regions, group, column, _whole) for column in ("s_points", "oe_points"))
+        volumes = (_range(regions, column, significant) for column in ("v_sphere_m3", "v_oe_m3"))
+        points = (_range(regions, column, _whole) for column in ("s_points", "oe_points"))
         return (*sizes, *volumes, *points)
 
     return _beside_the_paper(data, _VOLUME_HEADINGS, published, ours, "Table II: volumes and points")
@@ -131,9 +132,9 @@ def _span(ends: tuple[int, int]) -> str:
     return f"{count(ends[0])}-{count(ends[1])}"
 
 
-def _range(regions: Sequence[Row], group: Sequence[Row], column: str, shown: Callable[[float], str]) -> str:
+def _range(regions: Sequence[Row], column: str, shown: Callable[[float], str]) -> str:
     values = defined(regions, column)
     if len(values) == 0:
-        return shown(over_pairs(group, column))
+        return UNDEFINED
     low, high = shown(float(values.min())), shown(float(values.max()))
     return low if low == high else f"{low}{EN_DASH}{high}"

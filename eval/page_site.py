@@ -61,6 +61,7 @@ def _answers(data: RunData, scenario: str, seed: int, missing: list[str]) -> dic
     order = [name for name in SHOWN_PRESETS if name in variants]
     order += [name for name in variants if name not in SHOWN_PRESETS]
     found: dict[str, Answer] = {}
+    refused: dict[str, list[str]] = {}
     for name in order:
         try:
             answer = read_answer(data.folder.answer(scenario, seed, name))
@@ -68,10 +69,10 @@ def _answers(data: RunData, scenario: str, seed: int, missing: list[str]) -> dic
             missing.append(f"The stored answer of {name} on {scenario} cannot be read.")
             continue
         if answer.report is None:
-            why = f": {answer.error}" if answer.error else ""
-            missing.append(f"{name} gave no answer on {scenario} ({answer.status.replace('_', ' ')}{why}).")
+            refused.setdefault(answer.status.replace("_", " "), []).append(name)
         else:
             found[name] = answer
+    missing += [f"No answer of {', '.join(names)} on {scenario} ({why})." for why, names in refused.items()]
     return found
 
 

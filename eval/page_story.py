@@ -41,15 +41,22 @@ class Ranking:
 
 def story(data: RunData) -> list[str]:
     """Return the sentences of the first paragraph."""
+    answered = [
+        name
+        for name in scenarios(data, unchanged=False)
+        if any(row["status"] == "ok" for row in of(data.results, scenario=name))
+    ]
     rankings = [
         rank(scenario, measure, scenario_means(data, scenario, column.key))
-        for scenario in scenarios(data, unchanged=False)
+        for scenario in answered
         for column, measure in HEADLINE_COLUMNS
     ]
+    unanswered = [name for name in scenarios(data, unchanged=False) if name not in answered]
     variants = dict.fromkeys(str(row["variant"]) for row in data.results)
     return [
         _about_baselines(rankings, list(variants)),
         *(sentence(ranking) + _price(data, ranking) for ranking in rankings),
+        *(f"On {name}, no preset gave an answer." for name in unanswered),
         *_about_failures(data),
         *_about_unchanged(data),
         _about_size(data),

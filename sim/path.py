@@ -23,6 +23,8 @@ from sim.scene import World
 STEP_M = 0.05
 _SHARPEST_DEG = 150.0
 _FLOOR_SMOOTHING_M = 0.5
+# Takes the edge off turns that tighten where bend and swerve meet; it moves the line by a few centimetres at most.
+_LAST_SMOOTHING_M = 0.7
 # A quadrotor keeps this much air below it; what is lower is flown over.
 _AIR_BELOW_M = 0.5
 # The body checked against the walls: the true gap may be this share of the clearance where the wall bulges.
@@ -31,8 +33,10 @@ _TIGHTEST_SHARE = 0.5
 _CORNER_SHARE = 0.55
 # Inside a bend the line stays this share of the way to the centre of curvature, so that the turn does not tighten.
 _INSIDE_SHARE = 0.35
-# Half lengths tried for a swerve, the gentlest first.
-_SWERVES_M = (2.0, 1.5, 1.0, 0.7, 0.5, 0.25)
+# Half lengths tried for a swerve, the gentlest first; a sharper one only where it is needed.
+_SWERVES_M = (2.0, 1.4, 1.0, 0.7, 0.5)
+# Rather than swerve sharply between props on both sides, this share of the clearance is given up.
+_CHICANE_SHARE = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +67,7 @@ def plan_path(world: World, scenario: Scenario, session: str) -> Path:
     offset_m = _offsets(world, scenario, session, line, width_m)
     left = _left(headings_of(line))
     shifted = resample(np.column_stack([line[:, :2] + offset_m[:, None] * left, line[:, 2]]), STEP_M)
-    xy, level_m = shifted[:, :2], shifted[:, 2]
+    xy, level_m = smoothed(shifted[:, :2], _LAST_SMOOTHING_M), shifted[:, 2]
     floor_m = floor_heights(world.walls, np.column_stack([xy, level_m + PROBE_UP_M]))
     floor_m = smoothed(np.where(np.isnan(floor_m), level_m, floor_m), _FLOOR_SMOOTHING_M)
     height_m = plan.height_m or scenario.platform.sensor_height_m
@@ -108,7 +112,8 @@ def _reference(world: World, plan: SessionPlan, session: str) -> tuple[Float64Ar
     first, last = round(plan.start_m / STEP_M), len(line) - round(plan.end_m / STEP_M)
     if last - first < 2 / STEP_M:
         raise ScenarioError(
-            f"{session}: the route is {len(line) * STEP_M:.1f} m long and start_m + end_m leave less than 2 m of it"
+            f"{session}: the route is {(len(line) - 1) * STEP_M:.1f} m long and start_m + end_m leave less than 2 m "
+            "of it: shorten them"
         )
     return line[first:last], width_m[first:last]
 
@@ -135,15 +140,32 @@ def _offsets(world: World, scenario: Scenario, session: str, line: Float64Array,
     high = np.where(turn > 1e-3, np.minimum(high, _INSIDE_SHARE / np.maximum(turn, 1e-3)), high)
     low = np.where(turn < -1e-3, np.maximum(low, -_INSIDE_SHARE / np.maximum(-turn, 1e-3)), low)
     wanted = plan.lateral * room_m
-    _refuse_narrow(scenario, session, low, high, "the walls leave")
+    _refuse_narrow(scenario, session, low, high)
     for name, near_low, near_high in _obstacles(world, scenario, session, line, headings, height_m):
         _pass_by(session, name, wanted, low, high, near_low, near_high)
-    for half_m in _SWERVES_M:
-        inner_low, inner_high = _strictest(low, half_m, np.max), _strictest(high, half_m, np.min)
-        if (inner_low <= inner_high).all():
-            break
-    _refuse_narrow(scenario, session, inner_low, inner_high, "walls and props leave")
-    return smoothed(np.clip(wanted, inner_low, inner_high), half_m)
+    offset_m = _swerving(wanted, low, high, _SWERVES_M[0])
+    for half_m in (*_SWERVES_M[1:], None):
+        excess_m = np.maximum(low - offset_m, offset_m - high)
+        is_bad = excess_m > _CHICANE_SHARE * clearance_m
+        if not is_bad.any():
+            return offset_m
+        if half_m is not None:
+            share = np.clip(smoothed(_strictest(is_bad.astype(np.float64), 2.0, np.max), 2.0), 0.0, 1.0)
+            offset_m = share * _swerving(wanted, low, high, half_m) + (1.0 - share) * offset_m
+    worst_m = int(np.argmax(excess_m)) * STEP_M
+    raise ScenarioError(
+        f"{session}: props on both sides leave no smooth way {worst_m:.1f} m along the route: "
+        "set them farther apart, or lower platform.clearance_m"
+    )
+
+
+def _swerving(wanted: Float64Array, low: Float64Array, high: Float64Array, half_m: float) -> Float64Array:
+    """Return a smooth offset near the wanted one; it keeps the bounds wherever they agree within `half_m`."""
+    inner_low, inner_high = _strictest(low, half_m, np.max), _strictest(high, half_m, np.min)
+    middle = (inner_low + inner_high) / 2
+    is_crossed = inner_low > inner_high
+    target = np.where(is_crossed, middle, np.clip(wanted, inner_low, np.maximum(inner_low, inner_high)))
+    return smoothed(target, half_m)
 
 
 def _strictest(bound: Float64Array, half_m: float, of: Callable[..., Any]) -> Float64Array:
@@ -153,91 +175,14 @@ def _strictest(bound: Float64Array, half_m: float, of: Callable[..., Any]) -> Fl
     return np.asarray(of(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1), axis=1))
 
 
-def _obstacles(
-    world: World, scenario: Scenario, session: str, line: Float64Array, headings: Float64Array, height_m: float
-) -> list[tuple[str, Float64Array, Float64Array]]:
-    """Return for each prop in the way its name and the offsets it forbids, (N,) to (N,), NaN where it is far."""
-    clearance_m = scenario.platform.clearance_m
-    left = _left(headings)
-    found = []
-    for item in world.standing:
-        is_low = scenario.platform.kind == "quadrotor" and item.prop.size_m[2] + _AIR_BELOW_M < height_m
-        if session not in item.sessions or is_low:
-            continue
-        outline = resample(np.concatenate([(corners := standing_corners(item)), corners[:1]]), 0.1)
-        reach = float(np.linalg.norm(outline - outline.mean(axis=0), axis=1).max()) + clearance_m
-        near = np.flatnonzero(np.linalg.norm(line[:, :2] - outline.mean(axis=0), axis=1) < reach + 10.0)
-        delta = outline[None] - line[near, None, :2]
-        along = (delta * headings[near, None]).sum(axis=2)
-        across = (delta * left[near, None]).sum(axis=2)
-        reach_m = np.sqrt(np.maximum(clearance_m**2 - along**2, 0.0))
-        is_abreast = np.abs(along) < clearance_m
-        low, high = np.full(len(line), np.nan), np.full(len(line), np.nan)
-        low[near] = np.where(is_abreast, across - reach_m, np.inf).min(axis=1)
-        high[near] = np.where(is_abreast, across + reach_m, -np.inf).max(axis=1)
-        away = ~(low < high)
-        low[away] = high[away] = np.nan
-        found.append((item.prop.name, low, high))
-    return found
-
-
-def _pass_by(
-    session: str,
-    name: str,
-    wanted: Float64Array,
-    low: Float64Array,
-    high: Float64Array,
-    near_low: Float64Array,
-    near_high: Float64Array,
-) -> None:
-    """Narrow the bounds `low`, `high` in place so that the line passes a prop on one side, each time it comes by."""
-    stations = np.flatnonzero(np.isfinite(near_low))
-    for visit in np.split(stations, np.flatnonzero(np.diff(stations) > 1 / STEP_M) + 1):
-        if len(visit) == 0 or (near_low[visit] > high[visit]).all() or (near_high[visit] < low[visit]).all():
-            continue
-        shift_left = np.maximum(near_high[visit] - wanted[visit], 0.0).max()
-        shift_right = np.maximum(wanted[visit] - near_low[visit], 0.0).max()
-        fits_left = (near_high[visit] <= high[visit]).all()
-        fits_right = (near_low[visit] >= low[visit]).all()
-        if fits_left and (shift_left <= shift_right or not fits_right):
-            low[visit] = np.maximum(low[visit], near_high[visit])
-        elif fits_right:
-            high[visit] = np.minimum(high[visit], near_low[visit])
-        else:
-            raise ScenarioError(
-                f"{session}: prop {name!r} bars the way {visit[0] * STEP_M:.1f} m along the route: "
-                "move it to a side, make it smaller, or lower platform.clearance_m"
-            )
-
-
-def _refuse_narrow(scenario: Scenario, session: str, low: Float64Array, high: Float64Array, what: str) -> None:
+def _refuse_narrow(scenario: Scenario, session: str, low: Float64Array, high: Float64Array) -> None:
     gap = high - low
     worst = int(np.argmin(gap))
     if gap[worst] < 0:
+        needed_m = 2 * scenario.platform.clearance_m
         raise ScenarioError(
-            f"{session}: {what} {gap[worst] + 2 * scenario.platform.clearance_m:.2f} m at {worst * STEP_M:.1f} m along "
-            f"the route: {2 * scenario.platform.clearance_m:.2f} m are needed for platform.clearance_m"
-        )
-
-
-def _check_clearance(world: World, scenario: Scenario, session: str, points: Float64Array) -> None:
-    """Cast level rays all round and one up from every tenth sample: the line must keep off the walls."""
-    clearance_m = scenario.platform.clearance_m
-    angle = np.arange(24) * (2 * np.pi / 24)
-    level = np.stack([np.cos(angle), np.sin(angle), np.zeros(24)], axis=1)
-    directions = np.concatenate([level, [[0.0, 0.0, 1.0]]])
-    stations = points[:: round(0.5 / STEP_M)]
-    ranges_m, _, normals = world.walls.hits(
-        np.repeat(stations, len(directions), axis=0), np.tile(directions, (len(stations), 1))
-    )
-    facing = -(normals * np.tile(directions, (len(stations), 1))).sum(axis=1)
-    gap_m = np.where(facing > 0, ranges_m, 0.0).reshape(len(stations), -1)
-    worst = int(np.argmin(gap_m.min(axis=1)))
-    if gap_m[worst].min() < _TIGHTEST_SHARE * clearance_m:
-        x, y, z = stations[worst]
-        raise ScenarioError(
-            f"{session}: the sensor comes within {gap_m[worst].min():.2f} m of rock at ({x:.1f}, {y:.1f}, {z:.1f}): "
-            "choose another lateral, start_m, end_m or height"
+            f"{session}: the walls leave {gap[worst] + needed_m:.2f} m at {worst * STEP_M:.1f} m along the route: "
+            f"{needed_m:.2f} m are needed for platform.clearance_m"
         )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 import numpy.typing as npt
 
@@ -20,7 +22,7 @@ def render(
     width: int = 640,
     height: int = 480,
     field_of_view_deg: float = 70.0,
-    highlight: frozenset[int] = frozenset(),
+    highlight: Collection[int] = (),
 ) -> npt.NDArray[np.uint8]:
     """Return a picture (height, width, 3) of a scene.
 

@@ -9,11 +9,12 @@ import numpy as np
 
 from cdpipe.errors import ScenarioError
 from cdpipe.geometry import Float64Array, yaw_pose
-from scenarios.schema import Place, Prop, Scenario
+from scenarios.schema import Place, Prop, Scenario, Tunnel
 from sim.centreline import Centreline
 from sim.props import footprint
 from sim.raycast import Caster
 
+# Kept between prop and wall, beside one cell of the mesh: marching cubes bevels the foot of a wall over a cell.
 _WALL_GAP_M = 0.05
 # Rays down to the floor start this far above the centreline, below any roof and above any bump.
 PROBE_UP_M = 1.2
@@ -44,14 +45,16 @@ def place_props(scenario: Scenario, centreline: Centreline, walls: Caster) -> li
     found = []
     for prop in scenario.props:
         first = {"added": frozenset(("after",)), "none": both}.get(prop.change, frozenset(("before",)))
-        found.append(Standing(prop, first, _pose(prop, prop.place, centreline, walls)))
+        found.append(Standing(prop, first, _pose(prop, prop.place, scenario.tunnel, centreline, walls)))
         if prop.to is not None:
-            found.append(Standing(prop, frozenset(("after",)), _pose(prop, prop.to, centreline, walls)))
+            found.append(
+                Standing(prop, frozenset(("after",)), _pose(prop, prop.to, scenario.tunnel, centreline, walls))
+            )
     for a, b in combinations(found, 2):
         shared = a.sessions & b.sessions
         if shared and _overlap(_corners(a), _corners(b)):
             raise ScenarioError(
-                f"props {a.prop.name!r} and {b.prop.name!r} stand in one another in the {min(shared)} session: "
+                f"props {a.prop.name!r} and {b.prop.name!r} stand in one another in the {max(shared)} session: "
                 "give one another fraction or lateral"
             )
     return found
@@ -91,7 +94,7 @@ def standing_corners(standing: Standing) -> Float64Array:
     return _corners(standing)
 
 
-def _pose(prop: Prop, place: Place, centreline: Centreline, walls: Caster) -> Float64Array:
+def _pose(prop: Prop, place: Place, tunnel: Tunnel, centreline: Centreline, walls: Caster) -> Float64Array:
     point, heading, section = centreline.at(*place.between, place.fraction)
     left = np.array([-heading[1], heading[0]])
     yaw = float(np.arctan2(heading[1], heading[0]) + np.deg2rad(place.yaw_deg))
@@ -99,11 +102,10 @@ def _pose(prop: Prop, place: Place, centreline: Centreline, walls: Caster) -> Fl
     extent = np.abs(footprint(prop.size_m) @ turn.T).max(axis=0)  # half size along and across the drift
     stations = point[:2] + np.linspace(-extent[0], extent[0], 7)[:, None] * heading
     origins = np.column_stack([stations, np.full(len(stations), point[2])])
-    # A heap may lean against the wall; anything else keeps clear of it at every height it reaches.
     top = min(prop.size_m[2], 0.5 * section.height_m)
     heights = np.linspace(0.25, max(0.3, top), 4)
     sides = free_width(walls, origins, np.tile(left, (len(origins), 1)), heights, section.width_m / 2)
-    right_m, left_m = (float(side.min()) - _WALL_GAP_M for side in sides)
+    right_m, left_m = (float(side.min()) - _WALL_GAP_M - tunnel.resolution_m for side in sides)
     if right_m + left_m < 2 * extent[1]:
         raise ScenarioError(
             f"prop {prop.name!r} is {2 * extent[1]:.2f} m across, but between {place.between[0]!r} and "

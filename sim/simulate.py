@@ -74,7 +74,8 @@ def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progres
     world = build_world(scenario, seed)
     drives = _drives(scenario, world, sensor, seed)
     report("world", 1, 1)
-    partial = out.with_name(f".{out.name}.partial")
+    home = out.absolute()
+    partial = home.with_name(f".{home.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:
         partial.mkdir(parents=True)
@@ -84,7 +85,7 @@ def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progres
         changes = tuple(tally.finished() for tally in drives[0].tallies)
         drawn = scenario.model_dump(mode="json")
         write_pair_truth(partial, PairTruth(scenario.family, seed, scenario.score_radius_m, changes, drawn))
-        partial.replace(out)
+        partial.replace(home)
     except OSError as error:
         raise InputError(f"{out}: cannot write there: {error.strerror or error}") from error
     finally:

@@ -67,7 +67,7 @@ def section_distance(section: Section, across_m: Float64Array, up_m: Float64Arra
     above_m = np.maximum(up_m - spring_m, 0.0)
     level = np.sqrt((across_m / half_m) ** 2 + (above_m / arch_m) ** 2)
     steepness = np.sqrt((across_m / half_m**2) ** 2 + (above_m / arch_m**2) ** 2)
-    return np.asarray((level - 1.0) * level / np.maximum(steepness, 1e-6))
+    return np.where(above_m > 0, (level - 1.0) * level / np.maximum(steepness, 1e-9), across_m - half_m)
 
 
 def _block_meshes(

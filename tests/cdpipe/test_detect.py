@@ -43,7 +43,8 @@ def test_the_three_boxes_are_found(report: ChangeReport, box_centres_map: dict[s
 
 
 def test_the_report_names_its_settings_and_times(report: ChangeReport, tunnel_after: MappedSession) -> None:
-    assert set(report.seconds) == {"t_merge_s", "t_cd_s", "t_oe_s"}
+    assert set(report.seconds) == {"t_merge_s", "t_cd_s", "t_oe_s", "t_returns_s"}
+    assert report.seconds["t_returns_s"] < report.seconds["t_oe_s"]
     assert all(value > 0 for value in report.seconds.values())
     assert report.config == CONFIG.model_dump()
     assert report.evidence["inlier_share"] > 0.9

@@ -2,7 +2,7 @@ import base64
 import json
 import re
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from cdpipe.session import ScanChunk, SessionWriter
 from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport
 from eval.ground_truth import load_ground_truth
 from eval.page import write_page
-from eval.page_site import truth_marks
+from eval.page_site import truth_marks, world_to_odom
 from eval.runfolder import RunFolder
 from sim.truth import Change, PairTruth, write_labels, write_pair_truth, write_true_poses
 
@@ -165,15 +165,15 @@ def write_item_tables(run: Path) -> None:
     ]  # fmt: skip
     pd.DataFrame(changes).to_csv(run / "changes.csv", index=False)
     sizes = {
-        "v_sphere_m3": (201.0, 231.5),
-        "v_oe_m3": (0.4, np.nan),
-        "s_points": (700.0, 2100.0),
-        "oe_points": (33, 33),
+        "v_sphere_m3": (201.0, 231.5, 201.0),
+        "v_oe_m3": (0.4, 0.1, np.nan),
+        "s_points": (700.0, 2100.0, 1900.0),
+        "oe_points": (33, 0, 33),
     }
     regions = [
-        {"scenario": SITE, "seed": 7, "variant": "paper", "region": index, "is_reported": index < 2,
-         "outcome": ("true", "false")[index], **{name: pair[index] for name, pair in sizes.items()}}
-        for index in range(2)
+        {"scenario": SITE, "seed": 7, "variant": "paper", "region": index, "is_reported": index < 3,
+         "outcome": ("true", "false", "duplicate")[index], **{name: values[index] for name, values in sizes.items()}}
+        for index in range(3)
     ]  # fmt: skip
     pd.DataFrame(regions).to_csv(run / "regions.csv", index=False)
 
@@ -290,11 +290,11 @@ def test_tables_one_and_two_stand_beside_the_papers_values(page: Path) -> None:
     ]
     assert [texts(row) for row in volumes[2:4]] == [
         ["published", "53 117", "63 942", "206-223", "0.30-0.51", "648-2 470", "25-71"],
-        ["ours, paper", "51 234", "60 321", "201-232", "0.4", "700-2 100", "33"],
+        ["ours, paper", "51 234", "60 321", "201", "0.4", "700-1 900", "33"],
     ]
     assert (page.parent / "table2.csv").read_text().splitlines()[1:3] == [
         f"{SITE},published,53117,63942,206\u2013223,0.30\u20130.51,648\u20132470,25\u201371",
-        f"{SITE},ours, paper,51234,60321,201\u2013232,0.4,700\u20132100,33".replace("ours, paper", '"ours, paper"'),
+        f"{SITE},ours, paper,51234,60321,201,0.4,700\u20131900,33".replace("ours, paper", '"ours, paper"'),
     ]
 
 
@@ -349,7 +349,7 @@ def test_objects_carry_their_names_and_markup_in_texts_is_harmless(page: Path) -
 def test_a_whole_folder_lacks_nothing_but_the_refused_answer(page: Path) -> None:
     missing = page.read_text().partition('id="missing"')[2]
     lines = re.findall(r"<li>(.*)</li>", missing)
-    assert lines == [f"random-regions gave no answer on {SITE} (merge refused: no way)."]
+    assert lines == [f"No answer of random-regions on {SITE} (merge refused)."]
 
 
 @pytest.mark.parametrize(
@@ -398,6 +398,17 @@ def test_only_unchanged_pairs_make_a_page(run: Path) -> None:
     assert "silent" in page
 
 
+def test_a_site_without_any_answer_is_said_to_have_none_and_its_errors_are_told_once(run: Path) -> None:
+    refused = {"status": "merge_refused", "error": "too smooth", "region_recall": 0.0, "object_iou_point": 0.0}
+    rows = [result_row(SITE, name, **refused) for name in ("paper", "tunnelcd", "voxel-diff")]
+    pd.DataFrame(rows).to_csv(run / "results.csv", index=False)
+    text = write_page(run).read_text()
+    assert f"On {SITE}, no preset gave an answer." in text
+    assert "3 of 3 cases gave no answer" in text
+    assert text.count("too smooth") == 1
+    assert f"{SITE}, seed 7, paper, tunnelcd, voxel-diff: merge refused: too smooth" in text
+
+
 @pytest.mark.parametrize("content", [None, "", "scenario,seed,variant,status\n", "a,b\n1,2\n"])
 def test_a_folder_without_results_is_refused_in_one_line(run: Path, content: str | None) -> None:
     path = run / "results.csv"
@@ -444,6 +455,16 @@ def test_truth_is_marked_where_it_is_on_the_before_map(run: Path) -> None:
     # the before session's odom frame is the world here, whatever the after session's is
     np.testing.assert_allclose([[m.x_m, m.y_m] for m in marks], truth.centroids_world[:, :2], atol=1e-9)
     assert np.abs(truth.centroids_world[0, :2] - (2.5, 0.0)).max() < 2.1
+
+
+def test_a_world_point_enters_a_drifting_map_through_its_nearest_scan(run: Path) -> None:
+    before = load_ground_truth(RunFolder(run).pair(SITE, 7)).before
+    # from scan 3 on, the robot believes itself 1 m farther left
+    drifted = before.odom_T_sensor.copy()
+    drifted[3:, 1, 3] += 1.0
+    session = replace(before, odom_T_sensor=drifted)
+    np.testing.assert_allclose(world_to_odom(session, np.array([1.1, 0.5, 0.2])), [1.1, 0.5, 0.2], atol=1e-12)
+    np.testing.assert_allclose(world_to_odom(session, np.array([4.2, 0.5, 0.2])), [4.2, 1.5, 0.2], atol=1e-12)
 
 
 def test_the_same_folder_gives_the_same_page(run: Path) -> None:

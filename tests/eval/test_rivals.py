@@ -123,7 +123,7 @@ def test_unchanged_and_empty_answers() -> None:
     assert report.regions.centres_map.shape == (0, 3)
     assert report.objects == ()
     assert report.regions.keyframe_scores.tolist() == [0.0] * len(report.keyframe_scans[0])
-    assert set(report.seconds) == {"t_cd_s", "t_oe_s"}
+    assert {"t_cd_s", "t_oe_s"} <= set(report.seconds)
 
 
 def test_moving_the_after_session_changes_nothing() -> None:

@@ -327,6 +327,7 @@ def test_stages_are_shared_by_the_settings_they_depend_on(
     assert table(run)["variant"].tolist() == ["voxel-diff", "voxel-diff[map.voxel_m=0.3]", "random-regions"]
 
 
+@pytest.mark.usefixtures("simulated")
 def test_score_runs_nothing_and_gives_the_same(smoke_copy: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     def forbidden(*_: object, **__: object) -> None:
         raise AssertionError("score must not run anything")

@@ -56,6 +56,8 @@ def test_a_choice_may_hold_distributions_and_whole_mappings() -> None:
     drawn = [draw(tree, seed) for seed in range(50)]
     assert all(0 <= one["p"] < 1 or 5 <= one["p"] < 6 for one in drawn)
     assert {one["p"] < 1 for one in drawn} == {True, False}
+    index = stream(9, "scenario", "p").integers(2)
+    assert draw(tree, 9)["p"] == stream(9, "scenario", f"p.{index}").uniform(*[(0, 1), (5, 6)][index])
     assert all(one["m"] == {"k": 1} for one in drawn)
 
 

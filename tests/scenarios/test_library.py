@@ -6,6 +6,7 @@ import pytest
 
 from cdpipe.errors import InputError, ScenarioError
 from scenarios import check_scenario, load_scenario, scenario_names
+from scenarios.references import route_length_m
 from scenarios.schema import Scenario
 
 WORLD = """\
@@ -199,6 +200,12 @@ def test_worlds_that_cannot_be_driven_are_refused(tmp_path: Path) -> None:
         ":20: after.height_m = 3.5: the sensor would be above the roof of a drift 3.0 m high",
         ":21: platform.clearance_m = 2: leaves the platform no room in a drift 3.2 m wide",
     ]
+
+
+def test_route_length_by_hand(tmp_path: Path) -> None:
+    scenario = load_scenario(written(tmp_path, WORLD.replace("start_m: 2", "start_m: 2, end_m: 3")), 0)
+    assert route_length_m(scenario.tunnel, scenario.before) == 10 + 125**0.5
+    assert route_length_m(scenario.tunnel, scenario.after) == 10 + 125**0.5 - 5
 
 
 def test_a_mistake_inherited_from_a_base_points_into_the_base(tmp_path: Path) -> None:

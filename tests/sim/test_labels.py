@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from cdpipe.geometry import make_pose
+from cdpipe.ouster import SensorMetadata
+from scenarios.schema import Place, Prop, Scenario, Sensor
+from sim.labels import Ghost, cell_keys, claim_returns, list_changes
+from sim.lidar import Rays, revolution_rays, scan
+from sim.mesh import Mesh, box_mesh, moved
+from sim.scene import World, build_world
+
+
+def box_at(x: float, y: float, z: float, half_m: float = 0.5) -> Mesh:
+    return moved(box_mesh((half_m,) * 3), make_pose(translation=(x, y, z)))
+
+
+def fan(count: int) -> Rays:
+    """Level rays from the origin towards +x, spread over 20 degrees."""
+    angle = np.deg2rad(np.linspace(-10, 10, count))
+    directions = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)[:, None]
+    return Rays(np.zeros((count, 1, 3)), directions)
+
+
+def test_ghost_rays_by_hand() -> None:
+    rays = fan(2001)
+    ghost = Ghost(box_at(5.0, 0.0, 0.0))
+    half_angle = np.arctan(0.5 / 4.5)  # its near face is 1 m wide at 4.5 m
+    wanted = int((np.abs(np.deg2rad(np.linspace(-10, 10, 2001))) <= half_angle).sum())
+    assert abs(ghost.count(rays, np.full((2001, 1), 9.0, np.float32)) - wanted) <= 2  # all pass through
+    assert ghost.count(rays, np.full((2001, 1), 3.0, np.float32)) == 0  # all end before it
+    assert ghost.count(rays, np.zeros((2001, 1), np.float32)) == 0  # none was recorded
+    on_face = (4.5 / rays.directions[..., 0]).astype(np.float32)
+    assert abs(ghost.count(rays, on_face) - wanted) <= 2  # all end on its very surface
+    assert Ghost(box_at(70.0, 0.0, 0.0)).count(rays, np.full((2001, 1), 90.0, np.float32)) == 0  # out of reach
+
+
+def test_cells_by_hand() -> None:
+    points = np.array([[0.01, 0.01, 0.01], [0.09, 0.05, 0.02], [0.11, 0.05, 0.02], [-0.01, 0.05, 0.02]])
+    assert len(cell_keys(points)) == 3
+
+
+def sweep(world: World, scenario: Scenario, sensor: SensorMetadata, session: str, change: int = 0) -> tuple[int, int]:
+    """Ghost rays and returns of one change, seen from the drift's middle at three places."""
+    scene = world.after if session == "after" else world.before
+    tally = list_changes(scenario, world)[change]
+    ghosts = returns = 0
+    for number, x in enumerate((6.0, 10.0, 14.0)):
+        rays = revolution_rays(sensor, np.tile(make_pose(translation=(x, 0.0, 0.8)), (sensor.width, 1, 1)))
+        ideal = Sensor(range_noise=False, dropouts=False)
+        result = scan(scene, sensor, ideal, rays, 0, session, number)
+        distance_m = np.where(result.geom >= 0, result.true_range_m - sensor.beam_origin_m, 0.0).T
+        ghosts += tally.ghost.count(rays, distance_m)
+        returns += int((scene.instance[result.geom] == tally.change.instance).sum())
+    return ghosts, returns
+
+
+def test_a_box_hidden_behind_a_box_is_out_of_reach(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop], sensor: SensorMetadata
+) -> None:
+    # The small one stands at the wall; seen from the line, a large one covers it, and stays.
+    small = make_prop("small", 0.5, 1.0, size_m=(0.3, 0.2, 0.3), change="added")
+    screen = make_prop("screen", 0.5, 0.45, size_m=(6.5, 0.4, 1.9))
+    hidden, open_to_view = make_scenario(props=(small, screen)), make_scenario(props=(small,))
+    ghosts, returns = sweep(build_world(hidden, 0), hidden, sensor, "before")
+    assert ghosts == 0
+    ghosts, _ = sweep(build_world(open_to_view, 0), open_to_view, sensor, "before")
+    _, returns = sweep(build_world(open_to_view, 0), open_to_view, sensor, "after")
+    assert ghosts > 30
+    # Rays of the other session that meet the ghost of an unhidden box are as many as its returns.
+    assert abs(ghosts - returns) <= 0.02 * returns
+
+
+def test_a_moved_prop_is_two_linked_changes_and_a_short_move_is_partial(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop]
+) -> None:
+    def goal(fraction: float) -> Place:
+        return Place(between=("a", "b"), fraction=fraction, lateral=0.9)
+
+    props = (
+        make_prop("far", 0.2, change="moved", to=goal(0.3)),
+        make_prop("new", 0.45, change="added"),
+        make_prop("near", 0.6, change="moved", to=goal(0.62)),  # 0.4 m of its 0.8 m
+        make_prop("gone", 0.8, -0.9, change="removed"),
+        make_prop("stays", 0.3, -0.9),
+    )
+    scenario = make_scenario(props=props)
+    changes = [tally.change for tally in list_changes(scenario, build_world(scenario, 0))]
+    told = [(c.id, c.name, c.kind, c.session, c.partner, c.group, c.instance) for c in changes]
+    assert told == [
+        (1, "far", "moved", "before", 2, "full", 1),
+        (2, "far", "moved", "after", 1, "full", 1),
+        (3, "new", "added", "after", None, "full", 2),
+        (4, "near", "moved", "before", 5, "partial", 3),
+        (5, "near", "moved", "after", 4, "partial", 3),
+        (6, "gone", "removed", "before", None, "full", 4),
+    ]
+
+
+def test_of_a_short_move_only_what_is_off_the_old_surface_counts(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop]
+) -> None:
+    goal = Place(between=("a", "b"), fraction=0.42, lateral=0.9)
+    scenario = make_scenario(props=(make_prop("near", 0.4, change="moved", to=goal),))
+    world = build_world(scenario, 0)
+    removed, added = list_changes(scenario, world)
+    start, end = (item.world_T_object for item in world.standing)
+    # Points in the frame of the box where it stands after; it has come from -0.4 m along x.
+    local = np.array(
+        [
+            [0.4, 0.0, 0.45],  # front face, 0.4 m before the old front: new
+            [0.4, 0.0, 0.04],  # the same, but 4 cm over the floor, which was there before
+            [0.25, 0.1, 0.7],  # top, 0.25 m before the old front
+            [0.06, 0.1, 0.7],  # top, 6 cm before the old front
+            [-0.2, 0.1, 0.7],  # top, where the old top was
+            [-0.4, 0.0, 0.3],  # rear face, deep inside the old box: 0.4 m from its front, 0.3 m from its sides
+        ]
+    )
+    points = local @ end[:3, :3].T + end[:3, 3]
+    belongs = claim_returns(added, points, points)
+    np.testing.assert_array_equal(belongs, [True, False, True, False, False, True])
+    assert (added.n_returns, len(added.cells)) == (3, 3)
+    assert np.linalg.norm(end[:3, 3] - start[:3, 3]) < 0.8
+    assert claim_returns(removed, np.empty((0, 3)), np.empty((0, 3))).shape == (0,)
+
+
+def test_a_change_nobody_could_notice_says_why(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop]
+) -> None:
+    scenario = make_scenario(props=(make_prop("new", change="added"),))
+    tally = list_changes(scenario, build_world(scenario, 0))[0]
+    change = tally.finished()
+    assert not change.is_observable
+    assert change.why_not == "0 cells of 0.1 m filled, 10 needed; 0 rays of the other session reach it, 10 needed"
+    tally.cells.update(range(10))
+    tally.n_ghost_rays = 9
+    assert tally.finished().why_not == "9 rays of the other session reach it, 10 needed"
+    tally.n_ghost_rays = 10
+    assert (tally.finished().is_observable, tally.finished().why_not) == (True, "")
