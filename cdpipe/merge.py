@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.config import MergeConfig
 from cdpipe.descriptor import relative_yaws_rad
-from cdpipe.evidence import MIN_SPHERE_POINTS, OverlapCheck, Place, sphere_fit, why_refused
+from cdpipe.evidence import MIN_SPHERE_POINTS, MapCheck, Place, sphere_fit, why_refused
 from cdpipe.geometry import Float64Array, invert, make_pose, transform, yaw_pose
 from cdpipe.sphere import MapIndex
 from cdpipe.types import DescriptorSet, MappedSession, MergedMaps, PointMap
@@ -25,9 +25,9 @@ _N_YAWS = 2
 # Without orientation vectors: GICP recovers from about 60 degrees, so quarter turns cover the circle.
 _BLIND_YAWS_RAD = np.array([0.0, np.pi, np.pi / 2, -np.pi / 2])
 _NEIGHBOURS_PER_QUERY = 4
-# A hypothesis this good ends the search: right places reach 0.99 in the sphere, and most of the map then fits as well.
+# A hypothesis this good ends the search: right places reach 0.99 in the sphere and along both paths.
 _CLEAR_INLIER_SHARE = 0.97
-_CLEAR_OVERLAP = 0.8
+_CLEAR_AGREEMENT = 0.97
 _REFINE_CELL_M = 1.0
 # Gaussian voxels of half the correspondence distance: twice as accurate as 1 m on a real pair of 32-beam scans.
 _VGICP_CELLS = 2.0
@@ -56,19 +56,21 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     """Align the after session with the before session from their descriptors and maps alone.
 
     Evidence: `inlier_share` (share of both spheres' common points nearer than `inlier_m` to the other map),
-    `residual_m` (their median distance), `hessian_ratio`, `overlap` (share of the whole after map within 1 m of the
-    before map), `descriptor_distance` of the pair, `n_hypotheses` tried.
+    `residual_m` (their median distance), `hessian_ratio`, `agreement` (share of fitting points along both paths),
+    `overlap` (share of the whole after map within 1 m of the before map), `descriptor_distance` of the pair,
+    `n_hypotheses` tried.
 
     Returns:
-        The best hypothesis by inlier share, accepted or not and why; identity where nothing could be registered.
+        The best hypothesis, accepted or not and why; identity where nothing could be registered. Hypotheses that fit in
+        their sphere are ranked by agreement, the others by inlier share.
     """
-    overlap = OverlapCheck(before.map, after.map)
+    check = MapCheck(before.map, after.map)
     best: _Hypothesis | None = None
     n_hypotheses = 0
     for place, guess in _guesses(before, after, config):
         n_hypotheses += 1
-        found = _try(place, guess, overlap, config)
-        if best is None or _rank(found, config) > _rank(best, config):
+        found = _try(place, guess, check, config)
+        if best is None or _rank(found) > _rank(best):
             best = found
         if _is_clear(best, config):
             break
@@ -76,12 +78,11 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
         reason = "no pair of similar places had enough points to be registered"
         return MergedMaps(before.map, after.map, np.eye(4), {"n_hypotheses": float(n_hypotheses)}, False, reason)
     before_T_after = best.before_T_after
-    evidence = {**best.evidence, "n_hypotheses": float(n_hypotheses)}
-    if np.isnan(evidence["overlap"]):
-        evidence["overlap"] = overlap.share(before_T_after)
+    overlap = check.overlap(before_T_after)
+    evidence = {**best.evidence, "overlap": overlap, "n_hypotheses": float(n_hypotheses)}
     reason = why_refused(best.evidence, config)
     if config.refine_map and not reason:
-        before_T_after, evidence = _refined(before.map, after.map, before_T_after, evidence, overlap)
+        before_T_after, evidence = _refined(before.map, after.map, before_T_after, evidence, check)
     return MergedMaps(before.map, after.map, before_T_after, evidence, not reason, reason)
 
 
@@ -179,7 +180,7 @@ def _guesses(before: MappedSession, after: MappedSession, config: MergeConfig) -
             yield place, before_poses[i] @ yaw_pose(float(yaw_rad)) @ invert(after_poses[j])
 
 
-def _try(place: Place, guess: Float64Array, overlap: OverlapCheck, config: MergeConfig) -> _Hypothesis:
+def _try(place: Place, guess: Float64Array, check: MapCheck, config: MergeConfig) -> _Hypothesis:
     found = register(place.after_points, place.before_points, guess, config)
     inlier_share, residual_m = sphere_fit(place, found.target_T_source, config)
     evidence = {
@@ -187,23 +188,22 @@ def _try(place: Place, guess: Float64Array, overlap: OverlapCheck, config: Merge
         "residual_m": residual_m,
         "hessian_ratio": found.hessian_ratio,
         "descriptor_distance": place.descriptor_distance,
-        "overlap": np.nan,
     }
     if not why_refused(evidence, config):
-        evidence["overlap"] = overlap.share(found.target_T_source)
+        evidence["agreement"] = check.agreement(found.target_T_source)
     return _Hypothesis(found.target_T_source, evidence)
 
 
-def _rank(hypothesis: _Hypothesis, config: MergeConfig) -> tuple[bool, float]:
-    return not why_refused(hypothesis.evidence, config), hypothesis.evidence["inlier_share"]
+def _rank(hypothesis: _Hypothesis) -> tuple[float, float]:
+    return hypothesis.evidence.get("agreement", -1.0), hypothesis.evidence["inlier_share"]
 
 
 def _is_clear(hypothesis: _Hypothesis, config: MergeConfig) -> bool:
     evidence = hypothesis.evidence
     return (
-        not why_refused(hypothesis.evidence, config)
+        not why_refused(evidence, config)
         and evidence["inlier_share"] >= _CLEAR_INLIER_SHARE
-        and evidence["overlap"] >= _CLEAR_OVERLAP
+        and evidence["agreement"] >= _CLEAR_AGREEMENT
     )
 
 
@@ -212,7 +212,7 @@ def _refined(
     after: PointMap,
     before_T_after: Float64Array,
     evidence: Mapping[str, float],
-    overlap: OverlapCheck,
+    check: MapCheck,
 ) -> tuple[Float64Array, dict[str, float]]:
     """Register the whole maps coarsely; kept unless they then overlap less."""
     centre = before.points.mean(axis=0)
@@ -226,7 +226,7 @@ def _refined(
     )
     shift = make_pose(translation=centre)
     refined = shift @ found.T_target_source @ invert(shift) @ before_T_after
-    share = overlap.share(refined)
+    share = check.overlap(refined)
     if share < evidence["overlap"]:
         return before_T_after, dict(evidence)
     return refined, {**evidence, "overlap": share, "overlap_before_refinement": evidence["overlap"]}

@@ -12,7 +12,7 @@ import shutil
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -25,6 +25,7 @@ from cdpipe.descriptor.range_image import range_image
 from cdpipe.descriptor.training import PlaceData, PlaceScores, TrainingConfig, evaluate, train
 from cdpipe.geometry import travelled_m, yaw_rad
 from cdpipe.session import load_arrays
+from cdpipe.types import SessionName
 from eval.adapters import pipeline_input
 from scenarios.library import load_scenario
 from sim.simulate import simulate_pair
@@ -33,6 +34,7 @@ from sim.truth import read_true_poses
 KEYFRAME_SPACING_M = 1.0
 FAMILIES = ("narrow", "wide")
 FIRST_VALIDATION_SEED = 10000
+SESSIONS: tuple[SessionName, ...] = ("before", "after")
 
 
 def make_tunnel(family: str, seed: int, path: Path) -> None:
@@ -41,7 +43,7 @@ def make_tunnel(family: str, seed: int, path: Path) -> None:
     shutil.rmtree(pair, ignore_errors=True)
     simulate_pair(load_scenario(family, seed), seed, pair)
     images, positions, headings, sessions = [], [], [], []
-    for number, session in enumerate(("before", "after")):
+    for number, session in enumerate(SESSIONS):
         source = pipeline_input(pair, session)
         world_T_sensor = read_true_poses(pair / session)
         metres = np.floor(travelled_m(world_T_sensor) / KEYFRAME_SPACING_M)
@@ -67,7 +69,7 @@ def load_data(folder: Path, seeds: Iterable[int]) -> tuple[PlaceData, str]:
     """Read the tunnels of both families and the given seeds, making those that are missing; return their digest too."""
     folder.mkdir(parents=True, exist_ok=True)
     wanted = [(family, seed) for seed in seeds for family in FAMILIES]
-    tunnels = []
+    tunnels: list[dict[str, Any]] = []
     hasher = hashlib.sha256()
     with Progress(console=Console(stderr=True)) as progress:
         for family, seed in progress.track(wanted, description="tunnels"):

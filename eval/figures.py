@@ -136,7 +136,7 @@ def region_map(points: Points, regions: Sequence[RegionMark], radius_m: float, t
     for state, look in _TRUTH_LOOKS.items():
         marks = [mark for mark in truths if mark.state == state]
         axes.plot([mark.x_m for mark in marks], [mark.y_m for mark in marks], linestyle="none", **look)
-    for x_m, y_m, label in joined_labels(truths, 0.025 * raster.width_m):
+    for x_m, y_m, label in joined_labels(truths, 0.035 * raster.width_m):
         axes.annotate(
             label, (x_m, y_m), xytext=(7, 6), textcoords="offset points", fontsize=8, fontweight="bold",
             bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},

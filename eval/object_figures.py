@@ -11,6 +11,8 @@ from matplotlib.axes import Axes
 from cdpipe.geometry import Float64Array
 from eval.figures import BLACK, CONTEXT, blank_figure, data_address
 
+_TURNS_RAD = np.deg2rad([25.0, -25.0, 65.0, -65.0, 90.0])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Panel:
@@ -40,9 +42,10 @@ def object_panels(panels: Sequence[Panel], truth: Float64Array, view_from: Float
     low, high = flat.min(axis=0), flat.max(axis=0)
     margin = np.maximum(0.35 * (high - low), 0.3)
     low, high = low - margin, high + margin
-    # panels no flatter than 4:3, so that a railing and a box have the same height on the page
-    lack = 0.5 * max(0.0, 0.75 * (high[0] - low[0]) - (high[1] - low[1]))
-    low[1], high[1] = low[1] - lack, high[1] + lack
+    # between 4:3 and 3:4, so that a railing and a box have about the same size on the page
+    wide, tall = high - low
+    lack = 0.5 * np.maximum([0.75 * tall - wide, 0.75 * wide - tall], 0.0)
+    low, high = low - lack, high + lack
     width_in = 1.9
     height_in = float(np.clip(width_in * (high[1] - low[1]) / (high[0] - low[0]), 1.4, 2.6))
     figure = blank_figure(width_in * len(panels), height_in + 0.55)
@@ -69,15 +72,23 @@ def object_panels(panels: Sequence[Panel], truth: Float64Array, view_from: Float
 def oblique_view(truth: Float64Array, view_from: Float64Array) -> Callable[[Float64Array], Float64Array]:
     """Return a function from (N, 3) points to (N, 2) picture coordinates, metres: orthographic, 25 deg from above.
 
-    The eye stands on the side of `view_from`, turned by 25 deg about the object so that its depth is seen.
+    The eye stands on the side of `view_from`, turned about the object by the first of some angles that shows at least
+    60 % of the greatest width that any angle shows: no railing is seen from its end.
     """
-    offset = view_from[:2] - truth.mean(axis=0)[:2]
-    azimuth = np.arctan2(offset[1], offset[0]) + np.deg2rad(25.0)
+    centre = truth.mean(axis=0)
+    offset = view_from[:2] - centre[:2]
+    towards = np.arctan2(offset[1], offset[0])
+    widths = [_width_m(truth, towards + turn) for turn in _TURNS_RAD]
+    turn = next(turn for turn, width in zip(_TURNS_RAD, widths, strict=True) if width >= 0.6 * max(widths))
+    azimuth = towards + turn
     elevation = np.deg2rad(25.0)
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     up = np.array([-np.cos(azimuth) * np.sin(elevation), -np.sin(azimuth) * np.sin(elevation), np.cos(elevation)])
-    centre = truth.mean(axis=0)
     return lambda points: np.column_stack([(points - centre) @ right, (points - centre) @ up])
+
+
+def _width_m(points: Float64Array, azimuth_rad: float) -> float:
+    return float(np.ptp(points[:, :2] @ np.array([-np.sin(azimuth_rad), np.cos(azimuth_rad)])))
 
 
 def _scale_bar(axes: Axes, low: Float64Array, high: Float64Array) -> None:

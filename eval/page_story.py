@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from eval.page_columns import RESULT_COLUMNS, share
-from eval.page_run import BASELINES, RunData, named_variants, of, over_pairs, scenarios, text
+from eval.page_run import BASELINES, RunData, defined, named_variants, of, over_pairs, scenarios, text
 from eval.page_tables import alarm_text
 
 HEADLINE_COLUMNS = tuple(
@@ -16,6 +16,8 @@ HEADLINE_COLUMNS = tuple(
     for key, name in (("region_recall", "region recall"), ("object_iou_point", "object IoU"))
     if column.key == key
 )
+
+WRONG_MERGE_M = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +57,7 @@ def story(data: RunData) -> list[str]:
     variants = dict.fromkeys(str(row["variant"]) for row in data.results)
     return [
         _about_baselines(rankings, list(variants)),
+        *_about_wrong_merges(data),
         *(sentence(ranking) + _price(data, ranking) for ranking in rankings),
         *(f"On {name}, no preset gave an answer." for name in unanswered),
         *_about_failures(data),
@@ -131,6 +134,20 @@ def _about_baselines(rankings: Sequence[Ranking], variants: Sequence[str]) -> st
         names = joined(run_baselines)
         return f"The simple baselines that were run ({names}) win neither region recall nor object IoU anywhere."
     return " ".join(parts)
+
+
+def _about_wrong_merges(data: RunData) -> list[str]:
+    """Name the scenarios on which an accepted merge is so wrong that the scores after it say little about a method."""
+    found = []
+    for scenario in dict.fromkeys(str(row["scenario"]) for row in data.results):
+        errors = defined(of(data.results, scenario=scenario), "merge_error_m")
+        if (errors > WRONG_MERGE_M).any():
+            n = int((errors > WRONG_MERGE_M).sum())
+            found.append(
+                f"On {scenario}, {n} of {len(errors)} cases rest on a merge that was accepted and is wrong by up to "
+                f"{errors.max():.1f} m: what follows the merge cannot be judged by them."
+            )
+    return found
 
 
 def _about_failures(data: RunData) -> list[str]:

@@ -97,6 +97,11 @@ def headings_of(points: Float64Array) -> Float64Array:
     return np.asarray(tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12))
 
 
+def left_of(headings: Float64Array) -> Float64Array:
+    """Return the (N, 2) directions at right angles to the left."""
+    return np.stack([-headings[:, 1], headings[:, 0]], axis=1)
+
+
 def _drift_line(tunnel: Tunnel, index: int, drift: Drift, uses: dict[str, int], seed: int) -> DriftLine:
     section = drift.section or tunnel.section
     nodes = np.array([tunnel.nodes[name] for name in drift.nodes], dtype=np.float64)
@@ -158,6 +163,4 @@ def _meander(tunnel: Tunnel, index: int, points: Float64Array, fixed: list[int],
     for sample in fixed:
         share = np.clip(np.abs(along_m - sample * STEP_M) / (0.5 * tunnel.meander_length_m), 0.0, 1.0)
         wander_m *= share**2 * (3.0 - 2.0 * share)
-    headings = headings_of(points)
-    left = np.stack([-headings[:, 1], headings[:, 0], np.zeros(len(points))], axis=1)
-    return np.asarray(left * wander_m[:, None])
+    return np.column_stack([left_of(headings_of(points)) * wander_m[:, None], np.zeros(len(points))])

@@ -7,19 +7,23 @@ import numpy as np
 from cdpipe.errors import ScenarioError
 from cdpipe.geometry import Float64Array
 from scenarios.schema import Scenario
-from sim.centreline import resample
+from sim.centreline import left_of, resample
 from sim.placing import standing_corners
 from sim.scene import World
 
-@@
+STEP_M = 0.05  # between the samples of a line
+# A quadrotor keeps this much air below it; what is lower is flown over.
+_AIR_BELOW_M = 0.5
+# The body checked against the walls: the true gap may be this share of the clearance where the wall bulges.
+_TIGHTEST_SHARE = 0.5
 
 
-def _obstacles(
+def obstacles(
     world: World, scenario: Scenario, session: str, line: Float64Array, headings: Float64Array, height_m: float
 ) -> list[tuple[str, Float64Array, Float64Array]]:
     """Return for each prop in the way its name and the offsets it forbids, (N,) to (N,), NaN where it is far."""
     clearance_m = scenario.platform.clearance_m
-    left = _left(headings)
+    left = left_of(headings)
     found = []
     for item in world.standing:
         is_low = scenario.platform.kind == "quadrotor" and item.prop.size_m[2] + _AIR_BELOW_M < height_m
@@ -42,7 +46,7 @@ def _obstacles(
     return found
 
 
-def _pass_by(
+def pass_by(
     session: str,
     name: str,
     wanted: Float64Array,
@@ -71,7 +75,7 @@ def _pass_by(
             )
 
 
-def _check_clearance(world: World, scenario: Scenario, session: str, points: Float64Array) -> None:
+def check_clearance(world: World, scenario: Scenario, session: str, points: Float64Array) -> None:
     """Cast level rays all round and one up from every tenth sample: the line must keep off the walls."""
     clearance_m = scenario.platform.clearance_m
     angle = np.arange(24) * (2 * np.pi / 24)
@@ -90,5 +94,3 @@ def _check_clearance(world: World, scenario: Scenario, session: str, points: Flo
             f"{session}: the sensor comes within {gap_m[worst].min():.2f} m of rock at ({x:.1f}, {y:.1f}, {z:.1f}): "
             "choose another lateral, start_m, end_m or height"
         )
-
-

@@ -16,19 +16,15 @@ import numpy as np
 from cdpipe.errors import ScenarioError
 from cdpipe.geometry import Float64Array
 from scenarios.schema import Scenario, SessionPlan
-from sim.centreline import headings_of, resample
-from sim.placing import PROBE_UP_M, floor_heights, free_width, standing_corners
+from sim.centreline import headings_of, left_of, resample
+from sim.obstacles import STEP_M, check_clearance, obstacles, pass_by
+from sim.placing import PROBE_UP_M, floor_heights, free_width
 from sim.scene import World
 
-STEP_M = 0.05
 _SHARPEST_DEG = 150.0
 _FLOOR_SMOOTHING_M = 0.5
 # Takes the edge off turns that tighten where bend and swerve meet; it moves the line by a few centimetres at most.
 _LAST_SMOOTHING_M = 0.7
-# A quadrotor keeps this much air below it; what is lower is flown over.
-_AIR_BELOW_M = 0.5
-# The body checked against the walls: the true gap may be this share of the clearance where the wall bulges.
-_TIGHTEST_SHARE = 0.5
 # Corners of the route are rounded over this share of the drift's width to either side.
 _CORNER_SHARE = 0.55
 # Inside a bend the line stays this share of the way to the centre of curvature, so that the turn does not tighten.
@@ -65,14 +61,14 @@ def plan_path(world: World, scenario: Scenario, session: str) -> Path:
     plan: SessionPlan = getattr(scenario, session)
     line, width_m = _reference(world, plan, session)
     offset_m = _offsets(world, scenario, session, line, width_m)
-    left = _left(headings_of(line))
+    left = left_of(headings_of(line))
     shifted = resample(np.column_stack([line[:, :2] + offset_m[:, None] * left, line[:, 2]]), STEP_M)
     xy, level_m = smoothed(shifted[:, :2], _LAST_SMOOTHING_M), shifted[:, 2]
     floor_m = floor_heights(world.walls, np.column_stack([xy, level_m + PROBE_UP_M]))
     floor_m = smoothed(np.where(np.isnan(floor_m), level_m, floor_m), _FLOOR_SMOOTHING_M)
     height_m = plan.height_m or scenario.platform.sensor_height_m
     points = np.column_stack([xy, floor_m + height_m])
-    _check_clearance(world, scenario, session, points)
+    check_clearance(world, scenario, session, points)
     headings = headings_of(xy)
     distance_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
     yaw = smoothed(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0])), 4 * STEP_M)
@@ -132,7 +128,7 @@ def _offsets(world: World, scenario: Scenario, session: str, line: Float64Array,
     headings = headings_of(line)
     height_m = plan.height_m or scenario.platform.sensor_height_m
     heights = np.array([height_m] if scenario.platform.kind == "quadrotor" else [0.35, max(height_m, 0.4)])
-    right_m, left_m = free_width(world.walls, line, _left(headings), heights, float(width_m.max()))
+    right_m, left_m = free_width(world.walls, line, left_of(headings), heights, float(width_m.max()))
     room_m = np.maximum(width_m / 2 - clearance_m, 0.0)
     low = np.maximum(clearance_m - right_m, -room_m)
     high = np.minimum(left_m - clearance_m, room_m)
@@ -141,8 +137,8 @@ def _offsets(world: World, scenario: Scenario, session: str, line: Float64Array,
     low = np.where(turn < -1e-3, np.maximum(low, -_INSIDE_SHARE / np.maximum(-turn, 1e-3)), low)
     wanted = plan.lateral * room_m
     _refuse_narrow(scenario, session, low, high)
-    for name, near_low, near_high in _obstacles(world, scenario, session, line, headings, height_m):
-        _pass_by(session, name, wanted, low, high, near_low, near_high)
+    for name, near_low, near_high in obstacles(world, scenario, session, line, headings, height_m):
+        pass_by(session, name, wanted, low, high, near_low, near_high)
     offset_m = _swerving(wanted, low, high, _SWERVES_M[0])
     for half_m in (*_SWERVES_M[1:], None):
         excess_m = np.maximum(low - offset_m, offset_m - high)
@@ -184,7 +180,3 @@ def _refuse_narrow(scenario: Scenario, session: str, low: Float64Array, high: Fl
             f"{session}: the walls leave {gap[worst] + needed_m:.2f} m at {worst * STEP_M:.1f} m along the route: "
             f"{needed_m:.2f} m are needed for platform.clearance_m"
         )
-
-
-def _left(headings: Float64Array) -> Float64Array:
-    return np.stack([-headings[:, 1], headings[:, 0]], axis=1)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float32Array, Float64Array, Int32Array, make_pose
+from cdpipe.geometry import Float32Array, Int32Array
 from scenarios.schema import Scenario
 from sim.centreline import Centreline, build_centreline
 from sim.mesh import Mesh
@@ -20,6 +17,7 @@ from sim.props import Shape, shape_of
 from sim.raycast import Caster, model_meshes
 from sim.settling import add_solid, quaternion, settle
 from sim.tunnel import mesh_tunnel
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:

@@ -82,7 +82,6 @@ def _block_meshes(
     sigma_m = float(np.sqrt(sum(octave.amplitude_m**2 for octave in tunnel.roughness)))
     margin_m = _NOISE_LIMIT_SIGMA * sigma_m + 3 * cell_m
     trees = [cKDTree(line.points[:, :2]) for line in centreline.drifts]
-    n_inner = 0
     for block in _blocks_near(centreline, margin_m, cell_m):
         # One node of overlap on the high side; the planes between blocks belong to both.
         ix, iy = (np.arange(start, start + _BLOCK_CELLS + 1) for start in block * _BLOCK_CELLS)
@@ -96,9 +95,8 @@ def _block_meshes(
         fraction = local - floor
         axis = np.argmax(fraction, axis=1)
         keys = np.concatenate([floor + offset, axis[:, None]], axis=1)
-        is_inner = (fraction > 0).sum(axis=1) > 1  # the extra vertex Lewiner's cases put inside a cell
-        keys[is_inner, 3] = 3 + n_inner + np.arange(is_inner.sum())
-        n_inner += int(is_inner.sum())
+        is_inner = (fraction > 0).sum(axis=1) > 1  # the one extra vertex that Lewiner's cases may put in a cell
+        keys[is_inner, 3] = 3
         yield keys, (local.astype(np.float64) + offset) * cell_m, faces.astype(np.int64)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cdpipe.config import MergeConfig
-from cdpipe.evidence import OverlapCheck, Place, sphere_fit, why_refused
+from cdpipe.evidence import MapCheck, Place, sphere_fit, why_refused
 from cdpipe.geometry import Float64Array, make_pose
 from cdpipe.types import MappedSession
 
@@ -51,12 +51,28 @@ def test_overlap_counts_the_after_map_within_a_metre(tunnel_before: MappedSessio
     line = np.column_stack([np.arange(11.0) * 2, np.zeros(11), np.zeros(11)])
     before = replace(tunnel_before.map, points=line)
     after = replace(tunnel_before.map, points=np.concatenate([line, shifted(line, x_m=-20.9)]))
-    assert OverlapCheck(before, after).share(make_pose()) == 12 / 22
-    assert OverlapCheck(before, after).share(make_pose(translation=(0, 0, 1.5))) == 0.0
+    assert MapCheck(before, after).overlap(make_pose()) == 12 / 22
+    assert MapCheck(before, after).overlap(make_pose(translation=(0, 0, 1.5))) == 0.0
+
+
+def test_agreement_asks_along_both_paths_and_only_where_both_were(tunnel_before: MappedSession) -> None:
+    same = tunnel_before.map
+    assert MapCheck(same, same).agreement(make_pose()) == 1.0
+    assert MapCheck(same, same).agreement(make_pose(translation=(500.0, 0, 0))) == 0.0
+    # a session that saw the first half alone agrees with one that saw all of it
+    x_m, middle_m = same.points[:, 0], np.median(same.points[:, 0])
+    is_driven = same.odom_T_keyframe[:, 0, 3] < middle_m - 6.0
+    half = replace(same, points=same.points[x_m <= middle_m], keyframe_scans=same.keyframe_scans[is_driven])
+    assert MapCheck(same, half).agreement(make_pose()) == 1.0
+    # lifted by 0.6 m the floor misses, and it was seen from both paths
+    assert MapCheck(same, same).agreement(make_pose(translation=(0, 0, 0.6))) < 0.93
 
 
 def test_reasons_in_plain_words() -> None:
     config = MergeConfig(min_inlier_share=0.9, min_hessian_ratio=0.01)
     assert why_refused({"inlier_share": 0.9, "hessian_ratio": 0.01}, config) == ""
     assert why_refused({"inlier_share": 0.5, "hessian_ratio": 0.0}, config).startswith("only 50% of the points")
+    alike = {"inlier_share": 1.0, "hessian_ratio": 0.1, "agreement": 0.75}
+    assert "only 75% of the points do" in why_refused(alike, config)
+    assert why_refused({**alike, "agreement": 0.93}, config) == ""
     assert "0.0050" in why_refused({"inlier_share": 1.0, "hessian_ratio": 0.005}, config)

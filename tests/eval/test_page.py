@@ -333,6 +333,7 @@ def test_the_first_sentence_says_that_a_baseline_wins(page: Path) -> None:
     assert "voxel-diff is best with 0.79, 0.33 ahead of tunnelcd (0.46)" in text
     assert "1 of 3 presets raise a false alarm (paper); voxel-diff refused the merge or failed." in text
     assert "0.50 ahead of paper (0.50). False regions per 100 m: voxel-diff 4.25." in text
+    assert "rest on a merge" not in text
     assert "a single pair carries no interval" in text
     assert "Abacus 3000, 2 cores, 8.5 GB" in text
 
@@ -407,6 +408,14 @@ def test_a_site_without_any_answer_is_said_to_have_none_and_its_errors_are_told_
     assert "3 of 3 cases gave no answer" in text
     assert text.count("too smooth") == 1
     assert f"{SITE}, seed 7, paper, tunnelcd, voxel-diff: merge refused: too smooth" in text
+
+
+def test_an_accepted_merge_that_is_wrong_is_said(run: Path) -> None:
+    rows = [result_row(SITE, name, merge_error_m=error) for name, error in (("paper", 28.283), ("tunnelcd", 0.05))]
+    pd.DataFrame(rows).to_csv(run / "results.csv", index=False)
+    assert f"On {SITE}, 1 of 2 cases rest on a merge that was accepted and is wrong by up to 28.3 m" in (
+        write_page(run).read_text()
+    )
 
 
 @pytest.mark.parametrize("content", [None, "", "scenario,seed,variant,status\n", "a,b\n1,2\n"])

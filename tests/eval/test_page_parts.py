@@ -160,6 +160,13 @@ def test_the_oblique_view_keeps_up_above_and_turns_with_the_eye() -> None:
     np.testing.assert_allclose(side(np.array([[1.0, 2.0, 3.0]])), turned(np.array([[-2.0, 1.0, 3.0]])), atol=1e-12)
 
 
+def test_a_railing_is_not_seen_from_its_end() -> None:
+    railing = np.column_stack([np.linspace(-2, 2, 50), np.zeros(50), np.zeros(50)])
+    for bearing in np.deg2rad(np.arange(0, 360, 15)):
+        flat = oblique_view(railing, 9.0 * np.array([math.cos(bearing), math.sin(bearing), 0.0]))(railing)
+        assert np.ptp(flat[:, 0]) > 0.55 * 4.0
+
+
 def test_an_object_that_was_missed_is_drawn_black() -> None:
     points = square(0, 0) + np.array([0.0, 0.0, 0.5])
     nothing = np.zeros((0, 3))

@@ -6,6 +6,7 @@ import pytest
 
 from cdpipe.errors import InputError, ScenarioError
 from scenarios import check_scenario, load_scenario, scenario_names
+from scenarios.library import FAMILIES
 from scenarios.references import route_length_m
 from scenarios.schema import Scenario
 
@@ -267,3 +268,12 @@ def test_unknown_names_suggest_the_nearest() -> None:
 def test_negative_seeds_are_refused() -> None:
     with pytest.raises(InputError, match="seed = -1: expected a whole number >= 0"):
         load_scenario(scenario_names()[0], -1)
+
+
+def test_the_readme_s_first_file_is_valid_and_its_families_exist(tmp_path: Path) -> None:
+    text = (FAMILIES.parent / "README.md").read_text()
+    example = text.split("```yaml\n")[1].split("```")[0]
+    assert check_scenario(written(tmp_path, example)).props[0].change == "added"
+    table = text.split("## Families")[1].split("###")[0]
+    named = {word for line in table.splitlines() for cell in line.split("|")[1:2] for word in cell.split("`")[1::2]}
+    assert named == set(scenario_names())

@@ -73,6 +73,18 @@ def test_range_noise_has_the_sigma_of_its_range(make_scenario: Callable[..., Sce
         assert part.std() == pytest.approx(np.hypot(sigma_m, 1e-3 / np.sqrt(12)), rel=0.03)
 
 
+def test_revolutions_and_sessions_have_their_own_noise(
+    make_scenario: Callable[..., Scenario], sensor: SensorMetadata
+) -> None:
+    scene = room(make_scenario, (4.0, 4.0, 4.0), 0.5)
+    rays = revolution_rays(sensor, np.tile(np.eye(4), (sensor.width, 1, 1)))
+    cases = [(7, "before", 0), (7, "before", 1), (7, "after", 0), (8, "before", 0)]
+    noise = [scan(scene, sensor, Sensor(dropouts=False), rays, *case) for case in cases]
+    errors = np.stack([(each.range_mm / 1000.0 - each.true_range_m).ravel() for each in noise])
+    between = np.corrcoef(errors)[np.triu_indices(4, 1)]
+    assert np.abs(between).max() < 5 / np.sqrt(errors.shape[1])
+
+
 def test_detection_meets_both_anchors() -> None:
     ranges_m = np.array([45.0, 55.0])
     np.testing.assert_allclose(detection_probability(np.array([0.1, 0.1]), ranges_m), [0.9, 0.5], rtol=1e-9)

@@ -38,6 +38,10 @@ def test_odometry_drifts_by_exactly_its_figures_on_a_straight_line(sensor: Senso
         turn_deg = np.rad2deg(yaw_rad(invert(estimated[0]) @ estimated[200]))
         assert abs(scale - 1.0) == pytest.approx(0.015, abs=1e-7)
         assert abs(turn_deg) == pytest.approx(2.0, abs=1e-9)
+        # The straight line becomes an arc: radius L / theta, end at (R sin theta, R (1 - cos theta)).
+        theta, arc_m = np.deg2rad(turn_deg), 100.0 * scale
+        end = (arc_m / theta * np.sin(theta), arc_m / theta * (1 - np.cos(theta)), 0.0)
+        np.testing.assert_allclose(estimated[200, :3, 3], end, atol=1e-6)
         signs.add((scale > 1.0, turn_deg > 0.0))
     assert len(signs) > 2
 
