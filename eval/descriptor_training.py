@@ -27,6 +27,7 @@ from cdpipe.geometry import travelled_m, yaw_rad
 from cdpipe.session import load_arrays
 from cdpipe.types import SessionName
 from eval.adapters import pipeline_input
+from eval.provenance import git_commit
 from scenarios.library import load_scenario
 from sim.simulate import simulate_pair
 from sim.truth import read_true_poses
@@ -135,6 +136,7 @@ def main(
             f"python -m eval.descriptor_training --data DATA --out OUT --train-tunnels {train_tunnels} "
             f"--validation-tunnels {validation_tunnels} --steps {steps} --seed {seed} --threads {threads}"
         ),
+        "commit": git_commit(),
         "device": f"{platform.machine()} CPU, {threads} threads",
         "seconds": round(seconds, 1),
     }

@@ -85,7 +85,7 @@ def describe_run(
         "config_digests": {name: digest(config) for name, config in configs.items()},
         "checkpoints": dict(checkpoints),
         "versions": versions(),
-        "git_commit": _git_commit(),
+        "git_commit": git_commit(),
         "machine": machine(),
     }
 
@@ -95,7 +95,7 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def _git_commit() -> str | None:
+def git_commit() -> str | None:
     """Commit of the source tree this package runs from, with "+" where files differ from it; None outside git."""
     root = Path(__file__).resolve().parent.parent
     if not (root / ".git").exists():

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+import trimesh
 from scipy.spatial import cKDTree
 
 from cdpipe.geometry import BoolArray, Float64Array, Int32Array, require_shape, transform
@@ -42,31 +43,12 @@ def joined(meshes: list[Mesh]) -> Mesh:
 
 def box_mesh(half_size_m: npt.ArrayLike) -> Mesh:
     """Return a box about the origin, facing outwards, from its half edges (3,)."""
-    corners = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 3)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = [face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]
-    return Mesh(corners * np.asarray(half_size_m), np.array(faces, np.int32))
+    return _from_trimesh(trimesh.creation.box(extents=2.0 * np.asarray(half_size_m)))
 
 
 def cylinder_mesh(radius_m: float, half_height_m: float, segments: int) -> Mesh:
     """Return a closed cylinder about the z axis, facing outwards."""
-    angle = np.arange(segments) * (2 * np.pi / segments)
-    ring = np.stack([radius_m * np.cos(angle), radius_m * np.sin(angle)], axis=1)
-    low = np.column_stack([ring, np.full(segments, -half_height_m)])
-    high = np.column_stack([ring, np.full(segments, half_height_m)])
-    vertices = np.concatenate([low, high, [[0, 0, -half_height_m], [0, 0, half_height_m]]])
-    i = np.arange(segments)
-    j = (i + 1) % segments
-    bottom, top = np.full(segments, 2 * segments), np.full(segments, 2 * segments + 1)
-    faces = np.concatenate(
-        [
-            np.stack([i, j, segments + j], axis=1),
-            np.stack([i, segments + j, segments + i], axis=1),
-            np.stack([bottom, j, i], axis=1),
-            np.stack([top, segments + i, segments + j], axis=1),
-        ]
-    )
-    return Mesh(vertices, faces.astype(np.int32))
+    return _from_trimesh(trimesh.creation.cylinder(radius=radius_m, height=2.0 * half_height_m, sections=segments))
 
 
 def near_part(mesh: Mesh, target: Mesh, within_m: float) -> Mesh:
@@ -103,24 +85,11 @@ def is_near_surface(points: Float64Array, mesh: Mesh, within_m: float) -> BoolAr
 
 def point_triangle_distance(points: Float64Array, triangles: Float64Array) -> Float64Array:
     """Return the (N,) distance of each point (N, 3) to its own triangle (N, 3, 3), metres."""
-    a = triangles[:, 0]
-    edges = (triangles[:, 1] - a, triangles[:, 2] - a)
-    rel = points - a
-    e00, e01, e11 = (np.einsum("ij,ij->i", edges[i], edges[j]) for i, j in ((0, 0), (0, 1), (1, 1)))
-    r0, r1 = (np.einsum("ij,ij->i", edge, rel) for edge in edges)
-    area = np.maximum(e00 * e11 - e01**2, 1e-30)
-    u, v = (e11 * r0 - e01 * r1) / area, (e00 * r1 - e01 * r0) / area
-    foot = a + u[:, None] * edges[0] + v[:, None] * edges[1]
-    inside = (u >= 0) & (v >= 0) & (u + v <= 1)
-    to_plane = np.where(inside, np.linalg.norm(points - foot, axis=1), np.inf)
-    sides = [_segment_distance(points, triangles[:, i], triangles[:, (i + 1) % 3]) for i in range(3)]
-    return np.asarray(np.minimum.reduce([to_plane, *sides]))
+    return np.asarray(np.linalg.norm(points - trimesh.triangles.closest_point(triangles, points), axis=1))
 
 
-def _segment_distance(points: Float64Array, start: Float64Array, end: Float64Array) -> Float64Array:
-    along = end - start
-    share = np.einsum("ij,ij->i", points - start, along) / np.maximum(np.einsum("ij,ij->i", along, along), 1e-30)
-    return np.asarray(np.linalg.norm(points - start - np.clip(share, 0.0, 1.0)[:, None] * along, axis=1))
+def _from_trimesh(solid: trimesh.Trimesh) -> Mesh:
+    return Mesh(np.asarray(solid.vertices, dtype=np.float64), np.asarray(solid.faces, dtype=np.int32))
 
 
 def _touches_box(triangles: Float64Array, low: Float64Array, high: Float64Array) -> BoolArray:
