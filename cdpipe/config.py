@@ -80,7 +80,7 @@ class ClusterConfig(Settings):
     """New points into objects."""
 
     radius_m: Positive = Field(0.5, description="points nearer than this are one object")
-    min_points: Count = Field(8, description="smaller clusters are dropped")
+    min_points: Count = Field(16, description="smaller clusters are dropped")
 
 
 class PipelineConfig(Settings):

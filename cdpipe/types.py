@@ -99,12 +99,6 @@ class PointMap:
         """(K, 4, 4) pose of each keyframe."""
         return self.odom_T_sensor[self.keyframe_scans]
 
-    def returns_of(self, point_mask: BoolArray) -> Int32Array:
-        """Return the (R, 2) (scan, pixel) of every return behind the marked map points."""
-        chosen = np.flatnonzero(point_mask[self.return_points])
-        scans = np.searchsorted(self.scan_offsets, chosen, side="right") - 1
-        return np.column_stack([scans, self.return_pixels[chosen]]).astype(np.int32)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DescriptorSet:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from cdpipe.config import DescriptorConfig
-from cdpipe.descriptor import describe_scans, load_descriptors, relative_yaws_rad, save_descriptors
+from cdpipe.descriptor import describe_scan, describe_scans, load_descriptors, relative_yaws_rad, save_descriptors
 from cdpipe.descriptor.network import DIMENSIONS, initial_network, yaw_correlation
 from cdpipe.descriptor.range_image import COLUMNS, ELEVATION_RAD, ROWS, range_image
 from cdpipe.descriptor.training import PlaceData, TrainingConfig, evaluate, train
@@ -55,6 +55,9 @@ def test_descriptors_are_unit_vectors_and_survive_the_disk(tmp_path: Path, metho
     config = DescriptorConfig(method=method)
     made = describe_scans(_Source(), np.array([0, 2]), config)
     np.testing.assert_allclose(np.linalg.norm(made.q, axis=1), 1.0, atol=1e-5)
+    q, w = describe_scan(_Source().scan(2), config)
+    np.testing.assert_allclose(made.q[1], q, atol=1e-6)
+    np.testing.assert_allclose(made.w[1], w, atol=1e-6)
     assert load_descriptors(tmp_path, config) is None
     save_descriptors(tmp_path, made)
     read = load_descriptors(tmp_path, config)

@@ -9,7 +9,7 @@ from cdpipe.config import MapConfig
 from cdpipe.errors import InputError
 from cdpipe.geometry import make_pose, transform, yaw_pose
 from cdpipe.mapping import build_map, keyframes
-from cdpipe.types import PosedScan, ScanSource
+from cdpipe.types import PointMap, PosedScan, ScanSource
 
 
 class RandomScans:
@@ -42,6 +42,13 @@ def brute_force(source: ScanSource, voxel_m: float, max_range_m: float) -> dict[
     return cells
 
 
+def returns_of(point_map: PointMap, index: int) -> list[list[int]]:
+    """[scan, pixel] of every return behind one map point."""
+    scans = np.repeat(np.arange(len(point_map.odom_T_sensor)), np.diff(point_map.scan_offsets))
+    chosen = point_map.return_points == index
+    return np.column_stack([scans[chosen], point_map.return_pixels[chosen]]).tolist()
+
+
 @pytest.mark.parametrize("batch_scans", [1, 3, 64])
 def test_the_map_equals_a_dict_of_cells(batch_scans: int) -> None:
     source = RandomScans()
@@ -52,8 +59,7 @@ def test_the_map_equals_a_dict_of_cells(batch_scans: int) -> None:
     for index, point in enumerate(point_map.points):
         found = cells.pop(tuple(np.floor(point / 0.5).astype(int).tolist()))
         np.testing.assert_allclose(point, np.mean([entry[2] for entry in found], axis=0), atol=1e-12)
-        mask = np.arange(len(point_map.points)) == index
-        assert point_map.returns_of(mask).tolist() == [[scan, pixel] for scan, pixel, _ in found]
+        assert returns_of(point_map, index) == [[scan, pixel] for scan, pixel, _ in found]
     assert not cells
 
 
@@ -86,7 +92,7 @@ def test_a_map_of_one_point() -> None:
     source.odom_T_sensor = np.eye(4)[None]
     point_map = build_map(source, MapConfig())
     np.testing.assert_array_equal(point_map.points, [[1.0, 2.0, 3.0]])
-    assert point_map.returns_of(np.array([True])).tolist() == [[0, 5]]
+    assert returns_of(point_map, 0) == [[0, 5]]
 
 
 def test_nothing_within_range_and_poses_too_far_out() -> None:
