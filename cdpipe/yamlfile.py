@@ -34,18 +34,18 @@ class Document:
     Attributes:
         source: File name or other origin, for messages.
         value: The content as plain dicts, lists and scalars.
-        lines: 1-based line of each key path; parts set from elsewhere are absent.
+        origins: "file:line", or "--set", of each key path that has one.
     """
 
     source: str
     value: Any
-    lines: Mapping[Key, int] = field(default_factory=dict)
+    origins: Mapping[Key, str] = field(default_factory=dict)
 
     def where(self, key: Key) -> str:
-        """Return "file:line" of a key, of its nearest known parent if it has no line of its own."""
-        while key and key not in self.lines:
+        """Return the origin of a key, of its nearest known parent if it has none of its own."""
+        while key and key not in self.origins:
             key = key[:-1]
-        return f"{self.source}:{self.lines[key]}" if key in self.lines else self.source
+        return self.origins.get(key, self.source)
 
 
 def read_yaml(path: Path, text: str | None = None) -> Document:
@@ -67,7 +67,7 @@ def read_yaml(path: Path, text: str | None = None) -> Document:
     value = _plain(node, (), lines, mistakes, str(path))
     if mistakes:
         raise InputError("\n".join(mistakes))
-    return Document(str(path), value, lines)
+    return Document(str(path), value, {key: f"{path}:{line}" for key, line in lines.items()})
 
 
 def validated(model: type[ModelT], document: Document) -> ModelT:
@@ -92,7 +92,7 @@ def with_settings(document: Document, settings: Iterable[str]) -> Document:
         InputError: A setting has no "=" or is not YAML.
     """
     value = _copied(document.value)
-    lines = dict(document.lines)
+    origins = dict(document.origins)
     for setting in settings:
         name, equals, text = setting.partition("=")
         if not equals or not name:
@@ -108,8 +108,10 @@ def with_settings(document: Document, settings: Iterable[str]) -> Document:
             if not isinstance(place, dict):
                 raise InputError(f"--set {setting}: {parent} is a value, not a group of settings")
         place[last] = parsed
-        lines = {key: line for key, line in lines.items() if ".".join(map(str, key)) != name}
-    return replace(document, value=value, lines=lines)
+        written = (*parents, last)
+        origins = {key: where for key, where in origins.items() if key[: len(written)] != written}
+        origins[written] = "--set"
+    return replace(document, value=value, origins=origins)
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,23 +19,6 @@ SUFFIXES = (".yaml", ".yml")
 
 # what the schema says of a dangling reference without a line of its own; references.py says it with one
 _SAID_WITH_LINES = ("which is not in tunnel.nodes", "which no drift joins", "two props are called")
-
-
-@dataclass(frozen=True, slots=True)
-class SourcedDocument(Document):
-    """A document put together from several places.
-
-    Attributes:
-        origins: "file:line", or "--set", of each key path that has one.
-    """
-
-    origins: Mapping[Key, str] = field(default_factory=dict)
-
-    def where(self, key: Key) -> str:
-        """Return the origin of a key, or of its nearest known parent."""
-        while key and key not in self.origins:
-            key = key[:-1]
-        return self.origins.get(key, self.source)
 
 
 def scenario_names() -> list[str]:
@@ -83,7 +65,7 @@ def _checked(scenario: Scenario | None, mistakes: list[str]) -> Scenario:
     return scenario
 
 
-def _scenario(document: SourcedDocument, seed: int) -> tuple[Scenario | None, list[str]]:
+def _scenario(document: Document, seed: int) -> tuple[Scenario | None, list[str]]:
     """Draw a scenario; return it and every mistake found, both if the world only contradicts itself."""
     mistakes = [_told(document, key, rule) for key, rule in form_mistakes(document.value).items()]
     drawn = drawing(document.value, seed)
@@ -91,7 +73,7 @@ def _scenario(document: SourcedDocument, seed: int) -> tuple[Scenario | None, li
     is_frozen = tree.pop("frozen", False)
     if not isinstance(is_frozen, bool):
         mistakes.append(_told(document, ("frozen",), "expected true or false"))
-    place = SourcedDocument(document.source, tree, {}, _drawn_origins(document, drawn))
+    place = Document(document.source, tree, _drawn_origins(document, drawn))
     references = reference_mistakes(tree)
     mistakes += [_told(place, key, rule) for key, rule in references]
     try:
@@ -109,7 +91,7 @@ def _frozen(scenario: Scenario) -> Scenario:
     return scenario.model_copy(update={"props": tuple(props)})
 
 
-def _drawn_origins(document: SourcedDocument, drawn: Drawing) -> dict[Key, str]:
+def _drawn_origins(document: Document, drawn: Drawing) -> dict[Key, str]:
     return {key: document.where(source) for key, source in drawn.origins.items()}
 
 
@@ -122,7 +104,7 @@ def _without_repetition(lines: list[str], broken: set[Key], has_references: bool
     ]
 
 
-def _told(document: SourcedDocument, key: Key, rule: str) -> str:
+def _told(document: Document, key: Key, rule: str) -> str:
     value = document.value
     for part in key:
         is_there = part in value if isinstance(value, dict) else isinstance(value, list) and part in range(len(value))
@@ -142,16 +124,8 @@ def _line_of(line: str) -> tuple[str, int]:
     return (match[1], int(match[2])) if match else (line, 0)
 
 
-def _document(name_or_path: str, settings: Iterable[str]) -> SourcedDocument:
-    document = _extended(_path_of(name_or_path), ())
-    settings = list(settings)
-    changed = with_settings(document, settings)
-    origins = dict(document.origins)
-    for setting in settings:
-        name = tuple(setting.partition("=")[0].split("."))
-        origins = {key: where for key, where in origins.items() if key[: len(name)] != name}
-        origins[name] = "--set"
-    return SourcedDocument(document.source, changed.value, {}, origins)
+def _document(name_or_path: str, settings: Iterable[str]) -> Document:
+    return with_settings(_extended(_path_of(name_or_path), ()), settings)
 
 
 def _path_of(name_or_path: str) -> Path:
@@ -178,20 +152,20 @@ def _family_of(path: Path) -> str:
     return resolved.relative_to(root).with_suffix("").as_posix() if resolved.is_relative_to(root) else path.stem
 
 
-def _extended(path: Path, children: tuple[Path, ...]) -> SourcedDocument:
+def _extended(path: Path, children: tuple[Path, ...]) -> Document:
     """Read a file and write it over the one it extends; `family` is its own name unless it gives one."""
     read = read_yaml(path)
     if not isinstance(read.value, dict):
         raise ScenarioError(f"{path}: expected keys and values, got {type(read.value).__name__}")
-    origins = {key: f"{path}:{line}" for key, line in read.lines.items()}
+    origins = dict(read.origins)
     value: dict[Any, Any] = dict(read.value)
     value.setdefault("family", _family_of(path))
     base_name = value.pop("extends", None)
     if base_name is None:
-        return SourcedDocument(str(path), value, {}, origins)
+        return Document(str(path), value, origins)
     base = _extended(_base_path(base_name, path, origins[("extends",)], children), (*children, path))
     kept = {key: where for key, where in base.origins.items() if not _is_replaced(key, base.value, value)}
-    return SourcedDocument(str(path), merged(base.value, value), {}, kept | origins)
+    return Document(str(path), merged(base.value, value), kept | origins)
 
 
 def _base_path(name: Any, path: Path, where: str, children: tuple[Path, ...]) -> Path:
