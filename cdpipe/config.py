@@ -63,7 +63,6 @@ class QueryConfig(Settings):
 class ExtractConfig(Settings):
     """Point-to-voxel comparison inside a region."""
 
-    method: Literal["voxel"] = Field("voxel", description="occupancy voxels of the other session")
     voxel_m: Positive = Field(0.65, description="voxel size (paper: 0.65)")
     min_points: Count = Field(1, description="points that make a voxel occupied")
     origin_m: float = Field(0.0, description="offset of the grid along every axis")

@@ -49,9 +49,9 @@ def cut_out(
     """Compare both maps inside every reported region and group the map points that are in one of them only.
 
     A map point belongs to at most one object: the better region takes it first. The figures are the paper's Table II
-    by our definition: `v_sphere_m3` volume of the convex hull of the after map's points in the sphere, `v_oe_m3` sum of
-    the volumes of the convex hulls of the region's objects, `s_points` after map points in the sphere, `oe_points` map
-    points on the objects.
+    by our definition, all of the after map: `v_sphere_m3` volume of the convex hull of its points in the sphere,
+    `v_oe_m3` sum of the volumes of the convex hulls of its objects in the region, `s_points` its points in the sphere,
+    `oe_points` those of them on the objects.
 
     Args:
         merged: Both maps.
@@ -80,9 +80,10 @@ def cut_out(
                 found.append(PointGroup(session, indices[members], points[members], region))
                 is_taken[session][indices[members]] = True
         figures["v_sphere_m3"][region] = hull_volume_m3(sphere["after"])
-        figures["v_oe_m3"][region] = sum(hull_volume_m3(group.points_map) for group in found)
+        added = [group.points_map for group in found if group.session == "after"]
+        figures["v_oe_m3"][region] = sum(hull_volume_m3(points) for points in added)
         figures["s_points"][region] = len(sphere["after"])
-        figures["oe_points"][region] = sum(len(group.points_map) for group in found)
+        figures["oe_points"][region] = sum(len(points) for points in added)
         groups += found
     return groups, figures
 

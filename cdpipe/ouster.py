@@ -177,8 +177,11 @@ def parse_metadata(document: dict[str, Any], source: str, mode: str | None = Non
     for key in ("beam_altitude_angles", "beam_azimuth_angles", "lidar_mode"):
         if key not in flat:
             raise InputError(f"{source}: {key} is missing: expected the metadata JSON of an Ouster sensor")
-    altitude = np.asarray(flat["beam_altitude_angles"], dtype=np.float64)
-    azimuth = np.asarray(flat["beam_azimuth_angles"], dtype=np.float64)
+    try:
+        altitude = np.asarray(flat["beam_altitude_angles"], dtype=np.float64)
+        azimuth = np.asarray(flat["beam_azimuth_angles"], dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{source}: beam angles must be lists of numbers ({error})") from error
     if altitude.ndim != 1 or altitude.shape != azimuth.shape or not np.isfinite([altitude, azimuth]).all():
         raise InputError(
             f"{source}: beam_altitude_angles and beam_azimuth_angles must be equally long lists of numbers, "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from cdpipe.session import ScanChunk, Session, chunk_path, is_session, read_sess
 from cdpipe.types import PosedScan, ScanSource
 
 _UNIT_TOLERANCE = 1e-3
+_NUMBERS = re.compile(r"(\d+)")
 _TUM_LINE = "stamp tx ty tz qx qy qz qw"
 
 
@@ -138,6 +140,14 @@ def _open_ply_scans(folder: Path) -> PlyScans:
     if not files:
         raise InputError(
             f"{folder}: no scans in it: expected session.json (a session of ours), or *.ply scans with a TUM trajectory"
+        )
+    by_number = sorted(
+        files, key=lambda file: [int(part) if part.isdigit() else part for part in _NUMBERS.split(file.name)]
+    )
+    if by_number != files:
+        raise InputError(
+            f"{folder}: the *.ply files are numbered without leading zeros, so that their names sort as "
+            f"{files[0].name}, {files[1].name}, ...: pad the numbers to equal length"
         )
     trajectories = sorted([*folder.glob("*.txt"), *folder.glob("*.tum")])
     if len(trajectories) != 1:

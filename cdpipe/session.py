@@ -190,7 +190,9 @@ def read_session(path: Path) -> Session:
             )
         n_scans, chunk_scans = int(document["n_scans"]), int(document["chunk_scans"])
         sensor_document, provenance = document["sensor"], document["provenance"]
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        if chunk_scans < 1:
+            raise ValueError(f"chunk_scans = {chunk_scans}")
+    except (KeyError, TypeError, ValueError) as error:  # ValueError: not JSON, not text, or not a number
         raise InputError(f"{path / 'session.json'}: damaged: {error}") from error
     poses = load_arrays(path / "odometry.npz").get("odom_T_sensor")
     if poses is None or len(poses) != n_scans:

@@ -182,6 +182,8 @@ class ChangeRegions:
         require_shape("centres_map", self.centres_map, (n, 3))
         require_shape("pairs", self.pairs, (n, 2))
         require_shape("is_reported", self.is_reported, (n,))
+        if self.is_reported.dtype != np.bool_:
+            raise ValueError(f"is_reported must be a boolean mask, got {self.is_reported.dtype}")
         if (np.diff(self.scores) > 0).any():
             raise ValueError("scores must fall: best candidate first")
 

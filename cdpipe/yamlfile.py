@@ -57,14 +57,16 @@ def read_yaml(path: Path, text: str | None = None) -> Document:
     try:
         text = path.read_text() if text is None else text
         node = yaml.compose(text, Loader=yaml.SafeLoader)
+        lines: dict[Key, int] = {}
+        mistakes: list[str] = []
+        value = _plain(node, (), lines, mistakes, str(path))
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
         raise InputError(f"{path}:{line}: not YAML: {error.problem}") from error
-    lines: dict[Key, int] = {}
-    mistakes: list[str] = []
-    value = _plain(node, (), lines, mistakes, str(path))
+    except (yaml.YAMLError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: not YAML: {error}") from error
     if mistakes:
         raise InputError("\n".join(mistakes))
     return Document(str(path), value, {key: f"{path}:{line}" for key, line in lines.items()})

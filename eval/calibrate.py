@@ -38,7 +38,10 @@ def alarm_threshold(best_scores: Float64Array, alarm_share: float = ALARM_SHARE)
 
 
 def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per variant: threshold, pairs, pairs that alarm at it, refused pairs.
+    """Return one row per variant and scenario: threshold, pairs, pairs that alarm at it, pairs without an answer.
+
+    A threshold belongs to a kind of site, as the radius does: what is much change in a narrow drift is little in a
+    wide one.
 
     Raises:
         InputError: A pair has changes, so that its alarms would not be false.
@@ -48,14 +51,13 @@ def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
         raise InputError(f"{', '.join(changed)}: has changes: calibration needs unchanged pairs")
     best = regions.groupby(["variant", "scenario", "seed"])["score"].max()
     rows = []
-    for variant, cases in results.groupby("variant", sort=False):
+    for (variant, scenario), cases in results.groupby(["variant", "scenario"], sort=False):
         ok = cases[cases["status"] == "ok"]
-        keys = [(variant, scenario, seed) for scenario, seed in zip(ok["scenario"], ok["seed"], strict=True)]
-        scores = np.array([best.get(key, -np.inf) for key in keys], dtype=np.float64)
+        scores = np.array([best.get((variant, scenario, seed), -np.inf) for seed in ok["seed"]], dtype=np.float64)
         threshold = alarm_threshold(scores)
         n_alarms = int((scores >= threshold).sum())
-        rows.append((variant, threshold, len(ok), n_alarms, len(cases) - len(ok)))
-    return pd.DataFrame(rows, columns=["variant", "threshold", "n_pairs", "n_alarms", "n_refused"])
+        rows.append((variant, scenario, threshold, len(ok), n_alarms, len(cases) - len(ok)))
+    return pd.DataFrame(rows, columns=["variant", "scenario", "threshold", "n_pairs", "n_alarms", "n_unanswered"])
 
 
 def main(run: Annotated[Path, typer.Argument(help="folder of `tunnelcd run calibrate`")]) -> None:

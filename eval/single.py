@@ -32,7 +32,7 @@ def describe_session(folder: Path, config: PipelineConfig) -> tuple[DescriptorSe
     source = open_scans(folder)
     chosen = keyframes(source.odom_T_sensor, config.map.keyframe_spacing_m)
     descriptors = describe_scans(source, chosen, config.descriptor)
-    return descriptors, save_descriptors(folder, descriptors)
+    return descriptors, save_descriptors(folder, descriptors, source.odom_T_sensor)
 
 
 def detect_pair(before: Path, after: Path, config: PipelineConfig, on_stage: OnStage) -> ChangeReport:
@@ -104,7 +104,7 @@ def object_table(report: ChangeReport) -> pd.DataFrame:
 
 
 def _descriptors(folder: Path, source: ScanSource, pointmap: PointMap, config: PipelineConfig) -> DescriptorSet:
-    stored = load_descriptors(folder, config.descriptor)
+    stored = load_descriptors(folder, config.descriptor, source.odom_T_sensor)
     if stored is not None and np.array_equal(stored.keyframe_scans, pointmap.keyframe_scans):
         return stored
     return describe_scans(source, pointmap.keyframe_scans, config.descriptor)

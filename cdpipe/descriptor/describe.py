@@ -18,7 +18,7 @@ from cdpipe.descriptor.network import (
 )
 from cdpipe.descriptor.range_image import range_image
 from cdpipe.errors import InputError
-from cdpipe.geometry import Float32Array, Int64Array
+from cdpipe.geometry import Float32Array, Float64Array, Int64Array
 from cdpipe.session import load_arrays
 from cdpipe.types import DescriptorSet, PosedScan, ScanSource
 
@@ -51,8 +51,11 @@ def describe_scans(source: ScanSource, keyframe_scans: Int64Array, config: Descr
     return DescriptorSet(q, w, keyframe_scans, config.method, checkpoint)
 
 
-def save_descriptors(folder: Path, descriptors: DescriptorSet) -> Path:
-    """Store descriptors beside a session, in `folder/descriptors/<name>.npz`, and return the file."""
+def save_descriptors(folder: Path, descriptors: DescriptorSet, odom_T_sensor: Float64Array) -> Path:
+    """Store descriptors beside a session, in `folder/descriptors/<name>.npz`, and return the file.
+
+    The poses (S, 4, 4) of the session are stored with them, to tell whether they still belong to it.
+    """
     path = folder / "descriptors" / f"{descriptors.name}.npz"
     partial = path.with_suffix(".partial.npz")
     try:
@@ -64,6 +67,7 @@ def save_descriptors(folder: Path, descriptors: DescriptorSet) -> Path:
             checkpoint=np.array(descriptors.checkpoint),
             q=descriptors.q,
             keyframe_scans=descriptors.keyframe_scans,
+            odom_T_sensor=odom_T_sensor,
             **orientation,
         )
         partial.replace(path)
@@ -72,16 +76,24 @@ def save_descriptors(folder: Path, descriptors: DescriptorSet) -> Path:
     return path
 
 
-def load_descriptors(folder: Path, config: DescriptorConfig) -> DescriptorSet | None:
-    """Read stored descriptors; None where there are none, or none of the present checkpoint."""
+def load_descriptors(folder: Path, config: DescriptorConfig, odom_T_sensor: Float64Array) -> DescriptorSet | None:
+    """Read stored descriptors; None where there are none, or none of the present checkpoint and of these poses.
+
+    Raises:
+        InputError: The file is damaged.
+    """
     path = folder / "descriptors" / f"{config.method}.npz"
     if not path.is_file():
         return None
     arrays = load_arrays(path)
-    checkpoint = str(arrays["checkpoint"])
-    if checkpoint != _network(config.method)[1]:
-        return None
-    return DescriptorSet(arrays["q"], arrays.get("w"), arrays["keyframe_scans"], config.method, checkpoint)
+    try:
+        checkpoint = str(arrays["checkpoint"])
+        is_of_session = np.array_equal(arrays["odom_T_sensor"], odom_T_sensor)
+        if not is_of_session or checkpoint != _network(config.method)[1]:
+            return None
+        return DescriptorSet(arrays["q"], arrays.get("w"), arrays["keyframe_scans"], config.method, checkpoint)
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: damaged ({error}): remove it and describe the session again") from error
 
 
 def checkpoint_digest(config: DescriptorConfig) -> str:

@@ -9,6 +9,7 @@ from cdpipe.descriptor import describe_scan, describe_scans, load_descriptors, r
 from cdpipe.descriptor.network import DIMENSIONS, initial_network, yaw_correlation
 from cdpipe.descriptor.range_image import COLUMNS, ELEVATION_RAD, ROWS, range_image
 from cdpipe.descriptor.training import PlaceData, TrainingConfig, evaluate, train
+from cdpipe.errors import InputError
 from cdpipe.types import PosedScan
 
 
@@ -58,13 +59,18 @@ def test_descriptors_are_unit_vectors_and_survive_the_disk(tmp_path: Path, metho
     q, w = describe_scan(_Source().scan(2), config)
     np.testing.assert_allclose(made.q[1], q, atol=1e-6)
     np.testing.assert_allclose(made.w[1], w, atol=1e-6)
-    assert load_descriptors(tmp_path, config) is None
-    save_descriptors(tmp_path, made)
-    read = load_descriptors(tmp_path, config)
+    poses = _Source.odom_T_sensor
+    assert load_descriptors(tmp_path, config, poses) is None
+    path = save_descriptors(tmp_path, made, poses)
+    assert load_descriptors(tmp_path, config, poses + 1e-9) is None  # recorded anew
+    read = load_descriptors(tmp_path, config, poses)
     assert read is not None
     np.testing.assert_array_equal(read.q, made.q)
     np.testing.assert_array_equal(read.w, made.w)
     assert (read.name, read.checkpoint) == (method, made.checkpoint)
+    np.savez(path, q=made.q)
+    with pytest.raises(InputError, match=r"damaged .* describe the session again"):
+        load_descriptors(tmp_path, config, poses)
 
 
 def _rooms(n_tunnels: int) -> PlaceData:

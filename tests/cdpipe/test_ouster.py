@@ -68,6 +68,7 @@ def test_nested_metadata_of_newer_firmware_is_read() -> None:
     [
         ({"beam_altitude_angles": None}, "beam_altitude_angles is missing"),
         ({"beam_azimuth_angles": [1.0]}, "equally long"),
+        ({"beam_azimuth_angles": ["left"]}, "lists of numbers"),
         ({"beam_altitude_angles": list(range(32))}, "must fall"),
         ({"lidar_mode": "fast"}, "expected <columns>x<Hz>"),
         ({"lidar_to_sensor_transform": [1, 2]}, "16 numbers"),

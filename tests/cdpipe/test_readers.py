@@ -60,6 +60,12 @@ def test_ply_scans_with_a_trajectory(tmp_path: Path) -> None:
     np.testing.assert_array_equal(second.stamps_ns, [500_000_000, 500_000_000])
 
 
+def test_unpadded_numbers_would_pair_scans_with_wrong_poses(tmp_path: Path) -> None:
+    folder = recording(tmp_path / "run", 3)
+    (folder / "scan_000.ply").rename(folder / "scan_10.ply")
+    assert "pad the numbers to equal length" in said(folder)
+
+
 def test_each_chunk_is_read_once_when_read_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = open_scans(session(tmp_path / "session"))
     reads: list[int] = []

@@ -92,6 +92,15 @@ def test_other_folders_and_versions_are_named(tmp_path: Path) -> None:
         read_session(path)
 
 
+@pytest.mark.parametrize("change", [{"n_scans": "many"}, {"chunk_scans": 0}, {"sensor": None}])
+def test_a_damaged_description_is_named(tmp_path: Path, change: dict[str, object]) -> None:
+    path = _written(tmp_path / "s")
+    document = json.loads((path / "session.json").read_text())
+    (path / "session.json").write_text(json.dumps({**document, **change}))
+    with pytest.raises(InputError, match=r"session\.json"):
+        read_session(path)
+
+
 def test_nothing_is_unpickled(tmp_path: Path) -> None:
     path = _written(tmp_path / "s")
     np.savez(path / "odometry.npz", odom_T_sensor=np.array([{"a": 1}] * 5, dtype=object))

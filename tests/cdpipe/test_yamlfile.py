@@ -57,6 +57,18 @@ def test_files_that_are_not_one_mapping(text: str, message: str) -> None:
         read_yaml(Path("box.yaml"), text)
 
 
+@pytest.mark.parametrize("text", ["a: !foo b\n", "a: \x07\n", "{[1]: 2}\n", "a: 2020-13-45\n"])
+def test_yaml_that_only_looks_like_yaml(text: str) -> None:
+    with pytest.raises(InputError, match=r"box\.yaml.*: not YAML"):
+        read_yaml(Path("box.yaml"), text)
+
+
+def test_a_file_that_is_no_text(tmp_path: Path) -> None:
+    (tmp_path / "box.yaml").write_bytes(b"name: \xff\xfe\n")
+    with pytest.raises(InputError, match=r"box\.yaml: not YAML"):
+        read_yaml(tmp_path / "box.yaml")
+
+
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nowhere\.yaml: cannot be read"):
         read_yaml(tmp_path / "nowhere.yaml")

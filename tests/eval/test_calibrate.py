@@ -38,7 +38,7 @@ def test_a_table_by_hand() -> None:
         columns=["scenario", "seed", "variant", "score"],
     )
     row = thresholds(_results(), regions).iloc[0]
-    assert (row["variant"], row["n_pairs"], row["n_alarms"], row["n_refused"]) == ("m", 3, 0, 1)
+    assert (row["variant"], row["n_pairs"], row["n_alarms"], row["n_unanswered"]) == ("m", 3, 0, 1)
     assert row["threshold"] == pytest.approx(5.001)
 
 
