@@ -63,6 +63,7 @@ def test_ply_scans_with_a_trajectory(tmp_path: Path) -> None:
 def test_unpadded_numbers_would_pair_scans_with_wrong_poses(tmp_path: Path) -> None:
     folder = recording(tmp_path / "run", 3)
     (folder / "scan_000.ply").rename(folder / "scan_10.ply")
+    (folder / "scan_001.ply").rename(folder / "scan_9.ply")
     assert "pad the numbers to equal length" in said(folder)
 
 
