@@ -1,8 +1,9 @@
 """Putting both maps into one frame: FRAME (Stathoulopoulos et al., arXiv 2301.09213), re-implemented from its text.
 
 A k-d tree on the place vectors gives the closest descriptor pairs, the orientation vectors the yaw between them, and
-the spheres around a pair are registered with GICP, then VGICP. Ours, because the paper has none of it: several pairs
-are tried, every alignment is measured (cdpipe/evidence.py), and one without enough evidence is refused.
+the spheres around a pair are registered with GICP, then VGICP. Ours, because the paper has none of it: pairs are ranked
+by how many others agree with them, several are tried, every alignment is measured (cdpipe/evidence.py), and one without
+enough evidence is refused.
 """
 
 from __future__ import annotations
@@ -17,14 +18,17 @@ from scipy.spatial import cKDTree
 from cdpipe.config import MergeConfig
 from cdpipe.descriptor import relative_yaws_rad
 from cdpipe.evidence import MIN_SPHERE_POINTS, MapCheck, Place, sphere_fit, why_refused
-from cdpipe.geometry import Float64Array, invert, make_pose, transform, yaw_pose
+from cdpipe.geometry import Float64Array, Int64Array, invert, make_pose, transform, yaw_pose
 from cdpipe.sphere import MapIndex
 from cdpipe.types import DescriptorSet, MappedSession, MergedMaps, PointMap
 
 _N_YAWS = 2
 # Without orientation vectors: GICP recovers from about 60 degrees, so quarter turns cover the circle.
 _BLIND_YAWS_RAD = np.array([0.0, np.pi, np.pi / 2, -np.pi / 2])
-_NEIGHBOURS_PER_QUERY = 4
+# Keyframes paired at most; pair by pair they are compared, so that twice as many cost four times the time.
+_MAX_PAIRS = 1500
+_SUPPORT_M = 2.0
+_SUPPORT_SHARE = 0.01
 # A hypothesis this good ends the search: right places reach 0.99 in the sphere and along both paths.
 _CLEAR_INLIER_SHARE = 0.97
 _CLEAR_AGREEMENT = 0.97
@@ -127,32 +131,49 @@ def register(
 
 
 def closest_pairs(before: MappedSession, after: MappedSession, config: MergeConfig) -> list[tuple[int, int, float]]:
-    """Return up to `n_candidates` (before keyframe, after keyframe, descriptor distance), closest first.
+    """Return up to `n_candidates` (before keyframe, after keyframe, descriptor distance), most supported first.
 
-    A pair whose two keyframes both lie within half a sphere of an already chosen pair's would repeat that trial and is
-    left out.
+    Every after keyframe is paired with its nearest before keyframe in descriptor space. In a mine of equal drifts most
+    of these pairs are wrong, the closest ones too, but only right ones agree with one another; see `pair_support`. Of
+    equal support the closest comes first. A pair whose two keyframes both lie within half a sphere of an already chosen
+    pair's would repeat that trial and is left out.
     """
     if len(before.descriptors.q) == 0 or len(after.descriptors.q) == 0:
         return []
-    n_neighbours = min(_NEIGHBOURS_PER_QUERY, len(before.descriptors.q))
-    found = cKDTree(before.descriptors.q).query(after.descriptors.q, k=[*range(1, n_neighbours + 1)])
+    n_after = len(after.descriptors.q)
+    queried = np.unique(np.linspace(0, n_after - 1, min(n_after, _MAX_PAIRS)).round().astype(np.int64))
+    found = cKDTree(before.descriptors.q).query(after.descriptors.q[queried])
     distances, nearest = np.asarray(found[0]), np.asarray(found[1])
-    before_positions = keyframe_poses(before.map, before.descriptors)[:, :3, 3]
-    after_positions = keyframe_poses(after.map, after.descriptors)[:, :3, 3]
-    chosen: list[tuple[int, int, float]] = []
-    for flat in np.argsort(distances, axis=None, kind="stable"):
-        j, rank = divmod(int(flat), n_neighbours)
-        i = int(nearest[j, rank])
+    before_positions = keyframe_poses(before.map, before.descriptors)[nearest, :3, 3]
+    after_positions = keyframe_poses(after.map, after.descriptors)[queried, :3, 3]
+    support = pair_support(before_positions, after_positions)
+    chosen: list[int] = []
+    for pair in np.lexsort((distances, -support)).tolist():
         is_repeated = any(
-            np.linalg.norm(before_positions[i] - before_positions[other_i]) < config.sphere_radius_m / 2
-            and np.linalg.norm(after_positions[j] - after_positions[other_j]) < config.sphere_radius_m / 2
-            for other_i, other_j, _ in chosen
+            np.linalg.norm(before_positions[pair] - before_positions[other]) < config.sphere_radius_m / 2
+            and np.linalg.norm(after_positions[pair] - after_positions[other]) < config.sphere_radius_m / 2
+            for other in chosen
         )
         if not is_repeated:
-            chosen.append((i, j, float(distances[j, rank])))
+            chosen.append(pair)
         if len(chosen) == config.n_candidates:
             break
-    return chosen
+    return [(int(nearest[pair]), int(queried[pair]), float(distances[pair])) for pair in chosen]
+
+
+def pair_support(before_positions: Float64Array, after_positions: Float64Array) -> Int64Array:
+    """Return for each of P pairs how many are as far from it in the before as in the after session, itself included.
+
+    A rigid motion keeps distances: any two right pairs pass, whatever the motion is. The tolerance is 2 m, for two
+    keyframes of one place that are a metre apart, and 1 % of the distance, for drift.
+
+    Args:
+        before_positions: (P, 3) before keyframe of each pair, its session's odom frame, metres.
+        after_positions: (P, 3) after keyframe of each pair, likewise.
+    """
+    apart_m = [np.linalg.norm(p[:, None] - p[None], axis=2) for p in (before_positions, after_positions)]
+    is_consistent = np.abs(apart_m[0] - apart_m[1]) < _SUPPORT_M + _SUPPORT_SHARE * apart_m[1]
+    return np.asarray(np.count_nonzero(is_consistent, axis=1))
 
 
 def keyframe_poses(point_map: PointMap, descriptors: DescriptorSet) -> Float64Array:

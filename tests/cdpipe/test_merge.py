@@ -9,7 +9,7 @@ import pytest
 
 from cdpipe.config import MergeConfig
 from cdpipe.geometry import Float64Array, invert, make_pose, rotation_angle_rad, stream, transform, yaw_pose
-from cdpipe.merge import closest_pairs, merge_maps, register
+from cdpipe.merge import closest_pairs, merge_maps, pair_support, register
 from cdpipe.ply import read_ply_points
 from cdpipe.types import DescriptorSet, MappedSession
 
@@ -128,17 +128,28 @@ def test_maps_too_small_to_register_are_refused(tunnel_before: MappedSession) ->
         np.testing.assert_array_equal(merged.before_T_after, np.eye(4))
 
 
-def test_pairs_are_closest_first_and_apart(tunnel_before: MappedSession, tunnel_after: MappedSession) -> None:
-    config = MergeConfig(n_candidates=4)
-    pairs = closest_pairs(tunnel_before, tunnel_after, config)
+def test_only_right_pairs_support_one_another() -> None:
+    # three right pairs, turned by 90 degrees and moved; two wrong ones
+    before = np.array([[0.0, 0, 0], [10, 0, 0], [25, 5, 0], [40, 0, 0], [7, 0, 0]])
+    after = transform(yaw_pose(np.pi / 2, (100, 50, 1)), before)
+    after[3:] = [[130.0, 20, 0], [101, 95, 0]]
+    assert pair_support(before, after).tolist() == [3, 3, 3, 1, 1]
+    # 2 m and 1 % of the distance are tolerated, more is not
+    line = np.array([[0.0, 0, 0], [100, 0, 0]])
+    for stretch_m, n in ((2.9, 2), (3.2, 1)):
+        assert pair_support(line, line + np.array([[0.0, 0, 0], [stretch_m, 0, 0]])).tolist() == [n, n]
+
+
+def test_pairs_are_nearest_in_descriptor_space_and_apart(
+    tunnel_before: MappedSession, tunnel_after: MappedSession
+) -> None:
+    pairs = closest_pairs(tunnel_before, tunnel_after, MergeConfig(n_candidates=4))
     assert len(pairs) == 4
-    distances = [distance for _, _, distance in pairs]
-    assert distances == sorted(distances)
     q_before, q_after = tunnel_before.descriptors.q, tunnel_after.descriptors.q
     all_distances = np.linalg.norm(q_before[:, None] - q_after[None], axis=2)
-    assert distances[0] == pytest.approx(all_distances.min(), abs=1e-6)
     for i, j, distance in pairs:
         assert distance == pytest.approx(all_distances[i, j], abs=1e-6)
+        assert distance == pytest.approx(all_distances[:, j].min(), abs=1e-6)
     # keyframes are a metre apart on a tunnel without loops: half a sphere is five of them
     before_keyframes = sorted(i for i, _, _ in pairs)
     assert min(np.diff(before_keyframes)) >= 4
