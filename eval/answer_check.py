@@ -53,9 +53,11 @@ def _check_regions(regions: ChangeRegions, n_keyframes: int, n_scans: int) -> No
 
 
 def _check_scans(name: str, scans: Int64Array, n_scans: int) -> None:
+    if scans.ndim == 1 and len(scans) == 0:
+        return  # no keyframes named; nothing has a type then
     if scans.ndim != 1 or not np.issubdtype(scans.dtype, np.integer):
         raise ValueError(f"{name} must be a list of whole numbers, got {scans.dtype} {scans.shape}")
-    if len(scans) and not (scans.min() >= 0 and scans.max() < n_scans):
+    if not (scans.min() >= 0 and scans.max() < n_scans):
         raise ValueError(f"{name} names scans {scans.min()} to {scans.max()}, the session has 0 to {n_scans - 1}")
 
 

@@ -15,6 +15,7 @@ import typer
 
 from cdpipe.errors import InputError
 from cdpipe.geometry import Float64Array
+from eval.cli import input_errors
 
 ALARM_SHARE = 0.05
 
@@ -62,10 +63,19 @@ def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
 
 def main(run: Annotated[Path, typer.Argument(help="folder of `tunnelcd run calibrate`")]) -> None:
     """Print and write the thresholds of a calibration run."""
-    table = thresholds(pd.read_csv(run / "results.csv"), pd.read_csv(run / "regions.csv"))
+    table = thresholds(_read(run / "results.csv"), _read(run / "regions.csv"))
     table.to_csv(run / "thresholds.csv", index=False)
     typer.echo(table.to_string(index=False))
 
 
+def _read(path: Path) -> pd.DataFrame:
+    try:
+        return pd.read_csv(path)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: {reason}: name a folder that `tunnelcd run calibrate` made") from error
+
+
 if __name__ == "__main__":
-    typer.run(main)
+    with input_errors():
+        typer.run(main)

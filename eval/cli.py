@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,24 +25,34 @@ if TYPE_CHECKING:
     from eval.plan import Plan
 
 
-class _Funnel(TyperGroup):
-    """Turns what a user can cause into one line and an exit code; anything else stays a traceback."""
+@contextmanager
+def input_errors() -> Iterator[None]:
+    """Turn what a user can cause into one line for each mistake and exit code 2; anything else stays a traceback."""
+    from cdpipe.errors import TunnelcdError
 
+    try:
+        yield
+    except TunnelcdError as error:
+        for line in str(error).splitlines():
+            sys.stderr.write(f"error: {line}\n")
+        raise SystemExit(2) from error
+
+
+class _Funnel(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
-        from cdpipe.errors import TunnelcdError
-
         try:
-            return super().invoke(ctx)
-        except TunnelcdError as error:
-            for line in str(error).splitlines():
-                sys.stderr.write(f"error: {line}\n")
-            raise typer.Exit(2) from error
+            with input_errors():
+                return super().invoke(ctx)
         except KeyboardInterrupt as error:
-            sys.stderr.write("interrupted; finished cells are kept, the same command goes on from there\n")
+            kept = "finished cells are kept, the same command goes on from there"
+            sys.stderr.write(
+                f"interrupted; {kept if ctx.invoked_subcommand in _KEEP_CELLS else 'nothing was written'}\n"
+            )
             raise typer.Exit(130) from error
 
 
+_KEEP_CELLS = ("run", "demo")
 app = typer.Typer(
     cls=_Funnel,
     no_args_is_help=True,
@@ -146,7 +157,9 @@ def score(
     if answer is not None:
         from eval.scoring import score_pair
 
-        _row(score_pair(folder, answer).row)
+        row = score_pair(folder, answer).row
+        if not quiet:
+            _row(row)
         return
     from eval.rescoring import rescore
     from eval.runfolder import open_run_folder
@@ -225,9 +238,11 @@ def check(files: Annotated[list[str], typer.Argument(help="scenario, plan or pre
 
 
 def _run(plan: Plan, out: Path, *, force: bool, limit: int | None, quiet: bool) -> None:
+    from eval.plan import cells
     from eval.runfolder import start_run_folder
     from eval.runner import run_plan
 
+    cells(plan)  # settings that contradict each other are refused before a folder is made
     run = start_run_folder(out)
     with shown_progress(quiet) as progress:
         outcome = run_plan(plan, run, command=["tunnelcd", *sys.argv[1:]], force=force, limit=limit, progress=progress)

@@ -27,6 +27,8 @@ from cdpipe.geometry import travelled_m, yaw_rad
 from cdpipe.session import load_arrays
 from cdpipe.types import SessionName
 from eval.adapters import pipeline_input
+from eval.cli import input_errors
+from eval.output import make_writable
 from eval.provenance import git_commit
 from scenarios.library import load_scenario
 from sim.simulate import simulate_pair
@@ -68,7 +70,7 @@ def make_tunnel(family: str, seed: int, path: Path) -> None:
 
 def load_data(folder: Path, seeds: Iterable[int]) -> tuple[PlaceData, str]:
     """Read the tunnels of both families and the given seeds, making those that are missing; return their digest too."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_writable(folder)
     wanted = [(family, seed) for seed in seeds for family in FAMILIES]
     tunnels: list[dict[str, Any]] = []
     hasher = hashlib.sha256()
@@ -96,6 +98,7 @@ def main(
 ) -> None:
     """Train the scan descriptor on families narrow and wide; validation seeds only judge it."""
     use_threads(threads)
+    make_writable(out)
     training, data_digest = load_data(data, range(train_tunnels))
     validation, _ = load_data(data, range(FIRST_VALIDATION_SEED, FIRST_VALIDATION_SEED + validation_tunnels))
     config = TrainingConfig(seed=seed, steps=steps)
@@ -140,7 +143,6 @@ def main(
         "device": f"{platform.machine()} CPU, {threads} threads",
         "seconds": round(seconds, 1),
     }
-    out.mkdir(parents=True, exist_ok=True)
     (out / "3deg.safetensors").write_bytes(content)
     (out / "3deg.json").write_text(json.dumps(card, indent=1) + "\n")
     Console().print_json(json.dumps(card))
@@ -151,4 +153,5 @@ def _scores(scores: PlaceScores) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    with input_errors():
+        typer.run(main)

@@ -30,7 +30,8 @@ class ObjectMatches:
         iou_point: (C,) IoU of the point sets, 0 where unmatched, NaN for unobservable changes.
         iou_voxel: (C,) likewise for 0.1 m voxels, mean over 8 grid phases.
         iou_box: (C,) likewise for axis-aligned boxes.
-        is_excused: (O,) objects that lie mostly on changes outside of the main group and so cannot be false.
+        is_excused: (O,) objects with more than half of their rows on changes outside of the main group (unobservable or
+            partial), which so cannot be false.
     """
 
     matched_object: Int64Array
@@ -117,7 +118,8 @@ def match_objects(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], 
             ious["voxel"][row] = voxel_iou(true, answered)
             ious["box"][row] = box_iou(true, answered)
     is_main = truth.is_observable & ~truth.is_partial
-    is_excused = n_shared[~is_main].sum(axis=0) > n_shared[is_main].sum(axis=0)
+    n_rows = np.array([len(of_object) for of_object in rows], dtype=np.int64)
+    is_excused = 2 * n_shared[~is_main].sum(axis=0) > n_rows
     return ObjectMatches(matched_object, matched_change, ious["point"], ious["voxel"], ious["box"], is_excused)
 
 

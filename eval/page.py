@@ -7,6 +7,7 @@ is fetched. What a folder lacks is named on the page; only a folder without resu
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -86,6 +87,7 @@ def _content(data: RunData, tables: Mapping[str, Table]) -> dict[str, Any]:
         "sites": sites,
         "settings": settings(data),
         "provenance": json.dumps(data.provenance, indent=2, ensure_ascii=False),
+        "commits": commits_text(data),
         "columns": RESULT_COLUMNS,
         "time_meanings": TIME_MEANINGS,
         "point_colours": POINT_COLOURS,
@@ -121,6 +123,15 @@ def machine_text(provenance: Mapping[str, Any]) -> str:
         f"OMP_NUM_THREADS {used}",
     ]
     return ", ".join(part for part in parts if part)
+
+
+def commits_text(data: RunData) -> str:
+    """Return which commits made how many of the answers, "" where all are of one; cells are kept when code changes."""
+    counts = Counter(text(row, "commit") or "unknown" for row in data.results)
+    if len(counts) < 2:
+        return ""
+    named = ", ".join(f"{commit} ({n} {'row' if n == 1 else 'rows'})" for commit, n in counts.items())
+    return f"The answers were made by more than one commit: {named}. A + marks a tree that differed from its commit."
 
 
 def settings(data: RunData) -> Table:

@@ -147,7 +147,7 @@ TIME_MEANINGS = (
      "The paper's own total holds the merge on site 1 and leaves it out on site 2, so none is quoted."),
     ("V_sphere", "Volume of a region's sphere that is tunnel, by our definition; the paper states none.",
      "The paper's values are 34-58 % of 4/3 π r³."),
-    ("V_OE", "Volume of what was cut out of the region.", "Undefined where nothing was cut out."),
+    ("V_OE", "Volume of what was cut out of the region, after map only.", "Undefined where nothing was cut out."),
     ("points", "Thinned map points: of both maps, in a region's sphere, and on the objects cut out of it.",
      "Least and greatest over the regions that find a change."),
 )  # fmt: skip

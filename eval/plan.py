@@ -1,17 +1,17 @@
 """What is run: scenarios x seeds x variants, read from a plan file and spread out into cells.
 
-name: smoke
+name: example
 description: what the plan is for
-scenarios: [smoke/one_box]
+scenarios: [paper/site1, paper/site2]
 seeds: "20000:20002"                 # B excluded, in quotes; or a list
 variants:
-- preset: paper                    # a shipped preset or the path of a .yaml file
-set: ["extract.voxel_m=0.4"]     # part of the variant's name
-per_scenario: {paper/site2: ["query.radius_m=10"]}   # belongs to the site, not to the name
+  - preset: paper                    # a shipped preset or the path of a .yaml file
+    set: ["extract.voxel_m=0.4"]     # part of the variant's name
+    per_scenario: {paper/site2: ["query.radius_m=10"]}   # belongs to the site, not to the name
 grid:
-- variant: tunnelcd                # a preset
-scenarios: [paper/site1]         # out of the plan's
-keys: {extract.voxel_m: [0.2, 0.4], query.radius_m: [3, 4.5]}
+  - variant: tunnelcd                # a preset
+    scenarios: [paper/site1]         # out of the plan's
+    keys: {extract.voxel_m: [0.2, 0.4], query.radius_m: [3, 4.5]}
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ def cell_document(score: CaseScore, identity: Mapping[str, Any], key: str, place
 
     Args:
         score: What was scored.
-        identity: scenario, seed, variant and preset, whatever the answer calls itself.
+        identity: scenario, seed, variant and preset, whatever the answer calls itself; commit, the code that made it.
         key: Digest of what the cell depends on.
         place: Where its rows stand in the tables: scenario, variant.
     """
@@ -44,6 +44,7 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
     """Score every stored answer of a run again, without running anything, and rewrite the tables.
 
     An answer that no run made (another program's, put beside ours) becomes a variant named like its folder.
+    Nothing is written before all are scored, so that a mistake in one or an interrupt leaves the run as it was.
 
     Returns:
         How many answers were scored.
@@ -53,23 +54,24 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
     """
     progress = progress or Silent()
     folders = list(run.answer_folders())
-    n_done = 0
+    documents: dict[Path, dict[str, Any]] = {}
     for (slug, seed), group in groupby(folders, key=lambda folder: folder.parts[-3:-1]):
         truth = load_ground_truth(run.path / "pairs" / slug / seed)
         for folder in group:
-            progress.cells(f"{slug} {seed} {folder.name}", n_done, len(folders))
+            progress.cells(f"{slug} {seed} {folder.name}", len(documents), len(folders))
             path = run.path / "cells" / slug / seed / f"{folder.name}.json"
             stored = run.read_cell(path)
             score = score_stored(truth, folder)
             if stored is None:
                 names = {"scenario": slug.replace("__", "/"), "seed": int(seed)}
-                identity = {**names, "variant": folder.name, "preset": folder.name}
+                identity = {**names, "variant": folder.name, "preset": folder.name, "commit": None}
                 document = cell_document(score, identity, "", (len(folders), len(folders)))
             else:
-                identity = {name: stored["row"][name] for name in (*IDENTITY, "preset")}
+                identity = {name: stored["row"].get(name) for name in (*IDENTITY, "preset", "commit")}
                 document = cell_document(score, identity, stored["key"], stored["order"])
-            run.write_cell(path, document)
-            n_done += 1
-    progress.cells("done", n_done, n_done)
+            documents[path] = document
+    for path, document in documents.items():
+        run.write_cell(path, document)
+    progress.cells("done", len(documents), len(documents))
     write_tables(run)
-    return n_done
+    return len(documents)

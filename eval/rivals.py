@@ -178,12 +178,12 @@ def _changed_share(maps: _Maps, is_changed: dict[SessionName, BoolArray], config
 
 
 def _figures(maps: _Maps, regions: ChangeRegions, objects: Sequence[ChangedObject]) -> dict[str, Float64Array]:
-    """Return the volume table by the definition of `extract_objects`."""
+    """Return the volume table by the definition of `cut_out`: all four figures are of the after map."""
     figures = {name: np.full(len(regions.scores), np.nan) for name in FIGURES}
     index = MapIndex(maps.points["after"])
     for region in np.flatnonzero(regions.is_reported).tolist():
         sphere = maps.points["after"][index.crop(regions.centres_map[region], regions.radius_m)]
-        own = [item.points_map for item in objects if item.region == region]
+        own = [item.points_map for item in objects if item.region == region and item.session == "after"]
         figures["v_sphere_m3"][region] = hull_volume_m3(sphere)
         figures["v_oe_m3"][region] = sum(hull_volume_m3(points) for points in own)
         figures["s_points"][region] = len(sphere)

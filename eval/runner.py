@@ -97,7 +97,7 @@ def run_plan(
     for pair in pairs:
         todo = pair.todo[: n_run - n_done]
         if todo:
-            _run_pair(run, pair, todo, progress, (n_done, n_run))
+            _run_pair(run, pair, todo, progress, (n_done, n_run), provenance["git_commit"])
         n_done += len(todo)
     progress.cells("done", n_done, n_run)
     write_tables(run)
@@ -155,7 +155,12 @@ def _is_simulated(path: Path, scenario: Scenario | None, seed: int) -> bool:
 
 
 def _run_pair(
-    run: RunFolder, pair: _Pair, todo: Sequence[_Todo], progress: RunProgress, counts: tuple[int, int]
+    run: RunFolder,
+    pair: _Pair,
+    todo: Sequence[_Todo],
+    progress: RunProgress,
+    counts: tuple[int, int],
+    commit: str | None,
 ) -> None:
     """Run the cells of one pair; its maps are let go when this returns, before the next pair's are built."""
     done, total = counts
@@ -175,7 +180,8 @@ def _run_pair(
             folder = run.answer(pair.name, pair.seed, cell.variant)
             _answer(stages, cell, folder)
             score = score_stored(truth, folder)
-        identity = {"scenario": pair.name, "seed": pair.seed, "variant": cell.variant, "preset": cell.preset}
+        names = {"scenario": pair.name, "seed": pair.seed, "variant": cell.variant, "preset": cell.preset}
+        identity = {**names, "commit": commit}
         path = run.cell(pair.name, pair.seed, cell.variant)
         run.write_cell(path, cell_document(score, identity, each.key, each.place))
 

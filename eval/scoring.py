@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from cdpipe.answer import Answer, read_answer
+from cdpipe.extract import FIGURES, hull_volume_m3
 from cdpipe.geometry import Float64Array, travelled_m
 from cdpipe.types import ChangedObject, ChangeReport
 from eval.answer_check import check_answer
@@ -24,7 +24,6 @@ from eval.object_metrics import ObjectMatches, kinds_right, match_objects, objec
 from eval.region_metrics import RegionScores, keyframes_or_all, score_regions, unanswered_regions
 
 METRICS_VERSION = 1
-FIGURES = ("v_sphere_m3", "v_oe_m3", "s_points", "oe_points")
 _NAN = float("nan")
 
 
@@ -238,16 +237,6 @@ def _object_rows(
             }
         )
     return rows
-
-
-def hull_volume_m3(points: Float64Array) -> float:
-    """Return the volume of the convex hull of (N, 3) points; 0 for fewer than four or for points in one plane."""
-    if len(points) < 4:
-        return 0.0
-    try:
-        return float(ConvexHull(points).volume)
-    except QhullError:
-        return 0.0
 
 
 def _mean(values: Float64Array) -> float:

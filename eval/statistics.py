@@ -11,7 +11,18 @@ from cdpipe.geometry import Float64Array, stream
 from eval.ranking import auroc, average_precision
 
 N_RESAMPLES = 2000
-_IDENTITY = ("scenario", "family", "seed", "variant", "preset", "status", "error", "metrics_version", "score_radius_m")
+_IDENTITY = (
+    "scenario",
+    "family",
+    "seed",
+    "variant",
+    "preset",
+    "status",
+    "error",
+    "metrics_version",
+    "score_radius_m",
+    "commit",
+)
 
 
 def summarise(

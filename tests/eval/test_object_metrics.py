@@ -346,3 +346,26 @@ def test_rows_near_points_equal_brute_force() -> None:
     owner = np.where(distances.min(axis=1) <= 0.1, owners[distances.argmin(axis=1)], -1)
     for index, rows in enumerate(rows_near_points(universe, objects)):
         assert rows.tolist() == np.flatnonzero(owner == index).tolist()
+
+
+@pytest.mark.parametrize("fields", [{"is_observable": False}, {"group": "partial"}])
+def test_an_object_is_excused_only_by_more_than_half_of_its_rows(fields: dict[str, object]) -> None:
+    # change 2, cells 20-29, is outside of the main group
+    truth = ground_truth([change(1), change(2, **fields)], after=TWO_THINGS)
+
+    def is_excused(rows: np.ndarray) -> bool:
+        return bool(match_objects([thing()], [rows], truth).is_excused[0])
+
+    assert not is_excused(np.append(span(30, 40), 29))  # ten of wall, one of change 2
+    assert not is_excused(span(25, 35))  # half and half
+    assert is_excused(span(25, 34))  # five of nine
+    # what it has of change 1 weighs no more than wall
+    assert is_excused(np.concatenate([span(5, 9), span(25, 30)]))
+    assert not is_excused(np.zeros(0, dtype=np.int64))
+
+
+def test_an_object_of_wall_that_touches_an_unobservable_change_is_false() -> None:
+    truth = ground_truth([change(1), change(2, is_observable=False)], after=TWO_THINGS)
+    columns, outcomes = columns_of(truth, [thing(), thing()], [span(5, 15), span(29, 40)])
+    assert outcomes == ("match", "false")
+    assert (columns["object_precision_50"], columns["n_ignored_objects"]) == (0.5, 0)

@@ -478,3 +478,15 @@ def test_a_world_point_enters_a_drifting_map_through_its_nearest_scan(run: Path)
 
 def test_the_same_folder_gives_the_same_page(run: Path) -> None:
     assert write_page(run).read_bytes() == write_page(run).read_bytes()
+
+
+def test_answers_of_several_commits_are_told(run: Path) -> None:
+    results = pd.read_csv(run / "results.csv")
+    for commits, told in (
+        (["abc"] * len(results), False),
+        (["abc+", *["def"] * (len(results) - 2), ""], True),
+    ):
+        results.assign(commit=commits).to_csv(run / "results.csv", index=False)
+        text = write_page(run).read_text().partition("<summary>Provenance</summary>")[2]
+        assert ("more than one commit" in text) == told
+        assert (f"abc+ (1 row), def ({len(results) - 2} rows), unknown (1 row)" in text) == told

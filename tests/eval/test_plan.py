@@ -1,8 +1,10 @@
+import textwrap
 from pathlib import Path
 
 import pytest
 
 from cdpipe.errors import InputError
+from eval import plan as plan_module
 from eval.plan import (
     Plan,
     cells,
@@ -206,9 +208,19 @@ def test_paper_plan_holds_what_the_page_shows() -> None:
         assert {c.config.query.radius_m for c in plain} == {10.0 if scenario == "paper/site2" else 4.5}
     grid = [c for c in found if "[" in c.variant]
     assert len({(c.config.extract.voxel_m, c.config.query.radius_m) for c in grid}) == len(grid) == 9
-    assert {(c.scenario, c.preset) for c in grid} == {("paper/site1", "tunnelcd")}
+    assert {(c.scenario, c.preset) for c in grid} == {("paper/site1", "paper-topn")}
 
 
 def test_unknown_plan_names_the_nearest() -> None:
     with pytest.raises(InputError, match='did you mean "smoke"'):
         load_plan("smok")
+
+
+def test_the_example_of_the_documentation_is_a_plan(tmp_path: Path) -> None:
+    documentation = plan_module.__doc__ or ""
+    plan = read(tmp_path, textwrap.dedent(documentation.partition("\n\n")[2]))
+    assert set(Plan.model_fields) == plan.model_fields_set
+    assert plan.seeds == (20000, 20001)
+    # of each seed: the variant on both sites, and four grid points on one
+    assert len(cells(plan)) == 2 * (2 + 4)
+    assert {cell.variant for cell in cells(plan) if cell.preset == "paper"} == {"paper[extract.voxel_m=0.4]"}

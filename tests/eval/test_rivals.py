@@ -102,14 +102,15 @@ def test_keyframe_score_is_the_changed_share_around_it() -> None:
 def test_threshold_is_in_points_and_a_near_cluster_joins_the_larger_one() -> None:
     small, large = crate(23.0, 0.6), crate(20.0)  # 27 and 64 points, centroids 3 m apart
     far = crate(35.0, 0.6)
+    small_too = ("outlier.sigmas=10", "cluster.min_points=16")
     merged = pair([], [small, large, far])
-    loose = answer(merged, load_config("voxel-diff", ["outlier.sigmas=10", "query.radius_m=4.5"]))
+    loose = answer(merged, load_config("voxel-diff", [*small_too, "query.threshold=0", "query.radius_m=4.5"]))
     assert loose.regions.scores.tolist() == [64.0, 27.0]
     assert sorted((item.score, item.region) for item in loose.objects) == [(27.0, 0), (27.0, 1), (64.0, 0)]
-    strict = answer(merged, load_config("voxel-diff", ["outlier.sigmas=10", "query.threshold=28"]))
+    strict = answer(merged, load_config("voxel-diff", [*small_too, "query.threshold=28"]))
     assert strict.regions.is_reported.tolist() == [True, False]
     assert [(item.score, item.region) for item in strict.objects] == [(64.0, 0)]
-    fixed = answer(merged, load_config("voxel-diff", ["outlier.sigmas=10", "query.n_regions=1", "query.threshold=99"]))
+    fixed = answer(merged, load_config("voxel-diff", [*small_too, "query.n_regions=1", "query.threshold=99"]))
     assert sorted(item.score for item in fixed.objects) == [27.0, 64.0]
 
 
@@ -186,3 +187,17 @@ def test_random_regions_stay_where_the_after_session_came() -> None:
 def test_every_preset_has_its_method() -> None:
     assert {load_config(name).method for name in preset_names()} <= set(METHODS)
     assert METHODS["voxel-diff"] is voxel_diff
+
+
+def test_figures_are_of_the_after_map() -> None:
+    # a crate went and a smaller one came 2 m beside it: one region holds both, the table only what came
+    config = load_config(
+        "voxel-diff", ["outlier.sigmas=10", "cluster.min_points=16", "query.n_regions=1", "query.radius_m=4.5"]
+    )
+    report = answer(pair([crate(20.0)], [crate(22.0, 0.6)]), config)
+    assert sorted((item.session, len(item.returns), item.region) for item in report.objects) == [
+        ("after", 27, 0),
+        ("before", 64, 0),
+    ]
+    assert report.figures["oe_points"][0] == 27
+    assert report.figures["v_oe_m3"][0] == pytest.approx(0.4**3)

@@ -14,7 +14,7 @@ from cdpipe.geometry import invert, transform
 from cdpipe.readers import open_scans
 from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport
 from eval.ground_truth import GroundTruth, load_ground_truth
-from eval.scoring import METRICS_VERSION, CaseScore, hull_volume_m3, score_pair
+from eval.scoring import METRICS_VERSION, CaseScore, score_pair
 
 ONES = (
     "region_recall",
@@ -170,6 +170,18 @@ def test_a_false_region_by_hand(tiny_pair: Path, tiny_merge: np.ndarray) -> None
     assert case.row["region_precision"] == 2 / 3
     assert case.row["region_recall"] == 2 / 3
     assert case.row["false_regions_per_100m"] == pytest.approx(100 / 19.5)
+
+
+def test_an_empty_keyframe_list_may_be_of_any_type(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
+    report = true_report(tiny_pair, tiny_merge)
+    whole, floats = (
+        scored(tiny_pair, replace(report, keyframe_scans=(np.zeros(0, t), np.zeros(0, t)))).row
+        for t in (np.int64, np.float64)
+    )
+    np.testing.assert_equal(floats, whole)
+    assert {name: floats[name] for name in ONES} == dict.fromkeys(ONES, 1.0)
+    with pytest.raises(InputError, match="after_keyframe_scans must be a list of whole numbers, got float64"):
+        scored(tiny_pair, replace(report, keyframe_scans=(np.zeros(0), np.zeros(3))))
 
 
 def without_objects_and_regions(report: ChangeReport) -> ChangeReport:
@@ -335,9 +347,3 @@ def test_answers_that_cannot_be_are_refused_in_one_line(
 def test_a_pair_without_truth_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="only simulated pairs have truth"):
         score_pair(tmp_path, tmp_path)
-
-
-def test_hull_volume_by_hand() -> None:
-    assert hull_volume_m3(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])) == pytest.approx(1 / 6)
-    assert hull_volume_m3(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.0]])) == 0.0
-    assert hull_volume_m3(np.zeros((0, 3))) == 0.0
