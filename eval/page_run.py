@@ -19,7 +19,7 @@ from eval.runfolder import RunFolder
 Row = Mapping[str, Any]
 REQUIRED = ("scenario", "seed", "variant", "status")
 BASELINES = ("voxel-diff", "c2c", "random-regions")
-SHOWN_PRESETS = ("paper", "tunnelcd")
+SHOWN_PRESETS = ("paper", "tunnelcd", "voxel-diff")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,7 +136,7 @@ class GridOf:
 
     Attributes:
         scenario: Where it was run.
-        preset: Over which preset.
+        preset: Over which preset, and what else was set to one value.
         keys: The two settings; rows first.
         values: Their values, as texts, in rising order.
         points: Name of the variant at each pair of values.
@@ -150,19 +150,22 @@ class GridOf:
 
 
 def grids(data: RunData) -> list[GridOf]:
-    """Find the grids among the variants: those of one preset that set the same two keys, each to several values."""
-    found: dict[tuple[str, str, tuple[str, str]], dict[tuple[str, str], str]] = {}
+    """Find the grids among the variants: one preset, the same keys, two of them set to several values, the rest to one."""
+    found: dict[tuple[str, str, tuple[str, ...]], dict[str, dict[str, str]]] = {}
     for row in data.results:
         preset, settings = split_variant(str(row["variant"]))
-        if len(settings) == 2:
-            (key_a, value_a), (key_b, value_b) = settings.items()
-            points = found.setdefault((str(row["scenario"]), preset, (key_a, key_b)), {})
-            points[value_a, value_b] = str(row["variant"])
+        found.setdefault((str(row["scenario"]), preset, tuple(settings)), {})[str(row["variant"])] = settings
     result = []
-    for (scenario, preset, keys), points in found.items():
-        axes = (_sorted({a for a, _ in points}), _sorted({b for _, b in points}))
-        if min(len(axis) for axis in axes) >= 2:
-            result.append(GridOf(scenario, preset, keys, axes, points))
+    for (scenario, preset, keys), variants in found.items():
+        values = {key: _sorted({settings[key] for settings in variants.values()}) for key in keys}
+        varied = [key for key in keys if len(values[key]) >= 2]
+        if len(varied) == 2:
+            row_key, column_key = varied
+            fixed = ", ".join(f"{key}={values[key][0]}" for key in keys if key not in varied)
+            points = {(settings[row_key], settings[column_key]): name for name, settings in variants.items()}
+            axes = (values[row_key], values[column_key])
+            name = f"{preset} with {fixed}" if fixed else preset
+            result.append(GridOf(scenario, name, (row_key, column_key), axes, points))
     return result
 
 

@@ -287,6 +287,7 @@ def test_tables_one_and_two_stand_beside_the_papers_values(page: Path) -> None:
         ["published", "0.051", "-", "0.016-0.019", "0.0004-0.0005", "-", "-", "-"],
         ["ours, paper", "0.0987", "3.21", "0.0123", "0.00045", "0.5", "0.599", "0.432"],
         ["ours, tunnelcd", "-", "-", "-", "-", "0.0625", "-", "-"],
+        ["ours, voxel-diff", "-", "-", "-", "-", "2.35", "-", "-"],
     ]
     assert [texts(row) for row in volumes[2:4]] == [
         ["published", "53 117", "63 942", "206-223", "0.30-0.51", "648-2 470", "25-71"],
@@ -316,8 +317,8 @@ def test_nothing_is_fetched_and_every_picture_is_inside(page: Path) -> None:
     assert "url(" not in text
     assert "@import" not in text
     sources = re.findall(r'src="([^"]*)"', text)
-    # two maps, two presets' regions, two observable changes
-    assert len(sources) == 6
+    # two maps, three presets' regions, two observable changes
+    assert len(sources) == 7
     for source in sources:
         assert base64.b64decode(source.removeprefix("data:image/png;base64,"), validate=True).startswith(b"\x89PNG")
     links = re.findall(r'href="([^"]*)"', text)

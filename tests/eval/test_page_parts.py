@@ -1,6 +1,7 @@
 import base64
 import io
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,9 +21,10 @@ from eval.figures import (
 )
 from eval.object_figures import Panel, object_panels, oblique_view
 from eval.page_columns import RESULT_COLUMNS, UNDEFINED, count, significant
-from eval.page_run import split_variant
+from eval.page_run import RunData, grids, split_variant
 from eval.page_story import rank, sentence
 from eval.page_tables import best, escape_latex, heat_colour
+from eval.runfolder import RunFolder
 
 HIGH = next(column for column in RESULT_COLUMNS if column.key == "object_iou_point")
 LOW = next(column for column in RESULT_COLUMNS if column.key == "t_total_s")
@@ -102,6 +104,16 @@ def test_variants_are_taken_apart() -> None:
         {"extract.voxel_m": "0.3", "query.radius_m": "4.5"},
     )
     assert split_variant("paper-topn") == ("paper-topn", {})
+
+
+def test_a_grid_varies_two_settings_and_may_fix_others(tmp_path: Path) -> None:
+    points = [f"p[a.x={a},b.y={b},c.n=8]" for a in (0.3, 10.0) for b in (1, 2)]
+    others = ["p", "p[a.x=0.3,b.y=1]", "q[a.x=1]", "q[a.x=2]"]
+    rows = tuple({"scenario": "s", "variant": name} for name in [*points, *others])
+    (grid,) = grids(RunData(RunFolder(tmp_path), rows, (), (), {}, ()))
+    assert (grid.preset, grid.keys) == ("p with c.n=8", ("a.x", "b.y"))
+    assert grid.values == (("0.3", "10.0"), ("1", "2"))
+    assert grid.points["10.0", "1"] == points[2]
 
 
 def test_latex_commands_in_names_are_harmless() -> None:

@@ -208,7 +208,7 @@ def test_paper_plan_holds_what_the_page_shows() -> None:
         assert {c.config.query.radius_m for c in plain} == {10.0 if scenario == "paper/site2" else 4.5}
     grid = [c for c in found if "[" in c.variant]
     assert len({(c.config.extract.voxel_m, c.config.query.radius_m) for c in grid}) == len(grid) == 9
-    assert {(c.scenario, c.preset) for c in grid} == {("paper/site1", "paper-topn")}
+    assert {(c.scenario, c.preset) for c in grid} == {("paper/site1", "paper-paired")}
 
 
 def test_unknown_plan_names_the_nearest() -> None:
