@@ -150,7 +150,7 @@ class GridOf:
 
 
 def grids(data: RunData) -> list[GridOf]:
-    """Find the grids among the variants: one preset, the same keys, two of them set to several values, the rest to one."""
+    """Find the grids: variants of one preset that set the same keys, two of them to several values, the rest to one."""
     found: dict[tuple[str, str, tuple[str, ...]], dict[str, dict[str, str]]] = {}
     for row in data.results:
         preset, settings = split_variant(str(row["variant"]))
