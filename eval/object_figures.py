@@ -61,8 +61,8 @@ def object_panels(panels: Sequence[Panel], truth: Float64Array, view_from: Float
         axes.set_aspect("equal")
         axes.set_xticks([])
         axes.set_yticks([])
-        axes.set_title(panel.title, fontsize=9, pad=4)
-        axes.set_xlabel(panel.note, fontsize=7, labelpad=4)
+        axes.set_title(panel.title, fontsize=11, pad=4)
+        axes.set_xlabel(panel.note.replace(", ", "\n", 1), fontsize=9, labelpad=4)
         for spine in axes.spines.values():
             spine.set_color("#bbbbbb")
     _scale_bar(figure.axes[0], low, high)
@@ -96,4 +96,4 @@ def _scale_bar(axes: Axes, low: Float64Array, high: Float64Array) -> None:
     length_m = next((step for step in (5.0, 2.0, 1.0, 0.5, 0.2) if step < 0.4 * width_m), 0.1)
     x_m, y_m = low[0] + 0.06 * width_m, low[1] + 0.07 * (high[1] - low[1])
     axes.plot([x_m, x_m + length_m], [y_m, y_m], color=BLACK, linewidth=2, solid_capstyle="butt")
-    axes.annotate(f"{length_m:g} m", (x_m + length_m, y_m), xytext=(3, -3), textcoords="offset points", fontsize=7)
+    axes.annotate(f"{length_m:g} m", (x_m + length_m, y_m), xytext=(3, -3), textcoords="offset points", fontsize=9)

@@ -148,6 +148,6 @@ TIME_MEANINGS = (
     ("V_sphere", "Volume of a region's sphere that is tunnel, by our definition; the paper states none.",
      "The paper's values are 34-58 % of 4/3 π r³."),
     ("V_OE", "Volume of what was cut out of the region, after map only.", "Undefined where nothing was cut out."),
-    ("points", "Thinned map points: of both maps, in a region's sphere, and on the objects cut out of it.",
+    ("points", "Thinned map points: of both maps; of the after map in a region's sphere and on its objects.",
      "Least and greatest over the regions that find a change."),
 )  # fmt: skip
