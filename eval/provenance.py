@@ -43,7 +43,7 @@ def digest(value: Any) -> str:
 def machine() -> dict[str, Any]:
     """Return what the machine and its thread settings are."""
     return {
-        "platform": platform.platform(),
+        "platform": f"{platform.system()} {platform.machine()}",
         "cpu": _cpu_model(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "memory_gb": _memory_gb(),
