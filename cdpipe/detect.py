@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from time import perf_counter
 
@@ -14,6 +15,8 @@ from cdpipe.merge import merge_maps
 from cdpipe.query import find_regions
 from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, MergedMaps, ScanSource
 
+Comparison = Callable[[MergedMaps, DescriptorSet, DescriptorSet, PipelineConfig], ChangeReport]
+
 
 def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
     """Do what a robot does while it drives: thin its map and describe its keyframes.
@@ -23,21 +26,6 @@ def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
     """
     thin_map = build_map(source, config.map)
     return MappedSession(thin_map, describe_scans(source, thin_map.keyframe_scans, config.descriptor))
-
-
-def detect_changes(before: MappedSession, after: MappedSession, config: PipelineConfig) -> ChangeReport:
-    """Merge two mapped sessions and report what changed between them.
-
-    Raises:
-        MergeFailedError: The sessions could not be aligned with enough evidence; it carries what was measured.
-    """
-    start = perf_counter()
-    merged = merge_maps(before, after, config.merge)
-    t_merge_s = perf_counter() - start
-    if not merged.is_accepted:
-        raise MergeFailedError(f"the sessions cannot be merged: {merged.reason}", merged.evidence)
-    report = compare(merged, before.descriptors, after.descriptors, config)
-    return replace(report, seconds={"t_merge_s": t_merge_s, **report.seconds})
 
 
 def compare(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig) -> ChangeReport:
@@ -63,3 +51,26 @@ def compare(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, con
         keyframe_scans=(before.keyframe_scans, after.keyframe_scans),
         config=config.model_dump(),
     )
+
+
+def detect_changes(
+    before: MappedSession, after: MappedSession, config: PipelineConfig, method: Comparison = compare
+) -> ChangeReport:
+    """Merge two mapped sessions and report what changed between them.
+
+    Args:
+        before: The earlier session.
+        after: The later one.
+        config: All settings.
+        method: What compares the merged maps: the paper's chain, or a rival.
+
+    Raises:
+        MergeFailedError: The sessions could not be aligned with enough evidence; it carries what was measured.
+    """
+    start = perf_counter()
+    merged = merge_maps(before, after, config.merge)
+    t_merge_s = perf_counter() - start
+    if not merged.is_accepted:
+        raise MergeFailedError(f"the sessions cannot be merged: {merged.reason}", merged.evidence)
+    report = method(merged, before.descriptors, after.descriptors, config)
+    return replace(report, seconds={"t_merge_s": t_merge_s, **report.seconds})

@@ -14,7 +14,7 @@ from cdpipe.geometry import BoolArray, Float64Array, Int64Array, invert, transfo
 from cdpipe.novelty import cluster_labels, inlier_mask, new_points_mask
 from cdpipe.objects import PointGroup, assemble_objects
 from cdpipe.sphere import MapIndex
-from cdpipe.types import ChangedObject, ChangeRegions, MergedMaps, SessionName
+from cdpipe.types import ChangeRegions, MergedMaps, SessionName
 
 __all__ = [
     "FIGURES",
@@ -22,25 +22,12 @@ __all__ = [
     "assemble_objects",
     "cluster_labels",
     "cut_out",
-    "extract_objects",
     "hull_volume_m3",
     "inlier_mask",
     "new_points_mask",
 ]
 
 FIGURES = ("v_sphere_m3", "v_oe_m3", "s_points", "oe_points")
-
-
-def extract_objects(
-    merged: MergedMaps, regions: ChangeRegions, config: PipelineConfig
-) -> tuple[tuple[ChangedObject, ...], dict[str, Float64Array]]:
-    """Cut the changed objects out of every reported region: `cut_out`, then `assemble_objects`.
-
-    Returns:
-        The objects, best region first, and (R,) figures by name, NaN for regions that are not reported.
-    """
-    groups, figures = cut_out(merged, regions, config)
-    return assemble_objects(merged, groups), figures
 
 
 def cut_out(

@@ -6,7 +6,7 @@ favour the rivals: what is computed for the tables only (figures, keyframe score
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.config import PipelineConfig
-from cdpipe.detect import compare
+from cdpipe.detect import Comparison, compare
 from cdpipe.extract import (
     FIGURES,
     PointGroup,
@@ -30,7 +30,6 @@ from cdpipe.query import rank_regions
 from cdpipe.sphere import MapIndex
 from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport, DescriptorSet, MergedMaps, SessionName
 
-Method = Callable[[MergedMaps, DescriptorSet, DescriptorSet, PipelineConfig], ChangeReport]
 _DIRECTIONS: tuple[tuple[SessionName, SessionName], ...] = (("after", "before"), ("before", "after"))
 
 
@@ -99,7 +98,7 @@ def random_regions(
     return _report(merged, (before, after), regions, objects, figures, seconds, config)
 
 
-METHODS: dict[str, Method] = {"descriptor": compare, "voxel-diff": voxel_diff, "random-regions": random_regions}
+METHODS: dict[str, Comparison] = {"descriptor": compare, "voxel-diff": voxel_diff, "random-regions": random_regions}
 USES_DESCRIPTORS = frozenset({"descriptor"})
 
 

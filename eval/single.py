@@ -12,9 +12,9 @@ import pandas as pd
 from cdpipe.answer import write_answer
 from cdpipe.config import PipelineConfig
 from cdpipe.descriptor import describe_scans, load_descriptors, save_descriptors, use_threads
+from cdpipe.detect import detect_changes
 from cdpipe.errors import InputError, MergeFailedError
 from cdpipe.mapping import build_map, keyframes
-from cdpipe.merge import merge_maps
 from cdpipe.readers import open_scans
 from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, PointMap, ScanSource
 from eval.provenance import THREADS
@@ -56,15 +56,12 @@ def detect_pair(before: Path, after: Path, config: PipelineConfig, on_stage: OnS
         start = time.perf_counter()
         mapped.append(MappedSession(pointmap, _descriptors(folder, source, pointmap, config)))
         t_descriptor_s += time.perf_counter() - start
-    on_stage("merge", 0, 1)
-    start = time.perf_counter()
-    merged = merge_maps(mapped[0], mapped[1], config.merge)
-    t_merge_s = time.perf_counter() - start
-    if not merged.is_accepted:
-        raise MergeFailedError(f"{before} and {after} cannot be merged: {merged.reason}", merged.evidence)
-    on_stage("compare", 0, 1)
-    report = METHODS[config.method](merged, mapped[0].descriptors, mapped[1].descriptors, config)
-    seconds = {**report.seconds, "t_merge_s": t_merge_s, "t_descriptor_s": t_descriptor_s}
+    on_stage("merge and compare", 0, 1)
+    try:
+        report = detect_changes(mapped[0], mapped[1], config, METHODS[config.method])
+    except MergeFailedError as error:
+        raise MergeFailedError(f"{before} and {after}: {error}", error.evidence) from error
+    seconds = {**report.seconds, "t_descriptor_s": t_descriptor_s}
     sizes = {f"map_points_{name}": len(each.map.points) for name, each in zip(("before", "after"), mapped, strict=True)}
     return replace(report, seconds=seconds, evidence={**report.evidence, **sizes})
 

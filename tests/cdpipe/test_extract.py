@@ -7,7 +7,7 @@ import pytest
 
 import cdpipe.objects
 from cdpipe.config import ClusterConfig, ExtractConfig, OutlierConfig, PipelineConfig
-from cdpipe.extract import PointGroup, assemble_objects, extract_objects, hull_volume_m3
+from cdpipe.extract import PointGroup, assemble_objects, cut_out, hull_volume_m3
 from cdpipe.geometry import Float64Array, invert, make_pose, transform, yaw_pose
 from cdpipe.types import ChangedObject, ChangeRegions, MergedMaps, PointMap
 
@@ -18,6 +18,13 @@ CONFIG = PipelineConfig(
 )
 # grid points lie away from the borders of the 0.4 m voxels, so that a rigid motion of the frame cannot tip them over
 _STEP = 0.1
+
+
+def extract_objects(
+    pair: MergedMaps, candidates: ChangeRegions, config: PipelineConfig
+) -> tuple[tuple[ChangedObject, ...], dict[str, np.ndarray]]:
+    groups, figures = cut_out(pair, candidates, config)
+    return assemble_objects(pair, groups), figures
 
 
 def lattice(low: tuple[float, ...], high: tuple[float, ...]) -> Float64Array:
