@@ -4,17 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cdpipe.config import load_config, preset_names
+from cdpipe.config import PipelineConfig, load_config, preset_names
 from cdpipe.errors import InputError
 from cdpipe.yamlfile import read_yaml
-from eval.plan import cells, load_plan, plan_names
+from eval.plan import Plan, cells, load_plan, plan_names
 from scenarios.library import check_scenario, scenario_names
+from scenarios.schema import Scenario
+
+_KEYS = {
+    "preset": set(PipelineConfig.model_fields),
+    "plan": set(Plan.model_fields),
+    "scenario": {*Scenario.model_fields, "extends", "frozen"},
+}
 
 
 def check_file(name_or_path: str) -> str:
     """Check a scenario, plan or preset, and return which of them it is, in words.
 
-    A file is a plan if it has the key `scenarios`, a scenario if it has `tunnel` or `extends`, and else a preset.
+    A file is taken for the kind with which it shares most keys, so that one misspelt key does not change what it is.
 
     Raises:
         InputError: It has mistakes, all of them at once; or there is no such thing.
@@ -31,13 +38,15 @@ def check_file(name_or_path: str) -> str:
         raise InputError(f"{name_or_path}: no plan, scenario or preset of this name, and no .yaml file; see `list`")
     content = read_yaml(Path(name_or_path)).value
     keys = set(content) if isinstance(content, dict) else set()
-    if "scenarios" in keys:
+    n_shared = {kind: len(keys & known) for kind, known in _KEYS.items()}
+    kind = max(n_shared, key=lambda name: n_shared[name])
+    if kind == "plan":
         return _plan(name_or_path)
-    if keys & {"tunnel", "extends"}:
+    if kind == "scenario":
         check_scenario(name_or_path)
-        return "a scenario"
-    load_config(name_or_path)
-    return "a preset"
+    else:
+        load_config(name_or_path)
+    return f"a {kind}"
 
 
 def _plan(name_or_path: str) -> str:
