@@ -139,6 +139,13 @@ def detect(
     if quiet:
         return
     _table("regions (map frame = the before session's odometry)", region_table(report))
+    if not report.regions.is_reported.any():
+        scores = report.regions.scores
+        typer.echo(
+            f"nothing reaches query.threshold = {config.query.threshold:g}; "
+            f"the best of {len(scores)} candidates scores {scores[:1].max(initial=0.0):.4g}; "
+            "--set query.n_regions=3 reports the best three whatever they score\n"
+        )
     objects = object_table(report)
     _table("objects", objects[[name for name in objects.columns if not name.startswith(("min_", "max_"))]])
     times = ", ".join(f"{name[2:-2]} {seconds:.3f} s" for name, seconds in report.seconds.items())
