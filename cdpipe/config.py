@@ -43,7 +43,7 @@ class MergeConfig(Settings):
     inlier_m: Positive = Field(0.3, description="a point this near the other map is an inlier")
     min_inlier_share: Share = Field(0.9, description="accept at least this share of inliers in the sphere")
     min_hessian_ratio: Share = Field(0.006, description="smallest to largest translational eigenvalue: degeneracy")
-    min_agreement: Share = Field(0.93, description="accept at least this share of fitting points along both paths")
+    min_agreement: Share = Field(0.965, description="accept at least this share of fitting points along both paths")
     refine_map: bool = Field(False, description="one more GICP over the whole overlap (not in the paper)")
 
 

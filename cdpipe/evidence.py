@@ -1,8 +1,8 @@
 """What speaks for an alignment of two maps: how well a pair of spheres fits, and whether the rest of the maps agrees.
 
-Two tunnels can look alike for ten metres: in trials on validation seeds (12 right pairs of sessions, 24 wrong ones) a
-wrong pair of places reached an inlier share of 0.975. Along the whole path the maps then differ: right merges agreed in
-at least 0.99 of the points, wrong ones in at most 0.80.
+Two tunnels can look alike for ten metres: on validation seeds (51 right pairs of sessions, 24 of different tunnels) a
+wrong merge reached an inlier share of 0.951. Along the whole path the maps then differ: right merges agreed in at least
+0.989 of the points, wrong ones in at most 0.941, where only a short stretch met, and 0.72 otherwise.
 """
 
 from __future__ import annotations

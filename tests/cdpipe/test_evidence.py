@@ -74,5 +74,6 @@ def test_reasons_in_plain_words() -> None:
     assert why_refused({"inlier_share": 0.5, "hessian_ratio": 0.0}, config).startswith("only 50% of the points")
     alike = {"inlier_share": 1.0, "hessian_ratio": 0.1, "agreement": 0.75}
     assert "only 75% of the points do" in why_refused(alike, config)
-    assert why_refused({**alike, "agreement": 0.93}, config) == ""
+    assert why_refused({**alike, "agreement": 0.965}, config) == ""
+    assert "two places that look alike" in why_refused({**alike, "agreement": 0.95}, config)
     assert "0.0050" in why_refused({"inlier_share": 1.0, "hessian_ratio": 0.005}, config)
