@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from cdpipe.errors import InputError, ScenarioError
 from cdpipe.yamlfile import Document, Key, read_yaml, suggestion, validated, with_settings
 from scenarios.distributions import Drawing, dotted, drawing, form_mistakes, is_distribution, merged
-from scenarios.references import contradictions, reference_mistakes
+from scenarios.references import contradictions, file_keys, reference_mistakes
 from scenarios.schema import Prop, Scenario
 
 FAMILIES = Path(__file__).parent / "families"
@@ -18,7 +19,9 @@ CHECKED_SEEDS = range(8)
 SUFFIXES = (".yaml", ".yml")
 
 # what the schema says of a dangling reference without a line of its own; references.py says it with one
-_SAID_WITH_LINES = ("which is not in tunnel.nodes", "which no drift joins", "two props are called")
+_SAID_WITH_LINES = (
+    "which is not in tunnel.nodes", "which no drift joins", "two props are called", "which is not in areas",
+)  # fmt: skip
 
 
 def scenario_names() -> list[str]:
@@ -74,10 +77,12 @@ def _scenario(document: Document, seed: int) -> tuple[Scenario | None, list[str]
     if not isinstance(is_frozen, bool):
         mistakes.append(_told(document, ("frozen",), "expected true or false"))
     place = Document(document.source, tree, _drawn_origins(document, drawn))
+    tree, missing = _with_files(place)
+    mistakes += missing
     references = reference_mistakes(tree)
     mistakes += [_told(place, key, rule) for key, rule in references]
     try:
-        scenario = validated(Scenario, place)
+        scenario = validated(Scenario, replace(place, value=tree))
     except InputError as error:
         return None, mistakes + _without_repetition(str(error).splitlines(), drawn.broken, bool(references))
     mistakes += [_told(place, key, rule) for key, rule in contradictions(scenario)]
@@ -86,9 +91,34 @@ def _scenario(document: Document, seed: int) -> tuple[Scenario | None, list[str]
 
 def _frozen(scenario: Scenario) -> Scenario:
     """Return the scenario with nothing changing: the world stays as the before session saw it."""
-    stay = {"change": "none", "to": None}
+    stay = {"change": "none", "to": None, "shift": None, "loaded_share": None}
     props: list[Prop] = [prop.model_copy(update=stay) for prop in scenario.props if prop.change != "added"]
     return scenario.model_copy(update={"props": tuple(props)})
+
+
+def _with_files(document: Document) -> tuple[dict[Any, Any], list[str]]:
+    """Return the tree with every file's path as seen from the working folder, and the files that are missing.
+
+    A relative path starts at the file that holds its key, one given by --set at the working folder.
+    """
+    tree, missing = document.value, []
+    for key, name in file_keys(document.value):
+        holder, colon, line = document.where(key).rpartition(":")
+        path = Path(holder).parent / name if colon and line.isdigit() else Path(name)
+        if not path.is_file():
+            seen = "" if str(path) == name else f": expected {path}"
+            missing.append(_told(document, key, f"no such file{seen}"))
+        tree = _with_value(tree, key, str(path))
+    return tree, missing
+
+
+def _with_value(value: Any, key: Key, new: str) -> Any:
+    """Return dicts and lists with one value replaced; what lies beside it is shared, not copied."""
+    if not key:
+        return new
+    parts: Any = dict(value) if isinstance(value, dict) else list(value)
+    parts[key[0]] = _with_value(parts[key[0]], key[1:], new)
+    return parts
 
 
 def _drawn_origins(document: Document, drawn: Drawing) -> dict[Key, str]:

@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Any
 
 from cdpipe.yamlfile import Key, suggestion
-from scenarios.schema import Scenario, SessionPlan, Tunnel
+from scenarios.schema import Furniture, Scenario, SessionPlan, Tunnel
 
 Mistake = tuple[Key, str]
 
@@ -30,10 +30,27 @@ def reference_mistakes(tree: Any) -> list[Mistake]:
         if len(set(pair)) == 2
     }
     of_drifts = list(_drift_mistakes(tunnel, nodes))
-    others = [*_prop_mistakes(tree, nodes, edges), *_route_mistakes(tree, nodes, edges)]
+    others = [
+        *_niche_mistakes(tunnel, nodes, edges),
+        *_area_mistakes(tree),
+        *_prop_mistakes(tree, nodes, edges),
+        *_route_mistakes(tree, nodes, edges),
+    ]
     if of_drifts:  # a misspelt drift joins nothing; what follows from that is not worth telling
         others = [(key, rule) for key, rule in others if not rule.startswith(_NO_DRIFT)]
     return of_drifts + others
+
+
+def file_keys(tree: Any) -> list[tuple[Key, str]]:
+    """Return every file that a drawn scenario names, as (key path, name)."""
+    places: list[tuple[Key, Any]] = [(("tunnel", "mesh"), _mapping(_mapping(tree, "tunnel"), "mesh").get("path"))]
+    places += [
+        (("props", index, "mesh"), _mapping(prop, "mesh").get("path"))
+        for index, prop in enumerate(_items(tree, "props"))
+    ]
+    files = [((*key, "path"), name) for key, name in places]
+    files += [((session, "trajectory"), _mapping(tree, session).get("trajectory")) for session in ("before", "after")]
+    return [(key, name) for key, name in files if isinstance(name, str)]
 
 
 def route_length_m(tunnel: Tunnel, plan: SessionPlan) -> float:
@@ -43,26 +60,73 @@ def route_length_m(tunnel: Tunnel, plan: SessionPlan) -> float:
 
 
 def contradictions(scenario: Scenario) -> list[Mistake]:
-    """Return what cannot be driven in a scenario whose references hold, as (key path, rule)."""
-    found: list[Mistake] = []
+    """Return what cannot be built or driven in a scenario whose references hold, as (key path, rule)."""
+    return [*_foreign_mistakes(scenario), *_undrawable(scenario), *_start_mistakes(scenario), *_room_mistakes(scenario)]
+
+
+def _start_mistakes(scenario: Scenario) -> Iterator[Mistake]:
     for name, plan in (("before", scenario.before), ("after", scenario.after)):
+        if plan.trajectory is not None:
+            continue
         left_m = route_length_m(scenario.tunnel, plan)
         if left_m < scenario.platform.scan_spacing_m:
             whole_m = left_m + plan.start_m + plan.end_m
-            found.append(((name, "start_m"), f"start_m and end_m leave nothing of the route, which is {whole_m:.1f} m"))
-    sections = [scenario.tunnel.section, *(drift.section for drift in scenario.tunnel.drifts if drift.section)]
-    free_m = min(section.width_m for section in sections) - 2 * scenario.platform.clearance_m
-    if free_m <= 0:
-        rule = f"leaves the platform no room in a drift {free_m + 2 * scenario.platform.clearance_m:.1f} m wide"
-        found.append((("platform", "clearance_m"), rule))
-    for name, height_m in (("before", scenario.before.height_m), ("after", scenario.after.height_m)):
-        is_own = height_m is not None
-        flown_m = height_m if height_m is not None else scenario.platform.sensor_height_m
-        roof_m = min(section.height_m for section in sections)
-        if flown_m >= roof_m:
+            yield (name, "start_m"), f"start_m and end_m leave nothing of the route, which is {whole_m:.1f} m"
+
+
+def _room_mistakes(scenario: Scenario) -> Iterator[Mistake]:
+    drifts = scenario.tunnel.drifts
+    if not drifts:  # nobody has said how wide the drifts of this mesh are
+        return
+    sections = [drift.section or scenario.tunnel.section for drift in drifts]
+    width_m = min(section.width_m for section in sections)
+    if width_m <= 2 * scenario.platform.clearance_m:
+        yield ("platform", "clearance_m"), f"leaves the platform no room in a drift {width_m:.1f} m wide"
+    roof_m = min(section.height_m for section in sections)
+    for name, plan in (("before", scenario.before), ("after", scenario.after)):
+        is_own = plan.height_m is not None
+        flown_m = plan.height_m if plan.height_m is not None else scenario.platform.sensor_height_m
+        if flown_m >= roof_m and plan.trajectory is None:
             key: Key = (name, "height_m") if is_own else ("platform", "sensor_height_m")
-            found.append((key, f"the sensor would be above the roof of a drift {roof_m:.1f} m high"))
-    return found
+            yield key, f"the sensor would be above the roof of a drift {roof_m:.1f} m high"
+
+
+def _foreign_mistakes(scenario: Scenario) -> Iterator[Mistake]:
+    """Tell what cannot be done to walls that come from a file, or without drifts along them."""
+    tunnel = scenario.tunnel
+    if tunnel.mesh is None:
+        return
+    shaping: list[tuple[Key, bool]] = [
+        (("niches",), bool(tunnel.niches)),
+        (("variation",), tunnel.variation is not None),
+        (("roughness",), any(octave.amplitude_m for octave in tunnel.roughness)),
+        (("meander_m",), tunnel.meander_m > 0),
+        (("floor", "crossfall_percent"), tunnel.floor.crossfall_percent != 0),
+        (("floor", "ruts"), tunnel.floor.ruts is not None),
+    ]
+    for key, is_given in shaping:
+        if is_given:
+            yield ("tunnel", *key), "shapes drifts, and tunnel.mesh is not shaped: leave it out"
+    if tunnel.drifts:
+        return
+    if tunnel.furniture != Furniture():
+        yield ("tunnel", "furniture"), "hangs along drifts: give tunnel.drifts that run through tunnel.mesh"
+    if tunnel.floor.stones is not None:
+        yield ("tunnel", "floor", "stones"), "lie along drifts: give tunnel.drifts that run through tunnel.mesh"
+
+
+def _undrawable(scenario: Scenario) -> Iterator[Mistake]:
+    """Tell which places the seed cannot draw along the way of both sessions, because a session has no route."""
+    without = [name for name, plan in (("before", scenario.before), ("after", scenario.after)) if not plan.route]
+    if not without:
+        return
+    needs = f"needs a route in both sessions, and {without[0]} has a trajectory"
+    if scenario.areas:
+        yield ("areas",), f"an area {needs}"
+    for index, prop in enumerate(scenario.props):
+        for name, place in (("place", prop.place), ("to", prop.to)):
+            if place is not None and place.between is None and place.at is None and place.area is None:
+                yield ("props", index, name), f"a place anywhere {needs}: give at, or between and fraction"
 
 
 def _drift_mistakes(tunnel: Any, nodes: list[str]) -> Iterator[Mistake]:
@@ -74,6 +138,27 @@ def _drift_mistakes(tunnel: Any, nodes: list[str]) -> Iterator[Mistake]:
                 yield key, _unknown_node(name, nodes)
             elif position and name == names[position - 1]:
                 yield key, "a drift cannot go from a node to itself"
+
+
+def _niche_mistakes(tunnel: Any, nodes: list[str], edges: set[frozenset[str]]) -> Iterator[Mistake]:
+    for index, niche in enumerate(_items(tunnel, "niches")):
+        pair = _items(niche, "between")
+        if len(_names(pair)) == 2 and frozenset(pair) not in edges:
+            yield ("tunnel", "niches", index, "between"), _no_drift(pair, nodes)
+
+
+def _area_mistakes(tree: Any) -> Iterator[Mistake]:
+    names = [_mapping({"area": area}, "area").get("name") for area in _items(tree, "areas")]
+    for index, name in enumerate(names):
+        if isinstance(name, str) and name in names[:index]:
+            yield ("areas", index, "name"), "another area has this name"
+    known = _names(names)
+    for index, prop in enumerate(_items(tree, "props")):
+        for place in ("place", "to"):
+            area = _mapping(prop, place).get("area")
+            if isinstance(area, str) and area not in known:
+                rule = f"no area is called {area}{suggestion(area, known)}" if known else "there are no areas"
+                yield ("props", index, place, "area"), rule
 
 
 def _prop_mistakes(tree: Any, nodes: list[str], edges: set[frozenset[str]]) -> Iterator[Mistake]:

@@ -1,6 +1,7 @@
 """What a scenario is, once its seed has drawn every distribution. Lengths in metres, angles in degrees.
 
-Frame: `world`, x forward, z up. A drift follows the polyline of its nodes; node z is floor level.
+Frame: `world`, x forward, z up. A drift follows the polyline of its nodes; node z is floor level. Left and right are
+those of a drift's own direction, from its first node to its last.
 """
 
 from __future__ import annotations
@@ -14,17 +15,29 @@ from cdpipe.yamlfile import Settings
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
 SignedShare = Annotated[float, Field(ge=-1, le=1)]
 Reflectivity = Annotated[float, Field(gt=0, le=1)]
-PropKind = Literal["box", "chair", "trolley", "railing", "muck_pile", "barrel"]
+Side = Literal["left", "right"]
+PropKind = Literal[
+    "box", "crate", "chair", "trolley", "barrel", "cone", "railing", "pallet", "rock", "vehicle", "muck_pile", "mesh"
+]
 
 
 class Section(Settings):
-    """Cross-section of a drift."""
+    """Cross-section of a drift at its nominal size; in a foreign mesh about how wide and high its drifts are."""
 
-    shape: Literal["horseshoe", "rectangle"] = "horseshoe"
-    width_m: Positive
-    height_m: Positive
+    shape: Literal["horseshoe", "d", "arch", "rectangle", "cave"] = "horseshoe"
+    width_m: Positive = 5.0
+    height_m: Positive = 4.0
+
+
+class Variation(Settings):
+    """Slow change of width and of height along every drift."""
+
+    share: Annotated[float, Field(ge=0, le=0.4)]  # standard deviation, as a share of the nominal size
+    length_m: Positive = 12.0  # correlation length
 
 
 class Roughness(Settings):
@@ -34,6 +47,31 @@ class Roughness(Settings):
     length_m: Positive
 
 
+class Ruts(Settings):
+    """Two wheel tracks along the middle of every drift."""
+
+    depth_m: Positive
+    gauge_m: Positive = 1.6  # between the middles of the two tracks
+    width_m: Positive = 0.45
+
+
+class Stones(Settings):
+    """Loose fragments on the floor, sizes after Rosin-Rammler, smaller ones left out."""
+
+    per_m2: NotNegative
+    size_m: Positive = 0.12  # characteristic size
+    max_size_m: Positive = 0.35
+
+
+class Floor(Settings):
+    """What makes the floor more than a plane."""
+
+    roughness: Share = 0.3  # share of the wall's roughness that the floor has
+    crossfall_percent: Finite = 0.0  # falls to the right where positive
+    ruts: Ruts | None = None
+    stones: Stones | None = None
+
+
 class Drift(Settings):
     """A drift through two or more nodes; its own section if it differs from the tunnel's."""
 
@@ -41,21 +79,94 @@ class Drift(Settings):
     section: Section | None = None
 
 
-class Tunnel(Settings):
-    """The walls: a graph of drifts, meshed from one signed distance field."""
+class Niche(Settings):
+    """A recess in one wall, floor level with the drift's."""
 
-    nodes: dict[str, tuple[float, float, float]]
-    drifts: Annotated[tuple[Drift, ...], Field(min_length=1)]
-    section: Section
+    between: tuple[str, str]
+    fraction: Share
+    side: Side
+    width_m: Positive
+    depth_m: Positive
+    height_m: Positive
+
+
+class Pipe(Settings):
+    """A pipe on brackets along one wall of every drift."""
+
+    diameter_m: Positive
+    side: Side
+    height_share: Share = 0.5  # of the drift's height
+
+
+class Duct(Settings):
+    """A ventilation duct hung below the roof of every drift."""
+
+    diameter_m: Positive
+    lateral: SignedShare = 0.5  # -1 right, +1 left
+
+
+class CableTray(Settings):
+    """A cable tray on brackets along one wall of every drift, with cables in it."""
+
+    width_m: Positive = 0.3
+    side: Side = "left"
+    height_share: Share = 0.7
+
+
+class Bolts(Settings):
+    """Rock bolts with plates, in a square pattern over roof and upper walls."""
+
+    spacing_m: Positive = 1.2
+
+
+class Screen(Settings):
+    """Welded wire mesh on roof and shoulders, in panels."""
+
+    share: Share = 1.0  # of the length of every drift
+    opening_m: Positive = 0.1
+
+
+class Furniture(Settings):
+    """What is fixed to the rock in both sessions and must never count as a change."""
+
+    pipes: tuple[Pipe, ...] = ()
+    ducts: tuple[Duct, ...] = ()
+    cable_trays: tuple[CableTray, ...] = ()
+    bolts: Bolts | None = None
+    screen: Screen | None = None
+
+
+class MeshFile(Settings):
+    """A surface someone else made: STL, OBJ, PLY or GLB. A relative path starts at the scenario's file."""
+
+    path: str
+    units: Literal["m", "cm", "mm", "in", "ft"] = "m"
+    up: Literal["x", "y", "z"] = "z"  # which axis of the file points up
+    flip: bool = False  # turn the surface inside out
+    allow_open: bool = False  # rays may leave through its holes
+
+
+class Tunnel(Settings):
+    """The walls: a graph of drifts, meshed from one signed distance field; or a mesh that nodes and drifts lie in."""
+
+    mesh: MeshFile | None = None
+    nodes: dict[str, tuple[Finite, Finite, Finite]] = Field(default_factory=dict)
+    drifts: tuple[Drift, ...] = ()
+    niches: tuple[Niche, ...] = ()
+    section: Section = Section()
+    variation: Variation | None = None
     roughness: tuple[Roughness, ...] = ()
-    floor_roughness: Annotated[float, Field(ge=0, le=1)] = 0.3  # share of the wall's roughness that the floor has
+    floor: Floor = Floor()
     meander_m: NotNegative = 0.0  # amplitude of the sideways wander of every centreline
     meander_length_m: Positive = 25.0
+    furniture: Furniture = Furniture()
     resolution_m: Positive = 0.15  # edge of the marching-cubes cell
     reflectivity: Reflectivity = 0.25
 
     @model_validator(mode="after")
     def _nodes_exist(self) -> Tunnel:
+        if not self.drifts and self.mesh is None:
+            raise ValueError("a tunnel needs drifts, or a mesh")
         for drift in self.drifts:
             for node in drift.nodes:
                 if node not in self.nodes:
@@ -63,13 +174,45 @@ class Tunnel(Settings):
         return self
 
 
-class Place(Settings):
-    """Where a prop stands: a share of the way between two neighbouring nodes, and across the drift."""
+class Area(Settings):
+    """A stretch of the tunnel that both sessions drive, where things change; the seed draws where it lies.
 
-    between: tuple[str, str]
-    fraction: Annotated[float, Field(ge=0, le=1)]
+    Areas keep as far from one another as four score radii where the tunnel is long enough.
+    """
+
+    name: str
+    length_m: Positive = 6.0
+
+
+class Place(Settings):
+    """Where a prop stands: between two nodes, at a point, in an area, or (none of these) anywhere on the way.
+
+    In the last two cases the seed draws the station, and draws again until the prop fits and stands in no other.
+    """
+
+    between: tuple[str, str] | None = None
+    fraction: Share | None = None  # of the way between the two nodes
+    at: tuple[Finite, Finite, Finite] | None = None  # world; the floor is looked for below it
+    area: str | None = None
     lateral: SignedShare = 0.0  # -1 right wall, +1 left wall, of the width the prop leaves free
-    yaw_deg: float = 0.0  # against the direction of the drift
+    yaw_deg: Finite = 0.0  # against the direction of the drift; with `at` against the x axis
+    posture: Literal["upright", "tipped", "leaning"] = "upright"  # leaning: against the nearer wall; a pile: banked up
+
+    @model_validator(mode="after")
+    def _one_way_to_say_where(self) -> Place:
+        if (self.between is None) != (self.fraction is None):
+            raise ValueError("between and fraction go together")
+        if sum(way is not None for way in (self.between, self.at, self.area)) > 1:
+            raise ValueError("give one of between, at and area")
+        return self
+
+
+class Shift(Settings):
+    """A short move from where a prop stands."""
+
+    distance_m: Positive
+    heading_deg: Finite = 0.0  # direction, against that of the drift
+    turn_deg: Finite = 0.0
 
 
 class Prop(Settings):
@@ -77,16 +220,29 @@ class Prop(Settings):
 
     name: str
     kind: PropKind
-    size_m: tuple[Positive, Positive, Positive]  # length, width, height of its bounding box
-    place: Place
-    change: Literal["none", "added", "removed", "moved"] = "none"
+    size_m: tuple[Positive, Positive, Positive] | None = None  # length, width, height when upright; a mesh has its own
+    mesh: MeshFile | None = None
+    place: Place = Place()
+    change: Literal["none", "added", "removed", "moved", "reshaped"] = "none"
     to: Place | None = None  # where a moved prop stands in the after session
-    reflectivity: Reflectivity = 0.4
+    shift: Shift | None = None  # or how far from its first place
+    loaded_share: Annotated[float, Field(gt=0, lt=1)] | None = None  # of a reshaped pile's volume, taken away
+    repose_deg: Annotated[float, Field(ge=30, le=45)] = 37.0  # flanks of a pile; blasted rock has 34 to 40
+    fragment_m: Positive = 0.25  # characteristic size of a pile's fragments
+    reflectivity: Reflectivity | None = None  # of every part; left out: what each part is made of
 
     @model_validator(mode="after")
-    def _moved_has_a_goal(self) -> Prop:
-        if (self.change == "moved") != (self.to is not None):
-            raise ValueError(f"prop {self.name!r}: change: moved and a place `to` go together")
+    def _parts_go_together(self) -> Prop:
+        if (self.kind == "mesh") != (self.mesh is not None):
+            raise ValueError(f"prop {self.name!r}: kind: mesh and a file `mesh` go together")
+        if (self.mesh is None) == (self.size_m is None):
+            raise ValueError(f"prop {self.name!r}: give size_m, but not to a mesh, which has its own")
+        if (self.change == "moved") != ((self.to is not None) != (self.shift is not None)):
+            raise ValueError(f"prop {self.name!r}: change: moved goes with a place `to` or a `shift`, not both")
+        if (self.change == "reshaped") != (self.loaded_share is not None):
+            raise ValueError(f"prop {self.name!r}: change: reshaped and loaded_share go together")
+        if self.change == "reshaped" and self.kind != "muck_pile":
+            raise ValueError(f"prop {self.name!r}: only a muck_pile can be reshaped")
         return self
 
 
@@ -107,27 +263,44 @@ class Platform(Settings):
     kind: Literal["ground_robot", "quadrotor"] = "ground_robot"
     sensor_height_m: Positive = 0.8  # above the floor
     speed_mps: Positive = 1.0
+    speed_variation: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # standard deviation, as a share of the speed
     scan_spacing_m: Positive = 0.25  # path between the recorded revolutions
     clearance_m: Positive = 0.5  # kept to walls and props
-    tilt_deg: NotNegative = 1.0  # standard deviation of roll and pitch
+    wheelbase_m: Positive = 0.6  # the robot's four wheels find the floor: roll, pitch and bounce follow
+    track_m: Positive = 0.5
+    tilt_deg: NotNegative = 1.0  # standard deviation of roll and pitch on top of that
+    bounce_m: NotNegative = 0.0  # and of the height
+    wander_m: NotNegative = 0.0  # standard deviation of the line from side to side, where there is room
 
 
 class Odometry(Settings):
-    """Systematic error of the session's own odometry, in KITTI's terms; the signs are drawn from the seed."""
+    """What a session's poses come from: truth with a systematic error in KITTI's terms, or KISS-ICP on its own scans.
 
+    The signs of the error are drawn from the seed; both figures 0 give true poses.
+    """
+
+    source: Literal["drift", "kiss-icp"] = "drift"
     translation_percent: NotNegative = 0.0
     yaw_deg_per_100m: NotNegative = 0.0
 
 
 class SessionPlan(Settings):
-    """One drive through the tunnel."""
+    """One drive through the tunnel: along a route, or on a recorded trajectory."""
 
-    route: Annotated[tuple[str, ...], Field(min_length=2)]
+    route: tuple[str, ...] = ()
+    trajectory: str | None = None  # TUM file of world_T_sensor, instead of a route; from the scenario's file
     lateral: SignedShare = 0.0  # which line: -1 right, +1 left, of the width the platform leaves free
     start_m: NotNegative = 0.0  # path left out at the start of the route
     end_m: NotNegative = 0.0  # and at its end
     height_m: Positive | None = None  # instead of platform.sensor_height_m
+    speed_mps: Positive | None = None  # instead of platform.speed_mps
     odometry: Odometry = Odometry()
+
+    @model_validator(mode="after")
+    def _route_or_trajectory(self) -> SessionPlan:
+        if (len(self.route) >= 2) == (self.trajectory is not None):
+            raise ValueError("give a route of two nodes or more, or a trajectory")
+        return self
 
 
 class Scenario(Settings):
@@ -137,6 +310,7 @@ class Scenario(Settings):
     description: str = ""
     score_radius_m: Positive = 4.5
     tunnel: Tunnel
+    areas: tuple[Area, ...] = ()
     props: tuple[Prop, ...] = ()
     sensor: Sensor = Sensor()
     platform: Platform = Platform()
@@ -149,13 +323,19 @@ class Scenario(Settings):
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"two props are called {name!r}")
-        edges = {
-            frozenset(pair) for drift in self.tunnel.drifts for pair in zip(drift.nodes, drift.nodes[1:], strict=False)
-        }
+        areas = [area.name for area in self.areas]
+        edges = {frozenset(pair) for drift in self.tunnel.drifts for pair in pairwise(drift.nodes)}
+        for niche in self.tunnel.niches:
+            if frozenset(niche.between) not in edges:
+                raise ValueError(f"a niche lies between {list(niche.between)}, which no drift joins")
         for prop in self.props:
             for place in (prop.place, prop.to):
-                if place is not None and frozenset(place.between) not in edges:
+                if place is None:
+                    continue
+                if place.between is not None and frozenset(place.between) not in edges:
                     raise ValueError(f"prop {prop.name!r} stands between {list(place.between)}, which no drift joins")
+                if place.area is not None and place.area not in areas:
+                    raise ValueError(f"prop {prop.name!r} stands in area {place.area!r}, which is not in areas")
         for session, plan in (("before", self.before), ("after", self.after)):
             for pair in pairwise(plan.route):
                 if frozenset(pair) not in edges:

@@ -9,12 +9,14 @@ import numpy as np
 
 from cdpipe.errors import ScenarioError
 from cdpipe.geometry import Float64Array, stream
-from scenarios.schema import Drift, Section, Tunnel
-from sim.noise import smooth_noise
+from scenarios.schema import Drift, Niche, Section, Tunnel
+from sim.noise import noise_at, smooth_noise
 
 STEP_M = 0.1
 # Nodes are places where things may stand, so a blind drift goes on for half its width behind its last node.
 _BLIND_SHARE = 0.5
+_VARIATION_LIMIT_SIGMA = 2.5
+_SMALLEST_SHARE = 0.5  # of the nominal size that a drift narrows or lowers to
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,29 +26,55 @@ class DriftLine:
     Attributes:
         points: (N, 3) samples about 0.1 m apart, metres.
         headings: (N, 2) unit direction of travel in the x-y plane.
-        slopes: (N,) rise per metre of travel.
-        section: Its cross-section.
+        section: Its cross-section at nominal size.
+        width_m: (N,) width there, variation included.
+        height_m: (N,) height there.
         node_samples: Sample that stands for each node, in the drift's order.
         is_blind: Whether the line ends in rock at its start and at its end.
     """
 
     points: Float64Array
     headings: Float64Array
-    slopes: Float64Array
     section: Section
+    width_m: Float64Array
+    height_m: Float64Array
     node_samples: tuple[int, ...]
     is_blind: tuple[bool, bool]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Recess:
+    """A niche in its place.
+
+    Attributes:
+        drift: Number of the drift whose wall it is in.
+        point: (3,) on the centreline, abreast of its middle.
+        heading: (2,) unit direction of the drift there.
+        outward: (2,) unit direction from the centreline into the niche.
+        back_m: Distance from the centreline to its back wall.
+        width_m: Along the drift.
+        height_m: Above the drift's floor.
+    """
+
+    drift: int
+    point: Float64Array
+    heading: Float64Array
+    outward: Float64Array
+    back_m: float
+    width_m: float
+    height_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Centreline:
-    """All drifts of a tunnel, and where the edge between two nodes lies."""
+    """All drifts of a tunnel, where the edge between two nodes lies, and the niches."""
 
     drifts: tuple[DriftLine, ...]
     edges: dict[tuple[str, str], tuple[int, int, int]]
+    recesses: tuple[Recess, ...] = ()
 
     def edge(self, start: str, end: str) -> tuple[Float64Array, Section]:
-        """Return the (N, 3) centreline from one node to a neighbouring one, and the section there."""
+        """Return the (N, 3) centreline from one node to a neighbouring one, and its nominal section."""
         drift, first, last = self.edges[start, end]
         line = self.drifts[drift]
         step = 1 if last >= first else -1
@@ -63,12 +91,23 @@ class Centreline:
         heading = line.headings[round(position)] * (1.0 if last >= first else -1.0)
         return point, heading, line.section
 
+    def local_section(self, start: str, end: str, fraction: float) -> Section:
+        """Return the section a share of the way between two neighbouring nodes, at the size it has there."""
+        drift, first, last = self.edges[start, end]
+        line = self.drifts[drift]
+        sample = round(first + fraction * (last - first))
+        return Section(
+            shape=line.section.shape, width_m=float(line.width_m[sample]), height_m=float(line.height_m[sample])
+        )
+
 
 def build_centreline(tunnel: Tunnel, seed: int) -> Centreline:
-    """Round the corners of every drift and add the meander that the seed draws.
+    """Round the corners of every drift and add the meander and the change of size that the seed draws.
+
+    In a foreign mesh the drifts follow their nodes: no meander, and nothing beyond a last node.
 
     Raises:
-        ScenarioError: Two neighbouring nodes of a drift coincide.
+        ScenarioError: Two neighbouring nodes of a drift coincide, or a niche is higher than its drift.
     """
     uses: dict[str, int] = {}
     for drift in tunnel.drifts:
@@ -80,7 +119,8 @@ def build_centreline(tunnel: Tunnel, seed: int) -> Centreline:
         for (a, b), (first, last) in zip(pairwise(drift.nodes), pairwise(line.node_samples), strict=True):
             edges.setdefault((a, b), (index, first, last))
             edges.setdefault((b, a), (index, last, first))
-    return Centreline(drifts, edges)
+    recesses = tuple(_recess(niche, index, drifts, edges) for index, niche in enumerate(tunnel.niches))
+    return Centreline(drifts, edges, recesses)
 
 
 def resample(points: Float64Array, step_m: float) -> Float64Array:
@@ -120,13 +160,43 @@ def _drift_line(tunnel: Tunnel, index: int, drift: Drift, uses: dict[str, int], 
     )
     is_blind = (not is_shared[0], not is_shared[-1])
     extra = round(_BLIND_SHARE * section.width_m / STEP_M)
-    if is_blind[0]:
+    is_extended = tunnel.mesh is None
+    if is_blind[0] and is_extended:
         points = np.concatenate([_extension(points[1], points[0], extra)[::-1], points])
         samples = [sample + extra for sample in samples]
-    if is_blind[1]:
+    if is_blind[1] and is_extended:
         points = np.concatenate([points, _extension(points[-2], points[-1], extra)])
-    slopes = np.gradient(points[:, 2]) / np.maximum(np.linalg.norm(np.gradient(points[:, :2], axis=0), axis=1), 1e-9)
-    return DriftLine(points, headings_of(points), slopes, section, tuple(samples), is_blind)
+    width_m, height_m = _sizes(tunnel, section, points, seed)
+    return DriftLine(points, headings_of(points), section, width_m, height_m, tuple(samples), is_blind)
+
+
+def _sizes(tunnel: Tunnel, section: Section, points: Float64Array, seed: int) -> tuple[Float64Array, Float64Array]:
+    """Width and height (N,) along a drift. Both depend on the place alone: drifts agree where they meet."""
+    variation = tunnel.variation
+    if variation is None or tunnel.mesh is not None:
+        return np.full(len(points), section.width_m), np.full(len(points), section.height_m)
+    keys = stream(seed, "tunnel", "variation").integers(2**63, size=2).tolist()
+    limit = _VARIATION_LIMIT_SIGMA
+    wander = [np.clip(noise_at(points[:, :2], variation.length_m, key), -limit, limit) for key in keys]
+    shares = [np.maximum(1.0 + variation.share * each, _SMALLEST_SHARE) for each in wander]
+    return section.width_m * shares[0], section.height_m * shares[1]
+
+
+def _recess(
+    niche: Niche, index: int, drifts: tuple[DriftLine, ...], edges: dict[tuple[str, str], tuple[int, int, int]]
+) -> Recess:
+    drift, first, last = edges[niche.between]
+    line = drifts[drift]
+    sample = round(first + niche.fraction * (last - first))
+    if niche.height_m > line.height_m[sample]:
+        raise ScenarioError(
+            f"tunnel.niches[{index}].height_m = {niche.height_m:g}: higher than the drift, "
+            f"{line.height_m[sample]:.2f} m there"
+        )
+    heading = line.headings[sample]
+    outward = left_of(heading[None])[0] * (1.0 if niche.side == "left" else -1.0)
+    back_m = line.width_m[sample] / 2 + niche.depth_m
+    return Recess(drift, line.points[sample], heading, outward, float(back_m), niche.width_m, niche.height_m)
 
 
 def _extension(inner: Float64Array, last: Float64Array, count: int) -> Float64Array:
@@ -154,7 +224,7 @@ def _round_corners(nodes: Float64Array, spans: Float64Array, is_shared: list[boo
 
 def _meander(tunnel: Tunnel, index: int, points: Float64Array, fixed: list[int], seed: int) -> Float64Array:
     """Sideways wander (N, 3) of a drift, zero at the samples `fixed` where it meets another drift."""
-    if tunnel.meander_m == 0.0:
+    if tunnel.meander_m == 0.0 or tunnel.mesh is not None:
         return np.zeros_like(points)
     along_m: Float64Array = np.arange(len(points), dtype=np.float64) * STEP_M
     key = int(stream(seed, "tunnel", "meander", str(index)).integers(2**63))

@@ -6,14 +6,16 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+from scipy.spatial import ConvexHull, cKDTree
 
 from cdpipe.geometry import BoolArray, Float32Array, Float64Array, Int64Array
 from scenarios.schema import Scenario
+from sim.contact import standing_surface
 from sim.lidar import Rays
-from sim.mesh import Mesh, is_near_surface, joined, near_part
+from sim.mesh import Mesh, is_near_surface, joined, near_part, split
 from sim.placing import Standing
 from sim.raycast import Caster
-from sim.scene import World
+from sim.scene import Scene, World
 from sim.truth import Change
 
 CELL_M = 0.1
@@ -21,6 +23,9 @@ NEAR_OLD_SURFACE_M = 0.1
 MIN_CELLS = 10
 MIN_GHOST_RAYS = 10
 GHOST_REACH_M = 50.0
+UNMOVED_M = 1e-3
+_SAME_SURFACE_M = 0.02  # of the two surfaces of a reshaped prop: what is nearer to the other one has not changed
+_SAMPLE_M = 0.03
 
 
 class Ghost:
@@ -63,6 +68,8 @@ class Tally:
         n_returns: Returns that belong to it so far.
         cells: Keys of the cells they fill, in the odom frame of its session.
         n_ghost_rays: Rays of the other session that meet its ghost so far.
+        n_returns_other: Returns of the other session on the same prop so far.
+        cells_other: Keys of the cells these fill, in the odom frame of that session.
     """
 
     change: Change
@@ -71,6 +78,8 @@ class Tally:
     n_returns: int = 0
     cells: set[int] = field(default_factory=set)
     n_ghost_rays: int = 0
+    n_returns_other: int = 0
+    cells_other: set[int] = field(default_factory=set)
 
     def finished(self) -> Change:
         """Return the change with its counts and whether it is observable."""
@@ -86,21 +95,35 @@ class Tally:
             n_ghost_rays=self.n_ghost_rays,
             is_observable=not reasons,
             why_not="; ".join(reasons),
+            n_returns_other=self.n_returns_other,
+            n_cells_other=len(self.cells_other),
         )
 
 
 def list_changes(scenario: Scenario, world: World) -> list[Tally]:
-    """Return every change of a pair, in the order of the props; a moved prop is a removal and an addition, linked."""
+    """Return every change of a pair, in the order of the props, as found by comparing what stands in the two scenes.
+
+    A prop that stands in one session only was added or removed. One of the same shape, any corner of which differs by
+    more than a millimetre, was moved: a removal and an addition, linked. One whose surface differs was reshaped: what
+    changed is the part that is gone.
+    """
     tallies: list[Tally] = []
     for instance, prop in enumerate(scenario.props, start=1):
-        if prop.change == "none":
+        stood = _only(world, prop.name, "before"), _only(world, prop.name, "after")
+        items = [item for item in stood if item is not None]
+        if len(items) < 2:
+            tallies.extend(_tally(len(tallies) + 1, instance, item, world, "full", None) for item in items)
             continue
-        places = [item for item in world.standing if item.prop.name == prop.name]
-        group: Literal["full", "partial"] = "partial" if _is_short_move(places) else "full"
+        start, end = items
+        if _is_same(start, end):
+            continue
+        if start.shape is not end.shape and np.allclose(start.world_T_object, end.world_T_object, atol=1e-6):
+            tallies.append(_reshaped(len(tallies) + 1, instance, start, world))
+            continue
+        group: Literal["full", "partial"] = "partial" if _is_short_move(start, end) else "full"
         first_id = len(tallies) + 1
-        for place, item in enumerate(places):
-            partner = first_id + 1 - place if len(places) == 2 else None
-            tallies.append(_tally(first_id + place, instance, item, world, group, partner))
+        tallies.append(_tally(first_id, instance, start, world, group, first_id + 1))
+        tallies.append(_tally(first_id + 1, instance, end, world, group, first_id))
     return tallies
 
 
@@ -129,6 +152,25 @@ def cell_keys(points: Float64Array) -> Int64Array:
     return np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2])
 
 
+def count_other(tally: Tally, points_odom: Float64Array) -> None:
+    """Add returns (N, 3) of the other session on the same prop, as that session measured them, to its tally."""
+    tally.n_returns_other += len(points_odom)
+    tally.cells_other.update(cell_keys(points_odom).tolist())
+
+
+def _only(world: World, name: str, session: str) -> Standing | None:
+    found = [item for item in world.standing if item.prop.name == name and session in item.sessions]
+    return found[0] if found else None
+
+
+def _is_same(start: Standing, end: Standing) -> bool:
+    """Tell whether two surfaces have the same corners to a millimetre."""
+    if start is end:
+        return True
+    a, b = standing_surface(start).vertices, standing_surface(end).vertices
+    return a.shape == b.shape and bool((np.linalg.norm(a - b, axis=1) <= UNMOVED_M).all())
+
+
 def _tally(
     change_id: int,
     instance: int,
@@ -139,7 +181,7 @@ def _tally(
 ) -> Tally:
     session: Literal["before", "after"] = "before" if "before" in item.sessions else "after"
     scene, other = (world.before, world.after) if session == "before" else (world.after, world.before)
-    surface = joined([mesh for mesh, owner in zip(scene.meshes, scene.instance, strict=True) if owner == instance])
+    surface = _surface_in(scene, instance)
     kind: Literal["added", "removed", "moved"] = "added" if session == "after" else "removed"
     change = Change(
         id=change_id,
@@ -151,20 +193,72 @@ def _tally(
         group=group,
         instance=instance,
         world_T_object=item.world_T_object.tolist(),
-        hull_volume_m3=world.shapes[item.prop.name].hull_volume_m3,
+        hull_volume_m3=item.shape.hull_volume_m3,
         n_returns=0,
         n_cells=0,
         n_ghost_rays=0,
         is_observable=False,
         why_not="",
+        mesh_volume_m3=item.shape.mesh_volume_m3,
     )
-    old = near_part(joined(list(other.meshes)), surface, 2 * NEAR_OLD_SURFACE_M) if group == "partial" else None
-    return Tally(change, Ghost(surface), old)
+    return Tally(change, Ghost(surface), _near(other, surface) if group == "partial" else None)
 
 
-def _is_short_move(places: list[Standing]) -> bool:
+def _reshaped(change_id: int, instance: int, item: Standing, world: World) -> Tally:
+    """Change of a pile partly loaded away.
+
+    Its ghost is the part of the old surface that is gone, left open: a ray that would have met the part removed comes
+    from the outside and meets that skin, for behind its rim the rest of the pile still stands.
+    """
+    full, rest = (compacted(_surface_in(scene, instance)) for scene in (world.before, world.after))
+    near_full, near_rest = _samples(full), _samples(rest)
+    is_gone = np.asarray(near_rest.query(full.vertices[full.faces].mean(axis=1))[0] > NEAR_OLD_SURFACE_M)
+    skin = Mesh(full.vertices, full.faces[is_gone])
+    # The part removed lies between the old skin and the new face below it.
+    floor_m = item.world_T_object[2, 3]
+    ends = np.concatenate([_off(full, near_rest, floor_m), _off(rest, near_full, floor_m)])
+    after = _only(world, item.prop.name, "after")
+    volumes = (item.shape.mesh_volume_m3, after.shape.mesh_volume_m3 if after is not None else None)
+    tally = _tally(change_id, instance, item, world, "partial", None)
+    tally.ghost = Ghost(compacted(skin if is_gone.any() else full))
+    tally.change = replace(
+        tally.change,
+        kind="reshaped",
+        hull_volume_m3=float(ConvexHull(ends).volume) if len(ends) > 3 else 0.0,
+        mesh_volume_m3=None if volumes[0] is None or volumes[1] is None else volumes[0] - volumes[1],
+    )
+    return tally
+
+
+def _off(mesh: Mesh, other: cKDTree, floor_m: float) -> Float64Array:
+    """Corners (N, 3) of a surface above the floor that lie off the samples of another one."""
+    corners = mesh.vertices[mesh.vertices[:, 2] >= floor_m]
+    return np.asarray(corners[other.query(corners)[0] > _SAME_SURFACE_M])
+
+
+def _samples(mesh: Mesh) -> cKDTree:
+    """Points no farther than 1.8 cm from any place on a surface: distances to them are exact to 2 mm at 0.1 m."""
+    middles = split(mesh.vertices[mesh.faces], _SAMPLE_M).mean(axis=1)
+    return cKDTree(np.concatenate([mesh.vertices, middles]), balanced_tree=False, compact_nodes=False)
+
+
+def _surface_in(scene: Scene, instance: int) -> Mesh:
+    return joined([mesh for mesh, owner in zip(scene.meshes, scene.instance, strict=True) if owner == instance])
+
+
+def _near(scene: Scene, surface: Mesh) -> Mesh:
+    """Return what of a scene lies near a surface."""
+    parts = (near_part(mesh, surface, 2 * NEAR_OLD_SURFACE_M) for mesh in scene.meshes)
+    return joined([compacted(part) for part in parts if len(part.faces)])
+
+
+def compacted(mesh: Mesh) -> Mesh:
+    """Return a mesh without the vertices that none of its faces uses."""
+    used, faces = np.unique(mesh.faces, return_inverse=True)
+    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32))
+
+
+def _is_short_move(start: Standing, end: Standing) -> bool:
     """Tell whether a prop moved by less than its own length, the longer side of its footprint."""
-    if len(places) < 2:
-        return False
-    start, end = (item.world_T_object[:3, 3] for item in places)
-    return bool(np.linalg.norm(end - start) < max(places[0].prop.size_m[:2]))
+    moved_m = np.linalg.norm(end.world_T_object[:3, 3] - start.world_T_object[:3, 3])
+    return bool(moved_m < max(start.shape.size_m[:2]))

@@ -66,20 +66,22 @@ def is_near_surface(points: Float64Array, mesh: Mesh, within_m: float) -> BoolAr
     triangles = mesh.vertices[mesh.faces]
     triangles = triangles[_touches_box(triangles, points.min(axis=0) - margin_m, points.max(axis=0) + margin_m)]
     # Small pieces have small bounding spheres, so that few candidates stand for each point.
-    triangles = _split(triangles, within_m)
+    triangles = split(triangles, within_m)
     if len(triangles) == 0:
         return is_near
     centres = triangles.mean(axis=1)
     reach_m = within_m + float(np.linalg.norm(triangles - centres[:, None], axis=2).max())
     tree = cKDTree(centres)
-    for start in range(0, len(points), 4096):
-        part = points[start : start + 4096]
-        near = np.asarray(tree.query_ball_point(part, reach_m), dtype=object)
-        counts = np.fromiter((len(found) for found in near), np.int64, len(part))
-        owner = np.repeat(np.arange(len(part)), counts)
+    nearest_m, _ = tree.query(points, distance_upper_bound=reach_m)
+    is_near |= nearest_m <= within_m  # a centre lies on the surface
+    unsure = np.flatnonzero(~is_near & np.isfinite(nearest_m))
+    for rows in np.split(unsure, range(4096, len(unsure), 4096)):
+        near = np.asarray(tree.query_ball_point(points[rows], reach_m), dtype=object)
+        counts = np.fromiter((len(found) for found in near), np.int64, len(rows))
+        owner = np.repeat(rows, counts)
         candidate = np.fromiter((index for found in near for index in found), np.int64, counts.sum())
-        distance_m = point_triangle_distance(part[owner], triangles[candidate])
-        is_near[start + owner[distance_m <= within_m]] = True
+        distance_m = point_triangle_distance(points[owner], triangles[candidate])
+        is_near[owner[distance_m <= within_m]] = True
     return is_near
 
 
@@ -96,7 +98,7 @@ def _touches_box(triangles: Float64Array, low: Float64Array, high: Float64Array)
     return np.asarray(((triangles.max(axis=1) >= low) & (triangles.min(axis=1) <= high)).all(axis=1))
 
 
-def _split(triangles: Float64Array, edge_m: float) -> Float64Array:
+def split(triangles: Float64Array, edge_m: float) -> Float64Array:
     """Halve triangles at their longest edge until none is longer than `edge_m`; the surface stays the same."""
     done = []
     while len(triangles):

@@ -44,6 +44,21 @@ def smooth_noise(axes_m: tuple[Float64Array, ...], length_m: float, key: int) ->
     return np.asarray(values / _VARIANCE_PER_AXIS ** (len(taps) / 2))
 
 
+def noise_at(points_m: Float64Array, length_m: float, key: int) -> Float64Array:
+    """Return the values (N,) of the same field as `smooth_noise` at scattered points (N, 1), (N, 2) or (N, 3)."""
+    step_m = length_m / _STEPS_PER_LENGTH
+    n_axes = points_m.shape[1]
+    indices, weight = [], np.ones((len(points_m),) + (1,) * n_axes)
+    for axis in range(n_axes):
+        first, weights = _spline_taps(points_m[:, axis] / step_m)
+        shape = [len(points_m)] + [4 if other == axis else 1 for other in range(n_axes)]
+        indices.append((first[:, None] + np.arange(4)).reshape(shape))
+        weight = weight * weights.T.reshape(shape)
+    values = lattice_values(np.broadcast_arrays(*indices), key)
+    total = (values * weight).reshape(len(points_m), -1).sum(axis=1)
+    return np.asarray(total / _VARIANCE_PER_AXIS ** (n_axes / 2))
+
+
 def lattice_values(index: Sequence[npt.NDArray[np.int64]], key: int) -> Float64Array:
     """Return numbers of mean 0 and variance 1, uniform, hashed from integer coordinates and a key."""
     state = np.full(index[0].shape, np.uint64(key & 0xFFFFFFFFFFFFFFFF))

@@ -6,23 +6,23 @@ are collected along it, and a smooth offset is found between them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array
+from cdpipe.geometry import Float64Array, stream
 from scenarios.schema import Scenario, SessionPlan
 from sim.centreline import headings_of, left_of, resample
-from sim.obstacles import STEP_M, check_clearance, obstacles, pass_by
-from sim.placing import PROBE_UP_M, floor_heights, free_width
+from sim.line import STEP_M, kept_between, smoothed, strictest
+from sim.noise import smooth_noise
+from sim.obstacles import boulders, obstacles, pass_by, sidestep
+from sim.placing import free_width
 from sim.scene import World
 
 _SHARPEST_DEG = 150.0
-_FLOOR_SMOOTHING_M = 0.5
+_WANDER_LENGTH_M = 8.0  # correlation length of the line's way from side to side
 # Takes the edge off turns that tighten where bend and swerve meet; it moves the line by a few centimetres at most.
 _LAST_SMOOTHING_M = 0.7
 # Corners of the route are rounded over this share of the drift's width to either side.
@@ -33,6 +33,8 @@ _INSIDE_SHARE = 0.35
 _SWERVES_M = (2.0, 1.4, 1.0, 0.7, 0.5)
 # Rather than swerve sharply between props on both sides, this share of the clearance is given up.
 _CHICANE_SHARE = 0.3
+# Where no smooth way is found, the stones within this distance are driven over.
+_STONE_REACH_M = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,51 +43,31 @@ class Path:
 
     Attributes:
         distance_m: (N,) horizontal distance travelled.
-        points: (N, 3) world position of the sensor, metres.
+        points: (N, 3) world position, metres; z is the centreline's, near the floor.
         yaw_rad: (N,) heading, unwrapped.
-        slope: (N,) rise of the floor per metre.
     """
 
     distance_m: Float64Array
     points: Float64Array
     yaw_rad: Float64Array
-    slope: Float64Array
 
 
-def plan_path(world: World, scenario: Scenario, session: str) -> Path:
-    """Return the line of one session.
+def plan_path(world: World, scenario: Scenario, seed: int, session: str) -> Path:
+    """Return the line of one session; the seed draws its wander.
 
     Raises:
         ScenarioError: The route turns back on itself, nothing is left of it, or the walls and props leave no room.
     """
     plan: SessionPlan = getattr(scenario, session)
     line, width_m = _reference(world, plan, session)
-    offset_m = _offsets(world, scenario, session, line, width_m)
+    offset_m = _offsets(world, scenario, seed, session, line, width_m)
     left = left_of(headings_of(line))
     shifted = resample(np.column_stack([line[:, :2] + offset_m[:, None] * left, line[:, 2]]), STEP_M)
-    xy, level_m = smoothed(shifted[:, :2], _LAST_SMOOTHING_M), shifted[:, 2]
-    floor_m = floor_heights(world.walls, np.column_stack([xy, level_m + PROBE_UP_M]))
-    floor_m = smoothed(np.where(np.isnan(floor_m), level_m, floor_m), _FLOOR_SMOOTHING_M)
-    height_m = plan.height_m or scenario.platform.sensor_height_m
-    points = np.column_stack([xy, floor_m + height_m])
-    check_clearance(world, scenario, session, points)
+    xy = smoothed(shifted[:, :2], _LAST_SMOOTHING_M)
     headings = headings_of(xy)
     distance_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
     yaw = smoothed(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0])), 4 * STEP_M)
-    return Path(distance_m, points, yaw, np.gradient(floor_m, distance_m))
-
-
-def smoothed(values: Float64Array, half_m: float) -> Float64Array:
-    """Return (N,) or (N, D) samples 0.05 m apart averaged with a Hann window of this half width, ends kept."""
-    half = round(half_m / STEP_M)
-    if half < 1 or len(values) < 2:
-        return values
-    window = np.hanning(2 * half + 3)[1:-1]
-    window /= window.sum()
-    padded = np.pad(values, [(half, half)] + [(0, 0)] * (values.ndim - 1), mode="reflect", reflect_type="odd")
-    if values.ndim == 1:
-        return np.convolve(padded, window, mode="valid")
-    return np.stack([np.convolve(column, window, mode="valid") for column in padded.T], axis=1)
+    return Path(distance_m, np.column_stack([xy, shifted[:, 2]]), yaw)
 
 
 def _reference(world: World, plan: SessionPlan, session: str) -> tuple[Float64Array, Float64Array]:
@@ -121,54 +103,73 @@ def _turn_deg(before: Float64Array, after: Float64Array) -> float:
     return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
-def _offsets(world: World, scenario: Scenario, session: str, line: Float64Array, width_m: Float64Array) -> Float64Array:
+def _offsets(
+    world: World, scenario: Scenario, seed: int, session: str, line: Float64Array, width_m: Float64Array
+) -> Float64Array:
     """Sideways offset (N,) from the reference line, positive to the left."""
     plan: SessionPlan = getattr(scenario, session)
     clearance_m = scenario.platform.clearance_m
     headings = headings_of(line)
     height_m = plan.height_m or scenario.platform.sensor_height_m
     heights = np.array([height_m] if scenario.platform.kind == "quadrotor" else [0.35, max(height_m, 0.4)])
-    right_m, left_m = free_width(world.walls, line, left_of(headings), heights, float(width_m.max()))
+    right_m, left_m = free_width(world.fixed, line, left_of(headings), heights, float(width_m.max()))
     room_m = np.maximum(width_m / 2 - clearance_m, 0.0)
     low = np.maximum(clearance_m - right_m, -room_m)
     high = np.minimum(left_m - clearance_m, room_m)
     turn = smoothed(np.gradient(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0]))) / STEP_M, 0.25)
     high = np.where(turn > 1e-3, np.minimum(high, _INSIDE_SHARE / np.maximum(turn, 1e-3)), high)
     low = np.where(turn < -1e-3, np.maximum(low, -_INSIDE_SHARE / np.maximum(-turn, 1e-3)), low)
-    wanted = plan.lateral * room_m
+    wanted = plan.lateral * room_m + scenario.platform.wander_m * _wander(len(line), seed, session)
     _refuse_narrow(scenario, session, low, high)
     for name, near_low, near_high in obstacles(world, scenario, session, line, headings, height_m):
         pass_by(session, name, wanted, low, high, near_low, near_high)
-    offset_m = _swerving(wanted, low, high, _SWERVES_M[0])
-    for half_m in (*_SWERVES_M[1:], None):
-        excess_m = np.maximum(low - offset_m, offset_m - high)
-        is_bad = excess_m > _CHICANE_SHARE * clearance_m
-        if not is_bad.any():
+    stones = boulders(world, scenario, line, headings, float(width_m.max()))
+    return _swerving(session, wanted, low, high, stones, _CHICANE_SHARE * clearance_m)
+
+
+def _swerving(
+    session: str,
+    wanted: Float64Array,
+    low: Float64Array,
+    high: Float64Array,
+    stones: list[tuple[Float64Array, Float64Array]],
+    give_m: float,
+) -> Float64Array:
+    """Smooth offset (N,) between the bounds, `give_m` beyond them at worst; stones are driven over where need be."""
+    while True:
+        inner_low, inner_high = low.copy(), high.copy()
+        for near_low, near_high in stones:
+            sidestep(wanted, inner_low, inner_high, near_low, near_high)
+        offset_m, excess_m = _smoothest(wanted, inner_low, inner_high, give_m)
+        worst = int(np.argmax(excess_m))
+        if excess_m[worst] <= give_m:
             return offset_m
-        if half_m is not None:
-            share = np.clip(smoothed(_strictest(is_bad.astype(np.float64), 2.0, np.max), 2.0), 0.0, 1.0)
-            offset_m = share * _swerving(wanted, low, high, half_m) + (1.0 - share) * offset_m
-    worst_m = int(np.argmax(excess_m)) * STEP_M
-    raise ScenarioError(
-        f"{session}: props on both sides leave no smooth way {worst_m:.1f} m along the route: "
-        "set them farther apart, or lower platform.clearance_m"
-    )
+        near = slice(max(0, worst - round(_STONE_REACH_M / STEP_M)), worst + round(_STONE_REACH_M / STEP_M))
+        kept = [stone for stone in stones if np.isnan(stone[0][near]).all()]
+        if len(kept) == len(stones):
+            raise ScenarioError(
+                f"{session}: props on both sides leave no smooth way {worst * STEP_M:.1f} m along the route: "
+                "set them farther apart, or lower platform.clearance_m"
+            )
+        stones = kept
 
 
-def _swerving(wanted: Float64Array, low: Float64Array, high: Float64Array, half_m: float) -> Float64Array:
-    """Return a smooth offset near the wanted one; it keeps the bounds wherever they agree within `half_m`."""
-    inner_low, inner_high = _strictest(low, half_m, np.max), _strictest(high, half_m, np.min)
-    middle = (inner_low + inner_high) / 2
-    is_crossed = inner_low > inner_high
-    target = np.where(is_crossed, middle, np.clip(wanted, inner_low, np.maximum(inner_low, inner_high)))
-    return smoothed(target, half_m)
+def _smoothest(
+    wanted: Float64Array, low: Float64Array, high: Float64Array, give_m: float
+) -> tuple[Float64Array, Float64Array]:
+    """Offset (N,) that swerves no more sharply than it must, and how far it is beyond the bounds (N,)."""
+    offset_m = kept_between(wanted, low, high, _SWERVES_M[0])
+    for half_m in _SWERVES_M[1:]:
+        is_bad = np.maximum(low - offset_m, offset_m - high) > give_m
+        if is_bad.any():
+            share = np.clip(smoothed(strictest(is_bad.astype(np.float64), 2.0, np.max), 2.0), 0.0, 1.0)
+            offset_m = share * kept_between(wanted, low, high, half_m) + (1.0 - share) * offset_m
+    return offset_m, np.maximum(low - offset_m, offset_m - high)
 
 
-def _strictest(bound: Float64Array, half_m: float, of: Callable[..., Any]) -> Float64Array:
-    """Take the strictest bound within `half_m` of each sample: a Hann average over that window then keeps the bound."""
-    half = round(half_m / STEP_M)
-    padded = np.pad(bound, half, mode="edge")
-    return np.asarray(of(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1), axis=1))
+def _wander(n_samples: int, seed: int, session: str) -> Float64Array:
+    along_m: Float64Array = np.arange(n_samples, dtype=np.float64) * STEP_M
+    return smooth_noise((along_m,), _WANDER_LENGTH_M, int(stream(seed, session, "wander").integers(2**63)))
 
 
 def _refuse_narrow(scenario: Scenario, session: str, low: Float64Array, high: Float64Array) -> None:

@@ -1,18 +1,39 @@
-"""Pictures of a scene: ray-cast, shaded by the angle to a lamp at the camera."""
+"""Pictures of a scene: ray-cast, each part in the colour of its material, under a lamp beside the camera.
+
+The lamp casts shadows, and corners are darker where less of the surroundings sends light in (ambient occlusion), so
+that shapes can be told on bare rock.
+"""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Collection
 
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.geometry import Float64Array
+from cdpipe.geometry import BoolArray, Float32Array, Float64Array, stream
 from sim.scene import Scene
 
-_ROCK_RGB = (0.55, 0.52, 0.48)
-_PROP_RGB = (0.86, 0.47, 0.16)
-_HIGHLIGHT_RGB = (0.85, 0.12, 0.12)
+COLOURS: dict[str, tuple[float, float, float]] = {
+    "rock": (0.50, 0.47, 0.43),
+    "wood": (0.60, 0.47, 0.32),
+    "paper": (0.70, 0.56, 0.38),
+    "plastic": (0.84, 0.36, 0.10),
+    "rubber": (0.10, 0.10, 0.11),
+    "steel": (0.58, 0.61, 0.65),
+    "paint": (0.80, 0.58, 0.10),
+    "fabric": (0.80, 0.68, 0.30),
+    "reflector": (0.95, 0.93, 0.88),
+    "glass": (0.14, 0.19, 0.22),
+}
+_PAINTS = ((0.80, 0.58, 0.10), (0.16, 0.36, 0.62), (0.20, 0.46, 0.28), (0.74, 0.34, 0.10), (0.42, 0.47, 0.52))
+HIGHLIGHT_RGB = (0.85, 0.10, 0.10)
+_LAMP_M = (1.1, 0.8)  # right of the camera and above it
+_LAMP_RADIUS_M = 0.05
+_OCCLUSION_RAYS = 4
+_OCCLUSION_M = 1.2
+_CHUNK = 300_000
 
 
 def render(
@@ -23,6 +44,7 @@ def render(
     height: int = 480,
     field_of_view_deg: float = 70.0,
     highlight: Collection[int] = (),
+    samples: int = 1,
 ) -> npt.NDArray[np.uint8]:
     """Return a picture (height, width, 3) of a scene.
 
@@ -34,30 +56,92 @@ def render(
         height: Pixels down.
         field_of_view_deg: Horizontal.
         highlight: Instance numbers to be drawn red.
+        samples: Rays across and down each pixel; more make edges and shadows smooth.
     """
     eye_m = np.asarray(eye, dtype=np.float64)
-    directions = _pixel_rays(np.asarray(target, dtype=np.float64) - eye_m, width, height, field_of_view_deg)
-    ranges_m, geom, normals = scene.caster.hits(np.broadcast_to(eye_m, directions.shape), directions)
-    lit = np.abs((normals * directions).sum(axis=1))
-    # A second light from above keeps level and upright faces apart.
-    above = np.clip(normals[:, 2] * -np.sign((normals * directions).sum(axis=1)), 0.0, 1.0)
-    fog = np.exp(-np.where(np.isfinite(ranges_m), ranges_m, 1e3) / 60.0)
-    shade = (0.12 + 0.63 * lit + 0.25 * above) * fog
-    owner = np.where(geom >= 0, scene.instance[geom], 0)
-    colour = np.where((owner > 0)[:, None], _PROP_RGB, _ROCK_RGB)
-    colour = np.where(np.isin(owner, sorted(highlight))[:, None], _HIGHLIGHT_RGB, colour)
-    pixels = np.clip(colour * shade[:, None], 0.0, 1.0) ** (1 / 1.6)
-    return np.asarray(pixels.reshape(height, width, 3) * 255, dtype=np.uint8)
-
-
-def _pixel_rays(forward: Float64Array, width: int, height: int, field_of_view_deg: float) -> Float64Array:
-    forward = forward / np.linalg.norm(forward)
-    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.99 else np.array([1.0, 0.0, 0.0])
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
+    forward, right, down = _axes(np.asarray(target, dtype=np.float64) - eye_m)
+    lamp_m = eye_m + _LAMP_M[0] * right - _LAMP_M[1] * down
+    aside_m = float(np.linalg.norm(lamp_m - eye_m))
+    free_m = float(scene.caster.cast(eye_m[None], _unit(lamp_m - eye_m)[None])[0][0])
+    lamp_m = eye_m + (lamp_m - eye_m) * min(1.0, 0.7 * free_m / aside_m)  # short of rock beside the camera
     half = np.tan(np.deg2rad(field_of_view_deg) / 2)
-    across = np.linspace(-half, half, width)[None, :, None]
-    along = np.linspace(-half, half, height)[:, None, None] * (height / width)
-    rays = (forward + across * right + along * down).reshape(-1, 3)
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    across = np.linspace(-half, half, width * samples)[None, :, None]
+    along = np.linspace(-half, half, height * samples)[:, None, None] * (height / width)
+    directions = _unit((forward + across * right + along * down).reshape(-1, 3))
+    colours = part_colours(scene)
+    colours[np.isin(scene.instance, sorted(highlight))] = HIGHLIGHT_RGB
+    generator = stream(0, "picture")
+    light = np.concatenate(
+        [
+            _shaded(scene, eye_m, lamp_m, directions[start : start + _CHUNK], colours, generator)
+            for start in range(0, len(directions), _CHUNK)
+        ]
+    )
+    pixels = light.reshape(height, samples, width, samples, 3).mean(axis=(1, 3))
+    return np.asarray(np.clip(pixels, 0.0, 1.0) ** (1 / 2.2) * 255, dtype=np.uint8)
+
+
+def part_colours(scene: Scene) -> Float64Array:
+    """Return a linear RGB colour (G, 3) for every geom."""
+    rows = [material_colour(part, material) for part, material in zip(scene.parts, scene.materials, strict=True)]
+    return np.array(rows) ** 2.2
+
+
+def material_colour(part: str, material: str) -> tuple[float, float, float]:
+    """Return the colour (red, green, blue, 0 to 1) of a material; painted parts differ by their name."""
+    return _PAINTS[zlib.crc32(part.encode()) % len(_PAINTS)] if material == "paint" else COLOURS[material]
+
+
+def _shaded(
+    scene: Scene,
+    eye_m: Float64Array,
+    lamp_m: Float64Array,
+    directions: Float64Array,
+    colours: Float64Array,
+    generator: np.random.Generator,
+) -> Float64Array:
+    """Return the linear light (N, 3) that comes back along each direction."""
+    ranges_m, geom, normals = scene.caster.hits(np.broadcast_to(eye_m, directions.shape), directions)
+    light = np.zeros((len(directions), 3))
+    seen = np.flatnonzero(geom >= 0)
+    if not len(seen):
+        return light
+    facing = normals[seen] * -np.sign((normals[seen] * directions[seen]).sum(axis=1))[:, None]
+    points = eye_m + ranges_m[seen, None] * directions[seen] + 2e-3 * facing
+    to_lamp = lamp_m + _LAMP_RADIUS_M * generator.normal(size=points.shape) - points
+    distance_m = np.linalg.norm(to_lamp, axis=1)
+    towards = to_lamp / distance_m[:, None]
+    lit = np.clip((facing * towards).sum(axis=1), 0.0, None) * ~_is_blocked(scene, points, towards, distance_m)
+    lamp = lit / (1.0 + (distance_m / 12.0) ** 2)
+    # from above a little more than from below, as light from a lit drift has it
+    around = _openness(scene, points, facing, generator) * (0.8 + 0.2 * facing[:, 2])
+    fog = 1.0 / (1.0 + (distance_m / 25.0) ** 2)
+    light[seen] = colours[geom[seen]] * (1.9 * lamp + 0.6 * around**1.4 * fog)[:, None]
+    return light
+
+
+def _openness(scene: Scene, points: Float64Array, facing: Float64Array, generator: np.random.Generator) -> Float32Array:
+    """Return the share (N,) of directions in front of each point that meet nothing close by, nearer counting more."""
+    total = np.zeros(len(points), dtype=np.float32)
+    for _ in range(_OCCLUSION_RAYS):
+        spread = _unit(generator.normal(size=points.shape))
+        ranges_m, _, _ = scene.caster.cast(points, _unit(facing + 0.999 * spread))
+        total += np.minimum(ranges_m / _OCCLUSION_M, 1.0)
+    return total / np.float32(_OCCLUSION_RAYS)
+
+
+def _is_blocked(scene: Scene, points: Float64Array, towards: Float64Array, distance_m: Float64Array) -> BoolArray:
+    ranges_m, _, _ = scene.caster.cast(points, towards)
+    return np.asarray(ranges_m < distance_m)
+
+
+def _axes(forward: Float64Array) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Return the unit vectors of a picture: into it, to the right, down."""
+    forward = _unit(forward)
+    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.99 else np.array([1.0, 0.0, 0.0])
+    right = _unit(np.cross(forward, up))
+    return forward, right, np.cross(forward, right)
+
+
+def _unit(vectors: Float64Array) -> Float64Array:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

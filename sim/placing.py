@@ -1,23 +1,25 @@
-"""From a prop's place in a scenario to a pose on the floor: across the free width, clear of walls and other props."""
+"""What stands where: a prop at its pose, the room it takes on the floor, and the rock round it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
+from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array, yaw_pose
-from scenarios.schema import Place, Prop, Scenario, Tunnel
-from sim.centreline import Centreline
-from sim.props import footprint
+from cdpipe.geometry import Float64Array, transform
+from scenarios.schema import Prop
 from sim.raycast import Caster
+from sim.shapes import Shape, footprint, solid_mesh
+
+Posture = Literal["upright", "tipped", "leaning"]
 
 # Kept between prop and wall, beside one cell of the mesh: marching cubes bevels the foot of a wall over a cell.
-_WALL_GAP_M = 0.05
+WALL_GAP_M = 0.05
 # Rays down to the floor start this far above the centreline, below any roof and above any bump.
 PROBE_UP_M = 1.2
+_REMEMBERED = 128  # shapes whose corners are asked for again and again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,38 +28,34 @@ class Standing:
 
     Attributes:
         prop: The prop.
+        shape: What it is made of here; a reshaped pile has another shape in each session.
         sessions: The sessions in which it stands here.
-        world_T_object: (4, 4) pose; before settling upright with its origin at floor level.
+        world_T_object: (4, 4) pose; before settling with its lowest point about at floor level.
+        posture: How it was put there.
+        wall: (2,) unit direction of the wall it leans against or is banked up against, else None.
     """
 
     prop: Prop
+    shape: Shape
     sessions: frozenset[str]
     world_T_object: Float64Array
+    posture: Posture = "upright"
+    wall: Float64Array | None = None
 
 
-def place_props(scenario: Scenario, centreline: Centreline, walls: Caster) -> list[Standing]:
-    """Return every prop at each of its places, upright; a moved prop appears twice.
+@dataclass(frozen=True, slots=True, eq=False)
+class Surroundings:
+    """What props are placed in.
 
-    Raises:
-        ScenarioError: A prop does not fit between the walls, or two stand in one another.
+    Attributes:
+        walls: The bare rock: its floor carries them.
+        fixed: Rock and furniture: what they must keep clear of.
+        gap_m: Kept between a prop and the side of the drift.
     """
-    both = frozenset(("before", "after"))
-    found = []
-    for prop in scenario.props:
-        first = {"added": frozenset(("after",)), "none": both}.get(prop.change, frozenset(("before",)))
-        found.append(Standing(prop, first, _pose(prop, prop.place, scenario.tunnel, centreline, walls)))
-        if prop.to is not None:
-            found.append(
-                Standing(prop, frozenset(("after",)), _pose(prop, prop.to, scenario.tunnel, centreline, walls))
-            )
-    for a, b in combinations(found, 2):
-        shared = a.sessions & b.sessions
-        if shared and _overlap(_corners(a), _corners(b)):
-            raise ScenarioError(
-                f"props {a.prop.name!r} and {b.prop.name!r} stand in one another in the {max(shared)} session: "
-                "give one another fraction or lateral"
-            )
-    return found
+
+    walls: Caster
+    fixed: Caster
+    gap_m: float
 
 
 def floor_heights(walls: Caster, points: Float64Array) -> Float64Array:
@@ -89,56 +87,59 @@ def free_width(
     return reach[0], reach[1]
 
 
+def standing_points(standing: Standing) -> Float64Array:
+    """Return the corners (N, 3) of a standing prop's surface, world frame; of one set into the floor those above it."""
+    local = corners_object(standing.shape)
+    if not standing.shape.is_settled:
+        local = local[local[:, 2] >= -0.05]
+    return transform(standing.world_T_object, local)
+
+
 def standing_corners(standing: Standing) -> Float64Array:
-    """Return the corners (4, 2) of a standing prop's bounding rectangle on the floor, world frame."""
-    return _corners(standing)
+    """Return the corners (4, 2) of a standing prop's bounding rectangle on the floor, world frame.
 
-
-def _pose(prop: Prop, place: Place, tunnel: Tunnel, centreline: Centreline, walls: Caster) -> Float64Array:
-    point, heading, section = centreline.at(*place.between, place.fraction)
-    left = np.array([-heading[1], heading[0]])
-    yaw = float(np.arctan2(heading[1], heading[0]) + np.deg2rad(place.yaw_deg))
-    turn = yaw_pose(np.deg2rad(place.yaw_deg))[:2, :2]
-    extent = np.abs(footprint(prop.size_m) @ turn.T).max(axis=0)  # half size along and across the drift
-    stations = point[:2] + np.linspace(-extent[0], extent[0], 7)[:, None] * heading
-    origins = np.column_stack([stations, np.full(len(stations), point[2])])
-    top = min(prop.size_m[2], 0.5 * section.height_m)
-    heights = np.linspace(0.25, max(0.3, top), 4)
-    sides = free_width(walls, origins, np.tile(left, (len(origins), 1)), heights, section.width_m / 2)
-    right_m, left_m = (float(side.min()) - _WALL_GAP_M - tunnel.resolution_m for side in sides)
-    if right_m + left_m < 2 * extent[1]:
-        raise ScenarioError(
-            f"prop {prop.name!r} is {2 * extent[1]:.2f} m across, but between {place.between[0]!r} and "
-            f"{place.between[1]!r} at {place.fraction:.2f} only {right_m + left_m:.2f} m are free: "
-            "make it smaller, turn it, or place it elsewhere"
-        )
-    low, high = extent[1] - right_m, left_m - extent[1]
-    across = (low + high) / 2 + place.lateral * (high - low) / 2
-    position = point[:2] + across * left
-    floor_m = _floor_under(prop, position, yaw, float(point[2]), walls)
-    return yaw_pose(yaw, (position[0], position[1], floor_m))
-
-
-def _floor_under(prop: Prop, position: Float64Array, yaw: float, level_m: float, walls: Caster) -> float:
-    share = np.linspace(-0.5, 0.5, 7)
-    grid = np.stack(np.meshgrid(share * prop.size_m[0], share * prop.size_m[1]), axis=-1).reshape(-1, 2)
-    xy = grid @ yaw_pose(yaw)[:2, :2].T + position
-    heights = floor_heights(walls, np.column_stack([xy, np.full(len(xy), level_m + PROBE_UP_M)]))
-    if np.isnan(heights).all():
-        raise ScenarioError(f"prop {prop.name!r}: there is no floor where it should stand")
-    return float(np.nanmedian(heights))
-
-
-def _corners(standing: Standing) -> Float64Array:
+    The rectangle keeps the object's own direction; of a prop that lies or leans it is that of what is seen from above.
+    """
     pose = standing.world_T_object
-    return np.asarray(footprint(standing.prop.size_m) @ pose[:2, :2].T + pose[:2, 3])
+    if standing.posture == "upright":
+        return np.asarray(footprint(standing.shape.size_m) @ pose[:2, :2].T + pose[:2, 3])
+    # Of the object's axes the one that lies flattest gives the direction of the rectangle.
+    axis = pose[:2, int(np.argmin(np.abs(pose[2, :3])))]
+    along = axis / np.linalg.norm(axis)
+    frame = np.stack([along, [-along[1], along[0]]])
+    points = standing_points(standing)[:, :2] @ frame.T
+    low, high = points.min(axis=0), points.max(axis=0)
+    rectangle = np.array([[high[0], high[1]], [low[0], high[1]], [low[0], low[1]], [high[0], low[1]]])
+    return np.asarray(rectangle @ frame)
 
 
-def _overlap(a: Float64Array, b: Float64Array) -> bool:
-    """Separating axes of two rectangles given by their corners."""
+def standing_height_m(standing: Standing) -> float:
+    """Return how high a standing prop reaches above its foot."""
+    if standing.posture == "upright":
+        return standing.shape.size_m[2]
+    return float(np.ptp(standing_points(standing)[:, 2]))
+
+
+def overlap(a: Float64Array, b: Float64Array) -> bool:
+    """Tell whether two rectangles, given by their corners (4, 2), have a point in common inside: separating axes."""
     for corners in (a, b):
         for edge in (corners[1] - corners[0], corners[2] - corners[1]):
             first, second = a @ edge, b @ edge
             if first.max() <= second.min() or second.max() <= first.min():
                 return False
     return True
+
+
+def grown(corners: Float64Array, by_m: float) -> Float64Array:
+    """Return the corners (4, 2) of a rectangle grown on every side."""
+    centre = corners.mean(axis=0)
+    edges = np.stack([corners[0] - corners[1], corners[1] - corners[2]])
+    edges /= np.maximum(np.linalg.norm(edges, axis=1, keepdims=True), 1e-9)
+    sign = np.sign(np.round((corners - centre) @ edges.T, 9))
+    return np.asarray(corners + by_m * sign @ edges)
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def corners_object(shape: Shape) -> Float64Array:
+    """Return the corners (N, 3) of all of a prop's primitives, object frame."""
+    return np.concatenate([solid_mesh(solid).vertices for solid in shape.solids])

@@ -1,47 +1,27 @@
-"""From a path to poses: when and where each column of each recorded revolution was taken, and where odometry had it."""
+"""From a drive to poses: when and where each column of each recorded revolution was taken, and as odometry has it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float32Array, Float64Array, Int64Array, invert, stream
+from cdpipe.geometry import Float32Array, Float64Array, Int64Array
 from cdpipe.ouster import SensorMetadata
-from scenarios.schema import Odometry, Platform, Scenario
-from sim.noise import smooth_noise
-from sim.path import Path, plan_path
+from scenarios.schema import Platform, Scenario, SessionPlan
+from sim.motion import Motion
+from sim.obstacles import check_clearance
+from sim.odometry import drifted
+from sim.path import plan_path
+from sim.ride import ride
 from sim.scene import World
+from sim.tum import check_inside, read_tum
 
-_TILT_LENGTH_M = 2.5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Motion:
-    """A movement over travelled distance: linear between samples, so that any column can be asked for.
-
-    Attributes:
-        distance_m: (N,) horizontal distance travelled.
-        points: (N, 3) position, metres.
-        angles_rad: (N, 3) yaw (unwrapped), pitch and roll, applied in this order about moving axes.
-    """
-
-    distance_m: Float64Array
-    points: Float64Array
-    angles_rad: Float64Array
-
-    def poses(self, distance_m: Float64Array) -> Float64Array:
-        """Return the poses (..., 4, 4) at distances (...)."""
-        flat = distance_m.ravel()
-        columns = [np.interp(flat, self.distance_m, self.points[:, axis]) for axis in range(3)]
-        angles = [np.interp(flat, self.distance_m, self.angles_rad[:, axis]) for axis in range(3)]
-        poses = np.zeros((len(flat), 4, 4))
-        poses[:, :3, :3] = _rotations(*angles)
-        poses[:, :3, 3] = np.stack(columns, axis=1)
-        poses[:, 3, 3] = 1.0
-        return poses.reshape(*distance_m.shape, 4, 4)
+# Revolutions and ways are compared with this much slack, so that rounding loses none.
+_SLACK = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,130 +31,115 @@ class Trajectory:
     Attributes:
         true: Movement of the sensor in the world frame.
         estimated: The same as the session's odometry has it, in its odom frame.
-        revolution_m: (S,) distance travelled at the middle column of each recorded revolution.
-        column_m: (W,) distance travelled at each column, from the middle one.
-        speed_mps: Speed.
+        revolution_s: (S,) time of the middle column of each recorded revolution.
+        column_s: (W,) time of each column after the middle one.
         column_offsets_ns: (W,) time of each column from the start of its revolution.
     """
 
     true: Motion
     estimated: Motion
-    revolution_m: Float64Array
-    column_m: Float64Array
-    speed_mps: float
+    revolution_s: Float64Array
+    column_s: Float64Array
     column_offsets_ns: Float64Array
 
     @property
     def n_scans(self) -> int:
         """Number of revolutions S."""
-        return len(self.revolution_m)
+        return len(self.revolution_s)
 
     def world_T_column(self, scans: slice) -> Float64Array:
         """Return the true poses (s, W, 4, 4) of every column of some revolutions."""
-        return self.true.poses(self.revolution_m[scans, None] + self.column_m)
+        return self.true.poses(self.revolution_s[scans, None] + self.column_s)
+
+    def odom_T_column(self, scan: int, columns: Int64Array) -> Float64Array:
+        """Return odometry's poses (N, 4, 4) of some columns (N,) of one revolution."""
+        return self.estimated.poses(self.revolution_s[scan] + self.column_s[columns])
 
     def sensor_T_column(self, scans: slice) -> Float32Array:
         """Return odometry's column poses (s, W, 7) in the frame of their revolution: x, y, z, qx, qy, qz, qw."""
-        odom_T_column = self.estimated.poses(self.revolution_m[scans, None] + self.column_m)
-        sensor_T_odom = invert(self.odom_T_sensor[scans])
-        relative = np.einsum("sij,swjk->swik", sensor_T_odom, odom_T_column)
-        quaternions = Rotation.from_matrix(relative[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
-        return np.concatenate(
-            [relative[..., :3, 3], quaternions.reshape(*relative.shape[:2], 4)], axis=2, dtype=np.float32
-        )
+        points, quaternions = self.estimated.sampled(self.revolution_s[scans, None] + self.column_s)
+        origins, middles = self.estimated.sampled(self.revolution_s[scans])
+        width = len(self.column_s)
+        sensor_R_odom = Rotation.from_quat(np.repeat(middles, width, axis=0)).inv()
+        offsets = sensor_R_odom.apply((points - origins[:, None]).reshape(-1, 3))
+        turns = (sensor_R_odom * Rotation.from_quat(quaternions.reshape(-1, 4))).as_quat(canonical=True)
+        return np.concatenate([offsets, turns], axis=1, dtype=np.float32).reshape(-1, width, 7)
 
     def column_stamps_ns(self, scans: slice) -> Int64Array:
         """Return the time (s, W) of every column since the first one of the session."""
-        start_ns = (self.revolution_m[scans] - self.revolution_m[0]) / self.speed_mps * 1e9
+        start_ns = (self.revolution_s[scans] - self.revolution_s[0]) * 1e9
         return np.asarray(np.rint(start_ns[:, None] + self.column_offsets_ns), dtype=np.int64)
 
     @property
     def world_T_sensor(self) -> Float64Array:
         """(S, 4, 4) true pose of each revolution, at its middle column."""
-        return self.true.poses(self.revolution_m)
+        return self.true.poses(self.revolution_s)
 
     @property
     def odom_T_sensor(self) -> Float64Array:
         """(S, 4, 4) pose of each revolution as odometry has it."""
-        return self.estimated.poses(self.revolution_m)
+        return self.estimated.poses(self.revolution_s)
 
 
 def plan_trajectory(world: World, scenario: Scenario, sensor: SensorMetadata, seed: int, session: str) -> Trajectory:
     """Return the drive of one session.
 
+    Where KISS-ICP is to estimate it, which needs the scans, `estimated` is the truth as seen from the first revolution.
+
     Raises:
-        ScenarioError: The route leaves no room, or the sensor cannot record that often.
+        InputError: The trajectory file cannot be read.
+        ScenarioError: The route leaves no room, the trajectory leaves the tunnel, or revolutions are too far apart.
     """
-    path = plan_path(world, scenario, session)
-    true = true_motion(path, scenario.platform, seed, session)
-    return record(true, getattr(scenario, session).odometry, scenario.platform, sensor, seed, session)
+    plan: SessionPlan = getattr(scenario, session)
+    scene = world.before if session == "before" else world.after
+    if plan.trajectory is not None:
+        true, lines = read_tum(Path(plan.trajectory))
+        check_inside(true, scene.caster, f"{session}: {plan.trajectory}", lines)
+    else:
+        path = plan_path(world, scenario, seed, session)
+        true = ride(path, world.fixed, scene.caster, scenario, seed, session)
+        check_clearance(world, scenario, session, true.way_m, true.points)
+    return record(true, scenario, sensor, seed, session)
 
 
-def true_motion(path: Path, platform: Platform, seed: int, session: str) -> Motion:
-    """Add the tilt of the platform: smooth noise, and on wheels the slope of the floor."""
-    keys = stream(seed, session, "tilt").integers(2**63, size=2).tolist()
-    pitch, roll = (
-        np.deg2rad(platform.tilt_deg) * smooth_noise((path.distance_m,), _TILT_LENGTH_M, key) for key in keys
-    )
-    if platform.kind == "ground_robot":
-        pitch = pitch - np.arctan(path.slope)
-    return Motion(path.distance_m, path.points, np.stack([path.yaw_rad, pitch, roll], axis=1))
-
-
-def record(
-    true: Motion, odometry: Odometry, platform: Platform, sensor: SensorMetadata, seed: int, session: str
-) -> Trajectory:
+def record(true: Motion, scenario: Scenario, sensor: SensorMetadata, seed: int, session: str) -> Trajectory:
     """Choose the revolutions to be recorded and let odometry estimate the movement.
 
     Raises:
-        ScenarioError: The path is shorter than a revolution, or `scan_spacing_m` asks for more revolutions than turn.
+        ScenarioError: The drive is shorter than a revolution, or `scan_spacing_m` asks for more revolutions than turn.
     """
-    turn_m = platform.speed_mps / sensor.rate_hz
-    if platform.scan_spacing_m < turn_m * (1 - 1e-9):
+    plan: SessionPlan = getattr(scenario, session)
+    revolution_s = recorded(true, scenario.platform, sensor.rate_hz, session)
+    column_s: Float64Array = np.arange(sensor.width, dtype=np.float64) - sensor.width // 2
+    column_s /= sensor.rate_hz * sensor.width
+    estimated = drifted(true, float(revolution_s[0]), plan.odometry, seed, session)
+    return Trajectory(true, estimated, revolution_s, column_s, sensor.column_offsets_ns())
+
+
+def recorded(true: Motion, platform: Platform, rate_hz: float, session: str) -> Float64Array:
+    """Return the time (S,) at the middle of each revolution that is kept.
+
+    The head turns all the time, from the start of the drive on; of its revolutions the first one is kept, and then the
+    first one at or after every further `scan_spacing_m` of way.
+    """
+    duration_s = true.time_s[-1] - true.time_s[0]
+    n_turns = int(np.floor(duration_s * rate_hz + _SLACK))
+    if n_turns < 1:
         raise ScenarioError(
-            f"platform.scan_spacing_m = {platform.scan_spacing_m:g}: at {platform.speed_mps:g} m/s and "
-            f"{sensor.rate_hz:g} Hz revolutions are {turn_m:g} m apart: give at least that"
+            f"{session}: the drive takes {duration_s:.3f} s, less than one revolution at {rate_hz:g} Hz: "
+            "give a longer route or trajectory"
         )
-    usable_m = true.distance_m[-1] - turn_m
-    if usable_m < 0:
-        raise ScenarioError(f"{session}: the path of {true.distance_m[-1]:.2f} m is shorter than one revolution")
-    n_scans = 1 + int(np.floor(usable_m / platform.scan_spacing_m))
-    revolution_m: Float64Array = turn_m / 2 + np.arange(n_scans, dtype=np.float64) * platform.scan_spacing_m
-    column_m: Float64Array = (np.arange(sensor.width, dtype=np.float64) - sensor.width // 2) * (turn_m / sensor.width)
-    estimated = estimate(true, float(revolution_m[0]), odometry, seed, session)
-    return Trajectory(true, estimated, revolution_m, column_m, platform.speed_mps, sensor.column_offsets_ns())
-
-
-def estimate(true: Motion, start_m: float, odometry: Odometry, seed: int, session: str) -> Motion:
-    """Return the movement as odometry has it: its increments scaled, its heading drifting with the way.
-
-    The odom frame is upright, with its origin at the sensor and its x axis along the sensor's heading after `start_m`.
-    The error is the same all along: after 100 m the path is `translation_percent` too long or short and the heading
-    `yaw_deg_per_100m` off, exactly. Roll and pitch come from gravity and stay true.
-    """
-    signs = stream(seed, session, "odometry").choice([-1.0, 1.0], size=2)
-    steps = np.diff(true.points, axis=0)
-    travelled_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
-    travelled_m -= np.interp(start_m, true.distance_m, travelled_m)
-    drift_rad = signs[1] * np.deg2rad(odometry.yaw_deg_per_100m) * travelled_m / 100.0
-    start_yaw_rad = np.interp(start_m, true.distance_m, true.angles_rad[:, 0])
-    turn_rad = (drift_rad[:-1] + drift_rad[1:]) / 2 - start_yaw_rad
-    cos, sin = np.cos(turn_rad), np.sin(turn_rad)
-    turned = np.stack([cos * steps[:, 0] - sin * steps[:, 1], sin * steps[:, 0] + cos * steps[:, 1], steps[:, 2]], 1)
-    scale = 1.0 + signs[0] * odometry.translation_percent / 100.0
-    points = np.concatenate([np.zeros((1, 3)), np.cumsum(scale * turned, axis=0)])
-    points -= [np.interp(start_m, true.distance_m, points[:, axis]) for axis in range(3)]
-    angles = true.angles_rad.copy()
-    angles[:, 0] += drift_rad - start_yaw_rad
-    return Motion(true.distance_m, points, angles)
-
-
-def _rotations(yaw: Float64Array, pitch: Float64Array, roll: Float64Array) -> Float64Array:
-    """Rz(yaw) Ry(pitch) Rx(roll), (N, 3, 3)."""
-    cy, sy, cp, sp, cr, sr = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll)
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+    middle_s = true.time_s[0] + (np.arange(n_turns, dtype=np.float64) + 0.5) / rate_hz
+    way_m = np.interp(middle_s, true.time_s, true.way_m)
+    steps_m = np.diff(way_m)
+    if platform.scan_spacing_m < steps_m.max(initial=0.0) * (1 - _SLACK):
+        fastest = int(np.argmax(steps_m))
+        speed_mps = steps_m[fastest] * rate_hz
+        raise ScenarioError(
+            f"{session}: platform.scan_spacing_m = {platform.scan_spacing_m:g}: at {speed_mps:.3g} m/s, "
+            f"{way_m[fastest]:.1f} m along the way, and {rate_hz:g} Hz revolutions are {steps_m[fastest]:.3g} m apart: "
+            "give at least that, or drive slower"
+        )
+    n_wanted = 1 + int(np.floor((way_m[-1] - way_m[0]) / platform.scan_spacing_m + _SLACK))
+    wanted_m = way_m[0] + np.arange(n_wanted, dtype=np.float64) * platform.scan_spacing_m
+    return np.asarray(middle_s[np.unique(np.minimum(np.searchsorted(way_m, wanted_m - _SLACK), n_turns - 1))])

@@ -42,12 +42,15 @@ class Change:
         group: "full", or "partial" for short moves and reshaped props.
         instance: Value of its returns in `instance`.
         world_T_object: (4, 4) pose as nested lists.
-        hull_volume_m3: Volume of its convex hull.
+        hull_volume_m3: Volume of its convex hull; of a reshaped prop that of the removed part.
         n_returns: Returns that belong to the change.
         n_cells: Cells of 0.1 m (that session's odom frame) they fill.
         n_ghost_rays: Rays of the other session that end in it or pass through it, were it there.
         is_observable: At least 10 cells and 10 ghost rays.
         why_not: The rule that failed, or "".
+        mesh_volume_m3: Volume of a closed surface, None for props of several parts; of a reshaped prop what is gone.
+        n_returns_other: Returns of the other session on the same prop, where it stands in both (moved, reshaped).
+        n_cells_other: Cells of 0.1 m they fill, in that session's odom frame.
     """
 
     id: int
@@ -65,6 +68,9 @@ class Change:
     n_ghost_rays: int
     is_observable: bool
     why_not: str
+    mesh_volume_m3: float | None = None
+    n_returns_other: int = 0
+    n_cells_other: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,18 +2,37 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 from functools import cache
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import pytest
 
-from scenarios import check_scenario, load_scenario, scenario_names
+from cdpipe.yamlfile import read_yaml
+from scenarios import check_scenario, library, load_scenario, scenario_names
 from scenarios.references import route_length_m
-from scenarios.schema import Place, Prop, Scenario, Tunnel
+from scenarios.schema import Furniture, Place, Scenario, Tunnel
 
 SEEDS = (*range(10), *range(10000, 10010))
-TRAINED = ("narrow", "wide")
+MANY = range(100)
+TRAINED = ("narrow", "wide", "network", "smooth")
+RANDOM = (*TRAINED, "cave")
+SITES = ("paper/site1", "paper/site2")
+HELD_OUT = {"trolley", "railing", "mesh"}
+LENGTHS_M = {"narrow": (120, 200), "wide": (240, 300), "network": (150, 300), "cave": (110, 190), "smooth": (115, 160)}
+BASES = {
+    "smoke/unchanged": "smoke/one_box",
+    "unchanged/site1": "paper/site1",
+    **{f"unchanged/{name}": name for name in RANDOM},
+}
 drawn = cache(load_scenario)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def each_file_is_read_once() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(library, "read_yaml", cache(read_yaml))
+        yield
 
 
 def lengths_m(scenario: Scenario) -> list[float]:
@@ -24,15 +43,29 @@ def changes(scenario: Scenario) -> Counter[str]:
     return Counter(prop.change for prop in scenario.props if prop.change != "none")
 
 
+def places(scenario: Scenario) -> list[Place]:
+    return [place for prop in scenario.props for place in (prop.place, prop.to) if place]
+
+
 def position_m(tunnel: Tunnel, place: Place) -> tuple[float, ...]:
+    assert place.between is not None and place.fraction is not None
     a, b = (tunnel.nodes[name] for name in place.between)
     return tuple(p + place.fraction * (q - p) for p, q in zip(a, b, strict=True))
 
 
+def edges(tunnel: Tunnel) -> set[frozenset[str]]:
+    return {frozenset(pair) for drift in tunnel.drifts for pair in pairwise(drift.nodes)}
+
+
+def is_reversed(scenario: Scenario) -> bool:
+    return scenario.after.route[0] == scenario.before.route[-1]
+
+
 def test_the_names_are_the_documented_ones() -> None:
     assert scenario_names() == [
-        "narrow", "paper/site1", "paper/site2", "smoke/one_box", "smoke/unchanged",
-        "unchanged/narrow", "unchanged/site1", "unchanged/wide", "wide",
+        "cave", "narrow", "network", "paper/site1", "paper/site2", "smoke/one_box", "smoke/unchanged", "smooth",
+        "unchanged/cave", "unchanged/narrow", "unchanged/network", "unchanged/site1", "unchanged/smooth",
+        "unchanged/wide", "wide",
     ]  # fmt: skip
 
 
@@ -42,10 +75,138 @@ def test_every_family_is_valid_for_many_seeds(name: str) -> None:
     for seed in SEEDS:
         scenario = drawn(name, seed)
         assert scenario.description
-        assert all(abs(place.lateral) >= 0.7 for prop in scenario.props for place in (prop.place, prop.to) if place)
-        assert (
-            scenario.tunnel.resolution_m <= min(scenario.tunnel.section.width_m, scenario.tunnel.section.height_m) / 8
-        )
+        assert all(abs(place.lateral) >= 0.5 for place in places(scenario))
+        section = scenario.tunnel.section
+        assert scenario.tunnel.resolution_m <= min(section.width_m, section.height_m) / 8
+        assert {plan.odometry.source for plan in (scenario.before, scenario.after)} == {"drift"}
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_no_pile_is_higher_than_its_flanks_allow(name: str) -> None:
+    for seed in MANY if name in RANDOM else SEEDS:
+        for prop in drawn(name, seed).props:
+            if prop.kind == "muck_pile" and prop.size_m is not None:
+                length_m, width_m, height_m = prop.size_m
+                run_m = min(length_m / 2, width_m if prop.place.posture == "leaning" else width_m / 2)
+                assert height_m <= 1.01 * run_m * math.tan(math.radians(prop.repose_deg)), (seed, prop.name)
+
+
+@pytest.mark.parametrize("name", [*RANDOM, *SITES, *(name for name in BASES if name.startswith("unchanged"))])
+def test_at_least_five_distractors_on_100_m(name: str) -> None:
+    for seed in MANY if name in RANDOM else SEEDS:
+        scenario = drawn(name, seed)
+        staying = [prop for prop in scenario.props if prop.change == "none" and prop.place.area is None]
+        # they stand anywhere on the edges that either session drives
+        way = {frozenset(pair) for plan in (scenario.before, scenario.after) for pair in pairwise(plan.route)}
+        way_m = sum(math.dist(*(scenario.tunnel.nodes[node] for node in edge)) for edge in way)
+        assert len(staying) >= 0.05 * way_m
+
+
+@pytest.mark.parametrize("name", RANDOM)
+def test_random_families_stay_in_their_stated_ranges(name: str) -> None:
+    shortest_m, longest_m = LENGTHS_M[name]
+    counts: Counter[int] = Counter()
+    kinds: set[str] = set()
+    for seed in MANY:
+        scenario = drawn(name, seed)
+        assert all(shortest_m <= one <= longest_m for one in lengths_m(scenario)), seed
+        counts[changes(scenario).total()] += 1
+        kinds |= set(changes(scenario))
+    assert set(counts) == set(range(7))
+    assert kinds == {"added", "removed", "moved", "reshaped"}
+
+
+@pytest.mark.parametrize("name", RANDOM)
+def test_most_of_the_way_is_far_from_the_areas_of_change(name: str) -> None:
+    for seed in MANY:
+        scenario = drawn(name, seed)
+        assert [area.name for area in scenario.areas] == ["a", "b"]
+        for prop in scenario.props:
+            where = {place.area for place in (prop.place, prop.to) if place is not None}
+            assert where <= ({None} if prop.change == "none" else {"a"} if prop.name[0] == "a" else {"b"})
+            assert prop.shift is None or 0.3 <= prop.shift.distance_m <= 1.0
+        near_m = sum(area.length_m + 4 * scenario.score_radius_m for area in scenario.areas)
+        assert near_m <= 0.4 * lengths_m(scenario)[0]
+
+
+@pytest.mark.parametrize("name", [*TRAINED, *(f"unchanged/{name}" for name in TRAINED)])
+def test_kinds_held_out_stand_in_no_family_that_is_trained_on(name: str) -> None:
+    for seed in MANY:
+        scenario = drawn(name, seed)
+        assert not {prop.kind for prop in scenario.props} & HELD_OUT
+        assert scenario.tunnel.mesh is None
+
+
+@pytest.mark.parametrize("name", RANDOM)
+def test_a_third_of_the_pairs_is_driven_in_both_directions(name: str) -> None:
+    share = sum(is_reversed(drawn(name, seed)) for seed in MANY) / len(MANY)
+    assert 0.2 < share < 0.47
+    twin = sum(is_reversed(drawn(f"unchanged/{name}", seed)) for seed in MANY) / len(MANY)
+    assert 0.37 < twin < 0.63
+
+
+@pytest.mark.parametrize(("name", "width_m"), [("narrow", (3.5, 6.5)), ("wide", (8, 12)), ("network", (4, 6.5))])
+def test_widths_and_platforms(name: str, width_m: tuple[float, float]) -> None:
+    shapes = set()
+    for seed in MANY:
+        scenario = drawn(name, seed)
+        sections = [scenario.tunnel.section, *(drift.section for drift in scenario.tunnel.drifts if drift.section)]
+        assert all(width_m[0] <= section.width_m <= width_m[1] for section in sections)
+        assert scenario.platform.kind == ("quadrotor" if name == "wide" else "ground_robot")
+        assert scenario.score_radius_m == (10 if name == "wide" else 4.5)
+        shapes.add(scenario.tunnel.section.shape)
+    assert {"horseshoe", "d", "arch"} <= shapes
+
+
+@pytest.mark.parametrize("name", ["narrow", "wide", "network"])
+def test_furniture_comes_and_goes_with_the_seed(name: str) -> None:
+    for item in ("pipes", "ducts", "cable_trays", "bolts", "screen"):
+        share = sum(bool(getattr(drawn(name, seed).tunnel.furniture, item)) for seed in MANY) / len(MANY)
+        assert 0.2 < share < 0.95, item
+    for item in ("ruts", "stones"):
+        share = sum(getattr(drawn(name, seed).tunnel.floor, item) is not None for seed in MANY) / len(MANY)
+        assert 0.3 < share < 0.7, item
+
+
+def test_the_network_has_loops_a_crossing_dead_ends_slopes_and_ways_of_its_own_for_each_session() -> None:
+    seen_once = 0
+    for seed in MANY:
+        scenario = drawn("network", seed)
+        joined = edges(scenario.tunnel)
+        degree = Counter(node for edge in joined for node in edge)
+        assert len(joined) - len(degree) + 1 == 2  # loops of a connected graph
+        assert degree["m2"] == 4
+        assert sum(count == 1 for count in degree.values()) >= 4
+        slopes = [
+            abs(a[2] - b[2]) / math.dist(a[:2], b[:2])
+            for a, b in ([scenario.tunnel.nodes[name] for name in edge] for edge in joined)
+        ]
+        assert max(slopes) > 0.02 and max(slopes) < 0.15
+        ways = [{frozenset(pair) for pair in pairwise(plan.route)} for plan in (scenario.before, scenario.after)]
+        assert {frozenset(("m0", "m1")), frozenset(("m3", "m4"))} <= ways[0] & ways[1]
+        seen_once += ways[0] != ways[1]
+    assert seen_once > 0.6 * len(MANY)
+
+
+def test_nothing_tells_the_place_in_smooth() -> None:
+    for name in ("smooth", "unchanged/smooth"):
+        for seed in MANY:
+            scenario = drawn(name, seed)
+            tunnel = scenario.tunnel
+            (drift,) = tunnel.drifts
+            assert [tunnel.nodes[node][1:] for node in drift.nodes] == [(0, 0), (0, 0)]
+            assert (tunnel.furniture, tunnel.niches, tunnel.variation, tunnel.meander_m) == (Furniture(), (), None, 0)
+            assert (tunnel.floor.ruts, tunnel.floor.stones, tunnel.floor.crossfall_percent) == (None, None, 0)
+            assert all(octave.amplitude_m < 0.005 for octave in tunnel.roughness)
+            for plan in (scenario.before, scenario.after):
+                assert min(plan.start_m, plan.end_m) > scenario.sensor.max_range_m
+
+
+def test_a_cave_has_nothing_fixed_to_its_rock() -> None:
+    for seed in SEEDS:
+        tunnel = drawn("cave", seed).tunnel
+        assert (tunnel.section.shape, tunnel.furniture) == ("cave", Furniture())
+        assert tunnel.roughness[0].amplitude_m >= 0.25 and tunnel.floor.stones is not None
 
 
 def test_site1_holds_what_the_paper_tells() -> None:
@@ -78,8 +239,8 @@ def test_site2_holds_what_the_paper_tells() -> None:
 
 def clusters_m(scenario: Scenario) -> int:
     """Number of groups of changed places when places within 15 m share a group, and no groups are within 40 m."""
-    places = [place for prop in scenario.props if prop.change != "none" for place in (prop.place, prop.to) if place]
-    spots = [position_m(scenario.tunnel, place) for place in places]
+    changed = [place for prop in scenario.props if prop.change != "none" for place in (prop.place, prop.to) if place]
+    spots = [position_m(scenario.tunnel, place) for place in changed]
     groups: list[list[tuple[float, ...]]] = []
     for spot in spots:
         near = [group for group in groups if min(math.dist(spot, other) for other in group) < 15]
@@ -89,47 +250,7 @@ def clusters_m(scenario: Scenario) -> int:
     return len(groups)
 
 
-@pytest.mark.parametrize(("name", "length_m"), [("narrow", (60, 100)), ("wide", (90, 150))])
-def test_training_families_stay_in_their_stated_ranges(name: str, length_m: tuple[float, float]) -> None:
-    counts = set()
-    for seed in range(100):
-        scenario = drawn(name, seed)
-        assert all(length_m[0] - 5 < one < length_m[1] for one in lengths_m(scenario))
-        counts.add(changes(scenario).total())
-        assert sum(prop.change == "none" for prop in scenario.props) >= 1
-        assert not {prop.kind for prop in scenario.props} & {"trolley", "railing"}
-    assert counts == {2, 3, 4, 5}
-
-
-@pytest.mark.parametrize("name", TRAINED)
-def test_no_prop_of_a_training_family_can_stand_in_another(name: str) -> None:
-    for seed in range(100):
-        scenario = drawn(name, seed)
-        stands = [(prop, place) for prop in scenario.props for place in (prop.place, prop.to) if place]
-        for (one, a), (other, b) in combinations(stands, 2):
-            if a.between == b.between and a.lateral * b.lateral > 0:
-                edge_m = math.dist(*(scenario.tunnel.nodes[node] for node in a.between))
-                assert abs(a.fraction - b.fraction) * edge_m > (along_m(one, a) + along_m(other, b)) / 2
-            at_bend = a.between != b.between and set(a.between) & set(b.between)
-            if at_bend and max(a.fraction, b.fraction) > 0.8 and min(a.fraction, b.fraction) < 0.2:
-                assert a.lateral * b.lateral < 0
-
-
-def along_m(prop: Prop, place: Place) -> float:
-    """Extent of a prop's box along the drift."""
-    yaw_rad = math.radians(place.yaw_deg)
-    return abs(prop.size_m[0] * math.cos(yaw_rad)) + abs(prop.size_m[1] * math.sin(yaw_rad))
-
-
-@pytest.mark.parametrize(
-    ("name", "base"),
-    [
-        ("smoke/unchanged", "smoke/one_box"),
-        ("unchanged/site1", "paper/site1"),
-        ("unchanged/narrow", "narrow"),
-        ("unchanged/wide", "wide"),
-    ],
-)
+@pytest.mark.parametrize(("name", "base"), BASES.items())
 def test_unchanged_families_are_their_base_with_nothing_changed(name: str, base: str) -> None:
     for seed in SEEDS:
         scenario, changed = drawn(name, seed), drawn(base, seed)
@@ -138,7 +259,18 @@ def test_unchanged_families_are_their_base_with_nothing_changed(name: str, base:
         assert [(prop.name, prop.place) for prop in scenario.props] == [
             (prop.name, prop.place) for prop in changed.props if prop.change != "added"
         ]
+        assert all(prop.to is None and prop.shift is None and prop.loaded_share is None for prop in scenario.props)
+        assert scenario.before == changed.before
         assert scenario.before != scenario.after
+
+
+@pytest.mark.parametrize("name", [name for name in BASES if name.startswith("unchanged/")])
+def test_unchanged_pairs_differ_in_line_direction_and_coverage(name: str) -> None:
+    pairs = [drawn(name, seed) for seed in MANY]
+    assert {is_reversed(scenario) for scenario in pairs} == {False, True}
+    assert all(scenario.before.lateral != scenario.after.lateral for scenario in pairs)
+    partial = [scenario for scenario in pairs if scenario.after.end_m > scenario.before.end_m + 10]
+    assert 0.2 < len(partial) / len(pairs) < 0.8
 
 
 def test_smoke_is_small_and_changes_one_box() -> None:

@@ -1,16 +1,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from cdpipe.geometry import make_pose
 from cdpipe.ouster import SensorMetadata
-from scenarios.schema import Place, Prop, Scenario, Sensor
+from scenarios.schema import Drift, Place, Platform, Prop, Scenario, Section, Sensor, SessionPlan, Shift, Tunnel
 from sim.labels import Ghost, cell_keys, claim_returns, list_changes
 from sim.lidar import Rays, revolution_rays, scan
-from sim.mesh import Mesh, box_mesh, moved
+from sim.mesh import Mesh, box_mesh, moved, point_triangle_distance
 from sim.scene import World, build_world
+from sim.simulate import simulate_pair
+from sim.truth import Change, read_pair_truth
 
 
 def box_at(x: float, y: float, z: float, half_m: float = 0.5) -> Mesh:
@@ -139,3 +143,130 @@ def test_a_change_nobody_could_notice_says_why(
     assert tally.finished().why_not == "9 rays of the other session reach it, 10 needed"
     tally.n_ghost_rays = 10
     assert (tally.finished().is_observable, tally.finished().why_not) == (True, "")
+
+
+def changes_of(scenario: Scenario, out: Path, seed: int = 0) -> dict[tuple[str, str], Change]:
+    """Simulate a pair and return its changes by name and session."""
+    simulate_pair(scenario, seed, out / "pair")
+    return {(change.name, change.session): change for change in read_pair_truth(out / "pair").changes}
+
+
+def test_a_box_behind_a_box_is_unobservable_and_the_truth_says_why(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop], tmp_path: Path
+) -> None:
+    hidden = make_prop("hidden", 0.5, 1.0, size_m=(0.3, 0.2, 0.3), change="added")
+    screen = make_prop("screen", 0.5, 0.45, size_m=(12.0, 0.3, 2.1))
+    changes = changes_of(make_scenario(props=(hidden, screen)), tmp_path)
+    change = changes["hidden", "after"]
+    assert (change.n_ghost_rays, change.n_cells, change.is_observable) == (0, 0, False)
+    assert change.why_not == "0 cells of 0.1 m filled, 10 needed; 0 rays of the other session reach it, 10 needed"
+    # Hidden in one session only: the screen goes with the change, so that one session sees it and the other cannot.
+    leaves = screen.model_copy(update={"change": "removed"})
+    after = changes_of(make_scenario(props=(hidden, leaves)), tmp_path / "leaves")
+    change = after["hidden", "after"]
+    assert change.n_cells >= 10
+    assert change.why_not == "0 rays of the other session reach it, 10 needed"
+    assert after["screen", "before"].is_observable
+
+
+def test_a_change_in_a_branch_that_one_session_drives_is_unobservable(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop], tmp_path: Path
+) -> None:
+    # The branch turns: nothing behind b-d is seen from the main drift.
+    tunnel = Tunnel(
+        nodes={"a": (0, 0, 0), "b": (12, 0, 0), "c": (24, 0, 0), "d": (12, 11, 0), "e": (24, 13, 0)},
+        drifts=(Drift(nodes=("a", "b", "c")), Drift(nodes=("b", "d", "e"))),
+        section=Section(width_m=3.5, height_m=3.0),
+        resolution_m=0.25,
+    )
+    place = Place(between=("d", "e"), fraction=0.7, lateral=0.8)
+    props = (make_prop("far", place=place, change="added"), make_prop("near", 0.5, 0.8, change="removed"))
+    routes = {"before": SessionPlan(route=("a", "b", "c")), "after": SessionPlan(route=("a", "b", "d", "e"))}
+    changes = changes_of(make_scenario(tunnel=tunnel, props=props, **routes), tmp_path)
+    far = changes["far", "after"]
+    assert far.n_cells >= 10
+    assert (far.n_ghost_rays, far.is_observable) == (0, False)
+    assert far.why_not == "0 rays of the other session reach it, 10 needed"
+    assert changes["near", "before"].is_observable
+
+
+def test_a_small_object_fills_too_few_cells(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop], tmp_path: Path
+) -> None:
+    can = make_prop("can", 0.5, 0.9, size_m=(0.08, 0.08, 0.1), change="removed")
+    change = changes_of(make_scenario(props=(can,), platform=Platform(scan_spacing_m=0.5)), tmp_path)["can", "before"]
+    assert change.n_returns > 0
+    assert 0 < change.n_cells < 10 <= change.n_ghost_rays
+    assert change.why_not == f"{change.n_cells} cells of 0.1 m filled, 10 needed"
+
+
+def test_both_halves_of_a_short_move_are_counted_and_know_the_other_session(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop], tmp_path: Path
+) -> None:
+    near = make_prop("near", 0.5, change="moved", shift=Shift(distance_m=0.4))
+    far = make_prop("far", 0.2, -0.9, change="moved", to=Place(between=("a", "b"), fraction=0.7, lateral=-0.9))
+    changes = changes_of(make_scenario(props=(near, far)), tmp_path)
+    for name, group in (("near", "partial"), ("far", "full")):
+        start, end = changes[name, "before"], changes[name, "after"]
+        assert (start.partner, end.partner) == (end.id, start.id)
+        assert (start.kind, end.kind, start.group, end.group) == ("moved", "moved", group, group)
+        assert start.is_observable and end.is_observable
+    # A full move counts all returns of either session; of a short one only a part, but all of the other's.
+    start, end = changes["far", "before"], changes["far", "after"]
+    assert (start.n_returns_other, start.n_cells_other) == (end.n_returns, end.n_cells)
+    assert (end.n_returns_other, end.n_cells_other) == (start.n_returns, start.n_cells)
+    start, end = changes["near", "before"], changes["near", "after"]
+    assert 0.1 * start.n_returns_other < end.n_returns < 0.9 * start.n_returns_other
+    assert 0.1 * end.n_returns_other < start.n_returns < 0.9 * end.n_returns_other
+
+
+def test_of_a_reshaped_pile_the_removed_part_is_the_change(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop], tmp_path: Path
+) -> None:
+    size_m = (2.4, 1.6, 0.8)
+    pile = make_prop("pile", 0.5, 0.7, kind="muck_pile", size_m=size_m, change="reshaped", loaded_share=0.4)
+    scenario = make_scenario(props=(pile, make_prop("box", 0.2)))
+    world = build_world(scenario, 0)
+    whole, rest = (item for item in world.standing if item.prop.name == "pile")
+    np.testing.assert_array_equal(whole.world_T_object, rest.world_T_object)
+    change = changes_of(scenario, tmp_path)["pile", "before"]
+    assert (change.kind, change.group, change.partner, change.session) == ("reshaped", "partial", None, "before")
+    assert change.is_observable
+    assert whole.shape.mesh_volume_m3 is not None and change.mesh_volume_m3 is not None
+    assert change.mesh_volume_m3 == pytest.approx(0.4 * whole.shape.mesh_volume_m3, rel=0.15)
+    assert change.mesh_volume_m3 <= change.hull_volume_m3 < whole.shape.hull_volume_m3
+    assert change.n_returns_other > 100  # what is left is seen after
+
+
+def test_returns_on_what_is_left_of_a_pile_are_no_change(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop], sensor: SensorMetadata
+) -> None:
+    size_m = (2.4, 1.6, 0.8)
+    pile = make_prop("pile", 0.5, 0.7, kind="muck_pile", size_m=size_m, change="reshaped", loaded_share=0.4)
+    scenario = make_scenario(props=(pile,))
+    world = build_world(scenario, 0)
+    (tally,) = list_changes(scenario, world)
+    rays = revolution_rays(sensor, np.tile(make_pose(translation=(10.0, -0.8, 0.9)), (sensor.width, 1, 1)))
+    result = scan(world.before, sensor, Sensor(range_noise=False, dropouts=False), rays, 0, "before", 0)
+    is_pile = ((world.before.instance[result.geom] == 1) & (result.geom >= 0)).T
+    reach_m = (result.true_range_m.T - sensor.beam_origin_m)[is_pile][:, None]
+    points = rays.origins[is_pile] + reach_m * rays.directions[is_pile]
+    belongs = claim_returns(tally, points, points)
+    # By brute force: every return against every triangle of the after session near it.
+    triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in world.after.meshes])
+    triangles = triangles[np.linalg.norm(triangles.mean(axis=1) - points.mean(axis=0), axis=1) < 4.0]
+    some = np.linspace(0, len(points) - 1, 60).astype(int)
+    for number in some:
+        distance_m = point_triangle_distance(np.tile(points[number], (len(triangles), 1)), triangles)
+        assert belongs[number] == (distance_m.min() > 0.1)
+    assert 5 < belongs[some].sum() < 55
+
+
+def test_a_ghost_needs_no_closed_surface() -> None:
+    rays = fan(501)
+    box = box_at(5.0, 0.0, 0.0)
+    middles = box.vertices[box.faces].mean(axis=1)
+    skin = Mesh(box.vertices, box.faces[middles[:, 0] < 4.6])  # its near face alone
+    ranges_m = np.full((501, 1), 9.0, np.float32)
+    assert len(skin.faces) == 2
+    assert Ghost(skin).count(rays, ranges_m) == Ghost(box).count(rays, ranges_m) > 100

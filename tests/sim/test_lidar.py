@@ -20,7 +20,7 @@ def room(make_scenario: Callable[..., Scenario], half_m: tuple[float, float, flo
     inside_out = Mesh(box_mesh(half_m).vertices, box_mesh(half_m).faces[:, ::-1])
     scenario = make_scenario()
     tunnel = scenario.tunnel.model_copy(update={"reflectivity": reflectivity})
-    return compile_scene(scenario.model_copy(update={"tunnel": tunnel}), inside_out, [], {}, "before")
+    return compile_scene(scenario.model_copy(update={"tunnel": tunnel}), inside_out, [], "before")
 
 
 def test_a_turning_and_moving_sensor_in_a_room_gives_planes_once_deskewed(
@@ -135,6 +135,30 @@ def test_another_prop_changes_only_the_beams_that_meet_it(
     assert same_ray[misses].mean() > 0.99  # the rest lie in the box's shadow line or dropped out on it
     np.testing.assert_array_equal(without.range_mm[same_ray], with_box.range_mm[same_ray])
     assert (~misses).sum() > 200
+
+
+def test_another_reflectivity_changes_only_the_beams_that_meet_the_prop(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop], sensor: SensorMetadata
+) -> None:
+    other = make_prop("other", 0.6, -0.9, kind="barrel", size_m=(0.6, 0.6, 0.9))
+    rays = revolution_rays(sensor, moved_poses(sensor.width, (6.0, 0.0, 0.8)))
+    dark, bright, gone = (
+        build_world(make_scenario(props=props), 5).before
+        for props in (
+            (make_prop("box", reflectivity=0.05), other),
+            (make_prop("box", reflectivity=0.9), other),
+            (other,),
+        )
+    )
+    first, second, third = (scan(scene, sensor, Sensor(), rays, 5, "before", 3) for scene in (dark, bright, gone))
+    meets = (dark.instance[first.geom] == 1) | (bright.instance[second.geom] == 1)
+    assert meets.sum() > 200
+    np.testing.assert_array_equal(first.range_mm[~meets], second.range_mm[~meets])
+    np.testing.assert_array_equal(first.reflectivity[~meets], second.reflectivity[~meets])
+    # Taken away, it changes no beam that went by it: what is behind has the noise it had.
+    same_ray = ~meets & (first.true_range_m == third.true_range_m)
+    assert same_ray[~meets].mean() > 0.99
+    np.testing.assert_array_equal(first.range_mm[same_ray], third.range_mm[same_ray])
 
 
 def moved_poses(width: int, place: tuple[float, float, float]) -> Float64Array:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.noise import lattice_values, smooth_noise
+from sim.noise import lattice_values, noise_at, smooth_noise
 
 
 def test_lattice_values_have_mean_0_and_variance_1() -> None:
@@ -28,3 +28,12 @@ def test_noise_depends_on_the_place_alone() -> None:
     part = smooth_noise((x[7:9], y[11:], z[2:5]), 1.0, key=9)
     np.testing.assert_array_equal(whole[7:9, 11:, 2:5], part)
     assert np.abs(whole - smooth_noise((x, y, z), 1.0, key=10)).max() > 1.0
+
+
+def test_scattered_points_have_the_values_of_the_grid() -> None:
+    axes = np.arange(-3.0, 3.0, 0.7), np.arange(-2.0, 5.0, 0.9), np.arange(0.0, 2.0, 0.6)
+    for count in (1, 2, 3):
+        points = np.stack(np.meshgrid(*axes[:count], indexing="ij"), axis=-1)
+        np.testing.assert_allclose(
+            noise_at(points.reshape(-1, count), 1.3, key=9), smooth_noise(axes[:count], 1.3, key=9).ravel(), atol=1e-12
+        )

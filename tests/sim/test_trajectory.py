@@ -4,32 +4,42 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cdpipe.errors import ScenarioError
-from cdpipe.geometry import invert, make_pose, require_poses, travelled_m, yaw_rad
+from cdpipe.geometry import invert, require_poses, travelled_m, yaw_rad
 from cdpipe.ouster import SensorMetadata
-from scenarios.schema import Odometry, Platform, Prop, Scenario, SessionPlan
-from sim.path import Path, plan_path, smoothed
+from scenarios.schema import Floor, Odometry, Platform, Prop, Scenario, SessionPlan, Stones
+from sim.line import kept_between, smoothed
+from sim.motion import Motion, motion_of
+from sim.path import plan_path
 from sim.placing import standing_corners
+from sim.ride import on_wheels
 from sim.scene import build_world
-from sim.trajectory import Motion, plan_trajectory, record, true_motion
+from sim.trajectory import Trajectory, plan_trajectory, record
 
 
-def straight_path(length_m: float, heading_rad: float = 0.4) -> Path:
-    distance_m = np.linspace(0.0, length_m, round(length_m / 0.05) + 1)
-    points = distance_m[:, None] * [np.cos(heading_rad), np.sin(heading_rad), 0.0] + [3.0, -2.0, 1.0]
-    return Path(distance_m, points, np.full(len(points), heading_rad), np.zeros(len(points)))
+def straight(length_m: float, speed_mps: float = 1.0, heading_rad: float = 0.4) -> Motion:
+    way_m = np.linspace(0.0, length_m, round(length_m / 0.05) + 1)
+    points = way_m[:, None] * [np.cos(heading_rad), np.sin(heading_rad), 0.0] + [3.0, -2.0, 1.0]
+    heading = Rotation.from_euler("z", np.full((len(way_m), 1), heading_rad))
+    return motion_of(way_m / speed_mps, way_m, points, heading)
 
 
-def recorded(path: Path, odometry: Odometry, sensor: SensorMetadata, seed: int = 0, spacing_m: float = 0.5):  # type: ignore[no-untyped-def] # noqa: ANN201 - the fixture's type says nothing to a test
-    platform = Platform(scan_spacing_m=spacing_m, tilt_deg=0.0)
-    return record(true_motion(path, platform, seed, "before"), odometry, platform, sensor, seed, "before")
+@pytest.fixture(scope="module")
+def recorded(make_scenario: Callable[..., Scenario], sensor: SensorMetadata) -> Callable[..., Trajectory]:
+    def make(motion: Motion, odometry: Odometry, seed: int = 0, spacing_m: float = 0.5) -> Trajectory:
+        plan = SessionPlan(route=("a", "b"), odometry=odometry)
+        scenario = make_scenario(platform=Platform(scan_spacing_m=spacing_m), before=plan)
+        return record(motion, scenario, sensor, seed, "before")
+
+    return make
 
 
-def test_odometry_drifts_by_exactly_its_figures_on_a_straight_line(sensor: SensorMetadata) -> None:
+def test_odometry_drifts_by_exactly_its_figures_on_a_straight_line(recorded: Callable[..., Trajectory]) -> None:
     signs = set()
     for seed in range(8):
-        drive = recorded(straight_path(100.1), Odometry(translation_percent=1.5, yaw_deg_per_100m=2.0), sensor, seed)
+        drive = recorded(straight(100.1), Odometry(translation_percent=1.5, yaw_deg_per_100m=2.0), seed)
         true, estimated = drive.world_T_sensor, drive.odom_T_sensor
         way_m = travelled_m(true)[200]
         assert way_m == pytest.approx(100.0, abs=1e-9)
@@ -46,28 +56,30 @@ def test_odometry_drifts_by_exactly_its_figures_on_a_straight_line(sensor: Senso
     assert len(signs) > 2
 
 
-def test_perfect_odometry_is_the_truth_seen_from_the_first_revolution(sensor: SensorMetadata) -> None:
-    drive = recorded(straight_path(30.0), Odometry(), sensor)
+def test_perfect_odometry_is_the_truth_seen_from_the_first_revolution(recorded: Callable[..., Trajectory]) -> None:
+    drive = recorded(straight(30.0), Odometry())
     world_T_odom = drive.world_T_sensor[0]
     np.testing.assert_allclose(drive.odom_T_sensor[0], np.eye(4), atol=1e-9)
     np.testing.assert_allclose(world_T_odom @ drive.odom_T_sensor, drive.world_T_sensor, atol=1e-9)
 
 
-def test_the_odom_frame_is_upright_even_where_the_platform_tilts(sensor: SensorMetadata) -> None:
-    platform = Platform(tilt_deg=3.0, scan_spacing_m=0.5)
-    motion = true_motion(straight_path(60.0), platform, 1, "after")
-    drive = record(motion, Odometry(yaw_deg_per_100m=1.0), platform, sensor, 1, "after")
+def test_the_odom_frame_is_upright_even_where_the_platform_tilts(recorded: Callable[..., Trajectory]) -> None:
+    level = straight(60.0)
+    angles = np.array([0.4, 0.0, 0.0]) + 0.05 * np.sin(level.way_m[:, None] * [0.0, 1.1, 1.7] + 0.3)
+    tilted = motion_of(level.time_s, level.way_m, level.points, Rotation.from_euler("ZYX", angles))
+    drive = recorded(tilted, Odometry(yaw_deg_per_100m=1.0), 1)
     first = drive.odom_T_sensor[0]
     np.testing.assert_allclose(first[:3, 3], 0.0, atol=1e-9)
     assert yaw_rad(first) == pytest.approx(0.0, abs=1e-9)
     # Gravity is the same in both frames.
     np.testing.assert_allclose(drive.odom_T_sensor[:, 2, :3], drive.world_T_sensor[:, 2, :3], atol=1e-9)
-    tilt_deg = np.rad2deg(motion.angles_rad[:, 1:])
-    assert 1.5 < tilt_deg.std() < 4.5
+    assert np.abs(drive.odom_T_sensor[:, 2, 0]).max() > 0.04
 
 
-def test_the_pose_of_a_revolution_is_that_of_its_middle_column(sensor: SensorMetadata) -> None:
-    drive = recorded(straight_path(20.0), Odometry(translation_percent=1.0), sensor, spacing_m=0.7)
+def test_the_pose_of_a_revolution_is_that_of_its_middle_column(
+    recorded: Callable[..., Trajectory], sensor: SensorMetadata
+) -> None:
+    drive = recorded(straight(20.0), Odometry(translation_percent=1.0), spacing_m=0.7)
     scans = slice(3, 9)
     columns = drive.world_T_column(scans)
     middle = sensor.width // 2
@@ -84,28 +96,82 @@ def test_the_pose_of_a_revolution_is_that_of_its_middle_column(sensor: SensorMet
     assert stamps[1, -1] - stamps[1, 0] == round(1e8 * (1 - 1 / sensor.width))
 
 
-def test_rotation_is_yaw_then_pitch_then_roll() -> None:
-    motion = Motion(np.array([0.0, 1.0]), np.zeros((2, 3)), np.tile([0.3, 0.2, 0.1], (2, 1)))
-    pose = motion.poses(np.array([0.5]))
-    require_poses("pose", pose)
-    # A nose-down pitch of a sensor that looks along +x is positive about y: x ends below the horizon.
-    assert pose[0, 2, 0] == pytest.approx(-np.sin(0.2))
-    assert yaw_rad(pose[0]) == pytest.approx(0.3)
-    assert pose[0, 2, 1] == pytest.approx(np.cos(0.2) * np.sin(0.1))
+def test_stamps_are_true_to_a_speed_that_varies(recorded: Callable[..., Trajectory], sensor: SensorMetadata) -> None:
+    # By hand: speed 1 + t / 50 m/s gives the way t + t^2 / 100.
+    time_s = np.linspace(0.0, 20.0, 401)
+    way_m = time_s + time_s**2 / 100
+    motion = motion_of(time_s, way_m, way_m[:, None] * [1.0, 0.0, 0.0], Rotation.identity(len(time_s)))
+    drive = recorded(motion, Odometry(), spacing_m=0.5)
+    stamps_s = drive.column_stamps_ns(slice(None)) / 1e9 + drive.revolution_s[0] + drive.column_s[0]
+    columns = drive.world_T_column(slice(None))
+    np.testing.assert_allclose(columns[:, :, 0, 3], stamps_s + stamps_s**2 / 100, atol=1e-4)
+    # The head turns at 10 Hz whatever the speed, so kept revolutions lie a whole number of turns apart.
+    turns = (drive.revolution_s - 0.05) * 10
+    np.testing.assert_allclose(turns, np.round(turns), atol=1e-9)
+    # Each is the first one at or after its half metre.
+    late_m = drive.world_T_sensor[:, 0, 3] - drive.world_T_sensor[0, 0, 3] - 0.5 * np.arange(drive.n_scans)
+    assert (late_m > -1e-6).all()
+    assert (late_m < 0.1 * (1 + drive.revolution_s / 50)).all()
+    in_turn_m = columns[:, -1, 0, 3] - columns[:, 0, 0, 3]
+    np.testing.assert_allclose(in_turn_m, 0.1 * (1 + drive.revolution_s / 50) * (1 - 1 / sensor.width), atol=1e-4)
 
 
-def test_a_line_keeps_to_its_side_and_height(make_scenario: Callable[..., Scenario]) -> None:
+def test_a_standing_robot_records_once_where_it_stands(recorded: Callable[..., Trajectory]) -> None:
+    time_s = np.array([0.0, 4.0, 14.0, 20.0])
+    way_m = np.array([0.0, 4.0, 4.0, 10.0])
+    drive = recorded(motion_of(time_s, way_m, way_m[:, None] * [1.0, 0.0, 0.0], Rotation.identity(4)), Odometry())
+    assert drive.n_scans == 1 + 2 * 9 + 1
+    assert (np.diff(drive.world_T_sensor[:, 0, 3]) > 0.35).all()
+
+
+def test_rotations_turn_evenly_between_samples_and_beyond() -> None:
+    turns = Rotation.from_rotvec(np.outer([0.0, 1.2, 1.2], [0.6, 0.0, 0.8]))
+    motion = motion_of(np.array([0.0, 2.0, 3.0]), np.zeros(3), np.array([[0.0] * 3, [4.0, 0, 0], [4.0, 0, 0]]), turns)
+    poses = motion.poses(np.array([-0.5, 0.5, 1.5, 2.5]))
+    require_poses("poses", poses)
+    expected = Rotation.from_rotvec(np.outer([-0.3, 0.3, 0.9, 1.2], [0.6, 0.0, 0.8])).as_matrix()
+    np.testing.assert_allclose(poses[:, :3, :3], expected, atol=1e-12)
+    np.testing.assert_allclose(poses[:, 0, 3], [-1.0, 1.0, 3.0, 4.0], atol=1e-12)
+    # q and -q are the same rotation: no way round.
+    flipped = Rotation.from_quat(turns.as_quat() * [[1], [-1], [1]])
+    again = motion_of(motion.time_s, motion.way_m, motion.points, flipped)
+    np.testing.assert_allclose(again.poses(np.array([1.5]))[0], poses[2], atol=1e-12)
+
+
+def test_a_line_keeps_to_its_side(make_scenario: Callable[..., Scenario]) -> None:
     scenario = make_scenario()
     world = build_world(scenario, 0)
     for session, lateral, start_m, end_m in (("before", -0.2, 2.0, 2.0), ("after", 0.2, 3.0, 1.0)):
-        path = plan_path(world, scenario, session)
+        path = plan_path(world, scenario, 0, session)
         # A drift 4 m wide leaves 1.5 m to either side of a platform that keeps 0.5 m.
         np.testing.assert_allclose(path.points[:, 1], lateral * 1.5, atol=0.02)
         assert path.points[0, 0] == pytest.approx(start_m, abs=0.1)
         assert path.points[-1, 0] == pytest.approx(20 - end_m, abs=0.1)
-        floor_m, _, _ = world.walls.cast(path.points, np.tile([0.0, 0.0, -1.0], (len(path.points), 1)))
-        assert np.abs(floor_m - 0.8).max() < 0.05
         np.testing.assert_allclose(np.diff(path.distance_m), 0.05, rtol=0.05)
+
+
+def test_the_other_way_round_is_the_same_line_driven_backwards(make_scenario: Callable[..., Scenario]) -> None:
+    there = make_scenario()
+    world = build_world(there, 0)
+    back = there.model_copy(update={"before": SessionPlan(route=("b", "a"), lateral=0.2, start_m=2.0, end_m=2.0)})
+    ahead, reverse = plan_path(world, there, 0, "before"), plan_path(world, back, 0, "before")
+    np.testing.assert_allclose(reverse.points[::-1], ahead.points, atol=0.01)
+    np.testing.assert_allclose(np.abs(reverse.yaw_rad[::-1] - ahead.yaw_rad), np.pi, atol=0.01)
+
+
+def test_a_line_wanders_where_there_is_room(make_scenario: Callable[..., Scenario]) -> None:
+    scenario = make_scenario(platform=Platform(wander_m=0.3))
+    world = build_world(scenario, 0)
+    lines = [plan_path(world, scenario, seed, "before").points[:, 1] + 0.3 for seed in range(12)]
+    assert (
+        0.2
+        < np.concatenate([np.interp(np.linspace(0, 1, 50), np.linspace(0, 1, len(y)), y) for y in lines]).std()
+        < 0.4
+    )
+    wild = scenario.model_copy(update={"platform": Platform(wander_m=30.0)})
+    points = plan_path(world, wild, 0, "before").points
+    assert np.abs(points[:, 1]).max() <= 1.5 + 1e-9  # 2 m less the clearance
+    assert np.ptp(points[:, 1]) > 1.0
 
 
 def test_a_line_bends_round_props_and_quadrotors_fly_over_low_ones(
@@ -113,14 +179,14 @@ def test_a_line_bends_round_props_and_quadrotors_fly_over_low_ones(
 ) -> None:
     scenario = make_scenario(props=(make_prop("box", 0.5, -0.1, 30.0),))
     world = build_world(scenario, 0)
-    path = plan_path(world, scenario, "before")
+    path = plan_path(world, scenario, 0, "before")
     corners = standing_corners(world.standing[0])
     outline = np.concatenate([np.linspace(corners[i], corners[(i + 1) % 4], 40) for i in range(4)])
     gap_m = np.linalg.norm(path.points[:, None, :2] - outline[None], axis=2).min()
     assert 0.45 < gap_m < 0.75  # platform.clearance_m is 0.5
     assert np.abs(np.diff(path.yaw_rad)).max() < np.deg2rad(5.0)
     flying = scenario.model_copy(update={"platform": Platform(kind="quadrotor", sensor_height_m=1.6)})
-    np.testing.assert_allclose(plan_path(world, flying, "before").points[:, 1], -0.3, atol=0.05)
+    np.testing.assert_allclose(plan_path(world, flying, 0, "before").points[:, 1], -0.3, atol=0.05)
 
 
 def test_a_line_winds_between_props_on_both_sides(
@@ -129,7 +195,7 @@ def test_a_line_winds_between_props_on_both_sides(
     left, right = (make_prop(name, place, side, size_m=(0.7, 1.6, 0.7)) for name, place, side in _CHICANE)
     scenario = make_scenario(props=(left, right))
     world = build_world(scenario, 0)
-    path = plan_path(world, scenario, "before")
+    path = plan_path(world, scenario, 0, "before")
     for item in world.standing:
         corners = standing_corners(item)
         outline = np.concatenate([np.linspace(corners[i], corners[(i + 1) % 4], 40) for i in range(4)])
@@ -138,7 +204,7 @@ def test_a_line_winds_between_props_on_both_sides(
     left, right = (make_prop(name, place, side, size_m=(0.7, 2.0, 0.7)) for name, place, side in _CLOSE)
     closer = make_scenario(props=(left, right))
     with pytest.raises(ScenarioError, match="before: props on both sides leave no smooth way"):
-        plan_path(build_world(closer, 0), closer, "before")
+        plan_path(build_world(closer, 0), closer, 0, "before")
 
 
 _CHICANE = (("left", 0.4, 1.0), ("right", 0.5, -1.0))
@@ -158,12 +224,16 @@ def test_impossible_drives_are_refused(
         plan(platform=Platform(clearance_m=2.2))
     with pytest.raises(ScenarioError, match=r"before: the route is 20\.0 m long"):
         plan(before=SessionPlan(route=("a", "b"), start_m=12.0, end_m=7.0))
-    with pytest.raises(ScenarioError, match="before: the sensor comes within"):
+    with pytest.raises(ScenarioError, match=r"before: the sensor comes within .* m along the route, at \("):
         plan(before=SessionPlan(route=("a", "b"), height_m=2.94))
     with pytest.raises(ScenarioError, match=r"before\.route turns back at node 'b'"):
         plan(before=SessionPlan(route=("a", "b", "a")))
-    with pytest.raises(ScenarioError, match=r"platform\.scan_spacing_m = 0\.05: .* revolutions are 0\.1 m apart"):
+    with pytest.raises(ScenarioError, match=r"before: platform\.scan_spacing_m = 0\.05: at 1 m/s, .* are 0\.1 m apart"):
         plan(platform=Platform(scan_spacing_m=0.05))
+    with pytest.raises(ScenarioError, match=r"at 1\.\d+ m/s, \d+\.\d m along the way, .* give at least that, or drive"):
+        plan(platform=Platform(scan_spacing_m=0.1, speed_variation=0.3))
+    with pytest.raises(ScenarioError, match=r"before: the drive takes 0\.\d+ s, less than one revolution at 10 Hz"):
+        plan(before=SessionPlan(route=("a", "b"), speed_mps=300.0))
 
 
 def test_smoothing_keeps_straight_lines_and_ends() -> None:
@@ -172,4 +242,26 @@ def test_smoothing_keeps_straight_lines_and_ends() -> None:
     bent = np.abs(np.linspace(-1, 1, 201))
     assert smoothed(bent, 1.0)[[0, -1]] == pytest.approx([1.0, 1.0])
     assert smoothed(bent, 1.0)[100] > 0.02
-    assert make_pose().shape == (4, 4)
+    low, high = np.where(np.arange(200) == 100, 0.5, -1.0), np.full(200, 1.0)
+    kept = kept_between(np.zeros(200), low, high, 0.5)
+    assert (kept >= low - 1e-12).all()
+    assert np.abs(kept[[0, 60, 140, 199]]).max() < 1e-12
+
+
+def test_a_line_goes_round_high_stones_and_over_low_ones(make_scenario: Callable[..., Scenario]) -> None:
+    def driven(size_m: float, max_size_m: float, per_m2: float) -> tuple[float, float]:
+        floor = Floor(roughness=0.0, stones=Stones(per_m2=per_m2, size_m=size_m, max_size_m=max_size_m))
+        base = make_scenario(before=SessionPlan(route=("a", "b"), start_m=1.0, end_m=1.0))
+        scenario = base.model_copy(update={"tunnel": base.tunnel.model_copy(update={"floor": floor})})
+        world = build_world(scenario, 3)
+        path = plan_path(world, scenario, 3, "before")
+        heave_m, _, _ = on_wheels(path, world.fixed, scenario.platform)
+        level_m, _, _ = on_wheels(path, world.walls, scenario.platform)
+        return float(np.ptp(path.points[:, 1])), float(np.abs(heave_m - level_m).max())
+
+    wind_m, heave_m = driven(0.6, 0.8, 0.4)
+    assert wind_m > 0.2
+    assert heave_m < 0.03  # through the middle it would be over 0.05
+    wind_m, heave_m = driven(0.1, 0.12, 3.0)
+    assert wind_m < 0.05
+    assert 0.002 < heave_m < 0.05

@@ -1,0 +1,41 @@
+"""What can be done to a line sampled every 0.05 m: smoothing it, and keeping a bound through the smoothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from cdpipe.geometry import Float64Array
+
+STEP_M = 0.05  # between the samples of a line
+
+
+def smoothed(values: Float64Array, half_m: float) -> Float64Array:
+    """Return (N,) or (N, D) samples 0.05 m apart averaged with a Hann window of this half width, ends kept."""
+    half = round(half_m / STEP_M)
+    if half < 1 or len(values) < 2:
+        return values
+    window = np.hanning(2 * half + 3)[1:-1]
+    window /= window.sum()
+    padded = np.pad(values, [(half, half)] + [(0, 0)] * (values.ndim - 1), mode="reflect", reflect_type="odd")
+    if values.ndim == 1:
+        return np.convolve(padded, window, mode="valid")
+    return np.stack([np.convolve(column, window, mode="valid") for column in padded.T], axis=1)
+
+
+def strictest(bound: Float64Array, half_m: float, of: Callable[..., Any]) -> Float64Array:
+    """Take the strictest bound within `half_m` of each sample: a Hann average over that window then keeps the bound."""
+    half = round(half_m / STEP_M)
+    padded = np.pad(bound, half, mode="edge")
+    return np.asarray(of(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1), axis=1))
+
+
+def kept_between(wanted: Float64Array, low: Float64Array, high: Float64Array, half_m: float) -> Float64Array:
+    """Return smooth values (N,) near the wanted ones; they keep the bounds wherever these agree within `half_m`."""
+    inner_low, inner_high = strictest(low, half_m, np.max), strictest(high, half_m, np.min)
+    middle = (inner_low + inner_high) / 2
+    is_crossed = inner_low > inner_high
+    target = np.where(is_crossed, middle, np.clip(wanted, inner_low, np.maximum(inner_low, inner_high)))
+    return smoothed(target, half_m)
