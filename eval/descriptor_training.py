@@ -23,6 +23,7 @@ from cdpipe.descriptor import use_threads
 from cdpipe.descriptor.network import checkpoint_bytes, digest, initial_network
 from cdpipe.descriptor.range_image import range_image
 from cdpipe.descriptor.training import PlaceData, PlaceScores, TrainingConfig, evaluate, train
+from cdpipe.errors import ScenarioError
 from cdpipe.geometry import travelled_m, yaw_rad
 from cdpipe.session import load_arrays
 from cdpipe.types import SessionName
@@ -35,7 +36,7 @@ from sim.simulate import simulate_pair
 from sim.truth import read_true_poses
 
 KEYFRAME_SPACING_M = 1.0
-FAMILIES = ("narrow", "wide")
+FAMILIES = ("narrow", "wide", "network")
 FIRST_VALIDATION_SEED = 10000
 SESSIONS: tuple[SessionName, ...] = ("before", "after")
 
@@ -68,23 +69,33 @@ def make_tunnel(family: str, seed: int, path: Path) -> None:
     shutil.rmtree(pair)
 
 
-def load_data(folder: Path, seeds: Iterable[int]) -> tuple[PlaceData, str]:
-    """Read the tunnels of both families and the given seeds, making those that are missing; return their digest too."""
+def load_data(folder: Path, seeds: Iterable[int]) -> tuple[PlaceData, str, list[str]]:
+    """Read the tunnels of all families and the given seeds, making those that are missing.
+
+    Returns:
+        The keyframes, their digest, and the tunnels that could not be built, each with its reason.
+    """
     make_writable(folder)
     wanted = [(family, seed) for seed in seeds for family in FAMILIES]
     tunnels: list[dict[str, Any]] = []
+    refused: list[str] = []
     hasher = hashlib.sha256()
     with Progress(console=Console(stderr=True)) as progress:
         for family, seed in progress.track(wanted, description="tunnels"):
             path = folder / f"{family}-{seed}.npz"
-            if not path.is_file():
-                make_tunnel(family, seed, path)
+            try:
+                if not path.is_file():
+                    make_tunnel(family, seed, path)
+            except ScenarioError as error:
+                refused.append(f"{family} {seed}: {error}")
+                continue
             arrays = load_arrays(path)
             arrays["tunnels"] = np.full(len(arrays["sessions"]), len(tunnels))
             hasher.update(arrays["images_m"].tobytes())
             tunnels.append(arrays)
     fields = PlaceData.__dataclass_fields__
-    return PlaceData(**{name: np.concatenate([t[name] for t in tunnels]) for name in fields}), hasher.hexdigest()[:16]
+    data = PlaceData(**{name: np.concatenate([t[name] for t in tunnels]) for name in fields})
+    return data, hasher.hexdigest()[:16], refused
 
 
 def main(
@@ -96,11 +107,13 @@ def main(
     seed: int = 0,
     threads: int = 2,
 ) -> None:
-    """Train the scan descriptor on families narrow and wide; validation seeds only judge it."""
+    """Train the scan descriptor on families narrow, wide and network; validation seeds only judge it."""
     use_threads(threads)
     make_writable(out)
-    training, data_digest = load_data(data, range(train_tunnels))
-    validation, _ = load_data(data, range(FIRST_VALIDATION_SEED, FIRST_VALIDATION_SEED + validation_tunnels))
+    training, data_digest, refused = load_data(data, range(train_tunnels))
+    validation, _, refused_validation = load_data(
+        data, range(FIRST_VALIDATION_SEED, FIRST_VALIDATION_SEED + validation_tunnels)
+    )
     config = TrainingConfig(seed=seed, steps=steps)
     start = time.perf_counter()
     losses: list[tuple[float, float]] = []
@@ -123,10 +136,12 @@ def main(
             "train_seeds": f"0:{train_tunnels}",
             "n_keyframes": len(training.positions),
             "digest": data_digest,
+            "refused": refused,
         },
         "validation": {
             "seeds": f"{FIRST_VALIDATION_SEED}:{FIRST_VALIDATION_SEED + validation_tunnels}",
             "n_keyframes": len(validation.positions),
+            "refused": refused_validation,
             "trained": _scores(evaluate(network, validation)),
             "untrained": _scores(evaluate(initial_network(), validation)),
         },

@@ -97,8 +97,8 @@ def way(scenario: Scenario, centreline: Centreline) -> Stations:
     )
 
 
-def draw_areas(scenario: Scenario, centreline: Centreline, seed: int) -> dict[str, Stations]:
-    """Return the stretch of each area; it lies on edges that both sessions drive.
+def draw_areas(scenario: Scenario, centreline: Centreline, seed: int) -> dict[str, tuple[Stations, Stations]]:
+    """Return the stretch of each area, and the same with as much again to either side; both sessions drive them.
 
     Of up to 64 centres drawn for an area the first is taken that keeps it four score radii from the areas before it,
     else the one farthest from them.
@@ -109,7 +109,10 @@ def draw_areas(scenario: Scenario, centreline: Centreline, seed: int) -> dict[st
     if not scenario.areas:
         return {}
     shared = stations_of(_driven_edges(scenario, scenario.before), centreline)
-    chosen: dict[str, tuple[Stations, Area, Float64Array]] = {}
+    is_driven = np.ones(len(shared), dtype=bool)
+    for plan in (scenario.before, scenario.after):
+        is_driven &= _is_driven(shared, scenario, plan, centreline, 0.0)
+    chosen: dict[str, tuple[tuple[Stations, Stations], Area, Float64Array]] = {}
     for area in scenario.areas:
         starts, count = _possible(area, shared, scenario, centreline)
         draws = starts[(stream(seed, "areas", area.name).random(_AREA_TRIES) * len(starts)).astype(int)]
@@ -119,9 +122,11 @@ def draw_areas(scenario: Scenario, centreline: Centreline, seed: int) -> dict[st
             wanted_m = _APART_RADII * scenario.score_radius_m + (area.length_m + other.length_m) / 2
             spare_m = np.minimum(spare_m, np.linalg.norm(centres - centre, axis=1) - wanted_m)
         best = int(np.argmax(spare_m >= 0)) if (spare_m >= 0).any() else int(np.argmax(spare_m))
-        stretch = shared.part(slice(int(draws[best]), int(draws[best]) + count))
-        chosen[area.name] = (stretch, area, centres[best])
-    return {name: stretch for name, (stretch, _, _) in chosen.items()}
+        offset = np.arange(len(shared)) - int(draws[best])
+        stretch = shared.part((offset >= 0) & (offset < count))
+        longer = shared.part((offset >= -count) & (offset < 2 * count) & is_driven)
+        chosen[area.name] = ((stretch, longer), area, centres[best])
+    return {name: stretches for name, (stretches, _, _) in chosen.items()}
 
 
 def _possible(area: Area, shared: Stations, scenario: Scenario, centreline: Centreline) -> tuple[Int64Array, int]:

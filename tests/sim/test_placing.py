@@ -171,7 +171,7 @@ def area_scenario(make_scenario: MakeScenario, tunnel: Tunnel, count: int, **pla
 
 def middles(scenario: Scenario, seed: int) -> Float64Array:
     centreline: Centreline = build_centreline(scenario.tunnel, seed)
-    return np.array([each.points[len(each) // 2] for each in draw_areas(scenario, centreline, seed).values()])
+    return np.array([area.points[len(area) // 2] for area, _ in draw_areas(scenario, centreline, seed).values()])
 
 
 def test_areas_keep_four_score_radii_apart_where_there_is_room(make_scenario: MakeScenario) -> None:
@@ -224,3 +224,20 @@ def test_props_of_an_area_stand_in_it_and_not_in_a_junctions_mouth(
         for item in standing:
             assert abs(item.world_T_object[0, 3] - middle[0]) <= 3.0 + 0.1
             assert abs(item.world_T_object[0, 3] - 20.0) >= 0.75 * 4.0 - 0.1
+
+
+def test_a_crowded_area_takes_the_other_wall_then_the_tunnel_beside_it(
+    make_scenario: MakeScenario, make_prop: MakeProp
+) -> None:
+    # An area of 2 m holds one box of 1.6 m at either wall; the third goes beside it, within as much again.
+    tunnel = drift((0, 0, 0), (40, 0, 0))
+    boxes = tuple(
+        make_prop(f"box{n}", size_m=(1.6, 0.6, 0.5), place=Place(area="small", lateral=0.9)) for n in range(3)
+    )
+    for seed in range(3):
+        scenario = make_scenario(tunnel=tunnel, areas=(Area(name="small", length_m=2.0),), props=boxes)
+        middle_m = middles(scenario, seed)[0, 0]
+        x, y = np.array([each[0][:2, 3] for each in poses(build_world(scenario, seed)).values()]).T
+        assert abs(x[0] - middle_m) < 1.1
+        assert y[0] > 0.5 > -0.5 > y.min()
+        assert np.abs(x - middle_m).max() < 3.1
