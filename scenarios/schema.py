@@ -1,7 +1,8 @@
 """What a scenario is, once its seed has drawn every distribution. Lengths in metres, angles in degrees.
 
-Frame: `world`, x forward, z up. A drift follows the polyline of its nodes; node z is floor level. Left and right are
-those of a drift's own direction, from its first node to its last.
+Frame: `world`, x forward, z up. A drift follows the polyline of its nodes; node z is floor level. Left and right of
+furniture and niches are those of a drift's own direction, from its first node to its last; of a place those of the way
+from the first to the second node of `between` (drawn places: as driven); of a session those of its drive.
 """
 
 from __future__ import annotations
@@ -228,7 +229,7 @@ class Prop(Settings):
     shift: Shift | None = None  # or how far from its first place
     loaded_share: Annotated[float, Field(gt=0, lt=1)] | None = None  # of a reshaped pile's volume, taken away
     repose_deg: Annotated[float, Field(ge=30, le=45)] = 37.0  # flanks of a pile; blasted rock has 34 to 40
-    fragment_m: Positive = 0.25  # characteristic size of a pile's fragments
+    fragment_m: Annotated[float, Field(ge=0.02, le=2.0)] = 0.25  # characteristic size of a pile's fragments
     reflectivity: Reflectivity | None = None  # of every part; left out: what each part is made of
 
     @model_validator(mode="after")
@@ -243,6 +244,8 @@ class Prop(Settings):
             raise ValueError(f"prop {self.name!r}: change: reshaped and loaded_share go together")
         if self.change == "reshaped" and self.kind != "muck_pile":
             raise ValueError(f"prop {self.name!r}: only a muck_pile can be reshaped")
+        if self.kind in ("muck_pile", "railing") and "tipped" in (self.place.posture, self.to and self.to.posture):
+            raise ValueError(f"prop {self.name!r}: a {self.kind} is set into the floor, it cannot be tipped")
         return self
 
 
@@ -255,6 +258,12 @@ class Sensor(Settings):
     dropouts: bool = True
     max_range_m: Positive = 120.0
     min_range_m: NotNegative = 0.3
+
+    @model_validator(mode="after")
+    def _sees_something(self) -> Sensor:
+        if self.min_range_m >= self.max_range_m:
+            raise ValueError(f"sensor.min_range_m = {self.min_range_m:g} leaves nothing below max_range_m")
+        return self
 
 
 class Platform(Settings):
@@ -283,6 +292,12 @@ class Odometry(Settings):
     translation_percent: NotNegative = 0.0
     yaw_deg_per_100m: NotNegative = 0.0
 
+    @model_validator(mode="after")
+    def _one_source(self) -> Odometry:
+        if self.source == "kiss-icp" and (self.translation_percent or self.yaw_deg_per_100m):
+            raise ValueError("kiss-icp has an error of its own: leave translation_percent and yaw_deg_per_100m out")
+        return self
+
 
 class SessionPlan(Settings):
     """One drive through the tunnel: along a route, or on a recorded trajectory."""
@@ -298,8 +313,12 @@ class SessionPlan(Settings):
 
     @model_validator(mode="after")
     def _route_or_trajectory(self) -> SessionPlan:
-        if (len(self.route) >= 2) == (self.trajectory is not None):
+        if len(self.route) == 1 or bool(self.route) == (self.trajectory is not None):
             raise ValueError("give a route of two nodes or more, or a trajectory")
+        of_a_route = {"lateral": 0.0, "start_m": 0.0, "end_m": 0.0, "height_m": None, "speed_mps": None}
+        said = [name for name, left_out in of_a_route.items() if getattr(self, name) != left_out]
+        if self.trajectory is not None and said:
+            raise ValueError(f"a trajectory is driven as recorded: leave {', '.join(said)} out")
         return self
 
 

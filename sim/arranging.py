@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 
@@ -19,6 +19,7 @@ from sim.placing import (
     Surroundings,
     grown,
     overlap,
+    seen_from_above,
     standing_corners,
 )
 from sim.props import shape_of
@@ -32,6 +33,7 @@ _BETWEEN_M = 0.15
 _DROPS = 8
 _BEFORE, _AFTER = frozenset(("before",)), frozenset(("after",))
 _BOTH = _BEFORE | _AFTER
+Outline = Callable[[Standing], Float64Array]
 
 
 @dataclass(slots=True, eq=False)
@@ -46,12 +48,14 @@ class _Board:
         self.standing.extend(items)
         self.taken.extend([lane.taken_by(item) for lane in self.lanes] for item in items)
 
-    def neighbour(self, item: Standing, apart_m: float) -> tuple[Standing, str] | None:
+    def neighbour(
+        self, item: Standing, apart_m: float, outline: Outline = standing_corners
+    ) -> tuple[Standing, str] | None:
         """Return a prop that stands in this one's way, and the session."""
-        corners = grown(standing_corners(item), apart_m)
+        corners = grown(outline(item), apart_m)
         for other in self.standing:
             shared = item.sessions & other.sessions
-            if shared and overlap(corners, standing_corners(other)):
+            if shared and overlap(corners, outline(other)):
                 return other, max(shared)
         return None
 
@@ -142,6 +146,8 @@ def _set_down(job: _Job, spot: Spot, around: Surroundings, seed: int, board: _Bo
     _refuse_overlap(items, board)
     rested = [settle(item, around) for item in items]
     _refuse_overlap([item for item in rested if item.posture != "upright"], board)
+    if why := _touching(rested, board):
+        raise ScenarioError(f"prop {job.prop.name!r} cannot come to rest there: {why}: set them farther apart")
     return rested
 
 
@@ -196,7 +202,7 @@ def _first_fit(
                 continue
             drops += 1
             items = [settle(item, around) for item in items]
-            why = _clash([item for item in items if item.posture != "upright"], board)
+            why = _clash([item for item in items if item.posture != "upright"], board) or _touching(items, board)
             if not why:
                 return items, ""
         except ScenarioError as error:
@@ -204,6 +210,12 @@ def _first_fit(
         if drops >= _DROPS:
             break
     return [], why
+
+
+def _touching(items: Sequence[Standing], board: _Board) -> str:
+    """Say which prop one at rest runs into as it tilts on its floor; "" if none."""
+    clashes = [board.neighbour(item, 0.0, seen_from_above) for item in items]
+    return next((f"prop {clash[0].prop.name!r} is in the way" for clash in clashes if clash), "")
 
 
 def _clash(items: Sequence[Standing], board: _Board) -> str:

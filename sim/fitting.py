@@ -130,7 +130,7 @@ def _require_clear(
     reach_m = np.linalg.norm(outline, axis=1)
     floor = floor_heights(around.walls, np.array([[*position, spot.point[2] + PROBE_UP_M / 2]]))[0]
     if np.isnan(floor):
-        raise ScenarioError(f"prop {prop.name!r}: there is no floor {spot.where}")
+        raise ScenarioError(f"prop {prop.name!r}: there is no floor {spot.where}, looked for from 0.6 m above it")
     for height in np.linspace(0.25, max(0.3, float(high[2] - low[2])), 5):
         origins = np.tile([*position, floor + height], (len(outline), 1))
         directions = np.column_stack([outline / reach_m[:, None], np.zeros(len(outline))])
@@ -153,7 +153,7 @@ def _floor_under(
     xy = grid @ yaw_pose(yaw)[:2, :2].T + position
     heights = floor_heights(walls, np.column_stack([xy, np.full(len(xy), level_m + PROBE_UP_M)]))
     if np.isnan(heights).all():
-        raise ScenarioError(f"prop {prop.name!r}: there is no floor where it should stand")
+        raise ScenarioError(f"prop {prop.name!r}: there is no floor where it should stand, looked for from 1.2 m above")
     return float(np.nanmedian(heights))
 
 

@@ -117,7 +117,7 @@ def list_changes(scenario: Scenario, world: World) -> list[Tally]:
         start, end = items
         if _is_same(start, end):
             continue
-        if start.shape is not end.shape and np.allclose(start.world_T_object, end.world_T_object, atol=1e-6):
+        if prop.loaded_share is not None:
             tallies.append(_reshaped(len(tallies) + 1, instance, start, world))
             continue
         group: Literal["full", "partial"] = "partial" if _is_short_move(start, end) else "full"

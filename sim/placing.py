@@ -103,6 +103,12 @@ def standing_corners(standing: Standing) -> Float64Array:
     pose = standing.world_T_object
     if standing.posture == "upright":
         return np.asarray(footprint(standing.shape.size_m) @ pose[:2, :2].T + pose[:2, 3])
+    return seen_from_above(standing)
+
+
+def seen_from_above(standing: Standing) -> Float64Array:
+    """Return the corners (4, 2) of the rectangle about all of a prop as it tilts on its floor, world frame."""
+    pose = standing.world_T_object
     # Of the object's axes the one that lies flattest gives the direction of the rectangle.
     axis = pose[:2, int(np.argmin(np.abs(pose[2, :3])))]
     along = axis / np.linalg.norm(axis)

@@ -53,12 +53,15 @@ def draw_sizes(
         generator: Where the randomness comes from.
 
     Returns:
-        Sizes from the largest to the smallest, metres; none below 5 cm.
+        Sizes from the largest to the smallest, metres; none below 5 cm, or half the largest of a low pile.
     """
+    smallest_m = min(_SMALLEST_M, 0.5 * fragment_m)
+    if smallest_m >= largest_m:  # a low pile has only fines
+        smallest_m = 0.5 * largest_m
     sizes = np.empty(0)
     while _PLAN_SHARE * np.square(sizes).sum() < coverage * plan_m2:
         drawn = rosin_rammler(256, fragment_m, generator)
-        sizes = np.concatenate([sizes, drawn[(drawn >= min(_SMALLEST_M, 0.5 * fragment_m)) & (drawn <= largest_m)]])
+        sizes = np.concatenate([sizes, drawn[(drawn >= smallest_m) & (drawn <= largest_m)]])
     enough = int(np.searchsorted(_PLAN_SHARE * np.cumsum(np.square(sizes)), coverage * plan_m2)) + 1
     return np.asarray(np.sort(sizes[:enough])[::-1][:most])
 

@@ -114,7 +114,7 @@ def compile_scene(
         if session not in item.sessions:
             continue
         pose = item.world_T_object
-        body = spec.worldbody.add_body(name=item.prop.name, pos=pose[:3, 3], quat=quaternion(pose))
+        body = spec.worldbody.add_body(name=f"prop/{item.prop.name}", pos=pose[:3, 3], quat=quaternion(pose))
         for index, solid in enumerate(item.shape.solids):
             name = f"prop/{item.prop.name}/{index}"
             if solid.mesh is not None:

@@ -146,8 +146,6 @@ def _write_session(drive: _Drive, folder: Path, pool: Executor, report: Progress
     n_scans = drive.trajectory.n_scans
     provenance = {
         "made_by": "tunnelcd simulate",
-        "family": drive.scenario.family,
-        "seed": drive.seed,
         "session": drive.name,
         "sensor_profile": drive.scenario.sensor.profile,
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -186,3 +187,14 @@ def test_shapes_of_a_reshaped_pile_give_the_volume_that_is_gone() -> None:
 def test_a_pile_cannot_be_loaded_without_a_share() -> None:
     with pytest.raises(ValueError, match="loaded_share"):
         shape_of(Prop(name="p", kind="muck_pile", size_m=(4.0, 3.0, 1.0)), 3, is_loaded=True)
+
+
+@pytest.mark.parametrize("size_m", [(1.6, 1.2, 0.14), (0.5, 0.4, 0.05)])
+def test_a_pile_too_low_for_fragments_of_5_cm_is_built_of_finer_ones(
+    size_m: tuple[float, float, float], make_prop: Callable[..., Prop]
+) -> None:
+    shape = shape_of(make_prop("low", kind="muck_pile", size_m=size_m), 0)
+    assert shape.mesh_volume_m3 is not None
+    assert 0 < shape.mesh_volume_m3 < size_m[0] * size_m[1] * size_m[2]
+    less = make_prop("low", kind="muck_pile", size_m=size_m, change="reshaped", loaded_share=0.4)
+    assert (shape_of(less, 0, is_loaded=True).mesh_volume_m3 or 0) < shape.mesh_volume_m3

@@ -59,12 +59,12 @@ def test_an_unchanged_prop_has_the_very_same_pose_in_both_models(
     )
     world = build_world(make_scenario(props=props), 4)
     before, after = world.before.model, world.after.model
-    for name in ("stays", "world"):
+    for name in ("prop/stays", "world"):
         np.testing.assert_array_equal(before.body(name).pos, after.body(name).pos)
         np.testing.assert_array_equal(before.body(name).quat, after.body(name).quat)
-    assert sorted(before.body(i).name for i in range(before.nbody)) == ["goes", "gone", "stays", "world"]
-    assert sorted(after.body(i).name for i in range(after.nbody)) == ["goes", "new", "stays", "world"]
-    moved_m = after.body("goes").pos - before.body("goes").pos
+    assert sorted(before.body(i).name for i in range(before.nbody)) == ["prop/goes", "prop/gone", "prop/stays", "world"]
+    assert sorted(after.body(i).name for i in range(after.nbody)) == ["prop/goes", "prop/new", "prop/stays", "world"]
+    moved_m = after.body("prop/goes").pos - before.body("prop/goes").pos
     assert moved_m[0] == pytest.approx(2.0, abs=0.02)
     np.testing.assert_array_equal(np.unique(world.before.instance), [0, 1, 2, 4])
     np.testing.assert_array_equal(np.unique(world.after.instance), [0, 2, 3, 4])

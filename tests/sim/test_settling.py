@@ -8,10 +8,10 @@ import pytest
 
 from cdpipe.errors import ScenarioError
 from cdpipe.geometry import Float64Array, make_pose, transform
-from scenarios.schema import Place, Prop, Roughness, Scenario, Section, Tunnel
+from scenarios.schema import Drift, Floor, Place, Prop, Roughness, Scenario, Section, Tunnel
 from sim.contact import interpenetration_m, surface_points
 from sim.mesh import Mesh, box_mesh
-from sim.placing import Standing
+from sim.placing import Standing, overlap, seen_from_above
 from sim.raycast import Caster
 from sim.scene import World, build_world
 
@@ -181,3 +181,30 @@ def test_a_prop_settles_the_same_whoever_else_is_there(make_scenario: MakeScenar
     barrel = make_prop("barrel", 0.7, 0.7, kind="barrel", size_m=SIZES["barrel"])
     alone, both = (build_world(make_scenario(props=props), 2) for props in ((chair,), (barrel, chair)))
     np.testing.assert_array_equal(alone.standing[0].world_T_object, both.standing[1].world_T_object)
+
+
+def test_props_that_tilt_into_one_another_at_rest_are_refused(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop]
+) -> None:
+    # 1 cm between two tall boxes on a floor that rolls: side by side on the level, into each other as they tilt.
+    tunnel = Tunnel(
+        nodes={"a": (0, 0, 0), "b": (20, 0, 0)},
+        drifts=(Drift(nodes=("a", "b")),),
+        section=Section(width_m=4.0, height_m=3.2),
+        roughness=(Roughness(amplitude_m=0.16, length_m=1.5),),
+        floor=Floor(roughness=0.5),
+        resolution_m=0.2,
+    )
+    size_m = (0.5, 0.5, 0.9)
+    refused = 0
+    for seed in range(6):
+        pair = [make_prop(f"box{n}", size_m=size_m, place=Place(at=(8.0 + 0.51 * n, 0.3, 0.5))) for n in range(2)]
+        try:
+            a, b = (
+                seen_from_above(item) for item in build_world(make_scenario(tunnel=tunnel, props=pair), seed).standing
+            )
+            assert not overlap(a, b)
+        except ScenarioError as error:
+            assert "is in the way: set them farther apart" in str(error)
+            refused += 1
+    assert refused >= 1
