@@ -62,7 +62,7 @@ def answer(merged: MergedMaps, config: PipelineConfig) -> ChangeReport:
 
 def test_one_added_crate_by_hand() -> None:
     new = crate(20.0)  # 4 x 4 x 4 points
-    config = load_config("voxel-diff", ["outlier.sigmas=10"])
+    config = load_config("voxel-diff", ["query.threshold=0", "outlier.sigmas=10"])
     report = answer(pair([], [new]), config)
     assert len(new) == 64
     assert report.regions.scores.tolist() == [64.0]
@@ -77,7 +77,7 @@ def test_one_added_crate_by_hand() -> None:
 
 
 def test_removed_is_the_reverse_and_two_of_a_size_are_a_move() -> None:
-    config = load_config("voxel-diff", ["outlier.sigmas=10"])
+    config = load_config("voxel-diff", ["query.threshold=0", "outlier.sigmas=10"])
     removed = answer(pair([crate(20.0)], []), config).objects
     assert [(item.session, item.kind) for item in removed] == [("before", "removed")]
     moved = answer(pair([crate(10.0)], [crate(30.0)]), config).objects
@@ -88,7 +88,7 @@ def test_removed_is_the_reverse_and_two_of_a_size_are_a_move() -> None:
 
 
 def test_keyframe_score_is_the_changed_share_around_it() -> None:
-    config = load_config("voxel-diff", ["outlier.sigmas=10", "query.radius_m=2.2"])
+    config = load_config("voxel-diff", ["query.threshold=0", "outlier.sigmas=10", "query.radius_m=2.2"])
     merged = pair([], [crate(20.0)])
     report = answer(merged, config)
     centre = np.array([18.5, 0.0, 1.0])
@@ -128,7 +128,7 @@ def test_unchanged_and_empty_answers() -> None:
 
 
 def test_moving_the_after_session_changes_nothing() -> None:
-    config = load_config("voxel-diff", ["outlier.sigmas=10"])
+    config = load_config("voxel-diff", ["query.threshold=0", "outlier.sigmas=10"])
     merged = pair([crate(10.0)], [crate(30.0, 0.6)])
     elsewhere = yaw_pose(-1.1, (50.0, 7.0, -3.0))
     moved_map = replace(
