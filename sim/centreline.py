@@ -91,15 +91,6 @@ class Centreline:
         heading = line.headings[round(position)] * (1.0 if last >= first else -1.0)
         return point, heading, line.section
 
-    def local_section(self, start: str, end: str, fraction: float) -> Section:
-        """Return the section a share of the way between two neighbouring nodes, at the size it has there."""
-        drift, first, last = self.edges[start, end]
-        line = self.drifts[drift]
-        sample = round(first + fraction * (last - first))
-        return Section(
-            shape=line.section.shape, width_m=float(line.width_m[sample]), height_m=float(line.height_m[sample])
-        )
-
 
 def build_centreline(tunnel: Tunnel, seed: int) -> Centreline:
     """Round the corners of every drift and add the meander and the change of size that the seed draws.

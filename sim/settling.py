@@ -83,7 +83,7 @@ def _model(item: Standing, points: Float64Array, around: Surroundings) -> mujoco
     contact = _CONTACT if item.posture == "upright" else _CHOCKED
     _add_floor(spec, item, points, around.walls, contact)
     if item.wall is not None:
-        _add_wall(spec, item, points, around.fixed, contact)
+        _add_wall(spec, item, item.wall, points, around.fixed, contact)
     pose = item.world_T_object.copy()
     pose[2, 3] += _DROP_M - _floor_gap_m(pose, points, around.walls)
     body = spec.worldbody.add_body(name="prop", pos=pose[:3, 3], quat=quaternion(pose))
@@ -134,16 +134,19 @@ def _add_floor(
 
 
 def _add_wall(
-    spec: mujoco.MjSpec, item: Standing, points: Float64Array, fixed: Caster, contact: dict[str, Any]
+    spec: mujoco.MjSpec,
+    item: Standing,
+    wall: Float64Array,
+    points: Float64Array,
+    fixed: Caster,
+    contact: dict[str, Any],
 ) -> None:
     """Put up a height field of the wall, and what hangs on it, as level rays from the prop's middle find it."""
-    if item.wall is None:
-        return
     world = transform(item.world_T_object, points)
     low, high = world.min(axis=0), world.max(axis=0)
     middle = (low + high) / 2
-    out = np.append(-item.wall, 0.0)
-    aside = np.array([item.wall[1], -item.wall[0], 0.0])  # aside x up = out of the wall
+    out = np.append(-wall, 0.0)
+    aside = np.array([wall[1], -wall[0], 0.0])  # aside x up = out of the wall
     half = np.array([np.ptp(world @ aside) / 2 + 0.3, (high[2] - low[2]) / 2 + 0.25])
     columns, rows = (2 * int(np.ceil(extent / _WALL_STEP_M)) + 1 for extent in half)
     u, v = np.meshgrid(np.linspace(-half[0], half[0], columns), np.linspace(-half[1], half[1], rows))

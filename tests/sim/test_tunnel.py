@@ -147,10 +147,14 @@ def test_width_and_height_change_slowly_by_the_share_that_was_asked_for() -> Non
     walls = Caster([mesh_tunnel(tunnel, centreline, SEED)])
     for fraction in (0.1, 0.37, 0.8):
         point, _, nominal = centreline.at("a", "b", fraction)
-        local = centreline.local_section("a", "b", fraction)
+        drift, first, last = centreline.edges["a", "b"]
+        sample = round(first + fraction * (last - first))
+        width_m, height_m = (
+            float(size[sample]) for size in (centreline.drifts[drift].width_m, centreline.drifts[drift].height_m)
+        )
         assert nominal == section
-        assert local != section
-        for way, distance_m in (((0, 1, 0), local.width_m / 2), ((0, 0, 1), local.height_m - 1.4)):
+        assert (width_m, height_m) != (section.width_m, section.height_m)
+        for way, distance_m in (((0, 1, 0), width_m / 2), ((0, 0, 1), height_m - 1.4)):
             ranges_m, _, _ = walls.cast(point[None] + [0, 0, 1.4], np.array([way], dtype=np.float64))
             assert ranges_m[0] == pytest.approx(distance_m, abs=0.03)
 
@@ -291,7 +295,9 @@ def test_in_a_foreign_mesh_the_line_is_that_of_the_nodes() -> None:
     np.testing.assert_array_equal(points, centreline.drifts[0].points)
     across = left_of(np.array([[20.0, 5.0]]) / np.hypot(20, 5))[0]
     np.testing.assert_allclose(points[:, :2] @ across, 0.0, atol=1e-9)
-    assert section == centreline.local_section("a", "b", 0.5) == tunnel.section
+    assert section == tunnel.section
+    assert set(centreline.drifts[0].width_m) == {section.width_m}
+    assert set(centreline.drifts[0].height_m) == {section.height_m}
     assert build_centreline(Tunnel(mesh=MeshFile(path="mine.stl")), 0).drifts == ()
 
 
