@@ -3,7 +3,7 @@
     session.json        format, sensor metadata (Ouster keys), frames, units, provenance
     odometry.npz        odom_T_sensor (S, 4, 4) float64: pose of each revolution at its middle column
     chunks/00000.npz    range_mm (s, H, W) uint32 (0 = no return), reflectivity (s, H, W) uint8,
-                        column_stamps_ns (s, W) int64, column_poses (s, W, 7) float32
+                        signal (s, H, W) uint16 photons, column_stamps_ns (s, W) int64, column_poses (s, W, 7) float32
 
 `column_poses` hold `sensor_T_column`: translation (m) and quaternion (x, y, z, w) of each column in the frame of its
 revolution, as the session's own odometry saw it. A session is written under a temporary name and renamed when whole.
@@ -29,7 +29,7 @@ from cdpipe.geometry import Float32Array, Float64Array, Int64Array, require_pose
 from cdpipe.ouster import SensorMetadata, parse_metadata
 
 FORMAT = "tunnelcd-session"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,13 +38,15 @@ class ScanChunk:
 
     Attributes:
         range_mm: (s, H, W) uint32 staggered ranges, millimetres, 0 where nothing returned.
-        reflectivity: (s, H, W) uint8.
+        reflectivity: (s, H, W) uint8, calibrated: percent of a perfect diffuse reflector up to 100.
+        signal: (s, H, W) uint16 photons counted in the return, as the sensor's signal channel; 0 where unknown.
         column_stamps_ns: (s, W) int64 time of each column since the start of the session.
         column_poses: (s, W, 7) float32 `sensor_T_column` as x, y, z, qx, qy, qz, qw.
     """
 
     range_mm: npt.NDArray[np.uint32]
     reflectivity: npt.NDArray[np.uint8]
+    signal: npt.NDArray[np.uint16]
     column_stamps_ns: Int64Array
     column_poses: Float32Array
 
@@ -52,6 +54,7 @@ class ScanChunk:
         require_shape("range_mm", self.range_mm, (None, None, None))
         scans, _, width = self.range_mm.shape
         require_shape("reflectivity", self.reflectivity, self.range_mm.shape)
+        require_shape("signal", self.signal, self.range_mm.shape)
         require_shape("column_stamps_ns", self.column_stamps_ns, (scans, width))
         require_shape("column_poses", self.column_poses, (scans, width, 7))
 

@@ -250,12 +250,19 @@ class Prop(Settings):
 
 
 class Sensor(Settings):
-    """The LiDAR: an Ouster profile (shipped name or metadata .json), its mode, and which effects are on."""
+    """The LiDAR: an Ouster profile (shipped name or metadata .json), its mode, and which effects are on.
+
+    Every effect is a switch, so that what it does to a result can be measured; sim/README.md names the constants.
+    """
 
     profile: str = "os1-32-nominal"
     mode: Annotated[str, Field(pattern=r"^\d+x\d+$")] = "1024x10"
-    range_noise: bool = True
-    dropouts: bool = True
+    rolling_scan: bool = True  # a pose per column; off: the sensor stands still during each revolution
+    range_noise: bool = True  # by range and by the strength of the return
+    dropouts: bool = True  # weak returns are lost: reflectivity, incidence, range
+    sub_rays: Literal[1, 7, 19] = 1  # rays over each beam's width; 1: no divergence, no mixed pixels at edges
+    false_positives: bool = True  # returns where nothing is
+    range_step_mm: Literal[1, 8] = 1  # 8: the vendor's low-bandwidth packets
     max_range_m: Positive = 120.0
     min_range_m: NotNegative = 0.3
 

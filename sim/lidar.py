@@ -39,12 +39,14 @@ class Scan:
     Attributes:
         range_mm: uint32, 0 where nothing returned.
         reflectivity: uint8.
+        signal: uint16 photons.
         true_range_m: float32 distance from the spin axis's point to the surface along the beam, infinite for a miss.
         geom: int32 geom hit, -1 where nothing returned.
     """
 
     range_mm: npt.NDArray[np.uint32]
     reflectivity: npt.NDArray[np.uint8]
+    signal: npt.NDArray[np.uint16]
     true_range_m: Float32Array
     geom: Int32Array
 
@@ -92,6 +94,7 @@ def scan(
     return Scan(
         range_mm=range_mm,
         reflectivity=_reflectivity(power, is_return),
+        signal=np.where(is_return, np.rint(1000.0 * power), 0.0).astype(np.uint16),
         true_range_m=np.ascontiguousarray(true_range_m),
         geom=np.where(is_return, geom, -1).astype(np.int32),
     )

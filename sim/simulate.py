@@ -157,6 +157,7 @@ def _write_session(drive: _Drive, folder: Path, pool: Executor, report: Progress
             chunk = ScanChunk(
                 np.stack([each.scan.range_mm for each in revolutions]),
                 np.stack([each.scan.reflectivity for each in revolutions]),
+                np.stack([each.scan.signal for each in revolutions]),
                 drive.trajectory.column_stamps_ns(scans),
                 drive.trajectory.sensor_T_column(scans),
             )

@@ -67,7 +67,7 @@ def test_through_the_session_format_walls_stay_flat_to_the_range_step(sensor: Se
         for part in (slice(0, 2), slice(2, 3)):
             columns = np.array([column_poses for _, column_poses, _ in revolutions[part]], dtype=np.float32)
             dark = np.zeros(range_mm[part].shape, dtype=np.uint8)
-            writer.add(ScanChunk(range_mm[part], dark, stamps[part], columns))
+            writer.add(ScanChunk(range_mm[part], dark, dark.astype(np.uint16), stamps[part], columns))
         writer.close(poses)
     source = open_scans(tmp_path / "room")
     assert len(source.odom_T_sensor) == 3

@@ -35,7 +35,15 @@ def session(path: Path, n_scans: int = 5, column_pose: tuple[float, ...] = (0, 0
             ranges = np.full(shape, 4000, dtype=np.uint32)[:n]
             ranges[:, 0, 0] = np.arange(start, start + n) + 5000
             columns = np.tile(np.array(column_pose, dtype=np.float32), (n, sensor.width, 1))
-            writer.add(ScanChunk(ranges, np.zeros(shape, np.uint8)[:n], np.zeros((n, sensor.width), np.int64), columns))
+            writer.add(
+                ScanChunk(
+                    ranges,
+                    np.zeros(shape, np.uint8)[:n],
+                    np.zeros(shape, np.uint16)[:n],
+                    np.zeros((n, sensor.width), np.int64),
+                    columns,
+                )
+            )
         writer.close(np.array([yaw_pose(0.1 * index, (index, 0, 0)) for index in range(n_scans)]))
     return path
 

@@ -21,6 +21,7 @@ def _chunk(n_scans: int, seed: int) -> ScanChunk:
     return ScanChunk(
         range_mm=draw.integers(0, 9000, size=(n_scans, 3, 8)).astype(np.uint32),
         reflectivity=draw.integers(0, 255, size=(n_scans, 3, 8)).astype(np.uint8),
+        signal=draw.integers(0, 4000, size=(n_scans, 3, 8)).astype(np.uint16),
         column_stamps_ns=np.arange(n_scans * 8).reshape(n_scans, 8),
         column_poses=np.tile(np.array([0, 0, 0, 0, 0, 0, 1], dtype=np.float32), (n_scans, 8, 1)),
     )

@@ -54,7 +54,7 @@ def write_session(path: Path, name: str, *, has_changes: bool, stretch: float) -
         for index, first in enumerate(range(0, N_SCANS, CHUNK_SCANS)):
             part = slice(first, first + CHUNK_SCANS)
             zeros = np.zeros_like(range_mm[part], dtype=np.uint8)
-            writer.add(ScanChunk(range_mm[part], zeros, stamps[part], identity[part]))
+            writer.add(ScanChunk(range_mm[part], zeros, zeros.astype(np.uint16), stamps[part], identity[part]))
             instance = np.where(range_mm[part] == 0, -1, labels[part]).astype(np.int16)
             write_labels(writer.folder, index, instance, labels[part])
         write_true_poses(writer.folder, true_poses())

@@ -91,7 +91,9 @@ def write_session(pair: Path, name: str, odom_T_world: np.ndarray, index: int, b
     world_T_sensor = np.array([make_pose(translation=(float(step), 0.0, 0.8)) for step in range(N_SCANS)])
     stamps = np.arange(N_SCANS * WIDTH, dtype=np.int64).reshape(N_SCANS, WIDTH)
     with SessionWriter(pair / name, SENSOR, N_SCANS, {}) as writer:
-        writer.add(ScanChunk(range_mm, np.zeros(shape, dtype=np.uint8), stamps, poses))
+        writer.add(
+            ScanChunk(range_mm, np.zeros(shape, dtype=np.uint8), np.zeros(shape, dtype=np.uint16), stamps, poses)
+        )
         writer.close(odom_T_world @ world_T_sensor)
     write_labels(pair / name, 0, change_ids, change_ids)
     write_true_poses(pair / name, world_T_sensor)
