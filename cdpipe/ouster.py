@@ -8,6 +8,7 @@ reported range includes that offset.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
@@ -19,10 +20,7 @@ import numpy as np
 
 from cdpipe.errors import InputError
 from cdpipe.geometry import Float64Array, require_shape, transform
-
-# Beam-origin offset of units whose metadata does not state it (first generation; vendor SDK default for OS-1).
-_LEGACY_BEAM_ORIGIN_MM = 12.163
-_LIDAR_TO_SENSOR_MM = [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 36.18, 0, 0, 0, 1]
+from cdpipe.ouster_metadata import read_document, require_mode, sensor_fields
 
 
 @dataclass(frozen=True, slots=False, eq=False)
@@ -139,82 +137,33 @@ def load_profile(name_or_path: str, mode: str | None = None) -> SensorMetadata:
         mode: "<columns>x<Hz>" to use instead of the file's own.
 
     Raises:
-        InputError: The profile is unknown, or the file is not complete Ouster metadata.
+        InputError: The profile is unknown, the file is not complete Ouster metadata, or the mode is none of `MODES`.
     """
     if name_or_path.endswith(".json"):
-        path = Path(name_or_path)
-        if not path.is_file():
-            raise InputError(f"{path}: no such sensor metadata file")
-        text = path.read_text()
+        document = read_document(Path(name_or_path))
     elif name_or_path in profile_names():
-        text = (_profiles() / f"{name_or_path}.json").read_text()
+        document = json.loads((_profiles() / f"{name_or_path}.json").read_text())
     else:
         raise InputError(
             f"sensor profile {name_or_path!r} is unknown: name one of {', '.join(profile_names())}, "
             "or the path of an Ouster metadata .json"
         )
-    try:
-        document = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{name_or_path}: not JSON (line {error.lineno}: {error.msg})") from error
-    return parse_metadata(document, name_or_path, mode)
+    sensor = parse_metadata(document, name_or_path, mode)
+    require_mode(sensor.mode, name_or_path)
+    return sensor
 
 
-def parse_metadata(document: dict[str, Any], source: str, mode: str | None = None) -> SensorMetadata:
+def parse_metadata(document: Mapping[str, Any], source: str, mode: str | None = None) -> SensorMetadata:
     """Build the beam table from parsed metadata, in the flat or in the nested layout of newer firmware.
+
+    Any number of columns and any rate will do here; `load_profile` keeps to what the sensor can.
 
     Raises:
         InputError: A key is missing or the beams are inconsistent; the text names `source` and the key.
     """
     if not isinstance(document, dict):
         raise InputError(f"{source}: Ouster metadata must be a JSON object")
-    flat: dict[str, Any] = {}
-    for key, value in document.items():
-        flat.update(
-            value if isinstance(value, dict) and key not in ("data_format", "lidar_data_format") else {key: value}
-        )
-    layout = flat.get("data_format") or flat.get("lidar_data_format") or {}
-    for key in ("beam_altitude_angles", "beam_azimuth_angles", "lidar_mode"):
-        if key not in flat:
-            raise InputError(f"{source}: {key} is missing: expected the metadata JSON of an Ouster sensor")
-    try:
-        altitude = np.asarray(flat["beam_altitude_angles"], dtype=np.float64)
-        azimuth = np.asarray(flat["beam_azimuth_angles"], dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{source}: beam angles must be lists of numbers ({error})") from error
-    if altitude.ndim != 1 or altitude.shape != azimuth.shape or not np.isfinite([altitude, azimuth]).all():
-        raise InputError(
-            f"{source}: beam_altitude_angles and beam_azimuth_angles must be equally long lists of numbers, "
-            f"got {altitude.shape} and {azimuth.shape}"
-        )
-    # 32-beam units of the first generation list 64 beams and leave the absent ones at zero.
-    absent = (altitude == 0.0) & (azimuth == 0.0)
-    if len(altitude) == 64 and absent.sum() == 32:
-        altitude, azimuth = altitude[~absent], azimuth[~absent]
-    if len(altitude) == 0 or (np.diff(altitude) >= 0).any():
-        raise InputError(f"{source}: beam_altitude_angles must fall from the top beam to the bottom one")
-    transform_mm = np.asarray(flat.get("lidar_to_sensor_transform", _LIDAR_TO_SENSOR_MM), dtype=np.float64)
-    if transform_mm.size != 16:
-        raise InputError(f"{source}: lidar_to_sensor_transform must hold 16 numbers, got {transform_mm.size}")
-    sensor_T_lidar = transform_mm.reshape(4, 4).copy()
-    sensor_T_lidar[:3, 3] /= 1000.0
-    mode = mode or str(flat["lidar_mode"])
-    columns, _, rate = mode.partition("x")
-    if not (columns.isdigit() and rate.isdigit() and int(columns) > 0 and int(rate) > 0):
-        raise InputError(f"{source}: lidar_mode = {mode!r}: expected <columns>x<Hz>, e.g. 1024x10")
-    shift = layout.get("pixel_shift_by_row") if mode == flat["lidar_mode"] else None
-    if shift is None or len(shift) != len(altitude):
-        shift = np.round((azimuth - azimuth.min()) * int(columns) / 360.0).astype(int).tolist()
-    return SensorMetadata(
-        product=str(flat.get("prod_line", "unknown")),
-        serial=str(flat.get("prod_sn", "unknown")),
-        mode=mode,
-        altitude_deg=altitude,
-        azimuth_deg=azimuth,
-        beam_origin_m=float(flat.get("lidar_origin_to_beam_origin_mm", _LEGACY_BEAM_ORIGIN_MM)) / 1000.0,
-        sensor_T_lidar=sensor_T_lidar,
-        pixel_shift=tuple(int(value) for value in shift),
-    )
+    return SensorMetadata(**sensor_fields(document, source, mode))
 
 
 def _profiles() -> Traversable:

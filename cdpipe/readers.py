@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from cdpipe.captures import SUFFIXES
 from cdpipe.deskew import deskew
 from cdpipe.errors import InputError
 from cdpipe.geometry import Float64Array, Int64Array, make_pose
 from cdpipe.ply import read_ply_points
 from cdpipe.session import ScanChunk, Session, chunk_path, is_session, read_session
+from cdpipe.tum import TUM_LINE, read_tum, require_unit_poses, stamps_from_first_ns
 from cdpipe.types import PosedScan, ScanSource
 
-_UNIT_TOLERANCE = 1e-3
 _NUMBERS = re.compile(r"(\d+)")
-_TUM_LINE = "stamp tx ty tz qx qy qz qw"
 
 
 def open_scans(path: Path) -> ScanSource:
@@ -33,6 +33,11 @@ def open_scans(path: Path) -> ScanSource:
         InputError: The folder is missing or holds neither, or its trajectory does not fit its scans. Mistakes inside a
             single scan are raised when it is read.
     """
+    if path.suffix.lower() in SUFFIXES and not path.is_dir():
+        raise InputError(
+            f"{path}: a sensor's own recording: turn it into a session first, `tunnelcd convert {path} FOLDER`, and "
+            "name that folder"
+        )
     if not path.is_dir():
         raise InputError(f"{path}: no such folder: expected a session, or a folder of PLY scans with a TUM trajectory")
     return RecordedScans(read_session(path)) if is_session(path) else _open_ply_scans(path)
@@ -67,7 +72,7 @@ class RecordedScans:
             self._chunk, self._chunk_index = self._session.chunk(chunk_index), chunk_index
         where = f"{chunk_path(self._session.path, chunk_index)}: scan {index}"
         column_poses = self._chunk.column_poses[row].astype(np.float64)
-        _require_unit_poses(column_poses, lambda column: f"{where}, column {column}")
+        require_unit_poses(column_poses, lambda column: f"{where}, column {column}")
         range_mm = self._chunk.range_mm[row]
         is_hit = range_mm > 0
         if not is_hit.any():
@@ -152,55 +157,12 @@ def _open_ply_scans(folder: Path) -> PlyScans:
     trajectories = sorted([*folder.glob("*.txt"), *folder.glob("*.tum")])
     if len(trajectories) != 1:
         found = ", ".join(file.name for file in trajectories) or "none"
+        raise InputError(f"{folder}: expected exactly one trajectory (*.txt or *.tum, lines {TUM_LINE}), found {found}")
+    rows, _ = read_tum(trajectories[0])
+    if len(rows) != len(files):
         raise InputError(
-            f"{folder}: expected exactly one trajectory (*.txt or *.tum, lines {_TUM_LINE}), found {found}"
-        )
-    stamps_ns, odom_T_sensor = _read_tum(trajectories[0])
-    if len(odom_T_sensor) != len(files):
-        raise InputError(
-            f"{trajectories[0]}: {len(odom_T_sensor)} poses for {len(files)} *.ply scans: one line for each scan is "
+            f"{trajectories[0]}: {len(rows)} poses for {len(files)} *.ply scans: one line for each scan is "
             "needed, in the order of the file names"
         )
-    return PlyScans(folder, files, odom_T_sensor, stamps_ns)
-
-
-def _read_tum(path: Path) -> tuple[Int64Array, Float64Array]:
-    """Return stamps from the first one on (S,) and poses (S, 4, 4)."""
-    rows, numbers = [], []
-    try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text: {error}") from error
-    for number, line in enumerate(lines, start=1):
-        text = line.strip()
-        if not text or text.startswith("#"):
-            continue
-        try:
-            row = [float(word) for word in text.split()]
-        except ValueError:
-            row = []
-        if len(row) != 8:
-            raise InputError(f"{path}:{number}: expected eight numbers, {_TUM_LINE}; got {text[:60]!r}")
-        rows.append(row)
-        numbers.append(number)
-    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
-    _require_unit_poses(table[:, 1:], lambda index: f"{path}:{numbers[index]}")
-    if not np.isfinite(table[:, 0]).all():
-        raise InputError(f"{path}:{numbers[int(np.argmin(np.isfinite(table[:, 0])))]}: the stamp is not finite")
-    stamps_ns = np.round((table[:, 0] - table[:1, 0]) * 1e9).astype(np.int64)
-    poses = [make_pose(Rotation.from_quat(row[4:]).as_matrix(), row[1:4]) for row in table]
-    return stamps_ns, np.array(poses).reshape(-1, 4, 4)
-
-
-def _require_unit_poses(poses: Float64Array, where: Callable[[int], str]) -> None:
-    """Check (N, 7) poses x, y, z, qx, qy, qz, qw."""
-    is_finite = np.isfinite(poses).all(axis=1)
-    if not is_finite.all():
-        raise InputError(f"{where(int(np.argmin(is_finite)))}: the pose is not finite: mend it or leave the scan out")
-    norms = np.linalg.norm(poses[:, 3:], axis=1)
-    is_unit = np.abs(norms - 1.0) < _UNIT_TOLERANCE
-    if not is_unit.all():
-        index = int(np.argmin(is_unit))
-        raise InputError(
-            f"{where(index)}: the quaternion's length is {norms[index]:.6g}, expected 1: the order is qx qy qz qw"
-        )
+    poses = [make_pose(Rotation.from_quat(row[4:]).as_matrix(), row[1:4]) for row in rows]
+    return PlyScans(folder, files, np.array(poses).reshape(-1, 4, 4), stamps_from_first_ns(rows))

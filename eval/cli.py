@@ -235,6 +235,35 @@ def detect(
 
 
 @app.command()
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="SRC", help="session folder; or a recording, .osf or .pcap")],
+    out: Annotated[Path, typer.Argument(metavar="DST", help="new .osf file; or new session folder")],
+    metadata: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.json", help="of a .pcap's sensor; else the .json of its name", show_default=False),
+    ] = None,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.tum", help="poses of the sensor, stamped by its clock", show_default=False),
+    ] = None,
+    odometry: Annotated[
+        str | None, typer.Option(metavar="kiss-icp", help="estimate the poses", show_default=False)
+    ] = None,
+    without_truth: Annotated[
+        bool, typer.Option("--without-truth", help="leave LABEL and INSTANCE out of the .osf")
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a session as OSF for the vendor's SDK, or bring an OSF or PCAP of an Ouster in as a session."""
+    from eval.converting import Options
+    from eval.converting import convert as converted
+
+    with shown_progress(quiet) as progress:
+        told = converted(source, out, Options(metadata, trajectory, odometry, without_truth), progress)
+    _say(quiet, told)
+
+
+@app.command()
 def score(
     folder: Annotated[Path, typer.Argument(help="a run folder; or a simulated pair, with the answer as second folder")],
     answer: Annotated[
@@ -290,6 +319,35 @@ def report(folder: Annotated[Path, typer.Argument(help="a run folder")]) -> None
     typer.echo(f"page: {write_page(open_run_folder(folder).path)}")
 
 
+@app.command()
+def bench(
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE.json", help="also write the table", show_default=False)
+    ] = None,
+    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="this row alone; repeatable")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Measure the speed table, each figure beside its rival in the same run. A missed target is told, not an error."""
+    import pandas as pd
+
+    from eval.bench import chosen, contests, make_ready, measure, verdict, write_table
+    from eval.progress import Lines, Silent
+
+    rows = chosen(contests(), only or ())
+    if out is not None:
+        make_ready(out)
+    # lines, never bars: a thread that redraws them would be measured too
+    table = measure(rows, (Silent() if quiet else Lines()).cells)
+    if out is not None:
+        write_table(table, out)
+    if quiet:
+        return
+    shown = pd.DataFrame(table["rows"]).assign(met=[_MET[row["met"]] for row in table["rows"]])
+    cpu, cores = table["machine"]["cpu"], table["machine"]["cores"]
+    _table(f"speed, {cpu}, {cores} cores; ratio: times faster than the rival", shown)
+    typer.echo(f"{verdict(table['rows'])}{'' if out is None else f'; {out}'}")
+
+
 @app.command("list")
 def list_command() -> None:
     """Name the scenarios, plans, presets and sensor profiles there are."""
@@ -340,6 +398,7 @@ def _run(plan: Plan, out: Path, *, force: bool, limit: int | None, quiet: bool) 
     _say(quiet, f"{out}: {outcome.n_done} cells done, {outcome.n_kept} kept from earlier{left}")
 
 
+_MET = {True: "met", False: "missed", None: "-"}
 _SHOWN = (
     "region_recall", "region_precision", "region_recall_at_k", "n_regions", "object_iou_point", "object_f1_25",
     "merge_error_m", "t_total_s",
@@ -370,7 +429,7 @@ def _table(title: str, frame: pd.DataFrame) -> None:
     for row in frame.itertuples(index=False):
         table.add_row(*(_cell(value) for value in row))
     # wider than any table: a narrow terminal wraps the lines, where rich would cut off the numbers
-    Console(width=500).print(table)
+    Console(width=500, markup=False).print(table)
 
 
 def _row(row: dict[str, Any]) -> None:
@@ -380,6 +439,8 @@ def _row(row: dict[str, Any]) -> None:
 
 
 def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
     if isinstance(value, float):
         return "-" if math.isnan(value) else f"{value:.4g}"
     return str(value)

@@ -45,6 +45,26 @@ def new_folder(path: Path) -> Iterator[Path]:
         raise
 
 
+@contextmanager
+def made_parents(path: Path) -> Iterator[None]:
+    """Make the folders above `path`; remove those that are empty again when the block fails.
+
+    Raises:
+        InputError: They cannot be made.
+    """
+    made = _missing_parents(path.absolute())
+    try:
+        path.absolute().parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        _remove_empty(made)
+        raise unwritable(path, error) from error
+    try:
+        yield
+    except BaseException:
+        _remove_empty(made)
+        raise
+
+
 def make_writable(path: Path) -> None:
     """Make a folder unless it exists, and try whether a file can be made in it.
 

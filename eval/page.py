@@ -19,6 +19,7 @@ from cdpipe.config import settings_table
 from cdpipe.errors import InputError
 from eval.figures import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.page_columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
+from eval.page_effects import ENOUGH_PAIRS, draw_effects
 from eval.page_paper import time_table, volume_table
 from eval.page_run import RunData, first_seed, named_variants, of, read_document, read_run, scenarios, text
 from eval.page_site import draw_site
@@ -81,6 +82,8 @@ def _content(data: RunData, tables: Mapping[str, Table]) -> dict[str, Any]:
         "failures": failures(data),
         "results": tables["results"],
         "unchanged": unchanged,
+        "effects": draw_effects(data),
+        "enough_pairs": ENOUGH_PAIRS,
         "table1": tables["table1"],
         "table2": tables["table2"],
         "grids": grids,

@@ -15,6 +15,7 @@ import pandas as pd
 from cdpipe.errors import InputError
 from cdpipe.geometry import Float64Array
 from eval.runfolder import RunFolder
+from eval.worlds import references
 
 Row = Mapping[str, Any]
 REQUIRED = ("scenario", "seed", "variant", "status")
@@ -106,9 +107,13 @@ def of(rows: Iterable[Row], **wanted: Any) -> list[Row]:
 
 
 def scenarios(data: RunData, *, unchanged: bool) -> list[str]:
-    """Return the scenarios with changes, or those without, in the order of results.csv."""
+    """Return the scenarios with changes, or those without, in the order of results.csv.
+
+    Worlds that only repeat another one with some setting changed are left out: `eval.page_effects` shows them.
+    """
     names = dict.fromkeys(str(row["scenario"]) for row in data.results)
-    return [name for name in names if is_unchanged(data, name) == unchanged]
+    repeated = references(names)
+    return [name for name in names if name not in repeated and is_unchanged(data, name) == unchanged]
 
 
 def is_unchanged(data: RunData, scenario: str) -> bool:

@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from eval.page_columns import RESULT_COLUMNS, share
-from eval.page_run import BASELINES, RunData, defined, named_variants, of, over_pairs, scenarios, text
+from eval.page_run import BASELINES, RunData, defined, named_variants, of, over_pairs, scenarios, split_variant, text
 from eval.page_tables import alarm_text
+from eval.worlds import references
 
 HEADLINE_COLUMNS = tuple(
     (column, name)
@@ -63,6 +64,7 @@ def story(data: RunData) -> list[str]:
         *_about_failures(data),
         *_about_unchanged(data),
         _about_size(data),
+        *_about_repeated(data),
     ]
 
 
@@ -112,14 +114,14 @@ def _price(data: RunData, ranking: Ranking) -> str:
 
 
 def _about_baselines(rankings: Sequence[Ranking], variants: Sequence[str]) -> str:
-    run_baselines = [name for name in BASELINES if name in variants]
+    run_baselines = [name for name in variants if _is_baseline(name)]
     if not run_baselines:
         return "No simple baseline was run, so nothing here shows that the method is worth its effort."
     if len(run_baselines) == len(variants):
         return f"Only simple baselines were run: {joined(run_baselines)}."
     ahead, level = [], []
     for ranking in rankings:
-        simple = [name for name in ranking.winners if name in BASELINES]
+        simple = [name for name in ranking.winners if _is_baseline(name)]
         what = f"{ranking.measure} on {ranking.scenario}"
         if simple and len(simple) == len(ranking.winners):
             ahead.append(f"{joined(simple)} in {what} ({share(ranking.best)})")
@@ -134,6 +136,10 @@ def _about_baselines(rankings: Sequence[Ranking], variants: Sequence[str]) -> st
         names = joined(run_baselines)
         return f"The simple baselines that were run ({names}) win neither region recall nor object IoU anywhere."
     return " ".join(parts)
+
+
+def _is_baseline(variant: str) -> bool:
+    return split_variant(variant)[0] in BASELINES
 
 
 def _about_wrong_merges(data: RunData) -> list[str]:
@@ -177,9 +183,11 @@ def _about_unchanged(data: RunData) -> list[str]:
 
 
 def _about_size(data: RunData) -> str:
+    repeated = _repeated(data)
     pairs: dict[str, set[int]] = {}
     for row in data.results:
-        pairs.setdefault(str(row["scenario"]), set()).add(int(row["seed"]))
+        if row["scenario"] not in repeated:
+            pairs.setdefault(str(row["scenario"]), set()).add(int(row["seed"]))
     seeds = sorted(set().union(*pairs.values()))
     named = f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}"
     n = sum(len(found) for found in pairs.values())
@@ -190,3 +198,18 @@ def _about_size(data: RunData) -> str:
         )
     sizes = ", ".join(f"{name}: {len(found)}" for name, found in pairs.items())
     return f"n = {n} session pairs ({sizes}; {named}); values are means over the pairs where they are defined."
+
+
+def _repeated(data: RunData) -> dict[str, str]:
+    return references(str(row["scenario"]) for row in data.results)
+
+
+def _about_repeated(data: RunData) -> list[str]:
+    repeated = _repeated(data)
+    if not repeated:
+        return []
+    names = joined(list(dict.fromkeys(repeated.values())))
+    return [
+        f"{len(repeated)} further worlds repeat {names} with something set otherwise; what that does stands under "
+        "its own heading."
+    ]

@@ -2,15 +2,17 @@
 
 name: example
 description: what the plan is for
-scenarios: [paper/site1, paper/site2]
+scenarios:                           # eval/worlds.py tells more
+  - paper/site1
+  - {name: paper/site2, each: [sensor.range_noise=false, sensor.mode=512x10]}  # as it is, and again with each of these
 seeds: "20000:20002"                 # B excluded, in quotes; or a list
 variants:
   - preset: paper                    # a shipped preset or the path of a .yaml file
     set: ["extract.voxel_m=0.4"]     # part of the variant's name
-    per_scenario: {paper/site2: ["query.radius_m=10"]}   # belongs to the site, not to the name
+    per_scenario: {paper/site2: ["query.radius_m=10"]}   # belongs to the site, whatever is set there; not to the name
 grid:
   - variant: tunnelcd                # a preset
-    scenarios: [paper/site1]         # out of the plan's
+    scenarios: [paper/site1]         # out of the plan's; one world of several as paper/site2[sensor.mode=512x10]
     keys: {extract.voxel_m: [0.2, 0.4], query.radius_m: [3, 4.5]}
 """
 
@@ -18,7 +20,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -31,7 +33,10 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from cdpipe.config import PipelineConfig, load_config, preset_names
 from cdpipe.errors import InputError
 from cdpipe.yamlfile import Document, Settings, read_yaml, suggestion, validated, with_settings
-from scenarios.library import check_scenario, scenario_names
+from eval.worlds import ScenarioItem, World, group_of, known_label, told_as_values, world_slug, worlds_of
+from scenarios.schema import Scenario
+
+_LONGEST_SLUG = 200  # file systems take names of 255 bytes
 
 
 def parse_seeds(value: Any) -> tuple[int, ...]:
@@ -63,25 +68,21 @@ def setting_text(key: str, value: Any) -> str:
     return f"{key}={text.removesuffix('...' + chr(10)).strip()}"
 
 
-def _known_scenario(name: str) -> str:
-    names = scenario_names()
-    if name.endswith((".yaml", ".yml")):
-        _checked(lambda: check_scenario(name))
-    elif name not in names:
-        raise ValueError(f"unknown scenario{suggestion(name, names)} (known: {', '.join(names)})")
-    return name
-
-
 def _known_preset(name: str) -> str:
     if name.endswith((".yaml", ".yml")):
-        _checked(lambda: load_config(name))
+        told_as_values(lambda: load_config(name))
     elif name not in preset_names():
         raise ValueError(f"unknown preset{suggestion(name, preset_names())} (known: {', '.join(preset_names())})")
     return name
 
 
 def _valid_setting(setting: str) -> str:
-    _checked(lambda: validated(PipelineConfig, with_settings(Document("", {}), [setting])))
+    if group_of(setting) in Scenario.model_fields:
+        raise ValueError(
+            "belongs to the world, not to the method: set it in the plan, under scenarios, "
+            f'e.g. {{name: narrow, set: ["{setting}"]}}'
+        )
+    told_as_values(lambda: validated(PipelineConfig, with_settings(Document("", {}), [setting])))
     return setting
 
 
@@ -99,15 +100,7 @@ def _not_empty(value: Any) -> Any:
     return value
 
 
-def _checked(check: Callable[[], object]) -> None:
-    """Run a check of ours inside pydantic, which collects ValueErrors only."""
-    try:
-        check()
-    except InputError as error:
-        raise ValueError("; ".join(line.removeprefix(": ") for line in str(error).splitlines())) from error
-
-
-ScenarioName = Annotated[str, AfterValidator(_known_scenario)]
+Label = Annotated[str, AfterValidator(known_label)]
 PresetName = Annotated[str, AfterValidator(_known_preset)]
 Setting = Annotated[str, AfterValidator(_valid_setting)]
 NotEmpty = BeforeValidator(_not_empty)
@@ -119,14 +112,14 @@ class Variant(Settings):
 
     preset: PresetName
     set: tuple[Setting, ...] = ()
-    per_scenario: dict[ScenarioName, tuple[Setting, ...]] = Field(default_factory=dict)
+    per_scenario: dict[Label, tuple[Setting, ...]] = Field(default_factory=dict)
 
 
 class Grid(Settings):
     """Every combination of some values of some settings, over one preset."""
 
     variant: PresetName
-    scenarios: Annotated[tuple[ScenarioName, ...], NotEmpty]
+    scenarios: Annotated[tuple[Label, ...], NotEmpty]
     keys: Annotated[dict[str, Values], NotEmpty, AfterValidator(_valid_keys)]
 
 
@@ -135,28 +128,26 @@ class Plan(Settings):
 
     name: Annotated[str, Field(min_length=1)]
     description: str = ""
-    scenarios: Annotated[tuple[ScenarioName, ...], NotEmpty]
+    scenarios: Annotated[tuple[ScenarioItem, ...], NotEmpty]
     seeds: Annotated[tuple[int, ...], BeforeValidator(parse_seeds)]
     variants: Annotated[tuple[Variant, ...], NotEmpty]
     grid: tuple[Grid, ...] = ()
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Plan:
-        if len(set(self.scenarios)) < len(self.scenarios):
-            raise ValueError("a scenario is listed twice")
-        for variant in self.variants:
-            for name in variant.per_scenario:
-                if name not in self.scenarios:
-                    raise ValueError(f"per_scenario of {variant.preset} names {name!r}, which is not in scenarios")
-        for grid in self.grid:
-            for name in grid.scenarios:
-                if name not in self.scenarios:
-                    raise ValueError(f"the grid of {grid.variant} names {name!r}, which is not in scenarios")
-        for scenario in self.scenarios:
-            slugs = [slug(variant_name(preset, named)) for preset, named, _ in _methods(self, scenario)]
-            for each in slugs:
-                if slugs.count(each) > 1:
-                    raise ValueError(f"variant {each} stands twice in the plan for {scenario}")
+        worlds = worlds_of(self.scenarios)
+        _fit_folders([world_slug(world.label) for world in worlds], "scenario {} is listed twice")
+        names = dict.fromkeys(name for world in worlds for name in (world.name, world.label))
+        asked = [
+            (f"per_scenario of {variant.preset}", name) for variant in self.variants for name in variant.per_scenario
+        ]
+        asked += [(f"the grid of {grid.variant}", name) for grid in self.grid for name in grid.scenarios]
+        for who, name in asked:
+            if name not in names:
+                raise ValueError(f"{who} names {name!r}, which is not in scenarios{suggestion(name, names)}")
+        for world in worlds:
+            slugs = [slug(variant_name(preset, named)) for preset, named, _ in _methods(self, world)]
+            _fit_folders(slugs, "variant {} stands twice in the plan for " + world.label)
         return self
 
 
@@ -165,7 +156,7 @@ class Cell:
     """One scenario, one seed, one variant: one row of results.csv.
 
     Attributes:
-        scenario: Scenario name.
+        scenario: Label of its world: the scenario's name, and what is set over it in brackets.
         seed: Its seed.
         preset: Name of the preset.
         variant: Preset and the settings that name the variant.
@@ -250,13 +241,15 @@ def cells(plan: Plan) -> list[Cell]:
         InputError: The settings of a variant contradict each other or its preset.
     """
     found: list[Cell] = []
-    for scenario in plan.scenarios:
+    for world in worlds_of(plan.scenarios):
         methods = [
             (preset, variant_name(preset, named), load_config(preset, [*named, *silent]))
-            for preset, named, silent in _methods(plan, scenario)
+            for preset, named, silent in _methods(plan, world)
         ]
         found += [
-            Cell(scenario, seed, _stem(preset), name, config) for seed in plan.seeds for preset, name, config in methods
+            Cell(world.label, seed, _stem(preset), name, config)
+            for seed in plan.seeds
+            for preset, name, config in methods
         ]
     return found
 
@@ -272,18 +265,25 @@ def slug(variant: str) -> str:
     return re.sub(r"[^A-Za-z0-9._=,-]", "_", variant)
 
 
-def scenario_slug(scenario: str) -> str:
-    """Return a scenario's name as a folder name."""
-    return re.sub(r"[^A-Za-z0-9._=,-]", "_", scenario.replace("/", "__"))
-
-
-def _methods(plan: Plan, scenario: str) -> list[tuple[str, tuple[str, ...], tuple[str, ...]]]:
+def _methods(plan: Plan, world: World) -> list[tuple[str, tuple[str, ...], tuple[str, ...]]]:
     """(preset, settings that make the name, settings that the site asks for) of every variant and grid point."""
-    methods = [(v.preset, v.set, v.per_scenario.get(scenario, ())) for v in plan.variants]
+    places = dict.fromkeys((world.name, world.label))
+    methods = [
+        (v.preset, v.set, tuple(setting for place in places for setting in v.per_scenario.get(place, ())))
+        for v in plan.variants
+    ]
     for grid in plan.grid:
-        if scenario in grid.scenarios:
+        if not places.keys().isdisjoint(grid.scenarios):
             methods += [(grid.variant, point, ()) for point in _points(grid.keys)]
     return methods
+
+
+def _fit_folders(slugs: Sequence[str], twice: str) -> None:
+    for each in slugs:
+        if slugs.count(each) > 1:
+            raise ValueError(twice.replace("{}", each, 1))
+        if len(each) > _LONGEST_SLUG:
+            raise ValueError(f"{each} is too long for a folder's name: put the settings into a file of their own")
 
 
 def _points(keys: Mapping[str, Sequence[Any]]) -> list[tuple[str, ...]]:

@@ -63,7 +63,7 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
             stored = run.read_cell(path)
             score = score_stored(truth, folder)
             if stored is None:
-                names = {"scenario": slug.replace("__", "/"), "seed": int(seed)}
+                names = {"scenario": _scenario_of(run, slug), "seed": int(seed)}
                 identity = {**names, "variant": folder.name, "preset": folder.name, "commit": None}
                 document = cell_document(score, identity, "", (len(folders), len(folders)))
             else:
@@ -75,3 +75,11 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
     progress.cells("done", len(documents), len(documents))
     write_tables(run)
     return len(documents)
+
+
+def _scenario_of(run: RunFolder, slug: str) -> str:
+    """Return what the run's own cells call the world of a folder; the name of the folder where there are none."""
+    for path in sorted((run.path / "cells" / slug).glob("*/*.json")):
+        if (stored := run.read_cell(path)) is not None:
+            return str(stored["row"]["scenario"])
+    return slug.replace("__", "/")

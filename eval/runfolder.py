@@ -1,11 +1,12 @@
 """A run's folder: where everything lies, what is finished, and the tables that are put together from its cells.
 
-provenance.json                                  marks a run folder; written first
-pairs/<scenario>/<seed>/{before,after,truth}     simulated pairs
-answers/<scenario>/<seed>/<variant>/             raw answers (cdpipe.answer)
-maps/<scenario>/<seed>.npz                       thinned maps for pictures
-cells/<scenario>/<seed>/<variant>.json           a finished cell: key, order, row, items
+provenance.json                               marks a run folder; written first
+pairs/<world>/<seed>/{before,after,truth}     simulated pairs; a world is a scenario, with what is set over it
+answers/<world>/<seed>/<variant>/             raw answers (cdpipe.answer)
+maps/<world>/<seed>.npz                       thinned maps for pictures
+cells/<world>/<seed>/<variant>.json           a finished cell: key, order, row, items
 results.csv changes.csv regions.csv objects.csv keyframes.csv summary.csv
+effects.csv                                   where a world was run with and without a setting (eval.effects)
 """
 
 from __future__ import annotations
@@ -21,10 +22,12 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.errors import InputError
+from eval.effects import effects
 from eval.output import make_writable
-from eval.plan import scenario_slug, slug
+from eval.plan import slug
 from eval.provenance import TOOL
 from eval.statistics import summarise
+from eval.worlds import world_slug
 
 IDENTITY = ("scenario", "seed", "variant")
 ITEM_TABLES = ("changes", "regions", "objects", "keyframes")
@@ -40,19 +43,19 @@ class RunFolder:
 
     def pair(self, scenario: str, seed: int) -> Path:
         """Folder of a simulated pair."""
-        return self.path / "pairs" / scenario_slug(scenario) / str(seed)
+        return self.path / "pairs" / world_slug(scenario) / str(seed)
 
     def answer(self, scenario: str, seed: int, variant: str) -> Path:
         """Folder of a raw answer."""
-        return self.path / "answers" / scenario_slug(scenario) / str(seed) / slug(variant)
+        return self.path / "answers" / world_slug(scenario) / str(seed) / slug(variant)
 
     def cell(self, scenario: str, seed: int, variant: str) -> Path:
         """File of a finished cell."""
-        return self.path / "cells" / scenario_slug(scenario) / str(seed) / f"{slug(variant)}.json"
+        return self.path / "cells" / world_slug(scenario) / str(seed) / f"{slug(variant)}.json"
 
     def maps(self, scenario: str, seed: int) -> Path:
         """File of the thinned maps of a pair."""
-        return self.path / "maps" / scenario_slug(scenario) / f"{seed}.npz"
+        return self.path / "maps" / world_slug(scenario) / f"{seed}.npz"
 
     def answer_folders(self) -> Iterator[Path]:
         """Yield the folder of every stored answer, sorted."""
@@ -122,7 +125,10 @@ def open_run_folder(path: Path) -> RunFolder:
 
 
 def write_tables(run: RunFolder) -> pd.DataFrame:
-    """Put results.csv, the item tables and summary.csv together from the finished cells, and return the results.
+    """Put results.csv, the item tables, summary.csv and effects.csv together from the finished cells.
+
+    Returns:
+        The rows of results.csv.
 
     Raises:
         InputError: No cell is finished.
@@ -138,6 +144,9 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     for table, frame in items.items():
         _write_csv(run.path / f"{table}.csv", frame)
     _write_csv(run.path / "summary.csv", summarise(results, keyframes=items["keyframes"]))
+    found = effects(results)
+    if len(found):
+        _write_csv(run.path / "effects.csv", found)
     return results
 
 

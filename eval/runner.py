@@ -1,13 +1,13 @@
 """Runs a plan, one cell after the other; finished cells are kept, and a run that was cut off goes on where it stopped.
 
-A cell is finished when its file holds the digest of what it depends on: the scenario as drawn, the effective settings,
-the weights, and the version of the metrics. A merge that is refused and any other error of the input are rows of their
-own; a bug is not caught.
+A cell is finished when its file holds the digest of what it depends on: the scenario as drawn, the files it names, the
+effective settings, the weights, and the version of the metrics. A merge that is refused and any other error of the
+input are rows of their own; a bug is not caught.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -28,7 +28,9 @@ from eval.rescoring import cell_document, score_stored
 from eval.runfolder import RunFolder, remove, write_tables
 from eval.scoring import METRICS_VERSION, CaseScore
 from eval.stages import PairStages
+from eval.worlds import worlds_of
 from scenarios.library import load_scenario
+from scenarios.references import file_digests
 from scenarios.schema import Scenario
 from sim.simulate import simulate_pair
 from sim.truth import read_pair_truth
@@ -54,11 +56,23 @@ class _Todo:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pair:
-    """One scenario and seed: the scenario as drawn, or why it cannot be drawn, and the cells still to be done."""
+    """One world and seed, and the cells still to be done.
+
+    Attributes:
+        name: Label of the world.
+        family: Its scenario's.
+        seed: The seed.
+        scenario: The scenario as drawn, None where it cannot be drawn.
+        files: Digests of the files that the scenario names.
+        error: Why it cannot be drawn.
+        todo: Its cells.
+    """
 
     name: str
+    family: str
     seed: int
     scenario: Scenario | None
+    files: Mapping[str, str]
     error: str
     todo: tuple[_Todo, ...]
 
@@ -107,21 +121,22 @@ def run_plan(
 
 def _pairs(run: RunFolder, plan: Plan, all_cells: Sequence[Cell], force: bool) -> list[_Pair]:
     variants = list(dict.fromkeys(cell.variant for cell in all_cells))
+    places = {world.label: (place, world) for place, world in enumerate(worlds_of(plan.scenarios))}
     pairs = []
-    for (name, seed), group in groupby(all_cells, key=lambda cell: (cell.scenario, cell.seed)):
-        scenario, error = None, ""
+    for (label, seed), group in groupby(all_cells, key=lambda cell: (cell.scenario, cell.seed)):
+        place, world = places[label]
+        scenario, files, error = None, {}, ""
         try:
-            scenario = load_scenario(name, seed)
+            scenario = load_scenario(world.name, seed, world.settings)
+            files = file_digests(scenario)
         except ScenarioError as mistake:
             error = str(mistake)
-        every = [
-            _Todo(cell, _key(cell, scenario), (plan.scenarios.index(name), variants.index(cell.variant)))
-            for cell in group
-        ]
+        every = [_Todo(cell, _key(cell, scenario, files), (place, variants.index(cell.variant))) for cell in group]
         todo = [each for each in every if force or not _is_finished(run, each.cell, each.key)]
         # cells that share a map setting come one after the other, because only one setting's maps are held
         todo.sort(key=lambda each: each.cell.config.map.model_dump_json())
-        pairs.append(_Pair(name, seed, scenario, error, tuple(todo)))
+        family = world.name if scenario is None else scenario.family
+        pairs.append(_Pair(label, family, seed, scenario, files, error, tuple(todo)))
         _remove_stale(run, pairs[-1], force)
     return pairs
 
@@ -135,7 +150,7 @@ def _remove_stale(run: RunFolder, pair: _Pair, force: bool) -> None:
     """Remove what is about to be redone, so that no table can hold it should the run be cut off."""
     if not pair.todo:
         return
-    if force or not _is_simulated(run.pair(pair.name, pair.seed), pair.scenario, pair.seed):
+    if force or not _is_simulated(run.pair(pair.name, pair.seed), pair):
         remove(run.pair(pair.name, pair.seed))
         remove(run.maps(pair.name, pair.seed))
     for each in pair.todo:
@@ -143,15 +158,16 @@ def _remove_stale(run: RunFolder, pair: _Pair, force: bool) -> None:
         remove(run.answer(pair.name, pair.seed, each.cell.variant))
 
 
-def _is_simulated(path: Path, scenario: Scenario | None, seed: int) -> bool:
-    """Tell whether a pair is there, whole, and of this very scenario."""
-    if scenario is None:
+def _is_simulated(path: Path, pair: _Pair) -> bool:
+    """Tell whether a pair is there, whole, of this very scenario, and made from the files as they are now."""
+    if pair.scenario is None:
         return False
     try:
         truth = read_pair_truth(path)
     except InputError:
         return False
-    return truth.seed == seed and digest(truth.scenario) == digest(scenario.model_dump(mode="json"))
+    is_same = digest(truth.scenario) == digest(pair.scenario.model_dump(mode="json"))
+    return is_same and truth.seed == pair.seed and truth.files == pair.files
 
 
 def _run_pair(
@@ -235,15 +251,16 @@ def _answer(stages: PairStages, cell: Cell, folder: Path) -> None:
 
 def _unmade(pair: _Pair, error: str) -> CaseScore:
     """Score a case whose world cannot be made: there is no truth, so all but the identity is undefined."""
-    row = {"scenario": "", "family": pair.name, "seed": pair.seed, "variant": "", "preset": ""}
+    row = {"scenario": "", "family": pair.family, "seed": pair.seed, "variant": "", "preset": ""}
     outcome = {"status": "failed", "error": error, "metrics_version": METRICS_VERSION}
     return CaseScore(row={**row, **outcome}, changes=[], regions=[], objects=[])
 
 
-def _key(cell: Cell, scenario: Scenario | None) -> str:
+def _key(cell: Cell, scenario: Scenario | None, files: Mapping[str, str]) -> str:
     return digest(
         {
             "scenario": None if scenario is None else scenario.model_dump(mode="json"),
+            "files": dict(files),
             "seed": cell.seed,
             "config": cell.config.model_dump(mode="json"),
             "checkpoint": checkpoint_digest(cell.config.descriptor),

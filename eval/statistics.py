@@ -11,7 +11,7 @@ from cdpipe.geometry import Float64Array, stream
 from eval.ranking import auroc, average_precision
 
 N_RESAMPLES = 2000
-_IDENTITY = (
+IDENTITY_COLUMNS = (
     "scenario",
     "family",
     "seed",
@@ -45,7 +45,7 @@ def summarise(
         bootstrap interval `low` to `high`, `value_ok` over cases whose status is ok, `n` cases, `n_failed` of them not
         ok, and how many had a number: `n_used`, `n_used_ok`. An undefined number (NaN) counts in neither.
     """
-    metrics = [name for name in results.columns if name not in _IDENTITY]
+    metrics = [name for name in results.columns if name not in IDENTITY_COLUMNS]
     rows: list[dict[str, Any]] = []
     for (group, variant), cases in results.groupby([by, "variant"], sort=False):
         is_ok = (cases["status"] == "ok").to_numpy()
@@ -96,12 +96,18 @@ def paired_difference(
     """
     table = results.pivot_table(index=["scenario", "seed"], columns="variant", values=metric, dropna=False)
     if variant not in table or rival not in table:
-        return float("nan"), float("nan"), float("nan"), 0
-    differences = (table[variant] - table[rival]).dropna().to_numpy(dtype=np.float64)
-    if len(differences) == 0:
-        return float("nan"), float("nan"), float("nan"), 0
-    low, high = bootstrap_interval(differences, seed=seed)
-    return float(differences.mean()), low, high, len(differences)
+        return mean_with_interval(np.empty(0), seed)
+    return mean_with_interval((table[variant] - table[rival]).to_numpy(dtype=np.float64), seed)
+
+
+def mean_with_interval(values: Float64Array, seed: int = 0) -> tuple[float, float, float, int]:
+    """Return mean, low and high of its 95 % bootstrap interval, and how many of (N,) numbers are not NaN.
+
+    Without a number all are NaN, and for a single one the interval is.
+    """
+    values = values[~np.isnan(values)]
+    low, high = bootstrap_interval(values, seed=seed)
+    return _of_numbers(values, "mean"), low, high, len(values)
 
 
 def _summary(

@@ -35,7 +35,7 @@ class Universe:
         returns: (N,) int64 scan * n_pixels + pixel of each, rising.
         points_odom: (N, 3) float32 deskewed points, the session's odom frame, metres.
         change: (N,) int16 id of the change each belongs to, 0 for none.
-        instance: (N,) int16 what each hit: 0 walls and floor, n the n-th prop.
+        instance: (N,) int16 what each hit: 0 walls and floor, n the n-th prop, -2 nothing (a false return).
         n_scans: Revolutions of the session.
         n_pixels: Pixels of a revolution.
     """

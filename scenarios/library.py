@@ -47,14 +47,18 @@ def load_scenario(name_or_path: str, seed: int, settings: Iterable[str] = ()) ->
     return _checked(scenario, mistakes)
 
 
-def check_scenario(name_or_path: str) -> Scenario:
+def check_scenario(name_or_path: str, settings: Iterable[str] = ()) -> Scenario:
     """Check a scenario for several seeds without simulating it, and return it as seed 0 draws it.
+
+    Args:
+        name_or_path: A name of `scenario_names()`, or a YAML file.
+        settings: `a.b=value` pairs written over the file before anything is drawn.
 
     Raises:
         ScenarioError: The name is unknown, or the file has mistakes, told once each whatever the seed.
-        InputError: The file cannot be read.
+        InputError: The file cannot be read, or a setting has no valid form.
     """
-    document = _document(name_or_path, ())
+    document = _document(name_or_path, settings)
     first, mistakes = _scenario(document, CHECKED_SEEDS[0])
     for seed in CHECKED_SEEDS[1:]:
         told = {_key_of(line) for line in mistakes}

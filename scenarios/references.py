@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterator
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+from cdpipe.errors import InputError
+from cdpipe.ouster import load_profile
 from cdpipe.yamlfile import Key, suggestion
 from scenarios.schema import Furniture, Scenario, SessionPlan, Tunnel
 
@@ -50,7 +54,25 @@ def file_keys(tree: Any) -> list[tuple[Key, str]]:
     ]
     files = [((*key, "path"), name) for key, name in places]
     files += [((session, "trajectory"), _mapping(tree, session).get("trajectory")) for session in ("before", "after")]
+    profile = _mapping(tree, "sensor").get("profile")
+    files += [(("sensor", "profile"), profile)] if str(profile).endswith(".json") else []  # else a shipped one's name
     return [(key, name) for key, name in files if isinstance(name, str)]
+
+
+def file_digests(scenario: Scenario) -> dict[str, str]:
+    """Return the SHA-256 of every file that a drawn scenario names, by its path as seen from the working folder.
+
+    Raises:
+        InputError: One of them cannot be read.
+    """
+    found: dict[str, str] = {}
+    for _, name in file_keys(scenario.model_dump(mode="json")):
+        try:
+            with Path(name).open("rb") as file:
+                found[name] = hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as error:
+            raise InputError(f"{name}: cannot be read: {error.strerror}") from error
+    return found
 
 
 def route_length_m(tunnel: Tunnel, plan: SessionPlan) -> float:
@@ -61,7 +83,13 @@ def route_length_m(tunnel: Tunnel, plan: SessionPlan) -> float:
 
 def contradictions(scenario: Scenario) -> list[Mistake]:
     """Return what cannot be built or driven in a scenario whose references hold, as (key path, rule)."""
-    return [*_foreign_mistakes(scenario), *_undrawable(scenario), *_start_mistakes(scenario), *_room_mistakes(scenario)]
+    return [
+        *_foreign_mistakes(scenario),
+        *_undrawable(scenario),
+        *_start_mistakes(scenario),
+        *_room_mistakes(scenario),
+        *_sensor_mistakes(scenario),
+    ]
 
 
 def _start_mistakes(scenario: Scenario) -> Iterator[Mistake]:
@@ -89,6 +117,19 @@ def _room_mistakes(scenario: Scenario) -> Iterator[Mistake]:
         if flown_m >= roof_m and plan.trajectory is None:
             key: Key = (name, "height_m") if is_own else ("platform", "sensor_height_m")
             yield key, f"the sensor would be above the roof of a drift {roof_m:.1f} m high"
+
+
+def _sensor_mistakes(scenario: Scenario) -> Iterator[Mistake]:
+    sensor = scenario.sensor
+    if sensor.profile.endswith(".json") and not Path(sensor.profile).is_file():
+        return  # told as a missing file
+    key: Key = ("sensor", "profile")
+    try:
+        load_profile(sensor.profile)
+        key = ("sensor", "mode")
+        load_profile(sensor.profile, sensor.mode)
+    except InputError as error:
+        yield key, str(error)
 
 
 def _foreign_mistakes(scenario: Scenario) -> Iterator[Mistake]:

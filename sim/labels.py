@@ -11,10 +11,10 @@ from scipy.spatial import ConvexHull, cKDTree
 from cdpipe.geometry import BoolArray, Float32Array, Float64Array, Int64Array
 from scenarios.schema import Scenario
 from sim.contact import standing_surface
-from sim.lidar import Rays
-from sim.mesh import Mesh, is_near_surface, joined, near_part, split
+from sim.mesh import Mesh, NearSurface, joined, near_part, split
 from sim.placing import Standing
 from sim.raycast import Caster
+from sim.rays import Rays
 from sim.scene import Scene, World
 from sim.truth import Change
 
@@ -26,6 +26,7 @@ GHOST_REACH_M = 50.0
 UNMOVED_M = 1e-3
 _SAME_SURFACE_M = 0.02  # of the two surfaces of a reshaped prop: what is nearer to the other one has not changed
 _SAMPLE_M = 0.03
+_SLACK_M = 0.01  # by which the ball round a ghost is grown, so that rounding loses no ray
 
 
 class Ghost:
@@ -44,17 +45,35 @@ class Ghost:
             rays: A revolution's rays, world frame.
             ranges_m: (W, H) distance from the ray's origin to what it hit, 0 where nothing was recorded.
         """
-        if np.linalg.norm(rays.origins[0, 0] - self._centre) > GHOST_REACH_M:
+        if np.linalg.norm(rays.origins[0] - self._centre) > GHOST_REACH_M:
             return 0
-        delta = self._centre - rays.origins
-        along = np.einsum("ijk,ijk->ij", delta, rays.directions)
-        off_axis = np.einsum("ijk,ijk->ij", delta, delta) - along**2
-        near = (off_axis <= self._radius_m**2) & (along > -self._radius_m) & (ranges_m > 0)
-        if not near.any():
+        column, row = self._near(rays, ranges_m)
+        if not len(column):
             return 0
-        ghost_m, _, _ = self._caster.cast(rays.origins[near], rays.directions[near])
+        ghost_m, _, _ = self._caster.cast(rays.origins[column], rays.directions[column, row])
         # A millimetre: a ray that ends on the very same surface counts.
-        return int((ghost_m <= ranges_m[near] + 1e-3).sum())
+        return int((ghost_m <= ranges_m[column, row] + 1e-3).sum())
+
+    def _near(self, rays: Rays, ranges_m: Float32Array) -> tuple[Int64Array, Int64Array]:
+        """Columns and rows of the rays that can meet the ball round the object, and of some others.
+
+        A ray that starts within `spread` of the middle column's origin and meets the ball has the direction of a ray
+        that starts at that origin and meets the ball grown by `spread`.
+        """
+        middle = rays.origins[len(rays.origins) // 2]
+        spread_m = float(np.sqrt(((rays.origins - middle) ** 2).sum(axis=1).max()))
+        radius_m = self._radius_m + spread_m + _SLACK_M
+        towards = self._centre - middle
+        distance_m = float(np.linalg.norm(towards))
+        width, height, _ = rays.directions.shape
+        near = np.arange(width * height)
+        if distance_m > radius_m:
+            # How the product is summed is of no matter: the slack covers it, and what is too much is cast in vain.
+            along = rays.directions.reshape(-1, 3) @ (towards / distance_m).astype(np.float32)
+            near = np.flatnonzero(along > np.sqrt(1.0 - (radius_m / distance_m) ** 2) - 1e-6)
+        column, row = np.divmod(near, height)
+        is_within = ranges_m[column, row] > max(0.0, distance_m - radius_m)
+        return column[is_within], row[is_within]
 
 
 @dataclass(slots=True, eq=False)
@@ -74,7 +93,7 @@ class Tally:
 
     change: Change
     ghost: Ghost
-    other_surface: Mesh | None
+    other_surface: NearSurface | None
     n_returns: int = 0
     cells: set[int] = field(default_factory=set)
     n_ghost_rays: int = 0
@@ -127,23 +146,17 @@ def list_changes(scenario: Scenario, world: World) -> list[Tally]:
     return tallies
 
 
-def claim_returns(tally: Tally, points_world: Float64Array, points_odom: Float64Array) -> BoolArray:
-    """Add returns on a changed prop to its tally.
+def belonging(tally: Tally, points_world: Float64Array) -> BoolArray:
+    """Tell which returns on a changed prop, by their true places (N, 3), belong to its change."""
+    if tally.other_surface is None:
+        return np.ones(len(points_world), dtype=bool)
+    return ~tally.other_surface.marks(points_world)
 
-    Args:
-        tally: The change; its counts grow.
-        points_world: (N, 3) true places of the returns.
-        points_odom: (N, 3) the same returns as the session measured them, in its odom frame.
 
-    Returns:
-        (N,) which of them belong to the change.
-    """
-    belongs = np.ones(len(points_world), dtype=bool)
-    if tally.other_surface is not None:
-        belongs = ~is_near_surface(points_world, tally.other_surface, NEAR_OLD_SURFACE_M)
-    tally.n_returns += int(belongs.sum())
-    tally.cells.update(cell_keys(points_odom[belongs]).tolist())
-    return belongs
+def claim_returns(tally: Tally, points_odom: Float64Array) -> None:
+    """Add returns (N, 3) that belong to a change, as the session measured them in its odom frame, to its tally."""
+    tally.n_returns += len(points_odom)
+    tally.cells.update(cell_keys(points_odom).tolist())
 
 
 def cell_keys(points: Float64Array) -> Int64Array:
@@ -246,10 +259,10 @@ def _surface_in(scene: Scene, instance: int) -> Mesh:
     return joined([mesh for mesh, owner in zip(scene.meshes, scene.instance, strict=True) if owner == instance])
 
 
-def _near(scene: Scene, surface: Mesh) -> Mesh:
+def _near(scene: Scene, surface: Mesh) -> NearSurface:
     """Return what of a scene lies near a surface."""
     parts = (near_part(mesh, surface, 2 * NEAR_OLD_SURFACE_M) for mesh in scene.meshes)
-    return joined([compacted(part) for part in parts if len(part.faces)])
+    return NearSurface(joined([compacted(part) for part in parts if len(part.faces)]), NEAR_OLD_SURFACE_M)
 
 
 def compacted(mesh: Mesh) -> Mesh:

@@ -54,35 +54,40 @@ def cylinder_mesh(radius_m: float, half_height_m: float, segments: int) -> Mesh:
 def near_part(mesh: Mesh, target: Mesh, within_m: float) -> Mesh:
     """Return the triangles of a mesh whose bounding box comes within `within_m` of the bounding box of another."""
     low, high = target.vertices.min(axis=0) - within_m, target.vertices.max(axis=0) + within_m
-    return Mesh(mesh.vertices, mesh.faces[_touches_box(mesh.vertices[mesh.faces], low, high)])
+    # By corner, not by triangle: a screen has millions of them.
+    is_below, is_above = mesh.vertices < low, mesh.vertices > high
+    is_beside = is_below[mesh.faces].all(axis=1) | is_above[mesh.faces].all(axis=1)
+    return Mesh(mesh.vertices, mesh.faces[~is_beside.any(axis=1)])
 
 
-def is_near_surface(points: Float64Array, mesh: Mesh, within_m: float) -> BoolArray:
-    """Mark the points (N, 3) whose exact distance to the surface is at most `within_m`."""
-    is_near = np.zeros(len(points), dtype=bool)
-    if len(points) == 0:
+class NearSurface:
+    """Tells which points lie near a surface; made once, asked for every revolution, by any thread."""
+
+    def __init__(self, mesh: Mesh, within_m: float) -> None:
+        # Small pieces have small bounding spheres, so that few candidates stand for each point.
+        self._triangles = split(mesh.vertices[mesh.faces], within_m)
+        self._within_m = within_m
+        centres = self._triangles.mean(axis=1)
+        spread_m = np.linalg.norm(self._triangles - centres[:, None], axis=2).max(initial=0.0)
+        self._reach_m = within_m + float(spread_m)
+        self._tree = cKDTree(centres)
+
+    def marks(self, points: Float64Array) -> BoolArray:
+        """Mark the points (N, 3) whose exact distance to the surface is at most `within_m`."""
+        is_near = np.zeros(len(points), dtype=bool)
+        if len(points) == 0 or len(self._triangles) == 0:
+            return is_near
+        nearest_m, _ = self._tree.query(points, distance_upper_bound=self._reach_m)
+        is_near |= nearest_m <= self._within_m  # a centre lies on the surface
+        unsure = np.flatnonzero(~is_near & np.isfinite(nearest_m))
+        for rows in np.split(unsure, range(4096, len(unsure), 4096)):
+            near = np.asarray(self._tree.query_ball_point(points[rows], self._reach_m), dtype=object)
+            counts = np.fromiter((len(found) for found in near), np.int64, len(rows))
+            owner = np.repeat(rows, counts)
+            candidate = np.fromiter((index for found in near for index in found), np.int64, counts.sum())
+            distance_m = point_triangle_distance(points[owner], self._triangles[candidate])
+            is_near[owner[distance_m <= self._within_m]] = True
         return is_near
-    margin_m = within_m + 1e-6
-    triangles = mesh.vertices[mesh.faces]
-    triangles = triangles[_touches_box(triangles, points.min(axis=0) - margin_m, points.max(axis=0) + margin_m)]
-    # Small pieces have small bounding spheres, so that few candidates stand for each point.
-    triangles = split(triangles, within_m)
-    if len(triangles) == 0:
-        return is_near
-    centres = triangles.mean(axis=1)
-    reach_m = within_m + float(np.linalg.norm(triangles - centres[:, None], axis=2).max())
-    tree = cKDTree(centres)
-    nearest_m, _ = tree.query(points, distance_upper_bound=reach_m)
-    is_near |= nearest_m <= within_m  # a centre lies on the surface
-    unsure = np.flatnonzero(~is_near & np.isfinite(nearest_m))
-    for rows in np.split(unsure, range(4096, len(unsure), 4096)):
-        near = np.asarray(tree.query_ball_point(points[rows], reach_m), dtype=object)
-        counts = np.fromiter((len(found) for found in near), np.int64, len(rows))
-        owner = np.repeat(rows, counts)
-        candidate = np.fromiter((index for found in near for index in found), np.int64, counts.sum())
-        distance_m = point_triangle_distance(points[owner], triangles[candidate])
-        is_near[owner[distance_m <= within_m]] = True
-    return is_near
 
 
 def point_triangle_distance(points: Float64Array, triangles: Float64Array) -> Float64Array:
@@ -92,10 +97,6 @@ def point_triangle_distance(points: Float64Array, triangles: Float64Array) -> Fl
 
 def _from_trimesh(solid: trimesh.Trimesh) -> Mesh:
     return Mesh(np.asarray(solid.vertices, dtype=np.float64), np.asarray(solid.faces, dtype=np.int32))
-
-
-def _touches_box(triangles: Float64Array, low: Float64Array, high: Float64Array) -> BoolArray:
-    return np.asarray(((triangles.max(axis=1) >= low) & (triangles.min(axis=1) <= high)).all(axis=1))
 
 
 def split(triangles: Float64Array, edge_m: float) -> Float64Array:

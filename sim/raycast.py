@@ -47,21 +47,60 @@ class Caster:
             (N,) float32 distance, metres, infinite where nothing is hit; (N,) int32 number of the mesh hit, or -1;
             (N,) float32 absolute cosine between ray and surface normal, 0 for a miss.
         """
-        ranges_m, ids, normals = self.hits(origins, directions)
-        return ranges_m, ids, np.abs((normals * directions).sum(axis=1)).astype(np.float32)
+        return self._first(self._local(origins), np.ascontiguousarray(directions, dtype=np.float32))
+
+    def cast_columns(
+        self, origins: Float64Array, directions: Float32Array
+    ) -> tuple[Float32Array, Int32Array, Float32Array]:
+        """Return what `cast` does for a revolution, each (W, H); the fast way.
+
+        Args:
+            origins: (W, 3) float64 point where all beams of a column start, world frame, metres.
+            directions: (W, H, 3) float32 unit vectors, contiguous.
+        """
+        width, height, _ = directions.shape
+        local = np.repeat(self._local(origins), height, axis=0)
+        ranges_m, ids, cosines = self._first(local, directions.reshape(-1, 3))
+        return ranges_m.reshape(width, height), ids.reshape(width, height), cosines.reshape(width, height)
 
     def hits(
         self, origins: Float64Array | Float32Array, directions: Float64Array | Float32Array
     ) -> tuple[Float32Array, Int32Array, Float32Array]:
         """Return distances and mesh numbers as `cast` does, and the (N, 3) unit normals (0 for a miss)."""
-        local = np.ascontiguousarray(origins - self._centre_m, dtype=np.float32)
-        answer = self._scene.run(local, np.ascontiguousarray(directions, dtype=np.float32), output=1)
+        answer = self._scene.run(self._local(origins), np.ascontiguousarray(directions, dtype=np.float32), output=1)
         ids = answer["geomID"]
         is_hit = ids >= 0
         normals = answer["Ng"]
         length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
         normals = np.where(is_hit[:, None], normals / np.maximum(length, 1e-30)[:, None], 0.0)
         return np.where(is_hit, answer["tfar"], np.float32(np.inf)), ids, normals.astype(np.float32)
+
+    def _local(self, origins: Float64Array | Float32Array) -> Float32Array:
+        return np.ascontiguousarray(origins - self._centre_m, dtype=np.float32)
+
+    def _first(self, origins: Float32Array, directions: Float32Array) -> tuple[Float32Array, Int32Array, Float32Array]:
+        """First hits of rays (N, 3) that start at local points; few passes over memory, for every pixel comes here."""
+        answer = self._scene.run(origins, directions, output=1)
+        ranges_m, ids, normals = answer["tfar"], answer["geomID"], answer["Ng"]
+        products = normals * directions
+        cosines = _row_sums(products)
+        np.abs(cosines, out=cosines)
+        np.multiply(normals, normals, out=products)
+        lengths = _row_sums(products)
+        np.sqrt(lengths, out=lengths)
+        np.maximum(lengths, np.float32(1e-30), out=lengths)  # a sliver's normal may have no length
+        cosines /= lengths
+        is_miss = ids < 0
+        cosines[is_miss] = 0.0
+        ranges_m[is_miss] = np.inf
+        return ranges_m, ids, cosines
+
+
+def _row_sums(rows: Float32Array) -> Float32Array:
+    """Sum over the three columns of (N, 3), in their order."""
+    sums = rows[:, 0] + rows[:, 1]
+    sums += rows[:, 2]
+    return sums
 
 
 def model_meshes(model: mujoco.MjModel, data: mujoco.MjData) -> list[Mesh]:
@@ -79,7 +118,8 @@ def _geom_mesh(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Mesh:
         mesh_id = model.geom_dataid[geom]
         vertices = slice(model.mesh_vertadr[mesh_id], model.mesh_vertadr[mesh_id] + model.mesh_vertnum[mesh_id])
         faces = slice(model.mesh_faceadr[mesh_id], model.mesh_faceadr[mesh_id] + model.mesh_facenum[mesh_id])
-        local = Mesh(model.mesh_vert[vertices].astype(np.float64), model.mesh_face[faces])
+        # A copy: a view of its faces would keep the whole model.
+        local = Mesh(model.mesh_vert[vertices].astype(np.float64), model.mesh_face[faces].copy())
     elif kind == mujoco.mjtGeom.mjGEOM_BOX:
         local = box_mesh(size)
     elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:

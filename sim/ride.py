@@ -7,10 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.errors import ScenarioError
 from cdpipe.geometry import Float64Array, stream
+from cdpipe.motion import Motion, motion_of
 from scenarios.schema import Platform, Scenario
 from sim.lanes import AIR_BELOW_M
 from sim.line import kept_between, smoothed
-from sim.motion import Motion, motion_of
 from sim.noise import smooth_noise
 from sim.path import Path
 from sim.placing import PROBE_UP_M, floor_heights

@@ -1,8 +1,13 @@
-"""The world as MuJoCo models: props dropped once and frozen, then one static model for each session."""
+"""The world as MuJoCo compiles it: props dropped once and frozen, then the surfaces of each session's static scene.
+
+A kilometre of drift under wire mesh has five million triangles, and MuJoCo needs 0.65 kB for each of them while it
+compiles and 0.2 kB afterwards. So what is fixed is compiled once for both sessions, mesh by mesh, and of every model
+only the surfaces are kept, in the order of the geoms of the one model that all of them would make.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -28,12 +33,10 @@ _STONE_FREE_M = 0.1  # round the footprint of every prop
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What stands in the tunnel in one session.
+    """What stands in the tunnel in one session. Geom 0 is the wall, then come the fixtures, then the props.
 
     Attributes:
-        model: Compiled MuJoCo model; geom 0 is the wall, then come the fixtures, then the props.
-        data: Its forward state.
-        meshes: Surface of every geom, world frame, by geom id.
+        meshes: Surface of every geom as MuJoCo has it, world frame, by geom id; both sessions share what is fixed.
         caster: Embree over the same geoms under the same ids.
         instance: (G,) prop number (1-based, order of the scenario) of each geom, 0 for the wall and what is fixed.
         reflectivity: (G,) share of light sent back.
@@ -41,8 +44,6 @@ class Scene:
         materials: What each geom is made of, keys of `sim.materials.REFLECTIVITY`.
     """
 
-    model: mujoco.MjModel
-    data: mujoco.MjData
     meshes: tuple[Mesh, ...]
     caster: Caster
     instance: Int32Array
@@ -74,7 +75,7 @@ class World:
 
 
 def build_world(scenario: Scenario, seed: int) -> World:
-    """Mesh the tunnel, furnish it, set the props down and compile both sessions' models.
+    """Mesh the tunnel, furnish it, set the props down and compile both sessions' scenes.
 
     Raises:
         ScenarioError: The tunnel cannot be meshed, or a prop does not fit, does not come to rest or falls away.
@@ -84,54 +85,49 @@ def build_world(scenario: Scenario, seed: int) -> World:
     wall = mesh_tunnel(tunnel, centreline, seed) if tunnel.mesh is None else tunnel_mesh(tunnel.mesh)
     walls = Caster([wall])
     furniture = furnish(tunnel, centreline, walls, seed)
+    # Compiling takes the most memory: it comes before the other casters are there.
+    rock = [compiled_alone(mesh) for mesh in (wall, *(fixture.mesh for fixture in furniture))]
     hung = Caster([wall, *(fixture.mesh for fixture in furniture)]) if furniture else walls
     gap_m = WALL_GAP_M + (tunnel.resolution_m if tunnel.mesh is None else 0.0)
     standing = place_props(scenario, centreline, Surroundings(walls, hung, gap_m), seed)
     outlines = [grown(standing_corners(item), _STONE_FREE_M) for item in standing]
     stones = strew_stones(tunnel, centreline, walls, outlines, seed)
-    fixtures = furniture if stones is None else (*furniture, stones)
-    fixed = hung if stones is None else Caster([wall, *(fixture.mesh for fixture in fixtures)])
-    scenes = [compile_scene(scenario, wall, standing, session, fixtures) for session in ("before", "after")]
+    if stones is None:
+        fixtures, fixed = furniture, hung
+    else:
+        fixtures = (*furniture, stones)
+        rock.append(compiled_alone(stones.mesh))
+        fixed = Caster([wall, *(fixture.mesh for fixture in fixtures)])
+    scenes = [compile_scene(scenario, rock, fixtures, standing, session) for session in ("before", "after")]
     return World(centreline, walls, fixed, fixtures, tuple(standing), scenes[0], scenes[1])
 
 
 def compile_scene(
-    scenario: Scenario, wall: Mesh, standing: Sequence[Standing], session: str, fixtures: Sequence[Fixture] = ()
+    scenario: Scenario, rock: Sequence[Mesh], fixtures: Sequence[Fixture], standing: Sequence[Standing], session: str
 ) -> Scene:
-    """Compile the static model of one session: the wall, what is fixed to it, then every prop that stands in it."""
-    spec = mujoco.MjSpec()
+    """Return the scene of one session: the wall, what is fixed to it, then every prop that stands in it.
+
+    Args:
+        scenario: Numbers the props and says how bright the rock is.
+        rock: The wall and the fixtures as MuJoCo compiled them, see `compiled_alone`.
+        fixtures: What is fixed, in the order of `rock[1:]`.
+        standing: Props at their places, of both sessions.
+        session: "before" or "after".
+    """
     shares = REFLECTIVITY | {"rock": scenario.tunnel.reflectivity}  # what lies loose was blasted from the walls
     numbers = {prop.name: number for number, prop in enumerate(scenario.props, start=1)}
-    parts, materials, instance, reflectivity = [WALL], ["rock"], [0], [scenario.tunnel.reflectivity]
-    _add_fixed(spec, WALL, wall)
-    for fixture in fixtures:
-        _add_fixed(spec, f"fixture/{fixture.name}", fixture.mesh)
-        parts.append(fixture.name)
-        instance.append(0)
-        reflectivity.append(shares[fixture.material])
-        materials.append(fixture.material)
-    for item in standing:
-        if session not in item.sessions:
-            continue
-        pose = item.world_T_object
-        body = spec.worldbody.add_body(name=f"prop/{item.prop.name}", pos=pose[:3, 3], quat=quaternion(pose))
-        for index, solid in enumerate(item.shape.solids):
-            name = f"prop/{item.prop.name}/{index}"
-            if solid.mesh is not None:
-                _add_mesh(spec, name, solid.mesh)
-            add_solid(body, solid, mesh_name=name, contype=0, conaffinity=0)
+    parts, materials = [WALL, *(each.name for each in fixtures)], ["rock", *(each.material for each in fixtures)]
+    instance, reflectivity = [0] * len(rock), [shares[material] for material in materials]
+    here = [item for item in standing if session in item.sessions]
+    for item in here:
+        for solid in item.shape.solids:
             parts.append(item.prop.name)
             instance.append(numbers[item.prop.name])
             reflectivity.append(item.prop.reflectivity or shares[solid.material])
             materials.append(solid.material)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    meshes = model_meshes(model, data)
+    meshes = (*rock, *model_meshes(*compile_model([], here)))
     return Scene(
-        model,
-        data,
-        tuple(meshes),
+        meshes,
         Caster(meshes),
         np.array(instance, np.int32),
         np.array(reflectivity, np.float32),
@@ -140,9 +136,33 @@ def compile_scene(
     )
 
 
-def _add_fixed(spec: mujoco.MjSpec, name: str, mesh: Mesh) -> None:
-    _add_mesh(spec, name, mesh)
-    spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, contype=0, conaffinity=0)
+def compiled_alone(mesh: Mesh) -> Mesh:
+    """Return a fixed mesh as MuJoCo has it, world frame: its vertices are float32 about the mesh's own middle."""
+    return model_meshes(*compile_model([mesh], []))[0]
+
+
+def compile_model(fixed: Iterable[Mesh], standing: Iterable[Standing]) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Compile a static model, and bring its data forward: one geom for each fixed mesh, then those of every prop.
+
+    A geom comes out the same, to the bit, whatever else is in the model.
+    """
+    spec = mujoco.MjSpec()
+    for number, mesh in enumerate(fixed):
+        name = f"fixed/{number}"
+        _add_mesh(spec, name, mesh)
+        spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, contype=0, conaffinity=0)
+    for item in standing:
+        pose = item.world_T_object
+        body = spec.worldbody.add_body(name=f"prop/{item.prop.name}", pos=pose[:3, 3], quat=quaternion(pose))
+        for index, solid in enumerate(item.shape.solids):
+            name = f"prop/{item.prop.name}/{index}"
+            if solid.mesh is not None:
+                _add_mesh(spec, name, solid.mesh)
+            add_solid(body, solid, mesh_name=name, contype=0, conaffinity=0)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
 
 
 def _add_mesh(spec: mujoco.MjSpec, name: str, mesh: Mesh) -> None:

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from cdpipe.errors import ScenarioError
 from cdpipe.geometry import Float32Array, Float64Array, Int64Array
+from cdpipe.motion import Motion, rotation_matrices
 from cdpipe.ouster import SensorMetadata
 from scenarios.schema import Platform, Scenario, SessionPlan
-from sim.motion import Motion
 from sim.obstacles import check_clearance
 from sim.odometry import drifted
 from sim.path import plan_path
@@ -32,7 +31,7 @@ class Trajectory:
         true: Movement of the sensor in the world frame.
         estimated: The same as the session's odometry has it, in its odom frame.
         revolution_s: (S,) time of the middle column of each recorded revolution.
-        column_s: (W,) time of each column after the middle one.
+        column_s: (W,) time of each column's pose after the middle one's; all 0 where the scan does not roll.
         column_offsets_ns: (W,) time of each column from the start of its revolution.
     """
 
@@ -59,11 +58,14 @@ class Trajectory:
         """Return odometry's column poses (s, W, 7) in the frame of their revolution: x, y, z, qx, qy, qz, qw."""
         points, quaternions = self.estimated.sampled(self.revolution_s[scans, None] + self.column_s)
         origins, middles = self.estimated.sampled(self.revolution_s[scans])
-        width = len(self.column_s)
-        sensor_R_odom = Rotation.from_quat(np.repeat(middles, width, axis=0)).inv()
-        offsets = sensor_R_odom.apply((points - origins[:, None]).reshape(-1, 3))
-        turns = (sensor_R_odom * Rotation.from_quat(quaternions.reshape(-1, 4))).as_quat(canonical=True)
-        return np.concatenate([offsets, turns], axis=1, dtype=np.float32).reshape(-1, width, 7)
+        out = np.empty((*points.shape[:2], 7), dtype=np.float32)
+        odom_R_sensor = rotation_matrices(middles)[:, None]
+        offsets = points - origins[:, None]
+        for axis in range(3):
+            column = odom_R_sensor[..., axis]
+            out[..., axis] = sum(column[..., row] * offsets[..., row] for row in range(3))
+        out[..., 3:] = _from(middles[:, None], quaternions)
+        return out
 
     def column_stamps_ns(self, scans: slice) -> Int64Array:
         """Return the time (s, W) of every column since the first one of the session."""
@@ -79,6 +81,22 @@ class Trajectory:
     def odom_T_sensor(self) -> Float64Array:
         """(S, 4, 4) pose of each revolution as odometry has it."""
         return self.estimated.poses(self.revolution_s)
+
+
+def _from(start: Float64Array, end: Float64Array) -> Float64Array:
+    """Return the turn `start`^-1 `end` of unit quaternions x, y, z, w (..., 4), its w not negative."""
+    x1, y1, z1, w1 = (start[..., axis] for axis in range(4))
+    x2, y2, z2, w2 = (end[..., axis] for axis in range(4))
+    turn = np.stack(
+        [
+            w1 * x2 - x1 * w2 - y1 * z2 + z1 * y2,
+            w1 * y2 - y1 * w2 - z1 * x2 + x1 * z2,
+            w1 * z2 - z1 * w2 - x1 * y2 + y1 * x2,
+            w1 * w2 + x1 * x2 + y1 * y2 + z1 * z2,
+        ],
+        axis=-1,
+    )
+    return np.asarray(np.where(turn[..., 3:] < 0, -turn, turn))
 
 
 def plan_trajectory(world: World, scenario: Scenario, sensor: SensorMetadata, seed: int, session: str) -> Trajectory:
@@ -112,6 +130,8 @@ def record(true: Motion, scenario: Scenario, sensor: SensorMetadata, seed: int, 
     revolution_s = recorded(true, scenario.platform, sensor.rate_hz, session)
     column_s: Float64Array = np.arange(sensor.width, dtype=np.float64) - sensor.width // 2
     column_s /= sensor.rate_hz * sensor.width
+    if not scenario.sensor.rolling_scan:
+        column_s[:] = 0.0
     estimated = drifted(true, float(revolution_s[0]), plan.odometry, seed, session)
     return Trajectory(true, estimated, revolution_s, column_s, sensor.column_offsets_ns())
 

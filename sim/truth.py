@@ -5,16 +5,17 @@
     PAIR/before/truth/00000.npz      per chunk: instance (s, H, W) int16, change (s, H, W) int16
     PAIR/after/truth/...             likewise
 
-`instance`: -1 no return, 0 walls and floor, n the n-th prop (1-based). `change`: 0, or the id of the change the return
-belongs to. For a change of group "partial" (moved by less than its own length, or reshaped) only returns farther than
-0.1 m from the other session's true surface belong to it.
+`instance`: -1 no return, -2 a false return where nothing stands, 0 walls, floor and fixtures, n the n-th prop
+(1-based). `change`: 0 (always for a false return), or the id of the change the return belongs to. For a change of
+group "partial" (moved by less than its own length, or reshaped) only returns farther than 0.1 m from the other
+session's true surface belong to it.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -83,6 +84,7 @@ class PairTruth:
         score_radius_m: The family's distance within which a region finds a change.
         changes: All changes, observable or not.
         scenario: The scenario as drawn.
+        files: SHA-256 of every file that the scenario names, by its path as seen from the working folder.
     """
 
     family: str
@@ -90,6 +92,7 @@ class PairTruth:
     score_radius_m: float
     changes: tuple[Change, ...]
     scenario: dict[str, Any]
+    files: dict[str, str] = field(default_factory=dict)
 
 
 def write_pair_truth(pair: Path, truth: PairTruth) -> None:

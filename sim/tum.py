@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.errors import InputError, ScenarioError
 from cdpipe.geometry import Float64Array
-from sim.motion import Motion, motion_of
+from cdpipe.motion import Motion, motion_of
 from sim.raycast import Caster
 from sim.room import room_about
 

@@ -334,13 +334,14 @@ def test_run_score_report_on_one_folder(
     made: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = [word for word in SMALL if word != "--set"]
-    monkeypatch.setattr(runner, "load_scenario", lambda name, seed: load_scenario(name, seed, settings))
+    monkeypatch.setattr(runner, "load_scenario", lambda name, seed, _: load_scenario(name, seed, settings))
     plan = tmp_path / "mine.yaml"
     plan.write_text("name: mine\nscenarios: [smoke/one_box]\nseeds: [1]\nvariants: [{preset: voxel-diff}]\n")
     out = tmp_path / "run"
     arguments = ("run", plan, "--seeds", "20000:20001", "--grid", "query.radius_m=3,4.5", "--out", out)
     code, printed, _ = command(*arguments)
     assert (code, "2 cells done, 0 kept" in printed) == (0, True)
+    assert "voxel-diff[query.radius_m=4.5]" in printed
     results = pd.read_csv(out / "results.csv")
     assert results["variant"].tolist() == ["voxel-diff[query.radius_m=3]", "voxel-diff[query.radius_m=4.5]"]
     assert set(results["seed"]) == {20000}

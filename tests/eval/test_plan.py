@@ -12,10 +12,10 @@ from eval.plan import (
     load_plan,
     parse_seeds,
     plan_names,
-    scenario_slug,
     setting_text,
     slug,
     variant_name,
+    world_slug,
 )
 
 PLAN = """\
@@ -144,7 +144,7 @@ def test_names_and_slugs() -> None:
     assert variant_name("tunnelcd", ("a.b=0.3", "c=4")) == "tunnelcd[a.b=0.3,c=4]"
     assert slug("tunnelcd[a.b=0.3,c=4]") == "tunnelcd_a.b=0.3,c=4_"
     assert variant_name("my/own.yaml", ()) == "own"
-    assert scenario_slug("paper/site1") == "paper__site1"
+    assert world_slug("paper/site1") == "paper__site1"
     assert setting_text("query.n_regions", None) == "query.n_regions=null"
     assert setting_text("a.b", 4.5) == "a.b=4.5"
 
@@ -221,6 +221,6 @@ def test_the_example_of_the_documentation_is_a_plan(tmp_path: Path) -> None:
     plan = read(tmp_path, textwrap.dedent(documentation.partition("\n\n")[2]))
     assert set(Plan.model_fields) == plan.model_fields_set
     assert plan.seeds == (20000, 20001)
-    # of each seed: the variant on both sites, and four grid points on one
-    assert len(cells(plan)) == 2 * (2 + 4)
+    # of each seed: the variant on both sites and on two more worlds of one, and four grid points on the other
+    assert len(cells(plan)) == 2 * (2 + 2 + 4)
     assert {cell.variant for cell in cells(plan) if cell.preset == "paper"} == {"paper[extract.voxel_m=0.4]"}

@@ -1,6 +1,8 @@
+import hashlib
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +14,19 @@ from cdpipe.answer import read_answer
 from cdpipe.config import MapConfig
 from cdpipe.errors import InputError, ScenarioError
 from cdpipe.mapping import build_map
+from cdpipe.ouster import load_profile
 from cdpipe.readers import open_scans
 from eval import provenance, runner, stages
 from eval.adapters import pipeline_input
 from eval.plan import Plan, load_plan
 from eval.rescoring import rescore
-from eval.runfolder import RunFolder, open_run_folder, start_run_folder
+from eval.runfolder import RunFolder, open_run_folder, remove, start_run_folder
 from eval.runner import RunOutcome, run_plan
 from scenarios.library import load_scenario
+from scenarios.references import file_digests
 from scenarios.schema import Scenario
 from sim.simulate import simulate_pair
+from sim.truth import read_pair_truth, write_pair_truth
 
 ONE_BOX, UNCHANGED = "smoke/one_box", "smoke/unchanged"
 VARIANTS = ["paper", "tunnelcd", "voxel-diff", "random-regions"]
@@ -29,8 +34,8 @@ VARIANTS = ["paper", "tunnelcd", "voxel-diff", "random-regions"]
 SMALL = ("sensor.mode=512x10", "platform.scan_spacing_m=1.0")
 
 
-def load_small(name: str, seed: int) -> Scenario:
-    return load_scenario(name, seed, SMALL)
+def load_small(name: str, seed: int, settings: Iterable[str] = ()) -> Scenario:
+    return load_scenario(name, seed, [*SMALL, *settings])
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +226,7 @@ def test_a_pair_of_another_scenario_is_simulated_anew(
     plan = plan_of(tmp_path)
     run_in(tmp_path / "run", plan)
     changed = load_scenario(ONE_BOX, 20000, [*SMALL, "score_radius_m=5"])
-    monkeypatch.setattr(runner, "load_scenario", lambda name, seed: changed)
+    monkeypatch.setattr(runner, "load_scenario", lambda name, seed, settings: changed)
     assert run_in(tmp_path / "run", plan)[1].n_done == 1
     assert simulated == [ONE_BOX, ONE_BOX]
 
@@ -462,3 +467,120 @@ def test_scoring_again_changes_nothing_before_all_is_scored(smoke_copy: RunFolde
         rescore(smoke_copy)
     assert len(cells) == 8
     assert cells == {path: path.stat().st_mtime_ns for path in cells}
+
+
+@pytest.fixture
+def truthful(simulated: list[str], pairs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> list[Scenario]:
+    """Let the stand-in of the simulator write down what it was asked for, as the simulator does."""
+    asked: list[Scenario] = []
+
+    def copy(scenario: Scenario, seed: int, out: Path, on_progress: object = None) -> None:
+        asked.append(scenario)
+        shutil.copytree(pairs[scenario.family], out)
+        drawn, files = scenario.model_dump(mode="json"), file_digests(scenario)
+        write_pair_truth(out, replace(read_pair_truth(out), seed=seed, scenario=drawn, files=files))
+
+    monkeypatch.setattr(runner, "simulate_pair", copy)
+    return asked
+
+
+WORLDS = f"{ONE_BOX}, {{name: {ONE_BOX}, set: [sensor.range_noise=false], each: [sensor.sub_rays=7]}}"
+QUIET = f"{ONE_BOX}[sensor.range_noise=false]"
+BLURRED = f"{ONE_BOX}[sensor.range_noise=false,sensor.sub_rays=7]"
+
+
+def test_worlds_are_simulated_with_their_settings_and_named_by_them(tmp_path: Path, truthful: list[Scenario]) -> None:
+    run, outcome = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+    assert outcome == RunOutcome(3, 0, 0)
+    assert [(each.sensor.range_noise, each.sensor.sub_rays) for each in truthful] == [(True, 1), (False, 1), (False, 7)]
+    results = table(run)
+    assert results["scenario"].tolist() == [ONE_BOX, QUIET, BLURRED]
+    assert set(results["family"]) == {ONE_BOX}
+    assert list(run.provenance()["config_digests"]) == [f"{world} voxel-diff" for world in (ONE_BOX, QUIET, BLURRED)]
+    assert sorted(path.name for path in (run.path / "pairs").iterdir()) == [
+        "smoke__one_box",
+        "smoke__one_box_sensor.range_noise=false,sensor.sub_rays=7_",
+        "smoke__one_box_sensor.range_noise=false_",
+    ]
+    # the stand-in gives every world the same returns
+    effects = table(run, "effects")
+    assert set(effects["settings"]) == {"sensor.range_noise=false", "sensor.range_noise=false,sensor.sub_rays=7"}
+    assert set(effects["reference"]) == {ONE_BOX}
+    assert (effects["difference"].dropna() == 0).all()
+    assert set(effects.query("metric == 'region_recall'")["n"]) == {1}
+
+
+def test_the_pair_of_a_world_is_kept_while_its_scenario_is_the_same(
+    tmp_path: Path, truthful: list[Scenario], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = plan_of(tmp_path, scenarios=WORLDS)
+    run, _ = run_in(tmp_path / "run", plan)
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(0, 3, 0)
+    run.cell(QUIET, 20000, "voxel-diff").unlink()
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 2, 0)
+    assert len(truthful) == 3
+    # the same label, but the scenario behind it has changed
+    usual = runner.load_scenario
+    monkeypatch.setattr(
+        runner, "load_scenario", lambda name, seed, settings: usual(name, seed, [*settings, "score_radius_m=5"])
+    )
+    run.cell(ONE_BOX, 20000, "voxel-diff").unlink()
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(3, 0, 0)
+    assert len(truthful) == 6
+
+
+def test_a_pair_is_made_again_when_a_file_that_its_scenario_names_has_changed(
+    tmp_path: Path, truthful: list[Scenario]
+) -> None:
+    profile = tmp_path / "sensor.json"
+    profile.write_text(json.dumps(load_profile("os1-32-u0").to_json()))
+    scenario = tmp_path / "mine.yaml"
+    scenario.write_text(f"extends: {ONE_BOX}\nfamily: {ONE_BOX}\nsensor: {{profile: sensor.json}}\n")
+    plan = plan_of(tmp_path, scenarios=str(scenario))
+    run, _ = run_in(tmp_path / "run", plan)
+    content = profile.read_bytes()
+    truth = read_pair_truth(run.pair(str(scenario), 20000))
+    assert list(truth.files.values()) == [hashlib.sha256(content).hexdigest()]
+    assert [Path(name).resolve() for name in truth.files] == [profile.resolve()]
+    # touched, or moved away and back: nothing is redone
+    profile.unlink()
+    profile.write_bytes(content)
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(0, 1, 0)
+    profile.write_bytes(content + b"\n")
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 0, 0)
+    assert len(truthful) == 2
+    # and a pair of before is not taken for one of now when only its cell is lost
+    profile.write_bytes(content)
+    run.cell(str(scenario), 20000, "voxel-diff").unlink()
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 0, 0)
+    assert len(truthful) == 3
+
+
+def test_a_world_with_settings_that_cannot_be_made_keeps_its_family(
+    tmp_path: Path, truthful: list[Scenario], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = runner.load_scenario
+
+    def fails_with_settings(name: str, seed: int, settings: tuple[str, ...]) -> Scenario:
+        if settings:
+            raise ScenarioError("props stand in each other")
+        return usual(name, seed, settings)
+
+    monkeypatch.setattr(runner, "load_scenario", fails_with_settings)
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+    results = table(run)
+    assert results["status"].tolist() == ["ok", "failed", "failed"]
+    assert set(results["family"]) == {ONE_BOX}
+    assert table(run, "effects").query("metric == 'region_recall'")["n"].tolist() == [0, 0]
+
+
+def test_an_answer_beside_those_of_a_world_gets_the_name_of_the_world(tmp_path: Path, truthful: list[Scenario]) -> None:
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+    shutil.copytree(run.answer(QUIET, 20000, "voxel-diff"), run.answer(QUIET, 20000, "theirs"))
+    assert rescore(run) == 4
+    theirs = table(run).query("variant == 'theirs'")
+    assert theirs["scenario"].tolist() == [QUIET]
+    # where the run has no cell of the pair left, the folder's name has to do
+    remove(run.path / "cells")
+    rescore(run)
+    assert "smoke/one_box_sensor.range_noise=false_" in set(table(run)["scenario"])

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
+import hashlib
+import json
 from pathlib import Path
 
 import pytest
 
 from cdpipe.errors import InputError, ScenarioError
+from cdpipe.ouster import load_profile, profile_names
 from scenarios import check_scenario, load_scenario, scenario_names
 from scenarios.library import FAMILIES
-from scenarios.references import route_length_m
+from scenarios.references import file_digests, route_length_m
 from scenarios.schema import Scenario
 
 WORLD = """\
@@ -403,3 +406,50 @@ def test_the_readme_s_first_file_is_valid_and_its_families_exist(tmp_path: Path)
     table = text.split("## Families")[1].split("###")[0]
     named = {word for line in table.splitlines() for cell in line.split("|")[1:2] for word in cell.split("`")[1::2]}
     assert named == set(scenario_names())
+
+
+def test_a_sensor_that_is_not_there_is_told_with_its_line(tmp_path: Path) -> None:
+    assert mistakes_of(written(tmp_path, WORLD + "sensor: {profile: os1-33}\n")) == [
+        ":21: sensor.profile = 'os1-33': sensor profile 'os1-33' is unknown: name one of "
+        f"{', '.join(profile_names())}, or the path of an Ouster metadata .json"
+    ]
+    (line,) = mistakes_of(written(tmp_path, WORLD + "sensor:\n  mode: 333x10\n"))
+    assert line.startswith(":22: sensor.mode = '333x10': os1-32-nominal: lidar_mode = '333x10': expected one of")
+    (line,) = mistakes_of(written(tmp_path, WORLD + "sensor: {profile: own.json}\n"))
+    assert line == f":21: sensor.profile = 'own.json': no such file: expected {tmp_path / 'own.json'}"
+
+
+def test_a_profile_is_looked_for_beside_the_file_that_names_it(tmp_path: Path) -> None:
+    (tmp_path / "own.json").write_text(json.dumps(load_profile("os1-32-u0").to_json()))
+    profile = check_scenario(written(tmp_path, WORLD + "sensor: {profile: own.json}\n")).sensor.profile
+    assert Path(profile).resolve() == (tmp_path / "own.json").resolve()
+    (tmp_path / "own.json").write_text("{}")
+    (line,) = mistakes_of(str(tmp_path / "world.yaml"))
+    assert line.startswith(":21: sensor.profile") and "own.json" in line
+
+
+def test_settings_are_checked_as_if_they_stood_in_the_file(tmp_path: Path) -> None:
+    path = written(tmp_path, WORLD)
+    assert check_scenario(path, ["sensor.sub_rays=7"]).sensor.sub_rays == 7
+    with pytest.raises(ScenarioError) as caught:
+        check_scenario(path, ["sensor.sub_ray=7", "platform.speed_mps=-1"])
+    lines = str(caught.value).splitlines()
+    assert any("--set: sensor.sub_ray = 7: unknown key; did you mean" in line for line in lines)
+    assert any("--set: platform.speed_mps = -1" in line for line in lines)
+
+
+def test_every_file_of_a_scenario_has_a_digest(tmp_path: Path) -> None:
+    path = written(tmp_path, foreign_world(tmp_path) + "sensor: {profile: own.json}\n")
+    (tmp_path / "own.json").write_text(json.dumps(load_profile("os1-32-u0").to_json()))
+    for name in ("mine.stl", "chair.obj", "before.tum", "after.tum"):
+        (tmp_path / name).write_text(name)
+    scenario = check_scenario(path)
+    digests = {Path(name).name: digest for name, digest in file_digests(scenario).items()}
+    assert digests == {
+        name: hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
+        for name in ("mine.stl", "chair.obj", "before.tum", "after.tum", "own.json")
+    }
+    assert file_digests(load_scenario("smoke/one_box", 0)) == {}
+    (tmp_path / "mine.stl").unlink()
+    with pytest.raises(InputError, match=r"mine\.stl: cannot be read"):
+        file_digests(scenario)

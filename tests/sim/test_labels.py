@@ -9,9 +9,11 @@ import pytest
 from cdpipe.geometry import make_pose
 from cdpipe.ouster import SensorMetadata
 from scenarios.schema import Drift, Place, Platform, Prop, Scenario, Section, Sensor, SessionPlan, Shift, Tunnel
-from sim.labels import Ghost, cell_keys, claim_returns, list_changes
-from sim.lidar import Rays, revolution_rays, scan
+from sim.labels import Ghost, belonging, cell_keys, claim_returns, list_changes
+from sim.lidar import scan
 from sim.mesh import Mesh, box_mesh, moved, point_triangle_distance
+from sim.raycast import Caster
+from sim.rays import Rays, revolution_rays
 from sim.scene import World, build_world
 from sim.simulate import simulate_pair
 from sim.truth import Change, read_pair_truth
@@ -25,7 +27,7 @@ def fan(count: int) -> Rays:
     """Level rays from the origin towards +x, spread over 20 degrees."""
     angle = np.deg2rad(np.linspace(-10, 10, count))
     directions = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)[:, None]
-    return Rays(np.zeros((count, 1, 3)), directions)
+    return Rays(np.zeros((count, 3)), directions.astype(np.float32))
 
 
 def test_ghost_rays_by_hand() -> None:
@@ -41,6 +43,22 @@ def test_ghost_rays_by_hand() -> None:
     assert Ghost(box_at(70.0, 0.0, 0.0)).count(rays, np.full((2001, 1), 90.0, np.float32)) == 0  # out of reach
 
 
+def test_no_ray_that_meets_a_ghost_is_left_out(sensor: SensorMetadata) -> None:
+    generator = np.random.default_rng(4)
+    for place in generator.uniform((-8.0, -8.0, -2.0), (8.0, 8.0, 2.0), size=(12, 3)):
+        surface = box_at(*place, half_m=0.6)
+        # A quick sensor: its origin moves by 2 m during the revolution, sometimes through the object's own ball.
+        poses = np.tile(np.eye(4), (sensor.width, 1, 1))
+        poses[:, 0, 3] = np.linspace(-1.0, 1.0, sensor.width)
+        rays = revolution_rays(sensor, poses)
+        ranges_m = generator.uniform(0.0, 14.0, size=rays.directions.shape[:2]).astype(np.float32)
+        ranges_m[generator.random(ranges_m.shape) < 0.1] = 0.0
+        every_m, _, _ = Caster([surface]).cast_columns(rays.origins, rays.directions)
+        wanted = int(((every_m <= ranges_m + 1e-3) & (ranges_m > 0)).sum())
+        assert wanted > 20
+        assert Ghost(surface).count(rays, ranges_m) == wanted
+
+
 def test_cells_by_hand() -> None:
     points = np.array([[0.01, 0.01, 0.01], [0.09, 0.05, 0.02], [0.11, 0.05, 0.02], [-0.01, 0.05, 0.02]])
     assert len(cell_keys(points)) == 3
@@ -53,7 +71,7 @@ def sweep(world: World, scenario: Scenario, sensor: SensorMetadata, session: str
     ghosts = returns = 0
     for number, x in enumerate((6.0, 10.0, 14.0)):
         rays = revolution_rays(sensor, np.tile(make_pose(translation=(x, 0.0, 0.8)), (sensor.width, 1, 1)))
-        ideal = Sensor(range_noise=False, dropouts=False)
+        ideal = Sensor(range_noise=False, dropouts=False, false_positives=False)
         result = scan(scene, sensor, ideal, rays, 0, session, number)
         distance_m = np.where(result.geom >= 0, result.true_range_m - sensor.beam_origin_m, 0.0).T
         ghosts += tally.ghost.count(rays, distance_m)
@@ -123,11 +141,14 @@ def test_of_a_short_move_only_what_is_off_the_old_surface_counts(
         ]
     )
     points = local @ end[:3, :3].T + end[:3, 3]
-    belongs = claim_returns(added, points, points)
+    belongs = belonging(added, points)
     np.testing.assert_array_equal(belongs, [True, False, True, False, False, True])
+    claim_returns(added, points[belongs])
     assert (added.n_returns, len(added.cells)) == (3, 3)
     assert np.linalg.norm(end[:3, 3] - start[:3, 3]) < 0.8
-    assert claim_returns(removed, np.empty((0, 3)), np.empty((0, 3))).shape == (0,)
+    assert belonging(removed, np.empty((0, 3))).shape == (0,)
+    claim_returns(removed, np.empty((0, 3)))
+    assert (removed.n_returns, removed.cells) == (0, set())
 
 
 def test_a_change_nobody_could_notice_says_why(
@@ -247,11 +268,13 @@ def test_returns_on_what_is_left_of_a_pile_are_no_change(
     world = build_world(scenario, 0)
     (tally,) = list_changes(scenario, world)
     rays = revolution_rays(sensor, np.tile(make_pose(translation=(10.0, -0.8, 0.9)), (sensor.width, 1, 1)))
-    result = scan(world.before, sensor, Sensor(range_noise=False, dropouts=False), rays, 0, "before", 0)
+    result = scan(
+        world.before, sensor, Sensor(range_noise=False, dropouts=False, false_positives=False), rays, 0, "before", 0
+    )
     is_pile = ((world.before.instance[result.geom] == 1) & (result.geom >= 0)).T
-    reach_m = (result.true_range_m.T - sensor.beam_origin_m)[is_pile][:, None]
-    points = rays.origins[is_pile] + reach_m * rays.directions[is_pile]
-    belongs = claim_returns(tally, points, points)
+    column, row = np.nonzero(is_pile)
+    points = rays.points(row, column, (result.true_range_m - sensor.beam_origin_m)[row, column])
+    belongs = belonging(tally, points)
     # By brute force: every return against every triangle of the after session near it.
     triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in world.after.meshes])
     triangles = triangles[np.linalg.norm(triangles.mean(axis=1) - points.mean(axis=0), axis=1) < 4.0]

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cdpipe import odometry
 from cdpipe.errors import InputError, ScenarioError
 from cdpipe.geometry import invert, make_pose, rotation_angle_rad, transform, travelled_m, yaw_rad
+from cdpipe.odometry import deskewed
 from cdpipe.ouster import SensorMetadata
 from cdpipe.session import Session, read_session
 from scenarios.schema import Odometry, Platform, Roughness, Scenario, SessionPlan, Tunnel
-from sim import odometry
 from sim.mesh import Mesh, box_mesh
-from sim.odometry import deskewed, registered
+from sim.odometry import registered
 from sim.raycast import Caster
 from sim.simulate import simulate_pair
 from sim.truth import read_true_poses

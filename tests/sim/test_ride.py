@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.errors import ScenarioError
 from cdpipe.geometry import Float64Array
+from cdpipe.motion import Motion
 from scenarios.schema import Platform, Scenario, SessionPlan
 from sim.mesh import Mesh
-from sim.motion import Motion
 from sim.path import Path
 from sim.raycast import Caster
 from sim.ride import lean, on_wheels, ride, times

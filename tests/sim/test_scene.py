@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,9 +23,14 @@ from scenarios.schema import (
     Stones,
     Tunnel,
 )
+from sim.centreline import build_centreline
 from sim.labels import list_changes
 from sim.materials import REFLECTIVITY
-from sim.scene import Scene, build_world
+from sim.placing import Standing
+from sim.raycast import model_meshes
+from sim.scene import Scene, World, build_world, compile_model
+from sim.simulate import simulate_pair
+from sim.tunnel import mesh_tunnel
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +55,10 @@ def test_on_a_level_floor_a_box_rests_where_it_was_placed(
     np.testing.assert_allclose(at_wall.world_T_object[:2, 3], [14.0, 2.0 - 0.25 - 0.05 - 0.4], atol=0.06)
 
 
+def standing_in(world: World, session: str) -> list[Standing]:
+    return [item for item in world.standing if session in item.sessions]
+
+
 def test_an_unchanged_prop_has_the_very_same_pose_in_both_models(
     make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop]
 ) -> None:
@@ -58,7 +69,7 @@ def test_an_unchanged_prop_has_the_very_same_pose_in_both_models(
         make_prop("goes", 0.7, change="moved", to=Place(between=("a", "b"), fraction=0.8, lateral=0.5)),
     )
     world = build_world(make_scenario(props=props), 4)
-    before, after = world.before.model, world.after.model
+    before, after = (compile_model([], standing_in(world, session))[0] for session in ("before", "after"))
     for name in ("prop/stays", "world"):
         np.testing.assert_array_equal(before.body(name).pos, after.body(name).pos)
         np.testing.assert_array_equal(before.body(name).quat, after.body(name).quat)
@@ -198,3 +209,56 @@ def test_no_stone_lies_under_a_prop_of_either_session(
     for x in (8.0, 14.0):
         assert not ((np.abs(stones[:, 0] - x) < 1.0) & (np.abs(stones[:, 1]) < 0.75)).any()
     assert ((np.abs(stones[:, 0] - 11.0) < 1.0) & (np.abs(stones[:, 1]) < 0.75)).any()
+
+
+def test_scenes_hold_the_geoms_of_one_whole_model_to_the_bit_and_in_its_order(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop], furnished: Tunnel
+) -> None:
+    scenario = make_scenario(tunnel=furnished, props=everything(make_prop))
+    world = build_world(scenario, 4)
+    wall = mesh_tunnel(furnished, build_centreline(furnished, 4), 4)
+    fixed = [wall, *(fixture.mesh for fixture in world.fixtures)]
+    assert len(fixed) >= 4
+    for session, scene in (("before", world.before), ("after", world.after)):
+        model, data = compile_model(fixed, standing_in(world, session))
+        whole = model_meshes(model, data)
+        assert len(whole) == model.ngeom == len(scene.meshes) == len(scene.instance)
+        for expected, mesh in zip(whole, scene.meshes, strict=True):
+            np.testing.assert_array_equal(mesh.vertices, expected.vertices)
+            np.testing.assert_array_equal(mesh.faces, expected.faces)
+        owners = [model.body(body).name.removeprefix("prop/") for body in model.geom_bodyid[len(fixed) :]]
+        assert owners == list(scene.parts[len(fixed) :])
+
+
+def test_what_is_fixed_is_kept_once_and_no_view_of_a_compiled_model(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop], furnished: Tunnel
+) -> None:
+    world = build_world(make_scenario(tunnel=furnished, props=(make_prop("box", change="added"),)), 0)
+    n_fixed = 1 + len(world.fixtures)
+    assert len(world.before.meshes) == n_fixed
+    for one, other in zip(world.before.meshes[:n_fixed], world.after.meshes[:n_fixed], strict=True):
+        assert one is other
+    for mesh in world.after.meshes:
+        for array in (mesh.vertices, mesh.faces):
+            owner: object = array
+            while isinstance(owner, np.ndarray) and owner.base is not None:
+                owner = owner.base
+            assert isinstance(owner, np.ndarray), f"a view into {type(owner)}"
+
+
+def test_while_sessions_are_written_only_their_scenes_are_left_of_the_world(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop], tmp_path: Path
+) -> None:
+    def worlds() -> int:
+        gc.collect()
+        return sum(type(item) is World for item in gc.get_objects())  # isinstance would ask lazy modules
+
+    seen = {}
+    already = worlds()  # fixtures of other modules
+    simulate_pair(
+        make_scenario(props=(make_prop("box", change="added"),)),
+        0,
+        tmp_path / "pair",
+        lambda stage, done, total: seen.__setitem__(stage, worlds() - already),
+    )
+    assert seen["before"] == seen["after"] == 0

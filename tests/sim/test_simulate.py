@@ -79,12 +79,29 @@ def test_the_same_seed_gives_the_same_bytes_in_any_number_of_threads(
     assert all(other[name] != digest for name, digest in digests(pair).items() if name.endswith("00000.npz"))
 
 
+def test_short_chunks_hold_the_same_session(
+    scenario: Scenario, pair: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(simulate, "CHUNK_SCANS", 3)  # the last one holds fewer
+    simulate_pair(scenario, SEED, tmp_path / "short")
+    assert read_pair_truth(tmp_path / "short").changes == read_pair_truth(pair).changes
+    for name in ("before", "after"):
+        whole, short = read_session(pair / name), read_session(tmp_path / "short" / name)
+        assert (whole.n_chunks, short.n_chunks) == (1, -(-whole.n_scans // 3))
+        assert whole.n_scans % 3
+        for field in ("range_mm", "reflectivity", "signal", "column_stamps_ns", "column_poses"):
+            joined = np.concatenate([getattr(chunk, field) for chunk in short.chunks()])
+            np.testing.assert_array_equal(joined, getattr(whole.chunk(0), field))
+        labels = [np.concatenate(parts) for parts in zip(*read_labels(short.path, short.n_chunks), strict=True)]
+        np.testing.assert_array_equal(labels, next(read_labels(whole.path, 1)))
+
+
 def test_labels_match_what_is_where(scenario: Scenario, pair: Path) -> None:
     world = build_world(scenario, SEED)
     for name in ("before", "after"):
         points, labels = returns_in_world(read_session(pair / name))
         standing = [item for item in world.standing if name in item.sessions]
-        assert set(np.unique(labels[:, 0])) == {0} | {scenario.props.index(item.prop) + 1 for item in standing}
+        assert set(np.unique(labels[:, 0])) - {-2} == {0} | {scenario.props.index(item.prop) + 1 for item in standing}
         for item in standing:
             instance = scenario.props.index(item.prop) + 1
             local = transform(np.linalg.inv(item.world_T_object), points)
@@ -97,7 +114,7 @@ def test_labels_match_what_is_where(scenario: Scenario, pair: Path) -> None:
             # Well inside its box and above the floor there is nothing but the prop.
             core = (np.abs(local[:, :2]) < half[:2] - 0.05).all(axis=1) & (local[:, 2] > 0.15) & is_inside
             if item.prop.kind != "muck_pile":
-                assert (labels[core, 0] == instance).all()
+                assert np.isin(labels[core, 0], (instance, -2)).all()  # a false return may lie anywhere
 
 
 def test_changes_count_what_is_labelled(scenario: Scenario, pair: Path) -> None:
@@ -116,7 +133,7 @@ def test_changes_count_what_is_labelled(scenario: Scenario, pair: Path) -> None:
             np.concatenate(part) for part in zip(*read_labels(session.path, session.n_chunks), strict=True)
         )
         range_mm = np.concatenate([chunk.range_mm for chunk in session.chunks()])
-        np.testing.assert_array_equal(instance >= 0, range_mm > 0)
+        np.testing.assert_array_equal(instance != -1, range_mm > 0)
         for item in truth.changes:
             is_here = item.session == name
             assert (change == item.id).sum() == (item.n_returns if is_here else 0)

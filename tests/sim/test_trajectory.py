@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.errors import ScenarioError
 from cdpipe.geometry import invert, require_poses, travelled_m, yaw_rad
+from cdpipe.motion import Motion, motion_of
 from cdpipe.ouster import SensorMetadata
 from scenarios.schema import Floor, Odometry, Platform, Prop, Scenario, SessionPlan, Stones
 from sim.line import kept_between, smoothed
-from sim.motion import Motion, motion_of
 from sim.path import plan_path
 from sim.placing import standing_corners
 from sim.ride import on_wheels
@@ -94,6 +94,21 @@ def test_the_pose_of_a_revolution_is_that_of_its_middle_column(
     assert stamps[0, 0] == 0
     np.testing.assert_array_equal(np.diff(stamps[:, 0]), 700_000_000)
     assert stamps[1, -1] - stamps[1, 0] == round(1e8 * (1 - 1 / sensor.width))
+
+
+def test_column_poses_of_a_sensor_that_tumbles(sensor: SensorMetadata) -> None:
+    time_s = np.linspace(0.0, 1.0, 11)
+    rotations = Rotation.random(11, random_state=3)
+    motion = motion_of(time_s, time_s, np.random.default_rng(1).normal(size=(11, 3)), rotations)
+    column_s = (np.arange(sensor.width) - sensor.width // 2) / sensor.width * 0.1
+    drive = Trajectory(motion, motion, np.array([0.25, 0.55, 0.75]), column_s, sensor.column_offsets_ns())
+    columns = drive.sensor_T_column(slice(0, 3))
+    assert (columns[..., 6] >= 0).all()
+    for number, revolution_s in enumerate(drive.revolution_s):
+        middle = motion.poses(np.array([revolution_s]))[0]
+        wanted = np.linalg.inv(middle) @ motion.poses(revolution_s + column_s)
+        np.testing.assert_allclose(columns[number, :, :3], wanted[:, :3, 3], atol=1e-6)
+        np.testing.assert_allclose(Rotation.from_quat(columns[number, :, 3:]).as_matrix(), wanted[:, :3, :3], atol=1e-6)
 
 
 def test_stamps_are_true_to_a_speed_that_varies(recorded: Callable[..., Trajectory], sensor: SensorMetadata) -> None:

@@ -44,13 +44,16 @@ class Motion:
         first = np.clip(np.searchsorted(self.time_s, flat, side="right") - 1, 0, len(self.time_s) - 2)
         share = (flat - self.time_s[first]) / (self.time_s[first + 1] - self.time_s[first])
         points = self.points[first] + share[:, None] * (self.points[first + 1] - self.points[first])
-        start, end = self.quaternions[first], self.quaternions[first + 1]
-        angle = np.arccos(np.clip((start * end).sum(axis=1), -1.0, 1.0))
-        sine = np.maximum(np.sin(angle), _STRAIGHT_RAD)
+        # What depends on the stretch alone is worked out once for each: a revolution's columns share a few.
+        low, high = int(first.min(initial=len(self.time_s))), int(first.max(initial=0)) + 2
+        start, end = self.quaternions[low : high - 1], self.quaternions[low + 1 : high]
+        angles = np.arccos(np.clip((start * end).sum(axis=1), -1.0, 1.0))
+        stretch = first - low
+        angle, sine = angles[stretch], np.maximum(np.sin(angles), _STRAIGHT_RAD)[stretch]
         is_straight = angle < _STRAIGHT_RAD
         before = np.where(is_straight, 1.0 - share, np.sin((1.0 - share) * angle) / sine)
         after = np.where(is_straight, share, np.sin(share * angle) / sine)
-        quaternions = before[:, None] * start + after[:, None] * end
+        quaternions = before[:, None] * start[stretch] + after[:, None] * end[stretch]
         quaternions /= np.sqrt((quaternions * quaternions).sum(axis=1, keepdims=True))
         return points.reshape(*time_s.shape, 3), quaternions.reshape(*time_s.shape, 4)
 
