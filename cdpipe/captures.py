@@ -8,8 +8,8 @@ The SDK is an extra and imported only here and in `cdpipe.osf`, when a recording
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -29,6 +29,8 @@ SUFFIXES = (".osf", *PCAP_SUFFIXES)
 _LEAST_SHARE = 0.5
 # An Ethernet frame carries this much beside what it holds (Ethernet, IP, UDP and PCAP headers), to guess a number.
 _PACKET_OVERHEAD_BYTES = 58
+# What the SDK raises where a file is at fault; C++ exceptions arrive as any of these.
+SDK_ERRORS = (OSError, RuntimeError, ValueError, LookupError, ArithmeticError)
 
 
 @dataclass(frozen=True, slots=False, eq=False)
@@ -57,8 +59,11 @@ class Recording:
         n_packets = max(self.info.format.lidar_packets_per_frame(), 1)
         return max(self.path.stat().st_size // int(packet_bytes * n_packets), 1)
 
-    def revolutions(self) -> Iterator[Revolution]:
+    def revolutions(self, on_left_out: Callable[[int], object] = lambda number: None) -> Iterator[Revolution]:
         """Read all revolutions of which more than half the columns arrived.
+
+        Args:
+            on_left_out: Told the number of each of the others; one of which nothing arrived is not in the recording.
 
         Raises:
             InputError: The file is damaged, the clock went backwards, or no such revolution is in it.
@@ -73,6 +78,7 @@ class Recording:
                     continue
                 n_seen += 1
                 if np.count_nonzero(frame.status & 1) <= _LEAST_SHARE * window:
+                    on_left_out(n_seen - 1)
                     continue
                 revolution = decode(frame, self.sensor, mounting, f"{self.path}: revolution {n_seen - 1}")
                 if last_ns is not None and revolution.column_stamps_ns[0] <= last_ns:
@@ -134,7 +140,7 @@ def open_recording(path: Path, metadata: Path | None = None) -> Recording:
     require_mode(sensor.mode, str(metadata))
     try:
         info = core.SensorInfo(metadata.read_text(encoding="utf-8"))
-    except (RuntimeError, ValueError) as error:
+    except SDK_ERRORS as error:
         raise InputError(f"{metadata}: the vendor's SDK does not take it: {one_line(error)}") from error
     recording = Recording(path, sensor, info, metadata)
     _check_columns(recording)
@@ -151,12 +157,14 @@ def require_sdk() -> Any:
         from ouster.sdk import core
     except ImportError as error:
         raise InputError("OSF and PCAP need the vendor's SDK: pip install 'tunnelcd[ouster]'") from error
-    core.init_logger("error")  # what it warns of is said here, in one line
+    core.init_logger("off")  # it raises what it logs, and that is said here, in one line
     return core
 
 
 def one_line(error: BaseException) -> str:
-    """Return the text of one of the SDK's errors in one line."""
+    """Return the text of an error of the SDK or the disk in one line."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
     return " ".join(str(error).split())
 
 
@@ -164,29 +172,30 @@ def _opened(recording: Recording) -> Any:
     """Return the SDK's source of a recording; close it."""
     from ouster.sdk import osf, pcap
 
-    try:
+    with _sdk_reads(recording.path):
         if recording.metadata is None:
             return osf.OsfFrameSetSource(str(recording.path))
         return pcap.PcapFrameSetSource(str(recording.path), sensor_info=[recording.info])
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"{recording.path}: the vendor's SDK cannot read it: {one_line(error)}") from error
+
+
+@contextmanager
+def _sdk_reads(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except SDK_ERRORS as error:
+        raise InputError(f"{path}: the vendor's SDK cannot read it: {one_line(error)}") from error
 
 
 def _guarded(source: Any, path: Path) -> Iterator[Any]:
-    try:
+    with _sdk_reads(path):
         yield from source
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"{path}: the vendor's SDK cannot read it: {one_line(error)}") from error
 
 
 def _only_sensor(path: Path) -> Any:
     from ouster.sdk import osf
 
-    try:
-        with closing(osf.OsfFrameSetSource(str(path))) as source:
-            infos = list(source.sensor_info)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"{path}: the vendor's SDK cannot read it: {one_line(error)}") from error
+    with _sdk_reads(path), closing(osf.OsfFrameSetSource(str(path))) as source:
+        infos = list(source.sensor_info)
     if len(infos) != 1:
         sensors = ", ".join(f"{info.prod_line} {info.sn}" for info in infos) or "none"
         raise InputError(f"{path}: expected the recording of one sensor, it holds {len(infos)} ({sensors})")
@@ -206,7 +215,9 @@ def _check_columns(recording: Recording) -> None:
     layout = core.PacketFormat.from_info(recording.info)
     n_looked_at = 2 * recording.sensor.width // max(layout.columns_per_packet, 1)
     highest = -1
-    with closing(pcap.PcapPacketSource(str(recording.path), sensor_info=[recording.info])) as source:
+    with _sdk_reads(recording.path):
+        source = pcap.PcapPacketSource(str(recording.path), sensor_info=[recording.info])
+    with closing(source):
         for _, packet in _guarded(source, recording.path):
             if isinstance(packet, core.LidarPacket):
                 highest = max(highest, int(layout.packet_header(core.ColHeader.MEASUREMENT_ID, packet.buf).max()))

@@ -9,7 +9,10 @@ go along pixel by pixel. Every column counts as valid; one that never arrived si
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from itertools import repeat
 from pathlib import Path
 from typing import Any
@@ -41,34 +44,64 @@ def write_osf(
         on_progress: Told the stage, and how many revolutions of how many are done.
 
     Raises:
-        InputError: The file exists or cannot be written, a chunk is damaged, the vendor's SDK is not installed or does
-            not take this sensor.
+        InputError: The file exists or cannot be written, a chunk is damaged or its stamps do not rise, the vendor's SDK
+            is not installed or does not take this sensor.
     """
     core = require_sdk()
-    from ouster.sdk import osf
+    from ouster.sdk.osf import OsfDropFrameError
 
     if path.exists():
         raise InputError(f"{path} exists already: name a new file or remove it")
     if not path.absolute().parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}")
     info = sensor_info(session)
-    partial = path.with_name(f".{path.name}.partial")
     report = on_progress or (lambda stage, done, total: None)
     report("write", 0, session.n_scans)
+    done = 0
     try:
-        with osf.Writer(str(partial), info) as writer:
-            done = 0
+        with _new_osf(path, info) as writer:
             for chunk, more in zip(session.chunks(), fields or repeat({}), strict=fields is not None):
                 _check_fields(session, chunk, more)
                 for row in range(len(chunk.range_mm)):
                     writer.save(0, _frame(core, info, session, chunk, more, row, done))
                     done += 1
                     report("write", done, session.n_scans)
-        partial.rename(path)
+    except OsfDropFrameError as error:
+        raise InputError(
+            f"{session.path}: revolution {done} does not come after the one before it: the stamps of its chunks are "
+            "damaged, an OSF's must rise"
+        ) from error
     except (OSError, RuntimeError) as error:
-        raise InputError(f"{path}: cannot be written: {one_line(error)}") from error
+        way_out = "give it a disk with room and a folder you may write to"
+        raise InputError(f"{path}: cannot be written ({one_line(error)}): {way_out}") from error
+
+
+@contextmanager
+def _new_osf(path: Path, info: Any) -> Iterator[Any]:
+    """Yield the SDK's writer of a file in a hidden folder, which gets its name when the block ends well.
+
+    A writer that failed writes what is left once more as it is destroyed, and ends the process if that fails too. It
+    opens the file by its name each time: where that leads nowhere, its last attempt succeeds and leaves nothing.
+    """
+    from ouster.sdk import osf
+
+    folder = path.with_name(f".{path.name}.partial")
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    partial = folder / path.name
+    try:
+        writer = osf.Writer(str(partial), info)
+        try:
+            yield writer
+            writer.close()
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            partial.symlink_to(os.devnull)
+            writer.close()
+            raise
+        partial.rename(path)
     finally:
-        partial.unlink(missing_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def sensor_info(session: Session) -> Any:
@@ -118,7 +151,7 @@ def _frame(core: Any, info: Any, session: Session, chunk: ScanChunk, fields: Fie
     frame = core.LidarFrame(info, [core.FieldType(name, values.dtype) for name, values in arrays.items()])
     for name, values in arrays.items():
         frame.field(name)[:] = values
-    start_ns = int(session.provenance.get("sensor_clock_start_ns", 0))
+    start_ns = session.provenance.get("sensor_clock_start_ns", 0)
     frame.frame_id = number
     frame.timestamp[:] = chunk.column_stamps_ns[row] + start_ns
     frame.packet_timestamp[:] = frame.timestamp[:: info.format.columns_per_packet]

@@ -51,6 +51,10 @@ def read_document(path: Path) -> dict[str, Any]:
         document = json.loads(text)
     except json.JSONDecodeError as error:
         raise InputError(f"{path}: not JSON (line {error.lineno}: {error.msg})") from error
+    except ValueError as error:
+        raise InputError(
+            f"{path}: holds a whole number of thousands of digits: expected the metadata of an Ouster sensor"
+        ) from error
     except RecursionError as error:
         raise InputError(f"{path}: nested too deeply to be the metadata of an Ouster sensor") from error
     if not isinstance(document, dict):
@@ -106,16 +110,23 @@ def require_mode(mode: str, source: str) -> None:
 
 def _numbers(values: Any, source: str, key: str) -> Float64Array:
     """Return (N,) finite numbers."""
-    try:
-        numbers = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{source}: {key} must be a list of numbers: {error}") from error
-    if numbers.ndim != 1:
-        raise InputError(f"{source}: {key} must be a list of numbers, got an array of shape {numbers.shape}")
+    if not isinstance(values, list | tuple):
+        raise InputError(f"{source}: {key} must be a list of numbers, got {values!r:.40}")
+    numbers = np.array([_number(value, source, f"{key}[{at}]") for at, value in enumerate(values)], dtype=np.float64)
     if not np.isfinite(numbers).all():
         bad = int(np.argmin(np.isfinite(numbers)))
         raise InputError(f"{source}: {key}[{bad}] = {numbers[bad]}: expected a finite number")
     return numbers
+
+
+def _number(value: Any, source: str, key: str) -> float:
+    """Return a JSON number, which neither text nor true or false is."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{source}: {key} must be a number, got {value!r:.40}")
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise InputError(f"{source}: {key} is beyond any number a sensor has") from error
 
 
 def _beams(flat: Mapping[str, Any], source: str, product: str) -> tuple[Float64Array, Float64Array]:
@@ -146,8 +157,9 @@ def _beams(flat: Mapping[str, Any], source: str, product: str) -> tuple[Float64A
 
 def _columns(mode: str, source: str) -> int:
     columns, _, rate = mode.partition("x")
-    if not (columns.isdecimal() and rate.isdecimal() and int(columns) > 0 and int(rate) > 0):
-        raise InputError(f"{source}: lidar_mode = {mode!r}: expected <columns>x<Hz>, one of {', '.join(MODES)}")
+    is_number = all(word.isdecimal() and len(word) < 6 for word in (columns, rate))
+    if not is_number or int(columns) == 0 or int(rate) == 0:
+        raise InputError(f"{source}: lidar_mode = {mode!r:.40}: expected <columns>x<Hz>, one of {', '.join(MODES)}")
     return int(columns)
 
 
@@ -181,10 +193,7 @@ def _beam_origin_mm(flat: Mapping[str, Any], source: str, product: str) -> float
             raise InputError(f"{source}: {key} is more than a shift along x: such a sensor cannot be projected")
     if value is None:
         value = next((mm for line, mm in _BEAM_ORIGIN_MM.items() if product.startswith(line)), _OTHER_BEAM_ORIGIN_MM)
-    try:
-        beam_origin_mm = float(value)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{source}: {key} must be a number, got {value!r}") from error
+    beam_origin_mm = _number(value, source, key)
     if not 0.0 <= beam_origin_mm <= _FARTHEST_BEAM_ORIGIN_MM:
         raise InputError(
             f"{source}: {key} puts the beam origin {beam_origin_mm:g} mm from the axis: "

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.captures import Recording, open_recording
 from cdpipe.errors import InputError
-from cdpipe.geometry import Float32Array, Float64Array, Int64Array, make_pose, require_poses
+from cdpipe.geometry import BoolArray, Float32Array, Float64Array, Int64Array, make_pose, require_poses
 from cdpipe.motion import Motion, motion_of
 from cdpipe.odometry import estimate_motion, require_kiss_icp
 from cdpipe.revolutions import Revolution
@@ -44,21 +44,24 @@ class Imported:
         n_scans: Revolutions of the session.
         poses: Where their poses come from.
         sensor: Product line and mode.
+        n_left_out: Revolutions that are not in the session, because half their columns or fewer arrived.
     """
 
     n_scans: int
     poses: str
     sensor: str
+    n_left_out: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Times:
-    """First, middle and last stamp (S,) of every revolution, and whether any column has a pose of its own."""
+    """First, middle and last stamp (S,) of every revolution, and whether any of its columns has a pose of its own."""
 
     first_ns: Int64Array
     middle_ns: Int64Array
     last_ns: Int64Array
-    has_own_poses: bool
+    has_own_pose: BoolArray
+    n_left_out: int
 
 
 def import_recording(
@@ -98,23 +101,26 @@ def import_recording(
         "recording": source.name,
         "poses": poses,
         "sensor_clock_start_ns": int(times.first_ns[0]),
+        "revolutions_left_out": times.n_left_out,
     }
     with SessionWriter(out, recording.sensor, CHUNK_SCANS, provenance) as writer:
         writer.close(_write(writer, recording, times, motion, report))
-    return Imported(len(times.first_ns), poses, f"{recording.sensor.product}, {recording.sensor.mode}")
+    sensor = f"{recording.sensor.product}, {recording.sensor.mode}"
+    return Imported(len(times.first_ns), poses, sensor, times.n_left_out)
 
 
 def _times(recording: Recording, report: Progress) -> _Times:
-    stamps_ns, has_own_poses = [], False
+    stamps_ns, has_own_pose = [], []
+    left_out: list[int] = []
     middle = recording.sensor.width // 2
-    for number, revolution in enumerate(recording.revolutions()):
+    for number, revolution in enumerate(recording.revolutions(left_out.append)):
         report("look through", number, recording.n_guessed)
         stamps_ns.append(revolution.column_stamps_ns[[0, middle, -1]])
         off = np.abs(revolution.odom_T_column[revolution.is_valid] - recording.info.sensor_to_body)
-        has_own_poses = has_own_poses or bool(off.max() > _OWN_POSE_TOLERANCE)
+        has_own_pose.append(off.max() > _OWN_POSE_TOLERANCE)
     report("look through", len(stamps_ns), len(stamps_ns))
     first_ns, middle_ns, last_ns = np.array(stamps_ns).T
-    return _Times(first_ns, middle_ns, last_ns, has_own_poses)
+    return _Times(first_ns, middle_ns, last_ns, np.array(has_own_pose), len(left_out))
 
 
 def _motion(
@@ -135,10 +141,15 @@ def _motion(
             return estimate_motion(images, recording.sensor, middle_s, column_s, make_pose()), odometry
         except InputError as error:
             raise InputError(f"{recording.path}: {error}: give the poses with --trajectory") from error
-    if times.has_own_poses:
+    # The frame of the poses may begin at the first revolution, which then lies at its origin.
+    bare = 1 + np.flatnonzero(~times.has_own_pose[1:])
+    if times.has_own_pose.any() and not bare.size:
         return None, "own"
+    lack = "no poses in it"
+    if times.has_own_pose.any():
+        lack = f"{bare.size} of its {len(times.first_ns)} revolutions have no poses, the first of them number {bare[0]}"
     raise InputError(
-        f"{recording.path}: no poses in it: give --trajectory FILE.tum (the sensor's poses, stamped by its clock), or "
+        f"{recording.path}: {lack}: give --trajectory FILE.tum (the sensor's poses, stamped by its clock), or "
         f"--odometry {KISS_ICP} to estimate them"
     )
 

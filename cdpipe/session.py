@@ -16,6 +16,7 @@ import shutil
 import zipfile
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -126,10 +127,8 @@ class SessionWriter:
 
     def __enter__(self) -> SessionWriter:
         shutil.rmtree(self._partial, ignore_errors=True)
-        try:
+        with self._writing():
             (self._partial / "chunks").mkdir(parents=True)
-        except OSError as error:
-            raise InputError(f"{self._path}: cannot write there: {error.strerror}") from error
         return self
 
     def __exit__(
@@ -144,9 +143,14 @@ class SessionWriter:
         return self._partial
 
     def add(self, chunk: ScanChunk) -> None:
-        """Append one chunk; every chunk but the last must hold `chunk_scans` revolutions."""
+        """Append one chunk; every chunk but the last must hold `chunk_scans` revolutions.
+
+        Raises:
+            InputError: It cannot be written, for example because the disk is full; so do `close`.
+        """
         arrays = {name: getattr(chunk, name) for name in ScanChunk.__dataclass_fields__}
-        np.savez(chunk_path(self._partial, self._n_chunks), allow_pickle=False, **arrays)
+        with self._writing():
+            np.savez(chunk_path(self._partial, self._n_chunks), allow_pickle=False, **arrays)
         self._n_chunks += 1
 
     def close(self, odom_T_sensor: Float64Array) -> None:
@@ -154,7 +158,6 @@ class SessionWriter:
         require_poses("odom_T_sensor", odom_T_sensor)
         if self._n_chunks != -(-len(odom_T_sensor) // self._chunk_scans):
             raise ValueError(f"{self._n_chunks} chunks of {self._chunk_scans} do not hold {len(odom_T_sensor)} poses")
-        np.savez(self._partial / "odometry.npz", allow_pickle=False, odom_T_sensor=odom_T_sensor)
         document = {
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
@@ -165,8 +168,17 @@ class SessionWriter:
             "sensor": self._sensor.to_json(),
             "provenance": self._provenance,
         }
-        (self._partial / "session.json").write_text(json.dumps(document, indent=1))
-        self._partial.replace(self._path)
+        with self._writing():
+            np.savez(self._partial / "odometry.npz", allow_pickle=False, odom_T_sensor=odom_T_sensor)
+            (self._partial / "session.json").write_text(json.dumps(document, indent=1))
+            self._partial.replace(self._path)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise InputError(f"{self._path}: cannot write there: {error.strerror}") from error
 
 
 def is_session(path: Path) -> bool:
@@ -195,7 +207,11 @@ def read_session(path: Path) -> Session:
         sensor_document, provenance = document["sensor"], document["provenance"]
         if chunk_scans < 1:
             raise ValueError(f"chunk_scans = {chunk_scans}")
-    except (KeyError, TypeError, ValueError) as error:  # ValueError: not JSON, not text, or not a number
+        _check_provenance(provenance)
+    except OSError as error:
+        raise InputError(f"{path / 'session.json'}: cannot be read: {error.strerror}") from error
+    # ValueError: not JSON, not text, or not a number
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"{path / 'session.json'}: damaged: {error}") from error
     poses = load_arrays(path / "odometry.npz").get("odom_T_sensor")
     if poses is None or len(poses) != n_scans:
@@ -211,6 +227,15 @@ def read_session(path: Path) -> Session:
         raise InputError(f"{path / 'odometry.npz'}: {error}") from error
     sensor = parse_metadata(sensor_document, str(path / "session.json"))
     return Session(path, sensor, poses, chunk_scans, provenance)
+
+
+def _check_provenance(provenance: Any) -> None:
+    """Raise `ValueError` unless it is a JSON object whose clock, where it names one, fits the stamps."""
+    if not isinstance(provenance, dict):
+        raise ValueError(f"provenance = {provenance!r:.40}, expected a JSON object")
+    start_ns = provenance.get("sensor_clock_start_ns", 0)
+    if type(start_ns) is not int or not 0 <= start_ns < 2**62:
+        raise ValueError(f"provenance.sensor_clock_start_ns = {start_ns!r:.40}, expected nanoseconds, 0 to 2^62")
 
 
 def chunk_path(folder: Path, index: int) -> Path:

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import mmap
 import struct
+import zlib
 from pathlib import Path
+from typing import BinaryIO
 
 from cdpipe.errors import InputError
 
@@ -27,10 +29,10 @@ _PCAPNG_ORDERS = {b"\x4d\x3c\x2b\x1a": "<", b"\x1a\x2b\x3c\x4d": ">"}
 
 
 def require_whole_osf(path: Path) -> None:
-    """Compare the length an OSF file states in its header with its own.
+    """Compare the length an OSF file states in its header with its own, and header and metadata with their checksums.
 
     Raises:
-        InputError: It is no OSF file, was never finished, or is cut short.
+        InputError: It is no OSF file, was never finished, is cut short, or header or metadata are damaged.
     """
     n_bytes = _size(path)
     with path.open("rb") as file:
@@ -40,8 +42,14 @@ def require_whole_osf(path: Path) -> None:
     metadata_at, stated_bytes = _osf_header(header)
     if metadata_at == 0:
         raise InputError(f"{path}: the recording was never finished: its writer was not closed, record it again")
-    if stated_bytes != n_bytes or metadata_at >= n_bytes:
+    if n_bytes < stated_bytes:
         raise InputError(f"{path}: cut short: {n_bytes} of {stated_bytes} bytes are there: copy it again")
+    if n_bytes > stated_bytes:
+        raise InputError(f"{path}: damaged: {n_bytes} bytes where its header says {stated_bytes}: copy it again")
+    with path.open("rb") as file:
+        for part, at in (("header", 0), ("metadata", metadata_at)):
+            if not _is_sound(file, at, n_bytes):
+                raise InputError(f"{path}: damaged: its {part} and the checksum of it do not agree: copy it again")
 
 
 def require_whole_pcap(path: Path) -> None:
@@ -92,6 +100,16 @@ def _osf_header(header: bytes) -> tuple[int, int]:
         )
     except struct.error:
         return 0, 0
+
+
+def _is_sound(file: BinaryIO, at: int, n_bytes: int) -> bool:
+    """Check one of the blocks an OSF file is made of: its length, so many bytes, and the CRC-32 of both."""
+    file.seek(at)
+    prefix = file.read(4)
+    end = at + 4 + int.from_bytes(prefix, "little")
+    if end + 4 > n_bytes:
+        return False
+    return zlib.crc32(prefix + file.read(end - at - 4)) == int.from_bytes(file.read(4), "little")
 
 
 def _walk_pcap(data: mmap.mmap, order: str) -> tuple[int, int]:

@@ -55,7 +55,10 @@ def convert(source: Path, out: Path, options: Options, progress: RunProgress) ->
             odometry=options.odometry,
             on_progress=progress.stage,
         )
-    return f"{out}: session of {imported.n_scans} revolutions, {imported.sensor}, poses: {imported.poses}"
+    told = f"{out}: session of {imported.n_scans} revolutions, {imported.sensor}, poses: {imported.poses}"
+    if imported.n_left_out:
+        told += f"; {imported.n_left_out} left out, of which half the columns or fewer arrived"
+    return told
 
 
 def _export(source: Path, out: Path, options: Options, progress: RunProgress) -> str:

@@ -1,7 +1,7 @@
 """What a setting of the world does to a method: the same seeds with it and without it, and the mean of the differences.
 
-A world `narrow[sensor.range_noise=false]` is held against `narrow` of the same run (`eval.worlds.references`). A seed
-draws the same tunnel, the same changes and the same drives in both, so each pair is its own control.
+A world `narrow[sensor.range_noise=false]` is held against `narrow` in the same folder (`eval.worlds.references`). A
+seed draws the same tunnel, the same changes and the same drives in both, so each pair is its own control.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import pandas as pd
 from eval.statistics import IDENTITY_COLUMNS, mean_with_interval
 from eval.worlds import references, settings_over
 
+KEYS = ("scenario", "variant", "seed")
 COLUMNS = ("reference", "settings", "variant", "metric", "without", "with", "difference", "low", "high", "n")
 
 
@@ -25,23 +26,19 @@ def effects(results: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
         seed: Seed of the bootstrap.
 
     Returns:
-        One row per world with settings on top of another one, variant and metric: `reference`, the other world;
-        `settings`, what it has on top; the means `without` and `with` them, their `difference` (with - without) and its
+        One row per world and variant with a reference, and metric: `reference`, the other world; `settings`, what
+        the world has on top of it; the means `without` and `with` them, their `difference` (with - without) and its
         95 % bootstrap interval `low` to `high`; all over the `n` seeds that have a number in both worlds, NaN where
         there is none. Times are left out: they say more about the machine. Without such worlds there is no row.
     """
     metrics = [name for name in results.columns if name not in IDENTITY_COLUMNS and not name.startswith("t_")]
-    places = [results["scenario"], results["variant"], results["seed"]]
-    numbers = results[metrics].apply(pd.to_numeric, errors="coerce").set_index(places)
+    numbers = results[metrics].apply(pd.to_numeric, errors="coerce").set_index(results["seed"])
+    cases = dict(list(numbers.groupby([results["scenario"].to_numpy(), results["variant"].to_numpy()])))
     rows: list[dict[str, Any]] = []
-    for world, reference in references(results["scenario"]).items():
-        changed, plain = numbers.loc[world].align(numbers.loc[reference], join="inner", axis=0)
-        in_both = set(changed.index.get_level_values("variant"))
-        for variant in dict.fromkeys(results["variant"]):
-            if variant in in_both:
-                pair = plain.loc[variant], changed.loc[variant]
-                names = {"reference": reference, "settings": settings_over(world, reference), "variant": variant}
-                rows += [{**names, "metric": metric, **_effect(*pair, metric, seed)} for metric in metrics]
+    for (world, variant), reference in references(zip(*(results[name] for name in KEYS), strict=True)).items():
+        changed, plain = cases[world, variant].align(cases[reference, variant], join="inner", axis=0)
+        names = {"reference": reference, "settings": settings_over(world, reference), "variant": variant}
+        rows += [{**names, "metric": metric, **_effect(plain, changed, metric, seed)} for metric in metrics]
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 

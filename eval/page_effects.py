@@ -116,5 +116,6 @@ def _picture(title: str, rows: Sequence[Row], columns: Sequence[Column], names: 
     }
     counts = sorted({int(row["n"]) for row in rows if row["metric"] in _DRAWN})
     n = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
-    caption = f"Dots are means over {n} session pairs, lines their 95 % intervals; right of 0 is better."
+    pairs = "pair" if n == "1" else "pairs"
+    caption = f"Dots are means over {n} session {pairs}, lines their 95 % intervals; right of 0 is better."
     return Picture(title, effect_plot(panels), caption)

@@ -109,11 +109,16 @@ def of(rows: Iterable[Row], **wanted: Any) -> list[Row]:
 def scenarios(data: RunData, *, unchanged: bool) -> list[str]:
     """Return the scenarios with changes, or those without, in the order of results.csv.
 
-    Worlds that only repeat another one with some setting changed are left out: `eval.page_effects` shows them.
+    Those whose every variant only repeats another world's are left out: `eval.page_effects` shows them.
     """
-    names = dict.fromkeys(str(row["scenario"]) for row in data.results)
-    repeated = references(names)
-    return [name for name in names if name not in repeated and is_unchanged(data, name) == unchanged]
+    held = repeats(data)
+    names = dict.fromkeys(world for world, variant, _ in _cases(data) if (world, variant) not in held)
+    return [name for name in names if is_unchanged(data, name) == unchanged]
+
+
+def repeats(data: RunData) -> dict[tuple[str, str], str]:
+    """Return the world that each (world, variant) is held against, where there is one: `eval.worlds.references`."""
+    return references(_cases(data))
 
 
 def is_unchanged(data: RunData, scenario: str) -> bool:
@@ -124,15 +129,17 @@ def is_unchanged(data: RunData, scenario: str) -> bool:
 
 
 def named_variants(data: RunData, scenario: str) -> list[str]:
-    """Return the variants of a scenario that are no grid point, in the order of results.csv."""
-    names = dict.fromkeys(str(row["variant"]) for row in of(data.results, scenario=scenario))
+    """Return the variants of a scenario that are neither grid point nor repetition, in the order of results.csv."""
+    held = repeats(data)
+    names = dict.fromkeys(name for world, name, _ in _cases(data) if world == scenario and (world, name) not in held)
     on_grid = {name for grid in grids(data) if grid.scenario == scenario for name in grid.points.values()}
     return [name for name in names if name not in on_grid]
 
 
 def first_seed(data: RunData, scenario: str) -> int:
-    """Return the seed of a scenario that the pictures show."""
-    return min(int(row["seed"]) for row in of(data.results, scenario=scenario))
+    """Return the seed of a scenario that the pictures show: the first that is no repetition."""
+    held = repeats(data)
+    return min(seed for world, name, seed in _cases(data) if world == scenario and (world, name) not in held)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,6 +200,10 @@ def read_document(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return document if isinstance(document, dict) else {}
+
+
+def _cases(data: RunData) -> list[tuple[str, str, int]]:
+    return [(str(row["scenario"]), str(row["variant"]), int(row["seed"])) for row in data.results]
 
 
 def _sorted(values: set[str]) -> tuple[str, ...]:

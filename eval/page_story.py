@@ -7,9 +7,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from eval.page_columns import RESULT_COLUMNS, share
-from eval.page_run import BASELINES, RunData, defined, named_variants, of, over_pairs, scenarios, split_variant, text
+from eval.page_run import (
+    BASELINES,
+    RunData,
+    defined,
+    named_variants,
+    of,
+    over_pairs,
+    repeats,
+    scenarios,
+    split_variant,
+    text,
+)
 from eval.page_tables import alarm_text
-from eval.worlds import references
 
 HEADLINE_COLUMNS = tuple(
     (column, name)
@@ -183,10 +193,10 @@ def _about_unchanged(data: RunData) -> list[str]:
 
 
 def _about_size(data: RunData) -> str:
-    repeated = _repeated(data)
+    held = repeats(data)
     pairs: dict[str, set[int]] = {}
     for row in data.results:
-        if row["scenario"] not in repeated:
+        if (row["scenario"], row["variant"]) not in held:
             pairs.setdefault(str(row["scenario"]), set()).add(int(row["seed"]))
     seeds = sorted(set().union(*pairs.values()))
     named = f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}"
@@ -200,16 +210,11 @@ def _about_size(data: RunData) -> str:
     return f"n = {n} session pairs ({sizes}; {named}); values are means over the pairs where they are defined."
 
 
-def _repeated(data: RunData) -> dict[str, str]:
-    return references(str(row["scenario"]) for row in data.results)
-
-
 def _about_repeated(data: RunData) -> list[str]:
-    repeated = _repeated(data)
-    if not repeated:
+    held = repeats(data)
+    if not held:
         return []
-    names = joined(list(dict.fromkeys(repeated.values())))
-    return [
-        f"{len(repeated)} further worlds repeat {names} with something set otherwise; what that does stands under "
-        "its own heading."
-    ]
+    n = len({world for world, _ in held})
+    what = "1 further world repeats" if n == 1 else f"{n} further worlds repeat"
+    names = joined(list(dict.fromkeys(held.values())))
+    return [f"{what} {names} with something set otherwise; what that does stands under its own heading."]

@@ -28,15 +28,27 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, field_validator, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from cdpipe.config import PipelineConfig, load_config, preset_names
 from cdpipe.errors import InputError
 from cdpipe.yamlfile import Document, Settings, read_yaml, suggestion, validated, with_settings
-from eval.worlds import ScenarioItem, World, group_of, known_label, told_as_values, world_slug, worlds_of
+from eval.worlds import (
+    OneOrMore,
+    ScenarioItem,
+    World,
+    group_of,
+    known_label,
+    setting_text,
+    told_as_values,
+    world_slug,
+    worlds_of,
+)
 from scenarios.schema import Scenario
 
 _LONGEST_SLUG = 200  # file systems take names of 255 bytes
+_TOO_LONG = "is too long for a folder's name: put the settings into a file of their own"
 
 
 def parse_seeds(value: Any) -> tuple[int, ...]:
@@ -60,12 +72,6 @@ def parse_seeds(value: Any) -> tuple[int, ...]:
     if not all(type(seed) is int and seed >= 0 for seed in value) or len(set(value)) < len(value):
         raise ValueError(f"{rule}, none twice")
     return tuple(value)
-
-
-def setting_text(key: str, value: Any) -> str:
-    """Return `key=value` as --set takes it."""
-    text = yaml.safe_dump(value, default_flow_style=True, width=10_000)
-    return f"{key}={text.removesuffix('...' + chr(10)).strip()}"
 
 
 def _known_preset(name: str) -> str:
@@ -103,6 +109,7 @@ def _not_empty(value: Any) -> Any:
 Label = Annotated[str, AfterValidator(known_label)]
 PresetName = Annotated[str, AfterValidator(_known_preset)]
 Setting = Annotated[str, AfterValidator(_valid_setting)]
+MethodSettings = Annotated[tuple[Setting, ...], OneOrMore]
 NotEmpty = BeforeValidator(_not_empty)
 Values = Annotated[tuple[Any, ...], NotEmpty]
 
@@ -111,8 +118,8 @@ class Variant(Settings):
     """One method to run: a preset and what is set over it."""
 
     preset: PresetName
-    set: tuple[Setting, ...] = ()
-    per_scenario: dict[Label, tuple[Setting, ...]] = Field(default_factory=dict)
+    set: MethodSettings = ()
+    per_scenario: dict[Label, MethodSettings] = Field(default_factory=dict)
 
 
 class Grid(Settings):
@@ -133,10 +140,29 @@ class Plan(Settings):
     variants: Annotated[tuple[Variant, ...], NotEmpty]
     grid: tuple[Grid, ...] = ()
 
+    @field_validator("scenarios")
+    @classmethod
+    def _worlds_differ(cls, items: tuple[ScenarioItem, ...]) -> tuple[ScenarioItem, ...]:
+        known: set[object] = set()
+        mistakes: list[InitErrorDetails] = []
+        for place, item in enumerate(items):
+            for index, world in enumerate(worlds_of([item])):
+                folder = world_slug(world.label)
+                names = {folder, (world.name, world.settings)}
+                rule = _TOO_LONG if len(folder) > _LONGEST_SLUG else "is listed twice" if known & names else ""
+                if rule:
+                    error = PydanticCustomError("world", "{rule}", {"rule": f"scenario {world.label} {rule}"})
+                    where = (place, "each", index - 1) if index else (place,)
+                    written = ",".join(world.own) or world.name
+                    mistakes.append(InitErrorDetails(type=error, loc=where, input=written))
+                known |= names
+        if mistakes:
+            raise ValidationError.from_exception_data(cls.__name__, mistakes)
+        return items
+
     @model_validator(mode="after")
     def _parts_fit(self) -> Plan:
         worlds = worlds_of(self.scenarios)
-        _fit_folders([world_slug(world.label) for world in worlds], "scenario {} is listed twice")
         names = dict.fromkeys(name for world in worlds for name in (world.name, world.label))
         asked = [
             (f"per_scenario of {variant.preset}", name) for variant in self.variants for name in variant.per_scenario
@@ -146,8 +172,12 @@ class Plan(Settings):
             if name not in names:
                 raise ValueError(f"{who} names {name!r}, which is not in scenarios{suggestion(name, names)}")
         for world in worlds:
-            slugs = [slug(variant_name(preset, named)) for preset, named, _ in _methods(self, world)]
-            _fit_folders(slugs, "variant {} stands twice in the plan for " + world.label)
+            folders = [slug(variant_name(preset, named)) for preset, named, _ in _methods(self, world)]
+            for folder in folders:
+                if folders.count(folder) > 1:
+                    raise ValueError(f"variant {folder} stands twice in the plan for {world.label}")
+                if len(folder) > _LONGEST_SLUG:
+                    raise ValueError(f"variant {folder} {_TOO_LONG}")
         return self
 
 
@@ -276,14 +306,6 @@ def _methods(plan: Plan, world: World) -> list[tuple[str, tuple[str, ...], tuple
         if not places.keys().isdisjoint(grid.scenarios):
             methods += [(grid.variant, point, ()) for point in _points(grid.keys)]
     return methods
-
-
-def _fit_folders(slugs: Sequence[str], twice: str) -> None:
-    for each in slugs:
-        if slugs.count(each) > 1:
-            raise ValueError(twice.replace("{}", each, 1))
-        if len(each) > _LONGEST_SLUG:
-            raise ValueError(f"{each} is too long for a folder's name: put the settings into a file of their own")
 
 
 def _points(keys: Mapping[str, Sequence[Any]]) -> list[tuple[str, ...]]:

@@ -23,27 +23,25 @@ from eval.cli import input_errors
 from eval.output import make_writable, unwritable
 from eval.reality_plots import draw_measures, draw_novelty, draw_scene
 from eval.reality_scenes import (
-    Drive,
     as_revolutions,
-    column_poses,
+    cast_at_origin,
     drive_of,
     find_recording,
     real_revolution,
-    simulated,
+    with_effects,
 )
 from eval.reality_tables import markdown, measured, novelty_table, side_by_side, surface_rows
 from eval.rebuilt_scene import Rebuilt, rebuild
 from eval.sensor_measures import Revolutions
-from eval.static_novelty import WAYS, Novelty, Way, effect_variants, static_novelty
+from eval.static_novelty import Novelty, effect_variants, novelty_cases, static_novelty
 from scenarios.schema import Sensor
+from sim.revolution import Drive, cast_revolution
 
 DATA_VARIABLE = "TUNNELCD_REAL_DATA"
 PROFILE = "os1-32-g"
 WORLDS = (("narrow", 10000), ("wide", 10000))
 REAL, SAME_SCENE = "real", "real scene"
 _N_REPEATS = 10  # revolutions of each simulated source
-_N_NOVELTY = 40
-_STANDING_NUMBERS = (4, 10, 20, 40, 100, 200)
 # The real unit reports returns to 204 m; a tunnel has none so far.
 _FAR_M = 250.0
 
@@ -102,33 +100,20 @@ def compare(data: Path | None) -> Comparison:
 
 
 def _recast(rebuilt: Rebuilt, real: Revolutions, settings: Sensor, n_revolutions: int) -> Revolutions:
-    standing = np.broadcast_to(np.eye(4), (real.sensor.width, 4, 4)).copy()
-    scans = [simulated(rebuilt.scene, real.sensor, settings, standing, number) for number in range(n_revolutions)]
+    scans = [cast_at_origin(rebuilt.scene, real.sensor, settings, number) for number in range(n_revolutions)]
     return as_revolutions(real.sensor, scans)
 
 
 def _driven(drive: Drive, settings: Sensor) -> Revolutions:
     """Return revolutions spread evenly over a drive."""
-    numbers = np.linspace(0, drive.trajectory.n_scans - 1, _N_REPEATS).astype(int).tolist()
-    scans = [simulated(drive.scene, drive.sensor, settings, column_poses(drive, n), n) for n in numbers]
-    return as_revolutions(drive.sensor, scans)
+    recorded = with_effects(drive, settings)
+    numbers = np.linspace(0, recorded.trajectory.n_scans - 1, _N_REPEATS).astype(int).tolist()
+    return as_revolutions(recorded.sensor, [cast_revolution(recorded, number)[1] for number in numbers])
 
 
 def _novelty(drive: Drive) -> list[Novelty]:
-    start = drive.trajectory.n_scans // 3
-    default = drive.scenario.sensor
-
-    def of(settings: Sensor, variant: str, way: Way, n_revolutions: int) -> Novelty:
-        return static_novelty(drive, settings, variant, way, range(start, start + n_revolutions))
-
-    found = [of(default, "default", "standing", number) for number in _STANDING_NUMBERS]
-    found += [
-        of(settings, variant, way, _N_NOVELTY)
-        for way in WAYS
-        for variant, settings in effect_variants(default).items()
-        if (way, variant) != ("standing", "default")  # among the numbers above
-    ]
-    return found
+    first = drive.trajectory.n_scans // 3
+    return [static_novelty(drive, case, first) for case in novelty_cases(drive.scenario.sensor)]
 
 
 def main(

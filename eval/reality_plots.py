@@ -82,7 +82,8 @@ def draw_novelty(results: Sequence[Novelty], path: Path) -> None:
     left.set_title("standing, default effects; dotted: real recording", fontsize=10)
     left.legend(title="voxel", frameon=False)
     most = [each for each in results if each.n_revolutions == _most_common(results)]
-    variants = list(dict.fromkeys(each.variant for each in most))
+    # What a standing sensor has no case of keeps its place among the others.
+    variants = list(dict.fromkeys(each.variant for each in sorted(most, key=_is_standing)))
     ways = list(dict.fromkeys(each.way for each in most))
     for place, (way, colour) in enumerate(zip(ways, (BLUE, ORANGE, VERMILLION), strict=False)):
         bars = {each.variant: 100.0 * each.shares[0] for each in most if each.way == way}
@@ -108,6 +109,10 @@ def _dress(axes: Axes, ticks: Sequence[str], across: str, up: str, scale: str) -
     if scale == "linear" and not up.startswith("share that"):
         axes.set_ylim(bottom=0.0)
     axes.grid(visible=True, lw=0.3)
+
+
+def _is_standing(novelty: Novelty) -> bool:
+    return novelty.way == "standing"
 
 
 def _n_revolutions(novelty: Novelty) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,32 +14,15 @@ from cdpipe.geometry import Float64Array
 from cdpipe.ouster import SensorMetadata
 from eval.sensor_measures import Revolutions, destaggered
 from scenarios.library import load_scenario
-from scenarios.schema import Scenario, Sensor
+from scenarios.schema import Sensor
 from sim.lidar import Scan, scan
 from sim.rays import revolution_rays
-from sim.scene import Scene, build_world
-from sim.trajectory import Trajectory, plan_trajectory
+from sim.revolution import Drive
+from sim.scene import Scene
+from sim.simulate import plan_drives
+from sim.trajectory import record
 
 RECORDING = "OS-1-32-G_v2.1.1_1024x10"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Drive:
-    """One session of a simulated world.
-
-    Attributes:
-        scenario: As drawn.
-        seed: Its seed.
-        scene: What the session's sensor meets.
-        sensor: Its beam table.
-        trajectory: Its way.
-    """
-
-    scenario: Scenario
-    seed: int
-    scene: Scene
-    sensor: SensorMetadata
-    trajectory: Trajectory
 
 
 def find_recording(folder: Path | None) -> Path:
@@ -76,19 +59,29 @@ def drive_of(family: str, seed: int, sensor: SensorMetadata, profile: str) -> Dr
         ScenarioError: The world cannot be built.
     """
     settings = [f"sensor.profile={profile}", f"sensor.mode={sensor.mode}"]
-    scenario = load_scenario(family, seed, settings)
-    world = build_world(scenario, seed)
-    return Drive(scenario, seed, world.before, sensor, plan_trajectory(world, scenario, sensor, seed, "before"))
+    return plan_drives(load_scenario(family, seed, settings), sensor, seed)[0]
 
 
-def column_poses(drive: Drive, number: int, is_rolling: bool = True) -> Float64Array:
-    """Return the true poses (W, 4, 4) of a revolution's columns; not rolling: all as the middle one."""
-    poses = drive.trajectory.world_T_column(slice(number, number + 1))[0]
-    return poses if is_rolling else np.broadcast_to(poses[len(poses) // 2], poses.shape).copy()
+def with_effects(drive: Drive, settings: Sensor) -> Drive:
+    """Return the same drive recorded with other effects: where the scan does not roll, its columns have one pose."""
+    scenario = drive.scenario.model_copy(update={"sensor": settings})
+    trajectory = record(drive.trajectory.true, scenario, drive.sensor, drive.seed, drive.name)
+    return replace(drive, scenario=scenario, trajectory=trajectory)
 
 
-def simulated(scene: Scene, sensor: SensorMetadata, settings: Sensor, poses: Float64Array, number: int) -> Scan:
-    """Return what a sensor reports whose columns have poses (W, 4, 4)."""
+def standing(drive: Drive, number: int, n_revolutions: int) -> Drive:
+    """Return revolutions all recorded where a drive recorded the middle column of one, the sensor standing still."""
+    still = replace(
+        drive.trajectory,
+        revolution_s=np.full(n_revolutions, drive.trajectory.revolution_s[number]),
+        column_s=np.zeros(drive.sensor.width),
+    )
+    return replace(drive, trajectory=still)
+
+
+def cast_at_origin(scene: Scene, sensor: SensorMetadata, settings: Sensor, number: int) -> Scan:
+    """Return a revolution of a sensor that stands still at the origin of a scene."""
+    poses = np.broadcast_to(np.eye(4), (sensor.width, 4, 4))
     return scan(scene, sensor, settings, revolution_rays(sensor, poses), 0, "before", number)
 
 

@@ -58,18 +58,17 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
     for (slug, seed), group in groupby(folders, key=lambda folder: folder.parts[-3:-1]):
         truth = load_ground_truth(run.path / "pairs" / slug / seed)
         for folder in group:
-            progress.cells(f"{slug} {seed} {folder.name}", len(documents), len(folders))
             path = run.path / "cells" / slug / seed / f"{folder.name}.json"
             stored = run.read_cell(path)
-            score = score_stored(truth, folder)
             if stored is None:
                 names = {"scenario": _scenario_of(run, slug), "seed": int(seed)}
                 identity = {**names, "variant": folder.name, "preset": folder.name, "commit": None}
-                document = cell_document(score, identity, "", (len(folders), len(folders)))
+                key, place = "", (len(folders), len(folders))
             else:
                 identity = {name: stored["row"].get(name) for name in (*IDENTITY, "preset", "commit")}
-                document = cell_document(score, identity, stored["key"], stored["order"])
-            documents[path] = document
+                key, place = stored["key"], stored["order"]
+            progress.cells("{scenario} {seed} {variant}".format(**identity), len(documents), len(folders))
+            documents[path] = cell_document(score_stored(truth, folder), identity, key, place)
     for path, document in documents.items():
         run.write_cell(path, document)
     progress.cells("done", len(documents), len(documents))

@@ -147,6 +147,8 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     found = effects(results)
     if len(found):
         _write_csv(run.path / "effects.csv", found)
+    else:
+        remove(run.path / "effects.csv")
     return results
 
 

@@ -79,27 +79,6 @@ def bootstrap_interval(
     return float(low), float(high)
 
 
-def paired_difference(
-    results: pd.DataFrame, metric: str, variant: str, rival: str, seed: int = 0
-) -> tuple[float, float, float, int]:
-    """Return mean, low and high of the difference of a metric on the pairs that both variants have a number for.
-
-    Args:
-        results: Rows as in results.csv.
-        metric: The column.
-        variant: The one to look at.
-        rival: The one to take away from it.
-        seed: Seed of the bootstrap.
-
-    Returns:
-        Mean of `variant - rival`, its 95 % interval, and the number of pairs; NaN without pairs.
-    """
-    table = results.pivot_table(index=["scenario", "seed"], columns="variant", values=metric, dropna=False)
-    if variant not in table or rival not in table:
-        return mean_with_interval(np.empty(0), seed)
-    return mean_with_interval((table[variant] - table[rival]).to_numpy(dtype=np.float64), seed)
-
-
 def mean_with_interval(values: Float64Array, seed: int = 0) -> tuple[float, float, float, int]:
     """Return mean, low and high of its 95 % bootstrap interval, and how many of (N,) numbers are not NaN.
 

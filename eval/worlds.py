@@ -9,17 +9,19 @@ scenarios:
       - [sensor.range_noise=false, sensor.dropouts=false]
 
 These are four worlds: `paper/site1`, `narrow[platform.speed_mps=0.5]` and
-`narrow[platform.speed_mps=0.5,sensor.range_noise=false]`, and so on. The column `scenario` holds that name; `family` is
-the scenario's own, whatever was set.
+`narrow[platform.speed_mps=0.5][sensor.range_noise=false]`, and so on. The column `scenario` holds that name; `family`
+is the scenario's own, whatever was set. What comes on top stands in brackets of its own, so that the name alone tells
+what a world is held against, whichever plan ran it.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any
 
+import yaml
 from pydantic import (
     AfterValidator,
     BeforeValidator,
@@ -55,7 +57,13 @@ def told_as_values(check: Callable[[], object]) -> None:
     try:
         check()
     except InputError as error:
-        raise ValueError("; ".join(line.removeprefix(": ") for line in str(error).splitlines())) from error
+        raise ValueError("; ".join(_without_option(str(error)))) from error
+
+
+def setting_text(key: str, value: Any) -> str:
+    """Return `key=value` as --set takes it."""
+    text = yaml.safe_dump(value, default_flow_style=True, width=10_000)
+    return f"{key}={text.removesuffix('...' + chr(10)).strip()}"
 
 
 def group_of(setting: str) -> str:
@@ -67,16 +75,34 @@ def _as_list(value: Any) -> Any:
     return [value] if isinstance(value, str) else value
 
 
+def _one_spelling(setting: str) -> str:
+    """Write the value as YAML reads it: `off` and `false ` are the same world as `false`."""
+    key, equals, text = setting.partition("=")
+    try:
+        return setting_text(key, yaml.safe_load(text)) if equals else setting
+    except yaml.YAMLError:
+        return setting
+
+
+def _fit_on_top(settings: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+    if not settings:
+        raise ValueError("an empty list sets nothing: leave it out")
+    if "name" in info.data:
+        _check_draws(info.data["name"], (*info.data.get("set", ()), *settings))
+    return settings
+
+
 ScenarioName = Annotated[str, AfterValidator(known_scenario)]
-OneOrMore = Annotated[tuple[str, ...], BeforeValidator(_as_list)]
+OneOrMore = BeforeValidator(_as_list)
+WorldSettings = Annotated[tuple[Annotated[str, AfterValidator(_one_spelling)], ...], OneOrMore]
 
 
 class ScenarioItem(Settings):
     """One item of a plan's scenarios: a name, or a mapping; it stands for one world or for several."""
 
     name: ScenarioName
-    set: tuple[str, ...] = ()
-    each: tuple[OneOrMore, ...] = ()
+    set: WorldSettings = ()
+    each: Annotated[tuple[Annotated[WorldSettings, AfterValidator(_fit_on_top)], ...], OneOrMore] = ()
 
     @model_validator(mode="before")
     @classmethod
@@ -91,17 +117,8 @@ class ScenarioItem(Settings):
     @classmethod
     def _set_fits(cls, settings: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
         if settings and "name" in info.data:
-            _draws(info.data["name"], [settings])
+            _check_draws(info.data["name"], settings)
         return settings
-
-    @field_validator("each")
-    @classmethod
-    def _each_fits(cls, each: tuple[tuple[str, ...], ...], info: ValidationInfo) -> tuple[tuple[str, ...], ...]:
-        if not all(each):
-            raise ValueError("an empty list sets nothing: leave it out")
-        if "name" in info.data:
-            _draws(info.data["name"], [(*info.data.get("set", ()), *more) for more in each])
-        return each
 
     @model_serializer(mode="wrap")
     def _as_written(self, handler: SerializerFunctionWrapHandler) -> Any:
@@ -112,24 +129,32 @@ class ScenarioItem(Settings):
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """A scenario, and the `a.b=value` settings that are written over it before a seed draws it."""
+    """A scenario, and the `a.b=value` settings that are written over it before a seed draws it.
+
+    Attributes:
+        name: The scenario.
+        common: What its item sets in all of its worlds.
+        own: What this world has on top.
+    """
 
     name: str
-    settings: tuple[str, ...] = ()
+    common: tuple[str, ...] = ()
+    own: tuple[str, ...] = ()
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """All that is set, in the order in which it is written over the scenario."""
+        return (*self.common, *self.own)
 
     @property
     def label(self) -> str:
         """What it is called in tables: the scenario, and its settings in brackets where there are any."""
-        return f"{self.name}[{','.join(self.settings)}]" if self.settings else self.name
+        return self.name + "".join(f"[{','.join(part)}]" for part in (self.common, self.own) if part)
 
 
 def worlds_of(items: Iterable[ScenarioItem]) -> list[World]:
     """Return the worlds that the items of a plan stand for, in their order."""
-    return [
-        World(item.name, settings)
-        for item in items
-        for settings in (item.set, *((*item.set, *own) for own in item.each))
-    ]
+    return [World(item.name, item.set, own) for item in items for own in ((), *item.each)]
 
 
 def known_label(label: str) -> str:
@@ -148,37 +173,52 @@ def world_slug(label: str) -> str:
     return re.sub(r"[^A-Za-z0-9._=,-]", "_", label.replace("/", "__"))
 
 
-def settings_over(label: str, reference: str) -> str:
-    """Return the settings that a world has on top of another one, "" where it is no such world.
+def references(cases: Iterable[tuple[str, str, int]]) -> dict[tuple[str, str], str]:
+    """Return the world that each world is held against, for each variant that both were run with.
 
-    `narrow[a=1,b=2]` has "b=2" over `narrow[a=1]` and "a=1,b=2" over `narrow`.
-    """
-    head = f"{reference[:-1]}," if reference.endswith("]") else f"{reference}["
-    return label[len(head) : -1] if label.startswith(head) and label.endswith("]") else ""
-
-
-def references(labels: Iterable[str]) -> dict[str, str]:
-    """Return the world that each world is held against: of those it adds settings to, the one with the fewest.
+    That is the nearest world whose label is its own less one or more brackets at the end: `narrow[a=1]` for
+    `narrow[a=1][b=2]`, or else `narrow`.
 
     Args:
-        labels: All worlds of a run; one that adds to no other has no reference and is left out.
+        cases: World, variant and seed of each row of a run.
+
+    Returns:
+        The other world by (world, variant); nothing where there is none with a seed in common.
     """
-    known = list(dict.fromkeys(labels))
-    found = {label: [other for other in known if settings_over(label, other)] for label in known}
-    return {label: min(others, key=len) for label, others in found.items() if others}
+    seeds: dict[tuple[str, str], set[int]] = {}
+    for world, variant, seed in cases:
+        seeds.setdefault((world, variant), set()).add(seed)
+    found: dict[tuple[str, str], str] = {}
+    for (world, variant), own in seeds.items():
+        shared = (other for other in _barer(world) if not own.isdisjoint(seeds.get((other, variant), ())))
+        if (nearest := next(shared, None)) is not None:
+            found[world, variant] = nearest
+    return found
 
 
-def _draws(name: str, worlds: Iterable[tuple[str, ...]]) -> None:
-    """Refuse settings that do not fit a scenario, whatever the seed; each mistake is told once."""
-    lines: dict[str, None] = {}
-    for settings in worlds:
-        of_method = [setting for setting in settings if group_of(setting) in PipelineConfig.model_fields]
-        lines |= {
-            f"{setting} belongs to the method, not to the world: set it under variants": None for setting in of_method
-        }
-        try:
-            check_scenario(name, [setting for setting in settings if setting not in of_method])
-        except InputError as error:
-            lines |= dict.fromkeys(str(error).splitlines())
+def settings_over(world: str, reference: str) -> str:
+    """Return the settings that a world has on top of its reference: "a=1,b=2" for `narrow[a=1][b=2]` over `narrow`."""
+    return world[len(reference) + 1 : -1].replace("][", ",")
+
+
+def _barer(label: str) -> Iterator[str]:
+    """Yield what stands before each bracket of a label, longest first; not all of it need be a world."""
+    if label.endswith("]"):
+        yield from (label[:place] for place in range(len(label) - 1, 0, -1) if label[place] == "[")
+
+
+def _check_draws(name: str, settings: tuple[str, ...]) -> None:
+    """Refuse settings that do not fit a scenario, whatever the seed."""
+    of_method = [setting for setting in settings if group_of(setting) in PipelineConfig.model_fields]
+    lines = [f"{setting} belongs to the method, not to the world: set it under variants" for setting in of_method]
+    try:
+        check_scenario(name, [setting for setting in settings if setting not in of_method])
+    except InputError as error:
+        lines += _without_option(str(error))
     if lines:
-        raise ValueError("; ".join(lines))
+        raise ValueError("; ".join(dict.fromkeys(lines)))
+
+
+def _without_option(told: str) -> list[str]:
+    """Return the lines of an error without the option of the command line that they seem to come from."""
+    return [re.sub(r"^(--set)?:? ", "", line) for line in told.splitlines()]

@@ -263,7 +263,7 @@ class Sensor(Settings):
     sub_rays: Literal[1, 7, 19] = 1  # rays over each beam's width; 1: no divergence, no mixed pixels at edges
     false_positives: bool = True  # returns where nothing is
     range_step_mm: Literal[1, 8] = 1  # 8: the vendor's low-bandwidth packets
-    max_range_m: Positive = 120.0
+    max_range_m: Annotated[float, Field(gt=0, le=524)] = 120.0  # the vendor's range field: 19 bits of millimetres
     min_range_m: NotNegative = 0.3
 
     @model_validator(mode="after")

@@ -72,7 +72,8 @@ def place_props(scenario: Scenario, centreline: Centreline, around: Surroundings
 
     Props with a given place come first. A drawn place is drawn again until the prop fits between the walls, stands
     clear of the others, leaves the robot its way and comes to rest: 80 times, 80 times at the opposite wall, and in an
-    area 160 times more with as much tunnel again to either side. The draws of one prop depend on no other.
+    area 160 times more with as much tunnel again to either side; one that leans 160 times more where humps of the
+    floor hide a part of the wall. The draws of one prop depend on no other.
 
     Raises:
         ScenarioError: A prop does not fit, stands in another, does not come to rest, or finds no place.
@@ -174,11 +175,13 @@ def _find_place(
     if len(stretches[0]) == 0:
         raise ScenarioError(f"prop {job.prop.name!r}: a mesh without drifts has no stations to draw: give `place.at`")
     opposite = replace(job, place=job.place.model_copy(update={"lateral": -job.place.lateral}))
-    rounds = [(stations, wanted) for stations in stretches for wanted in (job, opposite)]
+    rounds = [(stations, wanted, False) for stations in stretches for wanted in (job, opposite)]
+    if job.place.posture == "leaning":
+        rounds += [(stretches[-1], wanted, True) for wanted in (job, opposite)]
     why = ""
-    for number, (stations, wanted) in enumerate(rounds):
+    for number, (stations, wanted, over_humps) in enumerate(rounds):
         purpose = ("to" if job.is_goal else "place") + (f"-{number}" if number else "")
-        spots = drawn_spots(job.prop.name, purpose, stations, scenario, centreline, seed)
+        spots = drawn_spots(job.prop.name, purpose, stations, scenario, centreline, seed, over_humps)
         items, why = _first_fit(wanted, spots, around, seed, board)
         if items:
             return items

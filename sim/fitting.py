@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array, make_pose, yaw_pose
+from cdpipe.geometry import Float32Array, Float64Array, make_pose, yaw_pose
 from scenarios.schema import Place, Prop
 from sim.bed import BEHIND_M
 from sim.mesh import split
@@ -18,6 +18,9 @@ from sim.shapes import Shape, footprint, solid_mesh
 
 # A prop may lean on a wall that is this even; at a drift's mouth it is not.
 _UNEVEN_WALL_M = 0.8
+# What rises no more steeply is floor; of a wall at least half must be seen over it.
+_FLOOR_UP = 0.7
+_SEEN_SHARE = 0.5
 _LEAN_GAP_M = 0.01
 _BULGE_M = 0.15  # of rock that a leaning prop may meet between its corners
 
@@ -32,6 +35,7 @@ class Spot:
         width_m, height_m: Nominal size of the drift.
         where: How a message calls it.
         is_line: Whether the drift's width is shared out by `lateral`; else the prop stands at the point itself.
+        over_humps: Whether an uneven wall is judged again, by what is seen of it over humps of the floor.
     """
 
     point: Float64Array
@@ -40,6 +44,7 @@ class Spot:
     height_m: float
     where: str
     is_line: bool = True
+    over_humps: bool = False
 
 
 def placed(
@@ -185,15 +190,15 @@ def _at_wall(
     origins = np.column_stack([base[:2] + along, level_m + np.maximum(points[:, 2] - foot_m, 0.1)])
     is_pile = prop.kind == "muck_pile"
     caster = around.walls if is_pile else around.fixed
-    reach_m = caster.cast(origins, np.tile([*wall, 0.0], (len(origins), 1)))[0]
+    reach_m, _, normals = caster.hits(origins, np.tile([*wall, 0.0], (len(origins), 1)))
+    if not _is_even(reach_m, is_pile, spot):
+        # Under a long prop the floor may rise above its foot: a ray from there starts in rock, or meets the floor.
+        is_wall = np.isfinite(reach_m) & (normals[:, :2] @ wall < 0) & (normals[:, 2] < _FLOOR_UP)
+        is_seen = spot.over_humps and is_wall.mean() >= _SEEN_SHARE
+        if not (is_seen and _is_even(reach_m[is_wall], is_pile, spot)):
+            raise ScenarioError(f"prop {prop.name!r}: there is no even wall to lean against {spot.where}")
+        reach_m, points = reach_m[is_wall], points[is_wall]
     room_m = reach_m - points[:, :2] @ wall
-    no_wall = ScenarioError(f"prop {prop.name!r}: there is no even wall to lean against {spot.where}")
-    if not np.isfinite(reach_m).all():
-        raise no_wall
-    # A pile goes on behind its plane, which is put at the mean of the wall.
-    hollow_m, limit_m = (reach_m.max() - reach_m.mean(), BEHIND_M) if is_pile else (np.ptp(reach_m), _UNEVEN_WALL_M)
-    if hollow_m > limit_m or reach_m.max() > spot.width_m + 2.0:
-        raise no_wall
     # A pile's flat back lies in the mean line of the wall and goes on into the rock; all else stays out of it.
     position = base[:2] + float(room_m.mean() if is_pile else room_m.min() - _LEAN_GAP_M) * wall
     if shape.is_settled:
@@ -202,6 +207,16 @@ def _at_wall(
     yaw = float(np.arctan2(rotation[1, 0], rotation[0, 0]))
     floor_m = _floor_under(prop, -half, half, position, yaw, float(spot.point[2]), around.walls)
     return make_pose(rotation, np.append(position, floor_m)), wall
+
+
+def _is_even(reach_m: Float32Array, is_pile: bool, spot: Spot) -> bool:
+    """Tell whether a wall at these distances (N,) is one to lean against, infinite where no rock was met."""
+    if not np.isfinite(reach_m).all() or reach_m.max() > spot.width_m + 2.0:
+        return False
+    # A pile goes on behind its plane, which is put at the mean of the wall.
+    if is_pile:
+        return bool(reach_m.max() - reach_m.mean() <= BEHIND_M)
+    return bool(np.ptp(reach_m) <= _UNEVEN_WALL_M)
 
 
 def _back(shape: Shape) -> Float64Array:

@@ -87,7 +87,8 @@ def footprint(sub_rays: int) -> tuple[Float64Array, Float64Array]:
 
     A round Gaussian whose half-brightness circle has radius 1. Seven rays: the rule that integrates polynomials of
     degree 5 exactly, half the light in the middle, the rest in a hexagon two standard deviations out. Nineteen: a
-    hexagonal lattice of spacing 1, two rings about the middle, each ray with the Gaussian's brightness there.
+    hexagonal lattice of spacing 1, two rings about the middle, each ray with the Gaussian's brightness there; cut
+    off at radius 2, they are 4 % narrower than the Gaussian.
 
     Returns:
         (n, 2) places across the beam, (n,) shares that add up to 1; the middle first.
@@ -158,5 +159,5 @@ def _across(directions: Float32Array) -> tuple[Float32Array, Float32Array]:
     level = np.maximum(np.hypot(x, y), np.float32(1e-6))
     right, up = np.empty_like(directions), np.empty_like(directions)
     right[:, 0], right[:, 1], right[:, 2] = y / level, -x / level, 0.0
-    up[:, 0], up[:, 1], up[:, 2] = right[:, 1] * -z, right[:, 0] * z, level
+    up[:, 0], up[:, 1], up[:, 2] = right[:, 1] * z, right[:, 0] * -z, level
     return right, up

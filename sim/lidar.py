@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.geometry import Float32Array, Int32Array, stream
+from cdpipe.geometry import BoolArray, Float32Array, Int32Array, stream
 from cdpipe.ouster import SensorMetadata
 from scenarios.schema import Sensor
 from sim.footprint import central_echo, spread_echo
@@ -25,6 +25,9 @@ from sim.rays import Rays
 from sim.scene import Scene
 
 MISS, FALSE_RETURN = -1, -2
+# A blended echo this far from what it is said to come from is a place in mid air: the pixel is mixed. As much as a
+# return must be off the old surface to count as changed.
+MIXED_M = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +40,8 @@ class Scan:
         signal: uint16 photons.
         true_range_m: float32 distance from the spin axis's point to the surface along the beam, infinite for a miss.
         geom: int32 geom hit, `MISS` where nothing returned, `FALSE_RETURN` where nothing stands.
+        is_mixed: True for a return whose echo, before noise, is more than 0.1 m off the surface of `geom`: it blends
+            with what is behind or before it. Never so with one ray per beam.
     """
 
     range_mm: npt.NDArray[np.uint32]
@@ -44,6 +49,7 @@ class Scan:
     signal: npt.NDArray[np.uint16]
     true_range_m: Float32Array
     geom: Int32Array
+    is_mixed: BoolArray
 
 
 def scan(
@@ -90,4 +96,5 @@ def scan(
         signal=signal_channel(photons).T,
         true_range_m=echo.true_range_m.T,
         geom=geom.T,
+        is_mixed=((geom >= 0) & (np.abs(echo.range_m - echo.true_range_m) > MIXED_M)).T,
     )

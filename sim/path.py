@@ -35,6 +35,8 @@ _SWERVES_M = (2.0, 1.4, 1.0, 0.7, 0.5)
 _CHICANE_SHARE = 0.3
 # Where no smooth way is found, the stones within this distance are driven over.
 _STONE_REACH_M = 4.0
+# Between the heights of a wary look: no pipe is thinner.
+_WARY_STEP_M = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,15 +54,23 @@ class Path:
     yaw_rad: Float64Array
 
 
-def plan_path(world: World, scenario: Scenario, seed: int, session: str) -> Path:
+def plan_path(world: World, scenario: Scenario, seed: int, session: str, is_wary: bool = False) -> Path:
     """Return the line of one session; the seed draws its wander.
+
+    Args:
+        world: What is driven through.
+        scenario: Its platform and its sessions.
+        seed: What the wander is drawn from.
+        session: "before" or "after".
+        is_wary: Keep off all that hangs or juts out within the clearance above and below the sensor too, not just off
+            what is level with it.
 
     Raises:
         ScenarioError: The route turns back on itself, nothing is left of it, or the walls and props leave no room.
     """
     plan: SessionPlan = getattr(scenario, session)
     line, width_m = _reference(world, plan, session)
-    offset_m = _offsets(world, scenario, seed, session, line, width_m)
+    offset_m = _offsets(world, scenario, seed, session, line, width_m, _heights_m(scenario, plan, is_wary))
     left = left_of(headings_of(line))
     shifted = resample(np.column_stack([line[:, :2] + offset_m[:, None] * left, line[:, 2]]), STEP_M)
     xy = smoothed(shifted[:, :2], _LAST_SMOOTHING_M)
@@ -103,16 +113,33 @@ def _turn_deg(before: Float64Array, after: Float64Array) -> float:
     return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
+def _heights_m(scenario: Scenario, plan: SessionPlan, is_wary: bool) -> Float64Array:
+    """Heights (H,) above the floor at which the line looks for walls."""
+    height_m = plan.height_m or scenario.platform.sensor_height_m
+    is_flying = scenario.platform.kind == "quadrotor"
+    heights_m = np.array([height_m] if is_flying else [0.35, max(height_m, 0.4)])
+    if not is_wary:
+        return heights_m
+    reach_m = scenario.platform.clearance_m
+    low_m = max(height_m - reach_m, 0.35) if is_flying else 0.35
+    return np.arange(low_m, heights_m[-1] + reach_m, _WARY_STEP_M)
+
+
 def _offsets(
-    world: World, scenario: Scenario, seed: int, session: str, line: Float64Array, width_m: Float64Array
+    world: World,
+    scenario: Scenario,
+    seed: int,
+    session: str,
+    line: Float64Array,
+    width_m: Float64Array,
+    heights_m: Float64Array,
 ) -> Float64Array:
     """Sideways offset (N,) from the reference line, positive to the left."""
     plan: SessionPlan = getattr(scenario, session)
     clearance_m = scenario.platform.clearance_m
     headings = headings_of(line)
     height_m = plan.height_m or scenario.platform.sensor_height_m
-    heights = np.array([height_m] if scenario.platform.kind == "quadrotor" else [0.35, max(height_m, 0.4)])
-    right_m, left_m = free_width(world.fixed, line, left_of(headings), heights, float(width_m.max()))
+    right_m, left_m = free_width(world.fixed, line, left_of(headings), heights_m, float(width_m.max()))
     room_m = np.maximum(width_m / 2 - clearance_m, 0.0)
     low = np.maximum(clearance_m - right_m, -room_m)
     high = np.minimum(left_m - clearance_m, room_m)

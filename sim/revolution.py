@@ -23,7 +23,7 @@ SessionName = Literal["before", "after"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """Returns of one revolution on a changed prop.
+    """Returns of one revolution on a changed prop, mixed pixels left out.
 
     Attributes:
         row, column: (N,) pixels.
@@ -79,14 +79,15 @@ class Drive:
 def simulate_revolution(drive: Drive, number: int) -> Revolution:
     """Simulate one revolution; depends on nothing but its number, so any thread may do it."""
     rays, result = cast_revolution(drive, number)
-    reach_m = np.where(result.geom >= 0, result.true_range_m - np.float32(drive.sensor.beam_origin_m), np.float32(0.0))
+    reach_m = true_reach_m(drive.sensor, result)
     instance = drive.labels.take(result.geom, mode="wrap")
     hits, ghost_rays = {}, {}
     for tally in drive.tallies:
         change = tally.change
         if change.session != drive.name:
             ghost_rays[change.id] = tally.ghost.count(rays, reach_m.T)
-        row, column = np.divmod(np.flatnonzero(instance == change.instance), drive.sensor.width)
+        is_on_it = (instance == change.instance) & ~result.is_mixed
+        row, column = np.divmod(np.flatnonzero(is_on_it), drive.sensor.width)
         if len(row):
             is_own = change.session == drive.name
             points_world = rays.points(row, column, reach_m[row, column])
@@ -101,6 +102,11 @@ def cast_revolution(drive: Drive, number: int) -> tuple[Rays, Scan]:
     world_T_column = drive.trajectory.world_T_column(slice(number, number + 1))[0]
     rays = revolution_rays(drive.sensor, world_T_column)
     return rays, scan(drive.scene, drive.sensor, drive.scenario.sensor, rays, drive.seed, drive.name, number)
+
+
+def true_reach_m(sensor: SensorMetadata, result: Scan) -> Float32Array:
+    """Return how far (H, W) float32 each ray goes from its origin to what it hit, 0 where nothing real returned."""
+    return np.where(result.geom >= 0, result.true_range_m - np.float32(sensor.beam_origin_m), np.float32(0.0))
 
 
 def label_changes(drive: Drive, revolutions: list[Revolution]) -> Int16Array:

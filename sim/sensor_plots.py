@@ -20,7 +20,14 @@ from scenarios.schema import Sensor
 from sim.footprint import central_echo, spread_echo
 from sim.lidar import FALSE_RETURN, Scan, scan
 from sim.mesh import Mesh, box_mesh
-from sim.optics import detection_probability, range_sigma_m, received_photons, reflectivity_channel
+from sim.optics import (
+    FALSE_RETURN_RATE,
+    PHOTONS_AT_1_M,
+    detection_probability,
+    range_sigma_m,
+    received_photons,
+    reflectivity_channel,
+)
 from sim.raycast import Caster
 from sim.rays import Rays, revolution_rays
 from sim.scene import Scene
@@ -148,7 +155,7 @@ def _channels(figure: Figure) -> None:
         light = received_photons(share * np.ones_like(range_m), range_m)
         left.loglog(range_m, light, color=colour, label=f"{100 * share:.0f} %")
     far_m = _grid(4.0, 120.0)
-    left.loglog(far_m, 0.25 * 139_800 / far_m**2, ":", color="grey", label="25 %, 1/R^2 alone")
+    left.loglog(far_m, 0.25 * PHOTONS_AT_1_M / far_m**2, ":", color="grey", label="25 %, 1/R^2 alone")
     left.plot(_REAL_LIGHT[0], 25 * np.array(_REAL_LIGHT[1]), "kx", label="real unit, as 25 %")
     left.set(xlabel="range (m)", ylabel="photons", title="Signal, met squarely", ylim=(1, 3000))
     left.legend(fontsize=7)
@@ -192,8 +199,10 @@ def _false_returns(figure: Figure) -> None:
     left.legend(fontsize=7, loc="lower left", framealpha=1.0)
     ranges_m = np.concatenate(drawn)
     right.hist(ranges_m, bins=12, range=(0.0, 120.0), color=_COLOURS[1], edgecolor="white")
-    right.axhline(40 * 32768 * 1e-4 / 11.97, color="k", linewidth=0.8)
-    right.set(xlabel="range (m)", ylabel="false returns per 10 m", title=f"{len(ranges_m)} in 40; line: expected 131")
+    expected = 40 * sensor.height * sensor.width * FALSE_RETURN_RATE
+    right.axhline(expected * 10.0 / (Sensor().max_range_m - Sensor().min_range_m), color="k", linewidth=0.8)
+    title = f"{len(ranges_m)} in 40; line: expected {expected:.0f}"
+    right.set(xlabel="range (m)", ylabel="false returns per 10 m", title=title)
 
 
 def _steps(figure: Figure) -> None:

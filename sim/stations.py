@@ -59,11 +59,11 @@ def stations_of(edges: Sequence[Edge], centreline: Centreline) -> Stations:
     )
 
 
-def spot_between(edge: Edge, fraction: float, centreline: Centreline) -> Spot:
+def spot_between(edge: Edge, fraction: float, centreline: Centreline, over_humps: bool = False) -> Spot:
     """Return the spot a share of the way along an edge."""
     point, heading, section = centreline.at(*edge, fraction)
     where = f"between {edge[0]!r} and {edge[1]!r} at {fraction:.2f}"
-    return Spot(point, heading, section.width_m, section.height_m, where)
+    return Spot(point, heading, section.width_m, section.height_m, where, over_humps=over_humps)
 
 
 def given_spot(place: Place, scenario: Scenario, centreline: Centreline) -> Spot | None:
@@ -72,21 +72,29 @@ def given_spot(place: Place, scenario: Scenario, centreline: Centreline) -> Spot
         x, y, z = place.at
         section = scenario.tunnel.section
         where = f"at ({x:g}, {y:g}, {z:g})"
-        return Spot(np.array(place.at), np.array([1.0, 0.0]), section.width_m, section.height_m, where, is_line=False)
+        point, heading = np.array(place.at), np.array([1.0, 0.0])
+        return Spot(point, heading, section.width_m, section.height_m, where, is_line=False, over_humps=True)
     if place.between is None or place.fraction is None:
         return None
-    return spot_between(place.between, place.fraction, centreline)
+    return spot_between(place.between, place.fraction, centreline, over_humps=True)
 
 
 def drawn_spots(
-    name: str, purpose: str, stations: Stations, scenario: Scenario, centreline: Centreline, seed: int
+    name: str,
+    purpose: str,
+    stations: Stations,
+    scenario: Scenario,
+    centreline: Centreline,
+    seed: int,
+    over_humps: bool = False,
 ) -> Iterator[Spot]:
     """Yield up to 80 spots drawn for one prop, none in the mouth of a junction; no other prop touches these draws."""
     generator = stream(seed, "props", name, purpose)
     is_free = ~_in_mouth(stations.points, scenario)
     for index in (generator.random(PLACE_TRIES) * len(stations)).astype(int).tolist():
         if is_free[index]:
-            yield spot_between(stations.edges[stations.edge[index]], float(stations.fraction[index]), centreline)
+            edge, fraction = stations.edges[stations.edge[index]], float(stations.fraction[index])
+            yield spot_between(edge, fraction, centreline, over_humps)
 
 
 def way(scenario: Scenario, centreline: Centreline) -> Stations:

@@ -16,7 +16,7 @@ from sim.obstacles import check_clearance
 from sim.odometry import drifted
 from sim.path import plan_path
 from sim.ride import ride
-from sim.scene import World
+from sim.scene import Scene, World
 from sim.tum import check_inside, read_tum
 
 # Revolutions and ways are compared with this much slack, so that rounding loses none.
@@ -114,10 +114,24 @@ def plan_trajectory(world: World, scenario: Scenario, sensor: SensorMetadata, se
         true, lines = read_tum(Path(plan.trajectory))
         check_inside(true, scene.caster, f"{session}: {plan.trajectory}", lines)
     else:
-        path = plan_path(world, scenario, seed, session)
-        true = ride(path, world.fixed, scene.caster, scenario, seed, session)
-        check_clearance(world, scenario, session, true.way_m, true.points)
+        true = _driven(world, scene, scenario, seed, session)
     return record(true, scenario, sensor, seed, session)
+
+
+def _driven(world: World, scene: Scene, scenario: Scenario, seed: int, session: str, is_wary: bool = False) -> Motion:
+    """Drive the session's line; where it comes too near to something, a wary one is tried."""
+    path = plan_path(world, scenario, seed, session, is_wary)
+    true = ride(path, world.fixed, scene.caster, scenario, seed, session)
+    try:
+        check_clearance(world, scenario, session, true.way_m, true.points)
+    except ScenarioError as too_near:
+        if is_wary:
+            raise
+        try:
+            return _driven(world, scene, scenario, seed, session, is_wary=True)
+        except ScenarioError:
+            raise too_near from None
+    return true
 
 
 def record(true: Motion, scenario: Scenario, sensor: SensorMetadata, seed: int, session: str) -> Trajectory:

@@ -107,6 +107,7 @@ def wall_lines(axis: Axis, plan: WallPlan) -> list[Line]:
     across_m = _inside_only(limit_m, axis.is_inside)
     is_low = up_m - cross.half_height_m < PASSING_M - 0.05
     is_usable &= ~(is_low & _is_on_a_way(axis, axis.at(plan.side * across_m, up_m)))
+    is_usable &= across_m < axis.section.width_m  # farther off is the view down another drift, no wall of this one
     return _pieces(axis, plan.side * across_m, up_m, is_usable)
 
 

@@ -1,16 +1,11 @@
-"""Recordings made with the vendor's SDK come in as sessions, and sessions leave as what it opens."""
+"""Recordings made with the vendor's SDK come in as sessions."""
 
 from __future__ import annotations
 
-import builtins
 import importlib.util
-import json
 import os
-import struct
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,18 +13,30 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from cdpipe.captures import open_recording
-from cdpipe.errors import InputError
 from cdpipe.geometry import Float64Array, make_pose, transform, yaw_pose
-from cdpipe.osf import write_osf
-from cdpipe.ouster import SensorMetadata, load_profile
 from cdpipe.ply import read_ply_points
-from cdpipe.readers import open_scans
 from cdpipe.recording import import_recording
-from cdpipe.session import Session, read_session
+from cdpipe.session import read_session
 from cdpipe.tum import motion_along
-
-core = pytest.importorskip("ouster.sdk.core", reason="pip install 'tunnelcd[ouster]'")
-from ouster.sdk import osf, pcap  # noqa: E402 - only where the extra is installed
+from tests.cdpipe.recordings import (
+    HALF_ROOM_M,
+    SENSOR,
+    START_NS,
+    core,
+    frames,
+    in_a_room,
+    info_of,
+    left,
+    odom_T_sensor,
+    on_a_small_disk,
+    osf,
+    our_points,
+    pcap,
+    said,
+    vendor_points,
+    write_frames,
+    write_tum,
+)
 
 needs_kiss_icp = pytest.mark.skipif(
     importlib.util.find_spec("kiss_icp") is None, reason="needs the extra `odometry`: KISS-ICP"
@@ -38,103 +45,6 @@ ROOT = Path(os.environ.get("TUNNELCD_REAL_DATA", "")) / "ouster"
 needs_real_data = pytest.mark.skipif(
     "TUNNELCD_REAL_DATA" not in os.environ, reason="real recordings: TUNNELCD_REAL_DATA is not set"
 )
-START_NS = 987_654_321_000
-SENSOR = load_profile("os1-32-g", "512x10")
-FIELDS = (("RANGE", np.uint32), ("REFLECTIVITY", np.uint8), ("SIGNAL", np.uint16))
-
-
-def odom_T_sensor(time_s: float) -> Float64Array:
-    """A drive along a bend: 2 m/s, 0.4 rad/s."""
-    return yaw_pose(0.4 * time_s, (2.0 * time_s, 0.3 * time_s**2, 0.1))
-
-
-def info_of(sensor: SensorMetadata, profile: str = "RNG19_RFL8_SIG16_NIR16") -> Any:
-    info = core.SensorInfo(json.dumps(sensor.to_json()))
-    info.format.udp_profile_lidar = getattr(core.UDPProfileLidar, profile)
-    return info
-
-
-def frames(info: Any, n: int = 3, pose: Callable[[float], Float64Array] = odom_T_sensor) -> list[Any]:
-    """Revolutions without gap, every column with its own pose; every third return missing."""
-    draw = np.random.default_rng(11)
-    made = []
-    for number in range(n):
-        frame = core.LidarFrame(info, [core.FieldType(name, kind) for name, kind in FIELDS])
-        frame.frame_id = 7 + number
-        for name, kind in FIELDS:
-            frame.field(name)[:] = (
-                draw.integers(500, min(60_000, np.iinfo(kind).max + 1), (frame.h, frame.w))
-                if (kind is not np.uint8)
-                else draw.integers(0, 256, (frame.h, frame.w))
-            )
-        frame.field("RANGE")[draw.random((frame.h, frame.w)) < 0.3] = 0
-        time_s = 0.1 * number + np.arange(frame.w) * 0.1 / frame.w
-        frame.timestamp[:] = START_NS + np.round(time_s * 1e9).astype(np.int64)
-        frame.packet_timestamp[:] = frame.timestamp[:: info.format.columns_per_packet]
-        frame.measurement_id[:] = np.arange(frame.w)
-        frame.status[:] = 1
-        frame.body_to_world[:] = np.stack([pose(t) for t in time_s])
-        made.append(frame)
-    return made
-
-
-def write_frames(path: Path, info: Any, made: list[Any]) -> Path:
-    with osf.Writer(str(path), info) as writer:
-        for frame in made:
-            writer.save(0, frame)
-    return path
-
-
-def record(path: Path, info: Any, made: list[Any], serial: int = 0) -> Path:
-    """A capture of the frames' packets, and the metadata beside it."""
-    packets = []
-    for frame in made:
-        some = core.frame_to_packets(frame, core.PacketFormat.from_info(info), 0, serial)
-        for number, packet in enumerate(some):
-            packet.host_timestamp = int(frame.timestamp[16 * number])
-        packets += some
-    pcap.record(packets, str(path))
-    path.with_suffix(".json").write_text(info.to_json_string())
-    return path
-
-
-def vendor_points(path: Path) -> list[Float64Array]:
-    """Points of every revolution in the frame of its poses, as the SDK computes them."""
-    clouds = []
-    with osf.OsfFrameSetSource(str(path)) as source:
-        lut = core.XYZLut(source.sensor_info[0], use_extrinsics=True)
-        for (frame,) in source:
-            points = core.dewarp(np.ascontiguousarray(lut(frame)), frame.body_to_world)
-            clouds.append(points[frame.field("RANGE") > 0])
-    return clouds
-
-
-def our_points(path: Path) -> list[Float64Array]:
-    return [transform(scan.odom_T_sensor, scan.points_sensor) for scan in open_scans(path).scans()]
-
-
-def said(call: Callable[[], object]) -> str:
-    with pytest.raises(InputError) as caught:
-        call()
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
-def left(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
-
-
-def write_tum(path: Path, first_s: float, last_s: float, rate_hz: float = 100.0) -> Path:
-    lines = []
-    for time_s in np.arange(first_s, last_s, 1 / rate_hz):
-        pose = odom_T_sensor(time_s)
-        numbers = [START_NS / 1e9 + time_s, *pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
-        lines.append(" ".join(f"{number:.9f}" for number in numbers))
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
-# Coming in: OSF
 
 
 def test_an_osf_with_poses_maps_to_the_points_of_the_vendor(tmp_path: Path) -> None:
@@ -196,6 +106,42 @@ def test_revolutions_cut_by_the_ends_of_the_recording_are_left_out(tmp_path: Pat
     )
 
 
+def test_revolutions_left_out_are_counted_wherever_they_are(tmp_path: Path) -> None:
+    info = info_of(SENSOR)
+    made = frames(info, 5)
+    made[2].status[:256] = 0
+    made[4].status[10:] = 0
+    imported = import_recording(write_frames(tmp_path / "r.osf", info, made), tmp_path / "s")
+    assert (imported.n_scans, imported.n_left_out) == (3, 2)
+    assert read_session(tmp_path / "s").provenance["revolutions_left_out"] == 2
+    made[2].status[255] = 1
+    imported = import_recording(write_frames(tmp_path / "more.osf", info, made), tmp_path / "t")
+    assert (imported.n_scans, imported.n_left_out) == (4, 1)
+
+
+def test_revolutions_without_poses_among_others_are_refused(tmp_path: Path) -> None:
+    info = info_of(SENSOR)
+    made = frames(info, 4)
+    made[0].body_to_world[:] = np.eye(4)  # where the frame of the others begins
+    path = write_frames(tmp_path / "r.osf", info, made)
+    import_recording(path, tmp_path / "s")
+    np.testing.assert_array_equal(read_session(tmp_path / "s").odom_T_sensor[0], np.eye(4))
+    made[2].body_to_world[:] = np.eye(4)
+    path = write_frames(tmp_path / "hole.osf", info, made)
+    told = said(lambda: import_recording(path, tmp_path / "t"))
+    assert "1 of its 4 revolutions have no poses, the first of them number 2: give --trajectory FILE.tum" in told
+    import_recording(path, tmp_path / "t", trajectory=write_tum(tmp_path / "t.tum", -0.05, 0.5))
+
+
+def test_an_import_that_fills_the_disk_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
+    info = info_of(SENSOR)
+    path = write_frames(tmp_path / "r.osf", info, frames(info))
+    call = "import_recording(Path(sys.argv[1]), Path(sys.argv[2]))"
+    told = on_a_small_disk(call, 100_000, path, tmp_path / "s")
+    assert told == (0, f"{tmp_path / 's'}: cannot write there: File too large\n", "")
+    assert left(tmp_path) == ["r.osf"]
+
+
 def test_without_poses_it_says_what_to_give(tmp_path: Path) -> None:
     info = info_of(SENSOR)
     path = write_frames(tmp_path / "r.osf", info, frames(info, 2, lambda _: np.eye(4)))
@@ -246,6 +192,28 @@ def test_a_trajectory_that_leaves_time_out_is_named(
     assert expected in said(lambda: motion_along(tum, START_NS, START_NS + 300_000_000, 0.15))
 
 
+@pytest.mark.parametrize(("last_s", "is_enough"), [(0.19, True), (0.12, False)])
+def test_a_trajectory_may_end_a_revolution_and_a_half_short(tmp_path: Path, last_s: float, is_enough: bool) -> None:
+    info = info_of(SENSOR)
+    path = write_frames(tmp_path / "r.osf", info, frames(info, 3))
+    tum = write_tum(tmp_path / "t.tum", 0.0, last_s)
+    if is_enough:
+        assert import_recording(path, tmp_path / "s", trajectory=tum).n_scans == 3
+        return
+    assert "span the recording" in said(lambda: import_recording(path, tmp_path / "s", trajectory=tum))
+
+
+def test_a_trajectory_may_have_gaps_before_and_after_the_recording(tmp_path: Path) -> None:
+    whole = write_tum(tmp_path / "whole.tum", -4.0, 4.0)
+    lines = whole.read_text().splitlines()
+    time_s = np.array([float(line.split()[0]) for line in lines]) - START_NS / 1e9
+    kept = (np.abs(time_s) < 1.0) | (np.abs(time_s) > 3.0)
+    tum = tmp_path / "t.tum"
+    tum.write_text("\n".join(line for line, keep in zip(lines, kept, strict=True) if keep))
+    motion = motion_along(tum, START_NS, START_NS + 300_000_000, 0.15)
+    np.testing.assert_allclose(motion.poses(np.array(0.2)), odom_T_sensor(0.2), atol=1e-5)
+
+
 def test_a_trajectory_whose_stamps_do_not_rise_is_named(tmp_path: Path) -> None:
     (tmp_path / "t.tum").write_text("# x\n0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
     assert "t.tum:4: the stamp does not come after" in said(lambda: motion_along(tmp_path / "t.tum", 0, 10, 0.1))
@@ -256,12 +224,7 @@ def test_kiss_icp_finds_the_way_through_a_room(tmp_path: Path) -> None:
     """A sensor that steps 0.2 m between revolutions through a box of 12 x 8 x 5 m, standing still in each."""
     info = info_of(SENSOR)
     made = frames(info, 4, lambda _: np.eye(4))
-    half = np.array([6.0, 4.0, 2.5])
-    for number, frame in enumerate(made):
-        origins = SENSOR.origins + np.array([0.2 * number, 0.0, 0.0])
-        with np.errstate(divide="ignore"):
-            reach = ((np.sign(SENSOR.directions) * half - origins) / SENSOR.directions).min(axis=-1)
-        frame.field("RANGE")[:] = np.round(1000.0 * (reach + SENSOR.beam_origin_m))
+    in_a_room(made, lambda time_s: make_pose(translation=(0.2 * int(10 * time_s + 1e-9), 0.0, 0.0)))
     path = write_frames(tmp_path / "r.osf", info, made)
     assert import_recording(path, tmp_path / "s", odometry="kiss-icp").poses == "kiss-icp"
     found = read_session(tmp_path / "s").odom_T_sensor
@@ -271,35 +234,22 @@ def test_kiss_icp_finds_the_way_through_a_room(tmp_path: Path) -> None:
     assert len(our_points(tmp_path / "s")) == 4
 
 
-def test_damaged_and_foreign_osf_files_are_named(tmp_path: Path) -> None:
+@needs_kiss_icp
+def test_a_revolution_on_the_move_is_deskewed_before_it_is_registered(tmp_path: Path) -> None:
+    """The sensor stands, then drives and turns fast: skewed revolutions meet a map that is not."""
+
+    def world_T_sensor(time_s: float) -> Float64Array:
+        moved_s = max(time_s - 0.3, 0.0)
+        return yaw_pose(4.0 * moved_s, (-2.0 + 4.0 * moved_s, 0.3, 0.1))
+
     info = info_of(SENSOR)
-    whole = write_frames(tmp_path / "whole.osf", info, frames(info)).read_bytes()
-    path = tmp_path / "cut.osf"
-    for n_bytes, expected in (
-        (0, "not an OSF file"),
-        (20, "never finished|cut short|not an OSF"),
-        (len(whole) // 2, "cut short: .* bytes are there"),
-        (len(whole) - 1, "cut short"),
-    ):
-        path.write_bytes(whole[:n_bytes])
-        with pytest.raises(InputError, match=expected):
-            import_recording(path, tmp_path / "s")
-    path.write_bytes(b"PNG" * 1000)
-    assert "not an OSF file" in said(lambda: import_recording(path, tmp_path / "s"))
-    hole = len(whole) // 2
-    path.write_bytes(whole[:hole] + bytes(2000) + whole[hole + 2000 :])
-    assert "damaged: " in said(lambda: import_recording(path, tmp_path / "s"))
-    assert left(tmp_path) == ["cut.osf", "whole.osf"]
-
-
-def test_an_osf_of_two_sensors_is_refused(tmp_path: Path) -> None:
-    infos = [info_of(replace(SENSOR, serial=serial)) for serial in ("1001", "1002")]
-    path = tmp_path / "two.osf"
-    with osf.Writer(str(path), infos) as writer:
-        for stream, info in enumerate(infos):
-            writer.save(stream, frames(info, 1)[0])
-    told = said(lambda: import_recording(path, tmp_path / "s"))
-    assert "expected the recording of one sensor, it holds 2 (OS-1-32-G 1001, OS-1-32-G 1002)" in told
+    made = frames(info, 6, lambda _: np.eye(4))
+    in_a_room(made, world_T_sensor)
+    import_recording(write_frames(tmp_path / "r.osf", info, made), tmp_path / "s", odometry="kiss-icp")
+    world = [transform(world_T_sensor(0.0), points) for points in our_points(tmp_path / "s")]
+    off_the_walls_m = [np.abs(np.abs(points) - HALF_ROOM_M).min(axis=1).mean() for points in world]
+    assert off_the_walls_m[0] < 0.001
+    assert max(off_the_walls_m[4:]) < 0.06  # 0.10 and 0.15 m where every column is taken to be the middle one
 
 
 def test_what_an_osf_cannot_hold_is_named(tmp_path: Path) -> None:
@@ -344,247 +294,6 @@ def test_another_height_and_wider_channels_come_in(tmp_path: Path) -> None:
     assert chunk.range_mm.shape == (1, n, 512)
     assert (chunk.reflectivity == 255).all()
     assert (chunk.signal == 0).all()
-
-
-# Coming in: PCAP
-
-
-@pytest.fixture
-def capture(tmp_path: Path) -> Path:
-    info = info_of(SENSOR)
-    return record(tmp_path / "c.pcap", info, frames(info))
-
-
-def pcapng_of(path: Path) -> Path:
-    """The same packets in the newer container: a section, an interface, a block for each packet."""
-    data = path.read_bytes()
-    blocks, at = [struct.pack("<IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -1, 28)], 24
-    blocks.append(struct.pack("<IIHHII", 1, 20, 1, 0, 65535, 20))
-    while at < len(data):
-        length = struct.unpack_from("<I", data, at + 8)[0]
-        body = data[at + 16 : at + 16 + length] + bytes(-length % 4)
-        size = 32 + len(body)
-        blocks.append(
-            struct.pack("<IIIIIII", 6, size, 0, 0, len(blocks), length, length) + body + struct.pack("<I", size)
-        )
-        at += 16 + length
-    out = path.with_suffix(".pcapng")
-    out.write_bytes(b"".join(blocks))
-    return out
-
-
-def test_a_pcap_with_its_metadata_comes_in(capture: Path, tmp_path: Path) -> None:
-    tum = write_tum(tmp_path / "t.tum", -0.05, 0.4)
-    made = frames(info_of(SENSOR))
-    for number, source in enumerate((capture, pcapng_of(capture))):
-        out = tmp_path / f"s{number}"
-        assert import_recording(source, out, trajectory=tum).n_scans == 3
-        chunk = read_session(out).chunk(0)
-        for row, frame in enumerate(made):
-            np.testing.assert_array_equal(chunk.range_mm[row], frame.field("RANGE"))
-            np.testing.assert_array_equal(chunk.signal[row], frame.field("SIGNAL"))
-            np.testing.assert_array_equal(chunk.column_stamps_ns[row] + START_NS, frame.timestamp)
-
-
-def test_a_pcap_that_lost_packets_keeps_the_rest(capture: Path, tmp_path: Path) -> None:
-    info = info_of(SENSOR)
-    made = frames(info)
-    for frame in made:
-        frame.status[64:96] = 0  # two packets
-    path = record(tmp_path / "lost.pcap", info, made)
-    import_recording(path, tmp_path / "s", trajectory=write_tum(tmp_path / "t.tum", -0.05, 0.4))
-    chunk = read_session(tmp_path / "s").chunk(0)
-    assert (chunk.range_mm[:, :, 64:96] == 0).all()
-    assert chunk.range_mm[0, :, 96:].any()
-    np.testing.assert_allclose(np.diff(chunk.column_stamps_ns[0]), 195_312, atol=2)
-
-
-def test_metadata_of_a_pcap(capture: Path, tmp_path: Path) -> None:
-    moved = tmp_path / "elsewhere.json"
-    capture.with_suffix(".json").rename(moved)
-    assert "c.json is not beside it: give the sensor's metadata .json with --metadata" in said(
-        lambda: open_recording(capture)
-    )
-    assert len(list(open_recording(capture, moved).revolutions())) == 3
-    fewer = tmp_path / "fewer.json"
-    fewer.write_text(info_of(load_profile("os1-32-g", "1024x10")).to_json_string())
-    assert "no whole revolution" in said(lambda: list(open_recording(capture, fewer).revolutions()))
-    wide = load_profile("os1-32-g", "1024x10")
-    other = record(tmp_path / "wide.pcap", info_of(wide), frames(info_of(wide), 1))
-    assert "count columns up to 1023: it is the metadata of another mode" in said(lambda: open_recording(other, moved))
-    n = 128
-    tall = replace(
-        SENSOR, product="OS-1-128", altitude_deg=np.linspace(20, -20, n), azimuth_deg=np.zeros(n), pixel_shift=(0,) * n
-    )
-    fewer.write_text(info_of(tall).to_json_string())
-    told = said(lambda: list(open_recording(capture, fewer).revolutions()))
-    assert "no lidar packet of the sensor in" in told
-    assert "OS-1-128" in told
-    fewer.write_text(json.dumps({"lasers": [], "num_lasers": 16}))
-    assert "fewer.json: beam_altitude_angles is missing" in said(lambda: open_recording(capture, fewer))
-    assert "none.json: no such sensor metadata" in said(lambda: open_recording(capture, tmp_path / "none.json"))
-
-
-def test_a_capture_cut_anywhere_is_named(capture: Path, tmp_path: Path) -> None:
-    metadata = capture.with_suffix(".json")
-    for source in (capture, pcapng_of(capture)):
-        whole = source.read_bytes()
-        path = tmp_path / f"part{source.suffix}"
-        for n_bytes in (0, 10, 25, 400, len(whole) // 2, len(whole) - 1):
-            path.write_bytes(whole[:n_bytes])
-            told = said(lambda path=path: open_recording(path, metadata))
-            assert told.startswith(f"{path}: ")
-            assert ("not a PCAP file" if n_bytes < 24 else "cut short or damaged after") in told
-        path.write_bytes(b"GIF89a" + bytes(100))
-        assert "neither PCAP nor PCAPNG" in said(lambda path=path: open_recording(path, metadata))
-
-
-def test_a_capture_of_another_makers_sensor(tmp_path: Path) -> None:
-    """Sixteen-beam packets of 1206 bytes to port 2368, as another maker's sensors send."""
-    udp = struct.pack(">HHHH", 2368, 2368, 8 + 1206, 0) + bytes(1206)
-    ip = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(udp), 0, 0, 64, 17, 0, bytes([192, 168, 1, 2]), bytes(4))
-    packet = bytes(12) + b"\x08\x00" + ip + udp
-    records = b"".join(struct.pack("<IIII", 1, n, len(packet), len(packet)) + packet for n in range(200))
-    path = tmp_path / "other.pcap"
-    path.write_bytes(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1) + records)
-    path.with_suffix(".json").write_text(info_of(SENSOR).to_json_string())
-    told = said(lambda: import_recording(path, tmp_path / "s", odometry=None))
-    assert "no lidar packet of the sensor in" in told
-
-
-def test_names_that_are_no_recording(tmp_path: Path) -> None:
-    (tmp_path / "folder.osf").mkdir()
-    (tmp_path / "scan.bag").write_bytes(b"x")
-    assert "is a folder" in said(lambda: open_recording(tmp_path / "folder.osf"))
-    assert "no such file" in said(lambda: open_recording(tmp_path / "none.pcap"))
-    assert "expected a recording, .osf, .pcap, .pcapng" in said(lambda: open_recording(tmp_path / "scan.bag"))
-    assert "leave --metadata out" in said(lambda: open_recording(_empty(tmp_path / "a.osf"), tmp_path / "m.json"))
-
-
-def _empty(path: Path) -> Path:
-    path.write_bytes(b"")
-    return path
-
-
-def test_without_the_sdk_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real_import = builtins.__import__
-
-    def no_ouster(name: str, *rest: Any) -> Any:
-        if name.startswith("ouster"):
-            raise ImportError(name)
-        return real_import(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", no_ouster)
-    for call in (lambda: open_recording(tmp_path / "a.osf"), lambda: write_osf(_none(), tmp_path / "a.osf")):
-        assert "need the vendor's SDK: pip install 'tunnelcd[ouster]'" in said(call)
-
-
-def _none() -> Any:
-    return None
-
-
-# Leaving
-
-
-@pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
-    """70 revolutions in two chunks, with own poses."""
-    folder = tmp_path_factory.mktemp("session")
-    info = info_of(SENSOR)
-    import_recording(write_frames(folder / "r.osf", info, frames(info, 70)), folder / "s")
-    return read_session(folder / "s")
-
-
-def labels(session: Session) -> Iterator[dict[str, np.ndarray]]:
-    for number, chunk in enumerate(session.chunks()):
-        draw = np.random.default_rng(number)
-        yield {
-            "LABEL": draw.integers(0, 70, chunk.range_mm.shape).astype(np.uint16),
-            "INSTANCE": draw.integers(-2, 500, chunk.range_mm.shape).astype(np.int16),
-        }
-
-
-def test_the_vendor_reads_what_a_session_holds(session: Session, tmp_path: Path) -> None:
-    path = tmp_path / "out.osf"
-    told: list[tuple[str, int, int]] = []
-    write_osf(session, path, labels(session), lambda *stage: told.append(stage))
-    assert told[0] == ("write", 0, 70)
-    assert told[-1] == ("write", 70, 70)
-    assert left(tmp_path) == ["out.osf"]
-    chunks, fields = list(session.chunks()), list(labels(session))
-    poses = np.concatenate([chunk.column_poses for chunk in chunks]).astype(np.float64)
-    with osf.OsfFrameSetSource(str(path)) as source:
-        info = source.sensor_info[0]
-        assert len(source) == 70
-        for number, (frame,) in enumerate(source):
-            at = divmod(number, session.chunk_scans)
-            assert frame.complete()
-            np.testing.assert_array_equal(frame.field("RANGE"), chunks[at[0]].range_mm[at[1]])
-            np.testing.assert_array_equal(frame.field("REFLECTIVITY"), chunks[at[0]].reflectivity[at[1]])
-            np.testing.assert_array_equal(frame.field("SIGNAL"), chunks[at[0]].signal[at[1]])
-            np.testing.assert_array_equal(frame.field("LABEL"), fields[at[0]]["LABEL"][at[1]])
-            np.testing.assert_array_equal(frame.field("INSTANCE"), fields[at[0]]["INSTANCE"][at[1]])
-            np.testing.assert_array_equal(frame.timestamp, chunks[at[0]].column_stamps_ns[at[1]] + START_NS)
-            for column in (0, 300):
-                relative = make_pose(
-                    Rotation.from_quat(poses[number, column, 3:]).as_matrix(), poses[number, column, :3]
-                )
-                np.testing.assert_allclose(
-                    frame.body_to_world[column], session.odom_T_sensor[number] @ relative, atol=1e-12
-                )
-    assert (info.prod_line, info.w, info.h) == ("OS-1-32-G", 512, 32)
-    assert json.loads(info.user_data)["tunnelcd"]["made_by"] == "tunnelcd convert"
-    for ours, vendor in zip(our_points(session.path), vendor_points(path), strict=True):
-        np.testing.assert_allclose(ours, vendor, atol=1e-6)
-
-
-def test_there_and_back_is_the_same_session(session: Session, tmp_path: Path) -> None:
-    write_osf(session, tmp_path / "out.osf", labels(session))
-    import_recording(tmp_path / "out.osf", tmp_path / "back")
-    back = read_session(tmp_path / "back")
-    np.testing.assert_allclose(back.odom_T_sensor, session.odom_T_sensor, atol=1e-6)
-    np.testing.assert_allclose(back.sensor.directions, session.sensor.directions, atol=1e-12)
-    assert back.chunk_scans == session.chunk_scans
-    for one, other in zip(session.chunks(), back.chunks(), strict=True):
-        for name in ("range_mm", "reflectivity", "signal", "column_stamps_ns"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-        np.testing.assert_allclose(one.column_poses, other.column_poses, atol=1e-6)
-    assert not (tmp_path / "back" / "truth").exists()
-
-
-def test_an_osf_is_never_overwritten_and_never_half_written(
-    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "out.osf"
-    path.write_text("mine")
-    assert "out.osf exists already" in said(lambda: write_osf(session, path))
-    assert path.read_text() == "mine"
-    path.unlink()
-    whole = Session.chunk
-
-    def interrupted(self: Session, index: int) -> Any:
-        if index == 1:
-            raise KeyboardInterrupt
-        return whole(self, index)
-
-    monkeypatch.setattr(Session, "chunk", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        write_osf(session, path)
-    assert left(tmp_path) == []
-
-
-def test_what_cannot_leave_is_named(session: Session, tmp_path: Path) -> None:
-    assert "there is no folder" in said(lambda: write_osf(session, tmp_path / "none" / "out.osf"))
-    short = ({"LABEL": each["LABEL"][:, :, :4]} for each in labels(session))
-    assert "field LABEL is (64, 32, 4) where ranges are (64, 32, 512)" in said(
-        lambda: write_osf(session, tmp_path / "out.osf", short)
-    )
-    odd = replace(session, sensor=replace(SENSOR, mode="64x10"))
-    assert "the vendor's SDK does not take its sensor" in said(lambda: write_osf(odd, tmp_path / "out.osf"))
-    assert left(tmp_path) == []
-
-
-# Real recordings
 
 
 @needs_real_data

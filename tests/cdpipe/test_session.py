@@ -1,3 +1,4 @@
+import errno
 import json
 from pathlib import Path
 
@@ -93,12 +94,45 @@ def test_other_folders_and_versions_are_named(tmp_path: Path) -> None:
         read_session(path)
 
 
-@pytest.mark.parametrize("change", [{"n_scans": "many"}, {"chunk_scans": 0}, {"sensor": None}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"n_scans": "many"},
+        {"n_scans": float("inf")},
+        {"chunk_scans": 0},
+        {"sensor": None},
+        {"provenance": None},
+        {"provenance": ["x"]},
+        {"provenance": {"sensor_clock_start_ns": "x"}},
+        {"provenance": {"sensor_clock_start_ns": None}},
+        {"provenance": {"sensor_clock_start_ns": -1}},
+        {"provenance": {"sensor_clock_start_ns": 10**30}},
+    ],
+)
 def test_a_damaged_description_is_named(tmp_path: Path, change: dict[str, object]) -> None:
     path = _written(tmp_path / "s")
     document = json.loads((path / "session.json").read_text())
     (path / "session.json").write_text(json.dumps({**document, **change}))
     with pytest.raises(InputError, match=r"session\.json"):
+        read_session(path)
+
+
+@pytest.mark.parametrize("text", [b"", b"\xff\xfe", b"[]", b"[" * 200_000, b'{"format": ' + b"9" * 5000 + b"}"])
+def test_a_description_that_is_none_is_named(tmp_path: Path, text: bytes) -> None:
+    path = _written(tmp_path / "s")
+    (path / "session.json").write_bytes(text)
+    with pytest.raises(InputError, match=r"session\.json: damaged"):
+        read_session(path)
+
+
+def test_an_unreadable_description_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = _written(tmp_path / "s")
+
+    def unreadable(*_: object, **__: object) -> str:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_text", unreadable)
+    with pytest.raises(InputError, match=r"session\.json: cannot be read: Permission denied"):
         read_session(path)
 
 

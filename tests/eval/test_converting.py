@@ -104,6 +104,19 @@ def test_a_pair_there_and_back_gives_the_same_answer(pair: Path, tmp_path: Path,
     assert one.size > 0
 
 
+def test_what_is_left_out_is_told(pair: Path, tmp_path: Path, command: Command) -> None:
+    assert command("convert", pair / "before", tmp_path / "whole.osf", "--quiet")[0] == 0
+    frames = frames_of(tmp_path / "whole.osf")
+    frames[3].status[:300] = 0
+    with osf.Writer(str(tmp_path / "part.osf"), frames[0].sensor_info) as writer:
+        for frame in frames:
+            writer.save(0, frame)
+    code, out, _ = command("convert", tmp_path / "part.osf", tmp_path / "s")
+    assert code == 0
+    assert f"session of {len(frames) - 1} revolutions" in out
+    assert out.endswith("poses: own; 1 left out, of which half the columns or fewer arrived\n")
+
+
 def test_detect_says_how_to_bring_a_recording_in(tmp_path: Path, command: Command) -> None:
     (tmp_path / "a.osf").write_bytes(b"")
     result = command("detect", tmp_path / "a.osf", tmp_path / "b.osf", "--out", tmp_path / "out")

@@ -16,13 +16,13 @@ from eval.effect_figures import Effect, effect_plot
 from eval.figures import BLUE, ORANGE
 from eval.page import write_page
 from eval.page_effects import draw_effects, shortened
-from eval.page_run import read_run, scenarios
+from eval.page_run import first_seed, named_variants, read_run, scenarios
 
 NAN = float("nan")
 PLAIN, NOISE, BOTH = (
     "n[p.s=1]",
-    "n[p.s=1,sensor.range_noise=false]",
-    "n[p.s=1,sensor.range_noise=false,sensor.sub_rays=7]",
+    "n[p.s=1][sensor.range_noise=false]",
+    "n[p.s=1][sensor.range_noise=false,sensor.sub_rays=7]",
 )
 OTHER = "smoke/unchanged"
 SEEDS = range(6)
@@ -124,6 +124,33 @@ def test_a_page_without_such_worlds_has_no_such_heading(run: Path) -> None:
     page = write_page(run).read_text()
     assert "effects" not in re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL)
     assert "further worlds" not in page
+
+
+def test_a_plain_scenario_of_other_seeds_in_the_same_folder_hides_nothing(run: Path) -> None:
+    results = pd.read_csv(run / "results.csv")
+    plain = results[(results["scenario"] == PLAIN) & (results["seed"] == 0)].assign(scenario="n", seed=10000)
+    only_here = plain.assign(scenario=NOISE, seed=2, variant="foreign")
+    before = draw_effects(read_run(run))
+    pd.concat([results, plain, only_here]).to_csv(run / "results.csv", index=False)
+    data = read_run(run)
+    assert draw_effects(data) == before
+    # what no effect shows stands in the main tables
+    assert scenarios(data, unchanged=False) == [PLAIN, "n", NOISE]
+    assert named_variants(data, NOISE) == ["foreign"]
+    assert first_seed(data, NOISE) == 2
+    assert f"({PLAIN}: 6, {OTHER}: 6, n: 1, {NOISE}: 1;" in write_page(run).read_text()
+    # at the same seeds it is one more thing to be held against, and the others stay with their own
+    pd.concat([results, plain.assign(seed=0)]).to_csv(run / "results.csv", index=False)
+    assert [part.reference for part in draw_effects(read_run(run))] == ["n", PLAIN, OTHER]
+
+
+def test_one_is_not_written_as_many(run: Path) -> None:
+    results = pd.read_csv(run / "results.csv")
+    is_one = results["scenario"].isin([PLAIN, NOISE]) & (results["seed"] == 0)
+    results[is_one].to_csv(run / "results.csv", index=False)
+    page = html.unescape(write_page(run).read_text())
+    assert f"1 further world repeats {PLAIN} with" in page
+    assert "Dots are means over 1 session pair, lines" in page
 
 
 def test_a_label_is_text_and_never_markup(run: Path) -> None:

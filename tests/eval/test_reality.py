@@ -18,7 +18,16 @@ from cdpipe.ouster import SensorMetadata, load_profile
 from eval import reality_scenes
 from eval.reality import DATA_VARIABLE, main
 from eval.reality_plots import draw_measures, draw_novelty, draw_scene
-from eval.reality_scenes import as_revolutions, drive_of, find_recording, real_revolution, simulated
+from eval.reality_scenes import (
+    as_revolutions,
+    cast_at_origin,
+    drive_of,
+    find_recording,
+    real_revolution,
+    standing,
+    with_effects,
+    world_points,
+)
 from eval.reality_tables import COLUMNS, markdown, measured, novelty_table, side_by_side
 from eval.rebuilt_scene import rebuild
 from eval.sensor_measures import (
@@ -35,13 +44,29 @@ from eval.sensor_measures import (
     spread,
     staggered,
 )
-from eval.static_novelty import Novelty, effect_variants, static_novelty
+from eval.static_novelty import (
+    N_REVOLUTIONS,
+    STANDING_NUMBERS,
+    Case,
+    Novelty,
+    Way,
+    effect_variants,
+    novelty_cases,
+    static_novelty,
+)
+from scenarios.library import load_scenario
 from scenarios.schema import Sensor
+from sim.revolution import Drive, cast_revolution
+from sim.simulate import plan_drives
 
 SENSOR = load_profile("os1-32-g", "1024x10")
 EVERYWHERE = np.ones((1, SENSOR.height, SENSOR.width), dtype=bool)
 OFF = Sensor(range_noise=False, dropouts=False, false_positives=False, rolling_scan=False, max_range_m=250.0)
-STANDING = np.broadcast_to(np.eye(4), (SENSOR.width, 4, 4)).copy()
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    return drive_of("smoke/one_box", 0, SENSOR, "os1-32-g")
 
 
 def with_ranges(range_m: np.ndarray, signal: float = 100.0, reflectivity: float = 20.0) -> Revolutions:
@@ -173,7 +198,7 @@ def test_novelty_of_uniform_points_is_the_chance_of_an_empty_voxel() -> None:
     assert novel_shares(halves, (0.1,))[0] == pytest.approx(expected, rel=0.1)
 
 
-def test_rebuilt_scene_gives_a_recording_back_and_closes_small_holes_only() -> None:
+def test_rebuilt_scene_gives_a_recording_back_and_closes_small_holes_only(drive: Drive) -> None:
     """Ground 2 m below and a wall 12 m ahead; the simulator with every effect off must report what was recorded."""
     ground_m, wall_m = wall_ranges(np.array([0.0, 0.0, -1.0]), 2.0), wall_ranges(np.array([1.0, 0.0, 0.0]), 12.0)
     both = np.stack([np.where(each > 0, each, np.inf) for each in (ground_m, wall_m)]).min(axis=0)
@@ -183,8 +208,8 @@ def test_rebuilt_scene_gives_a_recording_back_and_closes_small_holes_only() -> N
     holes[0, row, column : column + 2] = 0.0
     holes[0, row, column + 10 : column + 13] = 0.0
     recorded = with_ranges(holes)
-    rebuilt = rebuild(recorded, drive_of("smoke/one_box", 0, SENSOR, "os1-32-g").scene)
-    again = as_revolutions(SENSOR, [simulated(rebuilt.scene, SENSOR, OFF, STANDING, 0)])
+    rebuilt = rebuild(recorded, drive.scene)
+    again = as_revolutions(SENSOR, [cast_at_origin(rebuilt.scene, SENSOR, OFF, 0)])
     assert rebuilt.is_surface[row, column : column + 2].all()
     assert not rebuilt.is_surface[row, column + 10 : column + 13].any()
     np.testing.assert_array_equal(again.is_return[0], rebuilt.is_surface)
@@ -195,29 +220,71 @@ def test_rebuilt_scene_gives_a_recording_back_and_closes_small_holes_only() -> N
     assert np.mean((shares >= 18) & (shares <= 22)) > 0.95  # 20 % apparent, in steps of 13 %
 
 
-def test_standing_sensor_without_effects_sees_nothing_new_and_noise_alone_makes_it() -> None:
-    drive = drive_of("smoke/one_box", 0, SENSOR, "os1-32-g")
+def test_standing_sensor_without_effects_sees_nothing_new_and_noise_alone_makes_it(drive: Drive) -> None:
     variants = effect_variants(drive.scenario.sensor)
-    numbers = range(4)
-    off = static_novelty(drive, variants["all off"], "all off", "standing", numbers)
-    default = static_novelty(drive, variants["default"], "default", "standing", numbers)
-    driving = static_novelty(drive, variants["all off"], "all off", "driving", numbers)
+
+    def found(variant: str, way: Way) -> Novelty:
+        return static_novelty(drive, Case(way, variant, variants[variant], 4), 0)
+
+    off, default, driving = found("all off", "standing"), found("default", "standing"), found("all off", "driving")
     assert off.shares == (0.0, 0.0, 0.0)
     assert default.shares[0] > default.shares[1] > default.shares[2] > 0.0
     assert driving.shares[0] > 0.01  # another place samples other voxels
-    assert default == static_novelty(drive, variants["default"], "default", "standing", numbers)
+    assert default == found("default", "standing")
+    assert found("all off", "driving, poses off").shares[0] > driving.shares[0]
 
 
-def test_points_of_a_moved_sensor_lie_on_the_same_wall() -> None:
-    drive = drive_of("smoke/one_box", 0, SENSOR, "os1-32-g")
-    pose = reality_scenes.column_poses(drive, 0, is_rolling=False)
-    assert (pose == pose[:1]).all()
-    result = simulated(drive.scene, SENSOR, OFF, pose, 0)
-    points = reality_scenes.world_points(SENSOR, result, pose)
-    shift = make_pose(translation=(1.0, 2.0, 3.0))
-    moved = reality_scenes.world_points(SENSOR, result, shift @ pose)
+def test_no_case_of_novelty_is_the_same_as_another() -> None:
+    default = Sensor()
+    cases = novelty_cases(default)
+    assert [each.n_revolutions for each in cases if (each.way, each.variant) == ("standing", "default")] == list(
+        STANDING_NUMBERS
+    )
+    assert N_REVOLUTIONS in STANDING_NUMBERS
+    driving = [each for each in cases if each.way == "driving"]
+    assert {each.variant: each.settings for each in driving} == effect_variants(default)
+    assert len(driving) == len(effect_variants(default))
+    told = [(each.way, each.variant) for each in cases if each.n_revolutions == N_REVOLUTIONS]
+    assert len(told) == len(set(told)) == 3 * len(driving) - 1  # how it rolls is no matter to a sensor that stands
+    assert ("standing", "rolling_scan off") not in told
+
+
+def test_a_drive_with_an_effect_off_is_the_drive_of_a_scenario_that_says_so(drive: Drive) -> None:
+    said = ["sensor.profile=os1-32-g", "sensor.rolling_scan=false", "sensor.false_positives=false"]
+    told = plan_drives(load_scenario("smoke/one_box", 0, said), SENSOR, 0)[0]
+    default = drive.scenario.sensor
+    off = with_effects(drive, default.model_copy(update={"rolling_scan": False, "false_positives": False}))
+    rolls = with_effects(drive, default.model_copy(update={"false_positives": False}))
+    stands, wanted, bent = (cast_revolution(each, 3)[1].range_mm for each in (off, told, rolls))
+    np.testing.assert_array_equal(stands, wanted)
+    assert (stands != bent).mean() > 0.3
+    np.testing.assert_array_equal(cast_revolution(with_effects(off, default), 3)[1].range_mm, _range_mm(drive, 3))
+
+
+def test_revolutions_of_a_standing_sensor_share_one_pose_and_no_noise(drive: Drive) -> None:
+    still = standing(drive, 5, 3)
+    poses = still.trajectory.world_T_column(slice(0, 3))
+    middle = drive.trajectory.world_T_column(slice(5, 6))[0, SENSOR.width // 2]
+    np.testing.assert_array_equal(poses, np.broadcast_to(middle, (3, SENSOR.width, 4, 4)))
+    first, second = _range_mm(still, 0), _range_mm(still, 1)
+    both = (first > 0) & (second > 0)
+    apart_mm = first[both].astype(float) - second[both]
+    assert 0 < np.median(np.abs(apart_mm)) < 20
+    assert abs(np.median(apart_mm)) <= 1
+
+
+def _range_mm(drive: Drive, number: int) -> np.ndarray:
+    return cast_revolution(drive, number)[1].range_mm
+
+
+def test_points_of_a_moved_sensor_lie_on_the_same_wall(drive: Drive) -> None:
+    off = with_effects(drive, OFF)
+    _, result = cast_revolution(off, 0)
+    poses = off.trajectory.world_T_column(slice(0, 1))[0]
+    points = world_points(SENSOR, result, poses)
+    moved = world_points(SENSOR, result, make_pose(translation=(1.0, 2.0, 3.0)) @ poses)
     np.testing.assert_allclose(moved - points, np.broadcast_to([1.0, 2.0, 3.0], points.shape), atol=1e-9)
-    seen = (invert(pose[0]) @ np.c_[points, np.ones(len(points))].T).T[:, :3]
+    seen = (invert(poses[0]) @ np.c_[points, np.ones(len(points))].T).T[:, :3]  # it does not roll: all as the first
     expected = SENSOR.project(result.range_mm / 1000.0).swapaxes(0, 1)[result.range_mm.T > 0]
     np.testing.assert_allclose(seen, expected, atol=1e-9)
 

@@ -19,8 +19,9 @@ from cdpipe.readers import open_scans
 from eval import provenance, runner, stages
 from eval.adapters import pipeline_input
 from eval.plan import Plan, load_plan
+from eval.progress import Silent
 from eval.rescoring import rescore
-from eval.runfolder import RunFolder, open_run_folder, remove, start_run_folder
+from eval.runfolder import RunFolder, open_run_folder, remove, start_run_folder, write_tables
 from eval.runner import RunOutcome, run_plan
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
@@ -486,7 +487,7 @@ def truthful(simulated: list[str], pairs: dict[str, Path], monkeypatch: pytest.M
 
 WORLDS = f"{ONE_BOX}, {{name: {ONE_BOX}, set: [sensor.range_noise=false], each: [sensor.sub_rays=7]}}"
 QUIET = f"{ONE_BOX}[sensor.range_noise=false]"
-BLURRED = f"{ONE_BOX}[sensor.range_noise=false,sensor.sub_rays=7]"
+BLURRED = f"{ONE_BOX}[sensor.range_noise=false][sensor.sub_rays=7]"
 
 
 def test_worlds_are_simulated_with_their_settings_and_named_by_them(tmp_path: Path, truthful: list[Scenario]) -> None:
@@ -499,15 +500,38 @@ def test_worlds_are_simulated_with_their_settings_and_named_by_them(tmp_path: Pa
     assert list(run.provenance()["config_digests"]) == [f"{world} voxel-diff" for world in (ONE_BOX, QUIET, BLURRED)]
     assert sorted(path.name for path in (run.path / "pairs").iterdir()) == [
         "smoke__one_box",
-        "smoke__one_box_sensor.range_noise=false,sensor.sub_rays=7_",
         "smoke__one_box_sensor.range_noise=false_",
+        "smoke__one_box_sensor.range_noise=false__sensor.sub_rays=7_",
     ]
     # the stand-in gives every world the same returns
     effects = table(run, "effects")
-    assert set(effects["settings"]) == {"sensor.range_noise=false", "sensor.range_noise=false,sensor.sub_rays=7"}
-    assert set(effects["reference"]) == {ONE_BOX}
+    assert set(effects["settings"]) == {"sensor.range_noise=false", "sensor.sub_rays=7"}
+    assert effects.groupby("settings")["reference"].unique().map(list).tolist() == [[ONE_BOX], [QUIET]]
     assert (effects["difference"].dropna() == 0).all()
     assert set(effects.query("metric == 'region_recall'")["n"]) == {1}
+
+
+def test_effects_that_are_no_more_leave_no_table(tmp_path: Path, truthful: list[Scenario]) -> None:
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+    assert (run.path / "effects.csv").exists()
+    for world in (QUIET, BLURRED):
+        remove(run.cell(world, 20000, "voxel-diff"))
+    write_tables(run)
+    assert not (run.path / "effects.csv").exists()
+
+
+def test_scoring_again_names_worlds_as_running_does(tmp_path: Path, truthful: list[Scenario]) -> None:
+    labels: list[str] = []
+
+    class Heard(Silent):
+        def cells(self, label: str, done: int, total: int) -> None:
+            labels.append(label)
+
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+    shutil.copytree(run.answer(QUIET, 20000, "voxel-diff"), run.answer(QUIET, 20000, "foreign"))
+    rescore(run, Heard())
+    named = [f"{world} 20000 voxel-diff" for world in (ONE_BOX, QUIET, BLURRED)]
+    assert sorted(labels) == sorted([*named, f"{QUIET} 20000 foreign", "done"])
 
 
 def test_the_pair_of_a_world_is_kept_while_its_scenario_is_the_same(

@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 
 from cdpipe.config import load_config
 from cdpipe.ouster import load_profile, profile_names
+from eval.page_effects import ENOUGH_PAIRS
 from eval.plan import cells, load_plan
 from eval.worlds import references, settings_over, worlds_of
 from scenarios.library import load_scenario
@@ -44,13 +45,18 @@ def test_every_effect_of_the_sensor_has_a_row_of_its_own() -> None:
 
 
 def test_all_rows_are_held_against_the_first_and_differ_from_it_in_the_sensor_only() -> None:
-    assert references(world.label for world in WORLDS) == {world.label: REFERENCE.label for world in WORLDS[1:]}
+    held = references((world.label, "v", 0) for world in WORLDS)
+    assert held == {(world.label, "v"): REFERENCE.label for world in WORLDS[1:]}
     for seed in PLAN.seeds[:2]:
         plain = load_scenario(REFERENCE.name, seed, REFERENCE.settings)
         drawn = [load_scenario(world.name, seed, world.settings) for world in WORLDS[1:]]
         assert all(each.model_copy(update={"sensor": plain.sensor}) == plain for each in drawn)
         sensors = [plain.sensor, *(each.sensor for each in drawn)]
         assert all(sensors.count(sensor) == 1 for sensor in sensors)
+
+
+def test_there_are_pairs_enough_to_set_a_difference_in_bold() -> None:
+    assert len(PLAN.seeds) >= ENOUGH_PAIRS
 
 
 def test_no_threshold_hides_an_effect() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from cdpipe.geometry import stream
 from eval.ranking import auroc
-from eval.statistics import bootstrap_interval, paired_difference, summarise
+from eval.statistics import bootstrap_interval, summarise
 
 NAN = float("nan")
 
@@ -86,16 +86,6 @@ def test_the_interval_is_that_of_the_seed() -> None:
     values = stream(2, "values").random(12)
     assert bootstrap_interval(values, seed=4) == bootstrap_interval(values, seed=4)
     assert bootstrap_interval(values, seed=4) != bootstrap_interval(values, seed=5)
-
-
-def test_paired_difference_by_hand() -> None:
-    mean, low, high, n = paired_difference(results(), "region_recall", "ours", "paper")
-    assert (mean, n) == ((0.0 + 0.25 + 0.5) / 3, 3)
-    assert 0.0 <= low < mean < high <= 0.5
-    mean, low, _, n = paired_difference(results(), "region_precision", "ours", "paper")
-    assert (mean, n) == (0.75, 1)
-    assert np.isnan(low)
-    assert paired_difference(results(), "region_recall", "ours", "absent")[3] == 0
 
 
 def test_pooled_ranking_is_that_of_all_keyframes_together() -> None:

@@ -23,7 +23,7 @@ variants:
   - preset: paper
     per_scenario:
       smoke/one_box: [query.radius_m=5, query.threshold=0.1]
-      smoke/one_box[platform.scan_spacing_m=1,sensor.range_noise=false]: [query.radius_m=6]
+      smoke/one_box[platform.scan_spacing_m=1][sensor.range_noise=false]: [query.radius_m=6]
 grid:
   - variant: tunnelcd
     scenarios: [smoke/one_box]
@@ -33,8 +33,8 @@ grid:
     keys: {extract.voxel_m: [0.3]}
 """
 PLAIN = "smoke/one_box[platform.scan_spacing_m=1]"
-QUIET = "smoke/one_box[platform.scan_spacing_m=1,sensor.range_noise=false]"
-COARSE = "smoke/one_box[platform.scan_spacing_m=1,sensor.mode=512x10,sensor.sub_rays=7]"
+QUIET = "smoke/one_box[platform.scan_spacing_m=1][sensor.range_noise=false]"
+COARSE = "smoke/one_box[platform.scan_spacing_m=1][sensor.mode=512x10,sensor.sub_rays=7]"
 
 
 def read(folder: Path, text: str = PLAN) -> Plan:
@@ -59,9 +59,10 @@ def test_worlds_by_hand(tmp_path: Path) -> None:
     assert found == [
         World("smoke/unchanged"),
         World("smoke/one_box", (spacing,)),
-        World("smoke/one_box", (spacing, noise)),
-        World("smoke/one_box", (spacing, "sensor.mode=512x10", "sensor.sub_rays=7")),
+        World("smoke/one_box", (spacing,), (noise,)),
+        World("smoke/one_box", (spacing,), ("sensor.mode=512x10", "sensor.sub_rays=7")),
     ]
+    assert found[2].settings == (spacing, noise)
     assert [world.label for world in found] == ["smoke/unchanged", PLAIN, QUIET, COARSE]
 
 
@@ -111,21 +112,28 @@ scenarios:
   - 12
   - {name: smoke/one_box, set: [sensor.range_nois=false, sensor.mode=300x10, query.radius_m=3]}
   - name: smoke/one_box
-    each: [[sensor.sub_rays=8], sensor.profile=os1-32-q0, []]
+    each:
+      - [sensor.sub_rays=8]
+      - sensor.profile=os1-32-q0
+      - []
   - {name: smoke/one_box, sett: [sensor.sub_rays=7]}
-  - {name: smoke/one_box, each: [sensor.sub_rays=20, sensor.dropout=false, tunnel]}
+  - {name: smoke/one_box, each: tunnel}
+  - {name: smoke/one_box, set: sensor.dropout=false}
 seeds: [1]
-variants: [{preset: papr}]
+variants: [{preset: papr, set: query.n_region=3}]
 """
     told = mistakes(tmp_path, text)
     expected = {
         3: ["smoke/one_bx", 'did you mean "smoke/one_box"?'],
         4: ["12", "expected a scenario's name, or {name"],
         5: ['did you mean "range_noise"?', "300x10", "query.radius_m=3 belongs to the method", "under variants"],
-        7: ["an empty list sets nothing"],
-        8: ["sett", 'did you mean "set"?'],
-        9: ["sensor.sub_rays = 20", 'did you mean "dropouts"?', "--set tunnel: expected key=value"],
-        11: ["'papr'"],
+        8: [": sensor.sub_rays = 8: input should be 1, 7 or 19"],
+        9: ["'os1-32-q0' is unknown: name one of os1-32-g"],
+        10: ["an empty list sets nothing"],
+        11: ["sett", 'did you mean "set"?'],
+        12: [": tunnel: expected key=value"],
+        13: [": sensor.dropout = False", 'did you mean "dropouts"?'],
+        15: ["'papr'"],
     }
     for line, words in expected.items():
         assert [
@@ -134,7 +142,47 @@ variants: [{preset: papr}]
             line,
             told,
         )
-    assert len(told) == len(expected)
+    assert told[-1].startswith("plan.yaml:15: variants.0.set.0 = 'query.n_region=3': query.n_region = 3: unknown key")
+    assert len(told) == len(expected) + 1
+    assert not any("--set" in line for line in told)
+
+
+def test_one_setting_needs_no_list_and_a_value_has_one_spelling(tmp_path: Path) -> None:
+    text = """\
+name: short
+scenarios: [{name: smoke/one_box, set: sensor.mode=512x10, each: "sensor.range_noise=off "}]
+seeds: [1]
+variants: [{preset: paper, set: query.n_regions=3, per_scenario: {smoke/one_box: query.radius_m=5}}]
+"""
+    plan = read(tmp_path, text)
+    mode, noise = "sensor.mode=512x10", "sensor.range_noise=false"
+    assert worlds_of(plan.scenarios) == [World("smoke/one_box", (mode,)), World("smoke/one_box", (mode,), (noise,))]
+    assert plan.variants[0].set == ("query.n_regions=3",)
+    assert plan.variants[0].per_scenario == {"smoke/one_box": ("query.radius_m=5",)}
+
+
+def test_every_repeated_world_is_told_by_its_name_at_its_line(tmp_path: Path) -> None:
+    text = """\
+name: twice
+scenarios:
+  - smoke/one_box
+  - name: smoke/one_box
+    set: sensor.mode=512x10
+    each:
+      - sensor.range_noise=false
+      - sensor.range_noise=Off
+  - {name: smoke/one_box, set: [sensor.mode=512x10, sensor.range_noise=no]}
+  - smoke/one_box
+seeds: [1]
+variants: [{preset: paper}]
+"""
+    told = [line.partition(": ")[::2] for line in mistakes(tmp_path, text)]
+    label = "smoke/one_box[sensor.mode=512x10]"
+    assert [(line, rule.rpartition(": ")[2]) for line, rule in told] == [
+        ("plan.yaml:8", f"scenario {label}[sensor.range_noise=false] is listed twice"),
+        ("plan.yaml:9", f"scenario {label[:-1]},sensor.range_noise=false] is listed twice"),
+        ("plan.yaml:10", "scenario smoke/one_box is listed twice"),
+    ]
 
 
 def test_a_profile_that_is_not_there_is_told_before_anything_runs(tmp_path: Path) -> None:
@@ -178,31 +226,38 @@ def test_folder_names() -> None:
 
 def test_settings_over_by_hand() -> None:
     assert settings_over("narrow[a=1,b=2]", "narrow") == "a=1,b=2"
-    assert settings_over("narrow[a=1,b=2]", "narrow[a=1]") == "b=2"
-    # a list among the values, and a file whose own name ends in a bracket
-    assert settings_over("narrow[a=[1, 2],b=2]", "narrow[a=[1, 2]]") == "b=2"
-    for world, other in [
-        ("narrow[a=1]", "narrow[a=1]"),
-        ("narrow[a=12]", "narrow[a=1]"),
-        ("narrow", "narrow[a=1]"),
-        ("narrow[a=1]", "nar"),
-        ("narrow2", "narrow"),
-        ("wide[a=1]", "narrow"),
-    ]:
-        assert settings_over(world, other) == ""
+    assert settings_over("narrow[a=1][b=2,c=3]", "narrow[a=1]") == "b=2,c=3"
+    assert settings_over("narrow[a=1][b=2]", "narrow") == "a=1,b=2"
+    assert settings_over("narrow[a=[[1, 2], [3]]][b=2]", "narrow[a=[[1, 2], [3]]]") == "b=2"
 
 
-def test_a_world_is_held_against_the_one_with_the_fewest_settings_that_it_adds_to() -> None:
-    assert references(["n[a=1,b=2]", "n[a=1]", "n", "w[a=1]", "n[c=3]"]) == {
-        "n[a=1,b=2]": "n",
+def held(*worlds: str) -> dict[str, str]:
+    return {world: other for (world, _), other in references((world, "v", 7) for world in worlds).items()}
+
+
+def test_a_world_is_held_against_what_its_item_sets_in_all_of_its_worlds() -> None:
+    # another plan's plain scenario in the same folder, and a combination that begins as another row does
+    assert held("n[a=1][b=2,c=3]", "n", "n[a=1][b=2]", "n[a=1]") == {
         "n[a=1]": "n",
-        "n[c=3]": "n",
+        "n[a=1][b=2]": "n[a=1]",
+        "n[a=1][b=2,c=3]": "n[a=1]",
     }
-    assert references(["w[a=1]", "w[a=1,b=2]", "w[a=1,b=2,c=3]", "w[b=2]"]) == {
-        "w[a=1,b=2]": "w[a=1]",
-        "w[a=1,b=2,c=3]": "w[a=1]",
-    }
-    assert references(["n[a=1]", "n[a=2]", "m"]) == {}
+    assert held("n", "n[a=1][b=2]") == {"n[a=1][b=2]": "n"}
+    assert held("n[a=[1, [2]]]", "n[a=[1, [2]]][b=2]") == {"n[a=[1, [2]]][b=2]": "n[a=[1, [2]]]"}
+    assert held("n[a=1]", "n[a=1,b=2]", "n[a=12]", "m", "na[b=1]", "x[1].yaml", "x") == {}
+
+
+def test_worlds_are_held_against_each_other_only_where_seed_and_variant_are_the_same() -> None:
+    cases = [
+        ("n", "ours", 10000),
+        ("n", "theirs", 7),
+        ("n[a=1]", "ours", 8),
+        ("n[a=1][b=2]", "ours", 7),
+        ("n[a=1][b=2]", "ours", 8),
+        ("n[a=1][b=2]", "theirs", 7),
+        ("n[a=1][b=2]", "foreign", 7),
+    ]
+    assert references(cases) == {("n[a=1][b=2]", "ours"): "n[a=1]", ("n[a=1][b=2]", "theirs"): "n"}
 
 
 def test_the_example_of_the_documentation_is_as_it_says(tmp_path: Path) -> None:

@@ -102,6 +102,16 @@ def test_at_least_five_distractors_on_100_m(name: str) -> None:
         assert len(staying) >= 0.05 * way_m
 
 
+@pytest.mark.parametrize("name", ["cave", "smooth", "unchanged/cave", "unchanged/smooth"])
+def test_there_are_enough_to_have_five_on_100_m_of_the_before_path_alone(name: str) -> None:
+    # Part of what may be driven lies beyond where the before session drives: half as many again as needed on average.
+    for seed in MANY:
+        scenario = drawn(name, seed)
+        drives = {frozenset(pair) for plan in (scenario.before, scenario.after) for pair in pairwise(plan.route)}
+        way_m = sum(math.dist(*(scenario.tunnel.nodes[node] for node in edge)) for edge in drives)
+        assert sum(prop.change == "none" and prop.place.area is None for prop in scenario.props) >= 0.075 * way_m
+
+
 @pytest.mark.parametrize("name", RANDOM)
 def test_random_families_stay_in_their_stated_ranges(name: str) -> None:
     shortest_m, longest_m = LENGTHS_M[name]

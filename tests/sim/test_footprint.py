@@ -4,6 +4,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cdpipe.geometry import Float64Array
 from sim.footprint import DIVERGENCE_RAD, PULSE_M, WAIST_M, Echo, blended, central_echo, footprint, spread_echo
@@ -150,6 +151,33 @@ def test_the_beam_widens_by_its_divergence() -> None:
         reaches_m = aside_m[echo.geom[:, 0] == 0].max()
         step_m = aside_m[1] - aside_m[0]
         assert reaches_m == pytest.approx(2 * half_width_m(reach_m), abs=1.5 * abs(step_m) + 1e-4)
+
+
+@pytest.mark.parametrize("pitch_deg", [-40.0, -20.0, 25.0])
+@pytest.mark.parametrize("sub_rays", [7, 19])
+def test_a_scene_and_its_beams_tilted_together_give_the_same_echoes(sub_rays: Literal[7, 19], pitch_deg: float) -> None:
+    rng = np.random.default_rng(5)
+    yaw, level = rng.uniform(-np.pi, np.pi, 400), np.deg2rad(rng.uniform(-0.4, 0.4, 400))
+    turn = Rotation.from_euler("y", pitch_deg, degrees=True).as_matrix()
+    ways = np.stack([np.cos(level), np.sin(level) * np.cos(yaw), np.sin(level) * np.sin(yaw)], axis=1)
+    plates = [plate(10.0, (-5.0, 0.0)), plate(10.3, (-5.0, 5.0))]
+    plates[0] = Mesh(plates[0].vertices[:, [0, 2, 1]], plates[0].faces)  # its edge lies level, so that height counts
+    echoes = [
+        spread_echo(
+            Caster([Mesh(mesh.vertices @ matrix.T, mesh.faces) for mesh in plates]),
+            np.full(2, 0.3, np.float32),
+            Rays(np.zeros((400, 3)), (ways @ matrix.T)[:, None].astype(np.float32)),
+            0.015,
+            sub_rays,
+        )
+        for matrix in (np.eye(3), turn)
+    ]
+    is_mixed = (echoes[0].range_m > 10.05) & (echoes[0].range_m < 10.28)
+    assert is_mixed.sum() > 20
+    # A sub-ray within rounding of the edge may fall to either side.
+    off = np.abs(echoes[0].range_m - echoes[1].range_m)
+    assert np.sort(off, axis=None)[:-4].max() < 2e-4
+    assert (echoes[0].geom != echoes[1].geom).sum() <= 4
 
 
 def brute_force(ranges_m: Float64Array, photons: Float64Array) -> tuple[float, float]:

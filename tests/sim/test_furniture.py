@@ -243,6 +243,24 @@ def test_a_duct_hangs_under_the_roof_where_it_should(lateral: float) -> None:
     assert 3.0 - 0.1 - 0.6 - 0.1 < tube[:, 2].min() < 3.0 - 0.1 - 0.6 + 0.02
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_no_pipe_hangs_in_mid_air_where_its_wall_opens_into_another_drift(seed: int) -> None:
+    tunnel = straight(
+        Furniture(pipes=(Pipe(diameter_m=0.2, side="right", height_share=0.45),)),
+        nodes={"corner": (0, 0, 0), "along": (50, -1, 0.5), "aside": (3, 30, 0.5)},
+        drifts=(Drift(nodes=("corner", "along")), Drift(nodes=("corner", "aside"))),
+        section=Section(width_m=10.0, height_m=5.2),
+        meander_m=0.8,
+        meander_length_m=40.0,
+        resolution_m=0.5,
+    )
+    centreline = build_centreline(tunnel, seed)
+    wall = mesh_tunnel(tunnel, centreline, seed)
+    near = cKDTree(wall.vertices[wall.faces].mean(axis=1))
+    for fixture in furnish(tunnel, centreline, Caster([wall]), seed):
+        assert near.query(fixture.mesh.vertices)[0].max() < 1.0
+
+
 def test_bolts_are_as_dense_as_their_spacing_says_and_stick_out_of_the_rock() -> None:
     for spacing_m in (1.0, 1.5):
         tunnel = straight(Furniture(bolts=Bolts(spacing_m=spacing_m)), length_m=36.0)

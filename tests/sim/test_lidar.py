@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +9,13 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.geometry import Float32Array, Float64Array, Int64Array, make_pose, transform
+from cdpipe.geometry import Float32Array, Float64Array, Int64Array, make_pose, stream, transform
 from cdpipe.ouster import SensorMetadata, load_profile
 from cdpipe.session import read_session
 from scenarios.schema import Prop, Scenario, Sensor
-from sim import optics
-from sim.lidar import FALSE_RETURN, Scan, scan
-from sim.mesh import Mesh, box_mesh
+from sim import lidar, optics
+from sim.lidar import FALSE_RETURN, MISS, Scan, scan
+from sim.mesh import Mesh, box_mesh, moved
 from sim.optics import detection_probability, range_sigma_m, received_photons
 from sim.raycast import Caster
 from sim.rays import Rays, revolution_rays
@@ -217,6 +217,91 @@ def test_a_scan_that_does_not_roll_has_one_pose_and_still_a_stamp_for_each_colum
     stamps: Int64Array = stands.column_stamps_ns(every)
     np.testing.assert_array_equal(stamps, rolls.column_stamps_ns(every))
     np.testing.assert_allclose(np.diff(stamps, axis=1), 1e9 / 10 / 512, atol=1.0)
+
+
+SWITCHES = ("range_noise", "dropouts", "false_positives")
+
+
+@pytest.mark.parametrize("turned", SWITCHES)
+def test_a_switch_leaves_what_the_others_draw_as_it_is(sensor: SensorMetadata, turned: str) -> None:
+    scene = room((30.0, 20.0, 10.0), 0.1)  # far and dark: one return in nine is dropped
+    others = [name for name in SWITCHES if name != turned]
+    for states in product((False, True), repeat=2):
+        settings = Sensor().model_copy(update=dict(zip(others, states, strict=True)))
+        off, on = (
+            scan(scene, sensor, settings.model_copy(update={turned: state}), still(sensor), 9, "before", 2)
+            for state in (False, True)
+        )
+        is_true = (off.geom != FALSE_RETURN) & (on.geom != FALSE_RETURN)
+        both = is_true & (off.geom >= 0) & (on.geom >= 0)
+        assert both.mean() > 0.7
+        if turned == "range_noise":
+            assert (off.range_mm[both] != on.range_mm[both]).mean() > 0.5
+        else:
+            np.testing.assert_array_equal(off.range_mm[both], on.range_mm[both])
+        if turned == "dropouts":
+            assert 0.05 < (is_true & (off.geom >= 0) & (on.geom == MISS)).mean() < 0.3
+        else:
+            np.testing.assert_array_equal(off.geom[is_true], on.geom[is_true])
+        if turned == "false_positives":
+            assert not (off.geom == FALSE_RETURN).any() and (on.geom == FALSE_RETURN).any()
+        else:
+            is_false = on.geom == FALSE_RETURN
+            np.testing.assert_array_equal(off.geom == FALSE_RETURN, is_false)
+            np.testing.assert_array_equal(off.range_mm[is_false], on.range_mm[is_false])
+
+
+def test_each_effect_draws_from_a_stream_of_its_own(sensor: SensorMetadata, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[int, tuple[str, ...]]] = []
+
+    def listening(seed: int, *purpose: str) -> np.random.Generator:
+        asked.append((seed, purpose))
+        return stream(seed, *purpose)
+
+    monkeypatch.setattr(lidar, "stream", listening)
+    named = {}
+    for name in SWITCHES:
+        asked.clear()
+        settings = IDEAL.model_copy(update={name: True})
+        for case in ((3, "before", 0), (3, "after", 0), (3, "before", 1), (4, "before", 0)):
+            scan(room((4.0, 4.0, 4.0), 0.5), sensor, settings, still(sensor), *case)
+        named[name] = list(asked)
+        assert len(set(asked)) == 4
+    asked.clear()
+    scan(room((4.0, 4.0, 4.0), 0.5), sensor, Sensor(), still(sensor), 3, "before", 0)
+    assert asked == [named[name][0] for name in SWITCHES]
+    assert len(set(asked)) == 3
+
+
+def test_a_pixel_is_mixed_when_its_echo_lies_off_what_it_is_said_to_hit(
+    sensor: SensorMetadata, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # So much noise and so many dropouts that mixed pixels are told apart without either.
+    monkeypatch.setattr(lidar, "range_sigma_m", lambda *_: np.float32(0.08))
+    monkeypatch.setattr(lidar, "detection_probability", lambda _: np.float32(0.7))
+    behind = box_mesh((6.0, 6.0, 6.0))
+    walls = Mesh(behind.vertices, behind.faces[:, ::-1])
+    for depth_m, is_any in ((0.08, False), (0.7, True)):
+        # A post's face in front of the wall at +x.
+        post = moved(box_mesh((0.05, 1.0, 1.5)), make_pose(translation=(5.95 - depth_m, 0.0, 0.0)))
+        shares: Float32Array = np.full(2, 0.5, np.float32)
+        meshes = (walls, post)
+        scene = Scene(meshes, Caster(meshes), np.array([0, 1], np.int32), shares, ("wall", "post"), ("rock", "wood"))
+        one = scan(scene, sensor, IDEAL, still(sensor), 0, "before", 0)
+        assert not one.is_mixed.any()
+        clean, noisy = (
+            scan(scene, sensor, settings.model_copy(update={"sub_rays": 7}), still(sensor), 0, "before", 0)
+            for settings in (IDEAL, Sensor())
+        )
+        off_m = np.abs(clean.range_mm / 1000.0 - clean.true_range_m)
+        is_sure = np.abs(off_m - 0.1) > 1e-3
+        np.testing.assert_array_equal(clean.is_mixed[is_sure], off_m[is_sure] > 0.1)
+        is_at_post = clean.is_mixed & (np.abs(sensor.directions[..., 1]) < 0.3) & (sensor.directions[..., 0] > 0)
+        assert (is_at_post.sum() > 10) == is_any
+        kept = noisy.geom >= 0
+        assert 0.6 < kept.mean() < 0.8
+        np.testing.assert_array_equal(noisy.is_mixed[kept], clean.is_mixed[kept])  # noise and dropouts do not make one
+        assert not noisy.is_mixed[~kept].any()
 
 
 @pytest.mark.parametrize("settings", [Sensor(), EVERYTHING], ids=["default", "everything"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array
+from cdpipe.geometry import Float32Array, Float64Array
 from scenarios.schema import (
     Area,
     Drift,
@@ -21,6 +21,7 @@ from scenarios.schema import (
     Shift,
     Tunnel,
 )
+from sim import fitting, stations
 from sim.centreline import Centreline, build_centreline
 from sim.placing import Standing, grown, overlap, standing_corners
 from sim.scene import World, build_world
@@ -241,3 +242,54 @@ def test_a_crowded_area_takes_the_other_wall_then_the_tunnel_beside_it(
         assert abs(x[0] - middle_m) < 1.1
         assert y[0] > 0.5 > -0.5 > y.min()
         assert np.abs(x - middle_m).max() < 3.1
+
+
+# The floor rises by 0.35 m to the left wall: rays 0.1 m above its middle meet it 3.6 m before the wall at y = 5.
+SLOPING = drift((0, 0, 0), (30, 0, 0), width_m=10.0, floor={"roughness": 0.0, "crossfall_percent": 7.0})
+BANK = {"kind": "muck_pile", "size_m": (5.0, 2.5, 1.2), "change": "none"}
+
+
+def back_y(world: World) -> float:
+    """Where the flat back of the one pile is."""
+    (item,) = world.standing
+    assert item.wall is not None
+    return float(item.world_T_object[1, 3] + item.wall[1] * item.shape.size_m[1] / 2)
+
+
+def test_a_pile_at_a_given_place_is_banked_up_though_the_floor_rises_before_the_wall(
+    make_scenario: MakeScenario, make_prop: MakeProp
+) -> None:
+    place = Place(between=("a", "b"), fraction=0.5, lateral=0.9, posture="leaning")
+    world = build_world(make_scenario(tunnel=SLOPING, props=(make_prop("bank", **BANK, place=place),)), 0)
+    # Less a little for the rounded foot of the wall; with the rays that meet the floor the mean would be 4.3.
+    assert back_y(world) == pytest.approx(5.0, abs=0.1)
+    # A stretch of wall that is 2 m farther away is not hidden by the floor, it is not there.
+    niche = {"between": ("a", "b"), "fraction": 0.5, "side": "left", "width_m": 3.0, "depth_m": 2.0, "height_m": 2.5}
+    open_wall = SLOPING.model_validate(SLOPING.model_dump() | {"niches": [niche]})
+    with pytest.raises(ScenarioError, match="prop 'bank': there is no even wall to lean against"):
+        build_world(make_scenario(tunnel=open_wall, props=(make_prop("bank", **BANK, place=place),)), 0)
+
+
+def test_a_drawn_pile_looks_over_humps_only_where_all_else_failed(
+    make_scenario: MakeScenario, make_prop: MakeProp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries: list[bool] = []
+    even = fitting._is_even
+
+    def counted(reach_m: Float32Array, is_pile: bool, spot: fitting.Spot) -> bool:
+        tries.append(spot.over_humps)
+        return even(reach_m, is_pile, spot)
+
+    monkeypatch.setattr(fitting, "_is_even", counted)
+    bank = make_prop("bank", **BANK, place=Place(lateral=0.9, posture="leaning"))
+    # Down to the right the floor hides nothing; the pile that finds no even wall on the left goes there, as ever.
+    assert back_y(build_world(make_scenario(tunnel=SLOPING, props=(bank,)), 0)) == pytest.approx(-5.0, abs=0.03)
+    assert tries[: stations.PLACE_TRIES] == [False] * stations.PLACE_TRIES
+    assert not any(tries)
+    ridge = SLOPING.model_copy(update={"floor": SLOPING.floor.model_copy(update={"crossfall_percent": 0.0})})
+    monkeypatch.setattr(fitting, "_floor_under", lambda *_: -0.3)  # as if it stood lower than the floor about it
+    tries.clear()
+    (item,) = build_world(make_scenario(tunnel=ridge, props=(bank,)), 0).standing
+    assert abs(item.world_T_object[1, 3]) + 1.25 == pytest.approx(5.0, abs=0.03)
+    assert tries[: 2 * stations.PLACE_TRIES] == [False] * 2 * stations.PLACE_TRIES
+    assert tries[-1]

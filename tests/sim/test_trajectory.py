@@ -1,21 +1,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from cdpipe.errors import ScenarioError
-from cdpipe.geometry import invert, require_poses, travelled_m, yaw_rad
+from cdpipe.geometry import Float64Array, invert, require_poses, travelled_m, yaw_rad
 from cdpipe.motion import Motion, motion_of
 from cdpipe.ouster import SensorMetadata
 from scenarios.schema import Floor, Odometry, Platform, Prop, Scenario, SessionPlan, Stones
 from sim.line import kept_between, smoothed
 from sim.path import plan_path
 from sim.placing import standing_corners
+from sim.raycast import Caster
 from sim.ride import on_wheels
 from sim.scene import build_world
+from sim.sweep import bars
 from sim.trajectory import Trajectory, plan_trajectory, record
 
 
@@ -249,6 +252,26 @@ def test_impossible_drives_are_refused(
         plan(platform=Platform(scan_spacing_m=0.1, speed_variation=0.3))
     with pytest.raises(ScenarioError, match=r"before: the drive takes 0\.\d+ s, less than one revolution at 10 Hz"):
         plan(before=SessionPlan(route=("a", "b"), speed_mps=300.0))
+
+
+def test_a_line_that_comes_too_near_to_something_hung_is_planned_anew(
+    make_scenario: Callable[..., Scenario], sensor: SensorMetadata
+) -> None:
+    scenario = make_scenario(platform=Platform(scan_spacing_m=2.0, sensor_height_m=1.4, tilt_deg=0.1))
+    bare = build_world(scenario, 0)
+
+    def driven(starts: list[list[float]], ends: list[list[float]]) -> Float64Array:
+        hung = replace(bare, fixed=Caster([bare.before.meshes[0], bars(np.array(starts), np.array(ends), 0.2)]))
+        return plan_trajectory(hung, scenario, sensor, 0, "before").true.points
+
+    # The line runs at y = -0.3; 0.1 m above the sensor a bar hangs along it, which nothing level with it meets.
+    points = driven([[8.0, -0.5, 1.6]], [[11.0, -0.3, 1.6]])
+    abreast = points[(points[:, 0] > 8.0) & (points[:, 0] < 11.0)]
+    assert (abreast[:, 1] > np.interp(abreast[:, 0], [8.0, 11.0], [-0.5, -0.3]) + 0.1 + 0.45).all()
+    np.testing.assert_allclose(points[points[:, 0] < 4.0, 1], -0.3, atol=0.03)
+    # Between two of them 0.65 m are left: the first line's fault is told.
+    with pytest.raises(ScenarioError, match=r"before: the sensor comes within 0\.\d\d m of rock or furniture"):
+        driven([[8.0, -0.35, 1.6], [8.0, 0.5, 1.6]], [[11.0, -0.35, 1.6], [11.0, 0.5, 1.6]])
 
 
 def test_smoothing_keeps_straight_lines_and_ends() -> None:
