@@ -31,6 +31,7 @@ BOTH, CONTEXT = "#555555", "#c4c4c4"
 FAR_M = 1.0
 _MAP_WIDTH_IN, _MAP_HEIGHT_IN = 9.0, 6.0
 _DPI = 130
+_SQUARE_M, _LEAST_IN_SQUARE = 4.0, 20
 _MAX_TESTED = 250_000
 _DASHED = (0, (3, 2))
 _DISTANCE_COLOURS = LinearSegmentedColormap.from_list(
@@ -194,7 +195,7 @@ class _Raster:
 
     @classmethod
     def around(cls, *clouds: Points) -> _Raster:
-        plans = [cloud[:, :2] for cloud in clouds if len(cloud)]
+        plans = [_without_strays(cloud[:, :2]) for cloud in clouds if len(cloud)]
         if not plans:
             raise ValueError("a map to draw must hold points")
         low = np.min([plan.min(axis=0) for plan in plans], axis=0)
@@ -228,6 +229,14 @@ class _Raster:
         rows, columns, _ = self.cells(points)
         flat = np.bincount(rows * self.shape[1] + columns, minlength=self.shape[0] * self.shape[1])
         return flat.reshape(self.shape)
+
+
+def _without_strays(plan: Points) -> Points:
+    """Drop points (N, 2) with few others in their square: false returns far off must not shrink the picture."""
+    squares = np.floor(plan / _SQUARE_M).astype(np.int64)
+    _, square, counts = np.unique(squares, axis=0, return_inverse=True, return_counts=True)
+    is_bulk = counts[square.ravel()] >= _LEAST_IN_SQUARE
+    return plan[is_bulk] if is_bulk.any() else plan
 
 
 def _tinted(counts: npt.NDArray[np.int64], colour: str) -> Float64Array:

@@ -152,6 +152,12 @@ def test_regions_are_drawn_in_red_around_their_centres() -> None:
     assert share_of(one, RED) > 2 * share_of(none, RED)
 
 
+def test_stray_points_far_off_do_not_shrink_the_picture() -> None:
+    strays = np.array([[x, y, 0.0] for x in (-90.0, 90.0) for y in (-90.0, 90.0)])
+    plain, strewn = (pixels(overlay_map(points, points)) for points in (square(0, 0), np.r_[square(0, 0), strays]))
+    np.testing.assert_array_equal(plain, strewn)
+
+
 @pytest.mark.parametrize("draw", [overlay_map, distance_map])
 def test_maps_of_one_point_can_be_drawn(draw: object) -> None:
     assert draw(np.zeros((1, 3)), np.ones((1, 3))).startswith("data:image/png;base64,")
