@@ -55,7 +55,7 @@ def convert(source: Path, out: Path, options: Options, progress: RunProgress) ->
             odometry=options.odometry,
             on_progress=progress.stage,
         )
-    told = f"{out}: session of {imported.n_scans} revolutions, {imported.sensor}, poses: {imported.poses}"
+    told = f"{out}: session of {_revolutions(imported.n_scans)}, {imported.sensor}, poses: {imported.poses}"
     if imported.n_left_out:
         told += f"; {imported.n_left_out} left out, of which half the columns or fewer arrived"
     return told
@@ -75,7 +75,11 @@ def _export(source: Path, out: Path, options: Options, progress: RunProgress) ->
     with made_parents(out):
         write_osf(session, out, _truth_fields(session) if has_truth else None, progress.stage)
     also = "with truth as fields LABEL and INSTANCE" if has_truth else "without truth"
-    return f"{out}: {session.n_scans} revolutions, {also}, {out.stat().st_size / 1e6:.1f} MB"
+    return f"{out}: {_revolutions(session.n_scans)}, {also}, {out.stat().st_size / 1e6:.1f} MB"
+
+
+def _revolutions(n: int) -> str:
+    return "1 revolution" if n == 1 else f"{n} revolutions"
 
 
 def _truth_fields(session: Session) -> Iterator[Fields]:
