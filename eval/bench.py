@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from cdpipe.errors import InputError
+from cdpipe.yamlfile import suggestion
 from eval.output import make_writable, unwritable
 from eval.provenance import machine
 from sim.bench import BenchSite, sensor_contests
@@ -36,7 +37,8 @@ def chosen(every: Contests, only: Sequence[str]) -> Contests:
     """
     unknown = [name for name in only if name not in every]
     if unknown:
-        raise InputError(f"--only {', '.join(unknown)}: not a row of the table: expected some of {', '.join(every)}")
+        wrong = "; ".join(f"{name!r} is no row of the table{suggestion(name, list(every))}" for name in unknown)
+        raise InputError(f"--only: {wrong} (known: {', '.join(every)})")
     return {name: contest for name, contest in every.items() if not only or name in only}
 
 

@@ -9,6 +9,7 @@ import pytest
 from cdpipe.geometry import invert, make_pose, yaw_pose
 from cdpipe.ouster import SensorMetadata
 from cdpipe.session import ScanChunk, SessionWriter
+from eval.cli import main
 from sim.truth import Change, PairTruth, write_labels, write_pair_truth, write_true_poses
 
 N_SCANS, CHUNK_SCANS, HEIGHT, WIDTH = 14, 5, 4, 64
@@ -108,3 +109,17 @@ def tiny_pair_fixture(tmp_path: Path) -> Path:
 def tiny_merge_fixture() -> np.ndarray:
     """Return the true before_T_after of the tiny pair."""
     return ODOM_T_WORLD["before"] @ invert(ODOM_T_WORLD["after"])
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Run the command line; returns exit code, standard output and standard error."""
+
+    def call(*argv: str | Path) -> tuple[int, str, str]:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as caught:
+            main([str(word) for word in argv])
+        out, err = capsys.readouterr()
+        return int(caught.value.code or 0), out, err
+
+    return call

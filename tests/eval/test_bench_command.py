@@ -88,7 +88,7 @@ def test_only_some_rows_and_nothing_said(tmp_path: Path, capsys: pytest.CaptureF
 def test_an_unknown_row_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, err = run(capsys, "--only", "quick")
     assert (code, out) == (2, "")
-    assert err == "error: --only quick: not a row of the table: expected some of fast, slow, alone\n"
+    assert err == "error: --only: 'quick' is no row of the table (known: fast, slow, alone)\n"
 
 
 def test_where_the_table_cannot_go_is_told_before_anything_is_measured(

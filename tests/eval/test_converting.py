@@ -22,20 +22,6 @@ Command = Callable[..., Result]
 SMALL = ("--set", "sensor.mode=512x10", "--set", "platform.scan_spacing_m=1.0")
 
 
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str]) -> Command:
-    """Run the command line; returns exit code, standard output and standard error."""
-
-    def call(*argv: str | Path) -> Result:
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as caught:
-            main([str(word) for word in argv])
-        out, err = capsys.readouterr()
-        return int(caught.value.code or 0), out, err
-
-    return call
-
-
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("made") / "pair"
