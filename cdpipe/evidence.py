@@ -20,6 +20,13 @@ from cdpipe.sphere import MapIndex
 from cdpipe.types import PointMap
 from cdpipe.voxel import thinned
 
+# What is measured, and the setting of `merge` that it must reach.
+GATES = (
+    ("overlap", "min_overlap"),
+    ("inlier_share", "min_inlier_share"),
+    ("hessian_ratio", "min_hessian_ratio"),
+    ("agreement", "min_agreement"),
+)
 MIN_SPHERE_POINTS = 100
 _OVERLAP_M = 1.0
 _OVERLAP_CELL_M = 0.5

@@ -8,6 +8,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from cdpipe.alignment import PathAlignment
 from cdpipe.geometry import (
     BoolArray,
     Float32Array,
@@ -137,13 +138,18 @@ class MappedSession:
 class MergedMaps:
     """Both maps in the before session's odom frame, from here on called `map`.
 
+    Two odometries drift apart, so no single transform fits everywhere: `alignment` says where the after session's odom
+    frame lies around each place of its path.
+
     Attributes:
         before: The before map; its odom frame is the map frame.
         after: The after map, still in its own odom frame.
-        before_T_after: (4, 4) pose of the after session's odom frame in the map frame.
+        before_T_after: (4, 4) pose of the after session's odom frame in the map frame, one for the whole map.
         evidence: What was measured about the alignment, by name.
         is_accepted: Whether the evidence suffices.
         reason: Why not, or "".
+        local: The same place by place, as refined; None where nothing was.
+        seconds: Wall-clock seconds of `t_index_s`, `t_merge_s` and `t_refine_s`.
     """
 
     before: PointMap
@@ -152,9 +158,16 @@ class MergedMaps:
     evidence: Mapping[str, float]
     is_accepted: bool
     reason: str = ""
+    local: PathAlignment | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_poses("before_T_after", self.before_T_after[None])
+
+    @property
+    def alignment(self) -> PathAlignment:
+        """What every later stage aligns with."""
+        return PathAlignment.rigid(self.before_T_after) if self.local is None else self.local
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,6 +241,8 @@ class ChangeReport:
         figures: (R,) value of each row of the paper's Table II per region, by column name; NaN where not reported.
         keyframe_scans: Scans of the before and of the after keyframes that `regions.pairs` index.
         config: The effective settings.
+        local_before_T_after: (Ka, 4, 4) the merge as refined at each after keyframe; None where `before_T_after` holds
+            everywhere.
     """
 
     before_T_after: Float64Array
@@ -238,3 +253,4 @@ class ChangeReport:
     figures: Mapping[str, Float64Array]
     keyframe_scans: tuple[Int64Array, Int64Array]
     config: Mapping[str, object] = field(default_factory=dict)
+    local_before_T_after: Float64Array | None = None
