@@ -1,11 +1,15 @@
 """The answer of a method on disk: what `detect` writes and `score` reads, whoever made it.
 
     answer.json   format, status, method, config, seconds, evidence, before_T_after, radius_m, objects (session, kind,
-                  region, score, partner of each)
+                  region, score, partner of each); until: "merge" where the method was stopped after the merge
     answer.npz    region_centres_map (R, 3), region_scores (R,), region_pairs (R, 2), region_is_reported (R,),
                   keyframe_scores (Kb,), before_keyframe_scans (Kb,), after_keyframe_scans (Ka,),
                   object_returns (M, 2) int32 with object_return_offsets (O + 1,),
-                  object_points_map (P, 3) with object_point_offsets (O + 1,), and figure_<name> (R,) each
+                  object_points_map (P, 3) with object_point_offsets (O + 1,), and figure_<name> (R,) each;
+                  local_before_T_after (Ka, 4, 4), the merge as it holds at each after keyframe, where it is not
+                  before_T_after everywhere
+
+`seconds` names t_index_s, t_merge_s, t_refine_s, t_descriptor_s, t_cd_s and t_oe_s, as far as they were measured.
 
 A refused or failed case is an answer.json with its status and error, and no answer.npz. Another program's answer may
 leave out object_returns and give object_points_odom with object_point_odom_offsets instead: points in the odom frame of
@@ -19,7 +23,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +35,7 @@ from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport
 
 FORMAT = "tunnelcd-answer"
 FORMAT_VERSION = 1
+Until = Literal["merge"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,6 +50,8 @@ class Answer:
         seconds: Seconds per stage.
         evidence: What the merge measured.
         points_odom: Per object, the (P, 3) odom points of a foreign answer that names no returns; None otherwise.
+        until: After which stage the method was stopped on purpose, so that it says nothing about what comes later; None
+            where it ran to its end.
     """
 
     status: str
@@ -54,9 +61,10 @@ class Answer:
     seconds: Mapping[str, float]
     evidence: Mapping[str, float]
     points_odom: tuple[Float64Array, ...] | None = None
+    until: Until | None = None
 
 
-def write_answer(folder: Path, method: str, report: ChangeReport) -> None:
+def write_answer(folder: Path, method: str, report: ChangeReport, until: Until | None = None) -> None:
     """Write a whole answer into `folder`, which may exist; answer.json comes last and marks it complete."""
     folder.mkdir(parents=True, exist_ok=True)
     regions, objects = report.regions, report.objects
@@ -74,6 +82,8 @@ def write_answer(folder: Path, method: str, report: ChangeReport) -> None:
         "object_point_offsets": _offsets([item.points_map for item in objects]),
         **{f"figure_{name}": values for name, values in report.figures.items()},
     }
+    if report.local_before_T_after is not None:
+        arrays["local_before_T_after"] = report.local_before_T_after
     np.savez_compressed(folder / "answer.npz", allow_pickle=False, **arrays)
     document = {
         "status": "ok",
@@ -89,17 +99,23 @@ def write_answer(folder: Path, method: str, report: ChangeReport) -> None:
             for o in objects
         ],
     }
-    _write_json(folder, document)
+    _write_json(folder, document, until)
 
 
 def write_failure(
-    folder: Path, method: str, status: str, error: str, evidence: Mapping[str, float], config: Mapping[str, Any]
+    folder: Path,
+    method: str,
+    status: str,
+    error: str,
+    evidence: Mapping[str, float],
+    config: Mapping[str, Any],
+    until: Until | None = None,
 ) -> None:
     """Write the record of a case that gave no answer."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "answer.npz").unlink(missing_ok=True)
     document = {"status": status, "error": error, "method": method, "seconds": {}, "evidence": dict(evidence)}
-    _write_json(folder, {**document, "config": dict(config)})
+    _write_json(folder, {**document, "config": dict(config)}, until)
 
 
 def read_answer(folder: Path) -> Answer:
@@ -115,6 +131,9 @@ def read_answer(folder: Path) -> Answer:
         document = json.loads(path.read_text())
         if (document["format"], document["format_version"]) != (FORMAT, FORMAT_VERSION):
             raise InputError(f"{path}: expected format {FORMAT} {FORMAT_VERSION}")
+        until = document.get("until")
+        if until not in (None, *get_args(Until)):
+            raise ValueError(f"until = {until!r}: expected {', '.join(get_args(Until))}, or nothing")
         if document["status"] != "ok":
             return Answer(
                 document["status"],
@@ -123,12 +142,13 @@ def read_answer(folder: Path) -> Answer:
                 None,
                 document["seconds"],
                 document["evidence"],
+                until=until,
             )
         arrays = load_arrays(folder / "answer.npz")
         report, points_odom = _report(document, arrays)
     except (json.JSONDecodeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(f"{path}: damaged or incomplete: {error!r}") from error
-    return Answer("ok", "", document["method"], report, report.seconds, report.evidence, points_odom)
+    return Answer("ok", "", document["method"], report, report.seconds, report.evidence, points_odom, until)
 
 
 def _report(
@@ -171,13 +191,15 @@ def _report(
         figures={name[7:]: values for name, values in arrays.items() if name.startswith("figure_")},
         keyframe_scans=(arrays["before_keyframe_scans"], arrays["after_keyframe_scans"]),
         config=document["config"],
+        local_before_T_after=arrays.get("local_before_T_after"),
     )
     return report, points_odom
 
 
-def _write_json(folder: Path, document: Mapping[str, Any]) -> None:
+def _write_json(folder: Path, document: Mapping[str, Any], until: Until | None) -> None:
     partial = folder / ".answer.json.partial"
-    partial.write_text(json.dumps({"format": FORMAT, "format_version": FORMAT_VERSION, **document}, indent=1))
+    head = {"format": FORMAT, "format_version": FORMAT_VERSION, **({} if until is None else {"until": until})}
+    partial.write_text(json.dumps({**head, **document}, indent=1))
     partial.replace(folder / "answer.json")
 
 

@@ -33,18 +33,26 @@ class DescriptorConfig(Settings):
 
 
 class MergeConfig(Settings):
-    """FRAME: closest descriptor pairs, yaw from w, GICP then VGICP of the spheres around the pair, acceptance."""
+    """Both maps into one frame: candidate pairs of places, registration of spheres, acceptance, local refinement."""
 
-    n_candidates: Count = Field(6, description="descriptor pairs tried")
-    sphere_radius_m: Positive = Field(10.0, description="submap around each pair (FRAME: 10 m)")
-    voxel_m: Positive = Field(0.4, description="thinning of the spheres before registration")
+    method: Literal["voting", "frame", "kiss-matcher"] = Field(
+        "voting", description="candidates that agree; FRAME's closest pair; or KISS-Matcher on the whole maps"
+    )
+    n_candidates: Count = Field(6, description="hypotheses tried by `voting`")
+    sphere_radius_m: Positive = Field(10.0, description="submap around a pair (FRAME: 10 m)")
+    voxel_m: Positive = Field(0.4, description="thinning of a sphere before it is registered")
+    coarse_voxel_m: Positive = Field(0.8, description="the same while hypotheses are tried")
     gicp_correspondence_m: Positive = Field(3.0, description="FRAME: 3 m")
     vgicp_correspondence_m: Positive = Field(1.0, description="FRAME: 1 m")
-    inlier_m: Positive = Field(0.3, description="a point this near the other map is an inlier")
-    min_inlier_share: Share = Field(0.9, description="accept at least this share of inliers in the sphere")
-    min_hessian_ratio: Share = Field(0.006, description="smallest to largest translational eigenvalue: degeneracy")
-    min_agreement: Share = Field(0.965, description="accept at least this share of fitting points along both paths")
-    refine_map: bool = Field(False, description="one more GICP over the whole overlap (not in the paper)")
+    inlier_m: Positive = Field(0.1, description="a point this near the other map's surface is an inlier")
+    min_overlap: Share = Field(0.15, description="accept at least this share of the shorter path beside the other")
+    min_inlier_share: Share = Field(0.8, description="accept at least this share of inliers in the sphere")
+    min_hessian_ratio: Share = Field(0.01, description="smallest to largest translational eigenvalue: degeneracy")
+    min_agreement: Share = Field(0.8, description="accept at least this share of inliers along both paths")
+    accept_all: bool = Field(False, description="accept whatever was found, as FRAME does")
+    fallback: bool = Field(True, description="where nothing is accepted, let KISS-Matcher (extra `kiss`) try")
+    kiss_voxel_m: Positive = Field(0.6, description="cell of KISS-Matcher")
+    refine: Literal["none", "local"] = Field("local", description="align again around each keyframe of the overlap")
 
 
 class QueryConfig(Settings):

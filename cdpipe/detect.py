@@ -10,9 +10,11 @@ from cdpipe.config import PipelineConfig
 from cdpipe.descriptor import describe_scans
 from cdpipe.errors import MergeFailedError
 from cdpipe.extract import assemble_objects, cut_out
+from cdpipe.geometry import Float64Array
 from cdpipe.mapping import build_map
 from cdpipe.merge import merge_maps
 from cdpipe.query import find_regions
+from cdpipe.session_check import check_session, unit_hint
 from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, MergedMaps, ScanSource
 
 Comparison = Callable[[MergedMaps, DescriptorSet, DescriptorSet, PipelineConfig], ChangeReport]
@@ -22,8 +24,9 @@ def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
     """Do what a robot does while it drives: thin its map and describe its keyframes.
 
     Raises:
-        InputError: A scan cannot be used; the text names the file.
+        InputError: The session or one of its scans cannot be used; the text names it and says how to mend it.
     """
+    check_session(source, config.map)
     thin_map = build_map(source, config.map)
     return MappedSession(thin_map, describe_scans(source, thin_map.keyframe_scans, config.descriptor))
 
@@ -50,6 +53,22 @@ def compare(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, con
         figures=figures,
         keyframe_scans=(before.keyframe_scans, after.keyframe_scans),
         config=config.model_dump(),
+        local_before_T_after=local_alignment(merged, after),
+    )
+
+
+def local_alignment(merged: MergedMaps, after: DescriptorSet) -> Float64Array | None:
+    """Return the (Ka, 4, 4) alignment at each after keyframe, for a report; None where it is rigid."""
+    if merged.local is None:
+        return None
+    return merged.local.at(merged.after.odom_T_sensor[after.keyframe_scans, :3, 3])
+
+
+def refusal(merged: MergedMaps) -> MergeFailedError:
+    """Return the error of a merge that was not accepted: what failed, and what may help."""
+    hint = unit_hint(merged.before, merged.after)
+    return MergeFailedError(
+        f"the sessions cannot be merged: {merged.reason}{'; ' if hint else ''}{hint}", merged.evidence
     )
 
 
@@ -69,8 +88,8 @@ def detect_changes(
     """
     start = perf_counter()
     merged = merge_maps(before, after, config.merge)
-    t_merge_s = perf_counter() - start
+    whole = {"t_merge_s": perf_counter() - start}
     if not merged.is_accepted:
-        raise MergeFailedError(f"the sessions cannot be merged: {merged.reason}", merged.evidence)
+        raise refusal(merged)
     report = method(merged, before.descriptors, after.descriptors, config)
-    return replace(report, seconds={"t_merge_s": t_merge_s, **report.seconds})
+    return replace(report, seconds={**whole, **merged.seconds, **report.seconds})

@@ -6,11 +6,13 @@ object of about the same size are one moved object.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from cdpipe.config import PipelineConfig
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array, invert, transform
+from cdpipe.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.novelty import cluster_labels, inlier_mask, new_points_mask
 from cdpipe.objects import PointGroup, assemble_objects
 from cdpipe.sphere import MapIndex
@@ -27,6 +29,8 @@ __all__ = [
     "new_points_mask",
 ]
 
+# How far the alignment may bend between the centre of a sphere and its border: 1 % drift makes 0.1 m of 10 m.
+_BEND_M = 0.5
 FIGURES = ("v_sphere_m3", "v_oe_m3", "s_points", "oe_points")
 
 
@@ -56,20 +60,18 @@ def cut_out(
     figures = {name: np.full(len(regions.scores), np.nan) for name in FIGURES}
     groups: list[PointGroup] = []
     for region in np.flatnonzero(regions.is_reported).tolist():
-        centre_map = regions.centres_map[region]
+        spheres = crops.around(regions.centres_map[region], regions.radius_m)
         found: list[PointGroup] = []
-        sphere: dict[SessionName, Float64Array] = {}
         for session, other in _DIRECTIONS:
-            indices, points = crops.inside(session, centre_map, regions.radius_m)
-            _, reference = crops.reaching(other, centre_map, regions.radius_m)
-            sphere[session] = points
-            for members in _new_clusters(points, reference, is_taken[session][indices], config):
+            indices, points = spheres[session].inside
+            for members in _new_clusters(points, spheres[other].points, is_taken[session][indices], config):
                 found.append(PointGroup(session, indices[members], points[members], region))
                 is_taken[session][indices[members]] = True
-        figures["v_sphere_m3"][region] = hull_volume_m3(sphere["after"])
+        _, after_points = spheres["after"].inside
+        figures["v_sphere_m3"][region] = hull_volume_m3(after_points)
         added = [group.points_map for group in found if group.session == "after"]
         figures["v_oe_m3"][region] = sum(hull_volume_m3(points) for points in added)
-        figures["s_points"][region] = len(sphere["after"])
+        figures["s_points"][region] = len(after_points)
         figures["oe_points"][region] = sum(len(points) for points in added)
         groups += found
     return groups, figures
@@ -88,30 +90,57 @@ def hull_volume_m3(points: Float64Array) -> float:
 _DIRECTIONS: tuple[tuple[SessionName, SessionName], ...] = (("after", "before"), ("before", "after"))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sphere:
+    """Map points (N,) of one session, where they lie in the map frame (N, 3), and which of them the sphere holds.
+
+    The others are in voxels that the sphere touches.
+    """
+
+    indices: Int64Array
+    points: Float64Array
+    is_inside: BoolArray
+
+    @property
+    def inside(self) -> tuple[Int64Array, Float64Array]:
+        return self.indices[self.is_inside], self.points[self.is_inside]
+
+
 class _Crops:
-    """Spheres out of both maps, in the map frame; the after map itself is never transformed as a whole."""
+    """Spheres out of both maps, in the map frame; the after map itself is never moved as a whole."""
 
     def __init__(self, merged: MergedMaps, voxel_m: float) -> None:
-        self._poses = {"before": np.eye(4), "after": merged.before_T_after}
-        self._points = {"before": merged.before.points, "after": merged.after.points}
-        self._indices = {name: MapIndex(points) for name, points in self._points.items()}
+        self._alignment = merged.alignment
+        self._before, self._after = merged.before.points, merged.after.points
+        self._before_index, self._after_index = MapIndex(self._before), MapIndex(self._after)
         # a voxel that reaches into the sphere reaches at most its diagonal out of it
         self._border_m = np.sqrt(3.0) * voxel_m
 
-    def inside(
-        self, session: SessionName, centre_map: Float64Array, radius_m: float
-    ) -> tuple[Int64Array, Float64Array]:
-        """Return map point indices (N,) and points (N, 3) of the sphere."""
-        map_T_odom = self._poses[session]
-        centre_odom = transform(invert(map_T_odom), centre_map[None])[0]
-        indices = self._indices[session].crop(centre_odom, radius_m)
-        return indices, transform(map_T_odom, self._points[session][indices])
+    def around(self, centre_map: Float64Array, radius_m: float) -> dict[SessionName, _Sphere]:
+        """Return the spheres of both sessions about (3,) a centre."""
+        reach_m = radius_m + self._border_m
+        indices = self._before_index.crop(centre_map, reach_m)
+        points = self._before[indices]
+        before = _Sphere(indices, points, _is_within(points, centre_map, radius_m))
+        return {"before": before, "after": self._after_sphere(centre_map, radius_m, reach_m)}
 
-    def reaching(
-        self, session: SessionName, centre_map: Float64Array, radius_m: float
-    ) -> tuple[Int64Array, Float64Array]:
-        """Return the same with every point of the voxels that the sphere touches."""
-        return self.inside(session, centre_map, radius_m + self._border_m)
+    def _after_sphere(self, centre_map: Float64Array, radius_m: float, reach_m: float) -> _Sphere:
+        centre_odom = self._alignment.to_odom(centre_map[None])[0]
+        if self._alignment.is_rigid:
+            indices = self._after_index.crop(centre_odom, reach_m)
+            points = self._after[indices]
+            return _Sphere(indices, self._alignment.to_map(points), _is_within(points, centre_odom, radius_m))
+        # what is a sphere in the map frame is a slightly bent one in the after session's
+        indices = self._after_index.crop(centre_odom, reach_m + _BEND_M)
+        points = self._alignment.to_map(self._after[indices])
+        is_near = _is_within(points, centre_map, reach_m)
+        points = points[is_near]
+        return _Sphere(indices[is_near], points, _is_within(points, centre_map, radius_m))
+
+
+def _is_within(points: Float64Array, centre: Float64Array, radius_m: float) -> BoolArray:
+    offsets = points - centre
+    return np.asarray(np.einsum("ij,ij->i", offsets, offsets) <= radius_m * radius_m)
 
 
 def _new_clusters(

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from cdpipe.config import QueryConfig
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array, transform
+from cdpipe.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.types import ChangeRegions, DescriptorSet, MergedMaps
 
 
@@ -33,7 +33,7 @@ def find_regions(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet
     """
     before_positions = merged.before.odom_T_sensor[before.keyframe_scans, :3, 3]
     after_odom = merged.after.odom_T_sensor[after.keyframe_scans, :3, 3]
-    after_positions = transform(merged.before_T_after, after_odom)
+    after_positions = merged.alignment.to_map(after_odom)
     gap_b, near_a = _nearest(before_positions, after_positions)
     gap_a, near_b = _nearest(after_positions, before_positions)
     is_same_place_b, is_same_place_a = gap_b <= config.max_pair_m, gap_a <= config.max_pair_m

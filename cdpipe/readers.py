@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from cdpipe.captures import SUFFIXES
@@ -88,8 +91,20 @@ class RecordedScans:
         )
 
     def scans(self) -> Iterator[PosedScan]:
-        """Read all revolutions in order; each chunk is read once."""
-        return (self.scan(index) for index in range(len(self.odom_T_sensor)))
+        """Read all revolutions in order; each chunk is read once.
+
+        Raises:
+            InputError: As `scan`; or a revolution was recorded twice.
+        """
+        repeats = _Repeats()
+        for index, pose in enumerate(self.odom_T_sensor):
+            scan = self.scan(index)
+            assert self._chunk is not None
+            row = index % self._session.chunk_scans
+            stamp_ns = int(self._chunk.column_stamps_ns[row, 0])
+            where = f"{chunk_path(self._session.path, self._chunk_index)}: scan {index}"
+            repeats.require_new(where, f"scan {index}", self._chunk.range_mm[row], pose, stamp_ns)
+            yield scan
 
 
 class PlyScans:
@@ -136,8 +151,39 @@ class PlyScans:
         )
 
     def scans(self) -> Iterator[PosedScan]:
-        """Read all scans in order."""
-        return (self.scan(index) for index in range(len(self._files)))
+        """Read all scans in order.
+
+        Raises:
+            InputError: As `scan`; or two files hold the same scan.
+        """
+        repeats = _Repeats()
+        for index, file in enumerate(self._files):
+            scan = self.scan(index)
+            stamp_ns = int(self._stamps_ns[index])
+            repeats.require_new(str(file), file.name, scan.points_sensor, self._odom_T_sensor[index], stamp_ns)
+            yield scan
+
+
+class _Repeats:
+    """Finds scans that were recorded twice: the same returns to the last bit, which noise never gives twice."""
+
+    def __init__(self) -> None:
+        self._seen: dict[bytes, tuple[str, Float64Array, int]] = {}
+
+    def require_new(
+        self, where: str, name: str, content: npt.NDArray[Any], odom_T_sensor: Float64Array, stamp_ns: int
+    ) -> None:
+        """Remember a scan; raise `InputError` if it is there already, at another pose or at the same time."""
+        digest = hashlib.blake2b(np.ascontiguousarray(content).data, digest_size=16).digest()
+        if digest not in self._seen:
+            self._seen[digest] = name, odom_T_sensor, stamp_ns
+            return
+        other, pose, other_ns = self._seen[digest]
+        # a simulated sensor without noise that stands still sees the same again
+        if stamp_ns == other_ns or not np.array_equal(pose, odom_T_sensor):
+            raise InputError(
+                f"{where} repeats {other}: the same returns to the last bit, recorded twice: remove one and its pose"
+            )
 
 
 def _open_ply_scans(folder: Path) -> PlyScans:

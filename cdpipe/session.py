@@ -220,11 +220,11 @@ def read_session(path: Path) -> Session:
             "one pose for each scan is needed"
         )
     if n_scans == 0:
-        raise InputError(f"{path}: the session holds no scan")
+        raise InputError(f"{path}: the session holds no scan: record it, or convert the recording, again")
     try:
         require_poses("odom_T_sensor", poses)
     except ValueError as error:
-        raise InputError(f"{path / 'odometry.npz'}: {error}") from error
+        raise InputError(f"{path / 'odometry.npz'}: {error}: mend the pose, or leave the scan out") from error
     sensor = parse_metadata(sensor_document, str(path / "session.json"))
     return Session(path, sensor, poses, chunk_scans, provenance)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import get_args
 
@@ -21,12 +22,15 @@ def check_answer(answer: Answer, truth: GroundTruth, folder: Path) -> None:
         InputError: A number is NaN, an index lies outside of its session, or a return is named twice.
     """
     report = answer.report
-    if report is None:
-        return
     try:
+        _check_numbers("evidence", answer.evidence)
+        _check_numbers("seconds", answer.seconds)
+        if report is None:
+            return
         require_poses("before_T_after", report.before_T_after[None])
         for session, scans in zip(SESSIONS, report.keyframe_scans, strict=True):
             _check_scans(f"{session}_keyframe_scans", scans, len(truth.sessions[session].odom_T_sensor))
+        _check_local(report.local_before_T_after, len(report.keyframe_scans[1]), len(truth.after.odom_T_sensor))
         _check_regions(report.regions, len(report.keyframe_scans[0]), len(truth.before.odom_T_sensor))
         for name, values in report.figures.items():
             require_shape(f"figure_{name}", values, (len(report.regions.scores),))
@@ -37,6 +41,24 @@ def check_answer(answer: Answer, truth: GroundTruth, folder: Path) -> None:
             _check_points(session, report.objects, answer.points_odom)
     except ValueError as error:
         raise InputError(f"{folder}: not an answer to this pair: {error}") from error
+
+
+def _check_numbers(name: str, values: Mapping[str, object]) -> None:
+    for key, value in values.items():
+        if not isinstance(value, int | float):
+            raise ValueError(f"{name}.{key} = {value!r}: expected a number")
+
+
+def _check_local(local_before_T_after: Float64Array | None, n_keyframes: int, n_scans: int) -> None:
+    if local_before_T_after is None:
+        return
+    require_poses("local_before_T_after", local_before_T_after)
+    n_wanted = n_keyframes or n_scans
+    if len(local_before_T_after) != n_wanted:
+        raise ValueError(
+            f"local_before_T_after has {len(local_before_T_after)} poses: expected one for each of the {n_wanted} "
+            f"{'after keyframes' if n_keyframes else 'scans of the after session, as no keyframes are named'}"
+        )
 
 
 def _check_regions(regions: ChangeRegions, n_keyframes: int, n_scans: int) -> None:

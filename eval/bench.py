@@ -15,6 +15,7 @@ import numpy as np
 
 from cdpipe.errors import InputError
 from cdpipe.yamlfile import suggestion
+from eval.merge_bench import MergeSite, merge_contests, paper_sites
 from eval.output import make_writable, unwritable
 from eval.provenance import machine
 from sim.bench import BenchSite, sensor_contests
@@ -24,9 +25,11 @@ Contests = Mapping[str, Callable[[], Contest]]
 Row = dict[str, Any]
 
 
-def contests(site: BenchSite | None = None) -> dict[str, Callable[[], Contest]]:
+def contests(
+    site: BenchSite | None = None, merge_sites: Sequence[MergeSite] | None = None
+) -> dict[str, Callable[[], Contest]]:
     """Return everything that can be measured, by name, in the order of the table."""
-    return {**sensor_contests(site or BenchSite())}
+    return {**sensor_contests(site or BenchSite()), **merge_contests(merge_sites or paper_sites())}
 
 
 def chosen(every: Contests, only: Sequence[str]) -> Contests:

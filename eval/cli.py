@@ -223,15 +223,24 @@ def detect(
 ) -> None:
     """Find what changed between two sessions, simulated or recorded; needs no truth."""
     from cdpipe.config import load_config
+    from cdpipe.errors import MergeFailedError
     from eval.output import new_folder
-    from eval.single import detect_pair, object_table, region_table, write_detection
+    from eval.single import detect_pair, evidence_table, notes_on, object_table, region_table, write_detection
 
     config = load_config(preset, settings or ())
-    with new_folder(out) as partial, shown_progress(quiet) as progress:
-        report = detect_pair(before, after, config, progress.stage)
-        write_detection(partial, preset, report)
+    for note in notes_on(before, after):
+        typer.echo(f"note: {note}", err=True)
+    try:
+        with new_folder(out) as partial, shown_progress(quiet) as progress:
+            report = detect_pair(before, after, config, progress.stage)
+            write_detection(partial, preset, report)
+    except MergeFailedError as error:
+        if not quiet:
+            _table("merge: refused", evidence_table(error.evidence, config))
+        raise
     if quiet:
         return
+    _table("merge: accepted", evidence_table(report.evidence, config))
     _table("regions (map frame = the before session's odometry)", region_table(report))
     if not report.regions.is_reported.any():
         scores = report.regions.scores
@@ -422,12 +431,18 @@ def _results(folder: Path, quiet: bool) -> None:
         return
     import pandas as pd
 
+    from eval.merge_table import merge_overview
+
     results = pd.read_csv(folder / "results.csv")
     results["n_failed"] = results["status"] != "ok"
     groups = results.groupby(["scenario", "variant"], sort=False)
     counts = groups["n_failed"].agg(n="size", n_failed="sum")
-    shown = [name for name in _SHOWN if name in results.columns]
+    # a run that ends at the merge has nothing in the columns of what comes later
+    shown = [name for name in _SHOWN if name in results.columns and results[name].notna().any()]
     _table("means over pairs", counts.join(groups[shown].mean()).reset_index())
+    targets = merge_overview(results)
+    if len(targets):
+        _table("merge: share of the pairs within the target of their kind, with its 95 % interval", targets)
 
 
 def _table(title: str, frame: pd.DataFrame) -> None:

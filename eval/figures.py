@@ -70,7 +70,7 @@ def overlay_map(before: Points, after: Points) -> str:
         before: (N, 3) points, metres.
         after: (M, 3) points, shown in the same axes.
     """
-    raster = _Raster.around(before, after)
+    raster = Raster.around(before, after)
     n_before, n_after = raster.count(before), raster.count(after)
     image = _tinted(n_before, BLUE) * (n_before > 0)[..., None]
     image = np.where(((n_after > 0) & (n_before == 0))[..., None], _tinted(n_after, ORANGE), image)
@@ -90,7 +90,7 @@ def distance_map(before: Points, after: Points) -> str:
         before: (N, 3) points, metres.
         after: (M, 3) points in the same frame; a fixed random subset of a large map is tested.
     """
-    raster = _Raster.around(before, after)
+    raster = Raster.around(before, after)
     if len(after) > _MAX_TESTED:
         after = after[stream(0, "page", "subset").choice(len(after), _MAX_TESTED, replace=False)]
     tree = cKDTree(before, compact_nodes=False, balanced_tree=False)
@@ -126,7 +126,7 @@ def region_map(points: Points, regions: Sequence[RegionMark], radius_m: float, t
         radius_m: Their radius.
         truths: True positions; labels of neighbours are joined.
     """
-    raster = _Raster.around(points)
+    raster = Raster.around(points)
     counts = raster.count(points)
     figure, axes = _map_axes(raster)
     axes.imshow(_on_white(_tinted(counts, "#9a9a9a"), counts > 0), extent=raster.extent, origin="lower")
@@ -178,15 +178,20 @@ def joined_labels(marks: Sequence[TruthMark], reach_m: float) -> list[tuple[floa
 
 def data_address(figure: Figure) -> str:
     """Return a figure as `data:image/png;base64,...`."""
+    return "data:image/png;base64," + base64.b64encode(png(figure)).decode("ascii")
+
+
+def png(figure: Figure) -> bytes:
+    """Return a figure as a PNG file."""
     buffer = io.BytesIO()
     # no creation date or program version: the same run gives the same page
     FigureCanvasAgg(figure)
     figure.savefig(buffer, format="png", metadata={"Software": None})
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return buffer.getvalue()
 
 
 @dataclass(frozen=True, slots=True)
-class _Raster:
+class Raster:
     """Square cells over the plan of a map."""
 
     low: tuple[float, float]
@@ -194,8 +199,9 @@ class _Raster:
     shape: tuple[int, int]
 
     @classmethod
-    def around(cls, *clouds: Points) -> _Raster:
-        plans = [_without_strays(cloud[:, :2]) for cloud in clouds if len(cloud)]
+    def around(cls, *clouds: Points) -> Raster:
+        """Return cells over all points of some (N, 3) clouds but strays."""
+        plans = [cloud[bulk_mask(cloud[:, :2]), :2] for cloud in clouds if len(cloud)]
         if not plans:
             raise ValueError("a map to draw must hold points")
         low = np.min([plan.min(axis=0) for plan in plans], axis=0)
@@ -231,12 +237,17 @@ class _Raster:
         return flat.reshape(self.shape)
 
 
-def _without_strays(plan: Points) -> Points:
-    """Drop points (N, 2) with few others in their square: false returns far off must not shrink the picture."""
+def bulk_mask(plan: Points) -> npt.NDArray[np.bool_]:
+    """Mark points (N, 2) with others in their square: false returns far off must not shrink the picture.
+
+    All of them where every point stands alone.
+    """
     squares = np.floor(plan / _SQUARE_M).astype(np.int64)
-    _, square, counts = np.unique(squares, axis=0, return_inverse=True, return_counts=True)
-    is_bulk = counts[square.ravel()] >= _LEAST_IN_SQUARE
-    return plan[is_bulk] if is_bulk.any() else plan
+    # one number for each square: rows of two are sorted twenty times slower
+    numbers = (squares - squares.min(axis=0)) @ np.array([1, int(np.ptp(squares[:, 0])) + 1])
+    _, square, counts = np.unique(numbers, return_inverse=True, return_counts=True)
+    is_bulk = np.asarray(counts[square] >= _LEAST_IN_SQUARE)
+    return is_bulk if is_bulk.any() else np.ones(len(plan), dtype=np.bool_)
 
 
 def _tinted(counts: npt.NDArray[np.int64], colour: str) -> Float64Array:
@@ -255,7 +266,7 @@ def blank_figure(width_in: float, height_in: float) -> Figure:
     return Figure(figsize=(width_in, height_in), dpi=_DPI, layout="constrained", facecolor="white")
 
 
-def _map_axes(raster: _Raster) -> tuple[Figure, Axes]:
+def _map_axes(raster: Raster) -> tuple[Figure, Axes]:
     rows, columns = raster.shape
     height_in = float(np.clip(_MAP_WIDTH_IN * rows / columns, 2.0, _MAP_HEIGHT_IN))
     width_in = float(np.clip(height_in * columns / rows, 6.5, _MAP_WIDTH_IN))

@@ -8,18 +8,22 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import jinja2
+import pandas as pd
 
 from cdpipe.config import settings_table
 from cdpipe.errors import InputError
 from eval.figures import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
+from eval.merge_table import merge_table
 from eval.page_columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
 from eval.page_effects import ENOUGH_PAIRS, draw_effects
+from eval.page_merge import draw_merge, ends_at_merge
+from eval.page_merge_tables import MERGE_COLUMNS
 from eval.page_paper import time_table, volume_table
 from eval.page_run import RunData, first_seed, named_variants, of, read_document, read_run, scenarios, text
 from eval.page_site import draw_site
@@ -43,6 +47,8 @@ POINT_COLOURS = (
 def write_page(run: Path) -> Path:
     """Write `index.html` and the tables table1, table2 (.csv, .tex) and results.tex into a run folder.
 
+    Of a run whose plan ends at the merge the page shows the merge alone. Where pairs have a kind, merge.csv is written.
+
     Args:
         run: The folder; results.csv must be there, anything else may be missing.
 
@@ -53,12 +59,18 @@ def write_page(run: Path) -> Path:
         InputError: There are no results, or the folder cannot be written.
     """
     data = read_run(run)
-    tables = {"results": results_table(data), "table1": time_table(data), "table2": volume_table(data)}
-    files = {"results.tex": to_latex(tables["results"])}
-    for name in ("table1", "table2"):
-        files[f"{name}.csv"] = to_csv(tables[name])
-        files[f"{name}.tex"] = to_latex(tables[name])
-    files["index.html"] = _render(_content(data, tables))
+    files: dict[str, str] = {}
+    if len(merges := merge_table(pd.DataFrame(list(data.results)))):
+        files["merge.csv"] = merges.to_csv(index=False)
+    if ends_at_merge(data):
+        files["index.html"] = _render(_merge_content(data))
+    else:
+        tables = {"results": results_table(data), "table1": time_table(data), "table2": volume_table(data)}
+        files["results.tex"] = to_latex(tables["results"])
+        for name in ("table1", "table2"):
+            files[f"{name}.csv"] = to_csv(tables[name])
+            files[f"{name}.tex"] = to_latex(tables[name])
+        files["index.html"] = _render(_content(data, tables))
     for name, content in files.items():
         _write(run / name, content)
     return run / "index.html"
@@ -68,18 +80,15 @@ def _content(data: RunData, tables: Mapping[str, Table]) -> dict[str, Any]:
     sites = [draw_site(data, scenario) for scenario in scenarios(data, unchanged=False)]
     grids = grid_tables(data)
     unchanged = unchanged_table(data)
-    missing = [*data.missing, *(line for site in sites for line in site.missing)]
+    merge = draw_merge(data)
+    missing = [*data.missing, *(line for site in sites for line in site.missing), *merge.missing]
     missing += [] if sites else ["No scenario with changes was run."]
     missing += [] if unchanged.rows else ["No unchanged pair was run, so false alarms are not measured."]
     missing += [] if grids else ["No grid of two settings was run."]
     return {
-        "plan": str(data.provenance.get("plan", {}).get("name", "")),
+        **_about(data, missing),
         "sentences": story(data),
-        "machine": machine_text(data.provenance),
-        "command": str(data.provenance.get("command") or "unknown"),
-        "finished": str(data.provenance.get("finished") or "unknown"),
-        "missing": list(dict.fromkeys(missing)),
-        "failures": failures(data),
+        "merge": merge,
         "results": tables["results"],
         "unchanged": unchanged,
         "effects": draw_effects(data),
@@ -88,12 +97,37 @@ def _content(data: RunData, tables: Mapping[str, Table]) -> dict[str, Any]:
         "table2": tables["table2"],
         "grids": grids,
         "sites": sites,
-        "settings": settings(data),
-        "provenance": json.dumps(data.provenance, indent=2, ensure_ascii=False),
-        "commits": commits_text(data),
         "columns": RESULT_COLUMNS,
         "time_meanings": TIME_MEANINGS,
         "point_colours": POINT_COLOURS,
+    }
+
+
+def _merge_content(data: RunData) -> dict[str, Any]:
+    """Return the content of a page that shows the merge alone."""
+    merge = draw_merge(data)
+    # what a run without regions and objects does not hold is not missing
+    missing = [line for line in data.missing if line.startswith("provenance.json")]
+    return {
+        **_about(data, [*missing, *merge.missing]),
+        "sentences": merge.sentences,
+        "merge": merge,
+        "columns": MERGE_COLUMNS,
+    }
+
+
+def _about(data: RunData, missing: Sequence[str]) -> dict[str, Any]:
+    """Return what every page tells of its run."""
+    return {
+        "plan": str(data.provenance.get("plan", {}).get("name", "")),
+        "machine": machine_text(data.provenance),
+        "command": str(data.provenance.get("command") or "unknown"),
+        "finished": str(data.provenance.get("finished") or "unknown"),
+        "missing": list(dict.fromkeys(missing)),
+        "failures": failures(data),
+        "settings": settings(data),
+        "provenance": json.dumps(data.provenance, indent=2, ensure_ascii=False),
+        "commits": commits_text(data),
     }
 
 

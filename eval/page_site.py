@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from cdpipe.alignment import PathAlignment
 from cdpipe.answer import Answer, read_answer
 from cdpipe.errors import InputError
 from cdpipe.geometry import Float64Array, invert, transform
 from cdpipe.session import load_arrays
 from cdpipe.types import ChangeReport
+from eval.aligned import alignment_of
 from eval.figures import (
     Points,
     RegionMark,
@@ -48,7 +50,7 @@ def draw_site(data: RunData, scenario: str) -> Site:
     answers = _answers(data, scenario, seed, missing)
     maps = _maps(data.folder.maps(scenario, seed), missing)
     truth = _truth(data.folder.pair(scenario, seed), missing)
-    maps_drawn = [] if maps is None else _map_pictures(maps, answers, missing)
+    maps_drawn = [] if maps is None else _map_pictures(maps, answers, truth, missing)
     regions = [] if maps is None else _region_pictures(data, scenario, seed, maps[0], answers, truth)
     objects = [] if truth is None else object_pictures(data, scenario, seed, answers, truth)
     return Site(scenario, seed, tuple(maps_drawn), tuple(regions), tuple(objects), tuple(missing))
@@ -99,7 +101,9 @@ def _truth(pair: Path, missing: list[str]) -> GroundTruth | None:
         return None
 
 
-def _map_pictures(maps: tuple[Points, Points], answers: Mapping[str, Answer], missing: list[str]) -> list[Picture]:
+def _map_pictures(
+    maps: tuple[Points, Points], answers: Mapping[str, Answer], truth: GroundTruth | None, missing: list[str]
+) -> list[Picture]:
     before, after = maps
     pictures = [
         Picture(
@@ -114,7 +118,10 @@ def _map_pictures(maps: tuple[Points, Points], answers: Mapping[str, Answer], mi
         missing.append("No answer holds a merge, so the aligned maps are not shown.")
         return pictures
     name, report = chosen
-    aligned = transform(report.before_T_after, after.astype(np.float64))
+    alignment = _alignment(name, report, truth, missing)
+    if alignment is None:
+        return pictures
+    aligned = alignment.to_map(after.astype(np.float64))
     pictures.append(
         Picture(
             "The after map, aligned by the pipeline",
@@ -124,6 +131,22 @@ def _map_pictures(maps: tuple[Points, Points], answers: Mapping[str, Answer], mi
         )
     )
     return pictures
+
+
+def _alignment(name: str, report: ChangeReport, truth: GroundTruth | None, missing: list[str]) -> PathAlignment | None:
+    """Return what the after map was aligned with; None where that needs the session's poses and they cannot be read."""
+    if report.local_before_T_after is None:
+        return PathAlignment.rigid(report.before_T_after)
+    if truth is None:
+        missing.append(
+            f"The poses that the merge of {name} bends along cannot be read, so the aligned maps are missing."
+        )
+        return None
+    try:
+        return alignment_of(report, truth.after.odom_T_sensor)
+    except InputError as error:
+        missing.append(f"The merge of {name} does not fit the pair, so the aligned maps are missing: {error}")
+        return None
 
 
 def _region_pictures(

@@ -6,10 +6,13 @@ scenarios:                           # eval/worlds.py tells more
   - paper/site1
   - {name: paper/site2, each: [sensor.range_noise=false, sensor.mode=512x10]}  # as it is, and again with each of these
 seeds: "20000:20002"                 # B excluded, in quotes; or a list
+until: null                          # merge: map, describe, merge, and no further; only the columns of the merge
 variants:
   - preset: paper                    # a shipped preset or the path of a .yaml file
     set: ["extract.voxel_m=0.4"]     # part of the variant's name
     per_scenario: {paper/site2: ["query.radius_m=10"]}   # belongs to the site, whatever is set there; not to the name
+  - preset: tunnelcd
+    oracle_merge: {noise_m: 0.1, noise_deg: 0.2}         # merged by the truth: eval/oracles.py; {} is without noise
 grid:
   - variant: tunnelcd                # a preset
     scenarios: [paper/site1]         # out of the plan's; one world of several as paper/site2[sensor.mode=512x10]
@@ -25,15 +28,25 @@ from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from cdpipe.config import PipelineConfig, load_config, preset_names
 from cdpipe.errors import InputError
 from cdpipe.yamlfile import Document, Settings, read_yaml, suggestion, validated, with_settings
+from eval.oracles import OracleMerge
 from eval.worlds import (
     OneOrMore,
     ScenarioItem,
@@ -47,6 +60,8 @@ from eval.worlds import (
 )
 from scenarios.schema import Scenario
 
+ORACLE_MERGE = "oracle-merge"
+_ORACLE_PRESET = "tunnelcd"
 _LONGEST_SLUG = 200  # file systems take names of 255 bytes
 _TOO_LONG = "is too long for a folder's name: put the settings into a file of their own"
 
@@ -106,20 +121,33 @@ def _not_empty(value: Any) -> Any:
     return value
 
 
+def _with_braces(value: Any) -> Any:
+    # a bare `oracle_merge:` would be no oracle at all, and nothing would tell
+    if not isinstance(value, dict | OracleMerge):
+        raise ValueError("expected {noise_m: ..., noise_deg: ...}; {} is without noise")
+    return value
+
+
 Label = Annotated[str, AfterValidator(known_label)]
 PresetName = Annotated[str, AfterValidator(_known_preset)]
 Setting = Annotated[str, AfterValidator(_valid_setting)]
 MethodSettings = Annotated[tuple[Setting, ...], OneOrMore]
 NotEmpty = BeforeValidator(_not_empty)
 Values = Annotated[tuple[Any, ...], NotEmpty]
+Until = Literal["merge"]
 
 
 class Variant(Settings):
-    """One method to run: a preset and what is set over it."""
+    """One method to run: a preset and what is set over it, perhaps merged by the truth."""
 
     preset: PresetName
     set: MethodSettings = ()
     per_scenario: dict[Label, MethodSettings] = Field(default_factory=dict)
+    oracle_merge: Annotated[OracleMerge | None, BeforeValidator(_with_braces)] = None
+
+    @model_serializer(mode="wrap")
+    def _as_written(self, handler: SerializerFunctionWrapHandler) -> Any:
+        return {key: value for key, value in handler(self).items() if value is not None}
 
 
 class Grid(Settings):
@@ -137,6 +165,7 @@ class Plan(Settings):
     description: str = ""
     scenarios: Annotated[tuple[ScenarioItem, ...], NotEmpty]
     seeds: Annotated[tuple[int, ...], BeforeValidator(parse_seeds)]
+    until: Until | None = None
     variants: Annotated[tuple[Variant, ...], NotEmpty]
     grid: tuple[Grid, ...] = ()
 
@@ -172,7 +201,7 @@ class Plan(Settings):
             if name not in names:
                 raise ValueError(f"{who} names {name!r}, which is not in scenarios{suggestion(name, names)}")
         for world in worlds:
-            folders = [slug(variant_name(preset, named)) for preset, named, _ in _methods(self, world)]
+            folders = [slug(method.variant) for method in _methods(self, world)]
             for folder in folders:
                 if folders.count(folder) > 1:
                     raise ValueError(f"variant {folder} stands twice in the plan for {world.label}")
@@ -191,6 +220,8 @@ class Cell:
         preset: Name of the preset.
         variant: Preset and the settings that name the variant.
         config: The effective settings.
+        oracle: What merges instead of the method, or None.
+        until: Where it ends, None for the whole method.
     """
 
     scenario: str
@@ -198,6 +229,25 @@ class Cell:
     preset: str
     variant: str
     config: PipelineConfig
+    oracle: OracleMerge | None = None
+    until: Until | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Method:
+    """A variant or a grid point in one world: settings that make its name, and those that the site asks for."""
+
+    preset: str
+    named: tuple[str, ...]
+    silent: tuple[str, ...] = ()
+    oracle: OracleMerge | None = None
+
+    @property
+    def variant(self) -> str:
+        return variant_name(self.preset, self.named, self.oracle)
+
+    def config(self) -> PipelineConfig:
+        return load_config(self.preset, [*self.named, *self.silent])
 
 
 def load_plan(name_or_path: str) -> Plan:
@@ -252,11 +302,11 @@ def changed_plan(
     overridden = {_key(setting) for setting in (*settings, *itertools.chain(*axes))}
     document["variants"] = [
         {
-            "preset": variant.preset,
-            "set": [*_without(variant.set, overridden), *point, *settings],
-            "per_scenario": {name: _without(own, overridden) for name, own in variant.per_scenario.items()},
+            **variant,
+            "set": [*_without(variant["set"], overridden), *point, *settings],
+            "per_scenario": {name: _without(own, overridden) for name, own in variant["per_scenario"].items()},
         }
-        for variant in plan.variants
+        for variant in document["variants"]
         for point in itertools.product(*axes)
     ]
     for each in document["grid"]:
@@ -272,22 +322,26 @@ def cells(plan: Plan) -> list[Cell]:
     """
     found: list[Cell] = []
     for world in worlds_of(plan.scenarios):
-        methods = [
-            (preset, variant_name(preset, named), load_config(preset, [*named, *silent]))
-            for preset, named, silent in _methods(plan, world)
-        ]
+        methods = [(method, method.config()) for method in _methods(plan, world)]
         found += [
-            Cell(world.label, seed, _stem(preset), name, config)
-            for seed in plan.seeds
-            for preset, name, config in methods
+            Cell(world.label, seed, _stem(method.preset), method.variant, config, method.oracle, plan.until)
+            for seed in plan.seeds[: world.n_seeds]
+            for method, config in methods
         ]
     return found
 
 
-def variant_name(preset: str, settings: Iterable[str]) -> str:
-    """Return the preset's name, followed by its settings in brackets where there are any."""
+def variant_name(preset: str, settings: Iterable[str], oracle: OracleMerge | None = None) -> str:
+    """Return the preset's name, followed by its settings in brackets where there are any.
+
+    Merged by the truth it is called `oracle-merge`, with its noise and any preset but `tunnelcd` first in the brackets.
+    """
+    stem = _stem(preset)
+    if oracle is not None:
+        of_preset = [] if stem == _ORACLE_PRESET else [f"preset={stem}"]
+        stem, settings = ORACLE_MERGE, (*of_preset, *oracle.settings, *settings)
     joined = ",".join(settings)
-    return f"{_stem(preset)}[{joined}]" if joined else _stem(preset)
+    return f"{stem}[{joined}]" if joined else stem
 
 
 def slug(variant: str) -> str:
@@ -295,16 +349,15 @@ def slug(variant: str) -> str:
     return re.sub(r"[^A-Za-z0-9._=,-]", "_", variant)
 
 
-def _methods(plan: Plan, world: World) -> list[tuple[str, tuple[str, ...], tuple[str, ...]]]:
-    """(preset, settings that make the name, settings that the site asks for) of every variant and grid point."""
+def _methods(plan: Plan, world: World) -> list[_Method]:
     places = dict.fromkeys((world.name, world.label))
     methods = [
-        (v.preset, v.set, tuple(setting for place in places for setting in v.per_scenario.get(place, ())))
+        _Method(v.preset, v.set, tuple(s for place in places for s in v.per_scenario.get(place, ())), v.oracle_merge)
         for v in plan.variants
     ]
     for grid in plan.grid:
         if not places.keys().isdisjoint(grid.scenarios):
-            methods += [(grid.variant, point, ()) for point in _points(grid.keys)]
+            methods += [_Method(grid.variant, point) for point in _points(grid.keys)]
     return methods
 
 

@@ -31,7 +31,8 @@ def cell_document(score: CaseScore, identity: Mapping[str, Any], key: str, place
 
     Args:
         score: What was scored.
-        identity: scenario, seed, variant and preset, whatever the answer calls itself; commit, the code that made it.
+        identity: scenario, seed, variant and preset, whatever the answer calls itself; pair_kind; commit, the code that
+            made it.
         key: Digest of what the cell depends on.
         place: Where its rows stand in the tables: scenario, variant.
     """
@@ -61,11 +62,12 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
             path = run.path / "cells" / slug / seed / f"{folder.name}.json"
             stored = run.read_cell(path)
             if stored is None:
-                names = {"scenario": _scenario_of(run, slug), "seed": int(seed)}
+                names = {**_world_of(run, slug), "seed": int(seed)}
                 identity = {**names, "variant": folder.name, "preset": folder.name, "commit": None}
                 key, place = "", (len(folders), len(folders))
             else:
                 identity = {name: stored["row"].get(name) for name in (*IDENTITY, "preset", "commit")}
+                identity["pair_kind"] = stored["row"].get("pair_kind", "")
                 key, place = stored["key"], stored["order"]
             progress.cells("{scenario} {seed} {variant}".format(**identity), len(documents), len(folders))
             documents[path] = cell_document(score_stored(truth, folder), identity, key, place)
@@ -76,9 +78,9 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
     return len(documents)
 
 
-def _scenario_of(run: RunFolder, slug: str) -> str:
+def _world_of(run: RunFolder, slug: str) -> dict[str, Any]:
     """Return what the run's own cells call the world of a folder; the name of the folder where there are none."""
     for path in sorted((run.path / "cells" / slug).glob("*/*.json")):
         if (stored := run.read_cell(path)) is not None:
-            return str(stored["row"]["scenario"])
-    return slug.replace("__", "/")
+            return {"scenario": stored["row"]["scenario"], "pair_kind": stored["row"].get("pair_kind", "")}
+    return {"scenario": slug.replace("__", "/"), "pair_kind": ""}

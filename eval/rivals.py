@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.config import PipelineConfig
-from cdpipe.detect import Comparison, compare
+from cdpipe.detect import Comparison, compare, local_alignment
 from cdpipe.extract import (
     FIGURES,
     PointGroup,
@@ -25,7 +25,7 @@ from cdpipe.extract import (
     inlier_mask,
     new_points_mask,
 )
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array, stream, transform
+from cdpipe.geometry import BoolArray, Float64Array, Int64Array, stream
 from cdpipe.query import rank_regions
 from cdpipe.sphere import MapIndex
 from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport, DescriptorSet, MergedMaps, SessionName
@@ -105,10 +105,10 @@ USES_DESCRIPTORS = frozenset({"descriptor"})
 def _in_map_frame(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet) -> _Maps:
     after_path = merged.after.odom_T_sensor[after.keyframe_scans, :3, 3]
     return _Maps(
-        points={"before": merged.before.points, "after": transform(merged.before_T_after, merged.after.points)},
+        points={"before": merged.before.points, "after": merged.alignment.to_map(merged.after.points)},
         path={
             "before": merged.before.odom_T_sensor[before.keyframe_scans, :3, 3],
-            "after": transform(merged.before_T_after, after_path),
+            "after": merged.alignment.to_map(after_path),
         },
     )
 
@@ -213,4 +213,5 @@ def _report(
         figures=figures,
         keyframe_scans=(described[0].keyframe_scans, described[1].keyframe_scans),
         config=config.model_dump(),
+        local_before_T_after=local_alignment(merged, described[1]),
     )

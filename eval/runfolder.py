@@ -6,6 +6,7 @@ answers/<world>/<seed>/<variant>/             raw answers (cdpipe.answer)
 maps/<world>/<seed>.npz                       thinned maps for pictures
 cells/<world>/<seed>/<variant>.json           a finished cell: key, order, row, items
 results.csv changes.csv regions.csv objects.csv keyframes.csv summary.csv
+merge.csv                                     where pairs have a kind (eval.merge_table)
 effects.csv                                   where a world was run with and without a setting (eval.effects)
 """
 
@@ -23,6 +24,7 @@ import pandas as pd
 
 from cdpipe.errors import InputError
 from eval.effects import effects
+from eval.merge_table import merge_table
 from eval.output import make_writable
 from eval.plan import slug
 from eval.provenance import TOOL
@@ -125,7 +127,7 @@ def open_run_folder(path: Path) -> RunFolder:
 
 
 def write_tables(run: RunFolder) -> pd.DataFrame:
-    """Put results.csv, the item tables, summary.csv and effects.csv together from the finished cells.
+    """Put results.csv, the item tables, summary.csv, merge.csv and effects.csv together from the finished cells.
 
     Returns:
         The rows of results.csv.
@@ -144,11 +146,11 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     for table, frame in items.items():
         _write_csv(run.path / f"{table}.csv", frame)
     _write_csv(run.path / "summary.csv", summarise(results, keyframes=items["keyframes"]))
-    found = effects(results)
-    if len(found):
-        _write_csv(run.path / "effects.csv", found)
-    else:
-        remove(run.path / "effects.csv")
+    for name, found in (("effects", effects(results)), ("merge", merge_table(results))):
+        if len(found):
+            _write_csv(run.path / f"{name}.csv", found)
+        else:
+            remove(run.path / f"{name}.csv")
     return results
 
 

@@ -1,8 +1,8 @@
 """Runs a plan, one cell after the other; finished cells are kept, and a run that was cut off goes on where it stopped.
 
 A cell is finished when its file holds the digest of what it depends on: the scenario as drawn, the files it names, the
-effective settings, the weights, and the version of the metrics. A merge that is refused and any other error of the
-input are rows of their own; a bug is not caught.
+effective settings, the weights, the version of the metrics, and what the plan says of it (an oracle, where it ends, the
+kind of its pair). A merge that is refused and any other error of the input are rows of their own; a bug is not caught.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ from cdpipe.descriptor import checkpoint_digest, use_threads
 from cdpipe.errors import InputError, MergeFailedError, ScenarioError, TunnelcdError
 from eval.adapters import pipeline_input
 from eval.ground_truth import GroundTruth, load_ground_truth
+from eval.oracles import merged_by_truth
 from eval.plan import Cell, Plan, cells
 from eval.progress import RunProgress, Silent
 from eval.provenance import THREADS, describe_run, digest, now
 from eval.rescoring import cell_document, score_stored
 from eval.runfolder import RunFolder, remove, write_tables
 from eval.scoring import METRICS_VERSION, CaseScore
-from eval.stages import PairStages
+from eval.stages import Merge, PairStages
 from eval.worlds import worlds_of
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
@@ -61,6 +62,7 @@ class _Pair:
     Attributes:
         name: Label of the world.
         family: Its scenario's.
+        kind: What the plan calls such pairs, or "".
         seed: The seed.
         scenario: The scenario as drawn, None where it cannot be drawn.
         files: Digests of the files that the scenario names.
@@ -70,6 +72,7 @@ class _Pair:
 
     name: str
     family: str
+    kind: str
     seed: int
     scenario: Scenario | None
     files: Mapping[str, str]
@@ -131,12 +134,15 @@ def _pairs(run: RunFolder, plan: Plan, all_cells: Sequence[Cell], force: bool) -
             files = file_digests(scenario)
         except ScenarioError as mistake:
             error = str(mistake)
-        every = [_Todo(cell, _key(cell, scenario, files), (place, variants.index(cell.variant))) for cell in group]
+        every = [
+            _Todo(cell, _key(cell, world.pair_kind, scenario, files), (place, variants.index(cell.variant)))
+            for cell in group
+        ]
         todo = [each for each in every if force or not _is_finished(run, each.cell, each.key)]
         # cells that share a map setting come one after the other, because only one setting's maps are held
         todo.sort(key=lambda each: each.cell.config.map.model_dump_json())
         family = world.name if scenario is None else scenario.family
-        pairs.append(_Pair(label, family, seed, scenario, files, error, tuple(todo)))
+        pairs.append(_Pair(label, family, world.pair_kind, seed, scenario, files, error, tuple(todo)))
         _remove_stale(run, pairs[-1], force)
     return pairs
 
@@ -194,10 +200,10 @@ def _run_pair(
         else:
             stages, truth = opened
             folder = run.answer(pair.name, pair.seed, cell.variant)
-            _answer(stages, cell, folder)
+            _answer(stages, cell, truth, folder)
             score = score_stored(truth, folder)
         names = {"scenario": pair.name, "seed": pair.seed, "variant": cell.variant, "preset": cell.preset}
-        identity = {**names, "commit": commit}
+        identity = {**names, "pair_kind": pair.kind, "commit": commit}
         path = run.cell(pair.name, pair.seed, cell.variant)
         run.write_cell(path, cell_document(score, identity, each.key, each.place))
 
@@ -237,26 +243,35 @@ def _write_maps(path: Path, stages: PairStages) -> None:
     partial.replace(path)
 
 
-def _answer(stages: PairStages, cell: Cell, folder: Path) -> None:
+def _answer(stages: PairStages, cell: Cell, truth: GroundTruth, folder: Path) -> None:
     settings = cell.config.model_dump(mode="json")
+    run = stages.answer if cell.until is None else stages.merge_answer
     try:
-        report = stages.answer(cell.config)
+        report = run(cell.config, _oracle(cell, truth))
     except MergeFailedError as error:
-        write_failure(folder, cell.variant, "merge_refused", str(error), error.evidence, settings)
+        write_failure(folder, cell.variant, "merge_refused", str(error), error.evidence, settings, cell.until)
     except TunnelcdError as error:
-        write_failure(folder, cell.variant, "failed", str(error), {}, settings)
+        write_failure(folder, cell.variant, "failed", str(error), {}, settings, cell.until)
     else:
-        write_answer(folder, cell.variant, report)
+        write_answer(folder, cell.variant, report, cell.until)
+
+
+def _oracle(cell: Cell, truth: GroundTruth) -> Merge | None:
+    """Return what merges in the method's place; the stages get its result and never the truth in it."""
+    noise = cell.oracle
+    if noise is None:
+        return None
+    return lambda before, after: merged_by_truth(before, after, (truth.before, truth.after), noise, cell.seed)
 
 
 def _unmade(pair: _Pair, error: str) -> CaseScore:
     """Score a case whose world cannot be made: there is no truth, so all but the identity is undefined."""
-    row = {"scenario": "", "family": pair.family, "seed": pair.seed, "variant": "", "preset": ""}
+    row = {"scenario": "", "family": pair.family, "pair_kind": "", "seed": pair.seed, "variant": "", "preset": ""}
     outcome = {"status": "failed", "error": error, "metrics_version": METRICS_VERSION}
     return CaseScore(row={**row, **outcome}, changes=[], regions=[], objects=[])
 
 
-def _key(cell: Cell, scenario: Scenario | None, files: Mapping[str, str]) -> str:
+def _key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mapping[str, str]) -> str:
     return digest(
         {
             "scenario": None if scenario is None else scenario.model_dump(mode="json"),
@@ -264,6 +279,9 @@ def _key(cell: Cell, scenario: Scenario | None, files: Mapping[str, str]) -> str
             "seed": cell.seed,
             "config": cell.config.model_dump(mode="json"),
             "checkpoint": checkpoint_digest(cell.config.descriptor),
+            "oracle": None if cell.oracle is None else cell.oracle.model_dump(mode="json"),
+            "until": cell.until,
+            "pair_kind": pair_kind,
         }
     )
 

@@ -19,11 +19,11 @@ from cdpipe.types import ChangedObject, ChangeReport
 from eval.answer_check import check_answer
 from eval.answer_rows import answer_rows
 from eval.ground_truth import GroundTruth, load_ground_truth
-from eval.merge_metrics import merge_columns, merge_errors
+from eval.merge_metrics import evidence_columns, merge_columns, merge_errors, overlap_true
 from eval.object_metrics import ObjectMatches, kinds_right, match_objects, object_columns, unanswered_objects
 from eval.region_metrics import RegionScores, keyframes_or_all, score_regions, unanswered_regions
 
-METRICS_VERSION = 1
+METRICS_VERSION = 2
 _NAN = float("nan")
 
 
@@ -59,14 +59,17 @@ def score_pair(pair: Path, answer_folder: Path) -> CaseScore:
 
 
 def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
-    """Score an answer that was checked (`eval.answer_check`) against a pair's truth."""
+    """Score an answer that was checked (`eval.answer_check`) against a pair's truth.
+
+    An answer that ends at the merge is scored up to it: region and object columns are NaN, also where it was refused or
+    failed, and there are no items.
+    """
     after_travelled_m = travelled_m(truth.after.odom_T_sensor)
     report = answer.report
-    if report is None:
+    if report is None or answer.until == "merge":
         regions = unanswered_regions(len(truth.pair.changes), truth.n_observable)
         objects, object_scores = unanswered_objects(truth)
         right = np.full(len(truth.pair.changes), np.nan)
-        errors = None
         items: list[dict[str, Any]] = []
     else:
         regions = score_regions(report, truth, after_travelled_m)
@@ -74,22 +77,19 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
         objects = match_objects(report.objects, rows, truth)
         right = kinds_right(report.objects, objects, truth)
         object_scores = object_columns(objects, right, truth)
-        keyframes = tuple(
-            keyframes_or_all(scans, len(session.odom_T_sensor))
-            for scans, session in zip(report.keyframe_scans, (truth.before, truth.after), strict=True)
-        )
-        errors = merge_errors(truth.before, truth.after, report.before_T_after, (keyframes[0], keyframes[1]))
         items = _object_rows(report.objects, objects, [len(of_object) for of_object in rows], truth)
     n_regions = int(regions.columns["n_regions"])
+    found: dict[str, float] = {**regions.columns, **object_scores}
     row = {
         **_identity(answer, truth),
-        **regions.columns,
-        **object_scores,
-        **merge_columns(errors),
+        **(found if answer.until is None else dict.fromkeys(found, _NAN)),
+        **_merge(answer, truth),
         **_times(answer, n_regions),
         **_figure_means(report),
         **_sizes(answer, truth, n_regions, float(after_travelled_m[-1])),
     }
+    if answer.until == "merge":
+        return CaseScore(row=row, changes=[], regions=[], objects=[])
     keyframe_scores = np.zeros(0) if report is None else report.regions.keyframe_scores
     return CaseScore(
         row=row,
@@ -107,6 +107,7 @@ def _identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
     return {
         "scenario": truth.pair.family,
         "family": truth.pair.family,
+        "pair_kind": "",
         "seed": truth.pair.seed,
         "variant": answer.method,
         "preset": answer.method,
@@ -119,15 +120,32 @@ def _identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
     }
 
 
+def _merge(answer: Answer, truth: GroundTruth) -> dict[str, float]:
+    report, errors = answer.report, None
+    if report is not None:
+        before_scans, after_scans = (
+            keyframes_or_all(scans, len(session.odom_T_sensor))
+            for scans, session in zip(report.keyframe_scans, (truth.before, truth.after), strict=True)
+        )
+        local = report.local_before_T_after
+        merge = report.before_T_after if local is None else local
+        errors = merge_errors(truth.before, truth.after, merge, (before_scans, after_scans))
+    overlap = overlap_true(truth.before.world_T_sensor, truth.after.world_T_sensor)
+    return {**merge_columns(errors), "overlap_true": overlap, **evidence_columns(answer.evidence)}
+
+
 def _times(answer: Answer, n_regions: int) -> dict[str, float]:
     """Return the time columns; whatever an answer does not state is NaN, and so are sums that would need it."""
     seconds = {} if answer.report is None else answer.seconds
-    merge, descriptor, cd, oe = (
-        float(seconds.get(name, _NAN)) for name in ("t_merge_s", "t_descriptor_s", "t_cd_s", "t_oe_s")
+    index, merge, refine, descriptor, cd, oe = (
+        float(seconds.get(name, _NAN))
+        for name in ("t_index_s", "t_merge_s", "t_refine_s", "t_descriptor_s", "t_cd_s", "t_oe_s")
     )
     n_keyframes = 0 if answer.report is None else sum(len(scans) for scans in answer.report.keyframe_scans)
     return {
+        "t_index_s": index,
         "t_merge_s": merge,
+        "t_refine_s": refine,
         "t_descriptor_s": descriptor,
         "t_descriptor_per_keyframe_s": descriptor / n_keyframes if n_keyframes else _NAN,
         "t_cd_s": cd,
@@ -135,7 +153,7 @@ def _times(answer: Answer, n_regions: int) -> dict[str, float]:
         "t_oe_s": oe,
         "t_oe_per_region_s": oe / n_regions if n_regions else _NAN,
         "t_total_s": descriptor + cd + oe,
-        "t_total_with_merge_s": merge + descriptor + cd + oe,
+        "t_total_with_merge_s": index + merge + refine + descriptor + cd + oe,
         "t_total_paper_s": cd + oe,
     }
 
@@ -159,8 +177,8 @@ def _sizes(answer: Answer, truth: GroundTruth, n_regions: int, after_path_m: flo
         },
         "after_path_m": after_path_m,
         "is_unchanged_pair": is_unchanged,
-        # a refused pair was neither silent nor an alarm
-        "is_alarm": n_regions > 0 if is_unchanged and answer.report is not None else _NAN,
+        # a pair that was refused, or only merged, was neither silent nor an alarm
+        "is_alarm": n_regions > 0 if is_unchanged and answer.report is not None and answer.until is None else _NAN,
     }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +15,16 @@ from cdpipe.config import PipelineConfig
 from cdpipe.descriptor import describe_scans, load_descriptors, save_descriptors, use_threads
 from cdpipe.detect import detect_changes
 from cdpipe.errors import InputError, MergeFailedError
+from cdpipe.evidence import GATES
 from cdpipe.mapping import build_map, keyframes
 from cdpipe.readers import open_scans
+from cdpipe.session_check import check_session, is_same_session
 from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, PointMap, ScanSource
 from eval.provenance import THREADS
 from eval.rivals import METHODS
 from eval.stages import OnStage
+
+_SIZES = ("map_points_before", "map_points_after")
 
 
 def describe_session(folder: Path, config: PipelineConfig) -> tuple[DescriptorSet, Path]:
@@ -47,6 +52,9 @@ def detect_pair(before: Path, after: Path, config: PipelineConfig, on_stage: OnS
     """
     use_threads(THREADS)
     sources = open_scans(before), open_scans(after)
+    # both before either is mapped, which may take minutes
+    for source, other in (sources, sources[::-1]):
+        check_session(source, config.map, other)
     mapped: list[MappedSession] = []
     t_descriptor_s = 0.0
     for folder, source in zip((before, after), sources, strict=True):
@@ -62,8 +70,32 @@ def detect_pair(before: Path, after: Path, config: PipelineConfig, on_stage: OnS
     except MergeFailedError as error:
         raise MergeFailedError(f"{before} and {after}: {error}", error.evidence) from error
     seconds = {**report.seconds, "t_descriptor_s": t_descriptor_s}
-    sizes = {f"map_points_{name}": len(each.map.points) for name, each in zip(("before", "after"), mapped, strict=True)}
+    sizes = {name: len(each.map.points) for name, each in zip(_SIZES, mapped, strict=True)}
     return replace(report, seconds=seconds, evidence={**report.evidence, **sizes})
+
+
+def notes_on(before: Path, after: Path) -> list[str]:
+    """Return what is legal about two sessions and yet should be said.
+
+    Raises:
+        InputError: A session is missing or damaged.
+    """
+    if is_same_session(open_scans(before), open_scans(after)):
+        return [f"{before} and {after} are one and the same recording: nothing can have changed between them"]
+    return []
+
+
+def evidence_table(evidence: Mapping[str, float], config: PipelineConfig) -> pd.DataFrame:
+    """Return one row per figure that a merge measured: what it is, from where on it is accepted, and whether it is."""
+    gates = {name: (f"merge.{setting}", getattr(config.merge, setting)) for name, setting in GATES}
+    rows = []
+    for name, value in evidence.items():
+        if name in _SIZES:
+            continue
+        setting, least = gates.get(name, ("", np.nan))
+        passed = "-" if name not in gates else ("yes" if value >= least else "no")
+        rows.append((name, float(value), least, passed, setting))
+    return pd.DataFrame(rows, columns=["evidence", "measured", "at least", "passed", "setting"])
 
 
 def write_detection(folder: Path, method: str, report: ChangeReport) -> None:

@@ -1,7 +1,8 @@
 """The stages of one pair, each run once for all variants that share the settings it depends on, and timed.
 
 Times are wall clock of one process on fixed threads, one stage after the other: the first call warms up; where it took
-less than a second, the median of three further calls is the time, otherwise the first call is.
+less than a second, the median of three further calls is the time, otherwise the first call is. Of a stage with parts
+each part is timed so, and the parts by themselves.
 """
 
 from __future__ import annotations
@@ -10,20 +11,42 @@ import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TypeVar
+from typing import Protocol, TypeVar
+
+import numpy as np
 
 from cdpipe.config import MapConfig, PipelineConfig
 from cdpipe.descriptor import describe_scans
-from cdpipe.errors import MergeFailedError
+from cdpipe.detect import local_alignment, refusal
 from cdpipe.mapping import build_map
 from cdpipe.merge import merge_maps
-from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, MergedMaps, PointMap, ScanSource
+from cdpipe.session_check import check_session
+from cdpipe.types import (
+    ChangeRegions,
+    ChangeReport,
+    DescriptorSet,
+    MappedSession,
+    MergedMaps,
+    PointMap,
+    ScanSource,
+)
 from eval.rivals import METHODS, USES_DESCRIPTORS
 
 REPEAT_BELOW_S = 1.0
 REPEATS = 3
 OnStage = Callable[[str, int, int], None]
-T = TypeVar("T")
+Merge = Callable[[MappedSession, MappedSession], MergedMaps]
+
+
+class HasSeconds(Protocol):
+    """What says itself how long each of its parts took."""
+
+    @property
+    def seconds(self) -> Mapping[str, float]:
+        """Wall-clock seconds by name."""
+
+
+TimedT = TypeVar("TimedT", bound=HasSeconds)
 
 
 class PairStages:
@@ -41,7 +64,7 @@ class PairStages:
         self._map_key = ""
         self._maps: tuple[PointMap, PointMap] | None = None
         self._described: dict[str, tuple[tuple[DescriptorSet, DescriptorSet], float]] = {}
-        self._merged: dict[str, tuple[MergedMaps, float]] = {}
+        self._merged: dict[str, tuple[MergedMaps, Mapping[str, float]]] = {}
 
     def maps(self, config: MapConfig) -> tuple[PointMap, PointMap]:
         """Return both maps, each in its session's own odom frame."""
@@ -64,43 +87,73 @@ class PairStages:
         (before, after), seconds = self._described[key]
         return MappedSession(maps[0], before), MappedSession(maps[1], after), seconds
 
-    def merged(self, config: PipelineConfig) -> tuple[MergedMaps, float]:
-        """Return the merged maps and the seconds that merging took.
+    def merged(self, config: PipelineConfig, merge: Merge | None = None) -> tuple[MergedMaps, Mapping[str, float]]:
+        """Return the merged maps and the seconds of the merge's parts.
+
+        Args:
+            config: All settings.
+            merge: What merges instead of the method; called once, and its result is not kept.
 
         Raises:
             MergeFailedError: The evidence does not suffice.
         """
         before, after, _ = self.mapped(config)
-        key = config.descriptor.model_dump_json() + config.merge.model_dump_json()
-        if key not in self._merged:
-            self._on_stage("merge", 0, 1)
-            self._merged[key] = timed(lambda: merge_maps(before, after, config.merge))
-        merged, seconds = self._merged[key]
+        self._on_stage("merge", 0, 1)
+        if merge is None:
+            key = config.descriptor.model_dump_json() + config.merge.model_dump_json()
+            if key not in self._merged:
+                self._merged[key] = timed_parts(lambda: merge_maps(before, after, config.merge))
+            merged, seconds = self._merged[key]
+        else:
+            merged = merge(before, after)
+            seconds = merged.seconds
         if not merged.is_accepted:
-            raise MergeFailedError(f"the sessions cannot be merged: {merged.reason}", merged.evidence)
+            raise refusal(merged)
         return merged, seconds
 
-    def answer(self, config: PipelineConfig) -> ChangeReport:
-        """Run one method to its end.
+    def answer(self, config: PipelineConfig, merge: Merge | None = None) -> ChangeReport:
+        """Run one method to its end, perhaps merged by something else (`merged`).
 
         Raises:
             MergeFailedError: The maps could not be merged.
             TunnelcdError: The input does not allow an answer.
         """
         before, after, t_descriptor_s = self.mapped(config)
-        merged, t_merge_s = self.merged(config)
+        merged, of_merge = self.merged(config, merge)
         method = METHODS[config.method]
-        report, medians = timed_report(lambda: method(merged, before.descriptors, after.descriptors, config))
-        seconds = {
-            **medians,
-            "t_merge_s": t_merge_s,
-            "t_descriptor_s": t_descriptor_s if config.method in USES_DESCRIPTORS else 0.0,
-        }
-        sizes = {"map_points_before": len(before.map.points), "map_points_after": len(after.map.points)}
-        return replace(report, seconds=seconds, evidence={**report.evidence, **sizes})
+        report, medians = timed_parts(lambda: method(merged, before.descriptors, after.descriptors, config))
+        of_descriptors = {"t_descriptor_s": t_descriptor_s if config.method in USES_DESCRIPTORS else 0.0}
+        return replace(
+            report,
+            seconds={**medians, **of_merge, **of_descriptors},
+            evidence={**report.evidence, **_sizes(before, after)},
+        )
+
+    def merge_answer(self, config: PipelineConfig, merge: Merge | None = None) -> ChangeReport:
+        """Run one method up to its merge: an answer without regions and objects, and descriptors timed if it used them.
+
+        Raises:
+            MergeFailedError: The maps could not be merged.
+            TunnelcdError: The input does not allow an answer.
+        """
+        before, after, t_descriptor_s = self.mapped(config)
+        merged, of_merge = self.merged(config, merge)
+        uses_descriptors = merge is None and config.merge.method != "kiss-matcher"
+        return ChangeReport(
+            before_T_after=merged.before_T_after,
+            evidence={**merged.evidence, **_sizes(before, after)},
+            regions=_no_regions(config.query.radius_m),
+            objects=(),
+            seconds={**of_merge, "t_descriptor_s": t_descriptor_s if uses_descriptors else 0.0},
+            figures={},
+            keyframe_scans=(before.descriptors.keyframe_scans, after.descriptors.keyframe_scans),
+            config=config.model_dump(),
+            local_before_T_after=local_alignment(merged, after.descriptors),
+        )
 
     def _map(self, which: int, config: MapConfig) -> PointMap:
         self._on_stage(f"map {('before', 'after')[which]}", 0, 1)
+        check_session(self._sources[which], config)
         return build_map(self._sources[which], config)
 
     def _describe(
@@ -116,24 +169,21 @@ class PairStages:
         return (before, after), time.perf_counter() - start
 
 
-def timed(call: Callable[[], T]) -> tuple[T, float]:
-    """Return a call's result and its time by the rule of this module."""
-    result, first_s = _stopwatch(call)
-    if first_s >= REPEAT_BELOW_S:
-        return result, first_s
-    return result, statistics.median(_stopwatch(call)[1] for _ in range(REPEATS))
-
-
-def timed_report(call: Callable[[], ChangeReport]) -> tuple[ChangeReport, Mapping[str, float]]:
-    """Return a report and the seconds of its stages by the rule of this module."""
-    report, first_s = _stopwatch(call)
-    if first_s >= REPEAT_BELOW_S:
-        return report, report.seconds
-    repeats = [call().seconds for _ in range(REPEATS)]
-    return report, {name: statistics.median(run[name] for run in repeats) for name in report.seconds}
-
-
-def _stopwatch(call: Callable[[], T]) -> tuple[T, float]:
+def timed_parts(call: Callable[[], TimedT]) -> tuple[TimedT, Mapping[str, float]]:
+    """Return a call's result and the seconds of its parts by the rule of this module."""
     start = time.perf_counter()
     result = call()
-    return result, time.perf_counter() - start
+    if time.perf_counter() - start >= REPEAT_BELOW_S:
+        return result, result.seconds
+    repeats = [call().seconds for _ in range(REPEATS)]
+    return result, {name: statistics.median(run[name] for run in repeats) for name in result.seconds}
+
+
+def _sizes(before: MappedSession, after: MappedSession) -> dict[str, float]:
+    return {"map_points_before": len(before.map.points), "map_points_after": len(after.map.points)}
+
+
+def _no_regions(radius_m: float) -> ChangeRegions:
+    none = np.zeros(0)
+    pairs, is_reported = np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.bool_)
+    return ChangeRegions(np.zeros((0, 3)), radius_m, none, pairs, is_reported, none)

@@ -7,6 +7,8 @@ scenarios:
     each:                            # the same again with each of these on top: one setting, or a list
       - sensor.range_noise=false
       - [sensor.range_noise=false, sensor.dropouts=false]
+    pair_kind: clean                 # what the plan expects of the merge there: the column of that name, nothing else
+    n_seeds: 6                       # only the first six of the plan's seeds
 
 These are four worlds: `paper/site1`, `narrow[platform.speed_mps=0.5]` and
 `narrow[platform.speed_mps=0.5][sensor.range_noise=false]`, and so on. The column `scenario` holds that name; `family`
@@ -19,12 +21,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import (
     AfterValidator,
     BeforeValidator,
+    Field,
     SerializerFunctionWrapHandler,
     ValidationInfo,
     field_validator,
@@ -92,6 +95,7 @@ def _fit_on_top(settings: tuple[str, ...], info: ValidationInfo) -> tuple[str, .
     return settings
 
 
+PairKind = Literal["clean", "drift", "smooth", "disjoint"]
 ScenarioName = Annotated[str, AfterValidator(known_scenario)]
 OneOrMore = BeforeValidator(_as_list)
 WorldSettings = Annotated[tuple[Annotated[str, AfterValidator(_one_spelling)], ...], OneOrMore]
@@ -103,6 +107,8 @@ class ScenarioItem(Settings):
     name: ScenarioName
     set: WorldSettings = ()
     each: Annotated[tuple[Annotated[WorldSettings, AfterValidator(_fit_on_top)], ...], OneOrMore] = ()
+    pair_kind: PairKind | None = None
+    n_seeds: Annotated[int, Field(ge=1)] | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -110,7 +116,7 @@ class ScenarioItem(Settings):
         if isinstance(value, str):
             return {"name": value}
         if not isinstance(value, dict):
-            raise ValueError("expected a scenario's name, or {name: ..., set: [...], each: [...]}")
+            raise ValueError("expected a scenario's name, or {name: ..., set: [...], each: [...], pair_kind: ...}")
         return value
 
     @field_validator("set")
@@ -122,9 +128,8 @@ class ScenarioItem(Settings):
 
     @model_serializer(mode="wrap")
     def _as_written(self, handler: SerializerFunctionWrapHandler) -> Any:
-        if not self.set and not self.each:
-            return self.name
-        return {key: value for key, value in handler(self).items() if value}
+        written = {key: value for key, value in handler(self).items() if value}
+        return self.name if list(written) == ["name"] else written
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,11 +140,15 @@ class World:
         name: The scenario.
         common: What its item sets in all of its worlds.
         own: What this world has on top.
+        pair_kind: What its item calls its pairs, "" where it does not say; no part of the label.
+        n_seeds: How many of the plan's seeds it is run with, the first ones; None for all.
     """
 
     name: str
     common: tuple[str, ...] = ()
     own: tuple[str, ...] = ()
+    pair_kind: str = ""
+    n_seeds: int | None = None
 
     @property
     def settings(self) -> tuple[str, ...]:
@@ -154,7 +163,11 @@ class World:
 
 def worlds_of(items: Iterable[ScenarioItem]) -> list[World]:
     """Return the worlds that the items of a plan stand for, in their order."""
-    return [World(item.name, item.set, own) for item in items for own in ((), *item.each)]
+    return [
+        World(item.name, item.set, own, item.pair_kind or "", item.n_seeds)
+        for item in items
+        for own in ((), *item.each)
+    ]
 
 
 def known_label(label: str) -> str:

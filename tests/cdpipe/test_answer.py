@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -6,6 +7,7 @@ import pytest
 
 from cdpipe.answer import read_answer, write_answer, write_failure
 from cdpipe.errors import InputError
+from cdpipe.geometry import yaw_pose
 from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport
 
 
@@ -43,6 +45,33 @@ def test_an_answer_survives_the_disk(tmp_path: Path) -> None:
     np.testing.assert_array_equal(answer.report.objects[2].points_map, np.full((2, 3), 2.0))
     np.testing.assert_array_equal(answer.report.regions.keyframe_scores, [0.9, np.nan, 0.1])
     np.testing.assert_array_equal(answer.report.figures["v_oe_m3"], [0.3, np.nan])
+
+
+def test_a_local_merge_survives_the_disk_and_need_not_be_there(tmp_path: Path) -> None:
+    local = np.stack([yaw_pose(0.1 * index, (index, 2.0, 3.0)) for index in range(2)])
+    write_answer(tmp_path, "paper", replace(_report(), local_before_T_after=local))
+    read = read_answer(tmp_path).report
+    assert read is not None
+    np.testing.assert_array_equal(read.local_before_T_after, local)
+    # and none is left of it by an answer that has none
+    write_answer(tmp_path, "paper", _report())
+    read = read_answer(tmp_path).report
+    assert read is not None
+    assert read.local_before_T_after is None
+
+
+def test_an_answer_says_where_it_ends(tmp_path: Path) -> None:
+    write_answer(tmp_path, "paper", _report())
+    assert "until" not in json.loads((tmp_path / "answer.json").read_text())
+    assert read_answer(tmp_path).until is None
+    write_answer(tmp_path, "paper", _report(), "merge")
+    assert read_answer(tmp_path).until == "merge"
+    write_failure(tmp_path, "paper", "failed", "", {}, {}, "merge")
+    assert read_answer(tmp_path).until == "merge"
+    text = (tmp_path / "answer.json").read_text()
+    (tmp_path / "answer.json").write_text(text.replace('"until": "merge"', '"until": "query"'))
+    with pytest.raises(InputError, match="until = 'query': expected merge, or nothing"):
+        read_answer(tmp_path)
 
 
 def test_a_failure_replaces_an_older_answer(tmp_path: Path) -> None:

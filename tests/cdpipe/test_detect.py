@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.answer import read_answer, write_answer
 from cdpipe.config import ClusterConfig, ExtractConfig, MergeConfig, OutlierConfig, PipelineConfig, QueryConfig
 from cdpipe.detect import detect_changes, map_session
-from cdpipe.errors import MergeFailedError
+from cdpipe.errors import InputError, MergeFailedError
 from cdpipe.geometry import Float64Array, stream, yaw_pose
 from cdpipe.readers import open_scans
 from cdpipe.types import ChangeReport, MappedSession
@@ -43,7 +43,9 @@ def test_the_three_boxes_are_found(report: ChangeReport, box_centres_map: dict[s
 
 
 def test_the_report_names_its_settings_and_times(report: ChangeReport, tunnel_after: MappedSession) -> None:
-    assert set(report.seconds) == {"t_merge_s", "t_cd_s", "t_oe_s", "t_returns_s"}
+    assert set(report.seconds) == {
+        "t_index_s", "t_merge_s", "t_refine_s", "t_cd_s", "t_oe_s", "t_returns_s",
+    }  # fmt: skip
     assert report.seconds["t_returns_s"] < report.seconds["t_oe_s"]
     assert all(value > 0 for value in report.seconds.values())
     assert report.config == CONFIG.model_dump()
@@ -86,13 +88,22 @@ def test_a_folder_of_ply_scans_is_mapped(tmp_path: Path) -> None:
     assert len(session.map.return_points) == 8000
 
 
-def test_two_single_scans_are_refused_and_not_a_crash(tmp_path: Path) -> None:
+def test_a_single_scan_is_refused_because_it_has_no_path(tmp_path: Path) -> None:
+    meshio.ply.write(tmp_path / "0.ply", meshio.Mesh(stream(0, "one").normal(size=(50, 3)), []))
+    (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
+    with pytest.raises(InputError, match="1 scan: expected a drive, at least two scans along a path"):
+        map_session(open_scans(tmp_path), PipelineConfig())
+
+
+def test_two_sessions_of_few_points_are_refused_and_not_a_crash(tmp_path: Path) -> None:
     sessions = []
     for name, n_points in (("one", 1), ("few", 50)):
         folder = tmp_path / name
         folder.mkdir()
-        meshio.ply.write(folder / "0.ply", meshio.Mesh(stream(0, name).normal(size=(n_points, 3)), []))
-        (folder / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
+        for index in range(2):
+            cloud = stream(index, name).normal((0, 2, 0), size=(n_points, 3))
+            meshio.ply.write(folder / f"{index}.ply", meshio.Mesh(cloud, []))
+        (folder / "poses.txt").write_text("0 0 0 0 0 0 0 1\n1 1.5 0 0 0 0 0 1\n")
         config = PipelineConfig.model_validate({"descriptor": {"method": "untrained"}})
         sessions.append(map_session(open_scans(folder), config))
     with pytest.raises(MergeFailedError, match="enough points"):

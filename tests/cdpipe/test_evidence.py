@@ -6,74 +6,96 @@ import numpy as np
 import pytest
 
 from cdpipe.config import MergeConfig
-from cdpipe.evidence import MapCheck, Place, sphere_fit, why_refused
-from cdpipe.geometry import Float64Array, make_pose
+from cdpipe.evidence import SurfaceFit, sampled, surface_fit, why_refused
+from cdpipe.geometry import Float64Array, make_pose, yaw_pose
+from cdpipe.registration import IndexedMap
 from cdpipe.types import MappedSession
 
-CONFIG = MergeConfig(sphere_radius_m=10.0, inlier_m=0.3, voxel_m=0.1)
+CONFIG = MergeConfig()
+GOOD = {"overlap": 0.5, "inlier_share": 0.95, "hessian_ratio": 0.1, "agreement": 0.95}
 
 
-def floor(half_m: float = 12.0, step_m: float = 0.5) -> Float64Array:
+def floor(half_m: float = 12.0, step_m: float = 0.25) -> Float64Array:
     axis = np.arange(-half_m, half_m + 1e-9, step_m)
     return np.stack(np.meshgrid(axis, axis, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def shifted(points: Float64Array, x_m: float = 0.0, z_m: float = 0.0) -> Float64Array:
-    return points + np.array([x_m, 0.0, z_m])
+@pytest.fixture
+def floors(tunnel_before: MappedSession) -> tuple[IndexedMap, IndexedMap]:
+    """A flat floor, mapped twice; the second map has points half way between those of the first."""
+    maps = [replace(tunnel_before.map, points=floor() + np.array([shift, shift, 0.0])) for shift in (0.0, 0.125)]
+    return IndexedMap(maps[0], CONFIG, is_target=True), IndexedMap(maps[1], CONFIG, is_target=False)
 
 
-def place(after_points: Float64Array) -> Place:
-    return Place(floor(), after_points, np.zeros(3), np.zeros(3), 0.0)
+def fit_at(maps: tuple[IndexedMap, IndexedMap], pose: Float64Array) -> SurfaceFit:
+    return surface_fit(*maps, pose, sampled(maps[1].sphere(np.zeros(3), 5.0)), np.zeros(3), 5.0)
 
 
-@pytest.mark.parametrize(("lift_m", "share"), [(0.0, 1.0), (0.29, 1.0), (0.31, 0.0)])
-def test_a_lifted_floor_fits_up_to_the_inlier_distance(lift_m: float, share: float) -> None:
-    found_share, residual_m = sphere_fit(place(floor()), make_pose(translation=(0, 0, lift_m)), CONFIG)
-    assert found_share == share
-    assert residual_m == pytest.approx(lift_m)
+@pytest.mark.parametrize(("lift_m", "share"), [(0.0, 1.0), (0.09, 1.0), (0.11, 0.0)])
+def test_a_lifted_floor_fits_up_to_the_inlier_distance(
+    floors: tuple[IndexedMap, IndexedMap], lift_m: float, share: float
+) -> None:
+    fit = fit_at(floors, make_pose(translation=(0, 0, lift_m)))
+    assert fit.inlier_share(0.1) == share
+    assert fit.residual_m == pytest.approx(lift_m, abs=1e-9)
 
 
-def test_both_directions_count_alike() -> None:
-    # the after map has a second storey 1 m up: its points miss, those of the before map all fit
-    both = np.concatenate([floor(), shifted(floor(), z_m=1.0)])
-    n = [np.count_nonzero(np.linalg.norm(shifted(floor(), z_m=lift), axis=1) <= 9.7) for lift in (0, 1)]
-    share, _ = sphere_fit(place(both), make_pose(), CONFIG)
-    assert share == pytest.approx((n[0] / (n[0] + n[1]) + 1.0) / 2)
+def test_distances_are_along_the_normal_and_not_to_the_next_point(floors: tuple[IndexedMap, IndexedMap]) -> None:
+    # points of the second map lie 0.18 m from the nearest of the first, but on its surface
+    fit = fit_at(floors, make_pose(translation=(0.1, -0.05, 0.0)))
+    assert fit.residual_m == pytest.approx(0.0, abs=1e-9)
 
 
-def test_spheres_that_do_not_meet_have_no_inliers() -> None:
-    share, residual_m = sphere_fit(place(floor(2.0)), make_pose(translation=(300.0, 0, 0)), CONFIG)
-    assert (share, residual_m) == (0.0, np.inf)
+def test_what_has_no_counterpart_does_not_fit(floors: tuple[IndexedMap, IndexedMap]) -> None:
+    fit = fit_at(floors, make_pose(translation=(0, 0, 0.6)))
+    assert np.isinf(fit.forward_m).all()
+    assert fit.inlier_share(10.0) == 0.0
+    # where the other map has nothing at all, there is no point of it to look at either
+    assert fit_at(floors, make_pose(translation=(300.0, 0, 0))).inlier_share(0.1) == 0.0
 
 
-def test_overlap_counts_the_after_map_within_a_metre(tunnel_before: MappedSession) -> None:
-    # 22 points on a line against 11 of them: the 11 and the one at -0.9 m lie within a metre
-    line = np.column_stack([np.arange(11.0) * 2, np.zeros(11), np.zeros(11)])
-    before = replace(tunnel_before.map, points=line)
-    after = replace(tunnel_before.map, points=np.concatenate([line, shifted(line, x_m=-20.9)]))
-    assert MapCheck(before, after).overlap(make_pose()) == 12 / 22
-    assert MapCheck(before, after).overlap(make_pose(translation=(0, 0, 1.5))) == 0.0
+def test_the_lower_of_both_directions_counts() -> None:
+    fit = SurfaceFit(np.array([0.0, 0.0, 0.3, 0.3]), np.array([0.0, 0.3, 0.3, np.inf]), np.eye(3))
+    assert fit.inlier_share(0.1) == 0.25
 
 
-def test_agreement_asks_along_both_paths_and_only_where_both_were(tunnel_before: MappedSession) -> None:
-    same = tunnel_before.map
-    assert MapCheck(same, same).agreement(make_pose()) == 1.0
-    assert MapCheck(same, same).agreement(make_pose(translation=(500.0, 0, 0))) == 0.0
-    # a session that saw the first half alone agrees with one that saw all of it
-    x_m, middle_m = same.points[:, 0], np.median(same.points[:, 0])
-    is_driven = same.odom_T_keyframe[:, 0, 3] < middle_m - 6.0
-    half = replace(same, points=same.points[x_m <= middle_m], keyframe_scans=same.keyframe_scans[is_driven])
-    assert MapCheck(same, half).agreement(make_pose()) == 1.0
-    # lifted by 0.6 m the floor misses, and it was seen from both paths
-    assert MapCheck(same, same).agreement(make_pose(translation=(0, 0, 0.6))) < 0.93
+def test_a_plane_holds_one_direction_only_whichever_way_the_maps_are_turned(
+    floors: tuple[IndexedMap, IndexedMap],
+) -> None:
+    for pose in (make_pose(), yaw_pose(1.0)):
+        eigenvalues = np.linalg.eigvalsh(fit_at(floors, pose).normal_sum)
+        assert eigenvalues[:2] == pytest.approx(0.0, abs=1e-6)
+        assert eigenvalues[2] > 100
 
 
-def test_reasons_in_plain_words() -> None:
-    config = MergeConfig(min_inlier_share=0.9, min_hessian_ratio=0.01)
-    assert why_refused({"inlier_share": 0.9, "hessian_ratio": 0.01}, config) == ""
-    assert why_refused({"inlier_share": 0.5, "hessian_ratio": 0.0}, config).startswith("only 50% of the points")
-    alike = {"inlier_share": 1.0, "hessian_ratio": 0.1, "agreement": 0.75}
-    assert "only 75% of the points do" in why_refused(alike, config)
-    assert why_refused({**alike, "agreement": 0.965}, config) == ""
-    assert "two places that look alike" in why_refused({**alike, "agreement": 0.95}, config)
-    assert "0.0050" in why_refused({"inlier_share": 1.0, "hessian_ratio": 0.005}, config)
+def test_samples_are_every_kth_point() -> None:
+    points = np.arange(3000.0).reshape(1000, 3)
+    np.testing.assert_array_equal(sampled(points, 300), points[::3])
+    np.testing.assert_array_equal(sampled(points[:10], 300), points[:10])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("overlap", 0.1, "only 10% of the shorter one"),
+        ("inlier_share", 0.5, "only 50% of the points around the best pair"),
+        ("hessian_ratio", 0.0051, "degenerate"),
+        ("agreement", 0.75, "two places that look alike"),
+    ],
+)
+def test_each_gate_refuses_alone_and_says_why(name: str, value: float, said: str) -> None:
+    assert why_refused(GOOD, CONFIG) == ""
+    reason = why_refused({**GOOD, name: value}, CONFIG)
+    assert said in reason
+    assert f"merge.min_{name} asks for" in reason
+
+
+def test_what_could_not_be_measured_is_refused() -> None:
+    for name in GOOD:
+        assert why_refused({**GOOD, name: float("nan")}, CONFIG)
+        assert why_refused({key: value for key, value in GOOD.items() if key != name}, CONFIG)
+
+
+def test_the_gate_itself_is_enough() -> None:
+    at_the_gate = {name: getattr(CONFIG, f"min_{name}") for name in GOOD}
+    assert why_refused(at_the_gate, CONFIG) == ""

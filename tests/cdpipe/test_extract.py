@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import cdpipe.objects
+from cdpipe.alignment import PathAlignment
 from cdpipe.config import ClusterConfig, ExtractConfig, OutlierConfig, PipelineConfig
 from cdpipe.extract import PointGroup, assemble_objects, cut_out, hull_volume_m3
 from cdpipe.geometry import Float64Array, invert, make_pose, transform, yaw_pose
@@ -188,6 +189,47 @@ def test_moving_both_sessions_moves_the_objects() -> None:
         assert set(map(tuple, item.returns.tolist())) == set(map(tuple, other.returns.tolist()))
     for name, values in figures.items():
         np.testing.assert_allclose(moved_figures[name], values, rtol=1e-9)
+
+
+def bent(pose: Float64Array, strain: float, length_m: float = 40.0) -> PathAlignment:
+    """An after odometry that goes `strain` too far along x, corrected at anchors a metre apart."""
+    along = np.arange(-length_m, length_m + 0.5)
+    anchors = np.column_stack([along, 0 * along, 0 * along])
+    shifts = np.array([make_pose(translation=(-strain * x, 0, 0)) for x in along])
+    return PathAlignment(transform(invert(pose), anchors), shifts @ pose)
+
+
+def test_local_anchors_that_agree_give_the_rigid_answer() -> None:
+    pose = yaw_pose(0.83, (-7.0, 3.3, 0.1))
+    rigid = merged([FLOOR, PLATE], [FLOOR, BOX], pose)
+    candidates = regions([(0, 0, 0.5), (3, 3, 0.5)], 4.4)
+    local = replace(rigid, local=bent(pose, 0.0))
+    expected, figures = extract_objects(rigid, candidates, CONFIG)
+    objects, local_figures = extract_objects(local, candidates, CONFIG)
+    assert summary(objects) == summary(expected)
+    for item, other in zip(objects, expected, strict=True):
+        np.testing.assert_allclose(item.points_map, other.points_map, atol=1e-9)
+        np.testing.assert_array_equal(item.returns, other.returns)
+    for name, values in figures.items():
+        np.testing.assert_allclose(local_figures[name], values, rtol=1e-9)
+
+
+def test_a_bent_alignment_straightens_the_after_map() -> None:
+    # 4 % too far: 8 cm at the box, 20 cm at the rim of the floor
+    pose, strain = yaw_pose(-0.4, (2.0, 5.0, 0.2)), 0.04
+    straight = merged([FLOOR], [FLOOR, BOX], pose)
+    in_map = transform(pose, straight.after.points) * (1 + strain, 1, 1)
+    stretched = replace(straight.after, points=transform(invert(pose), in_map))
+    drifted = MergedMaps(straight.before, stretched, pose, {}, True, local=bent(pose, strain / (1 + strain)))
+    centre = (1.0, 0.5, 0.5)
+    for radius_m in (2.0, 4.9):
+        objects, figures = extract_objects(drifted, regions([centre], radius_m), CONFIG)
+        expected, _ = extract_objects(straight, regions([centre], radius_m), CONFIG)
+        assert summary(objects) == summary(expected)
+        np.testing.assert_allclose(objects[0].points_map, expected[0].points_map, atol=2e-3)
+        # cut to the sphere exactly, in the map frame
+        moved = drifted.alignment.to_map(stretched.points)
+        assert figures["s_points"][0] == np.count_nonzero(np.linalg.norm(moved - centre, axis=1) <= radius_m)
 
 
 @pytest.mark.parametrize("block_returns", [7, 1 << 22])

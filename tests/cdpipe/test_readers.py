@@ -148,3 +148,26 @@ def test_bad_sessions_are_named(tmp_path: Path) -> None:
     chunk["range_mm"][1] = 0
     np.savez(dark / "chunks" / "00001.npz", **chunk)
     assert "00001.npz: scan 3 holds no return: remove the scan" in said(dark, read=True)
+
+
+def test_a_scan_recorded_twice_is_named(tmp_path: Path) -> None:
+    folder = recording(tmp_path / "run")
+    (folder / "scan_002.ply").write_bytes((folder / "scan_000.ply").read_bytes())
+    expected = "scan_002.ply repeats scan_000.ply: the same returns to the last bit, recorded twice: remove one"
+    assert expected in said(folder, read=True)
+    twice = session(tmp_path / "twice")
+    chunk = dict(np.load(twice / "chunks" / "00001.npz"))
+    chunk["range_mm"][0] = np.load(twice / "chunks" / "00000.npz")["range_mm"][1]
+    np.savez(twice / "chunks" / "00001.npz", **chunk)
+    assert "00001.npz: scan 2 repeats scan 1: the same returns" in said(twice, read=True)
+
+
+def test_standing_still_without_noise_is_no_repetition(tmp_path: Path) -> None:
+    standing = "\n".join(f"{stamp} 0 0 0 0 0 0 1" for stamp in (0.0, 0.1, 0.2))
+    folder = recording(tmp_path / "run", trajectory=standing)
+    for index in (1, 2):
+        (folder / f"scan_00{index}.ply").write_bytes((folder / "scan_000.ply").read_bytes())
+    assert len(list(open_scans(folder).scans())) == 3
+    # at the same time it is the same scan
+    (folder / "trajectory.txt").write_text("\n".join(["0 0 0 0 0 0 0 1"] * 3))
+    assert "scan_001.ply repeats scan_000.ply" in said(folder, read=True)

@@ -5,7 +5,7 @@ import pytest
 
 from cdpipe.geometry import invert, make_pose, stream, yaw_pose
 from eval.ground_truth import SessionTruth
-from eval.merge_metrics import merge_columns, merge_errors, travel_directions
+from eval.merge_metrics import evidence_columns, merge_columns, merge_errors, overlap_true, travel_directions
 from eval.universe import Universe
 
 
@@ -79,6 +79,63 @@ def test_drift_of_either_session_counts_as_misalignment() -> None:
     columns = merge_columns(errors)
     assert columns["merge_error_along_m"] == pytest.approx(0.005 * 9.5)
     assert columns["merge_error_along_m_p95"] == pytest.approx(0.005 * 0.95 * 19)
+
+
+def test_a_local_merge_is_taken_at_each_after_keyframe() -> None:
+    # the after odometry believes keyframe k to be 0.005 k ahead of itself, and the local merge takes it back
+    after = drive(20, start_x_m=-6.0)
+    stretched = after.copy()
+    stretched[:, 0, 3] += 0.005 * np.arange(20)
+    truth = SessionTruth(AFTER_T_WORLD @ stretched, after, session(after, AFTER_T_WORLD).universe)
+    back = np.stack([make_pose(translation=(-0.005 * k, 0.0, 0.0)) for k in range(20)])
+    local = BEFORE_T_WORLD @ back @ invert(AFTER_T_WORLD)
+    before = session(drive(20), BEFORE_T_WORLD)
+    # the first two stand farther than 5 m from every before keyframe, and every third is a keyframe
+    chosen = np.arange(0, 20, 3)
+    errors = merge_errors(before, truth, local[chosen], (np.arange(20), chosen))
+    assert len(errors.metres) == 6
+    np.testing.assert_allclose(errors.metres, 0.0, atol=1e-9)
+    drifted = merge_errors(before, truth, TRUE_MERGE, (np.arange(20), chosen))
+    np.testing.assert_allclose(drifted.along_m, 0.005 * chosen[1:], atol=1e-9)
+
+
+def line(start: tuple[float, float], end: tuple[float, float], n: int) -> np.ndarray:
+    return np.stack([make_pose(translation=(*place, 0.0)) for place in np.linspace(start, end, n)])
+
+
+@pytest.mark.parametrize(
+    ("after", "share"),
+    [
+        (line((0, 0), (20, 0), 41), 1.0),
+        # the other way, and without a scan between the ends
+        (line((20, 4.9), (0, 4.9), 2), 1.0),
+        (line((0, 5.1), (20, 5.1), 41), 0.0),
+        # 15 of 40 m: the before path ends at 20, and 5 m beyond it are near
+        (line((10, 0), (50, 0), 3), 15 / 40),
+        # across: 5 m on either side of 24
+        (line((10, -12), (10, 12), 7), 10 / 24),
+        (line((500, 0), (600, 0), 9), 0.0),
+    ],
+)
+@pytest.mark.parametrize("n_before", [2, 33])
+def test_true_overlap_by_hand(after: np.ndarray, share: float, n_before: int) -> None:
+    assert overlap_true(line((0, 0), (20, 0), n_before), after) == pytest.approx(share, abs=0.1 / 24)
+
+
+def test_true_overlap_is_by_length_and_not_by_scans() -> None:
+    # it waits for long where the before session was, and then leaves
+    after = np.concatenate([line((20, 0), (20, 0), 500), line((20, 0), (20, 50), 3)])
+    assert overlap_true(line((0, 0), (20, 0), 9), after) == pytest.approx(5 / 50, abs=1e-9)
+    assert np.isnan(overlap_true(line((0, 0), (20, 0), 9), line((3, 0), (3, 0), 4)))
+    # a before session that never moved is still somewhere
+    assert overlap_true(line((0, 0), (0, 0), 4), line((-10, 0), (10, 0), 5)) == pytest.approx(0.5, abs=0.01)
+
+
+def test_evidence_columns_by_hand() -> None:
+    columns = evidence_columns({"overlap": 1, "hessian_ratio": 0.25, "residual_m": np.inf, "unknown": 7.0})
+    assert (columns["evidence_overlap"], columns["evidence_hessian_ratio"]) == (1.0, 0.25)
+    assert sum(map(np.isnan, columns.values())) == len(columns) - 2
+    assert "evidence_unknown" not in columns
 
 
 def test_errors_equal_the_definition_written_out() -> None:

@@ -221,6 +221,73 @@ def test_the_example_of_the_documentation_is_a_plan(tmp_path: Path) -> None:
     plan = read(tmp_path, textwrap.dedent(documentation.partition("\n\n")[2]))
     assert set(Plan.model_fields) == plan.model_fields_set
     assert plan.seeds == (20000, 20001)
-    # of each seed: the variant on both sites and on two more worlds of one, and four grid points on the other
-    assert len(cells(plan)) == 2 * (2 + 2 + 4)
+    # of each seed: both variants on both sites and on two more worlds of one, and four grid points on the other
+    assert len(cells(plan)) == 2 * (2 * (2 + 2) + 4)
     assert {cell.variant for cell in cells(plan) if cell.preset == "paper"} == {"paper[extract.voxel_m=0.4]"}
+
+
+ORACLES = """\
+name: merges
+scenarios: [smoke/one_box]
+seeds: [7]
+until: merge
+variants:
+  - {preset: tunnelcd}
+  - {preset: tunnelcd, oracle_merge: {}}
+  - {preset: tunnelcd, oracle_merge: {noise_m: 0.1, noise_deg: 0.2}}
+  - {preset: tunnelcd, oracle_merge: {noise_m: 0.05}, set: ["query.radius_m=3"]}
+  - {preset: paper, oracle_merge: {}}
+"""
+
+
+def test_oracles_are_variants_of_their_own(tmp_path: Path) -> None:
+    found = cells(read(tmp_path, ORACLES))
+    assert [(c.preset, c.variant) for c in found] == [
+        ("tunnelcd", "tunnelcd"),
+        ("tunnelcd", "oracle-merge"),
+        ("tunnelcd", "oracle-merge[noise_m=0.1,noise_deg=0.2]"),
+        ("tunnelcd", "oracle-merge[noise_m=0.05,noise_deg=0,query.radius_m=3]"),
+        ("paper", "oracle-merge[preset=paper]"),
+    ]
+    noises = [None if c.oracle is None else (c.oracle.noise_m, c.oracle.noise_deg) for c in found]
+    assert noises == [None, (0, 0), (0.1, 0.2), (0.05, 0), (0, 0)]
+    # the later stages are the preset's
+    assert found[1].config == found[0].config
+    assert found[3].config.query.radius_m == 3
+
+
+def test_a_plan_may_end_at_the_merge(tmp_path: Path) -> None:
+    assert {c.until for c in cells(read(tmp_path, ORACLES))} == {"merge"}
+    assert {c.until for c in cells(read(tmp_path))} == {None}
+
+
+def test_the_command_line_keeps_oracles_and_the_end(tmp_path: Path) -> None:
+    plan = read(tmp_path, ORACLES)
+    assert changed_plan(plan) == plan
+    found = cells(changed_plan(plan, settings=["query.radius_m=6"], grid=["extract.voxel_m=0.1,0.2"]))
+    assert len(found) == 10
+    assert {c.until for c in found} == {"merge"}
+    assert "oracle-merge[noise_m=0.1,noise_deg=0.2,extract.voxel_m=0.2,query.radius_m=6]" in {c.variant for c in found}
+    # a provenance holds no key that the plan does not say
+    variants = plan.model_dump(mode="json")["variants"]
+    assert ["oracle_merge" in variant for variant in variants] == [False, True, True, True, True]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("until: merge", "until: merg", ["plan.yaml:4:", "until = 'merg'", 'did you mean "merge"?']),
+        ("noise_deg: 0.2", "noise_dg: 0.2", ["plan.yaml:8:", "noise_dg", 'did you mean "noise_deg"?']),
+        ("noise_m: 0.1", "noise_m: -0.1", ["plan.yaml:8:", "noise_m = -0.1", "greater than or equal to 0"]),
+        ("noise_deg: 0.2", "noise_deg: .nan", ["plan.yaml:8:", "noise_deg"]),
+        # a bare key would be no oracle, and nothing would tell
+        ("oracle_merge: {noise_m: 0.1, noise_deg: 0.2}", "oracle_merge: ", ["plan.yaml:8:", "{} is without noise"]),
+        ("{noise_m: 0.1, noise_deg: 0.2}", "0.1", ["plan.yaml:8:", "expected {noise_m: ..., noise_deg: ...}"]),
+        ("{noise_m: 0.1, noise_deg: 0.2}", "{noise_m: 0}", ["variant oracle-merge stands twice"]),
+        ("oracle_merge: {noise_m: 0.05}", "oracle_merg: {}", ["plan.yaml:9:", 'did you mean "oracle_merge"?']),
+    ],
+)
+def test_mistakes_of_oracles_and_of_the_end(tmp_path: Path, old: str, new: str, words: list[str]) -> None:
+    assert old in ORACLES
+    (line,) = mistakes(tmp_path, ORACLES.replace(old, new))
+    assert all(word in line for word in words), line

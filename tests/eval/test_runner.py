@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,13 @@ import pandas as pd
 import pytest
 
 from cdpipe.answer import read_answer
-from cdpipe.config import MapConfig
+from cdpipe.config import MapConfig, MergeConfig
 from cdpipe.errors import InputError, ScenarioError
 from cdpipe.mapping import build_map
+from cdpipe.merge import merge_maps
 from cdpipe.ouster import load_profile
 from cdpipe.readers import open_scans
+from cdpipe.types import MappedSession, MergedMaps
 from eval import provenance, runner, stages
 from eval.adapters import pipeline_input
 from eval.plan import Plan, load_plan
@@ -331,7 +334,7 @@ def test_stages_are_shared_by_the_settings_they_depend_on(
     coarse = 'set: ["map.voxel_m=0.3"]'
     # the two that share a map stand apart in the plan
     # both presets merge alike
-    alike = 'set: ["merge.refine_map=true"]'
+    alike = 'set: ["merge.refine=local"]'
     variants = f"{{preset: voxel-diff}}, {{preset: voxel-diff, {coarse}}}, {{preset: random-regions, {alike}}}"
     run, _ = run_in(tmp_path / "run", plan_of(tmp_path, variants=variants))
     assert calls.count("build_map") == 2 * 2
@@ -342,7 +345,7 @@ def test_stages_are_shared_by_the_settings_they_depend_on(
     assert table(run)["variant"].tolist() == [
         "voxel-diff",
         "voxel-diff[map.voxel_m=0.3]",
-        "random-regions[merge.refine_map=true]",
+        "random-regions[merge.refine=local]",
     ]
 
 
@@ -412,31 +415,34 @@ def test_the_pipeline_never_sees_truth(pairs: dict[str, Path], tmp_path: Path) -
 
 def test_time_is_the_median_of_three_after_a_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = 0.0
-    durations = iter([0.9, 0.5, 0.1, 0.2])
+    # the middle one of three in each part, whichever call it was
+    parts = iter([(0.5, 0.4), (0.3, 0.1), (0.2, 0.5), (0.1, 0.3)])
 
-    def call() -> str:
+    def call() -> SimpleNamespace:
         nonlocal clock
-        clock += next(durations)
-        return "done"
+        cd, oe = next(parts)
+        clock += cd + oe
+        return SimpleNamespace(name="first" if cd == 0.5 else "later", seconds={"t_cd_s": cd, "t_oe_s": oe})
 
     monkeypatch.setattr(stages.time, "perf_counter", lambda: clock)
-    result, seconds = stages.timed(call)
-    assert result == "done"
-    assert seconds == pytest.approx(0.2)
-    assert next(durations, None) is None
+    result, seconds = stages.timed_parts(call)
+    assert result.name == "first"
+    assert seconds == {"t_cd_s": 0.2, "t_oe_s": 0.3}
+    assert next(parts, None) is None
 
 
 def test_a_long_call_is_timed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = 0.0
     calls = 0
 
-    def call() -> None:
+    def call() -> SimpleNamespace:
         nonlocal clock, calls
-        clock += 1.5
+        clock += 1.0
         calls += 1
+        return SimpleNamespace(seconds={"t_cd_s": 0.7})
 
     monkeypatch.setattr(stages.time, "perf_counter", lambda: clock)
-    assert stages.timed(call) == (None, 1.5)
+    assert stages.timed_parts(call)[1] == {"t_cd_s": 0.7}
     assert calls == 1
 
 
@@ -608,3 +614,170 @@ def test_an_answer_beside_those_of_a_world_gets_the_name_of_the_world(tmp_path: 
     remove(run.path / "cells")
     rescore(run)
     assert "smoke/one_box_sensor.range_noise=false_" in set(table(run)["scenario"])
+
+
+MERGES = ", ".join(
+    (
+        "{preset: tunnelcd}",
+        '{preset: tunnelcd, set: ["merge.min_hessian_ratio=1"]}',
+        "{preset: kiss-matcher}",
+        "{preset: tunnelcd, oracle_merge: {}}",
+        "{preset: tunnelcd, oracle_merge: {noise_m: 0.3, noise_deg: 1}}",
+    )
+)
+REFUSED = "tunnelcd[merge.min_hessian_ratio=1]"
+NOISY = "oracle-merge[noise_m=0.3,noise_deg=1]"
+ONE_CLEAN = f"{{name: {ONE_BOX}, pair_kind: clean}}"
+
+
+@pytest.fixture(scope="module")
+def merges(pairs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A plan that ends at the merge; KISS-Matcher is taken to meet an error of its input."""
+
+    def copy(scenario: Scenario, seed: int, out: Path, on_progress: object) -> None:
+        shutil.copytree(pairs[scenario.family], out)
+
+    def merge(before: MappedSession, after: MappedSession, config: MergeConfig) -> MergedMaps:
+        if config.method == "kiss-matcher":
+            raise InputError("not installed")
+        return merge_maps(before, after, config)
+
+    def forbidden(*_: object) -> None:
+        raise AssertionError("nothing comes after the merge")
+
+    folder = tmp_path_factory.mktemp("merges")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner, "simulate_pair", copy)
+        patch.setattr(runner, "load_scenario", load_small)
+        patch.setattr(stages, "merge_maps", merge)
+        patch.setattr(stages, "METHODS", {"descriptor": forbidden})
+        plan = plan_of(folder, scenarios=f"{ONE_CLEAN}, {UNCHANGED}", variants=MERGES, rest="until: merge")
+        return run_in(folder / "run", plan)[0]
+
+
+@pytest.fixture
+def merges_copy(merges: RunFolder, tmp_path: Path) -> RunFolder:
+    shutil.copytree(merges.path, tmp_path / "run")
+    return RunFolder(tmp_path / "run")
+
+
+def test_a_plan_that_ends_at_the_merge_has_every_case_and_no_more_than_the_merge(merges: RunFolder) -> None:
+    results = table(merges).set_index(["scenario", "variant"])
+    assert results["status"].tolist() == ["ok", "merge_refused", "failed", "ok", "ok"] * 2
+    assert results.loc[(ONE_BOX, "kiss-matcher"), "error"] == "not installed"
+    later = [name for name in results.columns if name.startswith(("region_", "object_", "t_cd", "t_oe", "t_total"))]
+    assert len(later) > 15
+    assert results[[*later, "n_regions", "n_objects", "is_alarm"]].isna().all(axis=None)
+    assert results["overlap_true"].notna().all()
+    merged = results[results["status"] == "ok"]
+    assert merged[["merge_error_m", "t_index_s", "t_merge_s", "t_refine_s", "t_descriptor_s"]].notna().all(axis=None)
+    assert (merged["merge_error_m"].loc[:, ["tunnelcd", "oracle-merge"]] < 0.1).all()
+    refused = results.loc[(ONE_BOX, REFUSED)]
+    assert np.isfinite(refused["evidence_hessian_ratio"])
+    for name in ("changes", "regions", "objects", "keyframes"):
+        assert len(table(merges, name)) == 0
+    assert merges.provenance()["plan"]["until"] == "merge"
+    assert read_answer(merges.answer(ONE_BOX, 20000, "tunnelcd")).until == "merge"
+    assert read_answer(merges.answer(ONE_BOX, 20000, "kiss-matcher")).until == "merge"
+
+
+def test_only_a_merge_that_asks_the_descriptors_is_charged_for_them(merges: RunFolder) -> None:
+    seconds = table(merges).set_index(["scenario", "variant"])["t_descriptor_s"]
+    assert seconds[ONE_BOX, "tunnelcd"] > 0
+    assert seconds[ONE_BOX, "oracle-merge"] == 0
+
+
+def test_the_kind_of_a_pair_is_a_column(merges: RunFolder) -> None:
+    results = table(merges)
+    assert list(results.columns)[:4] == ["scenario", "family", "pair_kind", "seed"]
+    kinds = results.fillna({"pair_kind": ""}).groupby("scenario")["pair_kind"].unique().map(list).to_dict()
+    assert kinds == {ONE_BOX: ["clean"], UNCHANGED: [""]}
+    assert "pair_kind" not in set(table(merges, "summary")["metric"])
+
+
+def test_scoring_again_keeps_the_kind_and_the_end(merges_copy: RunFolder) -> None:
+    before = table(merges_copy)
+    shutil.copytree(merges_copy.answer(ONE_BOX, 20000, "tunnelcd"), merges_copy.answer(ONE_BOX, 20000, "theirs"))
+    rescore(merges_copy)
+    after = table(merges_copy)
+    theirs = after[after["variant"] == "theirs"]
+    assert (theirs["pair_kind"].tolist(), theirs["scenario"].tolist()) == (["clean"], [ONE_BOX])
+    pd.testing.assert_frame_equal(after[after["variant"] != "theirs"], before)
+
+
+def test_an_error_of_an_oracle_is_its_noise(merges: RunFolder) -> None:
+    results = table(merges).set_index(["scenario", "variant"])
+    for scenario in (ONE_BOX, UNCHANGED):
+        exact, noisy = results.loc[(scenario, "oracle-merge")], results.loc[(scenario, NOISY)]
+        # the odometry of these pairs drifts, and between keyframes the alignment is blended
+        assert exact["merge_error_m"] < 0.002
+        assert noisy["merge_error_m"] == pytest.approx(0.3, abs=0.01)
+        assert noisy["merge_error_deg"] == pytest.approx(1.0, abs=0.02)
+        assert noisy[["t_index_s", "t_merge_s", "t_refine_s", "evidence_n_hypotheses"]].tolist() == [0, 0, 0, 0]
+
+
+def test_the_page_of_a_run_that_ends_at_the_merge(
+    merges_copy: RunFolder, command: Callable[..., tuple[int, str, str]]
+) -> None:
+    code, _, err = command("report", merges_copy.path)
+    assert (code, err) == (0, "")
+    page = (merges_copy.path / "index.html").read_text()
+    for words in ("merge refused", "not installed", "oracle-merge"):
+        assert words in page
+
+
+def test_what_is_printed_of_a_run_that_ends_at_the_merge(
+    merges_copy: RunFolder, command: Callable[..., tuple[int, str, str]]
+) -> None:
+    code, out, _ = command("score", merges_copy.path)
+    assert code == 0
+    assert "merge_error_m" in out
+    assert "region_recall" not in out
+
+
+def test_an_oracle_runs_the_stages_of_its_preset(tmp_path: Path, simulated: list[str]) -> None:
+    later = 'set: ["query.n_regions=2", "query.threshold=0"]'
+    variants = f"{{preset: tunnelcd, {later}}}, {{preset: tunnelcd, {later}, oracle_merge: {{}}}}"
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, variants=variants))
+    results = table(run)
+    assert results["variant"].str.partition("[")[0].tolist() == ["tunnelcd", "oracle-merge"]
+    assert results["status"].tolist() == ["ok", "ok"]
+    assert results["n_regions"].tolist() == [2, 2]
+    assert results["preset"].tolist() == ["tunnelcd", "tunnelcd"]
+    times = results.loc[1, ["t_total_with_merge_s", "t_total_s"]]
+    assert times["t_total_with_merge_s"] == times["t_total_s"] > 0
+    report = read_answer(run.answer(ONE_BOX, 20000, results["variant"][1])).report
+    assert report is not None
+    assert report.local_before_T_after is not None
+    assert len(report.local_before_T_after) == len(report.keyframe_scans[1])
+
+
+@pytest.mark.parametrize(
+    ("scenarios", "variants", "rest"),
+    [
+        (f"{{name: {ONE_BOX}, pair_kind: drift}}", "{preset: voxel-diff}", ""),
+        (ONE_BOX, "{preset: voxel-diff}", "until: merge"),
+    ],
+)
+def test_what_a_plan_says_of_a_cell_redoes_it(
+    tmp_path: Path, simulated: list[str], scenarios: str, variants: str, rest: str
+) -> None:
+    run_in(tmp_path / "run", plan_of(tmp_path, variants="{preset: voxel-diff}"))
+    changed = plan_of(tmp_path, scenarios=scenarios, variants=variants, rest=rest)
+    assert run_in(tmp_path / "run", changed)[1] == RunOutcome(1, 0, 0)
+    assert run_in(tmp_path / "run", changed)[1] == RunOutcome(0, 1, 0)
+    # the pair itself is the same
+    assert simulated == [ONE_BOX]
+
+
+def test_a_world_that_cannot_be_made_keeps_its_kind(
+    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> Scenario:
+        raise ScenarioError("props stand in each other")
+
+    monkeypatch.setattr(runner, "load_scenario", fails)
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=ONE_CLEAN, variants=MERGES, rest="until: merge"))
+    results = table(run)
+    assert results["status"].tolist() == ["failed"] * 5
+    assert set(results["pair_kind"]) == {"clean"}

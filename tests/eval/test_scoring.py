@@ -32,13 +32,16 @@ ONES = (
     "kind_accuracy",
 )
 COLUMN_TEXT = """
-scenario family seed variant preset status error metrics_version n_changes n_observable score_radius_m
+scenario family pair_kind seed variant preset status error metrics_version n_changes n_observable score_radius_m
 region_recall region_precision region_recall_at_k region_auroc region_ap false_regions_per_100m region_coverage
 n_regions n_true_regions n_false_regions n_duplicate_regions n_ignored_regions n_found_changes
 object_iou_point object_iou_voxel object_iou_box object_f1_25 object_f1_50 object_precision_50 object_pq kind_accuracy
 n_objects n_matched n_ignored_objects n_partial object_iou_point_partial
 merge_error_m merge_error_deg merge_error_along_m merge_error_m_p95 merge_error_deg_p95 merge_error_along_m_p95
-n_merge_pairs t_merge_s t_descriptor_s t_descriptor_per_keyframe_s t_cd_s t_cd_per_region_s t_oe_s t_oe_per_region_s
+n_merge_pairs overlap_true evidence_overlap evidence_inlier_share evidence_residual_m evidence_hessian_ratio
+evidence_agreement evidence_descriptor_distance evidence_n_hypotheses evidence_is_fallback evidence_n_refined
+evidence_refined_inlier_share evidence_max_correction_m t_index_s t_merge_s t_refine_s
+t_descriptor_s t_descriptor_per_keyframe_s t_cd_s t_cd_per_region_s t_oe_s t_oe_per_region_s
 t_total_s t_total_with_merge_s t_total_paper_s v_sphere_m3 v_oe_m3 s_points oe_points
 map_points_before map_points_after n_keyframes_before n_keyframes_after after_path_m is_unchanged_pair is_alarm
 """
@@ -77,7 +80,14 @@ def true_report(pair: Path, merge: np.ndarray) -> ChangeReport:
         evidence={"map_points_before": 123.0},
         regions=regions,
         objects=true_objects(truth),
-        seconds={"t_merge_s": 1.0, "t_descriptor_s": 2.8, "t_cd_s": 0.3, "t_oe_s": 0.06},
+        seconds={
+            "t_index_s": 0.5,
+            "t_merge_s": 1.0,
+            "t_refine_s": 0.25,
+            "t_descriptor_s": 2.8,
+            "t_cd_s": 0.3,
+            "t_oe_s": 0.06,
+        },
         figures={"v_sphere_m3": np.arange(n, dtype=np.float64)},
         keyframe_scans=(np.arange(14), np.arange(14)),
     )
@@ -120,7 +130,8 @@ def test_times_and_sizes_by_hand(tiny_pair: Path, tiny_merge: np.ndarray) -> Non
     assert row["t_cd_per_region_s"] == pytest.approx(0.1)
     assert row["t_oe_per_region_s"] == pytest.approx(0.02)
     assert row["t_total_s"] == pytest.approx(3.16)
-    assert row["t_total_with_merge_s"] == pytest.approx(4.16)
+    assert (row["t_index_s"], row["t_merge_s"], row["t_refine_s"]) == (0.5, 1.0, 0.25)
+    assert row["t_total_with_merge_s"] == pytest.approx(4.91)
     assert row["t_total_paper_s"] == pytest.approx(0.36)
     assert row["v_sphere_m3"] == 1.0
     assert np.isnan(row["v_oe_m3"])
@@ -219,6 +230,76 @@ def test_a_refused_case_scores_zero_and_has_no_times(tiny_pair: Path) -> None:
     assert (case.regions, case.objects) == ([], [])
 
 
+NOT_OF_THE_MERGE = [name for name in COLUMNS if name.startswith(("region_", "object_", "kind_", "false_regions"))]
+NOT_OF_THE_MERGE += [name for name in COLUMNS if name.startswith("n_") and name.endswith(("_regions", "_objects"))]
+NOT_OF_THE_MERGE += ["n_regions", "n_objects", "n_found_changes", "n_matched", "n_partial", "is_alarm"]
+
+
+@pytest.mark.parametrize("has_changes", [True, False])
+def test_an_answer_that_ends_at_the_merge_is_scored_up_to_it(
+    write_tiny_pair: Callable[..., Path], tiny_merge: np.ndarray, has_changes: bool
+) -> None:
+    pair = write_tiny_pair(has_changes=has_changes)
+    report = without_objects_and_regions(true_report(pair, tiny_merge))
+    folder = pair.parent / "answer"
+    write_answer(folder, "test-method", report, "merge")
+    case = score_pair(pair, folder)
+    assert case.row["status"] == "ok"
+    assert np.isnan([case.row[name] for name in NOT_OF_THE_MERGE]).all()
+    assert case.row["merge_error_m"] == pytest.approx(0.0, abs=1e-9)
+    assert (case.row["t_merge_s"], case.row["n_merge_pairs"]) == (1.0, 14)
+    assert (case.row["n_changes"], case.row["n_observable"]) == ((3, 3) if has_changes else (0, 0))
+    assert (case.changes, case.regions, case.objects, case.keyframes) == ([], [], [], [])
+    assert sorted(case.row) == sorted(COLUMNS)
+    write_failure(folder, "paper", "merge_refused", "too smooth", {"overlap": 0.1}, {}, "merge")
+    refused = score_pair(pair, folder)
+    assert (refused.row["status"], refused.row["error"]) == ("merge_refused", "too smooth")
+    assert np.isnan([refused.row[name] for name in (*NOT_OF_THE_MERGE, "merge_error_m", "t_merge_s")]).all()
+    assert (refused.row["evidence_overlap"], refused.changes) == (0.1, [])
+
+
+def test_a_local_merge_is_scored_at_each_after_keyframe(
+    write_tiny_pair: Callable[..., Path], tiny_merge: np.ndarray
+) -> None:
+    # both odometries stretch the way by 1 %, so that one transform fits; keyframe k is put 0.1 k m too high
+    pair = write_tiny_pair(stretch=1.01)
+    report = true_report(pair, tiny_merge)
+    keyframes = np.array([2, 3, 7])
+    local = np.repeat(tiny_merge[None], 3, axis=0)
+    local[:, 2, 3] += 0.1 * keyframes
+    named = replace(report, keyframe_scans=(np.arange(14), keyframes))
+    assert scored(pair, named).row["merge_error_m"] == pytest.approx(0.0, abs=1e-9)
+    row = scored(pair, replace(named, local_before_T_after=local)).row
+    assert row["merge_error_m"] == pytest.approx(0.3)
+    assert row["merge_error_m_p95"] == pytest.approx(0.3 + 0.9 * 0.4)
+    assert row["n_merge_pairs"] == 3
+
+
+def test_evidence_is_in_the_row_whatever_came_of_the_merge(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
+    report = replace(true_report(tiny_pair, tiny_merge), evidence={"agreement": 0.9, "residual_m": np.inf, "own": 3.0})
+    row = scored(tiny_pair, report).row
+    assert row["evidence_agreement"] == 0.9
+    # what is infinite was not measured
+    assert np.isnan([row["evidence_residual_m"], row["evidence_overlap"]]).all()
+    assert "evidence_own" not in row
+
+
+def test_the_true_overlap_is_there_whatever_the_status(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
+    assert scored(tiny_pair, true_report(tiny_pair, tiny_merge)).row["overlap_true"] == 1.0
+    write_failure(tiny_pair.parent / "answer", "paper", "failed", "", {}, {})
+    assert score_pair(tiny_pair, tiny_pair.parent / "answer").row["overlap_true"] == 1.0
+
+
+def test_parts_of_the_merge_that_are_not_stated_are_undefined_and_so_is_the_sum(
+    tiny_pair: Path, tiny_merge: np.ndarray
+) -> None:
+    report = true_report(tiny_pair, tiny_merge)
+    seconds = {name: value for name, value in report.seconds.items() if name != "t_index_s"}
+    row = scored(tiny_pair, replace(report, seconds=seconds)).row
+    assert np.isnan([row["t_index_s"], row["t_total_with_merge_s"]]).all()
+    assert (row["t_merge_s"], row["t_refine_s"], row["t_total_s"]) == (1.0, 0.25, pytest.approx(3.16))
+
+
 def test_an_unchanged_pair(write_tiny_pair: Callable[..., Path], tiny_merge: np.ndarray) -> None:
     pair = write_tiny_pair(has_changes=False)
     report = true_report(pair, tiny_merge)
@@ -291,6 +372,9 @@ def broken(name: str, report: ChangeReport) -> ChangeReport:
     regions, objects = report.regions, report.objects
     nan_merge = report.before_T_after.copy()
     nan_merge[0, 3] = np.nan
+    local = np.repeat(report.before_T_after[None], 14, axis=0)
+    bent = local.copy()
+    bent[4, :3, :3] *= 1.01
     nan_centres = regions.centres_map.copy()
     nan_centres[1, 0] = np.nan
     return {
@@ -300,6 +384,14 @@ def broken(name: str, report: ChangeReport) -> ChangeReport:
         "pixel": lambda: with_returns(report, (0, 256)),
         "negative": lambda: with_returns(report, (0, -1)),
         "merge": lambda: replace(report, before_T_after=nan_merge),
+        "local": lambda: replace(report, local_before_T_after=local[:13]),
+        "local of every scan": lambda: replace(
+            report, local_before_T_after=local[:2], keyframe_scans=(np.arange(14), np.zeros(0, dtype=np.int64))
+        ),
+        "bent": lambda: replace(report, local_before_T_after=bent),
+        "flat": lambda: replace(report, local_before_T_after=local[0]),
+        "evidence": lambda: replace(report, evidence={"overlap": "high"}),
+        "seconds": lambda: replace(report, seconds={"t_cd_s": None}),
         "centre": lambda: replace(report, regions=replace(regions, centres_map=nan_centres)),
         "score": lambda: replace(report, regions=replace(regions, scores=np.full(3, np.nan))),
         "radius": lambda: replace(report, regions=replace(regions, radius_m=float("nan"))),
@@ -322,6 +414,12 @@ def broken(name: str, report: ChangeReport) -> ChangeReport:
         ("pixel", r"\(scan 0, pixel 256\), outside of the after session's 14 scans of 256 pixels"),
         ("negative", r"pixel -1\), outside"),
         ("merge", r"before_T_after\[0\] is not finite"),
+        ("local", "local_before_T_after has 13 poses: expected one for each of the 14 after keyframes"),
+        ("local of every scan", "has 2 poses: expected one for each of the 14 scans of the after session, as no"),
+        ("bent", r"local_before_T_after\[4\] is not a rigid transform"),
+        ("flat", r"local_before_T_after must be \(N, 4, 4\), got \(4, 4\)"),
+        ("evidence", "evidence.overlap = 'high': expected a number"),
+        ("seconds", "seconds.t_cd_s = None: expected a number"),
         ("centre", "region_centres_map: entry 1 is not a finite number"),
         ("score", "region_scores: entry 0 is not a finite number"),
         ("radius", "radius_m = nan"),

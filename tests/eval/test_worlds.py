@@ -104,6 +104,34 @@ def test_a_plan_is_dumped_as_it_is_written_and_read_back_the_same(tmp_path: Path
     assert worlds_of(again.scenarios) == worlds_of(plan.scenarios)
 
 
+def test_the_kind_of_a_pair_is_of_all_worlds_of_its_item_and_in_no_name(tmp_path: Path) -> None:
+    text = replaced(
+        "    set: [platform.scan_spacing_m=1]\n", "    set: [platform.scan_spacing_m=1]\n    pair_kind: drift\n"
+    )
+    plan = read(tmp_path, text)
+    found = worlds_of(plan.scenarios)
+    assert [world.pair_kind for world in found] == ["", "drift", "drift", "drift"]
+    assert [world.label for world in found] == [world.label for world in worlds_of(read(tmp_path).scenarios)]
+    assert worlds_of(changed_plan(plan, seeds="1").scenarios) == found
+    named = read(tmp_path, replaced("  - smoke/unchanged\n", "  - {name: smoke/unchanged, pair_kind: disjoint}\n"))
+    assert named.model_dump(mode="json")["scenarios"][0] == {"name": "smoke/unchanged", "pair_kind": "disjoint"}
+    assert changed_plan(named) == named
+
+
+@pytest.mark.parametrize(
+    ("item", "words"),
+    [
+        ("{name: smoke/unchanged, pair_kind: disjont}", ["plan.yaml:3:", "pair_kind = 'disjont'", 'mean "disjoint"?']),
+        ("{name: smoke/unchanged, pairkind: clean}", ["plan.yaml:3:", "pairkind", 'did you mean "pair_kind"?']),
+        # the kind tells no two worlds apart
+        ("{name: smoke/unchanged, pair_kind: clean}\n  - smoke/unchanged", ["plan.yaml:4:", "is listed twice"]),
+    ],
+)
+def test_mistakes_of_the_kind_of_a_pair(tmp_path: Path, item: str, words: list[str]) -> None:
+    (line,) = mistakes(tmp_path, replaced("  - smoke/unchanged\n", f"  - {item}\n"))
+    assert all(word in line for word in words), line
+
+
 def test_every_mistake_of_a_world_is_told_at_once_with_its_line(tmp_path: Path) -> None:
     text = """\
 name: bad

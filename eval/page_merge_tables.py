@@ -1,0 +1,167 @@
+"""The tables of the merge on the page, and the sentences made from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import pandas as pd
+
+from cdpipe.evidence import GATES
+from eval.merge_table import ALL_FAMILIES, RIGHT_DEG, RIGHT_M, TARGETS, is_wrong, kinds, texts
+from eval.page_columns import EN_DASH, UNDEFINED, Column, fine, significant
+from eval.page_run import split_variant
+from eval.page_tables import Cell, Table
+
+MAIN_VARIANT = "tunnelcd"
+ORACLE = "oracle-merge"
+MERGE_COLUMNS = (
+    Column("within_target", "within target", "high", fine,
+           "Share of all pairs, refused and failed ones included, that do what their kind asks for; below it the 95 % "
+           "Wilson interval over pairs.", "No target for an oracle."),
+    Column("wrong", "wrong, accepted", "low", fine,
+           f"Pairs that were accepted with a median error over {RIGHT_M:g} m or {RIGHT_DEG:g} deg, or although the "
+           "sessions share no place, where the error is undefined.", ""),
+    Column("merge_error_m", "error [m], [deg], along [m]", "low", fine,
+           "Median over the accepted pairs of a pair's median error; below it the 95th percentile over the pairs, and "
+           "of how many where not of all. Along: the part along the tunnel.", "Undefined where nothing was accepted."),
+    Column("merge_error_m_p95", "p95 along path [m]", "low", fine,
+           "The same of a pair's 95th percentile over its keyframes.", ""),
+    Column("overlap_true", "true overlap", None, fine,
+           "Share of the after drive that lies within 5 m of the before drive.", ""),
+    Column("t_index_s", "t_index", "low", significant, "Indexing both maps; can be done while mapping.", ""),
+    Column("t_merge_s", "t_merge", "low", significant,
+           "From indexed maps and stored vectors to an accepted transform, all hypotheses tried.", ""),
+    Column("t_refine_s", "t_refine", "low", significant, "Local refinement along the path.", ""),
+)  # fmt: skip
+
+
+def main_variant(names: Sequence[str]) -> str:
+    """Return the variant whose cases are shown: `tunnelcd`, else the first that is no oracle, else the first."""
+    if MAIN_VARIANT in names:
+        return MAIN_VARIANT
+    return next((name for name in names if not is_oracle(name)), names[0])
+
+
+def is_oracle(variant: str) -> bool:
+    """Tell whether a variant merges by the truth."""
+    return split_variant(variant)[0] == ORACLE
+
+
+def targets_table(table: pd.DataFrame) -> Table:
+    """Return a row for every kind of pair and variant: counts, share within the target, errors, met or not."""
+    headings = (
+        "variant", "target", "within target", "wrong, accepted", "pairs", "accepted", "refused", "failed", "error [m]",
+        "error [deg]", "along [m]", "p95 along path [m]",
+    )  # fmt: skip
+    rows = [
+        (_kind_text(str(row["pair_kind"])), (Cell(str(row["variant"])), *_target_cells(row)))
+        for row in _records(table[table["family"] == ALL_FAMILIES] if len(table) else table)
+    ]
+    return Table(headings, tuple(rows), "Every kind of pair: what is asked, and what each variant does")
+
+
+def families_table(table: pd.DataFrame) -> Table:
+    """Return the same for the variant that is shown, family by family."""
+    if len(table) == 0:
+        return Table((), ())
+    name = main_variant(list(dict.fromkeys(table["variant"])))
+    own = table[(table["family"] != ALL_FAMILIES) & (table["variant"] == name)]
+    headings = (
+        "family", "target", "within target", "wrong, accepted", "pairs", "accepted", "refused", "failed", "error [m]",
+        "error [deg]", "along [m]", "p95 along path [m]",
+    )  # fmt: skip
+    rows = [(str(row["pair_kind"]), (Cell(str(row["family"])), *_target_cells(row))) for row in _records(own)]
+    return Table(headings, tuple(rows), f"The same by family: {name}; all variants are in merge.csv")
+
+
+def refusals_table(results: pd.DataFrame) -> Table:
+    """Return for every kind and variant how many refusals name which gate, and how many name none."""
+    refused = results[results["status"] == "merge_refused"]
+    refused = refused.assign(pair_kind=kinds(refused), error=texts(refused, "error"))
+    rows: list[tuple[str, tuple[Cell, ...]]] = []
+    for kind in [name for name in TARGETS if (refused["pair_kind"] == name).any()]:
+        for variant, group in refused[refused["pair_kind"] == kind].groupby("variant", sort=False):
+            named = [[setting in error for _, setting in GATES] for error in group["error"]]
+            counts = [sum(column) for column in zip(*named, strict=True)]
+            n_none = sum(not any(row) for row in named)
+            cells = (Cell(str(variant)), Cell(str(len(group))), *(Cell(str(n)) for n in (*counts, n_none)))
+            rows.append((kind, cells))
+    headings = ("variant", "refused", *(name.replace("_", " ") for name, _ in GATES), "none of these")
+    return Table(headings, tuple(rows), "Which gate the refusals name")
+
+
+def story(table: pd.DataFrame, results: pd.DataFrame) -> list[str]:
+    """Return the sentences of the first paragraph of a run that ends at the merge."""
+    n_pairs = results.groupby(["scenario", "seed"]).ngroups
+    variants = list(dict.fromkeys(str(name) for name in results["variant"]))
+    name = main_variant(variants)
+    sentences = []
+    if len(table):
+        own = _records(table[(table["variant"] == name) & (table["family"] == ALL_FAMILIES)])
+        missed = [str(row["pair_kind"]) for row in own if row["is_met"] is False]
+        n_wrong = sum(int(row["n_wrong_accepted"]) for row in own)
+        verdict = f"misses its target on {', '.join(missed)}" if missed else "meets every target"
+        sentences.append(
+            f"{name} {verdict}; wrong and accepted: {n_wrong} of {sum(row['n_pairs'] for row in own)} pairs."
+        )
+        sentences += [_target_sentence(row) for row in own]
+    else:
+        sentences.append(f"{name}: no pair of this run has a kind, so there is no target to hold it to.")
+    rivals = [other for other in variants if other != name and not is_oracle(other)]
+    for other in rivals:
+        wrong = int(is_wrong(results[results["variant"] == other]).sum())
+        n = int((results["variant"] == other).sum())
+        sentences.append(f"{other}: wrong and accepted {wrong} of {n}.")
+    n_failed = int((results["status"] == "failed").sum())
+    if n_failed:
+        sentences.append(f"{n_failed} of {len(results)} cases failed; they count as pairs that miss their target.")
+    sentences.append(f"n = {n_pairs} session pairs, {len(variants)} variants; intervals are Wilson's over pairs.")
+    return sentences
+
+
+def _target_sentence(row: dict[str, Any]) -> str:
+    kind = str(row["pair_kind"])
+    target = TARGETS.get(kind)
+    if target is None:
+        return f"{kind}: {row['n_pairs']} pairs, no target."
+    low, high = _percent(row["low"]), _percent(row["high"])
+    found = (
+        f"{row['n_within_target']} of {row['n_pairs']} pairs ({_percent(row['share_within_target'])}, {low} to {high})"
+    )
+    verdict = "met" if row["is_met"] else "not met"
+    return f"{kind}: {found} {target.rule}; target {_percent(target.share)}, {verdict}."
+
+
+def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    return [{str(key): value for key, value in row.items()} for row in table.to_dict("records")]
+
+
+def _kind_text(kind: str) -> str:
+    target = TARGETS.get(kind)
+    return kind if target is None else f"{kind}: {target.rule}; target {_percent(target.share)} of the pairs"
+
+
+def _target_cells(row: dict[str, Any]) -> tuple[Cell, ...]:
+    has_target = not is_oracle(str(row["variant"])) and str(row["pair_kind"]) in TARGETS
+    low, high = _percent(row["low"]).removesuffix(" %"), _percent(row["high"])
+    n_wrong = int(row["n_wrong_accepted"])
+    return (
+        Cell(("met" if row["is_met"] else "not met") if has_target else UNDEFINED, has_target and not row["is_met"]),
+        Cell(_percent(row["share_within_target"]), interval=f"{low}{EN_DASH}{high}"),
+        Cell(str(n_wrong), n_wrong > 0),
+        *(Cell(str(row[name])) for name in ("n_pairs", "n_accepted", "n_refused", "n_failed")),
+        *(_error_cell(row, name) for name in ("merge_error_m", "merge_error_deg", "merge_error_along_m")),
+        _error_cell(row, "merge_error_m_p95"),
+    )
+
+
+def _error_cell(row: dict[str, Any], column: str) -> Cell:
+    median, p95, n = (float(row[f"{part}_{column}"]) for part in ("median", "p95", "n"))
+    count_text = "" if n == row["n_accepted"] else f", n {n:.0f}"
+    return Cell(fine(median), interval="" if math.isnan(median) else fine(p95) + count_text)
+
+
+def _percent(value: float) -> str:
+    return UNDEFINED if math.isnan(value) else f"{100 * value:.1f} %".replace(".0 %", " %")
