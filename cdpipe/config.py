@@ -41,6 +41,7 @@ class MergeConfig(Settings):
     n_candidates: Count = Field(6, description="hypotheses tried by `voting`")
     sphere_radius_m: Positive = Field(10.0, description="submap around a pair (FRAME: 10 m)")
     voxel_m: Positive = Field(0.4, description="thinning of a sphere before it is registered")
+    target_voxel_m: Positive = Field(0.3, description="thinning of the before map, which the spheres are registered to")
     coarse_voxel_m: Positive = Field(0.8, description="the same while hypotheses are tried")
     gicp_correspondence_m: Positive = Field(3.0, description="FRAME: 3 m")
     vgicp_correspondence_m: Positive = Field(1.0, description="FRAME: 1 m")

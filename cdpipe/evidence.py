@@ -83,10 +83,10 @@ def surface_fit(
 
     centre_before = transform(before_T_after, centre_after[None])[0]
     chosen = sampled(before.columns.crop(centre_before, radius_m))
-    theirs = transform(invert(before_T_after), before.map.points[chosen])
+    theirs = transform(invert(before_T_after), before.points[chosen])
     found, squared_m2 = after.tree.batch_nearest_neighbor_search(theirs)
     turned = fine.normals[chosen] @ before_T_after[:3, :3]
-    backward_m = _plane_distances(theirs, after.map.points[found], turned, np.asarray(squared_m2))
+    backward_m = _plane_distances(theirs, after.points[found], turned, np.asarray(squared_m2))
     return SurfaceFit(forward_m, backward_m, seen.T @ seen)
 
 

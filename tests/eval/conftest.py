@@ -49,6 +49,7 @@ def write_session(path: Path, name: str, *, has_changes: bool, stretch: float) -
             range_mm[scans.start : scans.stop, 1:3, columns] = THING_MM
             labels[scans.start : scans.stop, 1:3, columns] = number
     range_mm[:, 0, 0] = 0
+    range_mm[:, 0, 1] += np.arange(N_SCANS, dtype=np.uint32)  # no two scans of a sensor are the same
     identity = np.tile(np.array([0, 0, 0, 0, 0, 0, 1], dtype=np.float32), (N_SCANS, WIDTH, 1))
     stamps = np.zeros((N_SCANS, WIDTH), dtype=np.int64)
     with SessionWriter(path, SENSOR, CHUNK_SCANS, {}) as writer:
