@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from cdpipe.geometry import Float64Array, Int64Array, invert, require_poses, require_shape, transform
 from cdpipe.voxel import cell_keys
 
-# Anchors stand a metre or so apart; a wider blend would iron out real bends, a narrower one tears points apart.
+# Anchors stand 4 m apart; a wider blend would iron out real bends, a narrower one tears points apart.
 _BLEND_M = 2.0
 # Twice four blending lengths of path: what is left out weighs 0.0003, so that a step in position is a step no larger.
 _BLENDED = 16

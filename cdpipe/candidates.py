@@ -98,17 +98,26 @@ def pair_votes(
         after_poses: (P, 4, 4) after keyframe of each pair, likewise.
         yaws_rad: (P,) yaw of the after keyframe in the before keyframe.
     """
-    before_places, after_places = (poses[:, 0, 3] + 1j * poses[:, 1, 3] for poses in (before_poses, after_poses))
-    turns = np.exp(1j * (yaws_rad + _heading_rad(before_poses) - _heading_rad(after_poses)))
-    before_shift = before_places[None] - before_places[:, None]
-    after_shift = after_places[None] - after_places[:, None]
-    after_m = np.abs(after_shift)
+    turns_rad = yaws_rad + _heading_rad(before_poses) - _heading_rad(after_poses)
+    cosines, sines = np.cos(turns_rad), np.sin(turns_rad)
+    before_x, before_y = (_differences(before_poses[:, axis, 3]) for axis in (0, 1))
+    after_x, after_y = (_differences(after_poses[:, axis, 3]) for axis in (0, 1))
+    after_m = np.sqrt(after_x**2 + after_y**2)
     tolerance_m = _APART_M + _APART_SHARE * after_m
-    agrees = np.abs(np.abs(before_shift) - after_m) < tolerance_m
-    agrees &= np.abs(before_shift - turns[:, None] * after_shift) < tolerance_m + np.sin(_YAW_RAD) * after_m
-    # the angle between two unit vectors, by its cosine
-    agrees &= np.outer(turns.real, turns.real) + np.outer(turns.imag, turns.imag) > np.cos(_YAW_RAD)
-    return agrees, np.asarray((agrees * np.exp(-after_m / _VOTE_REACH_M)).sum(axis=1))
+    agrees = np.abs(np.sqrt(before_x**2 + before_y**2) - after_m) < tolerance_m
+    # where the after shift leads if it is turned as the pair says
+    miss_x = before_x - (cosines[:, None] * after_x - sines[:, None] * after_y)
+    miss_y = before_y - (sines[:, None] * after_x + cosines[:, None] * after_y)
+    agrees &= miss_x**2 + miss_y**2 < (tolerance_m + np.sin(_YAW_RAD) * after_m) ** 2
+    # the angle between two turns, by its cosine
+    agrees &= np.outer(cosines, cosines) + np.outer(sines, sines) > np.cos(_YAW_RAD)
+    votes = np.zeros(len(yaws_rad))
+    np.add.at(votes, np.nonzero(agrees)[0], np.exp(-after_m[agrees] / _VOTE_REACH_M))
+    return agrees, votes
+
+
+def _differences(values: Float64Array) -> Float64Array:
+    return values[None] - values[:, None]
 
 
 def _is_same(one: Float64Array, other: Float64Array, position: Float64Array) -> bool:

@@ -38,9 +38,10 @@ class MergeConfig(Settings):
     method: Literal["voting", "frame", "kiss-matcher"] = Field(
         "voting", description="candidates that agree; FRAME's closest pair; or KISS-Matcher on the whole maps"
     )
-    n_candidates: Count = Field(6, description="hypotheses tried by `voting`")
+    n_candidates: Count = Field(4, description="hypotheses tried by `voting`")
     sphere_radius_m: Positive = Field(10.0, description="submap around a pair (FRAME: 10 m)")
     voxel_m: Positive = Field(0.4, description="thinning of a sphere before it is registered")
+    seen_within_m: Positive = Field(15.0, description="map points that were only seen from farther are left out")
     target_voxel_m: Positive = Field(0.3, description="thinning of the before map, which the spheres are registered to")
     coarse_voxel_m: Positive = Field(0.8, description="the same while hypotheses are tried")
     gicp_correspondence_m: Positive = Field(3.0, description="FRAME: 3 m")

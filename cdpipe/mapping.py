@@ -14,13 +14,16 @@ from cdpipe.types import PointMap, PosedScan, ScanSource
 from cdpipe.voxel import UniqueCells, cell_keys, max_coordinate_m
 
 _BATCH_SCANS = 64
+# Nearer returns weigh no more; the sensor's own shortest range is less.
+_MIN_RANGE_M = 1.0
 
 
 def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_SCANS) -> PointMap:
     """Thin the returns of a session to one point for each occupied cell of its odom frame, and choose keyframes.
 
-    A map point is the mean of the returns of its cell. Points are ordered by 2 m columns and then by cell, which is the
-    order `cdpipe.sphere.MapIndex` wants; the order does not depend on `batch_scans`.
+    A map point is the mean of the returns of its cell, weighed by the inverse square of their range: what was seen from
+    near is known best, and odometry has drifted least since. Points are ordered by 2 m columns and then by cell, which
+    is the order `cdpipe.sphere.MapIndex` wants; the order does not depend on `batch_scans`.
 
     Args:
         source: The session, read once from front to back.
@@ -57,22 +60,28 @@ class _MapAccumulator:
         self._cells = UniqueCells()
         self._batch_cells: list[Int64Array] = []
         self._batch_sums: list[Float64Array] = []
+        self._nearest_m2: Float64Array = np.zeros(0)
         self._return_cells: list[Int32Array] = []
         self._return_pixels: list[Int32Array] = []
         self._n_returns: list[int] = []
 
     def add(self, scans: list[PosedScan]) -> None:
-        clouds = []
+        clouds, ranges_m2 = [], []
         for scan in scans:
-            is_near = np.einsum("ij,ij->i", scan.points_sensor, scan.points_sensor) <= self._config.max_range_m**2
+            squared_m2 = np.einsum("ij,ij->i", scan.points_sensor, scan.points_sensor)
+            is_near = squared_m2 <= self._config.max_range_m**2
+            ranges_m2.append(np.maximum(squared_m2[is_near], _MIN_RANGE_M**2))
             clouds.append(transform(scan.odom_T_sensor, scan.points_sensor[is_near]))
             self._return_pixels.append(scan.pixels[is_near])
             self._n_returns.append(len(clouds[-1]))
         points = np.concatenate(clouds)
         ids = self._cells.add(cell_keys(points, self._config.voxel_m))
         self._return_cells.append(ids.astype(np.int32))
-        n_cells = len(self._cells)
-        sums: Float64Array = np.column_stack([np.bincount(ids, points[:, axis], n_cells) for axis in range(3)])
+        n_cells, squared_m2 = len(self._cells), np.concatenate(ranges_m2)
+        parts = [np.bincount(ids, points[:, axis] / squared_m2, n_cells) for axis in range(3)]
+        sums: Float64Array = np.column_stack([*parts, np.bincount(ids, 1 / squared_m2, n_cells)])
+        self._nearest_m2 = np.append(self._nearest_m2, np.full(n_cells - len(self._nearest_m2), np.inf))
+        np.minimum.at(self._nearest_m2, ids, squared_m2)
         is_touched = np.bincount(ids, minlength=n_cells) > 0
         self._batch_cells.append(np.flatnonzero(is_touched))
         self._batch_sums.append(sums[is_touched])
@@ -81,14 +90,15 @@ class _MapAccumulator:
         if len(self._cells) == 0:
             raise InputError(f"{source.name}: no return within map.max_range_m = {self._config.max_range_m} m")
         cells, sums = np.concatenate(self._batch_cells), np.concatenate(self._batch_sums)
-        totals = np.column_stack([np.bincount(cells, sums[:, axis], len(self._cells)) for axis in range(3)])
-        points = totals / self._cells.counts[:, None]
+        totals = np.column_stack([np.bincount(cells, sums[:, column], len(self._cells)) for column in range(4)])
+        points = totals[:, :3] / totals[:, 3:]
         order = np.lexsort((self._cells.keys, column_keys(points)))
         rank = np.empty(len(order), dtype=np.int32)
         rank[order] = np.arange(len(order), dtype=np.int32)
         return_points = np.concatenate([rank[part] for part in self._return_cells])
         return PointMap(
             points=points[order],
+            nearest_m=np.sqrt(self._nearest_m2[order]).astype(np.float32),
             voxel_m=self._config.voxel_m,
             odom_T_sensor=source.odom_T_sensor,
             keyframe_scans=keyframe_scans,

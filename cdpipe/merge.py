@@ -35,11 +35,14 @@ from cdpipe.types import MappedSession, MergedMaps
 from cdpipe.walk import Step, Walk, evenly, is_shared, walk
 
 # Spheres along the path on which an alignment is judged, and their radius: walls 5 m away must be inside.
-_CHECKS = 10
+_CHECKS = 8
 _CHECK_RADIUS_M = 8.0
 # A hypothesis is ranked where it is only coarsely registered.
 _RANK_INLIER_M = 0.2
-_FIRST_TRY_M = 1.0
+_RANK_STEPS = 10
+_RANK_SAMPLES = 150
+# Longest correspondences while walking: what may have drifted since the last stop, less than a narrow drift is wide.
+_FIRST_TRY_M, _CHECK_REACH_M = 1.0, 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +83,8 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
         if not reason and config.refine == "local":
             local, measured = refined(*maps, best.walk, config)
             evidence |= measured
+            if local is not None:
+                before_T_after = rigid_fit(local.anchors_odom, local.before_T_after)
     seconds = {
         "t_index_s": indexed - start,
         "t_merge_s": merged - indexed,
@@ -133,8 +138,9 @@ def _ranked(candidates: Iterable[Candidate], maps: tuple[IndexedMap, IndexedMap]
             candidate.before_T_after,
             config.gicp_correspondence_m,
             config.coarse_voxel_m,
+            _RANK_STEPS,
         ).target_T_source
-        fit = surface_fit(before, after, pose, sampled(points), centre, config.sphere_radius_m)
+        fit = surface_fit(before, after, pose, sampled(points, _RANK_SAMPLES), centre, config.sphere_radius_m)
         share = fit.inlier_share(_RANK_INLIER_M)
         distance = {"descriptor_distance": candidate.descriptor_distance, "is_fallback": 0.0}
         found.append((share, _Start(candidate.after_keyframe, pose, distance)))
@@ -195,19 +201,20 @@ def _judged(start: _Start, maps: tuple[IndexedMap, IndexedMap], config: MergeCon
     fit = surface_fit(before, after, pose, sampled(points), centre, _CHECK_RADIUS_M)
     keyframes = evenly(len(after.positions), _CHECKS, [start.keyframe])
     first = int(np.searchsorted(keyframes, start.keyframe))
-    step = Step(_CHECK_RADIUS_M, config.voxel_m, config.gicp_correspondence_m, first_try_m=_FIRST_TRY_M)
+    step = Step(_CHECK_RADIUS_M, config.voxel_m, _CHECK_REACH_M, first_try_m=_FIRST_TRY_M)
     walked = walk(before, after, keyframes, first, pose, step, config)
+    asked = walked.fits[np.isin(walked.keyframes, keyframes)]
     evidence = {
         **start.evidence,
         "overlap": _overlap(walked, before, after),
         "inlier_share": fit.inlier_share(config.inlier_m),
         "residual_m": fit.residual_m,
         "hessian_ratio": eigenvalue_ratio(walked.normal_sum),
-        "agreement": float(np.nanmean(walked.fits)) if np.isfinite(walked.fits).any() else 0.0,
+        "agreement": float(np.nanmean(asked)) if np.isfinite(asked).any() else 0.0,
     }
     is_common = walked.fits > 0
     if config.method != "frame" and is_common.any():
-        pose = rigid_fit(after.positions[keyframes[is_common]], walked.before_T_after[is_common])
+        pose = rigid_fit(after.positions[walked.keyframes[is_common]], walked.before_T_after[is_common])
     return _Hypothesis(pose, walked, evidence)
 
 

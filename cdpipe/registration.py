@@ -67,7 +67,8 @@ class Surface:
 class IndexedMap:
     """A map prepared for merging, which can be done while it is being built.
 
-    A target is thinned to `merge.target_voxel_m`, which halves the time and costs no accuracy (cdpipe/README.md).
+    Only what was seen from near is used: a return from afar stands where the odometry of then says, which has drifted
+    since. A target is thinned to `merge.target_voxel_m`: half the time, as accurate (cdpipe/README.md).
 
     Attributes:
         map: The map.
@@ -80,7 +81,8 @@ class IndexedMap:
 
     def __init__(self, point_map: PointMap, config: MergeConfig, is_target: bool) -> None:
         self.map = point_map
-        self.points = _thinned(point_map.points, config.target_voxel_m) if is_target else point_map.points
+        near = point_map.points[point_map.nearest_m <= config.seen_within_m]
+        self.points = _thinned(near, config.target_voxel_m) if is_target else near
         self.columns = MapIndex(self.points)
         self.positions = point_map.odom_T_keyframe[:, :3, 3]
         self.path = cKDTree(self.positions)
@@ -155,6 +157,7 @@ def align_sphere(
     initial_guess: Float64Array,
     correspondence_m: float,
     voxel_m: float | None = None,
+    max_steps: int = 20,
 ) -> Registration:
     """Align a sphere with an indexed map, by GICP or, from nearby, point to plane.
 
@@ -170,6 +173,7 @@ def align_sphere(
         initial_guess: (4, 4) `target_T_source` to start from.
         correspondence_m: Points farther apart than this are no pair.
         voxel_m: GICP, the sphere thinned to this; None: point to plane, with the points as they are.
+        max_steps: It ends after as many.
     """
     centred = points - centre
     if voxel_m is None:
@@ -183,6 +187,7 @@ def align_sphere(
         initial_guess @ make_pose(translation=centre),
         registration_type="PLANE_ICP" if voxel_m is None else "GICP",
         max_correspondence_distance=correspondence_m,
+        max_iterations=max_steps,
         num_threads=1,
     )
     return Registration(found.T_target_source @ make_pose(translation=-centre), np.asarray(found.H))

@@ -71,7 +71,9 @@ class PointMap:
     """A thinned map and, for each of its points, the returns it stands for.
 
     Attributes:
-        points: (N, 3) float64 mean of the returns of each occupied cell, the session's odom frame, metres.
+        points: (N, 3) float64 mean of the returns of each occupied cell, the session's odom frame, metres; each return
+            weighs by the inverse square of its range.
+        nearest_m: (N,) float32 shortest range of the returns of each.
         voxel_m: Cell size of the thinning.
         odom_T_sensor: (S, 4, 4) pose of every scan.
         keyframe_scans: (K,) int64 index of the scan of each keyframe.
@@ -81,6 +83,7 @@ class PointMap:
     """
 
     points: Float64Array
+    nearest_m: Float32Array
     voxel_m: float
     odom_T_sensor: Float64Array
     keyframe_scans: Int64Array
@@ -90,6 +93,7 @@ class PointMap:
 
     def __post_init__(self) -> None:
         require_shape("points", self.points, (None, 3))
+        require_shape("nearest_m", self.nearest_m, (len(self.points),))
         require_poses("odom_T_sensor", self.odom_T_sensor)
         require_shape("keyframe_scans", self.keyframe_scans, (None,))
         require_shape("return_pixels", self.return_pixels, self.return_points.shape)

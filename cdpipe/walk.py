@@ -8,13 +8,13 @@ wrong alignment is found out where the two tunnels differ.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from cdpipe.config import MergeConfig
 from cdpipe.evidence import SurfaceFit, sampled, surface_fit
-from cdpipe.geometry import Float64Array, Int64Array, transform
+from cdpipe.geometry import Float64Array, Int64Array, make_pose, transform
 from cdpipe.registration import MIN_SPHERE_POINTS, IndexedMap, Registration, align_sphere, motion_between
 
 # Places farther from the before path were not driven twice.
@@ -22,6 +22,9 @@ SHARED_M = 5.0
 # A registration that moves a place farther than this against its neighbour is wrong, not drift.
 _JUMP_M, _JUMP_SHARE = 1.0, 0.03
 _JUMP_RAD, _JUMP_RAD_PER_M = np.deg2rad(2.0), np.deg2rad(0.03)
+# Below this the way is lost; it is looked for again in steps of half the length, down to so many keyframes.
+_LOST_FIT = 0.7
+_SHORTEST_STEP = 3
 # A first try that fits as well as this needs no second.
 _CLEAR_FIT = 0.9
 
@@ -49,7 +52,7 @@ class Walk:
     """What was found at A after keyframes, in the order of the path.
 
     Attributes:
-        keyframes: (A,) after keyframes.
+        keyframes: (A,) after keyframes: those asked for, and others where the way from one to the next was lost.
         before_T_after: (A, 4, 4) alignment at each; carried over from its neighbour where nothing was registered.
         information: (A, 6, 6) Hessian of each registration, turn then shift in after odom axes; zero where there is
             none.
@@ -84,27 +87,63 @@ def walk(
         step: How a place is registered.
         config: `inlier_m`.
     """
-    n = len(keyframes)
-    found = np.repeat(before_T_after[None], n, axis=0)
-    information = np.zeros((n, 6, 6))
-    fits = np.full(n, np.nan)
-    normal_sum = np.zeros((3, 3))
-    for way in (range(start, n), range(start - 1, -1, -1)):
-        previous = start
-        for place in way:
-            centre = after.positions[keyframes[place]]
-            found[place] = found[previous]
-            if is_shared(before, transform(found[place], centre[None]))[0]:
-                apart_m = float(np.linalg.norm(centre - after.positions[keyframes[previous]]))
-                fits[place] = 0.0
-                registered = _registered(before, after, centre, found[previous], apart_m, step, config)
-                if registered is not None:
-                    result, fit = registered
-                    found[place], information[place] = result.target_T_source, result.information
-                    fits[place] = fit.inlier_share(config.inlier_m)
-                    normal_sum += fit.normal_sum
-            previous = place
-    return Walk(keyframes, found, information, fits, normal_sum)
+    first = _Stop(int(keyframes[start]), before_T_after)
+    first = _stop(before, after, first, first.keyframe, step, config)
+    stops = [first]
+    for way in (keyframes[start + 1 :], keyframes[:start][::-1]):
+        previous = first
+        for keyframe in way.tolist():
+            reached = _reached(before, after, previous, keyframe, step, config)
+            stops += reached
+            previous = reached[-1]
+    stops.sort(key=lambda stop: stop.keyframe)
+    return Walk(
+        keyframes=np.array([stop.keyframe for stop in stops], dtype=np.int64),
+        before_T_after=np.array([stop.before_T_after for stop in stops]),
+        information=np.array([stop.information for stop in stops]),
+        fits=np.array([stop.fit for stop in stops]),
+        normal_sum=np.sum([stop.normal_sum for stop in stops], axis=0),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stop:
+    """What was found at one after keyframe; see `Walk`."""
+
+    keyframe: int
+    before_T_after: Float64Array
+    information: Float64Array = field(default_factory=lambda: np.zeros((6, 6)))
+    fit: float = np.nan
+    normal_sum: Float64Array = field(default_factory=lambda: np.zeros((3, 3)))
+
+
+def _reached(
+    before: IndexedMap, after: IndexedMap, previous: _Stop, keyframe: int, step: Step, config: MergeConfig
+) -> list[_Stop]:
+    """Go from a stop to a keyframe; if the way is lost, in two halves, as long as there was a way."""
+    stop = _stop(before, after, previous, keyframe, step, config)
+    middle = (previous.keyframe + keyframe) // 2
+    is_short = abs(keyframe - previous.keyframe) <= _SHORTEST_STEP
+    if not stop.fit < _LOST_FIT or not previous.fit >= _LOST_FIT or is_short:
+        return [stop]
+    halfway = _reached(before, after, previous, middle, step, config)
+    return [*halfway, *_reached(before, after, halfway[-1], keyframe, step, config)]
+
+
+def _stop(
+    before: IndexedMap, after: IndexedMap, previous: _Stop, keyframe: int, step: Step, config: MergeConfig
+) -> _Stop:
+    centre = after.positions[keyframe]
+    guess = previous.before_T_after
+    if not is_shared(before, transform(guess, centre[None]))[0]:
+        return _Stop(keyframe, guess)
+    apart_m = float(np.linalg.norm(centre - after.positions[previous.keyframe]))
+    registered = _registered(before, after, centre, guess, apart_m, step, config)
+    if registered is None:
+        return _Stop(keyframe, guess, fit=0.0)
+    found, fit = registered
+    share = fit.inlier_share(config.inlier_m)
+    return _Stop(keyframe, found.target_T_source, found.information, share, fit.normal_sum)
 
 
 def is_shared(before: IndexedMap, positions_map: Float64Array) -> Float64Array:
@@ -134,16 +173,28 @@ def _registered(
         return None
     own = sampled(points)
     if step.first_try_m is not None:
-        found = align_sphere(own, centre, before.target, guess, step.first_try_m)
-        fit = surface_fit(before, after, found.target_T_source, own, centre, step.radius_m)
-        if fit.inlier_share(config.inlier_m) >= _CLEAR_FIT and _is_near(found.target_T_source, guess, centre, apart_m):
-            return found, fit
+        found = _held(align_sphere(own, centre, before.target, guess, step.first_try_m), guess, centre, apart_m)
+        if found is not None:
+            fit = surface_fit(before, after, found.target_T_source, own, centre, step.radius_m)
+            if fit.inlier_share(config.inlier_m) >= _CLEAR_FIT:
+                return found, fit
     found = align_sphere(points, centre, before.target, guess, step.correspondence_m, step.gicp_voxel_m)
-    if not _is_near(found.target_T_source, guess, centre, apart_m):
+    found = _held(found, guess, centre, apart_m)
+    if found is None:
         return None
     return found, surface_fit(before, after, found.target_T_source, own, centre, step.radius_m)
 
 
-def _is_near(pose: Float64Array, guess: Float64Array, centre: Float64Array, apart_m: float) -> bool:
-    jump_m, jump_rad = motion_between(pose, guess, centre)
-    return jump_m <= _JUMP_M + _JUMP_SHARE * apart_m and jump_rad <= _JUMP_RAD + _JUMP_RAD_PER_M * apart_m
+def _held(found: Registration, guess: Float64Array, centre: Float64Array, apart_m: float) -> Registration | None:
+    """Return a registration if odometry can have drifted so far, and without its turn if only that cannot be.
+
+    The section of a narrow drift is nearly round, and near a dead end little else holds a sphere against rolling.
+    """
+    jump_m, jump_rad = motion_between(found.target_T_source, guess, centre)
+    if jump_m > _JUMP_M + _JUMP_SHARE * apart_m:
+        return None
+    if jump_rad <= _JUMP_RAD + _JUMP_RAD_PER_M * apart_m:
+        return found
+    reached = transform(found.target_T_source, centre[None])[0]
+    unturned = make_pose(guess[:3, :3], reached - guess[:3, :3] @ centre)
+    return Registration(unturned, np.zeros((6, 6)))

@@ -34,7 +34,7 @@ class MergedPairs:
     outcomes: Sequence[str]
 
 
-_LEAST_ERROR_M, _MOST_ERROR_M = 1e-3, 300.0
+_LEAST_ERROR_M, _MOST_ERROR_M = 1e-4, 300.0
 # what has no error stands on lines of its own above the plot
 _LINES = {"accepted, no error defined": 1e3, "refused": 3e3, "failed": 9e3}
 
@@ -91,7 +91,7 @@ def _error_panel(axes: Axes, pairs: MergedPairs, limits_m: tuple[float, float]) 
     axes.axhline(_MOST_ERROR_M * 1.5, color="#b0b0b0", linewidth=0.8)
     axes.set_yscale("log")
     axes.set(xlim=(-0.04, 1.04), ylim=(_LEAST_ERROR_M / 1.5, max(_LINES.values()) * 2))
-    decades = [10.0**power for power in range(-3, 3)]
+    decades = [10.0**power for power in range(-4, 3)]
     names = [f"{value:g}" for value in decades]
     axes.set_yticks([*decades, *_LINES.values()], [*names, *_LINES])
     axes.minorticks_off()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -68,8 +68,8 @@ def read_case(data: RunData, row: Row, variants: tuple[str, ...] = ()) -> Case:
     return Case(row, variants or (variant,), evidence, _gates(document.get("config")))
 
 
-def distinct_cases(data: RunData, rows: Sequence[Row]) -> list[Case]:
-    """Return each merge once: variants that differ only in later stages share one."""
+def distinct_cases(data: RunData, rows: Sequence[Row], preferred: str) -> list[Case]:
+    """Return each merge once: variants that differ only in later stages share one, and `preferred` speaks for them."""
     found: dict[tuple[Any, ...], list[Case]] = {}
     for row in rows:
         case = read_case(data, row)
@@ -77,10 +77,12 @@ def distinct_cases(data: RunData, rows: Sequence[Row]) -> list[Case]:
         errors = tuple(fine(number(row, name)) for name in ("merge_error_m", "merge_error_deg"))
         key = (row["scenario"], row["seed"], text(row, "status"), text(row, "error"), measured, errors)
         found.setdefault(key, []).append(case)
-    return [
-        Case(first.row, tuple(name for case in cases for name in case.variants), first.evidence, first.gates)
-        for first, cases in ((cases[0], cases) for cases in found.values())
-    ]
+    chosen: list[Case] = []
+    for cases in found.values():
+        names = tuple(name for case in cases for name in case.variants)
+        speaker = cases[names.index(preferred) if preferred in names else 0]
+        chosen.append(replace(speaker, variants=names))
+    return chosen
 
 
 def case_table(cases: Sequence[Case], caption: str, *, by_kind: bool) -> Table:

@@ -12,6 +12,7 @@ from cdpipe.evidence import GATES
 from eval.merge_table import ALL_FAMILIES, RIGHT_DEG, RIGHT_M, TARGETS, is_wrong, kinds, texts
 from eval.page_columns import EN_DASH, UNDEFINED, Column, fine, significant
 from eval.page_run import split_variant
+from eval.page_story import joined
 from eval.page_tables import Cell, Table
 
 MAIN_VARIANT = "tunnelcd"
@@ -102,7 +103,8 @@ def story(table: pd.DataFrame, results: pd.DataFrame) -> list[str]:
         own = _records(table[(table["variant"] == name) & (table["family"] == ALL_FAMILIES)])
         missed = [str(row["pair_kind"]) for row in own if row["is_met"] is False]
         n_wrong = sum(int(row["n_wrong_accepted"]) for row in own)
-        verdict = f"misses its target on {', '.join(missed)}" if missed else "meets every target"
+        every = [str(row["pair_kind"]) for row in own]
+        verdict = f"misses its target on {joined(missed)}" if missed else f"meets its target on {joined(every)}"
         sentences.append(
             f"{name} {verdict}; wrong and accepted: {n_wrong} of {sum(row['n_pairs'] for row in own)} pairs."
         )
@@ -117,7 +119,8 @@ def story(table: pd.DataFrame, results: pd.DataFrame) -> list[str]:
     n_failed = int((results["status"] == "failed").sum())
     if n_failed:
         sentences.append(f"{n_failed} of {len(results)} cases failed; they count as pairs that miss their target.")
-    sentences.append(f"n = {n_pairs} session pairs, {len(variants)} variants; intervals are Wilson's over pairs.")
+    pairs = "1 session pair" if n_pairs == 1 else f"{n_pairs} session pairs"
+    sentences.append(f"n = {pairs}, {len(variants)} variants; intervals are Wilson's 95 % over pairs.")
     return sentences
 
 

@@ -43,6 +43,7 @@ def point_map(points: Float64Array) -> PointMap:
     n = len(points)
     return PointMap(
         points=points,
+        nearest_m=np.ones(n, np.float32),
         voxel_m=0.1,
         odom_T_sensor=np.stack([np.eye(4)] * 2),
         keyframe_scans=np.zeros(1, np.int64),
@@ -214,13 +215,29 @@ def test_local_anchors_that_agree_give_the_rigid_answer() -> None:
         np.testing.assert_allclose(local_figures[name], values, rtol=1e-9)
 
 
+def stretched(straight: MergedMaps, strain: float) -> MergedMaps:
+    """The same maps with an after odometry that goes too far along x, and the alignment that takes it back."""
+    pose = straight.before_T_after
+    in_map = transform(pose, straight.after.points) * (1 + strain, 1, 1)
+    after = replace(straight.after, points=transform(invert(pose), in_map))
+    return MergedMaps(straight.before, after, pose, {}, True, local=bent(pose, strain / (1 + strain)))
+
+
+def test_the_border_of_a_bent_sphere_makes_nothing_new() -> None:
+    # full voxels of the floor hold 16 points: one that lost a point to the crop would not count as occupied
+    drifted = stretched(merged([FLOOR], [FLOOR], yaw_pose(0.7, (1.0, 2.0, 0.1))), 0.09)
+    full = CONFIG.model_copy(
+        update={"extract": ExtractConfig(voxel_m=0.4, min_points=16), "cluster": ClusterConfig(min_points=1)}
+    )
+    for radius_m in (2.3, 3.7, 4.9):
+        objects, _ = extract_objects(drifted, regions([(0.2, 0.2, 0.1)], radius_m), full)
+        assert objects == ()
+
+
 def test_a_bent_alignment_straightens_the_after_map() -> None:
     # 4 % too far: 8 cm at the box, 20 cm at the rim of the floor
-    pose, strain = yaw_pose(-0.4, (2.0, 5.0, 0.2)), 0.04
-    straight = merged([FLOOR], [FLOOR, BOX], pose)
-    in_map = transform(pose, straight.after.points) * (1 + strain, 1, 1)
-    stretched = replace(straight.after, points=transform(invert(pose), in_map))
-    drifted = MergedMaps(straight.before, stretched, pose, {}, True, local=bent(pose, strain / (1 + strain)))
+    straight = merged([FLOOR], [FLOOR, BOX], yaw_pose(-0.4, (2.0, 5.0, 0.2)))
+    drifted = stretched(straight, 0.04)
     centre = (1.0, 0.5, 0.5)
     for radius_m in (2.0, 4.9):
         objects, figures = extract_objects(drifted, regions([centre], radius_m), CONFIG)
@@ -228,7 +245,7 @@ def test_a_bent_alignment_straightens_the_after_map() -> None:
         assert summary(objects) == summary(expected)
         np.testing.assert_allclose(objects[0].points_map, expected[0].points_map, atol=2e-3)
         # cut to the sphere exactly, in the map frame
-        moved = drifted.alignment.to_map(stretched.points)
+        moved = drifted.alignment.to_map(drifted.after.points)
         assert figures["s_points"][0] == np.count_nonzero(np.linalg.norm(moved - centre, axis=1) <= radius_m)
 
 

@@ -163,7 +163,7 @@ def test_a_scan_recorded_twice_is_named(tmp_path: Path) -> None:
 
 
 def test_standing_still_without_noise_is_no_repetition(tmp_path: Path) -> None:
-    standing = "\n".join(f"{stamp} 0 0 0 0 0 0 1" for stamp in (0.0, 0.1, 0.2))
+    standing = "\n".join(f"{stamp} 0 0 0 0 0 0 1" for stamp in (0.0, 0.1)) + "\n0.2 0.05 0 0 0 0 0 1"
     folder = recording(tmp_path / "run", trajectory=standing)
     for index in (1, 2):
         (folder / f"scan_00{index}.ply").write_bytes((folder / "scan_000.ply").read_bytes())

@@ -29,7 +29,7 @@ def test_a_right_start_fits_all_along(maps: tuple[IndexedMap, IndexedMap], true_
         for pose, keyframe in zip(found.before_T_after, keyframes, strict=True)
     ]
     # the ends of the path, where half of each sphere is missing, are found less well
-    assert np.median(errors, axis=0)[0] < 0.03
+    assert np.median(errors, axis=0)[0] < 0.06
     assert np.max(errors, axis=0)[0] < 0.2
     assert np.rad2deg(np.max(errors, axis=0)[1]) < 1.0
     assert eigenvalue_ratio(found.normal_sum) > 0.02

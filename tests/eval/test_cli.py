@@ -110,6 +110,10 @@ def test_detect_writes_its_answer_and_needs_no_truth(pair: Path, tmp_path: Path,
     assert len(vertices) == objects["n_points"].sum()
     assert np.bincount(vertices["f3"]).tolist() == objects["n_points"].tolist()
     assert "added" in out
+    assert "merge: accepted" in out
+    inliers = next(line.split() for line in out.splitlines() if "inlier_share" in line)
+    assert float(inliers[1]) == pytest.approx(report.evidence["inlier_share"], abs=1e-3)
+    assert inliers[3:] == ["yes", "merge.min_inlier_share"]
     assert {"t_merge_s", "t_descriptor_s", "t_cd_s", "t_oe_s"} <= set(report.seconds)
 
 
@@ -255,9 +259,23 @@ def test_sessions_of_different_tunnels_are_refused(pair: Path, tmp_path: Path, c
     wider = ("--set", "tunnel.section.width_m=7", "--set", "tunnel.section.height_m=5")
     assert command("simulate", "smoke/one_box", "--out", elsewhere, "--quiet", *SMALL, *wider)[0] == 0
     before = tree(tmp_path)
-    result = command("detect", pair / "before", elsewhere / "after", "--out", tmp_path / "out")
-    assert_refused(result, "cannot be merged", str(elsewhere / "after"))
+    quiet = command("detect", pair / "before", elsewhere / "after", "--out", tmp_path / "out", "--quiet")
+    assert_refused(quiet, "cannot be merged", str(elsewhere / "after"))
+    code, out, err = command("detect", pair / "before", elsewhere / "after", "--out", tmp_path / "out")
+    assert code == 2
+    assert err.splitlines()[-1] == quiet[2].splitlines()[-1]
+    assert "merge: refused" in out
+    assert any({"no", "merge.min_inlier_share"} <= set(line.split()) for line in out.splitlines())
     assert tree(tmp_path) == before
+
+
+def test_a_session_beside_itself_is_compared_and_it_is_said(pair: Path, tmp_path: Path, command: Command) -> None:
+    code, _, err = command("detect", pair / "before", pair / "before", *FINE, "--out", tmp_path / "out", "--quiet")
+    same = f"note: {pair / 'before'} and {pair / 'before'} are one and the same recording"
+    assert (code, err) == (0, f"{same}: nothing can have changed between them\n")
+    report = read_answer(tmp_path / "out").report
+    assert report is not None
+    assert report.objects == ()
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,9 @@ CHANGES = (
 def write_session(pair: Path, name: str, odom_T_world: np.ndarray, index: int, block: tuple[slice, ...]) -> None:
     shape = (N_SCANS, SENSOR.height, WIDTH)
     range_mm = np.full(shape, 3000, dtype=np.uint32)
+    # no two scans are the same to the last bit
+    range_mm[:, 0, 0] += np.arange(N_SCANS, dtype=np.uint32)
+    range_mm[:, 0, 0] += np.arange(len(range_mm), dtype=np.uint32)  # no two scans of a sensor are the same
     range_mm[block] = 2000
     change_ids = np.zeros(shape, dtype=np.int16)
     change_ids[block] = index
@@ -196,8 +199,10 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_answer(folder.answer(SITE, 7, "voxel-diff"), "voxel-diff", report(()))
     write_failure(folder.answer(SITE, 7, "random-regions"), "random-regions", "merge_refused", "no way", {}, {})
     points = np.random.default_rng(0).uniform((-2, -3, 0), (8, 3, 3), (500, 3)).astype(np.float32)
-    folder.maps(SITE, 7).parent.mkdir(parents=True)
-    np.savez(folder.maps(SITE, 7), before_points=points, after_points=points[:400] + 1)
+    for scenario in (SITE, EMPTY):
+        folder.maps(scenario, 7).parent.mkdir(parents=True)
+        np.savez(folder.maps(scenario, 7), before_points=points, after_points=points[:400] + 1)
+    write_answer(folder.answer(EMPTY, 7, "tunnelcd"), "tunnelcd", report(()))
     pd.DataFrame(result_rows()).to_csv(run / "results.csv", index=False)
     write_item_tables(run)
     machine = {
@@ -319,8 +324,8 @@ def test_nothing_is_fetched_and_every_picture_is_inside(page: Path) -> None:
     assert "url(" not in text
     assert "@import" not in text
     sources = re.findall(r'src="([^"]*)"', text)
-    # two maps, three presets' regions, two observable changes, one merge
-    assert len(sources) == 8
+    # two maps, three presets' regions, two observable changes, two merges
+    assert len(sources) == 9
     for source in sources:
         assert base64.b64decode(source.removeprefix("data:image/png;base64,"), validate=True).startswith(b"\x89PNG")
     links = re.findall(r'href="([^"]*)"', text)

@@ -35,6 +35,7 @@ def point_map(points: Float64Array, odom_T_map: Float64Array) -> PointMap:
     poses = np.array([odom_T_map @ yaw_pose(0.0, (x, 0.0, 1.0)) for x in np.arange(0.5, LENGTH_M)])
     return PointMap(
         points=transform(odom_T_map, points),
+        nearest_m=np.ones(n, np.float32),
         voxel_m=SPACING_M,
         odom_T_sensor=poses,
         keyframe_scans=np.arange(len(poses)),

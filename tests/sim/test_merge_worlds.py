@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +14,8 @@ from scipy.spatial import cKDTree
 
 from cdpipe.geometry import Float64Array, stream
 from cdpipe.ouster import SensorMetadata
-from scenarios import load_scenario
+from cdpipe.yamlfile import read_yaml
+from scenarios import library, load_scenario
 from scenarios.schema import SessionPlan, Tunnel
 from sim.centreline import Centreline, build_centreline, resample
 from sim.mesh import Mesh
@@ -26,6 +29,13 @@ STEP_M = 0.5
 SEEDS = range(10000, 10024)
 COARSE = ("tunnel.resolution_m=0.45", "sensor.mode=512x10", "platform.scan_spacing_m=4")
 CLEAN = ("merge/narrow", "merge/wide", "merge/network", "merge/cave", "merge/site1")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def each_file_is_read_once() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(library, "read_yaml", cache(read_yaml))
+        yield
 
 
 def line(centreline: Centreline, plan: SessionPlan) -> Float64Array:
