@@ -28,6 +28,7 @@ from cdpipe.registration import (
     IndexedMap,
     align_sphere,
     eigenvalue_ratio,
+    near_points,
     register,
     rigid_fit,
 )
@@ -37,6 +38,7 @@ from cdpipe.walk import Step, Walk, evenly, is_shared, walk
 # Spheres along the path on which an alignment is judged, and their radius: walls 5 m away must be inside.
 _CHECKS = 8
 _CHECK_RADIUS_M = 8.0
+_TOO_FEW = "no pair of similar places had enough points to be registered"
 # A hypothesis is ranked where it is only coarsely registered.
 _RANK_INLIER_M = 0.2
 _RANK_STEPS = 10
@@ -65,11 +67,13 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     Returns:
         The best hypothesis, accepted or not and why; identity where nothing could be registered.
     """
+    if min(len(near_points(session.map, config)) for session in (before, after)) < MIN_SPHERE_POINTS:
+        return MergedMaps(before.map, after.map, np.eye(4), {"n_hypotheses": 0.0}, False, _TOO_FEW)
     start = perf_counter()
     maps = (IndexedMap(before.map, config, is_target=True), IndexedMap(after.map, config, is_target=False))
     indexed = perf_counter()
     best, n_hypotheses = _hypothesis(before, after, maps, config)
-    reason = "no pair of similar places had enough points to be registered"
+    reason = _TOO_FEW
     evidence: dict[str, float] = {"n_hypotheses": float(n_hypotheses)}
     if best is not None:
         reason = "" if config.accept_all else why_refused(best.evidence, config)

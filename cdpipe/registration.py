@@ -81,7 +81,7 @@ class IndexedMap:
 
     def __init__(self, point_map: PointMap, config: MergeConfig, is_target: bool) -> None:
         self.map = point_map
-        near = point_map.points[point_map.nearest_m <= config.seen_within_m]
+        near = near_points(point_map, config)
         self.points = _thinned(near, config.target_voxel_m) if is_target else near
         self.columns = MapIndex(self.points)
         self.positions = point_map.odom_T_keyframe[:, :3, 3]
@@ -107,6 +107,11 @@ class IndexedMap:
     def sphere(self, centre: Float64Array, radius_m: float) -> Float64Array:
         """Return the (N, 3) map points within `radius_m` of `centre` (3,)."""
         return self.points[self.columns.crop(centre, radius_m)]
+
+
+def near_points(point_map: PointMap, config: MergeConfig) -> Float64Array:
+    """Return the (N, 3) points of a map that were seen from within `merge.seen_within_m`."""
+    return point_map.points[point_map.nearest_m <= config.seen_within_m]
 
 
 def _thinned(points: Float64Array, voxel_m: float) -> Float64Array:

@@ -31,14 +31,15 @@ class RandomScans:
 
 
 def brute_force(source: ScanSource, voxel_m: float, max_range_m: float) -> dict[tuple[int, ...], list[tuple]]:
-    """(scan, pixel, point) of the returns of every occupied cell."""
+    """(scan, pixel, point, range) of the returns of every occupied cell."""
     cells: dict[tuple[int, ...], list[tuple]] = {}
     for scan in source.scans():
         for pixel, sensor_point in zip(scan.pixels.tolist(), scan.points_sensor, strict=True):
-            if np.linalg.norm(sensor_point) <= max_range_m:
+            range_m = float(np.linalg.norm(sensor_point))
+            if range_m <= max_range_m:
                 point = transform(scan.odom_T_sensor, sensor_point[None])[0]
                 cell = tuple(np.floor(point / voxel_m).astype(int).tolist())
-                cells.setdefault(cell, []).append((scan.index, pixel, point))
+                cells.setdefault(cell, []).append((scan.index, pixel, point, range_m))
     return cells
 
 
@@ -58,8 +59,11 @@ def test_the_map_equals_a_dict_of_cells(batch_scans: int) -> None:
     assert len(point_map.return_points) == sum(len(found) for found in cells.values()) == sum(399 + k for k in range(7))
     for index, point in enumerate(point_map.points):
         found = cells.pop(tuple(np.floor(point / 0.5).astype(int).tolist()))
-        np.testing.assert_allclose(point, np.mean([entry[2] for entry in found], axis=0), atol=1e-12)
-        assert returns_of(point_map, index) == [[scan, pixel] for scan, pixel, _ in found]
+        ranges_m = np.maximum([range_m for *_, range_m in found], 1.0)
+        mean = np.average([entry[2] for entry in found], axis=0, weights=ranges_m**-2)
+        np.testing.assert_allclose(point, mean, atol=1e-12)
+        assert point_map.nearest_m[index] == pytest.approx(ranges_m.min(), rel=1e-6)
+        assert returns_of(point_map, index) == [[scan, pixel] for scan, pixel, *_ in found]
     assert not cells
 
 

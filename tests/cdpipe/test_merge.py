@@ -182,6 +182,7 @@ def test_a_smooth_straight_corridor_is_refused_because_it_slides(tunnel_before: 
         point_map = replace(
             tunnel_before.map,
             points=points,
+            nearest_m=np.full(len(points), 3.0, np.float32),
             odom_T_sensor=poses,
             keyframe_scans=np.arange(3),
             scan_offsets=np.zeros(4, np.int64),
@@ -202,12 +203,16 @@ def test_maps_too_small_to_register_are_refused(tunnel_before: MappedSession) ->
         w=np.zeros((0, 64), np.float32),
         keyframe_scans=np.zeros(0, np.int64),
     )
-    few_points = replace(tunnel_before.map, points=tunnel_before.map.points[:1])
-    for after in (
-        MappedSession(tunnel_before.map, no_keyframe),
-        MappedSession(few_points, tunnel_before.descriptors),
+    one, points = tunnel_before.map.nearest_m[:1], tunnel_before.map.points[:1]
+    few_points = MappedSession(replace(tunnel_before.map, points=points, nearest_m=one), tunnel_before.descriptors)
+    far_off = replace(tunnel_before.map, nearest_m=np.full(len(tunnel_before.map.points), 40.0, np.float32))
+    for before, after in (
+        (tunnel_before, MappedSession(tunnel_before.map, no_keyframe)),
+        (tunnel_before, few_points),
+        (few_points, tunnel_before),
+        (tunnel_before, MappedSession(far_off, tunnel_before.descriptors)),
     ):
-        merged = merge_maps(tunnel_before, after, CONFIG)
+        merged = merge_maps(before, after, CONFIG)
         assert not merged.is_accepted
         assert "enough points" in merged.reason
         np.testing.assert_array_equal(merged.before_T_after, np.eye(4))

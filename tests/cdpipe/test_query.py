@@ -15,7 +15,16 @@ def session(positions: list[tuple[float, float, float]], q: list[list[float]]) -
     poses = np.array([make_pose(translation=position) for position in positions]).reshape(-1, 4, 4)
     scans = np.arange(len(positions))
     nothing = np.zeros(0, np.int32)
-    point_map = PointMap(np.zeros((0, 3)), np.zeros(0, np.float32), 0.2, poses, scans, nothing, nothing, np.zeros(len(scans) + 1, np.int64))
+    point_map = PointMap(
+        np.zeros((0, 3)),
+        np.zeros(0, np.float32),
+        0.2,
+        poses,
+        scans,
+        nothing,
+        nothing,
+        np.zeros(len(scans) + 1, np.int64),
+    )
     vectors = np.array(q, dtype=np.float32).reshape(-1, 2)
     return point_map, DescriptorSet(vectors, None, scans, "by hand", "")
 

@@ -40,7 +40,9 @@ def session(world_T_sensor: np.ndarray, odom_T_world: np.ndarray, drift_deg_per_
 def mapped(truth: SessionTruth, keyframes: np.ndarray) -> MappedSession:
     none = np.zeros(0, dtype=np.int32)
     offsets = np.zeros(N + 1, dtype=np.int64)
-    point_map = PointMap(np.zeros((0, 3)), np.zeros(0, np.float32), 0.2, truth.odom_T_sensor, keyframes, none, none, offsets)
+    point_map = PointMap(
+        np.zeros((0, 3)), np.zeros(0, np.float32), 0.2, truth.odom_T_sensor, keyframes, none, none, offsets
+    )
     vectors = np.ones((len(keyframes), 4), dtype=np.float32)
     return MappedSession(point_map, DescriptorSet(vectors, None, keyframes, "test", ""))
 
