@@ -62,7 +62,7 @@ def refined(
     if not is_good.any():
         return None, evidence
     information = walked.information * np.where(is_good, _INDEPENDENT_SHARE, 0.0)[:, None, None]
-    positions = after.positions[keyframes]
+    positions = after.positions[walked.keyframes]
     smooth = smoothed(positions, walked.before_T_after, information)
     alignment = PathAlignment(positions, smooth)
     moved_m = np.linalg.norm(alignment.to_map(positions) - coarse.to_map(positions), axis=1)

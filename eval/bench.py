@@ -15,7 +15,7 @@ import numpy as np
 
 from cdpipe.errors import InputError
 from cdpipe.yamlfile import suggestion
-from eval.merge_bench import MergeSite, merge_contests, paper_sites
+from eval.merge_bench import FailedContest, MergeSite, merge_contests, paper_sites
 from eval.output import make_writable, unwritable
 from eval.provenance import machine
 from sim.bench import BenchSite, sensor_contests
@@ -68,8 +68,11 @@ def row_of(name: str, contest: Contest) -> Row:
 
     `value` and `rival_value` are medians over the `n` repetitions, `spread` is the distance between the quartiles of
     `value`; `ratio` tells how many times faster than its rival it is, and `met` whether that reaches `target`. What
-    has no rival has None there.
+    has no rival that its time can be compared with has None there. What failed has no value, `met` is False and
+    `reason` says why; it is "" everywhere else.
     """
+    if isinstance(contest, FailedContest):
+        return _failed_row(name, contest)
     figures = _figures(contest, contest.seconds)
     value = float(np.median(figures))
     rival = float(np.median(_figures(contest, contest.rival_seconds))) if contest.rival_seconds else None
@@ -86,15 +89,26 @@ def row_of(name: str, contest: Contest) -> Row:
         "met": None if ratio is None or contest.target is None else ratio >= contest.target,
         "n": len(figures),
         "spread": float(high - low),
+        "reason": "",
     }
 
 
 def verdict(rows: Sequence[Row]) -> str:
-    """Return one line: how many targets are met, and which are missed."""
+    """Return one line: how many targets are met, which are missed, and which could not be judged for want of a rival."""
     judged = [row for row in rows if row["met"] is not None]
     missed = [row["name"] for row in judged if not row["met"]]
+    open_ones = [row["name"] for row in rows if row["met"] is None and row["target"] is not None]
     told = f"{len(judged) - len(missed)} of {len(judged)} targets met"
-    return told if not missed else f"{told}; missed: {', '.join(missed)}"
+    if missed:
+        told += f"; missed: {', '.join(missed)}"
+    if open_ones:
+        told += f"; {len(open_ones)} not judged: {', '.join(open_ones)}"
+    return told
+
+
+def reasons(rows: Sequence[Row]) -> list[str]:
+    """Return one line for every row that failed."""
+    return [f"{row['name']}: {row['reason']}" for row in rows if row["reason"]]
 
 
 def make_ready(path: Path) -> None:
@@ -121,6 +135,22 @@ def write_table(table: Mapping[str, Any], path: Path) -> None:
     except OSError as error:
         partial.unlink(missing_ok=True)
         raise unwritable(path, error) from error
+
+
+def _failed_row(name: str, contest: FailedContest) -> Row:
+    return {
+        "name": name,
+        "value": None,
+        "unit": contest.unit,
+        "rival": None,
+        "rival_value": None,
+        "ratio": None,
+        "target": contest.target,
+        "met": False,
+        "n": 0,
+        "spread": None,
+        "reason": contest.reason,
+    }
 
 
 def _figures(contest: Contest, seconds: Sequence[float]) -> list[float]:

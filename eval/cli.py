@@ -351,7 +351,7 @@ def bench(
     """Measure the speed table, each figure beside its rival in the same run. A missed target is told, not an error."""
     import pandas as pd
 
-    from eval.bench import chosen, contests, make_ready, measure, verdict, write_table
+    from eval.bench import chosen, contests, make_ready, measure, reasons, verdict, write_table
     from eval.progress import Lines, Silent
 
     rows = chosen(contests(), only or ())
@@ -363,9 +363,11 @@ def bench(
         write_table(table, out)
     if quiet:
         return
-    shown = pd.DataFrame(table["rows"]).assign(met=[_MET[row["met"]] for row in table["rows"]])
+    shown = pd.DataFrame(table["rows"]).assign(met=[_MET[row["met"]] for row in table["rows"]]).drop(columns="reason")
     cpu, cores = table["machine"]["cpu"], table["machine"]["cores"]
     _table(f"speed, {cpu}, {cores} cores; ratio: times faster than the rival", shown)
+    for line in reasons(table["rows"]):
+        typer.echo(line)
     typer.echo(f"{verdict(table['rows'])}{'' if out is None else f'; {out}'}")
 
 

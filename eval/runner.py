@@ -1,8 +1,9 @@
 """Runs a plan, one cell after the other; finished cells are kept, and a run that was cut off goes on where it stopped.
 
 A cell is finished when its file holds the digest of what it depends on: the scenario as drawn, the files it names, the
-effective settings, the weights, the version of the metrics, and what the plan says of it (an oracle, where it ends, the
-kind of its pair). A merge that is refused and any other error of the input are rows of their own; a bug is not caught.
+effective settings, the weights, the version of the metrics, what the plan says of it (an oracle, where it ends, the kind
+of its pair), and whether KISS-Matcher was missing where its merge asks for it. A merge that is refused and any other
+error of the input are rows of their own; a bug is not caught.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from cdpipe.answer import write_answer, write_failure
+from cdpipe.coarse import is_kiss_matcher_installed
 from cdpipe.config import DescriptorConfig, MapConfig
 from cdpipe.descriptor import checkpoint_digest, use_threads
 from cdpipe.errors import InputError, MergeFailedError, ScenarioError, TunnelcdError
@@ -272,6 +274,9 @@ def _unmade(pair: _Pair, error: str) -> CaseScore:
 
 
 def _key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mapping[str, str]) -> str:
+    merge = cell.config.merge
+    asks_kiss_matcher = merge.method == "kiss-matcher" or (merge.method == "voting" and merge.fallback)
+    is_missed = cell.oracle is None and asks_kiss_matcher and not is_kiss_matcher_installed()
     return digest(
         {
             "scenario": None if scenario is None else scenario.model_dump(mode="json"),
@@ -282,6 +287,8 @@ def _key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mapping[s
             "oracle": None if cell.oracle is None else cell.oracle.model_dump(mode="json"),
             "until": cell.until,
             "pair_kind": pair_kind,
+            # what was made without the extra is made again once it is there; nothing is said where it is
+            **({"kiss_matcher": "absent"} if is_missed else {}),
         }
     )
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from cdpipe.config import MapConfig
 from cdpipe.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
@@ -146,3 +148,28 @@ def box_centres_map() -> dict[str, Float64Array]:
         name: np.array([along, bend(np.array(along), 0) + across, up])
         for name, ((along, across, up), _) in boxes.items()
     }
+
+
+def _bent(session: MappedSession, total_rad: float) -> tuple[MappedSession, Float64Array]:
+    """Let a session's odometry turn steadily, and return what takes each keyframe's surroundings back (K, 4, 4).
+
+    Every map point goes with the keyframe nearest to it, as it would in a map that such an odometry had built.
+    """
+    path = session.map.odom_T_keyframe
+    bends = [np.eye(4)]
+    for pose in path[1:]:
+        about = make_pose(translation=pose[:3, 3])
+        bends.append(bends[-1] @ about @ yaw_pose(total_rad / (len(path) - 1)) @ invert(about))
+    stack = np.array(bends)
+    nearest_point = cKDTree(path[:, :3, 3]).query(session.map.points)[1]
+    nearest_scan = cKDTree(path[:, :3, 3]).query(session.map.odom_T_sensor[:, :3, 3])[1]
+    chosen = stack[nearest_point]
+    points = np.einsum("nij,nj->ni", chosen[:, :3, :3], session.map.points) + chosen[:, :3, 3]
+    point_map = replace(session.map, points=points, odom_T_sensor=stack[nearest_scan] @ session.map.odom_T_sensor)
+    return MappedSession(point_map, session.descriptors), invert(stack)
+
+
+@pytest.fixture(scope="session")
+def bent() -> Callable[[MappedSession, float], tuple[MappedSession, Float64Array]]:
+    """How to bend a session: see `_bent`."""
+    return _bent

@@ -1,12 +1,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 from cdpipe.config import MergeConfig, load_config
 from cdpipe.evidence import why_refused
@@ -17,6 +17,7 @@ from cdpipe.registration import register
 from cdpipe.types import DescriptorSet, MappedSession, MergedMaps
 
 CONFIG = MergeConfig(fallback=False)
+Bend = Callable[[MappedSession, float], tuple[MappedSession, Float64Array]]
 FRAME = load_config("frame").merge
 
 
@@ -32,25 +33,6 @@ def moved(session: MappedSession, new_T_old: Float64Array) -> MappedSession:
         odom_T_sensor=new_T_old @ session.map.odom_T_sensor,
     )
     return MappedSession(point_map, session.descriptors)
-
-
-def bent(session: MappedSession, total_rad: float) -> tuple[MappedSession, Float64Array]:
-    """Let a session's odometry turn steadily, and return what takes each keyframe's surroundings back (K, 4, 4).
-
-    Every map point goes with the keyframe nearest to it, as it would in a map that such an odometry had built.
-    """
-    path = session.map.odom_T_keyframe
-    bends = [np.eye(4)]
-    for pose in path[1:]:
-        about = make_pose(translation=pose[:3, 3])
-        bends.append(bends[-1] @ about @ yaw_pose(total_rad / (len(path) - 1)) @ invert(about))
-    stack = np.array(bends)
-    nearest_point = cKDTree(path[:, :3, 3]).query(session.map.points)[1]
-    nearest_scan = cKDTree(path[:, :3, 3]).query(session.map.odom_T_sensor[:, :3, 3])[1]
-    chosen = stack[nearest_point]
-    points = np.einsum("nij,nj->ni", chosen[:, :3, :3], session.map.points) + chosen[:, :3, 3]
-    point_map = replace(session.map, points=points, odom_T_sensor=stack[nearest_scan] @ session.map.odom_T_sensor)
-    return MappedSession(point_map, session.descriptors), invert(stack)
 
 
 def path_error_m(merged: MergedMaps, true: Float64Array) -> float:
@@ -86,10 +68,10 @@ def test_without_refinement_one_transform_holds_everywhere(
 
 
 def test_maps_that_bend_apart_are_aligned_along_the_path(
-    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array, bent: Bend
 ) -> None:
     # the after odometry turns by 2 degrees over its 52 m: no single transform is nearer than decimetres at both ends
-    drifting, true_at = bent(tunnel_after, total_rad=np.deg2rad(2.0))
+    drifting, true_at = bent(tunnel_after, np.deg2rad(2.0))
     merged = merge_maps(tunnel_before, drifting, CONFIG)
     assert merged.is_accepted
     path = drifting.map.odom_T_keyframe[:, :3, 3]

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -60,6 +61,24 @@ def test_a_registration_that_jumps_is_no_drift(
     off = make_pose(translation=(0.0, 0.0, 1.6)) @ true_before_T_after
     found = walk(*maps, evenly(len(maps[1].positions), 8), 3, off, STEP, CONFIG)
     assert found.fits[3] == 0.0
+
+
+def test_where_the_way_is_lost_it_is_looked_for_in_smaller_steps(
+    tunnel_before: MappedSession,
+    tunnel_after: MappedSession,
+    true_before_T_after: Float64Array,
+    bent: Callable[[MappedSession, float], tuple[MappedSession, Float64Array]],
+) -> None:
+    # the after odometry bends by 6 degrees: too much for one step from end to end, not for several
+    bent_after, _ = bent(tunnel_after, np.deg2rad(6.0))
+    before = IndexedMap(tunnel_before.map, CONFIG, is_target=True)
+    after = IndexedMap(bent_after.map, CONFIG, is_target=False)
+    ends = np.array([0, len(after.positions) - 1])
+    found = walk(before, after, ends, 0, true_before_T_after, STEP, CONFIG)
+    assert found.fits.min() > 0.7
+    assert len(found.keyframes) > 2
+    assert (np.diff(found.keyframes) > 0).all()
+    assert len(found.before_T_after) == len(found.information) == len(found.fits) == len(found.keyframes)
 
 
 def test_shared_is_within_five_metres_of_the_before_path(tunnel_before: MappedSession) -> None:
