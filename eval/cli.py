@@ -433,7 +433,9 @@ def _results(folder: Path, quiet: bool) -> None:
         return
     import pandas as pd
 
+    from eval.coverage import coverage
     from eval.merge_table import merge_overview
+    from eval.runfolder import RunFolder
 
     results = pd.read_csv(folder / "results.csv")
     results["n_failed"] = results["status"] != "ok"
@@ -442,7 +444,12 @@ def _results(folder: Path, quiet: bool) -> None:
     # a run that ends at the merge has nothing in the columns of what comes later
     shown = [name for name in _SHOWN if name in results.columns and results[name].notna().any()]
     _table("means over pairs", counts.join(groups[shown].mean()).reset_index())
-    targets = merge_overview(results)
+    cases = zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
+    covered = coverage(RunFolder(folder).provenance(), cases)
+    is_whole = covered is None or covered.is_whole
+    targets = merge_overview(results, is_whole=is_whole)
+    if covered is not None and not is_whole:
+        typer.echo(f"{covered.sentence}\n")
     if len(targets):
         _table("merge: share of the pairs within the target of their kind, with its 95 % interval", targets)
 

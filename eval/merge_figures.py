@@ -26,6 +26,7 @@ _UNSEEN_M = 1.0
 _MAX_DRAWN = 120_000
 _NEIGHBOURS = 6
 _SQUARE_M = 8.0
+_MARGIN_M = 0.5
 _WIDTH_IN = 9.0
 _COLOURS = LinearSegmentedColormap.from_list(
     "gap", [(0.0, "#dfe7ee"), (0.2, "#a9c6dc"), (0.4, "#f3d9a4"), (0.65, VERMILLION), (1.0, "#6d0f00")]
@@ -90,7 +91,7 @@ def alignment_picture(before: Points, aligned: Points) -> str:
     distances_m = surface_distances(before, aligned)
     before = _subset(before[bulk_mask(before[:, :2])])
     worst = worst_stretch(aligned, distances_m)
-    left, right, bottom, top = raster.extent
+    left, right, bottom, top = raster.extent if worst is None else _around_both(raster.extent, _around(worst))
     aspect = (right - left) / (top - bottom)
     height_in = float(np.clip((_WIDTH_IN - 0.9) / (aspect + 1.0), 2.4, 4.4))
     figure = blank_figure(_WIDTH_IN, height_in + 1.1)
@@ -125,6 +126,18 @@ def _around(centre: tuple[float, float]) -> tuple[float, float, float, float]:
     """Left, right, bottom, top of the square that is shown enlarged."""
     half = STRETCH_M / 2
     return centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half
+
+
+def _around_both(
+    extent: tuple[float, float, float, float], square: tuple[float, float, float, float]
+) -> tuple[float, float, float, float]:
+    """Left, right, bottom, top of the smallest window that shows the whole of both, the square's outline too."""
+    return (
+        min(extent[0], square[0] - _MARGIN_M),
+        max(extent[1], square[1] + _MARGIN_M),
+        min(extent[2], square[2] - _MARGIN_M),
+        max(extent[3], square[3] + _MARGIN_M),
+    )
 
 
 def _points_from_above(

@@ -107,10 +107,11 @@ def _decades(values: Float64Array) -> tuple[float, float]:
 
 
 def time_plot(times: Mapping[str, Mapping[str, Float64Array]]) -> str:
-    """Draw the seconds of every pair, a panel for each part of the merge and a row for each variant.
+    """Draw the seconds of every accepted pair, a panel for each part of the merge and a row for each variant.
 
     Args:
-        times: For each panel's name the (N,) defined seconds of each variant; a bar marks their median.
+        times: For each panel's name the (N,) defined seconds of each variant; a bar marks their median, and
+            their number stands beside them.
     """
     variants = list(dict.fromkeys(name for panel in times.values() for name in panel))
     figure = blank_figure(_WIDTH_IN, 0.9 + 0.32 * len(variants))
@@ -121,6 +122,15 @@ def time_plot(times: Mapping[str, Mapping[str, Float64Array]]) -> str:
             seconds = seconds[seconds > 0]
             shift = stream(0, "page", "strip").uniform(-0.22, 0.22, len(seconds))
             axes.plot(seconds, row + shift, linestyle="none", marker="o", markersize=2.5, color=BLUE, alpha=0.4)
+            axes.text(
+                1.02,
+                row,
+                f"n {len(seconds)}",
+                transform=axes.get_yaxis_transform(),
+                fontsize=6,
+                va="center",
+                clip_on=False,
+            )
             if len(seconds):
                 axes.plot([np.median(seconds)] * 2, [row - 0.34, row + 0.34], color=BLACK, linewidth=1.6)
         axes.set_xscale("log")

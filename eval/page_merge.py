@@ -7,19 +7,36 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from cdpipe.geometry import Float64Array
+from eval.coverage import Coverage, coverage
 from eval.merge_plots import MergedPairs, error_plot, time_plot
-from eval.merge_table import EXACT_M, RIGHT_DEG, RIGHT_M, TIMES, kinds, merge_table, numbers
+from eval.merge_table import (
+    EXACT_M,
+    RIGHT_DEG,
+    RIGHT_M,
+    TARGETS,
+    TIMES,
+    is_oracle,
+    is_within_target,
+    kinds,
+    merge_table,
+    numbers,
+)
 from eval.page_merge_cases import MAX_ROWS, Case, case_table, distinct_cases, draw_case, read_case
-from eval.page_merge_tables import families_table, is_oracle, main_variant, refusals_table, story, targets_table
+from eval.page_merge_tables import (
+    families_table,
+    main_variant,
+    refusals_table,
+    stated_seconds,
+    story,
+    targets_table,
+    times_table,
+)
 from eval.page_objects import Picture
 from eval.page_run import RunData, repeats, text
 from eval.page_tables import Table
 
 N_WORST = 10
 MAX_PICTURES = 24
-# a variant that leaves a part out is done with it in microseconds
-_NOTHING_S = 1e-4
 _TIME_NAMES = {"t_index_s": "t_index [s]", "t_merge_s": "t_merge [s]", "t_refine_s": "t_refine [s]"}
 
 
@@ -30,9 +47,10 @@ class MergePart:
     Attributes:
         is_main: Whether the run ended at the merge, so that this is all there is.
         sentences: The first paragraph of such a page.
-        tables: Of the targets: over all families, by family, and of the reasons for refusals.
+        tables: Of the targets: over all families, by family; of the reasons for refusals; of the times.
         plots: Errors against overlap, times.
-        cases: What was measured of single merges: the worst accepted and the refused ones, or all of an ordinary run.
+        cases: What was measured of single merges: the worst accepted ones and all outside their target, or all of an
+            ordinary run.
         pictures: Aligned maps of those.
         notes: What was left out for space.
         missing: What could not be drawn.
@@ -54,6 +72,12 @@ def ends_at_merge(data: RunData) -> bool:
     return isinstance(plan, dict) and plan.get("until") == "merge"
 
 
+def covered_by(data: RunData) -> Coverage | None:
+    """Return how much of its plan a run holds; None where that is not known."""
+    cases = ((str(row["scenario"]), int(row["seed"]), str(row["variant"])) for row in data.results)
+    return coverage(data.provenance, cases)
+
+
 def draw_merge(data: RunData) -> MergePart:
     """Return tables and pictures of the merges of a run."""
     results = pd.DataFrame(list(data.results))
@@ -61,7 +85,12 @@ def draw_merge(data: RunData) -> MergePart:
     notes: list[str] = []
     by_kind = bool((kinds(results) != "").any())
     table = merge_table(results)
-    tables = (targets_table(table), families_table(table), refusals_table(results)) if by_kind else ()
+    is_main, covered = ends_at_merge(data), covered_by(data)
+    is_whole = covered is None or covered.is_whole
+    tables: tuple[Table, ...] = (times_table(results),) if by_kind or is_main else ()
+    if by_kind:
+        of_targets = targets_table(table, is_whole=is_whole), families_table(table, is_whole=is_whole)
+        tables = (*of_targets, refusals_table(results), *tables)
     plots = (_error_plot(results), _time_plot(results)) if by_kind else ()
     if by_kind:
         cases, shown = _chosen_cases(data, results, notes)
@@ -70,10 +99,9 @@ def draw_merge(data: RunData) -> MergePart:
     drawn = [draw_case(data, case, missing) for case in shown[:MAX_PICTURES]]
     if len(shown) > MAX_PICTURES:
         notes.append(f"The aligned maps of {len(shown) - MAX_PICTURES} further cases are left out of this page.")
-    is_main = ends_at_merge(data)
     return MergePart(
         is_main,
-        tuple(story(table, results)) if is_main else (),
+        tuple(story(table, results, covered)) if is_main else (),
         tuple(part for part in tables if part.rows),
         tuple(plot for plot in plots if plot is not None),
         tuple(part for part in cases if part.rows),
@@ -105,7 +133,7 @@ def _error_plot(results: pd.DataFrame) -> Picture | None:
 def _time_plot(results: pd.DataFrame) -> Picture | None:
     variants = [name for name in dict.fromkeys(str(v) for v in results["variant"]) if not is_oracle(name)]
     panels = {
-        _TIME_NAMES[column]: {name: _seconds(results[results["variant"] == name], column) for name in variants}
+        _TIME_NAMES[column]: {name: stated_seconds(results[results["variant"] == name], column) for name in variants}
         for column in TIMES
     }
     if not any((values > 0).any() for panel in panels.values() for values in panel.values()):
@@ -113,17 +141,13 @@ def _time_plot(results: pd.DataFrame) -> Picture | None:
     return Picture(
         "Time of the merge",
         time_plot(panels),
-        "One dot per pair, a bar at the median, logarithmic; one thread. Indexing can be done while mapping.",
+        "One dot per accepted pair (n of them; refused ones state no time), a bar at the median, logarithmic; one "
+        "thread. Indexing can be done while mapping.",
     )
 
 
-def _seconds(results: pd.DataFrame, column: str) -> Float64Array:
-    values = numbers(results, column)
-    return values[values >= _NOTHING_S]
-
-
 def _chosen_cases(data: RunData, results: pd.DataFrame, notes: list[str]) -> tuple[list[Table], list[Case]]:
-    """Return the worst accepted merges of the variant that is shown, and clean and drift pairs it did not merge."""
+    """Return the worst accepted merges of the variant that is shown, and all of its pairs outside their target."""
     name = main_variant([str(variant) for variant in results["variant"]])
     mine = np.flatnonzero((results["variant"] == name).to_numpy())
     badness = np.fmax(numbers(results, "merge_error_m") / RIGHT_M, numbers(results, "merge_error_deg") / RIGHT_DEG)
@@ -131,21 +155,22 @@ def _chosen_cases(data: RunData, results: pd.DataFrame, notes: list[str]) -> tup
     badness = np.nan_to_num(badness, nan=np.inf)
     status, kind = results["status"].to_numpy(), kinds(results)
     accepted = mine[status[mine] == "ok"]
-    worst = [
-        read_case(data, data.results[index])
-        for index in accepted[np.argsort(-badness[accepted], kind="stable")][:N_WORST]
-    ]
-    unmerged = [
-        read_case(data, data.results[index])
-        for index in mine[(status[mine] != "ok") & np.isin(kind[mine], ("clean", "drift"))]
-    ]
+    worst = accepted[np.argsort(-badness[accepted], kind="stable")][:N_WORST].tolist()
+    outside = mine[~is_within_target(results)[mine] & np.isin(kind[mine], list(TARGETS))]
+    # not merged first, in the order of the table; then the worst of those that were accepted
+    outside = outside[np.lexsort((-badness[outside], status[outside] == "ok"))].tolist()
+    cases = {index: read_case(data, data.results[index]) for index in dict.fromkeys([*outside, *worst])}
     tables = [
-        case_table(worst, f"The worst accepted merges of {name}, worst first", by_kind=True),
-        case_table(unmerged, f"Clean and drift pairs that {name} did not merge", by_kind=True),
+        case_table(
+            [cases[index] for index in worst], f"The worst accepted merges of {name}, worst first", by_kind=True
+        ),
+        case_table(
+            [cases[index] for index in outside], f"Every pair of {name} that is outside its target", by_kind=True
+        ),
     ]
-    if not unmerged:
-        notes.append(f"{name} merged every clean and every drift pair.")
-    return tables, [*unmerged, *worst]
+    if not outside:
+        notes.append(f"{name}: every pair is within its target.")
+    return tables, list(cases.values())
 
 
 def _every_case(data: RunData, notes: list[str]) -> tuple[list[Table], list[Case]]:

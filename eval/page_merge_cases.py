@@ -30,7 +30,7 @@ MAX_ROWS = 40
 _ANCHOR_SPACING_M = 1.0
 _HEADINGS = (
     "case", *(name.replace("_", " ") for name, _ in GATES), "residual [m]", "true overlap", "error [m]", "error [deg]",
-    "along [m]", "outcome, and why",
+    "along [m]", "p95 along path [m]", "outcome, and why",
 )  # fmt: skip
 
 
@@ -169,7 +169,7 @@ def _cells(case: Case, *, by_kind: bool) -> tuple[Cell, ...]:
         *(_gate_cell(case, name) for name, _ in GATES),
         Cell(fine(case.evidence.get("residual_m", np.nan))),
         Cell(share(number(row, "overlap_true"))),
-        *(Cell(fine(number(row, f"merge_error_{name}"))) for name in ("m", "deg", "along_m")),
+        *(Cell(fine(number(row, f"merge_error_{name}"))) for name in ("m", "deg", "along_m", "m_p95")),
         Cell(outcome_text(case)),
     )
 

@@ -62,6 +62,7 @@ from scenarios.schema import Scenario
 
 ORACLE_MERGE = "oracle-merge"
 _ORACLE_PRESET = "tunnelcd"
+_AFTER_MERGE = ("query", "extract", "outlier", "cluster")
 _LONGEST_SLUG = 200  # file systems take names of 255 bytes
 _TOO_LONG = "is too long for a folder's name: put the settings into a file of their own"
 
@@ -145,6 +146,19 @@ class Variant(Settings):
     per_scenario: dict[Label, MethodSettings] = Field(default_factory=dict)
     oracle_merge: Annotated[OracleMerge | None, BeforeValidator(_with_braces)] = None
 
+    @model_validator(mode="after")
+    def _settings_act(self) -> Variant:
+        if self.oracle_merge is not None:
+            for setting in self.every_setting:
+                if group_of(setting) == "merge":
+                    raise ValueError(f"{setting} does nothing: this variant is merged by the truth; leave it out")
+        return self
+
+    @property
+    def every_setting(self) -> tuple[str, ...]:
+        """What is set over the preset anywhere."""
+        return (*self.set, *itertools.chain(*self.per_scenario.values()))
+
     @model_serializer(mode="wrap")
     def _as_written(self, handler: SerializerFunctionWrapHandler) -> Any:
         return {key: value for key, value in handler(self).items() if value is not None}
@@ -188,6 +202,17 @@ class Plan(Settings):
         if mistakes:
             raise ValidationError.from_exception_data(cls.__name__, mistakes)
         return items
+
+    @model_validator(mode="after")
+    def _settings_act(self) -> Plan:
+        asked = [(variant.preset, setting) for variant in self.variants for setting in variant.every_setting]
+        asked += [(f"the grid of {grid.variant}", key) for grid in self.grid for key in grid.keys]
+        for who, setting in asked:
+            if self.until == "merge" and group_of(setting) in _AFTER_MERGE:
+                raise ValueError(
+                    f"{setting} of {who} does nothing: the plan ends at the merge; leave it out, or leave out until"
+                )
+        return self
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Plan:
@@ -282,7 +307,8 @@ def changed_plan(
         plan: The plan.
         seeds: "A:B", replaces the plan's seeds.
         settings: `key=value`, written over every variant and every grid point.
-        grid: `key=v1,v2`; every variant is run at every combination. The plan's own grids stay as they are.
+        grid: `key=v1,v2`; every variant is run at every combination. The plan's own grids stay as they are. Variants
+            that are merged by the truth get neither settings nor grids of `merge`.
 
     Raises:
         InputError: One of them cannot be read, or its key or value is wrong.
@@ -303,11 +329,11 @@ def changed_plan(
     document["variants"] = [
         {
             **variant,
-            "set": [*_without(variant["set"], overridden), *point, *settings],
+            "set": [*_without(variant["set"], overridden), *added],
             "per_scenario": {name: _without(own, overridden) for name, own in variant["per_scenario"].items()},
         }
         for variant in document["variants"]
-        for point in itertools.product(*axes)
+        for added in _additions(variant, axes, settings)
     ]
     for each in document["grid"]:
         each["keys"].update({_key(setting): [yaml.safe_load(setting.partition("=")[2])] for setting in settings})
@@ -329,6 +355,16 @@ def cells(plan: Plan) -> list[Cell]:
             for method, config in methods
         ]
     return found
+
+
+def planned_cases(plan: Plan) -> set[tuple[str, int, str]]:
+    """Return (scenario, seed, variant) of all cells."""
+    return {
+        (world.label, seed, method.variant)
+        for world in worlds_of(plan.scenarios)
+        for method in _methods(plan, world)
+        for seed in plan.seeds[: world.n_seeds]
+    }
 
 
 def variant_name(preset: str, settings: Iterable[str], oracle: OracleMerge | None = None) -> str:
@@ -364,6 +400,16 @@ def _methods(plan: Plan, world: World) -> list[_Method]:
 def _points(keys: Mapping[str, Sequence[Any]]) -> list[tuple[str, ...]]:
     axes = [[setting_text(key, value) for value in values] for key, values in keys.items()]
     return list(itertools.product(*axes))
+
+
+def _additions(
+    variant: Mapping[str, Any], axes: Sequence[Sequence[str]], settings: Sequence[str]
+) -> list[tuple[str, ...]]:
+    """Return what the command line adds to a variant, once for each copy of it."""
+    if "oracle_merge" in variant:
+        axes = [axis for axis in axes if group_of(axis[0]) != "merge"]
+        settings = [setting for setting in settings if group_of(setting) != "merge"]
+    return [(*point, *settings) for point in itertools.product(*axes)]
 
 
 def _grid_axis(text: str) -> list[str]:

@@ -84,7 +84,7 @@ def test_samples_are_every_kth_point() -> None:
         ("overlap", 0.1, "only 10% of the shorter one"),
         ("inlier_share", 0.5, "only 50% of the points around the best pair"),
         ("hessian_ratio", 0.0051, "degenerate"),
-        ("agreement", 0.75, "two places that look alike"),
+        ("agreement", 0.7, "two places that look alike"),
     ],
 )
 def test_each_gate_refuses_alone_and_says_why(name: str, value: float, said: str) -> None:
