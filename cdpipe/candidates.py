@@ -148,6 +148,9 @@ def _pairs(before: DescriptorSet, after: DescriptorSet, n_queries: int, nearest:
         yaws_rad = np.repeat(_BLIND_YAWS_RAD[None], len(i), axis=0)
     else:
         yaws_rad = relative_yaws_rad(before.w[i], after.w[j], n_yaws)
+        is_blind = np.isnan(yaws_rad).all(axis=1)
+        if is_blind.all():  # vectors without a peak say nothing
+            yaws_rad = np.repeat(_BLIND_YAWS_RAD[None], len(i), axis=0)
     which = np.repeat(np.arange(len(i)), yaws_rad.shape[1])
     is_there = ~np.isnan(yaws_rad.ravel())
     which = which[is_there]

@@ -50,11 +50,14 @@ class MergeConfig(Settings):
     min_overlap: Share = Field(0.15, description="accept at least this share of the shorter path beside the other")
     min_inlier_share: Share = Field(0.85, description="accept at least this share of inliers in the sphere")
     min_hessian_ratio: Share = Field(0.015, description="smallest to largest translational eigenvalue: degeneracy")
-    min_agreement: Share = Field(0.75, description="accept at least this share of inliers along both paths")
+    min_agreement: Share = Field(0.8, description="accept at least this share of inliers along both paths")
+    min_distinctness: Annotated[float, Field(ge=1)] = Field(
+        1.3, description="accept if any other alignment that fits has a residual this many times larger"
+    )
     accept_all: bool = Field(False, description="accept whatever was found, as FRAME does")
     fallback: bool = Field(True, description="where nothing is accepted, let KISS-Matcher (extra `kiss`) try")
     kiss_voxel_m: Positive = Field(0.6, description="cell of KISS-Matcher")
-    refine: Literal["none", "local"] = Field("local", description="align again around each keyframe of the overlap")
+    refine: Literal["none", "local"] = Field("local", description="align again every few metres along the overlap")
 
 
 class QueryConfig(Settings):

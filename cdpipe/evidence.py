@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from cdpipe.config import MergeConfig
 from cdpipe.geometry import Float64Array, invert, transform
-from cdpipe.registration import IndexedMap
+from cdpipe.registration import IndexedMap, plane_jacobian
 
 # What is measured, and the setting of `merge` that it must reach.
 GATES = (
@@ -23,6 +23,7 @@ GATES = (
     ("inlier_share", "min_inlier_share"),
     ("hessian_ratio", "min_hessian_ratio"),
     ("agreement", "min_agreement"),
+    ("distinctness", "min_distinctness"),
 )
 # Points of a sphere that are looked at, and how near a counterpart must be for its normal to mean anything.
 _SAMPLES = 300
@@ -36,13 +37,13 @@ class SurfaceFit:
     Attributes:
         forward_m: (N,) distances of some after points to the before surface, inf where there is none within 0.5 m.
         backward_m: (M,) the same of before points to the after surface.
-        normal_sum: (3, 3) sum of n n^T over the before normals n at the after points that have a counterpart, map
-            frame: the Hessian of a shift. Where all normals are square to one direction, the maps can slide along it.
+        information: (6, 6) Hessian of the forward distances: turn, then shift, in after odom axes about the place.
+            Where all normals are square to one direction its shift is not held: the maps can slide.
     """
 
     forward_m: Float64Array
     backward_m: Float64Array
-    normal_sum: Float64Array
+    information: Float64Array
 
     def inlier_share(self, inlier_m: float) -> float:
         """Return the share of points nearer than `inlier_m` to the other surface, the lower of both directions."""
@@ -50,8 +51,9 @@ class SurfaceFit:
 
     @property
     def residual_m(self) -> float:
-        """Median distance, both directions together."""
-        return float(np.median(np.concatenate([self.forward_m, self.backward_m])))
+        """Median distance, both directions together; NaN where there is none."""
+        median_m = float(np.median(np.concatenate([self.forward_m, self.backward_m])))
+        return median_m if np.isfinite(median_m) else float("nan")
 
 
 def surface_fit(
@@ -79,7 +81,8 @@ def surface_fit(
     found, squared_m2 = fine.tree.batch_nearest_neighbor_search(moved)
     normals = fine.normals[found]
     forward_m = _plane_distances(moved, fine.points[found], normals, np.asarray(squared_m2))
-    seen = normals[np.isfinite(forward_m)]
+    is_seen = np.isfinite(forward_m)
+    jacobian = plane_jacobian((own - centre_after)[is_seen], normals[is_seen] @ before_T_after[:3, :3])
 
     centre_before = transform(before_T_after, centre_after[None])[0]
     chosen = sampled(before.columns.crop(centre_before, radius_m))
@@ -87,7 +90,7 @@ def surface_fit(
     found, squared_m2 = after.tree.batch_nearest_neighbor_search(theirs)
     turned = fine.normals[chosen] @ before_T_after[:3, :3]
     backward_m = _plane_distances(theirs, after.points[found], turned, np.asarray(squared_m2))
-    return SurfaceFit(forward_m, backward_m, seen.T @ seen)
+    return SurfaceFit(forward_m, backward_m, jacobian.T @ jacobian)
 
 
 def sampled(of_map: npt.NDArray[Any], n: int = _SAMPLES) -> npt.NDArray[Any]:
@@ -101,8 +104,8 @@ def why_refused(evidence: Mapping[str, float], config: MergeConfig) -> str:
         value, least = evidence.get(name, np.nan), getattr(config, setting)
         # written so that NaN, what could not be measured, is refused as well
         if not value >= least:
-            said = f"{value:.4f}" if name == "hessian_ratio" else f"{value:.0%}"
-            asked = f"{least:g}" if name == "hessian_ratio" else f"{least:.0%}"
+            is_share = name not in ("hessian_ratio", "distinctness")
+            said, asked = (f"{value:.0%}", f"{least:.0%}") if is_share else (f"{value:.4g}", f"{least:g}")
             return f"{_REASONS[name].format(value=said)}; merge.{setting} asks for {asked}"
     return ""
 
@@ -123,4 +126,6 @@ _REASONS = {
     "too smooth and straight to tell where along it the robot was; drive on to a bend, a branch or a niche",
     "agreement": "the best pair of places fits, but along both paths only {value} of the points do: two places that "
     "look alike, or odometry that drifts by more than a few percent",
+    "distinctness": "another alignment fits nearly as well (its residual is {value} times this one's): the tunnel "
+    "repeats itself; drive on to where it does not",
 }

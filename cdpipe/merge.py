@@ -11,7 +11,7 @@ second method where nothing was accepted (cdpipe/coarse.py), and an alignment th
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -20,14 +20,15 @@ from cdpipe.alignment import PathAlignment
 from cdpipe.candidates import Candidate, closest_pair, voted_candidates
 from cdpipe.coarse import coarse_pose, is_kiss_matcher_installed
 from cdpipe.config import MergeConfig
-from cdpipe.evidence import sampled, surface_fit, why_refused
-from cdpipe.geometry import Float64Array, transform
+from cdpipe.evidence import SurfaceFit, sampled, surface_fit, why_refused
+from cdpipe.geometry import BoolArray, Float64Array, Int64Array, transform
 from cdpipe.refine import refined
 from cdpipe.registration import (
     MIN_SPHERE_POINTS,
     IndexedMap,
-    align_sphere,
+    align_by_gicp,
     eigenvalue_ratio,
+    motion_between,
     near_points,
     register,
     rigid_fit,
@@ -43,6 +44,15 @@ _TOO_FEW = "no pair of similar places had enough points to be registered"
 _RANK_INLIER_M = 0.2
 _RANK_STEPS = 10
 _RANK_SAMPLES = 150
+# A start that fits its place this well, against the best one, is followed too.
+_RIVAL_SHARE = 0.95
+_OTHER_MOTION_M = 1.0
+# What distinctness says where nothing else fits.
+_DISTINCT = 10.0
+# Fewer places than this, the start left out, are no evidence of a path; worse fits than that do not shape the answer.
+_MIN_PLACES, _GOOD_FIT = 3, 0.7
+# Cosine of 15 degrees, the most that an answer may tip the after map.
+_UPRIGHT = 0.966
 # Longest correspondences while walking: what may have drifted since the last stop, less than a narrow drift is wide.
 _FIRST_TRY_M, _CHECK_REACH_M = 1.0, 1.5
 
@@ -62,6 +72,7 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     Evidence: `overlap` (share of the shorter path that lies beside the other), `inlier_share` and `residual_m` (share
     of points within `inlier_m` of the other map's surface, and their median distance, around the pair),
     `hessian_ratio` (of a shift, along the whole path), `agreement` (mean share of inliers along the path),
+    `distinctness` (residual of the best other alignment that passes, against this one's; 10 where there is none),
     `descriptor_distance` of the pair, `n_hypotheses` judged along the path, `is_fallback`.
 
     Returns:
@@ -100,18 +111,18 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
 def _hypothesis(
     before: MappedSession, after: MappedSession, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
 ) -> tuple[_Hypothesis | None, int]:
-    """Return the first hypothesis that is accepted, or else the best, and how many were tried."""
+    """Return the hypothesis that is accepted, or else the best, and how many were followed along the path."""
     if config.method == "frame":
-        return _first_accepted(_by_frame(closest_pair(before, after), maps, config), maps, config)
+        return _chosen(_by_frame(closest_pair(before, after), maps, config), maps, config)
     best: _Hypothesis | None = None
     n_tried = 0
     if config.method == "voting":
         starts = _ranked(voted_candidates(before, after, config), maps, config)
-        best, n_tried = _first_accepted(starts, maps, config)
+        best, n_tried = _chosen(starts, maps, config)
         is_accepted = best is not None and not why_refused(best.evidence, config)
         if is_accepted or not (config.fallback and is_kiss_matcher_installed()):
             return best, n_tried
-    other, n_other = _first_accepted(_by_kiss_matcher(maps, config), maps, config)
+    other, n_other = _chosen(_by_kiss_matcher(maps, config), maps, config)
     if other is not None and (best is None or not why_refused(other.evidence, config)):
         best = other
     return best, n_tried + n_other
@@ -119,15 +130,16 @@ def _hypothesis(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Start:
-    """An alignment found around one after keyframe, before the rest of the path was asked."""
+    """An alignment found around one after keyframe, how well it fits there, and what is known of it so far."""
 
     keyframe: int
     before_T_after: Float64Array
     evidence: Mapping[str, float]
+    share: float = 1.0
 
 
 def _ranked(candidates: Iterable[Candidate], maps: tuple[IndexedMap, IndexedMap], config: MergeConfig) -> list[_Start]:
-    """Register every candidate coarsely and return those that could be, the best fit first."""
+    """Register every candidate coarsely and return them, the best fit first; too small spheres are left out."""
     before, after = maps
     found = []
     for candidate in candidates:
@@ -135,7 +147,7 @@ def _ranked(candidates: Iterable[Candidate], maps: tuple[IndexedMap, IndexedMap]
         points = after.sphere(centre, config.sphere_radius_m)
         if len(points) < MIN_SPHERE_POINTS:
             continue
-        pose = align_sphere(
+        pose = align_by_gicp(
             points,
             centre,
             before.coarse_target,
@@ -143,12 +155,12 @@ def _ranked(candidates: Iterable[Candidate], maps: tuple[IndexedMap, IndexedMap]
             config.gicp_correspondence_m,
             config.coarse_voxel_m,
             _RANK_STEPS,
-        ).target_T_source
+        )
         fit = surface_fit(before, after, pose, sampled(points, _RANK_SAMPLES), centre, config.sphere_radius_m)
         share = fit.inlier_share(_RANK_INLIER_M)
         distance = {"descriptor_distance": candidate.descriptor_distance, "is_fallback": 0.0}
-        found.append((share, _Start(candidate.after_keyframe, pose, distance)))
-    return [start for _, start in sorted(found, key=lambda pair: -pair[0])]
+        found.append(_Start(candidate.after_keyframe, pose, distance, share))
+    return sorted(found, key=lambda start: -start.share)
 
 
 def _by_frame(
@@ -161,70 +173,125 @@ def _by_frame(
         source = after.sphere(after.positions[candidate.after_keyframe], config.sphere_radius_m)
         target = before.sphere(before.positions[candidate.before_keyframe], config.sphere_radius_m)
         if min(len(source), len(target)) >= MIN_SPHERE_POINTS:
-            pose = register(source, target, candidate.before_T_after, config).target_T_source
+            pose = register(source, target, candidate.before_T_after, config)
             distance = {"descriptor_distance": candidate.descriptor_distance, "is_fallback": 0.0}
             found.append(_Start(candidate.after_keyframe, pose, distance))
     return found
 
 
 def _by_kiss_matcher(maps: tuple[IndexedMap, IndexedMap], config: MergeConfig) -> list[_Start]:
-    """KISS-Matcher on the whole maps; its answer is walked from the after keyframe nearest to the before path."""
+    """KISS-Matcher on the whole maps; its answer is walked from the after keyframe nearest to the before path.
+
+    Odometry knows what is up: an answer that tips the maps is none.
+    """
     before, after = maps
     found = coarse_pose(before.map.points, after.map.points, config.kiss_voxel_m)
-    if found is None:
+    if found is None or found.before_T_after[2, 2] < _UPRIGHT:
         return []
     distances_m, _ = before.path.query(transform(found.before_T_after, after.positions))
     return [_Start(int(np.argmin(distances_m)), found.before_T_after, {"is_fallback": 1.0})]
 
 
-def _first_accepted(
+def _chosen(
     starts: Iterable[_Start], maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
 ) -> tuple[_Hypothesis | None, int]:
-    """Judge one start after the other until one is accepted; otherwise return the one that agrees best."""
-    best: _Hypothesis | None = None
-    n_tried = 0
+    """Follow one start after the other until one is accepted, and every other that fits its place about as well.
+
+    A tunnel that repeats itself has several alignments that pass all gates. The one with the smallest residual along
+    the path is taken; `distinctness` says how much smaller it is.
+    """
+    judged: list[_Hypothesis] = []
+    accepted: list[_Hypothesis] = []
+    best_share = 0.0
     for start in starts:
-        n_tried += 1
-        hypothesis = _judged(start, maps, config)
-        if best is None or hypothesis.evidence["agreement"] > best.evidence["agreement"]:
-            best = hypothesis
-        if not why_refused(hypothesis.evidence, config):
-            return hypothesis, n_tried
-    return best, n_tried
+        best_share = max(best_share, start.share)
+        if accepted and (start.share < _RIVAL_SHARE * best_share or not _is_rival(start, accepted, maps, config)):
+            continue
+        judged.append(_judged(start, maps, config))
+        if not why_refused(judged[-1].evidence, config):
+            accepted.append(judged[-1])
+    if not accepted:
+        return max(judged, key=lambda each: np.nan_to_num(each.evidence["agreement"]), default=None), len(judged)
+    best, *others = sorted(accepted, key=_path_residual_m)
+    place = maps[1].positions[best.walk.keyframes[0]]
+    rivals = [o for o in others if motion_between(o.before_T_after, best.before_T_after, place)[0] > _OTHER_MOTION_M]
+    if rivals:
+        ratio = min(_path_residual_m(rivals[0]) / _path_residual_m(best), _DISTINCT)
+        best = replace(best, evidence={**best.evidence, "distinctness": ratio})
+    return best, len(judged)
+
+
+def _is_rival(
+    start: _Start, accepted: Iterable[_Hypothesis], maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
+) -> bool:
+    """Tell whether a start is another motion than the accepted ones, and fits its place well enough to be one."""
+    after = maps[1]
+    centre = after.positions[start.keyframe]
+    pose, fit = _at_place(start, maps, config)
+    for other in accepted:
+        alignment = PathAlignment(after.positions[other.walk.keyframes], other.walk.before_T_after)
+        if motion_between(pose, alignment.at(centre[None])[0], centre)[0] < _OTHER_MOTION_M:
+            return False
+    return fit.inlier_share(config.inlier_m) >= config.min_inlier_share
+
+
+def _path_residual_m(hypothesis: _Hypothesis) -> float:
+    return float(np.nanmean(hypothesis.walk.residuals_m))
 
 
 def _judged(start: _Start, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig) -> _Hypothesis:
-    """Register a start finely and follow it along the path."""
+    """Register a start finely and follow it along the path, and again along the shared part where that is short."""
+    before, after = maps
+    pose, fit = _at_place(start, maps, config)
+    step = Step(_CHECK_RADIUS_M, config.voxel_m, _CHECK_REACH_M, first_try_m=_FIRST_TRY_M)
+
+    def along(keyframes: Int64Array) -> tuple[Walk, Float64Array]:
+        """Return the walk, and the fits of the places asked for but the start, which was chosen for its fit."""
+        walked = walk(before, after, keyframes, int(np.searchsorted(keyframes, start.keyframe)), pose, step, config)
+        fits = walked.fits[np.isin(walked.keyframes, keyframes) & (walked.keyframes != start.keyframe)]
+        return walked, fits[np.isfinite(fits)]
+
+    everywhere = np.arange(len(after.positions))
+    walked, fits = along(evenly(everywhere, _CHECKS, start.keyframe))
+    shared = everywhere[_is_shared_keyframe(walked, before, after)]
+    if len(fits) < _CHECKS // 2 < len(shared):
+        walked, fits = along(evenly(shared, _CHECKS, start.keyframe))
+    evidence = {
+        **start.evidence,
+        "overlap": min(1.0, len(shared) / min(len(before.positions), len(after.positions))),
+        "inlier_share": fit.inlier_share(config.inlier_m),
+        "residual_m": fit.residual_m,
+        "hessian_ratio": _hessian_ratio(walked),
+        "agreement": float(fits.mean()) if len(fits) >= _MIN_PLACES else float("nan"),
+        "distinctness": _DISTINCT,
+    }
+    is_good = walked.fits >= _GOOD_FIT
+    if config.method != "frame" and is_good.any():
+        pose = rigid_fit(after.positions[walked.keyframes[is_good]], walked.before_T_after[is_good])
+    return _Hypothesis(pose, walked, evidence)
+
+
+def _at_place(
+    start: _Start, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
+) -> tuple[Float64Array, SurfaceFit]:
+    """Register a start finely, but FRAME's own answer, and hold it against the surface."""
     before, after = maps
     centre = after.positions[start.keyframe]
     pose = start.before_T_after
     points = after.sphere(centre, _CHECK_RADIUS_M)
     if config.method != "frame" and len(points) >= MIN_SPHERE_POINTS:
-        found = align_sphere(points, centre, before.target, pose, config.vgicp_correspondence_m, config.voxel_m)
-        pose = found.target_T_source
-    fit = surface_fit(before, after, pose, sampled(points), centre, _CHECK_RADIUS_M)
-    keyframes = evenly(len(after.positions), _CHECKS, [start.keyframe])
-    first = int(np.searchsorted(keyframes, start.keyframe))
-    step = Step(_CHECK_RADIUS_M, config.voxel_m, _CHECK_REACH_M, first_try_m=_FIRST_TRY_M)
-    walked = walk(before, after, keyframes, first, pose, step, config)
-    asked = walked.fits[np.isin(walked.keyframes, keyframes)]
-    evidence = {
-        **start.evidence,
-        "overlap": _overlap(walked, before, after),
-        "inlier_share": fit.inlier_share(config.inlier_m),
-        "residual_m": fit.residual_m,
-        "hessian_ratio": eigenvalue_ratio(walked.normal_sum),
-        "agreement": float(np.nanmean(asked)) if np.isfinite(asked).any() else 0.0,
-    }
-    is_common = walked.fits > 0
-    if config.method != "frame" and is_common.any():
-        pose = rigid_fit(after.positions[walked.keyframes[is_common]], walked.before_T_after[is_common])
-    return _Hypothesis(pose, walked, evidence)
+        pose = align_by_gicp(points, centre, before.target, pose, config.vgicp_correspondence_m, config.voxel_m)
+    return pose, surface_fit(before, after, pose, sampled(points), centre, _CHECK_RADIUS_M)
 
 
-def _overlap(walked: Walk, before: IndexedMap, after: IndexedMap) -> float:
-    """Return the share of the shorter path's keyframes that lie within 5 m of the other path."""
+def _is_shared_keyframe(walked: Walk, before: IndexedMap, after: IndexedMap) -> BoolArray:
+    """Return for each after keyframe whether the before session passed within 5 m of it."""
     alignment = PathAlignment(after.positions[walked.keyframes], walked.before_T_after)
-    positions_map = alignment.to_map(after.positions)
-    n_shared = int(np.count_nonzero(is_shared(before, positions_map)))
-    return min(1.0, n_shared / min(len(before.positions), len(after.positions)))
+    return is_shared(before, alignment.to_map(after.positions))
+
+
+def _hessian_ratio(walked: Walk) -> float:
+    """Return the eigenvalue ratio of the shift's Hessian, all places together: one bend holds the whole path."""
+    rotations = walked.before_T_after[:, :3, :3]
+    hessians = rotations @ walked.information[:, 3:, 3:] @ rotations.transpose(0, 2, 1)
+    return eigenvalue_ratio(hessians.sum(axis=0))

@@ -7,11 +7,10 @@ hypotheses and a sphere for every metre of path affordable.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import small_gicp
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from cdpipe.config import MergeConfig
 from cdpipe.geometry import Float64Array, invert, make_pose, transform
@@ -21,26 +20,11 @@ from cdpipe.types import PointMap
 # Fewer points than this are not registered.
 MIN_SPHERE_POINTS = 100
 _NEIGHBOURS = 10
+# Distances beyond this count less and less; a change is not to pull.
+_ROBUST_M = 0.1
+_PLANE_STEPS, _PLANE_CONVERGED, _DAMPING, _MIN_PAIRS = 8, 1e-3, 1e-3, 30
 # Gaussian voxels of half the correspondence distance: twice as accurate as 1 m on a real pair of 32-beam scans.
 _VGICP_CELLS = 2.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Registration:
-    """Result of aligning two clouds.
-
-    Attributes:
-        target_T_source: (4, 4) pose of the source cloud in the target's frame.
-        information: (6, 6) Hessian of the last step: turn, then shift, in the source's axes about its centre.
-    """
-
-    target_T_source: Float64Array
-    information: Float64Array
-
-    @property
-    def hessian_ratio(self) -> float:
-        """Smallest to largest eigenvalue of the translational Hessian; near 0 where the clouds can slide."""
-        return eigenvalue_ratio(self.information[3:, 3:])
 
 
 class Surface:
@@ -75,7 +59,7 @@ class IndexedMap:
         points: (N, 3) the points that are worked with.
         columns: For cutting spheres out of them.
         positions: (K, 3) of its keyframes, odom frame, metres.
-        path: k-d tree of them.
+        path: k-d tree of the positions of all scans.
         tree: k-d tree of the points.
     """
 
@@ -85,9 +69,9 @@ class IndexedMap:
         self.points = _thinned(near, config.target_voxel_m) if is_target else near
         self.columns = MapIndex(self.points)
         self.positions = point_map.odom_T_keyframe[:, :3, 3]
-        self.path = cKDTree(self.positions)
+        self.path = cKDTree(point_map.odom_T_sensor[:, :3, 3])
         self._fine = Surface(self.points) if is_target else None
-        self._coarse = Surface(point_map.points, config.coarse_voxel_m) if is_target else None
+        self._coarse = Surface(self.points, config.coarse_voxel_m) if is_target else None
         self.tree = self._fine.tree if self._fine else small_gicp.KdTree(self.points)
 
     @property
@@ -122,8 +106,8 @@ def _thinned(points: Float64Array, voxel_m: float) -> Float64Array:
 
 def register(
     source_points: Float64Array, target_points: Float64Array, initial_guess: Float64Array, config: MergeConfig
-) -> Registration:
-    """Align two clouds by GICP and then VGICP, as FRAME does.
+) -> Float64Array:
+    """Return the (4, 4) `target_T_source` of two clouds by GICP and then VGICP, as FRAME does.
 
     Args:
         source_points: (N, 3) points, metres.
@@ -132,6 +116,7 @@ def register(
         config: Thinning and correspondence distances.
     """
     target_cloud, target_tree = small_gicp.preprocess_points(target_points, config.voxel_m, num_threads=1)
+    # about the source's centre: small_gicp solves for a turn about the origin, which may be far away
     centre = source_points.mean(axis=0)
     source_cloud, _ = small_gicp.preprocess_points(source_points - centre, config.voxel_m, num_threads=1)
     coarse = small_gicp.align(
@@ -152,24 +137,19 @@ def register(
         max_correspondence_distance=config.vgicp_correspondence_m,
         num_threads=1,
     )
-    return Registration(fine.T_target_source @ make_pose(translation=-centre), np.asarray(fine.H))
+    return np.asarray(fine.T_target_source @ make_pose(translation=-centre))
 
 
-def align_sphere(
+def align_by_gicp(
     points: Float64Array,
     centre: Float64Array,
     target: Surface,
     initial_guess: Float64Array,
     correspondence_m: float,
-    voxel_m: float | None = None,
+    voxel_m: float,
     max_steps: int = 20,
-) -> Registration:
-    """Align a sphere with an indexed map, by GICP or, from nearby, point to plane.
-
-    GICP needs the covariances of the sphere's points, which takes as long again as the registration; it finds its way
-    from a metre off. From a decimetre off the planes of the target alone do, with a few hundred points.
-
-    Registered about the sphere's centre: small_gicp solves for a turn about the origin, which may be far away.
+) -> Float64Array:
+    """Return the (4, 4) `target_T_source` of a sphere against an indexed map; finds its way from a metre off and more.
 
     Args:
         points: (N, 3) points of the sphere, source frame, metres.
@@ -177,25 +157,65 @@ def align_sphere(
         target: What it is aligned with.
         initial_guess: (4, 4) `target_T_source` to start from.
         correspondence_m: Points farther apart than this are no pair.
-        voxel_m: GICP, the sphere thinned to this; None: point to plane, with the points as they are.
+        voxel_m: The sphere is thinned to this.
         max_steps: It ends after as many.
     """
-    centred = points - centre
-    if voxel_m is None:
-        source = small_gicp.PointCloud(centred)
-    else:
-        source, _ = small_gicp.preprocess_points(centred, voxel_m, _NEIGHBOURS, num_threads=1)
+    source, _ = small_gicp.preprocess_points(points - centre, voxel_m, _NEIGHBOURS, num_threads=1)
     found = small_gicp.align(
         target.cloud,
         source,
         target.tree,
         initial_guess @ make_pose(translation=centre),
-        registration_type="PLANE_ICP" if voxel_m is None else "GICP",
+        registration_type="GICP",
         max_correspondence_distance=correspondence_m,
         max_iterations=max_steps,
         num_threads=1,
     )
-    return Registration(found.T_target_source @ make_pose(translation=-centre), np.asarray(found.H))
+    return np.asarray(found.T_target_source @ make_pose(translation=-centre))
+
+
+def align_to_planes(
+    points: Float64Array, centre: Float64Array, target: Surface, initial_guess: Float64Array, correspondence_m: float
+) -> Float64Array:
+    """Return the (4, 4) `target_T_source` that brings a few hundred points onto the target's planes.
+
+    Gauss-Newton on the distances along the target's normals. Needs no covariances of the points, which take GICP as
+    long as the registration, but must start within decimetres. Ours, because small_gicp's PLANE_ICP sums the squares of
+    n_x d_x, n_y d_y and n_z d_z instead of squaring n . d: it resists sliding along a plane, and depends on the frame.
+
+    Args: as `align_by_gicp`.
+    """
+    pose = initial_guess @ make_pose(translation=centre)
+    centred = points - centre
+    for _ in range(_PLANE_STEPS):
+        moved = transform(pose, centred)
+        found, squared_m2 = target.tree.batch_nearest_neighbor_search(moved)
+        is_pair = np.asarray(squared_m2) < correspondence_m**2
+        if np.count_nonzero(is_pair) < _MIN_PAIRS:
+            break
+        chosen = np.asarray(found)[is_pair]
+        distances_m = np.einsum("ij,ij->i", moved[is_pair] - target.points[chosen], target.normals[chosen])
+        jacobian = plane_jacobian(centred[is_pair], target.normals[chosen] @ pose[:3, :3])
+        weighted = jacobian / (1.0 + (distances_m / _ROBUST_M) ** 2)[:, None]
+        hessian = weighted.T @ jacobian
+        # where nothing holds the points they stay: a thousandth of what holds them best
+        damped = hessian + _DAMPING * np.diag(hessian).reshape(2, 3).max(axis=1).repeat(3) * np.eye(6)
+        step = -np.linalg.solve(damped, weighted.T @ distances_m)
+        pose = pose @ make_pose(Rotation.from_rotvec(step[:3]).as_matrix(), step[3:])
+        if np.abs(step).max() < _PLANE_CONVERGED:  # metres, radians
+            break
+    return pose @ make_pose(translation=-centre)
+
+
+def plane_jacobian(offsets: Float64Array, normals: Float64Array) -> Float64Array:
+    """Return (N, 6) by how much each point moves along its normal if the cloud turns, and shifts, in its own axes.
+
+    Args:
+        offsets: (N, 3) points about the centre they turn around.
+        normals: (N, 3) normals in the same axes.
+    """
+    (x, y, z), (a, b, c) = offsets.T, normals.T
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=1)
 
 
 def eigenvalue_ratio(hessian: Float64Array) -> float:

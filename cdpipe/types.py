@@ -132,10 +132,20 @@ class DescriptorSet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedSession:
-    """What a robot brings home: its thinned map and the descriptors of its keyframes."""
+    """What a robot brings home: its thinned map and the descriptors of its keyframes, all of them or none."""
 
     map: PointMap
     descriptors: DescriptorSet
+
+    def __post_init__(self) -> None:
+        described = self.descriptors.keyframe_scans
+        if len(described) and not np.array_equal(described, self.map.keyframe_scans):
+            raise ValueError(
+                f"the descriptors are of {len(described)} keyframes that are not the map's "
+                f"{len(self.map.keyframe_scans)}: describe the session again"
+            )
+        if not np.isfinite(self.descriptors.q).all():
+            raise ValueError("descriptors.q is not finite: describe the session again")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,15 +7,14 @@ wrong alignment is found out where the two tunnels differ.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from cdpipe.config import MergeConfig
 from cdpipe.evidence import SurfaceFit, sampled, surface_fit
-from cdpipe.geometry import Float64Array, Int64Array, make_pose, transform
-from cdpipe.registration import MIN_SPHERE_POINTS, IndexedMap, Registration, align_sphere, motion_between
+from cdpipe.geometry import BoolArray, Float64Array, Int64Array, make_pose, transform
+from cdpipe.registration import MIN_SPHERE_POINTS, IndexedMap, align_by_gicp, align_to_planes, motion_between
 
 # Places farther from the before path were not driven twice.
 SHARED_M = 5.0
@@ -54,17 +53,16 @@ class Walk:
     Attributes:
         keyframes: (A,) after keyframes: those asked for, and others where the way from one to the next was lost.
         before_T_after: (A, 4, 4) alignment at each; carried over from its neighbour where nothing was registered.
-        information: (A, 6, 6) Hessian of each registration, turn then shift in after odom axes; zero where there is
-            none.
+        information: (A, 6, 6) Hessian of each, turn then shift in after odom axes; zero where there is none.
         fits: (A,) share of inliers, 0 where it did not fit or jumped, NaN where the before session never drove.
-        normal_sum: (3, 3) sum of n n^T over the normals of everything that was looked at, map frame.
+        residuals_m: (A,) median distance to the surface, NaN where nothing was registered.
     """
 
     keyframes: Int64Array
     before_T_after: Float64Array
     information: Float64Array
     fits: Float64Array
-    normal_sum: Float64Array
+    residuals_m: Float64Array
 
 
 def walk(
@@ -102,7 +100,7 @@ def walk(
         before_T_after=np.array([stop.before_T_after for stop in stops]),
         information=np.array([stop.information for stop in stops]),
         fits=np.array([stop.fit for stop in stops]),
-        normal_sum=np.sum([stop.normal_sum for stop in stops], axis=0),
+        residuals_m=np.array([stop.residual_m for stop in stops]),
     )
 
 
@@ -114,7 +112,7 @@ class _Stop:
     before_T_after: Float64Array
     information: Float64Array = field(default_factory=lambda: np.zeros((6, 6)))
     fit: float = np.nan
-    normal_sum: Float64Array = field(default_factory=lambda: np.zeros((3, 3)))
+    residual_m: float = np.nan
 
 
 def _reached(
@@ -124,7 +122,7 @@ def _reached(
     stop = _stop(before, after, previous, keyframe, step, config)
     middle = (previous.keyframe + keyframe) // 2
     is_short = abs(keyframe - previous.keyframe) <= _SHORTEST_STEP
-    if not stop.fit < _LOST_FIT or not previous.fit >= _LOST_FIT or is_short:
+    if not stop.fit < _LOST_FIT or not previous.fit >= _CLEAR_FIT or is_short:
         return [stop]
     halfway = _reached(before, after, previous, middle, step, config)
     return [*halfway, *_reached(before, after, halfway[-1], keyframe, step, config)]
@@ -141,21 +139,20 @@ def _stop(
     registered = _registered(before, after, centre, guess, apart_m, step, config)
     if registered is None:
         return _Stop(keyframe, guess, fit=0.0)
-    found, fit = registered
-    share = fit.inlier_share(config.inlier_m)
-    return _Stop(keyframe, found.target_T_source, found.information, share, fit.normal_sum)
+    pose, fit, information = registered
+    return _Stop(keyframe, pose, information, fit.inlier_share(config.inlier_m), fit.residual_m)
 
 
-def is_shared(before: IndexedMap, positions_map: Float64Array) -> Float64Array:
+def is_shared(before: IndexedMap, positions_map: Float64Array) -> BoolArray:
     """Return for (N, 3) positions in the map frame whether the before session passed within 5 m."""
     distances_m, _ = before.path.query(positions_map, distance_upper_bound=SHARED_M)
     return np.isfinite(distances_m)
 
 
-def evenly(n_keyframes: int, n: int, and_also: Sequence[int] = ()) -> Int64Array:
-    """Return about n keyframes of a path, evenly spaced, and some others."""
-    chosen = np.linspace(0, n_keyframes - 1, min(n, n_keyframes)).round().astype(np.int64)
-    return np.unique(np.concatenate([chosen, np.array(and_also, dtype=np.int64)]))
+def evenly(keyframes: Int64Array, n: int, and_also: int) -> Int64Array:
+    """Return about n of some keyframes, evenly spaced, and one other."""
+    chosen = np.linspace(0, len(keyframes) - 1, min(n, len(keyframes))).round().astype(np.int64)
+    return np.unique(np.append(keyframes[chosen], and_also))
 
 
 def _registered(
@@ -166,35 +163,43 @@ def _registered(
     apart_m: float,
     step: Step,
     config: MergeConfig,
-) -> tuple[Registration, SurfaceFit] | None:
-    """Register one place; None where it has too few points, or ends farther away than odometry can have drifted."""
+) -> tuple[Float64Array, SurfaceFit, Float64Array] | None:
+    """Register one place: pose, fit, information.
+
+    None where it has too few points, or ends farther away than odometry can have drifted.
+    """
     points = after.sphere(centre, step.radius_m)
     if len(points) < MIN_SPHERE_POINTS:
         return None
     own = sampled(points)
+
+    def judged(found: Float64Array) -> tuple[Float64Array, SurfaceFit, Float64Array] | None:
+        held = _held(found, guess, centre, apart_m)
+        if held is None:
+            return None
+        fit = surface_fit(before, after, held, own, centre, step.radius_m)
+        information = fit.information
+        if held is not found:
+            # its turn is the neighbour's
+            information = information.copy()
+            information[:3] = information[:, :3] = 0.0
+        return held, fit, information
+
     if step.first_try_m is not None:
-        found = _held(align_sphere(own, centre, before.target, guess, step.first_try_m), guess, centre, apart_m)
-        if found is not None:
-            fit = surface_fit(before, after, found.target_T_source, own, centre, step.radius_m)
-            if fit.inlier_share(config.inlier_m) >= _CLEAR_FIT:
-                return found, fit
-    found = align_sphere(points, centre, before.target, guess, step.correspondence_m, step.gicp_voxel_m)
-    found = _held(found, guess, centre, apart_m)
-    if found is None:
-        return None
-    return found, surface_fit(before, after, found.target_T_source, own, centre, step.radius_m)
+        first = judged(align_to_planes(own, centre, before.target, guess, step.first_try_m))
+        if first is not None and first[1].inlier_share(config.inlier_m) >= _CLEAR_FIT:
+            return first
+    return judged(align_by_gicp(points, centre, before.target, guess, step.correspondence_m, step.gicp_voxel_m))
 
 
-def _held(found: Registration, guess: Float64Array, centre: Float64Array, apart_m: float) -> Registration | None:
-    """Return a registration if odometry can have drifted so far, and without its turn if only that cannot be.
+def _held(found: Float64Array, guess: Float64Array, centre: Float64Array, apart_m: float) -> Float64Array | None:
+    """Return a pose if odometry can have drifted so far, and without its turn if only that cannot be.
 
     The section of a narrow drift is nearly round, and near a dead end little else holds a sphere against rolling.
     """
-    jump_m, jump_rad = motion_between(found.target_T_source, guess, centre)
+    jump_m, jump_rad = motion_between(found, guess, centre)
     if jump_m > _JUMP_M + _JUMP_SHARE * apart_m:
         return None
     if jump_rad <= _JUMP_RAD + _JUMP_RAD_PER_M * apart_m:
         return found
-    reached = transform(found.target_T_source, centre[None])[0]
-    unturned = make_pose(guess[:3, :3], reached - guess[:3, :3] @ centre)
-    return Registration(unturned, np.zeros((6, 6)))
+    return make_pose(guess[:3, :3], transform(found, centre[None])[0] - guess[:3, :3] @ centre)

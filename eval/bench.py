@@ -94,7 +94,7 @@ def row_of(name: str, contest: Contest) -> Row:
 
 
 def verdict(rows: Sequence[Row]) -> str:
-    """Return one line: how many targets are met, which are missed, and which could not be judged for want of a rival."""
+    """Return one line: how many targets are met, which are missed, and which had no rival to be judged by."""
     judged = [row for row in rows if row["met"] is not None]
     missed = [row["name"] for row in judged if not row["met"]]
     open_ones = [row["name"] for row in rows if row["met"] is None and row["target"] is not None]

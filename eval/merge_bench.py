@@ -6,7 +6,7 @@ less and cost 5 mm at most.
 
 Both sides end at an accepted rigid transform: ours from descriptors (all-in), stored vectors or indexed maps, the
 rival's from two clouds. Refinement along the path is a row of its own; the rival has nothing like it. A rival that is
-wrong is no rival: its time is not compared. Of ours that is refused or wrong the row says why, and its target is missed.
+wrong is no rival: its time is not compared. Where ours is refused or wrong the row says why, and its target is missed.
 """
 
 from __future__ import annotations

@@ -3,6 +3,10 @@
 Run as `python -m eval.merge_gates RUN --out DIR`, where RUN is the folder of `tunnelcd run merge-gates`: a variant with
 `merge.accept_all`, so that every best hypothesis is kept with its evidence, right or wrong. Writes DIR/gates.csv and
 DIR/gates.png. Thresholds go into cdpipe/config.py by hand, so that none changes behind anyone's back.
+
+Even under `merge.accept_all` the search itself stops at today's gates: the next candidate, and KISS-Matcher, are tried
+only where the one before is below one of them. So which merge is kept depends on the thresholds that were set; they are
+chosen from one run, and not iterated.
 """
 
 from __future__ import annotations
@@ -22,9 +26,12 @@ from cdpipe.errors import InputError
 from cdpipe.evidence import GATES
 from cdpipe.geometry import BoolArray, Float64Array, stream
 from eval.cli import input_errors
+from eval.coverage import plan_of
 from eval.figures import BLACK, BLUE, VERMILLION, blank_figure, png
-from eval.merge_table import TARGETS, is_accepted, is_right, kinds, numbers
+from eval.merge_table import TARGETS, is_accepted, is_right, kinds, numbers, texts
 from eval.output import make_writable
+from eval.page_run import read_document
+from eval.plan import cells
 
 KEPT_SHARE = 0.995
 LOGARITHMIC = ("hessian_ratio",)
@@ -37,6 +44,33 @@ def committed_thresholds() -> dict[str, float]:
     return {name: float(getattr(merge, setting)) for name, setting in GATES}
 
 
+def require_ungated(results: pd.DataFrame, variant: str, provenance: Mapping[str, Any]) -> None:
+    """Make sure that no gate stood between a variant's merges and the table: thresholds of what is left mean nothing.
+
+    Args:
+        results: Rows as in results.csv.
+        variant: The one that accepts everything.
+        provenance: Content of provenance.json.
+
+    Raises:
+        InputError: A merge was refused by a gate, or the plan does not say that the variant accepts all.
+    """
+    refused = results[((results["variant"] == variant) & (results["status"] == "merge_refused")).to_numpy()]
+    for row in refused.assign(error=texts(refused, "error")).to_dict("records"):
+        named = [f"merge.{setting}" for _, setting in GATES if f"merge.{setting}" in row["error"]]
+        if named:
+            raise InputError(
+                f"{row['scenario']}, seed {row['seed']}: refused by {named[0]}: run the plan with merge.accept_all=true"
+            )
+    plan = plan_of(provenance)
+    found = [] if plan is None else [cell.config for cell in cells(plan) if cell.variant == variant]
+    if not found or not all(config.merge.accept_all for config in found):
+        raise InputError(
+            f"provenance.json: variant {variant} is not told to have merge.accept_all=true: "
+            "run a plan whose variant sets it, as `merge-gates` does"
+        )
+
+
 def measured(results: pd.DataFrame, variant: str) -> pd.DataFrame:
     """Return the accepted merges of a variant with their evidence: `right`, `kind`, and a column for each gate.
 
@@ -47,11 +81,7 @@ def measured(results: pd.DataFrame, variant: str) -> pd.DataFrame:
     Raises:
         InputError: There is no such variant, or the evidence is not in the table.
     """
-    names = list(dict.fromkeys(results["variant"].astype(str)))
-    if not variant and len(names) == 1:
-        variant = names[0]
-    if variant not in names:
-        raise InputError(f"--variant {variant or '(none)'}: name one of the run's: {', '.join(names)}")
+    variant = chosen_variant(results, variant)
     absent = [f"evidence_{name}" for name, _ in GATES if f"evidence_{name}" not in results]
     if absent:
         raise InputError(f"results.csv: column {', '.join(absent)} is missing: `tunnelcd score` the run again")
@@ -66,6 +96,20 @@ def measured(results: pd.DataFrame, variant: str) -> pd.DataFrame:
             **{name: numbers(own, f"evidence_{name}") for name, _ in GATES},
         }
     )
+
+
+def chosen_variant(results: pd.DataFrame, variant: str) -> str:
+    """Return the variant that is meant.
+
+    Raises:
+        InputError: There is no such variant, or none is named and there are several.
+    """
+    names = list(dict.fromkeys(results["variant"].astype(str)))
+    if not variant and len(names) == 1:
+        return names[0]
+    if variant not in names:
+        raise InputError(f"--variant {variant or '(none)'}: name one of the run's: {', '.join(names)}")
+    return variant
 
 
 def gate_table(cases: pd.DataFrame, thresholds: Mapping[str, float]) -> pd.DataFrame:
@@ -164,6 +208,7 @@ def main(
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{path}: {reason}: name a folder that `tunnelcd run merge-gates` made") from error
+    require_ungated(results, chosen_variant(results, variant), read_document(run / "provenance.json"))
     cases, thresholds = measured(results, variant), committed_thresholds()
     if len(cases) == 0:
         raise InputError(f"{path}: no merge was accepted: the plan's variant must set merge.accept_all=true")

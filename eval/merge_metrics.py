@@ -18,8 +18,8 @@ from eval.ground_truth import SessionTruth
 
 PAIR_RADIUS_M = 5.0
 EVIDENCE = (
-    "overlap", "inlier_share", "residual_m", "hessian_ratio", "agreement", "descriptor_distance", "n_hypotheses",
-    "is_fallback", "n_refined", "refined_inlier_share", "max_correction_m",
+    "overlap", "inlier_share", "residual_m", "hessian_ratio", "agreement", "distinctness", "descriptor_distance",
+    "n_hypotheses", "is_fallback", "n_refined", "refined_inlier_share", "max_correction_m",
 )  # fmt: skip
 _CHORD_M = 1.0
 _STEP_M = 0.1

@@ -116,8 +116,9 @@ def merge_table(results: pd.DataFrame) -> pd.DataFrame:
         `n_failed`, `n_within_target`; `share_within_target` of all pairs with its 95 % Wilson interval `low` to `high`;
         `target_share`; `n_wrong_accepted`; `n_p95_over_half_m`, accepted pairs whose 95th percentile along the path is
         over 0.5 m; `is_met`: the share reaches the target's and none is wrong and accepted (neither target nor verdict
-        for a merge by the truth); `n_named_degeneracy` of the refusals; `median_` and `p95_` over the accepted pairs of each error, `n_` of
-        them defined, and the median, 95th percentile and number of each time. Rows without a kind are left out.
+        for a merge by the truth); `n_named_degeneracy` of the refusals; `median_` and `p95_` over the accepted pairs of
+        each error, `n_` of them defined, and the median, 95th percentile and number of each time. Rows without a kind
+        are left out.
     """
     kind = kinds(results)
     cases = results.assign(

@@ -44,14 +44,13 @@ MERGE_COLUMNS = (
     Column("merge_error_m_p95", "p95 along path [m]", "low", fine,
            "The same of a pair's 95th percentile over its keyframes.", ""),
     Column("n_p95_over_half_m", "p95 over 0.5 m", "low", significant,
-           f"Accepted pairs whose 95th percentile along the path is over {RIGHT_M:g} m, though the median may be right.",
-           ""),
+           f"Accepted pairs whose 95th percentile along the path is over {RIGHT_M:g} m, median right or not.", ""),
     Column("overlap_true", "true overlap", None, fine,
            "Share of the after drive that lies within 5 m of the before drive.", ""),
     Column("t_index_s", "t_index", "low", significant, "Indexing both maps; can be done while mapping.", ""),
     Column("t_merge_s", "t_merge", "low", significant,
-           "From indexed maps and stored vectors to an accepted transform: every candidate registered coarsely, the best "
-           "judged along the path, the next only if it is refused.", ""),
+           "From indexed maps and stored vectors to an accepted transform: every candidate registered coarsely, the "
+           "best judged along the path, the next only if it is refused.", ""),
     Column("t_refine_s", "t_refine", "low", significant, "Local refinement along the path.", ""),
 )  # fmt: skip
 

@@ -59,12 +59,12 @@ PUBLISHED = {
     ),
 }
 _TIME_HEADINGS = (
-    "method", "t_index [s]", "t_merge [s]", "t_refine [s]", "t_descriptor [s]", "t_cd / region [s]", "t_oe / region [s]", "t_total [s]",
-    "with merge [s]", "as the paper [s]",
+    "method", "t_index [s]", "t_merge [s]", "t_refine [s]", "t_descriptor [s]", "t_cd / region [s]",
+    "t_oe / region [s]", "t_total [s]", "with merge [s]", "as the paper [s]",
 )  # fmt: skip
 _TIMES = (
-    "t_index_s", "t_merge_s", "t_refine_s", "t_descriptor_s", "t_cd_per_region_s", "t_oe_per_region_s", "t_total_s", "t_total_with_merge_s",
-    "t_total_paper_s",
+    "t_index_s", "t_merge_s", "t_refine_s", "t_descriptor_s", "t_cd_per_region_s", "t_oe_per_region_s",
+    "t_total_s", "t_total_with_merge_s", "t_total_paper_s",
 )  # fmt: skip
 _VOLUME_HEADINGS = (
     "method", "map points before", "map points after", "V_sphere [m³]", "V_OE [m³]", "points in sphere",

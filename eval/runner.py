@@ -1,9 +1,9 @@
 """Runs a plan, one cell after the other; finished cells are kept, and a run that was cut off goes on where it stopped.
 
 A cell is finished when its file holds the digest of what it depends on: the scenario as drawn, the files it names, the
-effective settings, the weights, the version of the metrics, what the plan says of it (an oracle, where it ends, the kind
-of its pair), and whether KISS-Matcher was missing where its merge asks for it. A merge that is refused and any other
-error of the input are rows of their own; a bug is not caught.
+effective settings, the weights, the version of the metrics, what the plan says of it (an oracle, where it ends, the
+kind of its pair), and whether KISS-Matcher was missing where its merge asks for it. A merge that is refused and
+any other error of the input are rows of their own; a bug is not caught.
 """
 
 from __future__ import annotations

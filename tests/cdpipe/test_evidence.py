@@ -12,7 +12,7 @@ from cdpipe.registration import IndexedMap
 from cdpipe.types import MappedSession
 
 CONFIG = MergeConfig()
-GOOD = {"overlap": 0.5, "inlier_share": 0.95, "hessian_ratio": 0.1, "agreement": 0.95}
+GOOD = {"overlap": 0.5, "inlier_share": 0.95, "hessian_ratio": 0.1, "agreement": 0.95, "distinctness": 10.0}
 
 
 def floor(half_m: float = 12.0, step_m: float = 0.25) -> Float64Array:
@@ -59,7 +59,7 @@ def test_what_has_no_counterpart_does_not_fit(floors: tuple[IndexedMap, IndexedM
 
 
 def test_the_lower_of_both_directions_counts() -> None:
-    fit = SurfaceFit(np.array([0.0, 0.0, 0.3, 0.3]), np.array([0.0, 0.3, 0.3, np.inf]), np.eye(3))
+    fit = SurfaceFit(np.array([0.0, 0.0, 0.3, 0.3]), np.array([0.0, 0.3, 0.3, np.inf]), np.eye(6))
     assert fit.inlier_share(0.1) == 0.25
 
 
@@ -67,7 +67,7 @@ def test_a_plane_holds_one_direction_only_whichever_way_the_maps_are_turned(
     floors: tuple[IndexedMap, IndexedMap],
 ) -> None:
     for pose in (make_pose(), yaw_pose(1.0)):
-        eigenvalues = np.linalg.eigvalsh(fit_at(floors, pose).normal_sum)
+        eigenvalues = np.linalg.eigvalsh(fit_at(floors, pose).information[3:, 3:])
         assert eigenvalues[:2] == pytest.approx(0.0, abs=1e-6)
         assert eigenvalues[2] > 100
 
@@ -85,6 +85,7 @@ def test_samples_are_every_kth_point() -> None:
         ("inlier_share", 0.5, "only 50% of the points around the best pair"),
         ("hessian_ratio", 0.0051, "degenerate"),
         ("agreement", 0.7, "two places that look alike"),
+        ("distinctness", 1.1, "the tunnel repeats itself"),
     ],
 )
 def test_each_gate_refuses_alone_and_says_why(name: str, value: float, said: str) -> None:

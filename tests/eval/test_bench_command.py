@@ -10,10 +10,11 @@ from cdpipe.errors import InputError
 from eval import bench
 from eval.bench import chosen, contests, measure, row_of, verdict, write_table
 from eval.cli import main
+from eval.merge_bench import FailedContest
 from sim.bench import BenchSite
 from sim.timing import Contest
 
-KEYS = ["name", "value", "unit", "rival", "rival_value", "ratio", "target", "met", "n", "spread"]
+KEYS = ["name", "value", "unit", "rival", "rival_value", "ratio", "target", "met", "n", "spread", "reason"]
 FAST = Contest("Mray/s", (0.5, 0.25, 0.4, 0.2, 1.0), 2.0, "a rival", (2.0, 1.0, 4.0), 4.5)
 SLOW = Contest("Mray/s", (1.0,), 2.0, "a rival", (1.0,), 1.7)
 ALONE = Contest("s", (3.0,))
@@ -37,7 +38,7 @@ def test_a_row_by_hand() -> None:
     # Figures 4, 8, 5, 10, 2: median 5, quartiles 4 and 8. The rival's 1, 2, 0.5: median 1.
     assert row == {
         "name": "fast", "value": 5.0, "unit": "Mray/s", "rival": "a rival", "rival_value": 1.0, "ratio": 5.0,
-        "target": 4.5, "met": True, "n": 5, "spread": 4.0,
+        "target": 4.5, "met": True, "n": 5, "spread": 4.0, "reason": "",
     }  # fmt: skip
     assert list(row) == KEYS
 
@@ -63,7 +64,7 @@ def test_the_table_and_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[st
     code, out, err = run(capsys, "--out", str(file))
     assert code == 0  # though a target is missed
     lines = [line.split() for line in out.splitlines()]
-    assert ["name", *KEYS[1:]] in lines
+    assert KEYS[:-1] in lines
     assert ["fast", "5", "Mray/s", "a", "rival", "1", "5", "4.5", "met", "5", "4"] in lines
     assert ["slow", "2", "Mray/s", "a", "rival", "2", "1", "1.7", "missed", "1", "0"] in lines
     assert ["alone", "3", "s", "-", "-", "-", "-", "-", "1", "0"] in lines
@@ -82,6 +83,41 @@ def test_only_some_rows_and_nothing_said(tmp_path: Path, capsys: pytest.CaptureF
     file = tmp_path / "speed.json"
     assert run(capsys, "--only", "alone", "--only", "fast", "--quiet", "--out", str(file)) == (0, "", "")
     assert [row["name"] for row in json.loads(file.read_text())["rows"]] == ["fast", "alone"]
+
+
+def test_a_rival_that_cannot_be_compared_leaves_its_target_open() -> None:
+    row = row_of("raced", Contest("s", (0.2,), None, "a rival: not judged, 7.0 m off", (), 6.0))
+    assert [row[key] for key in ("value", "rival_value", "ratio", "target", "met")] == [0.2, None, None, 6.0, None]
+    told = verdict([row_of("fast", FAST), row, row_of("alone", ALONE)])
+    assert told == "1 of 1 targets met; 1 not judged: raced"
+
+
+def test_what_failed_is_a_row_and_the_rows_before_it_stay(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failed = FailedContest("s", (), target=10.0, reason="it is 3.0 m off")
+    monkeypatch.setattr(bench, "contests", lambda: {"fast": lambda: FAST, "merge": lambda: failed})
+    code, out, _ = run(capsys, "--out", str(tmp_path / "speed.json"))
+    assert code == 0
+    assert out.splitlines()[-2:] == [
+        "merge: it is 3.0 m off",
+        f"1 of 2 targets met; missed: merge; {tmp_path / 'speed.json'}",
+    ]
+    first, last = json.loads((tmp_path / "speed.json").read_text())["rows"]
+    assert first["met"] is True
+    assert [last[key] for key in KEYS] == [
+        "merge",
+        None,
+        "s",
+        None,
+        None,
+        None,
+        10.0,
+        False,
+        0,
+        None,
+        "it is 3.0 m off",
+    ]
 
 
 @pytest.mark.usefixtures("three_rows")

@@ -13,7 +13,7 @@ from cdpipe.errors import MergeFailedError
 from cdpipe.geometry import yaw_pose
 from cdpipe.types import MergedMaps
 from eval import merge_bench
-from eval.bench import contests, measure, row_of
+from eval.bench import contests, measure, row_of, verdict
 from eval.merge_bench import Goals, MergeSite, merge_contests, paper_sites
 from sim.bench import BenchSite
 
@@ -55,7 +55,8 @@ def test_real_rows_of_a_small_world(site: MergeSite) -> None:
     assert (rows["merge-tiny"]["rival"], rows["merge-tiny"]["rival_value"]) == ("its limit, 100 ms", 0.1)
     assert rows["merge-tiny-index"]["rival_value"] == 4.0
     raced, all_in = rows["merge-tiny-raced"], rows["merge-tiny-all-in"]
-    assert raced["rival"] == all_in["rival"] == "KISS-Matcher at 0.5 m and GICP"
+    assert raced["rival"] == "KISS-Matcher at 0.5 m and GICP"
+    assert all_in["rival"].startswith(f"{raced['rival']} (ours: descriptors + index + merge to a rigid transform")
     assert raced["rival_value"] == all_in["rival_value"]
     assert (raced["n"], raced["target"], all_in["target"]) == (2, 10.0, 3.0)
     assert raced["value"] == rows["merge-tiny"]["value"]
@@ -67,7 +68,7 @@ def test_real_rows_of_a_small_world(site: MergeSite) -> None:
 def test_all_in_is_descriptors_index_and_merge(site: MergeSite) -> None:
     described = [replace(session, descriptor_s=(1.0, 3.0)) for session in site.sessions]
     fixed = replace(site)  # the same pair, none of its times
-    fixed.__dict__.update(sessions=tuple(described), raced=([PARTS, PARTS], [9.0, 9.0]), rival="told")
+    fixed.__dict__.update(sessions=tuple(described), raced=([PARTS, PARTS], [9.0, 9.0]), rival=("told", True))
     row = row_of("all-in", merge_contests([fixed])["merge-tiny-all-in"]())
     # 1 + 1 + 2 + 0.5 and 3 + 3 + 2 + 0.5
     assert (row["value"], row["rival_value"], row["spread"]) == (6.5, 9.0, 2.0)
@@ -92,6 +93,15 @@ def test_the_time_of_a_merge_that_failed_is_no_figure(
     told(monkeypatch, pose, reason)
     with pytest.raises(MergeFailedError, match=f"smoke/one_box seed 0 cannot be merged: .*{message}"):
         site.merge("none")
+    monkeypatch.setattr(merge_bench, "is_kiss_matcher_installed", lambda: False)
+    failing = replace(site)
+    failing.__dict__["sessions"] = site.sessions
+    rows = measure(merge_contests([failing]))["rows"]
+    assert [row["name"] for row in rows] == ROWS
+    assert {(row["value"], row["met"]) for row in rows} == {(None, False)}
+    assert [row["target"] for row in rows] == [1.0, 10.0, 1.0, 3.0, None]
+    assert all(message in row["reason"] for row in rows)
+    assert verdict(rows) == f"0 of 5 targets met; missed: {', '.join(ROWS)}"
 
 
 def test_turns_are_taken_and_the_first_does_not_count(site: MergeSite, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,10 +125,16 @@ def test_a_rival_that_is_wrong_or_missing_is_told(site: MergeSite, monkeypatch: 
     wrong.__dict__["sessions"] = nothing.__dict__["sessions"] = site.sessions
     monkeypatch.setattr(merge_bench, "is_kiss_matcher_installed", lambda: True)
     monkeypatch.setattr(merge_bench, "kiss_and_gicp", lambda *clouds: yaw_pose(0.0, (700.0, 0.0, 0.0)))
-    assert wrong.rival.startswith("KISS-Matcher at 0.5 m and GICP, ")
-    assert wrong.rival.endswith(" m off")
+    name, is_comparable = wrong.rival
+    assert name.startswith("KISS-Matcher at 0.5 m and GICP: not judged, ")
+    assert name.endswith(" m off")
+    assert not is_comparable
+    # a thousand times slower, and wrong: no target is met by that
+    wrong.__dict__["raced"] = ([PARTS, PARTS], [500.0, 500.0])
+    row = row_of("raced", merge_contests([wrong])["merge-tiny-raced"]())
+    assert (row["rival"], row["ratio"], row["target"], row["met"]) == (name, None, 10.0, None)
     monkeypatch.setattr(merge_bench, "kiss_and_gicp", lambda *clouds: None)
-    assert nothing.rival == "KISS-Matcher at 0.5 m and GICP, inf m off"
+    assert nothing.rival == ("KISS-Matcher at 0.5 m and GICP: not judged, it found nothing", False)
     missing = replace(site)
     missing.__dict__["sessions"] = site.sessions
     monkeypatch.setattr(merge_bench, "is_kiss_matcher_installed", lambda: False)

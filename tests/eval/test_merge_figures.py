@@ -4,9 +4,11 @@ import io
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from eval.merge_figures import alignment_picture, surface_distances, worst_stretch
+from eval import merge_figures
+from eval.merge_figures import _around_both, alignment_picture, surface_distances, worst_stretch
 from eval.merge_plots import MergedPairs, error_plot, time_plot
 
 NAN = float("nan")
@@ -90,6 +92,26 @@ def test_the_picture_is_dark_where_the_maps_are_apart() -> None:
     # the end of the drift, in the left panel, is right of its middle
     left_panel = near(bent[above, : int(bent.shape[1] * 0.66)], darkest)
     assert left_panel[:, 1].mean() > 0.33 * bent.shape[1]
+
+
+def test_the_window_holds_both_maps_and_the_whole_square() -> None:
+    assert _around_both((0.0, 40.0, -2.0, 2.0), (30.0, 46.0, -8.0, 8.0)) == (0.0, 46.5, -8.5, 8.5)
+    inside = (0.0, 100.0, -50.0, 50.0)
+    assert _around_both(inside, (30.0, 46.0, -8.0, 8.0)) == inside
+
+
+def test_the_whole_outline_of_the_worst_square_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    figures: list[Figure] = []
+    monkeypatch.setattr(merge_figures, "data_address", lambda figure: figures.append(figure) or "")
+    after = floor(offset_m=0.1)
+    after[after[:, 0] > 32, 2] += 0.1
+    merge_figures.alignment_picture(floor(), after)
+    whole = figures[0].axes[0]
+    (square,) = whole.patches
+    (left, right), (bottom, top) = whole.get_xlim(), whole.get_ylim()
+    x, y = square.get_xy()
+    assert left < x < x + square.get_width() < right
+    assert bottom < y < y + square.get_height() < top
 
 
 def test_maps_that_never_meet_make_a_picture() -> None:

@@ -1,5 +1,6 @@
 """From the evidence of right and wrong merges to the gates."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,16 @@ import pytest
 
 from cdpipe.errors import InputError
 from cdpipe.evidence import GATES
-from eval.merge_gates import committed_thresholds, draw_gates, gate_table, let_through, main, measured, suggest
+from eval.merge_gates import (
+    committed_thresholds,
+    draw_gates,
+    gate_table,
+    let_through,
+    main,
+    measured,
+    require_ungated,
+    suggest,
+)
 
 NAN = float("nan")
 ASKED = {"overlap": 0.2, "inlier_share": 0.8, "hessian_ratio": 0.01, "agreement": 0.8}
@@ -25,6 +35,14 @@ CASES = (
     ("disjoint", NAN, {"agreement": 0.1, "overlap": 0.0}),  # wrong
     ("disjoint", NAN, {"agreement": 0.85}),  # wrong, and let through
 )
+
+
+UNGATED = "tunnelcd[merge.accept_all=true]"
+
+
+def provenance(setting: str) -> dict[str, object]:
+    variants = [{"preset": "tunnelcd", "set": [setting]}]
+    return {"plan": {"name": "gates", "scenarios": ["smoke/one_box"], "seeds": [1], "variants": variants}}
 
 
 def table_of(cases: tuple[tuple[str, float, dict[str, float]], ...] = CASES) -> pd.DataFrame:
@@ -136,7 +154,8 @@ def test_one_kind_of_outcome_alone_can_be_drawn() -> None:
 def test_the_command_writes_table_and_plot_and_names_what_slips_through(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    table_of().to_csv(tmp_path / "results.csv", index=False)
+    table_of().assign(variant=UNGATED).to_csv(tmp_path / "results.csv", index=False)
+    (tmp_path / "provenance.json").write_text(json.dumps(provenance("merge.accept_all=true")))
     main(tmp_path, tmp_path / "out", "")
     told = capsys.readouterr().out
     written = pd.read_csv(tmp_path / "out" / "gates.csv")
@@ -146,6 +165,26 @@ def test_the_command_writes_table_and_plot_and_names_what_slips_through(
     assert f"wrong, but let through: {int(passed[3:].sum())}" in told
     with pytest.raises(InputError, match=r"results\.csv"):
         main(tmp_path / "nowhere", tmp_path / "out", "")
+
+
+def test_merges_that_a_gate_has_sifted_are_refused() -> None:
+    results = table_of().assign(variant=UNGATED, error="")
+    require_ungated(results, UNGATED, provenance("merge.accept_all=true"))
+    # nothing to register is no gate
+    results.loc[1, ["status", "error"]] = ["merge_refused", "too few points"]
+    require_ungated(results, UNGATED, provenance("merge.accept_all=true"))
+    results.loc[2, ["status", "error"]] = ["merge_refused", "it can slide; merge.min_hessian_ratio asks for 0.01"]
+    with pytest.raises(InputError, match=r"merge/drift, seed 2: refused by merge.min_hessian_ratio"):
+        require_ungated(results, UNGATED, provenance("merge.accept_all=true"))
+
+
+@pytest.mark.parametrize("told", [{}, {"plan": {"name": "merge-gates"}}, "merge.accept_all=false", "merge.refine=none"])
+def test_a_variant_that_is_not_told_to_accept_all_is_refused(told: str | dict[str, object]) -> None:
+    document = provenance(told) if isinstance(told, str) else told
+    variant = f"tunnelcd[{told}]" if isinstance(told, str) else UNGATED
+    with pytest.raises(InputError, match=r"merge.accept_all=true") as caught:
+        require_ungated(table_of().assign(variant=variant), variant, document)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_wrong_folder_ends_with_code_two(tmp_path: Path) -> None:

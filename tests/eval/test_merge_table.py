@@ -95,6 +95,29 @@ def test_smooth_may_be_refused_for_sliding_or_be_right() -> None:
     assert (row["n_within_target"], row["n_wrong_accepted"], row["n_named_degeneracy"]) == (2, 1, 1)
 
 
+def test_a_merge_by_the_truth_has_a_row_and_no_verdict() -> None:
+    rows = [case("clean", metres=0.01, variant=f"oracle-merge{noise}") for noise in ("", "[noise_m=0.1,noise_deg=0]")]
+    rows.append(case("clean", metres=0.01))
+    table = merge_table(pd.DataFrame(rows))
+    assert table["is_met"].tolist() == [None, None, True] * 2
+    assert table["target_share"].isna().tolist() == [True, True, False] * 2
+    assert table["n_within_target"].tolist() == [1] * 6
+    shown = merge_overview(pd.DataFrame(rows))
+    assert shown["met"].tolist() == [None, None, True]
+    assert merge_overview(pd.DataFrame(rows), is_whole=False)["met"].tolist() == [None] * 3
+
+
+def test_accepted_pairs_that_are_off_somewhere_along_the_path_are_counted() -> None:
+    rows = [
+        case("drift", metres=0.02, p95=0.5),
+        case("drift", metres=0.02, p95=0.51),
+        case("drift", metres=2.0, p95=3.0),
+        case("drift", "merge_refused", p95=9.0),
+        case("drift"),
+    ]
+    assert the_row(rows, "drift")["n_p95_over_half_m"] == 2
+
+
 def test_whoever_accepts_where_nothing_is_shared_is_wrong() -> None:
     rows = [
         case("disjoint", "merge_refused", error=UNLIKE),

@@ -19,14 +19,16 @@ from eval.merge_table import merge_table
 from eval.page import write_page
 from eval.page_merge import draw_merge
 from eval.page_merge_cases import true_alignment
-from eval.page_merge_tables import main_variant
+from eval.page_merge_tables import main_variant, times_table
 from eval.page_run import read_run
 from eval.runfolder import RunFolder
 
 NAN = float("nan")
 SLIDES = "the sessions cannot be merged: it can slide; merge.min_hessian_ratio asks for 0.01"
 UNLIKE = "the sessions cannot be merged: it does not fit; merge.min_agreement asks for <80%>"
-EVIDENCE = {"overlap": 0.61, "inlier_share": 0.92, "hessian_ratio": 0.123, "agreement": 0.87, "residual_m": 0.033}
+EVIDENCE = {name: 100.0 for name, _ in GATES} | {
+    "overlap": 0.61, "inlier_share": 0.92, "hessian_ratio": 0.123, "agreement": 0.87, "residual_m": 0.033,
+}  # fmt: skip
 CONFIG = load_config("tunnelcd").model_dump(mode="json")
 
 
@@ -144,21 +146,56 @@ def test_the_table_of_targets_and_the_csv_say_the_same(merge_run: RunFolder) -> 
     # an oracle is no method that could meet a target
     assert [row[1] for row in rows if row[0].startswith("oracle-merge")] == ["\u2013"]
     written = pd.read_csv(merge_run.path / "merge.csv")
-    pd.testing.assert_frame_equal(written, merge_table(pd.read_csv(merge_run.path / "results.csv")))
+    expected = merge_table(pd.read_csv(merge_run.path / "results.csv"))
+    verdicts = [None if pd.isna(value) else value for value in written["is_met"]]
+    assert verdicts == expected["is_met"].tolist()
+    pd.testing.assert_frame_equal(written.drop(columns="is_met"), expected.drop(columns="is_met"))
+
+
+def test_no_verdict_before_all_that_was_planned_is_there(merge_run: RunFolder) -> None:
+    plan = {
+        "name": "merge",
+        "until": "merge",
+        "scenarios": ["merge/smooth"],
+        "seeds": [0, 1],
+        "variants": [{"preset": "tunnelcd"}],
+    }
+    (merge_run.path / "provenance.json").write_text(json.dumps({"tool": "tunnelcd", "command": "run", "plan": plan}))
+    page = html.unescape(write_page(merge_run.path).read_text())
+    # smooth, 1 is not there
+    assert "1 of 2 planned pairs so far" in page
+    assert "its target on" not in page
+    assert {row[1] for row in table_rows(page, "Every kind of pair")[1:] if len(row) > 1} == {"\u2013"}
+    plan["seeds"] = [0]
+    (merge_run.path / "provenance.json").write_text(json.dumps({"tool": "tunnelcd", "command": "run", "plan": plan}))
+    page = html.unescape(write_page(merge_run.path).read_text())
+    assert "planned pairs" not in page
+    assert "tunnelcd misses its target on clean, drift and disjoint" in page
+
+
+def test_times_have_median_p95_and_number(merge_run: RunFolder) -> None:
+    rows = [row("clean", seed, t_merge_s=seconds) for seed, seconds in enumerate((0.1, 0.2, 0.4))]
+    rows.append(row("clean", 3, status="merge_refused", error=UNLIKE, t_merge_s=NAN))
+    table = times_table(pd.DataFrame([*rows, row("clean", 0, "oracle-merge", t_merge_s=0.0)]))
+    assert [[cell.text for cell in cells] for _, cells in table.rows] == [
+        ["tunnelcd", "\u2013", "\u2013", "0", "0.2", "0.38", "3", "\u2013", "\u2013", "0"]
+    ]
 
 
 def test_worst_merges_come_first_and_what_was_not_merged_is_listed_with_its_reason(merge_run: RunFolder) -> None:
     page = write_page(merge_run.path).read_text()
-    worst = table_rows(page, "The worst accepted merges of tunnelcd")[1:]
+    headings_of_worst, *worst = table_rows(page, "The worst accepted merges of tunnelcd")
     assert len(worst) == 10
     assert worst[0][0] == "merge/disjoint, 1 disjoint"
-    assert worst[0][7] == "\u2013"
+    assert worst[0][headings_of_worst.index("error [m]")] == "\u2013"
     assert [row[0] for row in worst[1:4]] == ["merge/drift, 0 drift", "merge/clean, 11 clean", "merge/clean, 10 clean"]
-    unmerged = table_rows(page, "Clean and drift pairs that tunnelcd did not merge")[1:]
-    assert [(row[0], row[-1]) for row in unmerged] == [
+    outside = table_rows(page, "Every pair of tunnelcd that is outside its target")[1:]
+    assert [(row[0], row[-1]) for row in outside[:2]] == [
         ("merge/clean, 12 clean", f"refused: {UNLIKE}"),
         ("merge/drift, 1 drift", "failed: broken off"),
     ]
+    # not merged first; then what was accepted and should not have been
+    assert [row[0] for row in outside[2:]] == ["merge/disjoint, 1 disjoint"]
     refusals = table_rows(page, "Which gate the refusals name")
     named = dict(zip(refusals[0], refusals[2], strict=True))
     assert (named["agreement"], named["hessian ratio"], named["none of these"]) == ("1", "0", "0")

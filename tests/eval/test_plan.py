@@ -12,6 +12,7 @@ from eval.plan import (
     load_plan,
     parse_seeds,
     plan_names,
+    planned_cases,
     setting_text,
     slug,
     variant_name,
@@ -235,7 +236,7 @@ variants:
   - {preset: tunnelcd}
   - {preset: tunnelcd, oracle_merge: {}}
   - {preset: tunnelcd, oracle_merge: {noise_m: 0.1, noise_deg: 0.2}}
-  - {preset: tunnelcd, oracle_merge: {noise_m: 0.05}, set: ["query.radius_m=3"]}
+  - {preset: tunnelcd, oracle_merge: {noise_m: 0.05}, set: ["map.voxel_m=0.3"]}
   - {preset: paper, oracle_merge: {}}
 """
 
@@ -246,14 +247,14 @@ def test_oracles_are_variants_of_their_own(tmp_path: Path) -> None:
         ("tunnelcd", "tunnelcd"),
         ("tunnelcd", "oracle-merge"),
         ("tunnelcd", "oracle-merge[noise_m=0.1,noise_deg=0.2]"),
-        ("tunnelcd", "oracle-merge[noise_m=0.05,noise_deg=0,query.radius_m=3]"),
+        ("tunnelcd", "oracle-merge[noise_m=0.05,noise_deg=0,map.voxel_m=0.3]"),
         ("paper", "oracle-merge[preset=paper]"),
     ]
     noises = [None if c.oracle is None else (c.oracle.noise_m, c.oracle.noise_deg) for c in found]
     assert noises == [None, (0, 0), (0.1, 0.2), (0.05, 0), (0, 0)]
     # the later stages are the preset's
     assert found[1].config == found[0].config
-    assert found[3].config.query.radius_m == 3
+    assert found[3].config.map.voxel_m == 0.3
 
 
 def test_a_plan_may_end_at_the_merge(tmp_path: Path) -> None:
@@ -264,10 +265,12 @@ def test_a_plan_may_end_at_the_merge(tmp_path: Path) -> None:
 def test_the_command_line_keeps_oracles_and_the_end(tmp_path: Path) -> None:
     plan = read(tmp_path, ORACLES)
     assert changed_plan(plan) == plan
-    found = cells(changed_plan(plan, settings=["query.radius_m=6"], grid=["extract.voxel_m=0.1,0.2"]))
+    found = cells(changed_plan(plan, settings=["map.keyframe_spacing_m=2"], grid=["map.voxel_m=0.1,0.4"]))
     assert len(found) == 10
     assert {c.until for c in found} == {"merge"}
-    assert "oracle-merge[noise_m=0.1,noise_deg=0.2,extract.voxel_m=0.2,query.radius_m=6]" in {c.variant for c in found}
+    assert "oracle-merge[noise_m=0.1,noise_deg=0.2,map.voxel_m=0.4,map.keyframe_spacing_m=2]" in {
+        c.variant for c in found
+    }
     # a provenance holds no key that the plan does not say
     variants = plan.model_dump(mode="json")["variants"]
     assert ["oracle_merge" in variant for variant in variants] == [False, True, True, True, True]
@@ -291,3 +294,46 @@ def test_mistakes_of_oracles_and_of_the_end(tmp_path: Path, old: str, new: str, 
     assert old in ORACLES
     (line,) = mistakes(tmp_path, ORACLES.replace(old, new))
     assert all(word in line for word in words), line
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("map.voxel_m=0.3", "merge.inlier_m=0.2", ["plan.yaml:9:", "merge.inlier_m=0.2 does nothing", "by the truth"]),
+        ("map.voxel_m=0.3", "query.radius_m=3", ["query.radius_m=3 of tunnelcd does nothing", "ends at the merge"]),
+        (
+            "{preset: paper,",
+            "{preset: paper, per_scenario: {smoke/one_box: cluster.min_points=9},",
+            ["cluster.min_points"],
+        ),
+        (
+            "  - {preset: paper, oracle_merge: {}}",
+            "grid: [{variant: paper, scenarios: [smoke/one_box], keys: {extract.voxel_m: [0.2]}}]",
+            ["extract.voxel_m of the grid of paper does nothing"],
+        ),
+    ],
+)
+def test_settings_that_nothing_reads(tmp_path: Path, old: str, new: str, words: list[str]) -> None:
+    assert old in ORACLES
+    (line,) = mistakes(tmp_path, ORACLES.replace(old, new))
+    assert all(word in line for word in words), line
+
+
+def test_the_same_settings_are_welcome_where_they_are_read(tmp_path: Path) -> None:
+    text = ORACLES.replace("until: merge\n", "").replace("map.voxel_m=0.3", "query.radius_m=3")
+    assert cells(read(tmp_path, text))[3].config.query.radius_m == 3
+    with pytest.raises(InputError, match=r"query.radius_m=3 of tunnelcd does nothing"):
+        changed_plan(read(tmp_path, ORACLES), settings=["query.radius_m=3"])
+
+
+def test_settings_of_the_merge_on_the_command_line_pass_by_the_oracles(tmp_path: Path) -> None:
+    plan = changed_plan(read(tmp_path, ORACLES), settings=["merge.refine=none"], grid=["merge.inlier_m=0.1,0.2"])
+    assert [c.variant for c in cells(plan)] == [
+        "tunnelcd[merge.inlier_m=0.1,merge.refine=none]",
+        "tunnelcd[merge.inlier_m=0.2,merge.refine=none]",
+        "oracle-merge",
+        "oracle-merge[noise_m=0.1,noise_deg=0.2]",
+        "oracle-merge[noise_m=0.05,noise_deg=0,map.voxel_m=0.3]",
+        "oracle-merge[preset=paper]",
+    ]
+    assert planned_cases(plan) == {(c.scenario, c.seed, c.variant) for c in cells(plan)}

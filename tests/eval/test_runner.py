@@ -21,7 +21,7 @@ from cdpipe.readers import open_scans
 from cdpipe.types import MappedSession, MergedMaps
 from eval import provenance, runner, stages
 from eval.adapters import pipeline_input
-from eval.plan import Plan, load_plan
+from eval.plan import Plan, cells, load_plan
 from eval.progress import Silent
 from eval.rescoring import rescore
 from eval.runfolder import RunFolder, open_run_folder, remove, start_run_folder, write_tables
@@ -781,3 +781,14 @@ def test_a_world_that_cannot_be_made_keeps_its_kind(
     results = table(run)
     assert results["status"].tolist() == ["failed"] * 5
     assert set(results["pair_kind"]) == {"clean"}
+
+
+def test_cells_made_without_kiss_matcher_are_made_again_once_it_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    def keys(*, is_installed: bool) -> dict[str, str]:
+        monkeypatch.setattr(runner, "is_kiss_matcher_installed", lambda: is_installed)
+        found = cells(load_plan("merge"))[:4]
+        return {cell.variant: runner._key(cell, "clean", None, {}) for cell in found}
+
+    there, missing = keys(is_installed=True), keys(is_installed=False)
+    changed = {variant: there[variant] != missing[variant] for variant in there}
+    assert changed == {"tunnelcd": True, "frame": False, "kiss-matcher": True, "oracle-merge": False}
