@@ -23,8 +23,8 @@ from eval.merge_gates import (
 )
 
 NAN = float("nan")
-ASKED = {"overlap": 0.2, "inlier_share": 0.8, "hessian_ratio": 0.01, "agreement": 0.8}
-GOOD = {"overlap": 0.5, "inlier_share": 0.9, "hessian_ratio": 0.1, "agreement": 0.9}
+ASKED = {"overlap": 0.2, "inlier_share": 0.8, "hessian_ratio": 0.01, "agreement": 0.8, "distinctness": 1.3}
+GOOD = {"overlap": 0.5, "inlier_share": 0.9, "hessian_ratio": 0.1, "agreement": 0.9, "distinctness": 10.0}
 # kind, error in metres, what is not as in GOOD
 CASES = (
     ("clean", 0.01, {}),
@@ -70,10 +70,10 @@ def test_counts_by_hand() -> None:
     assert set(table["n_right"]) == {3}
     assert set(table["n_wrong"]) == {4}
     names = [name for name, _ in GATES]
-    assert table.loc[names, "n_right_refused"].to_dict() == dict(zip(names, (1, 1, 0, 1), strict=True))
-    assert table.loc[names, "n_right_refused_alone"].to_dict() == dict(zip(names, (1, 0, 0, 0), strict=True))
-    assert table.loc[names, "n_wrong_refused"].to_dict() == dict(zip(names, (1, 0, 2, 1), strict=True))
-    assert table.loc[names, "n_wrong_refused_alone"].to_dict() == dict(zip(names, (0, 0, 2, 0), strict=True))
+    assert table.loc[names, "n_right_refused"].to_dict() == dict(zip(names, (1, 1, 0, 1, 0), strict=True))
+    assert table.loc[names, "n_right_refused_alone"].to_dict() == dict(zip(names, (1, 0, 0, 0, 0), strict=True))
+    assert table.loc[names, "n_wrong_refused"].to_dict() == dict(zip(names, (1, 0, 2, 1, 0), strict=True))
+    assert table.loc[names, "n_wrong_refused_alone"].to_dict() == dict(zip(names, (0, 0, 2, 0, 0), strict=True))
     assert table.loc["all", ["n_right_refused", "n_wrong_refused", "n_wrong_let_through"]].tolist() == [2, 3, 1]
     assert table.loc["overlap", ["worst_right", "best_wrong"]].tolist() == [0.1, 0.5]
     assert let_through(cases, ASKED).tolist() == [True, *[False] * 5, True]
@@ -85,7 +85,7 @@ def test_gates_judge_together_as_the_sum_of_single_merges() -> None:
         (
             str(draw.choice(["clean", "disjoint"])),
             float(draw.uniform(0, 1)),
-            {name: float(draw.uniform()) for name in GOOD},
+            {name: float(draw.uniform(0, 1.6 * ASKED[name])) for name in GOOD},
         )
         for _ in range(60)
     )
@@ -127,7 +127,9 @@ def test_suggestion_keeps_at_least_199_of_200() -> None:
 
 def test_committed_thresholds_are_the_presets() -> None:
     assert set(committed_thresholds()) == {name for name, _ in GATES}
-    assert all(0 < value < 1 for value in committed_thresholds().values())
+    thresholds = committed_thresholds()
+    assert all(0 < value < 1 for name, value in thresholds.items() if name != "distinctness")
+    assert thresholds["distinctness"] > 1
 
 
 def test_only_accepted_merges_of_the_named_variant_count() -> None:
