@@ -86,10 +86,8 @@ def detect_changes(
     Raises:
         MergeFailedError: The sessions could not be aligned with enough evidence; it carries what was measured.
     """
-    start = perf_counter()
     merged = merge_maps(before, after, config.merge)
-    whole = {"t_merge_s": perf_counter() - start}
     if not merged.is_accepted:
         raise refusal(merged)
     report = method(merged, before.descriptors, after.descriptors, config)
-    return replace(report, seconds={**whole, **merged.seconds, **report.seconds})
+    return replace(report, seconds={**merged.seconds, **report.seconds})
