@@ -23,12 +23,15 @@ from cdpipe.walk import Step, Walk, walk
 
 # Every 2 m and thinned to 0.3 m is three times the work for the same centimetres (validation, cdpipe/README.md).
 _SPACING_M = 4.0
-_RADIUS_M = 8.0
+# What was seen from afar stands where the odometry of then put it, and so does what is far from the anchor. From afar
+# is 2.5 times as far as the walls pass by, which is the 20th percentile of the map's shortest ranges; 6 m at least.
+_SEEN_WITHIN, _WALL_PERCENTILE, _SEEN_WITHIN_M = 2.5, 20, 6.0
+_RADIUS_M = 5.0
 _VOXEL_M = 0.4
 _CORRESPONDENCE_M = 1.0
-# What a registration is taken to be worth: each of the 300 points looked at off the surface by this, one standard
-# deviation. Of 0.05 to 0.4 m the value with the smallest errors in narrow and wide tunnels (validation).
-_POINT_M = 0.2
+# How far a map point is off the surface, one standard deviation. Of 0.03 to 0.4 m the one with the smallest errors on
+# validation pairs whose sessions drift apart by 1 %; without drift a larger one averages more.
+_POINT_M = 0.05
 # What holds an anchor that nothing else holds, so that the system can be solved.
 _WEAKEST = 1e-6
 # What two odometries may drift apart over a metre of path, one standard deviation.
@@ -59,6 +62,11 @@ def refined(
     """
     if not np.isfinite(found.fits).any():
         return None, {"n_refined": 0.0}
+    wall_m = float(np.percentile(after.map.nearest_m, _WALL_PERCENTILE))
+    seen_within_m = min(max(_SEEN_WITHIN * wall_m, _SEEN_WITHIN_M), config.seen_within_m)
+    closer = config.model_copy(update={"seen_within_m": seen_within_m})
+    before = IndexedMap(before.map, closer, is_target=True)
+    after = IndexedMap(after.map, closer, is_target=False)
     keyframes, start = _anchors(after, found)
     coarse = PathAlignment(after.positions[found.keyframes], found.before_T_after)
     first = int(np.nanargmax(found.fits))
@@ -69,7 +77,7 @@ def refined(
     if np.count_nonzero(is_good) < _MIN_GOOD_SHARE * np.count_nonzero(np.isfinite(walked.fits)) or not is_good.any():
         return None, evidence
     information = walked.information * np.where(is_good, 1 / _POINT_M**2, 0.0)[:, None, None]
-    positions = after.positions[walked.keyframes]
+    positions = np.where(is_good[:, None], walked.held_at, after.positions[walked.keyframes])
     smooth = smoothed(positions, walked.before_T_after, information)
     alignment = PathAlignment(positions, smooth)
     moved_m = np.linalg.norm(alignment.to_map(positions) - coarse.to_map(positions), axis=1)
