@@ -445,7 +445,8 @@ def _results(folder: Path, quiet: bool) -> None:
     shown = [name for name in _SHOWN if name in results.columns and results[name].notna().any()]
     _table("means over pairs", counts.join(groups[shown].mean()).reset_index())
     cases = zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
-    covered = coverage(RunFolder(folder).provenance(), cases)
+    is_told = (folder / "provenance.json").is_file()
+    covered = coverage(RunFolder(folder).provenance(), cases) if is_told else None
     is_whole = covered is None or covered.is_whole
     targets = merge_overview(results, is_whole=is_whole)
     if covered is not None and not is_whole:

@@ -361,7 +361,9 @@ def test_demo_is_the_paper_plan_and_the_page(tmp_path: Path, command: Command, m
 
     def run_plan(plan: Plan, run: RunFolder, **options: Any) -> runner.RunOutcome:
         asked.append((plan.name, options["force"], options["limit"]))
-        pd.DataFrame([{"scenario": "a", "variant": "b", "status": "ok"}]).to_csv(run.path / "results.csv", index=False)
+        pd.DataFrame([{"scenario": "a", "seed": 1, "variant": "b", "status": "ok"}]).to_csv(
+            run.path / "results.csv", index=False
+        )
         return runner.RunOutcome(1, 0, 0)
 
     monkeypatch.setattr(runner, "run_plan", run_plan)
