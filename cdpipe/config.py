@@ -29,7 +29,9 @@ class MapConfig(Settings):
 class DescriptorConfig(Settings):
     """Which descriptor every keyframe gets while mapping."""
 
-    method: Literal["3deg", "untrained"] = Field("3deg", description="trained weights, or the same network untrained")
+    method: Literal["3deg", "untrained", "scan-context", "solid"] = Field(
+        "3deg", description="trained weights, the same network untrained, or one made by hand"
+    )
 
 
 class MergeConfig(Settings):
@@ -63,6 +65,9 @@ class MergeConfig(Settings):
 class QueryConfig(Settings):
     """From descriptors to changed regions: inverted query, threshold, suppression."""
 
+    compare: Literal["scan", "sphere", "difference"] = Field(
+        "scan", description="scan descriptors; sphere descriptors of both maps; or, by hand, the spheres' points"
+    )
     reading: Literal["nearest", "paired"] = Field(
         "nearest", description="A: nearest in descriptor space; B: the same place after alignment"
     )
@@ -98,7 +103,7 @@ class ClusterConfig(Settings):
 class PipelineConfig(Settings):
     """All settings of one method."""
 
-    method: Literal["descriptor", "voxel-diff", "random-regions"] = Field(
+    method: Literal["descriptor", "voxel-diff", "c2c", "random-regions"] = Field(
         "descriptor", description="the paper's pipeline, a whole-map rival, or a control"
     )
     seed: Annotated[int, Field(ge=0)] = Field(0, description="for methods that draw at random")

@@ -115,6 +115,7 @@ class DescriptorSet:
         keyframe_scans: (K,) int64 scan of each keyframe.
         name: Which descriptor.
         checkpoint: Digest of the weights, or "" where there are none.
+        spheres: (K, E) float32 what the map around each keyframe looks like (`describe_map`), or None.
     """
 
     q: Float32Array
@@ -122,9 +123,12 @@ class DescriptorSet:
     keyframe_scans: Int64Array
     name: str
     checkpoint: str
+    spheres: Float32Array | None = None
 
     def __post_init__(self) -> None:
         require_shape("q", self.q, (None, None))
+        if self.spheres is not None:
+            require_shape("spheres", self.spheres, (len(self.q), None))
         if self.w is not None:
             require_shape("w", self.w, (len(self.q), None))
         require_shape("keyframe_scans", self.keyframe_scans, (len(self.q),))
