@@ -1,4 +1,4 @@
-"""Scenarios by name or file: read, extended, drawn with a seed, checked and, where asked for, frozen."""
+"""Scenarios by name or file: read, extended, drawn with a seed, checked and, where asked for, frozen or turned over."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cdpipe.errors import InputError, ScenarioError
+from cdpipe.geometry import stream
 from cdpipe.yamlfile import Document, Key, read_yaml, suggestion, validated, with_settings
 from scenarios.distributions import Drawing, dotted, drawing, form_mistakes, is_distribution, merged
 from scenarios.references import contradictions, file_keys, reference_mistakes
@@ -80,6 +81,10 @@ def _scenario(document: Document, seed: int) -> tuple[Scenario | None, list[str]
     is_frozen = tree.pop("frozen", False)
     if not isinstance(is_frozen, bool):
         mistakes.append(_told(document, ("frozen",), "expected true or false"))
+    turnover = tree.pop("turnover", 0.0)
+    if isinstance(turnover, bool) or not isinstance(turnover, int | float) or not 0 <= turnover <= 1:
+        mistakes.append(_told(document, ("turnover",), "expected a share between 0 and 1"))
+        turnover = 0.0
     place = Document(document.source, tree, _drawn_origins(document, drawn))
     tree, missing = _with_files(place)
     mistakes += missing
@@ -90,13 +95,24 @@ def _scenario(document: Document, seed: int) -> tuple[Scenario | None, list[str]
     except InputError as error:
         return None, mistakes + _without_repetition(str(error).splitlines(), drawn.broken, bool(references))
     mistakes += [_told(place, key, rule) for key, rule in contradictions(scenario)]
-    return _frozen(scenario) if is_frozen else scenario, mistakes
+    return _frozen(scenario) if is_frozen else _turned_over(scenario, turnover, seed), mistakes
 
 
 def _frozen(scenario: Scenario) -> Scenario:
     """Return the scenario with nothing changing: the world stays as the before session saw it."""
     stay = {"change": "none", "to": None, "shift": None, "loaded_share": None}
     props: list[Prop] = [prop.model_copy(update=stay) for prop in scenario.props if prop.change != "added"]
+    return scenario.model_copy(update={"props": tuple(props)})
+
+
+def _turned_over(scenario: Scenario, turnover: float, seed: int) -> Scenario:
+    """Return the scenario with that share of what would stay added or removed instead, one as often as the other."""
+    props: list[Prop] = []
+    for prop in scenario.props:
+        draw = stream(seed, "turnover", prop.name).random()
+        if prop.change == "none" and draw < turnover:
+            prop = prop.model_copy(update={"change": "added" if draw < turnover / 2 else "removed"})
+        props.append(prop)
     return scenario.model_copy(update={"props": tuple(props)})
 
 
