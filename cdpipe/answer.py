@@ -110,11 +110,13 @@ def write_failure(
     evidence: Mapping[str, float],
     config: Mapping[str, Any],
     until: Until | None = None,
+    seconds: Mapping[str, float] | None = None,
 ) -> None:
-    """Write the record of a case that gave no answer."""
+    """Write the record of a case that gave no answer, and the seconds that were measured until then."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "answer.npz").unlink(missing_ok=True)
-    document = {"status": status, "error": error, "method": method, "seconds": {}, "evidence": dict(evidence)}
+    document: dict[str, Any] = {"status": status, "error": error, "method": method}
+    document |= {"seconds": dict(seconds or {}), "evidence": dict(evidence)}
     _write_json(folder, {**document, "config": dict(config)}, until)
 
 

@@ -96,28 +96,35 @@ def pair_votes(
     Args:
         before_poses: (P, 4, 4) before keyframe of each pair, its session's odom frame.
         after_poses: (P, 4, 4) after keyframe of each pair, likewise.
-        yaws_rad: (P,) yaw of the after keyframe in the before keyframe.
+        yaws_rad: (P,) yaw of the after keyframe in the before keyframe, about the sensor's own axis.
     """
-    turns_rad = yaws_rad + _heading_rad(before_poses) - _heading_rad(after_poses)
+    turns_rad = _turns_rad(before_poses, after_poses, yaws_rad)
+    before_xy, after_xy = before_poses[:, :2, 3], after_poses[:, :2, 3]
+    before_m, after_m = _apart_m(before_xy), _apart_m(after_xy)
+    # few are as far apart in both sessions; only those are looked at further
+    one, other = np.nonzero(np.abs(before_m - after_m) < _APART_M + _APART_SHARE * after_m)
+    apart_m = after_m[one, other]
     cosines, sines = np.cos(turns_rad), np.sin(turns_rad)
-    before_x, before_y = (_differences(before_poses[:, axis, 3]) for axis in (0, 1))
-    after_x, after_y = (_differences(after_poses[:, axis, 3]) for axis in (0, 1))
-    after_m = np.sqrt(after_x**2 + after_y**2)
-    tolerance_m = _APART_M + _APART_SHARE * after_m
-    agrees = np.abs(np.sqrt(before_x**2 + before_y**2) - after_m) < tolerance_m
+    before_x, before_y = (before_xy[other] - before_xy[one]).T
+    after_x, after_y = (after_xy[other] - after_xy[one]).T
     # where the after shift leads if it is turned as the pair says
-    miss_x = before_x - (cosines[:, None] * after_x - sines[:, None] * after_y)
-    miss_y = before_y - (sines[:, None] * after_x + cosines[:, None] * after_y)
-    agrees &= miss_x**2 + miss_y**2 < (tolerance_m + np.sin(_YAW_RAD) * after_m) ** 2
+    miss_x = before_x - (cosines[one] * after_x - sines[one] * after_y)
+    miss_y = before_y - (sines[one] * after_x + cosines[one] * after_y)
+    tolerance_m = _APART_M + (_APART_SHARE + np.sin(_YAW_RAD)) * apart_m
     # the angle between two turns, by its cosine
-    agrees &= np.outer(cosines, cosines) + np.outer(sines, sines) > np.cos(_YAW_RAD)
-    votes = np.zeros(len(yaws_rad))
-    np.add.at(votes, np.nonzero(agrees)[0], np.exp(-after_m[agrees] / _VOTE_REACH_M))
+    is_same_turn = cosines[one] * cosines[other] + sines[one] * sines[other] > np.cos(_YAW_RAD)
+    is_agreed = is_same_turn & (miss_x**2 + miss_y**2 < tolerance_m**2)
+    one, other, apart_m = one[is_agreed], other[is_agreed], apart_m[is_agreed]
+    agrees = np.zeros((len(yaws_rad),) * 2, dtype=np.bool_)
+    agrees[one, other] = True
+    votes: Float64Array = np.bincount(one, np.exp(-apart_m / _VOTE_REACH_M), len(yaws_rad)).astype(np.float64)
     return agrees, votes
 
 
-def _differences(values: Float64Array) -> Float64Array:
-    return values[None] - values[:, None]
+def _apart_m(xy: Float64Array) -> Float64Array:
+    """Return (P, P) distances between (P, 2) places."""
+    x, y = (xy[None, :, axis] - xy[:, None, axis] for axis in (0, 1))
+    return np.asarray(np.sqrt(x**2 + y**2))
 
 
 def _is_same(one: Float64Array, other: Float64Array, position: Float64Array) -> bool:
@@ -170,7 +177,7 @@ def _common_motion(
     before_centre, after_centre = weights @ before_xyz, weights @ after_xyz
     before_shift, after_shift = before_xyz - before_centre, after_xyz - after_centre
     directions = (after_shift[:, 0] - 1j * after_shift[:, 1]) * (before_shift[:, 0] + 1j * before_shift[:, 1])
-    turns_rad = (yaws_rad + _heading_rad(before_poses) - _heading_rad(after_poses))[agrees]
+    turns_rad = _turns_rad(before_poses[agrees], after_poses[agrees], yaws_rad[agrees])
     # a place is known to 1 m or so, a yaw to 5 degrees
     evidence = weights @ directions / 1.0**2 + weights @ np.exp(1j * turns_rad) / np.deg2rad(5.0) ** 2
     turn = yaw_pose(float(np.angle(evidence)))
@@ -187,5 +194,14 @@ def keyframe_poses(point_map: PointMap, descriptors: DescriptorSet) -> Float64Ar
     return point_map.odom_T_sensor[descriptors.keyframe_scans]
 
 
-def _heading_rad(poses: Float64Array) -> Float64Array:
-    return np.asarray(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+def _turns_rad(before_poses: Float64Array, after_poses: Float64Array, yaws_rad: Float64Array) -> Float64Array:
+    """Return (P,) by how much the after odom frame is turned about z in the before odom frame, as each pair says.
+
+    Not yaw plus headings: a sensor that hangs upside down sees yaw with the other sign.
+    """
+    cosines, sines = np.cos(yaws_rad), np.sin(yaws_rad)
+    x, y, z = np.moveaxis(before_poses[:, :3, :3], 2, 0)
+    yawed = np.stack([cosines[:, None] * x + sines[:, None] * y, cosines[:, None] * y - sines[:, None] * x, z], axis=2)
+    turns = yawed @ after_poses[:, :3, :3].transpose(0, 2, 1)
+    # the turn about z that is nearest to the whole
+    return np.asarray(np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1]))

@@ -32,6 +32,7 @@ class DescriptorConfig(Settings):
     method: Literal["3deg", "untrained", "scan-context", "solid"] = Field(
         "3deg", description="trained weights, the same network untrained, or one made by hand"
     )
+    precision: Literal["float32", "int8"] = Field("float32", description="of stored sphere descriptors")
 
 
 class MergeConfig(Settings):
@@ -84,6 +85,7 @@ class ExtractConfig(Settings):
     voxel_m: Positive = Field(0.65, description="voxel size (paper: 0.65)")
     min_points: Count = Field(1, description="points that make a voxel occupied")
     origin_m: float = Field(0.0, description="offset of the grid along every axis")
+    distance_m: Positive = Field(0.3, description="`c2c`: a point farther than this from the other cloud is new")
 
 
 class OutlierConfig(Settings):

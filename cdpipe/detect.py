@@ -7,7 +7,7 @@ from dataclasses import replace
 from time import perf_counter
 
 from cdpipe.config import PipelineConfig
-from cdpipe.descriptor import describe_scans
+from cdpipe.descriptor import describe_map, describe_scans
 from cdpipe.errors import MergeFailedError
 from cdpipe.extract import assemble_objects, cut_out
 from cdpipe.geometry import Float64Array
@@ -15,7 +15,7 @@ from cdpipe.mapping import build_map
 from cdpipe.merge import merge_maps
 from cdpipe.query import find_regions
 from cdpipe.session_check import check_session, unit_hint
-from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, MergedMaps, ScanSource
+from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, MergedMaps, PointMap, ScanSource
 
 Comparison = Callable[[MergedMaps, DescriptorSet, DescriptorSet, PipelineConfig], ChangeReport]
 
@@ -28,7 +28,15 @@ def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
     """
     check_session(source, config.map)
     thin_map = build_map(source, config.map)
-    return MappedSession(thin_map, describe_scans(source, thin_map.keyframe_scans, config.descriptor))
+    return MappedSession(thin_map, describe_mapped(source, thin_map, config))
+
+
+def describe_mapped(source: ScanSource, thin_map: PointMap, config: PipelineConfig) -> DescriptorSet:
+    """Describe a session's keyframes: their scans, and where spheres will be compared, the map around each."""
+    descriptors = describe_scans(source, thin_map.keyframe_scans, config.descriptor)
+    if config.query.compare != "sphere":
+        return descriptors
+    return replace(descriptors, spheres=describe_map(thin_map, thin_map.odom_T_keyframe, config.descriptor))
 
 
 def compare(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig) -> ChangeReport:
@@ -68,7 +76,9 @@ def refusal(merged: MergedMaps) -> MergeFailedError:
     """Return the error of a merge that was not accepted: what failed, and what may help."""
     hint = unit_hint(merged.before, merged.after)
     return MergeFailedError(
-        f"the sessions cannot be merged: {merged.reason}{'; ' if hint else ''}{hint}", merged.evidence
+        f"the sessions cannot be merged: {merged.reason}{'; ' if hint else ''}{hint}",
+        merged.evidence,
+        {name: merged.seconds[name] for name in ("t_index_s", "t_merge_s") if name in merged.seconds},
     )
 
 

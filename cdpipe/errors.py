@@ -22,8 +22,10 @@ class MergeFailedError(TunnelcdError):
 
     Attributes:
         evidence: What was measured, by name; values that were never reached are absent.
+        seconds: How long it took to find that out, `t_index_s` and `t_merge_s`; empty where that was not measured.
     """
 
-    def __init__(self, message: str, evidence: Mapping[str, float]) -> None:
+    def __init__(self, message: str, evidence: Mapping[str, float], seconds: Mapping[str, float] | None = None) -> None:
         super().__init__(message)
         self.evidence = dict(evidence)
+        self.seconds = dict(seconds or {})

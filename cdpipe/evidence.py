@@ -39,14 +39,11 @@ class SurfaceFit:
         backward_m: (M,) the same of before points to the after surface.
         information: (6, 6) Hessian of the forward distances: turn, then shift, in after odom axes about the place.
             Where all normals are square to one direction its shift is not held: the maps can slide.
-        held_at: (3,) where the points lie that hold the weakest shift, their mean, after odom frame: a registration of
-            maps that stretch differently is right there and not at the centre of its sphere.
     """
 
     forward_m: Float64Array
     backward_m: Float64Array
     information: Float64Array
-    held_at: Float64Array
 
     def inlier_share(self, inlier_m: float) -> float:
         """Return the share of points nearer than `inlier_m` to the other surface, the lower of both directions."""
@@ -85,8 +82,7 @@ def surface_fit(
     normals = fine.normals[found]
     forward_m = _plane_distances(moved, fine.points[found], normals, np.asarray(squared_m2))
     is_seen = np.isfinite(forward_m)
-    seen = own[is_seen]
-    jacobian = plane_jacobian(seen - centre_after, normals[is_seen] @ before_T_after[:3, :3])
+    jacobian = plane_jacobian(own[is_seen] - centre_after, normals[is_seen] @ before_T_after[:3, :3])
     information = jacobian.T @ jacobian
 
     centre_before = transform(before_T_after, centre_after[None])[0]
@@ -95,7 +91,7 @@ def surface_fit(
     found, squared_m2 = after.tree.batch_nearest_neighbor_search(theirs)
     turned = fine.normals[chosen] @ before_T_after[:3, :3]
     backward_m = _plane_distances(theirs, after.points[found], turned, np.asarray(squared_m2))
-    return SurfaceFit(forward_m, backward_m, information, _held_at(seen, jacobian, information, centre_after))
+    return SurfaceFit(forward_m, backward_m, information)
 
 
 def sampled(of_map: npt.NDArray[Any], n: int = _SAMPLES) -> npt.NDArray[Any]:
@@ -113,15 +109,6 @@ def why_refused(evidence: Mapping[str, float], config: MergeConfig) -> str:
             said, asked = (f"{value:.0%}", f"{least:.0%}") if is_share else (f"{value:.4g}", f"{least:g}")
             return f"{_REASONS[name].format(value=said)}; merge.{setting} asks for {asked}"
     return ""
-
-
-def _held_at(
-    points: Float64Array, jacobian: Float64Array, information: Float64Array, centre: Float64Array
-) -> Float64Array:
-    """Return the mean of the points, each weighed by how much it holds the weakest shift."""
-    weakest = np.linalg.eigh(information[3:, 3:])[1][:, 0]
-    weights = (jacobian[:, 3:] @ weakest) ** 2
-    return weights @ points / weights.sum() if weights.sum() > 0 else centre
 
 
 def _plane_distances(

@@ -66,20 +66,24 @@ class _MapAccumulator:
         self._n_returns: list[int] = []
 
     def add(self, scans: list[PosedScan]) -> None:
-        clouds, ranges_m2 = [], []
+        clouds, ranges_m2, n_near = [], [], []
         for scan in scans:
             squared_m2 = np.einsum("ij,ij->i", scan.points_sensor, scan.points_sensor)
             is_near = squared_m2 <= self._config.max_range_m**2
             ranges_m2.append(np.maximum(squared_m2[is_near], _MIN_RANGE_M**2))
             clouds.append(transform(scan.odom_T_sensor, scan.points_sensor[is_near]))
             self._return_pixels.append(scan.pixels[is_near])
-            self._n_returns.append(len(clouds[-1]))
+            n_near.append(len(clouds[-1]))
+        self._n_returns += n_near
         points = np.concatenate(clouds)
+        sensors = np.array([scan.odom_T_sensor[:3, 3] for scan in scans])
         ids = self._cells.add(cell_keys(points, self._config.voxel_m))
         self._return_cells.append(ids.astype(np.int32))
         n_cells, squared_m2 = len(self._cells), np.concatenate(ranges_m2)
-        parts = [np.bincount(ids, points[:, axis] / squared_m2, n_cells) for axis in range(3)]
-        sums: Float64Array = np.column_stack([*parts, np.bincount(ids, 1 / squared_m2, n_cells)])
+        weights = 1 / squared_m2
+        parts = [np.bincount(ids, points[:, axis] * weights, n_cells) for axis in range(3)]
+        parts += [np.bincount(ids, np.repeat(sensors[:, axis], n_near) * weights, n_cells) for axis in range(3)]
+        sums: Float64Array = np.column_stack([*parts, np.bincount(ids, weights, n_cells)])
         self._nearest_m2 = np.append(self._nearest_m2, np.full(n_cells - len(self._nearest_m2), np.inf))
         np.minimum.at(self._nearest_m2, ids, squared_m2)
         is_touched = np.bincount(ids, minlength=n_cells) > 0
@@ -90,8 +94,8 @@ class _MapAccumulator:
         if len(self._cells) == 0:
             raise InputError(f"{source.name}: no return within map.max_range_m = {self._config.max_range_m} m")
         cells, sums = np.concatenate(self._batch_cells), np.concatenate(self._batch_sums)
-        totals = np.column_stack([np.bincount(cells, sums[:, column], len(self._cells)) for column in range(4)])
-        points = totals[:, :3] / totals[:, 3:]
+        totals = np.column_stack([np.bincount(cells, column, len(self._cells)) for column in sums.T])
+        points, seen_from = totals[:, :3] / totals[:, 6:], totals[:, 3:6] / totals[:, 6:]
         order = np.lexsort((self._cells.keys, column_keys(points)))
         rank = np.empty(len(order), dtype=np.int32)
         rank[order] = np.arange(len(order), dtype=np.int32)
@@ -105,6 +109,7 @@ class _MapAccumulator:
             return_points=return_points,
             return_pixels=np.concatenate(self._return_pixels),
             scan_offsets=np.concatenate([[0], np.cumsum(self._n_returns)]).astype(np.int64),
+            seen_from=seen_from[order].astype(np.float32),
         )
 
 

@@ -79,7 +79,8 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
         The best hypothesis, accepted or not and why; identity where nothing could be registered.
     """
     if min(len(near_points(session.map, config)) for session in (before, after)) < MIN_SPHERE_POINTS:
-        return MergedMaps(before.map, after.map, np.eye(4), {"n_hypotheses": 0.0}, False, _TOO_FEW)
+        none = {"t_index_s": 0.0, "t_merge_s": 0.0, "t_refine_s": 0.0}
+        return MergedMaps(before.map, after.map, np.eye(4), {"n_hypotheses": 0.0}, False, _TOO_FEW, seconds=none)
     start = perf_counter()
     maps = (IndexedMap(before.map, config, is_target=True), IndexedMap(after.map, config, is_target=False))
     indexed = perf_counter()
@@ -91,20 +92,17 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
         if reason and config.fallback and not is_kiss_matcher_installed():
             reason += " (KISS-Matcher could not be asked: pip install 'tunnelcd[kiss]')"
         evidence = {**best.evidence, **evidence}
-    merged = perf_counter()
+    seconds = {"t_index_s": indexed - start, "t_merge_s": perf_counter() - indexed, "t_refine_s": 0.0}
     before_T_after, local = np.eye(4), None
     if best is not None:
         before_T_after = best.before_T_after
         if not reason and config.refine == "local":
+            refining = perf_counter()
             local, measured = refined(*maps, best.walk, config)
             evidence |= measured
             if local is not None:
                 before_T_after = rigid_fit(local.anchors_odom, local.before_T_after)
-    seconds = {
-        "t_index_s": indexed - start,
-        "t_merge_s": merged - indexed,
-        "t_refine_s": perf_counter() - merged,
-    }
+            seconds["t_refine_s"] = perf_counter() - refining
     return MergedMaps(before.map, after.map, before_T_after, evidence, not reason, reason, local, seconds)
 
 

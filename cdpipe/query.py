@@ -14,52 +14,94 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from cdpipe.config import QueryConfig
+from cdpipe.descriptor.sphere import change_logits
+from cdpipe.difference import sphere_difference
 from cdpipe.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.types import ChangeRegions, DescriptorSet, MergedMaps
 
+# A keyframe this share of the radius from a changed sector has the change, not just its edge, within the radius.
+_POOLED = 0.8
+
 
 def find_regions(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> ChangeRegions:
-    """Score every keyframe of both sessions by descriptor distance to its partner, and rank the places.
+    """Score the places both sessions came to by what `compare` says, and rank them.
+
+    Args:
+        merged: Accepted or not; for `scan` only its poses are used.
+        before: Descriptors of the before session; `pairs[:, 0]` indexes its keyframes.
+        after: Descriptors of the after session; `pairs[:, 1]` indexes its keyframes.
+        config: What is compared, reading, radius, threshold, suppression.
+    """
+    places = _Places(merged, before, after, config)
+    if config.compare == "scan":
+        return _by_scans(places, before, after, config)
+    if config.compare == "sphere":
+        return _by_spheres(places, change_logits(merged, before, places.is_covered_b), config)
+    scores = sphere_difference(merged, before, after, config)
+    return rank_regions(places.before, scores, places.pairs_b, scores, config)
+
+
+class _Places:
+    """Where the keyframes of both sessions stand in the map, and which of the other session is nearest to each."""
+
+    def __init__(self, merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> None:
+        self.before = merged.before.odom_T_sensor[before.keyframe_scans, :3, 3]
+        self.after = merged.alignment.to_map(merged.after.odom_T_sensor[after.keyframe_scans, :3, 3])
+        gap_b, self.near_a = _nearest(self.before, self.after)
+        gap_a, self.near_b = _nearest(self.after, self.before)
+        self.is_covered_b, self.is_covered_a = gap_b <= config.max_pair_m, gap_a <= config.max_pair_m
+
+    @property
+    def pairs_b(self) -> Int64Array:
+        """(Kb, 2) each before keyframe and the nearest after keyframe."""
+        return np.column_stack([np.arange(len(self.near_a)), self.near_a])
+
+
+def _by_scans(places: _Places, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> ChangeRegions:
+    """Score every keyframe of both sessions by descriptor distance to its partner.
 
     Every keyframe is a candidate at its own position: those of the after session queried among the before session's
     descriptors and, inverted, those of the before session among the after session's. In reading B, keyframes without a
     partner within `max_pair_m` are no candidates.
-
-    Args:
-        merged: Accepted or not; only its poses are used.
-        before: Descriptors of the before session; `pairs[:, 0]` indexes its keyframes.
-        after: Descriptors of the after session; `pairs[:, 1]` indexes its keyframes.
-        config: Reading, radius, threshold, suppression.
     """
-    before_positions = merged.before.odom_T_sensor[before.keyframe_scans, :3, 3]
-    after_odom = merged.after.odom_T_sensor[after.keyframe_scans, :3, 3]
-    after_positions = merged.alignment.to_map(after_odom)
-    gap_b, near_a = _nearest(before_positions, after_positions)
-    gap_a, near_b = _nearest(after_positions, before_positions)
-    is_same_place_b, is_same_place_a = gap_b <= config.max_pair_m, gap_a <= config.max_pair_m
-
+    is_covered_b, is_covered_a = places.is_covered_b, places.is_covered_a
     if config.reading == "nearest":
         score_b, partner_of_b = _nearest(before.q, after.q)
         score_a, partner_of_a = _nearest(after.q, before.q)
         is_candidate_b, is_candidate_a = np.isfinite(score_b), np.isfinite(score_a)
     else:
-        partner_of_b, partner_of_a = near_a, near_b
-        is_candidate_b, is_candidate_a = is_same_place_b, is_same_place_a
+        partner_of_b, partner_of_a = places.near_a, places.near_b
+        is_candidate_b, is_candidate_a = is_covered_b, is_covered_a
         score_b = _distances(before, after, partner_of_b, is_candidate_b)
         score_a = _distances(after, before, partner_of_a, is_candidate_a)
 
-    keyframe_scores = np.where(is_same_place_b, score_b, np.nan)
-    np.maximum.at(keyframe_scores, near_b[is_same_place_a], score_a[is_same_place_a])
+    keyframe_scores = np.where(is_covered_b, score_b, np.nan)
+    np.maximum.at(keyframe_scores, places.near_b[is_covered_a], score_a[is_covered_a])
 
     pairs_a = np.column_stack([partner_of_a, np.arange(len(score_a))])
     pairs_b = np.column_stack([np.arange(len(score_b)), partner_of_b])
     return rank_regions(
-        centres_map=np.concatenate([after_positions[is_candidate_a], before_positions[is_candidate_b]]),
+        centres_map=np.concatenate([places.after[is_candidate_a], places.before[is_candidate_b]]),
         scores=np.concatenate([score_a[is_candidate_a], score_b[is_candidate_b]]),
         pairs=np.concatenate([pairs_a[is_candidate_a], pairs_b[is_candidate_b]]),
         keyframe_scores=keyframe_scores,
         config=config,
     )
+
+
+def _by_spheres(places: _Places, logits: Float64Array, config: QueryConfig) -> ChangeRegions:
+    """Score every before keyframe by its most changed sector; the score of its sphere is the best in reach.
+
+    A sphere descriptor tells of the two metres before and behind its keyframe, a region of all within `radius_m`.
+    """
+    local = logits.max(axis=1) if len(logits) else np.zeros(0)
+    keyframe_scores = np.full(len(local), np.nan)
+    covered = np.flatnonzero(places.is_covered_b)
+    if len(covered):
+        tree = cKDTree(places.before[covered])
+        near = tree.query_ball_point(places.before[covered], _POOLED * config.radius_m)
+        keyframe_scores[covered] = [local[covered[found]].max() for found in near]
+    return rank_regions(places.before, local, places.pairs_b, keyframe_scores, config)
 
 
 def rank_regions(

@@ -13,9 +13,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cdpipe.config import MergeConfig
-from cdpipe.geometry import Float64Array, invert, make_pose, transform
+from cdpipe.geometry import Float32Array, Float64Array, invert, make_pose, transform
 from cdpipe.sphere import MapIndex, column_keys
 from cdpipe.types import PointMap
+from cdpipe.voxel import cell_keys
 
 # Fewer points than this are not registered.
 MIN_SPHERE_POINTS = 100
@@ -57,21 +58,28 @@ class IndexedMap:
     Attributes:
         map: The map.
         points: (N, 3) the points that are worked with.
+        seen_from: (N, 3) mean position of the sensor when each was seen; the point itself where that is not known.
         columns: For cutting spheres out of them.
         positions: (K, 3) of its keyframes, odom frame, metres.
         path: k-d tree of the positions of all scans.
         tree: k-d tree of the points.
     """
 
-    def __init__(self, point_map: PointMap, config: MergeConfig, is_target: bool) -> None:
+    def __init__(
+        self, point_map: PointMap, config: MergeConfig, is_target: bool, has_coarse_target: bool = True
+    ) -> None:
         self.map = point_map
-        near = near_points(point_map, config)
-        self.points = _thinned(near, config.target_voxel_m) if is_target else near
+        is_near = point_map.nearest_m <= config.seen_within_m
+        near = point_map.points[is_near]
+        seen_from = near if point_map.seen_from is None else point_map.seen_from[is_near]
+        self.points, self.seen_from = (
+            _thinned(near, seen_from, config.target_voxel_m) if is_target else (near, seen_from)
+        )
         self.columns = MapIndex(self.points)
         self.positions = point_map.odom_T_keyframe[:, :3, 3]
         self.path = cKDTree(point_map.odom_T_sensor[:, :3, 3])
         self._fine = Surface(self.points) if is_target else None
-        self._coarse = Surface(self.points, config.coarse_voxel_m) if is_target else None
+        self._coarse = Surface(self.points, config.coarse_voxel_m) if is_target and has_coarse_target else None
         self.tree = self._fine.tree if self._fine else small_gicp.KdTree(self.points)
 
     @property
@@ -98,10 +106,17 @@ def near_points(point_map: PointMap, config: MergeConfig) -> Float64Array:
     return point_map.points[point_map.nearest_m <= config.seen_within_m]
 
 
-def _thinned(points: Float64Array, voxel_m: float) -> Float64Array:
-    """Return the mean of the points of each cell, in the order that `MapIndex` wants."""
-    means = np.ascontiguousarray(small_gicp.voxelgrid_sampling(points, voxel_m).points()[:, :3])
-    return means[np.argsort(column_keys(means), kind="stable")]
+def _thinned(
+    points: Float64Array, seen_from: Float64Array | Float32Array, voxel_m: float
+) -> tuple[Float64Array, Float64Array]:
+    """Return the means of the points of each cell and of where they were seen from, in the order of `MapIndex`."""
+    keys = cell_keys(points, voxel_m)
+    order = np.argsort(keys, kind="stable")
+    first = np.flatnonzero(np.diff(keys[order], prepend=keys[order[:1]] - 1))
+    counts = np.diff(first, append=len(keys))[:, None]
+    means, seen = (np.add.reduceat(each[order], first, axis=0) / counts for each in (points, seen_from))
+    order = np.argsort(column_keys(means), kind="stable")
+    return means[order], seen[order]
 
 
 def register(

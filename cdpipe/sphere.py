@@ -40,12 +40,12 @@ class MapIndex:
         rows = np.arange(low[0], high[0] + 1)
         starts = np.searchsorted(self._keys, _key(rows, low[1]), side="left")
         ends = np.searchsorted(self._keys, _key(rows, high[1]), side="right")
-        found = []
-        for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
-            offsets = self._points[start:end] - centre
-            is_inside = np.einsum("ij,ij->i", offsets, offsets) <= radius_m * radius_m
-            found.append(start + np.flatnonzero(is_inside))
-        indices = np.concatenate(found)
+        slices = [(start, end) for start, end in zip(starts.tolist(), ends.tolist(), strict=True) if start < end]
+        if not slices:
+            return np.zeros(0, dtype=np.int64)
+        offsets = np.concatenate([self._points[start:end] for start, end in slices]) - centre
+        is_inside = np.einsum("ij,ij->i", offsets, offsets) <= radius_m * radius_m
+        indices: Int64Array = np.concatenate([np.arange(start, end) for start, end in slices])[is_inside]
         return indices if self._order is None else self._order[indices]
 
 

@@ -13,6 +13,7 @@ from cdpipe.geometry import (
     BoolArray,
     Float32Array,
     Float64Array,
+    Int8Array,
     Int32Array,
     Int64Array,
     require_poses,
@@ -21,6 +22,7 @@ from cdpipe.geometry import (
 
 Kind = Literal["added", "removed", "moved", "reshaped"]
 SessionName = Literal["before", "after"]
+Spheres = Float32Array | Int8Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +82,8 @@ class PointMap:
         return_points: (M,) int32 map point of each return, in scan order.
         return_pixels: (M,) int32 pixel of each return within its scan.
         scan_offsets: (S + 1,) int64; the returns of scan s are scan_offsets[s]:scan_offsets[s + 1].
+        seen_from: (N, 3) float32 mean position of the sensor when each point was seen, weighed as the point is; None
+            where that is not known.
     """
 
     points: Float64Array
@@ -90,9 +94,12 @@ class PointMap:
     return_points: Int32Array
     return_pixels: Int32Array
     scan_offsets: Int64Array
+    seen_from: Float32Array | None = None
 
     def __post_init__(self) -> None:
         require_shape("points", self.points, (None, 3))
+        if self.seen_from is not None:
+            require_shape("seen_from", self.seen_from, self.points.shape)
         require_shape("nearest_m", self.nearest_m, (len(self.points),))
         require_poses("odom_T_sensor", self.odom_T_sensor)
         require_shape("keyframe_scans", self.keyframe_scans, (None,))
@@ -115,7 +122,7 @@ class DescriptorSet:
         keyframe_scans: (K,) int64 scan of each keyframe.
         name: Which descriptor.
         checkpoint: Digest of the weights, or "" where there are none.
-        spheres: (K, E) float32 what the map around each keyframe looks like (`describe_map`), or None.
+        spheres: (K, E) float32 or int8 what the map around each keyframe looks like (`describe_map`), or None.
     """
 
     q: Float32Array
@@ -123,7 +130,7 @@ class DescriptorSet:
     keyframe_scans: Int64Array
     name: str
     checkpoint: str
-    spheres: Float32Array | None = None
+    spheres: Spheres | None = None
 
     def __post_init__(self) -> None:
         require_shape("q", self.q, (None, None))

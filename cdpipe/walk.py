@@ -56,7 +56,6 @@ class Walk:
         information: (A, 6, 6) Hessian of each, turn then shift in after odom axes; zero where there is none.
         fits: (A,) share of inliers, 0 where it did not fit or jumped, NaN where the before session never drove.
         residuals_m: (A,) median distance to the surface, NaN where nothing was registered.
-        held_at: (A, 3) where each alignment is right, after odom frame; see `SurfaceFit`.
     """
 
     keyframes: Int64Array
@@ -64,7 +63,6 @@ class Walk:
     information: Float64Array
     fits: Float64Array
     residuals_m: Float64Array
-    held_at: Float64Array
 
 
 def walk(
@@ -103,7 +101,6 @@ def walk(
         information=np.array([stop.information for stop in stops]),
         fits=np.array([stop.fit for stop in stops]),
         residuals_m=np.array([stop.residual_m for stop in stops]),
-        held_at=np.array([after.positions[s.keyframe] if s.held_at is None else s.held_at for s in stops]),
     )
 
 
@@ -116,7 +113,6 @@ class _Stop:
     information: Float64Array = field(default_factory=lambda: np.zeros((6, 6)))
     fit: float = np.nan
     residual_m: float = np.nan
-    held_at: Float64Array | None = None
 
 
 def _reached(
@@ -144,7 +140,7 @@ def _stop(
     if registered is None:
         return _Stop(keyframe, guess, fit=0.0)
     pose, fit, information = registered
-    return _Stop(keyframe, pose, information, fit.inlier_share(config.inlier_m), fit.residual_m, fit.held_at)
+    return _Stop(keyframe, pose, information, fit.inlier_share(config.inlier_m), fit.residual_m)
 
 
 def is_shared(before: IndexedMap, positions_map: Float64Array) -> BoolArray:

@@ -7,6 +7,7 @@ import types
 import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -55,13 +56,22 @@ def read_yaml(path: Path, text: str | None = None) -> Document:
         InputError: The file is missing, not YAML, or names a key twice.
     """
     try:
-        text = path.read_text() if text is None else text
+        document = _parsed(str(path), path.read_text() if text is None else text)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:  # not text
+        raise InputError(f"{path}: not YAML: {error}") from error
+    return replace(document, value=_copied(document.value))
+
+
+@lru_cache(maxsize=64)
+def _parsed(path: str, text: str) -> Document:
+    """Parse a text once: a family is drawn with many seeds, and parsing takes longer than drawing."""
+    try:
         node = yaml.compose(text, Loader=yaml.SafeLoader)
         lines: dict[Key, int] = {}
         mistakes: list[str] = []
-        value = _plain(node, (), lines, mistakes, str(path))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        value = _plain(node, (), lines, mistakes, path)
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
         raise InputError(f"{path}:{line}: not YAML: {error.problem}") from error
@@ -69,7 +79,7 @@ def read_yaml(path: Path, text: str | None = None) -> Document:
         raise InputError(f"{path}: not YAML: {error}") from error
     if mistakes:
         raise InputError("\n".join(mistakes))
-    return Document(str(path), value, {key: f"{path}:{line}" for key, line in lines.items()})
+    return Document(path, value, {key: f"{path}:{line}" for key, line in lines.items()})
 
 
 def validated(model: type[ModelT], document: Document) -> ModelT:

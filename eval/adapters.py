@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cdpipe.readers import open_scans
+from cdpipe.readers import RecordedScans, open_scans
+from cdpipe.session import Session
 from cdpipe.types import ScanSource, SessionName
 
 
@@ -19,3 +20,8 @@ def pipeline_input(pair: Path, session: SessionName) -> ScanSource:
         InputError: The session is missing or damaged.
     """
     return open_scans(pair / session)
+
+
+def held_input(session: Session) -> ScanSource:
+    """Return one session of a pair held in memory (`sim.held`) as the pipeline sees it; the truth is apart from it."""
+    return RecordedScans(session)

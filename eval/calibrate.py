@@ -1,7 +1,9 @@
 """Sets the threshold of every method to the same false-alarm rate: 5 % of unchanged validation pairs alarm.
 
-Run as `python -m eval.calibrate RUN`, where RUN is the folder of `tunnelcd run calibrate`. The thresholds are printed
-and written to RUN/thresholds.csv; they go into the presets by hand, so that no preset changes behind anyone's back.
+Run as `python -m eval.calibrate RUN`, where RUN is the folder of `tunnelcd run calibrate`. The thresholds are printed,
+with those at which every method has the same 0.1 false regions per 100 m, and written to RUN/thresholds.csv and, as
+presets and plans spell them, to RUN/thresholds.yaml. They are copied by hand, so that no preset changes behind anyone's
+back.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from cdpipe.geometry import Float64Array
 from eval.cli import input_errors
 
 ALARM_SHARE = 0.05
+FALSE_PER_100M = 0.1
 
 
 def alarm_threshold(best_scores: Float64Array, alarm_share: float = ALARM_SHARE) -> float:
@@ -29,43 +32,105 @@ def alarm_threshold(best_scores: Float64Array, alarm_share: float = ALARM_SHARE)
     """
     if len(best_scores) == 0 or np.isnan(best_scores).any():
         raise ValueError("best_scores must hold a number for each of at least one pair")
-    allowed = int(alarm_share * len(best_scores))
-    silent_best = np.sort(best_scores)[::-1][allowed]
-    if np.isinf(silent_best):
-        return 0.0
-    digits = 4 - int(np.floor(np.log10(max(abs(float(silent_best)), 1e-12)))) - 1
-    threshold = float(np.ceil(silent_best * 10.0**digits) / 10.0**digits)
-    return threshold if threshold > silent_best else float(round(threshold + 10.0**-digits, digits))
+    return _just_above(best_scores, int(alarm_share * len(best_scores)))
+
+
+def rate_threshold(scores: Float64Array, path_m: float, false_per_100m: float = FALSE_PER_100M) -> float:
+    """Return the smallest threshold, rounded up to four digits, that at most so many false regions per 100 m reach.
+
+    Args:
+        scores: (R,) score of every candidate of all unchanged pairs.
+        path_m: Way of their after sessions.
+        false_per_100m: What is allowed.
+    """
+    return _just_above(scores, int(false_per_100m * path_m / 100.0 + 1e-9))
 
 
 def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per variant and scenario: threshold, pairs, pairs that alarm at it, pairs without an answer.
+    """Return one row per variant and kind of site, with its thresholds at either rate.
 
     A threshold belongs to a kind of site, as the radius does: what is much change in a narrow drift is little in a
-    wide one.
+    wide one. Kinds of site differ in `score_radius_m`.
+
+    Returns:
+        `threshold`, which at most 5 % of the pairs reach, with `n_pairs`, `n_alarms` of them and `n_unanswered` further
+        ones; `threshold_at_rate`, which at most 0.1 false regions per 100 m reach, with the way `km` and `n_false`.
 
     Raises:
-        InputError: A pair has changes, so that its alarms would not be false.
+        InputError: A pair has changes, so that its alarms would not be false; or no pair of a kind has an answer.
     """
     changed = results.loc[results["n_changes"] > 0, "scenario"].unique()
     if len(changed):
         raise InputError(f"{', '.join(changed)}: has changes: calibration needs unchanged pairs")
-    best = regions.groupby(["variant", "scenario", "seed"])["score"].max()
     rows = []
-    for (variant, scenario), cases in results.groupby(["variant", "scenario"], sort=False):
+    for (variant, _), cases in results.groupby(["variant", "score_radius_m"], sort=False):
+        radius_m = float(cases["score_radius_m"].iloc[0])
         ok = cases[cases["status"] == "ok"]
-        scores = np.array([best.get((variant, scenario, seed), -np.inf) for seed in ok["seed"]], dtype=np.float64)
-        threshold = alarm_threshold(scores)
-        n_alarms = int((scores >= threshold).sum())
-        rows.append((variant, scenario, threshold, len(ok), n_alarms, len(cases) - len(ok)))
-    return pd.DataFrame(rows, columns=["variant", "scenario", "threshold", "n_pairs", "n_alarms", "n_unanswered"])
+        if len(ok) == 0:
+            raise InputError(f"{variant}, {radius_m:g} m: no pair has an answer: nothing to set a threshold by")
+        of_case = regions[regions["variant"] == variant].groupby(["scenario", "seed"])["score"]
+        found = {case: scores.to_numpy(dtype=np.float64) for case, scores in of_case}
+        candidates = [found.get(case, np.zeros(0)) for case in zip(ok["scenario"], ok["seed"], strict=True)]
+        best = np.array([scores.max(initial=-np.inf) for scores in candidates])
+        every, path_m = np.concatenate(candidates), float(ok["after_path_m"].sum())
+        threshold, at_rate = alarm_threshold(best), rate_threshold(every, path_m)
+        rows.append(
+            {
+                "variant": variant,
+                "score_radius_m": radius_m,
+                "threshold": threshold,
+                "n_pairs": len(ok),
+                "n_alarms": int((best >= threshold).sum()),
+                "n_unanswered": len(cases) - len(ok),
+                "threshold_at_rate": at_rate,
+                "km": path_m / 1000.0,
+                "n_false": int((every >= at_rate).sum()),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def as_settings(table: pd.DataFrame) -> str:
+    """Return the thresholds as YAML: for each rate and variant the line of a preset, then what wider sites need.
+
+    The preset holds the site of the smallest radius; wider ones stand in a plan, under `per_scenario` of the variant.
+    """
+    lines = []
+    rates = (
+        ("threshold", f"at most {ALARM_SHARE:.0%} of the unchanged pairs alarm"),
+        ("threshold_at_rate", f"at most {FALSE_PER_100M:g} false regions per 100 m"),
+    )
+    for column, meaning in rates:
+        lines += [f"{column}:  # {meaning}"]
+        for variant, own in table.sort_values("score_radius_m", kind="stable").groupby("variant", sort=False):
+            first, *wider = zip(own["score_radius_m"], own[column], strict=True)
+            lines += [f"  {variant}:", f"    preset: {{query: {{threshold: {first[1]:g}}}}}  # {first[0]:g} m"]
+            lines += [
+                f'    per_scenario_{radius_m:g}m: ["query.radius_m={radius_m:g}", "query.threshold={value:g}"]'
+                for radius_m, value in wider
+            ]
+    return "\n".join([*lines, ""])
 
 
 def main(run: Annotated[Path, typer.Argument(help="folder of `tunnelcd run calibrate`")]) -> None:
     """Print and write the thresholds of a calibration run."""
     table = thresholds(_read(run / "results.csv"), _read(run / "regions.csv"))
     table.to_csv(run / "thresholds.csv", index=False)
-    typer.echo(table.to_string(index=False))
+    settings = as_settings(table)
+    (run / "thresholds.yaml").write_text(settings)
+    typer.echo(f"{table.to_string(index=False)}\n\n{settings}")
+
+
+def _just_above(scores: Float64Array, allowed: int) -> float:
+    """Return the smallest number of four digits that no more than `allowed` of (N,) scores reach; 0 without need."""
+    if allowed >= len(scores):
+        return 0.0
+    silent_best = np.sort(scores)[::-1][allowed]
+    if np.isinf(silent_best):
+        return 0.0
+    digits = 4 - int(np.floor(np.log10(max(abs(float(silent_best)), 1e-12)))) - 1
+    threshold = float(np.ceil(silent_best * 10.0**digits) / 10.0**digits)
+    return threshold if threshold > silent_best else float(round(threshold + 10.0**-digits, digits))
 
 
 def _read(path: Path) -> pd.DataFrame:

@@ -57,14 +57,13 @@ class _Funnel(TyperGroup):
             with input_errors():
                 return super().invoke(ctx)
         except KeyboardInterrupt as error:
-            kept = "finished cells are kept, the same command goes on from there"
-            sys.stderr.write(
-                f"interrupted; {kept if ctx.invoked_subcommand in _KEEP_CELLS else 'nothing was written'}\n"
-            )
+            kept = _KEPT.get(ctx.invoked_subcommand or "")
+            told = f"finished {kept} are kept, the same command goes on from there" if kept else "nothing was written"
+            sys.stderr.write(f"interrupted; {told}\n")
             raise typer.Exit(130) from error
 
 
-_KEEP_CELLS = ("run", "demo")
+_KEPT = {"run": "cells", "demo": "cells", "dataset": "tunnels"}
 app = typer.Typer(
     cls=_Funnel,
     no_args_is_help=True,
@@ -341,6 +340,79 @@ def report(folder: Annotated[Path, typer.Argument(help="a run folder")]) -> None
 
 
 @app.command()
+def dataset(
+    families: Annotated[list[str], typer.Argument(metavar="FAMILY...", help="names from `list`, or .yaml files")],
+    seeds: Annotated[
+        str, typer.Option(metavar="A:B", help="B excluded; below 10000 to train, 10000 to 19999 to validate")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="data folder: new, empty, or to be continued", show_default=False)],
+    settings: SetSettings = None,
+    draws: Annotated[int, typer.Option(min=1, help="after images of each keyframe; the first is merged exactly")] = 4,
+    error_m: Annotated[float, typer.Option(min=0, help="merge error of the others: shift, per component")] = 0.03,
+    error_deg: Annotated[float, typer.Option(min=0, help="and turn, per component")] = 0.2,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="processes; each takes its own tunnels", show_default=False)
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="tcp://HOST:PORT", help="a Dask cluster instead", show_default=False)
+    ] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="make at most this many tunnels")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Make training data for descriptors, a shard for each tunnel. Finished tunnels are kept and skipped."""
+    import shlex
+
+    from eval.dataset import Recipe
+    from eval.dataset_run import Where, make_dataset
+
+    recipe = Recipe(draws, error_m, error_deg, tuple(settings or ()))
+    with shown_progress(quiet) as progress:
+        outcome = make_dataset(
+            families,
+            seeds,
+            recipe,
+            out,
+            Where(workers, scheduler),
+            limit,
+            shlex.join(["tunnelcd", *sys.argv[1:]]),
+            progress,
+        )
+    left = f", {outcome.n_left} left by --limit" if outcome.n_left else ""
+    refused = f", {outcome.n_refused} refused (README.md says why)" if outcome.n_refused else ""
+    rate = f"; {outcome.n_pairs} keyframe pairs, {outcome.n_pairs / outcome.seconds:.1f}/s" if outcome.n_made else ""
+    _say(quiet, f"{out}: {outcome.n_made} tunnels made, {outcome.n_kept} kept from earlier{refused}{left}{rate}")
+
+
+@app.command()
+def train(
+    data: Annotated[Path, typer.Argument(metavar="DIR", help="made by `tunnelcd dataset`, tunnels of both splits")],
+    out: Annotated[Path, typer.Option("--out", help="checkpoint, model card, curves", show_default=False)],
+    descriptor: Annotated[str, typer.Option(help="sphere or 3deg")] = "sphere",
+    steps: Annotated[int, typer.Option(min=1, help="at most")] = 4000,
+    seed: Annotated[int, typer.Option(min=0, help="of the first weights and of every draw")] = 0,
+    threads: Annotated[int, typer.Option(min=1, help="of torch")] = 2,
+    patience: Annotated[int, typer.Option(min=1, help="validations without a better score until it stops")] = 6,
+    quiet: Quiet = False,
+) -> None:
+    """Train a descriptor: checkpoint (safetensors), model card, curves. A run that was cut off goes on."""
+    import shlex
+
+    from cdpipe.descriptor.fit import FitConfig
+    from cdpipe.errors import InputError
+    from eval.training_run import TASKS, train_descriptor
+
+    if descriptor not in TASKS:
+        raise InputError(f"--descriptor {descriptor}: expected {' or '.join(TASKS)}")
+    command = shlex.join(["tunnelcd", *sys.argv[1:]])
+    with shown_progress(quiet) as progress:
+        trained = train_descriptor(
+            data, out, descriptor, FitConfig(seed, steps, patience=patience), threads, command, progress
+        )
+    scores = ", ".join(f"{name} {value}" for name, value in trained.card["validation"]["trained"].items())
+    _say(quiet, f"{trained.checkpoint}: best of step {trained.card['best_step']} on validation tunnels: {scores}")
+
+
+@app.command()
 def bench(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE.json", help="also write the table", show_default=False)
@@ -453,6 +525,23 @@ def _results(folder: Path, quiet: bool) -> None:
         typer.echo(f"{covered.sentence}\n")
     if len(targets):
         _table("merge: share of the pairs within the target of their kind, with its 95 % interval", targets)
+    if (folder / "regions_table.csv").is_file():
+        _region_results(folder)
+
+
+def _region_results(folder: Path) -> None:
+    import pandas as pd
+
+    from eval.region_table import region_overview
+
+    _table(
+        "regions: means over pairs, in and out of distribution; recall@0.1 is at 0.1 false regions per 100 m",
+        region_overview(pd.read_csv(folder / "regions_table.csv")),
+    )
+    if (folder / "regions_targets.csv").is_file():
+        targets = pd.read_csv(folder / "regions_targets.csv")
+        met = [_MET[None if pd.isna(value) else bool(value)] for value in targets["is_met"]]
+        _table("regions: what is asked", targets.drop(columns="is_met").assign(met=met))
 
 
 def _table(title: str, frame: pd.DataFrame) -> None:

@@ -75,6 +75,16 @@ class GroundTruth:
         """The after session."""
         return self.sessions["after"]
 
+    def range_m(self, index: int) -> float:
+        """Return the shortest range at which the session that holds a change saw it, metres; NaN where it did not."""
+        change = self.pair.changes[index]
+        return self.sessions[change.session].universe.range_of_change(change.id)
+
+    def points_odom(self, index: int) -> Float64Array:
+        """Return the (N, 3) cells of a change's truth, that session's odom frame, metres."""
+        universe = self.sessions[self.pair.changes[index].session].universe
+        return universe.points_odom[self.change_rows[index]].astype(np.float64)
+
     @property
     def n_observable(self) -> int:
         """Number of observable changes of both groups."""
@@ -87,8 +97,11 @@ def load_ground_truth(pair: Path) -> GroundTruth:
     Raises:
         InputError: A session or a part of the truth is missing, damaged or of another session.
     """
-    truth = read_pair_truth(pair)
-    sessions = {name: _load_session(pair / name) for name in SESSIONS}
+    return ground_truth(read_pair_truth(pair), {name: _load_session(pair / name) for name in SESSIONS})
+
+
+def ground_truth(truth: PairTruth, sessions: Mapping[SessionName, SessionTruth]) -> GroundTruth:
+    """Put a pair's truth together from the list of its changes and its two sessions."""
     rows, centroids = [], []
     for change in truth.changes:
         session = sessions[change.session]

@@ -25,9 +25,10 @@ from eval.page_effects import ENOUGH_PAIRS, draw_effects
 from eval.page_merge import draw_merge, ends_at_merge
 from eval.page_merge_tables import MERGE_COLUMNS
 from eval.page_paper import time_table, volume_table
+from eval.page_regions import REGION_COLUMNS, draw_regions
 from eval.page_run import RunData, first_seed, named_variants, of, read_document, read_run, scenarios, text
 from eval.page_site import draw_site
-from eval.page_story import story
+from eval.page_story import about_wrong_merges, story
 from eval.page_tables import (
     Cell,
     Table,
@@ -81,13 +82,17 @@ def _content(data: RunData, tables: Mapping[str, Table]) -> dict[str, Any]:
     grids = grid_tables(data)
     unchanged = unchanged_table(data)
     merge = draw_merge(data)
+    regions = draw_regions(data)
     missing = [*data.missing, *(line for site in sites for line in site.missing), *merge.missing]
+    missing += [] if regions is None else regions.missing
     missing += [] if sites else ["No scenario with changes was run."]
     missing += [] if unchanged.rows else ["No unchanged pair was run, so false alarms are not measured."]
     missing += [] if grids else ["No grid of two settings was run."]
     return {
         **_about(data, missing),
-        "sentences": story(data),
+        "sentences": story(data) if regions is None else [*regions.sentences, *about_wrong_merges(data)],
+        "regions": regions,
+        "region_columns": [] if regions is None else REGION_COLUMNS,
         "merge": merge,
         "results": tables["results"],
         "unchanged": unchanged,

@@ -68,7 +68,7 @@ def story(data: RunData) -> list[str]:
     variants = dict.fromkeys(str(row["variant"]) for row in data.results)
     return [
         _about_baselines(rankings, list(variants)),
-        *_about_wrong_merges(data),
+        *about_wrong_merges(data),
         *(sentence(ranking) + _price(data, ranking) for ranking in rankings),
         *(f"On {name}, no preset gave an answer." for name in unanswered),
         *_about_failures(data),
@@ -152,7 +152,7 @@ def _is_baseline(variant: str) -> bool:
     return split_variant(variant)[0] in BASELINES
 
 
-def _about_wrong_merges(data: RunData) -> list[str]:
+def about_wrong_merges(data: RunData) -> list[str]:
     """Name the scenarios on which an accepted merge is so wrong that the scores after it say little about a method."""
     found = []
     for scenario in dict.fromkeys(str(row["scenario"]) for row in data.results):

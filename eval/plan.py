@@ -6,6 +6,7 @@ scenarios:                           # eval/worlds.py tells more
   - paper/site1
   - {name: paper/site2, each: [sensor.range_noise=false, sensor.mode=512x10]}  # as it is, and again with each of these
 seeds: "20000:20002"                 # B excluded, in quotes; or a list
+report: regions                      # also the tables and plots of `eval.region_table`; left out: none
 until: null                          # merge: map, describe, merge, and no further; only the columns of the merge
 variants:
   - preset: paper                    # a shipped preset or the path of a .yaml file
@@ -180,6 +181,7 @@ class Plan(Settings):
     scenarios: Annotated[tuple[ScenarioItem, ...], NotEmpty]
     seeds: Annotated[tuple[int, ...], BeforeValidator(parse_seeds)]
     until: Until | None = None
+    report: Literal["regions"] | None = None
     variants: Annotated[tuple[Variant, ...], NotEmpty]
     grid: tuple[Grid, ...] = ()
 
@@ -212,6 +214,12 @@ class Plan(Settings):
                 raise ValueError(
                     f"{setting} of {who} does nothing: the plan ends at the merge; leave it out, or leave out until"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _report_has_regions(self) -> Plan:
+        if self.report == "regions" and self.until == "merge":
+            raise ValueError("report: regions needs regions, and the plan ends at the merge; leave one of them out")
         return self
 
     @model_validator(mode="after")

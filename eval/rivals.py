@@ -1,4 +1,4 @@
-"""What the pipeline is measured against: a comparison of whole maps without regions, and regions drawn at random.
+"""What the pipeline is measured against: comparisons of whole maps without regions, and regions drawn at random.
 
 Every method takes two merged maps and gives the same report, so that `METHODS` can be run side by side. Their clocks
 favour the rivals: what is computed for the tables only (figures, keyframe scores) is not counted.
@@ -6,15 +6,16 @@ favour the rivals: what is computed for the tables only (figures, keyframe score
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.config import PipelineConfig
+from cdpipe.config import ExtractConfig, PipelineConfig
 from cdpipe.detect import Comparison, compare, local_alignment
+from cdpipe.difference import is_within, marked_share
 from cdpipe.extract import (
     FIGURES,
     PointGroup,
@@ -29,6 +30,8 @@ from cdpipe.geometry import BoolArray, Float64Array, Int64Array, stream
 from cdpipe.query import rank_regions
 from cdpipe.sphere import MapIndex
 from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport, DescriptorSet, MergedMaps, SessionName
+
+NewMask = Callable[[Float64Array, Float64Array, ExtractConfig], BoolArray]
 
 _DIRECTIONS: tuple[tuple[SessionName, SessionName], ...] = (("after", "before"), ("before", "after"))
 
@@ -56,23 +59,15 @@ def voxel_diff(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, 
         after: Likewise.
         config: `extract`, `outlier`, `cluster` and `query` are used.
     """
-    start = perf_counter()
-    maps = _in_map_frame(merged, before, after)
-    groups: list[PointGroup] = []
-    is_changed: dict[SessionName, BoolArray] = {}
-    for session, other in _DIRECTIONS:
-        found = _changed_clusters(maps, session, other, config)
-        groups += [PointGroup(session, indices, maps.points[session][indices], -1) for indices in found]
-        is_changed[session] = np.zeros(len(maps.points[session]), dtype=np.bool_)
-        is_changed[session][np.concatenate([np.zeros(0, dtype=np.int64), *found])] = True
-    regions = _cluster_regions(groups, maps, config)
-    compared = perf_counter()
-    answered = _in_reported_regions(groups, regions, config)
-    grouped = perf_counter()
-    objects = assemble_objects(merged, answered)
-    seconds = _seconds(start, compared, grouped, perf_counter())
-    regions = replace(regions, keyframe_scores=_changed_share(maps, is_changed, config))
-    return _report(merged, (before, after), regions, objects, _figures(maps, regions, objects), seconds, config)
+    return _whole_map(merged, before, after, config, new_points_mask)
+
+
+def c2c(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig) -> ChangeReport:
+    """Compare the maps as `voxel_diff` does, but new is what is farther than `extract.distance_m` from the other map.
+
+    The distance to the nearest point, cloud to cloud (C2C), as CloudCompare and others measure it.
+    """
+    return _whole_map(merged, before, after, config, _far_points_mask)
 
 
 def random_regions(
@@ -98,8 +93,40 @@ def random_regions(
     return _report(merged, (before, after), regions, objects, figures, seconds, config)
 
 
-METHODS: dict[str, Comparison] = {"descriptor": compare, "voxel-diff": voxel_diff, "random-regions": random_regions}
+METHODS: dict[str, Comparison] = {
+    "descriptor": compare,
+    "voxel-diff": voxel_diff,
+    "c2c": c2c,
+    "random-regions": random_regions,
+}
 USES_DESCRIPTORS = frozenset({"descriptor"})
+
+
+def _whole_map(
+    merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig, new_mask: NewMask
+) -> ChangeReport:
+    """Compare, filter and cluster; `new_mask` says which points of a cloud are not in another."""
+    start = perf_counter()
+    maps = _in_map_frame(merged, before, after)
+    groups: list[PointGroup] = []
+    is_changed: dict[SessionName, BoolArray] = {}
+    for session, other in _DIRECTIONS:
+        found = _changed_clusters(maps, session, other, config, new_mask)
+        groups += [PointGroup(session, indices, maps.points[session][indices], -1) for indices in found]
+        is_changed[session] = np.zeros(len(maps.points[session]), dtype=np.bool_)
+        is_changed[session][np.concatenate([np.zeros(0, dtype=np.int64), *found])] = True
+    regions = _cluster_regions(groups, maps, config)
+    compared = perf_counter()
+    answered = _in_reported_regions(groups, regions, config)
+    grouped = perf_counter()
+    objects = assemble_objects(merged, answered)
+    seconds = _seconds(start, compared, grouped, perf_counter())
+    regions = replace(regions, keyframe_scores=_changed_share(maps, is_changed, config))
+    return _report(merged, (before, after), regions, objects, _figures(maps, regions, objects), seconds, config)
+
+
+def _far_points_mask(points: Float64Array, reference_points: Float64Array, config: ExtractConfig) -> BoolArray:
+    return ~is_within(points, reference_points, config.distance_m)
 
 
 def _in_map_frame(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet) -> _Maps:
@@ -114,11 +141,11 @@ def _in_map_frame(merged: MergedMaps, before: DescriptorSet, after: DescriptorSe
 
 
 def _changed_clusters(
-    maps: _Maps, session: SessionName, other: SessionName, config: PipelineConfig
+    maps: _Maps, session: SessionName, other: SessionName, config: PipelineConfig, new_mask: NewMask
 ) -> list[Int64Array]:
     """Return the map point indices of every cluster that is in one map only, largest first."""
     points = maps.points[session]
-    new = np.flatnonzero(new_points_mask(points, maps.points[other], config.extract))
+    new = np.flatnonzero(new_mask(points, maps.points[other], config.extract))
     gaps_m, _ = _nearest(points[new], maps.path[other])
     new = new[gaps_m <= config.query.radius_m]
     new = new[inlier_mask(points[new], config.outlier)]
@@ -163,17 +190,10 @@ def _centroids(groups: Sequence[PointGroup]) -> Float64Array:
 
 def _changed_share(maps: _Maps, is_changed: dict[SessionName, BoolArray], config: PipelineConfig) -> Float64Array:
     """Return the (K,) changed share around each before keyframe; NaN where the after session never came near."""
-    centres = maps.path["before"]
-    n_changed, n_all = np.zeros(len(centres)), np.zeros(len(centres))
-    for session, points in maps.points.items():
-        index = MapIndex(points)
-        for keyframe, centre in enumerate(centres):
-            inside = index.crop(centre, config.query.radius_m)
-            n_all[keyframe] += len(inside)
-            n_changed[keyframe] += np.count_nonzero(is_changed[session][inside])
-    gaps_m, _ = _nearest(centres, maps.path["after"])
-    is_seen = (gaps_m <= config.query.max_pair_m) & (n_all > 0)
-    return np.where(is_seen, n_changed / np.maximum(n_all, 1.0), np.nan)
+    clouds = [(points, is_changed[session]) for session, points in maps.points.items()]
+    scores = marked_share(clouds, maps.path["before"], config.query.radius_m)
+    gaps_m, _ = _nearest(maps.path["before"], maps.path["after"])
+    return np.where(gaps_m <= config.query.max_pair_m, scores, np.nan)
 
 
 def _figures(maps: _Maps, regions: ChangeRegions, objects: Sequence[ChangedObject]) -> dict[str, Float64Array]:

@@ -7,6 +7,8 @@ maps/<world>/<seed>.npz                       thinned maps for pictures
 cells/<world>/<seed>/<variant>.json           a finished cell: key, order, row, items
 results.csv changes.csv regions.csv objects.csv keyframes.csv summary.csv
 merge.csv                                     where pairs have a kind (eval.merge_table)
+regions_table.csv regions_targets.csv regions_by_size.csv roc.csv froc.csv
+                                              where the plan says `report: regions` (eval.region_table)
 effects.csv                                   where a world was run with and without a setting (eval.effects)
 """
 
@@ -23,11 +25,13 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.errors import InputError
+from eval.coverage import coverage
 from eval.effects import effects
 from eval.merge_table import merge_table
 from eval.output import make_writable
 from eval.plan import slug
 from eval.provenance import TOOL
+from eval.region_table import FILES, region_tables
 from eval.statistics import summarise
 from eval.worlds import world_slug
 
@@ -146,12 +150,30 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     for table, frame in items.items():
         _write_csv(run.path / f"{table}.csv", frame)
     _write_csv(run.path / "summary.csv", summarise(results, keyframes=items["keyframes"]))
-    for name, found in (("effects", effects(results)), ("merge", merge_table(results))):
+    tables = {"effects": effects(results), "merge": merge_table(results), **_region_tables(run, results, items)}
+    for name, found in tables.items():
         if len(found):
             _write_csv(run.path / f"{name}.csv", found)
         else:
             remove(run.path / f"{name}.csv")
     return results
+
+
+def reports_regions(provenance: Mapping[str, Any]) -> bool:
+    """Tell whether the plan of a run asks for the report of regions."""
+    plan = provenance.get("plan")
+    return isinstance(plan, Mapping) and plan.get("report") == "regions"
+
+
+def _region_tables(
+    run: RunFolder, results: pd.DataFrame, items: Mapping[str, pd.DataFrame]
+) -> Mapping[str, pd.DataFrame]:
+    provenance = run.provenance() if (run.path / "provenance.json").is_file() else {}
+    if not reports_regions(provenance) or "region_auroc" not in results:
+        return {name: pd.DataFrame() for name in FILES}
+    cases = zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
+    covered = coverage(provenance, cases)
+    return region_tables(results, items, is_whole=covered is None or covered.is_whole)
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

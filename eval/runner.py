@@ -19,9 +19,10 @@ import numpy as np
 from cdpipe.answer import write_answer, write_failure
 from cdpipe.coarse import is_kiss_matcher_installed
 from cdpipe.config import DescriptorConfig, MapConfig
-from cdpipe.descriptor import checkpoint_digest, use_threads
+from cdpipe.descriptor import checkpoint_digest, sphere_digest, use_threads
 from cdpipe.errors import InputError, MergeFailedError, ScenarioError, TunnelcdError
 from eval.adapters import pipeline_input
+from eval.domains import domain_of
 from eval.ground_truth import GroundTruth, load_ground_truth
 from eval.oracles import merged_by_truth
 from eval.plan import Cell, Plan, cells
@@ -251,7 +252,8 @@ def _answer(stages: PairStages, cell: Cell, truth: GroundTruth, folder: Path) ->
     try:
         report = run(cell.config, _oracle(cell, truth))
     except MergeFailedError as error:
-        write_failure(folder, cell.variant, "merge_refused", str(error), error.evidence, settings, cell.until)
+        measured = error.evidence, settings, cell.until, error.seconds
+        write_failure(folder, cell.variant, "merge_refused", str(error), *measured)
     except TunnelcdError as error:
         write_failure(folder, cell.variant, "failed", str(error), {}, settings, cell.until)
     else:
@@ -268,7 +270,8 @@ def _oracle(cell: Cell, truth: GroundTruth) -> Merge | None:
 
 def _unmade(pair: _Pair, error: str) -> CaseScore:
     """Score a case whose world cannot be made: there is no truth, so all but the identity is undefined."""
-    row = {"scenario": "", "family": pair.family, "pair_kind": "", "seed": pair.seed, "variant": "", "preset": ""}
+    names = {"scenario": "", "family": pair.family, "domain": domain_of(pair.family), "pair_kind": ""}
+    row = {**names, "seed": pair.seed, "variant": "", "preset": ""}
     outcome = {"status": "failed", "error": error, "metrics_version": METRICS_VERSION}
     return CaseScore(row={**row, **outcome}, changes=[], regions=[], objects=[])
 
@@ -284,6 +287,7 @@ def _key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mapping[s
             "seed": cell.seed,
             "config": cell.config.model_dump(mode="json"),
             "checkpoint": checkpoint_digest(cell.config.descriptor),
+            **({"sphere": sphere_digest()} if cell.config.query.compare == "sphere" else {}),
             "oracle": None if cell.oracle is None else cell.oracle.model_dump(mode="json"),
             "until": cell.until,
             "pair_kind": pair_kind,
@@ -297,4 +301,6 @@ def _provenance(plan: Plan, all_cells: Sequence[Cell], command: Sequence[str]) -
     configs = {f"{cell.scenario} {cell.variant}": cell.config.model_dump(mode="json") for cell in all_cells}
     methods = dict.fromkeys(cell.config.descriptor.method for cell in all_cells)
     checkpoints: dict[str, str] = {method: checkpoint_digest(DescriptorConfig(method=method)) for method in methods}
+    if any(cell.config.query.compare == "sphere" for cell in all_cells):
+        checkpoints["sphere"] = sphere_digest()
     return describe_run(plan.model_dump(mode="json"), configs, checkpoints, command)

@@ -18,6 +18,7 @@ from cdpipe.geometry import Float64Array, travelled_m
 from cdpipe.types import ChangedObject, ChangeReport
 from eval.answer_check import check_answer
 from eval.answer_rows import answer_rows
+from eval.domains import domain_of, is_change_in_distribution
 from eval.ground_truth import GroundTruth, load_ground_truth
 from eval.merge_metrics import evidence_columns, merge_columns, merge_errors, overlap_true
 from eval.object_metrics import ObjectMatches, kinds_right, match_objects, object_columns, unanswered_objects
@@ -107,6 +108,7 @@ def _identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
     return {
         "scenario": truth.pair.family,
         "family": truth.pair.family,
+        "domain": domain_of(truth.pair.family),
         "pair_kind": "",
         "seed": truth.pair.seed,
         "variant": answer.method,
@@ -136,7 +138,7 @@ def _merge(answer: Answer, truth: GroundTruth) -> dict[str, float]:
 
 def _times(answer: Answer, n_regions: int) -> dict[str, float]:
     """Return the time columns; whatever an answer does not state is NaN, and so are sums that would need it."""
-    seconds = {} if answer.report is None else answer.seconds
+    seconds = answer.seconds
     index, merge, refine, descriptor, cd, oe = (
         float(seconds.get(name, _NAN))
         for name in ("t_index_s", "t_merge_s", "t_refine_s", "t_descriptor_s", "t_cd_s", "t_oe_s")
@@ -175,6 +177,7 @@ def _sizes(answer: Answer, truth: GroundTruth, n_regions: int, after_path_m: flo
             f"n_keyframes_{name}": len(scans) if scans is not None and len(scans) else _NAN
             for name, scans in zip(truth.sessions, keyframes, strict=True)
         },
+        **{name: float(answer.evidence.get(name, _NAN)) for name in ("bytes_map_before", "bytes_regions_before")},
         "after_path_m": after_path_m,
         "is_unchanged_pair": is_unchanged,
         # a pair that was refused, or only merged, was neither silent nor an alarm
@@ -205,6 +208,9 @@ def _change_rows(
                 "matched_kind": report.objects[matched].kind if report is not None and matched >= 0 else "",
                 "is_kind_right": float(right[index]),
                 "n_truth_cells": len(truth.change_rows[index]),
+                "seen_hull_volume_m3": hull_volume_m3(truth.points_odom(index)),
+                "range_m": truth.range_m(index),
+                "is_in_distribution": is_change_in_distribution(truth.pair.family, change.prop_kind),
             }
         )
     return rows

@@ -68,7 +68,7 @@ def detect_pair(before: Path, after: Path, config: PipelineConfig, on_stage: OnS
     try:
         report = detect_changes(mapped[0], mapped[1], config, METHODS[config.method])
     except MergeFailedError as error:
-        raise MergeFailedError(f"{before} and {after}: {error}", error.evidence) from error
+        raise MergeFailedError(f"{before} and {after}: {error}", error.evidence, error.seconds) from error
     seconds = {**report.seconds, "t_descriptor_s": t_descriptor_s}
     sizes = {name: len(each.map.points) for name, each in zip(_SIZES, mapped, strict=True)}
     return replace(report, seconds=seconds, evidence={**report.evidence, **sizes})

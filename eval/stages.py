@@ -16,7 +16,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from cdpipe.config import MapConfig, PipelineConfig
-from cdpipe.descriptor import describe_scans
+from cdpipe.descriptor import describe_map, describe_scans
 from cdpipe.detect import local_alignment, refusal
 from cdpipe.mapping import build_map
 from cdpipe.merge import merge_maps
@@ -29,11 +29,13 @@ from cdpipe.types import (
     MergedMaps,
     PointMap,
     ScanSource,
+    Spheres,
 )
 from eval.rivals import METHODS, USES_DESCRIPTORS
 
 REPEAT_BELOW_S = 1.0
 REPEATS = 3
+_POSE_BYTES = 28.0
 OnStage = Callable[[str, int, int], None]
 Merge = Callable[[MappedSession, MappedSession], MergedMaps]
 
@@ -64,6 +66,7 @@ class PairStages:
         self._map_key = ""
         self._maps: tuple[PointMap, PointMap] | None = None
         self._described: dict[str, tuple[tuple[DescriptorSet, DescriptorSet], float]] = {}
+        self._spheres: dict[str, tuple[tuple[Spheres, Spheres], float]] = {}
         self._merged: dict[str, tuple[MergedMaps, Mapping[str, float]]] = {}
 
     def maps(self, config: MapConfig) -> tuple[PointMap, PointMap]:
@@ -73,6 +76,7 @@ class PairStages:
             # the old maps must be gone before the new ones are built: the large site fills gigabytes
             self._maps = None
             self._described.clear()
+            self._spheres.clear()
             self._merged.clear()
             self._maps = (self._map(0, config), self._map(1, config))
             self._map_key = key
@@ -81,10 +85,16 @@ class PairStages:
     def mapped(self, config: PipelineConfig) -> tuple[MappedSession, MappedSession, float]:
         """Return both sessions with their descriptors, and the seconds that all descriptors took."""
         maps = self.maps(config.map)
-        key = config.descriptor.model_dump_json()
+        key = config.descriptor.method
         if key not in self._described:
             self._described[key] = self._describe(maps, config)
         (before, after), seconds = self._described[key]
+        if config.query.compare == "sphere":
+            if config.descriptor.precision not in self._spheres:
+                self._spheres[config.descriptor.precision] = self._describe_spheres(maps, config)
+            (of_before, of_after), more_seconds = self._spheres[config.descriptor.precision]
+            before, after = replace(before, spheres=of_before), replace(after, spheres=of_after)
+            seconds += more_seconds
         return MappedSession(maps[0], before), MappedSession(maps[1], after), seconds
 
     def merged(self, config: PipelineConfig, merge: Merge | None = None) -> tuple[MergedMaps, Mapping[str, float]]:
@@ -100,7 +110,7 @@ class PairStages:
         before, after, _ = self.mapped(config)
         self._on_stage("merge", 0, 1)
         if merge is None:
-            key = config.descriptor.model_dump_json() + config.merge.model_dump_json()
+            key = config.descriptor.method + config.merge.model_dump_json()
             if key not in self._merged:
                 self._merged[key] = timed_parts(lambda: merge_maps(before, after, config.merge))
             merged, seconds = self._merged[key]
@@ -108,7 +118,7 @@ class PairStages:
             merged = merge(before, after)
             seconds = merged.seconds
         if not merged.is_accepted:
-            raise refusal(merged)
+            raise refusal(replace(merged, seconds=seconds))
         return merged, seconds
 
     def answer(self, config: PipelineConfig, merge: Merge | None = None) -> ChangeReport:
@@ -126,7 +136,7 @@ class PairStages:
         return replace(
             report,
             seconds={**medians, **of_merge, **of_descriptors},
-            evidence={**report.evidence, **_sizes(before, after)},
+            evidence={**report.evidence, **_sizes(before, after), **kept_bytes(before, config)},
         )
 
     def merge_answer(self, config: PipelineConfig, merge: Merge | None = None) -> ChangeReport:
@@ -168,6 +178,15 @@ class PairStages:
         )
         return (before, after), time.perf_counter() - start
 
+    def _describe_spheres(
+        self, maps: tuple[PointMap, PointMap], config: PipelineConfig
+    ) -> tuple[tuple[Spheres, Spheres], float]:
+        self._on_stage("describe spheres", 0, 1)
+        describe_map(maps[0], maps[0].odom_T_keyframe[:1], config.descriptor)  # loads the network
+        start = time.perf_counter()
+        before, after = (describe_map(pointmap, pointmap.odom_T_keyframe, config.descriptor) for pointmap in maps)
+        return (before, after), time.perf_counter() - start
+
 
 def timed_parts(call: Callable[[], TimedT]) -> tuple[TimedT, Mapping[str, float]]:
     """Return a call's result and the seconds of its parts by the rule of this module."""
@@ -181,6 +200,24 @@ def timed_parts(call: Callable[[], TimedT]) -> tuple[TimedT, Mapping[str, float]
 
 def _sizes(before: MappedSession, after: MappedSession) -> dict[str, float]:
     return {"map_points_before": len(before.map.points), "map_points_after": len(after.map.points)}
+
+
+def kept_bytes(before: MappedSession, config: PipelineConfig) -> dict[str, float]:
+    """Return the bytes of the thinned before map, and of what a method keeps of that session to find regions.
+
+    Both as float32: x, y, z of every map point; for a descriptor one vector and one pose (7 numbers) per keyframe. What
+    compares points, or sees the before map anew from other places, keeps the map. Random regions keep poses alone.
+    """
+    map_bytes = 12.0 * len(before.map.points)
+    vectors = {"scan": before.descriptors.q, "sphere": before.descriptors.spheres}.get(config.query.compare)
+    n_keyframes = len(before.map.keyframe_scans)
+    if config.method == "random-regions":
+        kept = _POSE_BYTES * n_keyframes
+    elif config.method == "descriptor" and vectors is not None:
+        kept = _POSE_BYTES * n_keyframes + 4.0 * vectors.size
+    else:
+        kept = map_bytes
+    return {"bytes_map_before": map_bytes, "bytes_regions_before": kept}
 
 
 def _no_regions(radius_m: float) -> ChangeRegions:

@@ -15,6 +15,7 @@ _NORMAL_95 = 1.959963984540054
 IDENTITY_COLUMNS = (
     "scenario",
     "family",
+    "domain",
     "pair_kind",
     "seed",
     "variant",

@@ -8,8 +8,8 @@ that a wrong merge acts only through what the method answers.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +18,12 @@ from cdpipe.errors import InputError
 from cdpipe.geometry import Float32Array, Int32Array, Int64Array, require_shape, transform
 from cdpipe.readers import open_scans
 from cdpipe.session import Session, chunk_path, load_arrays, read_session
+from cdpipe.types import PosedScan
 from cdpipe.voxel import cell_keys
 from sim.truth import Int16Array, read_labels
 
 CELL_M = 0.1
-_CACHE_VERSION = 1
+_CACHE_VERSION = 3
 _BATCH_RETURNS = 500_000
 _PENDING_ROWS = 4_000_000
 
@@ -38,6 +39,7 @@ class Universe:
         instance: (N,) int16 what each hit: 0 walls and floor, n the n-th prop, -2 nothing (a false return).
         n_scans: Revolutions of the session.
         n_pixels: Pixels of a revolution.
+        nearest_m: (C + 1,) float32 shortest range of any return of each change, by its id; infinite where none is.
     """
 
     returns: Int64Array
@@ -46,6 +48,7 @@ class Universe:
     instance: Int16Array
     n_scans: int
     n_pixels: int
+    nearest_m: Float32Array = field(default_factory=lambda: np.zeros(0, dtype=np.float32))
 
     def __post_init__(self) -> None:
         n = len(self.returns)
@@ -67,6 +70,11 @@ class Universe:
     def rows_of_change(self, change_id: int) -> Int64Array:
         """Return the rows that belong to a change: the cells of its truth."""
         return np.flatnonzero(self.change == change_id)
+
+    def range_of_change(self, change_id: int) -> float:
+        """Return the shortest range at which a change was seen, metres; NaN where it was not."""
+        nearest_m = float(self.nearest_m[change_id]) if change_id < len(self.nearest_m) else np.inf
+        return nearest_m if np.isfinite(nearest_m) else float("nan")
 
     def rows_of_returns(self, returns: Int32Array) -> Int64Array:
         """Return the rows, rising, that are among (M, 2) (scan, pixel) returns; the others share a cell with a row."""
@@ -102,28 +110,79 @@ def build_universe(session: Session) -> Universe:
     Raises:
         InputError: The session or its truth is missing or damaged.
     """
-    folded: list[_Rows] = []
-    pending: list[_Rows] = []
-    batch: list[_Rows] = []
-    for rows in _scan_rows(session):
-        batch.append(rows)
-        if _count(batch) < _BATCH_RETURNS:
-            continue
-        pending.append(_first_per_cell(batch))
-        batch = []
+    shape = session.sensor.height, session.sensor.width
+    builder = UniverseBuilder(str(session.path), *shape)
+    scans = open_scans(session.path).scans()
+    for index, (instance, change) in enumerate(read_labels(session.path, session.n_chunks)):
+        n_scans = min(session.chunk_scans, session.n_scans - index * session.chunk_scans)
+        for labels in (instance, change):
+            if labels.shape != (n_scans, *shape):
+                raise InputError(
+                    f"{session.path / 'truth'}: labels of chunk {index} are {labels.shape}, but the chunk holds "
+                    f"{n_scans} scans of {shape[0]} x {shape[1]}: truth of another session"
+                )
+        for scan_instance, scan_change, scan in zip(instance, change, scans, strict=False):
+            builder.add(scan, scan_instance, scan_change)
+    return builder.finish(session.n_scans)
+
+
+class UniverseBuilder:
+    """Takes the scans of a session one after the other and keeps the first return of each cell."""
+
+    def __init__(self, name: str, height: int, width: int) -> None:
+        self._name = name
+        self._n_pixels = height * width
+        self._folded: list[_Rows] = []
+        self._pending: list[_Rows] = []
+        self._batch: list[_Rows] = []
+        self._nearest_m: Float32Array = np.zeros(0, dtype=np.float32)
+
+    def add(self, scan: PosedScan, instance: Int16Array, change: Int16Array) -> None:
+        """Take the next scan with its (H, W) labels.
+
+        Raises:
+            InputError: A point lies too far out for its cell to be numbered.
+        """
+        if change.any():
+            self._nearest_m = _nearer(self._nearest_m, scan, change)
+        points_odom = transform(scan.odom_T_sensor, scan.points_sensor)
+        try:
+            cells = cell_keys(points_odom, CELL_M)
+        except ValueError as error:
+            raise InputError(f"{self._name}: scan {scan.index}: {error}") from error
+        # neighbours on a row mostly share a cell, and of these none but the first can be the cell's first
+        is_entered = np.append(True, cells[1:] != cells[:-1])[: len(cells)]
+        pixels = scan.pixels[is_entered]
+        self._batch.append(
+            _Rows(
+                cells=cells[is_entered],
+                returns=scan.index * self._n_pixels + pixels.astype(np.int64),
+                points_odom=points_odom[is_entered].astype(np.float32),
+                change=change.ravel()[pixels],
+                instance=instance.ravel()[pixels],
+            )
+        )
+        if _count(self._batch) < _BATCH_RETURNS:
+            return
+        self._pending.append(_first_per_cell(self._batch))
+        self._batch = []
         # folding only once as much is pending as folded keeps the sorting linear in the length of the session
-        if _count(pending) > max(_PENDING_ROWS, _count(folded)):
-            folded, pending = [_first_per_cell([*folded, *pending])], []
-    cells = _first_per_cell([*folded, *pending, *batch])
-    order = np.argsort(cells.returns)
-    return Universe(
-        returns=cells.returns[order],
-        points_odom=cells.points_odom[order],
-        change=cells.change[order],
-        instance=cells.instance[order],
-        n_scans=session.n_scans,
-        n_pixels=session.sensor.height * session.sensor.width,
-    )
+        if _count(self._pending) > max(_PENDING_ROWS, _count(self._folded)):
+            self._folded, self._pending = [_first_per_cell([*self._folded, *self._pending])], []
+
+    def finish(self, n_scans: int) -> Universe:
+        """Return the universe of the session, which has so many scans."""
+        cells = _first_per_cell([*self._folded, *self._pending, *self._batch])
+        order = np.argsort(cells.returns)
+        return Universe(
+            returns=cells.returns[order],
+            points_odom=cells.points_odom[order],
+            change=cells.change[order],
+            instance=cells.instance[order],
+            n_scans=n_scans,
+            n_pixels=self._n_pixels,
+            nearest_m=self._nearest_m,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,30 +194,15 @@ class _Rows:
     instance: Int16Array
 
 
-def _scan_rows(session: Session) -> Iterator[_Rows]:
-    n_pixels = session.sensor.height * session.sensor.width
-    scans = open_scans(session.path).scans()
-    for index, (instance, change) in enumerate(read_labels(session.path, session.n_chunks)):
-        n_scans = min(session.chunk_scans, session.n_scans - index * session.chunk_scans)
-        for labels in (instance, change):
-            if labels.shape != (n_scans, session.sensor.height, session.sensor.width):
-                raise InputError(
-                    f"{session.path / 'truth'}: labels of chunk {index} are {labels.shape}, but the chunk holds "
-                    f"{n_scans} scans of {session.sensor.height} x {session.sensor.width}: truth of another session"
-                )
-        for scan_instance, scan_change, scan in zip(instance, change, scans, strict=False):
-            points_odom = transform(scan.odom_T_sensor, scan.points_sensor)
-            try:
-                cells = cell_keys(points_odom, CELL_M)
-            except ValueError as error:
-                raise InputError(f"{session.path}: scan {scan.index}: {error}") from error
-            yield _Rows(
-                cells=cells,
-                returns=scan.index * n_pixels + scan.pixels.astype(np.int64),
-                points_odom=points_odom.astype(np.float32),
-                change=scan_change.ravel()[scan.pixels],
-                instance=scan_instance.ravel()[scan.pixels],
-            )
+def _nearer(nearest_m: Float32Array, scan: PosedScan, change: Int16Array) -> Float32Array:
+    """Return the shortest ranges by change id with those of one scan taken in."""
+    ids = change.ravel()[scan.pixels]
+    is_change = ids > 0
+    extended = np.full(max(len(nearest_m), int(ids.max(initial=0)) + 1), np.inf, dtype=np.float32)
+    extended[: len(nearest_m)] = nearest_m
+    range_m = np.linalg.norm(scan.points_sensor[is_change], axis=1).astype(np.float32)
+    np.minimum.at(extended, ids[is_change], range_m)
+    return extended
 
 
 def _count(parts: Sequence[_Rows]) -> int:
@@ -197,7 +241,7 @@ def _read_cache(path: Path, fingerprint: str, session: Session) -> Universe | No
 
 
 def _write_cache(path: Path, fingerprint: str, universe: Universe) -> None:
-    names = ("returns", "points_odom", "change", "instance")
+    names = ("returns", "points_odom", "change", "instance", "nearest_m")
     partial = path.with_name(f".{path.stem}.partial.npz")
     try:
         np.savez(

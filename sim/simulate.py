@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
@@ -24,7 +24,7 @@ from sim.odometry import odom_start, registered
 from sim.revolution import Drive, Revolution, SessionName, cast_revolution, label_changes, simulate_revolution
 from sim.scene import build_world
 from sim.trajectory import plan_trajectory
-from sim.truth import PairTruth, write_labels, write_pair_truth, write_true_poses
+from sim.truth import Int16Array, PairTruth, write_labels, write_pair_truth, write_true_poses
 
 CHUNK_SCANS = 64
 _THREADS = 2
@@ -65,15 +65,20 @@ def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progres
         partial.mkdir(parents=True)
         with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
             for drive in drives:
-                write_session(_with_own_odometry(drive, pool, report), partial / drive.name, pool, report)
-        changes = tuple(tally.finished() for tally in drives[0].tallies)
-        drawn = scenario.model_dump(mode="json")
-        write_pair_truth(partial, PairTruth(scenario.family, seed, scenario.score_radius_m, changes, drawn, files))
+                write_session(with_own_odometry(drive, pool, report), partial / drive.name, pool, report)
+        write_pair_truth(partial, pair_truth(scenario, seed, drives, files))
         partial.replace(home)
     except OSError as error:
         raise InputError(f"{out}: cannot write there: {error.strerror or error}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def pair_truth(scenario: Scenario, seed: int, drives: Sequence[Drive], files: Mapping[str, str]) -> PairTruth:
+    """Return what is known about a pair once both of its sessions were simulated."""
+    changes = tuple(tally.finished() for tally in drives[0].tallies)
+    drawn = scenario.model_dump(mode="json")
+    return PairTruth(scenario.family, seed, scenario.score_radius_m, changes, drawn, dict(files))
 
 
 def _refuse_taken(out: Path) -> None:
@@ -109,7 +114,7 @@ def plan_drives(scenario: Scenario, sensor: SensorMetadata, seed: int) -> list[D
     ]
 
 
-def _with_own_odometry(drive: Drive, pool: Executor, report: Progress) -> Drive:
+def with_own_odometry(drive: Drive, pool: Executor, report: Progress) -> Drive:
     """Let KISS-ICP estimate the drive, where the session asks for it, from the very scans that will be written."""
     plan: SessionPlan = getattr(drive.scenario, drive.name)
     if plan.odometry.source != "kiss-icp":
@@ -151,24 +156,29 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
     report(drive.name, 0, n_scans)
     with (
         SessionWriter(folder, drive.sensor, CHUNK_SCANS, provenance) as writer,
-        closing(_chunks_ahead(drive, pool)) as chunks,
+        closing(labelled_chunks(drive, pool)) as chunks,
     ):
+        for index, (chunk, instance, change) in enumerate(chunks):
+            writer.add(chunk)
+            write_labels(writer.folder, index, instance, change)
+            report(drive.name, index * CHUNK_SCANS + len(instance), n_scans)
+        write_true_poses(writer.folder, drive.trajectory.world_T_sensor)
+        writer.close(drive.trajectory.odom_T_sensor)
+
+
+def labelled_chunks(drive: Drive, pool: Executor) -> Generator[tuple[ScanChunk, Int16Array, Int16Array]]:
+    """Yield each chunk of a session with the (s, H, W) instance and change of its returns; the tallies are added to."""
+    with closing(_chunks_ahead(drive, pool)) as chunks:
         for index, revolutions in enumerate(chunks):
             start = index * CHUNK_SCANS
-            scans = slice(start, start + len(revolutions))
             chunk = ScanChunk(
                 np.stack([each.range_mm for each in revolutions]),
                 np.stack([each.reflectivity for each in revolutions]),
                 np.stack([each.signal for each in revolutions]),
-                drive.trajectory.column_stamps_ns(scans),
+                drive.trajectory.column_stamps_ns(slice(start, start + len(revolutions))),
                 np.stack([each.column_poses for each in revolutions]),
             )
-            writer.add(chunk)
-            instance = np.stack([each.instance for each in revolutions])
-            write_labels(writer.folder, index, instance, label_changes(drive, revolutions))
-            report(drive.name, scans.stop, n_scans)
-        write_true_poses(writer.folder, drive.trajectory.world_T_sensor)
-        writer.close(drive.trajectory.odom_T_sensor)
+            yield chunk, np.stack([each.instance for each in revolutions]), label_changes(drive, revolutions)
 
 
 def _chunks_ahead(drive: Drive, pool: Executor) -> Generator[list[Revolution]]:

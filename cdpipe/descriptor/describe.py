@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import torch
 
 from cdpipe.config import DescriptorConfig
+from cdpipe.descriptor.handmade import HANDMADE, VERSION
 from cdpipe.descriptor.network import (
     PlaceNetwork,
     checkpoint_bytes,
@@ -26,9 +28,8 @@ _BATCH = 32
 
 
 def describe_scan(scan: PosedScan, config: DescriptorConfig) -> tuple[Float32Array, Float32Array]:
-    """Return q (64,) and w (64,) of one scan."""
-    network, _ = _network(config.method)
-    q, w = _apply(network, range_image(scan.points_sensor)[None])
+    """Return q (D,) and w (64,) of one scan; D is 64, for descriptors made by hand the number of their rings."""
+    q, w = _described([scan.points_sensor], config.method)
     return q[0], w[0]
 
 
@@ -40,15 +41,13 @@ def describe_scans(source: ScanSource, keyframe_scans: Int64Array, config: Descr
         keyframe_scans: (K,) indices of the scans that are keyframes, rising.
         config: Which descriptor.
     """
-    network, checkpoint = _network(config.method)
     parts = []
     for start in range(0, len(keyframe_scans), _BATCH):
-        batch = keyframe_scans[start : start + _BATCH]
-        images = np.stack([range_image(source.scan(int(index)).points_sensor) for index in batch])
-        parts.append(_apply(network, images))
+        batch = keyframe_scans[start : start + _BATCH].tolist()
+        parts.append(_described((source.scan(index).points_sensor for index in batch), config.method))
     q = np.concatenate([part[0] for part in parts])
     w = np.concatenate([part[1] for part in parts])
-    return DescriptorSet(q, w, keyframe_scans, config.method, checkpoint)
+    return DescriptorSet(q, w, keyframe_scans, config.method, checkpoint_digest(config))
 
 
 def save_descriptors(folder: Path, descriptors: DescriptorSet, odom_T_sensor: Float64Array) -> Path:
@@ -89,7 +88,7 @@ def load_descriptors(folder: Path, config: DescriptorConfig, odom_T_sensor: Floa
     try:
         checkpoint = str(arrays["checkpoint"])
         is_of_session = np.array_equal(arrays["odom_T_sensor"], odom_T_sensor)
-        if not is_of_session or checkpoint != _network(config.method)[1]:
+        if not is_of_session or checkpoint != checkpoint_digest(config):
             return None
         return DescriptorSet(arrays["q"], arrays.get("w"), arrays["keyframe_scans"], config.method, checkpoint)
     except (KeyError, ValueError) as error:
@@ -97,13 +96,21 @@ def load_descriptors(folder: Path, config: DescriptorConfig, odom_T_sensor: Floa
 
 
 def checkpoint_digest(config: DescriptorConfig) -> str:
-    """Return the digest of the weights that descriptors made with `config` carry."""
-    return _network(config.method)[1]
+    """Return the digest of the weights that descriptors made with `config` carry; the version of those without."""
+    return f"version {VERSION}" if config.method in HANDMADE else _network(config.method)[1]
 
 
 def use_threads(n_threads: int) -> None:
     """Fix the number of threads the network runs on, so that every run of a case is equal."""
     torch.set_num_threads(n_threads)
+
+
+def _described(clouds_sensor: Iterable[Float64Array], method: str) -> tuple[Float32Array, Float32Array]:
+    """Return q (N, D) and w (N, 64) of N scans' points."""
+    if method in HANDMADE:
+        vectors = [HANDMADE[method](points) for points in clouds_sensor]
+        return np.stack([q for q, _ in vectors]), np.stack([w for _, w in vectors])
+    return _apply(_network(method)[0], np.stack([range_image(points) for points in clouds_sensor]))
 
 
 @cache

@@ -110,7 +110,7 @@ def trained_network() -> tuple[PlaceNetwork, str]:
     return network.eval(), digest(content)
 
 
-def checkpoint_bytes(network: PlaceNetwork) -> bytes:
+def checkpoint_bytes(network: nn.Module) -> bytes:
     """Return the weights as safetensors."""
     return save({name: tensor.contiguous() for name, tensor in network.state_dict().items()})
 

@@ -21,14 +21,16 @@ def range_image(points_sensor: Float64Array) -> Float32Array:
     Args:
         points_sensor: (N, 3) returns, sensor frame, metres.
     """
-    ranges = np.linalg.norm(points_sensor, axis=1)
-    points, ranges = points_sensor[ranges > 0], ranges[ranges > 0]
-    elevation = np.arcsin(np.clip(points[:, 2] / ranges, -1.0, 1.0))
+    x, y, z = np.ascontiguousarray(points_sensor.T)
+    ranges = np.sqrt(x * x + y * y + z * z)
+    is_return = ranges > 0
+    elevation = np.arcsin(np.clip(z / np.where(is_return, ranges, 1.0), -1.0, 1.0))
     rows = np.floor((ELEVATION_RAD - elevation) / (2 * ELEVATION_RAD) * ROWS).astype(np.int64)
-    turn = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
+    turn = np.arctan2(y, x) / (2 * np.pi)
     columns = np.floor(turn * COLUMNS).astype(np.int64) % COLUMNS
-    inside = (rows >= 0) & (rows < ROWS)
-    image = np.full(ROWS * COLUMNS, np.inf)
-    np.minimum.at(image, rows[inside] * COLUMNS + columns[inside], ranges[inside])
+    inside = (rows >= 0) & (rows < ROWS) & is_return
+    # float32 throughout: `minimum.at` is thirty times as fast on it, and rounding does not change which is least
+    image = np.full(ROWS * COLUMNS, np.inf, dtype=np.float32)
+    np.minimum.at(image, (rows * COLUMNS + columns)[inside], ranges[inside].astype(np.float32))
     image[np.isinf(image)] = 0.0
-    return image.reshape(ROWS, COLUMNS).astype(np.float32)
+    return image.reshape(ROWS, COLUMNS)

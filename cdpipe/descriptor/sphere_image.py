@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from cdpipe.geometry import Float32Array, Float64Array, Int64Array
+from cdpipe.geometry import Float32Array, Float64Array, Int64Array, invert, transform
+from cdpipe.sphere import MapIndex
 
 ROWS = 16
 COLUMNS = 96
 HALF_LENGTH_M = 2.0
 REACH_M = 12.0
+# Of the ball round a keyframe that holds all of its image.
+CROP_M = float(np.hypot(HALF_LENGTH_M, REACH_M))
 
 
 def pixels(points_anchor: Float64Array) -> Int64Array:
@@ -38,7 +41,24 @@ def sphere_image(points_anchor: Float64Array) -> Float32Array:
     """
     pixel = pixels(points_anchor)
     is_inside = pixel >= 0
-    image = np.full(ROWS * COLUMNS, np.inf)
-    np.minimum.at(image, pixel[is_inside], np.hypot(points_anchor[is_inside, 1], points_anchor[is_inside, 2]))
+    distances_m = np.hypot(points_anchor[is_inside, 1], points_anchor[is_inside, 2]).astype(np.float32)
+    # minimum.at is thirty times as fast where no type has to be converted
+    image = np.full(ROWS * COLUMNS, np.inf, dtype=np.float32)
+    np.minimum.at(image, pixel[is_inside], distances_m)
     image[np.isinf(image)] = 0.0
-    return image.reshape(ROWS, COLUMNS).astype(np.float32)
+    return image.reshape(ROWS, COLUMNS)
+
+
+def render(points: Float64Array, index: MapIndex, map_T_anchor: Float64Array) -> Float32Array:
+    """Return the (K, *image) images of a map at each of (K, 4, 4) poses, float32 as `sphere_image` gives them.
+
+    Args:
+        points: (N, 3) points of the map, metres.
+        index: Of these points.
+        map_T_anchor: (K, 4, 4) poses of the sensor in the map's frame.
+    """
+    images = [
+        sphere_image(transform(anchor_T_map, points[index.crop(map_T_here[:3, 3], CROP_M)]))
+        for map_T_here, anchor_T_map in zip(map_T_anchor, invert(map_T_anchor), strict=True)
+    ]
+    return np.stack(images) if images else sphere_image(np.zeros((0, 3)))[None][:0]

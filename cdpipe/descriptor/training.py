@@ -6,18 +6,18 @@ is the cross-entropy of the circular correlation of the two w, which does not av
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cdpipe.descriptor.network import DIMENSIONS, PlaceNetwork, initial_network, yaw_correlation
+from cdpipe.descriptor.network import DIMENSIONS, PlaceNetwork, yaw_correlation
 from cdpipe.descriptor.range_image import COLUMNS
 from cdpipe.geometry import BoolArray, Float32Array, Float64Array, Int64Array, require_shape, stream
 
 _MARGIN = 0.3
+_YAW_WEIGHT = 0.3
 _YAW_TEMPERATURE = 12.0
 _YAW_SPREAD_RAD = np.deg2rad(5.0)
 SAME_PLACE_M = 2.0
@@ -55,15 +55,8 @@ class PlaceData:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class TrainingConfig:
-    """What a training run depends on, beside its data."""
-
-    seed: int = 0
-    steps: int = 1500
-    tunnels_per_batch: int = 8
-    anchors_per_tunnel: int = 4
-    learning_rate: float = 2e-3
+TUNNELS_PER_BATCH = 8
+ANCHORS_PER_TUNNEL = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,27 +74,33 @@ class PlaceScores:
     yaw_flip_share: float
 
 
-def train(data: PlaceData, config: TrainingConfig, on_step: Callable[[int, float, float], None]) -> PlaceNetwork:
-    """Train a network from its seeded start; `on_step(step, place_loss, yaw_loss)` is called after every step."""
-    network = initial_network(config.seed).train()
-    optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.learning_rate, total_steps=config.steps)
-    draw = stream(config.seed, "train-descriptor")
-    partners = _partners(data)
-    for step in range(config.steps):
-        anchors = _anchors(data, partners, config, draw)
-        positives = np.array([draw.choice(partners[anchor]) for anchor in anchors])
+class PlaceTask:
+    """Trains a place network on some tunnels and scores it on others."""
+
+    def __init__(self, network: PlaceNetwork, training: PlaceData, validation: PlaceData, seed: int) -> None:
+        self._network, self._data, self._validation, self._seed = network, training, validation, seed
+        self._partners = _partners(training)
+
+    @property
+    def network(self) -> PlaceNetwork:
+        """The network."""
+        return self._network
+
+    def losses(self, step: int) -> dict[str, Tensor]:
+        """Return the triplet loss of q and the classification loss of w."""
+        draw = stream(self._seed, "train-place", str(step))
+        anchors = _anchors(self._data, draw)
+        positives = np.array([draw.choice(self._partners[anchor]) for anchor in anchors])
         chosen = np.concatenate([anchors, positives])
-        images, headings = _turned(data, chosen, draw)
-        q, w = network(images)
-        place_loss = _triplet_loss(q, _is_other_place(data, anchors, chosen))
-        yaw_loss = _yaw_loss(w, headings)
-        optimiser.zero_grad()
-        (place_loss + 0.3 * yaw_loss).backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
-        optimiser.step()
-        schedule.step()
-        on_step(step, place_loss.item(), yaw_loss.item())
-    return network.eval()
+        images, headings = _turned(self._data, chosen, draw)
+        q, w = self._network(images)
+        place_loss = _triplet_loss(q, _is_other_place(self._data, anchors, chosen))
+        return {"place": place_loss, "yaw": _YAW_WEIGHT * _yaw_loss(w, headings)}
+
+    def scores(self) -> dict[str, float]:
+        """Return recall@1 within 3 m, and the yaw's median error and share of flips."""
+        scores = evaluate(self._network, self._validation)
+        return {name: float(getattr(scores, name)) for name in scores.__slots__}
 
 
 def evaluate(network: PlaceNetwork, data: PlaceData) -> PlaceScores:
@@ -141,13 +140,11 @@ def _partners(data: PlaceData) -> list[Int64Array]:
     return partners
 
 
-def _anchors(
-    data: PlaceData, partners: list[Int64Array], config: TrainingConfig, draw: np.random.Generator
-) -> Int64Array:
+def _anchors(data: PlaceData, draw: np.random.Generator) -> Int64Array:
     tunnels = np.unique(data.tunnels)
-    chosen = draw.choice(tunnels, size=min(config.tunnels_per_batch, len(tunnels)), replace=False)
+    chosen = draw.choice(tunnels, size=min(TUNNELS_PER_BATCH, len(tunnels)), replace=False)
     return np.concatenate(
-        [draw.choice(np.flatnonzero(data.tunnels == tunnel), size=config.anchors_per_tunnel) for tunnel in chosen]
+        [draw.choice(np.flatnonzero(data.tunnels == tunnel), size=ANCHORS_PER_TUNNEL) for tunnel in chosen]
     )
 
 

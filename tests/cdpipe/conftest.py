@@ -165,7 +165,9 @@ def _bent(session: MappedSession, total_rad: float) -> tuple[MappedSession, Floa
     nearest_scan = cKDTree(path[:, :3, 3]).query(session.map.odom_T_sensor[:, :3, 3])[1]
     chosen = stack[nearest_point]
     points = np.einsum("nij,nj->ni", chosen[:, :3, :3], session.map.points) + chosen[:, :3, 3]
-    point_map = replace(session.map, points=points, odom_T_sensor=stack[nearest_scan] @ session.map.odom_T_sensor)
+    point_map = replace(
+        session.map, points=points, odom_T_sensor=stack[nearest_scan] @ session.map.odom_T_sensor, seen_from=None
+    )
     return MappedSession(point_map, session.descriptors), invert(stack)
 
 
@@ -173,3 +175,18 @@ def _bent(session: MappedSession, total_rad: float) -> tuple[MappedSession, Floa
 def bent() -> Callable[[MappedSession, float], tuple[MappedSession, Float64Array]]:
     """How to bend a session: see `_bent`."""
     return _bent
+
+
+def _looking_ahead(sample: int, scale: float) -> MappedSession:
+    """Map the tunnel with a sensor that sees only what is ahead and an odometry that scales the way."""
+    whole = scanned("ahead", make_pose(), 0, sample, [])
+    poses = whole.odom_T_sensor.copy()
+    poses[:, :3, 3] *= scale
+    clouds = [scan.points_sensor[scan.points_sensor[:, 0] > 0] for scan in whole.scans()]
+    return mapped(CloudScans("ahead", poses, clouds), make_pose())
+
+
+@pytest.fixture(scope="session")
+def looking_ahead() -> Callable[[int, float], MappedSession]:
+    """How to map the tunnel with a biased view: see `_looking_ahead`."""
+    return _looking_ahead

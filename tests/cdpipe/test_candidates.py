@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cdpipe.candidates import Candidate, closest_pair, pair_votes, voted_candidates
+from cdpipe.candidates import Candidate, _common_motion, closest_pair, pair_votes, voted_candidates
 from cdpipe.config import MergeConfig
 from cdpipe.geometry import Float64Array, invert, transform, yaw_pose
 from cdpipe.types import MappedSession
@@ -53,6 +53,21 @@ def test_a_shift_against_the_yaw_is_no_agreement() -> None:
     before, after = poses_at((0, 0), (30, 0)), poses_at((0, 0), (-30, 0))
     assert not pair_votes(before, after, np.zeros(2))[0][0, 1]
     assert pair_votes(before, after, np.full(2, np.pi))[0][0, 1]
+
+
+@pytest.mark.parametrize("is_upside_down", [False, True])
+def test_however_the_sensor_hangs_yaws_and_places_say_the_same(is_upside_down: bool) -> None:
+    # the after odom frame is turned by 40 degrees; at each place both sensors look another way
+    mount = np.diag([1.0, -1.0, -1.0, 1.0]) if is_upside_down else np.eye(4)
+    places, turn = [(0.0, 0.0), (12.0, 3.0), (30.0, -4.0)], np.deg2rad(40.0)
+    before = np.array([yaw_pose(h, (x, y, 0.0)) @ mount for h, (x, y) in zip((0.3, 1.4, -2.0), places, strict=True)])
+    seen_again = np.array([yaw_pose(h, (x, y, 0.0)) @ mount for h, (x, y) in zip((2.0, 0.1, 3.0), places, strict=True)])
+    relative = invert(before) @ seen_again
+    yaws_rad = np.arctan2(relative[:, 1, 0], relative[:, 0, 0])
+    agrees, _ = pair_votes(before, yaw_pose(-turn) @ seen_again, yaws_rad)
+    assert agrees.all()
+    guess = _common_motion(before, yaw_pose(-turn) @ seen_again, yaws_rad, agrees[0], 0)
+    np.testing.assert_allclose(guess, yaw_pose(turn), atol=1e-9)
 
 
 def path_miss_m(found: Candidate, true: Float64Array, session: MappedSession) -> float:

@@ -5,7 +5,8 @@ from cdpipe.errors import InputError
 
 
 def test_every_shipped_preset_is_valid() -> None:
-    assert {"paper", "paper-topn", "paper-paired", "voxel-diff", "random-regions", "tunnelcd"} <= set(preset_names())
+    named = {"paper", "paper-topn", "paper-paired", "voxel-diff", "c2c", "random-regions", "tunnelcd", "frame"}
+    assert named | {"kiss-matcher", "scan-context", "solid", "untrained", "sphere-difference"} <= set(preset_names())
     for name in preset_names():
         assert isinstance(load_config(name), PipelineConfig)
 
@@ -13,6 +14,16 @@ def test_every_shipped_preset_is_valid() -> None:
 def test_paper_preset_holds_the_published_settings() -> None:
     config = load_config("paper", ["query.radius_m=10"])
     assert (config.query.reading, config.query.radius_m, config.extract.voxel_m) == ("nearest", 10.0, 0.65)
+
+
+def test_presets_of_descriptors_differ_in_the_descriptor_alone() -> None:
+    same = ["query.threshold=0", "merge.refine=local"]
+    learned = load_config("paper-paired", same)
+    for name in ("scan-context", "solid", "untrained"):
+        config = load_config(name, same)
+        assert config.descriptor.method == name
+        assert config.model_copy(update={"descriptor": learned.descriptor}) == learned
+        assert load_config(name).merge == load_config("tunnelcd").merge
 
 
 def test_mistakes_come_with_suggestions() -> None:

@@ -6,9 +6,10 @@ import torch
 
 from cdpipe.config import DescriptorConfig
 from cdpipe.descriptor import describe_scan, describe_scans, load_descriptors, relative_yaws_rad, save_descriptors
+from cdpipe.descriptor.fit import FitConfig, fit
 from cdpipe.descriptor.network import DIMENSIONS, initial_network, yaw_correlation
 from cdpipe.descriptor.range_image import COLUMNS, ELEVATION_RAD, ROWS, range_image
-from cdpipe.descriptor.training import PlaceData, TrainingConfig, evaluate, train
+from cdpipe.descriptor.training import PlaceData, PlaceTask, evaluate
 from cdpipe.errors import InputError
 from cdpipe.types import PosedScan
 
@@ -91,15 +92,19 @@ def _rooms(n_tunnels: int) -> PlaceData:
     )
 
 
-def test_training_lowers_both_losses_and_repeats_by_seed() -> None:
+def test_training_lowers_both_losses_and_repeats_by_seed(tmp_path: Path) -> None:
     data = _rooms(3)
-    config = TrainingConfig(seed=1, steps=25, tunnels_per_batch=3, anchors_per_tunnel=3)
-    losses: list[tuple[float, float]] = []
-    network = train(data, config, lambda step, place, yaw: losses.append((place, yaw)))
-    assert np.mean(losses[-5:], axis=0)[0] < np.mean(losses[:5], axis=0)[0]
-    assert np.mean(losses[-5:], axis=0)[1] < np.mean(losses[:5], axis=0)[1]
-    again = train(data, config, lambda *_: None)
-    for one, other in zip(network.parameters(), again.parameters(), strict=True):
+    config = FitConfig(seed=1, steps=25, validate_every=25)
+    losses: list[dict[str, float]] = []
+    networks = []
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        task = PlaceTask(initial_network(1), data, data, seed=1)
+        fit(task, config, tmp_path / name, "", lambda _, parts: losses.append(dict(parts)), lambda _: None)
+        networks.append(task.network)
+    for part in ("place", "yaw"):
+        assert np.mean([step[part] for step in losses[20:25]]) < np.mean([step[part] for step in losses[:5]])
+    for one, other in zip(networks[0].parameters(), networks[1].parameters(), strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from cdpipe.config import MergeConfig
-from cdpipe.evidence import SurfaceFit, _held_at, sampled, surface_fit, why_refused
+from cdpipe.evidence import SurfaceFit, sampled, surface_fit, why_refused
 from cdpipe.geometry import Float64Array, make_pose, yaw_pose
-from cdpipe.registration import IndexedMap, plane_jacobian
+from cdpipe.registration import IndexedMap
 from cdpipe.types import MappedSession
 
 CONFIG = MergeConfig()
@@ -25,7 +25,7 @@ def floors(tunnel_before: MappedSession) -> tuple[IndexedMap, IndexedMap]:
     """A flat floor, mapped twice; the second map has points half way between those of the first."""
     points, near = floor(), np.ones(len(floor()), np.float32)
     maps = [
-        replace(tunnel_before.map, points=points + np.array([shift, shift, 0.0]), nearest_m=near)
+        replace(tunnel_before.map, points=points + np.array([shift, shift, 0.0]), nearest_m=near, seen_from=None)
         for shift in (0.0, 0.125)
     ]
     return IndexedMap(maps[0], CONFIG, is_target=True), IndexedMap(maps[1], CONFIG, is_target=False)
@@ -59,7 +59,7 @@ def test_what_has_no_counterpart_does_not_fit(floors: tuple[IndexedMap, IndexedM
 
 
 def test_the_lower_of_both_directions_counts() -> None:
-    fit = SurfaceFit(np.array([0.0, 0.0, 0.3, 0.3]), np.array([0.0, 0.3, 0.3, np.inf]), np.eye(6), np.zeros(3))
+    fit = SurfaceFit(np.array([0.0, 0.0, 0.3, 0.3]), np.array([0.0, 0.3, 0.3, np.inf]), np.eye(6))
     assert fit.inlier_share(0.1) == 0.25
 
 
@@ -70,19 +70,6 @@ def test_a_plane_holds_one_direction_only_whichever_way_the_maps_are_turned(
         eigenvalues = np.linalg.eigvalsh(fit_at(floors, pose).information[3:, 3:])
         assert eigenvalues[:2] == pytest.approx(0.0, abs=1e-6)
         assert eigenvalues[2] > 100
-
-
-def test_a_shift_is_held_where_the_points_are_that_hold_it() -> None:
-    # a straight corridor along x whose only face across it stands 6 m ahead
-    rng = np.random.default_rng(0)
-    walls = np.column_stack([rng.uniform(-8, 8, 200), np.repeat([-2.0, 2.0], 100), rng.uniform(0, 3, 200)])
-    face = np.column_stack([np.full(20, 6.0), rng.uniform(-2, 2, 20), rng.uniform(0, 3, 20)])
-    floor_too = np.column_stack([rng.uniform(-8, 8, 100), rng.uniform(-2, 2, 100), np.zeros(100)])
-    points = np.concatenate([walls, face, floor_too])
-    normals = np.repeat(np.eye(3)[[1, 0, 2]], [200, 20, 100], axis=0)
-    jacobian = plane_jacobian(points, normals)
-    found = _held_at(points, jacobian, jacobian.T @ jacobian, np.zeros(3))
-    np.testing.assert_allclose(found, face.mean(axis=0), atol=1e-9)
 
 
 def test_samples_are_every_kth_point() -> None:

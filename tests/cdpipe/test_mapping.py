@@ -62,6 +62,11 @@ def test_the_map_equals_a_dict_of_cells(batch_scans: int) -> None:
         ranges_m = np.maximum([range_m for *_, range_m in found], 1.0)
         mean = np.average([entry[2] for entry in found], axis=0, weights=ranges_m**-2)
         np.testing.assert_allclose(point, mean, atol=1e-12)
+        sensors = [source.odom_T_sensor[scan, :3, 3] for scan, *_ in found]
+        assert point_map.seen_from is not None
+        np.testing.assert_allclose(
+            point_map.seen_from[index], np.average(sensors, axis=0, weights=ranges_m**-2), atol=1e-5
+        )
         assert point_map.nearest_m[index] == pytest.approx(ranges_m.min(), rel=1e-6)
         assert returns_of(point_map, index) == [[scan, pixel] for scan, pixel, *_ in found]
     assert not cells

@@ -27,9 +27,11 @@ def map_error_m(found: Float64Array, true: Float64Array, points_after: Float64Ar
 
 
 def moved(session: MappedSession, new_T_old: Float64Array) -> MappedSession:
+    assert session.map.seen_from is not None
     point_map = replace(
         session.map,
         points=transform(new_T_old, session.map.points),
+        seen_from=transform(new_T_old, session.map.seen_from).astype(np.float32),
         odom_T_sensor=new_T_old @ session.map.odom_T_sensor,
     )
     return MappedSession(point_map, session.descriptors)
@@ -65,6 +67,7 @@ def test_without_refinement_one_transform_holds_everywhere(
     assert merged.is_accepted
     assert merged.local is None
     assert "n_refined" not in merged.evidence
+    assert merged.seconds["t_refine_s"] == 0.0
 
 
 def test_maps_that_bend_apart_are_aligned_along_the_path(
@@ -168,6 +171,7 @@ def test_a_smooth_straight_corridor_is_refused_because_it_slides(tunnel_before: 
             odom_T_sensor=poses,
             keyframe_scans=np.arange(3),
             scan_offsets=np.zeros(4, np.int64),
+            seen_from=None,
         )
         q = np.eye(3, 64, dtype=np.float32)
         sessions.append(MappedSession(point_map, DescriptorSet(q, None, np.arange(3), "place", "")))
@@ -186,7 +190,9 @@ def test_maps_too_small_to_register_are_refused(tunnel_before: MappedSession) ->
         keyframe_scans=np.zeros(0, np.int64),
     )
     one, points = tunnel_before.map.nearest_m[:1], tunnel_before.map.points[:1]
-    few_points = MappedSession(replace(tunnel_before.map, points=points, nearest_m=one), tunnel_before.descriptors)
+    few_points = MappedSession(
+        replace(tunnel_before.map, points=points, nearest_m=one, seen_from=None), tunnel_before.descriptors
+    )
     far_off = replace(tunnel_before.map, nearest_m=np.full(len(tunnel_before.map.points), 40.0, np.float32))
     for before, after in (
         (tunnel_before, MappedSession(tunnel_before.map, no_keyframe)),
@@ -197,6 +203,8 @@ def test_maps_too_small_to_register_are_refused(tunnel_before: MappedSession) ->
         merged = merge_maps(before, after, CONFIG)
         assert not merged.is_accepted
         assert "enough points" in merged.reason
+        assert set(merged.seconds) == {"t_index_s", "t_merge_s", "t_refine_s"}
+        assert merged.seconds["t_refine_s"] == 0.0
         np.testing.assert_array_equal(merged.before_T_after, np.eye(4))
 
 

@@ -1,79 +1,40 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
-from cdpipe.geometry import Float64Array, make_pose, yaw_pose
-from cdpipe.refine import smoothed
+from cdpipe.config import MergeConfig
+from cdpipe.merge import merge_maps
+from cdpipe.refine import _held
+from cdpipe.types import MappedSession
 
 
-def line(n: int) -> Float64Array:
-    return np.column_stack([2.0 * np.arange(n), np.zeros(n), np.zeros(n)])
+@pytest.mark.parametrize("scales", [(1.005, 0.995), (0.995, 1.005), (1.0, 1.0)])
+def test_maps_that_stretch_differently_are_aligned_where_the_robot_stood(
+    looking_ahead: Callable[[int, float], MappedSession], scales: tuple[float, float]
+) -> None:
+    # a sensor that looks ahead puts every face where the odometry stood some metres before it
+    before, after = (looking_ahead(sample, scale) for sample, scale in enumerate(scales, 1))
+    merged = merge_maps(before, after, MergeConfig(fallback=False))
+    assert merged.is_accepted
+    assert merged.local is not None
+    path = after.map.odom_T_keyframe[:, :3, 3]
+    errors_m = np.linalg.norm(merged.local.to_map(path) - path * scales[0] / scales[1], axis=1)
+    assert np.median(errors_m) < 0.01
+    assert np.percentile(errors_m, 95) < 0.02
 
 
-def stack(pose: Float64Array, n: int) -> Float64Array:
-    return np.repeat(pose[None], n, axis=0)
-
-
-def known(n: int, weight: float = 1e6) -> Float64Array:
-    return np.repeat(weight * np.eye(6)[None], n, axis=0)
-
-
-def positions_map(before_T_after: Float64Array, positions: Float64Array) -> Float64Array:
-    return np.einsum("aij,aj->ai", before_T_after[:, :3, :3], positions) + before_T_after[:, :3, 3]
-
-
-def test_measurements_that_agree_are_kept() -> None:
-    truth = stack(yaw_pose(0.8, (30.0, -5.0, 2.0)), 12)
-    np.testing.assert_allclose(smoothed(line(12), truth, known(12)), truth, atol=1e-9)
-
-
-def test_what_was_not_measured_follows_its_neighbours() -> None:
-    truth = stack(yaw_pose(0.8, (30.0, -5.0, 2.0)), 12)
-    measured, information = truth.copy(), known(12)
-    measured[5:8] = make_pose(translation=(0.0, 9.0, 0.0)) @ truth[5:8]
-    information[5:8] = 0.0
-    np.testing.assert_allclose(smoothed(line(12), measured, information), truth, atol=1e-6)
-
-
-def test_the_way_along_a_smooth_drift_comes_from_its_ends() -> None:
-    # along x nothing is known but at both ends, where the maps have drifted 0.2 m apart
-    measured, information = stack(np.eye(4), 11), known(11)
-    information[1:-1, 3, :] = information[1:-1, :, 3] = 0.0
-    measured[-1, 0, 3] = 0.2
-    measured[1:-1, 0, 3] = 7.0
-    found = smoothed(line(11), measured, information)
-    np.testing.assert_allclose(found[:, 0, 3], np.linspace(0, 0.2, 11), atol=1e-3)
-
-
-def test_noise_is_averaged_and_a_steady_drift_is_not() -> None:
-    n, rng = 60, np.random.default_rng(3)
-    positions = line(n)
-    truth = np.array([yaw_pose(np.deg2rad(0.01 * x), (0.004 * x, 0.0, 0.0)) for x in positions[:, 0]])
-    noise_m = 0.03
-    measured = truth.copy()
-    measured[:, :3, 3] += rng.normal(0, noise_m, (n, 3))
-    information = np.repeat(np.diag([1e7] * 3 + [1 / noise_m**2] * 3)[None], n, axis=0)
-    found = smoothed(positions, measured, information)
-    off_m = positions_map(found, positions) - positions_map(truth, positions)
-    assert np.sqrt(np.mean(off_m**2)) < 0.6 * noise_m
-    assert abs(off_m.mean()) < 0.01
-
-
-def test_one_anchor_is_what_was_measured() -> None:
-    measured = yaw_pose(0.3, (1.0, 2.0, 3.0))[None]
-    np.testing.assert_allclose(smoothed(np.zeros((1, 3)), measured, known(1)), measured, atol=1e-12)
-
-
-@pytest.mark.parametrize("n", [2, 7])
-def test_the_answer_moves_with_the_frames(n: int) -> None:
-    rng = np.random.default_rng(n)
-    positions = rng.normal(0, 10, (n, 3))
-    measured = np.array([yaw_pose(a, rng.normal(0, 0.1, 3)) for a in rng.normal(0, 0.01, n)])
-    information = known(n, 1e3)
-    moved = yaw_pose(1.1, (100.0, 50.0, -3.0))
-    np.testing.assert_allclose(
-        smoothed(positions, moved @ measured, information),
-        moved @ smoothed(positions, measured, information),
-        atol=1e-6,
-    )
+def test_a_smooth_wall_holds_nothing_along_itself() -> None:
+    # 300 normals across x, each off by some degrees: what they seem to hold along x is their noise
+    rng = np.random.default_rng(0)
+    normals = np.column_stack([rng.normal(0, 0.08, 300), np.repeat(np.eye(3)[1:, 1:], 150, axis=0)])
+    jacobian = np.hstack([np.cross(rng.uniform(-4, 4, (300, 3)), normals), normals])
+    information = jacobian.T @ jacobian
+    held = _held(information[None])[0]
+    assert information[3, 3] > 1.5
+    assert np.linalg.eigvalsh(held[3:, 3:])[0] == pytest.approx(0.0, abs=1e-6)
+    assert np.linalg.eigvalsh(held)[0] > -1e-6
+    np.testing.assert_allclose(np.diag(held)[4:], np.diag(information)[4:], rtol=0.05)
+    np.testing.assert_array_equal(held[:3, :3], information[:3, :3])

@@ -1,9 +1,11 @@
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
+from cdpipe.config import load_config
 from cdpipe.errors import InputError
-from eval.calibrate import alarm_threshold, thresholds
+from eval.calibrate import alarm_threshold, as_settings, rate_threshold, thresholds
 
 
 def test_five_per_cent_of_forty_pairs_alarm() -> None:
@@ -26,22 +28,59 @@ def test_pairs_without_candidates_count_as_silent() -> None:
         alarm_threshold(np.zeros(0))
 
 
+def test_half_a_kilometre_allows_five_tenths_of_a_false_region_and_so_none() -> None:
+    scores = np.array([9.0, 7.0, 7.0, 5.0])
+    # 0.1 per 100 m: 500 m allow none, 1000 m one, 3000 m three, 4000 m all four
+    assert rate_threshold(scores, 500.0) == pytest.approx(9.001)
+    assert rate_threshold(scores, 1000.0) == pytest.approx(7.001)
+    assert rate_threshold(scores, 2999.0) == pytest.approx(7.001)  # two share a score: both or none
+    assert rate_threshold(scores, 3000.0) == pytest.approx(5.001)
+    assert rate_threshold(scores, 4000.0) == 0.0
+    assert rate_threshold(np.zeros(0), 0.0) == 0.0
+
+
 def _results(n_changes: int = 0) -> pd.DataFrame:
-    rows = [("unchanged/a", seed, "m", "ok" if seed else "merge_refused", n_changes) for seed in range(4)]
-    return pd.DataFrame(rows, columns=["scenario", "seed", "variant", "status", "n_changes"])
+    rows = [
+        (scenario, seed, "m", "ok" if seed else "merge_refused", n_changes, radius_m, 1000.0)
+        for scenario, radius_m in (("null/a", 4.5), ("null/b", 4.5), ("null/c", 10.0))
+        for seed in range(4)
+    ]
+    columns = ["scenario", "seed", "variant", "status", "n_changes", "score_radius_m", "after_path_m"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _regions() -> pd.DataFrame:
+    found = [("null/a", 1, 5.0), ("null/a", 1, 4.0), ("null/a", 2, 3.0), ("null/b", 3, 6.0), ("null/c", 1, 200.0)]
+    rows = [(scenario, seed, "m", score) for scenario, seed, score in found]
+    return pd.DataFrame(rows, columns=["scenario", "seed", "variant", "score"])
 
 
 def test_a_table_by_hand() -> None:
-    # seed 0 was refused, seed 3 has no candidate; the best of the others is 5
-    regions = pd.DataFrame(
-        [("unchanged/a", 1, "m", 5.0), ("unchanged/a", 1, "m", 4.0), ("unchanged/a", 2, "m", 3.0)],
-        columns=["scenario", "seed", "variant", "score"],
-    )
-    row = thresholds(_results(), regions).iloc[0]
-    assert (row["variant"], row["n_pairs"], row["n_alarms"], row["n_unanswered"]) == ("m", 3, 0, 1)
-    assert row["threshold"] == pytest.approx(5.001)
+    # narrow: 8 pairs, 2 refused; of the six answered none may alarm (5 % of 6), the best score is 6.
+    # Their 6 km allow six false regions, and there are but four. Wide: 3 km allow three, there is one.
+    table = thresholds(_results(), _regions())
+    narrow, wide = table.to_dict("records")
+    assert (narrow["score_radius_m"], narrow["n_pairs"], narrow["n_alarms"], narrow["n_unanswered"]) == (4.5, 6, 0, 2)
+    assert narrow["threshold"] == pytest.approx(6.001)
+    assert (narrow["threshold_at_rate"], narrow["n_false"], narrow["km"]) == (0.0, 4, 6.0)
+    assert (wide["score_radius_m"], wide["threshold"], wide["km"]) == (10.0, pytest.approx(200.1), 3.0)
+
+
+def test_the_settings_are_lines_of_a_preset_and_of_a_plan() -> None:
+    document = yaml.safe_load(as_settings(thresholds(_results(), _regions())))
+    assert set(document) == {"threshold", "threshold_at_rate"}
+    found = document["threshold"]["m"]
+    assert found["preset"] == {"query": {"threshold": 6.001}}
+    assert found["per_scenario_10m"] == ["query.radius_m=10", "query.threshold=200.1"]
+    config = load_config("tunnelcd", found["per_scenario_10m"])
+    assert (config.query.radius_m, config.query.threshold) == (10.0, 200.1)
 
 
 def test_changed_pairs_are_refused() -> None:
-    with pytest.raises(InputError, match="unchanged/a: has changes"):
+    with pytest.raises(InputError, match="null/a, null/b, null/c: has changes"):
         thresholds(_results(n_changes=1), pd.DataFrame(columns=["scenario", "seed", "variant", "score"]))
+
+
+def test_a_kind_of_site_without_an_answer_gives_no_threshold() -> None:
+    with pytest.raises(InputError, match="m, 10 m: no pair has an answer"):
+        thresholds(_results().assign(status=["ok"] * 8 + ["failed"] * 4), _regions())

@@ -464,8 +464,6 @@ def test_help_loads_nothing_heavy() -> None:
         ("calibrate", ["absent"], ["absent/results.csv", "No such file"]),
         ("calibrate", ["empty"], ["empty/results.csv", "No such file"]),
         ("calibrate", ["damaged"], ["damaged/results.csv", "No columns to parse"]),
-        ("descriptor_training", ["--data", "file", "--out", "out"], ["file", "cannot write there"]),
-        ("descriptor_training", ["--data", "data", "--out", "file/out"], ["file/out", "cannot write there"]),
     ],
 )
 def test_programs_tell_mistakes_as_the_commands_do(

@@ -7,7 +7,7 @@ import pytest
 from cdpipe.config import PipelineConfig, load_config, preset_names
 from cdpipe.geometry import Float64Array, transform, yaw_pose
 from cdpipe.types import ChangeReport, DescriptorSet, MergedMaps, PointMap
-from eval.rivals import METHODS, random_regions, voxel_diff
+from eval.rivals import METHODS, c2c, random_regions, voxel_diff
 
 LENGTH_M = 40.0
 SPACING_M = 0.2
@@ -75,6 +75,36 @@ def test_one_added_crate_by_hand() -> None:
     # 4 points along each edge, 0.2 m apart: a hull of 0.6 m cubed
     assert report.figures["v_oe_m3"][0] == pytest.approx(0.6**3)
     assert report.figures["oe_points"][0] == 64
+
+
+def test_c2c_by_hand() -> None:
+    # hovering in the middle of the corridor all 64 points are new; lowered to 0.2 m above the floor's points, the lower
+    # layer of 16 is not; that it is nearer than a voxel to the floor takes more away from `voxel-diff`
+    settings = ("query.threshold=0", "outlier.sigmas=10", "cluster.min_points=16")
+    hovering, low = crate(20.0), crate(20.0) - (0.0, 0.0, 1.0)
+    assert low[:, 2].min() == pytest.approx(0.3)
+    for box, distance_m, n_new in ((hovering, 0.3, 64), (low, 0.3, 48), (low, 0.19, 64), (low, 0.5, 32)):
+        report = answer(pair([], [box]), load_config("c2c", [*settings, f"extract.distance_m={distance_m}"]))
+        assert report.regions.scores.tolist() == [n_new]
+        (item,) = report.objects
+        assert (item.session, item.kind, len(item.returns)) == ("after", "added", n_new)
+    by_voxel = answer(pair([], [low]), load_config("voxel-diff", [*settings]))
+    assert by_voxel.regions.scores.max(initial=0) < 48
+
+
+def test_c2c_measures_in_both_directions_and_at_any_place() -> None:
+    settings = ("query.threshold=0", "outlier.sigmas=10", "cluster.min_points=16")
+    merged = pair([crate(10.0)], [crate(30.0)])
+    objects = answer(merged, load_config("c2c", settings)).objects
+    assert {(item.session, item.kind, item.partner) for item in objects} == {
+        ("before", "moved", 0),
+        ("after", "moved", 1),
+    }
+    unchanged = answer(pair([], []), load_config("c2c", settings))
+    assert unchanged.regions.scores.shape == (0,)
+    assert unchanged.regions.keyframe_scores.tolist() == [0.0] * 40
+    passed_by = answer(pair([], [grid((60, -1, 0), (70, 1, 3))]), load_config("c2c", settings))
+    assert len(passed_by.regions.scores) == 0
 
 
 def test_removed_is_the_reverse_and_two_of_a_size_are_a_move() -> None:
@@ -188,6 +218,7 @@ def test_random_regions_stay_where_the_after_session_came() -> None:
 def test_every_preset_has_its_method() -> None:
     assert {load_config(name).method for name in preset_names()} <= set(METHODS)
     assert METHODS["voxel-diff"] is voxel_diff
+    assert METHODS["c2c"] is c2c
 
 
 def test_figures_are_of_the_after_map() -> None:

@@ -244,7 +244,9 @@ def test_a_refused_merge_is_a_row_that_scores_0(tmp_path: Path, simulated: list[
     assert row["status"] == "merge_refused"
     assert "cannot be merged" in row["error"]
     assert row[["region_recall", "region_recall_at_k", "object_iou_point", "object_f1_25"]].tolist() == [0, 0, 0, 0]
-    assert row[["t_merge_s", "t_total_s", "merge_error_m"]].isna().all()
+    assert row[["t_refine_s", "t_total_s", "merge_error_m"]].isna().all()
+    assert row["t_merge_s"] > 0
+    assert row["t_index_s"] > 0
     assert results.loc[(UNCHANGED, refused), "status"] == "merge_refused"
     assert np.isnan(results.loc[(UNCHANGED, refused), "region_recall"])
     assert results.loc[(ONE_BOX, "voxel-diff"), "status"] == "ok"

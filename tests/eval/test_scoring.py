@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from cdpipe.answer import write_answer, write_failure
 from cdpipe.errors import InputError
 from cdpipe.geometry import invert, transform
 from cdpipe.readers import open_scans
 from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport
+from eval.domains import domain_of, is_change_in_distribution
 from eval.ground_truth import GroundTruth, load_ground_truth
 from eval.scoring import METRICS_VERSION, CaseScore, score_pair
 
@@ -32,7 +34,7 @@ ONES = (
     "kind_accuracy",
 )
 COLUMN_TEXT = """
-scenario family pair_kind seed variant preset status error metrics_version n_changes n_observable score_radius_m
+scenario family domain pair_kind seed variant preset status error metrics_version n_changes n_observable score_radius_m
 region_recall region_precision region_recall_at_k region_auroc region_ap false_regions_per_100m region_coverage
 n_regions n_true_regions n_false_regions n_duplicate_regions n_ignored_regions n_found_changes
 object_iou_point object_iou_voxel object_iou_box object_f1_25 object_f1_50 object_precision_50 object_pq kind_accuracy
@@ -43,7 +45,8 @@ evidence_agreement evidence_descriptor_distance evidence_n_hypotheses evidence_i
 evidence_distinctness evidence_refined_inlier_share evidence_max_correction_m t_index_s t_merge_s t_refine_s
 t_descriptor_s t_descriptor_per_keyframe_s t_cd_s t_cd_per_region_s t_oe_s t_oe_per_region_s
 t_total_s t_total_with_merge_s t_total_paper_s v_sphere_m3 v_oe_m3 s_points oe_points
-map_points_before map_points_after n_keyframes_before n_keyframes_after after_path_m is_unchanged_pair is_alarm
+map_points_before map_points_after bytes_map_before bytes_regions_before
+n_keyframes_before n_keyframes_after after_path_m is_unchanged_pair is_alarm
 """
 COLUMNS = COLUMN_TEXT.split()
 
@@ -216,14 +219,16 @@ def test_an_empty_answer_scores_zero(tiny_pair: Path, tiny_merge: np.ndarray) ->
     assert np.isnan(row["t_cd_per_region_s"])
 
 
-def test_a_refused_case_scores_zero_and_has_no_times(tiny_pair: Path) -> None:
+def test_a_refused_case_scores_zero_and_has_the_times_of_its_merge(tiny_pair: Path) -> None:
     folder = tiny_pair.parent / "answer"
-    write_failure(folder, "paper", "merge_refused", "overlap too small", {"overlap": 0.1}, {})
+    seconds = {"t_index_s": 0.25, "t_merge_s": 0.5}
+    write_failure(folder, "paper", "merge_refused", "overlap too small", {"overlap": 0.1}, {}, seconds=seconds)
     case = score_pair(tiny_pair, folder)
     zeros = [name for name in ONES if name not in ("region_precision", "region_auroc", "region_ap")]
     assert {name: case.row[name] for name in zeros} == dict.fromkeys(zeros, 0.0)
-    undefined = ("region_precision", "region_auroc", "merge_error_m", "t_total_s", "t_merge_s", "region_coverage")
-    assert np.isnan([case.row[name] for name in undefined]).all()
+    undefined = ("region_precision", "region_auroc", "merge_error_m", "t_total_s", "t_refine_s", "region_coverage")
+    assert np.isnan([case.row[name] for name in (*undefined, "t_total_with_merge_s")]).all()
+    assert (case.row["t_index_s"], case.row["t_merge_s"]) == (0.25, 0.5)
     assert (case.row["status"], case.row["error"]) == ("merge_refused", "overlap too small")
     assert sorted(case.row) == sorted(COLUMNS)
     assert [row["is_found"] for row in case.changes] == [False] * 3
@@ -322,6 +327,39 @@ def test_an_unchanged_pair(write_tiny_pair: Callable[..., Path], tiny_merge: np.
     refused = score_pair(pair, pair.parent / "refused").row
     assert np.isnan(refused["is_alarm"])
     assert np.isnan(refused["region_recall"])
+
+
+def test_every_change_says_how_large_how_near_and_how_familiar_it_is(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
+    case = scored(tiny_pair, true_report(tiny_pair, tiny_merge))
+    truth = load_ground_truth(tiny_pair)
+    for index, row in enumerate(case.changes):
+        # the tiny pair puts every thing 2.5 m from the sensor of each scan that sees it
+        assert row["range_m"] == pytest.approx(2.5, abs=1e-3)
+        assert row["seen_hull_volume_m3"] == pytest.approx(ConvexHull(truth.points_odom(index)).volume)
+        assert row["is_in_distribution"] is False
+    assert case.row["domain"] == "out"
+    evidence = {"bytes_map_before": 1200.0, "bytes_regions_before": 284.0}
+    row = scored(tiny_pair, replace(true_report(tiny_pair, tiny_merge), evidence=evidence)).row
+    assert (row["bytes_map_before"], row["bytes_regions_before"]) == (1200.0, 284.0)
+
+
+@pytest.mark.parametrize(
+    ("family", "kind", "domain", "is_familiar"),
+    [
+        ("narrow", "box", "in", True),
+        ("null/wide", "box", "in", True),
+        ("network", "trolley", "in", False),
+        ("narrow", "mesh", "in", False),
+        ("cave", "box", "out", False),
+        ("regions/cave", "railing", "out", False),
+        ("paper/site1", "box", "out", False),
+        ("smooth", "box", "out", False),
+        ("mine/narrower", "box", "out", False),
+    ],
+)
+def test_what_is_in_distribution(family: str, kind: str, domain: str, is_familiar: bool) -> None:
+    assert domain_of(family) == domain
+    assert is_change_in_distribution(family, kind) is is_familiar
 
 
 def make_foreign(folder: Path, points_odom: list[np.ndarray]) -> None:

@@ -1,0 +1,179 @@
+"""What a folder of shards says of itself: index.csv, one row for each tunnel, and README.md, its data card.
+
+Both are made from the shards that lie there, so that they are right whatever run was cut off when.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cdpipe.descriptor.shard import FIELDS, SUFFIX, read_about, split_of
+from cdpipe.errors import InputError
+
+COUNTS = ("n_before", "n_after", "n_covered", "n_positive", "n_negative", "n_changes", "n_observable")
+INDEX_COLUMNS = (
+    "family", "seed", "split", "status", "shard", *COUNTS, "score_radius_m", "bytes", "sha256", "digest", "reason",
+)  # fmt: skip
+Row = dict[str, Any]
+
+
+def write_card(out: Path) -> None:
+    """Write index.csv and README.md of a folder.
+
+    Raises:
+        InputError: A shard is damaged.
+    """
+    rows = [*(_shard_row(path) for path in out.glob(f"*{SUFFIX}")), *_refused_rows(out)]
+    rows.sort(key=lambda row: (row["family"], row["seed"]))
+    _write_index(out / "index.csv", rows)
+    document = json.loads((out / "dataset.json").read_text())
+    _replace(out / "README.md", card(rows, document["recipe"], document["commands"]))
+
+
+def fields_table() -> str:
+    """Return the table of a shard's arrays in Markdown."""
+    lines = ["| array | shape | type | unit | frame | what |", "|---|---|---|---|---|---|"]
+    for each in FIELDS:
+        shape = each.shape.replace(",", ", ")
+        lines.append(f"| `{each.name}` | ({shape}) | {each.dtype} | {each.unit} | {each.frame} | {each.meaning} |")
+    return "\n".join(lines)
+
+
+def card(rows: Sequence[Row], recipe: Mapping[str, Any], commands: Sequence[str]) -> str:
+    """Return the data card.
+
+    Args:
+        rows: Of the index.
+        recipe: What all shards have in common.
+        commands: Those that filled the folder.
+    """
+    made = [row for row in rows if row["status"] == "ok"]
+    refused = [row for row in rows if row["status"] == "refused"]
+    settings = ", ".join(f"`{each}`" for each in recipe["settings"]) or "none"
+    told = "\n".join(f"- {row['family']} {row['seed']}: {row['reason']}" for row in refused) or "None."
+    made_by = "\n".join(commands)
+    return f"""# Training data of change descriptors, made by `tunnelcd dataset`
+
+Simulated tunnels, each driven twice by a ray-cast Ouster OS1-32; between the drives some objects came, went or moved.
+One shard is one tunnel, and a tunnel is of one split: seeds below 10000 train, 10000 to 19999 validate, 20000 to 29999
+test and are never trained on.
+
+{_counts_table(made)}
+
+A pair is a before keyframe with the after map rendered at the same place. A keyframe is positive within the family's
+score radius of an observable change, negative beyond 1.5 radii of every change, and left out in between.
+
+| | |
+|---|---|
+| families | {", ".join(sorted({row["family"] for row in made})) or "none"} |
+| set over the scenarios | {settings} |
+| after images of each pair | {recipe["draws"]}: the first merged exactly, each other off by a merge error of its own |
+| that error, standard deviation of each component | {recipe["error_m"]:g} m and {recipe["error_deg"]:g} deg |
+| digest of all shards | `{digest_of(made)}` |
+| bytes | {sum(row["bytes"] for row in made):,} |
+| licence | MIT, as tunnelcd itself: everything is simulated, nothing was recorded |
+
+## Tunnels that could not be built
+
+{told}
+
+## Made by
+
+```
+{made_by}
+```
+
+The same command makes the same bytes. Shards that are there are kept; what is missing is added.
+
+## Loading
+
+```python
+from cdpipe.descriptor.data import ChangePairs, open_dataset, stacked
+
+tunnels = open_dataset("DIR", "train")                      # or "validation"; families=..., seeds=range(...)
+pairs = ChangePairs(tunnels)                                # a torch Dataset of (tunnel, draw, anchor)
+tensors = stacked(tunnels, ("before_images", "after_images", "labels"))    # all in memory
+```
+
+`index.csv` has one row for each tunnel. A shard is a safetensors file:
+
+{fields_table()}
+
+K before keyframes (the anchors), J after keyframes, C changes, D draws, R x W pixels of a scan's range image, I the
+axes of the map's image, V x U its pixels. Names and kinds of the changed props are in the shard's metadata.
+"""
+
+
+def digest_of(rows: Sequence[Row]) -> str:
+    """Return one digest of all shards, whatever the order of the rows."""
+    lines = sorted(f"{row['shard']} {row['sha256']}" for row in rows)
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+
+
+def _counts_table(made: Sequence[Row]) -> str:
+    lines = [
+        "| family | split | seeds | tunnels | pairs | covered | positive | negative | changes | observable |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for family, split in sorted({(row["family"], row["split"]) for row in made}):
+        rows = [row for row in made if (row["family"], row["split"]) == (family, split)]
+        seeds = f"{min(row['seed'] for row in rows)} to {max(row['seed'] for row in rows)}"
+        lines.append(f"| {family} | {split} | {seeds} | {_sums(rows)} |")
+    lines.append(f"| all | | | {_sums(made)} |")
+    return "\n".join(lines)
+
+
+def _sums(rows: Sequence[Row]) -> str:
+    names = [name for name in COUNTS if name != "n_after"]
+    return " | ".join(f"{count:,}" for count in (len(rows), *(sum(row[name] for row in rows) for name in names)))
+
+
+def _shard_row(path: Path) -> Row:
+    about, content = read_about(path), path.read_bytes()
+    try:
+        return {
+            "family": about["family"],
+            "seed": about["seed"],
+            "split": split_of(about["seed"]),
+            "status": "ok",
+            "shard": path.name,
+            **{name: about["counts"][name] for name in COUNTS},
+            "score_radius_m": about["score_radius_m"],
+            "bytes": len(content),
+            "sha256": hashlib.sha256(content).hexdigest(),
+            "digest": about["digest"],
+            "reason": "",
+        }
+    except KeyError as error:
+        raise InputError(f"{path}: damaged: its metadata lacks {error}: remove it and run the command again") from error
+
+
+def _refused_rows(out: Path) -> list[Row]:
+    rows = []
+    for path in out.glob("*.refused.json"):
+        about = json.loads(path.read_text())
+        row = dict.fromkeys(INDEX_COLUMNS, "")
+        row |= {"status": "refused", "split": split_of(about["seed"])}
+        row |= {name: about[name] for name in ("family", "seed", "digest", "reason")}
+        rows.append(row)
+    return rows
+
+
+def _write_index(path: Path, rows: Sequence[Row]) -> None:
+    partial = path.with_name(f".{path.name}.partial")
+    with partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, INDEX_COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    partial.replace(path)
+
+
+def _replace(path: Path, text: str) -> None:
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(text)
+    partial.replace(path)

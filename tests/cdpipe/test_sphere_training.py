@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from cdpipe.descriptor.fit import FitConfig
+from cdpipe.descriptor.sphere_image import COLUMNS, ROWS
+from cdpipe.descriptor.sphere_network import SECTORS, initial_sphere_network
+from cdpipe.descriptor.sphere_training import BATCH, SphereData, SphereTask, pooled_scores, sector_targets
+
+WIDE = COLUMNS // SECTORS
+
+
+def _walls(n: int, changed: dict[int, tuple[int, int]], distance_m: float = 3.0) -> SphereData:
+    """N keyframes a metre apart in a round tunnel; of each of `changed` a block stands at (row, sector) afterwards."""
+    before = torch.full((n, ROWS, COLUMNS), distance_m) + 0.02 * torch.rand(
+        n, ROWS, COLUMNS, generator=torch.Generator().manual_seed(n)
+    )
+    after, marks = before.clone(), torch.zeros(n, ROWS, COLUMNS, dtype=torch.uint8)
+    for index, (row, sector) in changed.items():
+        block = slice(row, row + 3), slice(sector * WIDE, sector * WIDE + 4)
+        after[index][block] = distance_m - 1.0
+        marks[index][block] = 1
+    labels = np.array([1 if index in changed else 0 for index in range(n)], dtype=np.int64)
+    return SphereData(
+        before,
+        after[:, None],
+        torch.zeros(n, ROWS, COLUMNS, dtype=torch.uint8),
+        marks[:, None],
+        np.column_stack([10.0 * np.arange(n), np.zeros(n), np.zeros(n)]),
+        labels,
+        np.zeros(n, dtype=np.int64),
+        np.full(n, 4.5),
+    )
+
+
+def test_targets_by_hand() -> None:
+    nothing = torch.zeros(1, ROWS, COLUMNS, dtype=torch.uint8)
+    marks = nothing.clone()
+    marks[0, ROWS // 2, :3] = 1  # three pixels of sector 0: changed
+    marks[0, ROWS // 2, WIDE] = 1  # one pixel of sector 1: neither
+    marks[0, 0, 2 * WIDE : 3 * WIDE] = 1  # sector 2, but in a row that the neighbour answers for
+    marks[0, ROWS // 2, 3 * WIDE : 4 * WIDE] = 2  # sector 3: a change that does not count
+    expected = torch.zeros(1, SECTORS)
+    expected[0, 0], expected[0, 1], expected[0, 3] = 1, -1, -1
+    torch.testing.assert_close(sector_targets(marks, nothing), expected)
+    torch.testing.assert_close(sector_targets(nothing, marks), expected)
+
+
+def test_a_batch_keeps_images_and_targets_together_under_every_turn() -> None:
+    data = _walls(12, {0: (6, 2), 1: (7, 9), 2: (5, 14)})
+    task = SphereTask(initial_sphere_network(), data, data, seed=3)
+    n_changed = []
+    for step in range(24):
+        before, after, targets = task.batch(step)
+        assert before.shape == after.shape == (BATCH, ROWS, COLUMNS)
+        differs = ((before - after).abs() > 0.5)[:, ROWS // 4 : -ROWS // 4].sum(dim=1)
+        per_sector = differs.reshape(BATCH, SECTORS, WIDE).sum(dim=2)
+        # wherever the images differ by the block, and nowhere else, the target says so
+        assert ((targets == 1) == (per_sector >= 3)).all()
+        assert (targets[per_sector == 0] == 0).all()
+        n_changed.append(int((targets == 1).any(dim=1).sum()))
+    assert min(n_changed) > BATCH // 2  # the changed half, and what was pasted into the other
+    torch.testing.assert_close(task.batch(5)[1], task.batch(5)[1], rtol=0, atol=0)
+
+
+def test_training_finds_blocks_it_has_not_seen() -> None:
+    training = _walls(24, {index: (4 + index % 5, (5 * index) % SECTORS) for index in range(12)})
+    validation = _walls(10, {0: (6, 3), 4: (5, 11), 7: (8, 6)})
+    task = SphereTask(initial_sphere_network(), training, validation, seed=0)
+    optimiser = torch.optim.AdamW(task.network.parameters(), lr=FitConfig().learning_rate)
+    losses = []
+    for step in range(25):
+        optimiser.zero_grad()
+        loss = torch.stack(list(task.losses(step).values())).sum()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+        losses.append(loss.item())
+    assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
+    assert task.scores()["auroc"] == 1.0
+
+
+def test_a_score_reaches_as_far_as_the_query_pools() -> None:
+    data = _walls(6, {2: (6, 3)})
+    near = SphereData(
+        data.before_m, data.after_m, data.before_marks, data.after_marks,
+        data.positions / 5.0, data.labels, data.tunnels, data.score_radius_m,
+    )  # fmt: skip
+    network = initial_sphere_network()
+    alone, pooled = pooled_scores(network, data, 0), pooled_scores(network, near, 0)
+    # keyframes 2 m apart, 0.8 x 4.5 m reaches one on either side
+    expected = [alone[max(0, k - 1) : k + 2].max() for k in range(6)]
+    np.testing.assert_allclose(pooled, expected)
