@@ -32,8 +32,12 @@ def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
 
 
 def describe_mapped(source: ScanSource, thin_map: PointMap, config: PipelineConfig) -> DescriptorSet:
-    """Describe a session's keyframes: their scans, and where spheres will be compared, the map around each."""
-    descriptors = describe_scans(source, thin_map.keyframe_scans, config.descriptor)
+    """Describe the scans of a session's keyframes and, where spheres will be compared, the map around each."""
+    return with_spheres(describe_scans(source, thin_map.keyframe_scans, config.descriptor), thin_map, config)
+
+
+def with_spheres(descriptors: DescriptorSet, thin_map: PointMap, config: PipelineConfig) -> DescriptorSet:
+    """Return descriptors with those of the spheres, if spheres will be compared."""
     if config.query.compare != "sphere":
         return descriptors
     return replace(descriptors, spheres=describe_map(thin_map, thin_map.odom_T_keyframe, config.descriptor))

@@ -270,10 +270,9 @@ def _oracle(cell: Cell, truth: GroundTruth) -> Merge | None:
 
 def _unmade(pair: _Pair, error: str) -> CaseScore:
     """Score a case whose world cannot be made: there is no truth, so all but the identity is undefined."""
-    names = {"scenario": "", "family": pair.family, "domain": domain_of(pair.family), "pair_kind": ""}
-    row = {**names, "seed": pair.seed, "variant": "", "preset": ""}
+    row = {"scenario": "", "family": pair.family, "pair_kind": "", "seed": pair.seed, "variant": "", "preset": ""}
     outcome = {"status": "failed", "error": error, "metrics_version": METRICS_VERSION}
-    return CaseScore(row={**row, **outcome}, changes=[], regions=[], objects=[])
+    return CaseScore(row={**row, **outcome, "domain": domain_of(pair.family)}, changes=[], regions=[], objects=[])
 
 
 def _key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mapping[str, str]) -> str:

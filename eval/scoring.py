@@ -108,7 +108,6 @@ def _identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
     return {
         "scenario": truth.pair.family,
         "family": truth.pair.family,
-        "domain": domain_of(truth.pair.family),
         "pair_kind": "",
         "seed": truth.pair.seed,
         "variant": answer.method,
@@ -116,6 +115,7 @@ def _identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
         "status": answer.status,
         "error": answer.error,
         "metrics_version": METRICS_VERSION,
+        "domain": domain_of(truth.pair.family),
         "n_changes": len(truth.pair.changes),
         "n_observable": truth.n_observable,
         "score_radius_m": truth.pair.score_radius_m,

@@ -13,7 +13,7 @@ import pandas as pd
 from cdpipe.answer import write_answer
 from cdpipe.config import PipelineConfig
 from cdpipe.descriptor import describe_scans, load_descriptors, save_descriptors, use_threads
-from cdpipe.detect import detect_changes
+from cdpipe.detect import describe_mapped, detect_changes, map_session, with_spheres
 from cdpipe.errors import InputError, MergeFailedError
 from cdpipe.evidence import GATES
 from cdpipe.mapping import build_map, keyframes
@@ -35,9 +35,12 @@ def describe_session(folder: Path, config: PipelineConfig) -> tuple[DescriptorSe
     """
     use_threads(THREADS)
     source = open_scans(folder)
-    chosen = keyframes(source.odom_T_sensor, config.map.keyframe_spacing_m)
-    descriptors = describe_scans(source, chosen, config.descriptor)
-    return descriptors, save_descriptors(folder, descriptors, source.odom_T_sensor)
+    if config.query.compare == "sphere":
+        descriptors = map_session(source, config).descriptors
+    else:
+        chosen = keyframes(source.odom_T_sensor, config.map.keyframe_spacing_m)
+        descriptors = describe_scans(source, chosen, config.descriptor)
+    return descriptors, save_descriptors(folder, descriptors, source.odom_T_sensor, config.map)
 
 
 def detect_pair(before: Path, after: Path, config: PipelineConfig, on_stage: OnStage) -> ChangeReport:
@@ -133,10 +136,10 @@ def object_table(report: ChangeReport) -> pd.DataFrame:
 
 
 def _descriptors(folder: Path, source: ScanSource, pointmap: PointMap, config: PipelineConfig) -> DescriptorSet:
-    stored = load_descriptors(folder, config.descriptor, source.odom_T_sensor)
-    if stored is not None and np.array_equal(stored.keyframe_scans, pointmap.keyframe_scans):
-        return stored
-    return describe_scans(source, pointmap.keyframe_scans, config.descriptor)
+    stored = load_descriptors(folder, config.descriptor, source.odom_T_sensor, config.map)
+    if stored is None or not np.array_equal(stored.keyframe_scans, pointmap.keyframe_scans):
+        return describe_mapped(source, pointmap, config)
+    return stored if stored.spheres is not None else with_spheres(stored, pointmap, config)
 
 
 def _write_ply(path: Path, report: ChangeReport) -> None:

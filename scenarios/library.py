@@ -110,9 +110,9 @@ def _turned_over(scenario: Scenario, turnover: float, seed: int) -> Scenario:
     props: list[Prop] = []
     for prop in scenario.props:
         draw = stream(seed, "turnover", prop.name).random()
-        if prop.change == "none" and draw < turnover:
-            prop = prop.model_copy(update={"change": "added" if draw < turnover / 2 else "removed"})
-        props.append(prop)
+        is_turned = prop.change == "none" and draw < turnover
+        update = {"change": "added" if draw < turnover / 2 else "removed"} if is_turned else {}
+        props.append(prop.model_copy(update=update))
     return scenario.model_copy(update={"props": tuple(props)})
 
 

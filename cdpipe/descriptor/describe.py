@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
-from cdpipe.config import DescriptorConfig
+from cdpipe.config import DescriptorConfig, MapConfig
 from cdpipe.descriptor.handmade import HANDMADE, VERSION
 from cdpipe.descriptor.network import (
     PlaceNetwork,
@@ -19,6 +21,7 @@ from cdpipe.descriptor.network import (
     trained_network,
 )
 from cdpipe.descriptor.range_image import range_image
+from cdpipe.descriptor.sphere import sphere_digest
 from cdpipe.errors import InputError
 from cdpipe.geometry import Float32Array, Float64Array, Int64Array
 from cdpipe.session import load_arrays
@@ -50,16 +53,21 @@ def describe_scans(source: ScanSource, keyframe_scans: Int64Array, config: Descr
     return DescriptorSet(q, w, keyframe_scans, config.method, checkpoint_digest(config))
 
 
-def save_descriptors(folder: Path, descriptors: DescriptorSet, odom_T_sensor: Float64Array) -> Path:
+def save_descriptors(
+    folder: Path, descriptors: DescriptorSet, odom_T_sensor: Float64Array, map_config: MapConfig
+) -> Path:
     """Store descriptors beside a session, in `folder/descriptors/<name>.npz`, and return the file.
 
-    The poses (S, 4, 4) of the session are stored with them, to tell whether they still belong to it.
+    The poses (S, 4, 4) of the session are stored with them, to tell whether they still belong to it, and with sphere
+    descriptors the weights and the map settings they were made with.
     """
     path = folder / "descriptors" / f"{descriptors.name}.npz"
     partial = path.with_suffix(".partial.npz")
+    optional: dict[str, npt.NDArray[Any]] = {} if descriptors.w is None else {"w": descriptors.w}
+    if descriptors.spheres is not None:
+        optional |= {"spheres": descriptors.spheres, "spheres_of": np.array(_spheres_of(map_config))}
     try:
         path.parent.mkdir(exist_ok=True)
-        orientation = {} if descriptors.w is None else {"w": descriptors.w}
         np.savez(
             partial,
             allow_pickle=False,
@@ -67,7 +75,7 @@ def save_descriptors(folder: Path, descriptors: DescriptorSet, odom_T_sensor: Fl
             q=descriptors.q,
             keyframe_scans=descriptors.keyframe_scans,
             odom_T_sensor=odom_T_sensor,
-            **orientation,
+            **optional,
         )
         partial.replace(path)
     except OSError as error:
@@ -75,8 +83,12 @@ def save_descriptors(folder: Path, descriptors: DescriptorSet, odom_T_sensor: Fl
     return path
 
 
-def load_descriptors(folder: Path, config: DescriptorConfig, odom_T_sensor: Float64Array) -> DescriptorSet | None:
+def load_descriptors(
+    folder: Path, config: DescriptorConfig, odom_T_sensor: Float64Array, map_config: MapConfig
+) -> DescriptorSet | None:
     """Read stored descriptors; None where there are none, or none of the present checkpoint and of these poses.
+
+    Sphere descriptors come along where they are of the present weights, precision and map settings.
 
     Raises:
         InputError: The file is damaged.
@@ -90,9 +102,17 @@ def load_descriptors(folder: Path, config: DescriptorConfig, odom_T_sensor: Floa
         is_of_session = np.array_equal(arrays["odom_T_sensor"], odom_T_sensor)
         if not is_of_session or checkpoint != checkpoint_digest(config):
             return None
-        return DescriptorSet(arrays["q"], arrays.get("w"), arrays["keyframe_scans"], config.method, checkpoint)
+        spheres = arrays.get("spheres")
+        if spheres is not None:
+            is_present = str(arrays["spheres_of"]) == _spheres_of(map_config) and spheres.dtype == config.precision
+            spheres = spheres if is_present else None
+        return DescriptorSet(arrays["q"], arrays.get("w"), arrays["keyframe_scans"], config.method, checkpoint, spheres)
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: damaged ({error}): remove it and describe the session again") from error
+
+
+def _spheres_of(map_config: MapConfig) -> str:
+    return f"{sphere_digest()} {map_config.model_dump_json()}"
 
 
 def checkpoint_digest(config: DescriptorConfig) -> str:

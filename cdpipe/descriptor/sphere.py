@@ -58,8 +58,11 @@ def change_logits(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArr
     images = render(merged.after.points, MapIndex(merged.after.points), _in_after_odom(merged, map_T_anchor))
     spheres = stored_numbers(before.spheres[is_covered])
     with torch.inference_mode():
-        batches = zip(torch.split(torch.from_numpy(spheres), _BATCH), torch.split(torch.from_numpy(images), _BATCH), strict=True)
-        parts = [network.compare(s.reshape(-1, PER_SECTOR, SECTORS), i).numpy() for s, i in batches]
+        batches = (torch.split(torch.from_numpy(array), _BATCH) for array in (spheres, images))
+        parts = [
+            network.compare(stored.reshape(-1, PER_SECTOR, SECTORS), image).numpy()
+            for stored, image in zip(*batches, strict=True)
+        ]
     logits[is_covered] = np.concatenate([np.zeros((0, SECTORS)), *parts])
     return logits
 

@@ -1,17 +1,18 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from cdpipe.config import DescriptorConfig
+from cdpipe.config import DescriptorConfig, MapConfig
 from cdpipe.descriptor import describe_scan, describe_scans, load_descriptors, relative_yaws_rad, save_descriptors
 from cdpipe.descriptor.fit import FitConfig, fit
 from cdpipe.descriptor.network import DIMENSIONS, initial_network, yaw_correlation
 from cdpipe.descriptor.range_image import COLUMNS, ELEVATION_RAD, ROWS, range_image
 from cdpipe.descriptor.training import PlaceData, PlaceTask, evaluate
 from cdpipe.errors import InputError
-from cdpipe.types import PosedScan
+from cdpipe.types import PosedScan, Spheres
 
 
 def test_a_point_falls_where_its_angles_say() -> None:
@@ -61,17 +62,37 @@ def test_descriptors_are_unit_vectors_and_survive_the_disk(tmp_path: Path, metho
     np.testing.assert_allclose(made.q[1], q, atol=1e-6)
     np.testing.assert_allclose(made.w[1], w, atol=1e-6)
     poses = _Source.odom_T_sensor
-    assert load_descriptors(tmp_path, config, poses) is None
-    path = save_descriptors(tmp_path, made, poses)
-    assert load_descriptors(tmp_path, config, poses + 1e-9) is None  # recorded anew
-    read = load_descriptors(tmp_path, config, poses)
+    assert load_descriptors(tmp_path, config, poses, MapConfig()) is None
+    path = save_descriptors(tmp_path, made, poses, MapConfig())
+    assert load_descriptors(tmp_path, config, poses + 1e-9, MapConfig()) is None  # recorded anew
+    read = load_descriptors(tmp_path, config, poses, MapConfig())
     assert read is not None
     np.testing.assert_array_equal(read.q, made.q)
     np.testing.assert_array_equal(read.w, made.w)
     assert (read.name, read.checkpoint) == (method, made.checkpoint)
     np.savez(path, q=made.q)
     with pytest.raises(InputError, match=r"damaged .* describe the session again"):
-        load_descriptors(tmp_path, config, poses)
+        load_descriptors(tmp_path, config, poses, MapConfig())
+
+
+def test_stored_spheres_are_used_with_their_weights_precision_and_map_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poses, config = _Source.odom_T_sensor, DescriptorConfig()
+    spheres = np.linspace(-1, 1, 128, dtype=np.float32).reshape(2, 64)
+    made = replace(describe_scans(_Source(), np.array([0, 2]), config), spheres=spheres)
+    save_descriptors(tmp_path, made, poses, MapConfig())
+
+    def read(of: DescriptorConfig, map_config: MapConfig) -> Spheres | None:
+        found = load_descriptors(tmp_path, of, poses, map_config)
+        assert found is not None
+        return found.spheres
+
+    np.testing.assert_array_equal(read(config, MapConfig()), spheres)
+    assert read(config, MapConfig(voxel_m=0.3)) is None
+    assert read(DescriptorConfig(precision="int8"), MapConfig()) is None
+    monkeypatch.setattr("cdpipe.descriptor.describe.sphere_digest", lambda: "other")
+    assert read(config, MapConfig()) is None
 
 
 def _rooms(n_tunnels: int) -> PlaceData:

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpipe.config import DescriptorConfig
+from cdpipe.config import DescriptorConfig, MapConfig
 from cdpipe.descriptor import (
     checkpoint_digest,
     describe_scan,
@@ -184,12 +184,12 @@ def test_stored_vectors_of_another_version_are_stale(
     q, w = describe_scan(_Source().scan(2), config)
     np.testing.assert_array_equal(made.q[1], q)
     np.testing.assert_array_equal(made.w[1], w)
-    save_descriptors(tmp_path, made, _Source.odom_T_sensor)
-    read = load_descriptors(tmp_path, config, _Source.odom_T_sensor)
+    save_descriptors(tmp_path, made, _Source.odom_T_sensor, MapConfig())
+    read = load_descriptors(tmp_path, config, _Source.odom_T_sensor, MapConfig())
     assert read is not None
     np.testing.assert_array_equal(read.q, made.q)
     monkeypatch.setattr("cdpipe.descriptor.describe.VERSION", VERSION + 1)
-    assert load_descriptors(tmp_path, config, _Source.odom_T_sensor) is None
+    assert load_descriptors(tmp_path, config, _Source.odom_T_sensor, MapConfig()) is None
 
 
 def test_whoever_changes_the_vectors_raises_the_version() -> None:
