@@ -14,13 +14,11 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from cdpipe.config import QueryConfig
-from cdpipe.descriptor.sphere import change_logits
+from cdpipe.descriptor.pooling import best_in_reach
+from cdpipe.descriptor.sphere import change_probabilities
 from cdpipe.difference import sphere_difference
 from cdpipe.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.types import ChangeRegions, DescriptorSet, MergedMaps
-
-# A keyframe this share of the radius from a changed sector has the change, not just its edge, within the radius.
-_POOLED = 0.8
 
 
 def find_regions(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> ChangeRegions:
@@ -36,7 +34,7 @@ def find_regions(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet
     if config.compare == "scan":
         return _by_scans(places, before, after, config)
     if config.compare == "sphere":
-        return _by_spheres(places, change_logits(merged, before, places.is_covered_b), config)
+        return _by_spheres(places, change_probabilities(merged, before, places.is_covered_b), config)
     scores = sphere_difference(merged, before, after, config)
     return rank_regions(places.before, scores, places.pairs_b, scores, config)
 
@@ -89,18 +87,14 @@ def _by_scans(places: _Places, before: DescriptorSet, after: DescriptorSet, conf
     )
 
 
-def _by_spheres(places: _Places, logits: Float64Array, config: QueryConfig) -> ChangeRegions:
-    """Score every before keyframe by its most changed sector; the score of its sphere is the best in reach.
+def _by_spheres(places: _Places, local: Float64Array, config: QueryConfig) -> ChangeRegions:
+    """Score every before keyframe by the (K,) probability of its own stretch; that of its sphere is the best in reach.
 
     A sphere descriptor tells of the two metres before and behind its keyframe, a region of all within `radius_m`.
     """
-    local = logits.max(axis=1) if len(logits) else np.zeros(0)
     keyframe_scores = np.full(len(local), np.nan)
     covered = np.flatnonzero(places.is_covered_b)
-    if len(covered):
-        tree = cKDTree(places.before[covered])
-        near = tree.query_ball_point(places.before[covered], _POOLED * config.radius_m)
-        keyframe_scores[covered] = [local[covered[found]].max() for found in near]
+    keyframe_scores[covered] = best_in_reach(local[covered], places.before[covered], config.radius_m)
     return rank_regions(places.before, local, places.pairs_b, keyframe_scores, config)
 
 

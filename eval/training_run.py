@@ -79,6 +79,7 @@ def train_descriptor(
 
     history = fit(task, config, out, f"{name} {' '.join(digests)}", on_step, on_validation)
     draw_curves(out / "curves.png", name, history)
+    finished = task.finish()
     content = checkpoint_bytes(task.network)
     best = next(done for done in reversed(history) if done.is_best)
     card = {
@@ -89,6 +90,7 @@ def train_descriptor(
             **_described(tunnels[1], digests[1]),
             "trained": _rounded(best.scores),
             "untrained": _rounded(before),
+            **({"calibration": _rounded(finished)} if finished else {}),
         },
         "settings": asdict(config),
         "best_step": best.step,

@@ -55,6 +55,9 @@ class Task(Protocol):
     def scores(self) -> dict[str, float]:
         """Return the scores on the validation tunnels; the first one decides, larger is better."""
 
+    def finish(self) -> dict[str, float]:
+        """Do what is done once with the best weights, and return what the model card should say of it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Progress:

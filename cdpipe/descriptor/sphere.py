@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from cdpipe.config import DescriptorConfig
+from cdpipe.descriptor.pooling import agreed
 from cdpipe.descriptor.sphere_image import render
 from cdpipe.descriptor.sphere_network import PER_SECTOR, SECTORS, SphereNetwork, trained_sphere_network
 from cdpipe.geometry import BoolArray, Float32Array, Float64Array, invert
@@ -65,6 +66,22 @@ def change_logits(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArr
         ]
     logits[is_covered] = np.concatenate([np.zeros((0, SECTORS)), *parts])
     return logits
+
+
+def change_probabilities(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArray) -> Float64Array:
+    """Return the (K,) calibrated probability that the surroundings of each before keyframe changed, NaN if not covered.
+
+    Args:
+        merged: Both maps.
+        before: Its `spheres` are compared.
+        is_covered: (K,) which keyframes the after session came near.
+    """
+    probabilities = np.full(len(is_covered), np.nan)
+    logits = change_logits(merged, before, is_covered)[is_covered]
+    positions = merged.before.odom_T_sensor[before.keyframe_scans[is_covered], :3, 3]
+    most_changed = torch.from_numpy(agreed(logits, positions).max(axis=1))
+    probabilities[is_covered] = _network()[0].probability(most_changed).numpy()
+    return probabilities
 
 
 def stored_numbers(spheres: Spheres) -> Float32Array:

@@ -62,6 +62,8 @@ class SphereNetwork(nn.Module):
         beside = 64 if is_asymmetric else 0
         self.head = nn.ModuleList([nn.Conv1d(3 * per_sector + beside, 96, 3), nn.Conv1d(96, 64, 3)])
         self.logit = nn.Conv1d(64, 1, 1)
+        self.calibration: Tensor
+        self.register_buffer("calibration", torch.tensor([1.0, 0.0], dtype=torch.float64))
 
     def encode(self, images_m: Tensor) -> Tensor:
         """Return (B, per_sector, SECTORS) numbers in (-1, 1): the descriptor."""
@@ -79,6 +81,10 @@ class SphereNetwork(nn.Module):
             hidden = torch.relu(layer(nn.functional.pad(hidden, (1, 1), mode="circular")))
         logits: Tensor = self.logit(hidden)[:, 0] + _FIRST_LOGIT
         return logits
+
+    def probability(self, logits: Tensor) -> Tensor:
+        """Return the probability that a place changed of the log-odds of its most changed sector, as calibrated."""
+        return torch.sigmoid(self.calibration[0] * logits.double() + self.calibration[1])
 
     def forward(self, before_m: Tensor, after_m: Tensor) -> Tensor:
         """Return (B, SECTORS) log-odds of change between two images of the same places."""

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from scipy.spatial import cKDTree
+from scipy.optimize import minimize
 from torch import Tensor
 from torch.nn import functional
 
 from cdpipe.descriptor.data import TunnelShard
+from cdpipe.descriptor.pooling import agreed, best_in_reach
 from cdpipe.descriptor.shard import read_shard
 from cdpipe.descriptor.sphere_image import COLUMNS, ROWS
 from cdpipe.descriptor.sphere_network import SECTORS, SphereNetwork
@@ -36,8 +37,6 @@ _PASTED_SHIFT_ROWS = 3
 # What is put in front of a wall must stand out of it: less is neither changed nor unchanged.
 _STANDS_OUT_M = 0.15
 _IN_FRONT_M = 0.05
-# A keyframe's score is the best within this share of the score radius, as the pipeline's query takes it.
-POOLED = 0.8
 _CHANGED, _UNCOUNTED = 1, 2
 
 
@@ -184,18 +183,39 @@ class SphereTask:
         ]
         return {"auroc": float(np.nanmean(by_tunnel)), "auroc_pooled": _auroc(pooled, data.labels)}
 
+    def finish(self) -> dict[str, float]:
+        """Calibrate the probability on the validation tunnels (Platt); return slope, offset and Brier score there."""
+        data = self._validation
+        used = data.labels >= 0
+        pooled = pooled_scores(self._network, data, draw=min(1, data.n_draws - 1))[used]
+        slope, offset = platt(pooled, data.labels[used] == 1)
+        self._network.calibration.copy_(torch.tensor([slope, offset], dtype=torch.float64))
+        found = self._network.probability(torch.from_numpy(pooled)).numpy()
+        return {"slope": slope, "offset": offset, "brier": float(np.mean((found - data.labels[used]) ** 2))}
+
+
+def platt(scores: Float64Array, is_positive: BoolArray) -> tuple[float, float]:
+    """Return slope and offset of the logistic curve that fits N scores best, in likelihood."""
+
+    def loss(parameters: Float64Array) -> float:
+        logits = parameters[0] * scores + parameters[1]
+        return float(np.mean(np.logaddexp(0.0, np.where(is_positive, -logits, logits))))
+
+    found = minimize(loss, np.array([1.0, 0.0]), method="Nelder-Mead")
+    return float(found.x[0]), float(found.x[1])
+
 
 def pooled_scores(network: SphereNetwork, data: SphereData, draw: int) -> Float64Array:
     """Return the (N,) log-odds of each keyframe's most changed sector within reach, as the query pools them."""
     with torch.inference_mode():
         batches = zip(torch.split(data.before_m, 256), torch.split(data.after_m[:, draw], 256), strict=True)
-        local = torch.cat([network(before, after).amax(dim=1) for before, after in batches]).numpy().astype(np.float64)
-    pooled = np.empty_like(local)
+        logits = torch.cat([network(before, after) for before, after in batches]).numpy().astype(np.float64)
+    pooled = np.empty(len(logits))
     for tunnel in np.unique(data.tunnels):
         members = np.flatnonzero(data.tunnels == tunnel)
-        reach_m = POOLED * data.score_radius_m[members[0]]
-        near = cKDTree(data.positions[members]).query_ball_point(data.positions[members], reach_m)
-        pooled[members] = [local[members[found]].max() for found in near]
+        positions = data.positions[members]
+        local = agreed(logits[members], positions).max(axis=1)
+        pooled[members] = best_in_reach(local, positions, data.score_radius_m[members[0]])
     return pooled
 
 

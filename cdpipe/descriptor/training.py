@@ -102,6 +102,10 @@ class PlaceTask:
         scores = evaluate(self._network, self._validation)
         return {name: float(getattr(scores, name)) for name in scores.__slots__}
 
+    def finish(self) -> dict[str, float]:
+        """There is nothing to do."""
+        return {}
+
 
 def evaluate(network: PlaceNetwork, data: PlaceData) -> PlaceScores:
     """Score a network on tunnels it has not seen; every tunnel needs both sessions."""

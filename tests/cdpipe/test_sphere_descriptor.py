@@ -145,9 +145,9 @@ def test_regions_of_spheres_and_the_reach_of_their_scores() -> None:
     assert abs(regions.centres_map[0, 0] - 12) <= 1
     assert regions.pairs[0].tolist() == [round(regions.centres_map[0, 0])] * 2
     best = int(regions.pairs[0, 0])
-    # the score of the block reaches 0.8 x 4 m
+    # the score of the block reaches 4 m
     top = np.flatnonzero(regions.keyframe_scores == regions.scores[0])
-    assert top.tolist() == list(range(best - 3, best + 4))
+    assert top.tolist() == list(range(best - 4, best + 5))
 
 
 def test_keyframes_the_after_session_never_came_near_have_no_score() -> None:
