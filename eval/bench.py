@@ -15,6 +15,7 @@ import numpy as np
 
 from cdpipe.errors import InputError
 from cdpipe.yamlfile import suggestion
+from eval.descriptor_bench import descriptor_contests
 from eval.merge_bench import FailedContest, MergeSite, merge_contests, paper_sites
 from eval.output import make_writable, unwritable
 from eval.provenance import machine
@@ -29,7 +30,8 @@ def contests(
     site: BenchSite | None = None, merge_sites: Sequence[MergeSite] | None = None
 ) -> dict[str, Callable[[], Contest]]:
     """Return everything that can be measured, by name, in the order of the table."""
-    return {**sensor_contests(site or BenchSite()), **merge_contests(merge_sites or paper_sites())}
+    sites = merge_sites or paper_sites()
+    return {**sensor_contests(site or BenchSite()), **merge_contests(sites), **descriptor_contests(sites)}
 
 
 def chosen(every: Contests, only: Sequence[str]) -> Contests:

@@ -14,6 +14,7 @@ from cdpipe.geometry import yaw_pose
 from cdpipe.types import MergedMaps
 from eval import merge_bench
 from eval.bench import contests, measure, row_of, verdict
+from eval.descriptor_bench import descriptor_contests
 from eval.merge_bench import Goals, MergeSite, merge_contests, paper_sites
 from sim.bench import BenchSite
 
@@ -39,8 +40,10 @@ def told(monkeypatch: pytest.MonkeyPatch, before_T_after: np.ndarray, reason: st
 
 def test_rows_of_both_paper_sites_stand_in_the_table() -> None:
     names = list(contests())
-    assert [name for name in names if "60k" in name] == [name.replace("tiny", "60k") for name in ROWS]
-    assert [name for name in names if "1400k" in name] == [name.replace("tiny", "1400k") for name in ROWS]
+    for size in ("60k", "1400k"):
+        assert [name for name in names if size in name and "merge" in name] == [
+            name.replace("tiny", size) for name in ROWS
+        ]
     goals = [each.goals for each in paper_sites()]
     assert goals == [Goals(0.051, 0.1, 10.0, 3.0), Goals(0.1, 2.5, 10.0, 5.0)]
 
@@ -63,6 +66,13 @@ def test_real_rows_of_a_small_world(site: MergeSite) -> None:
     assert all_in["value"] > raced["value"] + rows["merge-tiny-index"]["value"]
     assert rows["merge-tiny-refine"]["met"] is None
     json.dumps(rows)
+
+
+def test_rows_of_descriptors_and_query(site: MergeSite) -> None:
+    rows = {row["name"]: row for row in measure(descriptor_contests([site]))["rows"]}
+    limits = {"3deg-tiny-per-scan": 0.1, "sphere-tiny-per-keyframe": 0.003, "query-tiny-per-region": 0.016}
+    assert {name: row["rival_value"] for name, row in rows.items()} == limits
+    assert all(0 < row["value"] < 1 and row["target"] == 1.0 for row in rows.values())
 
 
 def test_all_in_is_descriptors_index_and_merge(site: MergeSite) -> None:

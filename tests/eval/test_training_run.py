@@ -11,16 +11,15 @@ from safetensors.torch import load_file
 
 from cdpipe.descriptor.network import digest
 from cdpipe.descriptor.sphere_network import SphereNetwork
+from eval.dataset import Recipe
+from eval.dataset_run import Where, make_dataset
+from eval.progress import Silent
 
 Command = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture(scope="module", name="data")
 def data_fixture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from eval.dataset import Recipe
-    from eval.dataset_run import Where, make_dataset
-    from eval.progress import Silent
-
     folder = tmp_path_factory.mktemp("data")
     for seeds in ("3:4", "10003:10004"):
         make_dataset(["smoke/one_box"], seeds, Recipe(draws=2), folder, Where(None, None), None, "test", Silent())
