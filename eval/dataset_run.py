@@ -322,7 +322,7 @@ def _client(where: Where, n_tunnels: int) -> Iterator[Any]:
     settings = {
         "n_workers": min(where.workers or 1, n_tunnels),
         "threads_per_worker": 1,
-        "dashboard_address": None,
+        "dashboard_address": ":0",  # any free port: two runs may go on side by side
         "memory_limit": None,
         # an interrupted worker is no news
         "silence_logs": logging.CRITICAL,
