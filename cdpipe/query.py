@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.config import QueryConfig
 from cdpipe.descriptor.pooling import best_in_reach
-from cdpipe.descriptor.sphere import change_probabilities
+from cdpipe.descriptor.sphere import change_log_odds
 from cdpipe.difference import sphere_difference
 from cdpipe.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.types import ChangeRegions, DescriptorSet, MergedMaps
@@ -34,7 +34,7 @@ def find_regions(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet
     if config.compare == "scan":
         return _by_scans(places, before, after, config)
     if config.compare == "sphere":
-        return _by_spheres(places, change_probabilities(merged, before, places.is_covered_b), config)
+        return _by_spheres(places, change_log_odds(merged, before, places.is_covered_b), config)
     scores = sphere_difference(merged, before, after, config)
     return rank_regions(places.before, scores, places.pairs_b, scores, config)
 
@@ -88,7 +88,7 @@ def _by_scans(places: _Places, before: DescriptorSet, after: DescriptorSet, conf
 
 
 def _by_spheres(places: _Places, local: Float64Array, config: QueryConfig) -> ChangeRegions:
-    """Score every before keyframe by the (K,) probability of its own stretch; that of its sphere is the best in reach.
+    """Score every before keyframe by the (K,) log-odds of its own stretch; that of its sphere is the best in reach.
 
     A sphere descriptor tells of the two metres before and behind its keyframe, a region of all within `radius_m`.
     """

@@ -10,7 +10,7 @@ from time import perf_counter
 import numpy as np
 
 from cdpipe.config import load_config
-from cdpipe.descriptor.sphere import change_probabilities, describe_map
+from cdpipe.descriptor.sphere import change_log_odds, describe_map
 from cdpipe.merge import merge_maps
 from cdpipe.query import find_regions
 from eval.merge_bench import MergeSite
@@ -49,7 +49,7 @@ def _sphere(site: MergeSite) -> Contest:
 
     def both() -> None:
         spheres = describe_map(before.map, poses, site.config.descriptor)
-        change_probabilities(merged, replace(before.descriptors, spheres=spheres), is_covered)
+        change_log_odds(merged, replace(before.descriptors, spheres=spheres), is_covered)
 
     return _limited([seconds / len(poses) for seconds in timed(both, site.repeats)], _SPHERE_LIMIT_S)
 

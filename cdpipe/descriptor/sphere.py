@@ -68,20 +68,22 @@ def change_logits(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArr
     return logits
 
 
-def change_probabilities(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArray) -> Float64Array:
-    """Return the (K,) calibrated probability that the surroundings of each before keyframe changed, NaN if not covered.
+def change_log_odds(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArray) -> Float64Array:
+    """Return the (K,) calibrated log-odds that the surroundings of each before keyframe changed, NaN if not covered.
+
+    Their sigmoid is a probability, as the validation tunnels have it; log-odds rank alike and do not saturate.
 
     Args:
         merged: Both maps.
         before: Its `spheres` are compared.
         is_covered: (K,) which keyframes the after session came near.
     """
-    probabilities = np.full(len(is_covered), np.nan)
+    log_odds = np.full(len(is_covered), np.nan)
     logits = change_logits(merged, before, is_covered)[is_covered]
     positions = merged.before.odom_T_sensor[before.keyframe_scans[is_covered], :3, 3]
     most_changed = torch.from_numpy(agreed(logits, positions).max(axis=1))
-    probabilities[is_covered] = _network()[0].probability(most_changed).numpy()
-    return probabilities
+    log_odds[is_covered] = _network()[0].calibrated(most_changed).numpy()
+    return log_odds
 
 
 def stored_numbers(spheres: Spheres) -> Float32Array:

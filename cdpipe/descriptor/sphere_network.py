@@ -82,9 +82,10 @@ class SphereNetwork(nn.Module):
         logits: Tensor = self.logit(hidden)[:, 0] + _FIRST_LOGIT
         return logits
 
-    def probability(self, logits: Tensor) -> Tensor:
-        """Return the probability that a place changed of the log-odds of its most changed sector, as calibrated."""
-        return torch.sigmoid(self.calibration[0] * logits.double() + self.calibration[1])
+    def calibrated(self, logits: Tensor) -> Tensor:
+        """Return the log-odds that a place changed, of those of its most changed sector."""
+        log_odds: Tensor = self.calibration[0] * logits.double() + self.calibration[1]
+        return log_odds
 
     def forward(self, before_m: Tensor, after_m: Tensor) -> Tensor:
         """Return (B, SECTORS) log-odds of change between two images of the same places."""

@@ -184,13 +184,13 @@ class SphereTask:
         return {"auroc": float(np.nanmean(by_tunnel)), "auroc_pooled": _auroc(pooled, data.labels)}
 
     def finish(self) -> dict[str, float]:
-        """Calibrate the probability on the validation tunnels (Platt); return slope, offset and Brier score there."""
+        """Calibrate the log-odds on the validation tunnels (Platt); return slope, offset and Brier score there."""
         data = self._validation
         used = data.labels >= 0
         pooled = pooled_scores(self._network, data, draw=min(1, data.n_draws - 1))[used]
         slope, offset = platt(pooled, data.labels[used] == 1)
         self._network.calibration.copy_(torch.tensor([slope, offset], dtype=torch.float64))
-        found = self._network.probability(torch.from_numpy(pooled)).numpy()
+        found = torch.sigmoid(self._network.calibrated(torch.from_numpy(pooled))).numpy()
         return {"slope": slope, "offset": offset, "brier": float(np.mean((found - data.labels[used]) ** 2))}
 
 

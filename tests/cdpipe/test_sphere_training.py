@@ -105,11 +105,11 @@ def test_calibration_by_hand() -> None:
     np.testing.assert_allclose([slope, offset], [np.log(3), 0.0], atol=1e-3)
 
 
-def test_the_calibrated_probability_goes_with_the_weights() -> None:
+def test_the_calibration_goes_with_the_weights() -> None:
     data = _walls(12, {0: (6, 3), 4: (5, 11), 7: (8, 6)})
     task = SphereTask(initial_sphere_network(), data, data, seed=0)
     said = task.finish()
     kept = initial_sphere_network()
     kept.load_state_dict(task.network.state_dict())
-    expected = 1 / (1 + np.exp(-(said["slope"] * -2.0 + said["offset"])))
-    assert float(kept.probability(torch.tensor(-2.0))) == pytest.approx(expected)
+    expected = said["slope"] * -2.0 + said["offset"]
+    assert float(kept.calibrated(torch.tensor(-2.0))) == pytest.approx(expected)
