@@ -24,12 +24,14 @@ from cdpipe.registration import IndexedMap, plane_jacobian
 from cdpipe.walk import Step, Walk, walk
 
 # Every 2 m and thinned to 0.3 m is three times the work for the same centimetres (validation, cdpipe/README.md).
-_SPACING_M = 4.0
+_SPACING, _SPACING_M = 0.6, 4.0
 # What was seen from afar stands where the odometry of then put it, and so does what is far from the anchor. From afar
 # is 2.5 times as far as the walls pass by, which is the 20th percentile of the map's shortest ranges; 6 m at least.
 _SEEN_WITHIN, _WALL_PERCENTILE, _SEEN_WITHIN_M = 2.5, 20, 6.0
-_RADIUS_M = 5.0
-_VOXEL_M = 0.4
+# A sphere of 5 m in a drift 10 m wide holds floor, little of the walls, and hardly anything that tells the way along:
+# 1.8 times as far as the walls pass by, in steps and thinned in proportion.
+_RADIUS, _RADIUS_M = 1.8, 5.0
+_VOXEL, _VOXEL_M = 0.06, 0.4
 _CORRESPONDENCE_M = 1.0
 # How far a map point is off the surface, one standard deviation. Of 0.03 to 0.4 m the one with the smallest errors on
 # validation pairs whose sessions drift apart by 1 %; without drift a larger one averages more.
@@ -68,10 +70,11 @@ def refined(
     before = IndexedMap(before.map, closer, is_target=True, has_coarse_target=False)
     after = IndexedMap(after.map, closer, is_target=False)
     path_m = travelled_m(after.map.odom_T_keyframe)
-    keyframes, start = _anchors(path_m, found)
+    radius_m = max(_RADIUS * wall_m, _RADIUS_M)
+    keyframes, start = _anchors(path_m, found, max(_SPACING * radius_m, _SPACING_M))
     coarse = PathAlignment(after.positions[found.keyframes], found.before_T_after)
     first = int(np.nanargmax(found.fits))
-    step = Step(_RADIUS_M, _VOXEL_M, _CORRESPONDENCE_M)
+    step = Step(radius_m, max(_VOXEL * radius_m, _VOXEL_M), _CORRESPONDENCE_M)
     walked = walk(before, after, keyframes, start, found.before_T_after[first], step, config)
     is_good = walked.fits >= _MIN_FIT
     evidence = {"n_refined": float(np.count_nonzero(is_good))}
@@ -79,7 +82,8 @@ def refined(
         return None, evidence
     information = _held(walked.information) * np.where(is_good, 1 / _POINT_M**2, 0.0)[:, None, None]
     positions = after.positions[walked.keyframes]
-    chain = smoothed(positions, walked.before_T_after, information, _per_stretch(before, after, walked, is_good))
+    per_stretch = _per_stretch(before, after, walked, is_good, radius_m)
+    chain = smoothed(positions, walked.before_T_after, information, per_stretch)
     every = chain.at(path_m[walked.keyframes], path_m, after.positions)
     alignment = PathAlignment(after.positions, every)
     moved_m = np.linalg.norm(alignment.to_map(positions) - coarse.to_map(positions), axis=1)
@@ -90,10 +94,10 @@ def refined(
     }
 
 
-def _anchors(path_m: Float64Array, found: Walk) -> tuple[Int64Array, int]:
-    """Return after keyframes about 4 m apart, and where among them the best place of the walk stands."""
+def _anchors(path_m: Float64Array, found: Walk, spacing_m: float) -> tuple[Int64Array, int]:
+    """Return after keyframes about as far apart as that, and where among them the best place of the walk stands."""
     start = int(found.keyframes[np.nanargmax(found.fits)])
-    _, first = np.unique(np.floor((path_m - path_m[start]) / _SPACING_M + 1e-6), return_index=True)
+    _, first = np.unique(np.floor((path_m - path_m[start]) / spacing_m + 1e-6), return_index=True)
     keyframes = np.unique(np.append(first, start)).astype(np.int64)
     return keyframes, int(np.searchsorted(keyframes, start))
 
@@ -110,7 +114,9 @@ def _held(information: Float64Array) -> Float64Array:
     return scaled
 
 
-def _per_stretch(before: IndexedMap, after: IndexedMap, walked: Walk, is_good: BoolArray) -> Float64Array:
+def _per_stretch(
+    before: IndexedMap, after: IndexedMap, walked: Walk, is_good: BoolArray, radius_m: float
+) -> Float64Array:
     """Return (A, 6) by how much each registration errs, turn and shift, for a stretch of 1; zero where it did not fit.
 
     A counterpart that both sessions saw from x metres ahead of the anchor is x times the stretch too far ahead; the
@@ -119,7 +125,7 @@ def _per_stretch(before: IndexedMap, after: IndexedMap, walked: Walk, is_good: B
     result = np.zeros((len(walked.keyframes), 6))
     for a in np.flatnonzero(is_good):
         centre, pose = after.positions[walked.keyframes[a]], walked.before_T_after[a]
-        chosen = sampled(after.columns.crop(centre, _RADIUS_M))
+        chosen = sampled(after.columns.crop(centre, radius_m))
         moved = transform(pose, after.points[chosen])
         nearest, squared_m2 = before.target.tree.batch_nearest_neighbor_search(moved)
         is_pair = np.asarray(squared_m2) < _COUNTERPART_M**2

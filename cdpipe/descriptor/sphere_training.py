@@ -21,7 +21,7 @@ from torch.nn import functional
 from cdpipe.descriptor.data import TunnelShard
 from cdpipe.descriptor.pooling import agreed, best_in_reach
 from cdpipe.descriptor.shard import read_shard
-from cdpipe.descriptor.sphere_image import COLUMNS, ROWS
+from cdpipe.descriptor.sphere_image import COLUMNS, REACH_M, ROWS
 from cdpipe.descriptor.sphere_network import SECTORS, SphereNetwork
 from cdpipe.errors import InputError
 from cdpipe.geometry import BoolArray, Float64Array, Int64Array, stream
@@ -37,6 +37,9 @@ _PASTED_SHIFT_ROWS = 3
 # What is put in front of a wall must stand out of it: less is neither changed nor unchanged.
 _STANDS_OUT_M = 0.15
 _IN_FRONT_M = 0.05
+# How much wider or narrower a tunnel is made, and which share of an image's pixels may go missing.
+_LOG_SCALE = float(np.log(1.6))
+_MAX_MISSING = 0.3
 _CHANGED, _UNCOUNTED = 1, 2
 
 
@@ -164,6 +167,7 @@ class SphereTask:
         donors = draw.choice(self._donors, pasted.stop - pasted.start)
         shifts = draw.integers(-_PASTED_SHIFT_ROWS, _PASTED_SHIFT_ROWS, len(donors), endpoint=True)
         after[pasted], targets[pasted] = _pasted(after[pasted], data, donors, shifts)
+        before, after = _as_elsewhere(before, after, draw)
         if draw.random() < 0.5:
             before, after = after, before
         if draw.random() < 0.5:  # the sensor looks the other way, and right is left
@@ -217,6 +221,21 @@ def pooled_scores(network: SphereNetwork, data: SphereData, draw: int) -> Float6
         local = agreed(logits[members], positions).max(axis=1)
         pooled[members] = best_in_reach(local, positions, data.score_radius_m[members[0]])
     return pooled
+
+
+def _as_elsewhere(before: Tensor, after: Tensor, draw: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Return the images as if the tunnel were wider or narrower, and either map sparser.
+
+    Tunnels differ more than those that are trained on. What would lie beyond the renderer's reach is not seen.
+    """
+    factors = np.exp(draw.uniform(-_LOG_SCALE, _LOG_SCALE, size=(len(before), 1, 1)))
+    seen = []
+    for image in (before, after):
+        missing = draw.uniform(0.0, _MAX_MISSING, size=(len(before), 1, 1))
+        is_seen = draw.random(image.shape) >= missing
+        scaled = image * torch.from_numpy((factors * is_seen).astype(np.float32))
+        seen.append(torch.where(scaled <= REACH_M, scaled, 0.0))
+    return seen[0], seen[1]
 
 
 def _pasted(after: Tensor, data: SphereData, donors: Int64Array, shifts: Int64Array) -> tuple[Tensor, Tensor]:

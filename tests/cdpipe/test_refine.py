@@ -4,11 +4,15 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from cdpipe.config import MergeConfig
+from cdpipe.geometry import make_pose
 from cdpipe.merge import merge_maps
-from cdpipe.refine import _held
-from cdpipe.types import MappedSession
+from cdpipe.refine import _held, refined
+from cdpipe.registration import IndexedMap
+from cdpipe.types import MappedSession, PointMap
+from cdpipe.walk import Walk
 
 
 @pytest.mark.parametrize("scales", [(1.005, 0.995), (0.995, 1.005), (1.0, 1.0)])
@@ -38,3 +42,36 @@ def test_a_smooth_wall_holds_nothing_along_itself() -> None:
     assert np.linalg.eigvalsh(held)[0] > -1e-6
     np.testing.assert_allclose(np.diag(held)[4:], np.diag(information)[4:], rtol=0.05)
     np.testing.assert_array_equal(held[:3, :3], information[:3, :3])
+
+
+def wide_drift(sample: int) -> PointMap:
+    """A drift 10.6 m wide flown along its middle: floor and roof are even, only the walls tell the way along."""
+    rng = np.random.default_rng(sample)
+    along, across = rng.uniform(0, 60, 60_000), rng.uniform(-5.3, 5.3, 60_000)
+    floor, roof, left, right = np.arange(60_000).reshape(4, -1)
+    up = rng.uniform(-2.5, 3.5, 60_000)
+    up[floor], up[roof] = -2.5, 3.5
+    rough_m = 0.2 * np.sin(1.3 * along + np.sin(up)) + 0.15 * np.sin(2.9 * along) * np.cos(up)
+    across[left], across[right] = (5.3 + rough_m)[left], (-5.3 + rough_m)[right]
+    points = np.column_stack([along, across, up])
+    poses = np.array([make_pose(translation=(x, 0, 0)) for x in np.arange(5.0, 55.5, 0.5)])
+    nearest_m, _ = cKDTree(poses[:, :3, 3]).query(points)
+    none = np.zeros(0, np.int32)
+    offsets = np.zeros(len(poses) + 1, np.int64)
+    return PointMap(
+        points, np.asarray(nearest_m, np.float32), 0.1, poses, np.arange(0, len(poses), 2), none, none, offsets
+    )
+
+
+def test_the_walls_of_a_wide_drift_are_looked_at() -> None:
+    before, after = (wide_drift(sample) for sample in (1, 2))
+    config = MergeConfig(fallback=False)
+    maps = IndexedMap(before, config, is_target=True), IndexedMap(after, config, is_target=False)
+    keyframes = np.array([10, 25, 40])
+    coarse = np.repeat(make_pose(translation=(0.15, 0, 0))[None], 3, axis=0)
+    found = Walk(keyframes, coarse, np.zeros((3, 6, 6)), np.ones(3), np.zeros(3))
+    alignment, evidence = refined(*maps, found, config)
+    assert alignment is not None
+    assert evidence["n_refined"] > 8
+    path = after.odom_T_keyframe[:, :3, 3]
+    assert np.linalg.norm(alignment.to_map(path) - path, axis=1).max() < 0.01
