@@ -13,11 +13,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cdpipe.answer import read_answer
-from cdpipe.config import DescriptorConfig
+from cdpipe.config import PipelineConfig
 from cdpipe.errors import InputError
-from cdpipe.geometry import Int64Array
 from cdpipe.readers import open_scans
-from cdpipe.types import DescriptorSet, ScanSource
+from cdpipe.types import DescriptorSet, PointMap, ScanSource
 from eval import page, runner, single
 from eval import plan as plans
 from eval.cli import main
@@ -148,13 +147,13 @@ def test_describe_stores_what_detect_then_uses(
         assert code == 0
         assert str(pair / name / "descriptors" / "3deg.npz") in out
     calls: list[str] = []
-    usual = single.describe_scans
+    usual = single.describe_mapped
 
-    def counted(source: ScanSource, keyframe_scans: Int64Array, config: DescriptorConfig) -> DescriptorSet:
+    def counted(source: ScanSource, thin_map: PointMap, config: PipelineConfig) -> DescriptorSet:
         calls.append(source.name)
-        return usual(source, keyframe_scans, config)
+        return usual(source, thin_map, config)
 
-    monkeypatch.setattr(single, "describe_scans", counted)
+    monkeypatch.setattr(single, "describe_mapped", counted)
     arguments = ("detect", pair / "before", pair / "after", "--quiet", "--out")
     assert command(*arguments, tmp_path / "stored")[0] == 0
     assert calls == []
