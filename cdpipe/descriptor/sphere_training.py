@@ -178,35 +178,43 @@ class SphereTask:
         return before, after, targets
 
     def scores(self) -> dict[str, float]:
-        """Return AUROC of the keyframes, the mean over tunnels and of all together, with merge errors."""
+        """Return the log-likelihood of the keyframes' labels at the best calibration, and their AUROC, with merge errors.
+
+        AUROC, the mean over tunnels and of all together, soon reaches 1 and tells nothing more; the likelihood does.
+        """
         data = self._validation
         pooled = pooled_scores(self._network, data, draw=min(1, data.n_draws - 1))
         by_tunnel = [
             _auroc(pooled[mask], data.labels[mask])
             for mask in (data.tunnels == tunnel for tunnel in np.unique(data.tunnels))
         ]
-        return {"auroc": float(np.nanmean(by_tunnel)), "auroc_pooled": _auroc(pooled, data.labels)}
+        used = data.labels >= 0
+        return {
+            "log_likelihood": platt(pooled[used], data.labels[used] == 1)[2],
+            "auroc": float(np.nanmean(by_tunnel)),
+            "auroc_pooled": _auroc(pooled, data.labels),
+        }
 
     def finish(self) -> dict[str, float]:
         """Calibrate the log-odds on the validation tunnels (Platt); return slope, offset and Brier score there."""
         data = self._validation
         used = data.labels >= 0
         pooled = pooled_scores(self._network, data, draw=min(1, data.n_draws - 1))[used]
-        slope, offset = platt(pooled, data.labels[used] == 1)
+        slope, offset, _ = platt(pooled, data.labels[used] == 1)
         self._network.calibration.copy_(torch.tensor([slope, offset], dtype=torch.float64))
         found = torch.sigmoid(self._network.calibrated(torch.from_numpy(pooled))).numpy()
         return {"slope": slope, "offset": offset, "brier": float(np.mean((found - data.labels[used]) ** 2))}
 
 
-def platt(scores: Float64Array, is_positive: BoolArray) -> tuple[float, float]:
-    """Return slope and offset of the logistic curve that fits N scores best, in likelihood."""
+def platt(scores: Float64Array, is_positive: BoolArray) -> tuple[float, float, float]:
+    """Return slope and offset of the logistic curve that fits N scores best, and the mean log-likelihood it reaches."""
 
     def loss(parameters: Float64Array) -> float:
         logits = parameters[0] * scores + parameters[1]
         return float(np.mean(np.logaddexp(0.0, np.where(is_positive, -logits, logits))))
 
     found = minimize(loss, np.array([1.0, 0.0]), method="Nelder-Mead")
-    return float(found.x[0]), float(found.x[1])
+    return float(found.x[0]), float(found.x[1]), -float(found.fun)
 
 
 def pooled_scores(network: SphereNetwork, data: SphereData, draw: int) -> Float64Array:

@@ -101,8 +101,9 @@ def test_scores_are_agreed_on_by_neighbours_and_reach_the_radius() -> None:
 def test_calibration_by_hand() -> None:
     # of those scored 1 three in four are positive, of those scored -1 one in four: log-odds log 3 and -log 3
     scores = np.repeat([1.0, -1.0], 4)
-    slope, offset = platt(scores, np.array([1, 1, 1, 0, 1, 0, 0, 0], dtype=np.bool_))
+    slope, offset, likelihood = platt(scores, np.array([1, 1, 1, 0, 1, 0, 0, 0], dtype=np.bool_))
     np.testing.assert_allclose([slope, offset], [np.log(3), 0.0], atol=1e-3)
+    assert likelihood == pytest.approx(0.75 * np.log(0.75) + 0.25 * np.log(0.25), abs=1e-6)
 
 
 def test_the_calibration_goes_with_the_weights() -> None:

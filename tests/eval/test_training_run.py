@@ -36,7 +36,7 @@ def test_from_a_dataset_to_a_checkpoint_with_its_card(data: Path, tmp_path: Path
     assert card["checkpoint"] == digest(checkpoint.read_bytes())
     assert card["data"]["seeds"] == "3:4" and card["validation"]["seeds"] == "10003:10004"
     assert card["data"]["digest"] != card["validation"]["digest"]
-    assert set(card["validation"]["trained"]) == {"auroc", "auroc_pooled"}
+    assert set(card["validation"]["trained"]) == {"log_likelihood", "auroc", "auroc_pooled"}
     with (out / "curves.csv").open() as file:
         assert [row["step"] for row in csv.DictReader(file)] == ["3"]
     assert (out / "curves.png").stat().st_size > 1000
