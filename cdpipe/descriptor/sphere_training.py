@@ -178,7 +178,7 @@ class SphereTask:
         return before, after, targets
 
     def scores(self) -> dict[str, float]:
-        """Return the log-likelihood of the keyframes' labels at the best calibration, and their AUROC, with merge errors.
+        """Return the log-likelihood of the keyframes' labels, as best calibrated, and their AUROC, with merge errors.
 
         AUROC, the mean over tunnels and of all together, soon reaches 1 and tells nothing more; the likelihood does.
         """
