@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from time import perf_counter
 from typing import Protocol
 
 import torch
@@ -68,12 +69,14 @@ class Progress:
         losses: Mean of each part of the loss since the last validation.
         scores: On the validation tunnels.
         is_best: Whether the first score is the best so far.
+        seconds: Wall clock spent so far, that of runs that were cut off included.
     """
 
     step: int
     losses: Mapping[str, float]
     scores: Mapping[str, float]
     is_best: bool
+    seconds: float = field(default=0.0, compare=False)
 
 
 def learning_rate(step: int, config: FitConfig) -> float:
@@ -116,6 +119,7 @@ def fit(
     for done in history:
         on_validation(done)
     sums: dict[str, float] = {}
+    began = perf_counter() - (history[-1].seconds if history else 0.0)
     for step in range(history[-1].step if history else 0, config.steps):
         if _is_stopped(history, config.patience):
             break
@@ -137,7 +141,8 @@ def fit(
         scores = task.scores()
         first = next(iter(scores.values()))
         is_best = all(first > next(iter(done.scores.values())) for done in history)
-        history.append(Progress(step + 1, {name: value / n_steps for name, value in sums.items()}, scores, is_best))
+        means = {name: value / n_steps for name, value in sums.items()}
+        history.append(Progress(step + 1, means, scores, is_best, perf_counter() - began))
         sums = {}
         if is_best:
             best = {name: tensor.clone() for name, tensor in network.state_dict().items()}

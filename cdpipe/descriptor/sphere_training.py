@@ -207,11 +207,18 @@ class SphereTask:
 
 
 def platt(scores: Float64Array, is_positive: BoolArray) -> tuple[float, float, float]:
-    """Return slope and offset of the logistic curve that fits N scores best, and the mean log-likelihood it reaches."""
+    """Return slope and offset of the logistic curve that fits N scores best, and the mean log-likelihood it reaches.
+
+    Platt (1999): each class is held to be surer by one example less than it seems, so that classes that are wholly
+    apart still get a curve.
+    """
+    n_positive = int(np.count_nonzero(is_positive))
+    n_negative = len(is_positive) - n_positive
+    target = np.where(is_positive, (n_positive + 1) / (n_positive + 2), 1 / (n_negative + 2))
 
     def loss(parameters: Float64Array) -> float:
         logits = parameters[0] * scores + parameters[1]
-        return float(np.mean(np.logaddexp(0.0, np.where(is_positive, -logits, logits))))
+        return float(np.mean(target * np.logaddexp(0.0, -logits) + (1 - target) * np.logaddexp(0.0, logits)))
 
     found = minimize(loss, np.array([1.0, 0.0]), method="Nelder-Mead")
     return float(found.x[0]), float(found.x[1]), -float(found.fun)
