@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from cdpipe.descriptor import sphere_training
 from cdpipe.descriptor.fit import FitConfig
-from cdpipe.descriptor.sphere_image import COLUMNS, ROWS
+from cdpipe.descriptor.sphere_image import COLUMNS, REACH_M, ROWS
 from cdpipe.descriptor.sphere_network import SECTORS, initial_sphere_network
 from cdpipe.descriptor.sphere_training import BATCH, SphereData, SphereTask, platt, pooled_scores, sector_targets
 
@@ -50,6 +51,29 @@ def test_targets_by_hand() -> None:
     torch.testing.assert_close(sector_targets(nothing, marks), expected)
 
 
+@pytest.fixture(name="as_simulated")
+def as_simulated_fixture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tunnels as wide and maps as dense as they were simulated."""
+    monkeypatch.setattr(sphere_training, "_LOG_SCALE", 0.0)
+    monkeypatch.setattr(sphere_training, "_MAX_MISSING", 0.0)
+
+
+def test_another_width_and_density_change_no_place_and_no_target() -> None:
+    data = _walls(12, {0: (6, 2), 1: (7, 9), 2: (5, 14)})
+    task = SphereTask(initial_sphere_network(), data, data, seed=3)
+    before, after, targets = task.batch(0)
+    seen = (before > 0).float().flatten(1).mean(dim=1), (after > 0).float().flatten(1).mean(dim=1)
+    for share in seen:
+        assert 0.65 < share.min() < 0.8 < 0.95 < share.max() <= 1.0
+    # both images of a pair are scaled alike: where nothing stands the walls agree
+    is_wall = (before > 0) & (after > 0) & ((before - after).abs() < 0.3)
+    torch.testing.assert_close(before[is_wall], after[is_wall], atol=1e-5, rtol=0)
+    walls = torch.stack([image[image > 0].median() for image in before])
+    assert 3.0 / 1.65 < walls.min() < 2.2 and 4.2 < walls.max() < 3.0 * 1.65
+    assert before.max() <= REACH_M and (targets == 1).any(dim=1).sum() > BATCH // 2
+
+
+@pytest.mark.usefixtures("as_simulated")
 def test_a_batch_keeps_images_and_targets_together_under_every_turn() -> None:
     data = _walls(12, {0: (6, 2), 1: (7, 9), 2: (5, 14)})
     task = SphereTask(initial_sphere_network(), data, data, seed=3)
@@ -67,6 +91,7 @@ def test_a_batch_keeps_images_and_targets_together_under_every_turn() -> None:
     torch.testing.assert_close(task.batch(5)[1], task.batch(5)[1], rtol=0, atol=0)
 
 
+@pytest.mark.usefixtures("as_simulated")
 def test_training_tells_where_the_blocks_stand() -> None:
     training = _walls(24, {index: (4 + index % 5, (5 * index) % SECTORS) for index in range(12)})
     validation = _walls(10, {0: (6, 3), 4: (5, 11), 7: (8, 6)})

@@ -361,7 +361,9 @@ def test_a_run_that_is_interrupted_goes_on_where_it_stopped(
     ]
     argv += ["--out", str(tmp_path / "d")]
     root = Path(__file__).parents[2]
-    process = subprocess.Popen(argv, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # a shell's background jobs ignore Ctrl-C, and so would their children
+    heeding = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
+    process = subprocess.Popen(argv, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **heeding)
     first = tmp_path / "d" / "smoke__one_box-3.safetensors"
     while not first.is_file():
         assert process.poll() is None
