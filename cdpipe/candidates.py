@@ -101,19 +101,20 @@ def pair_votes(
     turns_rad = _turns_rad(before_poses, after_poses, yaws_rad)
     before_xy, after_xy = before_poses[:, :2, 3], after_poses[:, :2, 3]
     before_m, after_m = _apart_m(before_xy), _apart_m(after_xy)
-    # few are as far apart in both sessions; only those are looked at further
-    one, other = np.nonzero(np.abs(before_m - after_m) < _APART_M + _APART_SHARE * after_m)
-    apart_m = after_m[one, other]
     cosines, sines = np.cos(turns_rad), np.sin(turns_rad)
+    # the angle between two turns, by its cosine
+    directions = np.column_stack([cosines, sines])
+    is_same_turn = directions @ directions.T > np.cos(_YAW_RAD)
+    # few turn alike and are as far apart in both sessions; only those are looked at further
+    one, other = np.nonzero(is_same_turn & (np.abs(before_m - after_m) < _APART_M + _APART_SHARE * after_m))
+    apart_m = after_m[one, other]
     before_x, before_y = (before_xy[other] - before_xy[one]).T
     after_x, after_y = (after_xy[other] - after_xy[one]).T
     # where the after shift leads if it is turned as the pair says
     miss_x = before_x - (cosines[one] * after_x - sines[one] * after_y)
     miss_y = before_y - (sines[one] * after_x + cosines[one] * after_y)
     tolerance_m = _APART_M + (_APART_SHARE + np.sin(_YAW_RAD)) * apart_m
-    # the angle between two turns, by its cosine
-    is_same_turn = cosines[one] * cosines[other] + sines[one] * sines[other] > np.cos(_YAW_RAD)
-    is_agreed = is_same_turn & (miss_x**2 + miss_y**2 < tolerance_m**2)
+    is_agreed = miss_x**2 + miss_y**2 < tolerance_m**2
     one, other, apart_m = one[is_agreed], other[is_agreed], apart_m[is_agreed]
     agrees = np.zeros((len(yaws_rad),) * 2, dtype=np.bool_)
     agrees[one, other] = True
