@@ -100,6 +100,7 @@ def make_dataset(
     where, progress = where or Where(), progress or Silent()
     _require_usable(where)
     tunnels = _tunnels(families, seeds, recipe)
+    was_there, is_new = out.exists(), not (out / "dataset.json").is_file()
     _take_folder(out, recipe, command)
     missing = [tunnel for tunnel in tunnels if not _is_done(out, tunnel)]
     todo = missing[:limit]
@@ -112,7 +113,13 @@ def make_dataset(
                 _keep(out, tunnel, result)
                 pace.tell(tunnel, out)
     finally:
-        write_card(out)
+        if is_new and [path.name for path in out.iterdir()] == ["dataset.json"]:
+            # nothing came of it, as where a scheduler cannot be reached: leave nothing behind
+            (out / "dataset.json").unlink()
+            if not was_there:
+                out.rmdir()
+        else:
+            write_card(out)
     n_refused = sum((out / tunnel.refusal).is_file() for tunnel in tunnels)
     n_kept = len(tunnels) - len(missing)
     return DatasetOutcome(pace.n_made, n_kept, n_refused, len(missing) - len(todo), pace.n_pairs, pace.seconds)

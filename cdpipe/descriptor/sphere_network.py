@@ -42,41 +42,31 @@ class _UnrolledConv(nn.Module):
 
 
 class SphereNetwork(nn.Module):
-    """Images (B, ROWS, COLUMNS) of two sessions at the same places -> log-odds of change (B, SECTORS).
+    """Images (B, ROWS, COLUMNS) of two sessions at the same places -> log-odds of change (B, SECTORS)."""
 
-    Args:
-        per_sector: Numbers kept of each sector; 4 make the 64 of the descriptor.
-        is_asymmetric: Whether `compare` sees the second image, or its 64 numbers alone.
-    """
-
-    def __init__(self, per_sector: int = PER_SECTOR, is_asymmetric: bool = True) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.per_sector = per_sector
-        self.is_asymmetric = is_asymmetric
         inputs = (2, *_CHANNELS[:-1])
         self.trunk = nn.Sequential(
             *(_UnrolledConv(a, b, s) for a, b, s in zip(inputs, _CHANNELS, _STRIDES, strict=True))
         )
-        self.kept = nn.Conv2d(_CHANNELS[-1], per_sector, (ROWS // 4, 1))
+        self.kept = nn.Conv2d(_CHANNELS[-1], PER_SECTOR, (ROWS // 4, 1))
         self.seen = nn.Conv2d(_CHANNELS[-1], 64, (ROWS // 4, 1))
-        beside = 64 if is_asymmetric else 0
-        self.head = nn.ModuleList([nn.Conv1d(3 * per_sector + beside, 96, 3), nn.Conv1d(96, 64, 3)])
+        self.head = nn.ModuleList([nn.Conv1d(3 * PER_SECTOR + 64, 96, 3), nn.Conv1d(96, 64, 3)])
         self.logit = nn.Conv1d(64, 1, 1)
         self.calibration: Tensor
         self.register_buffer("calibration", torch.tensor([1.0, 0.0], dtype=torch.float64))
 
     def encode(self, images_m: Tensor) -> Tensor:
-        """Return (B, per_sector, SECTORS) numbers in (-1, 1): the descriptor."""
+        """Return (B, PER_SECTOR, SECTORS) numbers in (-1, 1): the descriptor."""
         return self._kept(self._features(images_m))
 
     def compare(self, spheres: Tensor, images_m: Tensor) -> Tensor:
-        """Return (B, SECTORS) log-odds of change between (B, per_sector, SECTORS) descriptors and images."""
+        """Return (B, SECTORS) log-odds of change between (B, PER_SECTOR, SECTORS) descriptors and images."""
         features = self._features(images_m)
         other = self._kept(features)
-        parts = [spheres, other, (spheres - other).abs()]
-        if self.is_asymmetric:
-            parts.append(torch.relu(self.seen(features)[:, :, 0]))
-        hidden = torch.cat(parts, dim=1)
+        seen = torch.relu(self.seen(features)[:, :, 0])
+        hidden = torch.cat([spheres, other, (spheres - other).abs(), seen], dim=1)
         for layer in self.head:
             hidden = torch.relu(layer(nn.functional.pad(hidden, (1, 1), mode="circular")))
         logits: Tensor = self.logit(hidden)[:, 0] + _FIRST_LOGIT
@@ -101,11 +91,11 @@ class SphereNetwork(nn.Module):
         return torch.tanh(self.kept(features)[:, :, 0])
 
 
-def initial_sphere_network(seed: int = 0, per_sector: int = PER_SECTOR, is_asymmetric: bool = True) -> SphereNetwork:
+def initial_sphere_network(seed: int = 0) -> SphereNetwork:
     """Return the untrained network; the same seed gives the same weights, and the global generator is left alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return SphereNetwork(per_sector, is_asymmetric).eval()
+        return SphereNetwork().eval()
 
 
 def trained_sphere_network() -> tuple[SphereNetwork, str]:

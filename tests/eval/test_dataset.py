@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -333,6 +333,19 @@ def test_mistakes_are_one_line_and_leave_no_folder(command: Callable, tmp_path: 
     code, out, err = command("dataset", *argv, "--out", tmp_path / "d")
     assert (code, out) == (2, "")
     assert told in err and err.count("\n") == 1 and err.startswith("error: ")
+    assert not (tmp_path / "d").exists()
+
+
+def test_an_unreachable_scheduler_is_named_and_leaves_no_folder(
+    command: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unreachable(todo: object, recipe: object, where: object) -> Iterator[object]:
+        raise InputError("--scheduler tcp://a:1: cannot be reached")
+        yield
+
+    monkeypatch.setattr(dataset_run, "_computed", unreachable)
+    code, _, err = command("dataset", FAMILY, "--seeds", "0", "--scheduler", "tcp://a:1", "--out", tmp_path / "d", "-q")
+    assert (code, err) == (2, "error: --scheduler tcp://a:1: cannot be reached\n")
     assert not (tmp_path / "d").exists()
 
 
