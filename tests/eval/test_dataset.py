@@ -343,6 +343,7 @@ def test_an_unreachable_scheduler_is_named_and_leaves_no_folder(
         raise InputError("--scheduler tcp://a:1: cannot be reached")
         yield
 
+    monkeypatch.setattr(dataset_run.importlib.util, "find_spec", lambda name: object())  # as if the extra were there
     monkeypatch.setattr(dataset_run, "_computed", unreachable)
     code, _, err = command("dataset", FAMILY, "--seeds", "0", "--scheduler", "tcp://a:1", "--out", tmp_path / "d", "-q")
     assert (code, err) == (2, "error: --scheduler tcp://a:1: cannot be reached\n")
