@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from cdpipe.alignment import PathAlignment
 from cdpipe.geometry import (
@@ -23,6 +24,8 @@ from cdpipe.geometry import (
 Kind = Literal["added", "removed", "moved", "reshaped"]
 SessionName = Literal["before", "after"]
 Spheres = Float32Array | Int8Array
+UInt8Array = npt.NDArray[np.uint8]
+Float16Array = npt.NDArray[np.float16]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,6 +72,23 @@ class ScanSource(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class KeyframeViews:
+    """How far the sensor saw from each keyframe: what is nearer and not there was seen through.
+
+    Attributes:
+        ranges_m: (K, ROWS, COLUMNS) float16 range of the nearest return of each pixel (`cdpipe.freespace`), 0 without.
+        sensor_T_odom: (K, 4, 4) float64 of the keyframes' scans.
+    """
+
+    ranges_m: Float16Array
+    sensor_T_odom: Float64Array
+
+    def __post_init__(self) -> None:
+        require_shape("ranges_m", self.ranges_m, (len(self.sensor_T_odom), None, None))
+        require_poses("sensor_T_odom", self.sensor_T_odom)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PointMap:
     """A thinned map and, for each of its points, the returns it stands for.
 
@@ -84,6 +104,9 @@ class PointMap:
         scan_offsets: (S + 1,) int64; the returns of scan s are scan_offsets[s]:scan_offsets[s + 1].
         seen_from: (N, 3) float32 mean position of the sensor when each point was seen, weighed as the point is; None
             where that is not known.
+        return_offsets: (M, 3) uint8 place of each return in its cell, in 1/256 of `voxel_m` from the cell's lower
+            corner; None where that was not kept.
+        views: What the scans of the keyframes saw, None where that was not kept.
     """
 
     points: Float64Array
@@ -95,11 +118,15 @@ class PointMap:
     return_pixels: Int32Array
     scan_offsets: Int64Array
     seen_from: Float32Array | None = None
+    return_offsets: UInt8Array | None = None
+    views: KeyframeViews | None = None
 
     def __post_init__(self) -> None:
         require_shape("points", self.points, (None, 3))
         if self.seen_from is not None:
             require_shape("seen_from", self.seen_from, self.points.shape)
+        if self.return_offsets is not None:
+            require_shape("return_offsets", self.return_offsets, (len(self.return_points), 3))
         require_shape("nearest_m", self.nearest_m, (len(self.points),))
         require_poses("odom_T_sensor", self.odom_T_sensor)
         require_shape("keyframe_scans", self.keyframe_scans, (None,))
@@ -204,8 +231,10 @@ class ChangeRegions:
         radius_m: Radius of all of them.
         scores: (R,) change score, falling; larger means changed more surely.
         pairs: (R, 2) int64 before and after keyframe of each.
-        is_reported: (R,) whether the threshold (or the fixed number) let it through.
+        is_reported: (R,) whether it stands in the answer: the threshold (or the fixed number) let it through, and it
+            was not withdrawn.
         keyframe_scores: (K,) score of every before keyframe, NaN where the after session never came near.
+        is_withdrawn: (R,) whether it was let through and then nothing could be cut out of it; None where no region was.
     """
 
     centres_map: Float64Array
@@ -214,9 +243,19 @@ class ChangeRegions:
     pairs: Int64Array
     is_reported: BoolArray
     keyframe_scores: Float64Array
+    is_withdrawn: BoolArray | None = None
+
+    @property
+    def is_proposed(self) -> BoolArray:
+        """(R,) whether the threshold (or the fixed number) let it through, whatever was cut out of it later."""
+        return self.is_reported if self.is_withdrawn is None else self.is_reported | self.is_withdrawn
 
     def __post_init__(self) -> None:
         n = len(self.scores)
+        if self.is_withdrawn is not None:
+            require_shape("is_withdrawn", self.is_withdrawn, (n,))
+            if (self.is_withdrawn & self.is_reported).any():
+                raise ValueError("is_withdrawn and is_reported: a region is one or the other")
         require_shape("centres_map", self.centres_map, (n, 3))
         require_shape("pairs", self.pairs, (n, 2))
         require_shape("is_reported", self.is_reported, (n,))
@@ -224,6 +263,25 @@ class ChangeRegions:
             raise ValueError(f"is_reported must be a boolean mask, got {self.is_reported.dtype}")
         if (np.diff(self.scores) > 0).any():
             raise ValueError("scores must fall: best candidate first")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectShape:
+    """How large an object is and how it stands, map frame.
+
+    Attributes:
+        map_T_box: (4, 4) pose of the oriented box around it: its centre, and its edges as axes; one axis is vertical.
+        box_m: (3,) edges of that box, metres; the vertical one last.
+        volume_m3: What it takes up above the surface it stands on, as far as it was seen.
+    """
+
+    map_T_box: Float64Array
+    box_m: Float64Array
+    volume_m3: float
+
+    def __post_init__(self) -> None:
+        require_poses("map_T_box", self.map_T_box[None])
+        require_shape("box_m", self.box_m, (3,))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,6 +296,9 @@ class ChangedObject:
         points_map: (P, 3) its thinned points, map frame, metres.
         score: Larger means surer.
         partner: Index of the other half of a moved object in the report, or -1.
+        shape: Boxes and volume; None in a foreign answer that does not tell.
+        displacement_map: (3,) from where a moved object stood to where it stands, map frame, metres; the same in both
+            halves, None for what was not moved.
     """
 
     session: SessionName
@@ -247,10 +308,14 @@ class ChangedObject:
     points_map: Float64Array
     score: float
     partner: int = -1
+    shape: ObjectShape | None = None
+    displacement_map: Float64Array | None = None
 
     def __post_init__(self) -> None:
         require_shape("returns", self.returns, (None, 2))
         require_shape("points_map", self.points_map, (None, 3))
+        if self.displacement_map is not None:
+            require_shape("displacement_map", self.displacement_map, (3,))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
