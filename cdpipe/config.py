@@ -80,12 +80,26 @@ class QueryConfig(Settings):
 
 
 class ExtractConfig(Settings):
-    """Point-to-voxel comparison inside a region."""
+    """Cutting objects out of a region: the paper's point-to-voxel comparison, distances, or surfaces."""
 
-    voxel_m: Positive = Field(0.65, description="voxel size (paper: 0.65)")
-    min_points: Count = Field(1, description="points that make a voxel occupied")
-    origin_m: float = Field(0.0, description="offset of the grid along every axis")
-    distance_m: Positive = Field(0.3, description="`c2c`: a point farther than this from the other cloud is new")
+    method: Literal["surface", "voxel", "nearest"] = Field(
+        "surface", description="distance from the other session's surface; the paper's voxels; or the nearest point's"
+    )
+    withdraw: bool = Field(True, description="take regions back in which nothing is found")
+    voxel_m: Positive = Field(0.65, description="`voxel`: size (paper: 0.65)")
+    min_points: Count = Field(1, description="`voxel`: points that make a voxel occupied")
+    origin_m: float = Field(0.0, description="`voxel`: offset of the grid along every axis")
+    distance_m: Positive = Field(
+        0.3, description="`nearest`, `c2c`: a point farther than this from the other cloud is new"
+    )
+    realign: bool = Field(True, description="`surface`: align each sphere once more before comparing")
+    seed_m: Positive = Field(0.12, description="`surface`: an object somewhere stands this clear of the surface")
+    border_m: Positive = Field(
+        0.04, description="`surface`: and ends where it stands less clear than this, or than 5 times the noise there"
+    )
+    min_cells: Count = Field(
+        30, description="`surface`: cells of 0.05 m that stand so clear and were seen through, at least"
+    )
 
 
 class OutlierConfig(Settings):

@@ -9,13 +9,13 @@ from time import perf_counter
 from cdpipe.config import PipelineConfig
 from cdpipe.descriptor import describe_map, describe_scans
 from cdpipe.errors import MergeFailedError
-from cdpipe.extract import assemble_objects, cut_out
+from cdpipe.extract import assemble_objects, cut_out, region_figures, with_withdrawn
 from cdpipe.geometry import Float64Array
 from cdpipe.mapping import build_map
 from cdpipe.merge import merge_maps
 from cdpipe.query import find_regions
 from cdpipe.session_check import check_session, unit_hint
-from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, MergedMaps, PointMap, ScanSource
+from cdpipe.types import ChangeRegions, ChangeReport, DescriptorSet, MappedSession, MergedMaps, PointMap, ScanSource
 
 Comparison = Callable[[MergedMaps, DescriptorSet, DescriptorSet, PipelineConfig], ChangeReport]
 
@@ -46,26 +46,46 @@ def with_spheres(descriptors: DescriptorSet, thin_map: PointMap, config: Pipelin
 def compare(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig) -> ChangeReport:
     """Find the changed regions of two merged maps and cut the objects out of them.
 
-    `t_returns_s` is the part of `t_oe_s` that lists the raw returns behind the extracted points: one pass over all
-    returns of both sessions, which scoring needs and the paper's extraction does not have.
+    `t_returns_s` is the part of `t_oe_s` that lists the objects' returns and tells their kind and shape, which the
+    paper's extraction does not have.
     """
     start = perf_counter()
     regions = find_regions(merged, before, after, config.query)
-    queried = perf_counter()
-    groups, figures = cut_out(merged, regions, config)
+    return extracted(merged, regions, (before, after), perf_counter() - start, config)
+
+
+def extracted(
+    merged: MergedMaps,
+    regions: ChangeRegions,
+    described: tuple[DescriptorSet, DescriptorSet],
+    t_cd_s: float,
+    config: PipelineConfig,
+) -> ChangeReport:
+    """Cut the objects out of some regions, wherever these are from, and take back the regions that hold none.
+
+    Args:
+        merged: Both maps.
+        regions: Candidates; the reported ones are looked at.
+        described: Descriptors of the before and of the after session; only the scans of their keyframes are used.
+        t_cd_s: How long it took to find the regions.
+        config: All settings.
+    """
+    start = perf_counter()
+    groups = cut_out(merged, regions, config)
+    regions = with_withdrawn(regions, groups, config)
     grouped = perf_counter()
     objects = assemble_objects(merged, groups)
-    extracted = perf_counter()
+    end = perf_counter()
     return ChangeReport(
         before_T_after=merged.before_T_after,
         evidence=merged.evidence,
         regions=regions,
         objects=objects,
-        seconds={"t_cd_s": queried - start, "t_oe_s": extracted - queried, "t_returns_s": extracted - grouped},
-        figures=figures,
-        keyframe_scans=(before.keyframe_scans, after.keyframe_scans),
+        seconds={"t_cd_s": t_cd_s, "t_oe_s": end - start, "t_returns_s": end - grouped},
+        figures=region_figures(merged, regions, groups),
+        keyframe_scans=(described[0].keyframe_scans, described[1].keyframe_scans),
         config=config.model_dump(),
-        local_before_T_after=local_alignment(merged, after),
+        local_before_T_after=local_alignment(merged, described[1]),
     )
 
 

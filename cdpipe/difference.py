@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from cdpipe.config import QueryConfig
 from cdpipe.geometry import BoolArray, Float64Array
+from cdpipe.novelty import is_within
 from cdpipe.sphere import MapIndex
 from cdpipe.types import DescriptorSet, MergedMaps
 
@@ -51,15 +51,6 @@ def sphere_difference(
     scores = marked_share(clouds, before_path, config.radius_m)
     scores[~is_within(before_path, after_path, config.max_pair_m)] = np.nan
     return scores
-
-
-def is_within(points: Float64Array, others: Float64Array, distance_m: float) -> BoolArray:
-    """Mark the (N, 3) points that have one of (M, 3) others within a distance, the border included."""
-    if len(points) == 0 or len(others) == 0:
-        return np.zeros(len(points), dtype=np.bool_)
-    # a bound lets the tree stop early but leaves the border out, so it is set a little wider
-    gaps_m, _ = cKDTree(others).query(points, distance_upper_bound=distance_m * (1 + 1e-6))
-    return np.asarray(gaps_m) <= distance_m
 
 
 def marked_share(

@@ -1,4 +1,4 @@
-"""From scans to a thinned map in one pass; memory grows with the map and by eight bytes a return."""
+"""From scans to a thinned map in one pass; memory grows with the map and by eleven bytes a return."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import numpy as np
 
 from cdpipe.config import MapConfig
 from cdpipe.errors import InputError
-from cdpipe.geometry import Float64Array, Int32Array, Int64Array, transform, travelled_m
+from cdpipe.freespace import view
+from cdpipe.geometry import Float64Array, Int32Array, Int64Array, invert, transform, travelled_m
 from cdpipe.sphere import column_keys
-from cdpipe.types import PointMap, PosedScan, ScanSource
+from cdpipe.types import PLACES, Float16Array, KeyframeViews, PointMap, PosedScan, ScanSource, UInt8Array
 from cdpipe.voxel import UniqueCells, cell_keys, max_coordinate_m
 
 _BATCH_SCANS = 64
@@ -34,11 +35,12 @@ def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_S
         InputError: A pose lies too far out for cells of this size, or no return is within range.
     """
     _require_reachable(source, config)
-    accumulator = _MapAccumulator(config)
+    keyframe_scans = keyframes(source.odom_T_sensor, config.keyframe_spacing_m)
+    accumulator = _MapAccumulator(config, frozenset(keyframe_scans.tolist()))
     scans = iter(source.scans())
     while batch := list(islice(scans, batch_scans)):
         accumulator.add(batch)
-    return accumulator.finish(source, keyframes(source.odom_T_sensor, config.keyframe_spacing_m))
+    return accumulator.finish(source, keyframe_scans)
 
 
 def keyframes(odom_T_sensor: Float64Array, spacing_m: float) -> Int64Array:
@@ -53,16 +55,19 @@ def keyframes(odom_T_sensor: Float64Array, spacing_m: float) -> Int64Array:
 
 
 class _MapAccumulator:
-    """Sums of the returns per cell, batch by batch."""
+    """Sums of the returns per cell, batch by batch, and what the keyframes saw."""
 
-    def __init__(self, config: MapConfig) -> None:
+    def __init__(self, config: MapConfig, keyframe_scans: frozenset[int]) -> None:
         self._config = config
+        self._keyframe_scans = keyframe_scans
+        self._views: list[Float16Array] = []
         self._cells = UniqueCells()
         self._batch_cells: list[Int64Array] = []
         self._batch_sums: list[Float64Array] = []
         self._nearest_m2: Float64Array = np.zeros(0)
         self._return_cells: list[Int32Array] = []
         self._return_pixels: list[Int32Array] = []
+        self._return_offsets: list[UInt8Array] = []
         self._n_returns: list[int] = []
 
     def add(self, scans: list[PosedScan]) -> None:
@@ -74,11 +79,15 @@ class _MapAccumulator:
             clouds.append(transform(scan.odom_T_sensor, scan.points_sensor[is_near]))
             self._return_pixels.append(scan.pixels[is_near])
             n_near.append(len(clouds[-1]))
+            if scan.index in self._keyframe_scans:
+                self._views.append(view(scan.points_sensor))
         self._n_returns += n_near
         points = np.concatenate(clouds)
         sensors = np.array([scan.odom_T_sensor[:3, 3] for scan in scans])
         ids = self._cells.add(cell_keys(points, self._config.voxel_m))
         self._return_cells.append(ids.astype(np.int32))
+        in_cells = points / self._config.voxel_m
+        self._return_offsets.append(((in_cells - np.floor(in_cells)) * PLACES).astype(np.uint8))
         n_cells, squared_m2 = len(self._cells), np.concatenate(ranges_m2)
         weights = 1 / squared_m2
         parts = [np.bincount(ids, points[:, axis] * weights, n_cells) for axis in range(3)]
@@ -110,6 +119,8 @@ class _MapAccumulator:
             return_pixels=np.concatenate(self._return_pixels),
             scan_offsets=np.concatenate([[0], np.cumsum(self._n_returns)]).astype(np.int64),
             seen_from=seen_from[order].astype(np.float32),
+            return_offsets=np.concatenate(self._return_offsets),
+            views=KeyframeViews(np.stack(self._views), invert(source.odom_T_sensor[keyframe_scans])),
         )
 
 

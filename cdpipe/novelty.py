@@ -38,6 +38,26 @@ def new_points_mask(points: Float64Array, reference_points: Float64Array, config
     return _new_by_grid(points, reference_points, low, shape.astype(np.int64), config)
 
 
+def is_within(points: Float64Array, others: Float64Array, distance_m: float) -> BoolArray:
+    """Mark the (N, 3) points that have one of (M, 3) others within a distance, the border included."""
+    if len(points) == 0 or len(others) == 0:
+        return np.zeros(len(points), dtype=np.bool_)
+    # a bound lets the tree stop early but leaves the border out, so it is set a little wider
+    gaps_m, _ = cKDTree(others).query(points, distance_upper_bound=distance_m * (1 + 1e-6))
+    return np.asarray(gaps_m) <= distance_m
+
+
+def far_points_mask(points: Float64Array, reference_points: Float64Array, config: ExtractConfig) -> BoolArray:
+    """Mark the points farther than `distance_m` from every point of the reference.
+
+    Args:
+        points: (N, 3) points, metres.
+        reference_points: (M, 3) points of the other session, same frame.
+        config: The distance.
+    """
+    return ~is_within(points, reference_points, config.distance_m)
+
+
 def inlier_mask(points: Float64Array, config: OutlierConfig) -> BoolArray:
     """Mark the points whose neighbourhood is about as dense as the rest of the cloud.
 

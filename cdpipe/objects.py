@@ -1,19 +1,29 @@
-"""From groups of map points to the objects of the answer: their returns, their kind, the partners of what was moved."""
+"""From groups of map points to the objects of the answer: their returns, kind and shape, the partners of what moved."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from cdpipe.geometry import Float64Array, Int32Array, Int64Array, require_shape
+from cdpipe.moves import find_moves
+from cdpipe.remains import is_part_of_a_rest
+from cdpipe.shape import cell_means, object_shape
+from cdpipe.sphere import MapIndex
 from cdpipe.types import ChangedObject, MergedMaps, PointMap, SessionName
 
-# Two objects may be the same one, moved, when each of their extents agrees within this factor.
-_SIZE_FACTOR = 1.35
 _BLOCK_RETURNS = 1 << 22
+# An object is measured on the means of its returns in cells of this share of the map's, where there are enough in one:
+# single returns are noise, unless there are hardly any others.
+_FINE_SHARE = 4
+_RETURNS_PER_CELL = 3
+_LEAST_FULL_CELLS = 0.2
+# How far around an object its surroundings are looked at, and how far the alignment may bend there.
+_AROUND_M = 1.0
+_BEND_M = 0.5
+_SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,52 +35,87 @@ class PointGroup:
         indices: (P,) map points.
         points_map: (P, 3) the same points in the map frame, metres.
         region: Index of the region they were found in, -1 without.
+        returns: (M,) which returns of the map the object is made of; None: all that its map points stand for. Then
+            `points_map` need not be map points.
     """
 
     session: SessionName
     indices: Int64Array
     points_map: Float64Array
     region: int
+    returns: Int64Array | None = None
 
     def __post_init__(self) -> None:
-        require_shape("points_map", self.points_map, (len(self.indices), 3))
+        require_shape("points_map", self.points_map, (len(self.indices) if self.returns is None else None, 3))
 
 
 def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[ChangedObject, ...]:
     """Make the objects of an answer out of groups of map points, in the same order.
 
-    An object's score is its number of map points, which compares objects of different regions and methods. Groups of
-    the after map are added, those of the before map removed; where one of each has about the same extents (best
-    one-to-one assignment over all), both are moved and name each other.
+    Groups of the after map are added, those of the before map removed. Where one of each looks like the other
+    (`cdpipe.moves`), both are moved and name each other. What was taken off something that still stands
+    (`cdpipe.remains`) is reshaped. An object's score is its number of map points, which compares objects of different
+    regions and methods. Shapes and moves are measured on the returns, where the maps know where they are.
 
     Args:
         merged: Both maps.
-        groups: No map point may be in two of them.
+        groups: No map point may be in two of them, and none may be empty.
     """
+    if not groups:
+        return ()
+    maps = {"before": merged.before, "after": merged.after}
     returns: dict[int, Int32Array] = {}
-    for session, point_map in (("before", merged.before), ("after", merged.after)):
+    points: dict[int, Float64Array] = {}
+    for session in _SESSIONS:
         members = [number for number, group in enumerate(groups) if group.session == session]
-        found = _returns_of_groups(point_map, [groups[number].indices for number in members])
-        returns.update(zip(members, found, strict=True))
-    objects = [
-        ChangedObject(
-            session=group.session,
-            kind="added" if group.session == "after" else "removed",
-            region=group.region,
-            returns=returns[number],
-            points_map=group.points_map,
-            score=float(len(group.indices)),
+        whole = [number for number in members if groups[number].returns is None]
+        chosen = dict(zip(whole, _returns_of_groups(maps[session], [groups[n].indices for n in whole]), strict=True))
+        for number in members:
+            own = groups[number].returns
+            indices = chosen[number] if own is None else np.sort(own)
+            returns[number] = _scan_and_pixel(maps[session], indices)
+            points[number] = _measured_points(merged, groups[number], indices)
+    surroundings = _Surroundings(merged)
+    objects = []
+    is_part: dict[int, bool] = {}
+    for number, group in enumerate(groups):
+        around = surroundings.of(group)
+        other = around["after" if group.session == "before" else "before"]
+        voxel_m = maps[group.session].voxel_m
+        taken, _ = cell_means(group.points_map, voxel_m)  # as dense as its surroundings
+        is_part[number] = group.session == "before" and is_part_of_a_rest(taken, around["before"], other)
+        is_fine = maps[group.session].return_offsets is not None
+        objects.append(
+            ChangedObject(
+                session=group.session,
+                kind="added" if group.session == "after" else ("reshaped" if is_part[number] else "removed"),
+                region=group.region,
+                returns=returns[number],
+                points_map=group.points_map,
+                score=float(len(group.indices)),
+                shape=object_shape(points[number], other, voxel_m / 2 if is_fine else voxel_m, voxel_m),
+            )
         )
-        for number, group in enumerate(groups)
-    ]
-    for removed, added in _moves(objects, max(merged.before.voxel_m, merged.after.voxel_m)):
-        objects[removed] = replace(objects[removed], kind="moved", partner=added)
-        objects[added] = replace(objects[added], kind="moved", partner=removed)
+    return _with_moves(objects, points, is_part)
+
+
+def _with_moves(
+    objects: list[ChangedObject], points: Mapping[int, Float64Array], is_part: Mapping[int, bool]
+) -> tuple[ChangedObject, ...]:
+    removed = [number for number, item in enumerate(objects) if item.session == "before"]
+    added = [number for number, item in enumerate(objects) if item.session == "after"]
+    may_go_far = [not is_part[number] for number in removed]
+    for move in find_moves([points[n] for n in removed], [points[n] for n in added], may_go_far):
+        start, end = removed[move.removed], added[move.added]
+        for number, partner in ((start, end), (end, start)):
+            objects[number] = replace(
+                objects[number], kind="moved", partner=partner, displacement_map=move.displacement_map
+            )
     return tuple(objects)
 
 
-def _returns_of_groups(point_map: PointMap, groups: Sequence[Int64Array]) -> list[Int32Array]:
-    """Return the (M, 2) (scan, pixel) of each group's returns, in one pass over the returns of the map."""
+def _returns_of_groups(point_map: PointMap, groups: Sequence[Int64Array]) -> list[Int64Array]:
+    """Return which (M,) returns each group is made of, rising, in one pass over the returns of the map."""
     if not groups:
         return []
     group_of_point = np.full(len(point_map.points), -1, dtype=np.int32)
@@ -84,32 +129,46 @@ def _returns_of_groups(point_map: PointMap, groups: Sequence[Int64Array]) -> lis
         ]
     )
     group = group_of_point[point_map.return_points[chosen]]
-    scans = np.searchsorted(point_map.scan_offsets, chosen, side="right") - 1
-    table = np.column_stack([scans, point_map.return_pixels[chosen]]).astype(np.int32)
-    table = table[np.argsort(group, kind="stable")]
-    return np.split(table, np.cumsum(np.bincount(group, minlength=len(groups)))[:-1])
+    by_group = chosen[np.argsort(group, kind="stable")]
+    return np.split(by_group, np.cumsum(np.bincount(group, minlength=len(groups)))[:-1])
 
 
-def _moves(objects: Sequence[ChangedObject], voxel_m: float) -> list[tuple[int, int]]:
-    """Return (removed, added) index pairs that look like one object, each object in at most one pair."""
-    removed = [index for index, item in enumerate(objects) if item.session == "before"]
-    added = [index for index, item in enumerate(objects) if item.session == "after"]
-    if not removed or not added:
-        return []
-    sizes_r = np.log([_extents_m(objects[index].points_map) + voxel_m for index in removed])
-    sizes_a = np.log([_extents_m(objects[index].points_map) + voxel_m for index in added])
-    misfit = np.abs(sizes_r[:, None] - sizes_a[None]).max(axis=2)
-    limit = np.log(_SIZE_FACTOR)
-    # pairs beyond the limit cost more than all allowed pairs together, so as many as possible are allowed ones
-    cost = np.where(misfit <= limit, misfit, limit * (1 + len(objects)))
-    rows, columns = linear_sum_assignment(cost)
-    return [(removed[r], added[a]) for r, a in zip(rows, columns, strict=True) if misfit[r, a] <= limit]
+def _scan_and_pixel(point_map: PointMap, returns: Int64Array) -> Int32Array:
+    """Return the (M, 2) scan and pixel of (M,) returns."""
+    scans = np.searchsorted(point_map.scan_offsets, returns, side="right") - 1
+    return np.column_stack([scans, point_map.return_pixels[returns]]).astype(np.int32)
 
 
-def _extents_m(points: Float64Array) -> Float64Array:
-    """Return the sorted edges (3,) of the evenly filled box with the same spread as the points.
+def _measured_points(merged: MergedMaps, group: PointGroup, returns: Int64Array) -> Float64Array:
+    """Return the points (P, 3) that a group is measured on, map frame: finer than the map's, where that is known."""
+    point_map = merged.before if group.session == "before" else merged.after
+    if point_map.return_offsets is None or len(returns) == 0:
+        return group.points_map
+    means, counts = cell_means(point_map.positions_of(returns), point_map.voxel_m / _FINE_SHARE)
+    is_full = counts >= _RETURNS_PER_CELL
+    if is_full.mean() >= _LEAST_FULL_CELLS:
+        means = means[is_full]
+    return means if group.session == "before" else merged.alignment.to_map(means)
 
-    Unlike the edges of the bounding box they do not change when the object is turned, nor with a stray point.
-    """
-    covariance = np.cov(points.T, bias=True) if len(points) > 1 else np.zeros((3, 3))
-    return np.sqrt(12.0 * np.linalg.eigvalsh(covariance).clip(min=0.0))
+
+class _Surroundings:
+    """What both sessions saw around an object, without what it is made of itself."""
+
+    def __init__(self, merged: MergedMaps) -> None:
+        self._merged = merged
+        self._before, self._after = MapIndex(merged.before.points), MapIndex(merged.after.points)
+
+    def of(self, group: PointGroup) -> dict[SessionName, Float64Array]:
+        """Return the points (N, 3) of each session, map frame, no farther than `_AROUND_M` beside a group's box."""
+        low, high = group.points_map.min(axis=0) - _AROUND_M, group.points_map.max(axis=0) + _AROUND_M
+        centre, radius_m = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+        found: dict[SessionName, Int64Array] = {"before": self._before.crop(centre, radius_m)}
+        centre_odom = self._merged.alignment.to_odom(centre[None])[0]
+        bend_m = 0.0 if self._merged.alignment.is_rigid else _BEND_M
+        found["after"] = self._after.crop(centre_odom, radius_m + bend_m)
+        found[group.session] = np.setdiff1d(found[group.session], group.indices)
+        points: dict[SessionName, Float64Array] = {
+            "before": self._merged.before.points[found["before"]],
+            "after": self._merged.alignment.to_map(self._merged.after.points[found["after"]]),
+        }
+        return {name: around[((around >= low) & (around <= high)).all(axis=1)] for name, around in points.items()}

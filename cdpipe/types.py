@@ -23,6 +23,7 @@ from cdpipe.geometry import (
 
 Kind = Literal["added", "removed", "moved", "reshaped"]
 SessionName = Literal["before", "after"]
+PLACES = 256  # along each edge of a map's cell, at which a return can be kept
 Spheres = Float32Array | Int8Array
 UInt8Array = npt.NDArray[np.uint8]
 Float16Array = npt.NDArray[np.float16]
@@ -104,7 +105,7 @@ class PointMap:
         scan_offsets: (S + 1,) int64; the returns of scan s are scan_offsets[s]:scan_offsets[s + 1].
         seen_from: (N, 3) float32 mean position of the sensor when each point was seen, weighed as the point is; None
             where that is not known.
-        return_offsets: (M, 3) uint8 place of each return in its cell, in 1/256 of `voxel_m` from the cell's lower
+        return_offsets: (M, 3) uint8 place of each return in its cell, in 1/PLACES of `voxel_m` from the cell's lower
             corner; None where that was not kept.
         views: What the scans of the keyframes saw, None where that was not kept.
     """
@@ -132,6 +133,17 @@ class PointMap:
         require_shape("keyframe_scans", self.keyframe_scans, (None,))
         require_shape("return_pixels", self.return_pixels, self.return_points.shape)
         require_shape("scan_offsets", self.scan_offsets, (len(self.odom_T_sensor) + 1,))
+
+    def positions_of(self, returns: Int64Array) -> Float64Array:
+        """Return the (N, 3) places of (N,) returns, the session's odom frame, metres, to 1/PLACES of a cell.
+
+        Raises:
+            ValueError: The map did not keep them.
+        """
+        if self.return_offsets is None:
+            raise ValueError("return_offsets is None: this map does not know where its returns are")
+        cells = np.floor(self.points[self.return_points[returns]] / self.voxel_m)
+        return (cells + (self.return_offsets[returns] + 0.5) / PLACES) * self.voxel_m
 
     @property
     def odom_T_keyframe(self) -> Float64Array:

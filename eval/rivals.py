@@ -14,19 +14,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.config import ExtractConfig, PipelineConfig
-from cdpipe.detect import Comparison, compare, local_alignment
-from cdpipe.difference import is_within, marked_share
+from cdpipe.detect import Comparison, compare, extracted, local_alignment
+from cdpipe.difference import marked_share
 from cdpipe.extract import (
     FIGURES,
     PointGroup,
     assemble_objects,
-    cluster_labels,
-    cut_out,
     hull_volume_m3,
-    inlier_mask,
-    new_points_mask,
 )
 from cdpipe.geometry import BoolArray, Float64Array, Int64Array, stream
+from cdpipe.novelty import cluster_labels, far_points_mask, inlier_mask, new_points_mask
 from cdpipe.query import rank_regions
 from cdpipe.sphere import MapIndex
 from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport, DescriptorSet, MergedMaps, SessionName
@@ -67,7 +64,7 @@ def c2c(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config:
 
     The distance to the nearest point, cloud to cloud (C2C), as CloudCompare and others measure it.
     """
-    return _whole_map(merged, before, after, config, _far_points_mask)
+    return _whole_map(merged, before, after, config, far_points_mask)
 
 
 def random_regions(
@@ -85,12 +82,7 @@ def random_regions(
     scores[gaps_m > config.query.max_pair_m] = np.nan
     pairs = np.column_stack([np.arange(len(scores)), partners])
     regions = rank_regions(maps.path["before"], scores, pairs, scores, config.query)
-    chosen = perf_counter()
-    groups, figures = cut_out(merged, regions, config)
-    grouped = perf_counter()
-    objects = assemble_objects(merged, groups)
-    seconds = _seconds(start, chosen, grouped, perf_counter())
-    return _report(merged, (before, after), regions, objects, figures, seconds, config)
+    return extracted(merged, regions, (before, after), perf_counter() - start, config)
 
 
 METHODS: dict[str, Comparison] = {
@@ -123,10 +115,6 @@ def _whole_map(
     seconds = _seconds(start, compared, grouped, perf_counter())
     regions = replace(regions, keyframe_scores=_changed_share(maps, is_changed, config))
     return _report(merged, (before, after), regions, objects, _figures(maps, regions, objects), seconds, config)
-
-
-def _far_points_mask(points: Float64Array, reference_points: Float64Array, config: ExtractConfig) -> BoolArray:
-    return ~is_within(points, reference_points, config.distance_m)
 
 
 def _in_map_frame(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet) -> _Maps:

@@ -1,0 +1,214 @@
+"""The surface rule over all reported regions: candidates by sphere, sites over all of them, objects by their returns.
+
+An object between two regions is one site, and so one object; two objects in one region are two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from cdpipe.config import ExtractConfig
+from cdpipe.crops import DIRECTIONS, Crops, Sphere
+from cdpipe.freespace import seen_through
+from cdpipe.geometry import BoolArray, Float64Array, Int64Array, invert, transform
+from cdpipe.objects import PointGroup
+from cdpipe.registration import MIN_SPHERE_POINTS, Surface, align_to_planes
+from cdpipe.surface import (
+    RIM_M,
+    SITE_M,
+    SURFACE_CELL_M,
+    candidates,
+    cell_means,
+    compare_site,
+    groups,
+    grown,
+)
+from cdpipe.types import ChangeRegions, MergedMaps, PointMap, SessionName
+
+# An object that begins inside of a sphere is followed this far out of it.
+_BEYOND_M = 1.5
+# Correspondences of the rounds of re-alignment, and how far it may carry a sphere: more is no correction.
+_ROUNDS_M = (0.5, 0.25)
+_MAX_SHIFT_M = 0.4
+# A site with fewer such candidates holds no object of a tenth of a cubic metre.
+_MIN_TELLING = 2
+_BLOCK_RETURNS = 1 << 22
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """Candidates of one session in one region: map points, and whether they make a site worth a closer look.
+
+    They do inside of the sphere, where the other session saw through them.
+    """
+
+    session: SessionName
+    region: int
+    indices: Int64Array
+    is_telling: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Agreement:
+    """How the surfaces of two spheres agree: (4, 4) the correction of the after one, and what distance is left."""
+
+    correction: Float64Array
+    noise_m: float
+
+
+def cut_by_surface(merged: MergedMaps, regions: ChangeRegions, config: ExtractConfig) -> list[PointGroup]:
+    """Return the objects that stand out of the other session's surface in the reported regions, best region first."""
+    crops = Crops(merged, margin_m=_BEYOND_M)
+    found: list[_Found] = []
+    agreements: dict[int, _Agreement] = {}
+    for region in np.flatnonzero(regions.is_reported).tolist():
+        spheres = crops.around(regions.centres_map[region], regions.radius_m)
+        if min(len(sphere.indices) for sphere in spheres.values()) == 0:
+            continue
+        agreements[region], of_region = _candidates(merged, spheres, regions.centres_map[region], region, config)
+        found += of_region
+    sites = _sites(crops, found, agreements)
+    return _objects(merged, sites, config)
+
+
+def _candidates(
+    merged: MergedMaps,
+    spheres: dict[SessionName, Sphere],
+    centre: Float64Array,
+    region: int,
+    config: ExtractConfig,
+) -> tuple[_Agreement, list[_Found]]:
+    """Return how the two spheres fit, and the candidates of both sessions."""
+    before, after = spheres["before"].points, spheres["after"].points
+    surface = Surface(before)
+    correction = realigned(after, centre, surface) if config.realign else np.eye(4)
+    after = transform(correction, after)
+    compared = {"after": (after, surface), "before": (before, Surface(after))}
+    found, noise_m = [], {}
+    for session, other in DIRECTIONS:
+        points, reference = compared[session]
+        chosen, noise_m[session] = candidates(points, reference)
+        sphere = spheres[session]
+        is_telling = sphere.is_inside[chosen] & _is_free(points[chosen], merged, other, correction)
+        found.append(_Found(session, region, sphere.indices[chosen], is_telling))
+    return _Agreement(correction, max(noise_m.values())), found
+
+
+def realigned(after: Float64Array, centre: Float64Array, surface: Surface) -> Float64Array:
+    """Return the (4, 4) correction, map frame, that brings a sphere of the after map onto the before map's surface.
+
+    The identity where there is too little to align or where it would carry the sphere farther than a correction may.
+    """
+    correction = np.eye(4)
+    if min(len(after), len(surface.points)) < MIN_SPHERE_POINTS:
+        return correction
+    for correspondence_m in _ROUNDS_M:
+        correction = align_to_planes(after, centre, surface, correction, correspondence_m)
+    shift_m = np.linalg.norm(transform(correction, centre[None])[0] - centre)
+    return correction if shift_m <= _MAX_SHIFT_M else np.eye(4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Site:
+    """Map points of both sessions around candidates of one, and the region whose correction holds there."""
+
+    session: SessionName
+    region: int
+    own: Int64Array
+    others: Int64Array
+    agreement: _Agreement
+
+
+def _sites(crops: Crops, found: Iterable[_Found], agreements: dict[int, _Agreement]) -> list[_Site]:
+    """Put the candidates of all regions together, session by session; best region first."""
+    sites = []
+    for session, other in DIRECTIONS:
+        of_session = [each for each in found if each.session == session and len(each.indices)]
+        if not of_session:
+            continue
+        indices = np.concatenate([each.indices for each in of_session])
+        is_telling = np.concatenate([each.is_telling for each in of_session])
+        region = np.concatenate([np.full(len(each.indices), each.region) for each in of_session])
+        order = np.lexsort((region, ~is_telling, indices))  # of a point's regions the best in which it tells
+        first = order[np.unique(indices[order], return_index=True)[1]]
+        indices, is_telling, region = indices[first], is_telling[first], region[first]
+        points = crops.points_map(session, indices)
+        labels, sizes = groups(points, SITE_M)
+        for label in np.flatnonzero(np.bincount(labels, is_telling, len(sizes)) >= _MIN_TELLING):
+            members = labels == label
+            best = int(region[members & is_telling].min())
+            own = crops.near(session, points[members], SITE_M)
+            others = crops.near(other, points[members], SITE_M + RIM_M)
+            sites.append(_Site(session, best, own, others, agreements[best]))
+    return sorted(sites, key=lambda site: site.region)
+
+
+def _objects(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) -> list[PointGroup]:
+    maps = {"before": merged.before, "after": merged.after}
+    pools = {
+        name: ReturnPool(
+            maps[name],
+            [site.own if site.session == name else site.others for site in sites],
+        )
+        for name in maps
+    }
+    result = []
+    for site in sites:
+        other: SessionName = "before" if site.session == "after" else "after"
+        correction = site.agreement.correction
+        returns = {site.session: pools[site.session].of(site.own), other: pools[other].of(site.others)}
+        after_map = merged.alignment.to_map(merged.after.positions_of(returns["after"]))
+        points = {
+            "before": merged.before.positions_of(returns["before"]),
+            "after": transform(correction, after_map),
+        }
+        compared = compare_site(points[site.session], points[other])
+        is_free = _is_free(compared.points, merged, other, correction)
+        for cells in grown(compared, is_free, site.agreement.noise_m, config):
+            is_member = np.zeros(len(compared.points), dtype=np.bool_)
+            is_member[cells] = True
+            of_object = is_member[compared.cell_of_return]
+            # the answer is in the map frame of the merge
+            in_map = (points["before"] if site.session == "before" else after_map)[of_object]
+            chosen = returns[site.session][of_object]
+            indices = np.unique(maps[site.session].return_points[chosen]).astype(np.int64)
+            thinned, _ = cell_means(in_map, SURFACE_CELL_M)
+            result.append(PointGroup(site.session, indices, thinned, site.region, chosen))
+    return result
+
+
+def _is_free(points_map: Float64Array, merged: MergedMaps, other: SessionName, correction: Float64Array) -> BoolArray:
+    """Mark what the other session saw through of (N, 3) places in the re-aligned map frame; all, if that is unknown."""
+    views = (merged.before if other == "before" else merged.after).views
+    if views is None:
+        return np.ones(len(points_map), dtype=np.bool_)
+    if other == "after":
+        points_map = merged.alignment.to_odom(transform(invert(correction), points_map))
+    return seen_through(points_map, views)
+
+
+class ReturnPool:
+    """The returns of some map points, found in one pass over all returns of a map."""
+
+    def __init__(self, point_map: PointMap, wanted: Iterable[Int64Array]) -> None:
+        is_wanted = np.zeros(len(point_map.points), dtype=np.bool_)
+        for indices in wanted:
+            is_wanted[indices] = True
+        owners = point_map.return_points
+        chosen = [
+            start + np.flatnonzero(is_wanted[owners[start : start + _BLOCK_RETURNS]])
+            for start in range(0, len(owners), _BLOCK_RETURNS)
+        ]
+        returns = np.concatenate(chosen) if chosen else np.zeros(0, dtype=np.int64)
+        self._returns = returns[np.argsort(owners[returns], kind="stable")]
+        self._owners = owners[self._returns]
+
+    def of(self, indices: Int64Array) -> Int64Array:
+        """Return the returns of some of the wanted map points, by map point."""
+        starts = np.searchsorted(self._owners, indices, side="left")
+        ends = np.searchsorted(self._owners, indices, side="right")
+        parts = [self._returns[start:end] for start, end in zip(starts.tolist(), ends.tolist(), strict=True)]
+        return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)

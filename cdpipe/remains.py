@@ -1,0 +1,65 @@
+"""Whether something was taken off what still stands, like a load off a muck pile, or removed as a whole."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from cdpipe.geometry import BoolArray, Float64Array
+from cdpipe.shape import ground_heights
+
+# How near a point must be to be the object's neighbour, and how near the other session's to have stayed.
+_BESIDE_M = 0.35
+_STAYED_M = 0.15
+# The ground is the lowest of columns this wide; the foot of an object and a rut are no farther above it.
+_GROUND_M = 0.8
+_ABOVE_GROUND_M = 0.15
+_ABOVE_TOP_M = 0.1
+# A flank of muck is not steeper than 57 deg, a wall is.
+_MIN_UPWARD = 0.6
+_NEIGHBOURS = 10
+_NORMAL_RADIUS_M = 0.4
+_MIN_NEIGHBOURS = 4
+# Found on validation pairs: removed props reach 0.3, what was loaded off a pile begins at 0.8.
+_LEAST_SEAM = 0.5
+
+
+def is_part_of_a_rest(taken_map: Float64Array, rest_map: Float64Array, other_map: Float64Array) -> bool:
+    """Tell whether a removed object was only a part: whether its surface went on in something that has stayed.
+
+    The seam is the object's points that have a neighbour which stayed, lies above the ground and on a slope. A whole
+    object meets only the floor, and perhaps a wall. The number of points on the seam is compared with the square root
+    of the number of all, as the length of a seam grows with that.
+
+    Args:
+        taken_map: (P, 3) the object's points, map frame, metres.
+        rest_map: (Q, 3) the other points of its session around it.
+        other_map: (R, 3) the points of the other session around it.
+    """
+    if min(len(taken_map), len(rest_map), len(other_map)) == 0:
+        return False
+    beside_m, _ = cKDTree(taken_map[:, :2]).query(rest_map[:, :2])
+    beside = rest_map[beside_m < _BESIDE_M]
+    stayed_m, _ = cKDTree(other_map).query(beside)
+    heights = beside[:, 2] - ground_heights(np.concatenate([rest_map, other_map]), beside, _GROUND_M)
+    is_rest = (stayed_m < _STAYED_M) & (heights > _ABOVE_GROUND_M)
+    is_rest &= beside[:, 2] < taken_map[:, 2].max() + _ABOVE_TOP_M
+    rest = beside[is_rest]
+    rest = rest[_is_slope(rest, rest_map)]
+    found = cKDTree(taken_map).query(rest)
+    apart_m, at = np.asarray(found[0]), np.asarray(found[1])
+    seam = np.unique(at[apart_m < _BESIDE_M])
+    return bool(len(seam) >= _LEAST_SEAM * np.sqrt(len(taken_map)))
+
+
+def _is_slope(places: Float64Array, surface: Float64Array) -> BoolArray:
+    """Tell where a surface (Q, 3) faces upwards rather than sideways at some of its points (N, 3)."""
+    wanted = [*range(1, min(_NEIGHBOURS, len(surface)) + 1)]
+    found = cKDTree(surface).query(places, k=wanted)
+    around, is_near = np.asarray(found[1]), np.asarray(found[0]) < _NORMAL_RADIUS_M
+    counts = is_near.sum(axis=1)
+    offsets = surface[around] - places[:, None]
+    means = (offsets * is_near[:, :, None]).sum(axis=1) / np.maximum(counts, 1)[:, None]
+    offsets = (offsets - means[:, None]) * is_near[:, :, None]
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))[1][:, :, 0]
+    return np.asarray((counts >= _MIN_NEIGHBOURS) & (np.abs(normals[:, 2]) > _MIN_UPWARD))

@@ -1,0 +1,141 @@
+"""The surface rule: what stands out of the other session's surface, where that session looked, is a changed object.
+
+Two steps, because a map point is the mean of a cell of 0.2 m and an object's foot is not:
+
+1. In every reported sphere map points off the planes through the other map's points are candidates (`candidates`);
+   those next to each other are a site.
+2. Around each site all returns of both sessions are compared, in cells of 0.05 and 0.1 m (`compare_site`). Objects grow
+   from cells that stand well clear of the surface and were seen through, down to what the surfaces differ by anyway
+   (`grown`).
+
+Whatever the other session never looked at is unknown, and no change by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from cdpipe.config import ExtractConfig
+from cdpipe.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.registration import Surface
+from cdpipe.voxel import cell_keys
+
+# Map points this far off are candidates: less than the lowest objects stand out, more than a cell's mean is off.
+_COARSE_M = 0.08
+_MIN_CANDIDATES = 3
+# Candidates nearer than this are one site, and everything this near to them is looked at closely.
+SITE_M = 0.5
+# Beyond the site the other session's surface is needed too.
+RIM_M = 0.3
+CELL_M = 0.05
+SURFACE_CELL_M = 0.1
+_LINK_M = 0.15
+# A plane holds for as far as the points that it was fitted to.
+_COARSE_PLANE_M, _PLANE_M = 0.4, 0.25
+_MIN_SURFACE = 20
+_NOISE_FACTOR = 5.0
+_SEED_FACTOR = 2.5
+_MAX_BORDER = 5.0
+# An object's foot, which no ray can have passed, reaches this far from what was seen through.
+_FOOT_M = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Site:
+    """Cells around candidates of one session, and what the other session's surface is to them.
+
+    Attributes:
+        points: (N, 3) means of the returns of each occupied cell, map frame, metres.
+        cell_of_return: (M,) cell of each return.
+        distance_m: (N,) how far each stands off the other session's surface; infinite where there is none.
+    """
+
+    points: Float64Array
+    cell_of_return: Int64Array
+    distance_m: Float64Array
+
+
+def distances_m(points: Float64Array, surface: Surface, plane_m: float) -> Float64Array:
+    """Return how far (N, 3) points are from a surface.
+
+    That is the distance from the plane through the nearest of the surface's points, as long as that point is within
+    `plane_m`; farther off it is the distance from the point itself.
+    """
+    found, squared_m2 = surface.tree.batch_nearest_neighbor_search(points)
+    chosen, nearest_m = np.asarray(found), np.sqrt(np.asarray(squared_m2))
+    along = np.einsum("ij,ij->i", points - surface.points[chosen], surface.normals[chosen])
+    return np.asarray(np.where(nearest_m < plane_m, np.abs(along), nearest_m))
+
+
+def candidates(points: Float64Array, surface: Surface) -> tuple[Int64Array, float]:
+    """Return the indices of the map points (N, 3) that stand off the other map's surface, three or more together.
+
+    And the median distance of all: how well the two surfaces agree.
+    """
+    distance_m = distances_m(points, surface, _COARSE_PLANE_M)
+    standing = np.flatnonzero(distance_m > _COARSE_M)
+    labels, sizes = groups(points[standing], SITE_M)
+    return standing[sizes[labels] >= _MIN_CANDIDATES], float(np.median(distance_m))
+
+
+def groups(points: Float64Array, link_m: float) -> tuple[Int64Array, Int64Array]:
+    """Return the (N,) group of each point, neighbours being within `link_m`, and the size of every group."""
+    n = len(points)
+    if n == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    pairs = cKDTree(points).query_pairs(link_m, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    _, labels = connected_components(graph, directed=False)
+    return labels.astype(np.int64), np.bincount(labels)
+
+
+def cell_means(points: Float64Array, cell_m: float) -> tuple[Float64Array, Int64Array]:
+    """Return the (N, 3) mean of the points of each occupied cell, and the (M,) cell of each point."""
+    _, cells = np.unique(cell_keys(points, cell_m), return_inverse=True)
+    counts = np.bincount(cells)
+    means = np.column_stack([np.bincount(cells, points[:, axis]) / counts for axis in range(3)])
+    return means, cells.astype(np.int64)
+
+
+def compare_site(points: Float64Array, reference: Float64Array) -> Site:
+    """Compare the (M, 3) returns around a site with the (R, 3) returns of the other session there, map frame."""
+    means, cell_of_return = cell_means(points, CELL_M)
+    if len(reference) == 0:
+        return Site(means, cell_of_return, np.full(len(means), np.inf))
+    surface_points, _ = cell_means(reference, SURFACE_CELL_M)
+    if len(surface_points) < _MIN_SURFACE:
+        return Site(means, cell_of_return, np.asarray(cKDTree(surface_points).query(means)[0]))
+    return Site(means, cell_of_return, distances_m(means, Surface(surface_points), _PLANE_M))
+
+
+def grown(site: Site, is_free: BoolArray, noise_m: float, config: ExtractConfig) -> list[Int64Array]:
+    """Return the cells of each object of a site.
+
+    What stands off the surface by more than the noise, and was seen through, belongs together where it touches; such a
+    group is an object if enough of it stands well clear. Its foot, at floor and wall, is too near to the surface for
+    any ray to have passed behind it; it is the object's as far as it also stands off.
+
+    Args:
+        site: Its cells.
+        is_free: (N,) cells that the other session saw through.
+        noise_m: Median distance of the two maps' surfaces around here.
+        config: Thresholds.
+    """
+    border_m = float(np.clip(_NOISE_FACTOR * noise_m, config.border_m, _MAX_BORDER * config.border_m))
+    seed_m = max(config.seed_m, _SEED_FACTOR * border_m)
+    stands_off = site.distance_m > border_m
+    core, foot = np.flatnonzero(stands_off & is_free), np.flatnonzero(stands_off & ~is_free)
+    labels, sizes = groups(site.points[core], _LINK_M)
+    kept = np.flatnonzero(np.bincount(labels, site.distance_m[core] > seed_m, len(sizes)) >= config.min_cells)
+    if len(kept) == 0:
+        return []
+    is_kept = np.isin(labels, kept)
+    core, labels = core[is_kept], labels[is_kept]
+    _, nearest = cKDTree(site.points[core]).query(site.points[foot], distance_upper_bound=_FOOT_M)
+    of_foot = np.append(labels, -1)[nearest]
+    return [np.concatenate([core[labels == label], foot[of_foot == label]]) for label in kept]
