@@ -1,8 +1,11 @@
 """The answer of a method on disk: what `detect` writes and `score` reads, whoever made it.
 
     answer.json   format, status, method, config, seconds, evidence, before_T_after, radius_m, objects (session, kind,
-                  region, score, partner of each); until: "merge" where the method was stopped after the merge
+                  region, score, partner of each; where it is known shape, which is map_T_box (4, 4), box_m (3,) and
+                  volume_m3, and for moved ones displacement_map (3,)); until: "merge" where the method was stopped
+                  after the merge
     answer.npz    region_centres_map (R, 3), region_scores (R,), region_pairs (R, 2), region_is_reported (R,),
+                  region_is_withdrawn (R,), where regions were let through that nothing could be cut out of,
                   keyframe_scores (Kb,), before_keyframe_scans (Kb,), after_keyframe_scans (Ka,),
                   object_returns (M, 2) int32 with object_return_offsets (O + 1,),
                   object_points_map (P, 3) with object_point_offsets (O + 1,), and figure_<name> (R,) each;
@@ -31,7 +34,7 @@ import numpy.typing as npt
 from cdpipe.errors import InputError
 from cdpipe.geometry import Float64Array, Int32Array, Int64Array
 from cdpipe.session import load_arrays
-from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport
+from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 
 FORMAT = "tunnelcd-answer"
 FORMAT_VERSION = 1
@@ -82,6 +85,8 @@ def write_answer(folder: Path, method: str, report: ChangeReport, until: Until |
         "object_point_offsets": _offsets([item.points_map for item in objects]),
         **{f"figure_{name}": values for name, values in report.figures.items()},
     }
+    if regions.is_withdrawn is not None:
+        arrays["region_is_withdrawn"] = regions.is_withdrawn
     if report.local_before_T_after is not None:
         arrays["local_before_T_after"] = report.local_before_T_after
     np.savez_compressed(folder / "answer.npz", allow_pickle=False, **arrays)
@@ -94,10 +99,7 @@ def write_answer(folder: Path, method: str, report: ChangeReport, until: Until |
         "seconds": dict(report.seconds),
         "evidence": dict(report.evidence),
         "config": dict(report.config),
-        "objects": [
-            {"session": o.session, "kind": o.kind, "region": o.region, "score": o.score, "partner": o.partner}
-            for o in objects
-        ],
+        "objects": [_object_document(item) for item in objects],
     }
     _write_json(folder, document, until)
 
@@ -173,6 +175,8 @@ def _report(
             points_map=points,
             score=meta["score"],
             partner=meta["partner"],
+            shape=None if meta.get("shape") is None else _shape(meta["shape"]),
+            displacement_map=None if meta.get("displacement_map") is None else _numbers(meta["displacement_map"]),
         )
         for meta, found, points in zip(metas, returns, points_map, strict=True)
     )
@@ -183,6 +187,7 @@ def _report(
         pairs=arrays["region_pairs"],
         is_reported=arrays["region_is_reported"],
         keyframe_scores=arrays["keyframe_scores"],
+        is_withdrawn=arrays.get("region_is_withdrawn"),
     )
     report = ChangeReport(
         before_T_after=np.asarray(document["before_T_after"], dtype=np.float64),
@@ -196,6 +201,33 @@ def _report(
         local_before_T_after=arrays.get("local_before_T_after"),
     )
     return report, points_odom
+
+
+def _object_document(item: ChangedObject) -> dict[str, Any]:
+    document: dict[str, Any] = {
+        "session": item.session,
+        "kind": item.kind,
+        "region": item.region,
+        "score": item.score,
+        "partner": item.partner,
+    }
+    if item.shape is not None:
+        document["shape"] = {
+            "map_T_box": item.shape.map_T_box.tolist(),
+            "box_m": item.shape.box_m.tolist(),
+            "volume_m3": item.shape.volume_m3,
+        }
+    if item.displacement_map is not None:
+        document["displacement_map"] = item.displacement_map.tolist()
+    return document
+
+
+def _shape(document: Mapping[str, Any]) -> ObjectShape:
+    return ObjectShape(_numbers(document["map_T_box"]), _numbers(document["box_m"]), float(document["volume_m3"]))
+
+
+def _numbers(values: Sequence[Any]) -> Float64Array:
+    return np.asarray(values, dtype=np.float64)
 
 
 def _write_json(folder: Path, document: Mapping[str, Any], until: Until | None) -> None:

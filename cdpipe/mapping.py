@@ -12,11 +12,13 @@ from cdpipe.freespace import view
 from cdpipe.geometry import Float64Array, Int32Array, Int64Array, invert, transform, travelled_m
 from cdpipe.sphere import column_keys
 from cdpipe.types import PLACES, Float16Array, KeyframeViews, PointMap, PosedScan, ScanSource, UInt8Array
-from cdpipe.voxel import UniqueCells, cell_keys, max_coordinate_m
+from cdpipe.voxel import UniqueCells, cell_corners, cell_keys, max_coordinate_m
 
 _BATCH_SCANS = 64
 # Nearer returns weigh no more; the sensor's own shortest range is less.
 _MIN_RANGE_M = 1.0
+# Share of a cell by which a mean that rounding carried out of it is put back.
+_INSIDE = 1e-6
 
 
 def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_SCANS) -> PointMap:
@@ -87,7 +89,9 @@ class _MapAccumulator:
         ids = self._cells.add(cell_keys(points, self._config.voxel_m))
         self._return_cells.append(ids.astype(np.int32))
         in_cells = points / self._config.voxel_m
-        self._return_offsets.append(((in_cells - np.floor(in_cells)) * PLACES).astype(np.uint8))
+        # the difference from a border just above rounds to a whole cell
+        places = np.minimum((in_cells - np.floor(in_cells)) * PLACES, PLACES - 1)
+        self._return_offsets.append(places.astype(np.uint8))
         n_cells, squared_m2 = len(self._cells), np.concatenate(ranges_m2)
         weights = 1 / squared_m2
         parts = [np.bincount(ids, points[:, axis] * weights, n_cells) for axis in range(3)]
@@ -105,6 +109,7 @@ class _MapAccumulator:
         cells, sums = np.concatenate(self._batch_cells), np.concatenate(self._batch_sums)
         totals = np.column_stack([np.bincount(cells, column, len(self._cells)) for column in sums.T])
         points, seen_from = totals[:, :3] / totals[:, 6:], totals[:, 3:6] / totals[:, 6:]
+        points = _in_their_cells(points, self._cells.keys, self._config.voxel_m)
         order = np.lexsort((self._cells.keys, column_keys(points)))
         rank = np.empty(len(order), dtype=np.int32)
         rank[order] = np.arange(len(order), dtype=np.int32)
@@ -122,6 +127,14 @@ class _MapAccumulator:
             return_offsets=np.concatenate(self._return_offsets),
             views=KeyframeViews(np.stack(self._views), invert(source.odom_T_sensor[keyframe_scans])),
         )
+
+
+def _in_their_cells(points: Float64Array, keys: Int64Array, voxel_m: float) -> Float64Array:
+    """Return the means (N, 3) of the returns of cells; rounding may carry one on a border into the next cell."""
+    tipped = np.flatnonzero(cell_keys(points, voxel_m) != keys)
+    low = cell_corners(keys[tipped], voxel_m)
+    points[tipped] = np.clip(points[tipped], low + _INSIDE * voxel_m, low + (1 - _INSIDE) * voxel_m)
+    return points
 
 
 def _require_reachable(source: ScanSource, config: MapConfig) -> None:

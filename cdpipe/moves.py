@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -26,6 +27,8 @@ _FAR = 0.6, 1.45
 _NEAR = 0.45, 1.6
 _LIKE_WITHIN_M = 0.1
 _MIN_POINTS = 4
+# A whole-map rival may cut out a hundred objects; a fit takes some 30 ms.
+_MOST_TRIED = 6
 # A coarse fit from each of so many headings, a fine one from the best of them.
 _HEADINGS = 16
 _REFINED = 3
@@ -56,11 +59,10 @@ def find_moves(
 ) -> list[Move]:
     """Pair removed with added objects that look like one, each in at most one pair.
 
-    All pairs together exceed the likeness that is asked for by as much as they can.
-
-    Two may be one where their extents agree within a factor and enough of their surfaces lies on each other. Where an
-    object moved by less than its own length, only what stuck out of the other place was found, so less is asked for.
-    Of equally like ones the nearer is taken.
+    All pairs together exceed the likeness that is asked for by as much as they can. Two may be one where their extents
+    agree within a factor and enough of their surfaces lies on each other. Where an object moved by less than its own
+    length, only what stuck out of the other place was found, so less is asked for. Of equally like ones the nearer is
+    taken.
 
     Args:
         removed: Points (P, 3) of each object of the before session, map frame, metres.
@@ -71,8 +73,8 @@ def find_moves(
     gain = np.zeros((len(gone), len(come)))
     moves: dict[tuple[int, int], Move] = {}
     for r, start in enumerate(gone):
-        for a, end in enumerate(come):
-            found = _one_object(start, end, may_go_far[r])
+        for a, pair in _likely(start, come, may_go_far[r]):
+            found = _one_object(start, come[a], pair)
             if found is not None:
                 gain[r, a], shift = found
                 moves[r, a] = Move(r, a, shift)
@@ -103,27 +105,42 @@ class _Cloud:
         return cls(points, few, cKDTree(points), cKDTree(few), log_extents, map_T_box[:3, 3], float(box_m[0]))
 
 
-def _one_object(start: _Cloud, end: _Cloud, may_go_far: bool) -> tuple[float, Float64Array] | None:
+class _Pair(NamedTuple):
+    """How far apart two objects are, level, by how much their extents differ at most (log), how like they must be."""
+
+    distance_m: float
+    misfit: float
+    is_near: bool
+    least: float
+
+
+def _likely(start: _Cloud, come: Sequence[_Cloud], may_go_far: bool) -> list[tuple[int, _Pair]]:
+    """Return the objects that one may have become: those near, then those of its extents, no more than are tried."""
+    pairs = []
+    for a, end in enumerate(come):
+        distance_m = float(np.linalg.norm(end.centre[:2] - start.centre[:2]))
+        misfit = float(np.abs(start.log_extents - end.log_extents).max())
+        is_near = distance_m < max(start.length_m, end.length_m)
+        least, size_factor = _NEAR if is_near else _FAR
+        if min(len(start.points), len(end.points)) >= _MIN_POINTS and misfit <= np.log(size_factor):
+            pairs.append((a, _Pair(distance_m, misfit, is_near, least)))
+    allowed = [(a, pair) for a, pair in pairs if pair.is_near or may_go_far]
+    return sorted(allowed, key=lambda item: (not item[1].is_near, item[1].misfit))[:_MOST_TRIED]
+
+
+def _one_object(start: _Cloud, end: _Cloud, pair: _Pair) -> tuple[float, Float64Array] | None:
     """Return by how much two objects are more alike than they need to be, and the displacement; None if they are not.
 
     The displacement is that of the middle of the upright box around both, laid on each other.
     """
-    misfit = float(np.abs(start.log_extents - end.log_extents).max())
-    distance_m = float(np.linalg.norm(end.centre[:2] - start.centre[:2]))
-    is_near = distance_m < max(start.length_m, end.length_m)
-    least, size_factor = _NEAR if is_near else _FAR
-    if min(len(start.points), len(end.points)) < _MIN_POINTS or misfit > np.log(size_factor):
-        return None
-    if not (is_near or may_go_far):
-        return None
     likeness, end_T_start = _laid_on(start, end)
-    excess = likeness - _MISFIT_WEIGHT * misfit - least
+    excess = likeness - _MISFIT_WEIGHT * pair.misfit - pair.least
     if excess <= 0.0:
         return None
     together = np.concatenate([start.points, transform(invert(end_T_start), end.points)])
     centre = upright_box(together)[0][:3, 3]
     shift = transform(end_T_start, centre[None])[0] - centre
-    return excess / (1.0 + _TIE_PER_M * distance_m), shift
+    return excess / (1.0 + _TIE_PER_M * pair.distance_m), shift
 
 
 def _laid_on(start: _Cloud, end: _Cloud) -> tuple[float, Float64Array]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from cdpipe.geometry import Float64Array, Int32Array, Int64Array, require_shape
 from cdpipe.moves import find_moves
@@ -23,6 +24,7 @@ _LEAST_FULL_CELLS = 0.2
 # How far around an object its surroundings are looked at, and how far the alignment may bend there.
 _AROUND_M = 1.0
 _BEND_M = 0.5
+_ON_OBJECT_M = 0.1
 _SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
 
 
@@ -166,9 +168,13 @@ class _Surroundings:
         centre_odom = self._merged.alignment.to_odom(centre[None])[0]
         bend_m = 0.0 if self._merged.alignment.is_rigid else _BEND_M
         found["after"] = self._after.crop(centre_odom, radius_m + bend_m)
-        found[group.session] = np.setdiff1d(found[group.session], group.indices)
         points: dict[SessionName, Float64Array] = {
             "before": self._merged.before.points[found["before"]],
             "after": self._merged.alignment.to_map(self._merged.after.points[found["after"]]),
         }
+        # a map point on the object's border may stand for returns of both; what lies off the object is its surroundings
+        is_own = np.isin(found[group.session], group.indices)
+        own = points[group.session]
+        is_own[is_own] = cKDTree(group.points_map).query(own[is_own])[0] < _ON_OBJECT_M
+        points[group.session] = own[~is_own]
         return {name: around[((around >= low) & (around <= high)).all(axis=1)] for name, around in points.items()}

@@ -67,7 +67,7 @@ def distances_m(points: Float64Array, surface: Surface, plane_m: float) -> Float
     `plane_m`; farther off it is the distance from the point itself.
     """
     found, squared_m2 = surface.tree.batch_nearest_neighbor_search(points)
-    chosen, nearest_m = np.asarray(found), np.sqrt(np.asarray(squared_m2))
+    chosen, nearest_m = np.asarray(found, dtype=np.int64), np.sqrt(np.asarray(squared_m2))
     along = np.einsum("ij,ij->i", points - surface.points[chosen], surface.normals[chosen])
     return np.asarray(np.where(nearest_m < plane_m, np.abs(along), nearest_m))
 

@@ -42,6 +42,12 @@ def cell_keys(points: Float64Array, cell_m: float, origin_m: float = 0.0) -> Int
     return keys
 
 
+def cell_corners(keys: Int64Array, cell_m: float) -> Float64Array:
+    """Return the (N, 3) lower corner of the cell of each key of `cell_keys`, metres from its `origin_m`."""
+    shifts = np.array([2 * _BITS, _BITS, 0])
+    return np.asarray((((keys[:, None] >> shifts) & ((1 << _BITS) - 1)) - _HALF) * cell_m)
+
+
 def thinned(points: Float64Array, cell_m: float) -> Float64Array:
     """Return the first point of each occupied cell, in the order of the cells' keys."""
     _, first = np.unique(cell_keys(points, cell_m), return_index=True)

@@ -92,6 +92,15 @@ def _check_object(where: str, item: ChangedObject, n_objects: int, n_regions: in
     if not -1 <= item.region < n_regions:
         raise ValueError(f"{where}.region = {item.region}: there are {n_regions} regions; -1 means none")
     _require_finite(f"{where}: object_points_map", item.points_map)
+    if item.shape is not None:
+        edges = item.shape.box_m.tolist()
+        if not all(np.isfinite(size) and size >= 0 for size in (*edges, item.shape.volume_m3)):
+            raise ValueError(
+                f"{where}.shape: edges {', '.join(f'{edge:g}' for edge in edges)} m and volume "
+                f"{item.shape.volume_m3:g} m3: expected finite numbers, none below 0"
+            )
+    if item.displacement_map is not None:
+        _require_finite(f"{where}.displacement_map", item.displacement_map)
 
 
 def _check_returns(session: SessionName, objects: tuple[ChangedObject, ...], truth: SessionTruth) -> None:

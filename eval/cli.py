@@ -249,7 +249,7 @@ def detect(
             "--set query.n_regions=3 reports the best three whatever they score\n"
         )
     objects = object_table(report)
-    _table("objects", objects[[name for name in objects.columns if not name.startswith(("min_", "max_"))]])
+    _table("objects", objects[[name for name in objects.columns if not name.startswith(("min_", "max_", "box_"))]])
     times = ", ".join(f"{name[2:-2]} {seconds:.3f} s" for name, seconds in report.seconds.items())
     typer.echo(f"{out}: answer.json, answer.npz, regions.csv, objects.csv, objects.ply ({times})")
 
@@ -527,6 +527,8 @@ def _results(folder: Path, quiet: bool) -> None:
         _table("merge: share of the pairs within the target of their kind, with its 95 % interval", targets)
     if (folder / "regions_table.csv").is_file():
         _region_results(folder)
+    if (folder / "objects_table.csv").is_file():
+        _object_results(folder)
 
 
 def _region_results(folder: Path) -> None:
@@ -538,10 +540,35 @@ def _region_results(folder: Path) -> None:
         "regions: means over pairs, in and out of distribution; recall@0.1 is at 0.1 false regions per 100 m",
         region_overview(pd.read_csv(folder / "regions_table.csv")),
     )
-    if (folder / "regions_targets.csv").is_file():
-        targets = pd.read_csv(folder / "regions_targets.csv")
+    _targets(folder, "regions")
+
+
+def _object_results(folder: Path) -> None:
+    import pandas as pd
+
+    from eval.object_groups import group_overview
+    from eval.object_table import object_overview
+
+    table = pd.read_csv(folder / "objects_table.csv")
+    _table(
+        "objects: means over pairs, missed ones 0; matched: median IoU of those matched; moved_m, pile_vol: median "
+        "error; recall and false regions per 100 m as proposed, and after withdrawal; seconds per proposed region",
+        object_overview(table),
+    )
+    if (folder / "objects_by_group.csv").is_file():
+        groups = group_overview(pd.read_csv(folder / "objects_by_group.csv"), str(table["variant"].iloc[0]))
+        _table(f"objects of {table['variant'].iloc[0]}, by kind of prop and by hull; volume: median error", groups)
+    _targets(folder, "objects")
+
+
+def _targets(folder: Path, subject: str) -> None:
+    import pandas as pd
+
+    path = folder / f"{subject}_targets.csv"
+    if path.is_file():
+        targets = pd.read_csv(path)
         met = [_MET[None if pd.isna(value) else bool(value)] for value in targets["is_met"]]
-        _table("regions: what is asked", targets.drop(columns="is_met").assign(met=met))
+        _table(f"{subject}: what is asked", targets.drop(columns="is_met").assign(met=met))
 
 
 def _table(title: str, frame: pd.DataFrame) -> None:

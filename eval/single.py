@@ -16,12 +16,13 @@ from cdpipe.descriptor import describe_scans, load_descriptors, save_descriptors
 from cdpipe.detect import describe_mapped, detect_changes, map_session, with_spheres
 from cdpipe.errors import InputError, MergeFailedError
 from cdpipe.evidence import GATES
+from cdpipe.geometry import yaw_rad
 from cdpipe.mapping import build_map, keyframes
 from cdpipe.readers import open_scans
 from cdpipe.session_check import check_session, is_same_session
-from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, PointMap, ScanSource
+from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, ObjectShape, PointMap, ScanSource
 from eval.provenance import THREADS
-from eval.rivals import METHODS
+from eval.rivals import METHODS, require_method
 from eval.stages import OnStage
 
 _SIZES = ("map_points_before", "map_points_after")
@@ -51,8 +52,9 @@ def detect_pair(before: Path, after: Path, config: PipelineConfig, on_stage: OnS
 
     Raises:
         MergeFailedError: The sessions could not be put into one frame.
-        InputError: A session is missing or damaged.
+        InputError: A session is missing or damaged, or the method's extra is not installed.
     """
+    require_method(config.method)
     use_threads(THREADS)
     sources = open_scans(before), open_scans(after)
     # both before either is mapped, which may take minutes
@@ -110,12 +112,16 @@ def write_detection(folder: Path, method: str, report: ChangeReport) -> None:
 
 
 def region_table(report: ChangeReport) -> pd.DataFrame:
-    """Return one row per reported region, best first; positions in the map frame, metres."""
+    """Return one row per region that was let through, best first; positions in the map frame, metres.
+
+    One that is withdrawn does not stand in the answer: nothing could be cut out of it.
+    """
     regions = report.regions
-    shown = np.flatnonzero(regions.is_reported)
+    shown = np.flatnonzero(regions.is_proposed)
     columns = {
         "region": shown,
         "score": regions.scores[shown],
+        "is_withdrawn": ~regions.is_reported[shown],
         **{f"{axis}_m": regions.centres_map[shown, k] for k, axis in enumerate("xyz")},
         **{name: values[shown] for name, values in report.figures.items()},
     }
@@ -123,16 +129,33 @@ def region_table(report: ChangeReport) -> pd.DataFrame:
 
 
 def object_table(report: ChangeReport) -> pd.DataFrame:
-    """Return one row per object: centroid and corners (map frame, metres), what happened to it, how large it is."""
+    """Return one row per object: what happened to it, where it is, how large it is; map frame, metres.
+
+    Centroid and corners of its points, centre, level edges (the longer one is the length), height and yaw of its
+    upright box, volume, and how far a moved one went. What is not known is empty.
+    """
     names = ["object", "session", "kind", "partner", "region", "score", "n_returns", "n_points"]
     places = ["x_m", "y_m", "z_m", *(f"{end}_{axis}_m" for end in ("min", "max") for axis in "xyz")]
+    boxes = ["box_x_m", "box_y_m", "box_z_m", "box_length_m", "box_width_m", "box_height_m", "box_yaw_deg", "volume_m3"]
+    shifts = [f"displacement_{axis}_m" for axis in "xyz"]
+    unknown = np.full(3, np.nan)
     rows = []
     for index, item in enumerate(report.objects):
         points = item.points_map if len(item.points_map) else np.full((1, 3), np.nan)
         identity = index, item.session, item.kind, item.partner, item.region, item.score
         counts = len(item.returns), len(item.points_map)
-        rows.append((*identity, *counts, *points.mean(axis=0), *points.min(axis=0), *points.max(axis=0)))
-    return pd.DataFrame(rows, columns=[*names, *places])
+        corners = *points.mean(axis=0), *points.min(axis=0), *points.max(axis=0)
+        shift = unknown if item.displacement_map is None else item.displacement_map
+        rows.append((*identity, *counts, *corners, *_box_row(item.shape), *shift))
+    return pd.DataFrame(rows, columns=[*names, *places, *boxes, *shifts])
+
+
+def _box_row(shape: ObjectShape | None) -> tuple[float, ...]:
+    """Return centre (3,), edges (3,), yaw in degrees and volume, NaN where nothing is known."""
+    if shape is None:
+        return (np.nan,) * 8
+    yaw_deg = float(np.rad2deg(yaw_rad(shape.map_T_box)))
+    return (*shape.map_T_box[:3, 3], *shape.box_m, yaw_deg, shape.volume_m3)
 
 
 def _descriptors(folder: Path, source: ScanSource, pointmap: PointMap, config: PipelineConfig) -> DescriptorSet:

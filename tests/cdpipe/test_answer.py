@@ -8,7 +8,7 @@ import pytest
 from cdpipe.answer import read_answer, write_answer, write_failure
 from cdpipe.errors import InputError
 from cdpipe.geometry import yaw_pose
-from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport
+from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 
 
 def _report() -> ChangeReport:
@@ -58,6 +58,58 @@ def test_a_local_merge_survives_the_disk_and_need_not_be_there(tmp_path: Path) -
     read = read_answer(tmp_path).report
     assert read is not None
     assert read.local_before_T_after is None
+
+
+def test_shapes_moves_and_withdrawn_regions_survive_the_disk_and_need_not_be_there(tmp_path: Path) -> None:
+    report = _report()
+    shape = ObjectShape(yaw_pose(0.3, (1.0, 2.0, 3.0)), np.array([1.5, 0.7, 0.4]), 0.25)
+    went = np.array([3.0, -4.0, 0.1])
+    first, second, third = report.objects
+    objects = (
+        replace(first, kind="moved", partner=2, shape=shape, displacement_map=went),
+        second,
+        replace(third, session="before", kind="moved", partner=0, displacement_map=went),
+    )
+    regions = replace(report.regions, is_withdrawn=np.array([False, True]))
+    write_answer(tmp_path, "paper", replace(report, objects=objects, regions=regions))
+    read = read_answer(tmp_path).report
+    assert read is not None
+    stored = read.objects[0].shape
+    assert stored is not None
+    np.testing.assert_array_equal(stored.map_T_box, shape.map_T_box)
+    np.testing.assert_array_equal(stored.box_m, shape.box_m)
+    assert stored.volume_m3 == 0.25
+    assert [item.shape is None for item in read.objects] == [False, True, True]
+    for item in (read.objects[0], read.objects[2]):
+        np.testing.assert_array_equal(item.displacement_map, went)
+    assert read.objects[1].displacement_map is None
+    np.testing.assert_array_equal(read.regions.is_withdrawn, [False, True])
+    np.testing.assert_array_equal(read.regions.is_proposed, [True, True])
+    # an answer without them, as others write it, is as good
+    write_answer(tmp_path, "paper", report)
+    assert "shape" not in (tmp_path / "answer.json").read_text()
+    read = read_answer(tmp_path).report
+    assert read is not None
+    first = read.objects[0]
+    assert all(value is None for value in (first.shape, first.displacement_map, read.regions.is_withdrawn))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("shape", {"map_T_box": np.eye(3).tolist(), "box_m": [1, 1, 1], "volume_m3": 1}, "map_T_box"),
+        ("shape", {"map_T_box": np.eye(4).tolist(), "box_m": [1, 1], "volume_m3": 1}, "box_m"),
+        ("shape", {"map_T_box": np.eye(4).tolist(), "box_m": [1, 1, 1]}, "volume_m3"),
+        ("displacement_map", [1.0, 2.0], "displacement_map"),
+    ],
+)
+def test_a_damaged_shape_is_named(name: str, value: object, words: str, tmp_path: Path) -> None:
+    write_answer(tmp_path, "other", _report())
+    document = json.loads((tmp_path / "answer.json").read_text())
+    document["objects"][1][name] = value
+    (tmp_path / "answer.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=f"damaged or incomplete: .*{words}"):
+        read_answer(tmp_path)
 
 
 def test_an_answer_says_where_it_ends(tmp_path: Path) -> None:
