@@ -24,6 +24,8 @@ from eval.page_columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
 from eval.page_effects import ENOUGH_PAIRS, draw_effects
 from eval.page_merge import draw_merge, ends_at_merge
 from eval.page_merge_tables import MERGE_COLUMNS
+from eval.page_object_report import draw_objects
+from eval.page_object_tables import OBJECT_COLUMNS
 from eval.page_paper import time_table, volume_table
 from eval.page_regions import REGION_COLUMNS, draw_regions
 from eval.page_run import RunData, first_seed, named_variants, of, read_document, read_run, scenarios, text
@@ -78,21 +80,29 @@ def write_page(run: Path) -> Path:
 
 
 def _content(data: RunData, tables: Mapping[str, Table]) -> dict[str, Any]:
-    sites = [draw_site(data, scenario) for scenario in scenarios(data, unchanged=False)]
+    objects = draw_objects(data)
+    # a run about objects shows its best and worst in their own section, and no maps
+    worlds = scenarios(data, unchanged=False)
+    sites = [draw_site(data, scenario) for scenario in worlds] if objects is None else []
     grids = grid_tables(data)
     unchanged = unchanged_table(data)
     merge = draw_merge(data)
     regions = draw_regions(data)
+    subject = regions or objects
     missing = [*data.missing, *(line for site in sites for line in site.missing), *merge.missing]
     missing += [] if regions is None else regions.missing
-    missing += [] if sites else ["No scenario with changes was run."]
-    missing += [] if unchanged.rows else ["No unchanged pair was run, so false alarms are not measured."]
-    missing += [] if grids else ["No grid of two settings was run."]
+    missing += [] if objects is None else objects.missing
+    missing += [] if worlds else ["No scenario with changes was run."]
+    if objects is None:
+        missing += [] if unchanged.rows else ["No unchanged pair was run, so false alarms are not measured."]
+        missing += [] if grids else ["No grid of two settings was run."]
     return {
         **_about(data, missing),
-        "sentences": story(data) if regions is None else [*regions.sentences, *about_wrong_merges(data)],
+        "sentences": story(data) if subject is None else [*subject.sentences, *about_wrong_merges(data)],
         "regions": regions,
         "region_columns": [] if regions is None else REGION_COLUMNS,
+        "objects": objects,
+        "object_columns": [] if objects is None else OBJECT_COLUMNS,
         "merge": merge,
         "results": tables["results"],
         "unchanged": unchanged,

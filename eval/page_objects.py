@@ -30,31 +30,56 @@ class Picture:
     caption: str
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Shown:
+    """What one method answered on a pair, to be drawn beside the truth of a change.
+
+    Attributes:
+        title: What to call the method.
+        answer: What it answered; None where there is nothing.
+        object_rows: Per answered object, the rows of its session's universe (`eval.answer_rows`).
+        row: Its row of changes.csv for that change, {} where there is none.
+    """
+
+    title: str
+    answer: Answer | None
+    object_rows: Sequence[Int64Array]
+    row: Row
+
+
 def object_pictures(
     data: RunData, scenario: str, seed: int, answers: Mapping[str, Answer], truth: GroundTruth
 ) -> list[Picture]:
     """Draw every observable change of a pair beside what the shown presets answered."""
-    shown = [name for name in SHOWN_PRESETS if name in named_variants(data, scenario)]
-    object_rows = {name: answer_rows(answers[name], truth) for name in shown if name in answers}
+    names = [name for name in SHOWN_PRESETS if name in named_variants(data, scenario)]
+    object_rows = {name: answer_rows(answers[name], truth) for name in names if name in answers}
     pictures = []
     for index, change in enumerate(truth.pair.changes):
         if not truth.is_observable[index]:
             continue
-        cutout = _cut_out(change, index, truth)
-        true_points, others = cutout.points[cutout.is_true], cutout.points[~cutout.is_true]
-        n_cells = f"{len(true_points):,} cells of {CELL_M:g} m"
-        panels = [Panel("truth", n_cells, ((others, CONTEXT), (true_points, BLUE)))]
-        for name in shown:
-            if name not in answers:
-                panels.append(Panel(name, "no answer", ((others, CONTEXT), (true_points, BLACK))))
-                continue
+        shown = []
+        for name in names:
             rows = of(data.changes, scenario=scenario, seed=seed, variant=name, id=change.id)
-            panels.append(
-                _answer_panel(name, answers[name], object_rows[name], rows[0] if rows else {}, change, cutout)
-            )
-        address = object_panels(panels, true_points, cutout.view_from)
-        pictures.append(Picture(_object_title(change), address, _object_caption(change)))
+            shown.append(Shown(name, answers.get(name), object_rows.get(name, ()), rows[0] if rows else {}))
+        pictures.append(
+            Picture(f"{change.id}. {object_title(change)}", change_panels(index, truth, shown), _object_caption(change))
+        )
     return pictures
+
+
+def change_panels(index: int, truth: GroundTruth, shown: Sequence[Shown]) -> str:
+    """Draw one change: its truth, and beside it what some methods answered."""
+    change = truth.pair.changes[index]
+    cutout = _cut_out(change, index, truth)
+    true_points, others = cutout.points[cutout.is_true], cutout.points[~cutout.is_true]
+    n_cells = f"{len(true_points):,} cells of {CELL_M:g} m"
+    panels = [Panel("truth", n_cells, ((others, CONTEXT), (true_points, BLUE)))]
+    for each in shown:
+        if each.answer is None:
+            panels.append(Panel(each.title, "no answer", ((others, CONTEXT), (true_points, BLACK))))
+        else:
+            panels.append(_answer_panel(each.title, each.answer, each.object_rows, each.row, change, cutout))
+    return object_panels(panels, true_points, cutout.view_from)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,11 +136,12 @@ def _answer_panel(
     return Panel(name, f"{where}IoU {share(number(row, 'iou_point'))}" + (f", {called}" if called else ""), layers)
 
 
-def _object_title(change: Change) -> str:
+def object_title(change: Change) -> str:
+    """Return what a change is: its prop, and what happened to it."""
     where = f", its place {change.session}" if change.kind == "moved" else ""
     kind = change.prop_kind.replace("_", " ")
     name = "" if change.name == change.prop_kind else f" “{change.name}”"
-    return f"{change.id}. {kind[0].upper()}{kind[1:]}{name}: {change.kind}{where}"
+    return f"{kind[0].upper()}{kind[1:]}{name}: {change.kind}{where}"
 
 
 def _object_caption(change: Change) -> str:

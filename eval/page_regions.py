@@ -19,7 +19,7 @@ from eval.page_tables import Cell, Table, best
 from eval.region_curves import RATES_PER_100M
 from eval.region_plots import Bins, Curve, domain_name, free_response_plot, roc_plot, size_plot
 from eval.region_table import FILES, MAIN_VARIANT, RIVALS
-from eval.runfolder import reports_regions
+from eval.runfolder import reported
 
 
 def _ms(seconds: float) -> str:
@@ -70,7 +70,7 @@ class RegionPart:
 
 def draw_regions(data: RunData) -> RegionPart | None:
     """Return tables and plots of the regions; None where the plan of the run does not ask for them."""
-    if not reports_regions(data.provenance):
+    if reported(data.provenance) != "regions":
         return None
     files = {name: data.folder.path / f"{name}.csv" for name in FILES}
     found = {name: pd.read_csv(path) for name, path in files.items() if path.is_file()}

@@ -6,7 +6,7 @@ scenarios:                           # eval/worlds.py tells more
   - paper/site1
   - {name: paper/site2, each: [sensor.range_noise=false, sensor.mode=512x10]}  # as it is, and again with each of these
 seeds: "20000:20002"                 # B excluded, in quotes; or a list
-report: regions                      # also the tables and plots of `eval.region_table`; left out: none
+report: regions                      # also the tables and plots of `eval.region_table`; objects: `eval.object_table`
 until: null                          # merge: map, describe, merge, and no further; only the columns of the merge
 variants:
   - preset: paper                    # a shipped preset or the path of a .yaml file
@@ -14,6 +14,7 @@ variants:
     per_scenario: {paper/site2: ["query.radius_m=10"]}   # belongs to the site, whatever is set there; not to the name
   - preset: tunnelcd
     oracle_merge: {noise_m: 0.1, noise_deg: 0.2}         # merged by the truth: eval/oracles.py; {} is without noise
+    oracle_regions: true                                 # a region around each change: eval/oracle_regions.py
 grid:
   - variant: tunnelcd                # a preset
     scenarios: [paper/site1]         # out of the plan's; one world of several as paper/site2[sensor.mode=512x10]
@@ -61,9 +62,11 @@ from eval.worlds import (
 )
 from scenarios.schema import Scenario
 
-ORACLE_MERGE = "oracle-merge"
+ORACLE_MERGE, ORACLE_REGIONS = "oracle-merge", "oracle-regions"
 _ORACLE_PRESET = "tunnelcd"
 _AFTER_MERGE = ("query", "extract", "outlier", "cluster")
+# what a region around each change still takes from the query
+_OF_TRUE_REGIONS = ("query.radius_m", "query.suppression")
 _LONGEST_SLUG = 200  # file systems take names of 255 bytes
 _TOO_LONG = "is too long for a folder's name: put the settings into a file of their own"
 
@@ -140,19 +143,21 @@ Until = Literal["merge"]
 
 
 class Variant(Settings):
-    """One method to run: a preset and what is set over it, perhaps merged by the truth."""
+    """One method to run: a preset and what is set over it, perhaps merged or told its regions by the truth."""
 
     preset: PresetName
     set: MethodSettings = ()
     per_scenario: dict[Label, MethodSettings] = Field(default_factory=dict)
     oracle_merge: Annotated[OracleMerge | None, BeforeValidator(_with_braces)] = None
+    oracle_regions: bool = False
 
     @model_validator(mode="after")
     def _settings_act(self) -> Variant:
-        if self.oracle_merge is not None:
-            for setting in self.every_setting:
-                if group_of(setting) == "merge":
-                    raise ValueError(f"{setting} does nothing: this variant is merged by the truth; leave it out")
+        for setting in self.every_setting:
+            if self.oracle_merge is not None and group_of(setting) == "merge":
+                raise ValueError(f"{setting} does nothing: this variant is merged by the truth; leave it out")
+            if self.oracle_regions and not _acts_on_true_regions(setting):
+                raise ValueError(f"{setting} does nothing: this variant's regions are the truth's; leave it out")
         return self
 
     @property
@@ -162,7 +167,7 @@ class Variant(Settings):
 
     @model_serializer(mode="wrap")
     def _as_written(self, handler: SerializerFunctionWrapHandler) -> Any:
-        return {key: value for key, value in handler(self).items() if value is not None}
+        return {key: value for key, value in handler(self).items() if value is not None and value is not False}
 
 
 class Grid(Settings):
@@ -181,7 +186,7 @@ class Plan(Settings):
     scenarios: Annotated[tuple[ScenarioItem, ...], NotEmpty]
     seeds: Annotated[tuple[int, ...], BeforeValidator(parse_seeds)]
     until: Until | None = None
-    report: Literal["regions"] | None = None
+    report: Literal["regions", "objects"] | None = None
     variants: Annotated[tuple[Variant, ...], NotEmpty]
     grid: tuple[Grid, ...] = ()
 
@@ -214,12 +219,18 @@ class Plan(Settings):
                 raise ValueError(
                     f"{setting} of {who} does nothing: the plan ends at the merge; leave it out, or leave out until"
                 )
+        if self.until == "merge" and any(variant.oracle_regions for variant in self.variants):
+            raise ValueError(
+                "oracle_regions does nothing: the plan ends at the merge; leave it out, or leave out until"
+            )
         return self
 
     @model_validator(mode="after")
-    def _report_has_regions(self) -> Plan:
-        if self.report == "regions" and self.until == "merge":
-            raise ValueError("report: regions needs regions, and the plan ends at the merge; leave one of them out")
+    def _report_has_its_subject(self) -> Plan:
+        if self.report is not None and self.until == "merge":
+            raise ValueError(
+                f"report: {self.report} needs {self.report}, and the plan ends at the merge; leave one of them out"
+            )
         return self
 
     @model_validator(mode="after")
@@ -255,6 +266,7 @@ class Cell:
         config: The effective settings.
         oracle: What merges instead of the method, or None.
         until: Where it ends, None for the whole method.
+        oracle_regions: Whether the regions are the truth's.
     """
 
     scenario: str
@@ -264,6 +276,7 @@ class Cell:
     config: PipelineConfig
     oracle: OracleMerge | None = None
     until: Until | None = None
+    oracle_regions: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,13 +287,29 @@ class _Method:
     named: tuple[str, ...]
     silent: tuple[str, ...] = ()
     oracle: OracleMerge | None = None
+    oracle_regions: bool = False
 
     @property
     def variant(self) -> str:
-        return variant_name(self.preset, self.named, self.oracle)
+        return variant_name(self.preset, self.named, self.oracle, oracle_regions=self.oracle_regions)
 
     def config(self) -> PipelineConfig:
-        return load_config(self.preset, [*self.named, *self.silent])
+        config = load_config(self.preset, [*self.named, *self.silent])
+        if self.oracle_regions and config.method != "descriptor":
+            raise InputError(f"{self.variant}: oracle_regions is for method: descriptor, this one is {config.method}")
+        return config
+
+    def cell(self, world: World, seed: int, config: PipelineConfig, until: Until | None) -> Cell:
+        return Cell(
+            scenario=world.label,
+            seed=seed,
+            preset=_stem(self.preset),
+            variant=self.variant,
+            config=config,
+            oracle=self.oracle,
+            until=until,
+            oracle_regions=self.oracle_regions,
+        )
 
 
 def load_plan(name_or_path: str) -> Plan:
@@ -316,7 +345,8 @@ def changed_plan(
         seeds: "A:B", replaces the plan's seeds.
         settings: `key=value`, written over every variant and every grid point.
         grid: `key=v1,v2`; every variant is run at every combination. The plan's own grids stay as they are. Variants
-            that are merged by the truth get neither settings nor grids of `merge`.
+            that are merged by the truth get neither settings nor grids of `merge`, those whose regions are the truth's
+            none of `query` but radius and suppression.
 
     Raises:
         InputError: One of them cannot be read, or its key or value is wrong.
@@ -358,7 +388,7 @@ def cells(plan: Plan) -> list[Cell]:
     for world in worlds_of(plan.scenarios):
         methods = [(method, method.config()) for method in _methods(plan, world)]
         found += [
-            Cell(world.label, seed, _stem(method.preset), method.variant, config, method.oracle, plan.until)
+            method.cell(world, seed, config, plan.until)
             for seed in plan.seeds[: world.n_seeds]
             for method, config in methods
         ]
@@ -375,15 +405,19 @@ def planned_cases(plan: Plan) -> set[tuple[str, int, str]]:
     }
 
 
-def variant_name(preset: str, settings: Iterable[str], oracle: OracleMerge | None = None) -> str:
+def variant_name(
+    preset: str, settings: Iterable[str], oracle: OracleMerge | None = None, *, oracle_regions: bool = False
+) -> str:
     """Return the preset's name, followed by its settings in brackets where there are any.
 
-    Merged by the truth it is called `oracle-merge`, with its noise and any preset but `tunnelcd` first in the brackets.
+    What takes its merge or its regions from the truth is called `oracle-merge`, `oracle-regions` or, both, joined by a
+    plus; any preset but `tunnelcd` and the noise of the merge come first in the brackets.
     """
     stem = _stem(preset)
-    if oracle is not None:
+    if oracle is not None or oracle_regions:
         of_preset = [] if stem == _ORACLE_PRESET else [f"preset={stem}"]
-        stem, settings = ORACLE_MERGE, (*of_preset, *oracle.settings, *settings)
+        settings = (*of_preset, *(() if oracle is None else oracle.settings), *settings)
+        stem = "+".join([ORACLE_MERGE] * (oracle is not None) + [ORACLE_REGIONS] * oracle_regions)
     joined = ",".join(settings)
     return f"{stem}[{joined}]" if joined else stem
 
@@ -396,8 +430,14 @@ def slug(variant: str) -> str:
 def _methods(plan: Plan, world: World) -> list[_Method]:
     places = dict.fromkeys((world.name, world.label))
     methods = [
-        _Method(v.preset, v.set, tuple(s for place in places for s in v.per_scenario.get(place, ())), v.oracle_merge)
-        for v in plan.variants
+        _Method(
+            preset=variant.preset,
+            named=variant.set,
+            silent=tuple(setting for place in places for setting in variant.per_scenario.get(place, ())),
+            oracle=variant.oracle_merge,
+            oracle_regions=variant.oracle_regions,
+        )
+        for variant in plan.variants
     ]
     for grid in plan.grid:
         if not places.keys().isdisjoint(grid.scenarios):
@@ -417,7 +457,15 @@ def _additions(
     if "oracle_merge" in variant:
         axes = [axis for axis in axes if group_of(axis[0]) != "merge"]
         settings = [setting for setting in settings if group_of(setting) != "merge"]
+    if variant.get("oracle_regions"):
+        axes = [axis for axis in axes if _acts_on_true_regions(axis[0])]
+        settings = [setting for setting in settings if _acts_on_true_regions(setting)]
     return [(*point, *settings) for point in itertools.product(*axes)]
+
+
+def _acts_on_true_regions(setting: str) -> bool:
+    """Tell whether a setting does anything where the regions are the truth's."""
+    return group_of(setting) != "query" or _key(setting) in _OF_TRUE_REGIONS
 
 
 def _grid_axis(text: str) -> list[str]:

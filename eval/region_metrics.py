@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.geometry import BoolArray, Float64Array, Int64Array, invert
 from cdpipe.types import ChangeReport
 from eval.ground_truth import GroundTruth, SessionTruth
 from eval.ranking import auroc, average_precision
@@ -52,6 +52,17 @@ def centres_in_world(centres_map: Float64Array, before: SessionTruth, keyframe_s
     tree = cKDTree(before.odom_T_sensor[keyframe_scans, :3, 3])
     _, nearest = tree.query(centres_map)
     return before.to_world(centres_map, keyframe_scans[nearest])
+
+
+def places_in_map(places_world: Float64Array, before: SessionTruth, keyframe_scans: Int64Array) -> Float64Array:
+    """Carry (N, 3) true places into the map frame, each through the true pose of the keyframe truly nearest to it."""
+    if len(places_world) == 0:
+        return np.zeros((0, 3))
+    world_T_keyframe = before.world_T_sensor[keyframe_scans]
+    _, nearest = cKDTree(world_T_keyframe[:, :3, 3]).query(places_world)
+    map_T_world = before.odom_T_sensor[keyframe_scans[nearest]] @ invert(world_T_keyframe[nearest])
+    moved = np.einsum("nij,nj->ni", map_T_world[:, :3, :3], places_world) + map_T_world[:, :3, 3]
+    return np.asarray(moved, dtype=np.float64)
 
 
 def match_regions(
@@ -162,45 +173,64 @@ def score_regions(report: ChangeReport, truth: GroundTruth, after_travelled_m: F
     keyframes = keyframes_or_all(report.keyframe_scans[0], len(truth.before.odom_T_sensor))
     centres = centres_in_world(regions.centres_map, truth.before, keyframes)
     matches = match_regions(centres, regions.is_reported, truth.centroids_world, truth.is_observable, radius_m)
-    n_found = int(np.count_nonzero(truth.is_observable & (matches.best_region >= 0)))
-    n_true, n_false = matches.count("true"), matches.count("false")
     path_m = float(after_travelled_m[-1])
+    proposed = match_regions(centres, regions.is_proposed, truth.centroids_world, truth.is_observable, radius_m)
 
     scores = regions.keyframe_scores
     positions = truth.before.world_T_sensor[keyframes[: len(scores)], :3, 3]
     labels = keyframe_labels(positions, truth.centroids_world, truth.is_observable, radius_m)
     used = labels >= 0
     columns = {
-        "region_recall": n_found / truth.n_observable if truth.n_observable else float("nan"),
-        "region_precision": n_true / (n_true + n_false) if n_true + n_false else float("nan"),
+        **_rates(matches, truth, path_m),
+        **{f"{name}_proposed": value for name, value in _rates(proposed, truth, path_m).items()},
         "region_recall_at_k": recall_at_k(matches.found, truth.is_observable),
         "region_auroc": auroc(scores[used], labels[used] == 1),
         "region_ap": average_precision(scores[used], labels[used] == 1),
-        "false_regions_per_100m": 100.0 * n_false / path_m if path_m > 0 else float("nan"),
         "region_coverage": covered_share(
             truth.after.world_T_sensor[:, :3, 3], after_travelled_m, centres[regions.is_reported], regions.radius_m
         ),
         "n_regions": int(np.count_nonzero(regions.is_reported)),
-        "n_true_regions": n_true,
-        "n_false_regions": n_false,
+        "n_withdrawn": int(np.count_nonzero(regions.is_proposed & ~regions.is_reported)),
+        "n_true_regions": matches.count("true"),
+        "n_false_regions": matches.count("false"),
         "n_duplicate_regions": matches.count("duplicate"),
         "n_ignored_regions": matches.count("ignored"),
-        "n_found_changes": n_found,
+        "n_found_changes": _n_found(matches, truth),
     }
     return RegionScores(columns, matches, labels)
+
+
+def _rates(matches: RegionMatches, truth: GroundTruth, path_m: float) -> dict[str, float]:
+    """Return recall, precision and false alarms of the regions that were matched as reported."""
+    n_true, n_false = matches.count("true"), matches.count("false")
+    return {
+        "region_recall": _n_found(matches, truth) / truth.n_observable if truth.n_observable else float("nan"),
+        "region_precision": n_true / (n_true + n_false) if n_true + n_false else float("nan"),
+        "false_regions_per_100m": 100.0 * n_false / path_m if path_m > 0 else float("nan"),
+    }
+
+
+def _n_found(matches: RegionMatches, truth: GroundTruth) -> int:
+    return int(np.count_nonzero(truth.is_observable & (matches.best_region >= 0)))
 
 
 def unanswered_regions(n_changes: int, n_observable: int) -> RegionScores:
     """Return the scores of a case without an answer: nothing found; rates of what was never reported stay NaN."""
     nan = float("nan")
     recall = 0.0 if n_observable else nan
-    rates = dict.fromkeys(
-        ("region_precision", "region_auroc", "region_ap", "false_regions_per_100m", "region_coverage"), nan
+    undefined = ("region_precision", "region_auroc", "region_ap", "false_regions_per_100m", "region_coverage")
+    rates = dict.fromkeys((*undefined, "region_precision_proposed", "false_regions_per_100m_proposed"), nan)
+    counts = (
+        "regions",
+        "withdrawn",
+        "true_regions",
+        "false_regions",
+        "duplicate_regions",
+        "ignored_regions",
+        "found_changes",
     )
-    counts = ("regions", "true_regions", "false_regions", "duplicate_regions", "ignored_regions", "found_changes")
     columns = {
-        "region_recall": recall,
-        "region_recall_at_k": recall,
+        **dict.fromkeys(("region_recall", "region_recall_proposed", "region_recall_at_k"), recall),
         **rates,
         **dict.fromkeys((f"n_{name}" for name in counts), 0),
     }

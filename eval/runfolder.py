@@ -9,6 +9,8 @@ results.csv changes.csv regions.csv objects.csv keyframes.csv summary.csv
 merge.csv                                     where pairs have a kind (eval.merge_table)
 regions_table.csv regions_targets.csv regions_by_size.csv roc.csv froc.csv
                                               where the plan says `report: regions` (eval.region_table)
+objects_table.csv objects_by_group.csv objects_targets.csv
+                                              where it says `report: objects` (eval.object_table)
 effects.csv                                   where a world was run with and without a setting (eval.effects)
 """
 
@@ -28,10 +30,13 @@ from cdpipe.errors import InputError
 from eval.coverage import coverage
 from eval.effects import effects
 from eval.merge_table import merge_table
+from eval.object_table import FILES as OBJECT_FILES
+from eval.object_table import object_tables
 from eval.output import make_writable
 from eval.plan import slug
 from eval.provenance import TOOL
-from eval.region_table import FILES, region_tables
+from eval.region_table import FILES as REGION_FILES
+from eval.region_table import region_tables
 from eval.statistics import summarise
 from eval.worlds import world_slug
 
@@ -150,7 +155,7 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     for table, frame in items.items():
         _write_csv(run.path / f"{table}.csv", frame)
     _write_csv(run.path / "summary.csv", summarise(results, keyframes=items["keyframes"]))
-    tables = {"effects": effects(results), "merge": merge_table(results), **_region_tables(run, results, items)}
+    tables = {"effects": effects(results), "merge": merge_table(results), **_report_tables(run, results, items)}
     for name, found in tables.items():
         if len(found):
             _write_csv(run.path / f"{name}.csv", found)
@@ -159,21 +164,28 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     return results
 
 
-def reports_regions(provenance: Mapping[str, Any]) -> bool:
-    """Tell whether the plan of a run asks for the report of regions."""
+def reported(provenance: Mapping[str, Any]) -> str:
+    """Return what the plan of a run asks a report of: "regions", "objects", or "" for none."""
     plan = provenance.get("plan")
-    return isinstance(plan, Mapping) and plan.get("report") == "regions"
+    return str(plan.get("report") or "") if isinstance(plan, Mapping) else ""
 
 
-def _region_tables(
+def _report_tables(
     run: RunFolder, results: pd.DataFrame, items: Mapping[str, pd.DataFrame]
 ) -> Mapping[str, pd.DataFrame]:
+    """Return the tables that the plan asks for, and empty ones for those that it does not."""
+    tables = {name: pd.DataFrame() for name in (*REGION_FILES, *OBJECT_FILES)}
     provenance = run.provenance() if (run.path / "provenance.json").is_file() else {}
-    if not reports_regions(provenance) or "region_auroc" not in results:
-        return {name: pd.DataFrame() for name in FILES}
-    cases = zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
-    covered = coverage(provenance, cases)
-    return region_tables(results, items, is_whole=covered is None or covered.is_whole)
+    subject = reported(provenance)
+    if not subject or "region_auroc" not in results:
+        return tables
+    covered = coverage(
+        provenance, zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
+    )
+    is_whole = covered is None or covered.is_whole
+    if subject == "regions":
+        return {**tables, **region_tables(results, items, is_whole=is_whole)}
+    return {**tables, **object_tables(results, items["changes"], is_whole=is_whole)}
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

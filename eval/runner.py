@@ -1,7 +1,7 @@
 """Runs a plan, one cell after the other; finished cells are kept, and a run that was cut off goes on where it stopped.
 
 A cell is finished when its file holds the digest of what it depends on: the scenario as drawn, the files it names, the
-effective settings, the weights, the version of the metrics, what the plan says of it (an oracle, where it ends, the
+effective settings, the weights, the version of the metrics, what the plan says of it (oracles, where it ends, the
 kind of its pair), and whether KISS-Matcher was missing where its merge asks for it. A merge that is refused and
 any other error of the input are rows of their own; a bug is not caught.
 """
@@ -24,6 +24,7 @@ from cdpipe.errors import InputError, MergeFailedError, ScenarioError, TunnelcdE
 from eval.adapters import pipeline_input
 from eval.domains import domain_of
 from eval.ground_truth import GroundTruth, load_ground_truth
+from eval.oracle_regions import Regions, regions_by_truth
 from eval.oracles import merged_by_truth
 from eval.plan import Cell, Plan, cells
 from eval.progress import RunProgress, Silent
@@ -248,9 +249,11 @@ def _write_maps(path: Path, stages: PairStages) -> None:
 
 def _answer(stages: PairStages, cell: Cell, truth: GroundTruth, folder: Path) -> None:
     settings = cell.config.model_dump(mode="json")
-    run = stages.answer if cell.until is None else stages.merge_answer
     try:
-        report = run(cell.config, _oracle(cell, truth))
+        if cell.until is None:
+            report = stages.answer(cell.config, _oracle(cell, truth), _true_regions(cell, truth))
+        else:
+            report = stages.merge_answer(cell.config, _oracle(cell, truth))
     except MergeFailedError as error:
         measured = error.evidence, settings, cell.until, error.seconds
         write_failure(folder, cell.variant, "merge_refused", str(error), *measured)
@@ -266,6 +269,13 @@ def _oracle(cell: Cell, truth: GroundTruth) -> Merge | None:
     if noise is None:
         return None
     return lambda before, after: merged_by_truth(before, after, (truth.before, truth.after), noise, cell.seed)
+
+
+def _true_regions(cell: Cell, truth: GroundTruth) -> Regions | None:
+    """Return what proposes regions in the method's place; the stages after it get these alone."""
+    if not cell.oracle_regions:
+        return None
+    return lambda scans: regions_by_truth(truth, scans, cell.config.query)
 
 
 def _unmade(pair: _Pair, error: str) -> CaseScore:
@@ -288,6 +298,7 @@ def _key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mapping[s
             "checkpoint": checkpoint_digest(cell.config.descriptor),
             **({"sphere": sphere_digest()} if cell.config.query.compare == "sphere" else {}),
             "oracle": None if cell.oracle is None else cell.oracle.model_dump(mode="json"),
+            **({"oracle_regions": True} if cell.oracle_regions else {}),
             "until": cell.until,
             "pair_kind": pair_kind,
             # what was made without the extra is made again once it is there; nothing is said where it is

@@ -6,25 +6,27 @@ scored again whenever the metrics change, and so can an answer that another prog
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cdpipe.answer import Answer, read_answer
-from cdpipe.extract import FIGURES, hull_volume_m3
+from cdpipe.extract import FIGURES
 from cdpipe.geometry import Float64Array, travelled_m
-from cdpipe.types import ChangedObject, ChangeReport
+from cdpipe.types import ChangeReport
 from eval.answer_check import check_answer
 from eval.answer_rows import answer_rows
-from eval.domains import domain_of, is_change_in_distribution
+from eval.domains import domain_of
 from eval.ground_truth import GroundTruth, load_ground_truth
+from eval.item_rows import change_rows, figure, object_rows, region_rows
 from eval.merge_metrics import evidence_columns, merge_columns, merge_errors, overlap_true
-from eval.object_metrics import ObjectMatches, kinds_right, match_objects, object_columns, unanswered_objects
-from eval.region_metrics import RegionScores, keyframes_or_all, score_regions, unanswered_regions
+from eval.object_metrics import kinds_right, match_objects, object_columns, unanswered_objects
+from eval.object_sizes import SizeErrors, size_columns, size_errors
+from eval.region_metrics import keyframes_or_all, score_regions, unanswered_regions
 
-METRICS_VERSION = 2
+METRICS_VERSION = 3
 _NAN = float("nan")
 
 
@@ -71,6 +73,7 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
         regions = unanswered_regions(len(truth.pair.changes), truth.n_observable)
         objects, object_scores = unanswered_objects(truth)
         right = np.full(len(truth.pair.changes), np.nan)
+        sizes = SizeErrors(right, right)
         items: list[dict[str, Any]] = []
     else:
         regions = score_regions(report, truth, after_travelled_m)
@@ -78,14 +81,16 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
         objects = match_objects(report.objects, rows, truth)
         right = kinds_right(report.objects, objects, truth)
         object_scores = object_columns(objects, right, truth)
-        items = _object_rows(report.objects, objects, [len(of_object) for of_object in rows], truth)
+        before_scans = keyframes_or_all(report.keyframe_scans[0], len(truth.before.odom_T_sensor))
+        sizes = size_errors(report.objects, objects, truth, before_scans)
+        items = object_rows(report.objects, objects, [len(of_object) for of_object in rows], truth)
     n_regions = int(regions.columns["n_regions"])
-    found: dict[str, float] = {**regions.columns, **object_scores}
+    found: dict[str, float] = {**regions.columns, **object_scores, **size_columns(sizes, truth)}
     row = {
         **_identity(answer, truth),
         **(found if answer.until is None else dict.fromkeys(found, _NAN)),
         **_merge(answer, truth),
-        **_times(answer, n_regions),
+        **_times(answer, n_regions + int(regions.columns["n_withdrawn"])),
         **_figure_means(report),
         **_sizes(answer, truth, n_regions, float(after_travelled_m[-1])),
     }
@@ -94,8 +99,8 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
     keyframe_scores = np.zeros(0) if report is None else report.regions.keyframe_scores
     return CaseScore(
         row=row,
-        changes=_change_rows(regions, objects, right, truth, report),
-        regions=_region_rows(report, regions, truth),
+        changes=change_rows(regions, (objects, sizes), right, truth, report),
+        regions=region_rows(report, regions, truth),
         objects=items,
         keyframes=[
             {"keyframe": index, "score": float(score), "label": int(label)}
@@ -136,12 +141,15 @@ def _merge(answer: Answer, truth: GroundTruth) -> dict[str, float]:
     return {**merge_columns(errors), "overlap_true": overlap, **evidence_columns(answer.evidence)}
 
 
-def _times(answer: Answer, n_regions: int) -> dict[str, float]:
-    """Return the time columns; whatever an answer does not state is NaN, and so are sums that would need it."""
+def _times(answer: Answer, n_proposed: int) -> dict[str, float]:
+    """Return the time columns; whatever an answer does not state is NaN, and so are sums that would need it.
+
+    What was withdrawn was compared and cut out as well, so it counts among the regions that the time was spent on.
+    """
     seconds = answer.seconds
-    index, merge, refine, descriptor, cd, oe = (
-        float(seconds.get(name, _NAN))
-        for name in ("t_index_s", "t_merge_s", "t_refine_s", "t_descriptor_s", "t_cd_s", "t_oe_s")
+    index, merge, refine, descriptor, cd, oe, returns = (
+        float(seconds.get(f"t_{name}_s", _NAN))
+        for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns")
     )
     n_keyframes = 0 if answer.report is None else sum(len(scans) for scans in answer.report.keyframe_scans)
     return {
@@ -151,9 +159,10 @@ def _times(answer: Answer, n_regions: int) -> dict[str, float]:
         "t_descriptor_s": descriptor,
         "t_descriptor_per_keyframe_s": descriptor / n_keyframes if n_keyframes else _NAN,
         "t_cd_s": cd,
-        "t_cd_per_region_s": cd / n_regions if n_regions else _NAN,
+        "t_cd_per_region_s": cd / n_proposed if n_proposed else _NAN,
         "t_oe_s": oe,
-        "t_oe_per_region_s": oe / n_regions if n_regions else _NAN,
+        "t_oe_per_region_s": oe / n_proposed if n_proposed else _NAN,
+        "t_returns_s": returns,
         "t_total_s": descriptor + cd + oe,
         "t_total_with_merge_s": index + merge + refine + descriptor + cd + oe,
         "t_total_paper_s": cd + oe,
@@ -161,11 +170,7 @@ def _times(answer: Answer, n_regions: int) -> dict[str, float]:
 
 
 def _figure_means(report: ChangeReport | None) -> dict[str, float]:
-    return {name: _mean(_figure(report, name)[report.regions.is_reported]) if report else _NAN for name in FIGURES}
-
-
-def _figure(report: ChangeReport, name: str) -> Float64Array:
-    return np.asarray(report.figures.get(name, np.full(len(report.regions.scores), np.nan)), dtype=np.float64)
+    return {name: _mean(figure(report, name)[report.regions.is_reported]) if report else _NAN for name in FIGURES}
 
 
 def _sizes(answer: Answer, truth: GroundTruth, n_regions: int, after_path_m: float) -> dict[str, Any]:
@@ -183,84 +188,6 @@ def _sizes(answer: Answer, truth: GroundTruth, n_regions: int, after_path_m: flo
         # a pair that was refused, or only merged, was neither silent nor an alarm
         "is_alarm": n_regions > 0 if is_unchanged and answer.report is not None and answer.until is None else _NAN,
     }
-
-
-def _change_rows(
-    regions: RegionScores,
-    objects: ObjectMatches,
-    right: Float64Array,
-    truth: GroundTruth,
-    report: ChangeReport | None,
-) -> list[dict[str, Any]]:
-    rows = []
-    for index, change in enumerate(truth.pair.changes):
-        fields = {name: value for name, value in asdict(change).items() if name != "world_T_object"}
-        matched = int(objects.matched_object[index])
-        rows.append(
-            {
-                **fields,
-                "is_found": bool(regions.matches.best_region[index] >= 0),
-                "best_region": int(regions.matches.best_region[index]),
-                "iou_point": float(objects.iou_point[index]),
-                "iou_voxel": float(objects.iou_voxel[index]),
-                "iou_box": float(objects.iou_box[index]),
-                "matched_object": matched,
-                "matched_kind": report.objects[matched].kind if report is not None and matched >= 0 else "",
-                "is_kind_right": float(right[index]),
-                "n_truth_cells": len(truth.change_rows[index]),
-                "seen_hull_volume_m3": hull_volume_m3(truth.points_odom(index)),
-                "range_m": truth.range_m(index),
-                "is_in_distribution": is_change_in_distribution(truth.pair.family, change.prop_kind),
-            }
-        )
-    return rows
-
-
-def _region_rows(report: ChangeReport | None, scored: RegionScores, truth: GroundTruth) -> list[dict[str, Any]]:
-    if report is None:
-        return []
-    regions = report.regions
-    figures = {name: _figure(report, name) for name in FIGURES}
-    return [
-        {
-            "region": index,
-            "score": float(regions.scores[index]),
-            "is_reported": bool(regions.is_reported[index]),
-            "outcome": scored.matches.outcomes[index],
-            **dict(zip(("x_m", "y_m", "z_m"), map(float, regions.centres_map[index]), strict=True)),
-            "found_changes": ";".join(str(truth.pair.changes[change].id) for change in scored.matches.found[index]),
-            **{name: float(values[index]) for name, values in figures.items()},
-        }
-        for index in range(len(regions.scores))
-    ]
-
-
-def _object_rows(
-    objects: tuple[ChangedObject, ...], matches: ObjectMatches, n_cells: list[int], truth: GroundTruth
-) -> list[dict[str, Any]]:
-    rows = []
-    for index, (item, outcome) in enumerate(zip(objects, matches.outcomes, strict=True)):
-        matched = int(matches.matched_change[index])
-        empty = len(item.points_map) == 0
-        low, high = (np.full(3, np.nan),) * 2 if empty else (item.points_map.min(axis=0), item.points_map.max(axis=0))
-        rows.append(
-            {
-                "object": index,
-                "session": item.session,
-                "kind": item.kind,
-                "region": item.region,
-                "score": float(item.score),
-                "n_returns": len(item.returns),
-                "n_cells": n_cells[index],
-                "matched_change": truth.pair.changes[matched].id if matched >= 0 else -1,
-                "iou_point": float(matches.iou_point[matched]) if matched >= 0 else 0.0,
-                "outcome": outcome,
-                **{f"min_{axis}_m": float(value) for axis, value in zip("xyz", low, strict=True)},
-                **{f"max_{axis}_m": float(value) for axis, value in zip("xyz", high, strict=True)},
-                "hull_volume_m3": hull_volume_m3(item.points_map),
-            }
-        )
-    return rows
 
 
 def _mean(values: Float64Array) -> float:

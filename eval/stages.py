@@ -31,6 +31,7 @@ from cdpipe.types import (
     ScanSource,
     Spheres,
 )
+from eval.oracle_regions import Regions, with_regions
 from eval.rivals import METHODS, USES_DESCRIPTORS
 
 REPEAT_BELOW_S = 1.0
@@ -121,8 +122,15 @@ class PairStages:
             raise refusal(replace(merged, seconds=seconds))
         return merged, seconds
 
-    def answer(self, config: PipelineConfig, merge: Merge | None = None) -> ChangeReport:
-        """Run one method to its end, perhaps merged by something else (`merged`).
+    def answer(
+        self, config: PipelineConfig, merge: Merge | None = None, regions: Regions | None = None
+    ) -> ChangeReport:
+        """Run one method to its end.
+
+        Args:
+            config: All settings.
+            merge: What merges instead of the method (`merged`).
+            regions: What proposes regions instead of the method, from the scans of the keyframes of both sessions.
 
         Raises:
             MergeFailedError: The maps could not be merged.
@@ -130,9 +138,10 @@ class PairStages:
         """
         before, after, t_descriptor_s = self.mapped(config)
         merged, of_merge = self.merged(config, merge)
-        method = METHODS[config.method]
+        method = METHODS[config.method] if regions is None else with_regions(regions)
         report, medians = timed_parts(lambda: method(merged, before.descriptors, after.descriptors, config))
-        of_descriptors = {"t_descriptor_s": t_descriptor_s if config.method in USES_DESCRIPTORS else 0.0}
+        is_described = regions is None and config.method in USES_DESCRIPTORS
+        of_descriptors = {"t_descriptor_s": t_descriptor_s if is_described else 0.0}
         return replace(
             report,
             seconds={**medians, **of_merge, **of_descriptors},
@@ -206,7 +215,8 @@ def kept_bytes(before: MappedSession, config: PipelineConfig) -> dict[str, float
     """Return the bytes of the thinned before map, and of what a method keeps of that session to find regions.
 
     Both as float32: x, y, z of every map point; for a descriptor one vector and one pose (7 numbers) per keyframe. What
-    compares points, or sees the before map anew from other places, keeps the map. Random regions keep poses alone.
+    compares points, or sees the before map anew from other places, keeps the map; `dufomap` also the returns of the
+    scans whose rays are cast. Random regions keep poses alone.
     """
     map_bytes = 12.0 * len(before.map.points)
     vectors = {"scan": before.descriptors.q, "sphere": before.descriptors.spheres}.get(config.query.compare)
@@ -215,6 +225,8 @@ def kept_bytes(before: MappedSession, config: PipelineConfig) -> dict[str, float
         kept = _POSE_BYTES * n_keyframes
     elif config.method == "descriptor" and vectors is not None:
         kept = _POSE_BYTES * n_keyframes + 4.0 * vectors.size
+    elif config.method == "dufomap":
+        kept = map_bytes + 12.0 * float(np.diff(before.map.scan_offsets)[:: config.dufomap.every_scan].sum())
     else:
         kept = map_bytes
     return {"bytes_map_before": map_bytes, "bytes_regions_before": kept}

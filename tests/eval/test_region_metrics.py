@@ -10,6 +10,7 @@ from eval.region_metrics import (
     covered_share,
     keyframe_labels,
     match_regions,
+    places_in_map,
     recall_at_k,
     unanswered_regions,
 )
@@ -137,8 +138,27 @@ def test_moving_the_odom_frame_changes_no_place_in_the_world() -> None:
     np.testing.assert_allclose(centres_in_world(centres_odom, before, np.arange(6)), centres_world, atol=1e-12)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_places_go_into_the_map_and_back(seed: int) -> None:
+    draw = stream(seed, "places")
+    along = np.arange(0.0, 60.0, 6.0)
+    world_T_sensor = np.stack([yaw_pose(draw.uniform(-3, 3), (x, draw.uniform(-1, 1), 0.5)) for x in along])
+    bends = np.stack([yaw_pose(0.01 * k, (40.0 + 0.05 * k, -7.0, 0.02 * k)) for k in range(len(along))])
+    before = SessionTruth(bends @ world_T_sensor, world_T_sensor, EMPTY)
+    keyframes = np.arange(0, len(along), 2)
+    # within 2 m of a keyframe, so that the nearest one is the same in either frame
+    places = world_T_sensor[draw.choice(keyframes, 20), :3, 3] + draw.uniform(-1.1, 1.1, (20, 3))
+    found = places_in_map(places, before, keyframes)
+    nearest = keyframes[np.linalg.norm(places[:, None] - world_T_sensor[keyframes, :3, 3], axis=2).argmin(axis=1)]
+    expected = [transform(bends[k], place[None])[0] for k, place in zip(nearest, places, strict=True)]
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    np.testing.assert_allclose(centres_in_world(found, before, keyframes), places, atol=1e-9)
+    assert places_in_map(np.zeros((0, 3)), before, keyframes).shape == (0, 3)
+
+
 def test_a_case_without_an_answer_recalls_nothing_where_there_was_something() -> None:
     columns = unanswered_regions(3, 2).columns
     assert (columns["region_recall"], columns["region_recall_at_k"], columns["n_regions"]) == (0.0, 0.0, 0)
-    assert np.isnan(columns["region_precision"])
+    assert (columns["region_recall_proposed"], columns["n_withdrawn"]) == (0.0, 0)
+    assert np.isnan([columns["region_precision"], columns["false_regions_per_100m_proposed"]]).all()
     assert np.isnan(unanswered_regions(1, 0).columns["region_recall"])

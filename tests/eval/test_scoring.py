@@ -13,7 +13,7 @@ from cdpipe.answer import write_answer, write_failure
 from cdpipe.errors import InputError
 from cdpipe.geometry import invert, transform
 from cdpipe.readers import open_scans
-from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport
+from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 from eval.domains import domain_of, is_change_in_distribution
 from eval.ground_truth import GroundTruth, load_ground_truth
 from eval.scoring import METRICS_VERSION, CaseScore, score_pair
@@ -38,12 +38,13 @@ scenario family domain pair_kind seed variant preset status error metrics_versio
 region_recall region_precision region_recall_at_k region_auroc region_ap false_regions_per_100m region_coverage
 n_regions n_true_regions n_false_regions n_duplicate_regions n_ignored_regions n_found_changes
 object_iou_point object_iou_voxel object_iou_box object_f1_25 object_f1_50 object_precision_50 object_pq kind_accuracy
-n_objects n_matched n_ignored_objects n_partial object_iou_point_partial
+region_recall_proposed region_precision_proposed false_regions_per_100m_proposed n_withdrawn
+n_objects n_matched n_ignored_objects n_partial object_iou_point_partial displacement_error_m pile_volume_error
 merge_error_m merge_error_deg merge_error_along_m merge_error_m_p95 merge_error_deg_p95 merge_error_along_m_p95
 n_merge_pairs overlap_true evidence_overlap evidence_inlier_share evidence_residual_m evidence_hessian_ratio
 evidence_agreement evidence_descriptor_distance evidence_n_hypotheses evidence_is_fallback evidence_n_refined
 evidence_distinctness evidence_refined_inlier_share evidence_max_correction_m t_index_s t_merge_s t_refine_s
-t_descriptor_s t_descriptor_per_keyframe_s t_cd_s t_cd_per_region_s t_oe_s t_oe_per_region_s
+t_descriptor_s t_descriptor_per_keyframe_s t_cd_s t_cd_per_region_s t_oe_s t_oe_per_region_s t_returns_s
 t_total_s t_total_with_merge_s t_total_paper_s v_sphere_m3 v_oe_m3 s_points oe_points
 map_points_before map_points_after bytes_map_before bytes_regions_before
 n_keyframes_before n_keyframes_after after_path_m is_unchanged_pair is_alarm
@@ -186,6 +187,53 @@ def test_a_false_region_by_hand(tiny_pair: Path, tiny_merge: np.ndarray) -> None
     assert case.row["false_regions_per_100m"] == pytest.approx(100 / 19.5)
 
 
+def test_withdrawn_regions_count_before_and_not_after(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
+    # the three regions of the truth, a false one above the threshold, and one that is below it
+    report = true_report(tiny_pair, tiny_merge)
+    centres = report.regions.centres_map
+    far = centres[:1] + np.array([0.0, 0.0, 50.0])
+    regions = replace(
+        report.regions,
+        centres_map=np.concatenate([centres, far, far]),
+        scores=np.array([1.0, 0.9, 0.8, 0.7, 0.1]),
+        pairs=np.zeros((5, 2), dtype=np.int64),
+        is_reported=np.array([True, True, False, False, False]),
+        is_withdrawn=np.array([False, False, True, True, False]),
+    )
+    case = scored(tiny_pair, replace(report, regions=regions, objects=(), figures={}))
+    rates = ("region_recall", "region_precision", "false_regions_per_100m")
+    assert [case.row[name] for name in rates] == pytest.approx([2 / 3, 1.0, 0.0])
+    assert [case.row[f"{name}_proposed"] for name in rates] == pytest.approx([1.0, 3 / 4, 100 / 19.5])
+    assert (case.row["n_regions"], case.row["n_withdrawn"], case.row["n_false_regions"]) == (2, 2, 0)
+    assert [row["is_withdrawn"] for row in case.regions] == [False, False, True, True, False]
+    assert [row["outcome"] for row in case.regions][2:] == ["unreported"] * 3
+    # time was spent on what was withdrawn as well
+    assert case.row["t_oe_per_region_s"] == pytest.approx(0.06 / 4)
+    assert case.row["region_recall_at_k"] == 1.0
+    # where nothing is ever withdrawn, before is after
+    plain = scored(tiny_pair, report).row
+    assert [plain[f"{name}_proposed"] for name in rates] == [plain[name] for name in rates]
+    assert plain["n_withdrawn"] == 0
+
+
+def test_displacement_and_volume_are_in_the_row_and_the_items(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
+    # every thing of the tiny pair stands at the world's origin, has 1 m3, and "moved" by nothing
+    report = true_report(tiny_pair, tiny_merge)
+    box = ObjectShape(np.eye(4), np.array([1.0, 1.0, 1.2]), 1.2)
+    objects = [replace(item, shape=box) for item in report.objects]
+    objects[1] = replace(objects[1], displacement_map=np.array([0.0, 0.0, 0.1]))
+    objects[2] = replace(objects[2], displacement_map=np.array([0.3, 0.0, 0.0]))
+    case = scored(tiny_pair, replace(report, objects=tuple(objects)))
+    np.testing.assert_allclose([row["displacement_error_m"] for row in case.changes], [np.nan, 0.1, 0.3])
+    np.testing.assert_allclose([row["volume_error_share"] for row in case.changes], 0.2)
+    assert case.row["displacement_error_m"] == pytest.approx(0.2)
+    assert np.isnan(case.row["pile_volume_error"])
+    np.testing.assert_allclose([row["moved_m"] for row in case.objects], [np.nan, 0.1, 0.3])
+    assert [row["volume_m3"] for row in case.objects] == [1.2] * 3
+    bare = scored(tiny_pair, report)
+    assert np.isnan([bare.row["displacement_error_m"], bare.objects[0]["volume_m3"]]).all()
+
+
 def test_an_empty_keyframe_list_may_be_of_any_type(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
     report = true_report(tiny_pair, tiny_merge)
     whole, floats = (
@@ -238,6 +286,7 @@ def test_a_refused_case_scores_zero_and_has_the_times_of_its_merge(tiny_pair: Pa
 NOT_OF_THE_MERGE = [name for name in COLUMNS if name.startswith(("region_", "object_", "kind_", "false_regions"))]
 NOT_OF_THE_MERGE += [name for name in COLUMNS if name.startswith("n_") and name.endswith(("_regions", "_objects"))]
 NOT_OF_THE_MERGE += ["n_regions", "n_objects", "n_found_changes", "n_matched", "n_partial", "is_alarm"]
+NOT_OF_THE_MERGE += ["n_withdrawn", "displacement_error_m", "pile_volume_error"]
 
 
 @pytest.mark.parametrize("has_changes", [True, False])
