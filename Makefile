@@ -19,7 +19,7 @@ $(VENV)/.installed: $(BIN)/python pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(PIP) --editable '.[dev,cluster,kiss,odometry,ouster,view]'
+	$(PIP) --editable '.[dev,cluster,dufomap,kiss,m3c2,odometry,ouster,view]'
 	touch $@
 
 demo: $(VENV)/.installed

@@ -16,6 +16,7 @@ from cdpipe.yamlfile import Document, Settings, read_yaml, suggestion, validated
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class MapConfig(Settings):
@@ -90,7 +91,7 @@ class ExtractConfig(Settings):
     min_points: Count = Field(1, description="`voxel`: points that make a voxel occupied")
     origin_m: float = Field(0.0, description="`voxel`: offset of the grid along every axis")
     distance_m: Positive = Field(
-        0.3, description="`nearest`, `c2c`: a point farther than this from the other cloud is new"
+        0.3, description="`nearest`, `c2c`, `m3c2`: a point farther than this from the other cloud is new"
     )
     realign: bool = Field(True, description="`surface`: align each sphere once more before comparing")
     seed_m: Positive = Field(0.12, description="`surface`: an object somewhere stands this clear of the surface")
@@ -116,10 +117,26 @@ class ClusterConfig(Settings):
     min_points: Count = Field(16, description="smaller clusters are dropped")
 
 
+class M3C2Config(Settings):
+    """Distances along normals (M3C2)."""
+
+    normal_m: Positive = Field(1.0, description="`m3c2`: radius of the plane a point's normal is taken from")
+    cylinder_m: Positive = Field(0.25, description="`m3c2`: radius of the cylinder along the normal")
+    depth_m: Positive = Field(1.5, description="`m3c2`: how far the cylinder reaches to either side")
+
+
+class DufomapConfig(Settings):
+    """Voids that rays passed through (DUFOMap)."""
+
+    voxel_m: Positive = Field(0.1, description="`dufomap`: voxel of the void map")
+    hit_inflation_m: NonNegative = Field(0.2, description="`dufomap`: no void this near in front of a return (d_s)")
+    every_scan: Count = Field(1, description="`dufomap`: every n-th scan's rays are cast")
+
+
 class PipelineConfig(Settings):
     """All settings of one method."""
 
-    method: Literal["descriptor", "voxel-diff", "c2c", "random-regions"] = Field(
+    method: Literal["descriptor", "voxel-diff", "c2c", "m3c2", "dufomap", "random-regions"] = Field(
         "descriptor", description="the paper's pipeline, a whole-map rival, or a control"
     )
     seed: Annotated[int, Field(ge=0)] = Field(0, description="for methods that draw at random")
@@ -130,6 +147,8 @@ class PipelineConfig(Settings):
     extract: ExtractConfig = ExtractConfig()
     outlier: OutlierConfig = OutlierConfig()
     cluster: ClusterConfig = ClusterConfig()
+    m3c2: M3C2Config = M3C2Config()
+    dufomap: DufomapConfig = DufomapConfig()
 
 
 def preset_names() -> list[str]:

@@ -50,7 +50,8 @@ def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
     """Return one row per variant and kind of site, with its thresholds at either rate.
 
     A threshold belongs to a kind of site, as the radius does: what is much change in a narrow drift is little in a
-    wide one. Kinds of site differ in `score_radius_m`.
+    wide one. Kinds of site differ in `score_radius_m`. Candidates that were withdrawn cannot alarm; for that to show,
+    the run must let more through than the threshold that is looked for.
 
     Returns:
         `threshold`, which at most 5 % of the pairs reach, with `n_pairs`, `n_alarms` of them and `n_unanswered` further
@@ -68,7 +69,8 @@ def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
         ok = cases[cases["status"] == "ok"]
         if len(ok) == 0:
             raise InputError(f"{variant}, {radius_m:g} m: no pair has an answer: nothing to set a threshold by")
-        of_case = regions[regions["variant"] == variant].groupby(["scenario", "seed"])["score"]
+        stands = (regions["variant"] == variant) & ~regions["is_withdrawn"].astype(bool)
+        of_case = regions[stands].groupby(["scenario", "seed"])["score"]
         found = {case: scores.to_numpy(dtype=np.float64) for case, scores in of_case}
         candidates = [found.get(case, np.zeros(0)) for case in zip(ok["scenario"], ok["seed"], strict=True)]
         best = np.array([scores.max(initial=-np.inf) for scores in candidates])

@@ -64,7 +64,7 @@ from scenarios.schema import Scenario
 
 ORACLE_MERGE, ORACLE_REGIONS = "oracle-merge", "oracle-regions"
 _ORACLE_PRESET = "tunnelcd"
-_AFTER_MERGE = ("query", "extract", "outlier", "cluster")
+_AFTER_MERGE = ("query", "extract", "outlier", "cluster", "m3c2", "dufomap")
 # what a region around each change still takes from the query
 _OF_TRUE_REGIONS = ("query.radius_m", "query.suppression")
 _LONGEST_SLUG = 200  # file systems take names of 255 bytes

@@ -51,8 +51,8 @@ def _results(n_changes: int = 0) -> pd.DataFrame:
 
 def _regions() -> pd.DataFrame:
     found = [("null/a", 1, 5.0), ("null/a", 1, 4.0), ("null/a", 2, 3.0), ("null/b", 3, 6.0), ("null/c", 1, 200.0)]
-    rows = [(scenario, seed, "m", score) for scenario, seed, score in found]
-    return pd.DataFrame(rows, columns=["scenario", "seed", "variant", "score"])
+    rows = [(scenario, seed, "m", score, False) for scenario, seed, score in found]
+    return pd.DataFrame(rows, columns=["scenario", "seed", "variant", "score", "is_withdrawn"])
 
 
 def test_a_table_by_hand() -> None:
@@ -64,6 +64,13 @@ def test_a_table_by_hand() -> None:
     assert narrow["threshold"] == pytest.approx(6.001)
     assert (narrow["threshold_at_rate"], narrow["n_false"], narrow["km"]) == (0.0, 4, 6.0)
     assert (wide["score_radius_m"], wide["threshold"], wide["km"]) == (10.0, pytest.approx(200.1), 3.0)
+
+
+def test_what_was_withdrawn_cannot_alarm() -> None:
+    regions = _regions()
+    regions.loc[regions["score"] == 6.0, "is_withdrawn"] = True
+    narrow, _ = thresholds(_results(), regions).to_dict("records")
+    assert narrow["threshold"] == pytest.approx(5.001)
 
 
 def test_the_settings_are_lines_of_a_preset_and_of_a_plan() -> None:

@@ -3,11 +3,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from cdpipe.config import PipelineConfig, load_config, preset_names
-from cdpipe.geometry import Float64Array, transform, yaw_pose
-from cdpipe.types import ChangeReport, DescriptorSet, MergedMaps, PointMap
+from cdpipe.geometry import BoolArray, Float64Array, transform, yaw_pose
+from cdpipe.types import ChangeReport, DescriptorSet, MergedMaps, PointMap, SessionName
 from eval.rivals import METHODS, c2c, random_regions, voxel_diff
+from eval.whole_map import PlacedMaps, whole_map
 
 LENGTH_M = 40.0
 SPACING_M = 0.2
@@ -233,3 +235,24 @@ def test_figures_are_of_the_after_map() -> None:
     ]
     assert report.figures["oe_points"][0] == 27
     assert report.figures["v_oe_m3"][0] == pytest.approx(0.4**3)
+
+
+def test_a_mask_of_ones_own_makes_a_method() -> None:
+    """The example of the guide in eval/README.md."""
+
+    def higher_mask(maps: PlacedMaps, session: SessionName, other: SessionName, config: PipelineConfig) -> BoolArray:
+        points, others = maps.points[session], maps.points[other]
+        beside = cKDTree(others[:, :2]).query(points[:, :2])[1]
+        return np.asarray(points[:, 2] - others[beside, 2] > config.extract.distance_m)
+
+    merged = pair([], [crate(20.0)])
+    # beside the walls the nearest point of the other map may be any of a column: only what stands in the middle counts
+    config = load_config("voxel-diff", ["query.threshold=0", "outlier.sigmas=10", "cluster.min_points=33"])
+
+    def in_the_middle(maps: PlacedMaps, session: SessionName, other: SessionName, config: PipelineConfig) -> BoolArray:
+        return higher_mask(maps, session, other, config) & (np.abs(maps.points[session][:, 1]) < 1.5)
+
+    report = whole_map(merged, descriptors(merged.before), descriptors(merged.after), config, in_the_middle)
+    assert report.regions.scores.tolist() == [64.0]
+    (item,) = report.objects
+    assert (item.session, item.kind) == ("after", "added")
