@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.sphere import MapIndex
+from cdpipe.sphere import MapIndex, is_in_sphere
 from cdpipe.types import MergedMaps, SessionName
 
 DIRECTIONS: tuple[tuple[SessionName, SessionName], ...] = (("after", "before"), ("before", "after"))
@@ -30,7 +30,8 @@ class Sphere:
     @property
     def inside(self) -> tuple[Int64Array, Float64Array]:
         """The map points of the sphere alone, and where they lie."""
-        return self.indices[self.is_inside], self.points[self.is_inside]
+        chosen = np.flatnonzero(self.is_inside)
+        return self.indices[chosen], self.points.take(chosen, axis=0)
 
 
 class Crops:
@@ -56,28 +57,23 @@ class Crops:
 
     def points_map(self, session: SessionName, indices: Int64Array) -> Float64Array:
         """Return the (N, 3) places of some map points of a session, map frame."""
-        points = self._points[session][indices]
+        points = self._points[session].take(indices, axis=0)
         return points if session == "before" else self._alignment.to_map(points)
 
     def _sphere(self, session: SessionName, centre_map: Float64Array, radius_m: float) -> Sphere:
         indices, points = self._crop(session, centre_map, radius_m + self._margin_m)
-        return Sphere(indices, points, _is_within(points, centre_map, radius_m))
+        return Sphere(indices, points, is_in_sphere(points, centre_map, radius_m))
 
     def _crop(self, session: SessionName, centre_map: Float64Array, reach_m: float) -> tuple[Int64Array, Float64Array]:
         if session == "before":
             indices = self._indices["before"].crop(centre_map, reach_m)
-            return indices, self._points["before"][indices]
+            return indices, self._points["before"].take(indices, axis=0)
         centre_odom = self._alignment.to_odom(centre_map[None])[0]
         if self._alignment.is_rigid:
             indices = self._indices["after"].crop(centre_odom, reach_m)
-            return indices, self._alignment.to_map(self._points["after"][indices])
+            return indices, self._alignment.to_map(self._points["after"].take(indices, axis=0))
         # what is a sphere in the map frame is a slightly bent one in the after session's
         indices = self._indices["after"].crop(centre_odom, reach_m + _BEND_M)
-        points = self._alignment.to_map(self._points["after"][indices])
-        is_near = _is_within(points, centre_map, reach_m)
-        return indices[is_near], points[is_near]
-
-
-def _is_within(points: Float64Array, centre: Float64Array, radius_m: float) -> BoolArray:
-    offsets = points - centre
-    return np.asarray(np.einsum("ij,ij->i", offsets, offsets) <= radius_m * radius_m)
+        points = self._alignment.to_map(self._points["after"].take(indices, axis=0))
+        is_near = is_in_sphere(points, centre_map, reach_m)
+        return indices[is_near], points.compress(is_near, axis=0)

@@ -20,6 +20,7 @@ from cdpipe.surface import (
     RIM_M,
     SITE_M,
     SURFACE_CELL_M,
+    PlaneTable,
     candidates,
     cell_means,
     compare_site,
@@ -29,7 +30,7 @@ from cdpipe.surface import (
 from cdpipe.types import ChangeRegions, MergedMaps, PointMap, SessionName
 
 # An object that begins inside of a sphere is followed this far out of it.
-_BEYOND_M = 1.5
+BEYOND_M = 1.5
 # Correspondences of the rounds of re-alignment, and how far it may carry a sphere: more is no correction.
 _ROUNDS_M = (0.5, 0.25)
 _MAX_SHIFT_M = 0.4
@@ -61,7 +62,7 @@ class _Agreement:
 
 def cut_by_surface(merged: MergedMaps, regions: ChangeRegions, config: ExtractConfig) -> list[PointGroup]:
     """Return the objects that stand out of the other session's surface in the reported regions, best region first."""
-    crops = Crops(merged, margin_m=_BEYOND_M)
+    crops = Crops(merged, margin_m=BEYOND_M)
     found: list[_Found] = []
     agreements: dict[int, _Agreement] = {}
     for region in np.flatnonzero(regions.is_reported).tolist():
@@ -86,7 +87,7 @@ def _candidates(
     surface = Surface(before)
     correction = realigned(after, centre, surface) if config.realign else np.eye(4)
     after = transform(correction, after)
-    compared = {"after": (after, surface), "before": (before, Surface(after))}
+    compared = {"after": (after, PlaneTable(surface)), "before": (before, PlaneTable(Surface(after)))}
     found, noise_m = [], {}
     for session, other in DIRECTIONS:
         points, reference = compared[session]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -30,12 +32,12 @@ def new_points_mask(points: Float64Array, reference_points: Float64Array, config
     """
     if len(points) == 0 or len(reference_points) == 0:
         return np.ones(len(points), dtype=np.bool_)
-    low = np.floor((points.min(axis=0) - config.origin_m) / config.voxel_m)
-    high = np.floor((points.max(axis=0) - config.origin_m) / config.voxel_m)
-    shape = high - low + 1
-    if shape.prod() > _MAX_DENSE_CELLS:
+    cells = _cells(points, config)
+    low = [int(each.min()) for each in cells]
+    shape = [int(each.max()) - least + 1 for each, least in zip(cells, low, strict=True)]
+    if math.prod(shape) > _MAX_DENSE_CELLS:
         return _new_by_keys(points, reference_points, config)
-    return _new_by_grid(points, reference_points, low, shape.astype(np.int64), config)
+    return _new_by_grid(cells, _cells(reference_points, config), low, shape, config.min_points)
 
 
 def is_within(points: Float64Array, others: Float64Array, distance_m: float) -> BoolArray:
@@ -102,23 +104,30 @@ def cluster_labels(points: Float64Array, config: ClusterConfig) -> Int64Array:
     return labels[groups]
 
 
+def _cells(points: Float64Array, config: ExtractConfig) -> list[Float64Array]:
+    """Return the (N,) cell of each point along each axis; axis by axis numpy is several times as fast."""
+    return [np.floor((points[:, axis] - config.origin_m) / config.voxel_m) for axis in range(3)]
+
+
 def _new_by_grid(
-    points: Float64Array, reference_points: Float64Array, low: Float64Array, shape: Int64Array, config: ExtractConfig
+    cells: list[Float64Array], reference: list[Float64Array], low: list[int], shape: list[int], min_points: int
 ) -> BoolArray:
-    """Look points up in a dense table over their own bounding box."""
-
-    def flat(cells: Float64Array) -> Int64Array:
-        index = cells.astype(np.int64)
-        return np.asarray((index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2])
-
-    reference = np.floor((reference_points - config.origin_m) / config.voxel_m) - low
-    reference = reference[((reference >= 0) & (reference < shape)).all(axis=1)]
-    if config.min_points == 1:
-        is_occupied = np.zeros(int(shape.prod()), dtype=np.bool_)
-        is_occupied[flat(reference)] = True
+    """Look cells up in a dense table over the box of all of them."""
+    is_in_box = np.ones(len(reference[0]), dtype=np.bool_)
+    for each, least, count in zip(reference, low, shape, strict=True):
+        is_in_box &= (each >= least) & (each < least + count)
+    inside = _in_table([each[is_in_box] for each in reference], low, shape)
+    if min_points == 1:
+        is_occupied = np.zeros(math.prod(shape), dtype=np.bool_)
+        is_occupied[inside] = True
     else:
-        is_occupied = np.bincount(flat(reference), minlength=int(shape.prod())) >= config.min_points
-    return ~is_occupied[flat(np.floor((points - config.origin_m) / config.voxel_m) - low)]
+        is_occupied = np.bincount(inside, minlength=math.prod(shape)) >= min_points
+    return ~is_occupied[_in_table(cells, low, shape)]
+
+
+def _in_table(cells: list[Float64Array], low: list[int], shape: list[int]) -> Int64Array:
+    x, y, z = (each - least for each, least in zip(cells, low, strict=True))
+    return np.asarray(((x * shape[1] + y) * shape[2] + z).astype(np.int64))
 
 
 def _new_by_keys(points: Float64Array, reference_points: Float64Array, config: ExtractConfig) -> BoolArray:

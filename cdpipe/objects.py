@@ -85,7 +85,9 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
         other = around["after" if group.session == "before" else "before"]
         voxel_m = maps[group.session].voxel_m
         taken, _ = cell_means(group.points_map, voxel_m)  # as dense as its surroundings
-        is_part[number] = group.session == "before" and is_part_of_a_rest(taken, around["before"], other)
+        # a rule that takes whole map points leaves an object's foot behind, which would pass for a rest
+        may_be_part = group.session == "before" and group.returns is not None
+        is_part[number] = may_be_part and is_part_of_a_rest(taken, around["before"], other)
         is_fine = maps[group.session].return_offsets is not None
         objects.append(
             ChangedObject(

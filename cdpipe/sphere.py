@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cdpipe.geometry import Float64Array, Int64Array, require_shape
+from cdpipe.geometry import BoolArray, Float64Array, Int64Array, require_shape
 
 _COLUMN_M = 2.0
 _SHIFT = 31
@@ -43,10 +43,20 @@ class MapIndex:
         slices = [(start, end) for start, end in zip(starts.tolist(), ends.tolist(), strict=True) if start < end]
         if not slices:
             return np.zeros(0, dtype=np.int64)
-        offsets = np.concatenate([self._points[start:end] for start, end in slices]) - centre
-        is_inside = np.einsum("ij,ij->i", offsets, offsets) <= radius_m * radius_m
-        indices: Int64Array = np.concatenate([np.arange(start, end) for start, end in slices])[is_inside]
+        points = np.concatenate([self._points[start:end] for start, end in slices])
+        inside = np.flatnonzero(is_in_sphere(points, centre, radius_m))
+        lengths = np.array([end - start for start, end in slices])
+        # what lies between the slices has to be added to a position among their points
+        skipped = np.array([start for start, _ in slices]) - np.cumsum(lengths) + lengths
+        indices: Int64Array = inside + np.repeat(skipped, lengths).take(inside)
         return indices if self._order is None else self._order[indices]
+
+
+def is_in_sphere(points: Float64Array, centre: Float64Array, radius_m: float) -> BoolArray:
+    """Mark the (N, 3) points within `radius_m` of `centre` (3,), the border included."""
+    # axis by axis: numpy sums over rows of three several times as slowly
+    x, y, z = (points[:, axis] - centre[axis] for axis in range(3))
+    return np.asarray(x * x + y * y + z * z <= radius_m * radius_m)
 
 
 def _key(row: Int64Array, column: Int64Array) -> Int64Array:

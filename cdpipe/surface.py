@@ -27,7 +27,7 @@ from cdpipe.voxel import cell_keys
 
 # Map points this far off are candidates: less than the lowest objects stand out, more than a cell's mean is off.
 _COARSE_M = 0.08
-_MIN_CANDIDATES = 3
+_MIN_CANDIDATES = 3  # `_are_three_together` is made for this number
 # Candidates nearer than this are one site, and everything this near to them is looked at closely.
 SITE_M = 0.5
 # Beyond the site the other session's surface is needed too.
@@ -35,6 +35,7 @@ RIM_M = 0.3
 CELL_M = 0.05
 SURFACE_CELL_M = 0.1
 _LINK_M = 0.15
+_TABLE_CELL_M = 0.25
 # A plane holds for as far as the points that it was fitted to.
 _COARSE_PLANE_M, _PLANE_M = 0.4, 0.25
 _MIN_SURFACE = 20
@@ -66,21 +67,71 @@ def distances_m(points: Float64Array, surface: Surface, plane_m: float) -> Float
     That is the distance from the plane through the nearest of the surface's points, as long as that point is within
     `plane_m`; farther off it is the distance from the point itself.
     """
-    found, squared_m2 = surface.tree.batch_nearest_neighbor_search(points)
-    chosen, nearest_m = np.asarray(found, dtype=np.int64), np.sqrt(np.asarray(squared_m2))
-    along = np.einsum("ij,ij->i", points - surface.points[chosen], surface.normals[chosen])
+    # of one neighbour it returns arrays, where the search for the nearest returns lists that take as long again
+    found, squared_m2 = surface.tree.batch_knn_search(points, 1)
+    chosen, nearest_m = found[:, 0].astype(np.int64), np.sqrt(squared_m2[:, 0])
+    offsets = points - surface.points.take(chosen, axis=0)
+    along = np.einsum("ij,ij->i", offsets, surface.normals.take(chosen, axis=0))
     return np.asarray(np.where(nearest_m < plane_m, np.abs(along), nearest_m))
 
 
-def candidates(points: Float64Array, surface: Surface) -> tuple[Int64Array, float]:
+class PlaneTable:
+    """One plane of a surface for each cell of a grid over it: most points lie on it, which takes one lookup to see."""
+
+    def __init__(self, surface: Surface) -> None:
+        self.surface = surface
+        self._low = surface.points.min(axis=0)
+        cells = self._cells(surface.points)
+        self._shape = cells.max(axis=1) + 1
+        self._table = np.full(int(self._shape.prod()), -1, dtype=np.int32)
+        self._table[self._flat(cells)] = np.arange(len(surface.points), dtype=np.int32)
+
+    def distances_m(self, points: Float64Array) -> Float64Array:
+        """Return how far (N, 3) points are from the plane of their cell; infinite where it has none."""
+        cells = self._cells(points)
+        is_inside = ((cells >= 0) & (cells < self._shape[:, None])).all(axis=0)
+        found = np.full(len(points), -1, dtype=np.int32)
+        found[is_inside] = self._table.take(self._flat(cells[:, is_inside]))
+        offsets = points - self.surface.points.take(found, axis=0)
+        along = np.abs(np.einsum("ij,ij->i", offsets, self.surface.normals.take(found, axis=0)))
+        return np.asarray(np.where(found >= 0, along, np.inf))
+
+    def _cells(self, points: Float64Array) -> Int64Array:
+        return np.stack([(points[:, axis] - self._low[axis]) // _TABLE_CELL_M for axis in range(3)]).astype(np.int64)
+
+    def _flat(self, cells: Int64Array) -> Int64Array:
+        return np.asarray((cells[0] * self._shape[1] + cells[1]) * self._shape[2] + cells[2])
+
+
+def candidates(points: Float64Array, table: PlaneTable) -> tuple[Int64Array, float]:
     """Return the indices of the map points (N, 3) that stand off the other map's surface, three or more together.
 
-    And the median distance of all: how well the two surfaces agree.
+    A point on the plane of its cell does not; of the others the distance from the nearest plane decides.
+
+    Returns:
+        The indices, and the median distance of all points: how well the two surfaces agree.
     """
-    distance_m = distances_m(points, surface, _COARSE_PLANE_M)
+    distance_m = table.distances_m(points)
+    doubtful = np.flatnonzero(distance_m > _COARSE_M)
+    distance_m[doubtful] = distances_m(points.take(doubtful, axis=0), table.surface, _COARSE_PLANE_M)
     standing = np.flatnonzero(distance_m > _COARSE_M)
-    labels, sizes = groups(points[standing], SITE_M)
-    return standing[sizes[labels] >= _MIN_CANDIDATES], float(np.median(distance_m))
+    return standing[_are_three_together(points[standing])], float(np.median(distance_m))
+
+
+def _are_three_together(points: Float64Array) -> BoolArray:
+    """Mark the (N, 3) points in groups of three or more, as `groups` has them, without making the groups.
+
+    Such a point has two neighbours, or one that has another.
+    """
+    is_together = np.zeros(len(points), dtype=np.bool_)
+    if len(points) < _MIN_CANDIDATES:
+        return is_together
+    one, other = cKDTree(points).query_pairs(SITE_M, output_type="ndarray").T
+    has_two = np.bincount(one, minlength=len(points)) + np.bincount(other, minlength=len(points)) >= 2
+    is_strong = has_two[one] | has_two[other]
+    is_together[one[is_strong]] = True
+    is_together[other[is_strong]] = True
+    return is_together
 
 
 def groups(points: Float64Array, link_m: float) -> tuple[Int64Array, Int64Array]:

@@ -16,6 +16,7 @@ import numpy as np
 from cdpipe.errors import InputError
 from cdpipe.yamlfile import suggestion
 from eval.descriptor_bench import descriptor_contests
+from eval.extract_bench import ExtractSite, extract_contests, extract_sites
 from eval.merge_bench import FailedContest, MergeSite, merge_contests, paper_sites
 from eval.output import make_writable, unwritable
 from eval.provenance import machine
@@ -27,11 +28,18 @@ Row = dict[str, Any]
 
 
 def contests(
-    site: BenchSite | None = None, merge_sites: Sequence[MergeSite] | None = None
+    site: BenchSite | None = None,
+    merge_sites: Sequence[MergeSite] | None = None,
+    spheres: Sequence[ExtractSite] | None = None,
 ) -> dict[str, Callable[[], Contest]]:
     """Return everything that can be measured, by name, in the order of the table."""
     sites = merge_sites or paper_sites()
-    return {**sensor_contests(site or BenchSite()), **merge_contests(sites), **descriptor_contests(sites)}
+    return {
+        **sensor_contests(site or BenchSite()),
+        **merge_contests(sites),
+        **descriptor_contests(sites),
+        **extract_contests(spheres or extract_sites()),
+    }
 
 
 def chosen(every: Contests, only: Sequence[str]) -> Contests:

@@ -18,15 +18,18 @@ from cdpipe.types import ChangeReport, MappedSession
 CONFIG = PipelineConfig(
     merge=MergeConfig(voxel_m=0.25),
     query=QueryConfig(reading="paired", n_regions=40, radius_m=4.5),
-    extract=ExtractConfig(voxel_m=0.3),
+    extract=ExtractConfig(method="voxel", voxel_m=0.3),
     outlier=OutlierConfig(sigmas=2.0),
     cluster=ClusterConfig(min_points=20),
 )
 
 
-@pytest.fixture(scope="module")
-def report(tunnel_before: MappedSession, tunnel_after: MappedSession) -> ChangeReport:
-    return detect_changes(tunnel_before, tunnel_after, CONFIG)
+BY_SURFACE = CONFIG.model_copy(update={"extract": ExtractConfig()})
+
+
+@pytest.fixture(scope="module", params=[CONFIG, BY_SURFACE], ids=["voxel", "surface"])
+def report(request: pytest.FixtureRequest, tunnel_before: MappedSession, tunnel_after: MappedSession) -> ChangeReport:
+    return detect_changes(tunnel_before, tunnel_after, request.param)
 
 
 def test_the_three_boxes_are_found(report: ChangeReport, box_centres_map: dict[str, Float64Array]) -> None:
@@ -48,7 +51,7 @@ def test_the_report_names_its_settings_and_times(report: ChangeReport, tunnel_af
     }  # fmt: skip
     assert report.seconds["t_returns_s"] < report.seconds["t_oe_s"]
     assert all(value > 0 for value in report.seconds.values())
-    assert report.config == CONFIG.model_dump()
+    assert report.config in (CONFIG.model_dump(), BY_SURFACE.model_dump())
     assert report.evidence["inlier_share"] > 0.9
     np.testing.assert_array_equal(report.keyframe_scans[1], tunnel_after.map.keyframe_scans)
     for item in report.objects:

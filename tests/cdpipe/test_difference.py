@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from cdpipe.config import QueryConfig
-from cdpipe.difference import NEW_BEYOND_M, is_within, marked_share, sphere_difference
+from cdpipe.difference import NEW_BEYOND_M, marked_share, sphere_difference
 from cdpipe.geometry import Float64Array, invert, make_pose, transform, yaw_pose
+from cdpipe.novelty import is_within
 from cdpipe.types import DescriptorSet, MergedMaps, PointMap
 
 BEFORE_T_AFTER = yaw_pose(0.7, (3.0, -2.0, 0.5))

@@ -8,12 +8,12 @@ import pytest
 import cdpipe.objects
 from cdpipe.alignment import PathAlignment
 from cdpipe.config import ClusterConfig, ExtractConfig, OutlierConfig, PipelineConfig
-from cdpipe.extract import PointGroup, assemble_objects, cut_out, hull_volume_m3
-from cdpipe.geometry import Float64Array, invert, make_pose, transform, yaw_pose
+from cdpipe.extract import PointGroup, assemble_objects, cut_out, hull_volume_m3, region_figures, with_withdrawn
+from cdpipe.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.types import ChangedObject, ChangeRegions, MergedMaps, PointMap
 
 CONFIG = PipelineConfig(
-    extract=ExtractConfig(voxel_m=0.4),
+    extract=ExtractConfig(method="voxel", voxel_m=0.4),
     outlier=OutlierConfig(sigmas=100.0),
     cluster=ClusterConfig(radius_m=0.3, min_points=8),
 )
@@ -24,8 +24,8 @@ _STEP = 0.1
 def extract_objects(
     pair: MergedMaps, candidates: ChangeRegions, config: PipelineConfig
 ) -> tuple[tuple[ChangedObject, ...], dict[str, np.ndarray]]:
-    groups, figures = cut_out(pair, candidates, config)
-    return assemble_objects(pair, groups), figures
+    groups = cut_out(pair, candidates, config)
+    return assemble_objects(pair, groups), region_figures(pair, candidates, groups)
 
 
 def lattice(low: tuple[float, ...], high: tuple[float, ...]) -> Float64Array:
@@ -227,7 +227,10 @@ def test_the_border_of_a_bent_sphere_makes_nothing_new() -> None:
     # full voxels of the floor hold 16 points: one that lost a point to the crop would not count as occupied
     drifted = stretched(merged([FLOOR], [FLOOR], yaw_pose(0.7, (1.0, 2.0, 0.1))), 0.09)
     full = CONFIG.model_copy(
-        update={"extract": ExtractConfig(voxel_m=0.4, min_points=16), "cluster": ClusterConfig(min_points=1)}
+        update={
+            "extract": ExtractConfig(method="voxel", voxel_m=0.4, min_points=16),
+            "cluster": ClusterConfig(min_points=1),
+        }
     )
     for radius_m in (2.3, 3.7, 4.9):
         objects, _ = extract_objects(drifted, regions([(0.2, 0.2, 0.1)], radius_m), full)
@@ -263,6 +266,120 @@ def test_objects_from_groups_of_both_maps(block_returns: int, monkeypatch: pytes
     assert second.returns.tolist() == [[0, 6], [0, 27], [0, 2100], [1, 6], [1, 27], [1, 2100]]
     assert (first.region, second.region) == (-1, 4)
     assert assemble_objects(pair, []) == ()
+
+
+def groups_at(pair: MergedMaps, *places: Float64Array) -> list[PointGroup]:
+    return [PointGroup("after", np.arange(len(points)), points, 0) for points in places]
+
+
+def test_regions_that_hold_nothing_are_taken_back() -> None:
+    pair = merged([FLOOR], [FLOOR, BOX])
+    # the box's corner nearest to x = 5.95 is (1.95, 1.75, 1.15): 4 m away, the border included
+    centres = [(0, 0, 0.5), (2, 1, 0.5), (-5, -5, 0.5), (5.95, 1.75, 1.15), (5.96, 1.75, 1.15), (1, 1, 1)]
+    before = regions(centres, radius_m=4.0, n_reported=5)
+    found = with_withdrawn(before, groups_at(pair, BOX), CONFIG)
+    assert found.is_reported.tolist() == [True, True, False, True, False, False]
+    assert found.is_withdrawn is not None
+    assert found.is_withdrawn.tolist() == [False, False, True, False, True, False]
+    assert found.is_proposed.tolist() == before.is_reported.tolist() == [True] * 5 + [False]
+    for same in ("centres_map", "scores", "pairs", "radius_m"):
+        assert getattr(found, same) is getattr(before, same)
+    at_origin = groups_at(pair, np.zeros((1, 3)))
+    for reach_m, is_held in ((4.0, True), (np.nextafter(4.0, 5.0), False)):
+        assert with_withdrawn(regions([(reach_m, 0, 0)], 4.0), at_origin, CONFIG).is_reported.tolist() == [is_held]
+    # what is far from one object may hold another
+    second = with_withdrawn(before, groups_at(pair, BOX, BOX - (6, 6, 0)), CONFIG)
+    assert second.is_reported.tolist() == [True, True, True, True, False, False]
+
+
+def test_without_objects_all_regions_are_taken_back_unless_none_is_to_be() -> None:
+    before = regions([(0, 0, 0.5), (3, 0, 0.5), (9, 0, 0.5)], n_reported=2)
+    nothing = with_withdrawn(before, [], CONFIG)
+    assert nothing.is_reported.tolist() == [False] * 3
+    assert nothing.is_withdrawn is not None
+    assert nothing.is_withdrawn.tolist() == [True, True, False]
+    kept = CONFIG.model_copy(update={"extract": ExtractConfig(method="voxel", withdraw=False)})
+    assert with_withdrawn(before, [], kept) is before
+    pair = merged([FLOOR], [FLOOR, BOX])
+    silent = regions([(0, 0, 0.5)], n_reported=0)
+    for proposed in (silent, regions([])):
+        found = with_withdrawn(proposed, groups_at(pair, BOX), CONFIG)
+        assert not found.is_reported.any()
+        assert not found.is_proposed.any()
+
+
+def slow_twin(pair: MergedMaps, candidates: ChangeRegions, config: PipelineConfig) -> list[tuple[str, int, set[int]]]:
+    """(session, region, map points) of every object, point by point."""
+    clouds = {"before": pair.before.points, "after": transform(pair.before_T_after, pair.after.points)}
+    voxel_m, origin_m = config.extract.voxel_m, config.extract.origin_m
+
+    def is_new(point: Float64Array, others: Float64Array) -> bool:
+        if config.extract.method == "nearest":
+            return bool(np.linalg.norm(others - point, axis=1).min() > config.extract.distance_m)
+        cell = np.floor((point - origin_m) / voxel_m)
+        in_cell = (np.floor((others - origin_m) / voxel_m) == cell).all(axis=1).sum()
+        return bool(in_cell < config.extract.min_points)
+
+    taken: set[tuple[str, int]] = set()
+    found = []
+    for region in np.flatnonzero(candidates.is_reported).tolist():
+        for session, other in (("after", "before"), ("before", "after")):
+            cloud = clouds[session]
+            near = np.linalg.norm(cloud - candidates.centres_map[region], axis=1) <= candidates.radius_m
+            new = [
+                index
+                for index in np.flatnonzero(near).tolist()
+                if (session, index) not in taken and is_new(cloud[index], clouds[other])
+            ]
+            gaps_m = np.linalg.norm(cloud[new][:, None] - cloud[new], axis=2)
+            k = config.outlier.neighbours
+            if len(new) > k:
+                spacing = np.sort(gaps_m, axis=1)[:, 1 : k + 1].mean(axis=1)
+                is_kept = np.abs(spacing - spacing.mean()) <= config.outlier.sigmas * spacing.std()
+                new, gaps_m = np.array(new)[is_kept].tolist(), gaps_m[is_kept][:, is_kept]
+            left = set(range(len(new)))
+            clusters = []
+            while left:
+                cluster, open_ones = set(), [min(left)]
+                while open_ones:
+                    here = open_ones.pop()
+                    if here in left:
+                        left.remove(here)
+                        cluster.add(here)
+                        open_ones += np.flatnonzero(gaps_m[here] <= config.cluster.radius_m).tolist()
+                if len(cluster) >= config.cluster.min_points:
+                    clusters.append({new[index] for index in cluster})
+            clusters.sort(key=lambda members: (-len(members), min(members)))
+            found += [(session, region, members) for members in clusters]
+            taken |= {(session, index) for members in clusters for index in members}
+    return found
+
+
+@pytest.mark.parametrize(
+    "rule",
+    [
+        ExtractConfig(method="voxel"),
+        ExtractConfig(method="voxel", voxel_m=0.4, origin_m=0.13),
+        ExtractConfig(method="voxel", voxel_m=0.8, min_points=3),
+        ExtractConfig(method="nearest"),
+        ExtractConfig(method="nearest", distance_m=0.45),
+    ],
+    ids=["paper", "origin", "min-points", "nearest", "farther"],
+)
+@pytest.mark.parametrize("seed", range(2))
+def test_both_rules_on_points_equal_their_slow_twin(rule: ExtractConfig, seed: int) -> None:
+    rng = stream(seed, "clouds")
+    shared = rng.uniform((-4, -4, 0), (4, 4, 0.2), (900, 3))
+    lumps = [rng.normal(rng.uniform((-3, -3, 0.8), (3, 3, 2.5)), 0.25, (60, 3)) for _ in range(6)]
+    jittered = [shared + rng.normal(0, 0.03, shared.shape) for _ in range(2)]
+    pair = merged([jittered[0], *lumps[:3]], [jittered[1], *lumps[2:]], yaw_pose(0.8, (3.0, -5.0, 0.4)))
+    candidates = regions([(-1.5, 0.0, 1.0), (1.0, 0.5, 1.0), (2.0, 2.0, 1.5)], 3.0, n_reported=2)
+    config = CONFIG.model_copy(
+        update={"extract": rule, "outlier": OutlierConfig(), "cluster": ClusterConfig(radius_m=0.5, min_points=8)}
+    )
+    found = [(each.session, each.region, set(each.indices.tolist())) for each in cut_out(pair, candidates, config)]
+    assert {each[0] for each in found} == {"before", "after"}
+    assert found == slow_twin(pair, candidates, config)
 
 
 def test_hulls_by_hand_and_degenerate() -> None:

@@ -1,15 +1,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from cdpipe.config import MapConfig
 from cdpipe.errors import InputError
-from cdpipe.geometry import make_pose, transform, yaw_pose
+from cdpipe.freespace import view
+from cdpipe.geometry import Float64Array, invert, make_pose, transform, yaw_pose
 from cdpipe.mapping import build_map, keyframes
-from cdpipe.types import PointMap, PosedScan, ScanSource
+from cdpipe.types import PLACES, PointMap, PosedScan, ScanSource
 
 
 class RandomScans:
@@ -77,8 +79,76 @@ def test_batches_do_not_change_the_map() -> None:
     one, other = (build_map(RandomScans(), config, batch_scans) for batch_scans in (2, 64))
     np.testing.assert_allclose(one.points, other.points, atol=1e-12)
     np.testing.assert_array_equal(one.return_points, other.return_points)
+    np.testing.assert_array_equal(one.return_offsets, other.return_offsets)
+    assert one.views is not None
+    assert other.views is not None
+    np.testing.assert_array_equal(one.views.ranges_m, other.views.ranges_m)
+    np.testing.assert_array_equal(one.views.sensor_T_odom, other.views.sensor_T_odom)
     again = build_map(RandomScans(), config, 2)
     np.testing.assert_array_equal(again.points, one.points)
+
+
+@pytest.mark.parametrize("batch_scans", [2, 64])
+def test_every_return_keeps_its_place_to_a_256th_of_a_cell(batch_scans: int) -> None:
+    source = RandomScans()
+    point_map = build_map(source, MapConfig(voxel_m=0.5, max_range_m=10.0), batch_scans)
+    places = [
+        transform(scan.odom_T_sensor, scan.points_sensor[np.linalg.norm(scan.points_sensor, axis=1) <= 10.0])
+        for scan in source.scans()
+    ]
+    returns = np.arange(len(point_map.return_points))
+    gaps_m = np.abs(point_map.positions_of(returns) - np.concatenate(places))
+    assert PLACES == 256
+    assert 0.9 * 0.5 / 512 < gaps_m.max() <= 0.5 / 512 + 1e-9
+    some = np.array([700, 3, 3])
+    np.testing.assert_array_equal(point_map.positions_of(some), point_map.positions_of(returns)[some])
+
+
+class OneCloud:
+    """One scan at the origin of points that are given."""
+
+    name = "one"
+    odom_T_sensor = np.eye(4)[None]
+
+    def __init__(self, points: Float64Array) -> None:
+        self._points = points
+
+    def scan(self, index: int) -> PosedScan:
+        rows = np.arange(len(self._points))
+        return PosedScan(index, self._points, np.eye(4), rows.astype(np.int64), rows.astype(np.int32))
+
+    def scans(self) -> Iterator[PosedScan]:
+        return iter([self.scan(0)])
+
+
+@pytest.mark.parametrize("voxel_m", [0.2, 0.3, 0.1])
+def test_returns_on_the_borders_of_cells_keep_their_places(voxel_m: float) -> None:
+    # multiples of the cell, and the next numbers below and above them: where rounding may tip a mean into a neighbour
+    along = np.arange(-40, 41) * voxel_m
+    along = np.concatenate([along, np.nextafter(along, np.inf), np.nextafter(along, -np.inf), [-1e-18, 1e-18]])
+    others = np.random.default_rng(0).permutation(along)
+    points = np.column_stack([along, others, others[::-1]])
+    point_map = build_map(OneCloud(points), MapConfig(voxel_m=voxel_m))
+    gaps_m = np.abs(point_map.positions_of(np.arange(len(points))) - points)
+    assert gaps_m.max() <= voxel_m / 512 + 1e-9
+
+
+def test_a_map_that_kept_no_places_says_so() -> None:
+    point_map = replace(build_map(RandomScans(), MapConfig()), return_offsets=None)
+    with pytest.raises(ValueError, match="return_offsets is None: this map does not know where its returns are"):
+        point_map.positions_of(np.zeros(1, np.int64))
+
+
+def test_keyframes_keep_what_they_saw() -> None:
+    source = RandomScans()
+    point_map = build_map(source, MapConfig(max_range_m=1.5), batch_scans=2)
+    assert point_map.keyframe_scans.tolist() == [0, 2, 4, 6]
+    assert point_map.views is not None
+    np.testing.assert_array_equal(point_map.views.sensor_T_odom, invert(source.odom_T_sensor[[0, 2, 4, 6]]))
+    for image, scan in zip(point_map.views.ranges_m, (0, 2, 4, 6), strict=True):
+        # a return that is not mapped was seen through to all the same
+        np.testing.assert_array_equal(image, view(source.scan(scan).points_sensor))
+        assert image.max() == 10.01 or image.max() == np.float16(10.01)
 
 
 def test_keyframes_by_hand() -> None:

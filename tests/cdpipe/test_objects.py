@@ -64,7 +64,8 @@ def group(merged: MergedMaps, session: SessionName, where: Float64Array) -> Poin
     wanted, _ = cell_means(where, 0.1)
     near_m = np.min(np.linalg.norm(points[:, None] - wanted[None], axis=2), axis=1)
     indices = np.flatnonzero((near_m < VOXEL_M / 2) & (points[:, 2] > 0.03))
-    return PointGroup(session, indices, points[indices], 0)
+    returns = np.flatnonzero(np.isin(point_map.return_points, indices))
+    return PointGroup(session, indices, points[indices], 0, returns)
 
 
 TALL = crate(yaw_pose(0.0, (2.0, -3.5, 0.0))) * (1.0, 1.0, 1.9)
@@ -87,6 +88,12 @@ def assembled() -> tuple[ChangedObject, ...]:
             group(SCENE, "after", crate(THERE)),
         ],
     )
+
+
+def test_what_was_cut_out_by_whole_map_points_is_never_reshaped() -> None:
+    gone = np.flatnonzero(PILE - LEFT > 0.1)
+    (item,) = assemble_objects(SCENE, [replace(group(SCENE, "before", ground(PILE)[gone]), returns=None)])
+    assert item.kind == "removed"
 
 
 def test_what_happened_to_each_of_four() -> None:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cdpipe.voxel import UniqueCells, cell_keys, max_coordinate_m, thinned
+from cdpipe.voxel import UniqueCells, cell_corners, cell_keys, max_coordinate_m, thinned
 
 
 def test_keys_by_hand() -> None:
@@ -13,6 +13,14 @@ def test_keys_by_hand() -> None:
     # x is the most significant part, z the least
     np.testing.assert_array_equal(keys - origin, [0, 0, 1 << 42, -(1 << 42), 1 << 21, 1])
     np.testing.assert_array_equal(cell_keys(points[:1], 0.5, origin_m=0.2), cell_keys(np.full((1, 3), -0.2), 0.5))
+
+
+def test_corners_by_hand_and_of_the_farthest_cells() -> None:
+    edge = max_coordinate_m(0.5)
+    points = np.array([[0.1, 0.6, -0.1], [-3.2, 0.0, 7.4], [-edge, edge, -edge]])
+    found = cell_corners(cell_keys(points, 0.5), 0.5)
+    np.testing.assert_array_equal(found, [[0.0, 0.5, -0.5], [-3.5, 0.0, 7.0], [-edge, edge, -edge]])
+    assert cell_corners(np.zeros(0, np.int64), 0.5).shape == (0, 3)
 
 
 def test_equal_keys_are_equal_cells() -> None:

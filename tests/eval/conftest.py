@@ -106,6 +106,12 @@ def tiny_pair_fixture(tmp_path: Path) -> Path:
     return write_pair(tmp_path / "pair")
 
 
+@pytest.fixture(scope="module", name="lasting_pair")
+def lasting_pair_fixture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a tiny pair that all tests of a module share."""
+    return write_pair(tmp_path_factory.mktemp("lasting") / "pair")
+
+
 @pytest.fixture(name="tiny_merge")
 def tiny_merge_fixture() -> np.ndarray:
     """Return the true before_T_after of the tiny pair."""

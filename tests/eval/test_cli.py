@@ -103,7 +103,8 @@ def test_detect_writes_its_answer_and_needs_no_truth(pair: Path, tmp_path: Path,
     objects = pd.read_csv(tmp_path / "out" / "objects.csv")
     assert objects["n_returns"].tolist() == [len(item.returns) for item in report.objects]
     assert objects["kind"].tolist() == [item.kind for item in report.objects]
-    assert objects["volume_m3"].tolist() == pytest.approx([item.shape.volume_m3 for item in report.objects if item.shape])
+    volumes_m3 = [item.shape.volume_m3 for item in report.objects if item.shape]
+    assert objects["volume_m3"].tolist() == pytest.approx(volumes_m3)
     assert len(pd.read_csv(tmp_path / "out" / "regions.csv")) == report.regions.is_proposed.sum()
     content = (tmp_path / "out" / "objects.ply").read_bytes()
     vertices = np.frombuffer(content[content.index(b"end_header\n") + 11 :], dtype="<f4,<f4,<f4,<i4")
