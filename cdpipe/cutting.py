@@ -137,7 +137,7 @@ def _sites(crops: Crops, found: Iterable[_Found], agreements: dict[int, _Agreeme
         first = order[np.unique(indices[order], return_index=True)[1]]
         indices, is_telling, region = indices[first], is_telling[first], region[first]
         points = crops.points_map(session, indices)
-        labels, sizes = groups(points, SITE_M)
+        labels, sizes = groups(points, 2 * SITE_M)  # nearer ones would look at the same returns
         for label in np.flatnonzero(np.bincount(labels, is_telling, len(sizes)) >= _MIN_TELLING):
             members = labels == label
             best = int(region[members & is_telling].min())
