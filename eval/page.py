@@ -9,16 +9,14 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import pandas as pd
 
 from cdpipe.config import settings_table
-from cdpipe.errors import InputError
 from eval.figures import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
+from eval.latex import latex_tables
 from eval.merge_table import merge_table
 from eval.page_columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
 from eval.page_effects import ENOUGH_PAIRS, draw_effects
@@ -27,7 +25,9 @@ from eval.page_merge_tables import MERGE_COLUMNS
 from eval.page_object_report import draw_objects
 from eval.page_object_tables import OBJECT_COLUMNS
 from eval.page_paper import time_table, volume_table
+from eval.page_pareto import draw_pareto, picture_bytes
 from eval.page_regions import REGION_COLUMNS, draw_regions
+from eval.page_render import rendered, written
 from eval.page_run import RunData, first_seed, named_variants, of, read_document, read_run, scenarios, text
 from eval.page_site import draw_site
 from eval.page_story import about_wrong_merges, story
@@ -40,6 +40,8 @@ from eval.page_tables import (
     to_latex,
     unchanged_table,
 )
+from eval.pareto import pareto_table
+from eval.sides import is_contended
 
 POINT_COLOURS = (
     (BLUE, "right"), (BLACK, "missed"), (VERMILLION, "wrong"), (ORANGE, "part of another answered object"),
@@ -48,9 +50,11 @@ POINT_COLOURS = (
 
 
 def write_page(run: Path) -> Path:
-    """Write `index.html` and the tables table1, table2 (.csv, .tex) and results.tex into a run folder.
+    """Write `index.html` and the tables table1, table2 (.csv, .tex), results.tex and summary.tex into a run folder.
 
-    Of a run whose plan ends at the merge the page shows the merge alone. Where pairs have a kind, merge.csv is written.
+    Also regions_table.tex and objects_table.tex where there are the tables, and pareto.csv with its pictures where
+    methods can be compared by their cost. Of a run whose plan ends at the merge the page shows the merge alone. Where
+    pairs have a kind, merge.csv is written.
 
     Args:
         run: The folder; results.csv must be there, anything else may be missing.
@@ -62,20 +66,25 @@ def write_page(run: Path) -> Path:
         InputError: There are no results, or the folder cannot be written.
     """
     data = read_run(run)
-    files: dict[str, str] = {}
+    files: dict[str, str | bytes] = {**latex_tables(data)}
     if len(merges := merge_table(pd.DataFrame(list(data.results)))):
         files["merge.csv"] = merges.to_csv(index=False)
     if ends_at_merge(data):
-        files["index.html"] = _render(_merge_content(data))
+        files["index.html"] = rendered("page.html", _merge_content(data))
     else:
         tables = {"results": results_table(data), "table1": time_table(data), "table2": volume_table(data)}
         files["results.tex"] = to_latex(tables["results"])
         for name in ("table1", "table2"):
             files[f"{name}.csv"] = to_csv(tables[name])
             files[f"{name}.tex"] = to_latex(tables[name])
-        files["index.html"] = _render(_content(data, tables))
-    for name, content in files.items():
-        _write(run / name, content)
+        points = pareto_table(data)
+        pictures = draw_pareto(points, is_contended=is_contended(data))
+        if len(points):
+            files["pareto.csv"] = points.to_csv(index=False)
+        files |= {f"pareto_{subject}.png": picture_bytes(each) for subject, each in pictures.items()}
+        files["index.html"] = rendered("page.html", {**_content(data, tables), "pareto": list(pictures.values())})
+    for name, file in files.items():
+        written(run / name, file)
     return run / "index.html"
 
 
@@ -216,25 +225,3 @@ def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
         else:
             flat[prefix + key] = "none" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
     return flat
-
-
-def _render(content: Mapping[str, Any]) -> str:
-    folder = resources.files("eval") / "templates"
-    sources = {name: (folder / name).read_text(encoding="utf-8") for name in ("page.html", "page.css")}
-    environment = jinja2.Environment(
-        loader=jinja2.DictLoader(sources),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("page.html").render(content)
-
-
-def _write(path: Path, content: str) -> None:
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        partial.write_text(content, encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error

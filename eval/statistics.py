@@ -25,6 +25,7 @@ IDENTITY_COLUMNS = (
     "metrics_version",
     "score_radius_m",
     "commit",
+    "is_contended",
 )
 
 

@@ -104,6 +104,16 @@ def test_two_objects_in_one_region_are_two() -> None:
         assert_is_cut_out(whole, after, box, lowest_m=0.12)
 
 
+@pytest.mark.parametrize("gap_m", [0.6, 0.8, 1.1])
+def test_objects_apart_share_no_return(gap_m: float) -> None:
+    # candidates 0.5 m apart are looked at together, and everything within 0.5 m of them
+    beside: Box = ((2.0 + gap_m, 1.5, 0.0), (2.5 + gap_m, 2.0, 0.6))
+    after = scanned((CRATE, beside), 2)
+    found = [returns_of(after[1], group) for group in cut(scanned((), 1), after)]
+    assert len(found) == 2
+    assert not found[0] & found[1]
+
+
 def test_an_object_between_two_regions_is_one() -> None:
     after = scanned((BEAM,), 2)
     # each sphere holds one end of it

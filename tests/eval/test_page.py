@@ -324,8 +324,8 @@ def test_nothing_is_fetched_and_every_picture_is_inside(page: Path) -> None:
     assert "url(" not in text
     assert "@import" not in text
     sources = re.findall(r'src="([^"]*)"', text)
-    # two maps, three presets' regions, two observable changes, two merges
-    assert len(sources) == 9
+    # two maps, three presets' regions, two observable changes, two merges, regions and objects against their cost
+    assert len(sources) == 11
     for source in sources:
         assert base64.b64decode(source.removeprefix("data:image/png;base64,"), validate=True).startswith(b"\x89PNG")
     links = re.findall(r'href="([^"]*)"', text)
