@@ -23,6 +23,8 @@ from eval.provenance import fix_threads
 if TYPE_CHECKING:
     import pandas as pd
 
+    from eval.cluster import Where
+    from eval.page_comparison import Comparison
     from eval.plan import Plan
 
 
@@ -87,10 +89,11 @@ def main(argv: Sequence[str] | None = None) -> None:
 @app.command()
 def demo(out: RunOut, quiet: Quiet = False) -> None:
     """Both paper sites end to end: simulate, detect, score, report."""
+    from eval.cluster import HERE
     from eval.page import write_page
     from eval.plan import load_plan
 
-    _run(load_plan("paper"), out, force=False, limit=None, quiet=quiet)
+    _run(load_plan("paper"), out, HERE, force=False, limit=None, quiet=quiet)
     page = write_page(out)
     typer.echo(f"page: {page}")
 
@@ -319,24 +322,70 @@ def run_command(
         list[str] | None,
         typer.Option("--grid", metavar="KEY=V1,V2", help="run every variant at each value; repeatable"),
     ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="processes; each takes its own pairs", show_default=False)
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="tcp://HOST:PORT", help="a Dask cluster that sees the run folder", show_default=False),
+    ] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="do at most this many cells")] = None,
     force: Annotated[bool, typer.Option("--force", help="redo finished cells, simulation included")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="list the cells and what is finished, and stop")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Run a plan: scenarios x seeds x variants. Finished cells are kept and skipped."""
+    from eval.cluster import Where, require_usable
     from eval.plan import changed_plan, load_plan
 
     chosen = changed_plan(load_plan(plan), seeds=seeds, settings=settings or (), grid=grid or ())
-    _run(chosen, out, force=force, limit=limit, quiet=quiet)
+    where = Where(workers, scheduler)
+    require_usable(where)
+    if dry_run:
+        _list_cells(chosen, out, force=force, limit=limit)
+    else:
+        _run(chosen, out, where, force=force, limit=limit, quiet=quiet)
 
 
 @app.command()
-def report(folder: Annotated[Path, typer.Argument(help="a run folder")]) -> None:
-    """Write one offline page with tables, plots and pictures of a run."""
-    from eval.page import write_page
-    from eval.runfolder import open_run_folder
+def report(
+    folder: Annotated[str, typer.Argument(metavar="RUN", help="a run folder")],
+    other: Annotated[
+        str | None,
+        typer.Argument(metavar="B", help="a second one, judged against the first; RUN:VARIANT is a method of one"),
+    ] = None,
+    against: Annotated[
+        str | None,
+        typer.Option(metavar="VARIANT", help="judge every method of the run against this one", show_default=False),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="of a comparison; else the folder judged", show_default=False)
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Write one offline page with tables, plots and pictures of a run; or what moved between two runs."""
+    from cdpipe.errors import InputError
 
-    typer.echo(f"page: {write_page(open_run_folder(folder).path)}")
+    if other is None and against is None:
+        from eval.page import write_page
+        from eval.runfolder import open_run_folder
+
+        if out is not None:
+            raise InputError("--out: the page of a run lies in its folder: leave --out to a comparison")
+        typer.echo(f"page: {write_page(open_run_folder(Path(folder)).path)}")
+        return
+    if other is not None and against is not None:
+        raise InputError(f"--against {against}: a second run is named too: write {folder}:{against} {other} instead")
+    from eval.page_comparison import compared, write_comparison
+    from eval.sides import read_side
+
+    first, second = (folder, other) if other is not None else (f"{folder}:{against}", folder)
+    a, b = read_side(first), read_side(second)
+    found = compared(a, b)
+    page = write_comparison(found, out or b.path)
+    if not quiet:
+        _comparison(found)
+    typer.echo(f"page: {page}")
 
 
 @app.command()
@@ -362,8 +411,9 @@ def dataset(
     """Make training data for descriptors, a shard for each tunnel. Finished tunnels are kept and skipped."""
     import shlex
 
+    from eval.cluster import Where
     from eval.dataset import Recipe
-    from eval.dataset_run import Where, make_dataset
+    from eval.dataset_run import make_dataset
 
     recipe = Recipe(draws, error_m, error_deg, tuple(settings or ()))
     with shown_progress(quiet) as progress:
@@ -479,18 +529,35 @@ def check(files: Annotated[list[str], typer.Argument(help="scenario, plan or pre
         raise InputError("\n".join(mistakes))
 
 
-def _run(plan: Plan, out: Path, *, force: bool, limit: int | None, quiet: bool) -> None:
+def _list_cells(plan: Plan, out: Path, *, force: bool, limit: int | None) -> None:
+    from collections import Counter
+
+    from eval.runner import listed
+
+    every = listed(plan, out, force=force, limit=limit)
+    for cell in every:
+        typer.echo(f"{cell.state:<8}  {cell.scenario} {cell.seed} {cell.variant}")
+    count = Counter(cell.state for cell in every)
+    left = f", {count['left']} left by --limit" if count["left"] else ""
+    typer.echo(
+        f"{out}: {len(every)} cells: {count['finished']} finished, {count['to do']} to do{left}; nothing was run"
+    )
+
+
+def _run(plan: Plan, out: Path, where: Where, *, force: bool, limit: int | None, quiet: bool) -> None:
     from eval.plan import cells
-    from eval.runfolder import start_run_folder
+    from eval.runfolder import removed_if_empty, start_run_folder
     from eval.runner import run_plan
 
     cells(plan)  # settings that contradict each other are refused before a folder is made
-    run = start_run_folder(out)
-    with shown_progress(quiet) as progress:
-        outcome = run_plan(plan, run, command=["tunnelcd", *sys.argv[1:]], force=force, limit=limit, progress=progress)
+    command = ["tunnelcd", *sys.argv[1:]]
+    with removed_if_empty(out), shown_progress(quiet, rate="cells") as progress:
+        run = start_run_folder(out)
+        outcome = run_plan(plan, run, command=command, force=force, limit=limit, where=where, progress=progress)
     _results(out, quiet)
     left = f", {outcome.n_left} left by --limit" if outcome.n_left else ""
-    _say(quiet, f"{out}: {outcome.n_done} cells done, {outcome.n_kept} kept from earlier{left}")
+    died = f", {outcome.n_died} of all killed their workers" if outcome.n_died else ""
+    _say(quiet, f"{out}: {outcome.n_done} cells done, {outcome.n_kept} kept from earlier{left}{died}")
 
 
 _MET = {True: "met", False: "missed", None: "-"}
@@ -559,6 +626,23 @@ def _object_results(folder: Path) -> None:
         groups = group_overview(pd.read_csv(folder / "objects_by_group.csv"), str(table["variant"].iloc[0]))
         _table(f"objects of {table['variant'].iloc[0]}, by kind of prop and by hull; volume: median error", groups)
     _targets(folder, "objects")
+
+
+_MAX_LINES = 60
+
+
+def _comparison(found: Comparison) -> None:
+    from eval.page_comparison import MOVED, overview, sentences
+
+    table = overview(found.table)
+    title = f"A: {found.names[0]}; B: {found.names[1]}; means over session pairs, B - A pair by pair"
+    if len(table) > _MAX_LINES:
+        title += f"; {len(table)} figures compared, those that moved"
+        table = table[table["B is"].isin(MOVED)]
+    if len(table):
+        _table(title, table)
+    for line in sentences(found):
+        typer.echo(line)
 
 
 def _targets(folder: Path, subject: str) -> None:

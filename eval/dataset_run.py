@@ -7,24 +7,22 @@ on where it stopped. A tunnel that cannot be built leaves a file with the reason
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import logging
 import time
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from cdpipe.descriptor.shard import FORMAT, FORMAT_VERSION, SUFFIX, read_about
 from cdpipe.errors import InputError, ScenarioError
+from eval.cluster import HERE, Where, connected, n_slots, require_usable
 from eval.dataset import Recipe, make_shard, shard_digest
 from eval.dataset_card import write_card
 from eval.output import make_writable
 from eval.plan import parse_seeds
-from eval.progress import RunProgress, Silent
-from eval.provenance import fix_threads
+from eval.progress import RunProgress, Silent, duration
 from eval.runfolder import write_json
 from eval.worlds import world_slug
 from scenarios.library import load_scenario
@@ -64,20 +62,12 @@ class DatasetOutcome:
     seconds: float
 
 
-@dataclass(frozen=True, slots=True)
-class Where:
-    """Where tunnels are computed: here if both are left out."""
-
-    workers: int | None = None
-    scheduler: str | None = None
-
-
 def make_dataset(
     families: Sequence[str],
     seeds: str,
     recipe: Recipe,
     out: Path,
-    where: Where | None = None,
+    where: Where = HERE,
     limit: int | None = None,
     command: str = "",
     progress: RunProgress | None = None,
@@ -97,8 +87,8 @@ def make_dataset(
     Raises:
         InputError: A family, the seeds, the folder or the scheduler is not what it should be.
     """
-    where, progress = where or Where(), progress or Silent()
-    _require_usable(where)
+    progress = progress or Silent()
+    require_usable(where)
     tunnels = _tunnels(families, seeds, recipe)
     was_there, is_new = out.exists(), not (out / "dataset.json").is_file()
     _take_folder(out, recipe, command)
@@ -123,16 +113,6 @@ def make_dataset(
     n_refused = sum((out / tunnel.refusal).is_file() for tunnel in tunnels)
     n_kept = len(tunnels) - len(missing)
     return DatasetOutcome(pace.n_made, n_kept, n_refused, len(missing) - len(todo), pace.n_pairs, pace.seconds)
-
-
-def _require_usable(where: Where) -> None:
-    if where.workers is not None and where.scheduler is not None:
-        raise InputError("--workers and --scheduler: a scheduler has workers of its own; leave one of them out")
-    if where == Where():
-        return
-    if importlib.util.find_spec("distributed") is None:
-        asked = "--workers" if where.scheduler is None else "--scheduler"
-        raise InputError(f"{asked} needs a package more: pip install 'tunnelcd[cluster]'")
 
 
 def _tunnels(families: Sequence[str], seeds: str, recipe: Recipe) -> list[Tunnel]:
@@ -247,14 +227,8 @@ class _Pace:
             self.n_pairs += n_pairs
             told = f"{n_pairs} pairs"
         left_s = self.seconds / self._n_done * (self._n_todo - self._n_done)
-        rate = f"{self.n_pairs / self.seconds:.1f} keyframe pairs/s, {_duration(left_s)} left"
+        rate = f"{self.n_pairs / self.seconds:.1f} keyframe pairs/s, {duration(left_s)} left"
         self._progress.cells(f"{tunnel.family} {tunnel.seed}: {told}; {rate}", self._n_done, self._n_todo)
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
 def _attempt(tunnel: Tunnel, recipe: Recipe) -> bytes | str:
@@ -275,11 +249,11 @@ def _computed(tunnels: Sequence[Tunnel], recipe: Recipe, where: Where) -> Genera
             wanted.append(tunnel)
     if not wanted:
         return
-    if where == Where():
+    if where == HERE:
         for tunnel in wanted:
             yield tunnel, _attempt(tunnel, recipe)
         return
-    with _client(where, len(wanted)) as client:
+    with connected(where, len(wanted)) as client:
         yield from _from_cluster(client, wanted, recipe)
 
 
@@ -296,8 +270,7 @@ def _from_cluster(client: Any, tunnels: Sequence[Tunnel], recipe: Recipe) -> Ite
             tunnel_of[futures[-1].key] = tunnel
         return futures
 
-    n_threads = max(1, sum(client.nthreads().values()))
-    coming = as_completed(submitted(_AHEAD * n_threads))
+    coming = as_completed(submitted(_AHEAD * max(1, n_slots(client))))
     for future in coming:
         result = future.result()
         tunnel = tunnel_of.pop(future.key)
@@ -305,37 +278,3 @@ def _from_cluster(client: Any, tunnels: Sequence[Tunnel], recipe: Recipe) -> Ite
         for more in submitted(1):
             coming.add(more)
         yield tunnel, result
-
-
-@contextmanager
-def _client(where: Where, n_tunnels: int) -> Iterator[Any]:
-    """Yield a Dask client of the scheduler named, or of as many worker processes here."""
-    from distributed import Client, LocalCluster  # noqa: PLC0415 - as above
-
-    if where.scheduler is not None:
-        try:
-            client = Client(where.scheduler, timeout="10s")
-        except (OSError, ValueError, TimeoutError) as error:
-            raise InputError(
-                f"--scheduler {where.scheduler}: cannot be reached ({error}): expected tcp://HOST:PORT"
-            ) from error
-        with client:
-            client.run(fix_threads)
-            if not client.nthreads():
-                raise InputError(f"--scheduler {where.scheduler}: has no workers: start some with `dask worker`")
-            yield client
-        return
-    fix_threads()
-    settings = {
-        "n_workers": min(where.workers or 1, n_tunnels),
-        "threads_per_worker": 1,
-        "dashboard_address": ":0",  # any free port: two runs may go on side by side
-        "memory_limit": None,
-        # an interrupted worker is no news
-        "silence_logs": logging.CRITICAL,
-    }
-    with (
-        LocalCluster(**settings) as cluster,
-        Client(cluster) as client,
-    ):
-        yield client

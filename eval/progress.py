@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import TracebackType
@@ -11,6 +12,8 @@ from typing import Protocol
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
+
+_PACE_S = 1800.0  # a cell may take minutes, and a pace needs two of them
 
 
 class RunProgress(Protocol):
@@ -44,6 +47,7 @@ class Bars:
             _Rate(),
             TimeRemainingColumn(),
             console=Console(stderr=True),
+            speed_estimate_period=_PACE_S,
         )
         self._cells = self._progress.add_task("cells", total=None, visible=False)
         self._stage = self._progress.add_task("", total=None, visible=False)
@@ -72,41 +76,66 @@ class Bars:
 
 
 class Lines:
-    """One line on standard error for each cell and stage: for logs, where bars would overwrite nothing."""
+    """One line on standard error for each cell and stage: for logs, where bars would overwrite nothing.
 
-    def __init__(self) -> None:
+    Args:
+        rate: Name of what is counted, to tell how many of them come in a minute and the time left; "" tells neither.
+    """
+
+    def __init__(self, rate: str = "") -> None:
         self._last = ""
+        self._rate = rate
+        self._start: tuple[float, int] | None = None
 
     def cells(self, label: str, done: int, total: int) -> None:
         """Write the label, once."""
-        self._write(f"[{done}/{total}] {label}")
+        line = f"[{done}/{total}] {label}"
+        self._write(line, self._pace(done, total))
 
     def stage(self, name: str, done: int, total: int) -> None:
         """Write the name, once."""
         self._write(f"  {name}")
 
-    def _write(self, line: str) -> None:
+    def _pace(self, done: int, total: int) -> str:
+        if self._start is None:
+            self._start = time.perf_counter(), done
+        seconds, n_new = time.perf_counter() - self._start[0], done - self._start[1]
+        if not self._rate or not n_new or not seconds:
+            return ""
+        left = f", {duration((total - done) * seconds / n_new)} left" if done < total else ""
+        return f"; {60 * n_new / seconds:.3g} {self._rate}/min{left}"
+
+    def _write(self, line: str, pace: str = "") -> None:
         if line != self._last:
-            sys.stderr.write(f"{line}\n")
+            sys.stderr.write(f"{line}{pace}\n")
             self._last = line
 
 
 @contextmanager
-def shown_progress(quiet: bool) -> Iterator[RunProgress]:
-    """Yield bars on a terminal, lines in a log, nothing if quiet."""
+def shown_progress(quiet: bool, rate: str = "") -> Iterator[RunProgress]:
+    """Yield bars on a terminal, lines in a log (with a rate where what is counted is named), nothing if quiet."""
     if quiet:
         yield Silent()
     elif not sys.stderr.isatty():
-        yield Lines()
+        yield Lines(rate)
     else:
         with Bars() as bars:
             yield bars
 
 
+def duration(seconds: float) -> str:
+    """Return a time in words: "1 h 05 min", "3 min 20 s", "7 s"."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+
+
 class _Rate(ProgressColumn):
-    """Steps per second."""
+    """Steps per second, or per minute where they are slow."""
 
     def render(self, task: Task) -> Text:
         """Render the speed of a task."""
         speed = task.finished_speed or task.speed
-        return Text(f"{speed:.2g}/s" if speed else "-/s")
+        if not speed:
+            return Text("-/s")
+        return Text(f"{speed:.2g}/s" if speed >= 0.1 else f"{60 * speed:.2g}/min")

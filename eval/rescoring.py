@@ -64,10 +64,12 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
             if stored is None:
                 names = {**_world_of(run, slug), "seed": int(seed)}
                 identity = {**names, "variant": folder.name, "preset": folder.name, "commit": None}
+                identity["is_contended"] = False
                 key, place = "", (len(folders), len(folders))
             else:
                 identity = {name: stored["row"].get(name) for name in (*IDENTITY, "preset", "commit")}
                 identity["pair_kind"] = stored["row"].get("pair_kind", "")
+                identity["is_contended"] = stored["row"].get("is_contended", False)
                 key, place = stored["key"], stored["order"]
             progress.cells("{scenario} {seed} {variant}".format(**identity), len(documents), len(folders))
             documents[path] = cell_document(score_stored(truth, folder), identity, key, place)

@@ -18,7 +18,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -122,6 +123,18 @@ def start_run_folder(path: Path) -> RunFolder:
     return run
 
 
+@contextmanager
+def removed_if_empty(path: Path) -> Iterator[None]:
+    """Leave no new folder behind where the block fails before it has written anything."""
+    was_there = path.exists()
+    try:
+        yield
+    except BaseException:
+        if not was_there and path.is_dir() and not any(path.iterdir()):
+            path.rmdir()
+        raise
+
+
 def open_run_folder(path: Path) -> RunFolder:
     """Open the folder of an earlier run.
 
@@ -149,7 +162,8 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     if not whole:
         raise InputError(f"{run.path}: no finished cell: run a plan first")
     whole.sort(key=lambda cell: (cell["order"][0], cell["row"]["scenario"], cell["row"]["seed"], cell["order"][1]))
-    results = pd.DataFrame([cell["row"] for cell in whole])
+    # cells of before there were workers were run alone
+    results = pd.DataFrame([{**cell["row"], "is_contended": cell["row"].get("is_contended", False)} for cell in whole])
     _write_csv(run.path / "results.csv", results)
     items = {table: _items(table, whole) for table in ITEM_TABLES}
     for table, frame in items.items():
@@ -191,9 +205,8 @@ def _report_tables(
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write JSON that appears whole or not at all; numpy scalars become plain numbers."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(json.dumps(document, indent=1, default=_plain))
-    partial.replace(path)
+    text = json.dumps(document, indent=1, default=_plain)
+    _whole(path, lambda partial: partial.write_text(text))
 
 
 def remove(path: Path) -> None:
@@ -210,9 +223,17 @@ def _items(table: str, cells: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def _write_csv(path: Path, frame: pd.DataFrame) -> None:
+    _whole(path, lambda partial: frame.to_csv(partial, index=False))
+
+
+def _whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file that appears whole or not at all; where the disk is full, nothing is left of it."""
     partial = path.with_name(f".{path.name}.partial")
-    frame.to_csv(partial, index=False)
-    partial.replace(path)
+    try:
+        write(partial)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _plain(value: Any) -> Any:

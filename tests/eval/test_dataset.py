@@ -23,11 +23,12 @@ from cdpipe.errors import InputError, ScenarioError
 from cdpipe.geometry import invert, rotation_angle_rad, transform, yaw_rad
 from cdpipe.mapping import build_map
 from cdpipe.types import DescriptorSet, MappedSession, PointMap
-from eval import dataset_run
+from eval import cluster, dataset_run
 from eval.adapters import pipeline_input
+from eval.cluster import Where
 from eval.dataset import Recipe, displaced, make_shard, merge_errors
 from eval.dataset_card import digest_of, fields_table
-from eval.dataset_run import Where, make_dataset
+from eval.dataset_run import make_dataset
 from eval.ground_truth import GroundTruth, load_ground_truth
 from eval.merge_metrics import PAIR_RADIUS_M
 from eval.oracles import OracleMerge, merged_by_truth
@@ -343,7 +344,7 @@ def test_an_unreachable_scheduler_is_named_and_leaves_no_folder(
         raise InputError("--scheduler tcp://a:1: cannot be reached")
         yield
 
-    monkeypatch.setattr(dataset_run.importlib.util, "find_spec", lambda name: object())  # as if the extra were there
+    monkeypatch.setattr(cluster.importlib.util, "find_spec", lambda name: object())  # as if the extra were there
     monkeypatch.setattr(dataset_run, "_computed", unreachable)
     code, _, err = command("dataset", FAMILY, "--seeds", "0", "--scheduler", "tcp://a:1", "--out", tmp_path / "d", "-q")
     assert (code, err) == (2, "error: --scheduler tcp://a:1: cannot be reached\n")
@@ -353,7 +354,7 @@ def test_an_unreachable_scheduler_is_named_and_leaves_no_folder(
 def test_without_the_extra_one_line_says_what_to_install(
     command: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dataset_run.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(cluster.importlib.util, "find_spec", lambda name: None)
     code, _, err = command("dataset", FAMILY, "--seeds", "0", "--workers", "2", "--out", tmp_path / "d")
     assert code == 2
     assert err == "error: --workers needs a package more: pip install 'tunnelcd[cluster]'\n"

@@ -19,7 +19,7 @@ from cdpipe.merge import merge_maps
 from cdpipe.ouster import load_profile
 from cdpipe.readers import open_scans
 from cdpipe.types import MappedSession, MergedMaps
-from eval import provenance, runner, stages
+from eval import pair_run, provenance, runner, stages
 from eval.adapters import pipeline_input
 from eval.plan import Plan, cells, load_plan
 from eval.progress import Silent
@@ -62,7 +62,7 @@ def simulated(pairs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> list[s
         assert seed == 20000
         shutil.copytree(pairs[scenario.family], out)
 
-    monkeypatch.setattr(runner, "simulate_pair", copy)
+    monkeypatch.setattr(pair_run, "simulate_pair", copy)
     monkeypatch.setattr(runner, "load_scenario", load_small)
     return asked
 
@@ -90,7 +90,7 @@ def smoke(pairs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> R
         shutil.copytree(pairs[scenario.family], out)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runner, "simulate_pair", copy)
+        patch.setattr(pair_run, "simulate_pair", copy)
         patch.setattr(runner, "load_scenario", load_small)
         return run_in(tmp_path_factory.mktemp("smoke") / "run", load_plan("smoke"), command=["tunnelcd", "run", "a b"])[
             0
@@ -190,7 +190,7 @@ def test_a_cell_cut_short_is_done_again_and_no_other(smoke_copy: RunFolder, simu
 def test_another_version_of_the_metrics_redoes_all(
     smoke_copy: RunFolder, simulated: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runner, "METRICS_VERSION", -1)
+    monkeypatch.setattr(pair_run, "METRICS_VERSION", -1)
     assert run_plan(load_plan("smoke"), smoke_copy, limit=1) == RunOutcome(1, 0, 7)
     # what is stale is in no table
     assert len(table(smoke_copy)) == 1
@@ -284,14 +284,15 @@ def test_an_error_of_the_input_is_a_row_and_a_bug_is_not(
 def test_a_world_that_cannot_be_made_is_a_row_and_the_others_go_on(
     tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch, stage: str
 ) -> None:
-    usual = getattr(runner, stage)
+    module = runner if stage == "load_scenario" else pair_run
+    usual = getattr(module, stage)
 
     def fails_for_one(what: Any, *rest: Any, **options: Any) -> Any:
         if ONE_BOX in (what, getattr(what, "family", "")):
             raise ScenarioError("props stand in each other")
         return usual(what, *rest, **options)
 
-    monkeypatch.setattr(runner, stage, fails_for_one)
+    monkeypatch.setattr(module, stage, fails_for_one)
     run, outcome = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=f"{ONE_BOX}, {UNCHANGED}"))
     assert outcome == RunOutcome(2, 0, 0)
     results = table(run).set_index("scenario")
@@ -358,8 +359,8 @@ def test_score_runs_nothing_and_gives_the_same(smoke_copy: RunFolder, monkeypatc
         raise AssertionError("score must not run anything")
 
     for module, name in (
-        (runner, "simulate_pair"),
-        (runner, "PairStages"),
+        (pair_run, "simulate_pair"),
+        (pair_run, "PairStages"),
         (stages, "build_map"),
         (stages, "merge_maps"),
     ):
@@ -490,7 +491,7 @@ def truthful(simulated: list[str], pairs: dict[str, Path], monkeypatch: pytest.M
         drawn, files = scenario.model_dump(mode="json"), file_digests(scenario)
         write_pair_truth(out, replace(read_pair_truth(out), seed=seed, scenario=drawn, files=files))
 
-    monkeypatch.setattr(runner, "simulate_pair", copy)
+    monkeypatch.setattr(pair_run, "simulate_pair", copy)
     return asked
 
 
@@ -650,7 +651,7 @@ def merges(pairs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> 
 
     folder = tmp_path_factory.mktemp("merges")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runner, "simulate_pair", copy)
+        patch.setattr(pair_run, "simulate_pair", copy)
         patch.setattr(runner, "load_scenario", load_small)
         patch.setattr(stages, "merge_maps", merge)
         patch.setattr(stages, "METHODS", {"descriptor": forbidden})
@@ -788,9 +789,9 @@ def test_a_world_that_cannot_be_made_keeps_its_kind(
 
 def test_cells_made_without_kiss_matcher_are_made_again_once_it_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     def keys(*, is_installed: bool) -> dict[str, str]:
-        monkeypatch.setattr(runner, "is_kiss_matcher_installed", lambda: is_installed)
+        monkeypatch.setattr(pair_run, "is_kiss_matcher_installed", lambda: is_installed)
         found = cells(load_plan("merge"))[:4]
-        return {cell.variant: runner._key(cell, "clean", None, {}) for cell in found}
+        return {cell.variant: pair_run.cell_key(cell, "clean", None, {}) for cell in found}
 
     there, missing = keys(is_installed=True), keys(is_installed=False)
     changed = {variant: there[variant] != missing[variant] for variant in there}
