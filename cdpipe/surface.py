@@ -38,6 +38,8 @@ _LINK_M = 0.15
 _TABLE_CELL_M = 0.25
 # A plane holds for as far as the points that it was fitted to.
 _COARSE_PLANE_M, _PLANE_M = 0.4, 0.25
+# Nor is what lies this flat beyond its edge off the surface: there the other map has a gap.
+_GRAZING = 0.2
 _MIN_SURFACE = 20
 _NOISE_FACTOR = 5.0
 _SEED_FACTOR = 2.5
@@ -65,14 +67,16 @@ def distances_m(points: Float64Array, surface: Surface, plane_m: float) -> Float
     """Return how far (N, 3) points are from a surface.
 
     That is the distance from the plane through the nearest of the surface's points, as long as that point is within
-    `plane_m`; farther off it is the distance from the point itself.
+    `plane_m` or the plane is nearly met; otherwise it is the distance from the point itself.
     """
     # of one neighbour it returns arrays, where the search for the nearest returns lists that take as long again
     found, squared_m2 = surface.tree.batch_knn_search(points, 1)
     chosen, nearest_m = found[:, 0].astype(np.int64), np.sqrt(squared_m2[:, 0])
     offsets = points - surface.points.take(chosen, axis=0)
     along = np.einsum("ij,ij->i", offsets, surface.normals.take(chosen, axis=0))
-    return np.asarray(np.where(nearest_m < plane_m, np.abs(along), nearest_m))
+    off_plane_m = np.abs(along)
+    is_on_plane = (nearest_m < plane_m) | (off_plane_m < _GRAZING * nearest_m)
+    return np.asarray(np.where(is_on_plane, off_plane_m, nearest_m))
 
 
 class PlaneTable:
