@@ -24,10 +24,16 @@ def test_distances_from_a_plane_are_heights_and_beyond_its_edge_from_its_rim() -
     above = np.column_stack([np.array([0.1, -1.0, 0.7, 2.1]), np.array([0.1, 0.33, -2.1, 0.05]), heights])
     surface = Surface(FLOOR)
     np.testing.assert_allclose(distances_m(above, surface, 0.4), np.abs(heights), atol=1e-9)
-    # 0.39 m beyond the edge the plane still holds, 0.41 m beyond it does not; nor 0.41 m above
-    beyond = np.array([[3.39, 0.0, 0.02], [3.41, 0.0, 0.02], [1.0, 1.0, 0.41]])
-    np.testing.assert_allclose(distances_m(beyond, surface, 0.4), [0.02, np.hypot(0.41, 0.02), 0.41], atol=1e-9)
-    np.testing.assert_allclose(distances_m(beyond, surface, 0.5), [0.02, 0.02, 0.41], atol=1e-9)
+    # 0.38 m beyond the edge the plane still holds, 0.41 m beyond it does not; nor 0.41 m above
+    beyond = np.array([[3.38, 0.0, 0.1], [3.41, 0.0, 0.1], [1.0, 1.0, 0.41]])
+    np.testing.assert_allclose(distances_m(beyond, surface, 0.4), [0.1, np.hypot(0.41, 0.1), 0.41], atol=1e-9)
+    np.testing.assert_allclose(distances_m(beyond, surface, 0.5), [0.1, 0.1, 0.41], atol=1e-9)
+
+
+def test_a_gap_of_the_map_does_not_stand_off_it() -> None:
+    # a fifth of the way to the nearest point is the most that what lies flat beyond an edge may be off its plane
+    beyond = np.array([[4.0, 0.0, 0.2], [4.0, 0.0, 0.21], [5.0, 0.0, 0.0]])
+    np.testing.assert_allclose(distances_m(beyond, Surface(FLOOR), 0.4), [0.2, np.hypot(1.0, 0.21), 0.0], atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -43,7 +49,9 @@ def test_distances_equal_brute_force_on_a_rough_cloud(seed: int) -> None:
         # the normal by hand: the direction in which its ten nearest, itself among them, spread least
         around = cloud[np.argsort(np.linalg.norm(cloud - cloud[nearest], axis=1))[:10]]
         normal = np.linalg.svd(around - around.mean(axis=0))[2][2]
-        expected.append(abs((point - cloud[nearest]) @ normal) if gaps_m[nearest] < 0.3 else gaps_m[nearest])
+        off_plane_m = abs((point - cloud[nearest]) @ normal)
+        is_on_plane = gaps_m[nearest] < 0.3 or off_plane_m < 0.2 * gaps_m[nearest]
+        expected.append(off_plane_m if is_on_plane else gaps_m[nearest])
     np.testing.assert_allclose(distances_m(points, surface, 0.3), expected, atol=1e-6)
 
 
