@@ -22,12 +22,12 @@ from cdpipe.surface import (
     SURFACE_CELL_M,
     PlaneTable,
     candidates,
-    cell_means,
     compare_site,
     groups,
     grown,
 )
 from cdpipe.types import ChangeRegions, MergedMaps, PointMap, SessionName
+from cdpipe.voxel import cell_means
 
 # An object that begins inside of a sphere is followed this far out of it.
 BEYOND_M = 1.5

@@ -11,9 +11,10 @@ from scipy.spatial import cKDTree
 from cdpipe.geometry import Float64Array, Int32Array, Int64Array, require_shape
 from cdpipe.moves import find_moves
 from cdpipe.remains import is_part_of_a_rest
-from cdpipe.shape import cell_means, object_shape
+from cdpipe.shape import object_shape
 from cdpipe.sphere import MapIndex
 from cdpipe.types import ChangedObject, MergedMaps, PointMap, SessionName
+from cdpipe.voxel import cell_means
 
 _BLOCK_RETURNS = 1 << 22
 # An object is measured on the means of its returns in cells of this share of the map's, where there are enough in one:
@@ -148,8 +149,8 @@ def _measured_points(merged: MergedMaps, group: PointGroup, returns: Int64Array)
     point_map = merged.before if group.session == "before" else merged.after
     if point_map.return_offsets is None or len(returns) == 0:
         return group.points_map
-    means, counts = cell_means(point_map.positions_of(returns), point_map.voxel_m / _FINE_SHARE)
-    is_full = counts >= _RETURNS_PER_CELL
+    means, cells = cell_means(point_map.positions_of(returns), point_map.voxel_m / _FINE_SHARE)
+    is_full = np.bincount(cells) >= _RETURNS_PER_CELL
     if is_full.mean() >= _LEAST_FULL_CELLS:
         means = means[is_full]
     return means if group.session == "before" else merged.alignment.to_map(means)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
-from cdpipe.geometry import Float64Array, Int64Array, yaw_pose
+from cdpipe.geometry import Float64Array, yaw_pose
 from cdpipe.types import ObjectShape
 from cdpipe.voxel import cell_keys
 
@@ -93,12 +93,6 @@ def ground_heights(surface: Float64Array, places: Float64Array, ground_m: float 
     n_columns = min(_GROUND_COLUMNS, len(lowest))
     _, nearest = cKDTree(lowest[:, :2]).query(places[:, :2], k=[*range(1, n_columns + 1)])
     return np.asarray(np.median(lowest[nearest, 2], axis=1))
-
-
-def cell_means(points: Float64Array, cell_m: float) -> tuple[Float64Array, Int64Array]:
-    """Return the mean (C, 3) of the points of each occupied cell of a grid, and how many (C,) they are."""
-    _, cell, counts = np.unique(cell_keys(points, cell_m), return_inverse=True, return_counts=True)
-    return np.column_stack([np.bincount(cell, points[:, axis]) / counts for axis in range(3)]), counts
 
 
 def _columns(points: Float64Array, column_m: float) -> Float64Array:

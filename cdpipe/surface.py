@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 from cdpipe.config import ExtractConfig
 from cdpipe.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.registration import Surface
-from cdpipe.voxel import cell_keys
+from cdpipe.voxel import cell_means
 
 # Map points this far off are candidates: less than the lowest objects stand out, more than a cell's mean is off.
 _COARSE_M = 0.08
@@ -147,14 +147,6 @@ def groups(points: Float64Array, link_m: float) -> tuple[Int64Array, Int64Array]
     graph = coo_array((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     _, labels = connected_components(graph, directed=False)
     return labels.astype(np.int64), np.bincount(labels)
-
-
-def cell_means(points: Float64Array, cell_m: float) -> tuple[Float64Array, Int64Array]:
-    """Return the (N, 3) mean of the points of each occupied cell, and the (M,) cell of each point."""
-    _, cells = np.unique(cell_keys(points, cell_m), return_inverse=True)
-    counts = np.bincount(cells)
-    means = np.column_stack([np.bincount(cells, points[:, axis]) / counts for axis in range(3)])
-    return means, cells.astype(np.int64)
 
 
 def compare_site(points: Float64Array, reference: Float64Array) -> Site:

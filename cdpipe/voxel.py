@@ -54,6 +54,14 @@ def thinned(points: Float64Array, cell_m: float) -> Float64Array:
     return points[first]
 
 
+def cell_means(points: Float64Array, cell_m: float) -> tuple[Float64Array, Int64Array]:
+    """Return the (C, 3) mean of the points of each occupied cell, and the (N,) cell of each point."""
+    _, cells = np.unique(cell_keys(points, cell_m), return_inverse=True)
+    counts = np.bincount(cells)
+    means = np.column_stack([np.bincount(cells, points[:, axis]) / counts for axis in range(3)])
+    return means, cells.astype(np.int64)
+
+
 class UniqueCells:
     """The distinct keys of a stream that is too long to hold; cells are numbered as they first appear.
 

@@ -7,9 +7,8 @@ import pytest
 
 from cdpipe.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.objects import PointGroup, _Surroundings, assemble_objects
-from cdpipe.shape import cell_means
 from cdpipe.types import PLACES, ChangedObject, MergedMaps, PointMap, SessionName
-from cdpipe.voxel import cell_keys
+from cdpipe.voxel import cell_keys, cell_means
 
 VOXEL_M = 0.2
 STEP_M = 0.04

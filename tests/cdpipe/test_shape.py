@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from cdpipe.geometry import Float64Array, invert, stream, transform, yaw_pose, yaw_rad
-from cdpipe.shape import cell_means, column_volume_m3, ground_heights, object_shape, upright_box
+from cdpipe.shape import column_volume_m3, ground_heights, object_shape, upright_box
+from cdpipe.voxel import cell_means
 
 NOTHING = np.zeros((0, 3))
 
@@ -134,6 +135,6 @@ def test_ground_by_hand() -> None:
 
 
 def test_means_of_cells_by_hand() -> None:
-    means, counts = cell_means(np.array([[0.01, 0.0, 0.0], [0.03, 0.0, 0.0], [0.07, 0.0, 0.0]]), 0.05)
+    means, cells = cell_means(np.array([[0.01, 0.0, 0.0], [0.03, 0.0, 0.0], [0.07, 0.0, 0.0]]), 0.05)
     np.testing.assert_allclose(means, [[0.02, 0, 0], [0.07, 0, 0]])
-    assert counts.tolist() == [2, 1]
+    assert cells.tolist() == [0, 0, 1]

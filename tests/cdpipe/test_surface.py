@@ -6,7 +6,8 @@ import pytest
 from cdpipe.config import ExtractConfig
 from cdpipe.geometry import Float64Array, stream, transform, yaw_pose
 from cdpipe.registration import Surface
-from cdpipe.surface import PlaneTable, Site, candidates, cell_means, compare_site, distances_m, groups, grown
+from cdpipe.surface import PlaneTable, Site, candidates, compare_site, distances_m, groups, grown
+from cdpipe.voxel import cell_means
 
 CONFIG = ExtractConfig()
 
