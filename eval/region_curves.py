@@ -1,9 +1,11 @@
 """How many changes are found at which price: the free-response curve over candidates, and the ROC over keyframes.
 
-The free-response curve lets the threshold fall over all candidates, reported or not, and counts the observable changes
-found against the false regions per 100 m of after path, over changed and unchanged pairs alike. Scores of some methods
-mean something else in a wide drift than in a narrow one, as the radius does, so a threshold belongs to one method and
-one kind of site (`score_radius_m`): at each rate every kind of site has the lowest threshold that keeps its own rate.
+The free-response curve lets the threshold fall over all candidates that were not withdrawn, reported or not, and counts
+the observable changes found against the false regions per 100 m of after path, over changed and unchanged pairs alike.
+Below a method's own threshold nothing was looked at and nothing withdrawn: there the curve is that of mere proposals.
+Scores of some methods mean something else in a wide drift than in a narrow one, as the radius does, so a threshold
+belongs to one method and one kind of site (`score_radius_m`): at each rate every kind of site has the lowest threshold
+that keeps its own rate.
 A pair without an answer misses all its changes, and its way is not counted.
 """
 
@@ -57,14 +59,19 @@ class RankedPairs:
     change_rows: Int64Array
 
 
-def ranked_pairs(results: pd.DataFrame, regions: pd.DataFrame, changes: pd.DataFrame) -> RankedPairs:
+def ranked_pairs(
+    results: pd.DataFrame, regions: pd.DataFrame, changes: pd.DataFrame, *, is_proposal: bool = False
+) -> RankedPairs:
     """Put together the candidates and changes of one variant.
 
     Args:
         results: Its rows of results.csv.
         regions: Its rows of regions.csv, candidates of a pair best first.
         changes: Its rows of changes.csv.
+        is_proposal: Count the candidates that were withdrawn as well.
     """
+    if not is_proposal:
+        regions = regions[~regions["is_withdrawn"].astype(bool)]
     cases = results[results["n_observable"].notna()].sort_values(PAIR)
     pairs = [(str(scenario), int(seed)) for scenario, seed in zip(cases["scenario"], cases["seed"], strict=True)]
     place = {pair: index for index, pair in enumerate(pairs)}

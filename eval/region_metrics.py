@@ -106,7 +106,7 @@ def match_regions(
 
 
 def recall_at_k(found: Sequence[tuple[int, ...]], is_observable: BoolArray) -> float:
-    """Return the share of the K observable changes that the K best candidates find, reported or not; NaN for K = 0."""
+    """Return the share of the K observable changes that the first K of `found` find, best first; NaN for K = 0."""
     k = int(np.count_nonzero(is_observable))
     if k == 0:
         return float("nan")
@@ -174,6 +174,8 @@ def score_regions(report: ChangeReport, truth: GroundTruth, after_travelled_m: F
     centres = centres_in_world(regions.centres_map, truth.before, keyframes)
     matches = match_regions(centres, regions.is_reported, truth.centroids_world, truth.is_observable, radius_m)
     path_m = float(after_travelled_m[-1])
+    is_withdrawn = regions.is_proposed & ~regions.is_reported
+    kept = [found for found, is_gone in zip(matches.found, is_withdrawn, strict=True) if not is_gone]
     proposed = match_regions(centres, regions.is_proposed, truth.centroids_world, truth.is_observable, radius_m)
 
     scores = regions.keyframe_scores
@@ -183,14 +185,15 @@ def score_regions(report: ChangeReport, truth: GroundTruth, after_travelled_m: F
     columns = {
         **_rates(matches, truth, path_m),
         **{f"{name}_proposed": value for name, value in _rates(proposed, truth, path_m).items()},
-        "region_recall_at_k": recall_at_k(matches.found, truth.is_observable),
+        "region_recall_at_k": recall_at_k(kept, truth.is_observable),
+        "region_recall_at_k_proposed": recall_at_k(matches.found, truth.is_observable),
         "region_auroc": auroc(scores[used], labels[used] == 1),
         "region_ap": average_precision(scores[used], labels[used] == 1),
         "region_coverage": covered_share(
             truth.after.world_T_sensor[:, :3, 3], after_travelled_m, centres[regions.is_reported], regions.radius_m
         ),
         "n_regions": int(np.count_nonzero(regions.is_reported)),
-        "n_withdrawn": int(np.count_nonzero(regions.is_proposed & ~regions.is_reported)),
+        "n_withdrawn": int(np.count_nonzero(is_withdrawn)),
         "n_true_regions": matches.count("true"),
         "n_false_regions": matches.count("false"),
         "n_duplicate_regions": matches.count("duplicate"),
@@ -230,7 +233,8 @@ def unanswered_regions(n_changes: int, n_observable: int) -> RegionScores:
         "found_changes",
     )
     columns = {
-        **dict.fromkeys(("region_recall", "region_recall_proposed", "region_recall_at_k"), recall),
+        **dict.fromkeys(("region_recall", "region_recall_at_k"), recall),
+        **dict.fromkeys(("region_recall_proposed", "region_recall_at_k_proposed"), recall),
         **rates,
         **dict.fromkeys((f"n_{name}" for name in counts), 0),
     }

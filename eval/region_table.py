@@ -36,7 +36,10 @@ MAIN_VARIANT, PAPER_VARIANT = "tunnelcd", "paper"
 RIVALS = ("voxel-diff", "c2c")
 FILES = ("regions_table", "regions_targets", "regions_by_size", "roc", "froc")
 LEAST_KM = 5.0
-_MEANS = ("region_auroc", "region_recall_at_k", "region_recall", "region_precision")
+_MEANS = (
+    "region_auroc", "region_recall_at_k", "region_recall_at_k_proposed", "region_recall", "region_recall_proposed",
+    "region_precision",
+)  # fmt: skip
 _MEDIANS = ("t_descriptor_per_keyframe_s", "t_cd_per_region_s")
 _AUROC, _RECALL_AT_K = {"in": 0.97, "out": 0.93}, {"in": 0.95, "out": 0.90}
 _WORDS = {"region_auroc": "AUROC", "region_recall_at_k": "recall at K"}
@@ -74,6 +77,7 @@ def region_tables(
             labelled = keyframes[keyframes["label"] >= 0]
             scores, positive = labelled["score"].to_numpy(dtype=np.float64), labelled["label"].to_numpy() == 1
             rows.append({**names, **_counts(own), "region_auroc_pooled": auroc(scores, positive), **_operating(each)})
+            rows[-1] |= _proposed(ranked_pairs(own, regions, changes, is_proposal=True))
             sizes += [{**names, **row} for row in recall_by_size(each, changes)]
             roc, froc = roc_curve(scores, positive), free_response(each)
             curves["roc"].append(_curve(names, roc, ("false_positive_rate", "true_positive_rate")))
@@ -135,7 +139,17 @@ def _of_cases(items: pd.DataFrame, cases: pd.DataFrame) -> pd.DataFrame:
     """Return the items of some rows of results.csv, in their order, with the columns that readers ask for."""
     wanted = [*PAIR, "variant"]
     own = items.merge(cases[wanted].drop_duplicates(), on=wanted, how="inner") if len(items) else items
-    needed = (*wanted, "id", "is_observable", "is_found", "n_truth_cells", "score", "found_changes", "label")
+    needed = (
+        *wanted,
+        "id",
+        "is_observable",
+        "is_found",
+        "n_truth_cells",
+        "score",
+        "found_changes",
+        "is_withdrawn",
+        "label",
+    )
     return own.assign(**{name: [] for name in needed if name not in own}) if len(own) == 0 else own
 
 
@@ -192,6 +206,11 @@ def _operating(ranked: RankedPairs) -> dict[str, float]:
         name = f"recall_at_{rate:g}"
         found |= {name: recall_at(ranked, rate), f"{name}_low": low, f"{name}_high": high}
     return found
+
+
+def _proposed(ranked: RankedPairs) -> dict[str, float]:
+    """Return recall at each false-alarm rate as if no candidate had been withdrawn."""
+    return {f"recall_at_{rate:g}_proposed": recall_at(ranked, rate) for rate in RATES_PER_100M}
 
 
 def _against(domain: str, rival: str, ranked: Mapping[tuple[str, str], RankedPairs]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from eval.object_metrics import kinds_right, match_objects, object_columns, unan
 from eval.object_sizes import SizeErrors, size_columns, size_errors
 from eval.region_metrics import keyframes_or_all, score_regions, unanswered_regions
 
-METRICS_VERSION = 3
+METRICS_VERSION = 4
 _NAN = float("nan")
 
 

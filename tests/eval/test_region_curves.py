@@ -44,7 +44,8 @@ def results(cases: Sequence[tuple[object, ...]] = CASES) -> pd.DataFrame:
 
 
 def regions(rows: Sequence[tuple[object, ...]] = CANDIDATES) -> pd.DataFrame:
-    return pd.DataFrame(rows, columns=["seed", "score", "found_changes"]).assign(scenario="a", variant="ours")
+    names = {"scenario": "a", "variant": "ours", "is_withdrawn": False}
+    return pd.DataFrame(rows, columns=["seed", "score", "found_changes"]).assign(**names)
 
 
 def changes(rows: Sequence[tuple[object, ...]] = CHANGES) -> pd.DataFrame:
@@ -64,6 +65,20 @@ def test_the_free_response_by_hand() -> None:
     np.testing.assert_allclose(recall, [1 / 4, 2 / 4, 3 / 4])
     found = {rate: recall_at(by_hand(), rate) for rate in (0.0, 0.099, 0.1, 0.2, 5.0)}
     assert found == {0.0: 0.25, 0.099: 0.25, 0.1: 0.5, 0.2: 0.75, 5.0: 0.75}
+
+
+def test_what_was_withdrawn_is_no_candidate_but_was_proposed() -> None:
+    # without the false region at 8 the third (7.0), which finds the change 2, costs nothing more; without the one at 7
+    # that change is never found
+    found = regions()
+    gone = found.assign(is_withdrawn=found["score"] == 8.0)
+    rates, recall = free_response(ranked_pairs(results(), gone, changes()))
+    np.testing.assert_allclose([rates[1], recall[1]], [0.05, 2 / 4])
+    assert recall_at(ranked_pairs(results(), gone, changes()), 0.05) == 2 / 4
+    assert recall_at(ranked_pairs(results(), gone, changes(), is_proposal=True), 0.05) == 1 / 4
+    lost = found.assign(is_withdrawn=found["score"] == 7.0)
+    assert recall_at(ranked_pairs(results(), lost, changes()), 10.0) == 2 / 4
+    assert recall_at(ranked_pairs(results(), lost, changes(), is_proposal=True), 10.0) == 3 / 4
 
 
 def test_a_later_candidate_on_a_found_change_counts_nothing_and_an_unobservable_one_is_not_false() -> None:

@@ -18,6 +18,7 @@ NAN = float("nan")
 PER_PAIR = {
     "region_auroc": NAN, "region_recall_at_k": NAN, "region_recall": NAN, "region_precision": NAN, "n_false_regions": 0,
     "n_found_changes": 0, "bytes_map_before": 1000.0, "bytes_regions_before": 100.0, "after_path_m": 1000.0,
+    "region_recall_at_k_proposed": NAN, "region_recall_proposed": NAN,
     "t_descriptor_per_keyframe_s": 0.01, "t_cd_per_region_s": NAN, "is_unchanged_pair": False, "is_alarm": NAN,
     "score_radius_m": 4.5, "n_observable": 0, "status": "ok",
 }  # fmt: skip
@@ -45,7 +46,7 @@ def tables(
     identity = [{name: row[name] for name in ("scenario", "seed", "variant")} for row in truth]
     change = {"id": 1, "is_observable": True, "n_truth_cells": 20, "is_found": True, "hull_volume_m3": 0.2}
     found = [
-        {**names, "score": 1.0, "found_changes": "1"}
+        {**names, "score": 1.0, "found_changes": "1", "is_withdrawn": False}
         for names, row in zip(identity, truth, strict=True)
         if row["status"] == "ok" and row["variant"] == "tunnelcd"
     ]
@@ -147,7 +148,8 @@ def test_a_rival_that_finds_more_makes_the_target_missed() -> None:
         {**row, "variant": {"tunnelcd": "c2c", "c2c": "tunnelcd"}[str(row["variant"])]} for row in [*ours, *theirs]
     ]
     regions = [
-        {"scenario": "narrow", "seed": s, "variant": "c2c", "score": 1.0, "found_changes": "1"} for s in range(4)
+        {"scenario": "narrow", "seed": s, "variant": "c2c", "score": 1.0, "found_changes": "1", "is_withdrawn": False}
+        for s in range(4)
     ]
     target = the_target(tables(swapped, regions=regions)["regions_targets"], str(target["target"]), "in")
     assert (target["value"], target["is_met"]) == (-1.0, False)

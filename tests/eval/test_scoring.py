@@ -38,7 +38,7 @@ scenario family domain pair_kind seed variant preset status error metrics_versio
 region_recall region_precision region_recall_at_k region_auroc region_ap false_regions_per_100m region_coverage
 n_regions n_true_regions n_false_regions n_duplicate_regions n_ignored_regions n_found_changes
 object_iou_point object_iou_voxel object_iou_box object_f1_25 object_f1_50 object_precision_50 object_pq kind_accuracy
-region_recall_proposed region_precision_proposed false_regions_per_100m_proposed n_withdrawn
+region_recall_proposed region_recall_at_k_proposed region_precision_proposed false_regions_per_100m_proposed n_withdrawn
 n_objects n_matched n_ignored_objects n_partial object_iou_point_partial displacement_error_m pile_volume_error
 merge_error_m merge_error_deg merge_error_along_m merge_error_m_p95 merge_error_deg_p95 merge_error_along_m_p95
 n_merge_pairs overlap_true evidence_overlap evidence_inlier_share evidence_residual_m evidence_hessian_ratio
@@ -209,7 +209,8 @@ def test_withdrawn_regions_count_before_and_not_after(tiny_pair: Path, tiny_merg
     assert [row["outcome"] for row in case.regions][2:] == ["unreported"] * 3
     # time was spent on what was withdrawn as well
     assert case.row["t_oe_per_region_s"] == pytest.approx(0.06 / 4)
-    assert case.row["region_recall_at_k"] == 1.0
+    # K = 3: the third that stands finds nothing, the third that was proposed finds the change withdrawn with it
+    assert (case.row["region_recall_at_k"], case.row["region_recall_at_k_proposed"]) == (2 / 3, 1.0)
     # where nothing is ever withdrawn, before is after
     plain = scored(tiny_pair, report).row
     assert [plain[f"{name}_proposed"] for name in rates] == [plain[name] for name in rates]
