@@ -23,27 +23,31 @@ ALARM_SHARE = 0.05
 FALSE_PER_100M = 0.1
 
 
-def alarm_threshold(best_scores: Float64Array, alarm_share: float = ALARM_SHARE) -> float:
+def alarm_threshold(best_scores: Float64Array, alarm_share: float = ALARM_SHARE, lowest: float | None = None) -> float:
     """Return the smallest threshold, rounded up to four digits, that at most `alarm_share` of the pairs reach.
 
     Args:
         best_scores: (P,) best candidate's score of every unchanged pair; -inf for a pair without candidates.
         alarm_share: Share of pairs that may alarm.
+        lowest: What the run let through: below that nothing was looked at, so no threshold is known to hold.
     """
     if len(best_scores) == 0 or np.isnan(best_scores).any():
         raise ValueError("best_scores must hold a number for each of at least one pair")
-    return _just_above(best_scores, int(alarm_share * len(best_scores)))
+    return _just_above(best_scores, int(alarm_share * len(best_scores)), lowest)
 
 
-def rate_threshold(scores: Float64Array, path_m: float, false_per_100m: float = FALSE_PER_100M) -> float:
+def rate_threshold(
+    scores: Float64Array, path_m: float, false_per_100m: float = FALSE_PER_100M, lowest: float | None = None
+) -> float:
     """Return the smallest threshold, rounded up to four digits, that at most so many false regions per 100 m reach.
 
     Args:
         scores: (R,) score of every candidate of all unchanged pairs.
         path_m: Way of their after sessions.
         false_per_100m: What is allowed.
+        lowest: As above.
     """
-    return _just_above(scores, int(false_per_100m * path_m / 100.0 + 1e-9))
+    return _just_above(scores, int(false_per_100m * path_m / 100.0 + 1e-9), lowest)
 
 
 def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
@@ -51,7 +55,7 @@ def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
 
     A threshold belongs to a kind of site, as the radius does: what is much change in a narrow drift is little in a
     wide one. Kinds of site differ in `score_radius_m`. Candidates that were withdrawn cannot alarm; for that to show,
-    the run must let more through than the threshold that is looked for.
+    the run must let more through than the threshold that is looked for, and no lower one is given.
 
     Returns:
         `threshold`, which at most 5 % of the pairs reach, with `n_pairs`, `n_alarms` of them and `n_unanswered` further
@@ -70,12 +74,16 @@ def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
         if len(ok) == 0:
             raise InputError(f"{variant}, {radius_m:g} m: no pair has an answer: nothing to set a threshold by")
         stands = (regions["variant"] == variant) & ~regions["is_withdrawn"].astype(bool)
+        lowest = _let_through(regions[regions["variant"] == variant].merge(cases[["scenario", "seed"]]))
+        if lowest is not None:
+            stands &= regions["score"] >= lowest
         of_case = regions[stands].groupby(["scenario", "seed"])["score"]
         found = {case: scores.to_numpy(dtype=np.float64) for case, scores in of_case}
         candidates = [found.get(case, np.zeros(0)) for case in zip(ok["scenario"], ok["seed"], strict=True)]
         best = np.array([scores.max(initial=-np.inf) for scores in candidates])
         every, path_m = np.concatenate(candidates), float(ok["after_path_m"].sum())
-        threshold, at_rate = alarm_threshold(best), rate_threshold(every, path_m)
+        threshold = alarm_threshold(best, lowest=lowest)
+        at_rate = rate_threshold(every, path_m, lowest=lowest)
         rows.append(
             {
                 "variant": variant,
@@ -123,11 +131,22 @@ def main(run: Annotated[Path, typer.Argument(help="folder of `tunnelcd run calib
     typer.echo(f"{table.to_string(index=False)}\n\n{settings}")
 
 
-def _just_above(scores: Float64Array, allowed: int) -> float:
-    """Return the smallest number of four digits that no more than `allowed` of (N,) scores reach; 0 without need."""
-    if allowed >= len(scores):
-        return 0.0
-    silent_best = np.sort(scores)[::-1][allowed]
+def _let_through(regions: pd.DataFrame) -> float | None:
+    """Return the lowest score of what was let through and looked at; None of a method that withdraws nothing."""
+    is_withdrawn = regions["is_withdrawn"].astype(bool)
+    if not is_withdrawn.any():
+        return None
+    return float(regions.loc[is_withdrawn | regions["is_reported"].astype(bool), "score"].min())
+
+
+def _just_above(scores: Float64Array, allowed: int, lowest: float | None) -> float:
+    """Return the smallest number of four digits, `lowest` or more, that no more than `allowed` of (N,) scores reach.
+
+    Without need it is what is lowest, or 0.
+    """
+    silent_best = -np.inf if allowed >= len(scores) else np.sort(scores)[::-1][allowed]
+    if lowest is not None:
+        silent_best = max(silent_best, np.nextafter(lowest, -np.inf))
     if np.isinf(silent_best):
         return 0.0
     digits = 4 - int(np.floor(np.log10(max(abs(float(silent_best)), 1e-12)))) - 1

@@ -51,8 +51,8 @@ def _results(n_changes: int = 0) -> pd.DataFrame:
 
 def _regions() -> pd.DataFrame:
     found = [("null/a", 1, 5.0), ("null/a", 1, 4.0), ("null/a", 2, 3.0), ("null/b", 3, 6.0), ("null/c", 1, 200.0)]
-    rows = [(scenario, seed, "m", score, False) for scenario, seed, score in found]
-    return pd.DataFrame(rows, columns=["scenario", "seed", "variant", "score", "is_withdrawn"])
+    rows = [(scenario, seed, "m", score, score >= 4.0, False) for scenario, seed, score in found]
+    return pd.DataFrame(rows, columns=["scenario", "seed", "variant", "score", "is_reported", "is_withdrawn"])
 
 
 def test_a_table_by_hand() -> None:
@@ -68,9 +68,24 @@ def test_a_table_by_hand() -> None:
 
 def test_what_was_withdrawn_cannot_alarm() -> None:
     regions = _regions()
-    regions.loc[regions["score"] == 6.0, "is_withdrawn"] = True
-    narrow, _ = thresholds(_results(), regions).to_dict("records")
+    regions.loc[regions["score"] == 6.0, ["is_reported", "is_withdrawn"]] = False, True
+    narrow, wide = thresholds(_results(), regions).to_dict("records")
     assert narrow["threshold"] == pytest.approx(5.001)
+    assert wide["threshold"] == pytest.approx(200.1)
+
+
+def test_no_threshold_is_below_what_was_looked_at() -> None:
+    # all that was let through, down to 4, was withdrawn; what scored 3 was never looked at
+    regions = _regions()
+    is_narrow = regions["scenario"] != "null/c"
+    regions.loc[is_narrow, "is_withdrawn"] = regions.loc[is_narrow, "is_reported"]
+    regions.loc[is_narrow, "is_reported"] = False
+    narrow, wide = thresholds(_results(), regions).to_dict("records")
+    assert (narrow["threshold"], narrow["threshold_at_rate"], narrow["n_alarms"]) == (4.0, 4.0, 0)
+    assert wide["threshold"] == pytest.approx(200.1)
+    assert alarm_threshold(np.full(5, -np.inf), lowest=-6.905) == -6.905
+    assert alarm_threshold(np.array([-7.0, -2.5]), lowest=-6.905) == pytest.approx(-2.499)
+    assert alarm_threshold(np.full(40, -8.0), lowest=-6.905) == -6.905
 
 
 def test_the_settings_are_lines_of_a_preset_and_of_a_plan() -> None:
