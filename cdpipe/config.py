@@ -101,6 +101,9 @@ class ExtractConfig(Settings):
     min_cells: Count = Field(
         30, description="`surface`: cells of 0.05 m that stand so clear and were seen through, at least"
     )
+    min_views: Positive = Field(
+        2.5, description="`surface`: keyframes by which an object was seen through, less those that hit it, in the mean"
+    )
 
 
 class OutlierConfig(Settings):

@@ -12,7 +12,7 @@ import numpy as np
 
 from cdpipe.config import ExtractConfig
 from cdpipe.crops import DIRECTIONS, Crops, Sphere
-from cdpipe.freespace import seen_through
+from cdpipe.freespace import net_views
 from cdpipe.geometry import BoolArray, Float64Array, Int64Array, invert, transform
 from cdpipe.objects import PointGroup
 from cdpipe.registration import MIN_SPHERE_POINTS, Surface, align_to_planes
@@ -37,6 +37,7 @@ _MAX_SHIFT_M = 0.4
 # A site with fewer such candidates holds no object of a tenth of a cubic metre.
 _MIN_TELLING = 2
 _BLOCK_RETURNS = 1 << 22
+_UNKNOWN_VIEWS = np.int64(1 << 20)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +94,7 @@ def _candidates(
         points, reference = compared[session]
         chosen, noise_m[session] = candidates(points, reference)
         sphere = spheres[session]
-        is_telling = sphere.is_inside[chosen] & _is_free(points[chosen], merged, other, correction)
+        is_telling = sphere.is_inside[chosen] & (_net_views(points[chosen], merged, other, correction) > 0)
         found.append(_Found(session, region, sphere.indices[chosen], is_telling))
     return _Agreement(correction, max(noise_m.values())), found
 
@@ -167,8 +168,8 @@ def _objects(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) -> l
             "after": transform(correction, after_map),
         }
         compared = compare_site(points[site.session], points[other])
-        is_free = _is_free(compared.points, merged, other, correction)
-        for cells in grown(compared, is_free, site.agreement.noise_m, config):
+        n_views = _net_views(compared.points, merged, other, correction)
+        for cells in grown(compared, n_views, site.agreement.noise_m, config):
             is_member = np.zeros(len(compared.points), dtype=np.bool_)
             is_member[cells] = True
             of_object = is_member[compared.cell_of_return]
@@ -181,14 +182,19 @@ def _objects(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) -> l
     return result
 
 
-def _is_free(points_map: Float64Array, merged: MergedMaps, other: SessionName, correction: Float64Array) -> BoolArray:
-    """Mark what the other session saw through of (N, 3) places in the re-aligned map frame; all, if that is unknown."""
+def _net_views(
+    points_map: Float64Array, merged: MergedMaps, other: SessionName, correction: Float64Array
+) -> Int64Array:
+    """Return how often the other session saw through (N, 3) places in the re-aligned map frame, less how often it hit.
+
+    Of a map that kept no views that is unknown, and more than any number asked for.
+    """
     views = (merged.before if other == "before" else merged.after).views
     if views is None:
-        return np.ones(len(points_map), dtype=np.bool_)
+        return np.full(len(points_map), _UNKNOWN_VIEWS)
     if other == "after":
         points_map = merged.alignment.to_odom(transform(invert(correction), points_map))
-    return seen_through(points_map, views)
+    return net_views(points_map, views)
 
 
 class ReturnPool:

@@ -39,9 +39,14 @@ def view(points_sensor: Float64Array) -> Float16Array:
 
 
 def seen_through(points_odom: Float64Array, views: KeyframeViews) -> BoolArray:
-    """Mark the (N,) places that more keyframes saw through than hit.
+    """Mark the (N,) places that more keyframes saw through than hit (`net_views`)."""
+    return net_views(points_odom, views) > 0
 
-    What no keyframe looked at, or was hidden from all, is not marked.
+
+def net_views(points_odom: Float64Array, views: KeyframeViews) -> Int64Array:
+    """Return how many more keyframes saw through each of (N,) places than hit it.
+
+    It is 0 of what no keyframe looked at, or was hidden from all.
 
     Args:
         points_odom: (N, 3) points in the odom frame of the session that looked, metres.
@@ -49,7 +54,7 @@ def seen_through(points_odom: Float64Array, views: KeyframeViews) -> BoolArray:
     """
     balance = np.zeros(len(points_odom), dtype=np.int64)
     if len(points_odom) == 0 or len(views.ranges_m) == 0:
-        return balance > 0
+        return balance
     centre = points_odom.mean(axis=0)
     spread_m = float(np.linalg.norm(points_odom - centre, axis=1).max())
     rotations, shifts = views.sensor_T_odom[:, :3, :3], views.sensor_T_odom[:, :3, 3]
@@ -60,7 +65,7 @@ def seen_through(points_odom: Float64Array, views: KeyframeViews) -> BoolArray:
         first_m, is_hit = _looked_up(views.ranges_m[keyframe], pixel[in_view], ranges_m[in_view])
         balance[in_view] += np.isfinite(first_m) & (first_m > ranges_m[in_view] + _MARGIN_M)
         balance[in_view] -= is_hit
-    return balance > 0
+    return balance
 
 
 def _looked_up(image: Float16Array, pixel: Int64Array, ranges_m: Float64Array) -> tuple[Float64Array, BoolArray]:

@@ -160,25 +160,28 @@ def compare_site(points: Float64Array, reference: Float64Array) -> Site:
     return Site(means, cell_of_return, distances_m(means, Surface(surface_points), _PLANE_M))
 
 
-def grown(site: Site, is_free: BoolArray, noise_m: float, config: ExtractConfig) -> list[Int64Array]:
+def grown(site: Site, net_views: Int64Array, noise_m: float, config: ExtractConfig) -> list[Int64Array]:
     """Return the cells of each object of a site.
 
     What stands off the surface by more than the noise, and was seen through, belongs together where it touches; such a
-    group is an object if enough of it stands well clear. Its foot, at floor and wall, is too near to the surface for
-    any ray to have passed behind it; it is the object's as far as it also stands off.
+    group is an object if enough of it stands well clear, and if `min_views` keyframes in the mean saw through it: where
+    only one or two did, from afar, the edge of what they could see is no change. Its foot, at floor and wall, is too
+    near to the surface for any ray to have passed behind it; it is the object's as far as it also stands off.
 
     Args:
         site: Its cells.
-        is_free: (N,) cells that the other session saw through.
+        net_views: (N,) keyframes of the other session that saw through each cell, less those that hit it.
         noise_m: Median distance of the two maps' surfaces around here.
         config: Thresholds.
     """
     border_m = float(np.clip(_NOISE_FACTOR * noise_m, config.border_m, _MAX_BORDER * config.border_m))
     seed_m = max(config.seed_m, _SEED_FACTOR * border_m)
-    stands_off = site.distance_m > border_m
+    stands_off, is_free = site.distance_m > border_m, net_views > 0
     core, foot = np.flatnonzero(stands_off & is_free), np.flatnonzero(stands_off & ~is_free)
     labels, sizes = groups(site.points[core], _LINK_M)
-    kept = np.flatnonzero(np.bincount(labels, site.distance_m[core] > seed_m, len(sizes)) >= config.min_cells)
+    n_clear = np.bincount(labels, site.distance_m[core] > seed_m, len(sizes))
+    n_views = np.bincount(labels, net_views[core], len(sizes))
+    kept = np.flatnonzero((n_clear >= config.min_cells) & (n_views >= config.min_views * sizes))
     if len(kept) == 0:
         return []
     is_kept = np.isin(labels, kept)

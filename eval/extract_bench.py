@@ -23,7 +23,7 @@ from cdpipe.crops import Crops, Sphere
 from cdpipe.cutting import BEYOND_M, ReturnPool, realigned
 from cdpipe.descriptor import use_threads
 from cdpipe.detect import map_session, refusal
-from cdpipe.freespace import seen_through
+from cdpipe.freespace import net_views, seen_through
 from cdpipe.geometry import Float64Array, Int64Array, transform
 from cdpipe.merge import merge_maps
 from cdpipe.novelty import inlier_mask, new_points_mask
@@ -179,7 +179,7 @@ class Region:
         in_map = self.merged.alignment.to_map(self.merged.after.positions_of(own))
         site = compare_site(transform(self.correction, in_map), self.merged.before.positions_of(others))
         noise_m = max(median_m for _, median_m in self.compared)
-        return grown(site, seen_through(site.points, _views(self.merged)), noise_m, config)
+        return grown(site, net_views(site.points, _views(self.merged)), noise_m, config)
 
     @cached_property
     def compared(self) -> tuple[tuple[Int64Array, float], tuple[Int64Array, float]]:

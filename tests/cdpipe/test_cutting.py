@@ -145,10 +145,12 @@ def test_what_the_other_session_never_saw_is_no_change() -> None:
     near = tuple(place for place in PATH if place[0] < 1.0)
     kept_out = scanned((partition,), 1, near)
     inside = scanned((partition, hidden), 2, (*near, *((x, 0.0, 1.5) for x in (2.6, 3.0, 3.4))))
-    looked = scanned((partition,), 3, (*near, *((x, 0.5, 1.5) for x in (2.6, 3.0, 3.4))))
+    looked = scanned((partition,), 3, (*near, *((2.8, y, 1.5) for y in (-2.5, -2.0, -1.5, -1.0, 0.5))))
+    glanced = scanned((partition,), 4, (*near, (2.8, -1.0, 1.5)))
     centres = [(2.5, 0.5, 1.0)]
     assert cut(kept_out, inside, centres) == []
     assert cut(inside, kept_out, centres) == []
+    assert cut(glanced, inside, centres) == []  # one keyframe is not enough
     (group,) = cut(looked, inside, centres)
     assert iou(returns_of(inside[1], group), inside[0].returns_on(1)) > 0.9
     # nobody remembers what was seen through: then everything that stands off is new

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from cdpipe.freespace import COLUMNS, ROWS, seen_through, view
+from cdpipe.freespace import COLUMNS, ROWS, net_views, seen_through, view
 from cdpipe.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.types import KeyframeViews
 from tests.cdpipe.rooms import ROOM, Box, cast
@@ -129,13 +129,15 @@ def test_looking_up_equals_its_slow_twin(seed: int) -> None:
             seen = [float(image[pixel]) for pixel in cross if image[pixel] > 0]
             balance += bool(seen) and min(seen) > range_m + 0.2
             balance -= any(abs(each - range_m) <= 0.2 for each in seen)
-        expected.append(balance > 0)
-    found = seen_through(points, KeyframeViews(images, invert(poses)))
-    assert 0.1 < np.mean(expected) < 0.9
+        expected.append(balance)
+    found = net_views(points, KeyframeViews(images, invert(poses)))
+    assert 0.1 < np.mean(np.array(expected) > 0) < 0.9
+    assert {-2, -1, 0, 1, 2, 3} <= set(expected)
     np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(seen_through(points, KeyframeViews(images, invert(poses))), found > 0)
     # places far from each other do not hide each other's keyframes
     np.testing.assert_array_equal(
-        [seen_through(point[None], KeyframeViews(images, invert(poses)))[0] for point in points[:200]], expected[:200]
+        [net_views(point[None], KeyframeViews(images, invert(poses)))[0] for point in points[:200]], expected[:200]
     )
 
 

@@ -159,8 +159,8 @@ def on_floor(*boxes: Float64Array) -> Site:
 
 
 def is_above(site: Site, height_m: float) -> np.ndarray:
-    """Seen through down to a height: no ray passed between foot and floor."""
-    return site.points[:, 2] > height_m
+    """Seen through by three keyframes down to a height: no ray passed between foot and floor."""
+    return np.where(site.points[:, 2] > height_m, 3, 0)
 
 
 BOX = skin((0, 0, 0), (0.8, 0.6, 0.7))
@@ -177,7 +177,7 @@ def test_a_box_is_grown_whole_down_to_the_border(noise_m: float, border_m: float
 
 def test_what_was_not_seen_through_grows_nothing() -> None:
     site = on_floor(BOX)
-    assert grown(site, np.zeros(len(site.points), np.bool_), 0.0, CONFIG) == []
+    assert grown(site, np.zeros(len(site.points), np.int64), 0.0, CONFIG) == []
     # nor does what stands behind it: the foot ends 0.3 m from what was seen through
     (found,) = grown(site, is_above(site, 0.56), 0.0, CONFIG)
     core = np.flatnonzero(site.points[:, 2] > 0.56)
@@ -190,10 +190,25 @@ def test_what_was_not_seen_through_grows_nothing() -> None:
 def test_an_object_has_enough_cells_that_stand_clear(n_clear: int, n_objects: int) -> None:
     cells = lattice((0, 0, 0.2), (0.35, 0.55, 0.2), 0.05)
     height_m = np.where(np.arange(len(cells)) < n_clear, 0.125, 0.115)
-    found = grown(Site(cells, np.arange(len(cells)), height_m), np.ones(len(cells), np.bool_), 0.0, CONFIG)
+    found = grown(Site(cells, np.arange(len(cells)), height_m), np.full(len(cells), 3), 0.0, CONFIG)
     assert [len(each) for each in found] == [len(cells)] * n_objects
     # noise raises what counts as clear: 2.5 times a border of 5 times the noise
-    assert grown(Site(cells, np.arange(len(cells)), height_m), np.ones(len(cells), np.bool_), 0.011, CONFIG) == []
+    assert grown(Site(cells, np.arange(len(cells)), height_m), np.full(len(cells), 3), 0.011, CONFIG) == []
+
+
+def test_an_object_was_seen_through_by_enough_keyframes_in_the_mean() -> None:
+    # the mean is over what was seen through at all: 100 cells by three and as many by two are 2.5, one view less is not
+    cells = lattice((0, 0, 0.3), (0.95, 0.45, 0.3), 0.05)
+    site = Site(cells, np.arange(200), np.full(200, 0.3))
+    views = np.repeat([3, 2], 100)
+    (found,) = grown(site, views, 0.0, CONFIG)
+    assert len(found) == 200
+    views[0] = 2
+    assert grown(site, views, 0.0, CONFIG) == []
+    (found,) = grown(site, views, 0.0, CONFIG.model_copy(update={"min_views": 2.4}))
+    assert len(found) == 200
+    # cells that were hit as often as seen through are no evidence either way
+    assert len(grown(site, np.repeat([3, 0], 100), 0.0, CONFIG)) == 1
 
 
 def test_two_boxes_half_a_metre_apart_are_two_and_touching_ones_are_one() -> None:
@@ -210,6 +225,6 @@ def test_two_boxes_half_a_metre_apart_are_two_and_touching_ones_are_one() -> Non
 
 def test_nothing_stands_off() -> None:
     site = on_floor()
-    assert grown(site, np.ones(len(site.points), np.bool_), 0.0, CONFIG) == []
+    assert grown(site, np.full(len(site.points), 3), 0.0, CONFIG) == []
     empty = Site(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0))
-    assert grown(empty, np.zeros(0, np.bool_), 0.0, CONFIG) == []
+    assert grown(empty, np.zeros(0, np.int64), 0.0, CONFIG) == []
