@@ -12,7 +12,7 @@ import numpy as np
 
 from cdpipe.config import ExtractConfig
 from cdpipe.crops import DIRECTIONS, Crops, Sphere
-from cdpipe.freespace import net_views
+from cdpipe.freespace import net_views, scans_past
 from cdpipe.geometry import BoolArray, Float64Array, Int64Array, invert, transform
 from cdpipe.objects import PointGroup
 from cdpipe.registration import MIN_SPHERE_POINTS, Surface, align_to_planes
@@ -25,6 +25,9 @@ from cdpipe.surface import (
     compare_site,
     groups,
     grown,
+    left_over,
+    low_grown,
+    nearest_of,
 )
 from cdpipe.types import ChangeRegions, MergedMaps, PointMap, SessionName
 from cdpipe.voxel import cell_means
@@ -36,6 +39,8 @@ _ROUNDS_M = (0.5, 0.25)
 _MAX_SHIFT_M = 0.4
 # A site with fewer such candidates holds no object of a tenth of a cubic metre.
 _MIN_TELLING = 2
+# What is nearer to the other map than this may be too low for a view to tell whether it was seen through.
+_LOW_M = 0.3
 _BLOCK_RETURNS = 1 << 22
 _UNKNOWN_VIEWS = np.int64(1 << 20)
 
@@ -44,7 +49,7 @@ _UNKNOWN_VIEWS = np.int64(1 << 20)
 class _Found:
     """Candidates of one session in one region: map points, and whether they make a site worth a closer look.
 
-    They do inside of the sphere, where the other session saw through them.
+    They do inside of the sphere, where the other session saw through them or they are low.
     """
 
     session: SessionName
@@ -94,7 +99,8 @@ def _candidates(
         points, reference = compared[session]
         chosen, noise_m[session] = candidates(points, reference)
         sphere = spheres[session]
-        is_telling = sphere.is_inside[chosen] & (_net_views(points[chosen], merged, other, correction) > 0)
+        is_low = nearest_of(points[chosen], reference.surface)[1] < _LOW_M
+        is_telling = sphere.is_inside[chosen] & (is_low | (_net_views(points[chosen], merged, other, correction) > 0))
         found.append(_Found(session, region, sphere.indices[chosen], is_telling))
     return _Agreement(correction, max(noise_m.values())), found
 
@@ -169,7 +175,13 @@ def _objects(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) -> l
         }
         compared = compare_site(points[site.session], points[other])
         n_views = _net_views(compared.points, merged, other, correction)
-        for cells in grown(compared, n_views, site.agreement.noise_m, config):
+        objects = grown(compared, n_views, site.agreement.noise_m, config)
+        left = left_over(compared, objects, site.agreement.noise_m, config)
+        if len(left):
+            ends, origins, scans = points[other], *_origins(merged, other, returns[other], correction)
+            n_past = scans_past(compared.points[left], ends, origins, scans)
+            objects += low_grown(compared, left, n_past, objects, site.agreement.noise_m, config)
+        for cells in objects:
             is_member = np.zeros(len(compared.points), dtype=np.bool_)
             is_member[cells] = True
             of_object = is_member[compared.cell_of_return]
@@ -195,6 +207,19 @@ def _net_views(
     if other == "after":
         points_map = merged.alignment.to_odom(transform(invert(correction), points_map))
     return net_views(points_map, views)
+
+
+def _origins(
+    merged: MergedMaps, session: SessionName, returns: Int64Array, correction: Float64Array
+) -> tuple[Float64Array, Int64Array]:
+    """Return the (M, 3) places, re-aligned map frame, from which the sensor saw some returns, and the scan of each."""
+    point_map = merged.before if session == "before" else merged.after
+    scans = np.searchsorted(point_map.scan_offsets, returns, side="right") - 1
+    seen, scan_of_return = np.unique(scans, return_inverse=True)
+    origins = point_map.odom_T_sensor[seen, :3, 3]
+    if session == "after":
+        origins = transform(correction, merged.alignment.to_map(origins))
+    return origins[scan_of_return], scans
 
 
 class ReturnPool:

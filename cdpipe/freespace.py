@@ -1,8 +1,10 @@
-"""What a session saw through: a place is free where rays from its keyframes went on behind it.
+"""What a session saw through: a place is free where its rays went on behind it.
 
 What one session has and the other has not is a change only if the other one looked there. Each keyframe keeps one image
 of its scan, the range of the nearest return of every pixel; a point well before all returns of its pixel and of the
-four beside it was seen through, one at their range was hit, and one behind them was hidden.
+four beside it was seen through, one at their range was hit, and one behind them was hidden (`net_views`). A pixel is as
+high as what lies low: of that only the rays themselves tell, those that came back from the floor just behind it
+(`scans_past`).
 """
 
 from __future__ import annotations
@@ -21,6 +23,10 @@ _MARGIN_M = 0.2
 _NEAREST_M = 0.5
 # Farther off, pixels are wider than what is looked for.
 _REACH_M = 15.0
+# Rays are followed from their end through cells of this size, from here to there: nearer ones touch what they hit, and
+# who passed farther above the floor was seen through by the views.
+_CELL_M = 0.1
+_PAST_M = (0.1, 1.0)
 _CROSS = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
 
 
@@ -66,6 +72,60 @@ def net_views(points_odom: Float64Array, views: KeyframeViews) -> Int64Array:
         balance[in_view] += np.isfinite(first_m) & (first_m > ranges_m[in_view] + _MARGIN_M)
         balance[in_view] -= is_hit
     return balance
+
+
+def scans_past(points: Float64Array, ends: Float64Array, origins: Float64Array, scans: Int64Array) -> Int64Array:
+    """Return how many scans had a ray through the cell of each place just before it came back, less those that hit it.
+
+    Args:
+        points: (N, 3) places, at least one, metres.
+        ends: (M, 3) returns of the session that looked, those about the places, same frame.
+        origins: (M, 3) where its sensor was then.
+        scans: (M,) which scan each is of.
+    """
+    grid = _Grid(points)
+    is_near = grid.is_within(ends, _PAST_M[1])
+    ends, origins, scans = ends[is_near], origins[is_near], scans[is_near]
+    ranges_m = np.linalg.norm(origins - ends, axis=1)
+    back = (origins - ends) / np.maximum(ranges_m, _NEAREST_M)[:, None]
+    passed = [np.zeros(0, dtype=np.int64)]
+    for step_m in np.arange(_PAST_M[0], _PAST_M[1], _CELL_M / 2):
+        is_long = ranges_m > step_m + _NEAREST_M
+        passed.append(grid.met((ends + step_m * back)[is_long], scans[is_long]))
+    return grid.n_scans(np.concatenate(passed)) - grid.n_scans(grid.met(ends, scans))
+
+
+class _Grid:
+    """The cells that some places (N, 3) lie in, and which scans have been in them."""
+
+    def __init__(self, points: Float64Array) -> None:
+        self._low = points.min(axis=0) - _CELL_M
+        self._shape = ((points.max(axis=0) - self._low) // _CELL_M).astype(np.int64) + 2
+        cells, self._cell_of_point = np.unique(self._flat(points)[0], return_inverse=True)
+        self._n_cells = len(cells)
+        self._table = np.full(int(self._shape.prod()), -1, dtype=np.int64)
+        self._table[cells] = np.arange(len(cells))
+
+    def is_within(self, points: Float64Array, margin_m: float) -> BoolArray:
+        """Mark the points in the box about all cells, or within a margin of it."""
+        high = self._low + self._shape * _CELL_M
+        return np.asarray(((points > self._low - margin_m) & (points < high + margin_m)).all(axis=1))
+
+    def met(self, points: Float64Array, scans: Int64Array) -> Int64Array:
+        """Return a key of cell and scan for each point in one of the cells."""
+        flat, is_inside = self._flat(points)
+        cells = self._table[flat]
+        return (scans[is_inside] * self._n_cells + cells)[cells >= 0]
+
+    def n_scans(self, keys: Int64Array) -> Int64Array:
+        """Return how many scans have a key in the cell of each place."""
+        return np.bincount(np.unique(keys) % self._n_cells, minlength=self._n_cells)[self._cell_of_point]
+
+    def _flat(self, points: Float64Array) -> tuple[Int64Array, BoolArray]:
+        cells = np.floor((points - self._low) / _CELL_M).astype(np.int64)
+        is_inside = ((cells >= 0) & (cells < self._shape)).all(axis=1)
+        x, y, z = cells[is_inside].T
+        return (x * self._shape[1] + y) * self._shape[2] + z, is_inside
 
 
 def _looked_up(image: Float16Array, pixel: Int64Array, ranges_m: Float64Array) -> tuple[Float64Array, BoolArray]:

@@ -46,6 +46,8 @@ _SEED_FACTOR = 2.5
 _MAX_BORDER = 5.0
 # An object's foot, which no ray can have passed, reaches this far from what was seen through.
 _FOOT_M = 0.3
+# Scans with a ray that passed a cell of 0.1 m on its last metre.
+_MIN_SCANS_PAST = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,14 +71,19 @@ def distances_m(points: Float64Array, surface: Surface, plane_m: float) -> Float
     That is the distance from the plane through the nearest of the surface's points, as long as that point is within
     `plane_m` or the plane is nearly met; otherwise it is the distance from the point itself.
     """
-    # of one neighbour it returns arrays, where the search for the nearest returns lists that take as long again
-    found, squared_m2 = surface.tree.batch_knn_search(points, 1)
-    chosen, nearest_m = found[:, 0].astype(np.int64), np.sqrt(squared_m2[:, 0])
+    chosen, nearest_m = nearest_of(points, surface)
     offsets = points - surface.points.take(chosen, axis=0)
     along = np.einsum("ij,ij->i", offsets, surface.normals.take(chosen, axis=0))
     off_plane_m = np.abs(along)
     is_on_plane = (nearest_m < plane_m) | (off_plane_m < _GRAZING * nearest_m)
     return np.asarray(np.where(is_on_plane, off_plane_m, nearest_m))
+
+
+def nearest_of(points: Float64Array, surface: Surface) -> tuple[Int64Array, Float64Array]:
+    """Return the surface's point nearest to each of (N, 3) points, and how far it is."""
+    # of one neighbour it returns arrays, where the search for the nearest returns lists that take as long again
+    found, squared_m2 = surface.tree.batch_knn_search(points, 1)
+    return found[:, 0].astype(np.int64), np.sqrt(squared_m2[:, 0])
 
 
 class PlaneTable:
@@ -174,14 +181,69 @@ def grown(site: Site, net_views: Int64Array, noise_m: float, config: ExtractConf
         noise_m: Median distance of the two maps' surfaces around here.
         config: Thresholds.
     """
-    border_m = float(np.clip(_NOISE_FACTOR * noise_m, config.border_m, _MAX_BORDER * config.border_m))
-    seed_m = max(config.seed_m, _SEED_FACTOR * border_m)
-    stands_off, is_free = site.distance_m > border_m, net_views > 0
+    stands_off, is_free = site.distance_m > border_of(noise_m, config), net_views > 0
     core, foot = np.flatnonzero(stands_off & is_free), np.flatnonzero(stands_off & ~is_free)
     labels, sizes = groups(site.points[core], _LINK_M)
-    n_clear = np.bincount(labels, site.distance_m[core] > seed_m, len(sizes))
     n_views = np.bincount(labels, net_views[core], len(sizes))
-    kept = np.flatnonzero((n_clear >= config.min_cells) & (n_views >= config.min_views * sizes))
+    is_seen = n_views >= config.min_views * sizes
+    kept = np.flatnonzero(is_seen & (_n_clear(site, core, labels, noise_m, config) >= config.min_cells))
+    return _with_feet(site, core, labels, kept, foot)
+
+
+def left_over(site: Site, taken: list[Int64Array], noise_m: float, config: ExtractConfig) -> Int64Array:
+    """Return the cells that stand off the surface and are in no object that was taken; none if few are clear of it."""
+    is_left = site.distance_m > border_of(noise_m, config)
+    is_left[np.concatenate([*taken, np.zeros(0, dtype=np.int64)])] = False
+    left = np.flatnonzero(is_left)
+    is_enough = np.count_nonzero(site.distance_m[left] > seed_of(noise_m, config)) >= config.min_cells
+    return left if is_enough else left[:0]
+
+
+def low_grown(
+    site: Site, left: Int64Array, n_past: Int64Array, taken: list[Int64Array], noise_m: float, config: ExtractConfig
+) -> list[Int64Array]:
+    """Return the cells of each low object: no view of a keyframe can tell of it, but rays passed just above its foot.
+
+    They pass a surface that is a little off as well. Of that some is clear; of a low object most is.
+
+    Args:
+        site: Its cells.
+        left: (L,) cells that may be such an object's (`left_over`).
+        n_past: (L,) scans of the other session with a ray that passed each of them.
+        taken: Cells of the objects there are; what touches one is what is left of it.
+        noise_m: As above.
+        config: Thresholds.
+    """
+    is_passed = n_past >= _MIN_SCANS_PAST
+    core, foot = left[is_passed], left[~is_passed]
+    labels, sizes = groups(site.points[core], _LINK_M)
+    n_clear = _n_clear(site, core, labels, noise_m, config)
+    is_whole = (n_clear >= config.min_cells) & (2 * n_clear >= sizes)
+    if any(len(each) for each in taken):
+        near = cKDTree(site.points[np.concatenate(taken)]).query(site.points[core], distance_upper_bound=_FOOT_M)[0]
+        is_whole &= np.bincount(labels, np.isfinite(near), len(sizes)) == 0
+    return _with_feet(site, core, labels, np.flatnonzero(is_whole), foot)
+
+
+def border_of(noise_m: float, config: ExtractConfig) -> float:
+    """Return how far a cell must stand off to be an object's, where surfaces differ by a noise."""
+    return float(np.clip(_NOISE_FACTOR * noise_m, config.border_m, _MAX_BORDER * config.border_m))
+
+
+def seed_of(noise_m: float, config: ExtractConfig) -> float:
+    """Return how far enough cells of an object must stand off."""
+    return max(config.seed_m, _SEED_FACTOR * border_of(noise_m, config))
+
+
+def _n_clear(site: Site, core: Int64Array, labels: Int64Array, noise_m: float, config: ExtractConfig) -> Int64Array:
+    is_clear = site.distance_m[core] > seed_of(noise_m, config)
+    return np.bincount(labels[is_clear], minlength=int(labels.max(initial=-1)) + 1)
+
+
+def _with_feet(
+    site: Site, core: Int64Array, labels: Int64Array, kept: Int64Array, foot: Int64Array
+) -> list[Int64Array]:
+    """Return the cells of some groups of the core, each with those of the foot that are nearest to it."""
     if len(kept) == 0:
         return []
     is_kept = np.isin(labels, kept)
