@@ -89,6 +89,18 @@ def test_one_came_one_went_and_one_stayed() -> None:
     assert_is_cut_out(groups["before"], before, 1)
 
 
+def test_a_pallet_is_found_by_the_rays_that_passed_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    pallet: Box = ((1.0, 1.6, 0.0), (2.2, 2.6, 0.144))
+    before, after = scanned((), 1), scanned((pallet,), 2)
+    for one, other, session in ((before, after, "after"), (after, before, "before")):
+        (group,) = cut(one, other)
+        assert group.session == session
+        assert iou(returns_of(after[1], group), after[0].returns_on(0)) > 0.8
+    assert cut(after, scanned((pallet,), 3)) == []
+    monkeypatch.setattr(cdpipe.cutting, "scans_past", lambda points, *_: np.zeros(len(points), np.int64))
+    assert cut(before, after) == []
+
+
 def test_nothing_changed() -> None:
     assert cut(scanned((), 1), scanned((), 3)) == []
     assert cut(scanned((CRATE, BARREL), 1), scanned((CRATE, BARREL), 2)) == []

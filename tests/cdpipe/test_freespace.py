@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from cdpipe.freespace import COLUMNS, ROWS, net_views, seen_through, view
+from cdpipe.freespace import COLUMNS, ROWS, net_views, scans_past, seen_through, view
 from cdpipe.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.types import KeyframeViews
 from tests.cdpipe.rooms import ROOM, Box, cast
@@ -157,3 +157,40 @@ def test_nothing_to_look_up_and_nobody_who_looked() -> None:
     assert seen_through(np.zeros((0, 3)), views).shape == (0,)
     nobody = KeyframeViews(np.zeros((0, ROWS, COLUMNS), np.float16), np.zeros((0, 4, 4)))
     assert seen_through(np.zeros((2, 3)), nobody).tolist() == [False, False]
+
+
+def test_a_ray_passes_what_stands_just_before_its_end() -> None:
+    # from 1.5 m up down to the floor at x = 5 and 5.05: 0.4 m before its end the one is 0.12 m above the floor
+    ends = np.array([[5.0, 0.05, 0.0], [5.05, 0.05, 0.0], [5.0, 0.05, 0.0]])
+    origins = np.tile([0.0, 0.05, 1.5], (3, 1))
+    places = np.array([[4.6, 0.05, 0.12], [4.6, 0.05, 0.6], [5.6, 0.05, 0.1], [3.5, 0.05, 0.45], [4.6, 0.05, -0.3]])
+    # two rays of one scan are one; a metre and more before its end nobody is asked, nor under the floor
+    assert scans_past(places, ends, origins, np.array([7, 7, 9])).tolist() == [2, 0, 0, 0, 0]
+    assert scans_past(places[:1], ends[:0], origins[:0], np.zeros(0, np.int64)).tolist() == [0]
+    hit = np.array([[5.02, 0.05, 0.0]])
+    assert scans_past(hit, ends[:1], origins[:1], np.array([3])).tolist() == [-1]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rays_that_pass_equal_their_slow_twin(seed: int) -> None:
+    rng = stream(seed, "rays")
+    places, ends = rng.uniform(0, 0.6, (40, 3)), rng.uniform(-0.3, 0.9, (400, 3))
+    origins = ends + rng.normal(0, 1, (400, 3)) * rng.choice([0.3, 4.0], (400, 1))
+    scans = rng.integers(5, 12, 400)
+    low = places.min(axis=0) - 0.1
+    expected = []
+    for place in places:
+        cell = np.floor((place - low) / 0.1)
+        passed, hit = set(), set()
+        for end, origin, scan in zip(ends, origins, scans, strict=True):
+            range_m = float(np.linalg.norm(origin - end))
+            for step in range(18):
+                step_m = 0.1 + 0.05 * step
+                way = end + step_m / max(range_m, 0.5) * (origin - end)
+                if range_m > step_m + 0.5 and (np.floor((way - low) / 0.1) == cell).all():
+                    passed.add(scan)
+            if (np.floor((end - low) / 0.1) == cell).all():
+                hit.add(scan)
+        expected.append(len(passed) - len(hit))
+    assert len(set(expected)) >= 4
+    np.testing.assert_array_equal(scans_past(places, ends, origins, scans), expected)

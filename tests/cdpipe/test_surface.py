@@ -6,7 +6,7 @@ import pytest
 from cdpipe.config import ExtractConfig
 from cdpipe.geometry import Float64Array, stream, transform, yaw_pose
 from cdpipe.registration import Surface
-from cdpipe.surface import PlaneTable, Site, candidates, compare_site, distances_m, groups, grown
+from cdpipe.surface import PlaneTable, Site, candidates, compare_site, distances_m, groups, grown, left_over, low_grown
 from cdpipe.voxel import cell_means
 
 CONFIG = ExtractConfig()
@@ -221,6 +221,37 @@ def test_two_boxes_half_a_metre_apart_are_two_and_touching_ones_are_one() -> Non
     site = on_floor(BOX, OTHER - (0.4, 0.0, 0.0))
     (found_one,) = grown(site, is_above(site, 0.21), 0.0, CONFIG)
     assert set(found_one.tolist()) == set(np.flatnonzero(site.points[:, 2] > 0.04).tolist())
+
+
+SLAB = lattice((0, 0, 0.05), (1.15, 0.95, 0.15), 0.05)
+
+
+def test_a_low_object_is_what_scans_passed_and_most_of_it_clear() -> None:
+    site = on_floor(SLAB)  # 24 x 20 cells at 0.05, 0.1 and 0.15 m
+    left = left_over(site, [], 0.0, CONFIG)
+    assert sorted(left.tolist()) == np.flatnonzero(site.points[:, 2] > 0.04).tolist()
+    height_m = site.points[left, 2]
+    # passed above 0.12 m all is clear, and the rest is its foot
+    (found,) = low_grown(site, left, np.where(height_m > 0.12, 3, 2), [], 0.0, CONFIG)
+    assert sorted(found.tolist()) == sorted(left.tolist())
+    assert low_grown(site, left, np.full(len(left), 2), [], 0.0, CONFIG) == []
+    # a third of what was passed is clear: so it is with a surface that is a little off
+    assert low_grown(site, left, np.full(len(left), 3), [], 0.0, CONFIG) == []
+    # half is enough
+    assert len(low_grown(site, left, np.where(height_m > 0.07, 3, 0), [], 0.0, CONFIG)) == 1
+    # noise raises what counts as clear
+    assert len(left_over(site, [], 0.02, CONFIG)) == 0
+
+
+def test_what_touches_an_object_is_no_low_one() -> None:
+    for gap_m, n_found in ((0.2, 0), (0.5, 1)):
+        site = on_floor(BOX, SLAB + np.array([0.8 + gap_m, 0.0, 0.0]))
+        taken = grown(site, np.where((site.points[:, 2] > 0.21) & (site.points[:, 0] < 0.9), 3, 0), 0.0, CONFIG)
+        assert len(taken) == 1
+        left = left_over(site, taken, 0.0, CONFIG)
+        assert not set(left.tolist()) & set(taken[0].tolist())
+        n_past = np.where(site.points[left, 2] > 0.12, 3, 0)
+        assert len(low_grown(site, left, n_past, taken, 0.0, CONFIG)) == n_found
 
 
 def test_nothing_stands_off() -> None:
