@@ -48,6 +48,8 @@ _MAX_BORDER = 5.0
 _FOOT_M = 0.3
 # Scans with a ray that passed a cell of 0.1 m on its last metre.
 _MIN_SCANS_PAST = 3
+# A quarter of a square metre in cells of 0.05 m: a lesser rise of the floor is the floor's.
+_MIN_LOW_CELLS = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,7 +197,7 @@ def left_over(site: Site, taken: list[Int64Array], noise_m: float, config: Extra
     is_left = site.distance_m > border_of(noise_m, config)
     is_left[np.concatenate([*taken, np.zeros(0, dtype=np.int64)])] = False
     left = np.flatnonzero(is_left)
-    is_enough = np.count_nonzero(site.distance_m[left] > seed_of(noise_m, config)) >= config.min_cells
+    is_enough = np.count_nonzero(site.distance_m[left] > seed_of(noise_m, config)) >= _MIN_LOW_CELLS
     return left if is_enough else left[:0]
 
 
@@ -218,7 +220,7 @@ def low_grown(
     core, foot = left[is_passed], left[~is_passed]
     labels, sizes = groups(site.points[core], _LINK_M)
     n_clear = _n_clear(site, core, labels, noise_m, config)
-    is_whole = (n_clear >= config.min_cells) & (2 * n_clear >= sizes)
+    is_whole = (n_clear >= _MIN_LOW_CELLS) & (2 * n_clear >= sizes)
     if any(len(each) for each in taken):
         near = cKDTree(site.points[np.concatenate(taken)]).query(site.points[core], distance_upper_bound=_FOOT_M)[0]
         is_whole &= np.bincount(labels, np.isfinite(near), len(sizes)) == 0
