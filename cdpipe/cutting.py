@@ -5,8 +5,9 @@ An object between two regions is one site, and so one object; two objects in one
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from cdpipe.surface import (
     SITE_M,
     SURFACE_CELL_M,
     PlaneTable,
+    Site,
     candidates,
     compare_site,
     groups,
@@ -43,6 +45,10 @@ _MIN_TELLING = 2
 _LOW_M = 0.3
 _BLOCK_RETURNS = 1 << 22
 _UNKNOWN_VIEWS = np.int64(1 << 20)
+
+
+# Ends, origins (both re-aligned map frame) and scans of some returns.
+Rays = tuple[Float64Array, Float64Array, Int64Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,13 +181,8 @@ def _objects(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) -> l
         }
         compared = compare_site(points[site.session], points[other])
         n_views = _net_views(compared.points, merged, other, correction)
-        objects = grown(compared, n_views, site.agreement.noise_m, config)
-        left = left_over(compared, objects, site.agreement.noise_m, config)
-        if len(left):
-            ends, origins, scans = points[other], *_origins(merged, other, returns[other], correction)
-            n_past = scans_past(compared.points[left], ends, origins, scans)
-            objects += low_grown(compared, left, n_past, objects, site.agreement.noise_m, config)
-        for cells in objects:
+        rays = partial(rays_of, merged, other, returns[other], points[other], correction)
+        for cells in object_cells(compared, n_views, rays, site.agreement.noise_m, config):
             is_member = np.zeros(len(compared.points), dtype=np.bool_)
             is_member[cells] = True
             of_object = is_member[compared.cell_of_return]
@@ -192,6 +193,25 @@ def _objects(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) -> l
             thinned, _ = cell_means(in_map, SURFACE_CELL_M)
             result.append(PointGroup(site.session, indices, thinned, site.region, chosen))
     return result
+
+
+def object_cells(
+    site: Site, n_views: Int64Array, rays: Callable[[], Rays], noise_m: float, config: ExtractConfig
+) -> list[Int64Array]:
+    """Return the cells of each object of a site: what the views tell of, then the low ones, of which only rays do.
+
+    Args:
+        site: Its cells.
+        n_views: (N,) keyframes of the other session that saw through each cell, less those that hit it.
+        rays: The other session's, called where they are needed.
+        noise_m: Median distance of the two maps' surfaces around here.
+        config: Thresholds.
+    """
+    objects = grown(site, n_views, noise_m, config)
+    left = left_over(site, objects, noise_m, config)
+    if len(left) == 0:
+        return objects
+    return objects + low_grown(site, left, scans_past(site.points[left], *rays()), objects, noise_m, config)
 
 
 def _net_views(
@@ -209,17 +229,17 @@ def _net_views(
     return net_views(points_map, views)
 
 
-def _origins(
-    merged: MergedMaps, session: SessionName, returns: Int64Array, correction: Float64Array
-) -> tuple[Float64Array, Int64Array]:
-    """Return the (M, 3) places, re-aligned map frame, from which the sensor saw some returns, and the scan of each."""
+def rays_of(
+    merged: MergedMaps, session: SessionName, returns: Int64Array, ends: Float64Array, correction: Float64Array
+) -> Rays:
+    """Return the (M, 3) ends of some returns as given, where the sensor was (M, 3), and the (M,) scan of each."""
     point_map = merged.before if session == "before" else merged.after
     scans = np.searchsorted(point_map.scan_offsets, returns, side="right") - 1
     seen, scan_of_return = np.unique(scans, return_inverse=True)
     origins = point_map.odom_T_sensor[seen, :3, 3]
     if session == "after":
         origins = transform(correction, merged.alignment.to_map(origins))
-    return origins[scan_of_return], scans
+    return ends, origins[scan_of_return], scans
 
 
 class ReturnPool:

@@ -20,7 +20,7 @@ import numpy as np
 
 from cdpipe.config import ExtractConfig, PipelineConfig, load_config
 from cdpipe.crops import Crops, Sphere
-from cdpipe.cutting import BEYOND_M, ReturnPool, realigned
+from cdpipe.cutting import BEYOND_M, ReturnPool, object_cells, rays_of, realigned
 from cdpipe.descriptor import use_threads
 from cdpipe.detect import map_session, refusal
 from cdpipe.freespace import net_views, seen_through
@@ -28,7 +28,7 @@ from cdpipe.geometry import Float64Array, Int64Array, transform
 from cdpipe.merge import merge_maps
 from cdpipe.novelty import inlier_mask, new_points_mask
 from cdpipe.registration import Surface
-from cdpipe.surface import RIM_M, SITE_M, PlaneTable, candidates, compare_site, groups, grown
+from cdpipe.surface import RIM_M, SITE_M, PlaneTable, candidates, compare_site, groups
 from cdpipe.types import KeyframeViews, MergedMaps, SessionName
 from eval.adapters import pipeline_input
 from eval.provenance import THREADS
@@ -174,12 +174,14 @@ class Region:
         return own_pool.of(own), other_pool.of(others)
 
     def look_closely(self, config: ExtractConfig) -> list[Int64Array]:
-        """Compare the returns of the largest site, look up what was seen through, and grow its objects."""
+        """Compare the returns of the largest site, look up what was seen through or passed, and grow its objects."""
         own, others = self.returns
         in_map = self.merged.alignment.to_map(self.merged.after.positions_of(own))
-        site = compare_site(transform(self.correction, in_map), self.merged.before.positions_of(others))
+        ends = self.merged.before.positions_of(others)
+        site = compare_site(transform(self.correction, in_map), ends)
         noise_m = max(median_m for _, median_m in self.compared)
-        return grown(site, net_views(site.points, _views(self.merged)), noise_m, config)
+        rays = partial(rays_of, self.merged, "before", others, ends, self.correction)
+        return object_cells(site, net_views(site.points, _views(self.merged)), rays, noise_m, config)
 
     @cached_property
     def compared(self) -> tuple[tuple[Int64Array, float], tuple[Int64Array, float]]:
