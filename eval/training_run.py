@@ -17,7 +17,7 @@ from cdpipe.descriptor import use_threads
 from cdpipe.descriptor.data import TunnelShard, open_dataset, place_data
 from cdpipe.descriptor.fit import FitConfig, Progress, Task, fit
 from cdpipe.descriptor.network import checkpoint_bytes, digest, initial_network
-from cdpipe.descriptor.sphere_network import initial_sphere_network
+from cdpipe.descriptor.sphere_network import SphereNetwork, initial_sphere_network
 from cdpipe.descriptor.sphere_training import SphereTask, sphere_data
 from cdpipe.descriptor.training import PlaceTask
 from cdpipe.errors import InputError
@@ -83,6 +83,7 @@ def train_descriptor(
     card = {
         "descriptor": f"{name}: {SOURCES[name]}",
         "checkpoint": digest(content),
+        **({"network": asdict(task.network.size)} if isinstance(task.network, SphereNetwork) else {}),
         "data": _described(tunnels[0], digests[0]),
         "validation": {
             **_described(tunnels[1], digests[1]),

@@ -7,7 +7,7 @@ and the mirrored tunnel are as likely as what was simulated; the merge error is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -226,16 +226,40 @@ def platt(scores: Float64Array, is_positive: BoolArray) -> tuple[float, float, f
 
 def pooled_scores(network: SphereNetwork, data: SphereData, draw: int) -> Float64Array:
     """Return the (N,) log-odds of each keyframe's most changed sector within reach, as the query pools them."""
+    return within_reach(local_scores(network, data, draw), data)
+
+
+def local_scores(
+    network: SphereNetwork, data: SphereData, draw: int, stored: Callable[[Tensor], Tensor] | None = None
+) -> Float64Array:
+    """Return the (N,) log-odds of each keyframe's own most changed sector, as it and its neighbours agree on it.
+
+    Args:
+        network: Encodes and compares.
+        data: Keyframes, tunnel by tunnel in the order of the path.
+        draw: Which merge error.
+        stored: What storing makes of the descriptors (B, PER_SECTOR, SECTORS); nothing by default.
+    """
+    logits = []
     with torch.inference_mode():
-        batches = zip(torch.split(data.before_m, 256), torch.split(data.after_m[:, draw], 256), strict=True)
-        logits = torch.cat([network(before, after) for before, after in batches]).numpy().astype(np.float64)
-    pooled = np.empty(len(logits))
+        for before, after in zip(torch.split(data.before_m, 256), torch.split(data.after_m[:, draw], 256), strict=True):
+            spheres = network.encode(before)
+            logits.append(network.compare(stored(spheres) if stored else spheres, after))
+    sectors = torch.cat(logits).numpy().astype(np.float64)
+    local = np.empty(len(sectors))
     for tunnel in np.unique(data.tunnels):
         members = np.flatnonzero(data.tunnels == tunnel)
-        positions = data.positions[members]
-        local = agreed(logits[members], positions).max(axis=1)
-        pooled[members] = best_in_reach(local, positions, data.score_radius_m[members[0]])
-    return pooled
+        local[members] = agreed(sectors[members], data.positions[members]).max(axis=1)
+    return local
+
+
+def within_reach(scores: Float64Array, data: SphereData) -> Float64Array:
+    """Return the (N,) best of the scores of a tunnel's keyframes within its score radius of each."""
+    best = np.empty(len(scores))
+    for tunnel in np.unique(data.tunnels):
+        members = np.flatnonzero(data.tunnels == tunnel)
+        best[members] = best_in_reach(scores[members], data.positions[members], data.score_radius_m[members[0]])
+    return best
 
 
 def _as_elsewhere(before: Tensor, after: Tensor, draw: np.random.Generator) -> tuple[Tensor, Tensor]:

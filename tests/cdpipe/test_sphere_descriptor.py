@@ -144,6 +144,7 @@ def test_regions_of_spheres_and_the_reach_of_their_scores() -> None:
     regions = find_regions(merged, before, after, config)
     assert abs(regions.centres_map[0, 0] - 12) <= 1
     assert regions.pairs[0].tolist() == [round(regions.centres_map[0, 0])] * 2
+    assert not regions.direction.any()  # it is always the before keyframe that is looked up
     best = int(regions.pairs[0, 0])
     # the score of the block reaches 4 m
     top = np.flatnonzero(regions.keyframe_scores == regions.scores[0])

@@ -10,7 +10,15 @@ from cdpipe.descriptor import sphere_training
 from cdpipe.descriptor.fit import FitConfig
 from cdpipe.descriptor.sphere_image import COLUMNS, REACH_M, ROWS
 from cdpipe.descriptor.sphere_network import SECTORS, initial_sphere_network
-from cdpipe.descriptor.sphere_training import BATCH, SphereData, SphereTask, platt, pooled_scores, sector_targets
+from cdpipe.descriptor.sphere_training import (
+    BATCH,
+    SphereData,
+    SphereTask,
+    local_scores,
+    platt,
+    pooled_scores,
+    sector_targets,
+)
 
 WIDE = COLUMNS // SECTORS
 
@@ -121,6 +129,19 @@ def test_scores_are_agreed_on_by_neighbours_and_reach_the_radius() -> None:
     # 4.5 m reach two on either side
     expected = [alone[max(0, k - 2) : k + 3].max() for k in range(6)]
     np.testing.assert_allclose(pooled_scores(network, near, 0), expected, rtol=1e-6)
+
+
+def test_what_is_compared_is_what_storing_left() -> None:
+    data = _walls(6, {2: (6, 3)})
+    network = initial_sphere_network()
+    with torch.inference_mode():
+        spheres, after = network.encode(data.before_m), data.after_m[:, 0]
+        halved = network.compare(spheres / 2, after).amax(dim=1).numpy()
+        whole = network.compare(spheres, after).amax(dim=1).numpy()
+    found = local_scores(network, data, 0, lambda stored: stored / 2)
+    np.testing.assert_allclose(found, halved, rtol=1e-5)
+    np.testing.assert_allclose(local_scores(network, data, 0), whole, rtol=1e-5)
+    assert np.abs(halved - whole).max() > 1e-4
 
 
 def test_calibration_by_hand() -> None:

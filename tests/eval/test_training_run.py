@@ -4,13 +4,13 @@ import csv
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from safetensors.torch import load_file
 
 from cdpipe.descriptor.network import digest
-from cdpipe.descriptor.sphere_network import SphereNetwork
+from cdpipe.descriptor.sphere_network import loaded_sphere_network
 from eval.dataset import Recipe
 from eval.dataset_run import Where, make_dataset
 from eval.progress import Silent
@@ -31,8 +31,9 @@ def test_from_a_dataset_to_a_checkpoint_with_its_card(data: Path, tmp_path: Path
     arguments = ("train", data, "--out", out, "--steps", "3", "--threads", "1", "--quiet")
     assert command(*arguments)[0] == 0
     checkpoint = out / "sphere.safetensors"
-    SphereNetwork().load_state_dict(load_file(checkpoint))
+    network = loaded_sphere_network(checkpoint.read_bytes())
     card = json.loads((out / "sphere.json").read_text())
+    assert card["network"] == asdict(network.size)
     assert card["checkpoint"] == digest(checkpoint.read_bytes())
     assert card["data"]["seeds"] == "3:4" and card["validation"]["seeds"] == "10003:10004"
     assert card["data"]["digest"] != card["validation"]["digest"]
