@@ -22,7 +22,7 @@ FLIPPED_DEG = 90.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceOutcomes:
-    """One pair of sessions, or several joined.
+    """What became of the places of one pair of sessions.
 
     Attributes:
         found_m: (P,) how far the place that was found lies from each asked after keyframe, in the world.
@@ -46,13 +46,6 @@ class PlaceOutcomes:
             "n_yaws": float(len(known_deg)),
         }
 
-    @classmethod
-    def joined(cls, parts: list[PlaceOutcomes]) -> PlaceOutcomes:
-        """Return several pairs as one, every keyframe counting once."""
-        if not parts:
-            return cls(np.zeros(0), np.zeros(0))
-        return cls(np.concatenate([p.found_m for p in parts]), np.concatenate([p.yaw_error_deg for p in parts]))
-
 
 def place_outcomes(
     before: DescriptorSet, after: DescriptorSet, world_T_before: Float64Array, world_T_after: Float64Array
@@ -72,7 +65,7 @@ def place_outcomes(
             f"{len(before.q)} and {len(after.q)} descriptors for {len(world_T_before)} and {len(world_T_after)} poses"
         )
     if len(before.q) == 0 or len(after.q) == 0:
-        return PlaceOutcomes.joined([])
+        return PlaceOutcomes(np.zeros(0), np.zeros(0))
     places_b, places_a = world_T_before[:, :3, 3], world_T_after[:, :3, 3]
     gaps_m, neighbours = cKDTree(places_b).query(places_a)
     j = np.flatnonzero(np.asarray(gaps_m) <= SAME_PLACE_M)

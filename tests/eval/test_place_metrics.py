@@ -3,7 +3,7 @@ import pytest
 
 from cdpipe.geometry import Float64Array, yaw_pose
 from cdpipe.types import DescriptorSet
-from eval.place_metrics import PlaceOutcomes, place_outcomes, place_scores
+from eval.place_metrics import place_outcomes, place_scores
 
 SIZE = 64
 BIN_RAD = 2 * np.pi / SIZE
@@ -75,20 +75,6 @@ def test_turning_the_world_changes_nothing() -> None:
     here, there = place_outcomes(*sets, BEFORE, after), place_outcomes(*sets, turn @ BEFORE, turn @ after)
     np.testing.assert_allclose(here.yaw_error_deg, there.yaw_error_deg, atol=1e-6)
     np.testing.assert_allclose(here.found_m, there.found_m, atol=1e-9)
-
-
-def test_joined_pairs_count_every_keyframe_once() -> None:
-    one, other = (
-        PlaceOutcomes(np.array([1.0]), np.array([2.0])),
-        PlaceOutcomes(np.full(3, 9.0), np.array([4.0, 6, 100])),
-    )
-    assert PlaceOutcomes.joined([one, other]).columns == {
-        "place_recall_at_1": 0.25,
-        "yaw_error_deg": 5.0,
-        "yaw_flip_share": 0.25,
-        "n_places": 4.0,
-        "n_yaws": 4.0,
-    }
 
 
 def test_descriptors_of_other_keyframes_are_refused() -> None:
