@@ -18,7 +18,10 @@ from cdpipe.descriptor.pooling import best_in_reach
 from cdpipe.descriptor.sphere import change_log_odds
 from cdpipe.difference import sphere_difference
 from cdpipe.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.types import ChangeRegions, DescriptorSet, MergedMaps
+from cdpipe.types import ChangeRegions, DescriptorSet, MergedMaps, UInt8Array
+
+# Of `ChangeRegions.direction`: whose keyframe is looked up in the other session.
+BEFORE, AFTER = 0, 1
 
 
 def find_regions(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> ChangeRegions:
@@ -36,7 +39,7 @@ def find_regions(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet
     if config.compare == "sphere":
         return _by_spheres(places, change_log_odds(merged, before, places.is_covered_b), config)
     scores = sphere_difference(merged, before, after, config)
-    return rank_regions(places.before, scores, places.pairs_b, scores, config)
+    return rank_regions(places.before, scores, places.pairs_b, scores, config, _from(BEFORE, scores))
 
 
 class _Places:
@@ -84,6 +87,7 @@ def _by_scans(places: _Places, before: DescriptorSet, after: DescriptorSet, conf
         pairs=np.concatenate([pairs_a[is_candidate_a], pairs_b[is_candidate_b]]),
         keyframe_scores=keyframe_scores,
         config=config,
+        direction=np.concatenate([_from(AFTER, pairs_a[is_candidate_a]), _from(BEFORE, pairs_b[is_candidate_b])]),
     )
 
 
@@ -95,7 +99,7 @@ def _by_spheres(places: _Places, local: Float64Array, config: QueryConfig) -> Ch
     keyframe_scores = np.full(len(local), np.nan)
     covered = np.flatnonzero(places.is_covered_b)
     keyframe_scores[covered] = best_in_reach(local[covered], places.before[covered], config.radius_m)
-    return rank_regions(places.before, local, places.pairs_b, keyframe_scores, config)
+    return rank_regions(places.before, local, places.pairs_b, keyframe_scores, config, _from(BEFORE, local))
 
 
 def rank_regions(
@@ -104,6 +108,7 @@ def rank_regions(
     pairs: Int64Array,
     keyframe_scores: Float64Array,
     config: QueryConfig,
+    direction: UInt8Array | None = None,
 ) -> ChangeRegions:
     """Order candidates by score, drop those too near to a better one, and mark what is reported.
 
@@ -113,6 +118,7 @@ def rank_regions(
         pairs: (N, 2) before and after keyframe of each.
         keyframe_scores: (K,) passed on.
         config: Radius, suppression distance, and threshold or number of regions.
+        direction: (N,) as in `ChangeRegions`, None where no keyframes are looked up.
     """
     order = np.argsort(-scores, kind="stable")
     order = order[~np.isnan(scores[order])]
@@ -128,7 +134,13 @@ def rank_regions(
         pairs=pairs[kept].astype(np.int64),
         is_reported=is_reported,
         keyframe_scores=keyframe_scores,
+        direction=None if direction is None else direction[kept],
     )
+
+
+def _from(session: int, candidates: npt.NDArray[Any]) -> UInt8Array:
+    """Return the direction of candidates that are all keyframes of one session."""
+    return np.full(len(candidates), session, dtype=np.uint8)
 
 
 def _survivors(centres: Float64Array, distance_m: float) -> BoolArray:

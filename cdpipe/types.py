@@ -247,6 +247,9 @@ class ChangeRegions:
             was not withdrawn.
         keyframe_scores: (K,) score of every before keyframe, NaN where the after session never came near.
         is_withdrawn: (R,) whether it was let through and then nothing could be cut out of it; None where no region was.
+        direction: (R,) uint8, whose keyframe was looked up in the other session: 0 the before session's, 1 the after
+            session's (`pairs` has both, and the centre is where the one that was looked up stands); None for methods
+            that look up no keyframes.
     """
 
     centres_map: Float64Array
@@ -256,6 +259,7 @@ class ChangeRegions:
     is_reported: BoolArray
     keyframe_scores: Float64Array
     is_withdrawn: BoolArray | None = None
+    direction: UInt8Array | None = None
 
     @property
     def is_proposed(self) -> BoolArray:
@@ -268,6 +272,10 @@ class ChangeRegions:
             require_shape("is_withdrawn", self.is_withdrawn, (n,))
             if (self.is_withdrawn & self.is_reported).any():
                 raise ValueError("is_withdrawn and is_reported: a region is one or the other")
+        if self.direction is not None:
+            require_shape("direction", self.direction, (n,))
+            if self.direction.dtype != np.uint8 or (self.direction > 1).any():
+                raise ValueError("direction must be uint8: 0 for a before keyframe that was looked up, 1 for an after")
         require_shape("centres_map", self.centres_map, (n, 3))
         require_shape("pairs", self.pairs, (n, 2))
         require_shape("is_reported", self.is_reported, (n,))

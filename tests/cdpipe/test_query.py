@@ -73,6 +73,30 @@ def test_reading_b_by_hand() -> None:
     }
 
 
+def test_the_direction_says_whose_keyframe_was_looked_up() -> None:
+    merged = MergedMaps(BEFORE[0], AFTER[0], make_pose(), {}, True)
+    for reading in ("nearest", "paired"):
+        regions = find_regions(merged, BEFORE[1], AFTER[1], QueryConfig(reading=reading, suppression=1e-9))
+        # before keyframes stand at y = 0, after keyframes at y = 1; the centre is where the asking one stands
+        np.testing.assert_array_equal(regions.direction, regions.centres_map[:, 1])
+        own = np.where(regions.direction == 0, regions.pairs[:, 0], regions.pairs[:, 1])
+        np.testing.assert_array_equal(regions.centres_map[:, 0], 10.0 * own)
+    assert sorted(regions.direction.tolist()) == [0, 0, 0, 1, 1, 1]
+
+
+def test_a_direction_is_dropped_and_ordered_with_its_candidate() -> None:
+    centres = np.array([[6.0, 0, 0], [3, 0, 0], [0, 0, 0]])
+    regions = rank_regions(
+        centres,
+        np.array([1.0, 2.0, 3.0]),
+        np.zeros((3, 2), np.int64),
+        np.zeros(0),
+        QueryConfig(radius_m=4.0),
+        np.array([1, 1, 0], np.uint8),
+    )
+    assert regions.direction.tolist() == [0, 1]
+
+
 def test_reading_b_leaves_out_keyframes_without_a_partner_nearby() -> None:
     far = session([(0, 1, 0), (15, 0.1, 0)], [[1, 0], [0, 1]])
     assert set(find(BEFORE, far, reading="paired", max_pair_m=5.0)) == {(0, 1, 0), (0, 0, 0)}
