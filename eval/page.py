@@ -1,7 +1,8 @@
 """One offline page about a run, with tables and pictures like the paper's, and its tables as CSV and LaTeX beside it.
 
-The page reads a run folder and runs nothing. Everything it shows is inside the file: no script, no font and no picture
-is fetched. What a folder lacks is named on the page; only a folder without results.csv is refused.
+The page reads a run folder and runs nothing. Everything it shows is inside the file: no script, font or picture is
+fetched, and what draws its charts stands in it once. Only 3-D views are files of their own. What a folder lacks is
+named on the page; only a folder without results.csv is refused.
 """
 
 from __future__ import annotations
@@ -15,31 +16,37 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.config import settings_table
+from eval.charts import Chart, plotly_script
 from eval.figures import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.latex import latex_tables
 from eval.merge_table import merge_table
 from eval.page_columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
 from eval.page_effects import ENOUGH_PAIRS, draw_effects
+from eval.page_factors import draw_factors
+from eval.page_grids import draw_grids
 from eval.page_merge import draw_merge, ends_at_merge
 from eval.page_merge_tables import MERGE_COLUMNS
-from eval.page_object_report import draw_objects
+from eval.page_object_report import ObjectPart, draw_objects
 from eval.page_object_tables import OBJECT_COLUMNS
 from eval.page_paper import time_table, volume_table
-from eval.page_pareto import draw_pareto, picture_bytes
-from eval.page_regions import REGION_COLUMNS, draw_regions
+from eval.page_pareto import draw_pareto
+from eval.page_regions import REGION_COLUMNS, RegionPart, draw_regions
 from eval.page_render import rendered, written
 from eval.page_run import RunData, first_seed, named_variants, of, read_document, read_run, scenarios, text
+from eval.page_scenarios import draw_scenarios
 from eval.page_site import draw_site
 from eval.page_story import about_wrong_merges, story
 from eval.page_tables import (
     Cell,
     Table,
-    grid_tables,
     results_table,
     to_csv,
     to_latex,
     unchanged_table,
 )
+from eval.page_verdict import is_judged, verdict_sentences
+from eval.page_views import Views, write_views
+from eval.page_worst import draw_worst, shown_variant, worst_rows
 from eval.pareto import pareto_table
 from eval.sides import is_contended
 
@@ -49,7 +56,7 @@ POINT_COLOURS = (
 )  # fmt: skip
 
 
-def write_page(run: Path) -> Path:
+def write_page(run: Path, views: Views = "chosen") -> Path:
     """Write `index.html` and the tables table1, table2 (.csv, .tex), results.tex and summary.tex into a run folder.
 
     Also regions_table.tex and objects_table.tex where there are the tables, and pareto.csv with its pictures where
@@ -58,6 +65,8 @@ def write_page(run: Path) -> Path:
 
     Args:
         run: The folder; results.csv must be there, anything else may be missing.
+        views: Which pairs get a 3-D view, a file of its own below `views/` that the page links to; "none" for a page
+            that is to stand without them.
 
     Returns:
         Path of the page.
@@ -78,36 +87,39 @@ def write_page(run: Path) -> Path:
             files[f"{name}.csv"] = to_csv(tables[name])
             files[f"{name}.tex"] = to_latex(tables[name])
         points = pareto_table(data)
-        pictures = draw_pareto(points, is_contended=is_contended(data))
         if len(points):
             files["pareto.csv"] = points.to_csv(index=False)
-        files |= {f"pareto_{subject}.png": picture_bytes(each) for subject, each in pictures.items()}
-        files["index.html"] = rendered("page.html", {**_content(data, tables), "pareto": list(pictures.values())})
+        content = _content(data, tables, draw_pareto(points, is_contended=is_contended(data)), views)
+        files |= {f"{each.name}.png": each.png for each in content["charts"] if each.png is not None}
+        files["index.html"] = rendered("page.html", content)
     for name, file in files.items():
         written(run / name, file)
     return run / "index.html"
 
 
-def _content(data: RunData, tables: Mapping[str, Table]) -> dict[str, Any]:
-    objects = draw_objects(data)
-    # a run about objects shows its best and worst in their own section, and no maps
+def _content(data: RunData, tables: Mapping[str, Table], pareto: Sequence[Chart], views: Views) -> dict[str, Any]:
+    regions, objects = draw_regions(data), draw_objects(data)
     worlds = scenarios(data, unchanged=False)
-    sites = [draw_site(data, scenario) for scenario in worlds] if objects is None else []
-    grids = grid_tables(data)
+    # a run about objects alone shows its best and worst in their own section, and no maps
+    is_mapped = regions is not None or objects is None
+    sites = [draw_site(data, scenario) for scenario in worlds] if is_mapped else []
+    variant = shown_variant(data)
+    worst = worst_rows(data, variant)
+    links = write_views(data, variant, [(str(row["scenario"]), int(row["seed"])) for row in worst], views)
+    grids, factors, by_scenario = draw_grids(data), draw_factors(data), draw_scenarios(data)
     unchanged = unchanged_table(data)
     merge = draw_merge(data)
-    regions = draw_regions(data)
-    subject = regions or objects
-    missing = [*data.missing, *(line for site in sites for line in site.missing), *merge.missing]
+    missing = [*data.missing, *(line for site in sites for line in site.missing), *merge.missing, *links.missing]
     missing += [] if regions is None else regions.missing
     missing += [] if objects is None else objects.missing
     missing += [] if worlds else ["No scenario with changes was run."]
     if objects is None:
         missing += [] if unchanged.rows else ["No unchanged pair was run, so false alarms are not measured."]
         missing += [] if grids else ["No grid of two settings was run."]
+    charts = [*(regions.plots if regions is not None else ()), *pareto, *by_scenario, *grids, *factors]
     return {
         **_about(data, missing),
-        "sentences": story(data) if subject is None else [*subject.sentences, *about_wrong_merges(data)],
+        "sentences": _first_paragraph(data, regions, objects),
         "regions": regions,
         "region_columns": [] if regions is None else REGION_COLUMNS,
         "objects": objects,
@@ -120,11 +132,30 @@ def _content(data: RunData, tables: Mapping[str, Table]) -> dict[str, Any]:
         "table1": tables["table1"],
         "table2": tables["table2"],
         "grids": grids,
+        "factors": factors,
+        "by_scenario": by_scenario,
+        "pareto": pareto,
+        "views": links,
+        "worst": draw_worst(data, variant, worst) if is_mapped else [],
+        "worst_variant": variant,
+        "charts": charts,
+        "plotly": plotly_script() if charts else "",
         "sites": sites,
         "columns": RESULT_COLUMNS,
         "time_meanings": TIME_MEANINGS,
         "point_colours": POINT_COLOURS,
     }
+
+
+def _first_paragraph(data: RunData, regions: RegionPart | None, objects: ObjectPart | None) -> list[str]:
+    """Return what is said first: of a run about one subject how that went, of any other who wins where."""
+    if (regions is None) != (objects is None):
+        part = regions or objects
+        return [*(part.sentences if part is not None else ()), *about_wrong_merges(data)]
+    told = verdict_sentences(data) if is_judged(data) else story(data)
+    found = {"Regions": regions.judged if regions else (), "Objects": objects.judged if objects else ()}
+    judged = [f"{name}: {line}" for name, lines in found.items() for line in lines]
+    return [told[0], *judged, *told[1:]]
 
 
 def _merge_content(data: RunData) -> dict[str, Any]:
@@ -137,6 +168,9 @@ def _merge_content(data: RunData) -> dict[str, Any]:
         "sentences": merge.sentences,
         "merge": merge,
         "columns": MERGE_COLUMNS,
+        "views": None,
+        "charts": (),
+        "plotly": "",
     }
 
 

@@ -29,9 +29,10 @@ from eval.runfolder import reported
 
 @dataclass(frozen=True, slots=True)
 class ObjectPart:
-    """What the page shows of the objects of a run."""
+    """What the page shows of the objects of a run; `judged` are those of its sentences that are about the targets."""
 
     sentences: tuple[str, ...]
+    judged: tuple[str, ...]
     tables: tuple[Table, ...]
     plots: tuple[Picture, ...]
     cases: tuple[Picture, ...]
@@ -40,13 +41,13 @@ class ObjectPart:
 
 def draw_objects(data: RunData) -> ObjectPart | None:
     """Return tables, plot and pictures of the objects; None where the plan of the run does not ask for them."""
-    if reported(data.provenance) != "objects":
+    if "objects" not in reported(data.provenance):
         return None
     found = {name: _read(data, name) for name in FILES}
     table, groups, targets = (found[name] for name in FILES)
     if len(table) == 0:
         line = "objects_table.csv is not in the run folder: `tunnelcd score` makes it."
-        return ObjectPart((line,), (), (), (), (line,))
+        return ObjectPart((line,), (line,), (), (), (), (line,))
     if len(targets) == 0:
         targets = pd.DataFrame(columns=["target", "domain", "variant", "is_met"])
     main = _main_variant(table)
@@ -57,6 +58,7 @@ def draw_objects(data: RunData) -> ObjectPart | None:
     plot = _size_plot(groups, data, main)
     return ObjectPart(
         tuple(story(table, targets, data, main)),
+        tuple(about_targets(targets, data)),
         tuple(each for each in tables if each.rows),
         () if plot is None else (plot,),
         tuple(cases),
@@ -64,8 +66,8 @@ def draw_objects(data: RunData) -> ObjectPart | None:
     )
 
 
-def story(table: pd.DataFrame, targets: pd.DataFrame, data: RunData, main: str) -> list[str]:
-    """Return the first sentences of the page: verdict, then what each rule reaches."""
+def about_targets(targets: pd.DataFrame, data: RunData) -> list[str]:
+    """Say how much of the plan was run, if not all, and how many targets are met."""
     covered = covered_by(data)
     sentences = [covered.sentence] if covered is not None and not covered.is_whole else []
     judged = targets[targets["is_met"].notna()]
@@ -73,6 +75,12 @@ def story(table: pd.DataFrame, targets: pd.DataFrame, data: RunData, main: str) 
     if len(judged):
         words = f"{len(judged) - len(missed)} of the {len(judged)} targets that this run can judge are met"
         sentences.append(f"{words}; missed: {joined(missed)}." if missed else f"{words}.")
+    return sentences
+
+
+def story(table: pd.DataFrame, targets: pd.DataFrame, data: RunData, main: str) -> list[str]:
+    """Return the first sentences of the page: verdict, then what each rule reaches."""
+    sentences = about_targets(targets, data)
     for domain in _domains(table):
         own = [row for row in records(table[table["domain"] == domain]) if not math.isnan(row["object_iou_point"])]
         told = [f"{spaced(str(row['variant']))} {share(row['object_iou_point'])}" for row in own]

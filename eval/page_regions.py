@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from eval.charts import Chart
 from eval.page_columns import EN_DASH, UNDEFINED, Column, share, significant
 from eval.page_merge import covered_by
-from eval.page_objects import Picture
+from eval.page_object_tables import spaced
 from eval.page_run import BASELINES, RunData
 from eval.page_story import joined
 from eval.page_tables import Cell, Table, best
+from eval.region_charts import free_response_figure, roc_figure, size_figure
 from eval.region_curves import RATES_PER_100M
 from eval.region_plots import Bins, Curve, domain_name, free_response_plot, roc_plot, size_plot
 from eval.region_table import FILES, MAIN_VARIANT, RIVALS
@@ -34,12 +36,15 @@ REGION_COLUMNS = (
     Column("region_auroc_pooled", "pooled", "high", share,
            "The same over all keyframes of all pairs at once, scores as they are.", ""),
     Column("region_recall_at_k", "recall at K", "high", share,
-           "Share of the K observable changes of a pair that its K best candidates find.", "0 without an answer."),
+           "Share of the K observable changes of a pair that its K best candidates find, without what was withdrawn.",
+           "0 without an answer."),
     Column("recall_at_0.1", "recall at 0.1 false", "high", share,
            "Share of all observable changes found at the lowest threshold with at most 0.1 false regions per 100 m of "
            "after path, changed and unchanged pairs together; a threshold for each method and kind of site.",
            "0 for the changes of a pair without an answer."),
     Column("recall_at_0.5", "at 0.5", "high", share, "The same at 0.5 false regions per 100 m.", ""),
+    Column("recall_at_0.1_proposed", "at 0.1, proposed", "high", share,
+           "At 0.1 false regions per 100 m as if no region had been withdrawn: what the scores alone can do.", ""),
     Column("region_recall", "recall", "high", share, "Share found at the method's own, calibrated threshold.", ""),
     Column("region_precision", "precision", "high", share, "True among true and false regions.",
            "Undefined where nothing was reported."),
@@ -60,17 +65,26 @@ _MAX_LINES = 5
 
 @dataclass(frozen=True, slots=True)
 class RegionPart:
-    """What the page shows of the regions of a run: first sentences, tables, plots, and what is not there."""
+    """What the page shows of the regions of a run.
+
+    Attributes:
+        sentences: The first paragraph of a page about regions alone.
+        judged: Those of its sentences that say how much was run, and which targets are met.
+        tables: Every method, silence, targets.
+        plots: ROC, free response, recall by size.
+        missing: What is not there.
+    """
 
     sentences: tuple[str, ...]
+    judged: tuple[str, ...]
     tables: tuple[Table, ...]
-    plots: tuple[Picture, ...]
+    plots: tuple[Chart, ...]
     missing: tuple[str, ...]
 
 
 def draw_regions(data: RunData) -> RegionPart | None:
     """Return tables and plots of the regions; None where the plan of the run does not ask for them."""
-    if reported(data.provenance) != "regions":
+    if "regions" not in reported(data.provenance):
         return None
     files = {name: data.folder.path / f"{name}.csv" for name in FILES}
     found = {name: pd.read_csv(path) for name, path in files.items() if path.is_file()}
@@ -79,7 +93,7 @@ def draw_regions(data: RunData) -> RegionPart | None:
     )
     table = found.get("regions_table")
     if table is None:
-        return RegionPart((missing[0],), (), (), missing)
+        return RegionPart((missing[0],), (missing[0],), (), (), missing)
     targets = found.get("regions_targets", pd.DataFrame(columns=["target", "is_met"]))
     tables = (regions_table(table), silence_table(table), targets_table(targets))
     plots = (
@@ -89,6 +103,7 @@ def draw_regions(data: RunData) -> RegionPart | None:
     )
     return RegionPart(
         tuple(story(table, targets, data)),
+        tuple(about_targets(targets, data)),
         tuple(each for each in tables if each.rows),
         tuple(each for each in plots if each is not None),
         missing,
@@ -103,7 +118,7 @@ def regions_table(table: pd.DataFrame) -> Table:
         for index, row in enumerate(_records(own)):
             cells = (_cell(row, column, marks[column.key][index]) for column in REGION_COLUMNS)
             counts = Cell(str(row["n_pairs"]), interval=f"{row['n_failed']} failed" if row["n_failed"] else "")
-            rows.append((_group(str(domain), row), (Cell(str(row["variant"])), counts, *cells)))
+            rows.append((_group(str(domain), row), (Cell(spaced(str(row["variant"]))), counts, *cells)))
     headings = ("method", "pairs", *(column.heading for column in REGION_COLUMNS))
     return Table(headings, tuple(rows), "Every method, in and out of the training distribution")
 
@@ -142,8 +157,8 @@ def targets_table(targets: pd.DataFrame) -> Table:
     return Table(("target", "where", "asked", "found", "pairs", ""), tuple(rows), "What is asked, and what is found")
 
 
-def story(table: pd.DataFrame, targets: pd.DataFrame, data: RunData) -> list[str]:
-    """Return the first sentences of the page: verdict, then who wins where by how much."""
+def about_targets(targets: pd.DataFrame, data: RunData) -> list[str]:
+    """Say how much of the plan was run, if not all, and how many targets are met."""
     covered = covered_by(data)
     sentences = [covered.sentence] if covered is not None and not covered.is_whole else []
     judged = targets[targets["is_met"].notna()]
@@ -156,6 +171,12 @@ def story(table: pd.DataFrame, targets: pd.DataFrame, data: RunData) -> list[str
         words = f"{n_met} of the {len(judged)} targets that this run can judge are met"
         named = [f"{name} ({', '.join(domains)})" for name, domains in missed.items()]
         sentences.append(f"{words}; missed: {joined(named)}." if named else f"{words}.")
+    return sentences
+
+
+def story(table: pd.DataFrame, targets: pd.DataFrame, data: RunData) -> list[str]:
+    """Return the first sentences of the page: verdict, then who wins where by how much."""
+    sentences = about_targets(targets, data)
     for domain, own in table[table["domain"] != "all"].groupby("domain", sort=False):
         for column, name in (("recall_at_0.1", "recall at 0.1 false regions per 100 m"), ("region_auroc", "AUROC")):
             sentences += _winner(str(domain), own, column, name)
@@ -201,16 +222,18 @@ def _silence(table: pd.DataFrame) -> list[str]:
     return [f"Silent where nothing changed ({significant(km)} km): {', '.join(parts)}."] if parts else []
 
 
-def _roc(curves: pd.DataFrame | None, table: pd.DataFrame) -> Picture | None:
+def _roc(curves: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
     panels = _curves(curves, ("false_positive_rate", "true_positive_rate"))
     if not panels:
         return None
-    return Picture(
+    return Chart(
+        "roc",
         "How keyframe scores tell changed places from unchanged ones",
-        roc_plot(panels),
+        roc_figure(panels),
         "Over all keyframes of all pairs at once, scores as they are (a keyframe that was never compared comes last). "
         f"Area of {MAIN_VARIANT if MAIN_VARIANT in set(table['variant']) else table['variant'].iloc[0]}: "
         + ", ".join(_areas(table, list(panels))),
+        roc_plot(panels),
     )
 
 
@@ -220,7 +243,7 @@ def _areas(table: pd.DataFrame, domains: Sequence[str]) -> list[str]:
     return [f"{share(float(own[domain]))} {domain_name(domain)}" for domain in domains if domain in own.index]
 
 
-def _free_response(curves: pd.DataFrame | None, table: pd.DataFrame) -> Picture | None:
+def _free_response(curves: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
     panels = _curves(curves, ("false_regions_per_100m", "recall"))
     if not panels:
         return None
@@ -230,16 +253,18 @@ def _free_response(curves: pd.DataFrame | None, table: pd.DataFrame) -> Picture 
         if curve is not None and not math.isnan(row["false_regions_per_100m"]):
             own = (float(row["false_regions_per_100m"]), float(recall))
             panels[str(row["domain"])][str(row["variant"])] = Curve(curve.x, curve.y, own)
-    return Picture(
+    return Chart(
+        "free_response",
         "Changes found against false regions, as the threshold falls",
-        free_response_plot(panels, RATES_PER_100M),
+        free_response_figure(panels, RATES_PER_100M),
         f"Lines: every candidate, reported or not. Dots: the methods' own thresholds. Vertical: "
         f"{' and '.join(f'{rate:g}' for rate in RATES_PER_100M)} false regions per 100 m; what lies at the left border "
         "has 0.01 or fewer. Changed and unchanged pairs together; a pair without an answer misses all its changes.",
+        free_response_plot(panels, RATES_PER_100M),
     )
 
 
-def _sizes(sizes: pd.DataFrame | None, table: pd.DataFrame) -> Picture | None:
+def _sizes(sizes: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
     if sizes is None or len(sizes) == 0:
         return None
     shown = _shown_methods(table)
@@ -256,11 +281,13 @@ def _sizes(sizes: pd.DataFrame | None, table: pd.DataFrame) -> Picture | None:
     if not panels:
         return None
     others = "" if len(shown) == table["variant"].nunique() else " All methods are in regions_by_size.csv."
-    return Picture(
+    return Chart(
+        "recall_by_size",
         "Recall by what a change is like",
-        size_plot(panels),
+        size_figure(panels),
         f"At {RATES_PER_100M[0]:g} false regions per 100 m. Under each bin the number of observable changes; bars: "
         f"95 % interval over pairs of {shown[-1]}.{others}",
+        size_plot(panels),
     )
 
 

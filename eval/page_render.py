@@ -11,7 +11,7 @@ import jinja2
 
 from cdpipe.errors import InputError
 
-_FILES = ("page.html", "comparison.html", "parts.html", "page.css")
+_FILES = ("page.html", "comparison.html", "parts.html", "page.css", "charts.js")
 
 
 def rendered(template: str, content: Mapping[str, Any]) -> str:

@@ -164,15 +164,16 @@ def _region_pictures(
             continue
         rows = of(data.changes, scenario=scenario, seed=seed, variant=name)
         marks = [] if truth is None else truth_marks(truth, rows)
-        regions = _region_marks(report, of(data.regions, scenario=scenario, seed=seed, variant=name))
-        caption = _region_caption(regions, report.regions.radius_m, [mark.state for mark in marks])
+        regions = region_marks(report, of(data.regions, scenario=scenario, seed=seed, variant=name))
+        caption = region_caption(regions, report.regions.radius_m, [mark.state for mark in marks])
         pictures.append(
             Picture(f"Changed regions: {name}", region_map(before, regions, report.regions.radius_m, marks), caption)
         )
     return pictures
 
 
-def _region_caption(regions: Sequence[RegionMark], radius_m: float, states: Sequence[State]) -> str:
+def region_caption(regions: Sequence[RegionMark], radius_m: float, states: Sequence[State]) -> str:
+    """Return what stands below a map of regions: how many, how many of them false, and how many changes they find."""
     n_false = sum(mark.is_false for mark in regions)
     words = [f"{len(regions)} regions of {radius_m:g} m reported, {n_false} of them false."]
     if states and "not scored" not in states:
@@ -208,7 +209,8 @@ def world_to_odom(session: SessionTruth, point_world: Float64Array) -> Float64Ar
     return np.asarray(transform(odom_T_world, point_world[None])[0])
 
 
-def _region_marks(report: ChangeReport, rows: Sequence[Row]) -> list[RegionMark]:
+def region_marks(report: ChangeReport, rows: Sequence[Row]) -> list[RegionMark]:
+    """Return the reported regions; `rows` of regions.csv say which of them are false."""
     outcomes = {int(number(row, "region")): text(row, "outcome") for row in rows}
     reported = np.flatnonzero(report.regions.is_reported)
     centres = report.regions.centres_map

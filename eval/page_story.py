@@ -29,6 +29,7 @@ HEADLINE_COLUMNS = tuple(
 )
 
 WRONG_MERGE_M = 1.0
+_MAX_NAMED = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,10 +72,10 @@ def story(data: RunData) -> list[str]:
         *about_wrong_merges(data),
         *(sentence(ranking) + _price(data, ranking) for ranking in rankings),
         *(f"On {name}, no preset gave an answer." for name in unanswered),
-        *_about_failures(data),
+        *about_failures(data),
         *_about_unchanged(data),
-        _about_size(data),
-        *_about_repeated(data),
+        about_size(data),
+        *about_repeated(data),
     ]
 
 
@@ -166,7 +167,8 @@ def about_wrong_merges(data: RunData) -> list[str]:
     return found
 
 
-def _about_failures(data: RunData) -> list[str]:
+def about_failures(data: RunData) -> list[str]:
+    """Say how many cases gave no answer."""
     bad = [row for row in data.results if text(row, "status") != "ok"]
     if not bad:
         return []
@@ -192,7 +194,8 @@ def _about_unchanged(data: RunData) -> list[str]:
     return found
 
 
-def _about_size(data: RunData) -> str:
+def about_size(data: RunData) -> str:
+    """Say how many pairs stand behind the figures."""
     held = repeats(data)
     pairs: dict[str, set[int]] = {}
     for row in data.results:
@@ -206,11 +209,18 @@ def _about_size(data: RunData) -> str:
             f"n = {n} session pair{'s' if n > 1 else ''}, one per scenario ({named}): a single pair carries no "
             "interval, and a difference between two presets on it may be chance."
         )
+    counts = {len(found) for found in pairs.values()}
+    if len(pairs) > _MAX_NAMED and len(counts) == 1:
+        return (
+            f"n = {n} session pairs ({len(pairs)} scenarios with {counts.pop()} each; {named}); values are means over "
+            "the pairs where they are defined."
+        )
     sizes = ", ".join(f"{name}: {len(found)}" for name, found in pairs.items())
     return f"n = {n} session pairs ({sizes}; {named}); values are means over the pairs where they are defined."
 
 
-def _about_repeated(data: RunData) -> list[str]:
+def about_repeated(data: RunData) -> list[str]:
+    """Say which worlds are repeated with something set otherwise."""
     held = repeats(data)
     if not held:
         return []

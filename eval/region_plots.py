@@ -13,27 +13,30 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from cdpipe.geometry import Float64Array
-from eval.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION, blank_figure, data_address
+from eval.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION, blank_figure, png
 
 _WIDTH_IN = 9.0
-_SKY, _PURPLE, _GREY = "#56B4E9", "#CC79A7", "#8a8a8a"
-_DASHED, _DOTTED = (0, (5, 2)), (0, (1, 1.5))
+_SKY, _PURPLE, _GREY, _TEAL, _WINE = "#56B4E9", "#CC79A7", "#8a8a8a", "#44AA99", "#882255"
+DASHED, DOTTED = (0, (5, 2)), (0, (1, 1.5))
 _LOOKS: dict[str, dict[str, Any]] = {
     "tunnelcd": {"color": BLACK, "linewidth": 2.2},
     "voxel-diff": {"color": ORANGE, "linewidth": 1.6},
     "c2c": {"color": VERMILLION, "linewidth": 1.6},
     "sphere-difference": {"color": GREEN, "linewidth": 1.6},
     "paper": {"color": BLUE, "linewidth": 1.4},
-    "paper-paired": {"color": BLUE, "linewidth": 1.4, "linestyle": _DASHED},
+    "paper-paired": {"color": BLUE, "linewidth": 1.4, "linestyle": DASHED},
+    "paper-topn": {"color": BLUE, "linewidth": 1.4, "linestyle": "dashdot"},
+    "m3c2": {"color": _TEAL, "linewidth": 1.6},
+    "dufomap": {"color": _WINE, "linewidth": 1.6},
     "scan-context": {"color": _PURPLE, "linewidth": 1.2},
-    "solid": {"color": _PURPLE, "linewidth": 1.2, "linestyle": _DASHED},
+    "solid": {"color": _PURPLE, "linewidth": 1.2, "linestyle": DASHED},
     "untrained": {"color": _SKY, "linewidth": 1.2},
-    "random-regions": {"color": _GREY, "linewidth": 1.2, "linestyle": _DOTTED},
+    "random-regions": {"color": _GREY, "linewidth": 1.2, "linestyle": DOTTED},
 }
 _OTHERS: tuple[dict[str, Any], ...] = tuple(
     {"color": colour, "linewidth": 1.2, "linestyle": "dashdot"} for colour in (BLUE, ORANGE, GREEN, VERMILLION, _PURPLE)
 )
-_LEAST_RATE, _MOST_RATE = 0.01, 10.0
+LEAST_RATE, MOST_RATE = 0.01, 10.0
 _DOMAIN_NAMES = {"in": "in distribution", "out": "out of distribution", "all": "all pairs"}
 
 
@@ -68,23 +71,23 @@ def domain_name(domain: str) -> str:
     return _DOMAIN_NAMES.get(domain, domain)
 
 
-def roc_plot(panels: Mapping[str, Mapping[str, Curve]]) -> str:
-    """Draw true against false positive rate of the keyframes, a panel for each domain and a line for each method."""
+def roc_plot(panels: Mapping[str, Mapping[str, Curve]]) -> bytes:
+    """Draw true against false positive rate as PNG, a panel for each domain and a line for each method."""
     figure, axes_of = _panels([list(panels)], 4.1)
     for axes, (domain, curves) in zip(axes_of[0], panels.items(), strict=True):
         axes.plot([0, 1], [0, 1], color="#d0d0d0", linewidth=0.8)
         for name, curve in curves.items():
-            axes.plot(curve.x, curve.y, **_look(name, list(curves)))
+            axes.plot(curve.x, curve.y, **line_look(name, list(curves)))
         axes.set(xlim=(0, 1), ylim=(0, 1.005), aspect="equal")
         axes.set_title(domain_name(domain), fontsize=9)
         axes.set_xlabel("keyframes far from any change, called changed", fontsize=8)
     axes_of[0][0].set_ylabel("keyframes near a change, called changed", fontsize=8)
     _legend(figure, panels.values())
-    return data_address(figure)
+    return png(figure)
 
 
-def free_response_plot(panels: Mapping[str, Mapping[str, Curve]], rates: Sequence[float]) -> str:
-    """Draw recall against false regions per 100 m, a panel for each domain; dots are the methods' own thresholds.
+def free_response_plot(panels: Mapping[str, Mapping[str, Curve]], rates: Sequence[float]) -> bytes:
+    """Draw recall against false regions per 100 m, a panel for each domain, as PNG; dots: the methods' own thresholds.
 
     Args:
         panels: Curves by domain and method.
@@ -95,26 +98,26 @@ def free_response_plot(panels: Mapping[str, Mapping[str, Curve]], rates: Sequenc
         for rate in rates:
             axes.axvline(rate, color="#c4c4c4", linewidth=0.8)
         for name, curve in curves.items():
-            look = _look(name, list(curves))
+            look = line_look(name, list(curves))
             # what comes at no false region at all stands at the left border
-            x = np.clip(np.append(curve.x, _MOST_RATE), _LEAST_RATE, _MOST_RATE)
+            x = np.clip(np.append(curve.x, MOST_RATE), LEAST_RATE, MOST_RATE)
             axes.plot(x, np.append(curve.y, curve.y[-1:]), drawstyle="steps-post", **look)
             if curve.own is not None:
-                own = (float(np.clip(curve.own[0], _LEAST_RATE, _MOST_RATE)), curve.own[1])
+                own = (float(np.clip(curve.own[0], LEAST_RATE, MOST_RATE)), curve.own[1])
                 axes.plot(*own, marker="o", markersize=5, color=look["color"], markeredgecolor="white", zorder=4)
         axes.set_xscale("log")
-        axes.set(xlim=(_LEAST_RATE, _MOST_RATE), ylim=(0, 1.02))
+        axes.set(xlim=(LEAST_RATE, MOST_RATE), ylim=(0, 1.02))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_title(domain_name(domain), fontsize=9)
         axes.set_xlabel("false regions per 100 m", fontsize=8)
     axes_of[0][0].set_ylabel("observable changes found", fontsize=8)
     _legend(figure, panels.values())
-    return data_address(figure)
+    return png(figure)
 
 
-def size_plot(panels: Mapping[str, Mapping[str, Mapping[str, Bins]]]) -> str:
-    """Draw recall over bins: a row for each domain, a column for each measure, a line for each method.
+def size_plot(panels: Mapping[str, Mapping[str, Mapping[str, Bins]]]) -> bytes:
+    """Draw recall over bins as PNG: a row for each domain, a column for each measure, a line for each method.
 
     Args:
         panels: Bins by domain, heading of the measure, and method; intervals are drawn of the last method.
@@ -123,7 +126,7 @@ def size_plot(panels: Mapping[str, Mapping[str, Mapping[str, Bins]]]) -> str:
     for row, (domain, measures) in zip(axes_of, panels.items(), strict=True):
         for axes, (measure, methods) in zip(row, measures.items(), strict=True):
             for index, (name, bins) in enumerate(methods.items()):
-                look = _look(name, list(methods))
+                look = line_look(name, list(methods))
                 bin_places = np.arange(len(bins.names))
                 # side by side, that lines at one height do not hide each other
                 places = bin_places + 0.07 * (index - (len(methods) - 1) / 2)
@@ -136,7 +139,7 @@ def size_plot(panels: Mapping[str, Mapping[str, Mapping[str, Bins]]]) -> str:
             axes.set_xlabel(measure, fontsize=8)
         row[0].set_ylabel(f"recall, {domain_name(domain)}", fontsize=8)
     _legend(figure, [methods for measures in panels.values() for methods in measures.values()])
-    return data_address(figure)
+    return png(figure)
 
 
 def _panels(rows: Sequence[Sequence[str]], height_in: float) -> tuple[Figure, list[list[Axes]]]:
@@ -154,13 +157,14 @@ def _panels(rows: Sequence[Sequence[str]], height_in: float) -> tuple[Figure, li
     return figure, [list(row[: len(names)]) for row, names in zip(grid, rows, strict=True)]
 
 
-def _look(name: str, names: Sequence[str]) -> dict[str, Any]:
+def line_look(name: str, names: Sequence[str]) -> dict[str, Any]:
+    """Return matplotlib's look of a method's line: its own, or one of a few in the order of `names`."""
     unknown = [each for each in names if each not in _LOOKS]
     return _LOOKS[name] if name in _LOOKS else _OTHERS[unknown.index(name) % len(_OTHERS)]
 
 
 def _legend(figure: Figure, groups: Any) -> None:
     every = [list(group) for group in groups]
-    looks = {name: _look(name, names) for names in every for name in names}
+    looks = {name: line_look(name, names) for names in every for name in names}
     handles = [Line2D([], [], label=name, **look) for name, look in looks.items()]
     figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 5), fontsize=8, frameon=False)

@@ -34,11 +34,15 @@ class Cloud:
         name: Its name in the view.
         points: (N, 3) float32, metres.
         colours: (N, 3) uint8 by what it shows, e.g. "change"; the first is the usual one.
+        size_m: Edge of a point, metres.
+        is_shown: Whether it is shown from the start, where there are no walls around it.
     """
 
     name: str
     points: Float32Array
     colours: Mapping[str, npt.NDArray[np.uint8]]
+    size_m: float = 0.025
+    is_shown: bool = True
 
 
 def session_cloud(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import html
 import io
 from collections.abc import Iterator
 from pathlib import Path
@@ -59,8 +60,13 @@ def show(server: Any, view: View) -> None:
     _add_switches(server, view, groups)
 
 
-def write_html(view: View, file: Path) -> None:
+def write_html(view: View, file: Path, legend: str = "") -> None:
     """Write a view as one file that needs no server and no network; its scene tree shows and hides every part.
+
+    Args:
+        view: What to show.
+        file: Where to write it.
+        legend: Elements of HTML that lie over the scene.
 
     Raises:
         InputError: viser is not installed, or the file cannot be written.
@@ -68,6 +74,10 @@ def write_html(view: View, file: Path) -> None:
     with running_server(0) as server:
         _add_nodes(server, view)
         text = server.scene.as_html()
+    if legend:
+        before, end, after = text.rpartition("</body>")
+        text = f"{before}{legend}{end}{after}"
+    text = text.replace("<title>Viser</title>", f"<title>{html.escape(view.title)}</title>", 1)
     try:
         file.write_text(text, encoding="utf-8")
     except OSError as error:
@@ -111,10 +121,10 @@ def _add_nodes(server: Any, view: View) -> dict[str, Any]:
             f"/{cloud.name}",
             cloud.points,
             first,
-            point_size=0.025,
+            point_size=cloud.size_m,
             precision="float32",
             point_shading="flat",
-            visible=not view.bands,  # they would hide the walls
+            visible=cloud.is_shown and not view.bands,  # they would hide the walls
         )
     for label in view.labels:
         handles[label.name] = scene.add_label(f"/{label.name}", label.text, position=label.position)

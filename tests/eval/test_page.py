@@ -306,31 +306,71 @@ def test_tables_one_and_two_stand_beside_the_papers_values(page: Path) -> None:
     ]
 
 
-def test_the_grid_has_rows_of_voxels_and_columns_of_radii(page: Path) -> None:
-    parser = _Tables()
-    parser.feed(page.read_text())
-    recall, iou = (table for table in parser.tables if "extract.voxel_m" in table[0][0][0])
+def without_scripts(text: str) -> str:
+    """The page without its scripts and the data of its charts."""
+    return re.sub(r"<script\b.*?</script>", "", text, flags=re.DOTALL)
+
+
+def chart(text: str, name: str) -> dict[str, Any]:
+    """Data and layout of a chart of the page."""
+    found = re.search(rf'<script type="application/json" id="data-{name}">(.*?)</script>', text, flags=re.DOTALL)
+    assert found is not None
+    return json.loads(found[1])
+
+
+def test_the_grid_is_a_heat_map_of_voxels_by_radii_for_each_figure(page: Path) -> None:
+    figure = chart(page.read_text(), "grid_1")
+    recall, iou = figure["data"]
+    headings = [note["text"] for note in figure["layout"]["annotations"]]
+    assert headings == ["region recall", "object IoU"]
     # i-th point of the grid, row by row: IoU i / 10, recall 1 - i / 10
-    assert [texts(row)[1:] for row in iou] == [["3.0", "6.0"], ["0.00", "0.10"], ["0.20", "0.30"], ["0.40", "0.50"]]
-    assert [texts(row)[1:] for row in recall[1:]] == [["1.00", "0.90"], ["0.80", "0.70"], ["0.60", "0.50"]]
-    assert [row[0][0] for row in iou[1:]] == ["0.15", "0.3", "0.65"]
-    assert [cell for row in iou + recall for cell in row if cell[1]] == [("0.50", True), ("1.00", True)]
+    assert (iou["y"], iou["x"]) == (["0.15", "0.3", "0.65"], ["3.0", "6.0"])
+    assert iou["text"] == [["0.00", "0.10"], ["0.20", "0.30"], ["0.40", "0.50"]]
+    assert recall["text"] == [["1.00", "0.90"], ["0.80", "0.70"], ["0.60", "0.50"]]
+    frames = [(shape["xref"], shape["x0"] + 0.48, shape["y0"] + 0.48) for shape in figure["layout"]["shapes"]]
+    assert frames == [("x", 0, 0), ("x2", 1, 2)]
+    assert 'id="grid_1"' in page.read_text()
 
 
 def test_nothing_is_fetched_and_every_picture_is_inside(page: Path) -> None:
     text = page.read_text()
-    assert "http" not in text
-    assert "<script" not in text
-    assert "url(" not in text
-    assert "@import" not in text
-    sources = re.findall(r'src="([^"]*)"', text)
-    # two maps, three presets' regions, two observable changes, two merges, regions and objects against their cost
-    assert len(sources) == 11
+    # what draws the charts stands there once, whatever addresses it mentions, and no script is fetched
+    assert text.count("<script>") == 2
+    assert re.findall(r"<script[^>]*\ssrc", text) == []
+    shown = without_scripts(text)
+    assert "http" not in shown
+    assert "url(" not in shown
+    assert "@import" not in shown
+    sources = re.findall(r'src="([^"]*)"', shown)
+    # two maps, three presets' regions, two observable changes, two merges
+    assert len(sources) == 9
     for source in sources:
         assert base64.b64decode(source.removeprefix("data:image/png;base64,"), validate=True).startswith(b"\x89PNG")
-    links = re.findall(r'href="([^"]*)"', text)
+    for name in re.findall(r'class="chart" id="([^"]*)"', shown):
+        assert chart(text, name)["data"]
+    links = re.findall(r'href="([^"]*)"', shown)
     assert links
-    assert all(link.startswith("#") and f'id="{link[1:]}"' in text for link in links)
+    for link in links:
+        assert f'id="{link[1:]}"' in text if link.startswith("#") else (page.parent / link).is_file()
+
+
+def test_quality_against_cost_is_a_chart_and_a_picture_for_papers(page: Path) -> None:
+    for name in ("pareto_regions", "pareto_objects"):
+        assert (page.parent / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert chart(page.read_text(), name)["layout"]["height"] > 0
+
+
+def test_a_page_without_a_chart_holds_no_script(run: Path) -> None:
+    pd.DataFrame([result_row(SITE, "paper")]).to_csv(run / "results.csv", index=False)
+    assert "<script" not in write_page(run).read_text()
+
+
+def test_the_first_pair_can_be_seen_in_3d_and_a_page_without_views_links_to_none(run: Path) -> None:
+    page = write_page(run)
+    file = run / "views" / "paper__site1" / "7.html"
+    assert 'href="views/paper__site1/7.html"' in page.read_text()
+    assert "viser" in file.read_text().lower()
+    assert 'href="views/' not in write_page(run, "none").read_text()
 
 
 def test_the_first_sentence_says_that_a_baseline_wins(page: Path) -> None:

@@ -39,6 +39,7 @@ def made_up(
                 if is_ok:
                     items["regions"] += [
                         {**names, "region": place, "score": scores[i], "is_reported": scores[i] > 1.5,
+                         "is_withdrawn": False,
                          "outcome": "true" if is_hit[i] else "false", "found_changes": str(i + 1) if is_hit[i] else ""}
                         for place, i in enumerate(order)
                     ]  # fmt: skip

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from eval.page_pareto import draw_pareto, picture_bytes
+from eval.page_pareto import draw_pareto
 from eval.page_run import RunData
 from eval.pareto import COLUMNS, front, pareto_table
 from eval.runfolder import RunFolder
@@ -91,17 +91,20 @@ def test_recall_at_a_rate_is_taken_from_the_table_of_regions(tmp_path: Path) -> 
 def test_one_method_is_no_comparison(tmp_path: Path) -> None:
     table = pareto_table(run(tmp_path, {"tunnelcd": (0.9, 3.0, 5.0)}))
     assert len(table) == 0
-    assert draw_pareto(table) == {}
+    assert draw_pareto(table) == []
 
 
 def test_the_picture_names_the_front(tmp_path: Path) -> None:
     methods = {"tunnelcd": (0.9, 3.0, 5.0), "voxel-diff": (0.3, 1.0, 9.0), "c2c": (0.2, 2.0, 9.0)}
-    pictures = draw_pareto(pareto_table(run(tmp_path, methods)))
-    assert list(pictures) == ["objects"]
-    assert picture_bytes(pictures["objects"]).startswith(b"\x89PNG")
-    front_text = pictures["objects"].caption.partition("On the front: ")[2]
+    (chart,) = draw_pareto(pareto_table(run(tmp_path, methods)))
+    assert chart.name == "pareto_objects"
+    assert chart.png is not None
+    assert chart.png.startswith(b"\x89PNG")
+    labels = [text for trace in chart.figure["data"] for text in trace.get("text", ()) if text]
+    assert labels == ["<b>tunnelcd</b>", "<b>voxel-diff</b>", "<b>tunnelcd</b>"]
+    front_text = chart.caption.partition("On the front: ")[2]
     assert "time of a pair, in distribution: tunnelcd, voxel-diff;" in front_text
     assert "c2c" not in front_text
     assert "beside other work" not in front_text
-    busy = draw_pareto(pareto_table(run(tmp_path, methods)), is_contended=True)["objects"]
+    (busy,) = draw_pareto(pareto_table(run(tmp_path, methods)), is_contended=True)
     assert busy.caption.endswith("Times were measured beside other work.")
