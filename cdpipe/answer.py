@@ -6,6 +6,8 @@
                   after the merge
     answer.npz    region_centres_map (R, 3), region_scores (R,), region_pairs (R, 2), region_is_reported (R,),
                   region_is_withdrawn (R,), where regions were let through that nothing could be cut out of,
+                  region_direction (R,) uint8, whose keyframe was looked up in the other session, 0 before, 1 after,
+                  where keyframes were,
                   keyframe_scores (Kb,), before_keyframe_scans (Kb,), after_keyframe_scans (Ka,),
                   object_returns (M, 2) int32 with object_return_offsets (O + 1,),
                   object_points_map (P, 3) with object_point_offsets (O + 1,), and figure_<name> (R,) each;
@@ -16,7 +18,8 @@
 
 A refused or failed case is an answer.json with its status and error, and no answer.npz. Another program's answer may
 leave out object_returns and give object_points_odom with object_point_odom_offsets instead: points in the odom frame of
-the session that holds the object, each standing for 0.1 m around it.
+the session that holds the object, each standing for 0.1 m around it. What else it may leave out, `answer_parts` tells;
+an unknown name is refused, so that a misspelt one is not taken for one left out.
 """
 
 from __future__ import annotations
@@ -31,13 +34,12 @@ from typing import Any, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
+from cdpipe.answer_parts import ARRAYS, DOCUMENT, FORMAT, FORMAT_VERSION, OBJECT, Parts
 from cdpipe.errors import InputError
 from cdpipe.geometry import Float64Array, Int32Array, Int64Array
 from cdpipe.session import load_arrays
 from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 
-FORMAT = "tunnelcd-answer"
-FORMAT_VERSION = 1
 Until = Literal["merge"]
 
 
@@ -87,6 +89,8 @@ def write_answer(folder: Path, method: str, report: ChangeReport, until: Until |
     }
     if regions.is_withdrawn is not None:
         arrays["region_is_withdrawn"] = regions.is_withdrawn
+    if regions.direction is not None:
+        arrays["region_direction"] = regions.direction
     if report.local_before_T_after is not None:
         arrays["local_before_T_after"] = report.local_before_T_after
     np.savez_compressed(folder / "answer.npz", allow_pickle=False, **arrays)
@@ -132,7 +136,7 @@ def read_answer(folder: Path) -> Answer:
     if not path.is_file():
         raise InputError(f"{path}: missing: expected an answer written by `tunnelcd detect` or by another method")
     try:
-        document = json.loads(path.read_text())
+        document = Parts(str(path), "key", DOCUMENT, json.loads(path.read_text()))
         if (document["format"], document["format_version"]) != (FORMAT, FORMAT_VERSION):
             raise InputError(f"{path}: expected format {FORMAT} {FORMAT_VERSION}")
         until = document.get("until")
@@ -141,63 +145,72 @@ def read_answer(folder: Path) -> Answer:
         if document["status"] != "ok":
             return Answer(
                 document["status"],
-                document["error"],
+                document.get("error", ""),
                 document["method"],
                 None,
-                document["seconds"],
-                document["evidence"],
+                document.get("seconds", {}),
+                document.get("evidence", {}),
                 until=until,
             )
-        arrays = load_arrays(folder / "answer.npz")
+        arrays = Parts(str(folder / "answer.npz"), "array", ARRAYS, load_arrays(folder / "answer.npz"))
         report, points_odom = _report(document, arrays)
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(f"{path}: damaged or incomplete: {error!r}") from error
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise InputError(f"{path}: damaged or incomplete: {error}") from error
     return Answer("ok", "", document["method"], report, report.seconds, report.evidence, points_odom, until)
 
 
-def _report(
-    document: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]
-) -> tuple[ChangeReport, tuple[Float64Array, ...] | None]:
-    metas = document["objects"]
-    points_map = _split(arrays, "object_points_map", "object_point_offsets", len(metas))
+def _report(document: Parts, arrays: Parts) -> tuple[ChangeReport, tuple[Float64Array, ...] | None]:
+    listed = document.get("objects", [])
+    metas = [Parts(f"{document.where}: objects[{i}]", "key", OBJECT, meta) for i, meta in enumerate(listed)]
+    points_map: list[Any] = [np.zeros((0, 3))] * len(metas)
+    if "object_points_map" in arrays:
+        points_map = _split(arrays, "object_points_map", "object_point_offsets", len(metas))
     points_odom = None
+    returns: list[Any] = [np.zeros((0, 2), dtype=np.int32)] * len(metas)
     if "object_returns" in arrays:
         returns = _split(arrays, "object_returns", "object_return_offsets", len(metas))
-    else:
+    elif "object_points_odom" in arrays:
         points_odom = tuple(_split(arrays, "object_points_odom", "object_point_odom_offsets", len(metas)))
-        returns = [np.zeros((0, 2), dtype=np.int32)] * len(metas)
+    elif metas:
+        raise InputError(
+            f"{arrays.where}: array object_points_odom is missing: the {len(metas)} objects of answer.json need their "
+            "points, (P, 3), or their object_returns, (M, 2)"
+        )
     objects = tuple(
         ChangedObject(
             session=meta["session"],
             kind=meta["kind"],
-            region=meta["region"],
+            region=meta.get("region", -1),
             returns=found,
             points_map=points,
-            score=meta["score"],
-            partner=meta["partner"],
+            score=meta.get("score", 0.0),
+            partner=meta.get("partner", -1),
             shape=None if meta.get("shape") is None else _shape(meta["shape"]),
             displacement_map=None if meta.get("displacement_map") is None else _numbers(meta["displacement_map"]),
         )
         for meta, found, points in zip(metas, returns, points_map, strict=True)
     )
+    scores = arrays["region_scores"]
     regions = ChangeRegions(
         centres_map=arrays["region_centres_map"],
         radius_m=document["radius_m"],
-        scores=arrays["region_scores"],
-        pairs=arrays["region_pairs"],
-        is_reported=arrays["region_is_reported"],
-        keyframe_scores=arrays["keyframe_scores"],
+        scores=scores,
+        pairs=arrays.get("region_pairs", np.full((len(scores), 2), -1)),
+        is_reported=arrays.get("region_is_reported", np.ones(len(scores), dtype=np.bool_)),
+        keyframe_scores=arrays.get("keyframe_scores", np.zeros(0)),
         is_withdrawn=arrays.get("region_is_withdrawn"),
+        direction=arrays.get("region_direction"),
     )
+    no_scans = np.zeros(0, dtype=np.int64)
     report = ChangeReport(
         before_T_after=np.asarray(document["before_T_after"], dtype=np.float64),
-        evidence=document["evidence"],
+        evidence=document.get("evidence", {}),
         regions=regions,
         objects=objects,
-        seconds=document["seconds"],
+        seconds=document.get("seconds", {}),
         figures={name[7:]: values for name, values in arrays.items() if name.startswith("figure_")},
-        keyframe_scans=(arrays["before_keyframe_scans"], arrays["after_keyframe_scans"]),
-        config=document["config"],
+        keyframe_scans=(arrays.get("before_keyframe_scans", no_scans), arrays.get("after_keyframe_scans", no_scans)),
+        config=document.get("config", {}),
         local_before_T_after=arrays.get("local_before_T_after"),
     )
     return report, points_odom
@@ -248,5 +261,10 @@ def _offsets(arrays: Sequence[npt.NDArray[Any]]) -> Int64Array:
 def _split(arrays: Mapping[str, npt.NDArray[Any]], values: str, offsets: str, n: int) -> list[Int32Array] | list[Any]:
     bounds = arrays[offsets]
     if len(bounds) != n + 1:
-        raise ValueError(f"{offsets} has {len(bounds)} entries for {n} objects")
+        raise ValueError(f"{offsets} has {len(bounds)} entries for {n} objects: expected {n + 1}")
+    if bounds[0] != 0 or (np.diff(bounds) < 0).any() or bounds[-1] != len(arrays[values]):
+        raise ValueError(
+            f"{offsets} goes from {bounds[0]} to {bounds[-1]}: expected rising from 0 to {len(arrays[values])}, the "
+            f"rows of {values}"
+        )
     return [arrays[values][a:b] for a, b in pairwise(bounds)]

@@ -12,19 +12,30 @@ from cdpipe.answer import Answer
 from cdpipe.errors import InputError
 from cdpipe.geometry import Float64Array, Int64Array, require_poses, require_shape
 from cdpipe.types import ChangedObject, ChangeRegions, Kind, SessionName
+from cdpipe.yamlfile import suggestion
+from eval.answer_rows import POINT_RADIUS_M, rows_near_points
 from eval.ground_truth import SESSIONS, GroundTruth, SessionTruth
+from eval.universe import Universe
+
+_STATUSES = ("ok", "merge_refused", "failed", "worker_died")
+_SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns"))
+_MANY = 100  # so many returns of any place hold the first one of some cell
 
 
 def check_answer(answer: Answer, truth: GroundTruth, folder: Path) -> None:
     """Raise `InputError`, naming the folder and the field, unless an ok answer can be scored against this pair.
 
     Raises:
-        InputError: A number is NaN, an index lies outside of its session, or a return is named twice.
+        InputError: A number is NaN, an index lies outside of its session, a return is named twice, or nothing that the
+            answer names is there.
     """
     report = answer.report
     try:
+        if answer.status not in _STATUSES:
+            raise ValueError(f"status = {answer.status!r}: expected {', '.join(_STATUSES)}")
         _check_numbers("evidence", answer.evidence)
         _check_numbers("seconds", answer.seconds)
+        _check_seconds(answer.seconds)
         if report is None:
             return
         require_poses("before_T_after", report.before_T_after[None])
@@ -38,7 +49,7 @@ def check_answer(answer: Answer, truth: GroundTruth, folder: Path) -> None:
             _check_object(f"objects[{index}]", item, len(report.objects), len(report.regions.scores))
         for session in SESSIONS:
             _check_returns(session, report.objects, truth.sessions[session])
-            _check_points(session, report.objects, answer.points_odom)
+            _check_points(session, report.objects, answer.points_odom, truth.sessions[session].universe)
     except ValueError as error:
         raise InputError(f"{folder}: not an answer to this pair: {error}") from error
 
@@ -47,6 +58,14 @@ def _check_numbers(name: str, values: Mapping[str, object]) -> None:
     for key, value in values.items():
         if not isinstance(value, int | float):
             raise ValueError(f"{name}.{key} = {value!r}: expected a number")
+
+
+def _check_seconds(seconds: Mapping[str, float]) -> None:
+    for name, value in seconds.items():
+        if name not in _SECONDS:
+            raise ValueError(f"seconds.{name} is unknown{suggestion(name, _SECONDS)} (known: {', '.join(_SECONDS)})")
+        if not 0 <= value < np.inf:
+            raise ValueError(f"seconds.{name} = {value}: expected seconds, 0 or more; leave out what was not measured")
 
 
 def _check_local(local_before_T_after: Float64Array | None, n_keyframes: int, n_scans: int) -> None:
@@ -123,6 +142,11 @@ def _check_returns(session: SessionName, objects: tuple[ChangedObject, ...], tru
     if not taken:
         return
     keys, counts = np.unique(np.concatenate(taken), return_counts=True)
+    if len(keys) >= _MANY and not np.isin(keys, truth.universe.returns).any():
+        raise ValueError(
+            f"object_returns of the {session} session: nothing returned at any of their {len(keys)} (scan, pixel): "
+            "a pixel is row * columns + column of the staggered image"
+        )
     if (counts > 1).any():
         scan, pixel = divmod(int(keys[counts > 1][0]), n_pixels)
         raise ValueError(
@@ -132,7 +156,10 @@ def _check_returns(session: SessionName, objects: tuple[ChangedObject, ...], tru
 
 
 def _check_points(
-    session: SessionName, objects: tuple[ChangedObject, ...], points_odom: tuple[Float64Array, ...] | None
+    session: SessionName,
+    objects: tuple[ChangedObject, ...],
+    points_odom: tuple[Float64Array, ...] | None,
+    universe: Universe,
 ) -> None:
     if points_odom is None:
         return
@@ -144,8 +171,13 @@ def _check_points(
             distinct = np.unique(points, axis=0)
             owners.append(np.full(len(distinct), index))
             all_points.append(distinct)
-    if not all_points:
+    if sum(map(len, all_points)) == 0:
         return
+    if not any(len(rows) for rows in rows_near_points(universe, all_points)):
+        raise ValueError(
+            f"object_points_odom of the {session} session: none of its {sum(map(len, all_points))} points is within "
+            f"{POINT_RADIUS_M:g} m of a return of that session: give them in its own odom frame, not in the map's"
+        )
     _, first, counts = np.unique(np.concatenate(all_points), axis=0, return_index=True, return_counts=True)
     if (counts > 1).any():
         owner = int(np.concatenate(owners)[first[counts > 1][0]])

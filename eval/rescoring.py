@@ -14,6 +14,9 @@ from eval.progress import RunProgress, Silent
 from eval.runfolder import IDENTITY, ITEM_TABLES, RunFolder, write_tables
 from eval.scoring import CaseScore, score_answer
 
+# of a cell that no run made: its rows stand behind all others
+NO_KEY, LAST = "", (1_000_000, 1_000_000)
+
 
 def score_stored(truth: GroundTruth, folder: Path) -> CaseScore:
     """Score the answer stored in a folder.
@@ -56,16 +59,15 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
     progress = progress or Silent()
     folders = list(run.answer_folders())
     documents: dict[Path, dict[str, Any]] = {}
+    place: Sequence[int]
     for (slug, seed), group in groupby(folders, key=lambda folder: folder.parts[-3:-1]):
         truth = load_ground_truth(run.path / "pairs" / slug / seed)
         for folder in group:
             path = run.path / "cells" / slug / seed / f"{folder.name}.json"
             stored = run.read_cell(path)
             if stored is None:
-                names = {**_world_of(run, slug), "seed": int(seed)}
-                identity = {**names, "variant": folder.name, "preset": folder.name, "commit": None}
-                identity["is_contended"] = False
-                key, place = "", (len(folders), len(folders))
+                identity = foreign_identity(run, slug, seed, folder.name)
+                key, place = NO_KEY, LAST
             else:
                 identity = {name: stored["row"].get(name) for name in (*IDENTITY, "preset", "commit")}
                 identity["pair_kind"] = stored["row"].get("pair_kind", "")
@@ -80,9 +82,15 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
     return len(documents)
 
 
-def _world_of(run: RunFolder, slug: str) -> dict[str, Any]:
-    """Return what the run's own cells call the world of a folder; the name of the folder where there are none."""
+def foreign_identity(run: RunFolder, slug: str, seed: str, name: str) -> dict[str, Any]:
+    """Return what `cell_document` wants to know of an answer that no run made.
+
+    The world is called what the run's own cells call it, or like its folder where there are none.
+    """
+    world = {"scenario": slug.replace("__", "/"), "pair_kind": ""}
     for path in sorted((run.path / "cells" / slug).glob("*/*.json")):
         if (stored := run.read_cell(path)) is not None:
-            return {"scenario": stored["row"]["scenario"], "pair_kind": stored["row"].get("pair_kind", "")}
-    return {"scenario": slug.replace("__", "/"), "pair_kind": ""}
+            world = {"scenario": stored["row"]["scenario"], "pair_kind": stored["row"].get("pair_kind", "")}
+            break
+    who = {"seed": int(seed), "variant": name, "preset": name, "commit": None, "is_contended": False}
+    return {**world, **who}

@@ -70,7 +70,8 @@ def test_shapes_moves_and_withdrawn_regions_survive_the_disk_and_need_not_be_the
         second,
         replace(third, session="before", kind="moved", partner=0, displacement_map=went),
     )
-    regions = replace(report.regions, is_withdrawn=np.array([False, True]))
+    direction = np.array([1, 0], np.uint8)
+    regions = replace(report.regions, is_withdrawn=np.array([False, True]), direction=direction)
     write_answer(tmp_path, "paper", replace(report, objects=objects, regions=regions))
     read = read_answer(tmp_path).report
     assert read is not None
@@ -84,6 +85,7 @@ def test_shapes_moves_and_withdrawn_regions_survive_the_disk_and_need_not_be_the
         np.testing.assert_array_equal(item.displacement_map, went)
     assert read.objects[1].displacement_map is None
     np.testing.assert_array_equal(read.regions.is_withdrawn, [False, True])
+    np.testing.assert_array_equal(read.regions.direction, direction)
     np.testing.assert_array_equal(read.regions.is_proposed, [True, True])
     # an answer without them, as others write it, is as good
     write_answer(tmp_path, "paper", report)
@@ -92,6 +94,13 @@ def test_shapes_moves_and_withdrawn_regions_survive_the_disk_and_need_not_be_the
     assert read is not None
     first = read.objects[0]
     assert all(value is None for value in (first.shape, first.displacement_map, read.regions.is_withdrawn))
+    assert read.regions.direction is None
+
+
+@pytest.mark.parametrize("direction", [np.array([0, 2], np.uint8), np.array([0, 1]), np.array([0], np.uint8)])
+def test_a_direction_that_is_none_is_refused(direction: object) -> None:
+    with pytest.raises(ValueError, match="direction"):
+        replace(_report().regions, direction=direction)
 
 
 @pytest.mark.parametrize(
