@@ -6,7 +6,7 @@ from pathlib import Path
 
 from cdpipe.config import PipelineConfig, load_config, preset_names
 from cdpipe.errors import InputError
-from cdpipe.yamlfile import read_yaml
+from cdpipe.yamlfile import read_yaml, suggestion
 from eval.plan import Plan, cells, load_plan, plan_names
 from scenarios.library import check_scenario, scenario_names
 from scenarios.schema import Scenario
@@ -35,7 +35,10 @@ def check_file(name_or_path: str) -> str:
         load_config(name_or_path)
         return "a preset"
     if not name_or_path.endswith((".yaml", ".yml")):
-        raise InputError(f"{name_or_path}: no plan, scenario or preset of this name, and no .yaml file; see `list`")
+        near = suggestion(name_or_path, [*plan_names(), *scenario_names(), *preset_names()])
+        raise InputError(
+            f"{name_or_path}: no plan, scenario or preset of this name, and no .yaml file{near or '; see `list`'}"
+        )
     content = read_yaml(Path(name_or_path)).value
     keys = set(content) if isinstance(content, dict) else set()
     n_shared = {kind: len(keys & known) for kind, known in _KEYS.items()}

@@ -50,6 +50,20 @@ def require_usable(where: Where) -> None:
         raise InputError(f"{asked} needs a package more: pip install 'tunnelcd[cluster]'")
 
 
+def require_reachable(where: Where) -> None:
+    """Knock at the scheduler that is named, if one is; quick, so that it can be done before anything slow is loaded.
+
+    Raises:
+        InputError: Nobody answers there, or something that is no scheduler.
+    """
+    if where.scheduler is None:
+        return
+    try:
+        _probe(where.scheduler)
+    except (OSError, ValueError) as error:
+        raise _unreachable(where.scheduler, error) from error
+
+
 @contextmanager
 def connected(where: Where, n_tasks: int) -> Iterator[Any]:
     """Yield a Dask client of the scheduler named, or of as many worker processes here, but no more than tasks.
@@ -101,8 +115,8 @@ def _of_scheduler(address: str) -> Iterator[Any]:
     try:
         _probe(address)
         client = Client(address, timeout=_CONNECT_S)
-    except (OSError, ValueError, TimeoutError) as error:
-        raise InputError(f"--scheduler {address}: cannot be reached ({error}): expected tcp://HOST:PORT") from error
+    except (OSError, ValueError) as error:
+        raise _unreachable(address, error) from error
     with client:
         if not client.nthreads():
             raise InputError(f"--scheduler {address}: has no workers: start some with `dask worker {address}`")
@@ -121,7 +135,14 @@ def _probe(address: str) -> None:
     if parts.scheme in ("tcp", "tls"):
         if not parts.hostname or not parts.port:
             raise ValueError("no host or no port")
-        socket.create_connection((parts.hostname, parts.port), timeout=_PROBE_S).close()
+        with socket.create_connection((parts.hostname, parts.port), timeout=_PROBE_S) as knocked:
+            # a scheduler speaks first; what accepts and says nothing would hold Dask until its time is up
+            if parts.scheme == "tcp" and not knocked.recv(1):
+                raise OSError("what listens there is no scheduler")
+
+
+def _unreachable(address: str, error: Exception) -> InputError:
+    return InputError(f"--scheduler {address}: cannot be reached ({error}): expected tcp://HOST:PORT")
 
 
 def dask_setup(worker: object) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.geometry import BoolArray, Float64Array
-from eval.plan import ORACLE_MERGE
+from eval.methods import ORACLE_MERGE
 from eval.statistics import wilson_interval
 
 RIGHT_M, RIGHT_DEG = 0.5, 2.0

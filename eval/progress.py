@@ -25,6 +25,9 @@ class RunProgress(Protocol):
     def stage(self, name: str, done: int, total: int) -> None:
         """One stage has come so far."""
 
+    def note(self, text: str) -> None:
+        """Something about the run as a whole, told once."""
+
 
 class Silent:
     """Says nothing."""
@@ -33,6 +36,9 @@ class Silent:
         """Say nothing."""
 
     def stage(self, name: str, done: int, total: int) -> None:
+        """Say nothing."""
+
+    def note(self, text: str) -> None:
         """Say nothing."""
 
 
@@ -74,6 +80,10 @@ class Bars:
             self._stage_name = name
         self._progress.update(self._stage, completed=done, total=total, visible=done < total)
 
+    def note(self, text: str) -> None:
+        """Write a line above the bars."""
+        self._progress.console.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)
+
 
 class Lines:
     """One line on standard error for each cell and stage: for logs, where bars would overwrite nothing.
@@ -95,6 +105,10 @@ class Lines:
     def stage(self, name: str, done: int, total: int) -> None:
         """Write the name, once."""
         self._write(f"  {name}")
+
+    def note(self, text: str) -> None:
+        """Write the line."""
+        self._write(f"note: {text}")
 
     def _pace(self, done: int, total: int) -> str:
         if self._start is None:

@@ -21,7 +21,7 @@ THREADS = 1
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 _PACKAGES = (
     "tunnelcd", "numpy", "scipy", "pandas", "torch", "mujoco", "embreex", "trimesh", "small_gicp", "kiss-matcher",
-    "scikit-image", "pydantic", "matplotlib",
+    "py4dgeo", "dufomap", "scikit-image", "pydantic", "matplotlib", "plotly", "distributed",
 )  # fmt: skip
 
 

@@ -50,7 +50,7 @@ def void_mask(maps: PlacedMaps, session: SessionName, other: SessionName, config
 
 
 def _in_void(cast_from: PointMap, points_odom: Float64Array, config: DufomapConfig) -> BoolArray:
-    void_map = _dufomap().dufomap(config.voxel_m, config.hit_inflation_m, _UNKNOWN_VOXELS, THREADS)
+    void_map = loaded_dufomap().dufomap(config.voxel_m, config.hit_inflation_m, _UNKNOWN_VOXELS, THREADS)
     for scan in range(0, len(cast_from.odom_T_sensor), config.every_scan):
         returns = np.arange(*cast_from.scan_offsets[scan : scan + 2])
         void_map.run(cast_from.positions_of(returns), _origin_pose(cast_from.odom_T_sensor[scan, :3, 3]), False)
@@ -62,7 +62,8 @@ def _origin_pose(origin_odom: Float64Array) -> list[float]:
     return [*origin_odom.tolist(), 1.0, 0.0, 0.0, 0.0]
 
 
-def _dufomap() -> Any:
+def loaded_dufomap() -> Any:
+    """Return the module dufomap, silent."""
     # its C++ part would write its settings to standard error each time; read when it is loaded
     os.environ.setdefault("GLOG_minloglevel", "2")
     import dufomap

@@ -38,7 +38,7 @@ def m3c2_mask(maps: PlacedMaps, session: SessionName, other: SessionName, config
     Returns:
         (N,) mask of the points of `session`.
     """
-    py4dgeo = _py4dgeo()
+    py4dgeo = loaded_py4dgeo()
     points = maps.points[session]
     core = np.flatnonzero(maps.is_comparable(points, other, config.query.radius_m))
     is_new = np.zeros(len(points), dtype=np.bool_)
@@ -61,7 +61,8 @@ def m3c2_mask(maps: PlacedMaps, session: SessionName, other: SessionName, config
     return is_new
 
 
-def _py4dgeo() -> Any:
+def loaded_py4dgeo() -> Any:
+    """Return the module py4dgeo, silent and held to one thread."""
     import py4dgeo
 
     # it logs to standard output and into a file in the working folder

@@ -4,6 +4,7 @@ provenance.json                               marks a run folder; written first
 pairs/<world>/<seed>/{before,after,truth}     simulated pairs; a world is a scenario, with what is set over it
 answers/<world>/<seed>/<variant>/             raw answers (cdpipe.answer)
 maps/<world>/<seed>.npz                       thinned maps for pictures
+stages/<world>/<seed>/                        what the pipeline's stages gave (eval.stage_cache); may be removed
 cells/<world>/<seed>/<variant>.json           a finished cell: key, order, row, items
 results.csv changes.csv regions.csv objects.csv keyframes.csv summary.csv
 merge.csv                                     where pairs have a kind (eval.merge_table)
@@ -31,10 +32,10 @@ from cdpipe.errors import InputError
 from eval.coverage import coverage
 from eval.effects import effects
 from eval.merge_table import merge_table
+from eval.methods import slug
 from eval.object_table import FILES as OBJECT_FILES
 from eval.object_table import object_tables
 from eval.output import make_writable
-from eval.plan import slug
 from eval.provenance import TOOL
 from eval.region_table import FILES as REGION_FILES
 from eval.region_table import region_tables
@@ -68,6 +69,10 @@ class RunFolder:
     def maps(self, scenario: str, seed: int) -> Path:
         """File of the thinned maps of a pair."""
         return self.path / "maps" / world_slug(scenario) / f"{seed}.npz"
+
+    def stages(self, scenario: str, seed: int) -> Path:
+        """Folder of what the stages of a pair gave."""
+        return self.path / "stages" / world_slug(scenario) / str(seed)
 
     def answer_folders(self) -> Iterator[Path]:
         """Yield the folder of every stored answer, sorted."""
@@ -178,10 +183,11 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     return results
 
 
-def reported(provenance: Mapping[str, Any]) -> str:
-    """Return what the plan of a run asks a report of: "regions", "objects", or "" for none."""
+def reported(provenance: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what the plan of a run asks a report of: "regions", "objects", both or nothing."""
     plan = provenance.get("plan")
-    return str(plan.get("report") or "") if isinstance(plan, Mapping) else ""
+    subjects = (plan.get("report") or ()) if isinstance(plan, Mapping) else ()
+    return (subjects,) if isinstance(subjects, str) else tuple(subjects)
 
 
 def _report_tables(
@@ -190,16 +196,18 @@ def _report_tables(
     """Return the tables that the plan asks for, and empty ones for those that it does not."""
     tables = {name: pd.DataFrame() for name in (*REGION_FILES, *OBJECT_FILES)}
     provenance = run.provenance() if (run.path / "provenance.json").is_file() else {}
-    subject = reported(provenance)
-    if not subject or "region_auroc" not in results:
+    subjects = reported(provenance)
+    if not subjects or "region_auroc" not in results:
         return tables
     covered = coverage(
         provenance, zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
     )
     is_whole = covered is None or covered.is_whole
-    if subject == "regions":
-        return {**tables, **region_tables(results, items, is_whole=is_whole)}
-    return {**tables, **object_tables(results, items["changes"], is_whole=is_whole)}
+    if "regions" in subjects:
+        tables |= region_tables(results, items, is_whole=is_whole)
+    if "objects" in subjects:
+        tables |= object_tables(results, items["changes"], is_whole=is_whole)
+    return tables
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

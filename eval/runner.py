@@ -19,10 +19,12 @@ from cdpipe.config import DescriptorConfig
 from cdpipe.descriptor import checkpoint_digest, sphere_digest
 from cdpipe.errors import InputError, ScenarioError
 from eval.cluster import HERE, Where, connected, require_usable
+from eval.methods import Cell
 from eval.pair_run import Made, Pair, PairRun, Todo, cell_key, is_finished, pair_lock
-from eval.plan import Cell, Plan, cells
+from eval.plan import Plan, cells
 from eval.progress import RunProgress, Silent
 from eval.provenance import describe_run, digest, now
+from eval.rivals import require_method
 from eval.run_workers import remove_traces, run_on_workers
 from eval.runfolder import RunFolder, remove, write_tables
 from eval.worlds import worlds_of
@@ -73,7 +75,8 @@ def run_plan(
         progress: Told what is being done.
 
     Raises:
-        InputError: A setting is wrong, the folder cannot be written, or the cluster cannot be used.
+        InputError: A setting is wrong, a method's extra is missing, the folder cannot be written, or the cluster cannot
+            be used.
     """
     progress = progress or Silent()
     require_usable(where)
@@ -83,6 +86,8 @@ def run_plan(
     n_todo = sum(len(pair.todo) for pair in pairs)
     chosen = _limited(pairs, limit)
     n_run = sum(len(pair.todo) for pair in chosen)
+    _require_extras(chosen)
+    _tell_idle(where, len(chosen), progress)
     made = Made(provenance["git_commit"])
     # a cluster that cannot be used is told before anything is written
     with nullcontext() if where == HERE or not chosen else connected(where, len(chosen)) as client:
@@ -170,6 +175,28 @@ def _limited(pairs: Sequence[Pair], limit: int | None) -> list[Pair]:
         if todo:
             chosen.append(replace(pair, todo=todo))
     return chosen
+
+
+def _require_extras(pairs: Sequence[Pair]) -> None:
+    """Refuse to begin where methods need packages that are not here; all of them at once."""
+    mistakes = []
+    for method in dict.fromkeys(each.cell.config.method for pair in pairs for each in pair.todo):
+        try:
+            require_method(method)
+        except InputError as error:
+            mistakes.append(str(error))
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+
+
+def _tell_idle(where: Where, n_pairs: int, progress: RunProgress) -> None:
+    """Say so where there are fewer pairs than workers: a pair is not split, since its cells share stages and maps."""
+    if where.workers is not None and 0 < n_pairs < where.workers:
+        pairs = "1 pair is" if n_pairs == 1 else f"{n_pairs} pairs are"
+        progress.note(
+            f"--workers {where.workers}: {pairs} left to do, and each keeps one worker busy (its cells share stages), "
+            f"so {where.workers - n_pairs} will not be started"
+        )
 
 
 def _remove_stale(run: RunFolder, pair: Pair, force: bool) -> None:

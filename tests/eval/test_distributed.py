@@ -25,8 +25,9 @@ from cdpipe.errors import InputError
 from eval import cluster, pair_run, progress, runner
 from eval.alone import death_of
 from eval.cluster import Where
+from eval.methods import slug
 from eval.pair_run import Made
-from eval.plan import Plan, cells, load_plan, slug
+from eval.plan import Plan, cells, load_plan
 from eval.progress import Lines
 from eval.run_workers import Task, remove_traces, work_on
 from eval.runfolder import RunFolder, start_run_folder, write_json

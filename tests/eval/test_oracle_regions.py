@@ -10,8 +10,10 @@ from cdpipe.errors import InputError
 from cdpipe.geometry import make_pose, yaw_pose
 from eval.ground_truth import GroundTruth, SessionTruth
 from eval.merge_table import is_oracle
+from eval.methods import slug, variant_name
 from eval.oracle_regions import regions_by_truth
-from eval.plan import Plan, cells, changed_plan, load_plan, slug, variant_name
+from eval.plan import Plan, cells, load_plan
+from eval.plan_changes import changed_plan
 from eval.region_metrics import centres_in_world, match_regions
 from eval.universe import Universe
 from sim.truth import Change, PairTruth

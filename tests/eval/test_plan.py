@@ -5,19 +5,11 @@ import pytest
 
 from cdpipe.errors import InputError
 from eval import plan as plan_module
-from eval.plan import (
-    Plan,
-    cells,
-    changed_plan,
-    load_plan,
-    parse_seeds,
-    plan_names,
-    planned_cases,
-    setting_text,
-    slug,
-    variant_name,
-    world_slug,
-)
+from eval.methods import slug, variant_name
+from eval.plan import Plan, cells, load_plan, parse_seeds, plan_names, planned_cases
+from eval.plan_changes import changed_plan
+from eval.runfolder import reported
+from eval.worlds import setting_text, world_slug
 
 PLAN = """\
 name: two
@@ -181,7 +173,7 @@ def test_command_line_grid_is_a_product_over_the_variants(tmp_path: Path) -> Non
         ({"settings": ["query.radius=3"]}, 'did you mean "radius_m"?'),
         ({"settings": ["query.radius_m"]}, "expected key=value"),
         ({"grid": ["query.radius_m=3,,4"]}, "--grid"),
-        ({"grid": ["query.radius_m=3,x"]}, "query.radius_m=x"),
+        ({"grid": ["query.radius_m=3,x"]}, "query.radius_m = 'x'"),
     ],
 )
 def test_mistakes_of_the_command_line(tmp_path: Path, kwargs: dict[str, object], words: str) -> None:
@@ -222,8 +214,8 @@ def test_the_example_of_the_documentation_is_a_plan(tmp_path: Path) -> None:
     plan = read(tmp_path, textwrap.dedent(documentation.partition("\n\n")[2]))
     assert set(Plan.model_fields) == plan.model_fields_set
     assert plan.seeds == (20000, 20001)
-    # of each seed: both variants on both sites and on two more worlds of one, and four grid points on the other
-    assert len(cells(plan)) == 2 * (2 * (2 + 2) + 4)
+    # of each seed: one variant on both sites and on two more worlds of one, another and four grid points on the other
+    assert len(cells(plan)) == 2 * ((2 + 2) + 1 + 4)
     assert {cell.variant for cell in cells(plan) if cell.preset == "paper"} == {"paper[extract.voxel_m=0.4]"}
 
 
@@ -337,3 +329,49 @@ def test_settings_of_the_merge_on_the_command_line_pass_by_the_oracles(tmp_path:
         "oracle-merge[preset=paper]",
     ]
     assert planned_cases(plan) == {(c.scenario, c.seed, c.variant) for c in cells(plan)}
+
+
+def test_a_variant_may_be_for_some_scenarios_alone(tmp_path: Path) -> None:
+    text = PLAN.replace("  - preset: tunnelcd\n", "  - preset: tunnelcd\n    scenarios: smoke/unchanged\n")
+    plan = read(tmp_path, text)
+    found = {(cell.scenario, cell.variant) for cell in cells(plan)}
+    assert ("smoke/unchanged", "tunnelcd[extract.voxel_m=0.4]") in found
+    assert ("smoke/one_box", "tunnelcd[extract.voxel_m=0.4]") not in found
+    assert {(scenario, variant) for scenario, _, variant in planned_cases(plan)} == found
+    assert cells(changed_plan(plan)) != [] and changed_plan(plan) == plan
+    assert mistakes(
+        tmp_path, text.replace("scenarios: smoke/unchanged", "scenarios: [smoke/unchanged, paper/site1]")
+    ) == [
+        "plan.yaml:8: variants.1.scenarios.1 = 'paper/site1': scenarios of tunnelcd names 'paper/site1', which is no "
+        "world of the plan"
+    ]
+
+
+def test_all_mistakes_between_parts_are_told_at_once_with_their_lines(tmp_path: Path) -> None:
+    text = PLAN.replace("{smoke/unchanged: [", "{unchanged/site1: [").replace("[0.2, 0.3]", "[0.2, 0.2]")
+    found = mistakes(tmp_path, text.replace("    scenarios: [smoke/one_box]", "    scenarios: [unchanged/smooth]"))
+    assert [line.partition(": ")[0] for line in found] == ["plan.yaml:6", "plan.yaml:11"]
+    found = mistakes(tmp_path, text)
+    assert [line.partition(": ")[0] for line in found] == ["plan.yaml:6", "plan.yaml:4", "plan.yaml:4"]
+
+
+def test_a_report_may_be_about_both(tmp_path: Path) -> None:
+    for written_as, subjects in (("regions", ("regions",)), ("[regions, objects]", ("regions", "objects")), ("", ())):
+        plan = read(tmp_path, f"{PLAN}report: {written_as}\n")
+        assert plan.report == subjects
+        assert reported({"plan": plan.model_dump(mode="json")}) == subjects
+    assert reported({"plan": {"report": "objects"}}) == ("objects",)  # as runs of before wrote it
+    (told,) = mistakes(tmp_path, f"{PLAN}report: [regions, object]\n")
+    assert 'did you mean "objects"?' in told
+
+
+def test_every_option_of_the_command_line_is_checked_at_once(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        changed_plan(
+            read(tmp_path), seeds="a", settings=["query.radus_m=3", "x"], grid=["extract.voxel=1", "extract.voxel_m"]
+        )
+    lines = str(caught.value).splitlines()
+    assert [line.partition(": ")[0] for line in lines] == [
+        "--seeds a", "--set query.radus_m=3", "--set x", "--grid extract.voxel=1", "--grid extract.voxel_m",
+    ]  # fmt: skip
+    assert [line.count("did you mean") for line in lines] == [0, 1, 0, 1, 0]

@@ -18,6 +18,7 @@ from scenarios.schema import Scenario
 VALIDATION, TEST = range(10000, 20000), range(20000, 30000)
 METHODS = (
     "paper", "paper-paired", "untrained", "scan-context", "solid", "sphere-difference", "voxel-diff", "c2c", "tunnelcd",
+    "m3c2", "dufomap",
 )  # fmt: skip
 WIDE = ("regions/wide", "regions/site2", "null/wide")
 
@@ -41,7 +42,7 @@ def test_regions_has_a_hundred_test_pairs_in_and_out_of_distribution() -> None:
     }  # fmt: skip
     assert counts.total() >= 100
     assert {domain_of(name) for name in counts} == {"in", "out"}
-    assert load_plan("regions").report == "regions"
+    assert load_plan("regions").report == ("regions",)
 
 
 def test_null_drives_five_kilometres_where_nothing_changed() -> None:
@@ -52,7 +53,7 @@ def test_null_drives_five_kilometres_where_nothing_changed() -> None:
     assert {scenario.after.route[0] == scenario.before.route[-1] for scenario in scenarios} == {True, False}
     assert min(scenario.after.end_m for scenario in scenarios) < 5 < 40 < max(s.after.end_m for s in scenarios)
     assert len(scenarios) >= 40  # one in twenty of fewer would be all or none
-    assert load_plan("null").report == "regions"
+    assert load_plan("null").report == ("regions",)
 
 
 def test_thresholds_are_set_on_twenty_validation_pairs_of_each_trained_family() -> None:

@@ -6,7 +6,8 @@ import pytest
 
 from cdpipe.errors import InputError
 from eval import worlds
-from eval.plan import Plan, cells, changed_plan, load_plan
+from eval.plan import Plan, cells, load_plan
+from eval.plan_changes import changed_plan
 from eval.worlds import World, references, settings_over, world_slug, worlds_of
 
 PLAN = """\
@@ -237,12 +238,12 @@ def test_worlds_that_do_not_fit(tmp_path: Path, old: str, new: str, words: str) 
     assert words in line
 
 
-@pytest.mark.parametrize("option", ["settings", "grid"])
-def test_a_setting_of_the_world_on_the_command_line_is_shown_its_place(tmp_path: Path, option: str) -> None:
+@pytest.mark.parametrize(("option", "name"), [("settings", "--set"), ("grid", "--grid")])
+def test_a_setting_of_the_world_on_the_command_line_is_shown_its_place(tmp_path: Path, option: str, name: str) -> None:
     with pytest.raises(InputError) as caught:
         changed_plan(read(tmp_path), **{option: ["sensor.range_noise=false"]})
     words = (
-        "--set sensor.range_noise=false: belongs to the world, not to the method: set it in the plan, under scenarios"
+        f"{name} sensor.range_noise=false: belongs to the world, not to the method: set it in the plan, under scenarios"
     )
     assert str(caught.value).startswith(words)
 

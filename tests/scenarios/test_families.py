@@ -77,7 +77,7 @@ def test_the_names_are_the_documented_ones() -> None:
         "narrow", "network", "null/cave", "null/narrow", "null/network", "null/site1", "null/wide",
         "paper/site1", "paper/site2", "regions/cave", "regions/narrow", "regions/network", "regions/site1",
         "regions/site2", "regions/wide", "smoke/one_box", "smoke/unchanged", "smooth",
-        "tight", "train/narrow", "train/network", "train/tight", "train/wide",
+        "stress/narrow", "tight", "train/narrow", "train/network", "train/tight", "train/wide",
         "unchanged/cave", "unchanged/narrow", "unchanged/network", "unchanged/site1", "unchanged/smooth",
         "unchanged/wide", "wide",
     ]  # fmt: skip
