@@ -23,14 +23,15 @@ from cdpipe.errors import MergeFailedError, ScenarioError, TunnelcdError
 from eval.adapters import pipeline_input
 from eval.domains import domain_of
 from eval.ground_truth import GroundTruth, load_ground_truth
+from eval.methods import Cell
 from eval.oracle_regions import Regions, regions_by_truth
 from eval.oracles import merged_by_truth
-from eval.plan import Cell
 from eval.progress import RunProgress
 from eval.provenance import THREADS, digest
 from eval.rescoring import cell_document, score_stored
 from eval.runfolder import RunFolder, remove
 from eval.scoring import METRICS_VERSION, CaseScore
+from eval.stage_cache import opened_cache
 from eval.stages import Merge, PairStages
 from scenarios.schema import Scenario
 from sim.simulate import simulate_pair
@@ -106,7 +107,7 @@ class PairRun:
         """Simulate the pair unless it is there, and open it, once; the text says why it cannot be made."""
         if self._opened is None:
             try:
-                self._opened = _open(self._run, self._pair, self._progress)
+                self._opened = _open(self._run, self._pair, self._made, self._progress)
             except ScenarioError as error:
                 self._opened = str(error)
         return self._opened
@@ -121,7 +122,7 @@ class PairRun:
         folder = self._run.answer(self._pair.name, self._pair.seed, cell.variant)
         try:
             _answer(stages, cell, truth, folder)
-            self._finish(each, score_stored(truth, folder))
+            self._finish(each, score_stored(truth, folder), is_contended=stages.is_contended)
         except BaseException as error:
             remove(folder)
             if isinstance(error, OSError) and error.filename is None:
@@ -140,10 +141,11 @@ class PairRun:
         write_failure(folder, each.cell.variant, status, error, {}, settings, each.cell.until)
         self._finish(each, score_stored(load_ground_truth(path), folder))
 
-    def _finish(self, each: Todo, score: CaseScore) -> None:
+    def _finish(self, each: Todo, score: CaseScore, *, is_contended: bool = False) -> None:
         pair, cell = self._pair, each.cell
         names = {"scenario": pair.name, "seed": pair.seed, "variant": cell.variant, "preset": cell.preset}
-        told = {"pair_kind": pair.kind, "commit": self._made.commit, "is_contended": self._made.is_contended}
+        is_contended |= self._made.is_contended
+        told = {"pair_kind": pair.kind, "commit": self._made.commit, "is_contended": is_contended}
         path = self._run.cell(pair.name, pair.seed, cell.variant)
         self._run.write_cell(path, cell_document(score, {**names, **told}, each.key, each.place))
 
@@ -199,8 +201,8 @@ def cell_key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mappi
     )
 
 
-def _open(run: RunFolder, pair: Pair, progress: RunProgress) -> tuple[PairStages, GroundTruth]:
-    """Simulate a pair unless it is there, store its maps for pictures, and open it.
+def _open(run: RunFolder, pair: Pair, made: Made, progress: RunProgress) -> tuple[PairStages, GroundTruth]:
+    """Simulate a pair unless it is there, store its maps for pictures, and open it with what is kept of its stages.
 
     Raises:
         ScenarioError: The seed draws no scenario, or one whose world cannot be built.
@@ -208,10 +210,14 @@ def _open(run: RunFolder, pair: Pair, progress: RunProgress) -> tuple[PairStages
     if pair.scenario is None:
         raise ScenarioError(pair.error)
     path = run.pair(pair.name, pair.seed)
+    kept = run.stages(pair.name, pair.seed)
     if not path.exists():
+        remove(kept)  # `--force` starts from nothing
         path.parent.mkdir(parents=True, exist_ok=True)
         simulate_pair(pair.scenario, pair.seed, path, on_progress=progress.stage)
-    stages = PairStages(pipeline_input(path, "before"), pipeline_input(path, "after"), progress.stage)
+    cache = opened_cache(kept, (path / "before", path / "after"))
+    sessions = pipeline_input(path, "before"), pipeline_input(path, "after")
+    stages = PairStages(*sessions, progress.stage, cache, is_shared=made.is_contended)
     picture = run.maps(pair.name, pair.seed)
     if not picture.exists():
         _write_maps(picture, stages)

@@ -1,17 +1,15 @@
-"""The stages of one pair, each run once for all variants that share the settings it depends on, and timed.
+"""The stages of one pair, each run once for all variants that share what it reads, and timed.
 
-Times are wall clock of one process on fixed threads, one stage after the other: the first call warms up; where it took
-less than a second, the median of three further calls is the time, otherwise the first call is. Of a stage with parts
-each part is timed so, and the parts by themselves.
+What a stage gave is found again by all that it read (eval/stage_cache.py), also by a later process: another voxel of
+the extraction runs the extraction alone, another radius the query and the extraction. What is found again has the
+seconds that it took when it ran (eval/stage_times.py).
 """
 
 from __future__ import annotations
 
-import statistics
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Protocol, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,83 +18,94 @@ from cdpipe.descriptor import describe_map, describe_scans
 from cdpipe.detect import local_alignment, refusal
 from cdpipe.mapping import build_map
 from cdpipe.merge import merge_maps
+from cdpipe.query import find_regions
 from cdpipe.session_check import check_session
-from cdpipe.types import (
-    ChangeRegions,
-    ChangeReport,
-    DescriptorSet,
-    MappedSession,
-    MergedMaps,
-    PointMap,
-    ScanSource,
-    Spheres,
-)
+from cdpipe.types import ChangeRegions, ChangeReport, MappedSession, MergedMaps, PointMap, ScanSource
 from eval.oracle_regions import Regions, with_regions
 from eval.rivals import METHODS, USES_DESCRIPTORS
+from eval.stage_cache import Kept, StageCache
+from eval.stage_results import (
+    descriptors_arrays,
+    descriptors_from,
+    descriptors_name,
+    maps_arrays,
+    maps_from,
+    maps_name,
+    merge_name,
+    merged_arrays,
+    merged_from,
+    regions_arrays,
+    regions_from,
+    regions_name,
+    spheres_arrays,
+    spheres_from,
+    spheres_name,
+)
+from eval.stage_times import REPEATS, TimedT, timed_parts
 
-REPEAT_BELOW_S = 1.0
-REPEATS = 3
 _POSE_BYTES = 28.0
 OnStage = Callable[[str, int, int], None]
 Merge = Callable[[MappedSession, MappedSession], MergedMaps]
 
 
-class HasSeconds(Protocol):
-    """What says itself how long each of its parts took."""
-
-    @property
-    def seconds(self) -> Mapping[str, float]:
-        """Wall-clock seconds by name."""
-
-
-TimedT = TypeVar("TimedT", bound=HasSeconds)
-
-
 class PairStages:
     """Both sessions of a pair and what has been computed from them so far.
 
-    Only the maps of one map setting are held at a time, and what was computed from them; cells that share it should
-    therefore come one after the other.
+    Only the maps of one map setting are held at a time; cells that share it should therefore come one after the other.
+
+    Args:
+        before: The before session.
+        after: The after session.
+        on_stage: Told what is computed.
+        cache: What is kept of the pair, perhaps of an earlier process.
+        is_shared: Whether workers share the machine, and so the times.
+
+    Attributes:
+        is_contended: Whether workers shared the machine while any of the times of the last answer was taken.
     """
 
     def __init__(
-        self, before: ScanSource, after: ScanSource, on_stage: OnStage = lambda name, done, total: None
+        self,
+        before: ScanSource,
+        after: ScanSource,
+        on_stage: OnStage = lambda name, done, total: None,
+        cache: StageCache | None = None,
+        *,
+        is_shared: bool = False,
     ) -> None:
         self._sources = (before, after)
         self._on_stage = on_stage
-        self._map_key = ""
+        self._cache = cache or StageCache()
+        self._is_shared = is_shared
+        self._maps_name = ""
         self._maps: tuple[PointMap, PointMap] | None = None
-        self._described: dict[str, tuple[tuple[DescriptorSet, DescriptorSet], float]] = {}
-        self._spheres: dict[str, tuple[tuple[Spheres, Spheres], float]] = {}
-        self._merged: dict[str, tuple[MergedMaps, Mapping[str, float]]] = {}
+        self.is_contended = is_shared
 
     def maps(self, config: MapConfig) -> tuple[PointMap, PointMap]:
         """Return both maps, each in its session's own odom frame."""
-        key = config.model_dump_json()
-        if self._maps is None or key != self._map_key:
+        name = maps_name(config)
+        if self._maps is None or name != self._maps_name:
             # the old maps must be gone before the new ones are built: the large site fills gigabytes
             self._maps = None
-            self._described.clear()
-            self._spheres.clear()
-            self._merged.clear()
-            self._maps = (self._map(0, config), self._map(1, config))
-            self._map_key = key
+            kept = self._cache.find(name)
+            if kept is None:
+                self._maps = self._map(0, config), self._map(1, config)
+                self._cache.keep(name, Kept(maps_arrays(self._maps)))
+            else:
+                self._maps = maps_from(kept.arrays)
+            self._maps_name = name
         return self._maps
 
-    def mapped(self, config: PipelineConfig) -> tuple[MappedSession, MappedSession, float]:
-        """Return both sessions with their descriptors, and the seconds that all descriptors took."""
+    def mapped(self, config: PipelineConfig) -> tuple[MappedSession, MappedSession, list[Kept]]:
+        """Return both sessions with their descriptors, and what was kept of these, with their seconds."""
         maps = self.maps(config.map)
-        key = config.descriptor.method
-        if key not in self._described:
-            self._described[key] = self._describe(maps, config)
-        (before, after), seconds = self._described[key]
+        kept = [self._kept(descriptors_name(config), lambda: self._describe(maps, config))]
+        before, after = descriptors_from(kept[0].arrays)
         if config.query.compare == "sphere":
-            if config.descriptor.precision not in self._spheres:
-                self._spheres[config.descriptor.precision] = self._describe_spheres(maps, config)
-            (of_before, of_after), more_seconds = self._spheres[config.descriptor.precision]
+            kept.append(self._kept(spheres_name(config), lambda: self._describe_spheres(maps, config)))
+            of_before, of_after = spheres_from(kept[1].arrays)
             before, after = replace(before, spheres=of_before), replace(after, spheres=of_after)
-            seconds += more_seconds
-        return MappedSession(maps[0], before), MappedSession(maps[1], after), seconds
+        return MappedSession(maps[0], before), MappedSession(maps[1], after), kept
 
     def merged(self, config: PipelineConfig, merge: Merge | None = None) -> tuple[MergedMaps, Mapping[str, float]]:
         """Return the merged maps and the seconds of the merge's parts.
@@ -109,18 +118,15 @@ class PairStages:
             MergeFailedError: The evidence does not suffice.
         """
         before, after, _ = self.mapped(config)
-        self._on_stage("merge", 0, 1)
         if merge is None:
-            key = config.descriptor.method + config.merge.model_dump_json()
-            if key not in self._merged:
-                self._merged[key] = timed_parts(lambda: merge_maps(before, after, config.merge))
-            merged, seconds = self._merged[key]
+            kept = self._kept(merge_name(config), lambda: self._merge(before, after, config))
+            merged = merged_from(kept.arrays, (before.map, after.map), self._spent(kept))
         else:
+            self._on_stage("merge", 0, 1)
             merged = merge(before, after)
-            seconds = merged.seconds
         if not merged.is_accepted:
-            raise refusal(replace(merged, seconds=seconds))
-        return merged, seconds
+            raise refusal(merged)
+        return merged, merged.seconds
 
     def answer(
         self, config: PipelineConfig, merge: Merge | None = None, regions: Regions | None = None
@@ -136,15 +142,22 @@ class PairStages:
             MergeFailedError: The maps could not be merged.
             TunnelcdError: The input does not allow an answer.
         """
-        before, after, t_descriptor_s = self.mapped(config)
+        self.is_contended = self._is_shared
+        before, after, described = self.mapped(config)
         merged, of_merge = self.merged(config, merge)
-        method = METHODS[config.method] if regions is None else with_regions(regions)
-        report, medians = timed_parts(lambda: method(merged, before.descriptors, after.descriptors, config))
         is_described = regions is None and config.method in USES_DESCRIPTORS
-        of_descriptors = {"t_descriptor_s": t_descriptor_s if is_described else 0.0}
+        of_query: Mapping[str, float] = {}
+        if regions is not None:
+            method = with_regions(regions)
+        elif config.method == "descriptor" and merge is None:
+            query = self._kept(regions_name(config), lambda: self._query(merged, before, after, config))
+            method, of_query = with_regions(lambda _: regions_from(query.arrays)), self._spent(query)
+        else:
+            method = METHODS[config.method]
+        report, medians = self._timed(lambda: method(merged, before.descriptors, after.descriptors, config))
         return replace(
             report,
-            seconds={**medians, **of_merge, **of_descriptors},
+            seconds={**medians, **of_query, **of_merge, **self._of_descriptors(described if is_described else ())},
             evidence={**report.evidence, **_sizes(before, after), **kept_bytes(before, config)},
         )
 
@@ -155,7 +168,8 @@ class PairStages:
             MergeFailedError: The maps could not be merged.
             TunnelcdError: The input does not allow an answer.
         """
-        before, after, t_descriptor_s = self.mapped(config)
+        self.is_contended = self._is_shared
+        before, after, described = self.mapped(config)
         merged, of_merge = self.merged(config, merge)
         uses_descriptors = merge is None and config.merge.method != "kiss-matcher"
         return ChangeReport(
@@ -163,48 +177,76 @@ class PairStages:
             evidence={**merged.evidence, **_sizes(before, after)},
             regions=_no_regions(config.query.radius_m),
             objects=(),
-            seconds={**of_merge, "t_descriptor_s": t_descriptor_s if uses_descriptors else 0.0},
+            seconds={**of_merge, **self._of_descriptors(described if uses_descriptors else ())},
             figures={},
             keyframe_scans=(before.descriptors.keyframe_scans, after.descriptors.keyframe_scans),
             config=config.model_dump(),
             local_before_T_after=local_alignment(merged, after.descriptors),
         )
 
+    def _kept(self, name: str, compute: Callable[[], Kept]) -> Kept:
+        kept = self._cache.find(name)
+        if kept is None:
+            kept = compute()
+            self._cache.keep(name, kept)
+        return kept
+
+    def _spent(self, kept: Kept) -> Mapping[str, float]:
+        """Return the seconds of a stage for the present answer."""
+        self.is_contended |= kept.is_contended
+        return kept.seconds
+
+    def _of_descriptors(self, kept: Sequence[Kept]) -> Mapping[str, float]:
+        return {"t_descriptor_s": sum((self._spent(each)["t_descriptor_s"] for each in kept), 0.0)}
+
+    def _timed(self, call: Callable[[], TimedT]) -> tuple[TimedT, Mapping[str, float]]:
+        return timed_parts(call, 0 if self._is_shared else REPEATS)
+
     def _map(self, which: int, config: MapConfig) -> PointMap:
         self._on_stage(f"map {('before', 'after')[which]}", 0, 1)
         check_session(self._sources[which], config)
         return build_map(self._sources[which], config)
 
-    def _describe(
-        self, maps: tuple[PointMap, PointMap], config: PipelineConfig
-    ) -> tuple[tuple[DescriptorSet, DescriptorSet], float]:
+    def _describe(self, maps: tuple[PointMap, PointMap], config: PipelineConfig) -> Kept:
         self._on_stage("describe keyframes", 0, 1)
         describe_scans(self._sources[0], maps[0].keyframe_scans[:1], config.descriptor)  # loads the network
         start = time.perf_counter()
-        before, after = (
+        descriptors = [
             describe_scans(source, pointmap.keyframe_scans, config.descriptor)
             for source, pointmap in zip(self._sources, maps, strict=True)
-        )
-        return (before, after), time.perf_counter() - start
+        ]
+        seconds = {"t_descriptor_s": time.perf_counter() - start}
+        return Kept(descriptors_arrays(descriptors), seconds, self._is_shared)
 
-    def _describe_spheres(
-        self, maps: tuple[PointMap, PointMap], config: PipelineConfig
-    ) -> tuple[tuple[Spheres, Spheres], float]:
+    def _describe_spheres(self, maps: tuple[PointMap, PointMap], config: PipelineConfig) -> Kept:
         self._on_stage("describe spheres", 0, 1)
         describe_map(maps[0], maps[0].odom_T_keyframe[:1], config.descriptor)  # loads the network
         start = time.perf_counter()
-        before, after = (describe_map(pointmap, pointmap.odom_T_keyframe, config.descriptor) for pointmap in maps)
-        return (before, after), time.perf_counter() - start
+        spheres = [describe_map(pointmap, pointmap.odom_T_keyframe, config.descriptor) for pointmap in maps]
+        return Kept(spheres_arrays(spheres), {"t_descriptor_s": time.perf_counter() - start}, self._is_shared)
+
+    def _merge(self, before: MappedSession, after: MappedSession, config: PipelineConfig) -> Kept:
+        self._on_stage("merge", 0, 1)
+        merged, seconds = self._timed(lambda: merge_maps(before, after, config.merge))
+        return Kept(merged_arrays(merged), seconds, self._is_shared)
+
+    def _query(self, merged: MergedMaps, before: MappedSession, after: MappedSession, config: PipelineConfig) -> Kept:
+        def query() -> _Query:
+            start = time.perf_counter()
+            regions = find_regions(merged, before.descriptors, after.descriptors, config.query)
+            return _Query(regions, {"t_cd_s": time.perf_counter() - start})
+
+        self._on_stage("query", 0, 1)
+        found, seconds = self._timed(query)
+        return Kept(regions_arrays(found.regions), seconds, self._is_shared)
 
 
-def timed_parts(call: Callable[[], TimedT]) -> tuple[TimedT, Mapping[str, float]]:
-    """Return a call's result and the seconds of its parts by the rule of this module."""
-    start = time.perf_counter()
-    result = call()
-    if time.perf_counter() - start >= REPEAT_BELOW_S:
-        return result, result.seconds
-    repeats = [call().seconds for _ in range(REPEATS)]
-    return result, {name: statistics.median(run[name] for run in repeats) for name in result.seconds}
+@dataclass(frozen=True, slots=True, eq=False)
+class _Query:
+    """Regions, and how long it took to find them."""
+
+    regions: ChangeRegions
+    seconds: Mapping[str, float]
 
 
 def _sizes(before: MappedSession, after: MappedSession) -> dict[str, float]:
@@ -224,7 +266,7 @@ def kept_bytes(before: MappedSession, config: PipelineConfig) -> dict[str, float
     if config.method == "random-regions":
         kept = _POSE_BYTES * n_keyframes
     elif config.method == "descriptor" and vectors is not None:
-        kept = _POSE_BYTES * n_keyframes + 4.0 * vectors.size
+        kept = _POSE_BYTES * n_keyframes + float(vectors.nbytes)
     elif config.method == "dufomap":
         kept = map_bytes + 12.0 * float(np.diff(before.map.scan_offsets)[:: config.dufomap.every_scan].sum())
     else:
