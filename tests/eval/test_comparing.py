@@ -170,8 +170,9 @@ def test_recall_at_a_rate_is_drawn_again_for_both(write: Write) -> None:
         names = [{key: each[key] for key in ("scenario", "seed", "variant")} for each in rows]
         changes = [{**each, "id": 1, "is_observable": True, "n_truth_cells": 20} for each in names]
         # the bad method scores a false region above every true one
-        regions = [{**each, "score": 0.5, "found_changes": "1"} for each in names]
-        regions += [] if is_good else [{**each, "score": 0.9, "found_changes": ""} for each in names for _ in "12"]
+        regions = [{**each, "score": 0.5, "found_changes": "1", "is_withdrawn": False} for each in names]
+        wrong = {"score": 0.9, "found_changes": "", "is_withdrawn": False}
+        regions += [] if is_good else [{**each, **wrong} for each in names for _ in "12"]
         return rows, {"regions": regions, "changes": changes}
 
     folders = []

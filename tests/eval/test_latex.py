@@ -117,7 +117,8 @@ def test_stored_tables_keep_their_numbers_and_name_what_is_not_tested(tmp_path: 
         "recall_at_0.5",
     )
     plain = {"region_auroc_pooled": NAN, "false_regions_per_100m": 0.1, "bytes_ratio": 10.0, "t_cd_per_region_s": NAN,
-             "t_descriptor_per_keyframe_s": 0.01, "n_pairs": 6, "n_observable": 12}  # fmt: skip
+             "recall_at_0.1_proposed": NAN, "t_descriptor_per_keyframe_s": 0.01, "n_pairs": 6,
+             "n_observable": 12}  # fmt: skip
     ends = {"": 0.0, "_low": -0.05, "_high": 0.05}
     stored = [
         {"domain": "in", "variant": variant, **plain,
