@@ -13,6 +13,7 @@ import numpy as np
 
 from cdpipe.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.types import Float16Array, KeyframeViews
+from cdpipe.voxel import cell_keys
 
 ROWS = 64
 COLUMNS = 512
@@ -83,49 +84,45 @@ def scans_past(points: Float64Array, ends: Float64Array, origins: Float64Array, 
         origins: (M, 3) where its sensor was then.
         scans: (M,) which scan each is of.
     """
-    grid = _Grid(points)
-    is_near = grid.is_within(ends, _PAST_M[1])
+    cells = _Cells(points)
+    is_near = cells.is_within(ends, _PAST_M[1])
     ends, origins, scans = ends[is_near], origins[is_near], scans[is_near]
     ranges_m = np.linalg.norm(origins - ends, axis=1)
     back = (origins - ends) / np.maximum(ranges_m, _NEAREST_M)[:, None]
     passed = [np.zeros(0, dtype=np.int64)]
     for step_m in np.arange(_PAST_M[0], _PAST_M[1], _CELL_M / 2):
         is_long = ranges_m > step_m + _NEAREST_M
-        passed.append(grid.met((ends + step_m * back)[is_long], scans[is_long]))
-    return grid.n_scans(np.concatenate(passed)) - grid.n_scans(grid.met(ends, scans))
+        passed.append(cells.met((ends + step_m * back)[is_long], scans[is_long]))
+    return cells.n_scans(np.concatenate(passed)) - cells.n_scans(cells.met(ends, scans))
 
 
-class _Grid:
+class _Cells:
     """The cells that some places (N, 3) lie in, and which scans have been in them."""
 
     def __init__(self, points: Float64Array) -> None:
-        self._low = points.min(axis=0) - _CELL_M
-        self._shape = ((points.max(axis=0) - self._low) // _CELL_M).astype(np.int64) + 2
-        cells, self._cell_of_point = np.unique(self._flat(points)[0], return_inverse=True)
-        self._n_cells = len(cells)
-        self._table = np.full(int(self._shape.prod()), -1, dtype=np.int64)
-        self._table[cells] = np.arange(len(cells))
+        self._low, self._high = points.min(axis=0) - _CELL_M, points.max(axis=0) + _CELL_M
+        self._keys, self._cell_of_point = np.unique(self._keys_of(points), return_inverse=True)
 
     def is_within(self, points: Float64Array, margin_m: float) -> BoolArray:
         """Mark the points in the box about all cells, or within a margin of it."""
-        high = self._low + self._shape * _CELL_M
-        return np.asarray(((points > self._low - margin_m) & (points < high + margin_m)).all(axis=1))
+        return np.asarray(((points > self._low - margin_m) & (points < self._high + margin_m)).all(axis=1))
 
     def met(self, points: Float64Array, scans: Int64Array) -> Int64Array:
         """Return a key of cell and scan for each point in one of the cells."""
-        flat, is_inside = self._flat(points)
-        cells = self._table[flat]
-        return (scans[is_inside] * self._n_cells + cells)[cells >= 0]
+        is_near = self.is_within(points, 0.0)
+        keys = self._keys_of(points[is_near])
+        cells = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        found = scans[is_near] * len(self._keys) + cells
+        return np.asarray(found[self._keys[cells] == keys], dtype=np.int64)
 
     def n_scans(self, keys: Int64Array) -> Int64Array:
         """Return how many scans have a key in the cell of each place."""
-        return np.bincount(np.unique(keys) % self._n_cells, minlength=self._n_cells)[self._cell_of_point]
+        n_cells = len(self._keys)
+        found = np.bincount(np.unique(keys) % n_cells, minlength=n_cells)
+        return np.asarray(found[self._cell_of_point], dtype=np.int64)
 
-    def _flat(self, points: Float64Array) -> tuple[Int64Array, BoolArray]:
-        cells = np.floor((points - self._low) / _CELL_M).astype(np.int64)
-        is_inside = ((cells >= 0) & (cells < self._shape)).all(axis=1)
-        x, y, z = cells[is_inside].T
-        return (x * self._shape[1] + y) * self._shape[2] + z, is_inside
+    def _keys_of(self, points: Float64Array) -> Int64Array:
+        return cell_keys(points - self._low, _CELL_M)
 
 
 def _looked_up(image: Float16Array, pixel: Int64Array, ranges_m: Float64Array) -> tuple[Float64Array, BoolArray]:
