@@ -45,11 +45,6 @@ def view(points_sensor: Float64Array) -> Float16Array:
     return image.reshape(ROWS, COLUMNS).astype(np.float16)
 
 
-def seen_through(points_odom: Float64Array, views: KeyframeViews) -> BoolArray:
-    """Mark the (N,) places that more keyframes saw through than hit (`net_views`)."""
-    return net_views(points_odom, views) > 0
-
-
 def net_views(points_odom: Float64Array, views: KeyframeViews) -> Int64Array:
     """Return how many more keyframes saw through each of (N,) places than hit it.
 

@@ -23,7 +23,7 @@ from cdpipe.crops import Crops, Sphere
 from cdpipe.cutting import BEYOND_M, ReturnPool, object_cells, rays_of, realigned
 from cdpipe.descriptor import use_threads
 from cdpipe.detect import map_session, refusal
-from cdpipe.freespace import net_views, seen_through
+from cdpipe.freespace import net_views
 from cdpipe.geometry import Float64Array, Int64Array, transform
 from cdpipe.merge import merge_maps
 from cdpipe.novelty import inlier_mask, new_points_mask
@@ -152,7 +152,7 @@ class Region:
         """(N,) candidates of the after sphere, without its margin, that the before session saw through."""
         chosen = self.compared[0][0]
         chosen = chosen[self.spheres["after"].is_inside[chosen]]
-        return chosen[seen_through(self.after_points[chosen], _views(self.merged))]
+        return chosen[net_views(self.after_points[chosen], _views(self.merged)) > 0]
 
     @cached_property
     def site(self) -> tuple[Int64Array, Int64Array]:
