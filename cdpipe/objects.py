@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.geometry import Float64Array, Int32Array, Int64Array, require_shape
+from cdpipe.geometry import Float64Array, Int32Array, Int64Array, invert, require_shape, transform
 from cdpipe.moves import find_moves
-from cdpipe.remains import is_part_of_a_rest
-from cdpipe.shape import object_shape
+from cdpipe.remains import is_muck, is_part_of_a_rest
+from cdpipe.shape import ground_heights, object_shape, upright_box
 from cdpipe.sphere import MapIndex
 from cdpipe.types import ChangedObject, MergedMaps, PointMap, SessionName
 from cdpipe.voxel import cell_means
@@ -26,6 +26,9 @@ _LEAST_FULL_CELLS = 0.2
 _AROUND_M = 1.0
 _BEND_M = 0.5
 _ON_OBJECT_M = 0.1
+# The ground is the lowest of columns this wide, and a bit more.
+_GROUND_M = 0.4
+_ABOVE_GROUND_M = 0.06
 _SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
 
 
@@ -101,16 +104,24 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
                 shape=object_shape(points[number], other, voxel_m / 2 if is_fine else voxel_m, voxel_m),
             )
         )
-    return _with_moves(objects, points, is_part)
+    return _with_moves(objects, points, is_part, surroundings)
 
 
 def _with_moves(
-    objects: list[ChangedObject], points: Mapping[int, Float64Array], is_part: Mapping[int, bool]
+    objects: list[ChangedObject],
+    points: Mapping[int, Float64Array],
+    is_part: Mapping[int, bool],
+    surroundings: _Surroundings,
 ) -> tuple[ChangedObject, ...]:
-    removed = [number for number, item in enumerate(objects) if item.session == "before"]
+    before = [number for number, item in enumerate(objects) if item.session == "before"]
+    removed = [number for number in before if not (is_part[number] and is_muck(points[number]))]
     added = [number for number, item in enumerate(objects) if item.session == "after"]
     may_go_far = [not is_part[number] for number in removed]
-    for move in find_moves([points[n] for n in removed], [points[n] for n in added], may_go_far):
+
+    def around(pairs: Sequence[tuple[int, int]]) -> list[tuple[Float64Array, Float64Array]]:
+        return surroundings.standing([np.concatenate([points[removed[r]], points[added[a]]]) for r, a in pairs])
+
+    for move in find_moves([points[n] for n in removed], [points[n] for n in added], may_go_far, around):
         start, end = removed[move.removed], added[move.added]
         for number, partner in ((start, end), (end, start)):
             objects[number] = replace(
@@ -149,35 +160,78 @@ def _measured_points(merged: MergedMaps, group: PointGroup, returns: Int64Array)
     point_map = merged.before if group.session == "before" else merged.after
     if point_map.return_offsets is None or len(returns) == 0:
         return group.points_map
-    means, cells = cell_means(point_map.positions_of(returns), point_map.voxel_m / _FINE_SHARE)
-    is_full = np.bincount(cells) >= _RETURNS_PER_CELL
-    if is_full.mean() >= _LEAST_FULL_CELLS:
-        means = means[is_full]
+    means = _fine_points(point_map, returns)
     return means if group.session == "before" else merged.alignment.to_map(means)
 
 
+def _fine_points(point_map: PointMap, returns: Int64Array) -> Float64Array:
+    """Return the means (P, 3) of some returns in small cells, odometry frame, without the cells of stray ones."""
+    if len(returns) == 0:
+        return np.zeros((0, 3))
+    means, cells = cell_means(point_map.positions_of(returns), point_map.voxel_m / _FINE_SHARE)
+    is_full = np.bincount(cells) >= _RETURNS_PER_CELL
+    return means[is_full] if is_full.mean() >= _LEAST_FULL_CELLS else means
+
+
 class _Surroundings:
-    """What both sessions saw around an object, without what it is made of itself."""
+    """What both sessions saw around objects."""
 
     def __init__(self, merged: MergedMaps) -> None:
         self._merged = merged
         self._before, self._after = MapIndex(merged.before.points), MapIndex(merged.after.points)
 
     def of(self, group: PointGroup) -> dict[SessionName, Float64Array]:
-        """Return the points (N, 3) of each session, map frame, no farther than `_AROUND_M` beside a group's box."""
+        """Return the points (N, 3) of each session, map frame, no farther than `_AROUND_M` beside a group's box.
+
+        Without what the group is made of itself.
+        """
         low, high = group.points_map.min(axis=0) - _AROUND_M, group.points_map.max(axis=0) + _AROUND_M
-        centre, radius_m = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-        found: dict[SessionName, Int64Array] = {"before": self._before.crop(centre, radius_m)}
-        centre_odom = self._merged.alignment.to_odom(centre[None])[0]
-        bend_m = 0.0 if self._merged.alignment.is_rigid else _BEND_M
-        found["after"] = self._after.crop(centre_odom, radius_m + bend_m)
-        points: dict[SessionName, Float64Array] = {
-            "before": self._merged.before.points[found["before"]],
-            "after": self._merged.alignment.to_map(self._merged.after.points[found["after"]]),
-        }
+        found = self._within((low + high) / 2, float(np.linalg.norm(high - low)) / 2)
+        points = {name: around for name, (_, around) in found.items()}
         # a map point on the object's border may stand for returns of both; what lies off the object is its surroundings
-        is_own = np.isin(found[group.session], group.indices)
+        is_own = np.isin(found[group.session][0], group.indices)
         own = points[group.session]
         is_own[is_own] = cKDTree(group.points_map).query(own[is_own])[0] < _ON_OBJECT_M
         points[group.session] = own[~is_own]
         return {name: around[((around >= low) & (around <= high)).all(axis=1)] for name, around in points.items()}
+
+    def standing(self, places: Sequence[Float64Array]) -> list[tuple[Float64Array, Float64Array]]:
+        """Return what either session has above the ground within the upright box around each set of points (P, 3).
+
+        Returns:
+            Points (Q, 3) of the before and (R, 3) of the after session, map frame, fine where the maps know that.
+        """
+        chosen: dict[SessionName, list[Int64Array]] = {"before": [], "after": []}
+        for place in places:
+            map_T_box, box_m = upright_box(place)
+            found = self._within(map_T_box[:3, 3], float(np.linalg.norm(box_m)) / 2 + _AROUND_M)
+            ground = np.concatenate([around for _, around in found.values()])
+            for session in _SESSIONS:
+                indices, around = found[session]
+                is_inside = (np.abs(transform(invert(map_T_box), around)) <= box_m / 2 + _ON_OBJECT_M).all(axis=1)
+                indices, around = indices[is_inside], around[is_inside]
+                is_high = around[:, 2] > ground_heights(ground, around, _GROUND_M) + _ABOVE_GROUND_M
+                chosen[session].append(indices[is_high])
+        return list(zip(self._finely("before", chosen["before"]), self._finely("after", chosen["after"]), strict=True))
+
+    def _within(self, centre_map: Float64Array, radius_m: float) -> dict[SessionName, tuple[Int64Array, Float64Array]]:
+        """Return which map points of each session lie about a place, and where (N, 3), map frame."""
+        before = self._before.crop(centre_map, radius_m)
+        alignment = self._merged.alignment
+        bend_m = 0.0 if alignment.is_rigid else _BEND_M
+        after = self._after.crop(alignment.to_odom(centre_map[None])[0], radius_m + bend_m)
+        return {
+            "before": (before, self._merged.before.points[before]),
+            "after": (after, alignment.to_map(self._merged.after.points[after])),
+        }
+
+    def _finely(self, session: SessionName, chosen: Sequence[Int64Array]) -> list[Float64Array]:
+        """Return the points (P, 3) of sets of map points, map frame: finer than the map's, where that is known."""
+        point_map = self._merged.before if session == "before" else self._merged.after
+        if point_map.return_offsets is None or not chosen:
+            points = [point_map.points[indices] for indices in chosen]
+        else:
+            (returns,) = _returns_of_groups(point_map, [np.unique(np.concatenate(chosen))])
+            owners = point_map.return_points[returns]
+            points = [_fine_points(point_map, returns[np.isin(owners, indices)]) for indices in chosen]
+        return [self._merged.alignment.to_map(odom) if session == "after" else odom for odom in points]

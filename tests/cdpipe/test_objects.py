@@ -178,3 +178,28 @@ def test_a_crate_in_the_place_of_a_barrel_is_not_a_move() -> None:
     pair = merge(np.concatenate([ground(0 * X), barrel]), np.concatenate([ground(0 * X), crate(HERE)]))
     objects = assemble_objects(pair, [group(pair, "before", barrel), group(pair, "after", crate(HERE))])
     assert [(item.kind, item.partner) for item in objects] == [("removed", -1), ("added", -1)]
+
+
+def test_a_crate_pushed_by_half_its_length_is_one_with_what_seems_to_have_stayed() -> None:
+    # of it before only the strip that it left, after only the end that came: they are no more alike than top and end
+    here, there = (make_pose(translation=(x, 0.01, 0.0)) for x in (0.01, 0.51))  # no side on the border of two cells
+    merged = merge(
+        np.concatenate([ground(np.zeros(X.size)), crate(here)]),
+        np.concatenate([ground(np.zeros(X.size)), crate(there)]),
+        yaw_pose(0.8, (12.0, -5.0, 0.395)),
+    )
+    left = crate(here)[crate(here)[:, 0] < 0.35]
+    came = crate(there)[crate(there)[:, 0] > 1.15]
+    gone, come = assemble_objects(merged, [group(merged, "before", left), group(merged, "after", came)])
+    assert (gone.kind, gone.partner, come.kind, come.partner) == ("moved", 1, "moved", 0)
+    assert gone.displacement_map is not None
+    np.testing.assert_allclose(gone.displacement_map, [0.5, 0.0, 0.0], atol=0.03)
+
+
+def test_what_stands_around_two_places_is_what_rises_above_the_ground_there() -> None:
+    around = _Surroundings(SCENE)
+    ((before, after),) = around.standing([crate(HERE)])
+    assert len(before) > 200
+    assert np.min(np.linalg.norm(before[:, None] - crate(HERE)[None], axis=2), axis=1).max() < 0.05
+    assert len(after) == 0
+    assert around.standing([]) == []

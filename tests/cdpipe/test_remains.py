@@ -1,7 +1,7 @@
 import numpy as np
 
 from cdpipe.geometry import Float64Array
-from cdpipe.remains import is_part_of_a_rest
+from cdpipe.remains import is_muck, is_part_of_a_rest
 
 STEP_M = 0.2
 AXIS = np.arange(-4.0, 4.0, STEP_M) + 0.1
@@ -62,3 +62,14 @@ def test_where_nothing_is_nothing_is_left() -> None:
     assert not is_part_of_a_rest(nothing, FLOOR, FLOOR)
     assert not is_part_of_a_rest(FLOOR, nothing, FLOOR)
     assert not is_part_of_a_rest(FLOOR, FLOOR, nothing)
+
+
+def test_a_flank_is_muck_and_a_crate_level_or_upright_is_not() -> None:
+    axis = np.arange(0.0, 2.0, 0.05)
+    x, y = (grid.ravel() for grid in np.meshgrid(axis, axis))
+    assert is_muck(np.column_stack([x, y, 0.65 * y]))  # 33 degrees
+    assert not is_muck(np.column_stack([x, y, np.full(x.size, 0.6)]))
+    sides = [np.column_stack([np.full(x.size, side), x, y]) for side in (0.0, 2.0)]
+    assert not is_muck(np.concatenate([np.column_stack([x, y, np.full(x.size, 2.0)]), *sides]))
+    # too few to have a surface
+    assert not is_muck(np.zeros((2, 3)))
