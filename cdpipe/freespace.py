@@ -134,9 +134,10 @@ def _looked_up(image: Float16Array, pixel: Int64Array, ranges_m: Float64Array) -
         row_start + (column - 1) % COLUMNS,
     )
     seen_m = image.ravel().take(np.concatenate(cross)).astype(np.float64)
-    is_hit = (np.abs(seen_m - np.tile(ranges_m, len(cross))) <= _MARGIN_M).reshape(len(cross), -1).any(axis=0)
+    seen_m = seen_m.reshape(len(cross), -1)
+    is_hit = np.asarray(np.any(np.abs(seen_m - ranges_m) <= _MARGIN_M, axis=0))
     seen_m[seen_m == 0] = np.inf
-    return seen_m.reshape(len(cross), -1).min(axis=0), is_hit
+    return seen_m.min(axis=0), is_hit
 
 
 def _pixels(points_sensor: Float64Array) -> tuple[Int64Array, Float64Array]:
