@@ -76,7 +76,7 @@ class Universe:
         nearest_m = float(self.nearest_m[change_id]) if change_id < len(self.nearest_m) else np.inf
         return nearest_m if np.isfinite(nearest_m) else float("nan")
 
-    def rows_of_returns(self, returns: Int32Array) -> Int64Array:
+    def rows_of_returns(self, returns: Int32Array | Int64Array) -> Int64Array:
         """Return the rows, rising, that are among (M, 2) (scan, pixel) returns; the others share a cell with a row."""
         wanted = returns[:, 0].astype(np.int64) * self.n_pixels + returns[:, 1]
         if len(self) == 0:
