@@ -12,7 +12,7 @@ removed is laid on all that the after session has there, and what was added on a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -109,6 +109,7 @@ class _Cloud:
     few: Float64Array
     whole: Float64Array
     tree: cKDTree
+    log_extents: Float64Array
 
     @classmethod
     def of(cls, points: Float64Array) -> _Cloud:
@@ -116,11 +117,11 @@ class _Cloud:
         while len(few) > _MOST_POINTS:
             few = thinned(points, cell_m)
             cell_m *= 1.2
-        return cls(points, few, points, cKDTree(points))
+        return cls(points, few, points, cKDTree(points), _log_extents(points))
 
     def with_rest(self, rest: Float64Array) -> _Cloud:
         whole = np.concatenate([self.points, rest])
-        return _Cloud(self.points, self.few, whole, cKDTree(whole))
+        return replace(self, whole=whole, tree=cKDTree(whole))
 
 
 def _neighbours(start: _Cloud, come: Sequence[_Cloud]) -> list[int]:
@@ -133,7 +134,7 @@ def _neighbours(start: _Cloud, come: Sequence[_Cloud]) -> list[int]:
 
 def _likely(start: _Cloud, come: Sequence[_Cloud]) -> list[int]:
     """Return the objects that one may have become somewhere else: those of its extents, no more than are tried."""
-    misfits = [float(np.abs(_log_extents(start) - _log_extents(end)).max()) for end in come]
+    misfits = [float(np.abs(start.log_extents - end.log_extents).max()) for end in come]
     order = sorted(range(len(come)), key=lambda a: misfits[a])
     return [a for a in order if misfits[a] <= np.log(_FAR_FACTOR)][:_MOST_TRIED]
 
@@ -150,7 +151,7 @@ def _one_object(start: _Cloud, end: _Cloud, least_share: float) -> tuple[float, 
     excess = likeness * (sum(shares) / 2 - least_share)  # of two that share all, the liker one
     if excess <= 0.0 or min(shares) < _EITHER_SHARE or likeness < _LIKENESS:
         return None
-    together = np.concatenate([start.whole, transform(invert(end_T_start), end.whole)])
+    together = np.concatenate([start.points, transform(invert(end_T_start), end.points)])
     centre = upright_box(together)[0][:3, 3]
     shift = transform(end_T_start, centre[None])[0] - centre
     distance_m = float(np.linalg.norm(shift[:2]))
@@ -232,11 +233,10 @@ def _middle(points: Float64Array) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _log_extents(cloud: _Cloud) -> Float64Array:
+def _log_extents(points: Float64Array) -> Float64Array:
     """Return the logarithms (3,) of the sorted edges of the evenly filled box with the same spread as the points.
 
     Unlike the edges of the bounding box they do not change when the object is turned, nor with a stray point.
     """
-    points = cloud.points
     covariance = np.cov(points.T, bias=True) if len(points) > 1 else np.zeros((3, 3))
     return np.asarray(np.log(np.sqrt(12.0 * np.linalg.eigvalsh(covariance).clip(min=0.0)) + _LIKE_WITHIN_M / 2))
