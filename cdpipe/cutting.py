@@ -18,6 +18,7 @@ from cdpipe.geometry import BoolArray, Float64Array, Int64Array, invert, transfo
 from cdpipe.objects import PointGroup
 from cdpipe.registration import MIN_SPHERE_POINTS, Surface, align_to_planes
 from cdpipe.surface import (
+    CELL_M,
     RIM_M,
     SITE_M,
     SURFACE_CELL_M,
@@ -186,13 +187,27 @@ def _objects(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) -> l
             is_member = np.zeros(len(compared.points), dtype=np.bool_)
             is_member[cells] = True
             of_object = is_member[compared.cell_of_return]
+            chosen = returns[site.session][of_object]
+            if _is_seen_through_by_its_own(maps[site.session], chosen):
+                continue
             # the answer is in the map frame of the merge
             in_map = (points["before"] if site.session == "before" else after_map)[of_object]
-            chosen = returns[site.session][of_object]
             indices = np.unique(maps[site.session].return_points[chosen]).astype(np.int64)
             thinned, _ = cell_means(in_map, SURFACE_CELL_M)
             result.append(PointGroup(site.session, indices, thinned, site.region, chosen))
     return result
+
+
+def _is_seen_through_by_its_own(point_map: PointMap, returns: Int64Array) -> bool:
+    """Tell whether the session that some returns are of saw through most of them itself.
+
+    What stands is hit again and again. Where a session came by twice and its odometry drifted in between, a wall that
+    one pass saw hangs in the room that the other pass looked through: the map is wrong there, and nothing changed.
+    """
+    if point_map.views is None:
+        return False
+    places, _ = cell_means(point_map.positions_of(returns), CELL_M)
+    return bool(net_views(places, point_map.views).mean() > 0)
 
 
 def object_cells(
