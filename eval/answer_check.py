@@ -20,6 +20,8 @@ from eval.universe import Universe
 _STATUSES = ("ok", "merge_refused", "failed", "worker_died")
 _SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns"))
 _MANY = 100  # so many returns of any place hold the first one of some cell
+# Thinned points lie among the returns they stand for, and a thinned map is nowhere as coarse as this.
+_ASIDE_M = 2.0
 
 
 def check_answer(answer: Answer, truth: GroundTruth, folder: Path) -> None:
@@ -50,6 +52,7 @@ def check_answer(answer: Answer, truth: GroundTruth, folder: Path) -> None:
         for session in SESSIONS:
             _check_returns(session, report.objects, truth.sessions[session])
             _check_points(session, report.objects, answer.points_odom, truth.sessions[session].universe)
+        _check_places(report.objects, truth.before.universe)
     except ValueError as error:
         raise InputError(f"{folder}: not an answer to this pair: {error}") from error
 
@@ -152,6 +155,27 @@ def _check_returns(session: SessionName, objects: tuple[ChangedObject, ...], tru
         raise ValueError(
             f"object_returns name return (scan {scan}, pixel {pixel}) of the {session} session twice: "
             "a return belongs to one object at most"
+        )
+
+
+def _check_places(objects: tuple[ChangedObject, ...], universe: Universe) -> None:
+    """Raise if no object of the before session lies where its returns do, whose odom frame is the map frame.
+
+    A pixel that returned in one session mostly did in the other, so nothing else tells when they are swapped.
+    """
+    aside_m = {}
+    for index, item in enumerate(objects):
+        rows = universe.rows_of_returns(item.returns) if item.session == "before" and len(item.returns) else ()
+        if len(rows) and len(item.points_map):
+            points = universe.points_odom[rows]
+            gap = np.maximum(points.min(axis=0) - item.points_map.max(axis=0), 0.0)
+            gap += np.maximum(item.points_map.min(axis=0) - points.max(axis=0), 0.0)
+            aside_m[index] = float(np.linalg.norm(gap))
+    if aside_m and min(aside_m.values()) > _ASIDE_M:
+        index, gap_m = next(iter(aside_m.items()))
+        raise ValueError(
+            f"objects[{index}]: object_points_map is {gap_m:.0f} m off the returns that object_returns names in the "
+            "before session: is it an answer to another pair, or to the sessions the other way round?"
         )
 
 

@@ -275,3 +275,28 @@ def test_returns_where_nothing_returned_are_refused(
     found, _, err = command("score", tiny_pair, folder)
     assert found == code
     assert ("nothing returned at any of their 14 (scan, pixel)" in err) == (code == 2)
+
+
+def test_an_answer_to_the_sessions_the_other_way_round_is_named(
+    tiny_pair: Path, command: Command, good: tuple[dict[str, Any], dict[str, Any]]
+) -> None:
+    document, arrays = good
+    universe = load_ground_truth(tiny_pair).before.universe
+    rows = np.arange(200)
+    own = universe.points_odom[rows].astype(np.float64)
+    returns = np.column_stack([universe.scans(rows), universe.pixels(rows)])
+    whole = {name: value for name, value in arrays.items() if name.startswith("region")} | {
+        "object_returns": returns,
+        "object_return_offsets": np.array([0, 200]),
+        "object_point_offsets": np.array([0, 200]),
+    }
+    document["objects"] = [{"session": "before", "kind": "removed"}]
+    for shift_m, expected in ((0.0, 0), (1.0, 0), (40.0, 2)):
+        folder = tiny_pair.parent / f"theirs-{shift_m:g}"
+        write_prediction(folder, document, {**whole, "object_points_map": own + shift_m})
+        code, _, err = command("score", tiny_pair, folder)
+        assert code == expected, err
+    extents_m = own.max(axis=0) - own.min(axis=0)
+    gap_m = np.linalg.norm(np.maximum(40.0 - extents_m, 0.0))
+    assert err.count("\n") == 1 and "or to the sessions the other way round?" in err
+    assert f"objects[0]: object_points_map is {gap_m:.0f} m off the returns" in err
