@@ -29,18 +29,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.answer_parts import ARRAYS, DOCUMENT, FORMAT, FORMAT_VERSION, OBJECT, Parts
+from cdpipe.answer_parts import (
+    FORMAT,
+    FORMAT_VERSION,
+    AnswerPart,
+    ShapePart,
+    Until,
+    checked_arrays,
+    checked_document,
+)
 from cdpipe.errors import InputError
-from cdpipe.geometry import Float64Array, Int32Array, Int64Array
+from cdpipe.geometry import Float64Array, Int64Array
 from cdpipe.session import load_arrays
 from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
-
-Until = Literal["merge"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,64 +142,56 @@ def read_answer(folder: Path) -> Answer:
     if not path.is_file():
         raise InputError(f"{path}: missing: expected an answer written by `tunnelcd detect` or by another method")
     try:
-        document = Parts(str(path), "key", DOCUMENT, json.loads(path.read_text()))
-        if (document["format"], document["format_version"]) != (FORMAT, FORMAT_VERSION):
-            raise InputError(f"{path}: expected format {FORMAT} {FORMAT_VERSION}")
-        until = document.get("until")
-        if until not in (None, *get_args(Until)):
-            raise ValueError(f"until = {until!r}: expected {', '.join(get_args(Until))}, or nothing")
-        if document["status"] != "ok":
+        document = checked_document(path, json.loads(path.read_text()))
+        if not isinstance(document, AnswerPart):
             return Answer(
-                document["status"],
-                document.get("error", ""),
-                document["method"],
+                document.status,
+                document.error,
+                document.method,
                 None,
-                document.get("seconds", {}),
-                document.get("evidence", {}),
-                until=until,
+                document.seconds,
+                document.evidence,
+                until=document.until,
             )
-        arrays = Parts(str(folder / "answer.npz"), "array", ARRAYS, load_arrays(folder / "answer.npz"))
+        arrays = load_arrays(folder / "answer.npz")
+        checked_arrays(folder / "answer.npz", arrays, len(document.objects))
         report, points_odom = _report(document, arrays)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(f"{path}: damaged or incomplete: {error}") from error
-    return Answer("ok", "", document["method"], report, report.seconds, report.evidence, points_odom, until)
+    except ValueError as error:  # not JSON, or arrays that do not go together
+        raise InputError(f"{folder}: damaged or incomplete: {error}") from error
+    return Answer("ok", "", document.method, report, report.seconds, report.evidence, points_odom, document.until)
 
 
-def _report(document: Parts, arrays: Parts) -> tuple[ChangeReport, tuple[Float64Array, ...] | None]:
-    listed = document.get("objects", [])
-    metas = [Parts(f"{document.where}: objects[{i}]", "key", OBJECT, meta) for i, meta in enumerate(listed)]
-    points_map: list[Any] = [np.zeros((0, 3))] * len(metas)
+def _report(
+    document: AnswerPart, arrays: Mapping[str, npt.NDArray[Any]]
+) -> tuple[ChangeReport, tuple[Float64Array, ...] | None]:
+    n = len(document.objects)
+    points_map: list[Any] = [np.zeros((0, 3))] * n
     if "object_points_map" in arrays:
-        points_map = _split(arrays, "object_points_map", "object_point_offsets", len(metas))
+        points_map = _split(arrays["object_points_map"], arrays["object_point_offsets"])
     points_odom = None
-    returns: list[Any] = [np.zeros((0, 2), dtype=np.int32)] * len(metas)
+    returns: list[Any] = [np.zeros((0, 2), dtype=np.int32)] * n
     if "object_returns" in arrays:
-        returns = _split(arrays, "object_returns", "object_return_offsets", len(metas))
+        returns = _split(arrays["object_returns"], arrays["object_return_offsets"])
     elif "object_points_odom" in arrays:
-        points_odom = tuple(_split(arrays, "object_points_odom", "object_point_odom_offsets", len(metas)))
-    elif metas:
-        raise InputError(
-            f"{arrays.where}: array object_points_odom is missing: the {len(metas)} objects of answer.json need their "
-            "points, (P, 3), or their object_returns, (M, 2)"
-        )
+        points_odom = tuple(_split(arrays["object_points_odom"], arrays["object_point_odom_offsets"]))
     objects = tuple(
         ChangedObject(
-            session=meta["session"],
-            kind=meta["kind"],
-            region=meta.get("region", -1),
+            session=part.session,
+            kind=part.kind,
+            region=part.region,
             returns=found,
             points_map=points,
-            score=meta.get("score", 0.0),
-            partner=meta.get("partner", -1),
-            shape=None if meta.get("shape") is None else _shape(meta["shape"]),
-            displacement_map=None if meta.get("displacement_map") is None else _numbers(meta["displacement_map"]),
+            score=part.score,
+            partner=part.partner,
+            shape=None if part.shape is None else _shape(part.shape),
+            displacement_map=None if part.displacement_map is None else _numbers(part.displacement_map),
         )
-        for meta, found, points in zip(metas, returns, points_map, strict=True)
+        for part, found, points in zip(document.objects, returns, points_map, strict=True)
     )
     scores = arrays["region_scores"]
     regions = ChangeRegions(
         centres_map=arrays["region_centres_map"],
-        radius_m=document["radius_m"],
+        radius_m=document.radius_m,
         scores=scores,
         pairs=arrays.get("region_pairs", np.full((len(scores), 2), -1)),
         is_reported=arrays.get("region_is_reported", np.ones(len(scores), dtype=np.bool_)),
@@ -203,14 +201,14 @@ def _report(document: Parts, arrays: Parts) -> tuple[ChangeReport, tuple[Float64
     )
     no_scans = np.zeros(0, dtype=np.int64)
     report = ChangeReport(
-        before_T_after=np.asarray(document["before_T_after"], dtype=np.float64),
-        evidence=document.get("evidence", {}),
+        before_T_after=_numbers(document.before_T_after),
+        evidence=document.evidence,
         regions=regions,
         objects=objects,
-        seconds=document.get("seconds", {}),
+        seconds=document.seconds,
         figures={name[7:]: values for name, values in arrays.items() if name.startswith("figure_")},
         keyframe_scans=(arrays.get("before_keyframe_scans", no_scans), arrays.get("after_keyframe_scans", no_scans)),
-        config=document.get("config", {}),
+        config=document.config,
         local_before_T_after=arrays.get("local_before_T_after"),
     )
     return report, points_odom
@@ -235,8 +233,8 @@ def _object_document(item: ChangedObject) -> dict[str, Any]:
     return document
 
 
-def _shape(document: Mapping[str, Any]) -> ObjectShape:
-    return ObjectShape(_numbers(document["map_T_box"]), _numbers(document["box_m"]), float(document["volume_m3"]))
+def _shape(part: ShapePart) -> ObjectShape:
+    return ObjectShape(_numbers(part.map_T_box), _numbers(part.box_m), part.volume_m3)
 
 
 def _numbers(values: Sequence[Any]) -> Float64Array:
@@ -258,13 +256,5 @@ def _offsets(arrays: Sequence[npt.NDArray[Any]]) -> Int64Array:
     return np.concatenate([[0], np.cumsum([len(array) for array in arrays])]).astype(np.int64)
 
 
-def _split(arrays: Mapping[str, npt.NDArray[Any]], values: str, offsets: str, n: int) -> list[Int32Array] | list[Any]:
-    bounds = arrays[offsets]
-    if len(bounds) != n + 1:
-        raise ValueError(f"{offsets} has {len(bounds)} entries for {n} objects: expected {n + 1}")
-    if bounds[0] != 0 or (np.diff(bounds) < 0).any() or bounds[-1] != len(arrays[values]):
-        raise ValueError(
-            f"{offsets} goes from {bounds[0]} to {bounds[-1]}: expected rising from 0 to {len(arrays[values])}, the "
-            f"rows of {values}"
-        )
-    return [arrays[values][a:b] for a, b in pairwise(bounds)]
+def _split(values: npt.NDArray[Any], offsets: Int64Array) -> list[npt.NDArray[Any]]:
+    return [values[a:b] for a, b in pairwise(offsets)]

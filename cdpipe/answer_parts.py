@@ -1,57 +1,144 @@
-"""The names in an answer's two files: which there are, which may be left out, and what is told of the others."""
+"""What may stand in an answer's two files, checked before anything is made of it; every mistake of a file at once."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from annotated_types import Len
+from pydantic import ConfigDict, Field, PositiveFloat
 
 from cdpipe.errors import InputError
-from cdpipe.yamlfile import suggestion
+from cdpipe.types import Kind, SessionName
+from cdpipe.yamlfile import Document, Settings, suggestion, validated
 
-FORMAT = "tunnelcd-answer"
-FORMAT_VERSION = 1
-# names, and what is expected where there is no default
-DOCUMENT = {
-    "format": FORMAT, "format_version": str(FORMAT_VERSION), "status": "ok, failed or merge_refused",
-    "method": "a name", "before_T_after": "4 x 4 numbers", "radius_m": "metres",
-    "until": None, "error": None, "seconds": None, "evidence": None, "config": None, "objects": None,
+FORMAT: Literal["tunnelcd-answer"] = "tunnelcd-answer"
+FORMAT_VERSION: Literal[1] = 1
+Until = Literal["merge"]
+
+_Vector = Annotated[list[float], Len(3, 3)]
+_Pose = Annotated[list[Annotated[list[float], Len(4, 4)]], Len(4, 4)]
+
+
+class _Part(Settings):
+    """Numbers are numbers, not text that looks like one."""
+
+    model_config = ConfigDict(strict=True)
+
+
+class ShapePart(_Part):
+    """The box around an object, and its volume."""
+
+    map_T_box: _Pose
+    box_m: _Vector
+    volume_m3: float
+
+
+class ObjectPart(_Part):
+    """One object; its points are in answer.npz."""
+
+    session: SessionName
+    kind: Kind
+    region: int = -1
+    score: float = 0.0
+    partner: int = -1
+    shape: ShapePart | None = None
+    displacement_map: _Vector | None = None
+
+
+class FailurePart(_Part):
+    """answer.json of a case without an answer, and what it has in common with one that has."""
+
+    format: Literal["tunnelcd-answer"]
+    format_version: Literal[1]
+    status: Literal["ok", "failed", "merge_refused", "worker_died"]
+    method: str
+    until: Until | None = None
+    error: str = ""
+    seconds: dict[str, float] = Field(default_factory=dict)
+    evidence: dict[str, float] = Field(default_factory=dict)
+    config: dict[str, Any] = Field(default_factory=dict)
+
+
+class AnswerPart(FailurePart):
+    """answer.json."""
+
+    before_T_after: _Pose
+    radius_m: PositiveFloat
+    objects: list[ObjectPart] = Field(default_factory=list)
+
+
+# Of answer.npz: candidates R, objects O, keyframes Kb and Ka, and how many returns and points come to.
+_SHAPES: dict[str, tuple[str | int, ...]] = {
+    "region_centres_map": ("R", 3), "region_scores": ("R",), "region_pairs": ("R", 2), "region_is_reported": ("R",),
+    "region_is_withdrawn": ("R",), "region_direction": ("R",), "keyframe_scores": ("Kb",),
+    "before_keyframe_scans": ("Kb",), "after_keyframe_scans": ("Ka",), "object_returns": ("M", 2),
+    "object_return_offsets": ("O + 1",), "object_points_map": ("P", 3), "object_point_offsets": ("O + 1",),
+    "object_points_odom": ("P", 3), "object_point_odom_offsets": ("O + 1",), "local_before_T_after": ("Ka", 4, 4),
 }  # fmt: skip
-OBJECT = {
-    "session": "before or after", "kind": "added, removed, moved or reshaped",
-    "region": None, "score": None, "partner": None, "shape": None, "displacement_map": None,
-}  # fmt: skip
-ARRAYS = {
-    "region_centres_map": "(R, 3)", "region_scores": "(R,)", "region_pairs": None, "region_is_reported": None,
-    "region_is_withdrawn": None, "region_direction": None, "keyframe_scores": None, "before_keyframe_scans": None,
-    "after_keyframe_scans": None, "object_returns": None, "object_return_offsets": "(O + 1,)",
-    "object_points_map": None, "object_point_offsets": "(O + 1,)", "object_points_odom": None,
-    "object_point_odom_offsets": "(O + 1,)", "local_before_T_after": None,
-}  # fmt: skip
+_REQUIRED = ("region_centres_map", "region_scores")
+_OFFSETS = {
+    "object_returns": "object_return_offsets",
+    "object_points_map": "object_point_offsets",
+    "object_points_odom": "object_point_odom_offsets",
+}
+_FIGURE = "figure_"
 
 
-class Parts(dict[str, Any]):
-    """The named parts of a file: all of them are known, and what is asked for and missing is told with its name."""
+def checked_document(path: Path, value: Any) -> AnswerPart | FailurePart:
+    """Return what answer.json says.
 
-    def __init__(self, where: str, what: str, known: Mapping[str, str | None], parts: Any) -> None:
-        """Take the parts.
+    Raises:
+        InputError: One line for each mistake.
+    """
+    document = Document(str(path), value)
+    is_failure = isinstance(value, dict) and value.get("status", "ok") in ("failed", "merge_refused", "worker_died")
+    return validated(FailurePart if is_failure else AnswerPart, document)
 
-        Args:
-            where: File, and place in it.
-            what: What a part is called: key, array.
-            known: Every name there may be, and what is expected where it may not be left out.
-            parts: The parts as read.
 
-        Raises:
-            InputError: They are not named, or one has a name that is not known.
-        """
-        if not isinstance(parts, dict):
-            raise InputError(f"{where}: expected names and values, got {type(parts).__name__}")
-        super().__init__(parts)
-        self.where, self._what, self._known = where, what, known
-        for name in parts:
-            if name not in known and not name.startswith("figure_"):
-                near = suggestion(name, known) or f" (known: {', '.join(known)})"
-                raise InputError(f"{where}: {what} {name} is unknown{near}")
+def checked_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects: int) -> None:
+    """Check that the arrays of answer.npz are known, numbers, of the right shape, and all there.
 
-    def __missing__(self, name: str) -> Any:
-        raise InputError(f"{self.where}: {self._what} {name} is missing: expected {self._known[name]}")
+    Raises:
+        InputError: One line for each mistake.
+    """
+    mistakes = []
+    for name, array in arrays.items():
+        shape = ("R",) if name.startswith(_FIGURE) else _SHAPES.get(name)
+        if shape is None:
+            near = suggestion(name, _SHAPES) or f" (known: {', '.join(_SHAPES)})"
+            mistakes.append(f"array {name} is unknown{near}")
+        elif array.dtype.kind not in "biuf":
+            mistakes.append(f"array {name}: expected numbers, got {array.dtype}")
+        elif array.ndim != len(shape) or array.shape[1:] != shape[1:]:
+            mistakes.append(f"array {name} must be {_spelt(shape)}, got {array.shape}")
+    wanted = [*_REQUIRED, *(_OFFSETS[name] for name in _OFFSETS if name in arrays)]
+    mistakes += [f"array {name} is missing: expected {_spelt(_SHAPES[name])}" for name in wanted if name not in arrays]
+    if n_objects and "object_returns" not in arrays and "object_points_odom" not in arrays:
+        mistakes.append(
+            f"array object_points_odom is missing: the {n_objects} objects of answer.json need their points, (P, 3), "
+            "or their object_returns, (M, 2)"
+        )
+    for name, offsets in _OFFSETS.items():
+        if not mistakes and name in arrays:
+            mistakes += _offset_mistakes(offsets, arrays[offsets], name, len(arrays[name]), n_objects)
+    if mistakes:
+        raise InputError("\n".join(f"{path}: {mistake}" for mistake in mistakes))
+
+
+def _offset_mistakes(name: str, offsets: npt.NDArray[Any], values: str, n_values: int, n_objects: int) -> list[str]:
+    if not np.issubdtype(offsets.dtype, np.integer):
+        return [f"array {name}: expected whole numbers, got {offsets.dtype}"]
+    if len(offsets) != n_objects + 1:
+        return [f"{name} has {len(offsets)} entries for {n_objects} objects: expected {n_objects + 1}"]
+    if offsets[0] != 0 or (np.diff(offsets) < 0).any() or offsets[-1] != n_values:
+        rows = f"{n_values}, the rows of {values}"
+        return [f"{name} goes from {offsets[0]} to {offsets[-1]}: expected rising from 0 to {rows}"]
+    return []
+
+
+def _spelt(shape: tuple[str | int, ...]) -> str:
+    return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"

@@ -117,7 +117,7 @@ def test_a_damaged_shape_is_named(name: str, value: object, words: str, tmp_path
     document = json.loads((tmp_path / "answer.json").read_text())
     document["objects"][1][name] = value
     (tmp_path / "answer.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match=f"damaged or incomplete: .*{words}"):
+    with pytest.raises(InputError, match=f"answer.json: objects.1.*{words}"):
         read_answer(tmp_path)
 
 
@@ -131,7 +131,7 @@ def test_an_answer_says_where_it_ends(tmp_path: Path) -> None:
     assert read_answer(tmp_path).until == "merge"
     text = (tmp_path / "answer.json").read_text()
     (tmp_path / "answer.json").write_text(text.replace('"until": "merge"', '"until": "query"'))
-    with pytest.raises(InputError, match="until = 'query': expected merge, or nothing"):
+    with pytest.raises(InputError, match="until = 'query': input should be 'merge'"):
         read_answer(tmp_path)
 
 
@@ -162,5 +162,5 @@ def test_damage_is_named(tmp_path: Path) -> None:
     document = json.loads((tmp_path / "answer.json").read_text())
     document["objects"].pop()
     (tmp_path / "answer.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match="object_point_offsets has 4 entries for 2 objects"):
+    with pytest.raises(InputError, match="object_return_offsets has 4 entries for 2 objects"):
         read_answer(tmp_path)
