@@ -13,7 +13,7 @@ import numpy as np
 
 from cdpipe.config import ExtractConfig
 from cdpipe.crops import DIRECTIONS, Crops, Sphere
-from cdpipe.freespace import net_views, scans_past
+from cdpipe.freespace import n_through_and_hit, net_views, scans_past
 from cdpipe.geometry import BoolArray, Float64Array, Int64Array, invert, transform
 from cdpipe.objects import PointGroup
 from cdpipe.registration import MIN_SPHERE_POINTS, Surface, align_to_planes
@@ -44,6 +44,8 @@ _MAX_SHIFT_M = 0.4
 _MIN_TELLING = 2
 # What is nearer to the other map than this may be too low for a view to tell whether it was seen through.
 _LOW_M = 0.3
+# Seen through by keyframes of its own session so many times as often as hit: a wall that drift has doubled.
+_DOUBLED = 3.0
 _BLOCK_RETURNS = 1 << 22
 _UNKNOWN_VIEWS = np.int64(1 << 20)
 
@@ -199,15 +201,18 @@ def _objects(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) -> l
 
 
 def _is_seen_through_by_its_own(point_map: PointMap, returns: Int64Array) -> bool:
-    """Tell whether the session that some returns are of saw through most of them itself.
+    """Tell whether the session that some returns are of saw through them itself, far more often than it hit them.
 
     What stands is hit again and again. Where a session came by twice and its odometry drifted in between, a wall that
-    one pass saw hangs in the room that the other pass looked through: the map is wrong there, and nothing changed.
+    was seen from afar on one pass hangs in the room that the other pass looked through: the map is wrong there, and
+    nothing changed. A thing that stands twice for the same reason is hit by either pass about as often as the other
+    sees through it, and stays.
     """
     if point_map.views is None:
         return False
     places, _ = cell_means(point_map.positions_of(returns), CELL_M)
-    return bool(net_views(places, point_map.views).mean() > 0)
+    n_through, n_hit = n_through_and_hit(places, point_map.views)
+    return bool(n_through.sum() > _DOUBLED * n_hit.sum())
 
 
 def object_cells(

@@ -53,9 +53,15 @@ def net_views(points_odom: Float64Array, views: KeyframeViews) -> Int64Array:
         points_odom: (N, 3) points in the odom frame of the session that looked, metres.
         views: What its keyframes saw.
     """
-    balance = np.zeros(len(points_odom), dtype=np.int64)
+    n_through, n_hit = n_through_and_hit(points_odom, views)
+    return n_through - n_hit
+
+
+def n_through_and_hit(points_odom: Float64Array, views: KeyframeViews) -> tuple[Int64Array, Int64Array]:
+    """Return how many keyframes saw through each of (N,) places, and how many hit it; as `net_views` takes them."""
+    n_through, n_hit = np.zeros((2, len(points_odom)), dtype=np.int64)
     if len(points_odom) == 0 or len(views.ranges_m) == 0:
-        return balance
+        return n_through, n_hit
     centre = points_odom.mean(axis=0)
     spread_m = float(np.linalg.norm(points_odom - centre, axis=1).max())
     rotations, shifts = views.sensor_T_odom[:, :3, :3], views.sensor_T_odom[:, :3, 3]
@@ -64,9 +70,9 @@ def net_views(points_odom: Float64Array, views: KeyframeViews) -> Int64Array:
         pixel, ranges_m = _pixels(points_odom @ rotations[keyframe].T + shifts[keyframe])
         in_view = np.flatnonzero((pixel >= 0) & (ranges_m >= _NEAREST_M) & (ranges_m <= _REACH_M))
         first_m, is_hit = _looked_up(views.ranges_m[keyframe], pixel[in_view], ranges_m[in_view])
-        balance[in_view] += np.isfinite(first_m) & (first_m > ranges_m[in_view] + _MARGIN_M)
-        balance[in_view] -= is_hit
-    return balance
+        n_through[in_view] += np.isfinite(first_m) & (first_m > ranges_m[in_view] + _MARGIN_M)
+        n_hit[in_view] += is_hit
+    return n_through, n_hit
 
 
 def scans_past(points: Float64Array, ends: Float64Array, origins: Float64Array, scans: Int64Array) -> Int64Array:

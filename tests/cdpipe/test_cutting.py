@@ -106,20 +106,46 @@ def test_nothing_changed() -> None:
     assert cut(scanned((CRATE, BARREL), 1), scanned((CRATE, BARREL), 2)) == []
 
 
+def drifted(boxes: tuple[Box, ...], path: Sequence[tuple[float, float, float]], off_m: float) -> Scanned:
+    """A session that came by again, the second time with an odometry that is off sideways."""
+    scans = RoomScans(boxes, 2, (*PATH, *path))
+    scans.odom_T_sensor[len(PATH) :, 1, 3] += off_m
+    return scans, scans.mapped()
+
+
+def both_ways(session: str, one: Scanned, other: Scanned) -> list[PointGroup]:
+    return cut(one, other) if session == "before" else cut(other, one)
+
+
 @pytest.mark.parametrize("session", ["before", "after"])
 def test_a_wall_that_hangs_in_the_room_after_drift_is_no_change(session: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    drifted = RoomScans((CRATE,), 2, (*PATH, (-1.0, 0.0, 1.5), (1.0, 0.0, 1.5)))
-    drifted.odom_T_sensor[-2:, :3, 3] += [0.0, -0.5, 0.0]  # it came by again, half a metre off
-    other, twice = scanned((), 1), (drifted, drifted.mapped())
-
-    def found() -> list[PointGroup]:
-        return cut(twice, other) if session == "before" else cut(other, twice)
-
-    (crate,) = found()
-    of_first_pass = {each for each in drifted.returns_on(0) if each[0] < len(PATH)}
+    twice = drifted((CRATE,), ((0.0, 0.0, 1.5),), -0.5)
+    (crate,) = both_ways(session, twice, scanned((), 1))
+    of_first_pass = {each for each in twice[0].returns_on(0) if each[0] < len(PATH)}
     assert len(returns_of(twice[1], crate) & of_first_pass) > 0.9 * len(of_first_pass)
     monkeypatch.setattr(cdpipe.cutting, "_is_seen_through_by_its_own", lambda *_: False)
-    assert len(found()) > 1
+    assert len(both_ways(session, twice, scanned((), 1))) > 1
+
+
+@pytest.mark.parametrize("n_again", [3, 5, 7])
+def test_a_thing_that_stands_twice_after_drift_is_still_a_change(n_again: int) -> None:
+    tall: Box = ((-0.3, -0.3, 0.0), (0.3, 0.3, 1.6))
+    beside = tuple((x, 2.0, 1.5) for x, _, _ in PATH)
+    before = scanned((), 1)
+    path = tuple((x, -2.0, 1.5) for x, _, _ in PATH)
+    scans = RoomScans((tall,), 2, (*path, *beside[:n_again]))
+    scans.odom_T_sensor[len(path) :, 1, 3] -= 1.2
+    twice = scans, scans.mapped()
+    found = set().union(*(returns_of(twice[1], group) for group in cut(before, twice)))
+    of_first_pass = {each for each in scans.returns_on(0) if each[0] < len(path)}
+    assert len(found & of_first_pass) > 0.7 * len(of_first_pass)
+
+
+def test_maps_without_views_keep_what_they_cannot_judge() -> None:
+    twice = drifted((CRATE,), ((0.0, 0.0, 1.5),), -0.5)
+    with_views = both_ways("after", twice, scanned((), 1))
+    blind = both_ways("after", (twice[0], replace(twice[1], views=None)), scanned((), 1))
+    assert len(blind) > len(with_views) == 1
 
 
 def test_two_objects_in_one_region_are_two() -> None:
