@@ -15,11 +15,10 @@ import pandas as pd
 
 from cdpipe.errors import InputError
 from eval.compared_columns import COMPARED, POOLED, POOLED_RATE_PER_100M, figures_of, is_time
-from eval.page_effects import ENOUGH_PAIRS
 from eval.region_curves import PAIR, interval_of, ranked_pairs, recall_at, resampled_recalls
 from eval.region_table import ALL_DOMAINS, DOMAINS
 from eval.sides import Side, check_versions, matched_variants
-from eval.statistics import mean_with_interval
+from eval.statistics import ENOUGH_PAIRS, mean_with_interval
 
 BETTER, WORSE, NOISE = "better", "worse", "no difference beyond noise"
 SAME, TOO_FEW, NOT_JUDGED = "the same", "too few pairs", "not judged"

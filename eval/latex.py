@@ -22,9 +22,10 @@ from eval.comparing import BETTER, WORSE, pooled_difference, verdict
 from eval.merge_table import numbers, texts
 from eval.page_columns import EN_DASH, RESULT_COLUMNS, Column
 from eval.page_object_tables import OBJECT_COLUMNS, is_told_the_truth, spaced
-from eval.page_regions import REGION_COLUMNS
+from eval.page_regions import REGION_COLUMNS, used_pairs
 from eval.page_run import RunData
-from eval.page_tables import best, escape_latex
+from eval.page_story import is_unmade
+from eval.page_tables import beside, best, escape_latex
 from eval.pareto import comparable, with_domain
 from eval.region_curves import PAIR
 from eval.region_plots import domain_name
@@ -92,7 +93,7 @@ def latex_float(label: str, caption: str, groups: Sequence[Group], columns: Sequ
         marks = [_marks(group, column, data, untested) for column in shown]
         body += [r"\midrule", rf"\multicolumn{{{len(shown) + 2}}}{{l}}{{\textit{{{escape_latex(group.name)}}}}} \\"]
         for index, row in enumerate(group.rows):
-            body += _lines(row, shown, [of_column[index] for of_column in marks])
+            body += _lines(row, shown, [of_column[index] for of_column in marks], group.results)
     names = [column.heading for column in shown if column.key in untested]
     return "\n".join(
         [
@@ -120,7 +121,8 @@ def _marks(group: Group, column: Column, data: RunData, untested: set[str]) -> l
     marks = [""] * len(group.rows)
     fair = [place for place, row in enumerate(group.rows) if not is_told_the_truth(row["variant"])]
     values = [float(group.rows[place][column.key]) for place in fair]
-    is_best = best(values, column)
+    counts = [used_pairs(group.results, str(group.rows[place]["variant"]), column.key)[0] for place in fair]
+    is_best = best(values, column, counts)
     if not any(is_best):
         return marks
     top = (max if column.better == "high" else min)(
@@ -155,14 +157,16 @@ def _is_told_apart(group: Group, column: Column, first: str, second: str, data: 
     return verdict("high", n_used, difference, interval) in (BETTER, WORSE)
 
 
-def _lines(row: Mapping[str, Any], columns: Sequence[Column], marks: Sequence[str]) -> list[str]:
-    """Return the line of values of a method and, where it has any, that of intervals."""
+def _lines(row: Mapping[str, Any], columns: Sequence[Column], marks: Sequence[str], results: pd.DataFrame) -> list[str]:
+    """Return the line of values of a method and, where it has any, that of intervals and of counts."""
     values, intervals = [], []
     for column, mark in zip(columns, marks, strict=True):
         written = escape_latex(column.shown(float(row[column.key])))
         values.append({"bold": rf"\textbf{{{written}}}", "dagger": f"{written}{_DAGGER}"}.get(mark, written))
         low, high = (float(row.get(f"{column.key}_{end}", math.nan)) for end in ("low", "high"))
-        told = "" if math.isnan(low) else escape_latex(f"{column.shown(low)}{EN_DASH}{column.shown(high)}")
+        told = "" if math.isnan(low) else f"{column.shown(low)}{EN_DASH}{column.shown(high)}"
+        used = used_pairs(results, str(row["variant"]), column.key)
+        told = escape_latex(beside(told, *used).replace("\n", "; "))
         intervals.append(rf"{{\scriptsize {told}}}" if told else "")
     lines = [" & ".join([escape_latex(spaced(str(row["variant"]))), str(row["n_pairs"]), *values]) + r" \\"]
     if any(intervals):
@@ -209,7 +213,10 @@ def _caption(words: str, data: RunData, results: pd.DataFrame, more: str = "") -
     plan = data.provenance.get("plan")
     name = str(plan.get("name") or "") if isinstance(plan, Mapping) else ""
     told = f"{words}{f', plan {name}' if name else ''}: {n_pairs} session pairs, {results['variant'].nunique()} methods"
-    failed = f"{n_failed} of {len(results)} cases without an answer, which miss all their changes"
+    n_unmade = sum(is_unmade({str(name): value for name, value in row.items()}) for row in results.to_dict("records"))
+    failed = f"{n_failed - n_unmade} of {len(results)} cases without an answer, which miss all their changes"
+    if n_unmade:
+        failed += f", {n_unmade} without a world, which are left out"
     beside = " Times were measured beside other work." if is_contended(data) else ""
     return escape_latex(f"{told}, {failed if n_failed else 'every case answered'}.{more}{beside}")
 

@@ -21,7 +21,7 @@ from eval.figures import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.latex import latex_tables
 from eval.merge_table import merge_table
 from eval.page_columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
-from eval.page_effects import ENOUGH_PAIRS, draw_effects
+from eval.page_effects import draw_effects
 from eval.page_factors import draw_factors
 from eval.page_grids import draw_grids
 from eval.page_merge import draw_merge, ends_at_merge
@@ -49,6 +49,7 @@ from eval.page_views import Views, write_views
 from eval.page_worst import draw_worst, shown_variant, worst_rows
 from eval.pareto import pareto_table
 from eval.sides import is_contended
+from eval.statistics import ENOUGH_PAIRS
 
 POINT_COLOURS = (
     (BLUE, "right"), (BLACK, "missed"), (VERMILLION, "wrong"), (ORANGE, "part of another answered object"),

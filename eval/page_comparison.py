@@ -17,7 +17,7 @@ from eval.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, comp
 from eval.effect_figures import Effect, effect_plot
 from eval.output import make_writable
 from eval.page_columns import Column
-from eval.page_effects import ENOUGH_PAIRS, signed
+from eval.page_effects import signed
 from eval.page_object_tables import spaced
 from eval.page_objects import Picture
 from eval.page_render import rendered, written
@@ -26,6 +26,7 @@ from eval.page_tables import Cell, Table
 from eval.region_plots import domain_name
 from eval.region_table import ALL_DOMAINS
 from eval.sides import Side, cautions, only_in, short_names, why_no_times
+from eval.statistics import ENOUGH_PAIRS
 
 COLOURS = {BETTER: "#d3e7f5", WORSE: "#fbdcc8"}
 MOVED = tuple(COLOURS)

@@ -15,10 +15,9 @@ from eval.page_columns import RESULT_COLUMNS, UNDEFINED, Column, count
 from eval.page_objects import Picture
 from eval.page_run import RunData, of, over_pairs
 from eval.page_tables import Cell, Table
+from eval.statistics import ENOUGH_PAIRS
 from eval.worlds import group_of
 
-# 2^(1-6) = 3 %: six fair coins show one side; five do in 6 % of all cases
-ENOUGH_PAIRS = 6
 _OBSERVABLE = Column("n_observable", "observable changes", None, count, "", "")
 _KEYS = (
     "region_recall", "region_recall_at_k", "region_auroc", "false_regions_per_100m", "object_iou_point",

@@ -20,7 +20,7 @@ from eval.page_object_tables import groups_table, methods_table, records, spaced
 from eval.page_objects import Picture
 from eval.page_regions import targets_table
 from eval.page_run import RunData
-from eval.page_story import joined
+from eval.page_story import about_failures, joined
 from eval.page_tables import Table
 from eval.region_plots import domain_name
 from eval.region_table import ALL_DOMAINS, MAIN_VARIANT
@@ -95,11 +95,9 @@ def story(table: pd.DataFrame, targets: pd.DataFrame, data: RunData, main: str) 
                 f"{domain_name(domain).capitalize()}, {main} matched {row['n_matched']} of {row['n_changes']} objects, "
                 f"with a median IoU of {share(row['iou_matched_median'])}."
             )
-    whole = table.drop_duplicates("variant", keep="last")
-    n_failed, n_cases = int(whole["n_failed"].sum()), int(whole["n_pairs"].sum())
-    if n_failed:
-        sentences.append(f"{n_failed} of {n_cases} cases gave no answer; all their objects count as missed.")
-    sentences.append(f"n = {int(whole['n_pairs'].max())} session pairs; intervals are 95 % over session pairs.")
+    sentences += about_failures(data)
+    n_pairs = int(table.drop_duplicates("variant", keep="last")["n_pairs"].max())
+    sentences.append(f"n = {n_pairs} session pairs; intervals are 95 % over session pairs.")
     return sentences
 
 

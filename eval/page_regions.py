@@ -11,16 +11,18 @@ import numpy as np
 import pandas as pd
 
 from eval.charts import Chart
+from eval.merge_table import numbers
 from eval.page_columns import EN_DASH, UNDEFINED, Column, share, significant
 from eval.page_merge import covered_by
 from eval.page_object_tables import spaced
 from eval.page_run import BASELINES, RunData
-from eval.page_story import joined
-from eval.page_tables import Cell, Table, best
+from eval.page_story import about_failures, joined
+from eval.page_tables import Cell, Table, beside, best
+from eval.pareto import with_domain
 from eval.region_charts import free_response_figure, roc_figure, size_figure
-from eval.region_curves import RATES_PER_100M
+from eval.region_curves import PAIR, RATES_PER_100M
 from eval.region_plots import Bins, Curve, domain_name, free_response_plot, roc_plot, size_plot
-from eval.region_table import FILES, MAIN_VARIANT, RIVALS
+from eval.region_table import ALL_DOMAINS, FILES, MAIN_VARIANT, RIVALS
 from eval.runfolder import reported
 
 
@@ -95,7 +97,7 @@ def draw_regions(data: RunData) -> RegionPart | None:
     if table is None:
         return RegionPart((missing[0],), (missing[0],), (), (), missing)
     targets = found.get("regions_targets", pd.DataFrame(columns=["target", "is_met"]))
-    tables = (regions_table(table), silence_table(table), targets_table(targets))
+    tables = (regions_table(table, with_domain(data.results)), silence_table(table), targets_table(targets))
     plots = (
         _roc(found.get("roc"), table),
         _free_response(found.get("froc"), table),
@@ -110,15 +112,27 @@ def draw_regions(data: RunData) -> RegionPart | None:
     )
 
 
-def regions_table(table: pd.DataFrame) -> Table:
-    """Return every method in and out of distribution, the best of each domain marked."""
+def regions_table(table: pd.DataFrame, cases: pd.DataFrame) -> Table:
+    """Return every method in and out of distribution, the best of each domain marked.
+
+    Args:
+        table: Rows of regions_table.csv.
+        cases: Rows of results.csv with their `domain`, which tell over how many pairs a mean is.
+    """
     rows: list[tuple[str, tuple[Cell, ...]]] = []
     for domain, own in table.groupby("domain", sort=False):
-        marks = {column.key: best(list(own[column.key]), column) for column in REGION_COLUMNS}
+        of_domain = cases if domain == ALL_DOMAINS else cases[cases["domain"] == domain]
+        marks, counts = {}, {}
+        for column in REGION_COLUMNS:
+            counts[column.key] = [used_pairs(of_domain, str(name), column.key) for name in own["variant"]]
+            marks[column.key] = best(list(own[column.key]), column, [n for n, _ in counts[column.key]])
         for index, row in enumerate(_records(own)):
-            cells = (_cell(row, column, marks[column.key][index]) for column in REGION_COLUMNS)
-            counts = Cell(str(row["n_pairs"]), interval=f"{row['n_failed']} failed" if row["n_failed"] else "")
-            rows.append((_group(str(domain), row), (Cell(spaced(str(row["variant"]))), counts, *cells)))
+            cells = (
+                _cell(row, column, marks[column.key][index], counts=counts[column.key][index])
+                for column in REGION_COLUMNS
+            )
+            pairs = Cell(str(row["n_pairs"]), interval=f"{row['n_failed']} failed" if row["n_failed"] else "")
+            rows.append((_group(str(domain), row), (Cell(spaced(str(row["variant"]))), pairs, *cells)))
     headings = ("method", "pairs", *(column.heading for column in REGION_COLUMNS))
     return Table(headings, tuple(rows), "Every method, in and out of the training distribution")
 
@@ -182,9 +196,7 @@ def story(table: pd.DataFrame, targets: pd.DataFrame, data: RunData) -> list[str
             sentences += _winner(str(domain), own, column, name)
     sentences += _silence(table)
     whole = table.drop_duplicates("variant", keep="last")
-    n_failed, n_cases = int(whole["n_failed"].sum()), int(whole["n_pairs"].sum())
-    if n_failed:
-        sentences.append(f"{n_failed} of {n_cases} cases gave no answer; all their changes count as missed.")
+    sentences += about_failures(data)
     sentences.append(
         f"n = {int(whole['n_pairs'].max())} session pairs, {len(whole)} methods; intervals are 95 % over session pairs."
     )
@@ -321,10 +333,31 @@ def _curves(curves: pd.DataFrame | None, columns: tuple[str, str]) -> dict[str, 
     return panels
 
 
-def _cell(row: Mapping[str, Any], column: Column, is_best: bool, low: str = "", high: str = "") -> Cell:
+def used_pairs(cases: pd.DataFrame, variant: str, key: str) -> tuple[int, int]:
+    """Return over how many pairs a method has a number in a column of results.csv, and of how many that could have.
+
+    Those that no method has (a pair without changes has no precision) could not. A figure that is no column of
+    results.csv is over all.
+    """
+    own = cases[cases["variant"] == variant]
+    if key not in cases:
+        return len(own), len(own)
+    pairs = pd.MultiIndex.from_frame(own[PAIR])
+    could = pd.MultiIndex.from_frame(cases.loc[~np.isnan(numbers(cases, key)), PAIR])
+    return int((~np.isnan(numbers(own, key))).sum()), int(pairs.isin(could).sum())
+
+
+def _cell(
+    row: Mapping[str, Any],
+    column: Column,
+    is_best: bool,
+    low: str = "",
+    high: str = "",
+    counts: tuple[int, int] = (0, 0),
+) -> Cell:
     ends = [float(row.get(name, math.nan)) for name in (low or f"{column.key}_low", high or f"{column.key}_high")]
     interval = "" if math.isnan(ends[0]) else f"{column.shown(ends[0])}{EN_DASH}{column.shown(ends[1])}"
-    return Cell(column.shown(float(row[column.key])), is_best, interval)
+    return Cell(column.shown(float(row[column.key])), is_best, beside(interval, *counts))
 
 
 def _group(domain: str, row: Mapping[str, Any]) -> str:

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from eval.page_columns import RESULT_COLUMNS, share
 from eval.page_run import (
     BASELINES,
+    Row,
     RunData,
     defined,
     named_variants,
+    number,
     of,
     over_pairs,
     repeats,
@@ -167,15 +169,26 @@ def about_wrong_merges(data: RunData) -> list[str]:
     return found
 
 
+def is_unmade(row: Row) -> bool:
+    """Tell whether a case has no truth: its world could not be made, or its worker died over it."""
+    return text(row, "status") != "ok" and "n_observable" in row and math.isnan(number(row, "n_observable"))
+
+
 def about_failures(data: RunData) -> list[str]:
-    """Say how many cases gave no answer."""
+    """Say how many cases gave no answer, and how many of them have no truth to be held against."""
     bad = [row for row in data.results if text(row, "status") != "ok"]
-    if not bad:
-        return []
-    return [
-        f"{len(bad)} of {len(data.results)} cases gave no answer (refused merge or error); they count as found nothing "
-        "and are listed below."
-    ]
+    n_unmade = sum(is_unmade(row) for row in bad)
+    n_all, n_refused = len(data.results), len(bad) - n_unmade
+    found = []
+    if n_refused:
+        words = f"{n_refused} of {n_all} cases gave no answer (refused merge or error)"
+        found.append(f"{words}; they count as found nothing and are listed below.")
+    if n_unmade:
+        found.append(
+            f"{n_unmade} of {n_all} cases could not be judged, as their world could not be made or their worker died; "
+            "they count among the failed and are left out of every mean."
+        )
+    return found
 
 
 def _about_unchanged(data: RunData) -> list[str]:

@@ -23,6 +23,7 @@ from eval.page_run import (
     GridOf,
     Row,
     RunData,
+    defined,
     flag,
     grids,
     named_variants,
@@ -32,7 +33,7 @@ from eval.page_run import (
     scenarios,
     text,
 )
-from eval.statistics import bootstrap_interval
+from eval.statistics import ENOUGH_PAIRS, bootstrap_interval
 
 _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
@@ -121,14 +122,31 @@ def status_text(group: Sequence[Row]) -> str:
     return _counted(counts)
 
 
-def best(values: Sequence[float], column: Column) -> list[bool]:
-    """Mark the best values of a column as written; none where all are equal or fewer than two are defined."""
-    written = [column.shown(value) for value in values]
-    defined = [float(column.shown(value).replace(THIN_SPACE, "")) for value in values if not math.isnan(value)]
+def best(values: Sequence[float], column: Column, n_used: Sequence[int] | None = None) -> list[bool]:
+    """Mark the best values of a column as written; none where all are equal or fewer than two are defined.
+
+    Args:
+        values: One for each row.
+        column: Which direction wins, and how values are written.
+        n_used: Over how many pairs each is. One over fewer than six takes no part where another is over more: a method
+            that hardly ever answers is not the best of those that do.
+    """
+    counts = n_used or [0] * len(values)
+    enough = min(ENOUGH_PAIRS, max(counts, default=0))
+    written = [
+        UNDEFINED if math.isnan(value) or n < enough else column.shown(value).replace(THIN_SPACE, "")
+        for value, n in zip(values, counts, strict=True)
+    ]
+    defined = [float(word) for word in written if word != UNDEFINED]
     if column.better is None or len(set(defined)) < 2:
         return [False] * len(values)
     winner = max(defined) if column.better == "high" else min(defined)
-    return [word != UNDEFINED and float(word.replace(THIN_SPACE, "")) == winner for word in written]
+    return [word != UNDEFINED and float(word) == winner for word in written]
+
+
+def beside(interval: str, n_used: int, n: int) -> str:
+    """Return what stands under a mean: its interval, and over how many pairs it is where that is not all of them."""
+    return "\n".join(filter(None, (interval, f"{n_used} of {n} pairs" if 0 < n_used < n else "")))
 
 
 def interval_text(group: Sequence[Row], column: Column) -> str:
@@ -140,9 +158,10 @@ def interval_text(group: Sequence[Row], column: Column) -> str:
 
 def _column_cells(groups: Sequence[Sequence[Row]], column: Column) -> list[Cell]:
     values = [over_pairs(group, column.key) for group in groups]
+    counts = [len(defined(group, column.key)) for group in groups]
     return [
-        Cell(column.shown(value), is_best, interval_text(group, column))
-        for group, value, is_best in zip(groups, values, best(values, column), strict=True)
+        Cell(column.shown(value), is_best, beside(interval_text(group, column), n, len(group)))
+        for group, value, n, is_best in zip(groups, values, counts, best(values, column, counts), strict=True)
     ]
 
 

@@ -11,6 +11,8 @@ from cdpipe.geometry import Float64Array, stream
 from eval.ranking import auroc, average_precision
 
 N_RESAMPLES = 2000
+# 2^(1-6) = 3 %: six fair coins show one side; five do in 6 % of all cases
+ENOUGH_PAIRS = 6
 _NORMAL_95 = 1.959963984540054
 IDENTITY_COLUMNS = (
     "scenario",

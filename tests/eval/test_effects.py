@@ -8,8 +8,8 @@ import pytest
 
 from eval.effects import COLUMNS, effects
 from eval.page_columns import RESULT_COLUMNS
-from eval.page_effects import ENOUGH_PAIRS, signed
-from eval.statistics import bootstrap_interval
+from eval.page_effects import signed
+from eval.statistics import ENOUGH_PAIRS, bootstrap_interval
 
 NAN = float("nan")
 QUIET = "n[sensor.range_noise=false]"

@@ -9,9 +9,9 @@ import pytest
 
 from cdpipe.errors import InputError
 from eval.methods import Cell
-from eval.page_effects import ENOUGH_PAIRS
 from eval.plan import cells, load_plan
 from eval.plan_changes import changed_plan
+from eval.statistics import ENOUGH_PAIRS
 from eval.worlds import worlds_of
 
 VALIDATION, TEST = range(10000, 20000), range(20000, 30000)

@@ -23,7 +23,7 @@ from eval.object_figures import Panel, object_panels, oblique_view
 from eval.page_columns import RESULT_COLUMNS, UNDEFINED, count, significant
 from eval.page_run import RunData, grids, split_variant
 from eval.page_story import rank, sentence
-from eval.page_tables import best, escape_latex, heat_colour
+from eval.page_tables import beside, best, escape_latex, heat_colour
 from eval.runfolder import RunFolder
 
 HIGH = next(column for column in RESULT_COLUMNS if column.key == "object_iou_point")
@@ -82,6 +82,17 @@ def test_counts_are_grouped_and_broken_means_keep_a_decimal() -> None:
 )
 def test_best_is_judged_as_written(values: list[float], column: object, marks: list[bool]) -> None:
     assert best(values, column) == marks
+
+
+def test_a_mean_over_hardly_any_pair_is_not_the_best() -> None:
+    values = [0.9, 1.0, 0.5]
+    assert best(values, HIGH, [60, 2, 60]) == [True, False, False]
+    assert best(values, HIGH, [60, 6, 60]) == [False, True, False]
+    # where nobody has more, nobody is left out
+    assert best(values, HIGH, [1, 1, 1]) == [False, True, False]
+    assert best(values, HIGH, [3, 2, 3]) == [True, False, False]
+    assert beside("0.1-0.2", 2, 60) == "0.1-0.2\n2 of 60 pairs"
+    assert [beside("", n, 60) for n in (0, 60)] == ["", ""]
 
 
 def test_ranking_names_ties_margins_and_nothing() -> None:

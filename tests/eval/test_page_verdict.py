@@ -102,3 +102,20 @@ def test_failures_refusals_and_silence_are_counted() -> None:
 @pytest.mark.parametrize(("n_pairs", "names", "expected"), [(2, "ab", True), (1, "ab", False), (2, "a", False)])
 def test_one_pair_or_one_method_is_no_verdict(n_pairs: int, names: str, *, expected: bool) -> None:
     assert is_judged(run({name: [0.5] * n_pairs for name in names})) is expected
+
+
+def test_a_world_that_could_not_be_made_misses_nothing() -> None:
+    data = run({"tunnelcd": [0.5] * 6, "c2c": [0.4] * 6})
+    lost = [row(name, 9, math.nan, status="failed", n_observable=math.nan) for name in ("tunnelcd", "c2c")]
+    words = told(RunData(data.folder, (*data.results, *lost), (), (), {}, ()))
+    assert "2 of 14 cases could not be judged" in words
+    assert "count as found nothing" not in words
+
+
+def test_another_merge_before_the_same_comparison_is_no_rival_and_the_paper_is_named() -> None:
+    methods = {"tunnelcd": [0.9] * 8, "kiss-matcher": [0.8] * 8, "c2c": [0.5] * 8, "paper": [0.1] * 8}
+    words = told(run(methods))
+    assert "object IoU: tunnelcd is best with 0.90, 0.40 ahead of c2c (0.50)" in words
+    assert "The paper's method: 0.10." in words
+    del methods["tunnelcd"]
+    assert "object IoU: kiss-matcher is best with 0.80" in told(run(methods))

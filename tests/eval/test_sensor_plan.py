@@ -12,8 +12,8 @@ from pydantic.fields import FieldInfo
 
 from cdpipe.config import load_config
 from cdpipe.ouster import load_profile, profile_names
-from eval.page_effects import ENOUGH_PAIRS
 from eval.plan import cells, load_plan
+from eval.statistics import ENOUGH_PAIRS
 from eval.worlds import references, settings_over, worlds_of
 from scenarios.library import load_scenario
 from scenarios.schema import Sensor
