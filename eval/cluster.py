@@ -115,7 +115,7 @@ def _of_scheduler(address: str) -> Iterator[Any]:
     try:
         _probe(address)
         client = Client(address, timeout=_CONNECT_S)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, MemoryError) as error:  # the last where what answers speaks another language
         raise _unreachable(address, error) from error
     with client:
         if not client.nthreads():
@@ -142,7 +142,10 @@ def _probe(address: str) -> None:
 
 
 def _unreachable(address: str, error: Exception) -> InputError:
-    return InputError(f"--scheduler {address}: cannot be reached ({error}): expected tcp://HOST:PORT")
+    told = str(error) or "it is no Dask scheduler"
+    return InputError(
+        f"--scheduler {address}: cannot be reached ({told}): expected tcp://HOST:PORT of a running `dask scheduler`"
+    )
 
 
 def dask_setup(worker: object) -> None:

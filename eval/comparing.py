@@ -51,14 +51,10 @@ def compare(a: Side, b: Side, *, times_count: bool = True, seed: int = 0) -> pd.
         `low` to `high` over session pairs; `verdict` on B. Pooled recall has the recalls in place of means.
 
     Raises:
-        InputError: The sides share no session pair, a side has one twice, or their metrics versions differ.
+        InputError: The sides share no session pair, or their metrics versions differ.
     """
     check_versions(a, b)
     figures = [figures_of(side.results) for side in (a, b)]
-    for side, frame in zip((a, b), figures, strict=True):
-        if (twice := frame[frame.duplicated([*PAIR, "variant"])]).size:
-            scenario, number, variant = twice.iloc[0][[*PAIR, "variant"]]
-            raise InputError(f"{side.path}/results.csv: {scenario}, seed {number}, {variant} stands there twice")
     rows: list[dict[str, Any]] = []
     for variants in matched_variants(a, b):
         own = [frame[frame["variant"] == name] for frame, name in zip(figures, variants, strict=True)]

@@ -48,7 +48,7 @@ from eval.page_verdict import is_judged, verdict_sentences
 from eval.page_views import Views, write_views
 from eval.page_worst import draw_worst, shown_variant, worst_rows
 from eval.pareto import pareto_table
-from eval.sides import is_contended
+from eval.sides import Side, check_versions, is_contended
 from eval.statistics import ENOUGH_PAIRS
 
 POINT_COLOURS = (
@@ -73,9 +73,10 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
         Path of the page.
 
     Raises:
-        InputError: There are no results, or the folder cannot be written.
+        InputError: There are no results, they are of several metrics versions, or the folder cannot be written.
     """
     data = read_run(run)
+    check_versions(Side(data), Side(data))
     files: dict[str, str | bytes] = {**latex_tables(data)}
     if len(merges := merge_table(pd.DataFrame(list(data.results)))):
         files["merge.csv"] = merges.to_csv(index=False)

@@ -48,7 +48,7 @@ def read_run(run: Path) -> RunData:
     """Read what the page needs from a run folder; everything but results.csv may be missing.
 
     Raises:
-        InputError: There is no results.csv, it holds no row, or lacks a column that names its rows.
+        InputError: There is no results.csv, it holds no row, lacks a column that names its rows, or one of them twice.
     """
     path = run / "results.csv"
     if not path.is_file():
@@ -59,10 +59,27 @@ def read_run(run: Path) -> RunData:
     absent = [name for name in REQUIRED if name not in results[0]]
     if absent:
         raise InputError(f"{path}: column {', '.join(absent)} is missing: expected a table written by `tunnelcd run`")
+    _require_cases(path, results)
     missing: list[str] = []
     items = {name: _optional_rows(run / f"{name}.csv", missing) for name in ("changes", "regions")}
     provenance = _optional_json(run / "provenance.json", missing)
     return RunData(RunFolder(run), results, items["changes"], items["regions"], provenance, tuple(missing))
+
+
+def _require_cases(path: Path, rows: Iterable[Row]) -> None:
+    """Refuse rows that are no case, or one that stands there twice: every mean would be wrong."""
+    seen = set()
+    for line, row in enumerate(rows, start=2):
+        try:
+            seed = int(row["seed"])
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{path}:{line}: seed = {row['seed']}: expected a whole number") from error
+        if float(row["seed"]) != seed:
+            raise InputError(f"{path}:{line}: seed = {row['seed']}: expected a whole number")
+        case = (text(row, "scenario"), seed, text(row, "variant"))
+        if case in seen:
+            raise InputError(f"{path}:{line}: {case[0]}, seed {case[1]}, {case[2]} stands there twice")
+        seen.add(case)
 
 
 def number(row: Row, column: str) -> float:

@@ -72,7 +72,13 @@ def _refuse_mistakes(seeds: str | None, settings: Sequence[str], grid: Sequence[
         checks.append((f"--seeds {seeds}", partial(parse_seeds, seeds)))
     checks += [(f"--set {setting}", partial(valid_setting, setting)) for setting in settings]
     checks += [(f"--grid {text}", partial(_check_axis, text)) for text in grid]
-    mistakes = []
+    axes = [key_of(text) for text in grid if "=" in text]
+    keys = [*axes, *{key_of(setting) for setting in settings}]
+    mistakes = [
+        f"--grid {key}: set twice, by another --grid or by --set, so that cells would be one: leave one out"
+        for key in dict.fromkeys(axes)
+        if keys.count(key) > 1
+    ]
     for option, check in checks:
         try:
             check()

@@ -15,6 +15,7 @@ from typing import Any
 
 import pandas as pd
 
+from cdpipe.config import preset_names
 from cdpipe.errors import InputError
 from cdpipe.yamlfile import suggestion
 from eval.coverage import plan_of
@@ -24,6 +25,7 @@ from eval.plan import planned_cases
 from eval.progress import RunProgress, Silent
 from eval.rescoring import LAST, NO_KEY, cell_document, foreign_identity, score_stored
 from eval.runfolder import RunFolder, remove, write_tables
+from eval.scoring import METRICS_VERSION
 
 _FILES = ("answer.json", "answer.npz")
 _TOLD = 5
@@ -39,12 +41,13 @@ def add_predictions(run: RunFolder, folder: Path, name: str, progress: RunProgre
 
     Raises:
         InputError: A case is missing or of no pair of this run, a file cannot be an answer to its pair (all such files
-            at once), or the run has a variant of this name already.
+            at once), the name is taken, or the run was scored by other metrics.
     """
     progress = progress or Silent()
     pairs = sorted(run.path.glob("pairs/*/*/truth"))
     found = _matched(run, folder, [truth.parent for truth in pairs])
     _require_free(run, name)
+    _require_current(run)
     documents: dict[Path, dict[str, Any]] = {}
     mistakes: list[str] = []
     for pair, prediction in found.items():
@@ -98,14 +101,18 @@ def _matched(run: RunFolder, folder: Path, pairs: Sequence[Path]) -> dict[Path, 
     given = {file.parent for file in folder.glob("**/answer.json")}
     found: dict[Path, Path] = {}
     wanted: dict[Path, str] = {}
+    known: set[Path] = set()
+    mistakes: list[str] = []
     for pair in pairs:
         scenario = foreign_identity(run, pair.parent.name, pair.name, "")["scenario"]
         wanted[pair] = f"{scenario}/{pair.name}"
         # written as the scenario is called, or as the run calls its folder
-        for place in (folder / wanted[pair], folder / pair.parent.name / pair.name):
-            if place in given:
-                found[pair] = place
-    mistakes = list(_strangers(folder, given - set(found.values()), list(wanted.values())))
+        places = {folder / wanted[pair], folder / pair.parent.name / pair.name} & given
+        if len(places) > 1:
+            mistakes.append(f"{' and '.join(map(str, sorted(places)))}: two predictions for one pair: leave one out")
+        known |= places
+        found.update((pair, place) for place in places)
+    mistakes += _strangers(folder, given - known, list(wanted.values()))
     if missing := [name for pair, name in wanted.items() if pair not in found]:
         mistakes.append(
             f"{folder}: no prediction for {_listed(missing)} of {run.path}: write "
@@ -123,12 +130,26 @@ def _strangers(folder: Path, places: set[Path], names: Sequence[str]) -> Iterato
 
 
 def _require_free(run: RunFolder, name: str) -> None:
-    """Refuse a name that stands for a method of the run."""
+    """Refuse a name that stands for a method of the run, or for one of ours."""
     if not slug(name).strip("._"):
         raise InputError(f"--as {name!r}: expected a name")
+    if name.partition("[")[0] in preset_names() or name.startswith("oracle-"):
+        raise InputError(f"--as {name}: a preset or an oracle of tunnelcd is called so: choose another")
     for path in sorted(run.path.glob(f"cells/*/*/{slug(name)}.json")):
         if (stored := run.read_cell(path)) is not None and stored["key"] != NO_KEY:
             raise InputError(f"--as {name}: the run has a variant of this name: choose another")
+
+
+def _require_current(run: RunFolder) -> None:
+    """Refuse a run that was scored by other metrics than its predictions would be."""
+    cells = (run.read_cell(path) for path in sorted(run.path.glob("cells/*/*/*.json")))
+    others = {cell["row"].get("metrics_version") for cell in cells if cell is not None} - {METRICS_VERSION}
+    if others:
+        told = " and ".join(sorted(map(str, others)))
+        raise InputError(
+            f"{run.path}: has rows of metrics version {told}, but predictions are scored by {METRICS_VERSION}: "
+            f"`tunnelcd score {run.path}` first, which scores all of it again"
+        )
 
 
 def _copy(prediction: Path, answer: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import pandas as pd
 from cdpipe.errors import InputError
 from cdpipe.yamlfile import suggestion
 from eval.coverage import coverage
-from eval.page_run import RunData, flag, read_run
+from eval.page_run import Row, RunData, flag, read_run
 from eval.region_curves import PAIR
 from eval.scoring import METRICS_VERSION
 
@@ -74,7 +74,7 @@ def check_versions(a: Side, b: Side) -> None:
     Raises:
         InputError: They differ, between the sides or within one; one line that says how to mend it.
     """
-    found = {side.path: _versions(side) for side in (a, b)}
+    found = {side.path: versions_of(side.data.results) for side in (a, b)}
     if len(set().union(*found.values())) <= 1:
         return
     told = " and ".join(f"{path}: metrics version {' and '.join(sorted(each))}" for path, each in found.items())
@@ -185,8 +185,9 @@ def other_worlds(a: Side, b: Side) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def _versions(side: Side) -> set[str]:
-    values = {row.get("metrics_version") for row in side.data.results}
+def versions_of(rows: Iterable[Row]) -> set[str]:
+    """Return the metrics versions that some rows of results.csv were scored by."""
+    values = {row.get("metrics_version") for row in rows}
     return {"unknown" if value is None or pd.isna(value) else f"{float(value):g}" for value in values}
 
 

@@ -11,6 +11,8 @@ import pytest
 from cdpipe.errors import InputError
 from eval.compared_columns import COMPARED, figures_of
 from eval.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare, paired_differences, verdict
+from eval.page import write_page
+from eval.page_run import read_run
 from eval.region_curves import ranked_pairs, recall_at
 from eval.scoring import METRICS_VERSION
 from eval.sides import cautions, is_one_machine, only_in, read_side, short_names, why_no_times
@@ -217,6 +219,20 @@ def test_runs_that_share_nothing_and_rows_that_stand_twice_are_refused(write: Wr
     twice = write("twice", [row(1), row(1)])
     with pytest.raises(InputError, match="regions/narrow, seed 1, tunnelcd stands there twice"):
         compared(a, twice)
+
+
+def test_a_run_of_mixed_metrics_gets_no_page(write: Write) -> None:
+    mixed = write("mixed", [row(1, metrics_version=METRICS_VERSION - 1), row(2)])
+    with pytest.raises(InputError, match=f"metrics version {METRICS_VERSION - 1} and {METRICS_VERSION}:"):
+        write_page(mixed)
+    assert not (mixed / "index.html").exists()
+
+
+@pytest.mark.parametrize(("seed", "told"), [("x", "seed = x: expected a whole number"), (1.5, "seed = 1.5: expected")])
+def test_a_seed_that_is_none_is_named(write: Write, seed: object, told: str) -> None:
+    broken = write("broken", [row(1), {**row(2), "seed": seed}])
+    with pytest.raises(InputError, match=f"results.csv:3: {told}"):
+        read_run(broken)
 
 
 def test_what_is_on_one_side_only_is_counted_and_named(write: Write) -> None:

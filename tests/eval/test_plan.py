@@ -154,6 +154,17 @@ def test_command_line_replaces_seeds_and_sets_every_variant(tmp_path: Path) -> N
     }
 
 
+@pytest.mark.parametrize(
+    ("settings", "grid"),
+    [(["extract.voxel_m=0.65"], ["extract.voxel_m=0.3,0.5"]), ([], ["extract.voxel_m=0.3", "extract.voxel_m=0.5"])],
+)
+def test_a_grid_that_something_else_writes_over_is_refused(
+    tmp_path: Path, settings: list[str], grid: list[str]
+) -> None:
+    with pytest.raises(InputError, match=r"--grid extract\.voxel_m: set twice"):
+        changed_plan(read(tmp_path), settings=settings, grid=grid)
+
+
 def test_command_line_grid_is_a_product_over_the_variants(tmp_path: Path) -> None:
     text = PLAN.partition("grid:")[0]
     plan = changed_plan(read(tmp_path, text), grid=["extract.voxel_m=0.1,0.2", "query.radius_m=3,5"])

@@ -19,6 +19,7 @@ from cdpipe.geometry import transform
 from eval import answer_check
 from eval.ground_truth import load_ground_truth
 from eval.runfolder import RunFolder, write_json
+from eval.scoring import METRICS_VERSION
 
 Command = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parents[2]
@@ -69,6 +70,7 @@ def run(tmp_path: Path, tiny_pair: Path) -> RunFolder:
         shutil.copytree(tiny_pair, folder.pair("tiny/pair", seed))
         names = {"scenario": "tiny/pair", "family": "tiny/pair", "seed": seed, "variant": "ours", "status": "ok"}
         row = {**names, "preset": "ours", "pair_kind": "clean", "n_observable": 3, "region_recall": 0.5}
+        row["metrics_version"] = METRICS_VERSION
         cell = {
             "key": "made",
             "order": [7, 0],
@@ -126,6 +128,34 @@ def test_a_run_takes_predictions_in_as_a_variant(
         pd.testing.assert_frame_equal(pd.read_csv(run.path / "results.csv"), results)
 
 
+def test_two_predictions_for_one_pair_are_refused(
+    tmp_path: Path, run: RunFolder, command: Command, good: tuple[dict[str, Any], dict[str, Any]]
+) -> None:
+    for folder in ("tiny/pair/3", "tiny__pair/3", "tiny/pair/4"):
+        write_prediction(tmp_path / "mine" / folder, *good)
+    code, _, err = command("score", run.path, "--predictions", tmp_path / "mine", "--as", "theirs")
+    assert code == 2 and err.count("\n") == 1
+    assert "tiny/pair/3 and " in err and "tiny__pair/3: two predictions for one pair: leave one out" in err
+
+
+def test_rows_of_other_metrics_are_scored_again_first(
+    tmp_path: Path, run: RunFolder, command: Command, good: tuple[dict[str, Any], dict[str, Any]]
+) -> None:
+    for seed in SEEDS:
+        write_prediction(tmp_path / f"mine/tiny/pair/{seed}", *good)
+    path = run.cell("tiny/pair", 3, "ours")
+    cell = run.read_cell(path)
+    assert cell is not None
+    cell["row"]["metrics_version"] = METRICS_VERSION - 1
+    run.write_cell(path, cell)
+    code, _, err = command("score", run.path, "--predictions", tmp_path / "mine", "--as", "theirs")
+    assert (
+        code == 2
+        and f"has rows of metrics version {METRICS_VERSION - 1}, but predictions are scored by {METRICS_VERSION}" in err
+    )
+    assert not run.cell("tiny/pair", 3, "theirs").exists()
+
+
 def test_missing_cases_strangers_and_mistakes_are_named_together_and_nothing_is_written(
     tmp_path: Path, run: RunFolder, command: Command, good: tuple[dict[str, Any], dict[str, Any]]
 ) -> None:
@@ -158,6 +188,12 @@ def test_missing_cases_strangers_and_mistakes_are_named_together_and_nothing_is_
         (("--predictions", "mine"), "give both, or neither"),
         (("--as", "theirs"), "give both, or neither"),
         (("--predictions", "mine", "--as", "ours"), "--as ours: the run has a variant of this name: choose another"),
+        (
+            ("--predictions", "mine", "--as", "tunnelcd"),
+            "--as tunnelcd: a preset or an oracle of tunnelcd is called so",
+        ),
+        (("--predictions", "mine", "--as", "paper[x=1]"), "a preset or an oracle of tunnelcd is called so"),
+        (("--predictions", "mine", "--as", "oracle-merge"), "a preset or an oracle of tunnelcd is called so"),
         (("--predictions", "mine", "--as", "."), "--as '.': expected a name"),
         (("--predictions", "absent", "--as", "theirs"), "absent: no such folder: expected absent/<scenario>/<seed>/"),
         (("answer", "--predictions", "mine", "--as", "theirs"), "goes with a run folder alone"),
