@@ -26,7 +26,7 @@ _Pose = Annotated[list[Annotated[list[float], Len(4, 4)]], Len(4, 4)]
 class _Part(Settings):
     """Numbers are numbers, not text that looks like one."""
 
-    model_config = ConfigDict(strict=True)
+    model_config = ConfigDict(strict=True, allow_inf_nan=True)  # NaN: not measured
 
 
 class ShapePart(_Part):

@@ -13,7 +13,9 @@ from pydantic import Field
 from cdpipe.errors import InputError
 from cdpipe.yamlfile import Document, Settings, read_yaml, suggestion, validated, with_settings
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0)]
+# Smaller ones are noise, and could not be numbered a kilometre from the origin.
+Cell = Annotated[float, Field(ge=0.01)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -22,7 +24,7 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 class MapConfig(Settings):
     """How scans become a thinned map and keyframes."""
 
-    voxel_m: Positive = Field(0.2, description="cell of the thinned map")
+    voxel_m: Cell = Field(0.2, description="cell of the thinned map")
     max_range_m: Positive = Field(60.0, description="returns beyond are not mapped")
     keyframe_spacing_m: Positive = Field(1.0, description="path between keyframes")
 
@@ -44,10 +46,10 @@ class MergeConfig(Settings):
     )
     n_candidates: Count = Field(4, description="hypotheses tried by `voting`")
     sphere_radius_m: Positive = Field(10.0, description="submap around a pair (FRAME: 10 m)")
-    voxel_m: Positive = Field(0.4, description="thinning of a sphere before it is registered")
+    voxel_m: Cell = Field(0.4, description="thinning of a sphere before it is registered")
     seen_within_m: Positive = Field(15.0, description="map points that were only seen from farther are left out")
-    target_voxel_m: Positive = Field(0.3, description="thinning of the before map, which the spheres are registered to")
-    coarse_voxel_m: Positive = Field(0.8, description="the same while hypotheses are tried")
+    target_voxel_m: Cell = Field(0.3, description="thinning of the before map, which the spheres are registered to")
+    coarse_voxel_m: Cell = Field(0.8, description="the same while hypotheses are tried")
     gicp_correspondence_m: Positive = Field(3.0, description="FRAME: 3 m")
     vgicp_correspondence_m: Positive = Field(1.0, description="FRAME: 1 m")
     inlier_m: Positive = Field(0.1, description="a point this near the other map's surface is an inlier")
@@ -60,7 +62,7 @@ class MergeConfig(Settings):
     )
     accept_all: bool = Field(False, description="accept whatever was found, as FRAME does")
     fallback: bool = Field(True, description="where nothing is accepted, let KISS-Matcher (extra `kiss`) try")
-    kiss_voxel_m: Positive = Field(0.6, description="cell of KISS-Matcher")
+    kiss_voxel_m: Cell = Field(0.6, description="cell of KISS-Matcher")
     refine: Literal["none", "local"] = Field("local", description="align again every few metres along the overlap")
 
 
@@ -87,9 +89,9 @@ class ExtractConfig(Settings):
         "surface", description="distance from the other session's surface; the paper's voxels; or the nearest point's"
     )
     withdraw: bool = Field(True, description="take regions back in which nothing is found")
-    voxel_m: Positive = Field(0.65, description="`voxel`: size (paper: 0.65)")
+    voxel_m: Cell = Field(0.65, description="`voxel`: size (paper: 0.65)")
     min_points: Count = Field(1, description="`voxel`: points that make a voxel occupied")
-    origin_m: float = Field(0.0, description="`voxel`: offset of the grid along every axis")
+    origin_m: float = Field(0.0, ge=-1000, le=1000, description="`voxel`: offset of the grid along every axis")
     distance_m: Positive = Field(
         0.3, description="`nearest`, `c2c`, `m3c2`: a point farther than this from the other cloud is new"
     )
@@ -131,7 +133,7 @@ class M3C2Config(Settings):
 class DufomapConfig(Settings):
     """Voids that rays passed through (DUFOMap)."""
 
-    voxel_m: Positive = Field(0.1, description="`dufomap`: voxel of the void map")
+    voxel_m: Cell = Field(0.1, description="`dufomap`: voxel of the void map")
     hit_inflation_m: NonNegative = Field(0.2, description="`dufomap`: no void this near in front of a return (d_s)")
     every_scan: Count = Field(1, description="`dufomap`: every n-th scan's rays are cast")
 

@@ -63,7 +63,8 @@ def region_figures(merged: MergedMaps, regions: ChangeRegions, groups: Sequence[
     """Return the paper's Table II by our definition, all of the after map: (R,) by name, NaN where not reported.
 
     `v_sphere_m3` volume of the convex hull of its points in the sphere, `v_oe_m3` sum of the volumes of the convex
-    hulls of its objects in the region, `s_points` its points in the sphere, `oe_points` those of them on the objects.
+    hulls of the objects found in the region, `s_points` its points in the sphere, `oe_points` those of the objects. An
+    object counts whole, as far as it reaches out of the sphere, and in the best of the regions that it lies in.
     """
     crops = Crops(merged, margin_m=0.0)
     figures = {name: np.full(len(regions.scores), np.nan) for name in FIGURES}
@@ -88,7 +89,10 @@ def hull_volume_m3(points: Float64Array) -> float:
 
 
 def _cut_by_points(merged: MergedMaps, regions: ChangeRegions, config: PipelineConfig) -> list[PointGroup]:
-    """Compare map points region by region; a map point belongs to at most one object: the better region takes it."""
+    """Compare map points region by region; a map point belongs to at most one object: the better region takes it.
+
+    As in the paper, each sampled area is cut by itself, so an object that lies in two of them is two objects.
+    """
     extract = config.extract
     # a voxel that reaches into the sphere reaches at most its diagonal out of it
     crops = Crops(merged, np.sqrt(3.0) * extract.voxel_m if extract.method == "voxel" else extract.distance_m)

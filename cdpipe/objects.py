@@ -65,7 +65,8 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
 
     Args:
         merged: Both maps.
-        groups: No map point may be in two of them, and none may be empty.
+        groups: None may be empty, and no return may be in two of them. A map point on the border of two objects may
+            stand for returns of both.
     """
     if not groups:
         return ()

@@ -20,9 +20,9 @@ Key = tuple[str | int, ...]
 
 
 class Settings(BaseModel):
-    """Base of every model read from YAML: frozen, and unknown keys are mistakes."""
+    """Base of every model read from YAML: frozen; unknown keys and numbers that are none are mistakes."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
@@ -139,8 +139,7 @@ def _mistake(model: type[BaseModel], document: Document, error: Any) -> str:
     name = ".".join(str(part) for part in key)
     where = document.where(key)
     if error["type"] == "extra_forbidden":
-        known = _fields_at(model, key[:-1])
-        return f"{where}: {name} = {error['input']!r}: unknown key{suggestion(str(key[-1]), known)}"
+        return f"{where}: {name} = {error['input']!r}: unknown key{_near_key(model, key)}"
     if error["type"] == "missing":
         return f"{where}: {name}: missing, a value is required"
     hint = ""
@@ -150,6 +149,15 @@ def _mistake(model: type[BaseModel], document: Document, error: Any) -> str:
     rule = error["msg"].removeprefix("Value error, ")
     rule = rule[0].lower() + rule[1:] if not rule[:2].isupper() else rule
     return f"{where}: {name} = {_brief(error['input'])}: {rule}{hint}" if name else f"{where}: {rule}{hint}"
+
+
+def _near_key(model: type[BaseModel], key: Key) -> str:
+    """Return a suggestion for an unknown key: one of that name in a group, if the group was left out, or a near one."""
+    last = str(key[-1])
+    grouped = [f"{group}.{last}" for group in model.model_fields if last in _fields_at(model, (group,))]
+    if len(key) == 1 and grouped:
+        return f"; did you mean {' or '.join(grouped)}?"
+    return suggestion(last, _fields_at(model, key[:-1]))
 
 
 def _brief(value: Any) -> str:

@@ -12,7 +12,7 @@ import yaml
 from cdpipe.errors import InputError
 from cdpipe.yamlfile import Document, validated
 from eval.plan import Plan, parse_seeds
-from eval.plan_parts import acts_on_true_regions, key_of, valid_setting
+from eval.plan_parts import acts_on_true_regions, key_of, valid_setting, valid_settings
 from eval.worlds import group_of
 
 
@@ -92,8 +92,7 @@ def _check_axis(text: str) -> None:
     key, equals, values = text.partition("=")
     if not equals or not key or not all(values.split(",")):
         raise ValueError("expected key=v1,v2, e.g. extract.voxel_m=0.2,0.4")
-    for setting in _grid_axis(text):
-        valid_setting(setting)
+    valid_settings(_grid_axis(text))
 
 
 def _grid_axis(text: str) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 from pydantic import (
@@ -49,6 +50,22 @@ def valid_setting(setting: str) -> str:
     return setting
 
 
+def valid_settings(settings: Iterable[str]) -> None:
+    """Check some `key=value` of the method.
+
+    Raises:
+        ValueError: What is wrong with any of them, all in one.
+    """
+    mistakes = []
+    for setting in settings:
+        try:
+            valid_setting(setting)
+        except ValueError as error:
+            mistakes.append(str(error))
+    if mistakes:
+        raise ValueError("; ".join(dict.fromkeys(mistakes)))
+
+
 def _known_preset(name: str) -> str:
     if name.endswith((".yaml", ".yml")):
         told_as_values(lambda: load_config(name))
@@ -58,9 +75,7 @@ def _known_preset(name: str) -> str:
 
 
 def _valid_keys(keys: dict[str, tuple[Any, ...]]) -> dict[str, tuple[Any, ...]]:
-    for key, values in keys.items():
-        for value in values:
-            valid_setting(setting_text(key, value))
+    valid_settings(setting_text(key, value) for key, values in keys.items() for value in values)
     return keys
 
 

@@ -37,6 +37,21 @@ def test_mistakes_come_with_suggestions() -> None:
         load_config("papr")
 
 
+def test_a_key_without_its_group_gets_the_whole_key() -> None:
+    with pytest.raises(InputError, match=r"min_cells = 3: unknown key; did you mean extract\.min_cells\?"):
+        load_config("tunnelcd", ["min_cells=3"])
+    with pytest.raises(InputError, match=r"did you mean map\.voxel_m or merge\.voxel_m or extract\.voxel_m"):
+        load_config("tunnelcd", ["voxel_m=0.3"])
+
+
+@pytest.mark.parametrize(
+    "setting", ["extract.origin_m=.nan", "extract.origin_m=1e9", "query.threshold=.inf", "extract.voxel_m=1e-7"]
+)
+def test_numbers_that_no_stage_could_use_are_refused(setting: str) -> None:
+    with pytest.raises(InputError, match=f"--set: {setting.partition('=')[0]} = .*: input should be"):
+        load_config("tunnelcd", [setting])
+
+
 def test_every_setting_has_a_meaning() -> None:
     rows = settings_table()
     assert ("extract.voxel_m", 0.65) in [row[:2] for row in rows]

@@ -102,7 +102,7 @@ speed: 3
             line,
             lines,
         )
-    assert any("extract.voxel_m=-1" in line and "greater than 0" in line for line in lines)
+    assert any("extract.voxel_m=-1" in line and "greater than" in line for line in lines)
 
 
 @pytest.mark.parametrize(
@@ -152,6 +152,13 @@ def test_command_line_replaces_seeds_and_sets_every_variant(tmp_path: Path) -> N
         "paper[query.radius_m=6,extract.voxel_m=0.5]",
         "tunnelcd[query.radius_m=6,extract.voxel_m=0.5]",
     }
+
+
+def test_every_wrong_value_of_a_grid_is_named(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"= 'x': input should be a valid number.*; extract\.voxel_m = -2: input should"
+    ):
+        changed_plan(read(tmp_path), grid=["extract.voxel_m=0.3,x,-2"])
 
 
 @pytest.mark.parametrize(
