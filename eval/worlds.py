@@ -51,7 +51,7 @@ def known_scenario(name: str) -> str:
     if name.endswith((".yaml", ".yml")):
         told_as_values(lambda: check_scenario(name))
     elif name not in names:
-        raise ValueError(f"unknown scenario{suggestion(name, names)} (known: {', '.join(names)})")
+        raise ValueError(f"unknown scenario{suggestion(name, names) or ': `tunnelcd list` shows all'}")
     return name
 
 

@@ -212,7 +212,7 @@ def test_shipped_plans_are_valid(name: str) -> None:
 
 def test_paper_plan_holds_what_the_page_shows() -> None:
     found = cells(load_plan("paper"))
-    presets = ["paper", "paper-topn", "paper-paired", "voxel-diff", "random-regions", "tunnelcd"]
+    presets = ["paper", "paper-topn", "paper-paired", "voxel-diff", "untrained", "random-regions", "tunnelcd"]
     for scenario in ("paper/site1", "paper/site2", "unchanged/site1"):
         plain = [c for c in found if c.scenario == scenario and "[" not in c.variant]
         assert sorted(c.variant for c in plain) == sorted(presets)
