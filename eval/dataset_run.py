@@ -124,11 +124,10 @@ def _tunnels(families: Sequence[str], seeds: str, recipe: Recipe) -> list[Tunnel
     if len(set(families)) < len(families):
         raise InputError(f"families {', '.join(families)}: one is named twice")
     tunnels = [_tunnel(family, seed, recipe) for seed in numbers for family in families]
-    for family in families:
-        of_family = [tunnel for tunnel in tunnels if tunnel.family == family]
-        # one bad draw is told in the data card; a family of which nothing can be drawn is a mistake of the command
-        if all(tunnel.refused for tunnel in of_family):
-            raise InputError(of_family[0].refused)
+    # one bad draw is told in the data card; a family of which nothing can be drawn is a mistake of the command
+    of_family = ([tunnel for tunnel in tunnels if tunnel.family == family] for family in families)
+    if mistakes := [own[0].refused for own in of_family if all(tunnel.refused for tunnel in own)]:
+        raise InputError("\n".join(mistakes))
     return tunnels
 
 
