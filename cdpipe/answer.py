@@ -142,22 +142,26 @@ def read_answer(folder: Path) -> Answer:
     if not path.is_file():
         raise InputError(f"{path}: missing: expected an answer written by `tunnelcd detect` or by another method")
     try:
-        document = checked_document(path, json.loads(path.read_text()))
-        if not isinstance(document, AnswerPart):
-            return Answer(
-                document.status,
-                document.error,
-                document.method,
-                None,
-                document.seconds,
-                document.evidence,
-                until=document.until,
-            )
-        arrays = load_arrays(folder / "answer.npz")
-        checked_arrays(folder / "answer.npz", arrays, len(document.objects))
+        value = json.loads(path.read_text())
+    except ValueError as error:
+        raise InputError(f"{path}: damaged, not JSON: {error}") from error
+    document = checked_document(path, value)
+    if not isinstance(document, AnswerPart):
+        return Answer(
+            document.status,
+            document.error,
+            document.method,
+            None,
+            document.seconds,
+            document.evidence,
+            until=document.until,
+        )
+    arrays = load_arrays(folder / "answer.npz")
+    checked_arrays(folder / "answer.npz", arrays, len(document.objects))
+    try:
         report, points_odom = _report(document, arrays)
-    except ValueError as error:  # not JSON, or arrays that do not go together
-        raise InputError(f"{folder}: damaged or incomplete: {error}") from error
+    except ValueError as error:
+        raise InputError(f"{folder / 'answer.npz'}: arrays that do not go together: {error}") from error
     return Answer("ok", "", document.method, report, report.seconds, report.evidence, points_odom, document.until)
 
 

@@ -7,6 +7,7 @@ answered object (displacement, volume, the median over those matched) is over th
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -78,19 +79,32 @@ def object_tables(results: pd.DataFrame, changes: pd.DataFrame, *, is_whole: boo
 
 
 def object_overview(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the columns of objects_table.csv that a terminal has room for."""
+    """Return the columns of objects_table.csv that a terminal has room for, intervals beside the values."""
     names = {
         "domain": "domain", "variant": "variant", "n_pairs": "n", "n_failed": "failed", "n_changes": "changes",
-        "object_iou_point": "iou", "object_iou_point_low": "low", "object_iou_point_high": "high",
-        "iou_matched_median": "matched", "object_iou_voxel": "voxel", "object_f1_25": "f1@25", "object_f1_50": "f1@50",
-        "object_precision_50": "prec@50", "kind_accuracy": "kind", "displacement_error_m": "moved_m",
-        "n_displacements": "of", "pile_volume_error": "pile_vol", "n_piles": "of ",
-        "object_iou_point_partial": "partial", "n_partial": "of  ", "region_recall_proposed": "recall_prop",
-        "region_recall": "recall", "false_regions_per_100m_proposed": "false_prop", "false_regions_per_100m": "false",
-        "t_oe_per_region_s": "t_oe/region",
-        "t_returns_per_region_s": "of that returns",
+        "object_iou_point": "iou", "iou_matched_median": "matched", "object_iou_voxel": "voxel",
+        "object_f1_25": "f1@25", "object_f1_50": "f1@50", "kind_accuracy": "kind",
+        "displacement_error_m": "moved_m", "n_displacements": "of",
+        "pile_volume_error": "pile_vol", "n_piles": "of ", "object_iou_point_partial": "partial", "n_partial": "of  ",
+        "region_recall_proposed": "recall_prop", "region_recall": "recall",
+        "false_regions_per_100m_proposed": "false_prop", "false_regions_per_100m": "false",
+        "t_oe_per_region_s": "t_oe/region", "t_returns_per_region_s": "of that returns",
     }  # fmt: skip
-    return table[list(names)].rename(columns=names)
+    shown = {
+        heading: [_with_interval(row, name) for row in table.to_dict("records")]
+        if f"{name}_low" in table
+        else table[name]
+        for name, heading in names.items()
+    }
+    return pd.DataFrame(shown)
+
+
+def _with_interval(row: Mapping[Any, Any], name: str) -> str:
+    value, low, high = (float(row[f"{name}{end}"]) for end in ("", "_low", "_high"))
+    digits = 3 if name.endswith("_m") else 2
+    if math.isnan(value):
+        return "-"
+    return f"{value:.{digits}f}" + ("" if math.isnan(low) else f" ({low:.{digits}f}-{high:.{digits}f})")
 
 
 def object_targets(table: pd.DataFrame, *, is_whole: bool) -> pd.DataFrame:

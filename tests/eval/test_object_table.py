@@ -99,7 +99,10 @@ def test_domains_are_apart_and_all_is_both() -> None:
     assert the_row(found["objects_table"], "all")["object_iou_point"] == pytest.approx(0.4)
     assert tuple(found) == FILES
     assert tables(rows[:1], changes[:1])["objects_table"]["domain"].tolist() == ["in"]
-    assert object_overview(found["objects_table"])["n"].tolist() == [1, 2, 3]
+    overview = object_overview(found["objects_table"])
+    assert overview["n"].tolist() == [1, 2, 3]
+    assert all(text.startswith("0.") for text in overview["iou"])
+    assert overview["iou"].iloc[-1].startswith("0.40 (") and overview["partial"].iloc[-1] == "-"
 
 
 def test_a_run_without_a_change_has_no_object_to_tell_of() -> None:
