@@ -45,7 +45,14 @@ def pareto_figure(own: pd.DataFrame, words: str) -> Figure:
             data += [{**_front(points, cost), **axes_of(index)}]
             for point in points:
                 look = _look(point, points, names, is_named=is_named)
-                data.append({**_point(point, cost), **look, **axes_of(index), **in_legend(str(point["variant"]), seen)})
+                data.append(
+                    {
+                        **_point(point, cost, is_named=is_named),
+                        **look,
+                        **axes_of(index),
+                        **in_legend(str(point["variant"]), seen),
+                    }
+                )
     return {"data": data, "layout": found}
 
 
@@ -71,14 +78,15 @@ def _ticks(low: float, high: float) -> dict[str, Any]:
     return {"tickvals": values, "ticktext": [f"{value:g}" for value in values]}
 
 
-def _point(point: dict[str, Any], cost: str) -> Figure:
+def _point(point: dict[str, Any], cost: str, *, is_named: bool) -> Figure:
     at, value = point["cost_value"] / COSTS[cost][1], point["quality_value"]
     interval = f"{value:.3f} (95 %: {point['low']:.3f} to {point['high']:.3f}, n {point['n_quality']})"
     hover = f"<b>{point['variant']}</b><br>{interval}<br>{at:.3g}, {COSTS[cost][0]}<extra></extra>"
-    is_best = point["is_on_front"]
+    # a name with settings is as long as the panel is wide; the legend has it
+    is_labelled = point["is_on_front"] and not (is_named and "[" in point["variant"])
     return {
-        "x": [at], "y": [value], "mode": "markers+text" if is_best else "markers", "hovertemplate": hover,
-        "text": [f"<b>{point['variant']}</b>" if is_best else ""], "textposition": "top left",
+        "x": [at], "y": [value], "mode": "markers+text" if is_labelled else "markers", "hovertemplate": hover,
+        "text": [f"<b>{point['variant']}</b>" if is_labelled else ""], "textposition": "top left",
         "cliponaxis": False,
         "textfont": {"size": 10, "color": BLACK},
     }  # fmt: skip
