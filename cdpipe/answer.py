@@ -54,7 +54,7 @@ class Answer:
     """A stored answer.
 
     Attributes:
-        status: "ok", "merge_refused" or "failed".
+        status: "ok", "merge_refused", "failed" or "worker_died".
         error: Why it is not ok, or "".
         method: Name of the preset or of the foreign method.
         report: The answer itself; None when the status is not ok.

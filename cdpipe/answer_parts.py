@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
-from annotated_types import Len
 from pydantic import ConfigDict, Field, PositiveFloat
 
 from cdpipe.errors import InputError
@@ -19,8 +18,10 @@ FORMAT: Literal["tunnelcd-answer"] = "tunnelcd-answer"
 FORMAT_VERSION: Literal[1] = 1
 Until = Literal["merge"]
 
-_Vector = Annotated[list[float], Len(3, 3)]
-_Pose = Annotated[list[Annotated[list[float], Len(4, 4)]], Len(4, 4)]
+Failure = Literal["failed", "merge_refused", "worker_died"]
+_Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+_Four = Field(min_length=4, max_length=4)
+_Pose = Annotated[list[Annotated[list[float], _Four]], _Four]
 
 
 class _Part(Settings):
@@ -54,13 +55,17 @@ class FailurePart(_Part):
 
     format: Literal["tunnelcd-answer"]
     format_version: Literal[1]
-    status: Literal["ok", "failed", "merge_refused", "worker_died"]
+    status: Literal["ok", Failure]
     method: str
     until: Until | None = None
     error: str = ""
     seconds: dict[str, float] = Field(default_factory=dict)
     evidence: dict[str, float] = Field(default_factory=dict)
     config: dict[str, Any] = Field(default_factory=dict)
+    # what an answer would have may be there, and is not read
+    before_T_after: Any = None
+    radius_m: Any = None
+    objects: Any = None
 
 
 class AnswerPart(FailurePart):
@@ -85,6 +90,7 @@ _OFFSETS = {
     "object_points_map": "object_point_offsets",
     "object_points_odom": "object_point_odom_offsets",
 }
+_MASKS = ("region_is_reported", "region_is_withdrawn")
 _FIGURE = "figure_"
 
 
@@ -95,7 +101,7 @@ def checked_document(path: Path, value: Any) -> AnswerPart | FailurePart:
         InputError: One line for each mistake.
     """
     document = Document(str(path), value)
-    is_failure = isinstance(value, dict) and value.get("status", "ok") in ("failed", "merge_refused", "worker_died")
+    is_failure = isinstance(value, dict) and value.get("status") in get_args(Failure)
     return validated(FailurePart if is_failure else AnswerPart, document)
 
 
@@ -111,20 +117,22 @@ def checked_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects
         if shape is None:
             near = suggestion(name, _SHAPES) or f" (known: {', '.join(_SHAPES)})"
             mistakes.append(f"array {name} is unknown{near}")
-        elif array.dtype.kind not in "biuf":
-            mistakes.append(f"array {name}: expected numbers, got {array.dtype}")
+        elif array.dtype.kind not in ("b" if name in _MASKS else "biuf"):
+            wanted = "true or false" if name in _MASKS else "numbers"
+            mistakes.append(f"array {name}: expected {wanted}, got {array.dtype}")
         elif array.ndim != len(shape) or array.shape[1:] != shape[1:]:
             mistakes.append(f"array {name} must be {_spelt(shape)}, got {array.shape}")
-    wanted = [*_REQUIRED, *(_OFFSETS[name] for name in _OFFSETS if name in arrays)]
-    mistakes += [f"array {name} is missing: expected {_spelt(_SHAPES[name])}" for name in wanted if name not in arrays]
+    needed = [*_REQUIRED, *(_OFFSETS[name] for name in _OFFSETS if name in arrays)]
+    mistakes += [f"array {name} is missing: expected {_spelt(_SHAPES[name])}" for name in needed if name not in arrays]
     if n_objects and "object_returns" not in arrays and "object_points_odom" not in arrays:
         mistakes.append(
             f"array object_points_odom is missing: the {n_objects} objects of answer.json need their points, (P, 3), "
             "or their object_returns, (M, 2)"
         )
-    for name, offsets in _OFFSETS.items():
-        if not mistakes and name in arrays:
-            mistakes += _offset_mistakes(offsets, arrays[offsets], name, len(arrays[name]), n_objects)
+    if not mistakes:
+        for name, offsets in _OFFSETS.items():
+            if name in arrays:
+                mistakes += _offset_mistakes(offsets, arrays[offsets], name, len(arrays[name]), n_objects)
     if mistakes:
         raise InputError("\n".join(f"{path}: {mistake}" for mistake in mistakes))
 
@@ -134,7 +142,7 @@ def _offset_mistakes(name: str, offsets: npt.NDArray[Any], values: str, n_values
         return [f"array {name}: expected whole numbers, got {offsets.dtype}"]
     if len(offsets) != n_objects + 1:
         return [f"{name} has {len(offsets)} entries for {n_objects} objects: expected {n_objects + 1}"]
-    if offsets[0] != 0 or (np.diff(offsets) < 0).any() or offsets[-1] != n_values:
+    if offsets[0] != 0 or (np.diff(offsets.astype(np.int64)) < 0).any() or offsets[-1] != n_values:
         rows = f"{n_values}, the rows of {values}"
         return [f"{name} goes from {offsets[0]} to {offsets[-1]}: expected rising from 0 to {rows}"]
     return []

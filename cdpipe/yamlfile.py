@@ -139,7 +139,7 @@ def _mistake(model: type[BaseModel], document: Document, error: Any) -> str:
     name = ".".join(str(part) for part in key)
     where = document.where(key)
     if error["type"] == "extra_forbidden":
-        return f"{where}: {name} = {error['input']!r}: unknown key{_near_key(model, key)}"
+        return f"{where}: {name} = {_brief(error['input'])}: unknown key{_near_key(model, key)}"
     if error["type"] == "missing":
         return f"{where}: {name}: missing, a value is required"
     hint = ""
@@ -154,7 +154,8 @@ def _mistake(model: type[BaseModel], document: Document, error: Any) -> str:
 def _near_key(model: type[BaseModel], key: Key) -> str:
     """Return a suggestion for an unknown key: one of that name in a group, if the group was left out, or a near one."""
     last = str(key[-1])
-    grouped = [f"{group}.{last}" for group in model.model_fields if last in _fields_at(model, (group,))]
+    groups = [name for name, field in model.model_fields.items() if isinstance(field.annotation, type)]
+    grouped = [f'"{group}.{last}"' for group in groups if last in _fields_at(model, (group,))]
     if len(key) == 1 and grouped:
         return f"; did you mean {' or '.join(grouped)}?"
     return suggestion(last, _fields_at(model, key[:-1]))

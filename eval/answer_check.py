@@ -164,7 +164,7 @@ def _check_places(objects: tuple[ChangedObject, ...], universe: Universe) -> Non
             gap += np.maximum(item.points_map.min(axis=0) - points.max(axis=0), 0.0)
             aside_m[index] = float(np.linalg.norm(gap))
     if aside_m and min(aside_m.values()) > _ASIDE_M:
-        index, gap_m = next(iter(aside_m.items()))
+        index, gap_m = min(aside_m.items(), key=lambda item: item[1])
         raise ValueError(
             f"objects[{index}]: object_points_map is {gap_m:.0f} m off the returns that object_returns names in the "
             "before session: is it an answer to another pair, or to the sessions the other way round?"

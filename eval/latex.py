@@ -22,10 +22,10 @@ from eval.comparing import BETTER, WORSE, pooled_difference, verdict
 from eval.merge_table import numbers, texts
 from eval.page_columns import EN_DASH, RESULT_COLUMNS, Column
 from eval.page_object_tables import OBJECT_COLUMNS, is_told_the_truth, spaced
-from eval.page_regions import REGION_COLUMNS, used_pairs
+from eval.page_regions import REGION_COLUMNS
 from eval.page_run import RunData
 from eval.page_story import is_unmade
-from eval.page_tables import beside, best, escape_latex
+from eval.page_tables import beside, best, escape_latex, used_pairs
 from eval.pareto import comparable, with_domain
 from eval.region_curves import PAIR
 from eval.region_plots import domain_name

@@ -22,6 +22,7 @@ from eval.page_regions import targets_table
 from eval.page_run import RunData
 from eval.page_story import about_failures, joined
 from eval.page_tables import Table
+from eval.pareto import with_domain
 from eval.region_plots import domain_name
 from eval.region_table import ALL_DOMAINS, MAIN_VARIANT
 from eval.runfolder import reported
@@ -53,7 +54,8 @@ def draw_objects(data: RunData) -> ObjectPart | None:
     main = _main_variant(table)
     rivals = voxel_variants(data, main)
     cases, missing = object_cases(data, main)
-    tables = [methods_table(table), withdrawal_table(table), targets_table(targets)]
+    rows = with_domain(data.results)
+    tables = [methods_table(table, rows), withdrawal_table(table, rows), targets_table(targets)]
     tables += [groups_table(groups, domain, main, rivals) for domain in _domains(table)]
     plot = _size_plot(groups, data, main)
     return ObjectPart(

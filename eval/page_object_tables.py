@@ -10,8 +10,9 @@ import pandas as pd
 
 from eval.object_table import ORACLE_VARIANT
 from eval.page_columns import EN_DASH, Column, share, significant
-from eval.page_tables import Cell, Table, best
+from eval.page_tables import Cell, Table, beside, best, used_pairs
 from eval.region_plots import domain_name
+from eval.region_table import ALL_DOMAINS
 
 
 def _cm(metres: float) -> str:
@@ -70,13 +71,18 @@ def spaced(variant: str) -> str:
     return variant.replace("[", " [").replace(",", ", ").replace("+", " + ")
 
 
-def methods_table(table: pd.DataFrame) -> Table:
-    """Return every method in and out of distribution; the best that asks no truth is marked."""
+def methods_table(table: pd.DataFrame, cases: pd.DataFrame) -> Table:
+    """Return every method in and out of distribution; the best that asks no truth is marked.
+
+    Args:
+        table: Rows of objects_table.csv.
+        cases: Rows of results.csv with their `domain`, which tell over how many pairs a mean is.
+    """
     rows: list[tuple[str, tuple[Cell, ...]]] = []
     for domain, own in _by_domain(table):
-        marks = {column.key: _marks(own, column) for column in OBJECT_COLUMNS}
+        marks = {column.key: _marks(own, column, cases) for column in OBJECT_COLUMNS}
         for index, row in enumerate(own):
-            cells = (_cell(row, column, marks[column.key][index]) for column in OBJECT_COLUMNS)
+            cells = (_cell(row, column, marks[column.key][index], cases) for column in OBJECT_COLUMNS)
             failed = f"{row['n_failed']} failed" if row["n_failed"] else ""
             rows.append(
                 (domain, (Cell(spaced(str(row["variant"]))), Cell(str(row["n_pairs"]), interval=failed), *cells))
@@ -85,13 +91,18 @@ def methods_table(table: pd.DataFrame) -> Table:
     return Table(headings, tuple(rows), "Objects: every rule, in and out of the training distribution")
 
 
-def withdrawal_table(table: pd.DataFrame) -> Table:
-    """Return recall and false alarms of the regions before and after those without an object were withdrawn."""
+def withdrawal_table(table: pd.DataFrame, cases: pd.DataFrame) -> Table:
+    """Return recall and false alarms of the regions before and after those without an object were withdrawn.
+
+    Args:
+        table: As of `methods_table`.
+        cases: As there.
+    """
     rows: list[tuple[str, tuple[Cell, ...]]] = []
     for domain, own in _by_domain(table):
-        marks = {column.key: _marks(own, column) for column in _REGION_COLUMNS}
+        marks = {column.key: _marks(own, column, cases) for column in _REGION_COLUMNS}
         for index, row in enumerate(own):
-            cells = (_cell(row, column, marks[column.key][index]) for column in _REGION_COLUMNS)
+            cells = (_cell(row, column, marks[column.key][index], cases) for column in _REGION_COLUMNS)
             rows.append((domain, (Cell(spaced(str(row["variant"]))), Cell(str(row["n_withdrawn"])), *cells)))
     headings = ("method", "withdrawn", *(column.heading for column in _REGION_COLUMNS))
     return Table(headings, tuple(rows), "Regions before and after those in which nothing survives are withdrawn")
@@ -107,14 +118,14 @@ def groups_table(groups: pd.DataFrame, domain: str, main: str, rivals: Sequence[
     others = [name for name in (*rivals, ORACLE_VARIANT) if len(own) and (own["variant"] == name).any()]
     rows = []
     for row in records(own[own["variant"] == main] if len(own) else own):
-        beside = [_same_group(own[own["variant"] == name], row) for name in others]
+        of_others = [_same_group(own[own["variant"] == name], row) for name in others]
         cells = (
             Cell(_group_name(row)), Cell(str(row["n_changes"]), interval=_pairs(int(row["n_pairs"]))),
             Cell(share(row["iou_point"]), interval=_interval(row, "iou_point", share)),
             Cell(share(row["iou_matched_median"])), Cell(share(row["share_50"])), Cell(share(row["share_found"])),
             Cell(share(row["kind_accuracy"])), Cell(_cm(row["displacement_error_m"])),
             Cell(_percent(row["volume_error"])),
-            *(Cell(share(value)) for value in beside),
+            *(Cell(share(value)) for value in of_others),
         )  # fmt: skip
         rows.append((_MEASURES[str(row["measure"])], cells))
     names = ("IoU, oracles" if name == ORACLE_VARIANT else "IoU, voxel rule" for name in others)
@@ -145,15 +156,24 @@ def _by_domain(table: pd.DataFrame) -> list[tuple[str, list[dict[str, Any]]]]:
     return found
 
 
-def _marks(rows: Sequence[Mapping[str, Any]], column: Column) -> list[bool]:
+def _marks(rows: Sequence[Mapping[str, Any]], column: Column, cases: pd.DataFrame) -> list[bool]:
     """Mark the best of the rows that are not told the truth."""
     fair = [index for index, row in enumerate(rows) if not is_told_the_truth(str(row["variant"]))]
-    is_best = best([float(rows[index][column.key]) for index in fair], column)
+    counts = [_used(rows[index], column, cases)[0] for index in fair]
+    is_best = best([float(rows[index][column.key]) for index in fair], column, counts)
     return [index in fair and is_best[fair.index(index)] for index in range(len(rows))]
 
 
-def _cell(row: Mapping[str, Any], column: Column, is_best: bool) -> Cell:
-    below = _interval(row, column.key, column.shown)
+def _used(row: Mapping[str, Any], column: Column, cases: pd.DataFrame) -> tuple[int, int]:
+    """Return over how many pairs a figure is and of how many it could be; of a median over objects their number."""
+    if column.key in _COUNTS:
+        return int(row[_COUNTS[column.key]]), int(row[_COUNTS[column.key]])
+    of_domain = cases if row["domain"] == ALL_DOMAINS else cases[cases["domain"] == row["domain"]]
+    return used_pairs(of_domain, str(row["variant"]), column.key)
+
+
+def _cell(row: Mapping[str, Any], column: Column, is_best: bool, cases: pd.DataFrame) -> Cell:
+    below = beside(_interval(row, column.key, column.shown), *_used(row, column, cases))
     if column.key in _COUNTS:
         below = "\n".join(filter(None, (below, f"n {row[_COUNTS[column.key]]}")))
     return Cell(column.shown(float(row[column.key])), is_best, below)

@@ -11,16 +11,15 @@ import numpy as np
 import pandas as pd
 
 from eval.charts import Chart
-from eval.merge_table import numbers
 from eval.page_columns import EN_DASH, UNDEFINED, Column, share, significant
 from eval.page_merge import covered_by
 from eval.page_object_tables import spaced
 from eval.page_run import BASELINES, RunData
 from eval.page_story import about_failures, joined
-from eval.page_tables import Cell, Table, beside, best
+from eval.page_tables import Cell, Table, beside, best, used_pairs
 from eval.pareto import with_domain
 from eval.region_charts import free_response_figure, roc_figure, size_figure
-from eval.region_curves import PAIR, RATES_PER_100M
+from eval.region_curves import RATES_PER_100M
 from eval.region_plots import Bins, Curve, domain_name, free_response_plot, roc_plot, size_plot
 from eval.region_table import ALL_DOMAINS, FILES, MAIN_VARIANT, RIVALS
 from eval.runfolder import reported
@@ -331,20 +330,6 @@ def _curves(curves: pd.DataFrame | None, columns: tuple[str, str]) -> dict[str, 
         x, y = (own[column].to_numpy(dtype=np.float64) for column in columns)
         panels.setdefault(str(domain), {})[str(variant)] = Curve(x, y)
     return panels
-
-
-def used_pairs(cases: pd.DataFrame, variant: str, key: str) -> tuple[int, int]:
-    """Return over how many pairs a method has a number in a column of results.csv, and of how many that could have.
-
-    Those that no method has (a pair without changes has no precision) could not. A figure that is no column of
-    results.csv is over all.
-    """
-    own = cases[cases["variant"] == variant]
-    if key not in cases:
-        return len(own), len(own)
-    pairs = pd.MultiIndex.from_frame(own[PAIR])
-    could = pd.MultiIndex.from_frame(cases.loc[~np.isnan(numbers(cases, key)), PAIR])
-    return int((~np.isnan(numbers(own, key))).sum()), int(pairs.isin(could).sum())
 
 
 def _cell(

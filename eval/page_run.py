@@ -72,7 +72,7 @@ def _require_cases(path: Path, rows: Iterable[Row]) -> None:
     for line, row in enumerate(rows, start=2):
         try:
             seed = int(row["seed"])
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise InputError(f"{path}:{line}: seed = {row['seed']}: expected a whole number") from error
         if float(row["seed"]) != seed:
             raise InputError(f"{path}:{line}: seed = {row['seed']}: expected a whole number")

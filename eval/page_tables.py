@@ -9,7 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
+from eval.merge_table import numbers
 from eval.page_columns import (
     EN_DASH,
     RESULT_COLUMNS,
@@ -33,6 +35,7 @@ from eval.page_run import (
     scenarios,
     text,
 )
+from eval.region_curves import PAIR
 from eval.statistics import ENOUGH_PAIRS, bootstrap_interval
 
 _LATEX = {
@@ -137,11 +140,25 @@ def best(values: Sequence[float], column: Column, n_used: Sequence[int] | None =
         UNDEFINED if math.isnan(value) or n < enough else column.shown(value).replace(THIN_SPACE, "")
         for value, n in zip(values, counts, strict=True)
     ]
-    defined = [float(word) for word in written if word != UNDEFINED]
-    if column.better is None or len(set(defined)) < 2:
+    known = [float(word) for word in written if word != UNDEFINED]
+    if column.better is None or len(set(known)) < 2:
         return [False] * len(values)
-    winner = max(defined) if column.better == "high" else min(defined)
+    winner = max(known) if column.better == "high" else min(known)
     return [word != UNDEFINED and float(word) == winner for word in written]
+
+
+def used_pairs(cases: pd.DataFrame, variant: str, key: str) -> tuple[int, int]:
+    """Return over how many pairs a method has a number in a column of results.csv, and of how many that could have.
+
+    Those that no method has (a pair without changes has no precision) could not. A figure that is no column of
+    results.csv is over all.
+    """
+    own = cases[cases["variant"] == variant]
+    if key not in cases:
+        return len(own), len(own)
+    pairs = pd.MultiIndex.from_frame(own[PAIR])
+    could = pd.MultiIndex.from_frame(cases.loc[~np.isnan(numbers(cases, key)), PAIR])
+    return int((~np.isnan(numbers(own, key))).sum()), int(pairs.isin(could).sum())
 
 
 def beside(interval: str, n_used: int, n: int) -> str:

@@ -26,6 +26,7 @@ from eval.progress import RunProgress, Silent
 from eval.rescoring import LAST, NO_KEY, cell_document, foreign_identity, score_stored
 from eval.runfolder import RunFolder, remove, write_tables
 from eval.scoring import METRICS_VERSION
+from eval.sides import versions_of
 
 _FILES = ("answer.json", "answer.npz")
 _TOLD = 5
@@ -143,9 +144,9 @@ def _require_free(run: RunFolder, name: str) -> None:
 def _require_current(run: RunFolder) -> None:
     """Refuse a run that was scored by other metrics than its predictions would be."""
     cells = (run.read_cell(path) for path in sorted(run.path.glob("cells/*/*/*.json")))
-    others = {cell["row"].get("metrics_version") for cell in cells if cell is not None} - {METRICS_VERSION}
+    others = versions_of(cell["row"] for cell in cells if cell is not None) - {str(METRICS_VERSION)}
     if others:
-        told = " and ".join(sorted(map(str, others)))
+        told = " and ".join(sorted(others))
         raise InputError(
             f"{run.path}: has rows of metrics version {told}, but predictions are scored by {METRICS_VERSION}: "
             f"`tunnelcd score {run.path}` first, which scores all of it again"

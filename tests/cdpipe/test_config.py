@@ -38,9 +38,9 @@ def test_mistakes_come_with_suggestions() -> None:
 
 
 def test_a_key_without_its_group_gets_the_whole_key() -> None:
-    with pytest.raises(InputError, match=r"min_cells = 3: unknown key; did you mean extract\.min_cells\?"):
+    with pytest.raises(InputError, match=r"min_cells = 3: unknown key; did you mean .extract\.min_cells.\?"):
         load_config("tunnelcd", ["min_cells=3"])
-    with pytest.raises(InputError, match=r"did you mean map\.voxel_m or merge\.voxel_m or extract\.voxel_m"):
+    with pytest.raises(InputError, match=r"did you mean .map\.voxel_m. or .merge\.voxel_m. or .extract\.voxel_m."):
         load_config("tunnelcd", ["voxel_m=0.3"])
 
 

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -14,7 +14,7 @@ from cdpipe.cutting import ReturnPool, cut_by_surface, realigned
 from cdpipe.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.objects import PointGroup
 from cdpipe.registration import Surface
-from cdpipe.types import MergedMaps, PointMap
+from cdpipe.types import MergedMaps, PointMap, PosedScan
 from tests.cdpipe.rooms import PATH, Box, RoomScans, room_regions
 
 CONFIG = ExtractConfig()
@@ -137,8 +137,33 @@ def test_a_thing_that_stands_twice_after_drift_is_still_a_change(n_again: int) -
     scans.odom_T_sensor[len(path) :, 1, 3] -= 1.2
     twice = scans, scans.mapped()
     found = set().union(*(returns_of(twice[1], group) for group in cut(before, twice)))
-    of_first_pass = {each for each in scans.returns_on(0) if each[0] < len(path)}
-    assert len(found & of_first_pass) > 0.7 * len(of_first_pass)
+    first = {each for each in scans.returns_on(0) if each[0] < len(path)}
+    for of_pass in (first, scans.returns_on(0) - first):
+        assert len(found & of_pass) > 0.7 * len(of_pass)
+
+
+@pytest.mark.parametrize(("n_again", "is_found"), [(1, False), (3, True), (7, True)])
+def test_what_was_put_down_between_two_passes_is_a_change_if_the_second_was_no_glimpse(
+    n_again: int, is_found: bool
+) -> None:
+    without, with_crate = RoomScans((), 4), RoomScans((CRATE,), 5)
+
+    class Both(RoomScans):
+        def __init__(self) -> None:
+            self.name = "put down in between"
+            self.odom_T_sensor = np.concatenate([without.odom_T_sensor, with_crate.odom_T_sensor[:n_again]])
+
+        def scan(self, index: int) -> PosedScan:
+            if index < len(PATH):
+                return without.scan(index)
+            return replace(with_crate.scan(index - len(PATH)), index=index)
+
+        def scans(self) -> Iterator[PosedScan]:
+            return (self.scan(index) for index in range(len(self.odom_T_sensor)))
+
+    scans = Both()
+    found = cut(scanned((), 1), (scans, scans.mapped()))
+    assert bool(found) == is_found
 
 
 def test_maps_without_views_keep_what_they_cannot_judge() -> None:

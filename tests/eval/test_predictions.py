@@ -278,7 +278,9 @@ def shifted(parts: dict[str, Any]) -> None:
             lambda a: a.update(keyframe_scores=np.array(["a"])),
             "array keyframe_scores: expected numbers, got <U1",
         ),
-        (False, lambda a: a.update(keyframe_scores=np.array([np.inf])), "keyframe_scores"),
+        (False, lambda a: a.update(keyframe_scores=np.array([np.inf])), "keyframe_scores: a score is infinite"),
+        (False, lambda a: a.update(region_is_withdrawn=np.zeros(2)), "region_is_withdrawn: expected true or false"),
+        (False, lambda a: a.update(region_is_reported=np.ones(2, int)), "region_is_reported: expected true or false"),
         (False, lambda a: a.update(before_keyframe_scans=np.array([3, 3])), "before_keyframe_scans names a scan twice"),
         (False, lambda a: a.update(region_centres_map=np.zeros(3)), "region_centres_map must be (R, 3), got (3,)"),
         (True, lambda d: d.update(objects=["box"]), "objects.0 = 'box': input should be a valid dictionary"),
@@ -351,7 +353,7 @@ def test_an_answer_to_the_sessions_the_other_way_round_is_named(
         "object_point_offsets": np.array([0, 200]),
     }
     document["objects"] = [{"session": "before", "kind": "removed"}]
-    for shift_m, expected in ((0.0, 0), (1.0, 0), (40.0, 2)):
+    for shift_m, expected in ((0.0, 0), (1.0, 0), (-1000.0, 2), (40.0, 2)):
         folder = tiny_pair.parent / f"theirs-{shift_m:g}"
         write_prediction(folder, document, {**whole, "object_points_map": own + shift_m})
         code, _, err = command("score", tiny_pair, folder)
