@@ -288,7 +288,7 @@ def test_a_scheduler_that_cannot_be_reached_is_named_at_once(
     code, out, err = command(*argv)
     assert (code, out) == (2, "")
     assert err.startswith("error: --scheduler tcp://127.0.0.1:9: cannot be reached (")
-    assert err.endswith("expected tcp://HOST:PORT\n") and err.count("\n") == 1
+    assert err.endswith("expected tcp://HOST:PORT of a running `dask scheduler`\n") and err.count("\n") == 1
     assert time.monotonic() - start < 10
     assert not (tmp_path / "run").exists()
 
