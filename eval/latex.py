@@ -23,7 +23,7 @@ from eval.merge_table import numbers, texts
 from eval.page_columns import EN_DASH, RESULT_COLUMNS, Column
 from eval.page_object_tables import OBJECT_COLUMNS, is_told_the_truth, spaced
 from eval.page_regions import REGION_COLUMNS
-from eval.page_run import RunData
+from eval.page_run import RunData, off_grids
 from eval.page_story import is_unmade
 from eval.page_tables import beside, best, escape_latex, used_pairs
 from eval.pareto import comparable, with_domain
@@ -59,6 +59,8 @@ class Group:
 def latex_tables(data: RunData) -> dict[str, str]:
     """Return summary.tex, and regions_table.tex and objects_table.tex where the tables of that name are in the run.
 
+    Points of grids are left to the tables' own files and to the charts of the page.
+
     Returns:
         LaTeX sources by file name; each needs nothing but the package booktabs.
     """
@@ -67,7 +69,7 @@ def latex_tables(data: RunData) -> dict[str, str]:
     for name, (words, columns) in _SUBJECTS.items():
         path = data.folder.path / f"{name}.csv"
         if path.is_file():
-            groups = _stored_groups(pd.read_csv(path), every)
+            groups = _stored_groups(off_grids(pd.read_csv(path), data), every)
             found[f"{name}.tex"] = latex_float(f"tab:{name}", _caption(words, data, every), groups, columns, data)
     caption = _caption("Every method over all its session pairs", data, results, " Times are medians, the rest means.")
     found["summary.tex"] = latex_float("tab:summary", caption, _summary_groups(results), SUMMARY_COLUMNS, data)

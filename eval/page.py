@@ -32,7 +32,7 @@ from eval.page_paper import time_table, volume_table
 from eval.page_pareto import draw_pareto
 from eval.page_regions import REGION_COLUMNS, RegionPart, draw_regions
 from eval.page_render import rendered, written
-from eval.page_run import RunData, first_seed, named_variants, of, read_document, read_run, scenarios, text
+from eval.page_run import RunData, first_seed, flag, named_variants, of, read_document, read_run, scenarios, text
 from eval.page_scenarios import draw_scenarios
 from eval.page_site import draw_site
 from eval.page_story import about_wrong_merges, story
@@ -110,13 +110,14 @@ def _content(data: RunData, tables: Mapping[str, Table], pareto: Sequence[Chart]
     links = write_views(data, variant, [(str(row["scenario"]), int(row["seed"])) for row in worst], views)
     grids, factors, by_scenario = draw_grids(data), draw_factors(data), draw_scenarios(data)
     unchanged = unchanged_table(data)
+    n_unchanged = len({(row["scenario"], row["seed"]) for row in data.results if flag(row, "is_unchanged_pair")})
     merge = draw_merge(data)
     missing = [*data.missing, *(line for site in sites for line in site.missing), *merge.missing, *links.missing]
     missing += [] if regions is None else regions.missing
     missing += [] if objects is None else objects.missing
     missing += [] if worlds else ["No scenario with changes was run."]
     if objects is None:
-        missing += [] if unchanged.rows else ["No unchanged pair was run, so false alarms are not measured."]
+        missing += [] if n_unchanged else ["No unchanged pair was run, so false alarms are not measured."]
         missing += [] if grids else ["No grid of two settings was run."]
     charts = [*(regions.plots if regions is not None else ()), *pareto, *by_scenario, *grids, *factors]
     return {
@@ -129,6 +130,7 @@ def _content(data: RunData, tables: Mapping[str, Table], pareto: Sequence[Chart]
         "merge": merge,
         "results": tables["results"],
         "unchanged": unchanged,
+        "n_unchanged": n_unchanged,
         "effects": draw_effects(data),
         "enough_pairs": ENOUGH_PAIRS,
         "table1": tables["table1"],

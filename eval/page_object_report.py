@@ -19,7 +19,7 @@ from eval.page_object_cases import object_cases, voxel_variants
 from eval.page_object_tables import groups_table, methods_table, records, spaced, withdrawal_table
 from eval.page_objects import Picture
 from eval.page_regions import targets_table
-from eval.page_run import RunData
+from eval.page_run import RunData, off_grids
 from eval.page_story import about_failures, joined
 from eval.page_tables import Table
 from eval.pareto import with_domain
@@ -44,13 +44,13 @@ def draw_objects(data: RunData) -> ObjectPart | None:
     """Return tables, plot and pictures of the objects; None where the plan of the run does not ask for them."""
     if "objects" not in reported(data.provenance):
         return None
-    found = {name: _read(data, name) for name in FILES}
-    table, groups, targets = (found[name] for name in FILES)
+    table, groups, targets = (_read(data, name) for name in FILES)
     if len(table) == 0:
         line = "objects_table.csv is not in the run folder: `tunnelcd score` makes it."
         return ObjectPart((line,), (line,), (), (), (), (line,))
     if len(targets) == 0:
         targets = pd.DataFrame(columns=["target", "domain", "variant", "is_met"])
+    table, groups = (each if len(each) == 0 else off_grids(each, data) for each in (table, groups))
     main = _main_variant(table)
     rivals = voxel_variants(data, main)
     cases, missing = object_cases(data, main)

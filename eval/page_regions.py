@@ -14,7 +14,7 @@ from eval.charts import Chart
 from eval.page_columns import EN_DASH, UNDEFINED, Column, share, significant
 from eval.page_merge import covered_by
 from eval.page_object_tables import spaced
-from eval.page_run import BASELINES, RunData
+from eval.page_run import BASELINES, RunData, off_grids
 from eval.page_story import about_failures, joined
 from eval.page_tables import Cell, Table, beside, best, used_pairs
 from eval.pareto import with_domain
@@ -92,15 +92,16 @@ def draw_regions(data: RunData) -> RegionPart | None:
     missing = tuple(
         f"{name}.csv is not in the run folder: `tunnelcd score` makes it." for name in FILES[:1] if name not in found
     )
-    table = found.get("regions_table")
-    if table is None:
+    if "regions_table" not in found:
         return RegionPart((missing[0],), (missing[0],), (), (), missing)
+    shown = {name: off_grids(each, data) if "variant" in each else each for name, each in found.items()}
+    table = shown["regions_table"]
     targets = found.get("regions_targets", pd.DataFrame(columns=["target", "is_met"]))
     tables = (regions_table(table, with_domain(data.results)), silence_table(table), targets_table(targets))
     plots = (
-        _roc(found.get("roc"), table),
-        _free_response(found.get("froc"), table),
-        _sizes(found.get("regions_by_size"), table),
+        _roc(shown.get("roc"), table),
+        _free_response(shown.get("froc"), table),
+        _sizes(shown.get("regions_by_size"), table),
     )
     return RegionPart(
         tuple(story(table, targets, data)),

@@ -201,6 +201,17 @@ def grids(data: RunData) -> list[GridOf]:
     return result
 
 
+def off_grids(table: pd.DataFrame, data: RunData) -> pd.DataFrame:
+    """Return the rows of a table whose `variant` is more than a point of a grid; all rows where none is.
+
+    `eval.page_grids` shows the points of grids, hundreds of them, in less space.
+    """
+    points = {(grid.scenario, name) for grid in grids(data) for name in grid.points.values()}
+    shown = {variant for world, variant, _ in _cases(data) if (world, variant) not in points}
+    rows = table[table["variant"].isin(shown)]
+    return rows if len(rows) else table
+
+
 def split_variant(variant: str) -> tuple[str, dict[str, str]]:
     """Return the preset of a variant and its settings: "a[k=1,l=2]" gives "a" and {"k": "1", "l": "2"}."""
     preset, bracket, rest = variant.partition("[")

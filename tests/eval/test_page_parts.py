@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
@@ -21,7 +22,7 @@ from eval.figures import (
 )
 from eval.object_figures import Panel, object_panels, oblique_view
 from eval.page_columns import RESULT_COLUMNS, UNDEFINED, count, significant
-from eval.page_run import RunData, grids, split_variant
+from eval.page_run import RunData, grids, off_grids, split_variant
 from eval.page_story import rank, sentence
 from eval.page_tables import beside, best, escape_latex, heat_colour
 from eval.runfolder import RunFolder
@@ -115,6 +116,18 @@ def test_variants_are_taken_apart() -> None:
         {"extract.voxel_m": "0.3", "query.radius_m": "4.5"},
     )
     assert split_variant("paper-topn") == ("paper-topn", {})
+
+
+def test_tables_leave_points_of_grids_out_unless_they_hold_nothing_else(tmp_path: Path) -> None:
+    points = [f"p[a.x={x},b.y={y}]" for x in (1, 2) for y in (3, 4)]
+    # the last point stands alone in the other scenario: it is shown for that
+    cases = [("one", "p"), ("one", "p[a.x=1]"), *(("one", name) for name in points), ("two", points[-1])]
+    rows = tuple({"scenario": scenario, "variant": name, "seed": 1} for scenario, name in cases)
+    table = pd.DataFrame({"variant": ["p", "p[a.x=1]", *points], "value": range(6)})
+    data = RunData(RunFolder(tmp_path), rows, (), (), {}, ())
+    assert off_grids(table, data)["value"].tolist() == [0, 1, 5]
+    of_grid = RunData(RunFolder(tmp_path), rows[2:6], (), (), {}, ())
+    assert off_grids(table[2:], of_grid)["value"].tolist() == [2, 3, 4, 5]
 
 
 def test_a_grid_varies_two_settings_and_may_fix_others(tmp_path: Path) -> None:

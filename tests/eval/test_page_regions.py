@@ -153,3 +153,13 @@ def test_silence_is_told_of_unchanged_pairs(tmp_path: Path) -> None:
     assert "Silent where nothing changed (0.8 km): tunnelcd 3 of 4." in part.sentences
     assert json.loads((quiet / "provenance.json").read_text())["plan"]["report"] == "regions"
     assert "3 of 4" in words(write_page(quiet))
+
+
+def test_unchanged_pairs_among_others_are_not_said_to_be_missing(run: Path) -> None:
+    results = pd.read_csv(run / "results.csv")
+    is_quiet = results["seed"] == results["seed"].min()
+    results.assign(is_unchanged_pair=is_quiet).to_csv(run / "results.csv", index=False)
+    told = words(write_page(run))
+    n = len(results[is_quiet].drop_duplicates(["scenario", "seed"]))
+    assert f"No scenario consists of unchanged pairs alone; the {n} among the others are judged under" in told
+    assert "No unchanged pair was run" not in told
