@@ -1,11 +1,13 @@
-"""Displacement and volume of matched objects against the truth, worked out by hand."""
+"""Displacement and volume of matched objects against the truth, worked out by hand and by slow twins."""
 
+import statistics
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from cdpipe.geometry import make_pose, yaw_pose
+from cdpipe.geometry import make_pose, stream, yaw_pose
 from cdpipe.types import ChangedObject, ObjectShape
 from eval.ground_truth import GroundTruth, SessionTruth
 from eval.object_metrics import match_objects
@@ -153,3 +155,75 @@ def test_columns_are_medians_of_what_is_there() -> None:
     assert columns == pytest.approx({"displacement_error_m": NAN, "pile_volume_error": 0.2}, nan_ok=True)
     none = size_columns(size_errors([], match_objects([], [], truth), truth, KEYFRAMES), truth)
     assert np.isnan(list(none.values())).all()
+
+
+def slow_place(truth: GroundTruth, scenario: dict[str, float], each: Change) -> list[float]:
+    """Return where the middle of a thing is in the map, from the text: through the truly nearest before keyframe."""
+    turn, middle = np.array(each.world_T_object), [0.0, 0.0, 0.0]
+    for axis in range(3):
+        middle[axis] = turn[axis][3] + turn[axis][2] * scenario.get(each.name, 0.0) / 2
+    world, odom = truth.before.world_T_sensor, truth.before.odom_T_sensor
+    nearest = min(KEYFRAMES.tolist(), key=lambda scan: sum((world[scan][i][3] - middle[i]) ** 2 for i in range(3)))
+    # seen from that keyframe, then from where odometry believes it was
+    seen = [sum(world[nearest][j][i] * (middle[j] - world[nearest][j][3]) for j in range(3)) for i in range(3)]
+    return [sum(odom[nearest][i][j] * seen[j] for j in range(3)) + odom[nearest][i][3] for i in range(3)]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_errors_of_displacement_and_volume_equal_their_slow_twins(seed: int) -> None:
+    draw = stream(seed, "size reference")
+    heights = {f"thing {pair}": float(draw.uniform(0.2, 2.0)) for pair in range(3)}
+    changes = []
+    for pair in range(3):
+        for half, session in enumerate(("before", "after")):
+            pose = make_pose(Rotation.from_rotvec(draw.normal(0, 0.8, 3)).as_matrix(), draw.uniform(-1, 21, 3))
+            changes.append(
+                change(
+                    2 * pair + half + 1, session, "moved", pose, name=f"thing {pair}", partner=2 * pair + 2 - half,
+                    prop_kind=str(draw.choice(["box", "muck_pile"])), group=str(draw.choice(["full", "partial"])),
+                    hull_volume_m3=float(draw.uniform(0.1, 4)), mesh_volume_m3=draw.choice([None, 0.5, 1.5]),
+                )
+            )  # fmt: skip
+    changes[4:] = [
+        replace(each, kind={"after": "added", "before": "removed"}[each.session], partner=None) for each in changes[4:]
+    ]
+    drift = np.stack([
+        make_pose(Rotation.from_rotvec((0, 0, 0.02 * n)).as_matrix(), (0.05 * n, 0.0, 0.01 * n)) for n in range(N_SCANS)
+    ])  # fmt: skip
+    props = [{"name": name, "size_m": [0.5, 0.5, height]} for name, height in heights.items()]
+    truth = truth_of(changes, drift, props=props)
+    objects, places = [], []
+    for session in ("before", "after"):
+        for place in range(3):
+            if draw.random() < 0.8:
+                said = None if draw.random() < 0.2 else tuple(draw.uniform(-5, 5, 3))
+                objects.append(thing(session, moved_by=said, volume_m3=draw.choice([None, 0.4, 2.5])))
+                places.append(place)
+    rows = [np.arange(WIDTH * place, WIDTH * (place + 1)) for place in places]
+    matches = match_objects(objects, rows, truth)
+    errors = size_errors(objects, matches, truth, KEYFRAMES)
+
+    of_moves, of_piles = [], []
+    for index, each in enumerate(changes):
+        own = [
+            item
+            for item, place in zip(objects, places, strict=True)
+            if (item.session, place) == (each.session, index // 2)
+        ]
+        apart = share = NAN
+        if own and own[0].displacement_map is not None and each.kind == "moved":
+            start, end = (slow_place(truth, heights, half) for half in changes[index // 2 * 2 : index // 2 * 2 + 2])
+            answered = own[0].displacement_map.tolist()
+            apart = sum((answered[i] - (end[i] - start[i])) ** 2 for i in range(3)) ** 0.5
+            of_moves.append(apart)
+        if own and own[0].shape is not None and not (each.kind == "moved" and each.group == "partial"):
+            true = each.hull_volume_m3 if each.mesh_volume_m3 is None else each.mesh_volume_m3
+            share = (own[0].shape.volume_m3 - true) / true
+            of_piles += [abs(share)] if each.prop_kind == "muck_pile" else []
+        assert errors.displacement_m[index] == pytest.approx(apart, nan_ok=True, abs=1e-9)
+        assert errors.volume_share[index] == pytest.approx(share, nan_ok=True, abs=1e-9)
+    expected = {
+        "displacement_error_m": statistics.median(of_moves) if of_moves else NAN,
+        "pile_volume_error": statistics.median(of_piles) if of_piles else NAN,
+    }
+    assert size_columns(errors, truth) == pytest.approx(expected, nan_ok=True, abs=1e-9)
