@@ -20,8 +20,8 @@ import pandas as pd
 from eval.compared_columns import COMPARED, POOLED, is_time
 from eval.comparing import BETTER, WORSE, pooled_difference, verdict
 from eval.merge_table import numbers, texts
-from eval.page_columns import EN_DASH, RESULT_COLUMNS, Column
-from eval.page_object_tables import OBJECT_COLUMNS, is_told_the_truth, spaced
+from eval.page_columns import EN_DASH, RESULT_COLUMNS, Column, spaced
+from eval.page_object_tables import OBJECT_COLUMNS, is_told_the_truth
 from eval.page_regions import REGION_COLUMNS
 from eval.page_run import RunData, off_grids
 from eval.page_story import is_unmade

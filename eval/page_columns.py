@@ -24,6 +24,11 @@ def fine(value: float) -> str:
     return UNDEFINED if math.isnan(value) else f"{value:.3f}"
 
 
+def spaced(variant: str) -> str:
+    """Return a variant's name with spaces where a line may break."""
+    return variant.replace("[", " [").replace(",", ", ").replace("+", " + ")
+
+
 def significant(value: float) -> str:
     """Write three significant digits without an exponent, for seconds and volumes."""
     if math.isnan(value):

@@ -16,9 +16,8 @@ from eval.compared_columns import COMPARED
 from eval.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare
 from eval.effect_figures import Effect, effect_plot
 from eval.output import make_writable
-from eval.page_columns import Column
+from eval.page_columns import Column, spaced
 from eval.page_effects import signed
-from eval.page_object_tables import spaced
 from eval.page_objects import Picture
 from eval.page_render import rendered, written
 from eval.page_story import joined

@@ -13,10 +13,10 @@ from eval.merge_table import numbers
 from eval.object_groups import main_changes
 from eval.object_plots import SizeLine, SizePanel, iou_by_size_plot
 from eval.object_table import FILES
-from eval.page_columns import share
+from eval.page_columns import share, spaced
 from eval.page_merge import covered_by
 from eval.page_object_cases import object_cases, voxel_variants
-from eval.page_object_tables import groups_table, methods_table, records, spaced, withdrawal_table
+from eval.page_object_tables import groups_table, methods_table, records, withdrawal_table
 from eval.page_objects import Picture
 from eval.page_regions import targets_table
 from eval.page_run import RunData, off_grids

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from eval.object_table import ORACLE_VARIANT
-from eval.page_columns import EN_DASH, Column, share, significant
+from eval.page_columns import EN_DASH, Column, share, significant, spaced
 from eval.page_tables import Cell, Table, beside, best, used_pairs
 from eval.region_plots import domain_name
 from eval.region_table import ALL_DOMAINS
@@ -64,11 +64,6 @@ _REGION_COLUMNS = (
     Column("t_oe_per_region_s", "t_oe / region [ms]", None, _ms, "", ""),
     Column("t_returns_per_region_s", "of that returns, kinds, shapes [ms]", None, _ms, "", ""),
 )  # fmt: skip
-
-
-def spaced(variant: str) -> str:
-    """Return a variant's name with spaces where a line may break."""
-    return variant.replace("[", " [").replace(",", ", ").replace("+", " + ")
 
 
 def methods_table(table: pd.DataFrame, cases: pd.DataFrame) -> Table:

@@ -11,9 +11,8 @@ import numpy as np
 import pandas as pd
 
 from eval.charts import Chart
-from eval.page_columns import EN_DASH, UNDEFINED, Column, share, significant
+from eval.page_columns import EN_DASH, UNDEFINED, Column, share, significant, spaced
 from eval.page_merge import covered_by
-from eval.page_object_tables import spaced
 from eval.page_run import BASELINES, RunData, off_grids
 from eval.page_story import about_failures, joined
 from eval.page_tables import Cell, Table, beside, best, used_pairs

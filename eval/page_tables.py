@@ -20,6 +20,7 @@ from eval.page_columns import (
     UNDEFINED,
     Column,
     share,
+    spaced,
 )
 from eval.page_run import (
     GridOf,
@@ -88,7 +89,7 @@ def results_table(data: RunData) -> Table:
         groups = [of(data.results, scenario=scenario, variant=name) for name in variants]
         columns = [_column_cells(groups, column) for column in RESULT_COLUMNS]
         rows += [
-            (scenario, (Cell(name), *(column[index] for column in columns), Cell(status_text(groups[index]))))
+            (scenario, (Cell(spaced(name)), *(column[index] for column in columns), Cell(status_text(groups[index]))))
             for index, name in enumerate(variants)
         ]
     return Table(headings, tuple(rows), "Every preset on every scenario")
@@ -102,7 +103,7 @@ def unchanged_table(data: RunData) -> Table:
         for name in named_variants(data, scenario):
             group = of(data.results, scenario=scenario, variant=name)
             values = (Cell(column.shown(over_pairs(group, column.key))) for column in UNCHANGED_COLUMNS)
-            rows.append((scenario, (Cell(name), Cell(alarm_text(group)), *values, Cell(status_text(group)))))
+            rows.append((scenario, (Cell(spaced(name)), Cell(alarm_text(group)), *values, Cell(status_text(group)))))
     return Table(headings, tuple(rows), "Pairs in which nothing changed")
 
 

@@ -15,8 +15,8 @@ import pandas as pd
 
 from eval.comparing import BETTER, verdict
 from eval.merge_table import numbers
-from eval.page_columns import RESULT_COLUMNS, Column, share, significant
-from eval.page_object_tables import is_told_the_truth, spaced
+from eval.page_columns import RESULT_COLUMNS, Column, share, significant, spaced
+from eval.page_object_tables import is_told_the_truth
 from eval.page_run import BASELINES, RunData, flag, is_unchanged, number, scenarios, split_variant, text
 from eval.page_story import about_failures, about_repeated, about_size, about_wrong_merges, joined
 from eval.pareto import BYTES, TIME, comparable

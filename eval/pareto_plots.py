@@ -13,7 +13,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import Bbox
 
 from eval.figures import BLACK, BLUE, blank_figure, png
-from eval.page_object_tables import is_told_the_truth, spaced
+from eval.page_columns import spaced
+from eval.page_object_tables import is_told_the_truth
 from eval.pareto import BYTES, TIME
 from eval.region_plots import domain_name
 
