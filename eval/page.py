@@ -23,7 +23,7 @@ from eval.merge_table import merge_table
 from eval.page_columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
 from eval.page_effects import draw_effects
 from eval.page_factors import draw_factors
-from eval.page_grids import draw_grids
+from eval.page_grids import PQ_COLUMN, draw_grids
 from eval.page_merge import draw_merge, ends_at_merge
 from eval.page_merge_tables import MERGE_COLUMNS
 from eval.page_object_report import ObjectPart, draw_objects
@@ -145,7 +145,7 @@ def _content(data: RunData, tables: Mapping[str, Table], pareto: Sequence[Chart]
         "charts": charts,
         "plotly": plotly_script() if charts else "",
         "sites": sites,
-        "columns": RESULT_COLUMNS,
+        "columns": (*RESULT_COLUMNS, *([PQ_COLUMN] if grids else [])),
         "time_meanings": TIME_MEANINGS,
         "point_colours": POINT_COLOURS,
     }

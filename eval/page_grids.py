@@ -10,7 +10,7 @@ import numpy as np
 
 from eval.charts import Chart, add_heading, axes_of, layout, set_axis
 from eval.figures import BLACK
-from eval.page_columns import RESULT_COLUMNS, Column
+from eval.page_columns import RESULT_COLUMNS, Column, share
 from eval.page_run import GridOf, RunData, grids, of, over_pairs
 
 _GRID_KEYS = (
@@ -18,12 +18,19 @@ _GRID_KEYS = (
     "region_auroc",
     "object_iou_point",
     "object_f1_50",
+    "object_pq",
     "false_regions_per_100m",
     "t_total_s",
 )
-SHARES = ("region_recall", "region_recall_at_k", "region_auroc", "object_iou_point", "object_f1_50")
+SHARES = ("region_recall", "region_recall_at_k", "region_auroc", "object_iou_point", "object_f1_50", "object_pq")
 _WHITE_TO_BLUE = [[0, "#ffffff"], [1, "#6baed6"]]
-_COLUMNS = {column.key: column for column in RESULT_COLUMNS}
+# by which settings are chosen: it asks for objects that are whole and for none that are false
+PQ_COLUMN = Column(
+    "object_pq", "object PQ", "high", share,
+    "Panoptic quality: the sum of the IoU of the objects right at 0.5, over these and half of what is false or missed.",
+    "As F1.",
+)  # fmt: skip
+_COLUMNS = {column.key: column for column in (*RESULT_COLUMNS, PQ_COLUMN)}
 N_ACROSS = 3
 
 

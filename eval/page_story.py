@@ -12,6 +12,7 @@ from eval.page_run import (
     Row,
     RunData,
     defined,
+    grids,
     named_variants,
     number,
     of,
@@ -68,9 +69,12 @@ def story(data: RunData) -> list[str]:
         for column, measure in HEADLINE_COLUMNS
     ]
     unanswered = [name for name in scenarios(data, unchanged=False) if name not in answered]
-    variants = dict.fromkeys(str(row["variant"]) for row in data.results)
+    shown = list(dict.fromkeys(name for scenario in answered for name in named_variants(data, scenario)))
+    if len(shown) < 2 and (tried := about_grids(data)):
+        return [*tried, *about_wrong_merges(data), *about_failures(data), about_size(data), *about_repeated(data)]
     return [
-        _about_baselines(rankings, list(variants)),
+        _about_baselines(rankings, shown),
+        *about_grids(data),
         *about_wrong_merges(data),
         *(sentence(ranking) + _price(data, ranking) for ranking in rankings),
         *(f"On {name}, no preset gave an answer." for name in unanswered),
@@ -79,6 +83,17 @@ def story(data: RunData) -> list[str]:
         about_size(data),
         *about_repeated(data),
     ]
+
+
+def about_grids(data: RunData) -> list[str]:
+    """Say which methods' settings were tried on grids, if any: their points are not among the results."""
+    n_points: dict[str, set[str]] = {}
+    for grid in grids(data):
+        n_points.setdefault(grid.preset.partition(" with ")[0], set()).update(grid.points.values())
+    if not n_points:
+        return []
+    named = [f"{preset} ({len(points)} variants)" for preset, points in n_points.items()]
+    return [f"Settings were tried on grids, shown below and not compared here: {joined(named)}."]
 
 
 def scenario_means(data: RunData, scenario: str, column: str) -> dict[str, float]:

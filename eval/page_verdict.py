@@ -18,7 +18,7 @@ from eval.merge_table import numbers
 from eval.page_columns import RESULT_COLUMNS, Column, share, significant, spaced
 from eval.page_object_tables import is_told_the_truth
 from eval.page_run import BASELINES, RunData, flag, is_unchanged, number, scenarios, split_variant, text
-from eval.page_story import about_failures, about_repeated, about_size, about_wrong_merges, joined
+from eval.page_story import about_failures, about_grids, about_repeated, about_size, about_wrong_merges, joined
 from eval.pareto import BYTES, TIME, comparable
 from eval.region_curves import PAIR
 from eval.region_plots import domain_name
@@ -83,8 +83,8 @@ def verdict_sentences(data: RunData) -> list[str]:
     wrong = about_wrong_merges(data)
     contended = ["Times were measured beside other work."] if is_contended(data) else []
     return [
-        *alone, *_tally(found), *told, *contended, *_about_silence(data, names), *wrong, *about_failures(data),
-        about_size(data), *about_repeated(data),
+        *alone, *_tally(found), *told, *about_grids(data), *contended, *_about_silence(data, names), *wrong,
+        *about_failures(data), about_size(data), *about_repeated(data),
     ]  # fmt: skip
 
 

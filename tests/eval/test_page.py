@@ -1,4 +1,5 @@
 import base64
+import html
 import json
 import re
 import shutil
@@ -330,6 +331,21 @@ def test_the_grid_is_a_heat_map_of_voxels_by_radii_for_each_figure(page: Path) -
     frames = [(shape["xref"], shape["x0"] + 0.48, shape["y0"] + 0.48) for shape in figure["layout"]["shapes"]]
     assert frames == [("x", 0, 0), ("x2", 1, 2)]
     assert 'id="grid_1"' in page.read_text()
+
+
+def test_a_run_of_grids_is_no_contest_and_names_no_point_of_them(run: Path, page: Path) -> None:
+    told = "Settings were tried on grids, shown below and not compared here: tunnelcd (6 variants)."
+    assert told in html.unescape(page.read_text())
+    # points of a baseline's grid are no baseline that was beaten, nor that won
+    rows = [row for row in result_rows() if "[" in row["variant"]]
+    others = [{**row, "variant": row["variant"].replace("tunnelcd", "c2c"), "object_pq": 0.25} for row in rows]
+    alone = result_row(SITE, "paper", object_iou_point=0.1, region_recall=0.1)
+    pd.DataFrame([*rows, *others, alone]).to_csv(run / "results.csv", index=False)
+    text = html.unescape(write_page(run).read_text())
+    summary = re.search(r'<div class="summary".*?</div>', text, flags=re.DOTALL)
+    assert summary is not None
+    assert "tunnelcd (6 variants) and c2c (6 variants)" in summary[0]
+    assert "baseline" not in summary[0] and "c2c[" not in summary[0]
 
 
 def test_nothing_is_fetched_and_every_picture_is_inside(page: Path) -> None:

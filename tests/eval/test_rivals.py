@@ -90,7 +90,7 @@ def test_c2c_by_hand() -> None:
         assert report.regions.scores.tolist() == [n_new]
         (item,) = report.objects
         assert (item.session, item.kind, len(item.returns)) == ("after", "added", n_new)
-    by_voxel = answer(pair([], [low]), load_config("voxel-diff", [*settings]))
+    by_voxel = answer(pair([], [low]), load_config("voxel-diff", [*settings, "extract.voxel_m=0.65"]))
     assert by_voxel.regions.scores.max(initial=0) < 48
 
 
