@@ -13,7 +13,7 @@ import numpy as np
 
 from cdpipe.config import ExtractConfig
 from cdpipe.crops import DIRECTIONS, Crops, Sphere
-from cdpipe.freespace import n_through_and_hit, net_views, scans_past
+from cdpipe.freespace import REACH_M, n_through_and_hit, net_views, scans_past
 from cdpipe.geometry import BoolArray, Float64Array, Int64Array, invert, transform
 from cdpipe.objects import PointGroup
 from cdpipe.registration import MIN_SPHERE_POINTS, Surface, align_to_planes
@@ -46,6 +46,8 @@ _MIN_TELLING = 2
 _LOW_M = 0.3
 # Seen through by keyframes of its own session so many times as often as hit: a wall that drift has doubled.
 _DOUBLED = 3.0
+# What keyframes looked at from here is seen by their scans, most of all: half of the reach of views.
+_NEAR_M = REACH_M / 2
 _BLOCK_RETURNS = 1 << 22
 _UNKNOWN_VIEWS = np.int64(1 << 20)
 
@@ -190,7 +192,7 @@ def _objects(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) -> l
             is_member[cells] = True
             of_object = is_member[compared.cell_of_return]
             chosen = returns[site.session][of_object]
-            if _is_seen_through_by_its_own(maps[site.session], chosen):
+            if _is_out_of_place(maps[site.session], chosen):
                 continue
             # the answer is in the map frame of the merge
             in_map = (points["before"] if site.session == "before" else after_map)[of_object]
@@ -200,19 +202,31 @@ def _objects(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) -> l
     return result
 
 
-def _is_seen_through_by_its_own(point_map: PointMap, returns: Int64Array) -> bool:
-    """Tell whether the session that some returns are of saw through them itself, far more often than it hit them.
+def _is_out_of_place(point_map: PointMap, returns: Int64Array) -> bool:
+    """Tell whether some returns of a session stand where there was nothing, by the word of the session itself.
 
-    What stands is hit again and again. Where a session came by twice and its odometry drifted in between, a wall that
-    was seen from afar on one pass hangs in the room that the other pass looked through: the map is wrong there, and
-    nothing changed. A thing that stands twice for the same reason is hit by either pass about as often as the other
-    sees through it, and stays.
+    Where a session came by twice and its odometry drifted in between, or where it saw a wall from far down another
+    drift, the wall stands twice in its map: the map is wrong there, and nothing changed. Either of two things tells:
+
+    - the session saw through them, far more often than it hit them. What stands is hit again and again;
+    - it looked at the place from near, and yet most of them came from afar: from near, something else was there.
+
+    A thing that stands twice because of drift is seen from near on either pass, and hit by one about as often as the
+    other sees through it; so it stays.
     """
     if point_map.views is None:
         return False
-    places, _ = cell_means(point_map.positions_of(returns), CELL_M)
+    points = point_map.positions_of(returns)
+    places, _ = cell_means(points, CELL_M)
     n_through, n_hit = n_through_and_hit(places, point_map.views)
-    return bool(n_through.sum() > _DOUBLED * n_hit.sum())
+    if n_through.sum() > _DOUBLED * n_hit.sum():
+        return True
+    scans = np.searchsorted(point_map.scan_offsets, returns, side="right") - 1
+    ranges_m = np.linalg.norm(points - point_map.odom_T_sensor[scans, :3, 3], axis=1)
+    if np.mean(ranges_m > REACH_M) <= 0.5:
+        return False
+    n_looked = sum(n_through_and_hit(places, point_map.views, within_m=_NEAR_M))
+    return bool(np.mean(n_looked > 0) > 0.5)
 
 
 def object_cells(

@@ -23,7 +23,7 @@ _ELEVATION_RAD = np.deg2rad(45.6)
 _MARGIN_M = 0.2
 _NEAREST_M = 0.5
 # Farther off, pixels are wider than what is looked for.
-_REACH_M = 15.0
+REACH_M = 15.0
 # Rays are followed from their end through cells of this size, from here to there: nearer ones touch what they hit, and
 # who passed farther above the floor was seen through by the views.
 _CELL_M = 0.1
@@ -57,8 +57,13 @@ def net_views(points_odom: Float64Array, views: KeyframeViews) -> Int64Array:
     return n_through - n_hit
 
 
-def n_through_and_hit(points_odom: Float64Array, views: KeyframeViews) -> tuple[Int64Array, Int64Array]:
-    """Return how many keyframes saw through each of (N,) places, and how many hit it; as `net_views` takes them."""
+def n_through_and_hit(
+    points_odom: Float64Array, views: KeyframeViews, within_m: float = REACH_M
+) -> tuple[Int64Array, Int64Array]:
+    """Return how many keyframes saw through each of (N,) places, and how many hit it; as `net_views` takes them.
+
+    Those farther from a place than `within_m` say nothing about it.
+    """
     n_through, n_hit = np.zeros((2, len(points_odom)), dtype=np.int64)
     if len(points_odom) == 0 or len(views.ranges_m) == 0:
         return n_through, n_hit
@@ -66,9 +71,9 @@ def n_through_and_hit(points_odom: Float64Array, views: KeyframeViews) -> tuple[
     spread_m = float(np.linalg.norm(points_odom - centre, axis=1).max())
     rotations, shifts = views.sensor_T_odom[:, :3, :3], views.sensor_T_odom[:, :3, 3]
     distances_m = np.linalg.norm(rotations @ centre + shifts, axis=1)
-    for keyframe in np.flatnonzero(distances_m <= _REACH_M + spread_m):
+    for keyframe in np.flatnonzero(distances_m <= within_m + spread_m):
         pixel, ranges_m = _pixels(points_odom @ rotations[keyframe].T + shifts[keyframe])
-        in_view = np.flatnonzero((pixel >= 0) & (ranges_m >= _NEAREST_M) & (ranges_m <= _REACH_M))
+        in_view = np.flatnonzero((pixel >= 0) & (ranges_m >= _NEAREST_M) & (ranges_m <= within_m))
         first_m, is_hit = _looked_up(views.ranges_m[keyframe], pixel[in_view], ranges_m[in_view])
         n_through[in_view] += np.isfinite(first_m) & (first_m > ranges_m[in_view] + _MARGIN_M)
         n_hit[in_view] += is_hit

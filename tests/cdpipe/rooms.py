@@ -29,6 +29,7 @@ class RoomScans:
         sample: int,
         path: Sequence[tuple[float, float, float]] = PATH,
         odom_T_room: Float64Array | None = None,
+        room: Box = ROOM,
     ) -> None:
         rng = stream(sample, "room")
         self.name = f"room {sample}"
@@ -39,7 +40,7 @@ class RoomScans:
         for position in path:
             room_T_sensor = yaw_pose(rng.uniform(-np.pi, np.pi), position)
             directions = _directions(rng.uniform(-0.5, 0.5, (_ROWS * _COLUMNS, 2)))
-            ranges_m, hits = cast(np.array(position), directions @ room_T_sensor[:3, :3].T, boxes)
+            ranges_m, hits = cast(np.array(position), directions @ room_T_sensor[:3, :3].T, boxes, room)
             ranges_m += rng.normal(0, _NOISE_M, len(ranges_m))
             self._clouds.append(ranges_m[:, None] * directions)
             self.hits.append(hits)
@@ -77,9 +78,11 @@ def _directions(jitter: Float64Array) -> Float64Array:
     return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
 
 
-def cast(origin: Float64Array, directions: Float64Array, boxes: Sequence[Box]) -> tuple[Float64Array, Int64Array]:
+def cast(
+    origin: Float64Array, directions: Float64Array, boxes: Sequence[Box], room: Box = ROOM
+) -> tuple[Float64Array, Int64Array]:
     """Return (N,) how far rays from inside of the room go, and the box that each hits, or WALLS."""
-    _, ranges_m = _slabs(origin, directions, ROOM)
+    _, ranges_m = _slabs(origin, directions, room)
     hits = np.full(len(directions), WALLS)
     for number, box in enumerate(boxes):
         enters_m, leaves_m = _slabs(origin, directions, box)

@@ -123,8 +123,46 @@ def test_a_wall_that_hangs_in_the_room_after_drift_is_no_change(session: str, mo
     (crate,) = both_ways(session, twice, scanned((), 1))
     of_first_pass = {each for each in twice[0].returns_on(0) if each[0] < len(PATH)}
     assert len(returns_of(twice[1], crate) & of_first_pass) > 0.9 * len(of_first_pass)
-    monkeypatch.setattr(cdpipe.cutting, "_is_seen_through_by_its_own", lambda *_: False)
+    monkeypatch.setattr(cdpipe.cutting, "_is_out_of_place", lambda *_: False)
     assert len(both_ways(session, twice, scanned((), 1))) > 1
+
+
+HALL: Box = ((-5.0, -4.0, 0.0), (40.0, 4.0, 3.0))
+LOCKER: Box = ((1.0, 1.5, 0.0), (2.6, 3.1, 2.0))
+DOWN_THE_HALL = tuple((x, 0.0, 1.5) for x in np.arange(18.0, 36.0, 1.0).tolist())
+
+
+def in_the_hall(path: Sequence[tuple[float, float, float]], n_off: int = 0, off_m: float = 0.0) -> Scanned:
+    """A session in a long hall with a locker; of its first scans the odometry is off sideways."""
+    scans = RoomScans((LOCKER,), 2, path, room=HALL)
+    scans.odom_T_sensor[:n_off, 1, 3] += off_m
+    return scans, scans.mapped()
+
+
+@pytest.mark.parametrize("session", ["before", "after"])
+def test_what_only_scans_from_afar_show_is_no_change_where_the_session_came_near(
+    session: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cdpipe.cutting, "_DOUBLED", np.inf)  # that the session saw through it would tell as well
+    right = in_the_hall((*DOWN_THE_HALL, *PATH))
+    off = in_the_hall((*DOWN_THE_HALL, *PATH), len(DOWN_THE_HALL), -1.2)
+    assert both_ways(session, off, right) == []
+    monkeypatch.setattr(cdpipe.cutting, "_NEAR_M", 0.0)  # as if it had never come near
+    hanging = both_ways(session, off, right)[0]  # the locker again, in front of itself
+    assert hanging.points_map[:, 1].max() < 1.5
+
+
+@pytest.mark.parametrize(("nearest_m", "is_far_share"), [(0.0, False), (12.0, True)])
+def test_a_thing_seen_mostly_from_afar_is_a_change_if_the_session_came_no_nearer(
+    nearest_m: float, is_far_share: bool
+) -> None:
+    path = tuple((x, 0.0, 1.5) for x in np.arange(1.8 + nearest_m, 36.0, 0.7).tolist())
+    empty = RoomScans((), 1, (*DOWN_THE_HALL, *PATH), room=HALL)
+    after = in_the_hall(path)
+    found = set().union(*(returns_of(after[1], group) for group in cut((empty, empty.mapped()), after)))
+    assert iou(found, after[0].returns_on(0)) > 0.7
+    ranges_m = [np.linalg.norm(after[0].scan(scan).points_sensor[pixel]) for scan, pixel in found]
+    assert (np.mean(np.array(ranges_m) > 15.0) > 0.5) == is_far_share
 
 
 @pytest.mark.parametrize("n_again", [3, 5, 7])
