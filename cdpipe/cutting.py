@@ -14,7 +14,7 @@ import numpy as np
 from cdpipe.config import ExtractConfig
 from cdpipe.crops import DIRECTIONS, Crops, Sphere
 from cdpipe.freespace import REACH_M, n_through_and_hit, net_views, scans_past
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array, invert, transform
+from cdpipe.geometry import BoolArray, Float64Array, Int64Array, invert, transform, travelled_m
 from cdpipe.objects import PointGroup
 from cdpipe.registration import MIN_SPHERE_POINTS, Surface, align_to_planes
 from cdpipe.surface import (
@@ -209,7 +209,8 @@ def _is_out_of_place(point_map: PointMap, returns: Int64Array) -> bool:
     drift, the wall stands twice in its map: the map is wrong there, and nothing changed. Either of two things tells:
 
     - the session saw through them, far more often than it hit them. What stands is hit again and again;
-    - it looked at the place from near, and yet most of them came from afar: from near, something else was there.
+    - it looked at the place from near, and yet most of them, by the way driven, came from afar: from near, something
+      else was there.
 
     A thing that stands twice because of drift is seen from near on either pass, and hit by one about as often as the
     other sees through it; so it stays.
@@ -223,7 +224,9 @@ def _is_out_of_place(point_map: PointMap, returns: Int64Array) -> bool:
         return True
     scans = np.searchsorted(point_map.scan_offsets, returns, side="right") - 1
     ranges_m = np.linalg.norm(points - point_map.odom_T_sensor[scans, :3, 3], axis=1)
-    if np.mean(ranges_m > REACH_M) <= 0.5:
+    # of a robot that waits, a thousand scans tell what one tells
+    way_m = np.diff(travelled_m(point_map.odom_T_sensor), prepend=0.0)[scans]
+    if way_m[ranges_m > REACH_M].sum() <= way_m[ranges_m <= REACH_M].sum():
         return False
     n_looked = sum(n_through_and_hit(places, point_map.views, within_m=_NEAR_M))
     return bool(np.mean(n_looked > 0) > 0.5)
