@@ -77,9 +77,11 @@ def inlier_mask(points: Float64Array, config: OutlierConfig) -> BoolArray:
         return np.ones(len(points), dtype=np.bool_)
     distances, _ = cKDTree(points).query(points, k=config.neighbours + 1)
     spacing = np.asarray(distances)[:, 1:].mean(axis=1)
+    mean = spacing.mean()
+    deviation = spacing - mean
     # closed, with room for rounding: in an even cloud sigma is 0 and nothing is an outlier
-    reach = config.sigmas * spacing.std() + 1e-9 * spacing.mean()
-    return np.asarray(np.abs(spacing - spacing.mean()) <= reach)
+    reach = config.sigmas * np.sqrt(np.mean(deviation * deviation)) + 1e-9 * mean
+    return np.asarray(np.abs(deviation) <= reach)
 
 
 def cluster_labels(points: Float64Array, config: ClusterConfig) -> Int64Array:
