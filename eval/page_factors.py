@@ -14,8 +14,8 @@ from cdpipe.errors import InputError
 from eval.charts import Chart, axes_of, error_bars, in_legend, layout, set_axis
 from eval.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION
 from eval.page_columns import RESULT_COLUMNS
-from eval.page_grids import N_ACROSS, SHARES, names_on
-from eval.page_run import Row, RunData, defined, grids, number, of, over_pairs, repeats, split_variant, text
+from eval.page_grids import N_ACROSS, SHARES
+from eval.page_run import Row, RunData, defined, grid_points, number, of, over_pairs, repeats, split_variant, text
 from eval.pareto import with_domain
 from eval.region_plots import domain_name
 from eval.statistics import bootstrap_interval
@@ -47,7 +47,7 @@ def factors(data: RunData) -> list[Factor]:
     held = repeats(data)
     cases = ((str(row["scenario"]), str(row["variant"])) for row in data.results)
     variants = list(dict.fromkeys(name for world, name in cases if (world, name) not in held))
-    on_grid = {name for grid in grids(data) for name in names_on(grid)}
+    on_grid = {name for _, name in grid_points(data)}
     found: dict[tuple[str, str], dict[str, str]] = {}
     for name in variants:
         preset, settings = split_variant(name)

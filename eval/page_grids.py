@@ -41,9 +41,8 @@ def draw_grids(data: RunData) -> list[Chart]:
         values = {key: _values(data, grid, key) for key in _GRID_KEYS}
         shown = [key for key, table in values.items() if len(np.unique(table[~np.isnan(table)])) > 1]
         if shown:
-            seeds = {
-                row["seed"] for row in of(data.results, scenario=grid.scenario) if row["variant"] in names_on(grid)
-            }
+            names = set(grid.points.values())
+            seeds = {row["seed"] for row in of(data.results, scenario=grid.scenario) if row["variant"] in names}
             found.append(
                 Chart(
                     f"grid_{place}",
@@ -101,8 +100,3 @@ def _values(data: RunData, grid: GridOf, key: str) -> Any:
     return np.array([
         [over_pairs(of(own, variant=grid.points.get((a, b))), key) for b in grid.values[1]] for a in grid.values[0]
     ], dtype=np.float64)  # fmt: skip
-
-
-def names_on(grid: GridOf) -> set[str]:
-    """Return the variants on a grid."""
-    return set(grid.points.values())

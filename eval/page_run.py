@@ -152,8 +152,8 @@ def named_variants(data: RunData, scenario: str) -> list[str]:
     """Return the variants of a scenario that are neither grid point nor repetition, in the order of results.csv."""
     held = repeats(data)
     names = dict.fromkeys(name for world, name, _ in _cases(data) if world == scenario and (world, name) not in held)
-    on_grid = {name for grid in grids(data) if grid.scenario == scenario for name in grid.points.values()}
-    return [name for name in names if name not in on_grid]
+    points = grid_points(data)
+    return [name for name in names if (scenario, name) not in points]
 
 
 def first_seed(data: RunData, scenario: str) -> int:
@@ -201,12 +201,17 @@ def grids(data: RunData) -> list[GridOf]:
     return result
 
 
+def grid_points(data: RunData) -> set[tuple[str, str]]:
+    """Return the scenario and the variant of every point of a grid."""
+    return {(grid.scenario, name) for grid in grids(data) for name in grid.points.values()}
+
+
 def off_grids(table: pd.DataFrame, data: RunData) -> pd.DataFrame:
     """Return the rows of a table whose `variant` is more than a point of a grid; all rows where none is.
 
     `eval.page_grids` shows the points of grids, hundreds of them, in less space.
     """
-    points = {(grid.scenario, name) for grid in grids(data) for name in grid.points.values()}
+    points = grid_points(data)
     shown = {variant for world, variant, _ in _cases(data) if (world, variant) not in points}
     rows = table[table["variant"].isin(shown)]
     return rows if len(rows) else table
