@@ -42,7 +42,9 @@ _HEADINGS = 16
 _REFINED = 3
 _COARSE_STEPS_M = (0.3, 0.25, 0.2)
 _FINE_STEPS_M = (0.15, 0.14, 0.13, 0.12, 0.11, 0.1, 0.08, 0.07, 0.06, 0.05)
-_MOST_POINTS = 150
+_MOST_POINTS, _MOST_COARSE_POINTS = 150, 50
+# Half as long for points beside the surface as with the library's own choice.
+_LEAF_POINTS = 32
 # A metre takes a hundredth off what two objects are too much alike: it decides between equals only.
 _TIE_PER_M = 0.01
 
@@ -113,15 +115,28 @@ class _Cloud:
 
     @classmethod
     def of(cls, points: Float64Array) -> _Cloud:
-        few, cell_m = points, _LIKE_WITHIN_M
-        while len(few) > _MOST_POINTS:
-            few = thinned(points, cell_m)
-            cell_m *= 1.2
-        return cls(points, few, points, cKDTree(points), _log_extents(points))
+        return cls(points, _few(points, _MOST_POINTS), points, _tree(points), _log_extents(points))
 
     def with_rest(self, rest: Float64Array) -> _Cloud:
         whole = np.concatenate([self.points, rest])
-        return replace(self, whole=whole, tree=cKDTree(whole))
+        return replace(self, whole=whole, tree=_tree(whole))
+
+    def coarse(self) -> _Cloud:
+        """Return fewer points, to lie on fewer: for a first guess in a quarter of the time."""
+        whole = thinned(self.whole, _LIKE_WITHIN_M)
+        return replace(self, few=_few(self.few, _MOST_COARSE_POINTS), whole=whole, tree=_tree(whole))
+
+
+def _few(points: Float64Array, most: int) -> Float64Array:
+    few, cell_m = points, _LIKE_WITHIN_M
+    while len(few) > most:
+        few = thinned(points, cell_m)
+        cell_m *= 1.2
+    return few
+
+
+def _tree(points: Float64Array) -> cKDTree:
+    return cKDTree(points, leafsize=_LEAF_POINTS)
 
 
 def _neighbours(start: _Cloud, come: Sequence[_Cloud]) -> list[int]:
@@ -165,14 +180,15 @@ def _laid_on(start: _Cloud, end: _Cloud) -> tuple[float, Float64Array]:
     with the middles of all that stands around them.
     """
     middles = {(_middle(start.points), _middle(end.points)), (_middle(start.whole), _middle(end.whole))}
+    coarse_start, coarse_end = start.coarse(), end.coarse()
     coarse = []
     for yaw_rad in np.arange(_HEADINGS) * (2 * np.pi / _HEADINGS):
         turn = yaw_pose(float(yaw_rad))
         for start_middle, end_middle in sorted(middles):
             guess = make_pose(turn[:3, :3], np.subtract(end_middle, transform(turn, np.array([start_middle]))[0]))
             for scale_m in _COARSE_STEPS_M:
-                guess = _step(start, end, guess, scale_m)
-            coarse.append((_likeness(start, end, guess), guess))
+                guess = _step(coarse_start, coarse_end, guess, scale_m)
+            coarse.append((_likeness(coarse_start, coarse_end, guess), guess))
     coarse.sort(key=lambda item: -item[0])
     fine = []
     for _, guess in coarse[:_REFINED]:
@@ -202,8 +218,9 @@ def _upright_fit(sources: Float64Array, goals: Float64Array, weights: Float64Arr
     source, goal = shares @ sources, shares @ goals
     a, b = (sources - source)[:, :2] * shares[:, None], (goals - goal)[:, :2]
     yaw_rad = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
-    turn = yaw_pose(float(yaw_rad))
-    return make_pose(turn[:3, :3], goal - transform(turn, source[None])[0])
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return make_pose(turn, goal - turn @ source)
 
 
 def _likeness(start: _Cloud, end: _Cloud, end_T_start: Float64Array) -> float:
