@@ -35,7 +35,7 @@ _BESIDE_SHARE, _EITHER_SHARE = 0.4, 0.2
 _LIKENESS = 0.62
 _LIKE_WITHIN_M = 0.1
 _MIN_POINTS = 4
-# A whole-map rival may cut out a hundred objects; a fit takes some 30 ms.
+# A whole-map rival may cut out a hundred objects; a fit takes some 20 ms.
 _MOST_TRIED = 6
 # A coarse fit from each of so many headings, a fine one from the best of them.
 _HEADINGS = 16
