@@ -21,6 +21,9 @@ from urllib.parse import urlsplit
 from cdpipe.errors import InputError
 from eval.provenance import THREAD_VARIABLES, THREADS, fix_threads, versions
 
+# Left to itself Dask has its workers give every freed array back to the system at once (MALLOC_TRIM_THRESHOLD_), which
+# costs a quarter of the time of a pair. Threads are set already.
+_OF_NANNIES: dict[str, Any] = {"distributed.nanny.pre-spawn-environ": {}}
 _PROBE_S, _CONNECT_S = 3.0, 6.0  # together less than ten seconds until an address that does not answer is named
 
 
@@ -90,7 +93,8 @@ def is_shared(client: Any) -> bool:
 
 @contextmanager
 def _of_this_machine(where: Where, n_tasks: int) -> Iterator[Any]:
-    from distributed import Client, LocalCluster  # noqa: PLC0415 - an extra, and slow to import
+    import dask  # noqa: PLC0415 - an extra, and slow to import
+    from distributed import Client, LocalCluster  # noqa: PLC0415 - as above
 
     fix_threads()
     settings = {
@@ -102,7 +106,7 @@ def _of_this_machine(where: Where, n_tasks: int) -> Iterator[Any]:
         # Ctrl-C reaches every process of the terminal: workers leave it to this one, which ends them
         "preload": [__name__],
     }
-    with LocalCluster(**settings) as cluster, Client(cluster) as client:
+    with dask.config.set(_OF_NANNIES), LocalCluster(**settings) as cluster, Client(cluster) as client:
         yield client
 
 

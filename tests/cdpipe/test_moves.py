@@ -92,6 +92,12 @@ def test_the_same_shape_in_another_size_is_another_object(factor: float) -> None
     assert moves([crate], [shifted(crate * factor, 3.0)], [True]) == []
 
 
+@pytest.mark.parametrize(("length_m", "is_same"), [(1.25, True), (1.7, False)])
+def test_a_longer_box_is_another_object_however_well_they_fit(length_m: float, is_same: bool) -> None:
+    short, long = box((1.0, 0.6, 0.5), "lrfb"), box((length_m, 0.6, 0.5), "lrfb")
+    assert len(moves([short], [shifted(long, 5.0)], [True])) == is_same
+
+
 def test_one_object_moves_once_and_of_two_alike_the_nearer_is_it() -> None:
     few = chair()
     copies = [shifted(few, 9.0), noisy(shifted(few, 4.0), "a", 0.004)]  # the farther one fits a little better

@@ -196,6 +196,23 @@ def test_a_crate_pushed_by_half_its_length_is_one_with_what_seems_to_have_stayed
     np.testing.assert_allclose(gone.displacement_map, [0.5, 0.0, 0.0], atol=0.03)
 
 
+def test_muck_put_beside_the_pile_it_was_taken_off_is_reshaped_and_added() -> None:
+    gone = np.flatnonzero(PILE - LEFT > 0.1)
+    load = ground(PILE)[gone] + (1.4, 0.0, 0.0)
+    pair = merge(ground(PILE), np.concatenate([ground(LEFT), load]))
+    objects = assemble_objects(pair, [group(pair, "before", ground(PILE)[gone]), group(pair, "after", load)])
+    assert [(item.kind, item.partner) for item in objects] == [("reshaped", -1), ("added", -1)]
+
+
+@pytest.mark.parametrize(("in_pile", "kinds"), [(True, ["reshaped", "added"]), (False, ["moved", "moved"])])
+def test_what_was_part_of_a_pile_did_not_go_far(in_pile: bool, kinds: list[str]) -> None:
+    here = yaw_pose(0.1, (2.3, 1.7, 0.15) if in_pile else (2.3, -1.7, 0.0))
+    pair = merge(np.concatenate([ground(PILE), crate(here)]), np.concatenate([ground(PILE), crate(HERE)]))
+    shown = crate(here)[crate(here)[:, 2] > 0.1]
+    objects = assemble_objects(pair, [group(pair, "before", shown), group(pair, "after", crate(HERE))])
+    assert [item.kind for item in objects] == kinds
+
+
 def test_what_stands_around_two_places_is_what_rises_above_the_ground_there() -> None:
     around = _Surroundings(SCENE)
     ((before, after),) = around.standing([crate(HERE)])

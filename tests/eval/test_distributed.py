@@ -479,3 +479,10 @@ def test_lines_tell_the_pace_and_the_time_left(
         lines.cells("narrow 7", done, total)
     told = ["[10/40] narrow 7", "[16/40] narrow 7; 6 cells/min, 4 min 00 s left", "[18/18] narrow 7; 2.67 cells/min"]
     assert capsys.readouterr().err.splitlines() == told
+
+
+def test_workers_of_this_machine_keep_freed_memory_and_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MALLOC_TRIM_THRESHOLD_", raising=False)
+    with cluster.connected(Where(workers=1), 1) as client:
+        assert client.submit(os.environ.get, "MALLOC_TRIM_THRESHOLD_").result() is None
+        assert client.submit(os.environ.get, "OMP_NUM_THREADS").result() == "1"
