@@ -183,6 +183,35 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     return results
 
 
+def current_results(run: RunFolder, earlier: Mapping[str, Any], now: Mapping[str, Any]) -> pd.DataFrame | None:
+    """Return the rows of results.csv where `write_tables` would write what is there already; None where it might not.
+
+    Args:
+        run: The folder.
+        earlier: The provenance of the run before.
+        now: That of the present one, which must be of the same plan, code and packages. Code that is under change, or
+            whose commit is not known, may have changed.
+    """
+    commit, subjects = now["git_commit"], reported(now)
+    if commit is None or commit.endswith("+") or "finished" not in earlier:
+        return None
+    if _lasting(earlier) != _lasting(json.loads(json.dumps(now, default=_plain))):
+        return None
+    names = ["results", "summary", *ITEM_TABLES]
+    names += [*(REGION_FILES if "regions" in subjects else ()), *(OBJECT_FILES if "objects" in subjects else ())]
+    tables, cells = [run.path / f"{name}.csv" for name in names], [*run.path.glob("cells/*/*/*.json")]
+    if not cells or not all(table.is_file() for table in tables):
+        return None
+    if max(cell.stat().st_mtime_ns for cell in cells) >= min(table.stat().st_mtime_ns for table in tables):
+        return None
+    results = pd.read_csv(run.path / "results.csv", low_memory=False)
+    return results if len(results) == len(cells) else None
+
+
+def _lasting(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in provenance.items() if key not in {"started", "finished", "command", "machine"}}
+
+
 def reported(provenance: Mapping[str, Any]) -> tuple[str, ...]:
     """Return what the plan of a run asks a report of: "regions", "objects", both or nothing."""
     plan = provenance.get("plan")

@@ -26,7 +26,7 @@ from eval.progress import RunProgress, Silent
 from eval.provenance import describe_run, digest, now
 from eval.rivals import require_method
 from eval.run_workers import remove_traces, run_on_workers
-from eval.runfolder import RunFolder, remove, write_tables
+from eval.runfolder import RunFolder, current_results, remove, write_tables
 from eval.worlds import worlds_of
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
@@ -89,6 +89,7 @@ def run_plan(
     _require_extras(chosen)
     _tell_idle(where, len(chosen), progress)
     made = Made(provenance["git_commit"])
+    earlier = run.provenance() if (run.path / "provenance.json").is_file() else {}
     # a cluster that cannot be used is told before anything is written
     with nullcontext() if where == HERE or not chosen else connected(where, len(chosen)) as client:
         run.write_provenance(provenance)
@@ -101,7 +102,9 @@ def run_plan(
         else:
             run_on_workers(client, run, chosen, made, progress)
     progress.cells("done", n_run, n_run)
-    results = write_tables(run)
+    results = None if n_run else current_results(run, earlier, provenance)
+    if results is None:
+        results = write_tables(run)
     run.write_provenance({**provenance, "finished": now()})
     n_died = int((results["status"] == "worker_died").sum())
     return RunOutcome(n_run, len(all_cells) - n_todo, n_todo - n_run, n_died)

@@ -1,5 +1,6 @@
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -796,3 +797,49 @@ def test_cells_made_without_kiss_matcher_are_made_again_once_it_is_there(monkeyp
     there, missing = keys(is_installed=True), keys(is_installed=False)
     changed = {variant: there[variant] != missing[variant] for variant in there}
     assert changed == {"tunnelcd": True, "frame": False, "kiss-matcher": True, "oracle-merge": False}
+
+
+def test_tables_that_are_there_are_put_together_again_only_where_something_may_have_changed(
+    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commit: list[str | None] = ["a" * 40]
+    written: list[RunFolder] = []
+
+    def write(run: RunFolder) -> pd.DataFrame:
+        written.append(run)
+        return write_tables(run)
+
+    def is_written(plan: Plan) -> bool:
+        written.clear()
+        assert run_plan(plan, run).n_done == 0
+        return bool(written)
+
+    monkeypatch.setattr(provenance, "git_commit", lambda: commit[0])
+    monkeypatch.setattr(runner, "write_tables", write)
+    plan, run = plan_of(tmp_path), start_run_folder(tmp_path / "run")
+    run_plan(plan, run)
+    results, (cell,) = run.path / "results.csv", run.path.glob("cells/*/*/*.json")
+    bytes_before = results.read_bytes()
+    assert not is_written(plan)
+    assert not is_written(plan)
+    assert results.read_bytes() == bytes_before
+    results.unlink()
+    assert is_written(plan)
+    cell.touch()
+    assert is_written(plan)
+    shutil.copy(cell, cell.with_name("another.json"))  # of another plan, and not newer
+    os.utime(cell.with_name("another.json"), ns=(0, 0))
+    assert is_written(plan)
+    cell.with_name("another.json").unlink()
+    assert is_written(plan)
+    assert not is_written(plan)
+    assert is_written(plan.model_copy(update={"description": "another"}))
+    for other in ("b" * 40, "b" * 40 + "+", "b" * 40 + "+", None, None):
+        commit[0] = other
+        assert is_written(plan)
+    document = run.provenance()
+    del document["finished"]
+    run.write_provenance(document)
+    commit[0] = "b" * 40
+    assert is_written(plan)
+    assert not is_written(plan)
