@@ -105,7 +105,9 @@ def run_plan(
     results = None if n_run else current_results(run, earlier, provenance)
     if results is None:
         results = write_tables(run)
-    run.write_provenance({**provenance, "finished": now()})
+        run.write_provenance({**provenance, "finished": now()})
+    else:
+        run.write_provenance(earlier)  # the run that did something
     n_died = int((results["status"] == "worker_died").sum())
     return RunOutcome(n_run, len(all_cells) - n_todo, n_todo - n_run, n_died)
 
