@@ -92,7 +92,8 @@ def run_plan(
     earlier = run.provenance() if (run.path / "provenance.json").is_file() else {}
     # a cluster that cannot be used is told before anything is written
     with nullcontext() if where == HERE or not chosen else connected(where, len(chosen)) as client:
-        run.write_provenance(provenance)
+        if n_run or not earlier:
+            run.write_provenance(provenance)
         remove_traces(run)
         # what --limit leaves over may be stale too, and no table may hold it
         for pair in pairs:
@@ -106,8 +107,6 @@ def run_plan(
     if results is None:
         results = write_tables(run)
         run.write_provenance({**provenance, "finished": now()})
-    else:
-        run.write_provenance(earlier)  # the run that did something
     n_died = int((results["status"] == "worker_died").sum())
     return RunOutcome(n_run, len(all_cells) - n_todo, n_todo - n_run, n_died)
 
