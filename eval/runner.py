@@ -92,7 +92,7 @@ def run_plan(
     earlier = run.provenance() if (run.path / "provenance.json").is_file() else {}
     # a cluster that cannot be used is told before anything is written
     with nullcontext() if where == HERE or not chosen else connected(where, len(chosen)) as client:
-        if n_run or not earlier:
+        if n_run:
             run.write_provenance(provenance)
         remove_traces(run)
         # what --limit leaves over may be stale too, and no table may hold it
@@ -105,6 +105,7 @@ def run_plan(
     progress.cells("done", n_run, n_run)
     results = None if n_run else current_results(run, earlier, provenance)
     if results is None:
+        run.write_provenance(provenance)  # it says which tables the plan asks for
         results = write_tables(run)
         run.write_provenance({**provenance, "finished": now()})
     n_died = int((results["status"] == "worker_died").sum())
