@@ -139,6 +139,15 @@ def test_strips_that_are_not_alike_are_one_object_with_what_seems_to_have_stayed
     np.testing.assert_allclose(move.displacement_map, [0.3, 0.0, 0.0], atol=0.05)
 
 
+def test_neighbours_that_share_just_enough_points_but_are_hardly_alike_are_two_objects() -> None:
+    # both have a rail of a metre on the floor; the other metre stands in one and lies across in the other
+    rail = face((0, 0, 0), (1.0, 0, 0))
+    post = np.concatenate([rail, face((0, 0, 0), (0, 0, 1.0))])
+    corner = np.concatenate([rail, face((0, 0, 0), (0, 1.0, 0))])
+    assert moves([noisy(post, "a")], [noisy(shifted(corner, 0.3, 0.1), "b")], [False]) == []
+    assert len(moves([noisy(post, "a")], [noisy(shifted(post, 0.3, 0.1), "b")], [False])) == 1
+
+
 def test_what_lies_on_what_stands_around_is_not_what_was_put_beside_it() -> None:
     # a load off the flank of a heap would lie on the rest of it; the chair put there would not
     heap = face((0, 0, 0), (2.0, 3.0, 0)) @ np.array([[1, 0, 0.6], [0, 1, 0], [0, 0, 0]])
