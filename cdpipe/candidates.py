@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from cdpipe.config import MergeConfig
 from cdpipe.descriptor import relative_yaws_rad
@@ -100,13 +101,15 @@ def pair_votes(
     """
     turns_rad = _turns_rad(before_poses, after_poses, yaws_rad)
     before_xy, after_xy = before_poses[:, :2, 3], after_poses[:, :2, 3]
-    before_m, after_m = _apart_m(before_xy), _apart_m(after_xy)
+    before_m, after_m = cdist(before_xy, before_xy), cdist(after_xy, after_xy)
     cosines, sines = np.cos(turns_rad), np.sin(turns_rad)
     # the angle between two turns, by its cosine
     directions = np.column_stack([cosines, sines])
     is_same_turn = directions @ directions.T > np.cos(_YAW_RAD)
     # few turn alike and are as far apart in both sessions; only those are looked at further
-    one, other = np.nonzero(is_same_turn & (np.abs(before_m - after_m) < _APART_M + _APART_SHARE * after_m))
+    before_m -= after_m
+    is_as_far = np.abs(before_m, out=before_m) < _APART_M + _APART_SHARE * after_m
+    one, other = np.divmod(np.flatnonzero(is_same_turn & is_as_far), len(turns_rad))
     apart_m = after_m[one, other]
     before_x, before_y = (before_xy[other] - before_xy[one]).T
     after_x, after_y = (after_xy[other] - after_xy[one]).T
@@ -120,12 +123,6 @@ def pair_votes(
     agrees[one, other] = True
     votes: Float64Array = np.bincount(one, np.exp(-apart_m / _VOTE_REACH_M), len(yaws_rad)).astype(np.float64)
     return agrees, votes
-
-
-def _apart_m(xy: Float64Array) -> Float64Array:
-    """Return (P, P) distances between (P, 2) places."""
-    x, y = (xy[None, :, axis] - xy[:, None, axis] for axis in (0, 1))
-    return np.asarray(np.sqrt(x**2 + y**2))
 
 
 def _is_same(one: Float64Array, other: Float64Array, position: Float64Array) -> bool:

@@ -98,7 +98,7 @@ class IndexedMap:
 
     def sphere(self, centre: Float64Array, radius_m: float) -> Float64Array:
         """Return the (N, 3) map points within `radius_m` of `centre` (3,)."""
-        return self.points[self.columns.crop(centre, radius_m)]
+        return self.columns.points_within(centre, radius_m)
 
 
 def near_points(point_map: PointMap, config: MergeConfig) -> Float64Array:

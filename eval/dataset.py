@@ -255,8 +255,8 @@ def _images(
     after_labels = np.stack([label_images(after_map, after.point_changes, each) for each in poses])
     ids = [change.id for change in truth.pair.changes]
     return {
-        "before_images": render(before.map.points, MapIndex(before.map.points), anchors),
-        "after_images": np.stack([render(after_map, after_index, each) for each in poses]),
+        "before_images": render(MapIndex(before.map.points), anchors),
+        "after_images": np.stack([render(after_index, each) for each in poses]),
         "before_labels": before_labels,
         "after_labels": after_labels,
         "before_visible": _visible(before_labels, ids),

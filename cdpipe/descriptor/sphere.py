@@ -32,7 +32,7 @@ def describe_map(thin_map: PointMap, map_T_anchor: Float64Array, config: Descrip
         config: `precision` is used.
     """
     network, _ = _network()
-    images = render(thin_map.points, MapIndex(thin_map.points), map_T_anchor)
+    images = render(MapIndex(thin_map.points), map_T_anchor)
     with torch.inference_mode():
         parts = [network.encode(batch).flatten(1).numpy() for batch in torch.split(torch.from_numpy(images), _BATCH)]
     spheres = np.concatenate([np.zeros((0, PER_SECTOR * SECTORS), np.float32), *parts])
@@ -56,7 +56,7 @@ def change_logits(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArr
     network, _ = _network()
     logits = np.full((len(is_covered), SECTORS), np.nan)
     map_T_anchor = merged.before.odom_T_sensor[before.keyframe_scans[is_covered]]
-    images = render(merged.after.points, MapIndex(merged.after.points), _in_after_odom(merged, map_T_anchor))
+    images = render(MapIndex(merged.after.points), _in_after_odom(merged, map_T_anchor))
     spheres = stored_numbers(before.spheres[is_covered])
     with torch.inference_mode():
         batches = (torch.split(torch.from_numpy(array), _BATCH) for array in (spheres, images))

@@ -49,16 +49,15 @@ def sphere_image(points_anchor: Float64Array) -> Float32Array:
     return image.reshape(ROWS, COLUMNS)
 
 
-def render(points: Float64Array, index: MapIndex, map_T_anchor: Float64Array) -> Float32Array:
+def render(index: MapIndex, map_T_anchor: Float64Array) -> Float32Array:
     """Return the (K, *image) images of a map at each of (K, 4, 4) poses, float32 as `sphere_image` gives them.
 
     Args:
-        points: (N, 3) points of the map, metres.
-        index: Of these points.
+        index: The map.
         map_T_anchor: (K, 4, 4) poses of the sensor in the map's frame.
     """
     images = [
-        sphere_image(transform(anchor_T_map, points[index.crop(map_T_here[:3, 3], CROP_M)]))
+        sphere_image(transform(anchor_T_map, index.points_within(map_T_here[:3, 3], CROP_M)))
         for map_T_here, anchor_T_map in zip(map_T_anchor, invert(map_T_anchor), strict=True)
     ]
     return np.stack(images) if images else sphere_image(np.zeros((0, 3)))[None][:0]

@@ -15,7 +15,9 @@ def test_a_sphere_equals_the_brute_force_one(radius_m: float) -> None:
     index = MapIndex(points)
     for centre in [*rng.uniform(-15, 15, (10, 3)), points[0], np.array([2.0, -4.0, 0.0]), np.array([500.0, 0, 0])]:
         inside = np.flatnonzero(((points - centre) ** 2).sum(axis=1) <= radius_m**2)
-        np.testing.assert_array_equal(np.sort(index.crop(centre, radius_m)), inside)
+        found = index.crop(centre, radius_m)
+        np.testing.assert_array_equal(np.sort(found), inside)
+        np.testing.assert_array_equal(index.points_within(centre, radius_m), points[found])
 
 
 def test_the_border_belongs_to_the_sphere() -> None:
@@ -34,3 +36,4 @@ def test_maps_of_the_pipeline_are_ordered_and_turned_ones_are_not(tunnel_before:
     for cloud, is_ordered in ((points, True), (turned, False)):
         indices = MapIndex(cloud).crop(cloud[1000], 3.0)
         assert (np.diff(indices) > 0).all() == is_ordered
+        np.testing.assert_array_equal(MapIndex(cloud).points_within(cloud[1000], 3.0), cloud[indices])

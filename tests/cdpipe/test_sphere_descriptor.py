@@ -53,7 +53,7 @@ def test_a_rendered_map_is_what_its_points_are_from_each_pose() -> None:
     draw = np.random.default_rng(3)
     points = draw.uniform(-20, 20, size=(4000, 3))
     poses = np.array([yaw_pose(angle, translation=draw.uniform(-5, 5, 3)) for angle in (0.0, 0.7, -2.0)])
-    images = render(points, MapIndex(points), poses)
+    images = render(MapIndex(points), poses)
     for image, pose in zip(images, poses, strict=True):
         expected: dict[int, float] = {}
         for x, y, z in transform(invert(pose), points):
