@@ -210,8 +210,11 @@ def read_session(path: Path) -> Session:
         _check_provenance(provenance)
     except OSError as error:
         raise InputError(f"{path / 'session.json'}: cannot be read: {error.strerror}") from error
+    except KeyError as error:
+        said = f"{path / 'session.json'}: damaged: no {error} in it"
+        raise InputError(f"{said}: expected a session written by `tunnelcd simulate`, copy it again") from error
     # ValueError: not JSON, not text, or not a number
-    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"{path / 'session.json'}: damaged: {error}") from error
     poses = load_arrays(path / "odometry.npz").get("odom_T_sensor")
     if poses is None or len(poses) != n_scans:

@@ -90,9 +90,10 @@ def run_plan(
     _tell_idle(where, len(chosen), progress)
     made = Made(provenance["git_commit"])
     earlier = run.provenance() if (run.path / "provenance.json").is_file() else {}
+    results = None if n_todo else current_results(run, earlier, provenance)
     # a cluster that cannot be used is told before anything is written
     with nullcontext() if where == HERE or not chosen else connected(where, len(chosen)) as client:
-        if n_run:
+        if results is None:
             run.write_provenance(provenance)
         remove_traces(run)
         # what --limit leaves over may be stale too, and no table may hold it
@@ -103,9 +104,7 @@ def run_plan(
         else:
             run_on_workers(client, run, chosen, made, progress)
     progress.cells("done", n_run, n_run)
-    results = None if n_run else current_results(run, earlier, provenance)
     if results is None:
-        run.write_provenance(provenance)  # it says which tables the plan asks for
         results = write_tables(run)
         run.write_provenance({**provenance, "finished": now()})
     n_died = int((results["status"] == "worker_died").sum())

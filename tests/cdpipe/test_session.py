@@ -117,6 +117,16 @@ def test_a_damaged_description_is_named(tmp_path: Path, change: dict[str, object
         read_session(path)
 
 
+def test_what_a_description_lacks_is_named(tmp_path: Path) -> None:
+    path = _written(tmp_path / "s")
+    document = json.loads((path / "session.json").read_text())
+    for key in ("format", "n_scans", "sensor"):
+        lacking = {name: value for name, value in document.items() if name != key}
+        (path / "session.json").write_text(json.dumps(lacking))
+        with pytest.raises(InputError, match=rf"session\.json: damaged: no '{key}' in it: expected a session"):
+            read_session(path)
+
+
 @pytest.mark.parametrize("text", [b"", b"\xff\xfe", b"[]", b"[" * 200_000, b'{"format": ' + b"9" * 5000 + b"}"])
 def test_a_description_that_is_none_is_named(tmp_path: Path, text: bytes) -> None:
     path = _written(tmp_path / "s")
