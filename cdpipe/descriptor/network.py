@@ -1,9 +1,9 @@
 """The scan descriptor: a re-implementation of 3DEG (arXiv 2210.07285), after OREOS (arXiv 1903.07918).
 
-Range image -> convolutions with circular padding along the azimuth -> two 64-d vectors: q, the place, unchanged by a
-turn of the sensor because it is pooled over the azimuth; w, the orientation, one value per 5.6 deg of azimuth, so that
-a turn of the sensor shifts it. No weights or code of 3DEG are public: layer sizes are ours, and w is read by circular
-correlation instead of by fully connected layers, which makes it turn with the sensor by construction.
+Range image -> convolutions with circular padding along the azimuth -> two 64-d vectors: q, the place, from maxima and
+the amplitudes of the lowest azimuth frequencies, which a turn of the sensor leaves alone; w, the orientation, one value
+per 5.6 deg of azimuth, so that a turn of the sensor shifts it. No weights or code of 3DEG are public: layer sizes are
+ours, and both vectors do by construction what fully connected layers have to learn: q stands still, w turns.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ DIMENSIONS = 64
 _CHANNELS = (24, 48, 64, 64)
 # Azimuth strides multiply to COLUMNS / DIMENSIONS, so that w has one value per remaining column.
 _STRIDES = ((2, 2), (2, 2), (2, 1), (1, 1))
+# Azimuth frequencies that q is made of, the mean among them: what is 26 deg wide and wider.
+_FREQUENCIES = 8
 _RANGE_SCALE_M = 10.0
 
 
@@ -50,7 +52,7 @@ class PlaceNetwork(nn.Module):
         self.layers = nn.Sequential(
             *(_CircularConv(a, b, s) for a, b, s in zip(inputs, _CHANNELS, _STRIDES, strict=True))
         )
-        self.place = nn.Linear(2 * _CHANNELS[-1] * 4, DIMENSIONS)
+        self.place = nn.Linear((_FREQUENCIES + 1) * _CHANNELS[-1] * 4, DIMENSIONS)
         self.heading = nn.Conv1d(4 * _CHANNELS[-1], 1, 1)
 
     def forward(self, ranges_m: Tensor) -> tuple[Tensor, Tensor]:
@@ -58,11 +60,19 @@ class PlaceNetwork(nn.Module):
         seen = (ranges_m > 0).float()
         nearness = seen * _RANGE_SCALE_M / (_RANGE_SCALE_M + ranges_m)
         features = self.layers(torch.stack([nearness, seen], dim=1)).flatten(1, 2)
-        pooled = torch.cat([features.mean(dim=2), features.amax(dim=2)], dim=1)
-        q = nn.functional.normalize(self.place(pooled), dim=1)
+        pooled = torch.cat([_amplitudes(features), features.amax(dim=2, keepdim=True)], dim=2)
+        q = nn.functional.normalize(self.place(pooled.flatten(1)), dim=1)
         heading = self.heading(features)[:, 0]
         w = nn.functional.normalize(heading - heading.mean(dim=1, keepdim=True), dim=1)
         return q, w
+
+
+def _amplitudes(features: Tensor) -> Tensor:
+    """(B, F, columns) -> (B, F, _FREQUENCIES) amplitudes of the lowest frequencies along the columns, mean first."""
+    spectrum = torch.fft.rfft(features, norm="forward")[..., :_FREQUENCIES]
+    # not abs(): its gradient at 0 is none
+    magnitudes = (spectrum.real.square() + spectrum.imag.square() + 1e-6).sqrt()
+    return torch.cat([magnitudes[..., :1], 2 * magnitudes[..., 1:]], dim=-1)
 
 
 def yaw_correlation(w_a: Tensor, w_b: Tensor) -> Tensor:

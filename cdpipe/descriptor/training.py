@@ -1,7 +1,10 @@
-"""How the place descriptor is trained: triplets with the hardest negative of the batch on q, yaw classification on w.
+"""How the place descriptor is trained: every place told from the others of its batch by q, yaw classification on w.
 
-The triplet loss is 3DEG's (arXiv 2210.07285, section III). Its yaw loss compares (cos, sin) of a regressed angle; ours
-is the cross-entropy of the circular correlation of the two w, which does not average the two ends of a tunnel.
+3DEG (arXiv 2210.07285, section III) takes triplets with the hardest negative. In tunnels that loss stays at its margin
+for hundreds of steps, as the hardest of hundred places looks like the right one; the cross-entropy over all negatives
+(InfoNCE, arXiv 1807.03748), in which the hard ones count most as well, learns from the first step on. 3DEG's yaw loss
+compares (cos, sin) of a regressed angle; ours is the cross-entropy of the circular correlation of the two w, which does
+not average the two ends of a tunnel.
 """
 
 from __future__ import annotations
@@ -14,14 +17,15 @@ from torch import Tensor
 
 from cdpipe.descriptor.network import DIMENSIONS, PlaceNetwork, yaw_correlation
 from cdpipe.descriptor.range_image import COLUMNS
+from cdpipe.errors import InputError
 from cdpipe.geometry import BoolArray, Float32Array, Float64Array, Int64Array, require_shape, stream
 
-_MARGIN = 0.3
+_TEMPERATURE = 0.03
 _YAW_WEIGHT = 0.3
 _YAW_TEMPERATURE = 12.0
 _YAW_SPREAD_RAD = np.deg2rad(5.0)
 SAME_PLACE_M = 2.0
-OTHER_PLACE_M = 8.0
+OTHER_PLACE_M = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +60,7 @@ class PlaceData:
 
 
 TUNNELS_PER_BATCH = 8
-ANCHORS_PER_TUNNEL = 4
+ANCHORS_PER_TUNNEL = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +79,23 @@ class PlaceScores:
 
 
 class PlaceTask:
-    """Trains a place network on some tunnels and scores it on others."""
+    """Trains a place network on some tunnels and scores it on others.
+
+    Raises:
+        InputError: No place of the training tunnels was driven through in both sessions.
+    """
 
     def __init__(self, network: PlaceNetwork, training: PlaceData, validation: PlaceData, seed: int) -> None:
         self._network, self._data, self._validation, self._seed = network, training, validation, seed
         self._partners = _partners(training)
+        paired = np.array([len(partners) > 0 for partners in self._partners])
+        by_tunnel = [np.flatnonzero(paired & (training.tunnels == tunnel)) for tunnel in np.unique(training.tunnels)]
+        self._paired = [keyframes for keyframes in by_tunnel if len(keyframes)]
+        if not self._paired:
+            raise InputError(
+                f"training tunnels: no keyframe within {SAME_PLACE_M:g} m of one of the other session; make tunnels "
+                "that both sessions drive through"
+            )
 
     @property
     def network(self) -> PlaceNetwork:
@@ -87,15 +103,25 @@ class PlaceTask:
         return self._network
 
     def losses(self, step: int) -> dict[str, Tensor]:
-        """Return the triplet loss of q and the classification loss of w."""
+        """Return the classification losses of q and w."""
         draw = stream(self._seed, "train-place", str(step))
-        anchors = _anchors(self._data, draw)
+        anchors = self._anchors(draw)
         positives = np.array([draw.choice(self._partners[anchor]) for anchor in anchors])
         chosen = np.concatenate([anchors, positives])
         images, headings = _turned(self._data, chosen, draw)
+        # a tunnel in the mirror is another tunnel
+        tunnels, index = np.unique(self._data.tunnels[chosen], return_inverse=True)
+        images, headings = _mirrored(images, headings, (draw.random(len(tunnels)) < 0.5)[index])
         q, w = self._network(images)
-        place_loss = _triplet_loss(q, _is_other_place(self._data, anchors, chosen))
+        place_loss = _place_loss(q, _is_other_place(self._data, anchors, chosen))
         return {"place": place_loss, "yaw": _YAW_WEIGHT * _yaw_loss(w, headings)}
+
+    def _anchors(self, draw: np.random.Generator) -> Int64Array:
+        n_tunnels = min(TUNNELS_PER_BATCH, len(self._paired))
+        tunnels = [self._paired[place] for place in draw.choice(len(self._paired), size=n_tunnels, replace=False)]
+        return np.concatenate(
+            [draw.choice(own, size=min(ANCHORS_PER_TUNNEL, len(own)), replace=False) for own in tunnels]
+        )
 
     def scores(self) -> dict[str, float]:
         """Return recall@1 within 3 m, and the yaw's median error and share of flips."""
@@ -132,24 +158,15 @@ def evaluate(network: PlaceNetwork, data: PlaceData) -> PlaceScores:
 
 
 def _partners(data: PlaceData) -> list[Int64Array]:
-    """For each keyframe, those of the same tunnel and place; itself only where there is no other."""
-    partners: list[Int64Array] = [np.array([index]) for index in range(len(data.positions))]
+    """For each keyframe, those of the same place in the other session of its tunnel."""
+    partners: list[Int64Array] = [np.zeros(0, dtype=np.int64)] * len(data.positions)
     for tunnel in np.unique(data.tunnels):
         members = np.flatnonzero(data.tunnels == tunnel)
         apart = np.linalg.norm(data.positions[members, None] - data.positions[None, members], axis=2)
+        is_partner = (apart <= SAME_PLACE_M) & (data.sessions[members, None] != data.sessions[None, members])
         for row, member in enumerate(members):
-            near = members[(apart[row] <= SAME_PLACE_M) & (members != member)]
-            if len(near):
-                partners[member] = near
+            partners[member] = members[is_partner[row]]
     return partners
-
-
-def _anchors(data: PlaceData, draw: np.random.Generator) -> Int64Array:
-    tunnels = np.unique(data.tunnels)
-    chosen = draw.choice(tunnels, size=min(TUNNELS_PER_BATCH, len(tunnels)), replace=False)
-    return np.concatenate(
-        [draw.choice(np.flatnonzero(data.tunnels == tunnel), size=ANCHORS_PER_TUNNEL) for tunnel in chosen]
-    )
 
 
 def _turned(data: PlaceData, chosen: Int64Array, draw: np.random.Generator) -> tuple[Tensor, Float64Array]:
@@ -160,18 +177,30 @@ def _turned(data: PlaceData, chosen: Int64Array, draw: np.random.Generator) -> t
     return torch.from_numpy(images), data.headings_rad[chosen] - shifts * 2 * np.pi / COLUMNS
 
 
+def _mirrored(images: Tensor, headings_rad: Float64Array, is_mirrored: BoolArray) -> tuple[Tensor, Float64Array]:
+    """Swap left and right of some images; a mirrored heading turns the other way."""
+    flips = torch.from_numpy(is_mirrored)[:, None, None]
+    return torch.where(flips, images.flip(2), images), np.where(is_mirrored, -headings_rad, headings_rad)
+
+
 def _is_other_place(data: PlaceData, anchors: Int64Array, chosen: Int64Array) -> Tensor:
     apart = np.linalg.norm(data.positions[anchors, None] - data.positions[None, chosen], axis=2)
     other_tunnel = data.tunnels[anchors, None] != data.tunnels[None, chosen]
     return torch.from_numpy(other_tunnel | (apart > OTHER_PLACE_M))
 
 
-def _triplet_loss(q: Tensor, is_negative: Tensor) -> Tensor:
-    anchors = q[: len(is_negative)]
-    distances = torch.cdist(anchors, q)
-    positive = (anchors - q[len(is_negative) :]).square().sum(dim=1).add(1e-9).sqrt()
-    hardest = distances.masked_fill(~is_negative, float("inf")).amin(dim=1)
-    return torch.relu(positive - hardest + _MARGIN).mean()
+def _place_loss(q: Tensor, is_negative: Tensor) -> Tensor:
+    """Cross-entropy of picking the positive of each anchor among that and all negatives.
+
+    Args:
+        q: (2 A, 64) place vectors, the anchors' first, then their positives' in the same order.
+        is_negative: (A, 2 A) which of them are of another place.
+    """
+    n = len(is_negative)
+    likeness = q[:n] @ q.T / _TEMPERATURE
+    positive = likeness[torch.arange(n), n + torch.arange(n)]
+    negatives = likeness.masked_fill(~is_negative, -torch.inf)
+    return (torch.logsumexp(torch.cat([positive[:, None], negatives], dim=1), dim=1) - positive).mean()
 
 
 def _yaw_loss(w: Tensor, headings_rad: Float64Array) -> Tensor:
