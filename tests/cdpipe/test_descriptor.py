@@ -10,7 +10,7 @@ from cdpipe.descriptor import describe_scan, describe_scans, load_descriptors, r
 from cdpipe.descriptor.fit import FitConfig, fit
 from cdpipe.descriptor.network import DIMENSIONS, initial_network, yaw_correlation
 from cdpipe.descriptor.range_image import COLUMNS, ELEVATION_RAD, ROWS, range_image
-from cdpipe.descriptor.training import PlaceData, PlaceTask, evaluate
+from cdpipe.descriptor.training import PlaceData, PlaceTask, _mirrored, _partners, _place_loss, evaluate
 from cdpipe.errors import InputError
 from cdpipe.types import PosedScan, Spheres
 
@@ -115,7 +115,7 @@ def _rooms(n_tunnels: int) -> PlaceData:
 
 def test_training_lowers_both_losses_and_repeats_by_seed(tmp_path: Path) -> None:
     data = _rooms(3)
-    config = FitConfig(seed=1, steps=25, validate_every=25)
+    config = FitConfig(seed=1, steps=40, validate_every=40)
     losses: list[dict[str, float]] = []
     networks = []
     for name in ("one", "other"):
@@ -123,10 +123,44 @@ def test_training_lowers_both_losses_and_repeats_by_seed(tmp_path: Path) -> None
         task = PlaceTask(initial_network(1), data, data, seed=1)
         fit(task, config, tmp_path / name, "", lambda _, parts: losses.append(dict(parts)), lambda _: None)
         networks.append(task.network)
-    for part in ("place", "yaw"):
-        assert np.mean([step[part] for step in losses[20:25]]) < np.mean([step[part] for step in losses[:5]])
+    at_first = losses[0]
+    for part, share in (("place", 0.1), ("yaw", 0.5)):
+        assert np.mean([step[part] for step in losses[35:40]]) < share * at_first[part]
     for one, other in zip(networks[0].parameters(), networks[1].parameters(), strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=0)
+
+
+def test_a_mirrored_image_is_that_of_the_mirrored_scan() -> None:
+    points = np.random.default_rng(3).normal(size=(400, 3)) * (8, 3, 1)
+    image, mirror_image = (torch.from_numpy(range_image(points * (1, side, 1)))[None] for side in (1, -1))
+    both, headings_rad = _mirrored(image.repeat(2, 1, 1), np.array([0.5, 0.5]), np.array([False, True]))
+    torch.testing.assert_close(both[0], image[0])
+    torch.testing.assert_close(both[1], mirror_image[0])
+    np.testing.assert_array_equal(headings_rad, [0.5, -0.5])
+
+
+def test_place_loss_counts_hard_negatives_of_other_places_alone() -> None:
+    anchor, near, far = torch.eye(3)
+    q = torch.stack([anchor, far, anchor, near])  # anchors 0 and 1, their positives 2 and 3
+    apart = torch.tensor([[False, True, False, True], [True, False, True, False]])
+    # 0 has its positive at 1 and negatives at 0; 1 has its positive and its negatives at 0
+    likeness = 1 / 0.03
+    first, second = np.log1p(2 * np.exp(-likeness)), np.log(3.0)
+    assert float(_place_loss(q, apart)) == pytest.approx((first + second) / 2)
+    # what is no negative does not count, however like it looks
+    assert float(_place_loss(torch.stack([anchor, anchor, anchor, anchor]), torch.zeros(2, 4, dtype=torch.bool))) == 0.0
+
+
+def test_places_of_one_session_alone_train_nothing() -> None:
+    data = _rooms(2)
+    with pytest.raises(InputError, match="both sessions drive through"):
+        PlaceTask(initial_network(0), data.subset(data.sessions == 0), data, seed=0)
+    # the after session drove half of the way: there each has its counterpart, beyond nobody has
+    halved = data.subset((data.sessions == 0) | (data.positions[:, 0] < 35))
+    for index, partners in enumerate(_partners(halved)):
+        assert len(partners) == (halved.positions[index, 0] < 35)
+        assert (halved.sessions[partners] != halved.sessions[index]).all()
+        assert (np.abs(halved.positions[partners, 0] - halved.positions[index, 0]) < 1).all()
 
 
 def test_scores_of_a_perfect_and_a_blind_network() -> None:
