@@ -24,7 +24,10 @@ _TEMPERATURE = 0.03
 _YAW_WEIGHT = 0.3
 _YAW_TEMPERATURE = 12.0
 _YAW_SPREAD_RAD = np.deg2rad(5.0)
-SAME_PLACE_M = 2.0
+# What is recognised: a keyframe as near as this, which may be on another line of the way.
+SAME_PLACE_M = 3.0
+# A place is learned from the keyframes of the other session that are at most so much farther than the nearest.
+_BESIDE_NEAREST_M = 1.0
 OTHER_PLACE_M = 4.0
 
 
@@ -147,9 +150,9 @@ def evaluate(network: PlaceNetwork, data: PlaceData) -> PlaceScores:
         before = np.flatnonzero((data.tunnels == tunnel) & (data.sessions == 0))
         after = np.flatnonzero((data.tunnels == tunnel) & (data.sessions == 1))
         apart = np.linalg.norm(data.positions[after, None] - data.positions[None, before], axis=2)
-        for row in np.flatnonzero(apart.min(axis=1) <= 3.0):
+        for row in np.flatnonzero(apart.min(axis=1) <= SAME_PLACE_M):
             found = int(np.argmax(q[before] @ q[after[row]]))
-            hits.append(bool(apart[row, found] <= 3.0))
+            hits.append(bool(apart[row, found] <= SAME_PLACE_M))
             near = int(np.argmin(apart[row]))
             peak = int(yaw_correlation(w[before[near]][None], w[after[row]][None]).argmax())
             error = peak * 2 * np.pi / DIMENSIONS - float(headings[after[row]] - headings[before[near]])
@@ -158,12 +161,14 @@ def evaluate(network: PlaceNetwork, data: PlaceData) -> PlaceScores:
 
 
 def _partners(data: PlaceData) -> list[Int64Array]:
-    """For each keyframe, those of the same place in the other session of its tunnel."""
+    """For each keyframe, the nearest of the other session of its tunnel and those beside it; none if all are far."""
     partners: list[Int64Array] = [np.zeros(0, dtype=np.int64)] * len(data.positions)
     for tunnel in np.unique(data.tunnels):
         members = np.flatnonzero(data.tunnels == tunnel)
         apart = np.linalg.norm(data.positions[members, None] - data.positions[None, members], axis=2)
-        is_partner = (apart <= SAME_PLACE_M) & (data.sessions[members, None] != data.sessions[None, members])
+        apart[data.sessions[members, None] == data.sessions[None, members]] = np.inf
+        limits = np.minimum(apart.min(axis=1) + _BESIDE_NEAREST_M, SAME_PLACE_M)
+        is_partner = apart <= limits[:, None]
         for row, member in enumerate(members):
             partners[member] = members[is_partner[row]]
     return partners

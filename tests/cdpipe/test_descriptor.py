@@ -155,6 +155,16 @@ def test_places_of_one_session_alone_train_nothing() -> None:
     data = _rooms(2)
     with pytest.raises(InputError, match="both sessions drive through"):
         PlaceTask(initial_network(0), data.subset(data.sessions == 0), data, seed=0)
+    # a line 2.5 m aside, keyframes every metre: the nearest one and its neighbours, no farther than 3 m
+    along_m, aside_m = np.tile(np.arange(10.0), 2), np.repeat([0.0, 2.5], 10)
+    aside = PlaceData(
+        np.zeros((20, ROWS, COLUMNS), np.float32),
+        np.column_stack([along_m, aside_m, np.zeros(20)]),
+        np.zeros(20),
+        np.zeros(20, np.int64),
+        np.repeat([0, 1], 10),
+    )
+    np.testing.assert_array_equal(_partners(aside)[5], [14, 15, 16])
     # the after session drove half of the way: there each has its counterpart, beyond nobody has
     halved = data.subset((data.sessions == 0) | (data.positions[:, 0] < 35))
     for index, partners in enumerate(_partners(halved)):
