@@ -58,10 +58,10 @@ def train_descriptor(
         InputError: The folder lacks a split, is damaged, or `out` holds another run.
     """
     use_threads(threads)
-    make_writable(out)
     tunnels = open_dataset(data, "train"), open_dataset(data, "validation")
     digests = tuple(data_digest(part) for part in tunnels)
     task = TASKS[name](*tunnels, config.seed)
+    make_writable(out)
     before = task.scores()
     latest: list[Progress] = []
 

@@ -63,6 +63,7 @@ def test_mistakes_are_one_line(data: Path, tmp_path: Path, command: Command) -> 
 
     assert "expected sphere or 3deg" in refused(data, "--out", tmp_path / "a", "--descriptor", "spere")
     assert "made by `tunnelcd dataset`" in refused(tmp_path, "--out", tmp_path / "b")
+    assert not (tmp_path / "b").exists()
     training = tmp_path / "training"
     shutil.copytree(data, training)
     rows = (training / "index.csv").read_text().splitlines()
