@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from cdpipe.errors import InputError
-from cdpipe.yamlfile import Document, Settings, read_yaml, suggestion, validated, with_settings
+from cdpipe.yamlfile import Document, Settings, read_yaml, suggestion, validated, with_section, with_settings
 
 Positive = Annotated[float, Field(gt=0)]
 # Smaller ones are noise, and could not be numbered a kilometre from the origin.
@@ -19,6 +19,7 @@ Cell = Annotated[float, Field(ge=0.01)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[float, Field(ge=0)]
+Site = Literal["narrow", "wide"]
 
 
 class MapConfig(Settings):
@@ -161,13 +162,36 @@ def preset_names() -> list[str]:
     return sorted(entry.name.removesuffix(".yaml") for entry in _presets().iterdir() if entry.name.endswith(".yaml"))
 
 
-def load_config(preset: str = "tunnelcd", settings: Iterable[str] = ()) -> PipelineConfig:
+def load_config(preset: str = "tunnelcd", settings: Iterable[str] = (), site: Site = "narrow") -> PipelineConfig:
     """Read a preset (a shipped name or the path of a .yaml file) and write `a.b=value` settings over it.
 
+    Args:
+        preset: What stands in it is for narrow drifts, and under `wide` what is otherwise in wide ones: the radius, and
+            with it the threshold.
+        settings: Written over either.
+        site: Which of them.
+
     Raises:
-        InputError: The preset is unknown, or keys or values are wrong; all mistakes at once.
+        InputError: The preset is unknown or not made for such a site, or keys or values are wrong; all mistakes of
+            both kinds of site at once.
     """
-    return validated(PipelineConfig, with_settings(_preset_document(preset), settings))
+    narrow, wide = with_section(_preset_document(preset), "wide")
+    found: dict[str, PipelineConfig] = {}
+    mistakes: dict[str, None] = {}
+    for name, document in (("narrow", narrow), ("wide", wide)):
+        try:
+            if document is not None:
+                found[name] = validated(PipelineConfig, with_settings(document, settings))
+        except InputError as error:
+            mistakes |= dict.fromkeys(str(error).splitlines())
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+    if site not in found:
+        raise InputError(
+            f"{narrow.source}: wide: missing: this preset does not say what it needs in wide drifts; "
+            "expected e.g. wide: {query: {radius_m: 10, threshold: 0.5}}"
+        )
+    return found[site]
 
 
 def settings_table() -> list[tuple[str, Any, str]]:

@@ -126,6 +126,25 @@ def with_settings(document: Document, settings: Iterable[str]) -> Document:
     return replace(document, value=value, origins=origins)
 
 
+def with_section(document: Document, name: str) -> tuple[Document, Document | None]:
+    """Split a document in what it says without its section `name`, and the same with that written over it.
+
+    Returns:
+        The second is None where there is no such section; its keys keep the lines at which they stand.
+
+    Raises:
+        InputError: The section is no group of settings.
+    """
+    if not isinstance(document.value, dict) or name not in document.value:
+        return document, None
+    section = document.value[name]
+    if not isinstance(section, dict):
+        raise InputError(f"{document.where((name,))}: {name} = {_brief(section)}: expected a group of settings")
+    rest = replace(document, value={key: value for key, value in document.value.items() if key != name})
+    origins = dict(document.origins) | {key[1:]: where for key, where in document.origins.items() if key[:1] == (name,)}
+    return rest, replace(rest, value=_overlaid(rest.value, section), origins=origins)
+
+
 def suggestion(word: str, known: Iterable[str]) -> str:
     """Return `; did you mean "…"?` for the closest known word, or ""."""
     close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
@@ -195,6 +214,12 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
         return [annotation] if issubclass(annotation, BaseModel) else []
     return [found for inner in typing.get_args(annotation) for found in _models_in(inner)]
+
+
+def _overlaid(below: Any, above: Any) -> Any:
+    if not isinstance(below, dict) or not isinstance(above, dict):
+        return _copied(above)
+    return {key: _overlaid(below.get(key), above[key]) if key in above else below[key] for key in {**below, **above}}
 
 
 def _copied(value: Any) -> Any:

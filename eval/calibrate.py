@@ -2,7 +2,7 @@
 
 Run as `python -m eval.calibrate RUN`, where RUN is the folder of `tunnelcd run calibrate`. The thresholds are printed,
 with those at which every method has the same 0.1 false regions per 100 m, and written to RUN/thresholds.csv and, as
-presets and plans spell them, to RUN/thresholds.yaml. They are copied by hand, so that no preset changes behind anyone's
+presets spell them, to RUN/thresholds.yaml. They are copied by hand, so that no preset changes behind anyone's
 back.
 """
 
@@ -101,10 +101,7 @@ def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
 
 
 def as_settings(table: pd.DataFrame) -> str:
-    """Return the thresholds as YAML: for each rate and variant the line of a preset, then what wider sites need.
-
-    The preset holds the site of the smallest radius; wider ones stand in a plan, under `per_scenario` of the variant.
-    """
+    """Return the thresholds as presets spell them in YAML: by rate and variant, for narrow sites and under `wide`."""
     lines = []
     rates = (
         ("threshold", f"at most {ALARM_SHARE:.0%} of the unchanged pairs alarm"),
@@ -116,7 +113,7 @@ def as_settings(table: pd.DataFrame) -> str:
             first, *wider = zip(own["score_radius_m"], own[column], strict=True)
             lines += [f"  {variant}:", f"    preset: {{query: {{threshold: {first[1]:g}}}}}  # {first[0]:g} m"]
             lines += [
-                f'    per_scenario_{radius_m:g}m: ["query.radius_m={radius_m:g}", "query.threshold={value:g}"]'
+                f"    wide_{radius_m:g}m: {{query: {{radius_m: {radius_m:g}, threshold: {value:g}}}}}"
                 for radius_m, value in wider
             ]
     return "\n".join([*lines, ""])

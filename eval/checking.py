@@ -12,7 +12,7 @@ from scenarios.library import check_scenario, scenario_names
 from scenarios.schema import Scenario
 
 _KEYS = {
-    "preset": set(PipelineConfig.model_fields),
+    "preset": {*PipelineConfig.model_fields, "wide"},
     "plan": set(Plan.model_fields),
     "scenario": {*Scenario.model_fields, "extends", "frozen"},
 }

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from eval.command_options import OutFolder, Preset, Quiet, SetSettings
+from eval.command_options import KindOfSite, OutFolder, Preset, Quiet, SetSettings
 from eval.printing import print_table, say
 from eval.progress import shown_progress
 
@@ -32,6 +32,7 @@ def detect(
     after: Annotated[Path, typer.Argument(help="the later session")],
     out: OutFolder,
     preset: Preset = "tunnelcd",
+    site: KindOfSite = "narrow",
     settings: SetSettings = None,
     quiet: Quiet = False,
 ) -> None:
@@ -41,7 +42,7 @@ def detect(
     from eval.output import new_folder
     from eval.single import detect_pair, evidence_table, notes_on, object_table, region_table, write_detection
 
-    config = load_config(preset, settings or ())
+    config = load_config(preset, settings or (), site)
     for note in notes_on(before, after):
         typer.echo(f"note: {note}", err=True)
     try:

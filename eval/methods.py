@@ -7,13 +7,15 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from cdpipe.config import PipelineConfig, load_config
+from cdpipe.config import PipelineConfig, Site, load_config
 from cdpipe.errors import InputError
 from eval.oracles import OracleMerge
-from eval.plan_parts import Grid, Variant
 from eval.worlds import World, setting_text
+
+if TYPE_CHECKING:
+    from eval.plan import Plan
 
 ORACLE_MERGE, ORACLE_REGIONS = "oracle-merge", "oracle-regions"
 _ORACLE_PRESET = "tunnelcd"
@@ -52,6 +54,7 @@ class Method:
     preset: str
     named: tuple[str, ...]
     silent: tuple[str, ...] = ()
+    site: Site = "narrow"
     oracle: OracleMerge | None = None
     oracle_regions: bool = False
 
@@ -66,7 +69,7 @@ class Method:
         Raises:
             InputError: They contradict each other or its preset.
         """
-        config = load_config(self.preset, [*self.named, *self.silent])
+        config = load_config(self.preset, [*self.named, *self.silent], self.site)
         if self.oracle_regions and config.method != "descriptor":
             raise InputError(f"{self.variant}: oracle_regions is for method: descriptor, this one is {config.method}")
         return config
@@ -85,23 +88,25 @@ class Method:
         )
 
 
-def methods_of(variants: Iterable[Variant], grids: Iterable[Grid], world: World) -> list[Method]:
-    """Return the methods that are run in a world: the variants, then the points of the grids that name it."""
+def methods_of(plan: Plan, world: World) -> list[Method]:
+    """Return the methods that a plan runs in one of its worlds: its variants, then the points of the grids there."""
     places = dict.fromkeys((world.name, world.label))
+    site: Site = "narrow" if places.keys().isdisjoint(plan.wide) else "wide"
     methods = [
         Method(
             preset=variant.preset,
             named=variant.set,
             silent=tuple(setting for place in places for setting in variant.per_scenario.get(place, ())),
+            site=site,
             oracle=variant.oracle_merge,
             oracle_regions=variant.oracle_regions,
         )
-        for variant in variants
+        for variant in plan.variants
         if not variant.scenarios or world.label in variant.scenarios
     ]
-    for grid in grids:
+    for grid in plan.grid:
         if not places.keys().isdisjoint(grid.scenarios):
-            methods += [Method(grid.variant, point) for point in _points(grid.keys)]
+            methods += [Method(grid.variant, point, site=site) for point in _points(grid.keys)]
     return methods
 
 

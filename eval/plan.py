@@ -5,13 +5,14 @@ description: what the plan is for
 scenarios:                           # eval/worlds.py tells more
   - paper/site1
   - {name: paper/site2, each: [sensor.range_noise=false, sensor.mode=512x10]}  # as it is, and again with each of these
+wide: [paper/site2]                  # wide drifts: presets with what stands under their `wide`
 seeds: "20000:20002"                 # B excluded, in quotes; or a list
 report: [regions, objects]           # also tables and plots: `eval.region_table`, `eval.object_table`; or one of them
 until: null                          # merge: map, describe, merge, and no further; only the columns of the merge
 variants:
   - preset: paper                    # a shipped preset or the path of a .yaml file
     set: ["extract.voxel_m=0.4"]     # part of the variant's name
-    per_scenario: {paper/site2: ["query.radius_m=10"]}   # belongs to the site, whatever is set there; not to the name
+    per_scenario: {paper/site2: ["query.threshold=1"]}   # belongs to the site, whatever is set there; not to the name
   - preset: tunnelcd
     oracle_merge: {noise_m: 0.1, noise_deg: 0.2}         # merged by the truth: eval/oracles.py; {} is without noise
     oracle_regions: true                                 # a region around each change: eval/oracle_regions.py
@@ -36,8 +37,8 @@ from cdpipe.errors import InputError
 from cdpipe.yamlfile import Settings, read_yaml, suggestion, validated
 from eval.methods import Cell, Until, methods_of
 from eval.plan_checks import misfits, refuse, repeated_worlds
-from eval.plan_parts import Grid, NotEmpty, Variant
-from eval.worlds import ScenarioItem, worlds_of
+from eval.plan_parts import Grid, Label, NotEmpty, Variant
+from eval.worlds import OneOrMore, ScenarioItem, worlds_of
 
 
 def parse_seeds(value: Any) -> tuple[int, ...]:
@@ -73,6 +74,7 @@ class Plan(Settings):
     name: Annotated[str, Field(min_length=1)]
     description: str = ""
     scenarios: Annotated[tuple[ScenarioItem, ...], NotEmpty]
+    wide: Annotated[tuple[Label, ...], OneOrMore] = ()
     seeds: Annotated[tuple[int, ...], BeforeValidator(parse_seeds)]
     until: Until | None = None
     report: Annotated[tuple[Literal["regions", "objects"], ...], BeforeValidator(_subjects)] = ()
@@ -124,7 +126,7 @@ def cells(plan: Plan) -> list[Cell]:
     mistakes: list[str] = []
     for world in worlds_of(plan.scenarios):
         methods = []
-        for method in methods_of(plan.variants, plan.grid, world):
+        for method in methods_of(plan, world):
             try:
                 methods.append((method, method.config()))
             except InputError as error:
@@ -144,7 +146,7 @@ def planned_cases(plan: Plan) -> set[tuple[str, int, str]]:
     return {
         (world.label, seed, method.variant)
         for world in worlds_of(plan.scenarios)
-        for method in methods_of(plan.variants, plan.grid, world)
+        for method in methods_of(plan, world)
         for seed in plan.seeds[: world.n_seeds]
     }
 

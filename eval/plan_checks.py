@@ -66,6 +66,8 @@ def _past_the_end(plan: Plan) -> Iterator[Mistake]:
         rule = f"report: {told} needs {told}, and the plan ends at the merge; leave one of them out"
         yield Mistake(("report",), told, rule)
     rule = "{} does nothing: the plan ends at the merge; leave it out, or leave out until"
+    if plan.wide:
+        yield Mistake(("wide",), ", ".join(plan.wide), rule.format("wide"))
     for place, variant in enumerate(plan.variants):
         for setting in variant.every_setting:
             if group_of(setting) in _AFTER_MERGE:
@@ -87,7 +89,9 @@ def _unknown_worlds(plan: Plan) -> Iterator[Mistake]:
                 rule = f"scenarios of {variant.preset} names {name!r}, which is no world of the plan"
                 yield Mistake(("variants", place, "scenarios", index), name, rule + suggestion(name, labels))
     known = dict.fromkeys(name for world in worlds for name in (world.name, world.label))
-    asked: list[tuple[tuple[str | int, ...], str, str]] = []
+    asked: list[tuple[tuple[str | int, ...], str, str]] = [
+        (("wide", index), "wide", name) for index, name in enumerate(plan.wide)
+    ]
     for place, variant in enumerate(plan.variants):
         asked += [
             (("variants", place, "per_scenario", name), f"per_scenario of {variant.preset}", name)
@@ -106,7 +110,7 @@ def _unknown_worlds(plan: Plan) -> Iterator[Mistake]:
 def _repeated_variants(plan: Plan) -> Iterator[Mistake]:
     told = set()
     for world in worlds_of(plan.scenarios):
-        folders = Counter(slug(method.variant) for method in methods_of(plan.variants, plan.grid, world))
+        folders = Counter(slug(method.variant) for method in methods_of(plan, world))
         for folder, n in folders.items():
             if folder not in told and (n > 1 or len(folder) > _LONGEST_SLUG):
                 told.add(folder)

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import pytest
 
 from cdpipe.config import PipelineConfig, load_config, preset_names, settings_table
@@ -11,8 +13,44 @@ def test_every_shipped_preset_is_valid() -> None:
         assert isinstance(load_config(name), PipelineConfig)
 
 
+def test_every_shipped_preset_says_what_wide_drifts_need() -> None:
+    for name in preset_names():
+        narrow, wide = load_config(name), load_config(name, site="wide")
+        assert (narrow.query.radius_m, wide.query.radius_m) == (4.5, 10.0)
+        scored = narrow.query.n_regions is None
+        assert (wide.query.threshold != narrow.query.threshold) == scored
+        same = {"radius_m": 4.5, "threshold": narrow.query.threshold}
+        assert wide.model_copy(update={"query": wide.query.model_copy(update=same)}) == narrow
+
+
+def test_settings_go_over_either_kind_of_site() -> None:
+    for site in ("narrow", "wide"):
+        assert load_config("tunnelcd", ["query.radius_m=7"], site).query.radius_m == 7
+
+
+def test_mistakes_of_both_kinds_of_site_are_told_at_once(tmp_path: Path) -> None:
+    preset = tmp_path / "mine.yaml"
+    preset.write_text("query: {radius_m: -1}\nwide:\n  query: {radius_m: 10, treshold: 1}\n")
+    with pytest.raises(InputError) as caught:
+        load_config(str(preset))
+    lines = str(caught.value).splitlines()
+    assert [line.partition(":")[2].partition(" =")[0] for line in lines] == ["1: query.radius_m", "3: query.treshold"]
+    assert 'did you mean "threshold"' in lines[1]
+    preset.write_text("wide: 10\n")
+    with pytest.raises(InputError, match=r"mine\.yaml:1: wide = 10: expected a group of settings"):
+        load_config(str(preset))
+
+
+def test_a_preset_without_wide_drifts_is_refused_there(tmp_path: Path) -> None:
+    preset = tmp_path / "mine.yaml"
+    preset.write_text("query: {radius_m: 3}\n")
+    assert load_config(str(preset)).query.radius_m == 3
+    with pytest.raises(InputError, match=r"mine\.yaml: wide: missing.*wide: \{query: \{radius_m: 10"):
+        load_config(str(preset), site="wide")
+
+
 def test_paper_preset_holds_the_published_settings() -> None:
-    config = load_config("paper", ["query.radius_m=10"])
+    config = load_config("paper", site="wide")
     assert (config.query.reading, config.query.radius_m, config.extract.voxel_m) == ("nearest", 10.0, 0.65)
 
 

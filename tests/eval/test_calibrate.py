@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -88,14 +90,15 @@ def test_no_threshold_is_below_what_was_looked_at() -> None:
     assert alarm_threshold(np.full(40, -8.0), lowest=-6.905) == -6.905
 
 
-def test_the_settings_are_lines_of_a_preset_and_of_a_plan() -> None:
+def test_the_settings_are_lines_of_a_preset(tmp_path: Path) -> None:
     document = yaml.safe_load(as_settings(thresholds(_results(), _regions())))
     assert set(document) == {"threshold", "threshold_at_rate"}
     found = document["threshold"]["m"]
     assert found["preset"] == {"query": {"threshold": 6.001}}
-    assert found["per_scenario_10m"] == ["query.radius_m=10", "query.threshold=200.1"]
-    config = load_config("tunnelcd", found["per_scenario_10m"])
-    assert (config.query.radius_m, config.query.threshold) == (10.0, 200.1)
+    preset = tmp_path / "mine.yaml"
+    preset.write_text(yaml.safe_dump({**found["preset"], "wide": found["wide_10m"]}))
+    queries = [load_config(str(preset), site=site).query for site in ("narrow", "wide")]
+    assert [(query.radius_m, query.threshold) for query in queries] == [(4.5, 6.001), (10.0, 200.1)]
 
 
 def test_changed_pairs_are_refused() -> None:

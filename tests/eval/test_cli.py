@@ -119,13 +119,14 @@ def test_detect_writes_its_answer_and_needs_no_truth(pair: Path, tmp_path: Path,
 
 
 def test_a_silent_detect_says_how_near_the_best_candidate_came(pair: Path, tmp_path: Path, command: Command) -> None:
-    silent = ("--preset", "paper", "--set", "query.threshold=9")
+    silent = ("--preset", "paper", "--site", "wide", "--set", "query.threshold=9")
     code, out, _ = command("detect", pair / "before", pair / "after", *silent, "--out", tmp_path / "out")
     report = read_answer(tmp_path / "out").report
     assert report is not None
     assert code == 0
     assert f"nothing reaches query.threshold = 9; the best of {len(report.regions.scores)} candidates scores" in out
     assert f"{report.regions.scores[0]:.4g}" in out
+    assert report.regions.radius_m == 10  # what the preset says of wide drifts
 
 
 def test_detect_finds_the_box_in_recorded_files_as_in_the_session(

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 
+from cdpipe.config import load_config
 from cdpipe.errors import InputError
 from eval import plan as plan_module
 from eval.methods import slug, variant_name
@@ -65,6 +66,38 @@ def test_settings_of_a_site_change_the_configuration_and_not_the_name(tmp_path: 
     assert {c.variant for c in paper.values()} == {"paper"}
     assert paper["smoke/one_box"].config.query.radius_m == 4.5
     assert paper["smoke/unchanged"].config.query.radius_m == 10
+
+
+def test_wide_worlds_get_what_the_presets_say_of_them(tmp_path: Path) -> None:
+    text = PLAN.replace('seeds: "7:9"', 'seeds: "7:9"\nwide: smoke/unchanged')
+    text = text.replace("query.radius_m=10", "query.threshold=2").replace("[smoke/one_box]", "[smoke/unchanged]")
+    found = {(c.scenario, c.variant): c.config.query for c in cells(read(tmp_path, text))}
+    wide = load_config("tunnelcd", site="wide").query
+    assert found["smoke/unchanged", "tunnelcd[extract.voxel_m=0.4]"] == wide
+    assert found["smoke/one_box", "tunnelcd[extract.voxel_m=0.4]"] == load_config("tunnelcd").query
+    # what the plan says goes over it
+    paper = found["smoke/unchanged", "paper"]
+    assert (paper.radius_m, paper.threshold) == (10, 2)
+    point = found["smoke/unchanged", "tunnelcd[extract.voxel_m=0.2,query.radius_m=3]"]
+    assert (point.radius_m, point.threshold) == (3, wide.threshold)
+
+
+def test_wide_names_worlds_of_the_plan_and_acts_after_the_merge(tmp_path: Path) -> None:
+    text = PLAN.replace('seeds: "7:9"', 'seeds: "7:9"\nwide: [narrow]')
+    assert mistakes(tmp_path, text) == [
+        "plan.yaml:4: wide.0 = 'narrow': wide names 'narrow', which is not in scenarios"
+    ]
+    text = "{name: m, until: merge, scenarios: [narrow, wide], wide: [wide], seeds: [7], variants: [{preset: paper}]}"
+    assert mistakes(tmp_path, text) == [
+        "plan.yaml:1: wide = 'wide': wide does nothing: the plan ends at the merge; leave it out, or leave out until"
+    ]
+
+
+def test_a_preset_that_says_nothing_of_wide_worlds_is_told(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("query: {radius_m: 3}\n")
+    text = f"{{name: m, scenarios: [wide], wide: [wide], seeds: [7], variants: [{{preset: {tmp_path}/mine.yaml}}]}}"
+    with pytest.raises(InputError, match=r"mine\.yaml: wide: missing"):
+        cells(read(tmp_path, text))
 
 
 def test_grid_points_get_their_values(tmp_path: Path) -> None:
