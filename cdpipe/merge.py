@@ -225,12 +225,18 @@ def _is_rival(
     """Tell whether a start is another motion than the accepted ones, and fits its place well enough to be one."""
     after = maps[1]
     centre = after.positions[start.keyframe]
+    known = [
+        PathAlignment(after.positions[other.walk.keyframes], other.walk.before_T_after).at(centre[None])[0]
+        for other in accepted
+    ]
+
+    def is_other(pose: Float64Array) -> bool:
+        return all(motion_between(pose, other, centre)[0] >= _OTHER_MOTION_M for other in known)
+
+    if not is_other(start.before_T_after):  # most are not, and registering finely takes as long as all the votes
+        return False
     pose, fit = _at_place(start, maps, config)
-    for other in accepted:
-        alignment = PathAlignment(after.positions[other.walk.keyframes], other.walk.before_T_after)
-        if motion_between(pose, alignment.at(centre[None])[0], centre)[0] < _OTHER_MOTION_M:
-            return False
-    return fit.inlier_share(config.inlier_m) >= config.min_inlier_share
+    return is_other(pose) and fit.inlier_share(config.inlier_m) >= config.min_inlier_share
 
 
 def _path_residual_m(hypothesis: _Hypothesis) -> float:
