@@ -115,7 +115,9 @@ def with_settings(document: Document, settings: Iterable[str]) -> Document:
             raise InputError(f"--set {setting}: the value is not YAML") from error
         *parents, last = name.split(".")
         place = value
-        for parent in parents:
+        for depth, parent in enumerate(parents, 1):
+            if parent not in place:
+                origins[tuple(parents[:depth])] = "--set"
             place = place.setdefault(parent, {})
             if not isinstance(place, dict):
                 raise InputError(f"--set {setting}: {parent} is a value, not a group of settings")
@@ -140,9 +142,10 @@ def with_section(document: Document, name: str) -> tuple[Document, Document | No
     section = document.value[name]
     if not isinstance(section, dict):
         raise InputError(f"{document.where((name,))}: {name} = {_brief(section)}: expected a group of settings")
-    rest = replace(document, value={key: value for key, value in document.value.items() if key != name})
-    origins = dict(document.origins) | {key[1:]: where for key, where in document.origins.items() if key[:1] == (name,)}
-    return rest, replace(rest, value=_overlaid(rest.value, section), origins=origins)
+    below = {key: where for key, where in document.origins.items() if key[:1] != (name,)}
+    above = {key[1:]: where for key, where in document.origins.items() if key[:1] == (name,) != key}
+    rest = replace(document, value={key: value for key, value in document.value.items() if key != name}, origins=below)
+    return rest, replace(rest, value=_overlaid(rest.value, section), origins=below | above)
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:
