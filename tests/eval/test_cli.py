@@ -324,15 +324,26 @@ def test_unknown_names(tmp_path: Path, command: Command) -> None:
     assert tree(tmp_path) == set()
 
 
-def test_usage_errors_exit_with_2(tmp_path: Path, command: Command) -> None:
-    for arguments in (
-        ["detect"],
-        ["no-such-command"],
-        ["simulate", "smoke/one_box", "--seed", "-1", "--out", tmp_path / "x"],
-    ):
-        code, _, err = command(*arguments)
-        assert code == 2
-        assert "Traceback" not in err
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["detect"], ["tunnelcd detect: Missing argument 'before'", "`tunnelcd detect --help`"]),
+        (["no-such-command"], ["tunnelcd: No such command 'no-such-command'"]),
+        (["run", "null", "--worker", "2"], ["tunnelcd run: No such option: --worker", "--workers"]),
+        (
+            ["simulate", "smoke/one_box", "--seed", "-1", "--out", "x"],
+            ["tunnelcd simulate: Invalid value for '--seed'"],
+        ),
+        (["detect", "a", "b", "--site", "wid", "--out", "x"], ["'--site': 'wid' is not one of 'narrow', 'wide'"]),
+    ],
+)
+def test_usage_errors_are_one_line(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch, arguments: list[str], words: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, out, err = command(*arguments)
+    assert_refused((code, out, err), *words)
+    assert len(err.splitlines()) == 1
     assert tree(tmp_path) == set()
 
 
