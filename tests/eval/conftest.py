@@ -10,7 +10,8 @@ from cdpipe.geometry import invert, make_pose, yaw_pose
 from cdpipe.ouster import SensorMetadata
 from cdpipe.session import ScanChunk, SessionWriter
 from eval.cli import main
-from sim.truth import Change, PairTruth, write_labels, write_pair_truth, write_true_poses
+from sim.truth import PairTruth, write_labels, write_pair_truth, write_true_poses
+from tests.eval.changes import change
 
 N_SCANS, CHUNK_SCANS, HEIGHT, WIDTH = 14, 5, 4, 64
 WALL_MM, THING_MM = 4000, 2500
@@ -69,24 +70,7 @@ def write_pair(pair: Path, *, has_changes: bool = True, stretch: float = 1.0) ->
     """Write a pair with an added and a moved thing, or one without changes; odometry stretches the way."""
     pair.mkdir()
     changes = [
-        Change(
-            id=number,
-            name=f"thing {number}",
-            prop_kind="box",
-            kind=kind,
-            session=session,
-            partner=partner,
-            group="full",
-            instance=number,
-            world_T_object=np.eye(4).tolist(),
-            hull_volume_m3=1.0,
-            n_returns=10,
-            n_cells=10,
-            n_ghost_rays=10,
-            is_observable=True,
-            why_not="",
-        )
-        for number, (session, kind, partner, _, _) in THINGS.items()
+        change(number, session, kind, partner=partner) for number, (session, kind, partner, _, _) in THINGS.items()
     ]
     for name in ("before", "after"):
         write_session(pair / name, name, has_changes=has_changes, stretch=stretch)

@@ -1,7 +1,6 @@
 """IoU, matching, instance scores and kinds: hand arithmetic on a row of cells, loops on random sets."""
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from eval.object_metrics import (
 )
 from eval.universe import Universe
 from sim.truth import Change, PairTruth
+from tests.eval.changes import change
 
 N_CELLS = 40
 NAN = float("nan")
@@ -38,27 +38,6 @@ def line_universe(change: list[int]) -> Universe:
         n_scans=1,
         n_pixels=n,
     )
-
-
-def change(number: int, session: str = "after", kind: str = "added", **fields: object) -> Change:
-    base = Change(
-        id=number,
-        name=f"thing {number}",
-        prop_kind="box",
-        kind=kind,
-        session=session,
-        partner=None,
-        group="full",
-        instance=number,
-        world_T_object=np.eye(4).tolist(),
-        hull_volume_m3=1.0,
-        n_returns=10,
-        n_cells=10,
-        n_ghost_rays=10,
-        is_observable=True,
-        why_not="",
-    )
-    return replace(base, **fields)
 
 
 def ground_truth(changes: list[Change], before: list[int] | None = None, after: list[int] | None = None) -> GroundTruth:

@@ -15,6 +15,7 @@ from eval.ground_truth import GroundTruth, SessionTruth
 from eval.object_metrics import kinds_right, match_objects, object_columns
 from eval.universe import Universe
 from sim.truth import Change, PairTruth
+from tests.eval.changes import change
 
 N_ROWS = 90
 SESSIONS = ("before", "after")
@@ -60,12 +61,8 @@ class Case:
                 free = [c for c in changes if c.kind == "moved" and c.session != session and c.partner is None]
                 partner = free[0].id if free else None
                 changes = [replace(c, partner=number) if c.id == partner else c for c in changes]
-            change = Change(
-                id=number, name=f"thing {number}", prop_kind="box", kind=kind, session=session, partner=partner,
-                group=group, instance=number, world_T_object=np.eye(4).tolist(), hull_volume_m3=1.0, n_returns=10,
-                n_cells=10, n_ghost_rays=10, is_observable=bool(draw.random() < 0.8), why_not="",
-            )  # fmt: skip
-            changes.append(change)
+            is_observable = bool(draw.random() < 0.8)
+            changes.append(change(number, session, kind, partner=partner, group=group, is_observable=is_observable))
         return changes
 
     def _answer(

@@ -14,6 +14,7 @@ from eval.object_metrics import match_objects
 from eval.object_sizes import size_columns, size_errors, true_displacements_map, true_volume_m3
 from eval.universe import Universe
 from sim.truth import Change, PairTruth
+from tests.eval.changes import change
 
 N_SCANS = 11
 KEYFRAMES = np.array([0, 5, 10])
@@ -22,19 +23,15 @@ NAN = float("nan")
 WIDTH = 10
 
 
-def change(number: int, session: str, kind: str, at: np.ndarray, **fields: object) -> Change:
-    base = Change(
-        id=number, name="thing", prop_kind="box", kind=kind, session=session, partner=None, group="full",
-        instance=number, world_T_object=at.tolist(), hull_volume_m3=2.0, n_returns=WIDTH, n_cells=WIDTH,
-        n_ghost_rays=10, is_observable=True, why_not="",
-    )  # fmt: skip
-    return replace(base, **fields)
+def change_at(number: int, session: str, kind: str, at: np.ndarray, **fields: object) -> Change:
+    ours = {"name": "thing", "world_T_object": at.tolist(), "hull_volume_m3": 2.0}
+    return change(number, session, kind, **{**ours, **fields})
 
 
 def moved(start: np.ndarray, end: np.ndarray, **fields: object) -> list[Change]:
     return [
-        change(1, "before", "moved", start, partner=2, **fields),
-        change(2, "after", "moved", end, partner=1, **fields),
+        change_at(1, "before", "moved", start, partner=2, **fields),
+        change_at(2, "after", "moved", end, partner=1, **fields),
     ]
 
 
@@ -86,7 +83,9 @@ def test_the_error_of_a_displacement_by_hand() -> None:
 
 
 def test_what_is_not_matched_or_never_moved_has_no_displacement() -> None:
-    truth = truth_of([change(1, "after", "added", np.eye(4)), change(2, "after", "moved", np.eye(4), partner=None)])
+    truth = truth_of(
+        [change_at(1, "after", "added", np.eye(4)), change_at(2, "after", "moved", np.eye(4), partner=None)]
+    )
     assert np.isnan(true_displacements_map(truth, KEYFRAMES)).all()
     displacement_m, _ = errors_of(truth, [thing("after", moved_by=(1.0, 0.0, 0.0))], [0])
     assert np.isnan(displacement_m).all()
@@ -123,11 +122,11 @@ def test_drift_between_the_two_places_belongs_to_the_map() -> None:
 
 def test_volumes_by_hand() -> None:
     changes = [
-        change(1, "after", "added", np.eye(4), hull_volume_m3=2.0, mesh_volume_m3=1.6),
-        change(2, "after", "added", np.eye(4), hull_volume_m3=2.0),
-        change(3, "after", "added", np.eye(4), hull_volume_m3=0.0),
-        change(4, "after", "added", np.eye(4)),
-        change(5, "after", "added", np.eye(4)),
+        change_at(1, "after", "added", np.eye(4), hull_volume_m3=2.0, mesh_volume_m3=1.6),
+        change_at(2, "after", "added", np.eye(4), hull_volume_m3=2.0),
+        change_at(3, "after", "added", np.eye(4), hull_volume_m3=0.0),
+        change_at(4, "after", "added", np.eye(4)),
+        change_at(5, "after", "added", np.eye(4)),
     ]
     objects = [thing("after", volume_m3=volume) for volume in (2.0, 1.5, 1.0, None)]
     _, volume_share = errors_of(truth_of(changes), objects, [0, 1, 2, 3])
@@ -136,16 +135,16 @@ def test_volumes_by_hand() -> None:
 
 def test_a_short_move_has_no_volume_and_a_reshaped_pile_that_of_what_is_gone() -> None:
     place = np.eye(4)
-    assert np.isnan(true_volume_m3(change(1, "after", "moved", place, group="partial")))
-    assert true_volume_m3(change(1, "before", "reshaped", place, group="partial", mesh_volume_m3=0.7)) == 0.7
-    assert true_volume_m3(change(1, "after", "moved", place)) == 2.0
+    assert np.isnan(true_volume_m3(change_at(1, "after", "moved", place, group="partial")))
+    assert true_volume_m3(change_at(1, "before", "reshaped", place, group="partial", mesh_volume_m3=0.7)) == 0.7
+    assert true_volume_m3(change_at(1, "after", "moved", place)) == 2.0
 
 
 def test_columns_are_medians_of_what_is_there() -> None:
     changes = [
-        change(1, "after", "added", np.eye(4), prop_kind="muck_pile"),
-        change(2, "after", "added", np.eye(4), prop_kind="muck_pile"),
-        change(3, "after", "added", np.eye(4)),
+        change_at(1, "after", "added", np.eye(4), prop_kind="muck_pile"),
+        change_at(2, "after", "added", np.eye(4), prop_kind="muck_pile"),
+        change_at(3, "after", "added", np.eye(4)),
     ]
     truth = truth_of(changes)
     objects = [thing("after", volume_m3=volume) for volume in (2.2, 1.4, 20.0)]
@@ -178,7 +177,7 @@ def test_errors_of_displacement_and_volume_equal_their_slow_twins(seed: int) -> 
         for half, session in enumerate(("before", "after")):
             pose = make_pose(Rotation.from_rotvec(draw.normal(0, 0.8, 3)).as_matrix(), draw.uniform(-1, 21, 3))
             changes.append(
-                change(
+                change_at(
                     2 * pair + half + 1, session, "moved", pose, name=f"thing {pair}", partner=2 * pair + 2 - half,
                     prop_kind=str(draw.choice(["box", "muck_pile"])), group=str(draw.choice(["full", "partial"])),
                     hull_volume_m3=float(draw.uniform(0.1, 4)), mesh_volume_m3=draw.choice([None, 0.5, 1.5]),

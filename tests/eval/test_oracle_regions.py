@@ -16,7 +16,8 @@ from eval.plan import Plan, cells, load_plan
 from eval.plan_changes import changed_plan
 from eval.region_metrics import centres_in_world, match_regions
 from eval.universe import Universe
-from sim.truth import Change, PairTruth
+from sim.truth import PairTruth
+from tests.eval.changes import change
 
 N_SCANS = 40
 SCANS = (np.arange(0, N_SCANS, 4), np.arange(1, N_SCANS, 3))
@@ -28,14 +29,7 @@ def truth_of(places: list[tuple[float, float]], n_cells: list[int], is_observabl
     bends = np.stack([yaw_pose(0.004 * index, (5.0 + 0.01 * index, -3.0, 0.0)) for index in range(N_SCANS)])
     none = np.zeros(0, dtype=np.int16)
     universe = Universe(np.zeros(0, np.int64), np.zeros((0, 3), np.float32), none, none, N_SCANS, 1)
-    changes = tuple(
-        Change(
-            id=number, name="thing", prop_kind="box", kind="added", session="after", partner=None, group="full",
-            instance=number, world_T_object=np.eye(4).tolist(), hull_volume_m3=1.0, n_returns=10, n_cells=10,
-            n_ghost_rays=10, is_observable=True, why_not="",
-        )
-        for number in range(1, len(places) + 1)
-    )  # fmt: skip
+    changes = tuple(change(number) for number in range(1, len(places) + 1))
     return GroundTruth(
         pair=PairTruth("test", 0, 4.5, changes, {}),
         sessions={

@@ -23,7 +23,8 @@ from eval.ground_truth import load_ground_truth
 from eval.page import write_page
 from eval.page_site import truth_marks, world_to_odom
 from eval.runfolder import RunFolder
-from sim.truth import Change, PairTruth, write_labels, write_pair_truth, write_true_poses
+from sim.truth import PairTruth, write_labels, write_pair_truth, write_true_poses
+from tests.eval.changes import change
 
 SITE, EMPTY = "paper/site1", "unchanged/site1"
 WIDTH, N_SCANS = 64, 6
@@ -54,30 +55,11 @@ METRICS = (
 GRID = {(v, r): 0.1 * i for i, (v, r) in enumerate((v, r) for v in ("0.15", "0.3", "0.65") for r in ("3.0", "6.0"))}
 
 
-def change(number: int, kind: str, session: str, *, is_observable: bool = True) -> Change:
-    return Change(
-        id=number,
-        name=f"thing-{number}",
-        prop_kind="box",
-        kind=kind,
-        session=session,
-        partner=None,
-        group="full",
-        instance=number,
-        world_T_object=np.eye(4).tolist(),
-        hull_volume_m3=0.5,
-        n_returns=48,
-        n_cells=40,
-        n_ghost_rays=30,
-        is_observable=is_observable,
-        why_not="" if is_observable else "too few rays",
-    )
-
-
+SEEN: dict[str, Any] = {"hull_volume_m3": 0.5, "n_returns": 48, "n_cells": 40, "n_ghost_rays": 30}
 CHANGES = (
-    change(1, "added", "after"),
-    change(2, "removed", "before"),
-    change(3, "added", "after", is_observable=False),
+    change(1, name="thing-1", **SEEN),
+    change(2, "before", "removed", name="thing-2", **SEEN),
+    change(3, name="thing-3", **SEEN, is_observable=False, why_not="too few rays"),
 )
 
 
