@@ -183,7 +183,7 @@ def draw_gates(cases: pd.DataFrame, table: pd.DataFrame) -> bytes:
         axes.axvline(by_gate[name]["threshold"], color=BLACK, linewidth=1.4)
         if not np.isnan(by_gate[name]["suggested"]):
             axes.axvline(by_gate[name]["suggested"], color=BLACK, linewidth=1.0, linestyle=(0, (3, 2)))
-        axes.set_title(f"{name.replace('_', ' ')}: merge.{setting} = {by_gate[name]['threshold']:g}", fontsize=9)
+        axes.set_title(f"{name.replace('_', ' ')}\nmerge.{setting} = {by_gate[name]['threshold']:g}", fontsize=9)
     for axes in panels[len(GATES) :]:
         axes.set_axis_off()
     handles = [
