@@ -87,18 +87,18 @@ for _name, _command in _COMMANDS.items():
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line and exit."""
     fix_threads()
+    words = list(sys.argv[1:] if argv is None else argv)
     try:
-        code = app(args=None if argv is None else list(argv), prog_name="tunnelcd", standalone_mode=False)
+        code = app(args=words, prog_name="tunnelcd", standalone_mode=False)
     except typer.TyperException as error:
-        _tell_usage(error)
+        command = " ".join(["tunnelcd", *(word for word in words[:1] if word in _COMMANDS)])
+        _tell_usage(command, error)
         raise SystemExit(error.exit_code) from error
     raise SystemExit(code)
 
 
-def _tell_usage(error: typer.TyperException) -> None:
+def _tell_usage(command: str, error: typer.TyperException) -> None:
     """Write what typer finds wrong with a command as one line, where typer alone would draw a box."""
-    context = getattr(error, "ctx", None)
-    command = context.command_path if context else "tunnelcd"
     # pydantic's name of the error says nothing; choices stand below one another
     message = " ".join(error.format_message().replace("Value error, ", "").split()).rstrip(".")
     if message:  # none for `tunnelcd` alone, which has shown its help by now

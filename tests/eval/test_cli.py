@@ -329,6 +329,10 @@ def test_unknown_names(tmp_path: Path, command: Command) -> None:
     [
         (["detect"], ["tunnelcd detect: Missing argument 'before'", "`tunnelcd detect --help`"]),
         (["no-such-command"], ["tunnelcd: No such command 'no-such-command'"]),
+        (
+            ["train", "data", "--out"],
+            ["tunnelcd train: Option '--out' requires an argument", "`tunnelcd train --help`"],
+        ),
         (["run", "null", "--worker", "2"], ["tunnelcd run: No such option: --worker", "--workers"]),
         (
             ["simulate", "smoke/one_box", "--seed", "-1", "--out", "x"],
