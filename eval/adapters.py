@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cdpipe.readers import RecordedScans, open_scans
-from cdpipe.session import Session
-from cdpipe.types import ScanSource, SessionName
+from cdpipe.io.readers import RecordedScans, open_scans
+from cdpipe.io.session import Session
+from cdpipe.model.types import ScanSource, SessionName
 
 
 def pipeline_input(pair: Path, session: SessionName) -> ScanSource:

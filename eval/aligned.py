@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from cdpipe.alignment import PathAlignment
-from cdpipe.errors import InputError
-from cdpipe.geometry import Float64Array, require_poses
-from cdpipe.types import ChangeReport
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, require_poses
+from cdpipe.model.alignment import PathAlignment
+from cdpipe.model.types import ChangeReport
 
 
 def alignment_of(report: ChangeReport, after_odom_T_sensor: Float64Array) -> PathAlignment:

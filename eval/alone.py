@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 
-def death_of(call: Callable[..., object], *args: object) -> str:
+def run_isolated(call: Callable[..., object], *args: object) -> str:
     """Call a function with these arguments in a new Python process, and wait.
 
     The process ends itself when this one dies. What it returns is not kept.

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpipe.answer import Answer
-from cdpipe.errors import InputError
-from cdpipe.geometry import Float64Array, Int64Array, require_poses, require_shape
-from cdpipe.types import ChangedObject, ChangeRegions, SessionName
-from cdpipe.yamlfile import suggestion
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, Int64Array, require_poses, require_shape
+from cdpipe.core.yamlfile import suggestion
+from cdpipe.io.answer import Answer
+from cdpipe.model.types import ChangedObject, ChangeRegions, SessionName
 from eval.answer_rows import POINT_RADIUS_M, rows_near_points
 from eval.ground_truth import SESSIONS, GroundTruth, SessionTruth
-from eval.universe import Universe
+from eval.universe import ScoringPoints
 
 _SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns"))
 _MANY = 100  # so many returns of any place hold the first one of some cell
@@ -150,7 +150,7 @@ def _check_returns(session: SessionName, objects: tuple[ChangedObject, ...], tru
         )
 
 
-def _check_places(objects: tuple[ChangedObject, ...], universe: Universe) -> None:
+def _check_places(objects: tuple[ChangedObject, ...], universe: ScoringPoints) -> None:
     """Raise if no object of the before session lies where its returns do; its odom frame is the map frame.
 
     A pixel that returned in one session mostly did in the other, so nothing else tells when they are swapped.
@@ -175,7 +175,7 @@ def _check_points(
     session: SessionName,
     objects: tuple[ChangedObject, ...],
     points_odom: tuple[Float64Array, ...] | None,
-    universe: Universe,
+    universe: ScoringPoints,
 ) -> None:
     if points_odom is None:
         return

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.answer import Answer
-from cdpipe.geometry import Float64Array, Int64Array
+from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.io.answer import Answer
 from eval.ground_truth import SESSIONS, GroundTruth
-from eval.universe import Universe
+from eval.universe import ScoringPoints
 
 POINT_RADIUS_M = 0.1
 
@@ -35,7 +35,7 @@ def answer_rows(answer: Answer, truth: GroundTruth) -> tuple[Int64Array, ...]:
 
 
 def rows_near_points(
-    universe: Universe, objects_odom: list[Float64Array], radius_m: float = POINT_RADIUS_M
+    universe: ScoringPoints, objects_odom: list[Float64Array], radius_m: float = POINT_RADIUS_M
 ) -> list[Int64Array]:
     """Return, for each object, the rows of the universe whose nearest predicted point is its own and within a radius.
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from cdpipe.errors import InputError
-from cdpipe.yamlfile import suggestion
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import suggestion
 from eval.descriptor_bench import descriptor_contests
 from eval.extract_bench import ExtractSite, extract_contests, extract_sites
 from eval.merge_bench import FailedContest, MergeSite, merge_contests, paper_sites

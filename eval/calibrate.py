@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 import typer
 
-from cdpipe.errors import InputError
-from cdpipe.geometry import Float64Array
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array
 from eval.cli import input_errors
 
 ALARM_SHARE = 0.05

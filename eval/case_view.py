@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.answer import read_answer
-from cdpipe.errors import InputError
-from cdpipe.geometry import Float64Array
-from cdpipe.session import load_arrays
-from cdpipe.types import ChangeReport
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array
+from cdpipe.io.answer import read_answer
+from cdpipe.io.session import load_arrays
+from cdpipe.model.types import ChangeReport
 from eval.aligned import alignment_of
 from eval.ground_truth import GroundTruth, load_ground_truth
 from eval.page_run import Row, flag, number, text

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cdpipe.config import PipelineConfig, load_config, preset_names
-from cdpipe.errors import InputError
-from cdpipe.yamlfile import read_yaml, suggestion
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import read_yaml, suggestion
+from cdpipe.model.config import PipelineConfig, load_config, preset_names
 from eval.plan import Plan, cells, load_plan, plan_names
 from scenarios.library import check_scenario, scenario_names
 from scenarios.schema import Scenario

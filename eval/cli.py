@@ -14,7 +14,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from cdpipe.errors import TunnelcdError
+from cdpipe.core.errors import TunnelcdError
 from eval import commands_pair, commands_run, commands_tools, commands_training, commands_world
 from eval.provenance import fix_threads
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 from eval.provenance import THREAD_VARIABLES, THREADS, fix_threads, versions
 
 # Dask has its workers give every freed array back to the system at once, which costs a quarter of the time of a pair.

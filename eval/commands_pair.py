@@ -20,7 +20,7 @@ def describe(
     quiet: Quiet = False,
 ) -> None:
     """Compute a session's descriptors and store them beside it, as a robot would while mapping."""
-    from cdpipe.config import load_config
+    from cdpipe.model.config import load_config
     from eval.single import describe_session
 
     descriptors, path = describe_session(session, load_config(preset, settings or ()))
@@ -37,8 +37,8 @@ def detect(
     quiet: Quiet = False,
 ) -> None:
     """Find what changed between two sessions, simulated or recorded; needs no truth."""
-    from cdpipe.config import load_config
-    from cdpipe.errors import MergeFailedError
+    from cdpipe.core.errors import MergeFailedError
+    from cdpipe.model.config import load_config
     from eval.output import new_folder
     from eval.single import detect_pair, evidence_table, notes_on, object_table, region_table, write_detection
 

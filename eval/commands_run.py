@@ -81,7 +81,7 @@ def score(
     quiet: Quiet = False,
 ) -> None:
     """Score stored answers against the truth again, or another program's predictions; nothing is run."""
-    from cdpipe.errors import InputError
+    from cdpipe.core.errors import InputError
 
     if (predictions is None) != (name is None):
         raise InputError("--predictions and --as: a run takes predictions under a name: give both, or neither")
@@ -127,7 +127,7 @@ def report(
     quiet: Quiet = False,
 ) -> None:
     """Write one offline page with tables, plots and pictures of a run; or what moved between two runs."""
-    from cdpipe.errors import InputError
+    from cdpipe.core.errors import InputError
 
     if other is None and against is None:
         from eval.page import write_page

@@ -44,8 +44,8 @@ def bench(
 
 def list_command() -> None:
     """Name the scenarios, plans, presets and sensor profiles there are."""
-    from cdpipe.config import preset_names
-    from cdpipe.ouster import profile_names
+    from cdpipe.model.config import preset_names
+    from cdpipe.sensor.ouster import profile_names
     from eval.plan import plan_names
     from scenarios.library import scenario_names
 
@@ -63,7 +63,7 @@ def list_command() -> None:
 
 def doctor() -> None:
     """Tell what is installed, whether it works, and what mends it where it does not."""
-    from cdpipe.errors import InputError
+    from cdpipe.core.errors import InputError
     from eval.doctor import examine, faults
 
     found = []
@@ -77,7 +77,7 @@ def doctor() -> None:
 
 def check(files: Annotated[list[str], typer.Argument(help="scenario, plan or preset: a name or a .yaml file")]) -> None:
     """Validate scenarios, plans and presets without running anything."""
-    from cdpipe.errors import InputError
+    from cdpipe.core.errors import InputError
     from eval.checking import check_file
 
     mistakes: list[str] = []

@@ -68,8 +68,8 @@ def train(
     quiet: Quiet = False,
 ) -> None:
     """Train a descriptor: checkpoint (safetensors), model card, curves. A run that was cut off goes on."""
-    from cdpipe.descriptor.fit import FitConfig
-    from cdpipe.errors import InputError
+    from cdpipe.core.errors import InputError
+    from cdpipe.training.fit import FitConfig
     from eval.training_run import TASKS, train_descriptor
 
     if descriptor not in TASKS:

@@ -44,7 +44,7 @@ def survey(
     """Build the worlds of families without scanning them, and tell size, density, changes, repose, roughness."""
     import pandas as pd
 
-    from cdpipe.errors import InputError
+    from cdpipe.core.errors import InputError
     from eval.output import make_writable
     from eval.plan import parse_seeds
     from sim import survey as surveys
@@ -87,7 +87,7 @@ def view(
     """Look at a world, a simulated pair or a session in the browser."""
     import time
 
-    from cdpipe.errors import InputError
+    from cdpipe.core.errors import InputError
     from eval.looking import view_of
     from sim.viewer import require_viser, running_server, show, write_html
 

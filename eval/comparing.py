@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 from eval.compared_columns import COMPARED, POOLED, POOLED_RATE_PER_100M, figures_of, is_time
 from eval.region_curves import PAIR, interval_of, ranked_pairs, recall_at, resampled_recalls
 from eval.region_table import ALL_DOMAINS, DOMAINS

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpipe.captures import SUFFIXES
-from cdpipe.errors import InputError
-from cdpipe.osf import Fields, write_osf
-from cdpipe.recording import import_recording
-from cdpipe.session import Session, is_session, read_session
+from cdpipe.core.errors import InputError
+from cdpipe.io.ouster.captures import SUFFIXES
+from cdpipe.io.ouster.osf import Fields, write_osf
+from cdpipe.io.ouster.recording import import_recording
+from cdpipe.io.session import Session, is_session, read_session
 from eval.output import made_parents
 from eval.progress import RunProgress
 from sim.truth import read_labels

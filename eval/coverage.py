@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from cdpipe.errors import InputError
-from cdpipe.yamlfile import Document, validated
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import Document, validated
 from eval.plan import Plan, planned_cases
 
 

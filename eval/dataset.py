@@ -16,16 +16,16 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from cdpipe.config import MapConfig, load_config
-from cdpipe.descriptor import sphere_image
-from cdpipe.descriptor.range_image import range_image
-from cdpipe.descriptor.shard import CHANGE_KINDS, FORMAT_VERSION, shard_bytes, split_of
-from cdpipe.descriptor.sphere_image import COLUMNS, CROP_M, HALF_LENGTH_M, REACH_M, ROWS, pixels, render
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array, Int64Array, invert, stream, transform, yaw_rad
-from cdpipe.mapping import build_map, keyframes
-from cdpipe.sphere import MapIndex
-from cdpipe.types import DescriptorSet, MappedSession, PointMap, PosedScan, ScanSource
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, Int64Array, invert, stream, transform, yaw_rad
+from cdpipe.core.grid_index import GridIndex
+from cdpipe.descriptors import sphere_image
+from cdpipe.descriptors.range_image import range_image
+from cdpipe.descriptors.sphere_image import COLUMNS, CROP_M, HALF_LENGTH_M, REACH_M, ROWS, pixels, render
+from cdpipe.mapping.mapping import build_map, keyframes
+from cdpipe.model.config import MapConfig, load_config
+from cdpipe.model.types import DescriptorSet, MappedSession, PointMap, PosedScan, ScanSource
+from cdpipe.training.shard import CHANGE_KINDS, FORMAT_VERSION, shard_bytes, split_of
 from eval.adapters import held_input
 from eval.ground_truth import SESSIONS, GroundTruth, SessionTruth, ground_truth
 from eval.merge_metrics import PAIR_RADIUS_M
@@ -36,7 +36,7 @@ from eval.universe import UniverseBuilder
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
-from sim.held import LabelledSession, hold_pair
+from sim.held import LabelledSession, simulate_in_memory
 
 _MAX_CHANGES = 255  # labels are bytes
 # Mapped at a time: their sums stay in the cache, which takes a quarter off the mapping of 64 at a time.
@@ -89,14 +89,14 @@ def shard_digest(scenario: Scenario, seed: int, recipe: Recipe) -> str:
 
 
 def make_shard(family: str, seed: int, recipe: Recipe) -> bytes:
-    """Simulate one tunnel and return its shard (`cdpipe.descriptor.shard`).
+    """Simulate one tunnel and return its shard (`cdpipe.training.shard`).
 
     Raises:
         ScenarioError: The world cannot be built, the sessions never meet, or there are too many changes for a label.
         InputError: A file that the scenario names cannot be read.
     """
     scenario = load_scenario(family, seed, recipe.settings)
-    pair = hold_pair(scenario, seed)
+    pair = simulate_in_memory(scenario, seed)
     if len(pair.truth.changes) > _MAX_CHANGES:
         raise ScenarioError(f"{family}: {len(pair.truth.changes)} changes, labels can tell {_MAX_CHANGES} apart")
     before, after = (_mapped(pair.sessions[name]) for name in SESSIONS)
@@ -250,12 +250,12 @@ def _images(
     anchors = before.map.odom_T_keyframe
     draws = merge_errors(recipe, seed)
     poses = [displaced(anchors, *error) for error in zip(draws["shift_m"], draws["turn_rad"], strict=True)]
-    after_index = MapIndex(after_map)
+    after_index = GridIndex(after_map)
     before_labels = label_images(before.map.points, before.point_changes, anchors)
     after_labels = np.stack([label_images(after_map, after.point_changes, each) for each in poses])
     ids = [change.id for change in truth.pair.changes]
     return {
-        "before_images": render(MapIndex(before.map.points), anchors),
+        "before_images": render(GridIndex(before.map.points), anchors),
         "after_images": np.stack([render(after_index, each) for each in poses]),
         "before_labels": before_labels,
         "after_labels": after_labels,
@@ -279,7 +279,7 @@ def label_images(
     labels = np.zeros((len(map_T_anchor), ROWS * COLUMNS), dtype=np.uint8)
     if len(changed) == 0:
         return labels.reshape(-1, ROWS, COLUMNS)
-    index = MapIndex(changed)
+    index = GridIndex(changed)
     for image, map_T_here, anchor_T_map in zip(labels, map_T_anchor, invert(map_T_anchor), strict=True):
         near = index.crop(map_T_here[:3, 3], CROP_M)
         points_anchor = transform(anchor_T_map, changed[near])

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cdpipe.descriptor.shard import FIELDS, SUFFIX, read_about, split_of
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
+from cdpipe.training.shard import FIELDS, SUFFIX, read_about, split_of
 
 COUNTS = ("n_before", "n_after", "n_covered", "n_positive", "n_negative", "n_changes", "n_observable")
 INDEX_COLUMNS = (
@@ -93,7 +93,7 @@ The same command makes the same bytes. Shards that are there are kept; what is m
 ## Loading
 
 ```python
-from cdpipe.descriptor.data import ChangePairs, open_dataset, stacked
+from cdpipe.training.data import ChangePairs, open_dataset, stacked
 
 tunnels = open_dataset("DIR", "train")                      # or "validation"; families=..., seeds=range(...)
 pairs = ChangePairs(tunnels)                                # a torch Dataset of (tunnel, draw, anchor)

@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from cdpipe.descriptor.shard import FORMAT, FORMAT_VERSION, SUFFIX, read_about
-from cdpipe.errors import InputError, ScenarioError
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.training.shard import FORMAT, FORMAT_VERSION, SUFFIX, read_about
 from eval.cluster import HERE, Where, connected, n_slots, require_usable
 from eval.dataset import Recipe, make_shard, shard_digest
 from eval.dataset_card import write_card

@@ -9,10 +9,10 @@ from time import perf_counter
 
 import numpy as np
 
-from cdpipe.config import load_config
-from cdpipe.descriptor.sphere import change_log_odds, describe_map
-from cdpipe.merge import merge_maps
-from cdpipe.query import find_regions
+from cdpipe.descriptors.sphere import change_log_odds, describe_map
+from cdpipe.merge.merge import merge_maps
+from cdpipe.model.config import load_config
+from cdpipe.query.query import find_regions
 from eval.merge_bench import MergeSite
 from sim.timing import Contest, timed
 

@@ -19,13 +19,13 @@ import numpy as np
 import pandas as pd
 import typer
 
-from cdpipe.descriptor import use_threads
-from cdpipe.descriptor.data import TunnelShard, open_dataset
-from cdpipe.descriptor.fit import FitConfig, fit
-from cdpipe.descriptor.sphere_network import SphereNetwork, SphereSize, initial_sphere_network, trained_sphere_network
-from cdpipe.descriptor.sphere_training import SphereTask, sphere_data
-from cdpipe.errors import InputError
-from cdpipe.geometry import stream
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import stream
+from cdpipe.descriptors import use_threads
+from cdpipe.descriptors.sphere_network import SphereNetwork, SphereSize, initial_sphere_network, trained_sphere_network
+from cdpipe.training.data import TunnelShard, open_dataset
+from cdpipe.training.fit import FitConfig, fit
+from cdpipe.training.sphere_training import SphereTask, sphere_data
 from eval.cli import input_errors
 from eval.descriptor_curve_plots import draw_curves
 from eval.descriptor_measures import FLOAT_BITS, HeldOut, held_out, measures

@@ -16,11 +16,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from cdpipe.descriptor.data import TunnelShard
-from cdpipe.descriptor.shard import read_shard
-from cdpipe.descriptor.sphere_network import SphereNetwork
-from cdpipe.descriptor.sphere_training import SphereData, local_scores, sphere_data, within_reach
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.descriptors.sphere_network import SphereNetwork
+from cdpipe.training.data import TunnelShard
+from cdpipe.training.shard import read_shard
+from cdpipe.training.sphere_training import SphereData, local_scores, sphere_data, within_reach
 from eval.ranking import auroc
 
 FLOAT_BITS = 32

@@ -15,13 +15,13 @@ from typing import Any, get_args
 
 import numpy as np
 
-from cdpipe.config import DescriptorConfig, PipelineConfig, load_config
-from cdpipe.descriptor import checkpoint_digest, describe_map, describe_scan
-from cdpipe.geometry import Float64Array
-from cdpipe.mapping import build_map
-from cdpipe.merge import merge_maps
-from cdpipe.query import find_regions
-from cdpipe.types import DescriptorSet, MappedSession, MergedMaps, PointMap, PosedScan, ScanSource
+from cdpipe.core.geometry import Float64Array
+from cdpipe.descriptors import checkpoint_digest, describe_map, describe_scan
+from cdpipe.mapping.mapping import build_map
+from cdpipe.merge.merge import merge_maps
+from cdpipe.model.config import DescriptorConfig, PipelineConfig, load_config
+from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, PosedScan, ScanSource
+from cdpipe.query.query import find_regions
 from eval.adapters import pipeline_input
 from eval.ground_truth import SESSIONS, GroundTruth, load_ground_truth
 from eval.place_metrics import place_scores

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 from eval.descriptor_rows import SPHERE
 from eval.domains import domain_of
 from eval.statistics import bootstrap_interval, mean_with_interval

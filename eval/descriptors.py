@@ -18,9 +18,9 @@ from typing import Annotated
 import pandas as pd
 import typer
 
-from cdpipe.config import load_config
-from cdpipe.descriptor import checkpoint_digest, sphere_digest, use_threads
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
+from cdpipe.descriptors import checkpoint_digest, sphere_digest, use_threads
+from cdpipe.model.config import load_config
 from eval.cli import input_errors
 from eval.descriptor_rows import METHODS, pair_rows
 from eval.descriptor_table import places_table, spheres_table

@@ -12,7 +12,7 @@ from importlib import resources
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cdpipe.geometry import Float64Array
+    from cdpipe.core.geometry import Float64Array
 
 _HALF_M = 3.0
 _SHIFT_M = (0.12, -0.07, 0.03)
@@ -45,13 +45,13 @@ def weights() -> str:
     """Load the shipped networks, and hold their digests against their model cards (torch, safetensors)."""
     import torch
 
-    from cdpipe.descriptor.network import trained_network
-    from cdpipe.descriptor.sphere_network import trained_sphere_network
+    from cdpipe.descriptors.network import trained_network
+    from cdpipe.descriptors.sphere_network import trained_sphere_network
 
     told = []
     for name, load in (("3deg", trained_network), ("sphere", trained_sphere_network)):
         network, digest = load()
-        card = json.loads((resources.files("cdpipe") / "descriptor" / f"{name}.json").read_text())
+        card = json.loads((resources.files("cdpipe") / "descriptors" / "weights" / f"{name}.json").read_text())
         _require(digest == card["checkpoint"], f"{name}.safetensors is {digest}, its model card {card['checkpoint']}")
         is_finite = all(torch.isfinite(values).all() for values in network.state_dict().values())
         _require(is_finite, f"{name}.safetensors holds numbers that are not finite")
@@ -84,11 +84,11 @@ def coarse_merge() -> str:
     """Find how two samples of a room fit together without a guess (kiss-matcher)."""
     import numpy as np
 
-    from cdpipe.coarse import coarse_pose
-    from cdpipe.geometry import transform, yaw_pose
+    from cdpipe.core.geometry import transform, yaw_pose
+    from cdpipe.merge.global_registration import register_globally
 
     before_T_after = yaw_pose(2.0, (30.0, -12.0, 1.0))
-    found = coarse_pose(transform(before_T_after, _room(0)), _room(1), 0.4)
+    found = register_globally(transform(before_T_after, _room(0)), _room(1), 0.4)
     if found is None:
         raise RuntimeError("two samples of one room were not matched")
     off_m = float(np.linalg.norm(found.before_T_after[:3, 3] - before_T_after[:3, 3]))
@@ -100,8 +100,8 @@ def odometry() -> str:
     """Let a sensor stand still for three revolutions (kiss-icp)."""
     import numpy as np
 
-    from cdpipe.odometry import estimate_motion
-    from cdpipe.ouster import load_profile
+    from cdpipe.mapping.odometry import estimate_motion
+    from cdpipe.sensor.ouster import load_profile
 
     sensor = load_profile("os1-32-nominal", "512x10")
     images = [np.full((sensor.height, 512), 5000, dtype=np.uint32)] * 3
@@ -115,7 +115,7 @@ def surface_distance() -> str:
     """Measure how far apart two floors are (py4dgeo)."""
     import numpy as np
 
-    from cdpipe.geometry import stream
+    from cdpipe.core.geometry import stream
     from eval.rival_m3c2 import loaded_py4dgeo
 
     py4dgeo, rng = loaded_py4dgeo(), stream(0, "doctor", "floor")
@@ -152,7 +152,7 @@ def void() -> str:
 
 def sdk() -> str:
     """Let the vendor's SDK load (ouster-sdk)."""
-    from cdpipe.captures import require_sdk
+    from cdpipe.io.ouster.captures import require_sdk
 
     core = require_sdk()
     info = core.SensorInfo.from_default(core.LidarMode._1024x10)
@@ -204,7 +204,7 @@ def _room(sample: int) -> Float64Array:
     """Return (N, 3) points on a room's walls and on what stands in it, metres; samples differ in where they fall."""
     import numpy as np
 
-    from cdpipe.geometry import stream
+    from cdpipe.core.geometry import stream
 
     layout, rng = stream(0, "doctor", "layout"), stream(sample, "doctor", "points")
     halves = np.vstack([[7.0, 4.0, 2.0], layout.uniform(0.3, 1.2, (14, 3))])

@@ -18,18 +18,18 @@ from time import thread_time
 
 import numpy as np
 
-from cdpipe.config import ExtractConfig, PipelineConfig, load_config
-from cdpipe.crops import Crops, Sphere
-from cdpipe.cutting import BEYOND_M, ReturnPool, object_cells, rays_of, realigned
-from cdpipe.descriptor import use_threads
-from cdpipe.detect import map_session, refusal
-from cdpipe.freespace import net_views
-from cdpipe.geometry import Float64Array, Int64Array, transform
-from cdpipe.merge import merge_maps
-from cdpipe.novelty import inlier_mask, new_points_mask
-from cdpipe.registration import Surface
-from cdpipe.surface import RIM_M, SITE_M, PlaneTable, candidates, compare_site, groups
-from cdpipe.types import KeyframeViews, MergedMaps, SessionName
+from cdpipe.core.geometry import Float64Array, Int64Array, transform
+from cdpipe.descriptors import use_threads
+from cdpipe.extract.crops import Crops, Sphere
+from cdpipe.extract.point_comparison import inlier_mask, new_points_mask
+from cdpipe.extract.surface import RIM_M, SITE_M, PlaneTable, candidates, compare_site, groups
+from cdpipe.extract.surface_rule import BEYOND_M, ReturnPool, object_cells, rays_of, realigned
+from cdpipe.mapping.free_space import free_space_votes
+from cdpipe.merge.merge import merge_maps
+from cdpipe.merge.registration import Surface
+from cdpipe.model.config import ExtractConfig, PipelineConfig, load_config
+from cdpipe.model.types import KeyframeViews, MergedMaps, SessionName
+from cdpipe.pipeline import map_session, refusal
 from eval.adapters import pipeline_input
 from eval.provenance import THREADS
 from scenarios.library import load_scenario
@@ -152,7 +152,7 @@ class Region:
         """(N,) candidates of the after sphere, without its margin, that the before session saw through."""
         chosen = self.compared[0][0]
         chosen = chosen[self.spheres["after"].is_inside[chosen]]
-        return chosen[net_views(self.after_points[chosen], _views(self.merged)) > 0]
+        return chosen[free_space_votes(self.after_points[chosen], _views(self.merged)) > 0]
 
     @cached_property
     def site(self) -> tuple[Int64Array, Int64Array]:
@@ -181,7 +181,7 @@ class Region:
         site = compare_site(transform(self.correction, in_map), ends)
         noise_m = max(median_m for _, median_m in self.compared)
         rays = partial(rays_of, self.merged, "before", others, ends, self.correction)
-        return object_cells(site, net_views(site.points, _views(self.merged)), rays, noise_m, config)
+        return object_cells(site, free_space_votes(site.points, _views(self.merged)), rays, noise_m, config)
 
     @cached_property
     def compared(self) -> tuple[tuple[Int64Array, float], tuple[Int64Array, float]]:

@@ -24,7 +24,7 @@ from matplotlib.patches import Circle, Patch
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from cdpipe.geometry import Float64Array, stream
+from cdpipe.core.geometry import Float64Array, stream
 
 BLUE, ORANGE, GREEN, VERMILLION, BLACK = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#1a1a1a"
 RED = "#C8102E"

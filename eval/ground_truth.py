@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpipe.errors import InputError
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array, invert, require_poses, require_shape
-from cdpipe.session import read_session
-from cdpipe.types import SessionName
-from eval.universe import Universe, load_universe
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, require_poses, require_shape
+from cdpipe.io.session import read_session
+from cdpipe.model.types import SessionName
+from eval.universe import ScoringPoints, load_universe
 from sim.truth import PairTruth, read_pair_truth, read_true_poses
 
 SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
@@ -30,7 +30,7 @@ class SessionTruth:
 
     odom_T_sensor: Float64Array
     world_T_sensor: Float64Array
-    universe: Universe
+    universe: ScoringPoints
 
     def __post_init__(self) -> None:
         require_poses("odom_T_sensor", self.odom_T_sensor)

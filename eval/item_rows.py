@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from cdpipe.extract import FIGURES, hull_volume_m3
-from cdpipe.geometry import Float64Array
-from cdpipe.types import ChangedObject, ChangeReport
+from cdpipe.core.geometry import Float64Array
+from cdpipe.extract.extract import FIGURES, hull_volume_m3
+from cdpipe.model.types import ChangedObject, ChangeReport
 from eval.domains import is_change_in_distribution
 from eval.ground_truth import GroundTruth
 from eval.object_metrics import ObjectMatches

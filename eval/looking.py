@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from cdpipe.errors import InputError
-from cdpipe.session import is_session
-from cdpipe.yamlfile import suggestion
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import suggestion
+from cdpipe.io.session import is_session
 from scenarios.library import SUFFIXES, load_scenario, scenario_names
 from sim.view import View, is_pair, view_folder, view_scenario
 

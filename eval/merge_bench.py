@@ -22,14 +22,14 @@ import numpy as np
 import small_gicp
 from scipy.spatial import cKDTree
 
-from cdpipe.coarse import coarse_pose, is_kiss_matcher_installed
-from cdpipe.config import PipelineConfig, load_config
-from cdpipe.descriptor import describe_scans, use_threads
-from cdpipe.errors import MergeFailedError
-from cdpipe.geometry import Float64Array, invert, make_pose, transform
-from cdpipe.mapping import build_map
-from cdpipe.merge import merge_maps
-from cdpipe.types import MappedSession, PosedScan, ScanSource, SessionName
+from cdpipe.core.errors import MergeFailedError
+from cdpipe.core.geometry import Float64Array, invert, make_pose, transform
+from cdpipe.descriptors import describe_scans, use_threads
+from cdpipe.mapping.mapping import build_map
+from cdpipe.merge.global_registration import is_kiss_matcher_installed, register_globally
+from cdpipe.merge.merge import merge_maps
+from cdpipe.model.config import PipelineConfig, load_config
+from cdpipe.model.types import MappedSession, PosedScan, ScanSource, SessionName
 from eval.adapters import pipeline_input
 from eval.provenance import THREADS
 from scenarios.library import load_scenario
@@ -202,7 +202,7 @@ def paper_sites() -> tuple[MergeSite, MergeSite]:
 
 def kiss_and_gicp(before_points: Float64Array, after_points: Float64Array, voxel_m: float) -> Float64Array | None:
     """Return before_T_after (4, 4) from two clouds alone, on one thread; None where KISS-Matcher finds nothing."""
-    found = coarse_pose(before_points, after_points, voxel_m)
+    found = register_globally(before_points, after_points, voxel_m)
     if found is None:
         return None
     # small_gicp solves for a turn about the origin, which may be far away

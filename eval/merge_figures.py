@@ -9,7 +9,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.patches import Rectangle
 from scipy.spatial import cKDTree
 
-from cdpipe.geometry import Float64Array, stream
+from cdpipe.core.geometry import Float64Array, stream
 from eval.figures import (
     BLACK,
     VERMILLION,

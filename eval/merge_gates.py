@@ -2,7 +2,7 @@
 
 Run as `python -m eval.merge_gates RUN --out DIR`, where RUN is the folder of `tunnelcd run merge-gates`: a variant with
 `merge.accept_all`, so that every best hypothesis is kept with its evidence, right or wrong. Writes DIR/gates.csv and
-DIR/gates.png. Thresholds go into cdpipe/config.py by hand, so that none changes behind anyone's back.
+DIR/gates.png. Thresholds go into cdpipe/model/config.py by hand, so that none changes behind anyone's back.
 
 Even under `merge.accept_all` the search itself stops at today's gates: the next candidate, and KISS-Matcher, are tried
 only where the one before is below one of them. So which merge is kept depends on the thresholds that were set; they are
@@ -21,10 +21,10 @@ import typer
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from cdpipe.config import load_config
-from cdpipe.errors import InputError
-from cdpipe.evidence import GATES
-from cdpipe.geometry import BoolArray, Float64Array, stream
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import BoolArray, Float64Array, stream
+from cdpipe.merge.evidence import GATES
+from cdpipe.model.config import load_config
 from eval.cli import input_errors
 from eval.coverage import plan_of
 from eval.figures import BLACK, BLUE, VERMILLION, blank_figure, png

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from cdpipe.geometry import Float64Array, Int64Array, invert, travelled_m
+from cdpipe.core.geometry import Float64Array, Int64Array, invert, travelled_m
 from eval.ground_truth import SessionTruth
 
 PAIR_RADIUS_M = 5.0

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from cdpipe.geometry import Float64Array, stream
+from cdpipe.core.geometry import Float64Array, stream
 from eval.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION, blank_figure, data_address
 
 _WIDTH_IN = 9.0

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cdpipe.geometry import BoolArray, Float64Array
+from cdpipe.core.geometry import BoolArray, Float64Array
 from eval.methods import ORACLE_MERGE
 from eval.statistics import wilson_interval
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from cdpipe.config import PipelineConfig, Site, load_config
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
+from cdpipe.model.config import PipelineConfig, Site, load_config
 from eval.oracles import OracleMerge
 from eval.worlds import World, setting_text
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 from eval.figures import BLACK, CONTEXT, blank_figure, data_address
 
 _TURNS_RAD = np.deg2rad([25.0, -25.0, 65.0, -65.0, 90.0])

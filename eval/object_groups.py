@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array, stream
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from eval.merge_table import numbers, texts
 from eval.region_curves import PAIR
 from eval.region_sizes import EDGES

@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.types import ChangedObject
-from cdpipe.voxel import cell_keys
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.voxel import cell_keys
+from cdpipe.model.types import ChangedObject
 from eval.ground_truth import SESSIONS, GroundTruth
 from eval.universe import CELL_M
 

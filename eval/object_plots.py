@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 from eval.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION, blank_figure, data_address
 from eval.region_plots import domain_name
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from cdpipe.geometry import Float64Array, Int64Array
-from cdpipe.types import ChangedObject
+from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.model.types import ChangedObject
 from eval.ground_truth import GroundTruth
 from eval.object_metrics import ObjectMatches
 from eval.region_metrics import places_in_map

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 from eval.domains import domain_of
 from eval.merge_table import numbers, texts
 from eval.object_groups import clustered_interval, main_changes, median, objects_by_group, pair_numbers

@@ -10,11 +10,11 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.config import PipelineConfig, QueryConfig
-from cdpipe.detect import Comparison, extracted
-from cdpipe.geometry import Int64Array
-from cdpipe.query import rank_regions
-from cdpipe.types import ChangeRegions, ChangeReport, DescriptorSet, MergedMaps
+from cdpipe.core.geometry import Int64Array
+from cdpipe.model.config import PipelineConfig, QueryConfig
+from cdpipe.model.types import ChangeRegions, ChangeReport, DescriptorSet, MergedMaps
+from cdpipe.pipeline import Comparison, extracted
+from cdpipe.query.query import rank_regions
 from eval.ground_truth import GroundTruth
 from eval.region_metrics import places_in_map
 

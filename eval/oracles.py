@@ -14,10 +14,10 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from cdpipe.alignment import PathAlignment
-from cdpipe.geometry import Float64Array, invert, stream
-from cdpipe.types import MappedSession, MergedMaps
-from cdpipe.yamlfile import Settings
+from cdpipe.core.geometry import Float64Array, invert, stream
+from cdpipe.core.yamlfile import Settings
+from cdpipe.model.alignment import PathAlignment
+from cdpipe.model.types import MappedSession, MergedMaps
 from eval.ground_truth import SessionTruth
 from eval.merge_metrics import PAIR_RADIUS_M
 

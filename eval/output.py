@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 
 
 @contextmanager

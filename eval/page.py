@@ -15,7 +15,7 @@ from typing import Any
 
 import pandas as pd
 
-from cdpipe.config import settings_table
+from cdpipe.model.config import settings_table
 from eval.charts import Chart, plotly_script
 from eval.figures import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.latex import latex_tables

@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cdpipe.config import load_config
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
+from cdpipe.model.config import load_config
 from eval.charts import Chart, axes_of, error_bars, in_legend, layout, set_axis
 from eval.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION
 from eval.page_columns import RESULT_COLUMNS

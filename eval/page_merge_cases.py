@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.alignment import PathAlignment
-from cdpipe.answer import read_answer
-from cdpipe.errors import InputError
-from cdpipe.evidence import GATES
-from cdpipe.geometry import invert, travelled_m
-from cdpipe.session import load_arrays, read_session
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import invert, travelled_m
+from cdpipe.io.answer import read_answer
+from cdpipe.io.session import load_arrays, read_session
+from cdpipe.merge.evidence import GATES
+from cdpipe.model.alignment import PathAlignment
 from eval.aligned import alignment_of
 from eval.merge_figures import FULL_M, alignment_picture
 from eval.merge_metrics import PAIR_RADIUS_M

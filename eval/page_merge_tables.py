@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cdpipe.evidence import GATES
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
+from cdpipe.merge.evidence import GATES
 from eval.coverage import Coverage
 from eval.merge_table import (
     ALL_FAMILIES,

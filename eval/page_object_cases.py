@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from cdpipe.answer import Answer, read_answer
-from cdpipe.errors import InputError
-from cdpipe.geometry import Int64Array
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Int64Array
+from cdpipe.io.answer import Answer, read_answer
 from eval.answer_rows import answer_rows
 from eval.ground_truth import GroundTruth, load_ground_truth
 from eval.page_columns import count, significant

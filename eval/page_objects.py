@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cdpipe.answer import Answer
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.io.answer import Answer
 from eval.answer_rows import answer_rows
 from eval.figures import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.ground_truth import GroundTruth

@@ -9,7 +9,7 @@ from typing import Any
 
 import jinja2
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 
 _FILES = ("page.html", "comparison.html", "parts.html", "page.css", "charts.js")
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cdpipe.errors import InputError
-from cdpipe.geometry import Float64Array
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array
 from eval.runfolder import RunFolder
 from eval.worlds import references
 

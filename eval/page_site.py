@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpipe.alignment import PathAlignment
-from cdpipe.answer import Answer, read_answer
-from cdpipe.errors import InputError
-from cdpipe.geometry import Float64Array, invert, transform
-from cdpipe.session import load_arrays
-from cdpipe.types import ChangeReport
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, invert, transform
+from cdpipe.io.answer import Answer, read_answer
+from cdpipe.io.session import load_arrays
+from cdpipe.model.alignment import PathAlignment
+from cdpipe.model.types import ChangeReport
 from eval.aligned import alignment_of
 from eval.figures import (
     Points,

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 from eval.case_view import view_file, write_case_view
 from eval.page_run import RunData, first_seed, of, scenarios
 

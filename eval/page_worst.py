@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from cdpipe.answer import read_answer
-from cdpipe.errors import InputError
-from cdpipe.session import load_arrays
+from cdpipe.core.errors import InputError
+from cdpipe.io.answer import read_answer
+from cdpipe.io.session import load_arrays
 from eval.figures import region_map
 from eval.ground_truth import load_ground_truth
 from eval.page_columns import share

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpipe.answer import write_answer, write_failure
-from cdpipe.coarse import is_kiss_matcher_installed
-from cdpipe.config import MapConfig
-from cdpipe.descriptor import checkpoint_digest, sphere_digest, use_threads
-from cdpipe.errors import MergeFailedError, ScenarioError, TunnelcdError
+from cdpipe.core.errors import MergeFailedError, ScenarioError, TunnelcdError
+from cdpipe.descriptors import checkpoint_digest, sphere_digest, use_threads
+from cdpipe.io.answer import write_answer, write_failure
+from cdpipe.merge.global_registration import is_kiss_matcher_installed
+from cdpipe.model.config import MapConfig
 from eval.adapters import pipeline_input
 from eval.domains import domain_of
 from eval.ground_truth import GroundTruth, load_ground_truth

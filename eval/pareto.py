@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cdpipe.geometry import BoolArray, Float64Array
+from cdpipe.core.geometry import BoolArray, Float64Array
 from eval.domains import domain_of
 from eval.merge_table import numbers, texts
 from eval.page_object_tables import is_told_the_truth

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.descriptor import relative_yaws_rad
-from cdpipe.geometry import Float64Array, require_poses
-from cdpipe.types import DescriptorSet
+from cdpipe.core.geometry import Float64Array, require_poses
+from cdpipe.descriptors import relative_yaws_rad
+from cdpipe.model.types import DescriptorSet
 
 SAME_PLACE_M = 3.0
 FLIPPED_DEG = 90.0

@@ -33,8 +33,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
-from cdpipe.errors import InputError
-from cdpipe.yamlfile import Settings, read_yaml, suggestion, validated
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import Settings, read_yaml, suggestion, validated
 from eval.methods import Cell, Until, methods_of
 from eval.plan_checks import misfits, refuse, repeated_worlds
 from eval.plan_parts import Grid, Label, NotEmpty, Variant

@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from cdpipe.errors import InputError
-from cdpipe.yamlfile import Document, validated
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import Document, validated
 from eval.plan import Plan, parse_seeds
 from eval.plan_parts import acts_on_true_regions, key_of, valid_setting, valid_settings
 from eval.worlds import group_of

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from pydantic import ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from cdpipe.yamlfile import suggestion
+from cdpipe.core.yamlfile import suggestion
 from eval.methods import methods_of, slug
 from eval.worlds import ScenarioItem, group_of, world_slug, worlds_of
 

@@ -15,8 +15,8 @@ from pydantic import (
     model_validator,
 )
 
-from cdpipe.config import PipelineConfig, load_config, preset_names
-from cdpipe.yamlfile import Document, Settings, suggestion, validated, with_settings
+from cdpipe.core.yamlfile import Document, Settings, suggestion, validated, with_settings
+from cdpipe.model.config import PipelineConfig, load_config, preset_names
 from eval.oracles import OracleMerge
 from eval.worlds import OneOrMore, group_of, known_label, setting_text, told_as_values
 from scenarios.schema import Scenario

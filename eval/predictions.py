@@ -1,6 +1,7 @@
 """Predictions that another program made for the pairs of a run, taken into the run as a variant.
 
-    DIR/<scenario>/<seed>/answer.json, answer.npz     the format of `cdpipe.answer`; eval/README.md has a short script
+    DIR/<scenario>/<seed>/answer.json, answer.npz     the format of `cdpipe.io.answer`; eval/README.md has a short
+    script
 
 Every pair of the run needs one, or the means would be over other pairs than everybody else's. A pair that the program
 could not do gets an answer.json of status `failed` and scores as a failure of ours does.
@@ -15,9 +16,9 @@ from typing import Any
 
 import pandas as pd
 
-from cdpipe.config import preset_names
-from cdpipe.errors import InputError
-from cdpipe.yamlfile import suggestion
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import suggestion
+from cdpipe.model.config import preset_names
 from eval.coverage import plan_of
 from eval.ground_truth import load_ground_truth
 from eval.methods import slug

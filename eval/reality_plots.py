@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 from eval.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION
 from eval.reality_tables import first_number
 from eval.sensor_measures import Revolutions

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpipe.captures import open_recording
-from cdpipe.errors import InputError
-from cdpipe.geometry import Float64Array
-from cdpipe.ouster import SensorMetadata
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array
+from cdpipe.io.ouster.captures import open_recording
+from cdpipe.sensor.ouster import SensorMetadata
 from eval.sensor_measures import Revolutions, destaggered
 from scenarios.library import load_scenario
 from scenarios.schema import Sensor

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pandas as pd
 
-from cdpipe.geometry import BoolArray, Float64Array
+from cdpipe.core.geometry import BoolArray, Float64Array
 from eval.sensor_measures import (
     Revolutions,
     edges,

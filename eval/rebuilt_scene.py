@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cdpipe.geometry import BoolArray, Float64Array, transform
-from cdpipe.ouster import SensorMetadata
+from cdpipe.core.geometry import BoolArray, Float64Array, transform
+from cdpipe.sensor.ouster import SensorMetadata
 from eval.sensor_measures import Revolutions
 from sim.mesh import Mesh
 from sim.optics import COUNTS_PER_DOUBLING

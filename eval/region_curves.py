@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array, stream
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from eval.statistics import N_RESAMPLES
 
 RATES_PER_100M = (0.1, 0.5)

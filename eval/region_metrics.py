@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array, invert
-from cdpipe.types import ChangeReport
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert
+from cdpipe.model.types import ChangeReport
 from eval.ground_truth import GroundTruth, SessionTruth
 from eval.ranking import auroc, average_precision
 

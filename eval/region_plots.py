@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 from eval.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION, blank_figure, png
 
 _WIDTH_IN = 9.0

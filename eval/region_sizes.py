@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cdpipe.geometry import BoolArray, Float64Array, stream
+from cdpipe.core.geometry import BoolArray, Float64Array, stream
 from eval.region_curves import RankedPairs, found_at, interval_of
 from eval.statistics import N_RESAMPLES
 

@@ -7,7 +7,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from cdpipe.answer import read_answer
+from cdpipe.io.answer import read_answer
 from eval.answer_check import check_answer
 from eval.ground_truth import GroundTruth, load_ground_truth
 from eval.progress import RunProgress, Silent

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from cdpipe.config import DufomapConfig, PipelineConfig
-from cdpipe.geometry import BoolArray, Float64Array
-from cdpipe.types import PointMap, SessionName
+from cdpipe.core.geometry import BoolArray, Float64Array
+from cdpipe.model.config import DufomapConfig, PipelineConfig
+from cdpipe.model.types import PointMap, SessionName
 from eval.provenance import THREADS
 from eval.whole_map import PlacedMaps
 

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from cdpipe.config import PipelineConfig
-from cdpipe.geometry import BoolArray
-from cdpipe.types import SessionName
+from cdpipe.core.geometry import BoolArray
+from cdpipe.model.config import PipelineConfig
+from cdpipe.model.types import SessionName
 from eval.provenance import THREADS
 from eval.whole_map import PlacedMaps, nearest_of
 

@@ -11,13 +11,13 @@ from time import perf_counter
 
 import numpy as np
 
-from cdpipe.config import PipelineConfig
-from cdpipe.detect import Comparison, compare, extracted
-from cdpipe.errors import InputError
-from cdpipe.geometry import BoolArray, stream
-from cdpipe.novelty import far_points_mask, new_points_mask
-from cdpipe.query import rank_regions
-from cdpipe.types import ChangeReport, DescriptorSet, MergedMaps, SessionName
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import BoolArray, stream
+from cdpipe.extract.point_comparison import far_points_mask, new_points_mask
+from cdpipe.model.config import PipelineConfig
+from cdpipe.model.types import ChangeReport, DescriptorSet, MergedMaps, SessionName
+from cdpipe.pipeline import Comparison, compare, extracted
+from cdpipe.query.query import rank_regions
 from eval.rival_dufomap import void_mask
 from eval.rival_m3c2 import m3c2_mask
 from eval.whole_map import PlacedMaps, nearest_of, placed_maps, whole_map

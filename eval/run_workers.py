@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cdpipe.errors import InputError
-from eval.alone import death_of
+from cdpipe.core.errors import InputError
+from eval.alone import run_isolated
 from eval.cluster import is_shared, n_slots
 from eval.pair_run import Made, Pair, PairRun, Todo, cell_key, is_finished, pair_lock
 from eval.progress import RunProgress, Silent
@@ -191,7 +191,7 @@ def _death_of_opening(task: Task, here: PairRun) -> str:
     with _traced(trace) as n_begun:
         if n_begun >= _TRIES:
             return "several times"
-        if n_begun and (death := death_of(open_or_do, _only(task))):
+        if n_begun and (death := run_isolated(open_or_do, _only(task))):
             return death
         here.open()
     return ""
@@ -203,7 +203,7 @@ def _death_of_cell(task: Task, here: PairRun, each: Todo, trace: Path) -> str:
         if n_begun >= _TRIES:
             return "several times"
         if n_begun:
-            return death_of(open_or_do, _only(task, each))
+            return run_isolated(open_or_do, _only(task, each))
         here.do(each)
     return ""
 

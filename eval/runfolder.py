@@ -2,7 +2,7 @@
 
 provenance.json                               marks a run folder; written first
 pairs/<world>/<seed>/{before,after,truth}     simulated pairs; a world is a scenario, with what is set over it
-answers/<world>/<seed>/<variant>/             raw answers (cdpipe.answer)
+answers/<world>/<seed>/<variant>/             raw answers (cdpipe.io.answer)
 maps/<world>/<seed>.npz                       thinned maps for pictures
 stages/<world>/<seed>/                        what the pipeline's stages gave (eval.stage_cache); may be removed
 cells/<world>/<seed>/<variant>.json           a finished cell: key, order, row, items
@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 from eval.coverage import coverage
 from eval.effects import effects
 from eval.merge_table import merge_table

@@ -15,9 +15,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from cdpipe.config import DescriptorConfig
-from cdpipe.descriptor import checkpoint_digest, sphere_digest
-from cdpipe.errors import InputError, ScenarioError
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.descriptors import checkpoint_digest, sphere_digest
+from cdpipe.model.config import DescriptorConfig
 from eval.cluster import HERE, Where, connected, require_usable
 from eval.methods import Cell
 from eval.pair_run import Made, Pair, PairRun, Todo, cell_key, is_finished, pair_lock

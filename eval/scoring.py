@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from cdpipe.answer import Answer, read_answer
-from cdpipe.extract import FIGURES
-from cdpipe.geometry import Float64Array, travelled_m
-from cdpipe.types import ChangeReport
+from cdpipe.core.geometry import Float64Array, travelled_m
+from cdpipe.extract.extract import FIGURES
+from cdpipe.io.answer import Answer, read_answer
+from cdpipe.model.types import ChangeReport
 from eval.answer_check import check_answer
 from eval.answer_rows import answer_rows
 from eval.domains import domain_of

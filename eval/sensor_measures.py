@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array, require_shape
-from cdpipe.ouster import SensorMetadata
-from cdpipe.voxel import cell_keys
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, require_shape
+from cdpipe.core.voxel import cell_keys
+from cdpipe.sensor.ouster import SensorMetadata
 
 ISOLATED_M = 1.0
 EDGE_M = 1.0

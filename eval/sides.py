@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from cdpipe.errors import InputError
-from cdpipe.yamlfile import suggestion
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import suggestion
 from eval.coverage import coverage
 from eval.page_run import Row, RunData, flag, read_run
 from eval.region_curves import PAIR

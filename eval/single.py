@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cdpipe.answer import write_answer
-from cdpipe.config import PipelineConfig
-from cdpipe.descriptor import describe_scans, load_descriptors, save_descriptors, use_threads
-from cdpipe.detect import describe_mapped, detect_changes, map_session, with_spheres
-from cdpipe.errors import InputError, MergeFailedError
-from cdpipe.evidence import GATES
-from cdpipe.geometry import yaw_rad
-from cdpipe.mapping import build_map, keyframes
-from cdpipe.readers import open_scans
-from cdpipe.session_check import check_session, is_same_session
-from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, ObjectShape, PointMap, ScanSource
+from cdpipe.core.errors import InputError, MergeFailedError
+from cdpipe.core.geometry import yaw_rad
+from cdpipe.descriptors import describe_scans, load_descriptors, save_descriptors, use_threads
+from cdpipe.io.answer import write_answer
+from cdpipe.io.readers import open_scans
+from cdpipe.mapping.mapping import build_map, keyframes
+from cdpipe.mapping.session_check import check_session, is_same_session
+from cdpipe.merge.evidence import GATES
+from cdpipe.model.config import PipelineConfig
+from cdpipe.model.types import ChangeReport, DescriptorSet, MappedSession, ObjectShape, PointMap, ScanSource
+from cdpipe.pipeline import describe_mapped, detect_changes, map_session, with_spheres
 from eval.provenance import THREADS
 from eval.rivals import METHODS, require_method
 from eval.stages import OnStage

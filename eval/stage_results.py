@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.alignment import PathAlignment
-from cdpipe.coarse import is_kiss_matcher_installed
-from cdpipe.config import MapConfig, PipelineConfig
-from cdpipe.descriptor import checkpoint_digest, sphere_digest
-from cdpipe.types import ChangeRegions, DescriptorSet, KeyframeViews, MergedMaps, PointMap, Spheres
+from cdpipe.descriptors import checkpoint_digest, sphere_digest
+from cdpipe.merge.global_registration import is_kiss_matcher_installed
+from cdpipe.model.alignment import PathAlignment
+from cdpipe.model.config import MapConfig, PipelineConfig
+from cdpipe.model.types import ChangeRegions, DescriptorSet, KeyframeViews, MergedMaps, PointMap, Spheres
 from eval.provenance import digest
 from eval.stage_cache import MAPS, Arrays
 

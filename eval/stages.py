@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cdpipe.config import MapConfig, PipelineConfig
-from cdpipe.descriptor import describe_map, describe_scans
-from cdpipe.detect import local_alignment, refusal
-from cdpipe.mapping import build_map
-from cdpipe.merge import merge_maps
-from cdpipe.query import find_regions
-from cdpipe.session_check import check_session
-from cdpipe.types import ChangeRegions, ChangeReport, MappedSession, MergedMaps, PointMap, ScanSource
+from cdpipe.descriptors import describe_map, describe_scans
+from cdpipe.mapping.mapping import build_map
+from cdpipe.mapping.session_check import check_session
+from cdpipe.merge.merge import merge_maps
+from cdpipe.model.config import MapConfig, PipelineConfig
+from cdpipe.model.types import ChangeRegions, ChangeReport, MappedSession, MergedMaps, PointMap, ScanSource
+from cdpipe.pipeline import local_alignment, refusal
+from cdpipe.query.query import find_regions
 from eval.oracle_regions import Regions, with_regions
 from eval.rivals import METHODS, USES_DESCRIPTORS
 from eval.stage_cache import Kept, StageCache

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cdpipe.geometry import Float64Array, invert, make_pose, stream
+from cdpipe.core.geometry import Float64Array, invert, make_pose, stream
 from eval.reality_scenes import standing, with_effects, world_points
 from eval.sensor_measures import novel_shares
 from scenarios.schema import Sensor

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from cdpipe.geometry import Float64Array, stream
+from cdpipe.core.geometry import Float64Array, stream
 from eval.ranking import auroc, average_precision
 
 N_RESAMPLES = 2000

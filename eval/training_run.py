@@ -13,22 +13,22 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from cdpipe.descriptor import use_threads
-from cdpipe.descriptor.data import TunnelShard, open_dataset, place_data
-from cdpipe.descriptor.fit import FitConfig, Progress, Task, fit
-from cdpipe.descriptor.network import checkpoint_bytes, digest, initial_network
-from cdpipe.descriptor.sphere_network import SphereNetwork, initial_sphere_network
-from cdpipe.descriptor.sphere_training import SphereTask, sphere_data
-from cdpipe.descriptor.training import PlaceTask
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
+from cdpipe.descriptors import use_threads
+from cdpipe.descriptors.network import checkpoint_bytes, digest, initial_network
+from cdpipe.descriptors.sphere_network import SphereNetwork, initial_sphere_network
+from cdpipe.training.data import TunnelShard, open_dataset, place_data
+from cdpipe.training.fit import FitConfig, Progress, Task, fit
+from cdpipe.training.scan_training import PlaceTask
+from cdpipe.training.sphere_training import SphereTask, sphere_data
 from eval.figures import BLUE, VERMILLION, blank_figure
 from eval.output import make_writable
 from eval.progress import RunProgress
 from eval.provenance import git_commit
 
 SOURCES = {
-    "sphere": "what the map around a keyframe looks like, 64 numbers (cdpipe.descriptor.sphere_network)",
-    "3deg": "re-implementation of 3DEG, arXiv 2210.07285 (cdpipe.descriptor.network)",
+    "sphere": "what the map around a keyframe looks like, 64 numbers (cdpipe.descriptors.sphere_network)",
+    "3deg": "re-implementation of 3DEG, arXiv 2210.07285 (cdpipe.descriptors.network)",
 }
 
 

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpipe.errors import InputError
-from cdpipe.geometry import Float32Array, Int32Array, Int64Array, require_shape, transform
-from cdpipe.readers import open_scans
-from cdpipe.session import Session, chunk_path, load_arrays, read_session
-from cdpipe.types import PosedScan
-from cdpipe.voxel import cell_keys
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float32Array, Int32Array, Int64Array, require_shape, transform
+from cdpipe.core.voxel import cell_keys
+from cdpipe.io.readers import open_scans
+from cdpipe.io.session import Session, chunk_path, load_arrays, read_session
+from cdpipe.model.types import PosedScan
 from sim.truth import Int16Array, read_labels
 
 CELL_M = 0.1
@@ -29,7 +29,7 @@ _PENDING_ROWS = 4_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Universe:
+class ScoringPoints:
     """One return per occupied cell, in the order they were measured.
 
     Attributes:
@@ -85,7 +85,7 @@ class Universe:
         return np.unique(place[self.returns[place] == wanted])
 
 
-def load_universe(session: Path) -> Universe:
+def load_universe(session: Path) -> ScoringPoints:
     """Return the universe of a simulated session, from `truth/universe.npz` if that fits, else built and stored there.
 
     Raises:
@@ -102,7 +102,7 @@ def load_universe(session: Path) -> Universe:
     return universe
 
 
-def build_universe(session: Session) -> Universe:
+def build_universe(session: Session) -> ScoringPoints:
     """Take the first return of each 0.1 m cell, in the order of scans and, within one, of row-major pixels.
 
     Streams over the session; memory grows with the number of cells, about 60 bytes each.
@@ -170,11 +170,11 @@ class UniverseBuilder:
         if _count(self._pending) > max(_PENDING_ROWS, _count(self._folded)):
             self._folded, self._pending = [_first_per_cell([*self._folded, *self._pending])], []
 
-    def finish(self, n_scans: int) -> Universe:
+    def finish(self, n_scans: int) -> ScoringPoints:
         """Return the universe of the session, which has so many scans."""
         cells = _first_per_cell([*self._folded, *self._pending, *self._batch])
         order = np.argsort(cells.returns)
-        return Universe(
+        return ScoringPoints(
             returns=cells.returns[order],
             points_odom=cells.points_odom[order],
             change=cells.change[order],
@@ -230,17 +230,17 @@ def _fingerprint(session: Session) -> str:
     return hasher.hexdigest()
 
 
-def _read_cache(path: Path, fingerprint: str, session: Session) -> Universe | None:
+def _read_cache(path: Path, fingerprint: str, session: Session) -> ScoringPoints | None:
     try:
         arrays = load_arrays(path)
         if str(arrays.pop("fingerprint")) != fingerprint:
             return None
-        return Universe(**arrays, n_scans=session.n_scans, n_pixels=session.sensor.height * session.sensor.width)
+        return ScoringPoints(**arrays, n_scans=session.n_scans, n_pixels=session.sensor.height * session.sensor.width)
     except (InputError, KeyError, TypeError, ValueError):
         return None  # absent or damaged: it is rebuilt from the session
 
 
-def _write_cache(path: Path, fingerprint: str, universe: Universe) -> None:
+def _write_cache(path: Path, fingerprint: str, universe: ScoringPoints) -> None:
     names = ("returns", "points_odom", "change", "instance", "nearest_m")
     partial = path.with_name(f".{path.stem}.partial.npz")
     try:

@@ -13,15 +13,15 @@ from time import perf_counter
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.config import PipelineConfig
-from cdpipe.detect import local_alignment
-from cdpipe.difference import marked_share
-from cdpipe.extract import FIGURES, PointGroup, assemble_objects, hull_volume_m3
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.novelty import cluster_labels, inlier_mask
-from cdpipe.query import rank_regions
-from cdpipe.sphere import MapIndex
-from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport, DescriptorSet, MergedMaps, SessionName
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.grid_index import GridIndex
+from cdpipe.extract.extract import FIGURES, PointGroup, assemble_objects, hull_volume_m3
+from cdpipe.extract.point_comparison import cluster_labels, inlier_mask
+from cdpipe.model.config import PipelineConfig
+from cdpipe.model.types import ChangedObject, ChangeRegions, ChangeReport, DescriptorSet, MergedMaps, SessionName
+from cdpipe.pipeline import local_alignment
+from cdpipe.query.difference import marked_share
+from cdpipe.query.query import rank_regions
 
 _DIRECTIONS: tuple[tuple[SessionName, SessionName], ...] = (("after", "before"), ("before", "after"))
 
@@ -157,7 +157,7 @@ def _changed_share(maps: PlacedMaps, is_changed: dict[SessionName, BoolArray], c
 def _figures(maps: PlacedMaps, regions: ChangeRegions, objects: Sequence[ChangedObject]) -> dict[str, Float64Array]:
     """Return the volume table by the definition of `cut_out`: all four figures are of the after map."""
     figures = {name: np.full(len(regions.scores), np.nan) for name in FIGURES}
-    index = MapIndex(maps.points["after"])
+    index = GridIndex(maps.points["after"])
     for region in np.flatnonzero(regions.is_reported).tolist():
         sphere = maps.points["after"][index.crop(regions.centres_map[region], regions.radius_m)]
         own = [item.points_map for item in objects if item.region == region and item.session == "after"]
@@ -169,7 +169,7 @@ def _figures(maps: PlacedMaps, regions: ChangeRegions, objects: Sequence[Changed
 
 
 def _seconds(start: float, compared: float, grouped: float, end: float) -> dict[str, float]:
-    """Return the times as `cdpipe.detect.compare` names them: `t_returns_s` is a part of `t_oe_s`."""
+    """Return the times as `cdpipe.pipeline.compare` names them: `t_returns_s` is a part of `t_oe_s`."""
     return {"t_cd_s": compared - start, "t_oe_s": end - compared, "t_returns_s": end - grouped}
 
 

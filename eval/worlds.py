@@ -35,9 +35,9 @@ from pydantic import (
     model_validator,
 )
 
-from cdpipe.config import PipelineConfig
-from cdpipe.errors import InputError
-from cdpipe.yamlfile import Settings, suggestion
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import Settings, suggestion
+from cdpipe.model.config import PipelineConfig
 from scenarios.library import check_scenario, scenario_names
 
 

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import stream
-from cdpipe.yamlfile import Key
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import stream
+from cdpipe.core.yamlfile import Key
 
 NAMES = ("uniform", "normal", "integers", "choice")
 

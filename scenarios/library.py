@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cdpipe.errors import InputError, ScenarioError
-from cdpipe.geometry import stream
-from cdpipe.yamlfile import Document, Key, read_yaml, suggestion, validated, with_settings
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.geometry import stream
+from cdpipe.core.yamlfile import Document, Key, read_yaml, suggestion, validated, with_settings
 from scenarios.distributions import Drawing, dotted, drawing, form_mistakes, is_distribution, merged
 from scenarios.references import contradictions, file_keys, reference_mistakes
 from scenarios.schema import Prop, Scenario

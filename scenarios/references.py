@@ -9,9 +9,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from cdpipe.errors import InputError
-from cdpipe.ouster import load_profile
-from cdpipe.yamlfile import Key, suggestion
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import Key, suggestion
+from cdpipe.sensor.ouster import load_profile
 from scenarios.schema import Furniture, Scenario, SessionPlan, Tunnel
 
 Mistake = tuple[Key, str]

@@ -8,8 +8,8 @@ from itertools import chain
 
 import numpy as np
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Place, Prop, Scenario
 from sim.centreline import Centreline
 from sim.fitting import Spot, placed
@@ -17,7 +17,7 @@ from sim.lanes import Lane, build_lanes
 from sim.placing import (
     Standing,
     Surroundings,
-    grown,
+    grow,
     overlap,
     seen_from_above,
     standing_corners,
@@ -52,7 +52,7 @@ class _Board:
         self, item: Standing, apart_m: float, outline: Outline = standing_corners
     ) -> tuple[Standing, str] | None:
         """Return a prop that stands in this one's way, and the session."""
-        corners = grown(outline(item), apart_m)
+        corners = grow(outline(item), apart_m)
         for other in self.standing:
             shared = item.sessions & other.sessions
             if shared and overlap(corners, outline(other)):

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d, percentile_filter
 from scipy.spatial import cKDTree
 
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from scenarios.schema import Section
 from sim.centreline import STEP_M, Centreline, headings_of, left_of, resample
 from sim.raycast import Caster

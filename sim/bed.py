@@ -9,7 +9,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array, stream
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from sim.mesh import Mesh
 from sim.noise import smooth_noise
 from sim.shapes import BELOW_FLOOR_M, Size

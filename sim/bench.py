@@ -16,8 +16,8 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from cdpipe.geometry import Float64Array, Int32Array, stream, yaw_pose
-from cdpipe.ouster import SensorMetadata, load_profile
+from cdpipe.core.geometry import Float64Array, Int32Array, stream, yaw_pose
+from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.library import load_scenario
 from scenarios.schema import Prop, PropKind, Scenario
 from sim.mesh import Mesh

@@ -7,8 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array, stream
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, stream
 from scenarios.schema import Drift, Niche, Section, Tunnel
 from sim.noise import noise_at, smooth_noise
 

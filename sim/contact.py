@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array, transform
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, transform
 from sim.mesh import Mesh, joined, moved, split
 from sim.placing import Standing, corners_object, standing_points
 from sim.raycast import Caster

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from cdpipe.geometry import BoolArray, Float64Array
+from cdpipe.core.geometry import BoolArray, Float64Array
 from sim.centreline import STEP_M, Centreline, DriftLine, left_of
 from sim.raycast import Caster
 from sim.sections import profile_distance

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cdpipe.geometry import Float32Array, Float64Array, Int64Array, stream
+from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, stream
 from scenarios.schema import Section, Tunnel
 from sim.centreline import Centreline, Recess
 from sim.floor import floor_heights, level_shares, smooth_step

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float32Array, Float64Array, make_pose, yaw_pose
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float32Array, Float64Array, make_pose, yaw_pose
 from scenarios.schema import Place, Prop
 from sim.bed import BEHIND_M
 from sim.mesh import split

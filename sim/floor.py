@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Floor, Ruts
 from sim.frame import Frame
 

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.geometry import Float32Array, Float64Array, Int32Array, Int64Array
+from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array, Int64Array
 from sim.optics import received_photons
 from sim.raycast import Caster
 from sim.rays import Rays

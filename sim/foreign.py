@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array, Int64Array
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, Int64Array
 from scenarios.schema import MeshFile
 from sim.mesh import Mesh
 from sim.topology import Edges, closed_volume_m3, edges_of, largest_hole, void_winding

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from sim.centreline import STEP_M, DriftLine, Recess
 
 MOUTH_SHARE = 1.3  # of the half width: how far from its line a drift has a say in the floor of others

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array, stream, yaw_pose, yaw_rad
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, stream, yaw_pose, yaw_rad
 from scenarios.library import load_scenario, scenario_names
 from scenarios.schema import Drift, Place, Prop, Roughness, Scenario, Section, SessionPlan, Tunnel
 from sim.mesh import moved

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cdpipe.geometry import Float64Array, Int64Array, stream
+from cdpipe.core.geometry import Float64Array, Int64Array, stream
 from scenarios.schema import CableTray, Duct, Furniture, Pipe
 from sim.axis import STATION_M, Axis, distances
 from sim.mesh import Mesh, joined

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from cdpipe.geometry import Float64Array, stream
+from cdpipe.core.geometry import Float64Array, stream
 from sim.bed import BEHIND_M, Bed, bed_mesh, build_bed
 from sim.mesh import Mesh, joined
 from sim.raycast import Caster

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpipe.geometry import Float64Array
-from cdpipe.odometry import require_kiss_icp
-from cdpipe.ouster import load_profile
-from cdpipe.session import ScanChunk, Session
+from cdpipe.core.geometry import Float64Array
+from cdpipe.io.session import ScanChunk, Session
+from cdpipe.mapping.odometry import require_kiss_icp
+from cdpipe.sensor.ouster import load_profile
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
 from sim.revolution import Drive, SessionName
@@ -58,7 +58,7 @@ class HeldPair:
     sessions: Mapping[SessionName, LabelledSession]
 
 
-def hold_pair(scenario: Scenario, seed: int, n_threads: int = 1) -> HeldPair:
+def simulate_in_memory(scenario: Scenario, seed: int, n_threads: int = 1) -> HeldPair:
     """Simulate a pair into memory, about 0.5 MB a revolution; to the byte what `simulate_pair` writes.
 
     Args:

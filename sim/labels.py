@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
-from cdpipe.geometry import BoolArray, Float32Array, Float64Array, Int64Array
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array
 from scenarios.schema import Scenario
 from sim.contact import standing_surface
 from sim.mesh import Mesh, NearSurface, joined, near_part, split

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Scenario, SessionPlan
 from sim.centreline import Centreline, headings_of, left_of, resample
 from sim.placing import Standing, free_width, standing_corners, standing_height_m

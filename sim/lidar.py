@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.geometry import BoolArray, Float32Array, Int32Array, stream
-from cdpipe.ouster import SensorMetadata
+from cdpipe.core.geometry import BoolArray, Float32Array, Int32Array, stream
+from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Sensor
 from sim.footprint import central_echo, spread_echo
 from sim.optics import (

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 
 STEP_M = 0.05  # between the samples of a line
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cdpipe.geometry import Float64Array, stream
+from cdpipe.core.geometry import Float64Array, stream
 from sim.heap import BURIED, Heap, column_volume_m3, largest_size_m, whole_mesh
 from sim.noise import smooth_noise
 from sim.rubble import Rubble, confined, draw_sizes, lay, moved_by, together

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import trimesh
 from scipy.spatial import cKDTree
 
-from cdpipe.geometry import BoolArray, Float64Array, Int32Array, require_shape, transform
+from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, require_shape, transform
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 
 # Mean of the squared cubic B-spline weights along one axis, 151/315: what the spline leaves of the lattice's variance.
 _VARIANCE_PER_AXIS = 151.0 / 315.0

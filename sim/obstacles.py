@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Scenario
 from sim.centreline import left_of, resample
 from sim.lanes import AIR_BELOW_M

@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from cdpipe.errors import InputError, ScenarioError
-from cdpipe.geometry import Float64Array, stream
-from cdpipe.motion import Motion, motion_of
-from cdpipe.odometry import estimate_motion
-from cdpipe.ouster import SensorMetadata
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.geometry import Float64Array, stream
+from cdpipe.core.motion import Motion, motion_of
+from cdpipe.mapping.odometry import estimate_motion
+from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Odometry
 
 
@@ -57,7 +57,7 @@ def registered(
     odom_T_first: Float64Array,
     session: str,
 ) -> Motion:
-    """Return the movement that KISS-ICP finds in a session's own revolutions: `cdpipe.odometry.estimate_motion`.
+    """Return the movement that KISS-ICP finds in a session's revolutions: `cdpipe.mapping.odometry.estimate_motion`.
 
     Raises:
         ScenarioError: A pose is not finite; the message names the session.

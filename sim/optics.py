@@ -12,7 +12,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.geometry import Float32Array, Int64Array
+from cdpipe.core.geometry import Float32Array, Int64Array
 
 # Photons from a perfect diffuse reflector at 1 m, were the receiver as good there as it is far off. Measured: the
 # unit's signal times range squared over its own calibrated reflectivity, median beyond 20 m (0.80 to 1.16 of

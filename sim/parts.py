@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull
 
-from cdpipe.geometry import Float64Array, make_pose
+from cdpipe.core.geometry import Float64Array, make_pose
 from sim.mesh import Mesh
 from sim.shapes import Solid
 

@@ -11,8 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array, stream
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, stream
 from scenarios.schema import Scenario, SessionPlan
 from sim.centreline import headings_of, left_of, resample
 from sim.line import STEP_M, kept_between, smoothed, strictest

@@ -12,7 +12,7 @@ from collections.abc import Collection
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.geometry import BoolArray, Float32Array, Float64Array, stream
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, stream
 from sim.scene import Scene
 
 COLOURS: dict[str, tuple[float, float, float]] = {

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from cdpipe.geometry import Float64Array, transform
+from cdpipe.core.geometry import Float64Array, transform
 from scenarios.schema import Prop
 from sim.raycast import Caster
 from sim.shapes import Shape, footprint, solid_mesh
@@ -136,7 +136,7 @@ def overlap(a: Float64Array, b: Float64Array) -> bool:
     return True
 
 
-def grown(corners: Float64Array, by_m: float) -> Float64Array:
+def grow(corners: Float64Array, by_m: float) -> Float64Array:
     """Return the corners (4, 2) of a rectangle grown on every side."""
     centre = corners.mean(axis=0)
     edges = np.stack([corners[0] - corners[1], corners[1] - corners[2]])

@@ -6,8 +6,8 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array, stream
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, stream
 from sim.shapes import Shape, solid_mesh
 
 _LEAN_DEG = (10.0, 25.0)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cdpipe.geometry import make_pose, stream
+from cdpipe.core.geometry import make_pose, stream
 from scenarios.schema import Prop
 from sim import equipment, wares
 from sim.foreign import prop_mesh

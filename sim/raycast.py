@@ -9,7 +9,7 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from cdpipe.geometry import Float32Array, Float64Array, Int32Array
+from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array
 from sim.mesh import Mesh, box_mesh, cylinder_mesh, moved
 
 _CYLINDER_SEGMENTS = 64

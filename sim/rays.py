@@ -7,8 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from cdpipe.geometry import Float32Array, Float64Array, Int64Array
-from cdpipe.ouster import SensorMetadata
+from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
+from cdpipe.sensor.ouster import SensorMetadata
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from cdpipe.geometry import Float32Array, Float64Array
-from cdpipe.session import ScanChunk, Session
+from cdpipe.core.geometry import Float32Array, Float64Array
+from cdpipe.io.session import ScanChunk, Session
 from sim.truth import read_labels
 
 Rgb = tuple[int, int, int]

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.geometry import BoolArray, Float32Array, Float64Array, Int64Array
-from cdpipe.ouster import SensorMetadata
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array
+from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Scenario
 from sim.labels import Tally, belonging, claim_returns, count_other
 from sim.lidar import Scan, scan

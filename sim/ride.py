@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array, stream
-from cdpipe.motion import Motion, motion_of
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, stream
+from cdpipe.core.motion import Motion, motion_of
 from scenarios.schema import Platform, Scenario
 from sim.lanes import AIR_BELOW_M
 from sim.line import kept_between, smoothed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cdpipe.geometry import Float64Array, Int32Array, stream
+from cdpipe.core.geometry import Float64Array, Int32Array, stream
 from sim.mesh import Mesh
 from sim.parts import hull_mesh
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cdpipe.geometry import BoolArray, Float64Array
+from cdpipe.core.geometry import BoolArray, Float64Array
 from sim.raycast import Caster
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from cdpipe.geometry import Float32Array, Int32Array
+from cdpipe.core.geometry import Float32Array, Int32Array
 from scenarios.schema import Scenario
 from sim.arranging import place_props
 from sim.centreline import Centreline, build_centreline
@@ -21,7 +21,7 @@ from sim.foreign import tunnel_mesh
 from sim.furniture import Fixture, furnish
 from sim.materials import REFLECTIVITY
 from sim.mesh import Mesh
-from sim.placing import WALL_GAP_M, Standing, Surroundings, grown, standing_corners
+from sim.placing import WALL_GAP_M, Standing, Surroundings, grow, standing_corners
 from sim.raycast import Caster, model_meshes
 from sim.settling import add_solid, quaternion
 from sim.stones import strew_stones
@@ -90,7 +90,7 @@ def build_world(scenario: Scenario, seed: int) -> World:
     hung = Caster([wall, *(fixture.mesh for fixture in furniture)]) if furniture else walls
     gap_m = WALL_GAP_M + (tunnel.resolution_m if tunnel.mesh is None else 0.0)
     standing = place_props(scenario, centreline, Surroundings(walls, hung, gap_m), seed)
-    outlines = [grown(standing_corners(item), _STONE_FREE_M) for item in standing]
+    outlines = [grow(standing_corners(item), _STONE_FREE_M) for item in standing]
     stones = strew_stones(tunnel, centreline, walls, outlines, seed)
     if stones is None:
         fixtures, fixed = furniture, hung

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Section
 
 _LEAST_WALL = 0.35  # of the height, below the crown

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from cdpipe.geometry import Float32Array, Float64Array, make_pose, yaw_pose
-from cdpipe.ouster import SensorMetadata, load_profile
+from cdpipe.core.geometry import Float32Array, Float64Array, make_pose, yaw_pose
+from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.schema import Sensor
 from sim.footprint import central_echo, spread_echo
 from sim.lidar import FALSE_RETURN, Scan, scan

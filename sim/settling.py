@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array, make_pose, transform
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, make_pose, transform
 from sim.contact import escapes, surface_points
 from sim.placing import PROBE_UP_M, Standing, Surroundings, floor_heights
 from sim.raycast import Caster

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 from sim.mesh import Mesh, box_mesh, cylinder_mesh, joined, moved
 
 # Posts of a railing and the foot of a heap go this far below the floor's level, so that no gap opens on rough floor.

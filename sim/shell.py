@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, map_coordinates, minimum_filter, uniform_filter
 
-from cdpipe.geometry import BoolArray, Float64Array
+from cdpipe.core.geometry import BoolArray, Float64Array
 from sim.axis import STATION_M, Axis, distances, is_opening, spread
 
 _ANGLES = np.deg2rad(np.linspace(-120.0, 120.0, 97))  # from the crown, to the left positive

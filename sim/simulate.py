@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.errors import InputError
-from cdpipe.odometry import require_kiss_icp
-from cdpipe.ouster import SensorMetadata, load_profile
-from cdpipe.session import ScanChunk, SessionWriter
+from cdpipe.core.errors import InputError
+from cdpipe.io.session import ScanChunk, SessionWriter
+from cdpipe.mapping.odometry import require_kiss_icp
+from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.references import file_digests
 from scenarios.schema import Scenario, SessionPlan
 from sim.labels import list_changes

@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array, stream
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from scenarios.schema import Area, Place, Scenario, SessionPlan
 from sim.centreline import Centreline
 from sim.fitting import Spot

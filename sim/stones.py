@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array, stream
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from scenarios.schema import Stones, Tunnel
 from sim.axis import Axis, axes_of, distances, nearest_of
 from sim.centreline import Centreline

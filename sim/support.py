@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array, stream
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from scenarios.schema import Bolts, Screen
 from sim.axis import distances, nearest_of
 from sim.mesh import Mesh, joined

@@ -10,9 +10,9 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from cdpipe.errors import TunnelcdError
-from cdpipe.geometry import Float64Array
-from cdpipe.ouster import load_profile
+from cdpipe.core.errors import TunnelcdError
+from cdpipe.core.geometry import Float64Array
+from cdpipe.sensor.ouster import load_profile
 from scenarios.library import load_scenario
 from sim.centreline import headings_of, left_of
 from sim.contact import interpenetration_m

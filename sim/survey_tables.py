@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 from sim.survey import Survey, WorldFigures
 
 _KINDS = ("added", "removed", "moved", "reshaped")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cdpipe.geometry import Float64Array, Int64Array
+from cdpipe.core.geometry import Float64Array, Int64Array
 from sim.mesh import Mesh
 
 _UP = np.array([0.0, 0.0, 1.0])

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from cdpipe.geometry import Float64Array, Int64Array
+from cdpipe.core.geometry import Float64Array, Int64Array
 from sim.mesh import Mesh
 
 _SAMPLES = (8, 64)

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float32Array, Float64Array, Int64Array
-from cdpipe.motion import Motion, rotation_matrices
-from cdpipe.ouster import SensorMetadata
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
+from cdpipe.core.motion import Motion, rotation_matrices
+from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Platform, Scenario, SessionPlan
 from sim.obstacles import check_clearance
 from sim.odometry import drifted

@@ -24,9 +24,9 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.errors import InputError
-from cdpipe.geometry import Float64Array
-from cdpipe.session import load_arrays
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array
+from cdpipe.io.session import load_arrays
 
 Int16Array = npt.NDArray[np.int16]
 

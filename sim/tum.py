@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cdpipe.errors import InputError, ScenarioError
-from cdpipe.geometry import Float64Array
-from cdpipe.motion import Motion, motion_of
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.geometry import Float64Array
+from cdpipe.core.motion import Motion, motion_of
 from sim.raycast import Caster
 from sim.room import room_about
 

@@ -10,8 +10,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array, Int64Array
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, Int64Array
 from scenarios.schema import Tunnel
 from sim.centreline import Centreline
 from sim.field import Field

@@ -16,10 +16,10 @@ import numpy.typing as npt
 from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
-from cdpipe.errors import InputError, ScenarioError
-from cdpipe.geometry import Float64Array
-from cdpipe.ouster import load_profile
-from cdpipe.session import is_session, read_session
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.geometry import Float64Array
+from cdpipe.io.session import is_session, read_session
+from cdpipe.sensor.ouster import load_profile
 from scenarios.schema import Scenario
 from sim.mesh import Mesh, joined, moved
 from sim.picture import material_colour

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 from sim.returns import CHANGE_RGB, SESSION_RGB
 from sim.view import View
 

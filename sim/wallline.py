@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from cdpipe.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from sim.axis import STATION_M, Axis, bridged, envelope, is_opening, nearest_of, runs_of
 
 PASSING_M = 2.1  # clear height under whatever crosses an opening, or in a high drift ...

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cdpipe.config import MapConfig
-from cdpipe.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
-from cdpipe.mapping import build_map
-from cdpipe.types import DescriptorSet, MappedSession, PosedScan, ScanSource
+from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
+from cdpipe.mapping.mapping import build_map
+from cdpipe.model.config import MapConfig
+from cdpipe.model.types import DescriptorSet, MappedSession, PosedScan, ScanSource
 
 LENGTH_M = 60.0
 HALF_WIDTHS_M, HEIGHT_M = (2.5, 3.5), 3.5  # by world

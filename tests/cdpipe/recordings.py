@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.errors import InputError
-from cdpipe.geometry import Float64Array, transform, yaw_pose
-from cdpipe.ouster import SensorMetadata, load_profile
-from cdpipe.readers import open_scans
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, transform, yaw_pose
+from cdpipe.io.readers import open_scans
+from cdpipe.sensor.ouster import SensorMetadata, load_profile
 
 core = pytest.importorskip("ouster.sdk.core", reason="pip install 'tunnelcd[ouster]'")
 from ouster.sdk import osf, pcap  # noqa: E402 - only where the extra is installed
@@ -127,10 +127,10 @@ def on_a_small_disk(call: str, n_bytes: int, *argv: str | Path) -> tuple[int, st
     script = f"""
 import resource, sys
 from pathlib import Path
-from cdpipe.errors import InputError
-from cdpipe.osf import write_osf
-from cdpipe.recording import import_recording
-from cdpipe.session import read_session
+from cdpipe.core.errors import InputError
+from cdpipe.io.ouster.osf import write_osf
+from cdpipe.io.ouster.recording import import_recording
+from cdpipe.io.session import read_session
 resource.setrlimit(resource.RLIMIT_FSIZE, ({n_bytes}, {n_bytes}))
 try:
     {call}

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from cdpipe.config import MapConfig
-from cdpipe.geometry import Float64Array, Int64Array, make_pose, stream, transform, yaw_pose
-from cdpipe.mapping import build_map
-from cdpipe.types import ChangeRegions, PointMap, PosedScan
+from cdpipe.core.geometry import Float64Array, Int64Array, make_pose, stream, transform, yaw_pose
+from cdpipe.mapping.mapping import build_map
+from cdpipe.model.config import MapConfig
+from cdpipe.model.types import ChangeRegions, PointMap, PosedScan
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # its lowest and its highest corner
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cdpipe.config import settings_table
+from cdpipe.model.config import settings_table
 
 README = Path(__file__).parents[2] / "cdpipe" / "README.md"
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpipe.geometry import invert, make_pose, yaw_pose
-from cdpipe.ouster import SensorMetadata
-from cdpipe.session import ScanChunk, SessionWriter
+from cdpipe.core.geometry import invert, make_pose, yaw_pose
+from cdpipe.io.session import ScanChunk, SessionWriter
+from cdpipe.sensor.ouster import SensorMetadata
 from eval.cli import main
 from sim.truth import PairTruth, write_labels, write_pair_truth, write_true_poses
 from tests.eval.changes import change

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cdpipe.errors import InputError
-from cdpipe.geometry import invert, make_pose, yaw_pose
-from cdpipe.types import ChangeRegions, ChangeReport
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import invert, make_pose, yaw_pose
+from cdpipe.model.types import ChangeRegions, ChangeReport
 from eval.aligned import alignment_of
 
 RIGID = yaw_pose(0.4, (3.0, -2.0, 0.5))

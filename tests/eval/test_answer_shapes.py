@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cdpipe.answer import Answer
-from cdpipe.errors import InputError
-from cdpipe.geometry import yaw_pose
-from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import yaw_pose
+from cdpipe.io.answer import Answer
+from cdpipe.model.types import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 from eval.answer_check import check_answer
 from eval.ground_truth import load_ground_truth
 from eval.single import write_detection

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 from eval import bench
 from eval.bench import chosen, contests, measure, row_of, verdict, write_table
 from eval.cli import main

@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 import yaml
 
-from cdpipe.config import load_config
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
+from cdpipe.model.config import load_config
 from eval.calibrate import alarm_threshold, as_settings, rate_threshold, thresholds
 
 

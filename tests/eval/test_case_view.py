@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpipe.answer import write_answer, write_failure
-from cdpipe.errors import InputError
-from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport
+from cdpipe.core.errors import InputError
+from cdpipe.io.answer import write_answer, write_failure
+from cdpipe.model.types import ChangedObject, ChangeRegions, ChangeReport
 from eval.case_view import box_path, case_view, roof_mask, sphere_path, write_case_view
 from eval.ground_truth import load_ground_truth
 from eval.page_run import RunData

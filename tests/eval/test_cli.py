@@ -12,11 +12,11 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.answer import read_answer
-from cdpipe.config import PipelineConfig
-from cdpipe.errors import InputError
-from cdpipe.readers import open_scans
-from cdpipe.types import DescriptorSet, PointMap, ScanSource
+from cdpipe.core.errors import InputError
+from cdpipe.io.answer import read_answer
+from cdpipe.io.readers import open_scans
+from cdpipe.model.config import PipelineConfig
+from cdpipe.model.types import DescriptorSet, PointMap, ScanSource
 from eval import page, runner, single
 from eval import plan as plans
 from eval.cli import main

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 from eval.compared_columns import COMPARED, figures_of
 from eval.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare, paired_differences, verdict
 from eval.page import write_page

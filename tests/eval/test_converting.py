@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cdpipe.readers import open_scans
-from cdpipe.session import Session, read_session
+from cdpipe.io.readers import open_scans
+from cdpipe.io.session import Session, read_session
 from eval import converting
 from eval.cli import main
 from sim.truth import read_labels

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cdpipe.config import load_config
-from cdpipe.descriptor.range_image import range_image
-from cdpipe.descriptor.shard import FIELDS, read_about, read_shard, shard_bytes
-from cdpipe.descriptor.sphere_image import COLUMNS, ROWS, pixels, sphere_image
-from cdpipe.errors import InputError, ScenarioError
-from cdpipe.geometry import invert, rotation_angle_rad, transform, yaw_rad
-from cdpipe.mapping import build_map
-from cdpipe.types import DescriptorSet, MappedSession, PointMap
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.geometry import invert, rotation_angle_rad, transform, yaw_rad
+from cdpipe.descriptors.range_image import range_image
+from cdpipe.descriptors.sphere_image import COLUMNS, ROWS, pixels, sphere_image
+from cdpipe.mapping.mapping import build_map
+from cdpipe.model.config import load_config
+from cdpipe.model.types import DescriptorSet, MappedSession, PointMap
+from cdpipe.training.shard import FIELDS, read_about, read_shard, shard_bytes
 from eval import cluster, dataset_run
 from eval.adapters import pipeline_input
 from eval.cluster import Where

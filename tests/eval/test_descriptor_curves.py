@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cdpipe.descriptor.data import TunnelShard
-from cdpipe.descriptor.sphere_network import SphereSize
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
+from cdpipe.descriptors.sphere_network import SphereSize
+from cdpipe.training.data import TunnelShard
 from eval import descriptor_curves
 from eval.dataset import Recipe
 from eval.dataset_run import Where, make_dataset

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from cdpipe.descriptor.sphere_image import COLUMNS, ROWS
-from cdpipe.descriptor.sphere_network import SECTORS, SphereNetwork
-from cdpipe.descriptor.sphere_training import SphereData
+from cdpipe.descriptors.sphere_image import COLUMNS, ROWS
+from cdpipe.descriptors.sphere_network import SECTORS, SphereNetwork
+from cdpipe.training.sphere_training import SphereData
 from eval.descriptor_measures import HeldOut, measures, rounded
 
 # two tunnels, keyframes 10 m apart, so that none has a neighbour

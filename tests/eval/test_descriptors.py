@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cdpipe.config import load_config
-from cdpipe.descriptor import describe_map, describe_scans
-from cdpipe.mapping import build_map
-from cdpipe.query import find_regions
-from cdpipe.types import MappedSession, MergedMaps
+from cdpipe.descriptors import describe_map, describe_scans
+from cdpipe.mapping.mapping import build_map
+from cdpipe.model.config import load_config
+from cdpipe.model.types import MappedSession, MergedMaps
+from cdpipe.query.query import find_regions
 from eval import descriptors as command
 from eval.adapters import pipeline_input
 from eval.descriptor_rows import describe_keyframes, pair_rows, scan_row, sphere_rows

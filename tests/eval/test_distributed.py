@@ -21,9 +21,9 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 from eval import cluster, pair_run, progress, runner
-from eval.alone import death_of
+from eval.alone import run_isolated
 from eval.cluster import Where
 from eval.methods import slug
 from eval.pair_run import Made
@@ -331,10 +331,10 @@ def test_a_machine_is_shared_where_two_tasks_run_at_a_time() -> None:
 
 
 def test_what_ends_a_process_of_its_own_is_told() -> None:
-    assert death_of(os.getpid) == ""
-    assert death_of(os._exit, 3) == "exit code 3"
+    assert run_isolated(os.getpid) == ""
+    assert run_isolated(os._exit, 3) == "exit code 3"
     with pytest.raises(FileNotFoundError):
-        death_of(os.stat, "/nowhere")
+        run_isolated(os.stat, "/nowhere")
 
 
 @pytest.mark.usefixtures("copies")

@@ -114,8 +114,8 @@ def test_the_extras_that_are_here_do_their_job(extra: str) -> None:
 def test_a_damaged_checkpoint_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: Callable[[bytes], bytes], words: str
 ) -> None:
-    shutil.copytree(ROOT / "cdpipe" / "descriptor", tmp_path / "descriptor", ignore=shutil.ignore_patterns("*.py"))
-    file = tmp_path / "descriptor" / "sphere.safetensors"
+    shutil.copytree(ROOT / "cdpipe" / "descriptors" / "weights", tmp_path / "descriptors" / "weights", ignore=shutil.ignore_patterns("*.py"))
+    file = tmp_path / "descriptors" / "weights" / "sphere.safetensors"
     file.write_bytes(damage(file.read_bytes()))
     monkeypatch.setattr(importlib.resources, "files", lambda _: tmp_path)
     with pytest.raises(Exception, match=words):

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from cdpipe.cutting import cut_by_surface
-from cdpipe.types import ChangeRegions
+from cdpipe.extract.surface_rule import cut_by_surface
+from cdpipe.model.types import ChangeRegions
 from eval.bench import contests, measure
 from eval.extract_bench import ExtractSite, extract_contests, extract_sites
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from cdpipe.config import preset_names
+from cdpipe.model.config import preset_names
 from eval.plan import cells, load_plan
 from eval.worlds import references, settings_over
 from scenarios import load_scenario

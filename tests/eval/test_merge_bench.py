@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cdpipe.coarse import is_kiss_matcher_installed
-from cdpipe.errors import MergeFailedError
-from cdpipe.geometry import yaw_pose
-from cdpipe.types import MergedMaps
+from cdpipe.core.errors import MergeFailedError
+from cdpipe.core.geometry import yaw_pose
+from cdpipe.merge.global_registration import is_kiss_matcher_installed
+from cdpipe.model.types import MergedMaps
 from eval import merge_bench
 from eval.bench import contests, measure, row_of, verdict
 from eval.descriptor_bench import descriptor_contests

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cdpipe.errors import InputError
-from cdpipe.evidence import GATES
+from cdpipe.core.errors import InputError
+from cdpipe.merge.evidence import GATES
 from eval.merge_gates import (
     committed_thresholds,
     draw_gates,

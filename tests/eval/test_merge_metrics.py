@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from cdpipe.geometry import invert, make_pose, stream, yaw_pose
+from cdpipe.core.geometry import invert, make_pose, stream, yaw_pose
 from eval.ground_truth import SessionTruth
 from eval.merge_metrics import evidence_columns, merge_columns, merge_errors, overlap_true, travel_directions
-from eval.universe import Universe
+from eval.universe import ScoringPoints
 
 
 def session(world_T_sensor: np.ndarray, odom_T_world: np.ndarray) -> SessionTruth:
-    empty = Universe(
+    empty = ScoringPoints(
         returns=np.zeros(0, dtype=np.int64),
         points_odom=np.zeros((0, 3), dtype=np.float32),
         change=np.zeros(0, dtype=np.int16),

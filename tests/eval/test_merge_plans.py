@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 from eval.methods import Cell
 from eval.plan import cells, load_plan
 from eval.plan_changes import changed_plan

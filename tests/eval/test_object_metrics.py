@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from cdpipe.geometry import stream
-from cdpipe.types import ChangedObject
+from cdpipe.core.geometry import stream
+from cdpipe.model.types import ChangedObject
 from eval.answer_rows import rows_near_points
 from eval.ground_truth import GroundTruth, SessionTruth
 from eval.object_metrics import (
@@ -18,7 +18,7 @@ from eval.object_metrics import (
     unanswered_objects,
     voxel_iou,
 )
-from eval.universe import Universe
+from eval.universe import ScoringPoints
 from sim.truth import Change, PairTruth
 from tests.eval.changes import change
 
@@ -26,11 +26,11 @@ N_CELLS = 40
 NAN = float("nan")
 
 
-def line_universe(change: list[int]) -> Universe:
+def line_universe(change: list[int]) -> ScoringPoints:
     """One cell every 0.1 m along x: row i is pixel i of the only scan."""
     n = len(change)
     points = np.column_stack([0.05 + 0.1 * np.arange(n), np.full(n, 0.05), np.full(n, 0.05)])
-    return Universe(
+    return ScoringPoints(
         returns=np.arange(n, dtype=np.int64),
         points_odom=points.astype(np.float32),
         change=np.array(change, dtype=np.int16),
@@ -318,7 +318,7 @@ def test_rows_near_points_equal_brute_force() -> None:
     draw = stream(2, "near")
     points = draw.uniform(0, 1, (400, 3)).astype(np.float32)
     zeros = np.zeros(400, dtype=np.int16)
-    universe = Universe(np.arange(400), points, zeros, zeros, 1, 400)
+    universe = ScoringPoints(np.arange(400), points, zeros, zeros, 1, 400)
     objects = [draw.uniform(0, 1, (20, 3)), draw.uniform(0.3, 0.8, (30, 3)), draw.uniform(0, 0.5, (5, 3))]
     every, owners = np.concatenate(objects), np.repeat([0, 1, 2], [20, 30, 5])
     distances = np.linalg.norm(points[:, None].astype(np.float64) - every[None], axis=2)

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cdpipe.geometry import stream
-from cdpipe.types import ChangedObject
+from cdpipe.core.geometry import stream
+from cdpipe.model.types import ChangedObject
 from eval.ground_truth import GroundTruth, SessionTruth
 from eval.object_metrics import kinds_right, match_objects, object_columns
-from eval.universe import Universe
+from eval.universe import ScoringPoints
 from sim.truth import Change, PairTruth
 from tests.eval.changes import change
 
@@ -35,7 +35,7 @@ class Case:
             # things are lumps of the cloud, not salt and pepper
             owner = np.array(ids)[np.digitize(points[:, 0], np.sort(draw.uniform(0, 1.2, len(ids) - 1)))]
             zeros = np.zeros(N_ROWS, dtype=np.int16)
-            universes[session] = Universe(
+            universes[session] = ScoringPoints(
                 np.arange(N_ROWS, dtype=np.int64), points, owner.astype(np.int16), zeros, 1, N_ROWS
             )
         self.truth = GroundTruth(
@@ -66,7 +66,7 @@ class Case:
         return changes
 
     def _answer(
-        self, draw: np.random.Generator, universes: dict[str, Universe]
+        self, draw: np.random.Generator, universes: dict[str, ScoringPoints]
     ) -> tuple[list[ChangedObject], list[np.ndarray]]:
         objects, rows = [], []
         for session in SESSIONS:

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.geometry import make_pose, stream, yaw_pose
-from cdpipe.types import ChangedObject, ObjectShape
+from cdpipe.core.geometry import make_pose, stream, yaw_pose
+from cdpipe.model.types import ChangedObject, ObjectShape
 from eval.ground_truth import GroundTruth, SessionTruth
 from eval.object_metrics import match_objects
 from eval.object_sizes import size_columns, size_errors, true_displacements_map, true_volume_m3
-from eval.universe import Universe
+from eval.universe import ScoringPoints
 from sim.truth import Change, PairTruth
 from tests.eval.changes import change
 
@@ -35,11 +35,11 @@ def moved(start: np.ndarray, end: np.ndarray, **fields: object) -> list[Change]:
     ]
 
 
-def universe(ids: list[int]) -> Universe:
+def universe(ids: list[int]) -> ScoringPoints:
     labels = np.repeat(np.array(ids, dtype=np.int16), WIDTH)
     n = len(labels)
     points = np.column_stack([np.arange(n) * 0.1, np.zeros(n), np.zeros(n)]).astype(np.float32)
-    return Universe(np.arange(n, dtype=np.int64), points, labels, np.zeros(n, np.int16), 1, n)
+    return ScoringPoints(np.arange(n, dtype=np.int64), points, labels, np.zeros(n, np.int16), 1, n)
 
 
 def truth_of(changes: list[Change], odom_T_world: np.ndarray | None = None, **scenario: object) -> GroundTruth:

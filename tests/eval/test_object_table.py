@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from cdpipe.geometry import stream
+from cdpipe.core.geometry import stream
 from eval.domains import domain_of
 from eval.object_groups import clustered_interval, group_overview, main_changes, objects_by_group
 from eval.object_table import FILES, ORACLE_VARIANT, object_overview, object_tables

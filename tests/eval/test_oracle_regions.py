@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpipe.config import QueryConfig
-from cdpipe.errors import InputError
-from cdpipe.geometry import make_pose, yaw_pose
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import make_pose, yaw_pose
+from cdpipe.model.config import QueryConfig
 from eval.ground_truth import GroundTruth, SessionTruth
 from eval.merge_table import is_oracle
 from eval.methods import slug, variant_name
@@ -15,7 +15,7 @@ from eval.oracle_regions import regions_by_truth
 from eval.plan import Plan, cells, load_plan
 from eval.plan_changes import changed_plan
 from eval.region_metrics import centres_in_world, match_regions
-from eval.universe import Universe
+from eval.universe import ScoringPoints
 from sim.truth import PairTruth
 from tests.eval.changes import change
 
@@ -28,7 +28,7 @@ def truth_of(places: list[tuple[float, float]], n_cells: list[int], is_observabl
     world = np.stack([make_pose(translation=(float(index), 0.0, 1.0)) for index in range(N_SCANS)])
     bends = np.stack([yaw_pose(0.004 * index, (5.0 + 0.01 * index, -3.0, 0.0)) for index in range(N_SCANS)])
     none = np.zeros(0, dtype=np.int16)
-    universe = Universe(np.zeros(0, np.int64), np.zeros((0, 3), np.float32), none, none, N_SCANS, 1)
+    universe = ScoringPoints(np.zeros(0, np.int64), np.zeros((0, 3), np.float32), none, none, N_SCANS, 1)
     changes = tuple(change(number) for number in range(1, len(places) + 1))
     return GroundTruth(
         pair=PairTruth("test", 0, 4.5, changes, {}),

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.geometry import invert, make_pose, stream, travelled_m, yaw_pose
-from cdpipe.types import DescriptorSet, MappedSession, MergedMaps, PointMap
+from cdpipe.core.geometry import invert, make_pose, stream, travelled_m, yaw_pose
+from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap
 from eval.ground_truth import SessionTruth
 from eval.merge_metrics import MergeErrors, merge_errors
 from eval.oracles import OracleMerge, merged_by_truth
-from eval.universe import Universe
+from eval.universe import ScoringPoints
 
 N = 60
 KEYFRAMES = (np.arange(0, N, 2), np.arange(1, N, 3))
@@ -33,7 +33,7 @@ def session(world_T_sensor: np.ndarray, odom_T_world: np.ndarray, drift_deg_per_
         yaw_pose(np.deg2rad(drift_deg_per_m * way), (0.01 * way * (drift_deg_per_m > 0), 0, 0)) for way in travelled
     ]
     none = np.zeros(0, dtype=np.int16)
-    universe = Universe(np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.float32), none, none, N, 1)
+    universe = ScoringPoints(np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.float32), none, none, N, 1)
     return SessionTruth(odom_T_world @ np.stack(slip) @ world_T_sensor, world_T_sensor, universe)
 
 

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 from eval.output import make_writable, new_folder
 
 

@@ -12,13 +12,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cdpipe.answer import write_answer, write_failure
-from cdpipe.config import load_config
-from cdpipe.errors import InputError
-from cdpipe.geometry import make_pose, yaw_pose
-from cdpipe.ouster import parse_metadata
-from cdpipe.session import ScanChunk, SessionWriter
-from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import make_pose, yaw_pose
+from cdpipe.io.answer import write_answer, write_failure
+from cdpipe.io.session import ScanChunk, SessionWriter
+from cdpipe.model.config import load_config
+from cdpipe.model.types import ChangedObject, ChangeRegions, ChangeReport
+from cdpipe.sensor.ouster import parse_metadata
 from eval.ground_truth import load_ground_truth
 from eval.page import write_page
 from eval.page_site import truth_marks, world_to_odom

@@ -10,11 +10,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cdpipe.answer import write_answer, write_failure
-from cdpipe.config import load_config
-from cdpipe.evidence import GATES
-from cdpipe.geometry import transform
-from cdpipe.types import ChangeRegions, ChangeReport
+from cdpipe.core.geometry import transform
+from cdpipe.io.answer import write_answer, write_failure
+from cdpipe.merge.evidence import GATES
+from cdpipe.model.config import load_config
+from cdpipe.model.types import ChangeRegions, ChangeReport
 from eval.merge_table import merge_table
 from eval.page import write_page
 from eval.page_merge import draw_merge

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from cdpipe.geometry import Float64Array, yaw_pose
-from cdpipe.types import DescriptorSet
+from cdpipe.core.geometry import Float64Array, yaw_pose
+from cdpipe.model.types import DescriptorSet
 from eval.place_metrics import place_outcomes, place_scores
 
 SIZE = 64

@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from cdpipe.config import load_config
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
+from cdpipe.model.config import load_config
 from eval import plan as plan_module
 from eval.methods import slug, variant_name
 from eval.plan import Plan, cells, load_plan, parse_seeds, plan_names, planned_cases

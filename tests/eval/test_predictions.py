@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cdpipe.geometry import transform
+from cdpipe.core.geometry import transform
 from eval import answer_check
 from eval.ground_truth import load_ground_truth
 from eval.runfolder import RunFolder, write_json

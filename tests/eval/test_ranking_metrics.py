@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from cdpipe.geometry import stream
+from cdpipe.core.geometry import stream
 from eval.ranking import auroc, average_precision
 
 

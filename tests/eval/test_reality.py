@@ -12,9 +12,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from cdpipe.errors import InputError
-from cdpipe.geometry import invert, make_pose
-from cdpipe.ouster import SensorMetadata, load_profile
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import invert, make_pose
+from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from eval import reality_scenes
 from eval.reality import DATA_VARIABLE, main
 from eval.reality_plots import draw_measures, draw_novelty, draw_scene

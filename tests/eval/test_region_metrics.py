@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cdpipe.geometry import invert, stream, transform, yaw_pose
+from cdpipe.core.geometry import invert, stream, transform, yaw_pose
 from eval.ground_truth import SessionTruth
 from eval.region_metrics import (
     centres_in_world,
@@ -14,9 +14,9 @@ from eval.region_metrics import (
     recall_at_k,
     unanswered_regions,
 )
-from eval.universe import Universe
+from eval.universe import ScoringPoints
 
-EMPTY = Universe(
+EMPTY = ScoringPoints(
     returns=np.zeros(0, dtype=np.int64),
     points_odom=np.zeros((0, 3), dtype=np.float32),
     change=np.zeros(0, dtype=np.int16),

@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import pytest
 
-from cdpipe.errors import InputError
-from cdpipe.yamlfile import Document, validated
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import Document, validated
 from eval.domains import domain_of
 from eval.plan import Plan, cells, load_plan
 from scenarios import load_scenario

@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 import yaml
 
-from cdpipe.config import load_config
-from cdpipe.types import DescriptorSet, MappedSession, PointMap
+from cdpipe.model.config import load_config
+from cdpipe.model.types import DescriptorSet, MappedSession, PointMap
 from eval.region_table import FILES, region_overview, region_tables
 from eval.stages import kept_bytes
 from eval.statistics import wilson_interval

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cdpipe.config import PipelineConfig, load_config, preset_names
-from cdpipe.geometry import BoolArray, Float64Array, transform, yaw_pose
-from cdpipe.types import ChangeReport, DescriptorSet, MergedMaps, PointMap, SessionName
+from cdpipe.core.geometry import BoolArray, Float64Array, transform, yaw_pose
+from cdpipe.model.config import PipelineConfig, load_config, preset_names
+from cdpipe.model.types import ChangeReport, DescriptorSet, MergedMaps, PointMap, SessionName
 from eval.rivals import METHODS, c2c, random_regions, voxel_diff
 from eval.whole_map import PlacedMaps, whole_map
 

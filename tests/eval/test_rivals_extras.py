@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpipe.config import load_config
-from cdpipe.errors import InputError
-from cdpipe.geometry import Float64Array, stream, transform, yaw_pose
-from cdpipe.types import ChangeReport, DescriptorSet, MappedSession, MergedMaps, PointMap, SessionName
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, stream, transform, yaw_pose
+from cdpipe.model.config import load_config
+from cdpipe.model.types import ChangeReport, DescriptorSet, MappedSession, MergedMaps, PointMap, SessionName
 from eval import rivals, single
 from eval.rival_dufomap import void_mask
 from eval.rival_m3c2 import m3c2_mask

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 from eval import cluster, pair_run, rivals, runner
 from eval.checking import check_file
 from eval.cluster import Where, require_reachable

@@ -12,14 +12,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cdpipe.answer import read_answer
-from cdpipe.config import MapConfig, MergeConfig
-from cdpipe.errors import InputError, ScenarioError
-from cdpipe.mapping import build_map
-from cdpipe.merge import merge_maps
-from cdpipe.ouster import load_profile
-from cdpipe.readers import open_scans
-from cdpipe.types import MappedSession, MergedMaps
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.io.answer import read_answer
+from cdpipe.io.readers import open_scans
+from cdpipe.mapping.mapping import build_map
+from cdpipe.merge.merge import merge_maps
+from cdpipe.model.config import MapConfig, MergeConfig
+from cdpipe.model.types import MappedSession, MergedMaps
+from cdpipe.sensor.ouster import load_profile
 from eval import pair_run, provenance, runner, stages
 from eval.adapters import pipeline_input
 from eval.plan import Plan, cells, load_plan

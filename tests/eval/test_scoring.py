@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from cdpipe.answer import write_answer, write_failure
-from cdpipe.errors import InputError
-from cdpipe.geometry import invert, transform
-from cdpipe.readers import open_scans
-from cdpipe.types import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import invert, transform
+from cdpipe.io.answer import write_answer, write_failure
+from cdpipe.io.readers import open_scans
+from cdpipe.model.types import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 from eval.domains import domain_of, is_change_in_distribution
 from eval.ground_truth import GroundTruth, load_ground_truth
 from eval.scoring import METRICS_VERSION, CaseScore, score_pair

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from pydantic.fields import FieldInfo
 
-from cdpipe.config import load_config
-from cdpipe.ouster import load_profile, profile_names
+from cdpipe.model.config import load_config
+from cdpipe.sensor.ouster import load_profile, profile_names
 from eval.plan import cells, load_plan
 from eval.statistics import ENOUGH_PAIRS
 from eval.worlds import references, settings_over, worlds_of

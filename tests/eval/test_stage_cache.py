@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cdpipe.alignment import PathAlignment
-from cdpipe.config import PipelineConfig, load_config
-from cdpipe.errors import MergeFailedError
-from cdpipe.types import ChangeRegions, DescriptorSet, KeyframeViews, MergedMaps, PointMap
+from cdpipe.core.errors import MergeFailedError
+from cdpipe.model.alignment import PathAlignment
+from cdpipe.model.config import PipelineConfig, load_config
+from cdpipe.model.types import ChangeRegions, DescriptorSet, KeyframeViews, MergedMaps, PointMap
 from eval import pair_run, runner, stage_cache, stage_results, stages
 from eval.adapters import pipeline_input
 from eval.plan import load_plan

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cdpipe.geometry import stream
+from cdpipe.core.geometry import stream
 from eval.ranking import auroc
 from eval.statistics import bootstrap_interval, summarise
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from cdpipe.descriptor.network import digest
-from cdpipe.descriptor.sphere_network import loaded_sphere_network
+from cdpipe.descriptors.network import digest
+from cdpipe.descriptors.sphere_network import loaded_sphere_network
 from eval.dataset import Recipe
 from eval.dataset_run import Where, make_dataset
 from eval.progress import Silent

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpipe.errors import InputError
-from cdpipe.geometry import transform
-from cdpipe.readers import open_scans
-from cdpipe.session import read_session
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import transform
+from cdpipe.io.readers import open_scans
+from cdpipe.io.session import read_session
 from eval import universe as module
 from eval.universe import build_universe, load_universe
 from sim.truth import read_labels, write_labels

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from cdpipe.errors import InputError
+from cdpipe.core.errors import InputError
 from eval import worlds
 from eval.plan import Plan, cells, load_plan
 from eval.plan_changes import changed_plan

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import stream
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import stream
 from scenarios.distributions import draw, drawing, merged
 
 

@@ -8,7 +8,7 @@ from itertools import combinations, pairwise
 
 import pytest
 
-from cdpipe.yamlfile import read_yaml
+from cdpipe.core.yamlfile import read_yaml
 from scenarios import check_scenario, library, load_scenario, scenario_names
 from scenarios.references import route_length_m
 from scenarios.schema import Furniture, Place, Scenario, Tunnel

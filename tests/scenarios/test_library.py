@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from cdpipe.errors import InputError, ScenarioError
-from cdpipe.ouster import load_profile, profile_names
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.sensor.ouster import load_profile, profile_names
 from scenarios import check_scenario, load_scenario, scenario_names
 from scenarios.library import FAMILIES
 from scenarios.references import file_digests, route_length_m

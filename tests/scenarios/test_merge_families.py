@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import pytest
 
-from cdpipe.yamlfile import read_yaml
+from cdpipe.core.yamlfile import read_yaml
 from scenarios import library, load_scenario, scenario_names
 from scenarios.schema import Odometry, Scenario, SessionPlan
 

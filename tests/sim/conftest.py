@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from cdpipe.ouster import SensorMetadata, load_profile
+from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.schema import Drift, Place, Platform, Prop, Roughness, Scenario, Section, Sensor, SessionPlan, Tunnel
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 from sim.footprint import DIVERGENCE_RAD, PULSE_M, WAIST_M, Echo, blended, central_echo, footprint, spread_echo
 from sim.mesh import Mesh
 from sim.optics import received_photons

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 import trimesh
 
-from cdpipe.errors import ScenarioError
+from cdpipe.core.errors import ScenarioError
 from scenarios.schema import MeshFile
 from sim import foreign
 from sim.foreign import UNIT_M, prop_mesh, tunnel_mesh

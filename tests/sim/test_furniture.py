@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cdpipe.geometry import BoolArray, Float64Array
+from cdpipe.core.geometry import BoolArray, Float64Array
 from scenarios.schema import (
     Bolts,
     CableTray,

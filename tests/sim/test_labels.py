@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpipe.geometry import make_pose
-from cdpipe.ouster import SensorMetadata
+from cdpipe.core.geometry import make_pose
+from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Drift, Place, Platform, Prop, Scenario, Section, Sensor, SessionPlan, Shift, Tunnel
 from sim.labels import Ghost, belonging, cell_keys, claim_returns, list_changes
 from sim.lidar import scan

@@ -9,9 +9,9 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.geometry import Float32Array, Float64Array, Int64Array, make_pose, stream, transform
-from cdpipe.ouster import SensorMetadata, load_profile
-from cdpipe.session import read_session
+from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, make_pose, stream, transform
+from cdpipe.io.session import read_session
+from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.schema import Prop, Scenario, Sensor
 from sim import lidar, optics
 from sim.lidar import FALSE_RETURN, MISS, Scan, scan

@@ -12,9 +12,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from cdpipe.geometry import Float64Array, stream
-from cdpipe.ouster import SensorMetadata
-from cdpipe.yamlfile import read_yaml
+from cdpipe.core.geometry import Float64Array, stream
+from cdpipe.core.yamlfile import read_yaml
+from cdpipe.sensor.ouster import SensorMetadata
 from scenarios import library, load_scenario
 from scenarios.schema import SessionPlan, Tunnel
 from sim.centreline import Centreline, build_centreline, resample

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe import odometry
-from cdpipe.errors import InputError, ScenarioError
-from cdpipe.geometry import invert, make_pose, rotation_angle_rad, transform, travelled_m, yaw_rad
-from cdpipe.odometry import deskewed
-from cdpipe.ouster import SensorMetadata
-from cdpipe.session import Session, read_session
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.geometry import invert, make_pose, rotation_angle_rad, transform, travelled_m, yaw_rad
+from cdpipe.io.session import Session, read_session
+from cdpipe.mapping import odometry
+from cdpipe.mapping.odometry import deskewed
+from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Odometry, Platform, Roughness, Scenario, SessionPlan, Tunnel
 from sim.mesh import Mesh, box_mesh
 from sim.odometry import registered

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from cdpipe.geometry import Float32Array, stream
+from cdpipe.core.geometry import Float32Array, stream
 from sim.optics import (
     FALSE_PHOTONS,
     FALSE_RETURN_RATE,

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float32Array, Float64Array
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float32Array, Float64Array
 from scenarios.schema import (
     Area,
     Drift,
@@ -23,7 +23,7 @@ from scenarios.schema import (
 )
 from sim import fitting, stations
 from sim.centreline import Centreline, build_centreline
-from sim.placing import Standing, grown, overlap, standing_corners
+from sim.placing import Standing, grow, overlap, standing_corners
 from sim.scene import World, build_world
 from sim.stations import draw_areas
 
@@ -157,12 +157,12 @@ def test_a_prop_keeps_clear_of_a_pipe(make_scenario: MakeScenario, make_prop: Ma
 
 def test_rectangles_grow_and_overlap_by_hand() -> None:
     square = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-    np.testing.assert_allclose(grown(square, 0.5), 1.5 * square)
+    np.testing.assert_allclose(grow(square, 0.5), 1.5 * square)
     turned = square @ np.array([[0.6, 0.8], [-0.8, 0.6]])
-    np.testing.assert_allclose(np.linalg.norm(grown(turned, 0.5), axis=1), 1.5 * np.sqrt(2))
+    np.testing.assert_allclose(np.linalg.norm(grow(turned, 0.5), axis=1), 1.5 * np.sqrt(2))
     assert overlap(square, square + np.array([1.9, 0.0]))
     assert not overlap(square, square + np.array([2.1, 0.0]))
-    assert not overlap(square, grown(square, 0.5) + np.array([2.6, 0.0]))
+    assert not overlap(square, grow(square, 0.5) + np.array([2.6, 0.0]))
 
 
 def area_scenario(make_scenario: MakeScenario, tunnel: Tunnel, count: int, **plans: SessionPlan) -> Scenario:

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from cdpipe.geometry import Float64Array, Int64Array, make_pose
+from cdpipe.core.geometry import Float64Array, Int64Array, make_pose
 from scenarios.schema import Prop, Scenario
 from sim.centreline import build_centreline
 from sim.mesh import Mesh, box_mesh, cylinder_mesh, moved

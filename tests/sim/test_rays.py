@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cdpipe.geometry import Float64Array, make_pose, transform
-from cdpipe.ouster import SensorMetadata
+from cdpipe.core.geometry import Float64Array, make_pose, transform
+from cdpipe.sensor.ouster import SensorMetadata
 from sim.rays import direction_parts, revolution_rays, turned
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpipe.geometry import Float64Array, invert
-from cdpipe.ouster import SensorMetadata
-from cdpipe.session import read_session
+from cdpipe.core.geometry import Float64Array, invert
+from cdpipe.io.session import read_session
+from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Odometry, Prop, Scenario, Sensor, SessionPlan, Shift
 from sim.labels import belonging
 from sim.mesh import Mesh, joined, point_triangle_distance

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array
-from cdpipe.motion import Motion
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array
+from cdpipe.core.motion import Motion
 from scenarios.schema import Platform, Scenario, SessionPlan
 from sim.mesh import Mesh
 from sim.path import Path

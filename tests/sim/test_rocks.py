@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.stats import kstest
 
-from cdpipe.geometry import stream
+from cdpipe.core.geometry import stream
 from sim.rocks import passing_share, rock_mesh, rosin_rammler
 from sim.shapes import signed_volume_m3
 from sim.topology import edges_of

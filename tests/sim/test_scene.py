@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array
 from scenarios.schema import (
     Drift,
     Duct,

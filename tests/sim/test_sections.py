@@ -5,7 +5,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Section
 from sim.sections import cave_floor_m, profile_distance, section_distance
 

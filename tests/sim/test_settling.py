@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array, make_pose, transform
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, make_pose, transform
 from scenarios.schema import Drift, Floor, Place, Prop, Roughness, Scenario, Section, Tunnel
 from sim.contact import interpenetration_m, surface_points
 from sim.mesh import Mesh, box_mesh

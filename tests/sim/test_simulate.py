@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.errors import InputError, ScenarioError
-from cdpipe.geometry import Float64Array, transform
-from cdpipe.session import Session, read_session
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.geometry import Float64Array, transform
+from cdpipe.io.session import Session, read_session
 from scenarios.schema import Odometry, Place, Prop, Scenario, SessionPlan
 from sim import simulate
 from sim.scene import build_world

@@ -6,7 +6,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import pdist
 
-from cdpipe.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Drift, Floor, Roughness, Section, Stones, Tunnel
 from sim.centreline import Centreline, build_centreline
 from sim.mesh import Mesh

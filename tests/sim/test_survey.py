@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpipe.errors import InputError, ScenarioError
+from cdpipe.core.errors import InputError, ScenarioError
 from sim import survey as surveys
 from sim.survey import Failure, Survey, WorldFigures, survey, survey_seed
 from sim.survey_tables import markdown, summary, write_csv

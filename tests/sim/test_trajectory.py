@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array, invert, require_poses, travelled_m, yaw_rad
-from cdpipe.motion import Motion, motion_of
-from cdpipe.ouster import SensorMetadata
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, invert, require_poses, travelled_m, yaw_rad
+from cdpipe.core.motion import Motion, motion_of
+from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Floor, Odometry, Platform, Prop, Scenario, SessionPlan, Stones
 from sim.line import kept_between, smoothed
 from sim.path import plan_path

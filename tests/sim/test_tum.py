@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.errors import InputError, ScenarioError
-from cdpipe.geometry import Float64Array, yaw_rad
-from cdpipe.ouster import SensorMetadata
-from cdpipe.session import read_session
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.geometry import Float64Array, yaw_rad
+from cdpipe.io.session import read_session
+from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import MeshFile, Platform, Scenario, SessionPlan, Tunnel
 from sim.mesh import Mesh, box_mesh
 from sim.raycast import Caster

@@ -5,8 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from cdpipe.errors import ScenarioError
-from cdpipe.geometry import Float64Array
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Drift, Floor, MeshFile, Niche, Roughness, Ruts, Section, Tunnel, Variation
 from sim.centreline import Centreline, build_centreline, left_of
 from sim.mesh import Mesh

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from cdpipe.errors import InputError, ScenarioError
-from cdpipe.geometry import Float64Array
-from cdpipe.readers import open_scans
-from cdpipe.session import read_session
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.geometry import Float64Array
+from cdpipe.io.readers import open_scans
+from cdpipe.io.session import read_session
 from eval.cli import main
 from eval.looking import view_of
 from scenarios.schema import MeshFile, Place, Prop, Scenario, Shift, Tunnel

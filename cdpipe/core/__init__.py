@@ -1,0 +1,1 @@
+"""What every stage stands on: errors, poses, motion, voxels, the spatial index and the YAML reader."""

@@ -1,0 +1,122 @@
+"""Cells of a regular grid as single integers, and the distinct cells of a stream of points."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cdpipe.core.geometry import Float64Array, Int64Array
+
+_BITS = 21
+_HALF = 1 << (_BITS - 1)
+
+
+def max_coordinate_m(cell_m: float) -> float:
+    """Return the coordinate below which `cell_keys` can name every cell of this size."""
+    return (_HALF - 1) * cell_m
+
+
+def cell_keys(points: Float64Array, cell_m: float, origin_m: float = 0.0) -> Int64Array:
+    """Return the key of the grid cell of each point; equal keys are equal cells, and keys order by x, then y, then z.
+
+    Args:
+        points: (N, 3) points, metres.
+        cell_m: Edge of a cell.
+        origin_m: Where the grid has a corner, the same along every axis.
+
+    Returns:
+        (N,) int64 keys.
+
+    Raises:
+        ValueError: A point is not finite or farther than `max_coordinate_m` from the origin.
+    """
+    keys = np.zeros(len(points), dtype=np.int64)
+    for axis in range(3):
+        cells = np.floor((points[:, axis] - origin_m) / cell_m)
+        # written so that NaN fails the comparison as well
+        if len(cells) and not (cells.min() >= -_HALF and cells.max() < _HALF):
+            raise ValueError(
+                f"points must be finite and within {max_coordinate_m(cell_m):.0f} m for cells of {cell_m} m"
+            )
+        keys <<= _BITS
+        keys += cells.astype(np.int64) + _HALF
+    return keys
+
+
+def cell_corners(keys: Int64Array, cell_m: float) -> Float64Array:
+    """Return the (N, 3) lower corner of the cell of each key of `cell_keys`, metres from its `origin_m`."""
+    shifts = np.array([2 * _BITS, _BITS, 0])
+    return np.asarray((((keys[:, None] >> shifts) & ((1 << _BITS) - 1)) - _HALF) * cell_m)
+
+
+def thinned(points: Float64Array, cell_m: float) -> Float64Array:
+    """Return the first point of each occupied cell, in the order of the cells' keys."""
+    _, first = np.unique(cell_keys(points, cell_m), return_index=True)
+    return points[first]
+
+
+def cell_means(points: Float64Array, cell_m: float) -> tuple[Float64Array, Int64Array]:
+    """Return the (C, 3) mean of the points of each occupied cell, and the (N,) cell of each point."""
+    _, cells = np.unique(cell_keys(points, cell_m), return_inverse=True)
+    counts = np.bincount(cells)
+    means = np.column_stack([np.bincount(cells, points[:, axis]) / counts for axis in range(3)])
+    return means, cells.astype(np.int64)
+
+
+class UniqueCells:
+    """The distinct keys of a stream that is too long to hold; cells are numbered as they first appear.
+
+    Memory grows with the number of distinct cells and not with the stream. Within one batch, new cells are numbered in
+    the order of their keys.
+    """
+
+    def __init__(self) -> None:
+        self._sorted_keys = np.zeros(0, dtype=np.int64)
+        self._sorted_ids = np.zeros(0, dtype=np.int64)
+        self._first: list[Int64Array] = []
+        self._counts = np.zeros(0, dtype=np.int64)
+        self._n_added = 0
+
+    def __len__(self) -> int:
+        return len(self._sorted_keys)
+
+    def add(self, keys: Int64Array) -> Int64Array:
+        """Take the next (N,) keys of the stream and return the (N,) cell numbers they belong to."""
+        # neighbours in a scan mostly share a cell: sorting what is left of their runs is several times faster
+        starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1])[: len(keys)])
+        lengths = np.diff(starts, append=len(keys))
+        cells, first, run_cell = np.unique(keys[starts], return_index=True, return_inverse=True)
+        first, counts = starts[first], np.bincount(run_cell, lengths, len(cells)).astype(np.int64)
+        place = np.searchsorted(self._sorted_keys, cells)
+        is_known = np.zeros(len(cells), dtype=np.bool_)
+        inside = place < len(self)
+        is_known[inside] = self._sorted_keys[place[inside]] == cells[inside]
+        is_new = ~is_known
+
+        ids = np.empty(len(cells), dtype=np.int64)
+        ids[is_known] = self._sorted_ids[place[is_known]]
+        ids[is_new] = len(self) + np.arange(np.count_nonzero(is_new))
+
+        self._counts = np.concatenate([self._counts, np.zeros(np.count_nonzero(is_new), dtype=np.int64)])
+        self._counts[ids] += counts
+        self._first.append(self._n_added + first[is_new])
+        self._sorted_keys = np.insert(self._sorted_keys, place[is_new], cells[is_new])
+        self._sorted_ids = np.insert(self._sorted_ids, place[is_new], ids[is_new])
+        self._n_added += len(keys)
+        return np.repeat(ids[run_cell], lengths)
+
+    @property
+    def keys(self) -> Int64Array:
+        """(C,) key of each cell, by its number."""
+        keys = np.empty(len(self), dtype=np.int64)
+        keys[self._sorted_ids] = self._sorted_keys
+        return keys
+
+    @property
+    def first_index(self) -> Int64Array:
+        """(C,) position in the whole stream of the first key of each cell."""
+        return np.concatenate(self._first) if self._first else np.zeros(0, dtype=np.int64)
+
+    @property
+    def counts(self) -> Int64Array:
+        """(C,) how many keys of the stream fell into each cell."""
+        return self._counts.copy()

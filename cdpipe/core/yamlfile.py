@@ -1,0 +1,257 @@
+"""YAML files checked against pydantic models, with every mistake of a file told at once and by line."""
+
+from __future__ import annotations
+
+import difflib
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from cdpipe.core.errors import InputError
+
+Key = tuple[str | int, ...]
+
+
+class Settings(BaseModel):
+    """Base of every model read from YAML: frozen; unknown keys and numbers that are none are mistakes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+@dataclass(frozen=True, slots=True)
+class Document:
+    """A parsed file and where each of its keys stands.
+
+    Attributes:
+        source: File name or other origin, for messages.
+        value: The content as plain dicts, lists and scalars.
+        origins: "file:line", or "--set", of each key path that has one.
+    """
+
+    source: str
+    value: Any
+    origins: Mapping[Key, str] = field(default_factory=dict)
+
+    def where(self, key: Key) -> str:
+        """Return the origin of a key, of its nearest known parent if it has none of its own."""
+        while key and key not in self.origins:
+            key = key[:-1]
+        return self.origins.get(key, self.source)
+
+
+def read_yaml(path: Path, text: str | None = None) -> Document:
+    """Parse a YAML file (or `text` under that name) with the safe loader.
+
+    Raises:
+        InputError: The file is missing, not YAML, or names a key twice.
+    """
+    try:
+        document = _parsed(str(path), path.read_text() if text is None else text)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:  # not text
+        raise InputError(f"{path}: not YAML: {error}") from error
+    return replace(document, value=_copied(document.value))
+
+
+@lru_cache(maxsize=64)
+def _parsed(path: str, text: str) -> Document:
+    """Parse a text once: a family is drawn with many seeds, and parsing takes longer than drawing."""
+    try:
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        lines: dict[Key, int] = {}
+        mistakes: list[str] = []
+        value = _plain(node, (), lines, mistakes, path)
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        raise InputError(f"{path}:{line}: not YAML: {error.problem}") from error
+    except (yaml.YAMLError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: not YAML: {error}") from error
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+    return Document(path, value, {key: f"{path}:{line}" for key, line in lines.items()})
+
+
+def validated(model: type[ModelT], document: Document) -> ModelT:
+    """Check a document against a model.
+
+    Raises:
+        InputError: One line per mistake: `file:line: key = value: rule; did you mean …`.
+    """
+    if not isinstance(document.value, dict):
+        raise InputError(f"{document.source}: expected keys and values, got {type(document.value).__name__}")
+    try:
+        return model.model_validate(document.value)
+    except ValidationError as error:
+        lines = [_mistake(model, document, item) for item in error.errors()]
+        raise InputError("\n".join(dict.fromkeys(lines))) from error
+
+
+def with_settings(document: Document, settings: Iterable[str]) -> Document:
+    """Return the document with `a.b=value` settings written over it; values are YAML scalars or lists.
+
+    Raises:
+        InputError: A setting has no "=" or is not YAML.
+    """
+    value = _copied(document.value)
+    origins = dict(document.origins)
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        if not equals or not name:
+            raise InputError(f"--set {setting}: expected key=value, e.g. extract.voxel_m=0.4")
+        try:
+            parsed = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise InputError(f"--set {setting}: the value is not YAML") from error
+        *parents, last = name.split(".")
+        place = value
+        for depth, parent in enumerate(parents, 1):
+            if parent not in place:
+                origins[tuple(parents[:depth])] = "--set"
+            place = place.setdefault(parent, {})
+            if not isinstance(place, dict):
+                raise InputError(f"--set {setting}: {parent} is a value, not a group of settings")
+        place[last] = parsed
+        written = (*parents, last)
+        origins = {key: where for key, where in origins.items() if key[: len(written)] != written}
+        origins[written] = "--set"
+    return replace(document, value=value, origins=origins)
+
+
+def with_section(document: Document, name: str) -> tuple[Document, Document | None]:
+    """Split a document in what it says without its section `name`, and the same with that written over it.
+
+    Returns:
+        The second is None where there is no such section; its keys keep the lines at which they stand.
+
+    Raises:
+        InputError: The section is no group of settings.
+    """
+    if not isinstance(document.value, dict) or name not in document.value:
+        return document, None
+    section = document.value[name]
+    if not isinstance(section, dict):
+        raise InputError(f"{document.where((name,))}: {name} = {_brief(section)}: expected a group of settings")
+    below = {key: where for key, where in document.origins.items() if key[:1] != (name,)}
+    above = {key[1:]: where for key, where in document.origins.items() if key[:1] == (name,) != key}
+    rest = replace(document, value={key: value for key, value in document.value.items() if key != name}, origins=below)
+    return rest, replace(rest, value=_overlaid(rest.value, section), origins=below | above)
+
+
+def suggestion(word: str, known: Iterable[str]) -> str:
+    """Return `; did you mean "…"?` for the closest known word, or ""."""
+    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
+    return f'; did you mean "{close[0]}"?' if close else ""
+
+
+def _mistake(model: type[BaseModel], document: Document, error: Any) -> str:
+    key = tuple(error["loc"])
+    # union members put the names of their alternatives into the location; keep what exists in the document
+    key = _existing(document.value, key) if error["type"] != "missing" else key
+    name = ".".join(str(part) for part in key)
+    where = document.where(key)
+    if error["type"] == "extra_forbidden":
+        return f"{where}: {name} = {_brief(error['input'])}: unknown key{_near_key(model, key)}"
+    if error["type"] == "missing":
+        return f"{where}: {name}: missing, a value is required"
+    hint = ""
+    expected = error.get("ctx", {}).get("expected")
+    if error["type"] == "literal_error" and isinstance(error["input"], str):
+        hint = suggestion(error["input"], [word.strip(" '\"") for word in expected.replace(" or ", ",").split(",")])
+    rule = error["msg"].removeprefix("Value error, ")
+    rule = rule[0].lower() + rule[1:] if not rule[:2].isupper() else rule
+    return f"{where}: {name} = {_brief(error['input'])}: {rule}{hint}" if name else f"{where}: {rule}{hint}"
+
+
+def _near_key(model: type[BaseModel], key: Key) -> str:
+    """Return a suggestion for an unknown key: one of that name in a group, if the group was left out, or a near one."""
+    last = str(key[-1])
+    groups = [name for name, field in model.model_fields.items() if isinstance(field.annotation, type)]
+    grouped = [f'"{group}.{last}"' for group in groups if last in _fields_at(model, (group,))]
+    if len(key) == 1 and grouped:
+        return f"; did you mean {' or '.join(grouped)}?"
+    return suggestion(last, _fields_at(model, key[:-1]))
+
+
+def _brief(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _existing(value: Any, key: Key) -> Key:
+    found: list[str | int] = []
+    for part in key:
+        try:
+            value = value[part]
+        except (KeyError, IndexError, TypeError):
+            continue
+        found.append(part)
+    return tuple(found)
+
+
+def _fields_at(model: type[BaseModel], key: Key) -> list[str]:
+    """Names of the fields a model allows below a key path, looking through lists, dicts and unions."""
+    models: list[type[BaseModel]] = [model]
+    for part in key:
+        if isinstance(part, int):
+            continue
+        below: list[type[BaseModel]] = []
+        for candidate in models:
+            info = candidate.model_fields.get(str(part))
+            below += _models_in(info.annotation) if info else [candidate]
+        models = below
+    return [name for candidate in models for name in candidate.model_fields]
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
+        return [annotation] if issubclass(annotation, BaseModel) else []
+    return [found for inner in typing.get_args(annotation) for found in _models_in(inner)]
+
+
+def _overlaid(below: Any, above: Any) -> Any:
+    if not isinstance(below, dict) or not isinstance(above, dict):
+        return _copied(above)
+    return {key: _overlaid(below.get(key), above[key]) if key in above else below[key] for key in {**below, **above}}
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _copied(item) for key, item in value.items()}
+    return [_copied(item) for item in value] if isinstance(value, list) else value
+
+
+def _plain(node: Any, key: Key, lines: dict[Key, int], mistakes: list[str], source: str) -> Any:
+    if node is None:
+        return None
+    lines.setdefault(key, node.start_mark.line + 1)
+    if isinstance(node, yaml.SequenceNode):
+        return [_plain(item, (*key, index), lines, mistakes, source) for index, item in enumerate(node.value)]
+    if isinstance(node, yaml.MappingNode):
+        content: dict[Any, Any] = {}
+        for name_node, item in node.value:
+            name = _scalar(name_node)
+            if name in content:
+                mistakes.append(f"{source}:{name_node.start_mark.line + 1}: {name}: the key stands here a second time")
+            lines[(*key, name)] = name_node.start_mark.line + 1
+            content[name] = _plain(item, (*key, name), lines, mistakes, source)
+        return content
+    return _scalar(node)
+
+
+def _scalar(node: Any) -> Any:
+    loader = yaml.SafeLoader("")
+    try:
+        return loader.construct_object(node)
+    finally:
+        loader.dispose()

@@ -1,0 +1,15 @@
+from .describe import checkpoint_digest, describe_scan, describe_scans, load_descriptors, save_descriptors, use_threads
+from .sphere import describe_map, sphere_digest
+from .yaw import relative_yaws_rad
+
+__all__ = [
+    "checkpoint_digest",
+    "describe_map",
+    "describe_scan",
+    "describe_scans",
+    "load_descriptors",
+    "relative_yaws_rad",
+    "save_descriptors",
+    "sphere_digest",
+    "use_threads",
+]

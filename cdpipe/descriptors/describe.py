@@ -1,0 +1,147 @@
+"""Descriptors of a session's keyframes, as a robot would compute and keep them while mapping."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
+from cdpipe.descriptors.handmade import HANDMADE, VERSION
+from cdpipe.descriptors.network import (
+    PlaceNetwork,
+    checkpoint_bytes,
+    digest,
+    initial_network,
+    trained_network,
+)
+from cdpipe.descriptors.range_image import range_image
+from cdpipe.descriptors.sphere import sphere_digest
+from cdpipe.io.session import load_arrays
+from cdpipe.model.config import DescriptorConfig, MapConfig
+from cdpipe.model.types import DescriptorSet, PosedScan, ScanSource
+
+_BATCH = 32
+
+
+def describe_scan(scan: PosedScan, config: DescriptorConfig) -> tuple[Float32Array, Float32Array]:
+    """Return q (D,) and w (64,) of one scan; D is 64, for descriptors made by hand the number of their rings."""
+    q, w = _described([scan.points_sensor], config.method)
+    return q[0], w[0]
+
+
+def describe_scans(source: ScanSource, keyframe_scans: Int64Array, config: DescriptorConfig) -> DescriptorSet:
+    """Describe the given scans of a session.
+
+    Args:
+        source: The session.
+        keyframe_scans: (K,) indices of the scans that are keyframes, rising.
+        config: Which descriptor.
+    """
+    parts = []
+    for start in range(0, len(keyframe_scans), _BATCH):
+        batch = keyframe_scans[start : start + _BATCH].tolist()
+        parts.append(_described((source.scan(index).points_sensor for index in batch), config.method))
+    q = np.concatenate([part[0] for part in parts])
+    w = np.concatenate([part[1] for part in parts])
+    return DescriptorSet(q, w, keyframe_scans, config.method, checkpoint_digest(config))
+
+
+def save_descriptors(
+    folder: Path, descriptors: DescriptorSet, odom_T_sensor: Float64Array, map_config: MapConfig
+) -> Path:
+    """Store descriptors beside a session, in `folder/descriptors/<name>.npz`, and return the file.
+
+    The poses (S, 4, 4) of the session are stored with them, to tell whether they still belong to it, and with sphere
+    descriptors the weights and the map settings they were made with.
+    """
+    path = folder / "descriptors" / f"{descriptors.name}.npz"
+    partial = path.with_suffix(".partial.npz")
+    optional: dict[str, npt.NDArray[Any]] = {} if descriptors.w is None else {"w": descriptors.w}
+    if descriptors.spheres is not None:
+        optional |= {"spheres": descriptors.spheres, "spheres_of": np.array(_spheres_of(map_config))}
+    try:
+        path.parent.mkdir(exist_ok=True)
+        np.savez(
+            partial,
+            allow_pickle=False,
+            checkpoint=np.array(descriptors.checkpoint),
+            q=descriptors.q,
+            keyframe_scans=descriptors.keyframe_scans,
+            odom_T_sensor=odom_T_sensor,
+            **optional,
+        )
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot write there: {error.strerror}") from error
+    return path
+
+
+def load_descriptors(
+    folder: Path, config: DescriptorConfig, odom_T_sensor: Float64Array, map_config: MapConfig
+) -> DescriptorSet | None:
+    """Read stored descriptors; None where there are none, or none of the present checkpoint and of these poses.
+
+    Sphere descriptors come along where they are of the present weights, precision and map settings.
+
+    Raises:
+        InputError: The file is damaged.
+    """
+    path = folder / "descriptors" / f"{config.method}.npz"
+    if not path.is_file():
+        return None
+    arrays = load_arrays(path)
+    try:
+        checkpoint = str(arrays["checkpoint"])
+        is_of_session = np.array_equal(arrays["odom_T_sensor"], odom_T_sensor)
+        if not is_of_session or checkpoint != checkpoint_digest(config):
+            return None
+        spheres = arrays.get("spheres")
+        if spheres is not None:
+            is_present = str(arrays["spheres_of"]) == _spheres_of(map_config) and spheres.dtype == config.precision
+            spheres = spheres if is_present else None
+        return DescriptorSet(arrays["q"], arrays.get("w"), arrays["keyframe_scans"], config.method, checkpoint, spheres)
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: damaged ({error}): remove it and describe the session again") from error
+
+
+def _spheres_of(map_config: MapConfig) -> str:
+    return f"{sphere_digest()} {map_config.model_dump_json()}"
+
+
+def checkpoint_digest(config: DescriptorConfig) -> str:
+    """Return the digest of the weights that descriptors made with `config` carry; the version of those without."""
+    return f"version {VERSION}" if config.method in HANDMADE else _network(config.method)[1]
+
+
+def use_threads(n_threads: int) -> None:
+    """Fix the number of threads the network runs on, so that every run of a case is equal."""
+    torch.set_num_threads(n_threads)
+
+
+def _described(clouds_sensor: Iterable[Float64Array], method: str) -> tuple[Float32Array, Float32Array]:
+    """Return q (N, D) and w (N, 64) of N scans' points."""
+    if method in HANDMADE:
+        vectors = [HANDMADE[method](points) for points in clouds_sensor]
+        return np.stack([q for q, _ in vectors]), np.stack([w for _, w in vectors])
+    return _apply(_network(method)[0], np.stack([range_image(points) for points in clouds_sensor]))
+
+
+@cache
+def _network(method: str) -> tuple[PlaceNetwork, str]:
+    if method == "untrained":
+        network = initial_network()
+        return network, digest(checkpoint_bytes(network))
+    return trained_network()
+
+
+def _apply(network: PlaceNetwork, images: Float32Array) -> tuple[Float32Array, Float32Array]:
+    with torch.inference_mode():
+        q, w = network(torch.from_numpy(images))
+    return q.numpy().astype(np.float32), w.numpy().astype(np.float32)

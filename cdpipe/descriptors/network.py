@@ -1,0 +1,109 @@
+"""The scan descriptor: a re-implementation of 3DEG (arXiv 2210.07285), after OREOS (arXiv 1903.07918).
+
+Range image -> convolutions with circular padding along the azimuth -> two 64-d vectors: q, the place, from maxima and
+the amplitudes of the lowest azimuth frequencies, which a turn of the sensor leaves alone; w, the orientation, one value
+per 5.6 deg of azimuth, so that a turn of the sensor shifts it. No weights or code of 3DEG are public: layer sizes are
+ours, and both vectors do by construction what fully connected layers have to learn: q stands still, w turns.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from importlib import resources
+
+import numpy as np
+import torch
+from safetensors.torch import load, save
+from torch import Tensor, nn
+
+from cdpipe.descriptors.range_image import COLUMNS
+
+DIMENSIONS = 64
+_CHANNELS = (24, 48, 64, 64)
+# Azimuth strides multiply to COLUMNS / DIMENSIONS, so that w has one value per remaining column.
+_STRIDES = ((2, 2), (2, 2), (2, 1), (1, 1))
+# Azimuth frequencies that q is made of, the mean among them: what is 26 deg wide and wider.
+_FREQUENCIES = 8
+_RANGE_SCALE_M = 10.0
+
+
+class _CircularConv(nn.Module):
+    """3 x 5 convolution, group norm and ReLU; azimuth wraps round, elevation repeats its edge."""
+
+    def __init__(self, inputs: int, outputs: int, stride: tuple[int, int]) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, outputs, (3, 5), stride=stride)
+        self.norm = nn.GroupNorm(8, outputs)
+
+    def forward(self, image: Tensor) -> Tensor:
+        wrapped = nn.functional.pad(image, (2, 2, 0, 0), mode="circular")
+        padded = nn.functional.pad(wrapped, (0, 0, 1, 1), mode="replicate")
+        activated: Tensor = torch.relu(self.norm(self.conv(padded)))
+        return activated
+
+
+class PlaceNetwork(nn.Module):
+    """(B, ROWS, COLUMNS) ranges in metres -> q (B, 64) of unit length and w (B, 64) of zero mean and unit length."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        inputs = (2, *_CHANNELS[:-1])
+        self.layers = nn.Sequential(
+            *(_CircularConv(a, b, s) for a, b, s in zip(inputs, _CHANNELS, _STRIDES, strict=True))
+        )
+        self.place = nn.Linear((_FREQUENCIES + 1) * _CHANNELS[-1] * 4, DIMENSIONS)
+        self.heading = nn.Conv1d(4 * _CHANNELS[-1], 1, 1)
+
+    def forward(self, ranges_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (q, w)."""
+        seen = (ranges_m > 0).float()
+        nearness = seen * _RANGE_SCALE_M / (_RANGE_SCALE_M + ranges_m)
+        features = self.layers(torch.stack([nearness, seen], dim=1)).flatten(1, 2)
+        pooled = torch.cat([_amplitudes(features), features.amax(dim=2, keepdim=True)], dim=2)
+        q = nn.functional.normalize(self.place(pooled.flatten(1)), dim=1)
+        heading = self.heading(features)[:, 0]
+        w = nn.functional.normalize(heading - heading.mean(dim=1, keepdim=True), dim=1)
+        return q, w
+
+
+def _amplitudes(features: Tensor) -> Tensor:
+    """(B, F, columns) -> (B, F, _FREQUENCIES) amplitudes of the lowest frequencies along the columns, mean first."""
+    spectrum = torch.fft.rfft(features, norm="forward")[..., :_FREQUENCIES]
+    # not abs(): its gradient at 0 is none
+    magnitudes = (spectrum.real.square() + spectrum.imag.square() + 1e-6).sqrt()
+    return torch.cat([magnitudes[..., :1], 2 * magnitudes[..., 1:]], dim=-1)
+
+
+def yaw_correlation(w_a: Tensor, w_b: Tensor) -> Tensor:
+    """Return (B, 64) circular correlation; its peak s says that b is turned by s * 2 pi / 64 against a."""
+    spectrum = torch.fft.rfft(w_a) * torch.fft.rfft(w_b).conj()
+    correlation: Tensor = torch.fft.irfft(spectrum, n=w_a.shape[-1])
+    return correlation
+
+
+def initial_network(seed: int = 0) -> PlaceNetwork:
+    """Return the untrained network; the same seed gives the same weights, and the global generator is left alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return PlaceNetwork().eval()
+
+
+def trained_network() -> tuple[PlaceNetwork, str]:
+    """Return the shipped network and the digest of its checkpoint."""
+    content = (resources.files("cdpipe") / "descriptors" / "weights" / "3deg.safetensors").read_bytes()
+    network = PlaceNetwork()
+    network.load_state_dict(load(content))
+    return network.eval(), digest(content)
+
+
+def checkpoint_bytes(network: nn.Module) -> bytes:
+    """Return the weights as safetensors."""
+    return save({name: tensor.contiguous() for name, tensor in network.state_dict().items()})
+
+
+def digest(content: bytes) -> str:
+    """Return the short digest by which a checkpoint is named."""
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+assert np.prod([stride[1] for stride in _STRIDES]) * DIMENSIONS == COLUMNS

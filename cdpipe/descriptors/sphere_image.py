@@ -1,0 +1,63 @@
+"""The map around a keyframe as the image that the sphere descriptor reads: the tunnel's wall, unrolled.
+
+A sphere's surface seen from its centre shows the wall ten metres off at a grazing angle. Keyframes stand a metre apart,
+so each needs to tell only of its own stretch: rows are metres along the keyframe's forward axis, columns turn about it,
+and the value is the distance of the nearest point from the axis.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, invert, transform
+from cdpipe.core.grid_index import GridIndex
+
+ROWS = 16
+COLUMNS = 96
+HALF_LENGTH_M = 2.0
+REACH_M = 12.0
+# Of the ball round a keyframe that holds all of its image.
+CROP_M = float(np.hypot(HALF_LENGTH_M, REACH_M))
+
+
+def pixels(points_anchor: Float64Array) -> Int64Array:
+    """Return the (N,) pixel, row * COLUMNS + column, of each point; -1 for those outside the image.
+
+    Args:
+        points_anchor: (N, 3) points in the keyframe's sensor frame, metres.
+    """
+    x, y, z = points_anchor.T
+    row = np.floor((x + HALF_LENGTH_M) * (ROWS / (2 * HALF_LENGTH_M))).astype(np.int64)
+    column = np.floor(np.arctan2(z, y) * (COLUMNS / (2 * np.pi))).astype(np.int64) % COLUMNS
+    is_inside = (row >= 0) & (row < ROWS) & (y * y + z * z <= REACH_M * REACH_M)
+    return np.where(is_inside, row * COLUMNS + column, -1)
+
+
+def sphere_image(points_anchor: Float64Array) -> Float32Array:
+    """Return the (ROWS, COLUMNS) float32 distance from the axis of the nearest point, metres, 0 where there is none.
+
+    Args:
+        points_anchor: (N, 3) points in the keyframe's sensor frame, metres.
+    """
+    pixel = pixels(points_anchor)
+    is_inside = pixel >= 0
+    distances_m = np.hypot(points_anchor[is_inside, 1], points_anchor[is_inside, 2]).astype(np.float32)
+    # minimum.at is thirty times as fast where no type has to be converted
+    image = np.full(ROWS * COLUMNS, np.inf, dtype=np.float32)
+    np.minimum.at(image, pixel[is_inside], distances_m)
+    image[np.isinf(image)] = 0.0
+    return image.reshape(ROWS, COLUMNS)
+
+
+def render(index: GridIndex, map_T_anchor: Float64Array) -> Float32Array:
+    """Return the (K, *image) images of a map at each of (K, 4, 4) poses, float32 as `sphere_image` gives them.
+
+    Args:
+        index: The map.
+        map_T_anchor: (K, 4, 4) poses of the sensor in the map's frame.
+    """
+    images = [
+        sphere_image(transform(anchor_T_map, index.points_within(map_T_here[:3, 3], CROP_M)))
+        for map_T_here, anchor_T_map in zip(map_T_anchor, invert(map_T_anchor), strict=True)
+    ]
+    return np.stack(images) if images else sphere_image(np.zeros((0, 3)))[None][:0]

@@ -1,0 +1,157 @@
+"""The network of the sphere descriptor: what was there in 64 numbers, and what of it is no longer so.
+
+`encode` reads the unrolled wall around a keyframe and keeps four numbers for each of 16 sectors round the tunnel axis:
+these are stored while mapping. `compare` reads those and the image of the other session from the same place, and gives
+each sector the log-odds that something in it changed. The image is at hand after the merge, so only one side has to fit
+into 64 numbers. Trained on simulated change (`cdpipe.training.sphere_training`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+
+import torch
+from safetensors.torch import load
+from torch import Tensor, nn
+
+from cdpipe.descriptors.network import digest
+from cdpipe.descriptors.sphere_image import COLUMNS, ROWS
+
+SECTORS = 16
+PER_SECTOR = 4
+_CHANNELS = (16, 32, 48)
+_SEEN = 64
+_HIDDEN = (96, 64)
+# Rows end as ROWS / 4, columns as SECTORS.
+_STRIDES = ((1, 2), (2, 3), (2, 1))
+_RANGE_SCALE_M = 6.0
+# Changes are rare: an untrained network says so.
+_FIRST_LOGIT = -3.0
+
+
+@dataclass(frozen=True, slots=True)
+class SphereSize:
+    """How large a sphere network is; the defaults are the shipped one's.
+
+    Attributes:
+        per_sector: Numbers stored for each of the 16 sectors.
+        width: Channels of every layer but the stored one, as a multiple of the shipped ones; a multiple of 1/2.
+        reads_after: Whether the comparison reads the after image whole, or the same few numbers of it alone.
+    """
+
+    per_sector: int = PER_SECTOR
+    width: float = 1.0
+    reads_after: bool = True
+
+    def __post_init__(self) -> None:
+        if self.per_sector < 1 or self.width <= 0 or self.width % 0.5:
+            raise ValueError(f"a network needs a number for each sector and halves of the shipped width, got {self}")
+
+    @property
+    def numbers(self) -> int:
+        """Numbers stored for each keyframe."""
+        return self.per_sector * SECTORS
+
+
+class _UnrolledConv(nn.Module):
+    """3 x 5 convolution, group norm and ReLU; columns wrap round the tunnel, beyond the rows nothing is seen."""
+
+    def __init__(self, inputs: int, outputs: int, stride: tuple[int, int]) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, outputs, (3, 5), stride=stride, padding=(1, 0))
+        self.norm = nn.GroupNorm(8, outputs)
+
+    def forward(self, image: Tensor) -> Tensor:
+        wrapped = nn.functional.pad(image, (2, 2, 0, 0), mode="circular")
+        activated: Tensor = torch.relu(self.norm(self.conv(wrapped)))
+        return activated
+
+
+class SphereNetwork(nn.Module):
+    """Images (B, ROWS, COLUMNS) of two sessions at the same places -> log-odds of change (B, SECTORS)."""
+
+    def __init__(self, size: SphereSize | None = None) -> None:
+        """Take a size, the shipped one's by default."""
+        super().__init__()
+        self.size = size or SphereSize()
+        channels, hidden = (tuple(int(n * self.size.width) for n in shipped) for shipped in (_CHANNELS, _HIDDEN))
+        n_seen = int(_SEEN * self.size.width) if self.size.reads_after else 0
+        inputs = (2, *channels[:-1])
+        self.trunk = nn.Sequential(
+            *(_UnrolledConv(a, b, s) for a, b, s in zip(inputs, channels, _STRIDES, strict=True))
+        )
+        self.kept = nn.Conv2d(channels[-1], self.size.per_sector, (ROWS // 4, 1))
+        if n_seen:
+            self.seen = nn.Conv2d(channels[-1], n_seen, (ROWS // 4, 1))
+        n_compared = 3 * self.size.per_sector + n_seen
+        self.head = nn.ModuleList([nn.Conv1d(n_compared, hidden[0], 3), nn.Conv1d(hidden[0], hidden[1], 3)])
+        self.logit = nn.Conv1d(hidden[1], 1, 1)
+        self.calibration: Tensor
+        self.register_buffer("calibration", torch.tensor([1.0, 0.0], dtype=torch.float64))
+
+    def encode(self, images_m: Tensor) -> Tensor:
+        """Return (B, PER_SECTOR, SECTORS) numbers in (-1, 1): the descriptor."""
+        return self._kept(self._features(images_m))
+
+    def compare(self, spheres: Tensor, images_m: Tensor) -> Tensor:
+        """Return (B, SECTORS) log-odds of change between (B, PER_SECTOR, SECTORS) descriptors and images."""
+        features = self._features(images_m)
+        other = self._kept(features)
+        parts = [spheres, other, (spheres - other).abs()]
+        if self.size.reads_after:
+            parts.append(torch.relu(self.seen(features)[:, :, 0]))
+        hidden = torch.cat(parts, dim=1)
+        for layer in self.head:
+            hidden = torch.relu(layer(nn.functional.pad(hidden, (1, 1), mode="circular")))
+        logits: Tensor = self.logit(hidden)[:, 0] + _FIRST_LOGIT
+        return logits
+
+    def calibrated(self, logits: Tensor) -> Tensor:
+        """Return the log-odds that a place changed, of those of its most changed sector."""
+        log_odds: Tensor = self.calibration[0] * logits.double() + self.calibration[1]
+        return log_odds
+
+    def forward(self, before_m: Tensor, after_m: Tensor) -> Tensor:
+        """Return (B, SECTORS) log-odds of change between two images of the same places."""
+        return self.compare(self.encode(before_m), after_m)
+
+    def _features(self, images_m: Tensor) -> Tensor:
+        seen = (images_m > 0).float()
+        nearness = seen * _RANGE_SCALE_M / (_RANGE_SCALE_M + images_m)
+        features: Tensor = self.trunk(torch.stack([nearness, seen], dim=1))
+        return features
+
+    def _kept(self, features: Tensor) -> Tensor:
+        return torch.tanh(self.kept(features)[:, :, 0])
+
+
+def initial_sphere_network(seed: int = 0, size: SphereSize | None = None) -> SphereNetwork:
+    """Return the untrained network; the same seed gives the same weights, and the global generator is left alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return SphereNetwork(size).eval()
+
+
+def size_of(tensors: Mapping[str, Tensor]) -> SphereSize:
+    """Return the size of the network that these weights are of; their shapes say it, so no checkpoint can lack it."""
+    per_sector, channels = tensors["kept.weight"].shape[:2]
+    return SphereSize(per_sector, channels / _CHANNELS[-1], "seen.weight" in tensors)
+
+
+def loaded_sphere_network(content: bytes) -> SphereNetwork:
+    """Return the network of a checkpoint, whatever its size."""
+    tensors = load(content)
+    network = SphereNetwork(size_of(tensors))
+    network.load_state_dict(tensors)
+    return network.eval()
+
+
+def trained_sphere_network() -> tuple[SphereNetwork, str]:
+    """Return the shipped network and the digest of its checkpoint."""
+    content = (resources.files("cdpipe") / "descriptors" / "weights" / "sphere.safetensors").read_bytes()
+    return loaded_sphere_network(content), digest(content)
+
+
+assert COLUMNS == SECTORS * 6 and ROWS % 4 == 0

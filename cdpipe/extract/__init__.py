@@ -1,0 +1,1 @@
+"""Cutting the changed objects out of the reported regions."""

@@ -1,0 +1,122 @@
+"""Cutting the changed objects out of the reported regions, in both directions.
+
+Added is what the after map has and the before map has not; removed is the reverse. What "has not" means is up to
+`extract.method`: the paper's point-to-voxel comparison, the distance from the nearest point, or that from the surface
+(`cdpipe.extract.surface_rule`), which also asks whether the other session looked there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.extract.crops import DIRECTIONS, Crops
+from cdpipe.extract.objects import PointGroup, assemble_objects
+from cdpipe.extract.point_comparison import cluster_labels, far_points_mask, inlier_mask, new_points_mask
+from cdpipe.extract.surface_rule import cut_by_surface
+from cdpipe.model.config import PipelineConfig
+from cdpipe.model.types import ChangeRegions, MergedMaps
+
+__all__ = [
+    "FIGURES",
+    "PointGroup",
+    "assemble_objects",
+    "cut_out",
+    "hull_volume_m3",
+    "region_figures",
+    "with_withdrawn",
+]
+
+FIGURES = ("v_sphere_m3", "v_oe_m3", "s_points", "oe_points")
+
+
+def cut_out(merged: MergedMaps, regions: ChangeRegions, config: PipelineConfig) -> list[PointGroup]:
+    """Compare both maps inside every reported region and group what is in one of them only, best region first.
+
+    Args:
+        merged: Both maps.
+        regions: Candidates; only the reported ones are looked at.
+        config: `extract`, and for `voxel` and `nearest` also `outlier` and `cluster`, are used.
+    """
+    if config.extract.method == "surface":
+        return cut_by_surface(merged, regions, config.extract)
+    return _cut_by_points(merged, regions, config)
+
+
+def with_withdrawn(regions: ChangeRegions, groups: Sequence[PointGroup], config: PipelineConfig) -> ChangeRegions:
+    """Take back the reported regions whose sphere holds nothing of what was cut out, if `extract.withdraw` says so."""
+    if not config.extract.withdraw:
+        return regions
+    is_empty = regions.is_reported.copy()
+    if groups:
+        tree = cKDTree(np.concatenate([group.points_map for group in groups]))
+        gaps_m, _ = tree.query(regions.centres_map[is_empty])
+        is_empty[is_empty] = np.asarray(gaps_m) > regions.radius_m
+    return replace(regions, is_reported=regions.is_reported & ~is_empty, is_withdrawn=is_empty)
+
+
+def region_figures(merged: MergedMaps, regions: ChangeRegions, groups: Sequence[PointGroup]) -> dict[str, Float64Array]:
+    """Return the paper's Table II by our definition, all of the after map: (R,) by name, NaN where not reported.
+
+    `v_sphere_m3` volume of the convex hull of its points in the sphere, `v_oe_m3` sum of the volumes of the convex
+    hulls of the objects found in the region, `s_points` its points in the sphere, `oe_points` those of the objects. An
+    object counts whole, as far as it reaches out of the sphere, and in the best of the regions that it lies in.
+    """
+    crops = Crops(merged, margin_m=0.0)
+    figures = {name: np.full(len(regions.scores), np.nan) for name in FIGURES}
+    for region in np.flatnonzero(regions.is_reported).tolist():
+        points = crops.around(regions.centres_map[region], regions.radius_m)["after"].points
+        added = [group for group in groups if group.session == "after" and group.region == region]
+        figures["v_sphere_m3"][region] = hull_volume_m3(points)
+        figures["v_oe_m3"][region] = sum(hull_volume_m3(group.points_map) for group in added)
+        figures["s_points"][region] = len(points)
+        figures["oe_points"][region] = sum(len(group.indices) for group in added)
+    return figures
+
+
+def hull_volume_m3(points: Float64Array) -> float:
+    """Return the volume of the convex hull, 0 for fewer than four points and for flat clouds."""
+    if len(points) < 4:
+        return 0.0
+    try:
+        return float(ConvexHull(points).volume)
+    except QhullError:
+        return 0.0
+
+
+def _cut_by_points(merged: MergedMaps, regions: ChangeRegions, config: PipelineConfig) -> list[PointGroup]:
+    """Compare map points region by region; a map point belongs to at most one object: the better region takes it.
+
+    As in the paper, each sampled area is cut by itself, so an object that lies in two of them is two objects.
+    """
+    extract = config.extract
+    # a voxel that reaches into the sphere reaches at most its diagonal out of it
+    crops = Crops(merged, np.sqrt(3.0) * extract.voxel_m if extract.method == "voxel" else extract.distance_m)
+    is_taken = {
+        "before": np.zeros(len(merged.before.points), np.bool_),
+        "after": np.zeros(len(merged.after.points), np.bool_),
+    }
+    groups: list[PointGroup] = []
+    for region in np.flatnonzero(regions.is_reported).tolist():
+        spheres = crops.around(regions.centres_map[region], regions.radius_m)
+        for session, other in DIRECTIONS:
+            indices, points = spheres[session].inside
+            for members in _new_clusters(points, spheres[other].points, is_taken[session][indices], config):
+                groups.append(PointGroup(session, indices[members], points[members], region))
+                is_taken[session][indices[members]] = True
+    return groups
+
+
+def _new_clusters(
+    points: Float64Array, reference: Float64Array, is_taken: BoolArray, config: PipelineConfig
+) -> list[Int64Array]:
+    """Return the indices into `points` of each object."""
+    is_new = new_points_mask if config.extract.method == "voxel" else far_points_mask
+    new = np.flatnonzero(is_new(points, reference, config.extract) & ~is_taken)
+    new = new[inlier_mask(points[new], config.outlier)]
+    labels = cluster_labels(points[new], config.cluster)
+    return [new[labels == label] for label in range(labels.max(initial=-1) + 1)]

@@ -1,0 +1,119 @@
+"""How large an object is and how it stands: upright boxes, and the volume between it and what the other session saw.
+
+The volume is what a surveyor measures from above. The height of the uppermost points in each column of a level grid,
+above the lowest the other session saw there, is interpolated between the columns over the convex outline of the
+footprint; its integral is the volume. For a pile that came or went the other session saw the floor, for the part
+loaded off a pile what was left of it. Of a box it is the box, as far as its top and sides show how far it reaches, of
+a chair about its hull.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
+
+from cdpipe.core.geometry import Float64Array, yaw_pose
+from cdpipe.core.voxel import cell_keys
+from cdpipe.model.types import ObjectShape
+
+# Of so many columns nearest to a place, the median tells its ground: one false return below the floor does not.
+_GROUND_COLUMNS = 5
+
+
+def object_shape(
+    points_map: Float64Array, other_map: Float64Array, column_m: float = 0.1, ground_m: float = 0.2
+) -> ObjectShape:
+    """Measure an object.
+
+    Args:
+        points_map: (P, 3) its points, map frame, metres; P of at least 1.
+        other_map: (Q, 3) what the other session saw below and around it; without any the object stands on a level
+            floor at its lowest point.
+        column_m: Columns of the object, not finer than its points are apart.
+        ground_m: Columns of the other session's points.
+    """
+    map_T_box, box_m = upright_box(points_map)
+    return ObjectShape(map_T_box, box_m, column_volume_m3(points_map, other_map, column_m, ground_m))
+
+
+def upright_box(points: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Return the smallest box with a vertical axis around (P, 3) points.
+
+    An edge of the smallest rectangle around a footprint lies on an edge of its convex outline, so all are tried.
+
+    Returns:
+        (4, 4) its pose, x along the longer level edge, yaw in [-90, 90) degrees, and its (3,) edges: longer level one,
+        shorter one, height.
+    """
+    outline = _outline(points[:, :2])
+    edges = np.roll(outline, -1, axis=0) - outline
+    yaws = np.arctan2(edges[:, 1], edges[:, 0])
+    axes = np.stack([np.column_stack([np.cos(yaws), np.sin(yaws)]), np.column_stack([-np.sin(yaws), np.cos(yaws)])])
+    along = np.einsum("kai,pi->kap", axes, outline)
+    low, high = along.min(axis=2), along.max(axis=2)
+    best = int(np.argmin((high - low).prod(axis=0)))
+    size, middle, yaw = (high - low)[:, best], (high + low)[:, best] / 2, float(yaws[best])
+    centre_xy = middle @ axes[:, best]
+    if size[1] > size[0]:
+        size, yaw = size[::-1], yaw + np.pi / 2
+    bottom_m, top_m = float(points[:, 2].min()), float(points[:, 2].max())
+    yaw = (yaw + np.pi / 2) % np.pi - np.pi / 2
+    return yaw_pose(yaw, (*centre_xy, (bottom_m + top_m) / 2)), np.array([*size, top_m - bottom_m])
+
+
+def column_volume_m3(
+    points_map: Float64Array, other_map: Float64Array, column_m: float = 0.1, ground_m: float = 0.2
+) -> float:
+    """Return the volume between an object and what the other session saw below it; arguments as of `object_shape`.
+
+    A footprint without an area has no volume.
+    """
+    columns = _columns(points_map, column_m)
+    heights = np.maximum(columns[:, 2] - ground_heights(other_map, columns, ground_m), 0.0)
+    try:
+        triangles = Delaunay(columns[:, :2]).simplices
+    except (QhullError, ValueError):
+        return 0.0
+    a, b, c = (columns[triangles[:, k], :2] for k in range(3))
+    doubled = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    return float((doubled / 2 * heights[triangles].mean(axis=1)).sum())
+
+
+def ground_heights(surface: Float64Array, places: Float64Array, ground_m: float = 0.2) -> Float64Array:
+    """Return (N,) how high the ground lies at (N, 2 or more) places, metres: the lowest points (Q, 3) of a surface.
+
+    Without any points it lies at the lowest of the places, which then must be (N, 3).
+    """
+    if len(surface) == 0:
+        return np.full(len(places), places[:, 2].min(initial=np.inf))
+    lowest = surface[np.argsort(surface[:, 2], kind="stable")]
+    flat = lowest * (1.0, 1.0, 0.0)
+    _, first = np.unique(cell_keys(flat, ground_m), return_index=True)
+    lowest = lowest[first]
+    n_columns = min(_GROUND_COLUMNS, len(lowest))
+    _, nearest = cKDTree(lowest[:, :2]).query(places[:, :2], k=[*range(1, n_columns + 1)])
+    return np.asarray(np.median(lowest[nearest, 2], axis=1))
+
+
+def _columns(points: Float64Array, column_m: float) -> Float64Array:
+    """Return the mean (C, 3) of the upper points of each column of a level grid: those no deeper than it is wide.
+
+    The lower ones are of a side that stands upright.
+    """
+    _, column = np.unique(cell_keys(points * (1.0, 1.0, 0.0), column_m), return_inverse=True)
+    highest = np.full(column.max(initial=-1) + 1, -np.inf)
+    np.maximum.at(highest, column, points[:, 2])
+    is_upper = points[:, 2] >= highest[column] - column_m
+    upper, column = points[is_upper], column[is_upper]
+    counts = np.bincount(column)
+    return np.column_stack([np.bincount(column, upper[:, axis]) / counts for axis in range(3)])
+
+
+def _outline(xy: Float64Array) -> Float64Array:
+    """Return the corners (C, 2) of the convex hull, in order; of points on a line its ends."""
+    try:
+        return np.asarray(xy[ConvexHull(xy).vertices])
+    except (QhullError, ValueError):
+        offsets = xy - xy.mean(axis=0)
+        along = offsets @ np.linalg.svd(offsets, full_matrices=False)[2][0]
+        return xy[[int(np.argmin(along)), int(np.argmax(along))]]

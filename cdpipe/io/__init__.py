@@ -1,0 +1,1 @@
+"""Reading and writing sessions, trajectories, point clouds and answers."""

@@ -1,0 +1,264 @@
+"""The answer of a method on disk: what `detect` writes and `score` reads, whoever made it.
+
+    answer.json   format, status, method, config, seconds, evidence, before_T_after, radius_m, objects (session, kind,
+                  region, score, partner of each; where it is known shape, which is map_T_box (4, 4), box_m (3,) and
+                  volume_m3, and for moved ones displacement_map (3,)); until: "merge" where the method was stopped
+                  after the merge
+    answer.npz    region_centres_map (R, 3), region_scores (R,), region_pairs (R, 2), region_is_reported (R,),
+                  region_is_withdrawn (R,), where regions were let through that nothing could be cut out of,
+                  region_direction (R,) uint8, whose keyframe was looked up in the other session, 0 before, 1 after,
+                  where keyframes were,
+                  keyframe_scores (Kb,), before_keyframe_scans (Kb,), after_keyframe_scans (Ka,),
+                  object_returns (M, 2) int32 with object_return_offsets (O + 1,),
+                  object_points_map (P, 3) with object_point_offsets (O + 1,), and figure_<name> (R,) each;
+                  local_before_T_after (Ka, 4, 4), the merge as it holds at each after keyframe, where it is not
+                  before_T_after everywhere
+
+`seconds` names t_index_s, t_merge_s, t_refine_s, t_descriptor_s, t_cd_s and t_oe_s, as far as they were measured.
+
+A refused or failed case is an answer.json with its status and error, and no answer.npz. Another program's answer may
+leave out object_returns and give object_points_odom with object_point_odom_offsets instead: points in the odom frame of
+the session that holds the object, each standing for 0.1 m around it. What else it may leave out, `answer_parts` tells;
+an unknown name is refused, so that a misspelt one is not taken for one left out.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.io.answer_parts import (
+    FORMAT,
+    FORMAT_VERSION,
+    AnswerPart,
+    ShapePart,
+    Until,
+    checked_arrays,
+    checked_document,
+)
+from cdpipe.io.session import load_arrays
+from cdpipe.model.types import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """A stored answer.
+
+    Attributes:
+        status: "ok", "merge_refused", "failed" or "worker_died".
+        error: Why it is not ok, or "".
+        method: Name of the preset or of the foreign method.
+        report: The answer itself; None when the status is not ok.
+        seconds: Seconds per stage.
+        evidence: What the merge measured.
+        points_odom: Per object, the (P, 3) odom points of a foreign answer that names no returns; None otherwise.
+        until: After which stage the method was stopped on purpose, so that it says nothing about what comes later; None
+            where it ran to its end.
+    """
+
+    status: str
+    error: str
+    method: str
+    report: ChangeReport | None
+    seconds: Mapping[str, float]
+    evidence: Mapping[str, float]
+    points_odom: tuple[Float64Array, ...] | None = None
+    until: Until | None = None
+
+
+def write_answer(folder: Path, method: str, report: ChangeReport, until: Until | None = None) -> None:
+    """Write a whole answer into `folder`, which may exist; answer.json comes last and marks it complete."""
+    folder.mkdir(parents=True, exist_ok=True)
+    regions, objects = report.regions, report.objects
+    arrays = {
+        "region_centres_map": regions.centres_map,
+        "region_scores": regions.scores,
+        "region_pairs": regions.pairs,
+        "region_is_reported": regions.is_reported,
+        "keyframe_scores": regions.keyframe_scores,
+        "before_keyframe_scans": report.keyframe_scans[0],
+        "after_keyframe_scans": report.keyframe_scans[1],
+        "object_returns": _stacked([item.returns for item in objects], (0, 2), np.int32),
+        "object_return_offsets": _offsets([item.returns for item in objects]),
+        "object_points_map": _stacked([item.points_map for item in objects], (0, 3), np.float64),
+        "object_point_offsets": _offsets([item.points_map for item in objects]),
+        **{f"figure_{name}": values for name, values in report.figures.items()},
+    }
+    if regions.is_withdrawn is not None:
+        arrays["region_is_withdrawn"] = regions.is_withdrawn
+    if regions.direction is not None:
+        arrays["region_direction"] = regions.direction
+    if report.local_before_T_after is not None:
+        arrays["local_before_T_after"] = report.local_before_T_after
+    np.savez_compressed(folder / "answer.npz", allow_pickle=False, **arrays)
+    document = {
+        "status": "ok",
+        "error": "",
+        "method": method,
+        "before_T_after": report.before_T_after.tolist(),
+        "radius_m": regions.radius_m,
+        "seconds": dict(report.seconds),
+        "evidence": dict(report.evidence),
+        "config": dict(report.config),
+        "objects": [_object_document(item) for item in objects],
+    }
+    _write_json(folder, document, until)
+
+
+def write_failure(
+    folder: Path,
+    method: str,
+    status: str,
+    error: str,
+    evidence: Mapping[str, float],
+    config: Mapping[str, Any],
+    until: Until | None = None,
+    seconds: Mapping[str, float] | None = None,
+) -> None:
+    """Write the record of a case that gave no answer, and the seconds that were measured until then."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "answer.npz").unlink(missing_ok=True)
+    document: dict[str, Any] = {"status": status, "error": error, "method": method}
+    document |= {"seconds": dict(seconds or {}), "evidence": dict(evidence)}
+    _write_json(folder, {**document, "config": dict(config)}, until)
+
+
+def read_answer(folder: Path) -> Answer:
+    """Read an answer.
+
+    Raises:
+        InputError: It is missing, damaged or inconsistent; the text names the file and the field.
+    """
+    path = folder / "answer.json"
+    if not path.is_file():
+        raise InputError(f"{path}: missing: expected an answer written by `tunnelcd detect` or by another method")
+    try:
+        value = json.loads(path.read_text())
+    except ValueError as error:
+        raise InputError(f"{path}: damaged, not JSON: {error}") from error
+    document = checked_document(path, value)
+    if not isinstance(document, AnswerPart):
+        return Answer(
+            document.status,
+            document.error,
+            document.method,
+            None,
+            document.seconds,
+            document.evidence,
+            until=document.until,
+        )
+    arrays = load_arrays(folder / "answer.npz")
+    checked_arrays(folder / "answer.npz", arrays, len(document.objects))
+    try:
+        report, points_odom = _report(document, arrays)
+    except ValueError as error:
+        raise InputError(f"{folder / 'answer.npz'}: arrays that do not go together: {error}") from error
+    return Answer("ok", "", document.method, report, report.seconds, report.evidence, points_odom, document.until)
+
+
+def _report(
+    document: AnswerPart, arrays: Mapping[str, npt.NDArray[Any]]
+) -> tuple[ChangeReport, tuple[Float64Array, ...] | None]:
+    n = len(document.objects)
+    points_map: list[Any] = [np.zeros((0, 3))] * n
+    if "object_points_map" in arrays:
+        points_map = _split(arrays["object_points_map"], arrays["object_point_offsets"])
+    points_odom = None
+    returns: list[Any] = [np.zeros((0, 2), dtype=np.int32)] * n
+    if "object_returns" in arrays:
+        returns = _split(arrays["object_returns"], arrays["object_return_offsets"])
+    elif "object_points_odom" in arrays:
+        points_odom = tuple(_split(arrays["object_points_odom"], arrays["object_point_odom_offsets"]))
+    objects = tuple(
+        ChangedObject(
+            session=part.session,
+            kind=part.kind,
+            region=part.region,
+            returns=found,
+            points_map=points,
+            score=part.score,
+            partner=part.partner,
+            shape=None if part.shape is None else _shape(part.shape),
+            displacement_map=None if part.displacement_map is None else _numbers(part.displacement_map),
+        )
+        for part, found, points in zip(document.objects, returns, points_map, strict=True)
+    )
+    scores = arrays["region_scores"]
+    regions = ChangeRegions(
+        centres_map=arrays["region_centres_map"],
+        radius_m=document.radius_m,
+        scores=scores,
+        pairs=arrays.get("region_pairs", np.full((len(scores), 2), -1)),
+        is_reported=arrays.get("region_is_reported", np.ones(len(scores), dtype=np.bool_)),
+        keyframe_scores=arrays.get("keyframe_scores", np.zeros(0)),
+        is_withdrawn=arrays.get("region_is_withdrawn"),
+        direction=arrays.get("region_direction"),
+    )
+    no_scans = np.zeros(0, dtype=np.int64)
+    report = ChangeReport(
+        before_T_after=_numbers(document.before_T_after),
+        evidence=document.evidence,
+        regions=regions,
+        objects=objects,
+        seconds=document.seconds,
+        figures={name[7:]: values for name, values in arrays.items() if name.startswith("figure_")},
+        keyframe_scans=(arrays.get("before_keyframe_scans", no_scans), arrays.get("after_keyframe_scans", no_scans)),
+        config=document.config,
+        local_before_T_after=arrays.get("local_before_T_after"),
+    )
+    return report, points_odom
+
+
+def _object_document(item: ChangedObject) -> dict[str, Any]:
+    document: dict[str, Any] = {
+        "session": item.session,
+        "kind": item.kind,
+        "region": item.region,
+        "score": item.score,
+        "partner": item.partner,
+    }
+    if item.shape is not None:
+        document["shape"] = {
+            "map_T_box": item.shape.map_T_box.tolist(),
+            "box_m": item.shape.box_m.tolist(),
+            "volume_m3": item.shape.volume_m3,
+        }
+    if item.displacement_map is not None:
+        document["displacement_map"] = item.displacement_map.tolist()
+    return document
+
+
+def _shape(part: ShapePart) -> ObjectShape:
+    return ObjectShape(_numbers(part.map_T_box), _numbers(part.box_m), part.volume_m3)
+
+
+def _numbers(values: Sequence[Any]) -> Float64Array:
+    return np.asarray(values, dtype=np.float64)
+
+
+def _write_json(folder: Path, document: Mapping[str, Any], until: Until | None) -> None:
+    partial = folder / ".answer.json.partial"
+    head = {"format": FORMAT, "format_version": FORMAT_VERSION, **({} if until is None else {"until": until})}
+    partial.write_text(json.dumps({**head, **document}, indent=1))
+    partial.replace(folder / "answer.json")
+
+
+def _stacked(arrays: Sequence[npt.NDArray[Any]], empty: tuple[int, int], dtype: type) -> npt.NDArray[Any]:
+    return np.concatenate(arrays) if arrays else np.zeros(empty, dtype=dtype)
+
+
+def _offsets(arrays: Sequence[npt.NDArray[Any]]) -> Int64Array:
+    return np.concatenate([[0], np.cumsum([len(array) for array in arrays])]).astype(np.int64)
+
+
+def _split(values: npt.NDArray[Any], offsets: Int64Array) -> list[npt.NDArray[Any]]:
+    return [values[a:b] for a, b in pairwise(offsets)]

@@ -1,0 +1,152 @@
+"""What may stand in an answer's two files, checked before anything is made of it; every mistake of a file at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import ConfigDict, Field, PositiveFloat
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import Document, Settings, suggestion, validated
+from cdpipe.model.types import Kind, SessionName
+
+FORMAT: Literal["tunnelcd-answer"] = "tunnelcd-answer"
+FORMAT_VERSION: Literal[1] = 1
+Until = Literal["merge"]
+
+Failure = Literal["failed", "merge_refused", "worker_died"]
+_Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+_Four = Field(min_length=4, max_length=4)
+_Pose = Annotated[list[Annotated[list[float], _Four]], _Four]
+
+
+class _Part(Settings):
+    """Numbers are numbers, not text that looks like one."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=True)  # NaN: not measured
+
+
+class ShapePart(_Part):
+    """The box around an object, and its volume."""
+
+    map_T_box: _Pose
+    box_m: _Vector
+    volume_m3: float
+
+
+class ObjectPart(_Part):
+    """One object; its points are in answer.npz."""
+
+    session: SessionName
+    kind: Kind
+    region: int = -1
+    score: float = 0.0
+    partner: int = -1
+    shape: ShapePart | None = None
+    displacement_map: _Vector | None = None
+
+
+class FailurePart(_Part):
+    """answer.json of a case without an answer, and what it has in common with one that has."""
+
+    format: Literal["tunnelcd-answer"]
+    format_version: Literal[1]
+    status: Literal["ok", Failure]
+    method: str
+    until: Until | None = None
+    error: str = ""
+    seconds: dict[str, float] = Field(default_factory=dict)
+    evidence: dict[str, float] = Field(default_factory=dict)
+    config: dict[str, Any] = Field(default_factory=dict)
+    # what an answer would have may be there, and is not read
+    before_T_after: Any = None
+    radius_m: Any = None
+    objects: Any = None
+
+
+class AnswerPart(FailurePart):
+    """answer.json."""
+
+    before_T_after: _Pose
+    radius_m: PositiveFloat
+    objects: list[ObjectPart] = Field(default_factory=list)
+
+
+# Of answer.npz: candidates R, objects O, keyframes Kb and Ka, and how many returns and points come to.
+_SHAPES: dict[str, tuple[str | int, ...]] = {
+    "region_centres_map": ("R", 3), "region_scores": ("R",), "region_pairs": ("R", 2), "region_is_reported": ("R",),
+    "region_is_withdrawn": ("R",), "region_direction": ("R",), "keyframe_scores": ("Kb",),
+    "before_keyframe_scans": ("Kb",), "after_keyframe_scans": ("Ka",), "object_returns": ("M", 2),
+    "object_return_offsets": ("O + 1",), "object_points_map": ("P", 3), "object_point_offsets": ("O + 1",),
+    "object_points_odom": ("P", 3), "object_point_odom_offsets": ("O + 1",), "local_before_T_after": ("Ka", 4, 4),
+}  # fmt: skip
+_REQUIRED = ("region_centres_map", "region_scores")
+_OFFSETS = {
+    "object_returns": "object_return_offsets",
+    "object_points_map": "object_point_offsets",
+    "object_points_odom": "object_point_odom_offsets",
+}
+_MASKS = ("region_is_reported", "region_is_withdrawn")
+_FIGURE = "figure_"
+
+
+def checked_document(path: Path, value: Any) -> AnswerPart | FailurePart:
+    """Return what answer.json says.
+
+    Raises:
+        InputError: One line for each mistake.
+    """
+    document = Document(str(path), value)
+    is_failure = isinstance(value, dict) and value.get("status") in get_args(Failure)
+    return validated(FailurePart if is_failure else AnswerPart, document)
+
+
+def checked_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects: int) -> None:
+    """Check that the arrays of answer.npz are known, numbers, of the right shape, and all there.
+
+    Raises:
+        InputError: One line for each mistake.
+    """
+    mistakes = []
+    for name, array in arrays.items():
+        shape = ("R",) if name.startswith(_FIGURE) else _SHAPES.get(name)
+        if shape is None:
+            near = suggestion(name, _SHAPES) or f" (known: {', '.join(_SHAPES)})"
+            mistakes.append(f"array {name} is unknown{near}")
+        elif array.dtype.kind not in ("b" if name in _MASKS else "biuf"):
+            wanted = "true or false" if name in _MASKS else "numbers"
+            mistakes.append(f"array {name}: expected {wanted}, got {array.dtype}")
+        elif array.ndim != len(shape) or array.shape[1:] != shape[1:]:
+            mistakes.append(f"array {name} must be {_spelt(shape)}, got {array.shape}")
+    needed = [*_REQUIRED, *(_OFFSETS[name] for name in _OFFSETS if name in arrays)]
+    mistakes += [f"array {name} is missing: expected {_spelt(_SHAPES[name])}" for name in needed if name not in arrays]
+    if n_objects and "object_returns" not in arrays and "object_points_odom" not in arrays:
+        mistakes.append(
+            f"array object_points_odom is missing: the {n_objects} objects of answer.json need their points, (P, 3), "
+            "or their object_returns, (M, 2)"
+        )
+    if not mistakes:
+        for name, offsets in _OFFSETS.items():
+            if name in arrays:
+                mistakes += _offset_mistakes(offsets, arrays[offsets], name, len(arrays[name]), n_objects)
+    if mistakes:
+        raise InputError("\n".join(f"{path}: {mistake}" for mistake in mistakes))
+
+
+def _offset_mistakes(name: str, offsets: npt.NDArray[Any], values: str, n_values: int, n_objects: int) -> list[str]:
+    if not np.issubdtype(offsets.dtype, np.integer):
+        return [f"array {name}: expected whole numbers, got {offsets.dtype}"]
+    if len(offsets) != n_objects + 1:
+        return [f"{name} has {len(offsets)} entries for {n_objects} objects: expected {n_objects + 1}"]
+    if offsets[0] != 0 or (np.diff(offsets.astype(np.int64)) < 0).any() or offsets[-1] != n_values:
+        rows = f"{n_values}, the rows of {values}"
+        return [f"{name} goes from {offsets[0]} to {offsets[-1]}: expected rising from 0 to {rows}"]
+    return []
+
+
+def _spelt(shape: tuple[str | int, ...]) -> str:
+    return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"

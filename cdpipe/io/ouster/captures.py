@@ -1,0 +1,231 @@
+"""A sensor's own recording, OSF or PCAP, revolution by revolution, read by the vendor's SDK.
+
+The SDK is an extra and imported only here and in `cdpipe.io.ouster.osf`, when a recording is opened.
+"""
+
+# ruff: noqa: PLC0415 - the vendor's SDK is an extra, and everybody else must be able to import this
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cdpipe.core.errors import InputError
+from cdpipe.io.ouster.integrity import require_whole_osf, require_whole_pcap
+from cdpipe.io.ouster.revolutions import Revolution, decode
+from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
+from cdpipe.sensor.ouster_metadata import read_document, require_mode
+
+PCAP_SUFFIXES = (".pcap", ".pcapng")
+SUFFIXES = (".osf", *PCAP_SUFFIXES)
+# A revolution with no more of its columns than this is left out: a recording begins and ends in the middle of one.
+_LEAST_SHARE = 0.5
+# An Ethernet frame carries this much beside what it holds (Ethernet, IP, UDP and PCAP headers), to guess a number.
+_PACKET_OVERHEAD_BYTES = 58
+# What the SDK raises where a file is at fault; C++ exceptions arrive as any of these.
+SDK_ERRORS = (OSError, RuntimeError, ValueError, LookupError, ArithmeticError)
+
+
+@dataclass(frozen=True, slots=False, eq=False)
+class Recording:
+    """A recording of one sensor, which can be read as often as wanted.
+
+    Attributes:
+        path: The file.
+        sensor: The sensor that made it.
+        info: The SDK's description of it.
+        metadata: The metadata file that belongs to a PCAP; an OSF has its own.
+    """
+
+    path: Path
+    sensor: SensorMetadata
+    info: Any
+    metadata: Path | None
+
+    @cached_property
+    def n_guessed(self) -> int:
+        """About how many revolutions it holds, for progress."""
+        if self.metadata is None:
+            with closing(_opened(self)) as source:
+                return max(len(source), 1)
+        packet_bytes = _packet_bytes(self.info) + _PACKET_OVERHEAD_BYTES
+        n_packets = max(self.info.format.lidar_packets_per_frame(), 1)
+        return max(self.path.stat().st_size // int(packet_bytes * n_packets), 1)
+
+    def revolutions(self, on_left_out: Callable[[int], object] = lambda number: None) -> Iterator[Revolution]:
+        """Read all revolutions of which more than half the columns arrived.
+
+        Args:
+            on_left_out: Told the number of each of the others; one of which nothing arrived is not in the recording.
+
+        Raises:
+            InputError: The file is damaged, the clock went backwards, or no such revolution is in it.
+        """
+        n_kept, n_seen, last_ns = 0, 0, None
+        mounting = np.asarray(self.info.sensor_to_body, dtype=np.float64)
+        window = max(self.info.format.valid_columns_per_frame(), 1)
+        with closing(_opened(self)) as source:
+            for frames in _guarded(source, self.path):
+                frame = frames[0]
+                if frame is None:
+                    continue
+                n_seen += 1
+                if np.count_nonzero(frame.status & 1) <= _LEAST_SHARE * window:
+                    on_left_out(n_seen - 1)
+                    continue
+                revolution = decode(frame, self.sensor, mounting, f"{self.path}: revolution {n_seen - 1}")
+                if last_ns is not None and revolution.column_stamps_ns[0] <= last_ns:
+                    raise InputError(
+                        f"{self.path}: revolution {n_seen - 1} does not come after the one before it: the sensor's "
+                        "clock was set during the recording, cut it there"
+                    )
+                last_ns = revolution.column_stamps_ns[-1]
+                n_kept += 1
+                yield revolution
+            self._check_end(source, n_seen, n_kept)
+
+    def _check_end(self, source: Any, n_seen: int, n_kept: int) -> None:
+        if self.metadata is None and n_seen < len(source):
+            raise InputError(f"{self.path}: damaged: {n_seen} of its {len(source)} revolutions can be read")
+        if n_kept:
+            return
+        if n_seen:
+            raise InputError(
+                f"{self.path}: no whole revolution: of none of its {n_seen} more than half the columns arrived; the "
+                f"recording is too short, or was not made in mode {self.sensor.mode}"
+            )
+        if self.metadata is not None:
+            n_other = source.size_error_count + source.id_error_count
+            raise InputError(
+                f"{self.path}: no lidar packet of the sensor in {self.metadata} ({self.sensor.product}, "
+                f"{_packet_bytes(self.info)} bytes each); {n_other or 'none'} of its packets look like another Ouster's"
+            )
+        raise InputError(f"{self.path}: holds no revolution")
+
+
+def open_recording(path: Path, metadata: Path | None = None) -> Recording:
+    """Open an OSF, or a PCAP with its metadata: `metadata`, or the .json of the same name beside it.
+
+    Raises:
+        InputError: A file is missing, cut short or of another kind, the metadata is that of another sensor or mode, the
+            OSF holds several sensors, or the vendor's SDK is not installed.
+    """
+    core = require_sdk()
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(f"{path}: expected a recording, {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}: expected a recording")
+    if suffix == ".osf":
+        if metadata is not None:
+            raise InputError(f"{path}: an OSF carries its sensor's metadata: leave --metadata out")
+        require_whole_osf(path)
+        info = _only_sensor(path)
+        sensor = parse_metadata(json.loads(info.to_json_string()), str(path))
+        require_mode(sensor.mode, str(path))
+        return Recording(path, sensor, info, None)
+    require_whole_pcap(path)
+    beside = path.with_suffix(".json")
+    if metadata is None and not beside.exists():
+        raise InputError(f"{path}: {beside.name} is not beside it: give the sensor's metadata .json with --metadata")
+    metadata = metadata or beside
+    sensor = parse_metadata(read_document(metadata), str(metadata))
+    require_mode(sensor.mode, str(metadata))
+    try:
+        info = core.SensorInfo(metadata.read_text(encoding="utf-8"))
+    except SDK_ERRORS as error:
+        raise InputError(f"{metadata}: the vendor's SDK does not take it: {one_line(error)}") from error
+    recording = Recording(path, sensor, info, metadata)
+    _check_columns(recording)
+    return recording
+
+
+def require_sdk() -> Any:
+    """Import the vendor's SDK and return its module `core`.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    try:
+        from ouster.sdk import core
+    except ImportError as error:
+        raise InputError("OSF and PCAP need the vendor's SDK: pip install 'tunnelcd[ouster]'") from error
+    core.init_logger("off")  # it raises what it logs, and that is said here, in one line
+    return core
+
+
+def one_line(error: BaseException) -> str:
+    """Return the text of an error of the SDK or the disk in one line."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return " ".join(str(error).split())
+
+
+def _opened(recording: Recording) -> Any:
+    """Return the SDK's source of a recording; close it."""
+    from ouster.sdk import osf, pcap
+
+    with _sdk_reads(recording.path):
+        if recording.metadata is None:
+            return osf.OsfFrameSetSource(str(recording.path))
+        return pcap.PcapFrameSetSource(str(recording.path), sensor_info=[recording.info])
+
+
+@contextmanager
+def _sdk_reads(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except SDK_ERRORS as error:
+        raise InputError(f"{path}: the vendor's SDK cannot read it: {one_line(error)}") from error
+
+
+def _guarded(source: Any, path: Path) -> Iterator[Any]:
+    with _sdk_reads(path):
+        yield from source
+
+
+def _only_sensor(path: Path) -> Any:
+    from ouster.sdk import osf
+
+    with _sdk_reads(path), closing(osf.OsfFrameSetSource(str(path))) as source:
+        infos = list(source.sensor_info)
+    if len(infos) != 1:
+        sensors = ", ".join(f"{info.prod_line} {info.sn}" for info in infos) or "none"
+        raise InputError(f"{path}: expected the recording of one sensor, it holds {len(infos)} ({sensors})")
+    return infos[0]
+
+
+def _packet_bytes(info: Any) -> int:
+    from ouster.sdk import core
+
+    return int(core.PacketFormat.from_info(info).lidar_packet_size)
+
+
+def _check_columns(recording: Recording) -> None:
+    """Refuse metadata of a mode with fewer columns than the packets count: the SDK would drop the rest in silence."""
+    from ouster.sdk import core, pcap
+
+    layout = core.PacketFormat.from_info(recording.info)
+    n_looked_at = 2 * recording.sensor.width // max(layout.columns_per_packet, 1)
+    highest = -1
+    with _sdk_reads(recording.path):
+        source = pcap.PcapPacketSource(str(recording.path), sensor_info=[recording.info])
+    with closing(source):
+        for _, packet in _guarded(source, recording.path):
+            if isinstance(packet, core.LidarPacket):
+                highest = max(highest, int(layout.packet_header(core.ColHeader.MEASUREMENT_ID, packet.buf).max()))
+                n_looked_at -= 1
+            if n_looked_at <= 0:
+                break
+    if highest >= recording.sensor.width:
+        raise InputError(
+            f"{recording.metadata}: lidar_mode = {recording.sensor.mode}, but the packets of {recording.path} count "
+            f"columns up to {highest}: it is the metadata of another mode"
+        )

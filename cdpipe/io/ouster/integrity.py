@@ -1,0 +1,134 @@
+"""Is a recording whole? Looked at here, before the vendor's SDK opens it: cut short, the SDK drops what it cannot read.
+
+A damaged OSF can end the process inside the SDK, so that no message would come at all.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import zlib
+from pathlib import Path
+from typing import BinaryIO
+
+from cdpipe.core.errors import InputError
+
+_OSF_MAGIC = b"OSF$"
+_OSF_HEADER_BYTES = 56
+_PCAP_HEADER_BYTES = 24
+_PCAP_RECORD_BYTES = 16
+# First four bytes -> byte order of the file; the second pair stamps nanoseconds.
+_PCAP_ORDERS = {
+    b"\xd4\xc3\xb2\xa1": "<",
+    b"\xa1\xb2\xc3\xd4": ">",
+    b"\x4d\x3c\xb2\xa1": "<",
+    b"\xa1\xb2\x3c\x4d": ">",
+}
+_PCAPNG_MAGIC = b"\x0a\x0d\x0d\x0a"
+_PCAPNG_ORDERS = {b"\x4d\x3c\x2b\x1a": "<", b"\x1a\x2b\x3c\x4d": ">"}
+
+
+def require_whole_osf(path: Path) -> None:
+    """Compare the length an OSF file states in its header with its own, and header and metadata with their checksums.
+
+    Raises:
+        InputError: It is no OSF file, was never finished, is cut short, or header or metadata are damaged.
+    """
+    n_bytes = _size(path)
+    with path.open("rb") as file:
+        header = file.read(_OSF_HEADER_BYTES)
+    if header[8:12] != _OSF_MAGIC:
+        raise InputError(f"{path}: not an OSF file: it does not begin as one")
+    metadata_at, stated_bytes = _osf_header(header)
+    if metadata_at == 0:
+        raise InputError(f"{path}: the recording was never finished: its writer was not closed, record it again")
+    if n_bytes < stated_bytes:
+        raise InputError(f"{path}: cut short: {n_bytes} of {stated_bytes} bytes are there: copy it again")
+    if n_bytes > stated_bytes:
+        raise InputError(f"{path}: damaged: {n_bytes} bytes where its header says {stated_bytes}: copy it again")
+    with path.open("rb") as file:
+        for part, at in (("header", 0), ("metadata", metadata_at)):
+            if not _is_sound(file, at, n_bytes):
+                raise InputError(f"{path}: damaged: its {part} and the checksum of it do not agree: copy it again")
+
+
+def require_whole_pcap(path: Path) -> None:
+    """Walk over the packets of a PCAP or PCAPNG file.
+
+    Raises:
+        InputError: It is neither, holds no packet, or ends in the middle of one.
+    """
+    if _size(path) < _PCAP_HEADER_BYTES:
+        raise InputError(f"{path}: not a PCAP file: {_size(path)} bytes are less than its header")
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        magic = data[:4]
+        if magic in _PCAP_ORDERS:
+            end, n_packets = _walk_pcap(data, _PCAP_ORDERS[magic])
+        elif magic == _PCAPNG_MAGIC and data[8:12] in _PCAPNG_ORDERS:
+            end, n_packets = _walk_pcapng(data, _PCAPNG_ORDERS[data[8:12]])
+        else:
+            raise InputError(f"{path}: neither PCAP nor PCAPNG: it does not begin as one")
+        n_bytes = len(data)
+    if end != n_bytes:
+        raise InputError(
+            f"{path}: cut short or damaged after {n_packets} packets: copy it again, or save the whole packets with "
+            f"`tcpdump -r {path.name} -w whole.pcap`"
+        )
+    if n_packets == 0:
+        raise InputError(f"{path}: holds no packet")
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _osf_header(header: bytes) -> tuple[int, int]:
+    """Return where the metadata begins and how long the file is (0, 0 if it does not say).
+
+    The header is a flatbuffer behind its length: the table's third and fourth fields.
+    """
+    try:
+        table = 4 + struct.unpack_from("<I", header, 4)[0]
+        fields = table - struct.unpack_from("<i", header, table)[0]
+        metadata, length = struct.unpack_from("<HH", header, fields + 8)
+        return (
+            struct.unpack_from("<Q", header, table + metadata)[0] if metadata else 0,
+            struct.unpack_from("<Q", header, table + length)[0] if length else 0,
+        )
+    except struct.error:
+        return 0, 0
+
+
+def _is_sound(file: BinaryIO, at: int, n_bytes: int) -> bool:
+    """Check one of the blocks an OSF file is made of: its length, so many bytes, and the CRC-32 of both."""
+    file.seek(at)
+    prefix = file.read(4)
+    end = at + 4 + int.from_bytes(prefix, "little")
+    if end + 4 > n_bytes:
+        return False
+    return zlib.crc32(prefix + file.read(end - at - 4)) == int.from_bytes(file.read(4), "little")
+
+
+def _walk_pcap(data: mmap.mmap, order: str) -> tuple[int, int]:
+    """Return where the last whole packet ends, and the number of packets."""
+    at, n_packets, lengths = _PCAP_HEADER_BYTES, 0, struct.Struct(f"{order}I")
+    while at + _PCAP_RECORD_BYTES <= len(data):
+        end = at + _PCAP_RECORD_BYTES + lengths.unpack_from(data, at + 8)[0]
+        if end > len(data):
+            break
+        at, n_packets = end, n_packets + 1
+    return at, n_packets
+
+
+def _walk_pcapng(data: mmap.mmap, order: str) -> tuple[int, int]:
+    """Return where the last whole block ends, and the number of packets."""
+    at, n_packets, block = 0, 0, struct.Struct(f"{order}II")
+    while at + 12 <= len(data):
+        kind, n_bytes = block.unpack_from(data, at)
+        if n_bytes < 12 or at + n_bytes > len(data):
+            break
+        at, n_packets = at + n_bytes, n_packets + (kind in (3, 6))
+    return at, n_packets

@@ -1,0 +1,161 @@
+"""A session leaves as OSF, the format of the vendor's SDK: ranges, reflectivity, signal, stamps and a pose per column.
+
+The sensor's metadata is complete, `body_to_world` of each column is its `odom_T_column`, and fields of the caller's can
+go along pixel by pixel. Every column counts as valid; one that never arrived simply has no returns.
+"""
+
+# ruff: noqa: PLC0415 - the vendor's SDK is an extra, and everybody else must be able to import this
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from itertools import repeat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float32Array, Float64Array
+from cdpipe.io.ouster.captures import one_line, require_sdk
+from cdpipe.io.session import ScanChunk, Session
+
+_CHANNELS = {"RANGE": "range_mm", "REFLECTIVITY": "reflectivity", "SIGNAL": "signal"}
+
+Fields = Mapping[str, npt.NDArray[Any]]
+Progress = Callable[[str, int, int], None]
+
+
+def write_osf(
+    session: Session, path: Path, fields: Iterable[Fields] | None = None, on_progress: Progress | None = None
+) -> None:
+    """Write a session as an OSF file, which appears under its name only when it is complete.
+
+    Args:
+        session: The session.
+        path: The new file.
+        fields: For each chunk further fields (s, H, W) by name, written as they are; left out: none.
+        on_progress: Told the stage, and how many revolutions of how many are done.
+
+    Raises:
+        InputError: The file exists or cannot be written, a chunk is damaged or its stamps do not rise, the vendor's SDK
+            is not installed or does not take this sensor.
+    """
+    core = require_sdk()
+    from ouster.sdk.osf import OsfDropFrameError
+
+    if path.exists():
+        raise InputError(f"{path} exists already: name a new file or remove it")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{path}: there is no folder {path.parent}")
+    info = sensor_info(session)
+    report = on_progress or (lambda stage, done, total: None)
+    report("write", 0, session.n_scans)
+    done = 0
+    try:
+        with _new_osf(path, info) as writer:
+            for chunk, more in zip(session.chunks(), fields or repeat({}), strict=fields is not None):
+                _check_fields(session, chunk, more)
+                for row in range(len(chunk.range_mm)):
+                    writer.save(0, _frame(core, info, session, chunk, more, row, done))
+                    done += 1
+                    report("write", done, session.n_scans)
+    except OsfDropFrameError as error:
+        raise InputError(
+            f"{session.path}: revolution {done} does not come after the one before it: the stamps of its chunks are "
+            "damaged, an OSF's must rise"
+        ) from error
+    except (OSError, RuntimeError) as error:
+        way_out = "give it a disk with room and a folder you may write to"
+        raise InputError(f"{path}: cannot be written ({one_line(error)}): {way_out}") from error
+
+
+@contextmanager
+def _new_osf(path: Path, info: Any) -> Iterator[Any]:
+    """Yield the SDK's writer of a file in a hidden folder, which gets its name when the block ends well.
+
+    A writer that failed writes what is left once more as it is destroyed, and ends the process if that fails too. It
+    opens the file by its name each time: where that leads nowhere, its last attempt succeeds and leaves nothing.
+    """
+    from ouster.sdk import osf
+
+    folder = path.with_name(f".{path.name}.partial")
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    partial = folder / path.name
+    try:
+        writer = osf.Writer(str(partial), info)
+        try:
+            yield writer
+            writer.close()
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            partial.symlink_to(os.devnull)
+            writer.close()
+            raise
+        partial.rename(path)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def sensor_info(session: Session) -> Any:
+    """Return the SDK's description of a session's sensor.
+
+    Raises:
+        InputError: The SDK does not take it, for example because the sensor has a number of beams that none has.
+    """
+    core = require_sdk()
+    document = {**session.sensor.to_json(), "status": "RUNNING"}
+    try:
+        info = core.SensorInfo(json.dumps(document))
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"{session.path}: the vendor's SDK does not take its sensor: {one_line(error)}") from error
+    info.format.udp_profile_lidar = core.UDPProfileLidar.RNG19_RFL8_SIG16_NIR16
+    info.user_data = json.dumps({"tunnelcd": session.provenance})
+    return info
+
+
+def column_poses(odom_T_sensor: Float64Array, sensor_T_column: Float32Array) -> Float64Array:
+    """Return odom_T_column (W, 4, 4).
+
+    Args:
+        odom_T_sensor: (4, 4) pose of the revolution.
+        sensor_T_column: (W, 7) as x, y, z, qx, qy, qz, qw.
+    """
+    stored = sensor_T_column.astype(np.float64)
+    poses = np.tile(np.eye(4), (len(stored), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(stored[:, 3:]).as_matrix()
+    poses[:, :3, 3] = stored[:, :3]
+    return odom_T_sensor @ poses
+
+
+def _check_fields(session: Session, chunk: ScanChunk, fields: Fields) -> None:
+    for name, values in fields.items():
+        if values.shape != chunk.range_mm.shape:
+            raise InputError(
+                f"{session.path}: field {name} is {values.shape} where ranges are {chunk.range_mm.shape}: it does not "
+                "belong to this session"
+            )
+
+
+def _frame(core: Any, info: Any, session: Session, chunk: ScanChunk, fields: Fields, row: int, number: int) -> Any:
+    """Return one revolution as the SDK's `LidarFrame`."""
+    arrays = {name: getattr(chunk, own)[row] for name, own in _CHANNELS.items()}
+    arrays |= {name: values[row] for name, values in fields.items()}
+    frame = core.LidarFrame(info, [core.FieldType(name, values.dtype) for name, values in arrays.items()])
+    for name, values in arrays.items():
+        frame.field(name)[:] = values
+    start_ns = session.provenance.get("sensor_clock_start_ns", 0)
+    frame.frame_id = number
+    frame.timestamp[:] = chunk.column_stamps_ns[row] + start_ns
+    frame.packet_timestamp[:] = frame.timestamp[:: info.format.columns_per_packet]
+    frame.measurement_id[:] = np.arange(frame.w)
+    frame.status[:] = 1
+    frame.body_to_world[:] = column_poses(session.odom_T_sensor[number], chunk.column_poses[row])
+    return frame

@@ -1,0 +1,212 @@
+"""A sensor's own recording becomes a session: its revolutions, and poses from the recording, a trajectory or KISS-ICP.
+
+Where each pose comes from:
+
+- `own`: an OSF carries a pose for each column (`body_to_world`, with the sensor's mounting `sensor_to_body`);
+- a TUM file of `odom_T_sensor`, its stamps on the sensor's clock, interpolated to every column;
+- `kiss-icp`: one pose for each revolution at its middle column, interpolated; the odom frame is the first one's sensor.
+
+Only the first return of a beam is kept. A column that did not arrive has no returns, and stamp and pose in between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, make_pose, require_poses
+from cdpipe.core.motion import Motion, motion_of
+from cdpipe.io.ouster.captures import Recording, open_recording
+from cdpipe.io.ouster.revolutions import Revolution
+from cdpipe.io.session import ScanChunk, SessionWriter
+from cdpipe.io.tum import motion_along
+from cdpipe.mapping.odometry import estimate_motion, require_kiss_icp
+
+CHUNK_SCANS = 64
+KISS_ICP = "kiss-icp"
+_OWN_POSE_TOLERANCE = 1e-9
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """What was brought in.
+
+    Attributes:
+        n_scans: Revolutions of the session.
+        poses: Where their poses come from.
+        sensor: Product line and mode.
+        n_left_out: Revolutions that are not in the session, because half their columns or fewer arrived.
+    """
+
+    n_scans: int
+    poses: str
+    sensor: str
+    n_left_out: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Times:
+    """First, middle and last stamp (S,) of every revolution, and whether any of its columns has a pose of its own."""
+
+    first_ns: Int64Array
+    middle_ns: Int64Array
+    last_ns: Int64Array
+    has_own_pose: BoolArray
+    n_left_out: int
+
+
+def import_recording(
+    source: Path,
+    out: Path,
+    *,
+    metadata: Path | None = None,
+    trajectory: Path | None = None,
+    odometry: str | None = None,
+    on_progress: Progress | None = None,
+) -> Imported:
+    """Write an OSF or a PCAP as a session folder, which appears under its name only when it is complete.
+
+    Args:
+        source: The recording.
+        out: The new folder.
+        metadata: The sensor's metadata .json of a PCAP; left out: the file of the same name beside it.
+        trajectory: TUM file with the sensor's poses, instead of the recording's own.
+        odometry: "kiss-icp" to estimate the poses instead.
+        on_progress: Told the stage, and how many revolutions of about how many are done.
+
+    Raises:
+        InputError: A file cannot be used, `out` exists, or there are no poses.
+    """
+    if odometry not in (None, KISS_ICP):
+        raise InputError(f"--odometry {odometry}: expected {KISS_ICP}")
+    if odometry is not None and trajectory is not None:
+        raise InputError("--trajectory and --odometry both give the poses: leave one out")
+    if odometry is not None:
+        require_kiss_icp(f"--odometry {odometry}")
+    report = on_progress or (lambda stage, done, total: None)
+    recording = open_recording(source, metadata)
+    times = _times(recording, report)
+    motion, poses = _motion(recording, times, trajectory, odometry, report)
+    provenance = {
+        "made_by": "tunnelcd convert",
+        "recording": source.name,
+        "poses": poses,
+        "sensor_clock_start_ns": int(times.first_ns[0]),
+        "revolutions_left_out": times.n_left_out,
+    }
+    with SessionWriter(out, recording.sensor, CHUNK_SCANS, provenance) as writer:
+        writer.close(_write(writer, recording, times, motion, report))
+    sensor = f"{recording.sensor.product}, {recording.sensor.mode}"
+    return Imported(len(times.first_ns), poses, sensor, times.n_left_out)
+
+
+def _times(recording: Recording, report: Progress) -> _Times:
+    stamps_ns, has_own_pose = [], []
+    left_out: list[int] = []
+    middle = recording.sensor.width // 2
+    for number, revolution in enumerate(recording.revolutions(left_out.append)):
+        report("look through", number, recording.n_guessed)
+        stamps_ns.append(revolution.column_stamps_ns[[0, middle, -1]])
+        off = np.abs(revolution.odom_T_column[revolution.is_valid] - recording.info.sensor_to_body)
+        has_own_pose.append(off.max() > _OWN_POSE_TOLERANCE)
+    report("look through", len(stamps_ns), len(stamps_ns))
+    first_ns, middle_ns, last_ns = np.array(stamps_ns).T
+    return _Times(first_ns, middle_ns, last_ns, np.array(has_own_pose), len(left_out))
+
+
+def _motion(
+    recording: Recording, times: _Times, trajectory: Path | None, odometry: str | None, report: Progress
+) -> tuple[Motion | None, str]:
+    """Return the movement, time from the first column on (None: every column has its own pose), and its name."""
+    start_ns = int(times.first_ns[0])
+    if trajectory is not None:
+        # The vendor's own tool writes one pose for each revolution, at its first column.
+        slack_s = 1.5 / recording.sensor.rate_hz
+        return motion_along(trajectory, start_ns, int(times.last_ns[-1]), slack_s), f"trajectory {trajectory.name}"
+    if odometry is not None:
+        offsets_ns = recording.sensor.column_offsets_ns()
+        column_s = (offsets_ns - offsets_ns[len(offsets_ns) // 2]) / 1e9
+        images = _range_images(recording, len(times.first_ns), report)
+        try:
+            middle_s = (times.middle_ns - start_ns) / 1e9
+            return estimate_motion(images, recording.sensor, middle_s, column_s, make_pose()), odometry
+        except InputError as error:
+            raise InputError(f"{recording.path}: {error}: give the poses with --trajectory") from error
+    # The frame of the poses may begin at the first revolution, which then lies at its origin.
+    bare = 1 + np.flatnonzero(~times.has_own_pose[1:])
+    if times.has_own_pose.any() and not bare.size:
+        return None, "own"
+    lack = "no poses in it"
+    if times.has_own_pose.any():
+        lack = f"{bare.size} of its {len(times.first_ns)} revolutions have no poses, the first of them number {bare[0]}"
+    raise InputError(
+        f"{recording.path}: {lack}: give --trajectory FILE.tum (the sensor's poses, stamped by its clock), or "
+        f"--odometry {KISS_ICP} to estimate them"
+    )
+
+
+def _range_images(recording: Recording, n_scans: int, report: Progress) -> Iterator[npt.NDArray[np.uint32]]:
+    for number, revolution in enumerate(recording.revolutions()):
+        report("odometry", number, n_scans)
+        yield revolution.range_mm
+    report("odometry", n_scans, n_scans)
+
+
+def _write(
+    writer: SessionWriter, recording: Recording, times: _Times, motion: Motion | None, report: Progress
+) -> Float64Array:
+    """Write every chunk and return the pose (S, 4, 4) of each revolution at its middle column."""
+    start_ns, n_scans = int(times.first_ns[0]), len(times.first_ns)
+    odom_T_sensor: list[Float64Array] = []
+    revolutions = recording.revolutions()
+    while batch := list(islice(revolutions, CHUNK_SCANS)):
+        column_poses = []
+        for revolution in batch:
+            stamps_s = (revolution.column_stamps_ns - start_ns) / 1e9
+            drive = motion or _own_motion(revolution, stamps_s, f"{recording.path}: revolution {len(odom_T_sensor)}")
+            pose, sensor_T_column = _column_poses(drive, stamps_s)
+            odom_T_sensor.append(pose)
+            column_poses.append(sensor_T_column)
+        writer.add(
+            ScanChunk(
+                np.stack([each.range_mm for each in batch]),
+                np.stack([each.reflectivity for each in batch]),
+                np.stack([each.signal for each in batch]),
+                np.stack([each.column_stamps_ns for each in batch]) - start_ns,
+                np.stack(column_poses),
+            )
+        )
+        report("write", len(odom_T_sensor), n_scans)
+    return np.stack(odom_T_sensor)
+
+
+def _own_motion(revolution: Revolution, stamps_s: Float64Array, where: str) -> Motion:
+    """Return the movement through the poses of the columns that arrived, so that it can be asked for the others."""
+    poses = revolution.odom_T_column[revolution.is_valid]
+    try:
+        require_poses("its column poses", poses)
+    except ValueError as error:
+        raise InputError(f"{where}: {error}: give the poses with --trajectory or --odometry {KISS_ICP}") from error
+    known_s = stamps_s[revolution.is_valid]
+    return motion_of(known_s, np.zeros(len(known_s)), poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]))
+
+
+def _column_poses(motion: Motion, stamps_s: Float64Array) -> tuple[Float64Array, Float32Array]:
+    """Return odom_T_sensor (4, 4) at the middle column, and sensor_T_column (W, 7) as a session stores it."""
+    points, quaternions = motion.sampled(stamps_s)
+    rotations = Rotation.from_quat(quaternions)
+    middle = len(stamps_s) // 2
+    sensor_R_odom = rotations[middle].inv()
+    stored = np.concatenate(
+        [sensor_R_odom.apply(points - points[middle]), (sensor_R_odom * rotations).as_quat(canonical=True)], axis=1
+    )
+    return make_pose(rotations[middle].as_matrix(), points[middle]), stored.astype(np.float32)

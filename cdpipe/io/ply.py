@@ -1,0 +1,106 @@
+"""The vertices of a PLY file, ascii or binary, whatever other properties and elements it has.
+
+A scan written by PCL carries a `camera` element, others begin with a property that is not x; general mesh readers
+stumble over both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array
+
+_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+_BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_N_WORDS = {"format": 3, "element": 3, "property": 3}
+_MAX_HEADER_BYTES = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class _Header:
+    encoding: str
+    n_vertices: int
+    properties: tuple[tuple[str, str], ...]
+    size: int
+
+
+def read_ply_points(path: Path) -> Float64Array:
+    """Read the (N, 3) vertices of a PLY file, in file order and in the file's unit.
+
+    Raises:
+        InputError: The file is missing, not PLY, cut short, or its vertices have no x, y, z.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    try:
+        header = _parse_header(content)
+        return _vertices(content, header)
+    except ValueError as error:
+        raise InputError(f"{path}: not a readable PLY scan: {error}") from error
+
+
+def _parse_header(content: bytes) -> _Header:
+    if content[:3] != b"ply":
+        raise ValueError('it does not begin with "ply"')
+    end = content.find(b"end_header", 0, _MAX_HEADER_BYTES)
+    newline = content.find(b"\n", end)
+    if end < 0 or newline < 0:
+        raise ValueError("its header has no end_header")
+    encoding, elements, properties = "", 0, []
+    n_vertices = -1
+    for line in content[:end].decode("ascii", errors="replace").splitlines():
+        words = line.split()
+        keyword = words[0] if words else ""
+        if len(words) < _N_WORDS.get(keyword, 0):
+            raise ValueError(f"its header line {line.strip()!r} is cut short")
+        if keyword == "format":
+            encoding = words[1]
+        elif keyword == "element":
+            elements += 1
+            if elements == 1 and words[1] == "vertex":
+                n_vertices = int(words[2])
+        elif keyword == "property" and elements == 1:
+            if words[1] not in _TYPES:
+                raise ValueError(f'vertices with a property of type "{words[1]}" are not supported')
+            properties.append((words[2], _TYPES[words[1]]))
+    if encoding not in _BYTE_ORDERS:
+        raise ValueError(f'unknown format "{encoding}"')
+    if n_vertices < 0:
+        raise ValueError('its first element is not "vertex"')
+    if not {"x", "y", "z"} <= {name for name, _ in properties}:
+        raise ValueError("its vertices have no x, y and z")
+    return _Header(encoding, n_vertices, tuple(properties), newline + 1)
+
+
+def _vertices(content: bytes, header: _Header) -> Float64Array:
+    names = [name for name, _ in header.properties]
+    if header.encoding == "ascii":
+        lines = content[header.size :].split(b"\n", header.n_vertices)[: header.n_vertices]
+        rows = [line.split() for line in lines]
+        n_found = sum(len(row) == len(names) for row in rows)
+        columns = [names.index(axis) for axis in "xyz"]
+        if n_found == header.n_vertices:
+            return np.array([[row[c] for c in columns] for row in rows], dtype=np.float64).reshape(-1, 3)
+    else:
+        order = _BYTE_ORDERS[header.encoding]
+        dtype = np.dtype([(f"{index}", order + kind) for index, (_, kind) in enumerate(header.properties)])
+        n_found = (len(content) - header.size) // dtype.itemsize
+        if n_found >= header.n_vertices:
+            table = np.frombuffer(content, dtype, header.n_vertices, header.size)
+            return np.column_stack([table[f"{names.index(axis)}"] for axis in "xyz"]).astype(np.float64)
+    raise ValueError(f"{header.n_vertices} vertices are announced, {n_found} are there: it is damaged or cut short")

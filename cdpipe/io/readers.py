@@ -1,0 +1,217 @@
+"""Opening a recorded session of either kind: a session folder of ours, or PLY scans with a TUM trajectory."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, Int64Array, make_pose
+from cdpipe.io.ouster.captures import SUFFIXES
+from cdpipe.io.ply import read_ply_points
+from cdpipe.io.session import ScanChunk, Session, chunk_path, is_session, read_session
+from cdpipe.io.tum import TUM_LINE, read_tum, require_unit_poses, stamps_from_first_ns
+from cdpipe.mapping.deskew import deskew
+from cdpipe.model.types import PosedScan, ScanSource
+
+_NUMBERS = re.compile(r"(\d+)")
+# Metres along an axis, or radians: about what odometry makes of standing still.
+_STANDING = 0.1
+
+
+def open_scans(path: Path) -> ScanSource:
+    """Open a folder of scans.
+
+    Args:
+        path: A session folder (cdpipe.io.session), or a folder of `*.ply` scans, taken in the order of their names,
+        with
+            one trajectory `*.txt` or `*.tum`: one line `stamp tx ty tz qx qy qz qw` for each scan, in the same order.
+            PLY points are in the sensor frame of their pose, metres, deskewed already; `pixels` are rows of the file.
+
+    Raises:
+        InputError: The folder is missing or holds neither, or its trajectory does not fit its scans. Mistakes inside a
+            single scan are raised when it is read.
+    """
+    if path.suffix.lower() in SUFFIXES and not path.is_dir():
+        raise InputError(
+            f"{path}: a sensor's own recording: turn it into a session first, `tunnelcd convert {path} FOLDER`, and "
+            "name that folder"
+        )
+    if not path.is_dir():
+        raise InputError(f"{path}: no such folder: expected a session, or a folder of PLY scans with a TUM trajectory")
+    return RecordedScans(read_session(path)) if is_session(path) else _open_ply_scans(path)
+
+
+class RecordedScans:
+    """The scans of a session folder, deskewed with its own odometry. The chunk read last is kept."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._chunk_index = -1
+        self._chunk: ScanChunk | None = None
+
+    @property
+    def name(self) -> str:
+        """The session's folder."""
+        return str(self._session.path)
+
+    @property
+    def odom_T_sensor(self) -> Float64Array:
+        """(S, 4, 4) pose of each revolution."""
+        return self._session.odom_T_sensor
+
+    def scan(self, index: int) -> PosedScan:
+        """Read one revolution.
+
+        Raises:
+            InputError: Its chunk is damaged, its column poses are not rigid, or nothing returned.
+        """
+        chunk_index, row = divmod(index, self._session.chunk_scans)
+        if self._chunk is None or chunk_index != self._chunk_index:
+            self._chunk, self._chunk_index = self._session.chunk(chunk_index), chunk_index
+        where = f"{chunk_path(self._session.path, chunk_index)}: scan {index}"
+        column_poses = self._chunk.column_poses[row].astype(np.float64)
+        require_unit_poses(column_poses, lambda column: f"{where}, column {column}")
+        range_mm = self._chunk.range_mm[row]
+        is_hit = range_mm > 0
+        if not is_hit.any():
+            raise InputError(f"{where} holds no return: remove the scan and its pose from the recording")
+        points = deskew(self._session.sensor.project(range_mm / 1000.0), column_poses)
+        stamps = np.broadcast_to(self._chunk.column_stamps_ns[row], is_hit.shape)
+        return PosedScan(
+            index=index,
+            points_sensor=points[is_hit],
+            odom_T_sensor=self.odom_T_sensor[index],
+            stamps_ns=stamps[is_hit],
+            pixels=np.flatnonzero(is_hit).astype(np.int32),
+        )
+
+    def scans(self) -> Iterator[PosedScan]:
+        """Read all revolutions in order; each chunk is read once.
+
+        Raises:
+            InputError: As `scan`; or a revolution was recorded twice.
+        """
+        repeats = _Repeats()
+        for index, pose in enumerate(self.odom_T_sensor):
+            scan = self.scan(index)
+            assert self._chunk is not None
+            row = index % self._session.chunk_scans
+            stamp_ns = int(self._chunk.column_stamps_ns[row, 0])
+            where = f"{chunk_path(self._session.path, self._chunk_index)}: scan {index}"
+            repeats.require_new(where, f"scan {index}", self._chunk.range_mm[row], pose, stamp_ns)
+            yield scan
+
+
+class PlyScans:
+    """Scans in PLY files, each with one pose."""
+
+    def __init__(self, folder: Path, files: list[Path], odom_T_sensor: Float64Array, stamps_ns: Int64Array) -> None:
+        self._folder = folder
+        self._files = files
+        self._odom_T_sensor = odom_T_sensor
+        self._stamps_ns = stamps_ns
+
+    @property
+    def name(self) -> str:
+        """The folder."""
+        return str(self._folder)
+
+    @property
+    def odom_T_sensor(self) -> Float64Array:
+        """(S, 4, 4) pose of each scan."""
+        return self._odom_T_sensor
+
+    def scan(self, index: int) -> PosedScan:
+        """Read one file.
+
+        Raises:
+            InputError: It is not a PLY scan, is empty, or holds a point that is not finite.
+        """
+        path = self._files[index]
+        points = read_ply_points(path)
+        if len(points) == 0:
+            raise InputError(f"{path}: holds no point: remove the scan and its line of the trajectory")
+        is_finite = np.isfinite(points).all(axis=1)
+        if not is_finite.all():
+            raise InputError(
+                f"{path}: vertex {int(np.argmin(is_finite))} is not finite ({np.count_nonzero(~is_finite)} are not): "
+                "remove them from the file"
+            )
+        return PosedScan(
+            index=index,
+            points_sensor=points,
+            odom_T_sensor=self._odom_T_sensor[index],
+            stamps_ns=np.full(len(points), self._stamps_ns[index]),
+            pixels=np.arange(len(points), dtype=np.int32),
+        )
+
+    def scans(self) -> Iterator[PosedScan]:
+        """Read all scans in order.
+
+        Raises:
+            InputError: As `scan`; or two files hold the same scan.
+        """
+        repeats = _Repeats()
+        for index, file in enumerate(self._files):
+            scan = self.scan(index)
+            stamp_ns = int(self._stamps_ns[index])
+            repeats.require_new(str(file), file.name, scan.points_sensor, self._odom_T_sensor[index], stamp_ns)
+            yield scan
+
+
+class _Repeats:
+    """Finds scans that were recorded twice: the same returns to the last bit, which noise never gives twice."""
+
+    def __init__(self) -> None:
+        self._seen: dict[bytes, tuple[str, Float64Array, int]] = {}
+
+    def require_new(
+        self, where: str, name: str, content: npt.NDArray[Any], odom_T_sensor: Float64Array, stamp_ns: int
+    ) -> None:
+        """Remember a scan; raise `InputError` if it is there already, at another pose or at the same time."""
+        digest = hashlib.blake2b(np.ascontiguousarray(content).data, digest_size=16).digest()
+        if digest not in self._seen:
+            self._seen[digest] = name, odom_T_sensor, stamp_ns
+            return
+        other, pose, other_ns = self._seen[digest]
+        # a simulated sensor without noise that stands still sees the same again, wherever odometry believes it to be
+        if stamp_ns == other_ns or np.abs(pose - odom_T_sensor).max() > _STANDING:
+            raise InputError(
+                f"{where} repeats {other}: the same returns to the last bit, recorded twice: remove one and its pose"
+            )
+
+
+def _open_ply_scans(folder: Path) -> PlyScans:
+    files = sorted(folder.glob("*.ply"))
+    if not files:
+        raise InputError(
+            f"{folder}: no scans in it: expected session.json (a session of ours), or *.ply scans with a TUM trajectory"
+        )
+    by_number = sorted(
+        files, key=lambda file: [int(part) if part.isdigit() else part for part in _NUMBERS.split(file.name)]
+    )
+    if by_number != files:
+        raise InputError(
+            f"{folder}: the *.ply files are numbered without leading zeros, so that their names sort as "
+            f"{files[0].name}, {files[1].name}, ...: pad the numbers to equal length"
+        )
+    trajectories = sorted([*folder.glob("*.txt"), *folder.glob("*.tum")])
+    if len(trajectories) != 1:
+        found = ", ".join(file.name for file in trajectories) or "none"
+        raise InputError(f"{folder}: expected exactly one trajectory (*.txt or *.tum, lines {TUM_LINE}), found {found}")
+    rows, _ = read_tum(trajectories[0])
+    if len(rows) != len(files):
+        raise InputError(
+            f"{trajectories[0]}: {len(rows)} poses for {len(files)} *.ply scans: one line for each scan is "
+            "needed, in the order of the file names"
+        )
+    poses = [make_pose(Rotation.from_quat(row[4:]).as_matrix(), row[1:4]) for row in rows]
+    return PlyScans(folder, files, np.array(poses).reshape(-1, 4, 4), stamps_from_first_ns(rows))

@@ -1,0 +1,261 @@
+"""A recorded session on disk: a folder with one JSON file and chunked arrays, without any truth.
+
+    session.json        format, sensor metadata (Ouster keys), frames, units, provenance
+    odometry.npz        odom_T_sensor (S, 4, 4) float64: pose of each revolution at its middle column
+    chunks/00000.npz    range_mm (s, H, W) uint32 (0 = no return), reflectivity (s, H, W) uint8,
+                        signal (s, H, W) uint16 photons, column_stamps_ns (s, W) int64, column_poses (s, W, 7) float32
+
+`column_poses` hold `sensor_T_column`: translation (m) and quaternion (x, y, z, w) of each column in the frame of its
+revolution, as the session's own odometry saw it. A session is written under a temporary name and renamed when whole.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, require_poses, require_shape
+from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
+
+FORMAT = "tunnelcd-session"
+FORMAT_VERSION = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanChunk:
+    """A run of consecutive revolutions.
+
+    Attributes:
+        range_mm: (s, H, W) uint32 staggered ranges, millimetres, 0 where nothing returned.
+        reflectivity: (s, H, W) uint8, calibrated: percent of a perfect diffuse reflector up to 100.
+        signal: (s, H, W) uint16 photons counted in the return, as the sensor's signal channel; 0 where unknown.
+        column_stamps_ns: (s, W) int64 time of each column since the start of the session.
+        column_poses: (s, W, 7) float32 `sensor_T_column` as x, y, z, qx, qy, qz, qw.
+    """
+
+    range_mm: npt.NDArray[np.uint32]
+    reflectivity: npt.NDArray[np.uint8]
+    signal: npt.NDArray[np.uint16]
+    column_stamps_ns: Int64Array
+    column_poses: Float32Array
+
+    def __post_init__(self) -> None:
+        require_shape("range_mm", self.range_mm, (None, None, None))
+        scans, _, width = self.range_mm.shape
+        require_shape("reflectivity", self.reflectivity, self.range_mm.shape)
+        require_shape("signal", self.signal, self.range_mm.shape)
+        require_shape("column_stamps_ns", self.column_stamps_ns, (scans, width))
+        require_shape("column_poses", self.column_poses, (scans, width, 7))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Session:
+    """An opened session; the arrays of its chunks are read when asked for.
+
+    Attributes:
+        path: Its folder.
+        sensor: The sensor that made it.
+        odom_T_sensor: (S, 4, 4) float64 pose of each revolution at its middle column, in the session's own odom frame.
+        chunk_scans: Revolutions per chunk; the last chunk may hold fewer.
+        provenance: What made it, as written.
+    """
+
+    path: Path
+    sensor: SensorMetadata
+    odom_T_sensor: Float64Array
+    chunk_scans: int
+    provenance: dict[str, Any]
+
+    @property
+    def n_scans(self) -> int:
+        """Number of revolutions S."""
+        return len(self.odom_T_sensor)
+
+    @property
+    def n_chunks(self) -> int:
+        """Number of chunk files."""
+        return -(-self.n_scans // self.chunk_scans)
+
+    def chunk(self, index: int) -> ScanChunk:
+        """Read one chunk.
+
+        Raises:
+            InputError: The file is missing or does not hold what the format promises.
+        """
+        path = chunk_path(self.path, index)
+        n_scans = min(self.chunk_scans, self.n_scans - index * self.chunk_scans)
+        arrays = load_arrays(path)
+        try:
+            chunk = ScanChunk(**arrays)
+            require_shape("range_mm", chunk.range_mm, (n_scans, self.sensor.height, self.sensor.width))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{path}: not a chunk of this session: {error}") from error
+        return chunk
+
+    def chunks(self) -> Iterator[ScanChunk]:
+        """Read all chunks in order."""
+        return (self.chunk(index) for index in range(self.n_chunks))
+
+
+class SessionWriter:
+    """Writes a session chunk by chunk; the folder appears under its name only when `close` is reached.
+
+    Use as a context manager; an exception inside removes what was written.
+    """
+
+    def __init__(self, path: Path, sensor: SensorMetadata, chunk_scans: int, provenance: dict[str, Any]) -> None:
+        if path.exists():
+            raise InputError(f"{path} exists already: name a new folder or remove it")
+        self._path = path
+        self._partial = path.with_name(f".{path.name}.partial")
+        self._sensor = sensor
+        self._chunk_scans = chunk_scans
+        self._provenance = provenance
+        self._n_chunks = 0
+
+    def __enter__(self) -> SessionWriter:
+        shutil.rmtree(self._partial, ignore_errors=True)
+        with self._writing():
+            (self._partial / "chunks").mkdir(parents=True)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            shutil.rmtree(self._partial, ignore_errors=True)
+
+    @property
+    def folder(self) -> Path:
+        """The unfinished folder, for files that belong beside the session (its truth)."""
+        return self._partial
+
+    def add(self, chunk: ScanChunk) -> None:
+        """Append one chunk; every chunk but the last must hold `chunk_scans` revolutions.
+
+        Raises:
+            InputError: It cannot be written, for example because the disk is full; so do `close`.
+        """
+        arrays = {name: getattr(chunk, name) for name in ScanChunk.__dataclass_fields__}
+        with self._writing():
+            np.savez(chunk_path(self._partial, self._n_chunks), allow_pickle=False, **arrays)
+        self._n_chunks += 1
+
+    def close(self, odom_T_sensor: Float64Array) -> None:
+        """Write the poses and the description, and give the folder its name."""
+        require_poses("odom_T_sensor", odom_T_sensor)
+        if self._n_chunks != -(-len(odom_T_sensor) // self._chunk_scans):
+            raise ValueError(f"{self._n_chunks} chunks of {self._chunk_scans} do not hold {len(odom_T_sensor)} poses")
+        document = {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "n_scans": len(odom_T_sensor),
+            "chunk_scans": self._chunk_scans,
+            "units": {"range": "mm", "length": "m", "time": "ns", "angle": "rad"},
+            "frames": {"odom": "the session's own, x forward, z up", "sensor": "Ouster sensor frame"},
+            "sensor": self._sensor.to_json(),
+            "provenance": self._provenance,
+        }
+        with self._writing():
+            np.savez(self._partial / "odometry.npz", allow_pickle=False, odom_T_sensor=odom_T_sensor)
+            (self._partial / "session.json").write_text(json.dumps(document, indent=1))
+            self._partial.replace(self._path)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise InputError(f"{self._path}: cannot write there: {error.strerror}") from error
+
+
+def is_session(path: Path) -> bool:
+    """Tell whether a folder holds a session of this format."""
+    return (path / "session.json").is_file()
+
+
+def read_session(path: Path) -> Session:
+    """Open a session folder.
+
+    Raises:
+        InputError: The folder or a file is missing, of another format or version, or its poses are not finite.
+    """
+    if not path.is_dir():
+        raise InputError(f"{path}: no such session folder")
+    if not is_session(path):
+        raise InputError(f"{path}: no session.json in it: expected a session written by `tunnelcd simulate`")
+    try:
+        document = json.loads((path / "session.json").read_text())
+        if (document["format"], document["format_version"]) != (FORMAT, FORMAT_VERSION):
+            raise InputError(
+                f"{path / 'session.json'}: format {document['format']} {document['format_version']}: "
+                f"this version reads {FORMAT} {FORMAT_VERSION}"
+            )
+        n_scans, chunk_scans = int(document["n_scans"]), int(document["chunk_scans"])
+        sensor_document, provenance = document["sensor"], document["provenance"]
+        if chunk_scans < 1:
+            raise ValueError(f"chunk_scans = {chunk_scans}")
+        _check_provenance(provenance)
+    except OSError as error:
+        raise InputError(f"{path / 'session.json'}: cannot be read: {error.strerror}") from error
+    except KeyError as error:
+        said = f"{path / 'session.json'}: damaged: no {error} in it"
+        raise InputError(f"{said}: expected a session written by `tunnelcd simulate`, copy it again") from error
+    # ValueError: not JSON, not text, or not a number
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise InputError(f"{path / 'session.json'}: damaged: {error}") from error
+    poses = load_arrays(path / "odometry.npz").get("odom_T_sensor")
+    if poses is None or len(poses) != n_scans:
+        raise InputError(
+            f"{path / 'odometry.npz'}: {0 if poses is None else len(poses)} poses for {n_scans} scans: "
+            "one pose for each scan is needed"
+        )
+    if n_scans == 0:
+        raise InputError(f"{path}: the session holds no scan: record it, or convert the recording, again")
+    try:
+        require_poses("odom_T_sensor", poses)
+    except ValueError as error:
+        raise InputError(f"{path / 'odometry.npz'}: {error}: mend the pose, or leave the scan out") from error
+    sensor = parse_metadata(sensor_document, str(path / "session.json"))
+    return Session(path, sensor, poses, chunk_scans, provenance)
+
+
+def _check_provenance(provenance: Any) -> None:
+    """Raise `ValueError` unless it is a JSON object whose clock, where it names one, fits the stamps."""
+    if not isinstance(provenance, dict):
+        raise ValueError(f"provenance = {provenance!r:.40}, expected a JSON object")
+    start_ns = provenance.get("sensor_clock_start_ns", 0)
+    if type(start_ns) is not int or not 0 <= start_ns < 2**62:
+        raise ValueError(f"provenance.sensor_clock_start_ns = {start_ns!r:.40}, expected nanoseconds, 0 to 2^62")
+
+
+def chunk_path(folder: Path, index: int) -> Path:
+    """Return the file of one chunk."""
+    return folder / "chunks" / f"{index:05d}.npz"
+
+
+def load_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
+    """Read an npz file without unpickling anything.
+
+    Raises:
+        InputError: The file is missing, cut short or not an npz of plain arrays.
+    """
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: missing") from error
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path}: unreadable, the file is damaged or cut short ({error})") from error

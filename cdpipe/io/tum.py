@@ -1,0 +1,103 @@
+"""Trajectories as TUM files: one line `stamp tx ty tz qx qy qz qw` for each pose, `#` starts a comment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.core.motion import Motion, motion_of
+
+TUM_LINE = "stamp tx ty tz qx qy qz qw"
+_UNIT_TOLERANCE = 1e-3
+# Poses farther apart than this say nothing about the columns between them.
+_LONGEST_GAP_S = 1.0
+
+
+def read_tum(path: Path) -> tuple[Float64Array, tuple[int, ...]]:
+    """Return the rows (N, 8) of a TUM file, and the number of each one's line.
+
+    Raises:
+        InputError: The file cannot be read, or a line is not eight finite numbers with a unit quaternion.
+    """
+    rows, numbers = [], []
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text: {error}") from error
+    for number, line in enumerate(lines, start=1):
+        text = line.strip()
+        if not text or text.startswith("#"):
+            continue
+        try:
+            row = [float(word) for word in text.split()]
+        except ValueError:
+            row = []
+        if len(row) != 8:
+            raise InputError(f"{path}:{number}: expected eight numbers, {TUM_LINE}; got {text[:60]!r}")
+        rows.append(row)
+        numbers.append(number)
+    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
+    require_unit_poses(table[:, 1:], lambda index: f"{path}:{numbers[index]}")
+    if not np.isfinite(table[:, 0]).all():
+        raise InputError(f"{path}:{numbers[int(np.argmin(np.isfinite(table[:, 0])))]}: the stamp is not finite")
+    return table, tuple(numbers)
+
+
+def motion_along(path: Path, first_ns: int, last_ns: int, slack_s: float) -> Motion:
+    """Return the movement of a TUM file, its time counted from `first_ns`.
+
+    Args:
+        path: The file; stamps in seconds of the same clock as `first_ns`.
+        first_ns: Time of the first column that needs a pose.
+        last_ns: Time of the last one.
+        slack_s: How far the poses may end short of either; there the movement goes on as it was.
+
+    Raises:
+        InputError: The file is not a trajectory, its stamps do not rise, or leave part of the time without poses.
+    """
+    rows, numbers = read_tum(path)
+    if len(rows) < 2:
+        raise InputError(f"{path}: {len(rows)} poses: a trajectory needs two lines `{TUM_LINE}` or more")
+    steps_s = np.diff(rows[:, 0])
+    if (steps_s <= 0).any():
+        raise InputError(f"{path}:{numbers[int(np.argmax(steps_s <= 0)) + 1]}: the stamp does not come after the last")
+    time_s = rows[:, 0] - first_ns / 1e9
+    length_s = (last_ns - first_ns) / 1e9
+    if time_s[0] > slack_s or time_s[-1] < length_s - slack_s:
+        raise InputError(
+            f"{path}: covers {rows[0, 0]:.3f} to {rows[-1, 0]:.3f} s, the recording {first_ns / 1e9:.3f} to "
+            f"{last_ns / 1e9:.3f} s of the sensor's clock: the stamps must be of that clock and span the recording"
+        )
+    is_gap = (steps_s > _LONGEST_GAP_S) & (time_s[:-1] < length_s) & (time_s[1:] > 0)
+    if is_gap.any():
+        gap = int(np.argmax(is_gap))
+        raise InputError(
+            f"{path}:{numbers[gap + 1]}: no pose for {steps_s[gap]:.2f} s before it, in the middle of the recording: "
+            f"at most {_LONGEST_GAP_S:g} s can be bridged"
+        )
+    way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1))])
+    return motion_of(time_s, way_m, rows[:, 1:4], Rotation.from_quat(rows[:, 4:]))
+
+
+def stamps_from_first_ns(rows: Float64Array) -> Int64Array:
+    """Return the stamps (N,) of TUM rows since the first, nanoseconds."""
+    return np.round((rows[:, 0] - rows[:1, 0]) * 1e9).astype(np.int64)
+
+
+def require_unit_poses(poses: Float64Array, where: Callable[[int], str]) -> None:
+    """Raise `InputError` unless (N, 7) poses x, y, z, qx, qy, qz, qw are finite with unit quaternions."""
+    is_finite = np.isfinite(poses).all(axis=1)
+    if not is_finite.all():
+        raise InputError(f"{where(int(np.argmin(is_finite)))}: the pose is not finite: mend it or leave the scan out")
+    norms = np.linalg.norm(poses[:, 3:], axis=1)
+    is_unit = np.abs(norms - 1.0) < _UNIT_TOLERANCE
+    if not is_unit.all():
+        index = int(np.argmin(is_unit))
+        raise InputError(
+            f"{where(index)}: the quaternion's length is {norms[index]:.6g}, expected 1: the order is qx qy qz qw"
+        )

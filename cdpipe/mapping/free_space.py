@@ -1,0 +1,162 @@
+"""What a session saw through: a place is free where its rays went on behind it.
+
+What one session has and the other has not is a change only if the other one looked there. Each keyframe keeps one image
+of its scan, the range of the nearest return of every pixel; a point well before all returns of its pixel and of the
+four beside it was seen through, one at their range was hit, and one behind them was hidden (`free_space_votes`). A
+pixel is as high as what lies low: of that only the rays themselves tell, those that came back from the floor just
+behind it (`grazing_ray_count`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.voxel import cell_keys
+from cdpipe.model.types import Float16Array, KeyframeViews
+
+ROWS = 64
+COLUMNS = 512
+# Elevations beyond are not kept: enough for lenses of 90 degrees.
+_ELEVATION_RAD = np.deg2rad(45.6)
+# A return this much behind a point went past it, at any range; one this near to it may have come from it.
+_MARGIN_M = 0.2
+_NEAREST_M = 0.5
+# Farther off, pixels are wider than what is looked for.
+REACH_M = 15.0
+# Rays are followed from their end through cells of this size, from here to there: nearer ones touch what they hit, and
+# who passed farther above the floor was seen through by the views.
+_CELL_M = 0.1
+_PAST_M = (0.1, 1.0)
+
+
+def view(points_sensor: Float64Array) -> Float16Array:
+    """Return the (ROWS, COLUMNS) float16 range of the nearest return of each pixel, metres, 0 without.
+
+    Args:
+        points_sensor: (N, 3) returns of a scan, sensor frame, metres.
+    """
+    pixel, ranges_m = _pixels(points_sensor)
+    is_kept = pixel >= 0
+    image = np.full(ROWS * COLUMNS, np.inf, dtype=np.float32)
+    np.minimum.at(image, pixel[is_kept], ranges_m[is_kept].astype(np.float32))
+    image[np.isinf(image)] = 0.0
+    return image.reshape(ROWS, COLUMNS).astype(np.float16)
+
+
+def free_space_votes(points_odom: Float64Array, views: KeyframeViews) -> Int64Array:
+    """Return how many more keyframes saw through each of (N,) places than hit it.
+
+    It is 0 of what no keyframe looked at, or was hidden from all.
+
+    Args:
+        points_odom: (N, 3) points in the odom frame of the session that looked, metres.
+        views: What its keyframes saw.
+    """
+    n_through, n_hit = n_through_and_hit(points_odom, views)
+    return n_through - n_hit
+
+
+def n_through_and_hit(
+    points_odom: Float64Array, views: KeyframeViews, within_m: float = REACH_M
+) -> tuple[Int64Array, Int64Array]:
+    """Return how many keyframes saw through each of (N,) places, and how many hit it; as `free_space_votes` takes them.
+
+    Those farther from a place than `within_m` say nothing about it.
+    """
+    n_through, n_hit = np.zeros((2, len(points_odom)), dtype=np.int64)
+    if len(points_odom) == 0 or len(views.ranges_m) == 0:
+        return n_through, n_hit
+    centre = points_odom.mean(axis=0)
+    spread_m = float(np.linalg.norm(points_odom - centre, axis=1).max())
+    rotations, shifts = views.sensor_T_odom[:, :3, :3], views.sensor_T_odom[:, :3, 3]
+    distances_m = np.linalg.norm(rotations @ centre + shifts, axis=1)
+    for keyframe in np.flatnonzero(distances_m <= within_m + spread_m):
+        pixel, ranges_m = _pixels(points_odom @ rotations[keyframe].T + shifts[keyframe])
+        in_view = np.flatnonzero((pixel >= 0) & (ranges_m >= _NEAREST_M) & (ranges_m <= within_m))
+        first_m, is_hit = _looked_up(views.ranges_m[keyframe], pixel[in_view], ranges_m[in_view])
+        n_through[in_view] += np.isfinite(first_m) & (first_m > ranges_m[in_view] + _MARGIN_M)
+        n_hit[in_view] += is_hit
+    return n_through, n_hit
+
+
+def grazing_ray_count(points: Float64Array, ends: Float64Array, origins: Float64Array, scans: Int64Array) -> Int64Array:
+    """Return how many scans had a ray through the cell of each place just before it came back, less those that hit it.
+
+    Args:
+        points: (N, 3) places, at least one, metres.
+        ends: (M, 3) returns of the session that looked, those about the places, same frame.
+        origins: (M, 3) where its sensor was then.
+        scans: (M,) which scan each is of.
+    """
+    cells = _Cells(points)
+    is_near = cells.is_within(ends, _PAST_M[1])
+    ends, origins, scans = ends[is_near], origins[is_near], scans[is_near]
+    ranges_m = np.linalg.norm(origins - ends, axis=1)
+    back = (origins - ends) / np.maximum(ranges_m, _NEAREST_M)[:, None]
+    passed = [np.zeros(0, dtype=np.int64)]
+    for step_m in np.arange(_PAST_M[0], _PAST_M[1], _CELL_M / 2):
+        is_long = ranges_m > step_m + _NEAREST_M
+        passed.append(cells.met((ends + step_m * back)[is_long], scans[is_long]))
+    return cells.n_scans(np.concatenate(passed)) - cells.n_scans(cells.met(ends, scans))
+
+
+class _Cells:
+    """The cells that some places (N, 3) lie in, and which scans have been in them."""
+
+    def __init__(self, points: Float64Array) -> None:
+        self._low, self._high = points.min(axis=0) - _CELL_M, points.max(axis=0) + _CELL_M
+        self._keys, self._cell_of_point = np.unique(self._keys_of(points), return_inverse=True)
+
+    def is_within(self, points: Float64Array, margin_m: float) -> BoolArray:
+        """Mark the points in the box about all cells, or within a margin of it."""
+        is_within = np.ones(len(points), dtype=np.bool_)
+        for axis in range(3):  # `all(axis=1)` over rows of three takes longer than the comparisons
+            is_within &= points[:, axis] > self._low[axis] - margin_m
+            is_within &= points[:, axis] < self._high[axis] + margin_m
+        return is_within
+
+    def met(self, points: Float64Array, scans: Int64Array) -> Int64Array:
+        """Return a key of cell and scan for each point in one of the cells."""
+        is_near = self.is_within(points, 0.0)
+        keys = self._keys_of(points[is_near])
+        cells = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        is_met = self._keys[cells] == keys
+        return np.asarray(scans[is_near][is_met] * len(self._keys) + cells[is_met], dtype=np.int64)
+
+    def n_scans(self, keys: Int64Array) -> Int64Array:
+        """Return how many scans have a key in the cell of each place."""
+        n_cells = len(self._keys)
+        found = np.bincount(np.unique(keys) % n_cells, minlength=n_cells)
+        return np.asarray(found[self._cell_of_point], dtype=np.int64)
+
+    def _keys_of(self, points: Float64Array) -> Int64Array:
+        return cell_keys(points - self._low, _CELL_M)
+
+
+def _looked_up(image: Float16Array, pixel: Int64Array, ranges_m: Float64Array) -> tuple[Float64Array, BoolArray]:
+    """Return the shortest range of the cross about each pixel, infinite without, and whether any is the point's own."""
+    column, row_start = pixel % COLUMNS, pixel - pixel % COLUMNS
+    cross = (
+        pixel,
+        np.where(pixel >= COLUMNS, pixel - COLUMNS, pixel),
+        np.where(pixel < (ROWS - 1) * COLUMNS, pixel + COLUMNS, pixel),
+        row_start + (column + 1) % COLUMNS,
+        row_start + (column - 1) % COLUMNS,
+    )
+    seen_m = image.ravel().take(np.concatenate(cross)).astype(np.float64)
+    seen_m = seen_m.reshape(len(cross), -1)
+    is_hit = np.asarray(np.any(np.abs(seen_m - ranges_m) <= _MARGIN_M, axis=0))
+    seen_m[seen_m == 0] = np.inf
+    return seen_m.min(axis=0), is_hit
+
+
+def _pixels(points_sensor: Float64Array) -> tuple[Int64Array, Float64Array]:
+    """Return the (N,) pixel of each point, -1 for those above or below the image, and its range."""
+    x, y, z = points_sensor.T
+    ranges_m = np.sqrt(x * x + y * y + z * z)
+    elevation = np.arctan2(z, np.hypot(x, y))
+    rows = np.floor((_ELEVATION_RAD - elevation) / (2 * _ELEVATION_RAD) * ROWS).astype(np.int64)
+    columns = np.floor(np.arctan2(y, x) / (2 * np.pi) * COLUMNS).astype(np.int64) % COLUMNS
+    is_inside = (rows >= 0) & (rows < ROWS) & (ranges_m > 0)
+    return np.where(is_inside, rows * COLUMNS + columns, -1), ranges_m

@@ -1,0 +1,172 @@
+"""What can be wrong with a whole session: no path, a unit that is not the metre, an axis up that is not z.
+
+Five scans are looked at before any time is spent. What is impossible in metres in any tunnel is refused here. Feet are
+not impossible; where two sessions then cannot be merged, `unit_hint` says that one looks as if it were in feet.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, Int64Array, require_poses, travelled_m
+from cdpipe.mapping.mapping import keyframes
+from cdpipe.model.config import MapConfig
+from cdpipe.model.types import PointMap, ScanSource
+
+UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "kilometres": 1000.0}
+_SAMPLED_SCANS = 5
+# The median return of a scan: sensors see nothing nearer, and half of the returns of a tunnel are never farther.
+_NEAREST_M, _FARTHEST_M = 0.25, 60.0
+_USUAL_M = (0.5, 20.0)
+# Steps between neighbouring scans.
+_USUAL_STEP_M = (0.005, 2.0)
+# Mean squares of the directions of a spinning sensor's returns: small along its axis, large across.
+_FLAT, _ROUND = 0.12, 0.25
+_MIN_RETURNS = 100
+_MAX_TILT_DEG = 45.0
+# Median returns of two sessions of one tunnel, one over the other at most.
+_SAME_TUNNEL = 1.4
+# How near a ratio of lengths is to that of two units.
+_SAME_SIZE = 1.2
+
+
+def check_session(source: ScanSource, config: MapConfig, other: ScanSource | None = None) -> None:
+    """Refuse a session that the pipeline cannot use as it is.
+
+    Args:
+        source: The session; five of its scans are read.
+        config: Path between keyframes.
+        other: A session of the same tunnel: beside it the unit of this one is easier to tell.
+
+    Raises:
+        InputError: Poses are not finite; there is one scan, or no path; points or trajectory are not in metres; z is
+            not up. The text says how to mend it.
+    """
+    poses = source.odom_T_sensor
+    try:
+        require_poses("the pose of scan", poses)
+    except ValueError as error:
+        raise InputError(f"{source.name}: {error}: mend it, or leave the scan out") from error
+    if len(poses) < 2:
+        raise InputError(
+            f"{source.name}: {len(poses)} scan: expected a drive, at least two scans along a path: what one scan sees "
+            "cannot be told from a place that looks alike (cdpipe.merge.merge.register aligns two single clouds)"
+        )
+    points = _sampled_points(source)
+    if len(points) == 0:
+        raise InputError(f"{source.name}: none of the scans that were looked at holds a return")
+    ranges_m = np.linalg.norm(points, axis=1)
+    _require_metres(source, ranges_m, other)
+    _require_path(source, config.keyframe_spacing_m)
+    _require_up(source, points[ranges_m > 0] / ranges_m[ranges_m > 0, None], config.keyframe_spacing_m)
+
+
+def is_same_session(before: ScanSource, after: ScanSource) -> bool:
+    """Tell whether both are one recording, perhaps copied: the same poses and the same first scan."""
+    return np.array_equal(before.odom_T_sensor, after.odom_T_sensor) and np.array_equal(
+        before.scan(0).points_sensor, after.scan(0).points_sensor
+    )
+
+
+def unit_hint(before: PointMap, after: PointMap) -> str:
+    """Return what to try where one tunnel is as much larger than the other as a foot is smaller than a metre, or ""."""
+    before_m, after_m = _median_return_m(before), _median_return_m(after)
+    for name, small_m, large_m in (("after", before_m, after_m), ("before", after_m, before_m)):
+        for unit, factor in UNITS.items():
+            if small_m > 0 and factor < 1 and 1 / _SAME_SIZE < factor * large_m / small_m < _SAME_SIZE:
+                return (
+                    f"the {name} session's returns lie {large_m / small_m:.1f} times as far as the other's: if it is "
+                    f"in {unit}, scale its points and its trajectory by {factor:g}"
+                )
+    return ""
+
+
+def _sampled(n_scans: int) -> list[int]:
+    chosen = np.linspace(0, n_scans - 1, min(n_scans, _SAMPLED_SCANS)).round().astype(np.int64)
+    return [int(index) for index in chosen]
+
+
+def _sampled_points(source: ScanSource) -> Float64Array:
+    return np.concatenate([source.scan(index).points_sensor for index in _sampled(len(source.odom_T_sensor))])
+
+
+def _require_metres(source: ScanSource, ranges_m: Float64Array, other: ScanSource | None) -> None:
+    median_m = float(np.median(ranges_m))
+    if not _NEAREST_M <= median_m <= _FARTHEST_M:
+        usual_m = _USUAL_M
+        if other is not None:
+            other_m = float(np.median(np.linalg.norm(_sampled_points(other), axis=1)))
+            if _NEAREST_M <= other_m <= _FARTHEST_M:
+                usual_m = other_m / _SAME_TUNNEL, other_m * _SAME_TUNNEL
+        side = "beyond" if median_m > _FARTHEST_M else "within"
+        raise InputError(
+            f"{source.name}: half of the returns lie {side} {median_m:.4g} m: expected metres; "
+            f"{_likely('the points', median_m, usual_m)}, and the trajectory too where it is in the same unit"
+        )
+    positions = source.odom_T_sensor[:, :3, 3]
+    step_m = float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
+    reach_m = float(np.quantile(ranges_m, 0.95))
+    if step_m > reach_m:
+        raise InputError(
+            f"{source.name}: neighbouring scans lie {step_m:.4g} m apart and see {reach_m:.3g} m far: expected a "
+            f"trajectory in metres; {_likely('the trajectory', step_m, _USUAL_STEP_M)}"
+        )
+
+
+def _require_path(source: ScanSource, spacing_m: float) -> None:
+    poses = source.odom_T_sensor
+    if len(keyframes(poses, spacing_m)) < 2:
+        way_m = float(travelled_m(poses)[-1])
+        raise InputError(
+            f"{source.name}: its {len(poses)} scans lie along {way_m:.3g} m: expected a path of at least "
+            f"map.keyframe_spacing_m = {spacing_m:g} m: drive farther"
+            + ("; if the trajectory is in kilometres, scale it by 1000" if way_m > 0 else "")
+        )
+
+
+def _likely(what: str, length: float, usual_m: tuple[float, float]) -> str:
+    """Say which units would make a length a usual one, and what to scale by."""
+    units = [unit for unit, factor in UNITS.items() if usual_m[0] <= factor * length <= usual_m[1]]
+    verb = "look" if what.endswith("s") else "looks"
+    if not units:
+        return f"find out the unit of {what} and scale to metres"
+    named = " or ".join(units)
+    factors = " or ".join(f"{UNITS[unit]:g}" for unit in units)
+    return f"{what} {verb} like {named}: scale by {factors}"
+
+
+def _require_up(source: ScanSource, directions: Float64Array, spacing_m: float) -> None:
+    poses = source.odom_T_sensor
+    spread, axes = np.linalg.eigh(directions.T @ directions / max(1, len(directions)))
+    if len(directions) >= _MIN_RETURNS and spread[0] < _FLAT and spread[1] > _ROUND:
+        axis = axes[:, 0]
+        tilts_deg = np.degrees(np.arccos(np.clip(np.abs(poses[:, 2, :3] @ axis), 0.0, 1.0)))
+        for frame, tilt_deg in (
+            ("the sensor's frame", float(np.degrees(np.arccos(min(1.0, abs(axis[2])))))),
+            ("the trajectory's frame", float(np.median(tilts_deg))),
+        ):
+            if tilt_deg > _MAX_TILT_DEG:
+                raise InputError(
+                    f"{source.name}: the sensor spins about an axis {tilt_deg:.0f} degrees off z of {frame}: expected "
+                    "x forward and z up (a camera's frame has z forward): turn the points and the poses"
+                )
+    positions = poses[keyframes(poses, spacing_m), :3, 3]
+    steps = np.diff(positions, axis=0)
+    slope_deg = float(np.degrees(np.arctan2(np.abs(steps[:, 2]).sum(), np.linalg.norm(steps[:, :2], axis=1).sum())))
+    if slope_deg > _MAX_TILT_DEG:
+        raise InputError(
+            f"{source.name}: the path climbs or falls by {slope_deg:.0f} degrees: expected a trajectory with z up (a "
+            "camera's frame has z forward): turn the poses; shafts are beyond this pipeline"
+        )
+
+
+def _median_return_m(point_map: PointMap) -> float:
+    """Return the median distance of mapped returns from where they were seen, over some scans."""
+    found = [np.zeros(0)]
+    for scan in _sampled(len(point_map.odom_T_sensor)):
+        returns: Int64Array = np.arange(point_map.scan_offsets[scan], point_map.scan_offsets[scan + 1])
+        offsets = point_map.points[point_map.return_points[returns]] - point_map.odom_T_sensor[scan, :3, 3]
+        found.append(np.linalg.norm(offsets, axis=1))
+    ranges_m = np.concatenate(found)
+    return float(np.median(ranges_m)) if len(ranges_m) else 0.0

@@ -1,0 +1,5 @@
+from .merge import merge_maps
+
+__all__ = [
+    "merge_maps",
+]

@@ -1,0 +1,205 @@
+"""Which places of two sessions may be the same: FRAME's closest descriptor pairs, and how many others agree with each.
+
+FRAME (arXiv 2301.09213) takes the closest pair of all. In a mine of equal drifts that one is often wrong, and so are
+most pairs; but right ones agree with one another, because the motion between the sessions is one and the same. So every
+pair votes for every other: they must be as far apart in one session as in the other, in the direction that the yaw of
+the pair says, and have about the same yaw.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, yaw_pose
+from cdpipe.descriptors.yaw import relative_yaws_rad
+from cdpipe.merge.registration import motion_between
+from cdpipe.model.config import MergeConfig
+from cdpipe.model.types import DescriptorSet, MappedSession, PointMap
+
+# After keyframes that are paired at most, before keyframes and yaws for each. Every pair is held against every other.
+_MAX_QUERIES = 100
+_NEAREST = 2
+_N_YAWS = 2
+# Without orientation vectors: GICP recovers from about 60 degrees, so quarter turns cover the circle.
+_BLIND_YAWS_RAD = np.array([0.0, np.pi, np.pi / 2, -np.pi / 2])
+# Keyframes of one place may be a metre or two apart; drift adds with the distance.
+_APART_M = 2.0
+_APART_SHARE = 0.02
+_YAW_RAD = np.deg2rad(20.0)
+# Motions nearer than this end in the same registration.
+_SAME_M = 3.0
+# Votes count less from farther away, where drift has bent the way between.
+_VOTE_REACH_M = 40.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A before and an after keyframe that may be the same place.
+
+    Attributes:
+        before_keyframe: Index of the before keyframe.
+        after_keyframe: Index of the after keyframe.
+        descriptor_distance: Between their place vectors.
+        before_T_after: (4, 4) where the after odom frame lies if they are.
+    """
+
+    before_keyframe: int
+    after_keyframe: int
+    descriptor_distance: float
+    before_T_after: Float64Array
+
+
+def closest_pair(before: MappedSession, after: MappedSession) -> list[Candidate]:
+    """Return the closest of all descriptor pairs, FRAME's only candidate; empty where a session has no descriptor."""
+    pairs = _pairs(before.descriptors, after.descriptors, len(after.descriptors.q), nearest=1, n_yaws=1)
+    if len(pairs.i) == 0:
+        return []
+    best = int(np.argmin(pairs.distances))
+    before_poses, after_poses = _poses(before), _poses(after)
+    i, j = int(pairs.i[best]), int(pairs.j[best])
+    guess = before_poses[i] @ yaw_pose(float(pairs.yaws_rad[best])) @ invert(after_poses[j])
+    return [Candidate(i, j, float(pairs.distances[best]), guess)]
+
+
+def voted_candidates(before: MappedSession, after: MappedSession, config: MergeConfig) -> list[Candidate]:
+    """Return up to `n_candidates` pairs, the one with most votes first; each stands for another motion.
+
+    The guess of each is the motion that fits the pairs that agree with it. A pair that agrees with a chosen one, or
+    whose motion is the same, would repeat its trial and is left out.
+    """
+    pairs = _pairs(before.descriptors, after.descriptors, _MAX_QUERIES, _NEAREST, _N_YAWS)
+    before_poses, after_poses = _poses(before)[pairs.i], _poses(after)[pairs.j]
+    agrees, votes = pair_votes(before_poses, after_poses, pairs.yaws_rad)
+    is_open = np.ones(len(pairs.i), dtype=np.bool_)
+    chosen: list[Candidate] = []
+    for pair in np.lexsort((pairs.distances, -votes)).tolist():
+        if not is_open[pair]:
+            continue
+        is_open &= ~agrees[pair]
+        guess = _common_motion(before_poses, after_poses, pairs.yaws_rad, agrees[pair], pair)
+        if any(_is_same(guess, other.before_T_after, after_poses[pair, :3, 3]) for other in chosen):
+            continue
+        chosen.append(Candidate(int(pairs.i[pair]), int(pairs.j[pair]), float(pairs.distances[pair]), guess))
+        if len(chosen) == config.n_candidates:
+            break
+    return chosen
+
+
+def pair_votes(
+    before_poses: Float64Array, after_poses: Float64Array, yaws_rad: Float64Array
+) -> tuple[BoolArray, Float64Array]:
+    """Return which of P pairs agree, (P, P), and the votes each gets, (P,); every pair agrees with itself.
+
+    Args:
+        before_poses: (P, 4, 4) before keyframe of each pair, its session's odom frame.
+        after_poses: (P, 4, 4) after keyframe of each pair, likewise.
+        yaws_rad: (P,) yaw of the after keyframe in the before keyframe, about the sensor's own axis.
+    """
+    turns_rad = _turns_rad(before_poses, after_poses, yaws_rad)
+    before_xy, after_xy = before_poses[:, :2, 3], after_poses[:, :2, 3]
+    before_m, after_m = cdist(before_xy, before_xy), cdist(after_xy, after_xy)
+    cosines, sines = np.cos(turns_rad), np.sin(turns_rad)
+    # the angle between two turns, by its cosine
+    directions = np.column_stack([cosines, sines])
+    is_same_turn = directions @ directions.T > np.cos(_YAW_RAD)
+    # few turn alike and are as far apart in both sessions; only those are looked at further
+    before_m -= after_m
+    is_as_far = np.abs(before_m, out=before_m) < _APART_M + _APART_SHARE * after_m
+    one, other = np.divmod(np.flatnonzero(is_same_turn & is_as_far), len(turns_rad))
+    apart_m = after_m[one, other]
+    before_x, before_y = (before_xy[other] - before_xy[one]).T
+    after_x, after_y = (after_xy[other] - after_xy[one]).T
+    # where the after shift leads if it is turned as the pair says
+    miss_x = before_x - (cosines[one] * after_x - sines[one] * after_y)
+    miss_y = before_y - (sines[one] * after_x + cosines[one] * after_y)
+    tolerance_m = _APART_M + (_APART_SHARE + np.sin(_YAW_RAD)) * apart_m
+    is_agreed = miss_x**2 + miss_y**2 < tolerance_m**2
+    one, other, apart_m = one[is_agreed], other[is_agreed], apart_m[is_agreed]
+    agrees = np.zeros((len(yaws_rad),) * 2, dtype=np.bool_)
+    agrees[one, other] = True
+    votes: Float64Array = np.bincount(one, np.exp(-apart_m / _VOTE_REACH_M), len(yaws_rad)).astype(np.float64)
+    return agrees, votes
+
+
+def _is_same(one: Float64Array, other: Float64Array, position: Float64Array) -> bool:
+    apart_m, apart_rad = motion_between(one, other, position)
+    return apart_m < _SAME_M and apart_rad < _YAW_RAD
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pairs:
+    """P pairs: before keyframes i, after keyframes j, distances of their q, yaws of j in i."""
+
+    i: Int64Array
+    j: Int64Array
+    distances: Float64Array
+    yaws_rad: Float64Array
+
+
+def _pairs(before: DescriptorSet, after: DescriptorSet, n_queries: int, nearest: int, n_yaws: int) -> _Pairs:
+    n_before, n_after = len(before.q), len(after.q)
+    if n_before == 0 or n_after == 0:
+        return _Pairs(*(np.zeros(0, dtype=np.int64),) * 2, *(np.zeros(0),) * 2)
+    queried = np.unique(np.linspace(0, n_after - 1, min(n_after, n_queries)).round().astype(np.int64))
+    ranks = [*range(1, min(nearest, n_before) + 1)]
+    found = cKDTree(before.q).query(after.q[queried], k=ranks)
+    distances, i = np.asarray(found[0]).ravel(), np.asarray(found[1], dtype=np.int64).ravel()
+    j = np.repeat(queried, len(ranks))
+    if before.w is None or after.w is None:
+        yaws_rad = np.repeat(_BLIND_YAWS_RAD[None], len(i), axis=0)
+    else:
+        yaws_rad = relative_yaws_rad(before.w[i], after.w[j], n_yaws)
+        is_blind = np.isnan(yaws_rad).all(axis=1)
+        if is_blind.all():  # vectors without a peak say nothing
+            yaws_rad = np.repeat(_BLIND_YAWS_RAD[None], len(i), axis=0)
+    which = np.repeat(np.arange(len(i)), yaws_rad.shape[1])
+    is_there = ~np.isnan(yaws_rad.ravel())
+    which = which[is_there]
+    return _Pairs(i[which], j[which], distances[which], yaws_rad.ravel()[is_there])
+
+
+def _common_motion(
+    before_poses: Float64Array, after_poses: Float64Array, yaws_rad: Float64Array, agrees: BoolArray, pair: int
+) -> Float64Array:
+    """Return before_T_after that fits a pair and those that agree with it, the near ones most: a turn about z, a shift.
+
+    The turn is the mean of what the yaws say and of what the directions between the places say.
+    """
+    before_xyz, after_xyz = before_poses[agrees, :3, 3], after_poses[agrees, :3, 3]
+    weights = np.exp(-np.linalg.norm(after_xyz - after_poses[pair, :3, 3], axis=1) / _VOTE_REACH_M)
+    weights /= weights.sum()
+    before_centre, after_centre = weights @ before_xyz, weights @ after_xyz
+    before_shift, after_shift = before_xyz - before_centre, after_xyz - after_centre
+    directions = (after_shift[:, 0] - 1j * after_shift[:, 1]) * (before_shift[:, 0] + 1j * before_shift[:, 1])
+    turns_rad = _turns_rad(before_poses[agrees], after_poses[agrees], yaws_rad[agrees])
+    # a place is known to 1 m or so, a yaw to 5 degrees
+    evidence = weights @ directions / 1.0**2 + weights @ np.exp(1j * turns_rad) / np.deg2rad(5.0) ** 2
+    turn = yaw_pose(float(np.angle(evidence)))
+    turn[:3, 3] = before_centre - turn[:3, :3] @ after_centre
+    return turn
+
+
+def _poses(session: MappedSession) -> Float64Array:
+    return keyframe_poses(session.map, session.descriptors)
+
+
+def keyframe_poses(point_map: PointMap, descriptors: DescriptorSet) -> Float64Array:
+    """Return the (K, 4, 4) `odom_T_sensor` of the keyframes that were described."""
+    return point_map.odom_T_sensor[descriptors.keyframe_scans]
+
+
+def _turns_rad(before_poses: Float64Array, after_poses: Float64Array, yaws_rad: Float64Array) -> Float64Array:
+    """Return (P,) by how much the after odom frame is turned about z in the before odom frame, as each pair says.
+
+    Not yaw plus headings: a sensor that hangs upside down sees yaw with the other sign.
+    """
+    cosines, sines = np.cos(yaws_rad), np.sin(yaws_rad)
+    x, y, z = np.moveaxis(before_poses[:, :3, :3], 2, 0)
+    yawed = np.stack([cosines[:, None] * x + sines[:, None] * y, cosines[:, None] * y - sines[:, None] * x, z], axis=2)
+    turns = yawed @ after_poses[:, :3, :3].transpose(0, 2, 1)
+    # the turn about z that is nearest to the whole
+    return np.asarray(np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1]))

@@ -1,0 +1,132 @@
+"""What speaks for an alignment of two maps, and which of it must be how good.
+
+Points of one map are held against the *surface* of the other: the distance along the normal of the nearest point. In a
+straight drift the nearest point is near wherever one stands; the surface, rough by decimetres, is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cdpipe.core.geometry import Float64Array, invert, transform
+from cdpipe.merge.registration import IndexedMap, plane_jacobian
+from cdpipe.model.config import MergeConfig
+
+# What is measured, and the setting of `merge` that it must reach.
+GATES = (
+    ("overlap", "min_overlap"),
+    ("inlier_share", "min_inlier_share"),
+    ("hessian_ratio", "min_hessian_ratio"),
+    ("agreement", "min_agreement"),
+    ("distinctness", "min_distinctness"),
+)
+# Points of a sphere that are looked at, and how near a counterpart must be for its normal to mean anything.
+_SAMPLES = 300
+_COUNTERPART_M = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceFit:
+    """How two maps fit around one place.
+
+    Attributes:
+        forward_m: (N,) distances of some after points to the before surface, inf where there is none within 0.5 m.
+        backward_m: (M,) the same of before points to the after surface.
+        information: (6, 6) Hessian of the forward distances: turn, then shift, in after odom axes about the place.
+            Where all normals are square to one direction its shift is not held: the maps can slide.
+    """
+
+    forward_m: Float64Array
+    backward_m: Float64Array
+    information: Float64Array
+
+    def inlier_share(self, inlier_m: float) -> float:
+        """Return the share of points nearer than `inlier_m` to the other surface, the lower of both directions."""
+        return min(float(np.mean(d < inlier_m)) if len(d) else 0.0 for d in (self.forward_m, self.backward_m))
+
+    @property
+    def residual_m(self) -> float:
+        """Median distance, both directions together; NaN where there is none."""
+        median_m = float(np.median(np.concatenate([self.forward_m, self.backward_m])))
+        return median_m if np.isfinite(median_m) else float("nan")
+
+
+def surface_fit(
+    before: IndexedMap,
+    after: IndexedMap,
+    before_T_after: Float64Array,
+    own: Float64Array,
+    centre_after: Float64Array,
+    radius_m: float,
+) -> SurfaceFit:
+    """Hold some points of each map around a place against the surface of the other.
+
+    Normals are the before map's both ways: the robot that mapped first had the time.
+
+    Args:
+        before: The before map, a target.
+        after: The after map.
+        before_T_after: (4, 4) the alignment that is judged.
+        own: (N, 3) `sampled` after points of the place, after odom frame.
+        centre_after: (3,) the place, after odom frame.
+        radius_m: How far around it the before points are taken.
+    """
+    fine = before.target
+    moved = transform(before_T_after, own)
+    found, squared_m2 = fine.tree.batch_nearest_neighbor_search(moved)
+    normals = fine.normals[found]
+    forward_m = _plane_distances(moved, fine.points[found], normals, np.asarray(squared_m2))
+    is_seen = np.isfinite(forward_m)
+    jacobian = plane_jacobian(own[is_seen] - centre_after, normals[is_seen] @ before_T_after[:3, :3])
+    information = jacobian.T @ jacobian
+
+    centre_before = transform(before_T_after, centre_after[None])[0]
+    chosen = sampled(before.columns.crop(centre_before, radius_m))
+    theirs = transform(invert(before_T_after), before.points[chosen])
+    found, squared_m2 = after.tree.batch_nearest_neighbor_search(theirs)
+    turned = fine.normals[chosen] @ before_T_after[:3, :3]
+    backward_m = _plane_distances(theirs, after.points[found], turned, np.asarray(squared_m2))
+    return SurfaceFit(forward_m, backward_m, information)
+
+
+def sampled(of_map: npt.NDArray[Any], n: int = _SAMPLES) -> npt.NDArray[Any]:
+    """Return about n of some points of a map; they are ordered by place, so that every k-th covers it evenly."""
+    return of_map[:: max(1, len(of_map) // n)]
+
+
+def why_refused(evidence: Mapping[str, float], config: MergeConfig) -> str:
+    """Return in plain words which acceptance test fails and what would help, or ""."""
+    for name, setting in GATES:
+        value, least = evidence.get(name, np.nan), getattr(config, setting)
+        # written so that NaN, what could not be measured, is refused as well
+        if not value >= least:
+            is_share = name not in ("hessian_ratio", "distinctness")
+            said, asked = (f"{value:.0%}", f"{least:.0%}") if is_share else (f"{value:.4g}", f"{least:g}")
+            return f"{_REASONS[name].format(value=said)}; merge.{setting} asks for {asked}"
+    return ""
+
+
+def _plane_distances(
+    points: Float64Array, nearest: Float64Array, normals: Float64Array, squared_m2: Float64Array
+) -> Float64Array:
+    distances = np.abs(np.einsum("ij,ij->i", points - nearest, normals))
+    return np.where(squared_m2 < _COUNTERPART_M**2, distances, np.inf)
+
+
+_REASONS = {
+    "overlap": "the paths meet along only {value} of the shorter one: the sessions may not overlap, or more of the way "
+    "must be driven twice",
+    "inlier_share": "only {value} of the points around the best pair of places fit the other map: the sessions may "
+    "not overlap, or the tunnel has changed too much there",
+    "hessian_ratio": "the alignment can slide (degenerate): its Hessian's eigenvalue ratio is {value}, the tunnel is "
+    "too smooth and straight to tell where along it the robot was; drive on to a bend, a branch or a niche",
+    "agreement": "the best pair of places fits, but along both paths only {value} of the points do: two places that "
+    "look alike, or odometry that drifts by more than a few percent",
+    "distinctness": "another alignment fits nearly as well (its residual is {value} times this one's): the tunnel "
+    "repeats itself; drive on to where it does not",
+}

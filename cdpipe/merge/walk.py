@@ -1,0 +1,205 @@
+"""Following an alignment along the after session's path: whether it goes on to fit, and how it bends.
+
+From the place where it was found, sphere after sphere is registered, each from where its neighbour ended, outwards in
+both directions. So the alignment follows maps that bend apart by metres, each sphere is independent evidence, and a
+wrong alignment is found out where the two tunnels differ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, make_pose, transform
+from cdpipe.merge.evidence import SurfaceFit, sampled, surface_fit
+from cdpipe.merge.registration import MIN_SPHERE_POINTS, IndexedMap, align_by_gicp, align_to_planes, motion_between
+from cdpipe.model.config import MergeConfig
+
+# Places farther from the before path were not driven twice.
+SHARED_M = 5.0
+# A registration that moves a place farther than this against its neighbour is wrong, not drift.
+_JUMP_M, _JUMP_SHARE = 1.0, 0.03
+_JUMP_RAD, _JUMP_RAD_PER_M = np.deg2rad(2.0), np.deg2rad(0.03)
+# Below this the way is lost; it is looked for again in steps of half the length, down to so many keyframes.
+_LOST_FIT = 0.7
+_SHORTEST_STEP = 3
+# A first try that fits as well as this needs no second.
+_CLEAR_FIT = 0.9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """How a place is registered while walking.
+
+    Attributes:
+        radius_m: Sphere around it.
+        gicp_voxel_m: Thinning of the sphere for GICP.
+        correspondence_m: Longest correspondence of GICP.
+        first_try_m: Longest correspondence of a registration point to plane that is tried first, and taken where it
+            fits; None: GICP at once.
+    """
+
+    radius_m: float
+    gicp_voxel_m: float
+    correspondence_m: float
+    first_try_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Walk:
+    """What was found at A after keyframes, in the order of the path.
+
+    Attributes:
+        keyframes: (A,) after keyframes: those asked for, and others where the way from one to the next was lost.
+        before_T_after: (A, 4, 4) alignment at each; carried over from its neighbour where nothing was registered.
+        information: (A, 6, 6) Hessian of each, turn then shift in after odom axes; zero where there is none.
+        fits: (A,) share of inliers, 0 where it did not fit or jumped, NaN where the before session never drove.
+        residuals_m: (A,) median distance to the surface, NaN where nothing was registered.
+    """
+
+    keyframes: Int64Array
+    before_T_after: Float64Array
+    information: Float64Array
+    fits: Float64Array
+    residuals_m: Float64Array
+
+
+def walk(
+    before: IndexedMap,
+    after: IndexedMap,
+    keyframes: Int64Array,
+    start: int,
+    before_T_after: Float64Array,
+    step: Step,
+    config: MergeConfig,
+) -> Walk:
+    """Register spheres around some after keyframes, from one of them outwards.
+
+    Args:
+        before: The before map, a target.
+        after: The after map.
+        keyframes: (A,) after keyframes, rising.
+        start: Position in `keyframes` of the one where `before_T_after` was found.
+        before_T_after: (4, 4) what was found there.
+        step: How a place is registered.
+        config: `inlier_m`.
+    """
+    first = _Stop(int(keyframes[start]), before_T_after)
+    first = _stop(before, after, first, first.keyframe, step, config)
+    stops = [first]
+    for way in (keyframes[start + 1 :], keyframes[:start][::-1]):
+        previous = first
+        for keyframe in way.tolist():
+            reached = _reached(before, after, previous, keyframe, step, config)
+            stops += reached
+            previous = reached[-1]
+    stops.sort(key=lambda stop: stop.keyframe)
+    return Walk(
+        keyframes=np.array([stop.keyframe for stop in stops], dtype=np.int64),
+        before_T_after=np.array([stop.before_T_after for stop in stops]),
+        information=np.array([stop.information for stop in stops]),
+        fits=np.array([stop.fit for stop in stops]),
+        residuals_m=np.array([stop.residual_m for stop in stops]),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stop:
+    """What was found at one after keyframe; see `Walk`."""
+
+    keyframe: int
+    before_T_after: Float64Array
+    information: Float64Array = field(default_factory=lambda: np.zeros((6, 6)))
+    fit: float = np.nan
+    residual_m: float = np.nan
+
+
+def _reached(
+    before: IndexedMap, after: IndexedMap, previous: _Stop, keyframe: int, step: Step, config: MergeConfig
+) -> list[_Stop]:
+    """Go from a stop to a keyframe; if the way is lost, in two halves, as long as there was a way."""
+    stop = _stop(before, after, previous, keyframe, step, config)
+    middle = (previous.keyframe + keyframe) // 2
+    is_short = abs(keyframe - previous.keyframe) <= _SHORTEST_STEP
+    if not stop.fit < _LOST_FIT or not previous.fit >= _CLEAR_FIT or is_short:
+        return [stop]
+    halfway = _reached(before, after, previous, middle, step, config)
+    return [*halfway, *_reached(before, after, halfway[-1], keyframe, step, config)]
+
+
+def _stop(
+    before: IndexedMap, after: IndexedMap, previous: _Stop, keyframe: int, step: Step, config: MergeConfig
+) -> _Stop:
+    centre = after.positions[keyframe]
+    guess = previous.before_T_after
+    if not is_shared(before, transform(guess, centre[None]))[0]:
+        return _Stop(keyframe, guess)
+    apart_m = float(np.linalg.norm(centre - after.positions[previous.keyframe]))
+    registered = _registered(before, after, centre, guess, apart_m, step, config)
+    if registered is None:
+        return _Stop(keyframe, guess, fit=0.0)
+    pose, fit, information = registered
+    return _Stop(keyframe, pose, information, fit.inlier_share(config.inlier_m), fit.residual_m)
+
+
+def is_shared(before: IndexedMap, positions_map: Float64Array) -> BoolArray:
+    """Return for (N, 3) positions in the map frame whether the before session passed within 5 m."""
+    distances_m, _ = before.path.query(positions_map, distance_upper_bound=SHARED_M)
+    return np.isfinite(distances_m)
+
+
+def evenly(keyframes: Int64Array, n: int, and_also: int) -> Int64Array:
+    """Return about n of some keyframes, evenly spaced, and one other."""
+    chosen = np.linspace(0, len(keyframes) - 1, min(n, len(keyframes))).round().astype(np.int64)
+    return np.unique(np.append(keyframes[chosen], and_also))
+
+
+def _registered(
+    before: IndexedMap,
+    after: IndexedMap,
+    centre: Float64Array,
+    guess: Float64Array,
+    apart_m: float,
+    step: Step,
+    config: MergeConfig,
+) -> tuple[Float64Array, SurfaceFit, Float64Array] | None:
+    """Register one place: pose, fit, information.
+
+    None where it has too few points, or ends farther away than odometry can have drifted.
+    """
+    points = after.sphere(centre, step.radius_m)
+    if len(points) < MIN_SPHERE_POINTS:
+        return None
+    own = sampled(points)
+
+    def judged(found: Float64Array) -> tuple[Float64Array, SurfaceFit, Float64Array] | None:
+        held = _held(found, guess, centre, apart_m)
+        if held is None:
+            return None
+        fit = surface_fit(before, after, held, own, centre, step.radius_m)
+        information = fit.information
+        if held is not found:
+            # its turn is the neighbour's
+            information = information.copy()
+            information[:3] = information[:, :3] = 0.0
+        return held, fit, information
+
+    if step.first_try_m is not None:
+        first = judged(align_to_planes(own, centre, before.target, guess, step.first_try_m))
+        if first is not None and first[1].inlier_share(config.inlier_m) >= _CLEAR_FIT:
+            return first
+    return judged(align_by_gicp(points, centre, before.target, guess, step.correspondence_m, step.gicp_voxel_m))
+
+
+def _held(found: Float64Array, guess: Float64Array, centre: Float64Array, apart_m: float) -> Float64Array | None:
+    """Return a pose if odometry can have drifted so far, and without its turn if only that cannot be.
+
+    The section of a narrow drift is nearly round, and near a dead end little else holds a sphere against rolling.
+    """
+    jump_m, jump_rad = motion_between(found, guess, centre)
+    if jump_m > _JUMP_M + _JUMP_SHARE * apart_m:
+        return None
+    if jump_rad <= _JUMP_RAD + _JUMP_RAD_PER_M * apart_m:
+        return found
+    return make_pose(guess[:3, :3], transform(found, centre[None])[0] - guess[:3, :3] @ centre)

@@ -1,0 +1,222 @@
+"""Every setting of the pipeline: one pydantic model, one dotted key each; a preset is a named set of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import Document, Settings, read_yaml, suggestion, validated, with_section, with_settings
+
+Positive = Annotated[float, Field(gt=0)]
+# Smaller ones are noise, and could not be numbered a kilometre from the origin.
+Cell = Annotated[float, Field(ge=0.01)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Count = Annotated[int, Field(ge=1)]
+NonNegative = Annotated[float, Field(ge=0)]
+Site = Literal["narrow", "wide"]
+
+
+class MapConfig(Settings):
+    """How scans become a thinned map and keyframes."""
+
+    voxel_m: Cell = Field(0.2, description="cell of the thinned map")
+    max_range_m: Positive = Field(60.0, description="returns beyond are not mapped")
+    keyframe_spacing_m: Positive = Field(1.0, description="path between keyframes")
+
+
+class DescriptorConfig(Settings):
+    """Which descriptor every keyframe gets while mapping."""
+
+    method: Literal["3deg", "untrained", "scan-context", "solid"] = Field(
+        "3deg", description="trained weights, the same network untrained, or one made by hand"
+    )
+    precision: Literal["float32", "int8"] = Field("float32", description="of stored sphere descriptors")
+
+
+class MergeConfig(Settings):
+    """Both maps into one frame: candidate pairs of places, registration of spheres, acceptance, local refinement."""
+
+    method: Literal["voting", "frame", "kiss-matcher"] = Field(
+        "voting", description="candidates that agree; FRAME's closest pair; or KISS-Matcher on the whole maps"
+    )
+    n_candidates: Count = Field(4, description="hypotheses tried by `voting`")
+    sphere_radius_m: Positive = Field(10.0, description="submap around a pair (FRAME: 10 m)")
+    voxel_m: Cell = Field(0.4, description="thinning of a sphere before it is registered")
+    seen_within_m: Positive = Field(15.0, description="map points that were only seen from farther are left out")
+    target_voxel_m: Cell = Field(0.3, description="thinning of the before map, which the spheres are registered to")
+    coarse_voxel_m: Cell = Field(0.8, description="the same while hypotheses are tried")
+    gicp_correspondence_m: Positive = Field(3.0, description="FRAME: 3 m")
+    vgicp_correspondence_m: Positive = Field(1.0, description="FRAME: 1 m")
+    inlier_m: Positive = Field(0.1, description="a point this near the other map's surface is an inlier")
+    min_overlap: Share = Field(0.15, description="accept at least this share of the shorter path beside the other")
+    min_inlier_share: Share = Field(0.85, description="accept at least this share of inliers in the sphere")
+    min_hessian_ratio: Share = Field(0.015, description="smallest to largest translational eigenvalue: degeneracy")
+    min_agreement: Share = Field(0.8, description="accept at least this share of inliers along both paths")
+    min_distinctness: Annotated[float, Field(ge=1)] = Field(
+        1.3, description="accept if any other alignment that fits has a residual this many times larger"
+    )
+    accept_all: bool = Field(False, description="accept whatever was found, as FRAME does")
+    fallback: bool = Field(True, description="where nothing is accepted, let KISS-Matcher (extra `kiss`) try")
+    kiss_voxel_m: Cell = Field(0.6, description="cell of KISS-Matcher")
+    refine: Literal["none", "local"] = Field("local", description="align again every few metres along the overlap")
+
+
+class QueryConfig(Settings):
+    """From descriptors to changed regions: inverted query, threshold, suppression."""
+
+    compare: Literal["scan", "sphere", "difference"] = Field(
+        "scan", description="scan descriptors; sphere descriptors of both maps; or, by hand, the spheres' points"
+    )
+    reading: Literal["nearest", "paired"] = Field(
+        "nearest", description="A: nearest in descriptor space; B: the same place after alignment"
+    )
+    radius_m: Positive = Field(4.5, description="radius of a region's sphere (paper: 4.5 and 10)")
+    threshold: float = Field(0.0, description="score from which a region is reported; calibrated on validation seeds")
+    n_regions: Count | None = Field(None, description="report this many regions instead of using the threshold")
+    suppression: Positive = Field(1.0, description="candidates nearer than this many radii to a better one are dropped")
+    max_pair_m: Positive = Field(5.0, description="keyframes farther apart are not the same place")
+
+
+class ExtractConfig(Settings):
+    """Cutting objects out of a region: the paper's point-to-voxel comparison, distances, or surfaces."""
+
+    method: Literal["surface", "voxel", "nearest"] = Field(
+        "surface", description="distance from the other session's surface; the paper's voxels; or the nearest point's"
+    )
+    withdraw: bool = Field(True, description="take regions back in which nothing is found")
+    voxel_m: Cell = Field(0.65, description="`voxel`: size (paper: 0.65)")
+    min_points: Count = Field(1, description="`voxel`: points that make a voxel occupied")
+    origin_m: float = Field(0.0, ge=-1000, le=1000, description="`voxel`: offset of the grid along every axis")
+    distance_m: Positive = Field(
+        0.3, description="`nearest`, `c2c`, `m3c2`: a point farther than this from the other cloud is new"
+    )
+    realign: bool = Field(True, description="`surface`: align each sphere once more before comparing")
+    seed_m: Positive = Field(0.12, description="`surface`: an object somewhere stands this clear of the surface")
+    border_m: Positive = Field(
+        0.04, description="`surface`: and ends where it stands less clear than this, or than 5 times the noise there"
+    )
+    min_cells: Count = Field(
+        30, description="`surface`: cells of 0.05 m that stand so clear and were seen through, at least"
+    )
+    min_views: Positive = Field(
+        2.5, description="`surface`: keyframes by which an object was seen through, less those that hit it, in the mean"
+    )
+
+
+class OutlierConfig(Settings):
+    """Statistical outlier removal on the new points, (mu - lambda sigma, mu + lambda sigma)."""
+
+    neighbours: Count = Field(8, description="k")
+    sigmas: Positive = Field(2.0, description="lambda")
+
+
+class ClusterConfig(Settings):
+    """New points into objects."""
+
+    radius_m: Positive = Field(0.5, description="points nearer than this are one object")
+    min_points: Count = Field(16, description="smaller clusters are dropped")
+
+
+class M3C2Config(Settings):
+    """Distances along normals (M3C2)."""
+
+    normal_m: Positive = Field(1.0, description="`m3c2`: radius of the plane a point's normal is taken from")
+    cylinder_m: Positive = Field(0.25, description="`m3c2`: radius of the cylinder along the normal")
+    depth_m: Positive = Field(1.5, description="`m3c2`: how far the cylinder reaches to either side")
+
+
+class DufomapConfig(Settings):
+    """Voids that rays passed through (DUFOMap)."""
+
+    voxel_m: Cell = Field(0.1, description="`dufomap`: voxel of the void map")
+    hit_inflation_m: NonNegative = Field(0.2, description="`dufomap`: no void this near in front of a return (d_s)")
+    every_scan: Count = Field(1, description="`dufomap`: every n-th scan's rays are cast")
+
+
+class PipelineConfig(Settings):
+    """All settings of one method."""
+
+    method: Literal["descriptor", "voxel-diff", "c2c", "m3c2", "dufomap", "random-regions"] = Field(
+        "descriptor", description="the paper's pipeline, a whole-map rival, or a control"
+    )
+    seed: Annotated[int, Field(ge=0)] = Field(0, description="for methods that draw at random")
+    map: MapConfig = MapConfig()
+    descriptor: DescriptorConfig = DescriptorConfig()
+    merge: MergeConfig = MergeConfig()
+    query: QueryConfig = QueryConfig()
+    extract: ExtractConfig = ExtractConfig()
+    outlier: OutlierConfig = OutlierConfig()
+    cluster: ClusterConfig = ClusterConfig()
+    m3c2: M3C2Config = M3C2Config()
+    dufomap: DufomapConfig = DufomapConfig()
+
+
+def preset_names() -> list[str]:
+    """Return the names of the shipped presets."""
+    return sorted(entry.name.removesuffix(".yaml") for entry in _presets().iterdir() if entry.name.endswith(".yaml"))
+
+
+def load_config(preset: str = "tunnelcd", settings: Iterable[str] = (), site: Site = "narrow") -> PipelineConfig:
+    """Read a preset (a shipped name or the path of a .yaml file) and write `a.b=value` settings over it.
+
+    Args:
+        preset: What stands in it is for narrow drifts, and under `wide` what is otherwise in wide ones: the radius, and
+            with it the threshold.
+        settings: Written over either.
+        site: Which of them.
+
+    Raises:
+        InputError: The preset is unknown or not made for such a site, or keys or values are wrong; all mistakes of
+            both kinds of site at once.
+    """
+    narrow, wide = with_section(_preset_document(preset), "wide")
+    found: dict[str, PipelineConfig] = {}
+    mistakes: dict[str, None] = {}
+    for name, document in (("narrow", narrow), ("wide", wide)):
+        try:
+            if document is not None:
+                found[name] = validated(PipelineConfig, with_settings(document, settings))
+        except InputError as error:
+            mistakes |= dict.fromkeys(str(error).splitlines())
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+    if site not in found:
+        raise InputError(
+            f"{narrow.source}: wide: missing: this preset does not say what it needs in wide drifts; "
+            "expected e.g. wide: {query: {radius_m: 10, threshold: 0.5}}"
+        )
+    return found[site]
+
+
+def settings_table() -> list[tuple[str, Any, str]]:
+    """Return (key, default, meaning) of every setting, for documentation."""
+    rows: list[tuple[str, Any, str]] = []
+    for name, info in PipelineConfig.model_fields.items():
+        if isinstance(info.default, Settings):
+            rows += [
+                (f"{name}.{key}", inner.default, inner.description or "")
+                for key, inner in type(info.default).model_fields.items()
+            ]
+        else:
+            rows.append((name, info.default, info.description or ""))
+    return rows
+
+
+def _preset_document(preset: str) -> Document:
+    if preset.endswith((".yaml", ".yml")):
+        return read_yaml(Path(preset))
+    names = preset_names()
+    if preset not in names:
+        raise InputError(f"preset {preset!r} is unknown{suggestion(preset, names)} (known: {', '.join(names)})")
+    file = _presets() / f"{preset}.yaml"
+    return read_yaml(Path(f"{preset}.yaml"), file.read_text())
+
+
+def _presets() -> Traversable:
+    return resources.files("cdpipe") / "methods" / "presets"

@@ -1,0 +1,5 @@
+"""From descriptors of both sessions to ranked change regions."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,6 @@
+from .query import find_regions, rank_regions
+
+__all__ = [
+    "find_regions",
+    "rank_regions",
+]

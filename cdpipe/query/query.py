@@ -1,0 +1,170 @@
+"""From descriptors to changed regions: the inverted query of the paper, in both readings, threshold and suppression.
+
+The paper asks for the keyframes whose descriptors differ most between the sessions, `argmax f(Q_t,i, Q_t+1,j)`, and
+does not say how i and j are paired. Reading A ("nearest"): j's nearest neighbour in descriptor space, as in their
+FRAME code; the two may be different places. Reading B ("paired"): the keyframe at the same place after alignment.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.descriptors.pooling import best_in_reach
+from cdpipe.descriptors.sphere import change_log_odds
+from cdpipe.model.config import QueryConfig
+from cdpipe.model.types import ChangeRegions, DescriptorSet, MergedMaps, UInt8Array
+from cdpipe.query.difference import sphere_difference
+
+# Of `ChangeRegions.direction`: whose keyframe is looked up in the other session.
+BEFORE, AFTER = 0, 1
+
+
+def find_regions(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> ChangeRegions:
+    """Score the places both sessions came to by what `compare` says, and rank them.
+
+    Args:
+        merged: Accepted or not; for `scan` only its poses are used.
+        before: Descriptors of the before session; `pairs[:, 0]` indexes its keyframes.
+        after: Descriptors of the after session; `pairs[:, 1]` indexes its keyframes.
+        config: What is compared, reading, radius, threshold, suppression.
+    """
+    places = _Places(merged, before, after, config)
+    if config.compare == "scan":
+        return _by_scans(places, before, after, config)
+    if config.compare == "sphere":
+        return _by_spheres(places, change_log_odds(merged, before, places.is_covered_b), config)
+    scores = sphere_difference(merged, before, after, config)
+    return rank_regions(places.before, scores, places.pairs_b, scores, config, _from(BEFORE, scores))
+
+
+class _Places:
+    """Where the keyframes of both sessions stand in the map, and which of the other session is nearest to each."""
+
+    def __init__(self, merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> None:
+        self.before = merged.before.odom_T_sensor[before.keyframe_scans, :3, 3]
+        self.after = merged.alignment.to_map(merged.after.odom_T_sensor[after.keyframe_scans, :3, 3])
+        gap_b, self.near_a = _nearest(self.before, self.after)
+        gap_a, self.near_b = _nearest(self.after, self.before)
+        self.is_covered_b, self.is_covered_a = gap_b <= config.max_pair_m, gap_a <= config.max_pair_m
+
+    @property
+    def pairs_b(self) -> Int64Array:
+        """(Kb, 2) each before keyframe and the nearest after keyframe."""
+        return np.column_stack([np.arange(len(self.near_a)), self.near_a])
+
+
+def _by_scans(places: _Places, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> ChangeRegions:
+    """Score every keyframe of both sessions by descriptor distance to its partner.
+
+    Every keyframe is a candidate at its own position: those of the after session queried among the before session's
+    descriptors and, inverted, those of the before session among the after session's. In reading B, keyframes without a
+    partner within `max_pair_m` are no candidates.
+    """
+    is_covered_b, is_covered_a = places.is_covered_b, places.is_covered_a
+    if config.reading == "nearest":
+        score_b, partner_of_b = _nearest(before.q, after.q)
+        score_a, partner_of_a = _nearest(after.q, before.q)
+        is_candidate_b, is_candidate_a = np.isfinite(score_b), np.isfinite(score_a)
+    else:
+        partner_of_b, partner_of_a = places.near_a, places.near_b
+        is_candidate_b, is_candidate_a = is_covered_b, is_covered_a
+        score_b = _distances(before, after, partner_of_b, is_candidate_b)
+        score_a = _distances(after, before, partner_of_a, is_candidate_a)
+
+    keyframe_scores = np.where(is_covered_b, score_b, np.nan)
+    np.maximum.at(keyframe_scores, places.near_b[is_covered_a], score_a[is_covered_a])
+
+    pairs_a = np.column_stack([partner_of_a, np.arange(len(score_a))])
+    pairs_b = np.column_stack([np.arange(len(score_b)), partner_of_b])
+    return rank_regions(
+        centres_map=np.concatenate([places.after[is_candidate_a], places.before[is_candidate_b]]),
+        scores=np.concatenate([score_a[is_candidate_a], score_b[is_candidate_b]]),
+        pairs=np.concatenate([pairs_a[is_candidate_a], pairs_b[is_candidate_b]]),
+        keyframe_scores=keyframe_scores,
+        config=config,
+        direction=np.concatenate([_from(AFTER, pairs_a[is_candidate_a]), _from(BEFORE, pairs_b[is_candidate_b])]),
+    )
+
+
+def _by_spheres(places: _Places, local: Float64Array, config: QueryConfig) -> ChangeRegions:
+    """Score every before keyframe by the (K,) log-odds of its own stretch; that of its sphere is the best in reach.
+
+    A sphere descriptor tells of the two metres before and behind its keyframe, a region of all within `radius_m`.
+    """
+    keyframe_scores = np.full(len(local), np.nan)
+    covered = np.flatnonzero(places.is_covered_b)
+    keyframe_scores[covered] = best_in_reach(local[covered], places.before[covered], config.radius_m)
+    return rank_regions(places.before, local, places.pairs_b, keyframe_scores, config, _from(BEFORE, local))
+
+
+def rank_regions(
+    centres_map: Float64Array,
+    scores: Float64Array,
+    pairs: Int64Array,
+    keyframe_scores: Float64Array,
+    config: QueryConfig,
+    direction: UInt8Array | None = None,
+) -> ChangeRegions:
+    """Order candidates by score, drop those too near to a better one, and mark what is reported.
+
+    Args:
+        centres_map: (N, 3) sphere centres, map frame, metres.
+        scores: (N,) larger means changed more surely; NaN is no candidate. Of equal scores the first comes first.
+        pairs: (N, 2) before and after keyframe of each.
+        keyframe_scores: (K,) passed on.
+        config: Radius, suppression distance, and threshold or number of regions.
+        direction: (N,) as in `ChangeRegions`, None where no keyframes are looked up.
+    """
+    order = np.argsort(-scores, kind="stable")
+    order = order[~np.isnan(scores[order])]
+    kept = order[_survivors(centres_map[order], config.suppression * config.radius_m)]
+    if config.n_regions is None:
+        is_reported = scores[kept] >= config.threshold
+    else:
+        is_reported = np.arange(len(kept)) < config.n_regions
+    return ChangeRegions(
+        centres_map=centres_map[kept],
+        radius_m=config.radius_m,
+        scores=scores[kept],
+        pairs=pairs[kept].astype(np.int64),
+        is_reported=is_reported,
+        keyframe_scores=keyframe_scores,
+        direction=None if direction is None else direction[kept],
+    )
+
+
+def _from(session: int, candidates: npt.NDArray[Any]) -> UInt8Array:
+    """Return the direction of candidates that are all keyframes of one session."""
+    return np.full(len(candidates), session, dtype=np.uint8)
+
+
+def _survivors(centres: Float64Array, distance_m: float) -> BoolArray:
+    """Mark, going from best to worst, every centre that is not nearer than `distance_m` to one marked before."""
+    is_kept = np.ones(len(centres), dtype=np.bool_)
+    for index, centre in enumerate(centres):
+        if is_kept[index]:
+            is_kept[index + 1 :] &= np.linalg.norm(centres[index + 1 :] - centre, axis=1) >= distance_m
+    return is_kept
+
+
+def _nearest(points: npt.NDArray[Any], others: npt.NDArray[Any]) -> tuple[Float64Array, Int64Array]:
+    """Return distance and index of the nearest of `others` for each point; infinity and 0 where there are none."""
+    if len(others) == 0 or len(points) == 0:
+        return np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64)
+    distances, indices = cKDTree(others.astype(np.float64)).query(points.astype(np.float64))
+    return np.asarray(distances, dtype=np.float64), np.asarray(indices, dtype=np.int64)
+
+
+def _distances(
+    queries: DescriptorSet, others: DescriptorSet, partners: Int64Array, is_paired: BoolArray
+) -> Float64Array:
+    """Return the descriptor distance of each query to its partner, NaN where it has none."""
+    distances = np.full(len(queries.q), np.nan)
+    chosen = queries.q[is_paired].astype(np.float64) - others.q[partners[is_paired]]
+    distances[is_paired] = np.linalg.norm(chosen, axis=1)
+    return distances

@@ -1,0 +1,1 @@
+"""What an Ouster sensor is: its metadata, its beam table and the ray of every pixel."""

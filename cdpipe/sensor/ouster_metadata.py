@@ -1,0 +1,221 @@
+"""The JSON an Ouster sensor describes itself with, checked: every mistake becomes one line that names file and key.
+
+Two layouts are read: the flat one of first firmwares and of `SensorMetadata.to_json`, and the nested one of newer
+firmware, which is also what the vendor's SDK writes.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array
+
+MODES = ("512x10", "512x20", "1024x10", "1024x20", "2048x10")
+
+_SECTIONS = ("sensor_info", "config_params", "beam_intrinsics", "lidar_intrinsics", "imu_intrinsics")
+# Distance of the beam origin from the spin axis where the metadata does not state it: what the vendor's SDK 1.0.1 takes
+# for a product line, first generation included.
+_BEAM_ORIGIN_MM = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762}
+_OTHER_BEAM_ORIGIN_MM = 12.163
+_FARTHEST_BEAM_ORIGIN_MM = 100.0
+_LIDAR_TO_SENSOR_MM = (-1.0, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 36.18, 0, 0, 0, 1)
+_BEAMS_OF_PRODUCT = re.compile(r"^OS-[0-9A-Za-z]+-(\d+)")
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        InputError: There is no such file, it cannot be read, or it holds anything else.
+    """
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder: name the metadata .json of an Ouster sensor")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such sensor metadata file") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not text: expected the metadata .json of an Ouster sensor") from error
+    if not text.strip():
+        raise InputError(f"{path}: is empty: expected the metadata .json of an Ouster sensor")
+    try:
+        document = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: not JSON (line {error.lineno}: {error.msg})") from error
+    except ValueError as error:
+        raise InputError(
+            f"{path}: holds a whole number of thousands of digits: expected the metadata of an Ouster sensor"
+        ) from error
+    except RecursionError as error:
+        raise InputError(f"{path}: nested too deeply to be the metadata of an Ouster sensor") from error
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: holds a JSON {type(document).__name__}: expected the metadata of an Ouster sensor")
+    return document
+
+
+def sensor_fields(document: Mapping[str, Any], source: str, mode: str | None = None) -> dict[str, Any]:
+    """Return the fields of a `SensorMetadata`.
+
+    Args:
+        document: The parsed JSON.
+        source: What to call it in messages.
+        mode: "<columns>x<Hz>" instead of the document's own.
+
+    Raises:
+        InputError: A key is missing, or what it holds cannot be or contradicts another.
+    """
+    flat = dict(document)
+    for section in _SECTIONS:
+        if isinstance(document.get(section), dict):
+            flat.update(document[section])
+    for key in ("beam_altitude_angles", "beam_azimuth_angles", "lidar_mode"):
+        if flat.get(key) is None:
+            keys = ", ".join(list(document)[:4]) or "nothing"
+            raise InputError(
+                f"{source}: {key} is missing (there is {keys}): expected the metadata JSON of an Ouster sensor"
+            )
+    product = str(flat.get("prod_line", "unknown"))
+    altitude_deg, azimuth_deg = _beams(flat, source, product)
+    own_mode = str(flat["lidar_mode"])
+    columns = _columns(mode or own_mode, source)
+    shift = _pixel_shift(document, source, len(altitude_deg), _columns(own_mode, source))
+    if shift is None or columns != _columns(own_mode, source):
+        shift = np.round((azimuth_deg - azimuth_deg.min()) * columns / 360.0).astype(int).tolist()
+    return {
+        "product": product,
+        "serial": str(flat.get("prod_sn", "unknown")),
+        "mode": mode or own_mode,
+        "altitude_deg": altitude_deg,
+        "azimuth_deg": azimuth_deg,
+        "beam_origin_m": _beam_origin_mm(flat, source, product) / 1000.0,
+        "sensor_T_lidar": _sensor_T_lidar(flat, source),
+        "pixel_shift": tuple(shift),
+    }
+
+
+def require_mode(mode: str, source: str) -> None:
+    """Raise `InputError` unless a mode is one an OS1-32 has."""
+    if mode not in MODES:
+        raise InputError(f"{source}: lidar_mode = {mode!r}: expected one of {', '.join(MODES)}")
+
+
+def _numbers(values: Any, source: str, key: str) -> Float64Array:
+    """Return (N,) finite numbers."""
+    if not isinstance(values, list | tuple):
+        raise InputError(f"{source}: {key} must be a list of numbers, got {values!r:.40}")
+    numbers = np.array([_number(value, source, f"{key}[{at}]") for at, value in enumerate(values)], dtype=np.float64)
+    if not np.isfinite(numbers).all():
+        bad = int(np.argmin(np.isfinite(numbers)))
+        raise InputError(f"{source}: {key}[{bad}] = {numbers[bad]}: expected a finite number")
+    return numbers
+
+
+def _number(value: Any, source: str, key: str) -> float:
+    """Return a JSON number, which neither text nor true or false is."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{source}: {key} must be a number, got {value!r:.40}")
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise InputError(f"{source}: {key} is beyond any number a sensor has") from error
+
+
+def _beams(flat: Mapping[str, Any], source: str, product: str) -> tuple[Float64Array, Float64Array]:
+    """Return altitude and azimuth (H,) of every beam, degrees, top beam first."""
+    altitude_deg = _numbers(flat["beam_altitude_angles"], source, "beam_altitude_angles")
+    azimuth_deg = _numbers(flat["beam_azimuth_angles"], source, "beam_azimuth_angles")
+    if len(altitude_deg) != len(azimuth_deg):
+        raise InputError(
+            f"{source}: beam_altitude_angles and beam_azimuth_angles must be equally long, "
+            f"got {len(altitude_deg)} and {len(azimuth_deg)} numbers"
+        )
+    # 32-beam units of the first generation list 64 beams and leave the absent ones at zero.
+    is_absent = (altitude_deg == 0.0) & (azimuth_deg == 0.0)
+    if len(altitude_deg) == 64 and is_absent.sum() == 32:
+        altitude_deg, azimuth_deg = altitude_deg[~is_absent], azimuth_deg[~is_absent]
+    named = _BEAMS_OF_PRODUCT.match(product)
+    if named is not None and int(named[1]) != len(altitude_deg):
+        raise InputError(
+            f"{source}: prod_line = {product!r} has {named[1]} beams, but {len(altitude_deg)} beam angles are listed"
+        )
+    for key, angles_deg, most_deg in (("altitude", altitude_deg, 90.0), ("azimuth", azimuth_deg, 180.0)):
+        if np.abs(angles_deg).max(initial=0.0) > most_deg:
+            raise InputError(f"{source}: beam_{key}_angles exceed {most_deg:g} deg: expected degrees")
+    if len(altitude_deg) == 0 or (np.diff(altitude_deg) >= 0).any():
+        raise InputError(f"{source}: beam_altitude_angles must fall from the top beam to the bottom one")
+    return altitude_deg, azimuth_deg
+
+
+def _columns(mode: str, source: str) -> int:
+    columns, _, rate = mode.partition("x")
+    is_number = all(word.isdecimal() and len(word) < 6 for word in (columns, rate))
+    if not is_number or int(columns) == 0 or int(rate) == 0:
+        raise InputError(f"{source}: lidar_mode = {mode!r:.40}: expected <columns>x<Hz>, one of {', '.join(MODES)}")
+    return int(columns)
+
+
+def _pixel_shift(document: Mapping[str, Any], source: str, height: int, columns: int) -> list[int] | None:
+    """Return the shift of each row in the document's own mode, None where it does not say."""
+    layout = document.get("lidar_data_format") or document.get("data_format") or {}
+    if not isinstance(layout, dict):
+        raise InputError(f"{source}: data_format must be a JSON object")
+    for key, expected in (("pixels_per_column", height), ("columns_per_frame", columns)):
+        if layout.get(key, expected) != expected:
+            raise InputError(f"{source}: data_format.{key} = {layout[key]!r}, but beams and lidar_mode say {expected}")
+    if layout.get("pixel_shift_by_row") is None:
+        return None
+    shift = _numbers(layout["pixel_shift_by_row"], source, "pixel_shift_by_row")
+    if len(shift) != height:
+        raise InputError(
+            f"{source}: pixel_shift_by_row must hold {height} numbers, one for each beam, got {len(shift)}"
+        )
+    return [int(value) for value in shift]
+
+
+def _beam_origin_mm(flat: Mapping[str, Any], source: str, product: str) -> float:
+    """Return the beam origin's distance from the axis; the SDK's transform goes before the older single figure."""
+    key, value = "lidar_origin_to_beam_origin_mm", flat.get("lidar_origin_to_beam_origin_mm")
+    if flat.get("beam_to_lidar_transform") is not None:
+        key = "beam_to_lidar_transform"
+        matrix = _matrix(flat[key], source, key)
+        value = matrix[0, 3]
+        matrix[0, 3] = 0.0
+        if np.abs(matrix - np.eye(4)).max() > 1e-9:
+            raise InputError(f"{source}: {key} is more than a shift along x: such a sensor cannot be projected")
+    if value is None:
+        value = next((mm for line, mm in _BEAM_ORIGIN_MM.items() if product.startswith(line)), _OTHER_BEAM_ORIGIN_MM)
+    beam_origin_mm = _number(value, source, key)
+    if not 0.0 <= beam_origin_mm <= _FARTHEST_BEAM_ORIGIN_MM:
+        raise InputError(
+            f"{source}: {key} puts the beam origin {beam_origin_mm:g} mm from the axis: "
+            f"expected 0 to {_FARTHEST_BEAM_ORIGIN_MM:g} mm"
+        )
+    return beam_origin_mm
+
+
+def _sensor_T_lidar(flat: Mapping[str, Any], source: str) -> Float64Array:
+    """Return the (4, 4) pose of the lidar frame in the sensor frame, metres."""
+    key = "lidar_to_sensor_transform"
+    sensor_T_lidar = _matrix(flat.get(key, _LIDAR_TO_SENSOR_MM), source, key)
+    rotation = sensor_T_lidar[:3, :3]
+    is_rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-6 and np.linalg.det(rotation) > 0
+    if not is_rigid or (sensor_T_lidar[3] != (0, 0, 0, 1)).any():
+        raise InputError(f"{source}: {key} is not a rigid transform: expected 16 numbers, row by row, millimetres")
+    sensor_T_lidar[:3, 3] /= 1000.0
+    return sensor_T_lidar
+
+
+def _matrix(values: Any, source: str, key: str) -> Float64Array:
+    numbers = _numbers(values, source, key)
+    if len(numbers) != 16:
+        raise InputError(f"{source}: {key} must hold 16 numbers, got {len(numbers)}")
+    return numbers.reshape(4, 4).copy()

@@ -1,0 +1,1 @@
+"""Training the learned descriptors on the shards that `tunnelcd dataset` makes."""

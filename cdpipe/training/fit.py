@@ -1,0 +1,208 @@
+"""The training loop of every descriptor: seeded, resumable, stopped early by what the validation tunnels say.
+
+A task brings the network, the loss of a step and the scores; the loop knows nothing of descriptors. Every draw of a
+step comes from (seed, step), so a run that was cut off goes on as if it had not been.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Protocol
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from cdpipe.core.errors import InputError
+
+_STATE = "state.safetensors"
+_WARM_UP = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class FitConfig:
+    """What a training run depends on, beside its data.
+
+    Attributes:
+        seed: Of the first weights and of every draw.
+        steps: At most this many; the learning rate falls to nothing over them.
+        learning_rate: Its highest.
+        validate_every: Steps between two validations.
+        patience: Validations without a new best score after which training stops.
+    """
+
+    seed: int = 0
+    steps: int = 4000
+    learning_rate: float = 2e-3
+    validate_every: int = 250
+    patience: int = 6
+
+
+class Task(Protocol):
+    """What is trained."""
+
+    @property
+    def network(self) -> nn.Module:
+        """The network; `fit` changes its weights."""
+
+    def losses(self, step: int) -> dict[str, Tensor]:
+        """Return the parts of a step's loss by name; their sum is minimised."""
+
+    def scores(self) -> dict[str, float]:
+        """Return the scores on the validation tunnels; the first one decides, larger is better."""
+
+    def finish(self) -> dict[str, float]:
+        """Do what is done once with the best weights, and return what the model card should say of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Where training stands after a validation.
+
+    Attributes:
+        step: Steps done.
+        losses: Mean of each part of the loss since the last validation.
+        scores: On the validation tunnels.
+        is_best: Whether the first score is the best so far.
+        seconds: Wall clock spent so far, that of runs that were cut off included.
+    """
+
+    step: int
+    losses: Mapping[str, float]
+    scores: Mapping[str, float]
+    is_best: bool
+    seconds: float = field(default=0.0, compare=False)
+
+
+def learning_rate(step: int, config: FitConfig) -> float:
+    """Return the rate of a step: a straight rise over the first tenth, then half a cosine down to nothing."""
+    warm = _WARM_UP * config.steps
+    if step < warm:
+        return config.learning_rate * (step + 1) / (warm + 1)
+    share = torch.tensor((step - warm) / max(config.steps - warm, 1.0))
+    return config.learning_rate * 0.5 * float(1.0 + torch.cos(torch.pi * share))
+
+
+def fit(
+    task: Task,
+    config: FitConfig,
+    folder: Path,
+    identity: str,
+    on_step: Callable[[int, Mapping[str, float]], None],
+    on_validation: Callable[[Progress], None],
+) -> list[Progress]:
+    """Train a task's network and leave the weights of its best validation in it.
+
+    Args:
+        task: Network, losses, scores.
+        config: Steps, rates, patience.
+        folder: Where the state is kept after every validation; a state that lies there is gone on from.
+        identity: Digest of data and settings; a state of another identity is refused.
+        on_step: Called with the step and its losses.
+        on_validation: Called after every validation, those of a resumed run included.
+
+    Returns:
+        Every validation, in order.
+
+    Raises:
+        InputError: The state in `folder` is of another run, or damaged.
+    """
+    network = task.network
+    optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=1e-3)
+    identity = json.dumps({"run": identity, **asdict(config)}, sort_keys=True)
+    history, best = _restored(folder / _STATE, network, optimiser, identity)
+    for done in history:
+        on_validation(done)
+    sums: dict[str, float] = {}
+    began = perf_counter() - (history[-1].seconds if history else 0.0)
+    for step in range(history[-1].step if history else 0, config.steps):
+        if _is_stopped(history, config.patience):
+            break
+        for group in optimiser.param_groups:
+            group["lr"] = learning_rate(step, config)
+        network.train()
+        losses = task.losses(step)
+        optimiser.zero_grad()
+        torch.stack(list(losses.values())).sum().backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
+        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimiser.step()
+        numbers = {name: loss.item() for name, loss in losses.items()}
+        sums = {name: sums.get(name, 0.0) + value for name, value in numbers.items()}
+        on_step(step + 1, numbers)
+        if (step + 1) % config.validate_every and step + 1 < config.steps:
+            continue
+        n_steps = step + 1 - (history[-1].step if history else 0)
+        network.eval()
+        scores = task.scores()
+        first = next(iter(scores.values()))
+        is_best = all(first > next(iter(done.scores.values())) for done in history)
+        means = {name: value / n_steps for name, value in sums.items()}
+        history.append(Progress(step + 1, means, scores, is_best, perf_counter() - began))
+        sums = {}
+        if is_best:
+            best = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+        _keep(folder / _STATE, network, optimiser, best, history, identity)
+        on_validation(history[-1])
+    network.load_state_dict(best)
+    network.eval()
+    return history
+
+
+def _is_stopped(history: list[Progress], patience: int) -> bool:
+    return len(history) > patience and not any(done.is_best for done in history[-patience:])
+
+
+def _keep(
+    path: Path,
+    network: nn.Module,
+    optimiser: torch.optim.Optimizer,
+    best: Mapping[str, Tensor],
+    history: list[Progress],
+    identity: str,
+) -> None:
+    """Write everything the next step depends on; safetensors, so that nothing is ever unpickled."""
+    tensors = {f"last.{name}": tensor for name, tensor in network.state_dict().items()}
+    tensors |= {f"best.{name}": tensor for name, tensor in best.items()}
+    for index, state in optimiser.state_dict()["state"].items():
+        tensors |= {f"optimiser.{index}.{name}": tensor for name, tensor in state.items()}
+    about = json.dumps({"identity": identity, "history": [asdict(done) for done in history]})
+    content = save({name: tensor.clone().contiguous() for name, tensor in tensors.items()}, {"about": about})
+    try:
+        partial = path.with_suffix(".partial")
+        partial.write_bytes(content)
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _restored(
+    path: Path, network: nn.Module, optimiser: torch.optim.Optimizer, identity: str
+) -> tuple[list[Progress], dict[str, Tensor]]:
+    """Read a state into network and optimiser; return the validations so far and the best weights."""
+    if not path.is_file():
+        return [], {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = json.loads(file.metadata()["about"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
+        if about["identity"] != identity:
+            raise InputError(f"{path}: of a run on other data or with other settings: name another --out")
+        history = [Progress(**done) for done in about["history"]]
+        network.load_state_dict(_below("last.", tensors))
+        states: dict[int, dict[str, Tensor]] = {}
+        for key, tensor in _below("optimiser.", tensors).items():
+            index, _, name = key.partition(".")
+            states.setdefault(int(index), {})[name] = tensor
+        optimiser.load_state_dict({**optimiser.state_dict(), "state": states})
+        return history, _below("best.", tensors)
+    except (SafetensorError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        raise InputError(f"{path}: damaged ({error}): remove it to train from the start") from error
+
+
+def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}

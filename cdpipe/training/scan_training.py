@@ -1,0 +1,218 @@
+"""How the place descriptor is trained: every place told from the others of its batch by q, yaw classification on w.
+
+3DEG (arXiv 2210.07285, section III) takes triplets with the hardest negative. In tunnels that loss stays at its margin
+for hundreds of steps, as the hardest of hundred places looks like the right one; the cross-entropy over all negatives
+(InfoNCE, arXiv 1807.03748), in which the hard ones count most as well, learns from the first step on. 3DEG's yaw loss
+compares (cos, sin) of a regressed angle; ours is the cross-entropy of the circular correlation of the two w, which does
+not average the two ends of a tunnel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, require_shape, stream
+from cdpipe.descriptors.network import DIMENSIONS, PlaceNetwork, yaw_correlation
+from cdpipe.descriptors.range_image import COLUMNS
+
+_TEMPERATURE = 0.03
+_YAW_WEIGHT = 0.3
+_YAW_TEMPERATURE = 12.0
+_YAW_SPREAD_RAD = np.deg2rad(5.0)
+# What is recognised: a keyframe as near as this, which may be on another line of the way.
+SAME_PLACE_M = 3.0
+# A place is learned from the keyframes of the other session that are at most so much farther than the nearest.
+_BESIDE_NEAREST_M = 1.0
+OTHER_PLACE_M = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceData:
+    """Keyframes with true poses; sessions of one tunnel share a world frame.
+
+    Attributes:
+        images_m: (N, ROWS, COLUMNS) float16 or float32 range images, metres.
+        positions: (N, 3) float64 sensor positions, world frame, metres.
+        headings_rad: (N,) float64 yaw of the sensor in the world frame.
+        tunnels: (N,) int64 which tunnel.
+        sessions: (N,) int64 0 before, 1 after.
+    """
+
+    images_m: Float32Array
+    positions: Float64Array
+    headings_rad: Float64Array
+    tunnels: Int64Array
+    sessions: Int64Array
+
+    def __post_init__(self) -> None:
+        n = len(self.images_m)
+        require_shape("positions", self.positions, (n, 3))
+        for name in ("headings_rad", "tunnels", "sessions"):
+            require_shape(name, getattr(self, name), (n,))
+
+    def subset(self, mask: BoolArray) -> PlaceData:
+        """Return the marked keyframes."""
+        return PlaceData(
+            self.images_m[mask], self.positions[mask], self.headings_rad[mask], self.tunnels[mask], self.sessions[mask]
+        )
+
+
+TUNNELS_PER_BATCH = 8
+ANCHORS_PER_TUNNEL = 8
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceScores:
+    """How well places and headings are recognised.
+
+    Attributes:
+        recall_at_1: Share of after keyframes whose nearest before descriptor, within its tunnel, lies within 3 m.
+        yaw_error_deg: Median absolute yaw error between true neighbours, best of the correlation's peaks.
+        yaw_flip_share: Share of those errors over 90 deg.
+    """
+
+    recall_at_1: float
+    yaw_error_deg: float
+    yaw_flip_share: float
+
+
+class PlaceTask:
+    """Trains a place network on some tunnels and scores it on others.
+
+    Raises:
+        InputError: No place of the training tunnels was driven through in both sessions.
+    """
+
+    def __init__(self, network: PlaceNetwork, training: PlaceData, validation: PlaceData, seed: int) -> None:
+        self._network, self._data, self._validation, self._seed = network, training, validation, seed
+        self._partners = _partners(training)
+        paired = np.array([len(partners) > 0 for partners in self._partners])
+        by_tunnel = [np.flatnonzero(paired & (training.tunnels == tunnel)) for tunnel in np.unique(training.tunnels)]
+        self._paired = [keyframes for keyframes in by_tunnel if len(keyframes)]
+        if not self._paired:
+            raise InputError(
+                f"training tunnels: no keyframe within {SAME_PLACE_M:g} m of one of the other session; make tunnels "
+                "that both sessions drive through"
+            )
+
+    @property
+    def network(self) -> PlaceNetwork:
+        """The network."""
+        return self._network
+
+    def losses(self, step: int) -> dict[str, Tensor]:
+        """Return the classification losses of q and w."""
+        draw = stream(self._seed, "train-place", str(step))
+        anchors = self._anchors(draw)
+        positives = np.array([draw.choice(self._partners[anchor]) for anchor in anchors])
+        chosen = np.concatenate([anchors, positives])
+        images, headings = _turned(self._data, chosen, draw)
+        # a tunnel in the mirror is another tunnel
+        tunnels, index = np.unique(self._data.tunnels[chosen], return_inverse=True)
+        images, headings = _mirrored(images, headings, (draw.random(len(tunnels)) < 0.5)[index])
+        q, w = self._network(images)
+        place_loss = _place_loss(q, _is_other_place(self._data, anchors, chosen))
+        return {"place": place_loss, "yaw": _YAW_WEIGHT * _yaw_loss(w, headings)}
+
+    def _anchors(self, draw: np.random.Generator) -> Int64Array:
+        n_tunnels = min(TUNNELS_PER_BATCH, len(self._paired))
+        tunnels = [self._paired[place] for place in draw.choice(len(self._paired), size=n_tunnels, replace=False)]
+        return np.concatenate(
+            [draw.choice(own, size=min(ANCHORS_PER_TUNNEL, len(own)), replace=False) for own in tunnels]
+        )
+
+    def scores(self) -> dict[str, float]:
+        """Return recall@1 within 3 m, and the yaw's median error and share of flips."""
+        scores = evaluate(self._network, self._validation)
+        return {name: float(getattr(scores, name)) for name in scores.__slots__}
+
+    def finish(self) -> dict[str, float]:
+        """There is nothing to do."""
+        return {}
+
+
+def evaluate(network: PlaceNetwork, data: PlaceData) -> PlaceScores:
+    """Score a network on tunnels it has not seen; every tunnel needs both sessions."""
+    draw = stream(0, "evaluate-descriptor")
+    images, headings = _turned(data, np.arange(len(data.positions)), draw)
+    with torch.inference_mode():
+        parts = [network(batch) for batch in torch.split(images, 64)]
+    q = torch.cat([part[0] for part in parts]).numpy()
+    w = torch.cat([part[1] for part in parts])
+    hits: list[bool] = []
+    errors: list[float] = []
+    for tunnel in np.unique(data.tunnels):
+        before = np.flatnonzero((data.tunnels == tunnel) & (data.sessions == 0))
+        after = np.flatnonzero((data.tunnels == tunnel) & (data.sessions == 1))
+        apart = np.linalg.norm(data.positions[after, None] - data.positions[None, before], axis=2)
+        for row in np.flatnonzero(apart.min(axis=1) <= SAME_PLACE_M):
+            found = int(np.argmax(q[before] @ q[after[row]]))
+            hits.append(bool(apart[row, found] <= SAME_PLACE_M))
+            near = int(np.argmin(apart[row]))
+            peak = int(yaw_correlation(w[before[near]][None], w[after[row]][None]).argmax())
+            error = peak * 2 * np.pi / DIMENSIONS - float(headings[after[row]] - headings[before[near]])
+            errors.append(abs(float(np.rad2deg(np.angle(np.exp(1j * error))))))
+    return PlaceScores(float(np.mean(hits)), float(np.median(errors)), float(np.mean(np.array(errors) > 90)))
+
+
+def _partners(data: PlaceData) -> list[Int64Array]:
+    """For each keyframe, the nearest of the other session of its tunnel and those beside it; none if all are far."""
+    partners: list[Int64Array] = [np.zeros(0, dtype=np.int64)] * len(data.positions)
+    for tunnel in np.unique(data.tunnels):
+        members = np.flatnonzero(data.tunnels == tunnel)
+        apart = np.linalg.norm(data.positions[members, None] - data.positions[None, members], axis=2)
+        apart[data.sessions[members, None] == data.sessions[None, members]] = np.inf
+        limits = np.minimum(apart.min(axis=1) + _BESIDE_NEAREST_M, SAME_PLACE_M)
+        is_partner = apart <= limits[:, None]
+        for row, member in enumerate(members):
+            partners[member] = members[is_partner[row]]
+    return partners
+
+
+def _turned(data: PlaceData, chosen: Int64Array, draw: np.random.Generator) -> tuple[Tensor, Float64Array]:
+    """Turn every image by a random angle; a shift to the right by k columns is a sensor turned by -k columns."""
+    shifts = draw.integers(0, COLUMNS, size=len(chosen))
+    columns = (np.arange(COLUMNS)[None, :] - shifts[:, None]) % COLUMNS
+    images = np.take_along_axis(data.images_m[chosen].astype(np.float32), columns[:, None, :], axis=2)
+    return torch.from_numpy(images), data.headings_rad[chosen] - shifts * 2 * np.pi / COLUMNS
+
+
+def _mirrored(images: Tensor, headings_rad: Float64Array, is_mirrored: BoolArray) -> tuple[Tensor, Float64Array]:
+    """Swap left and right of some images; a mirrored heading turns the other way."""
+    flips = torch.from_numpy(is_mirrored)[:, None, None]
+    return torch.where(flips, images.flip(2), images), np.where(is_mirrored, -headings_rad, headings_rad)
+
+
+def _is_other_place(data: PlaceData, anchors: Int64Array, chosen: Int64Array) -> Tensor:
+    apart = np.linalg.norm(data.positions[anchors, None] - data.positions[None, chosen], axis=2)
+    other_tunnel = data.tunnels[anchors, None] != data.tunnels[None, chosen]
+    return torch.from_numpy(other_tunnel | (apart > OTHER_PLACE_M))
+
+
+def _place_loss(q: Tensor, is_negative: Tensor) -> Tensor:
+    """Cross-entropy of picking the positive of each anchor among that and all negatives.
+
+    Args:
+        q: (2 A, 64) place vectors, the anchors' first, then their positives' in the same order.
+        is_negative: (A, 2 A) which of them are of another place.
+    """
+    n = len(is_negative)
+    likeness = q[:n] @ q.T / _TEMPERATURE
+    positive = likeness[torch.arange(n), n + torch.arange(n)]
+    negatives = likeness.masked_fill(~is_negative, -torch.inf)
+    return (torch.logsumexp(torch.cat([positive[:, None], negatives], dim=1), dim=1) - positive).mean()
+
+
+def _yaw_loss(w: Tensor, headings_rad: Float64Array) -> Tensor:
+    n = len(w) // 2
+    scores = _YAW_TEMPERATURE * yaw_correlation(w[:n], w[n:])
+    bins = np.arange(DIMENSIONS) * 2 * np.pi / DIMENSIONS
+    off = np.angle(np.exp(1j * (bins[None, :] - (headings_rad[n:] - headings_rad[:n])[:, None])))
+    target = np.exp(-0.5 * (off / _YAW_SPREAD_RAD) ** 2)
+    target /= target.sum(axis=1, keepdims=True)
+    return torch.nn.functional.cross_entropy(scores, torch.from_numpy(target.astype(np.float32)))

@@ -1,0 +1,153 @@
+"""One tunnel's training data as a file: what a shard holds, how it is written and how it is read.
+
+A shard is a safetensors file of named arrays; its metadata has one entry, `tunnelcd`, a JSON object with the family,
+the seed, the split, the digest of what the shard depends on, and what does not fit into arrays (`about`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from cdpipe.core.errors import InputError
+
+FORMAT = "tunnelcd-dataset"
+FORMAT_VERSION = 1
+SUFFIX = ".safetensors"
+CHANGE_KINDS = ("added", "removed", "moved", "reshaped")
+Split = Literal["train", "validation", "test", "unused"]
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One array of a shard.
+
+    Attributes:
+        name: Its name.
+        shape: Its axes: K before keyframes (the anchors), J after keyframes, C changes, D draws, R x W a scan's range
+            image, I the image of the map (as many axes as the renderer makes), V x U the pixels of that image.
+        dtype: As numpy names it.
+        unit: Of its values, or "".
+        frame: Of its values, or "".
+        meaning: In words.
+    """
+
+    name: str
+    shape: str
+    dtype: str
+    unit: str
+    frame: str
+    meaning: str
+
+
+FIELDS = (
+    Field("before_scans", "K", "int64", "", "", "revolution of each before keyframe"),
+    Field("after_scans", "J", "int64", "", "", "revolution of each after keyframe"),
+    Field("before_stamps_ns", "K", "int64", "ns", "", "time of its first return since the session's start"),
+    Field("after_stamps_ns", "J", "int64", "ns", "", "the same of the after keyframes"),
+    Field("before_world_T_keyframe", "K,4,4", "float64", "m", "world", "true pose of the sensor"),
+    Field("after_world_T_keyframe", "J,4,4", "float64", "m", "world", "true pose of the sensor"),
+    Field("before_odom_T_keyframe", "K,4,4", "float64", "m", "before odom", "the anchors: poses as believed"),
+    Field("after_odom_T_keyframe", "J,4,4", "float64", "m", "after odom", "poses as believed"),
+    Field("before_ranges_m", "K,R,W", "float16", "m", "sensor", "range image of the scan, 0 where nothing returned"),
+    Field("after_ranges_m", "J,R,W", "float16", "m", "sensor", "the same of the after keyframes"),
+    Field("before_images", "K,I", "float32", "m", "anchor", "before map rendered at the anchors"),
+    Field("after_images", "D,K,I", "float32", "m", "anchor", "after map, merged by the truth and off by a draw, there"),
+    Field("before_labels", "K,V,U", "uint8", "", "", "id of the change whose returns are in the pixel, 0 for none"),
+    Field("after_labels", "D,K,V,U", "uint8", "", "", "the same of each after image"),
+    Field("before_visible", "K,C", "int32", "pixels", "", "pixels of the before image that bear each change"),
+    Field("after_visible", "D,K,C", "int32", "pixels", "", "pixels of each after image that bear each change"),
+    Field("labels", "K", "int8", "", "", "1 near an observable change, 0 far from all, -1 left out"),
+    Field("is_covered", "K", "bool", "", "", "whether an after keyframe stands within 5 m"),
+    Field("nearest_after", "K", "int64", "", "", "after keyframe that truly stands nearest"),
+    Field("nearest_m", "K", "float64", "m", "world", "how far off it stands"),
+    Field("nearest_yaw_rad", "K", "float64", "rad", "world", "its heading minus the before keyframe's, in (-pi, pi]"),
+    Field("change_ids", "C", "int64", "", "", "id of each change, 1 to C"),
+    Field("change_session", "C", "uint8", "", "", "session that holds its returns: 0 before, 1 after"),
+    Field("change_kind", "C", "uint8", "", "", "0 added, 1 removed, 2 moved, 3 reshaped"),
+    Field("change_is_partial", "C", "bool", "", "", "group partial: moved by less than its length, or reshaped"),
+    Field("change_is_observable", "C", "bool", "", "", "whether it counts"),
+    Field("change_n_cells", "C", "int64", "cells", "", "0.1 m cells of its session that its truth fills"),
+    Field("change_centroid_world", "C,3", "float64", "m", "world", "centroid of these cells"),
+    Field("change_centroid_odom", "C,3", "float64", "m", "before odom", "the same through the nearest before keyframe"),
+    Field("draw_shift_m", "D,3", "float64", "m", "before odom", "merge error of each draw: shift; draw 0 has none"),
+    Field("draw_turn_rad", "D,3", "float64", "rad", "before odom", "and turn about the anchor, a rotation vector"),
+)  # fmt: skip
+
+
+def split_of(seed: int) -> Split:
+    """Return what a seed may be used for; a tunnel is of one split alone."""
+    if seed < 10_000:
+        return "train"
+    if seed < 20_000:
+        return "validation"
+    return "test" if seed < 30_000 else "unused"
+
+
+def shard_bytes(arrays: Mapping[str, npt.NDArray[Any]], about: Mapping[str, Any]) -> bytes:
+    """Return a shard; the same content gives the same bytes.
+
+    Raises:
+        ValueError: The arrays are not those of `FIELDS`, in name, number of axes or type.
+    """
+    if list(arrays) != [field.name for field in FIELDS]:
+        raise ValueError(f"a shard holds {[field.name for field in FIELDS]}, in that order, got {list(arrays)}")
+    for field in FIELDS:
+        if arrays[field.name].dtype != field.dtype:
+            raise ValueError(f"{field.name} must be {field.dtype}, got {arrays[field.name].dtype}")
+    text = json.dumps({"format": FORMAT, "format_version": FORMAT_VERSION, **about}, sort_keys=True)
+    # one entry alone: safetensors writes several in no fixed order
+    return save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, {"tunnelcd": text})
+
+
+def read_about(path: Path) -> dict[str, Any]:
+    """Read the metadata of a shard alone.
+
+    Raises:
+        InputError: It is missing, damaged, or of another format.
+    """
+    with _opened(path) as file:
+        return _about(path, file)
+
+
+def read_shard(path: Path, names: tuple[str, ...] = ()) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+    """Read some arrays of a shard, all by default, and its metadata.
+
+    Raises:
+        InputError: It is missing, damaged, of another format, or has no array of such a name.
+    """
+    with _opened(path) as file:
+        about = _about(path, file)
+        held = set(file.keys())
+        for name in names:
+            if name not in held:
+                raise InputError(f"{path}: holds no {name}: expected one of {', '.join(sorted(held))}")
+        return {name: file.get_tensor(name) for name in names or [field.name for field in FIELDS]}, about
+
+
+def _opened(path: Path) -> Any:
+    try:
+        return safe_open(path, framework="numpy")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such shard: run the command that made the folder again") from error
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path}: damaged ({error}): remove it, and run the command that made the folder") from error
+
+
+def _about(path: Path, file: Any) -> dict[str, Any]:
+    try:
+        about: dict[str, Any] = json.loads((file.metadata() or {})["tunnelcd"])
+        found = about["format"], about["format_version"]
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise InputError(f"{path}: not a shard of `tunnelcd dataset`") from error
+    if found != (FORMAT, FORMAT_VERSION):
+        raise InputError(f"{path}: format {found[0]} {found[1]}: this version reads {FORMAT} {FORMAT_VERSION}")
+    return about

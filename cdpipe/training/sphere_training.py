@@ -1,0 +1,304 @@
+"""How the sphere descriptor is trained: which sectors of which keyframes changed, told from simulated change.
+
+Each step takes as many changed places as unchanged ones. Half of the unchanged ones are changed on the spot: an object
+seen in one tunnel is put into the image of another, in front of what stands there. Both directions, the other heading
+and the mirrored tunnel are as likely as what was simulated; the merge error is another one at every draw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+from torch.nn import functional
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
+from cdpipe.descriptors.pooling import agreed, best_in_reach
+from cdpipe.descriptors.sphere_image import COLUMNS, REACH_M, ROWS
+from cdpipe.descriptors.sphere_network import SECTORS, SphereNetwork
+from cdpipe.training.data import TunnelShard
+from cdpipe.training.shard import read_shard
+
+BATCH = 64
+# Rows whose changes a keyframe answers for: a metre before and behind it, so that neighbours overlap.
+_OWN_ROWS = slice(ROWS // 4, ROWS - ROWS // 4)
+_MIN_PIXELS = 3
+_POSITIVE_WEIGHT = 3.0
+_PLACE_WEIGHT = 0.5
+_PASTED_SHARE = 0.25
+_PASTED_SHIFT_ROWS = 3
+# What is put in front of a wall must stand out of it: less is neither changed nor unchanged.
+_STANDS_OUT_M = 0.15
+_IN_FRONT_M = 0.05
+# How much wider or narrower a tunnel is made, and which share of an image's pixels may go missing.
+_LOG_SCALE = float(np.log(1.6))
+_MAX_MISSING = 0.3
+_CHANGED, _UNCOUNTED = 1, 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SphereData:
+    """Before keyframes that the after session came near, D draws of each.
+
+    Attributes:
+        before_m: (N, ROWS, COLUMNS) float32 images of the before maps.
+        after_m: (N, D, ROWS, COLUMNS) float32 images of the after maps.
+        before_marks: (N, ROWS, COLUMNS) uint8 0 unchanged, 1 an observable change, 2 one that does not count.
+        after_marks: (N, D, ROWS, COLUMNS) uint8 the same.
+        positions: (N, 3) float64 of the keyframes, world frame, metres.
+        labels: (N,) int8 1 near an observable change, 0 far from all, -1 left out.
+        tunnels: (N,) int64 which tunnel.
+        score_radius_m: (N,) float64 of its family.
+    """
+
+    before_m: Tensor
+    after_m: Tensor
+    before_marks: Tensor
+    after_marks: Tensor
+    positions: Float64Array
+    labels: Int64Array
+    tunnels: Int64Array
+    score_radius_m: Float64Array
+
+    @property
+    def n_draws(self) -> int:
+        """Number of merge errors of each keyframe."""
+        return int(self.after_m.shape[1])
+
+
+def sphere_data(tunnels: Sequence[TunnelShard]) -> SphereData:
+    """Read the images and labels of some tunnels into memory.
+
+    Raises:
+        InputError: A shard is missing or damaged, or no keyframe of any tunnel is covered.
+    """
+    names = (
+        "before_images", "after_images", "before_labels", "after_labels", "is_covered", "labels",
+        "before_world_T_keyframe", "change_ids", "change_is_observable",
+    )  # fmt: skip
+    parts: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in SphereData.__dataclass_fields__}
+    for place, tunnel in enumerate(tunnels):
+        arrays, about = read_shard(tunnel.path, names)
+        covered = arrays["is_covered"]
+        marks = np.zeros(256, np.uint8)
+        marks[arrays["change_ids"]] = np.where(arrays["change_is_observable"], _CHANGED, _UNCOUNTED)
+        parts["before_m"].append(arrays["before_images"][covered])
+        parts["after_m"].append(np.moveaxis(arrays["after_images"], 0, 1)[covered])
+        parts["before_marks"].append(marks[arrays["before_labels"][covered]])
+        parts["after_marks"].append(marks[np.moveaxis(arrays["after_labels"], 0, 1)[covered]])
+        parts["positions"].append(arrays["before_world_T_keyframe"][covered, :3, 3])
+        parts["labels"].append(arrays["labels"][covered])
+        parts["tunnels"].append(np.full(covered.sum(), place))
+        parts["score_radius_m"].append(np.full(covered.sum(), about["score_radius_m"]))
+    joined = {name: np.concatenate(arrays) for name, arrays in parts.items()}
+    if len(joined["labels"]) == 0:
+        raise InputError("no keyframe of these tunnels was seen by both sessions: make a larger dataset")
+    return SphereData(
+        before_m=torch.from_numpy(joined["before_m"]),
+        after_m=torch.from_numpy(joined["after_m"]),
+        before_marks=torch.from_numpy(joined["before_marks"]),
+        after_marks=torch.from_numpy(joined["after_marks"]),
+        positions=joined["positions"],
+        labels=joined["labels"].astype(np.int64),
+        tunnels=joined["tunnels"],
+        score_radius_m=joined["score_radius_m"],
+    )
+
+
+def sector_targets(before_marks: Tensor, after_marks: Tensor) -> Tensor:
+    """Return (..., SECTORS) float32 targets: 1 changed, 0 unchanged, -1 neither, of (..., ROWS, COLUMNS) marks.
+
+    A sector has changed where at least three pixels of a keyframe's own rows bear an observable change, in either
+    image; fewer pixels and changes that do not count are neither.
+    """
+    changed = _per_sector((before_marks == _CHANGED).float() + (after_marks == _CHANGED).float())
+    uncounted = _per_sector((before_marks == _UNCOUNTED).float() + (after_marks == _UNCOUNTED).float())
+    is_changed, is_untouched = changed >= _MIN_PIXELS, changed + uncounted == 0
+    return torch.where(is_changed, 1.0, torch.where(is_untouched, 0.0, -1.0))
+
+
+class SphereTask:
+    """Trains a sphere network on some tunnels and scores it on others."""
+
+    def __init__(self, network: SphereNetwork, training: SphereData, validation: SphereData, seed: int) -> None:
+        self._network, self._data, self._validation, self._seed = network, training, validation, seed
+        targets = sector_targets(training.before_marks, training.after_marks[:, 0])
+        self._changed = torch.nonzero((targets == 1).any(dim=1))[:, 0].numpy()
+        self._unchanged = torch.nonzero((targets == 0).all(dim=1))[:, 0].numpy()
+        stands_there = (training.after_marks[:, 0, _OWN_ROWS] == _CHANGED).flatten(1).sum(dim=1)
+        self._donors = torch.nonzero(stands_there >= _MIN_PIXELS)[:, 0].numpy()
+        if not len(self._donors) or not len(self._unchanged):
+            raise InputError("training needs keyframes with an object added and keyframes without: make more tunnels")
+
+    @property
+    def network(self) -> SphereNetwork:
+        """The network."""
+        return self._network
+
+    def losses(self, step: int) -> dict[str, Tensor]:
+        """Return the loss of the sectors, and that of the keyframes by their most changed sector."""
+        before, after, targets = self.batch(step)
+        logits = self._network(before, after)
+        is_known = targets >= 0
+        weight = torch.tensor(_POSITIVE_WEIGHT)
+        each = functional.binary_cross_entropy_with_logits(
+            logits, targets.clamp(min=0), reduction="none", pos_weight=weight
+        )
+        has_changed = (targets == 1).any(dim=1).float()
+        of_place = functional.binary_cross_entropy_with_logits(logits.logsumexp(dim=1), has_changed)
+        return {"sector": (each * is_known).sum() / is_known.sum(), "keyframe": _PLACE_WEIGHT * of_place}
+
+    def batch(self, step: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the images (B, ROWS, COLUMNS) of both sessions and the targets (B, SECTORS) of a step."""
+        data, draw = self._data, stream(self._seed, "train-sphere", str(step))
+        half = BATCH // 2
+        chosen = np.concatenate([draw.choice(self._changed, half), draw.choice(self._unchanged, half)])
+        errors = draw.integers(data.n_draws, size=BATCH)
+        before, after = data.before_m[chosen].clone(), data.after_m[chosen, errors].clone()
+        targets = sector_targets(data.before_marks[chosen], data.after_marks[chosen, errors])
+        pasted = slice(half, half + int(_PASTED_SHARE * BATCH))
+        donors = draw.choice(self._donors, pasted.stop - pasted.start)
+        shifts = draw.integers(-_PASTED_SHIFT_ROWS, _PASTED_SHIFT_ROWS, len(donors), endpoint=True)
+        after[pasted], targets[pasted] = _pasted(after[pasted], data, donors, shifts)
+        before, after = _as_elsewhere(before, after, draw)
+        if draw.random() < 0.5:
+            before, after = after, before
+        if draw.random() < 0.5:  # the sensor looks the other way, and right is left
+            before, after = before.flip(1), after.flip(1)
+        if draw.random() < 0.5:  # the tunnel mirrored: column c stands where COLUMNS / 2 - 1 - c stood
+            before, after = (image.flip(2).roll(COLUMNS // 2, 2) for image in (before, after))
+            targets = targets.flip(1).roll(SECTORS // 2, 1)
+        return before, after, targets
+
+    def scores(self) -> dict[str, float]:
+        """Return the log-likelihood of the keyframes' labels, as best calibrated, and their AUROC, with merge errors.
+
+        AUROC, the mean over tunnels and of all together, soon reaches 1 and tells nothing more; the likelihood does.
+        """
+        data = self._validation
+        pooled = pooled_scores(self._network, data, draw=min(1, data.n_draws - 1))
+        by_tunnel = [
+            _auroc(pooled[mask], data.labels[mask])
+            for mask in (data.tunnels == tunnel for tunnel in np.unique(data.tunnels))
+        ]
+        used = data.labels >= 0
+        return {
+            "log_likelihood": platt(pooled[used], data.labels[used] == 1)[2],
+            "auroc": float(np.nanmean(by_tunnel)),
+            "auroc_pooled": _auroc(pooled, data.labels),
+        }
+
+    def finish(self) -> dict[str, float]:
+        """Calibrate the log-odds on the validation tunnels (Platt); return slope, offset and Brier score there."""
+        data = self._validation
+        used = data.labels >= 0
+        pooled = pooled_scores(self._network, data, draw=min(1, data.n_draws - 1))[used]
+        slope, offset, _ = platt(pooled, data.labels[used] == 1)
+        self._network.calibration.copy_(torch.tensor([slope, offset], dtype=torch.float64))
+        found = torch.sigmoid(self._network.calibrated(torch.from_numpy(pooled))).numpy()
+        return {"slope": slope, "offset": offset, "brier": float(np.mean((found - data.labels[used]) ** 2))}
+
+
+def platt(scores: Float64Array, is_positive: BoolArray) -> tuple[float, float, float]:
+    """Return slope and offset of the logistic curve that fits N scores best, and the mean log-likelihood it reaches.
+
+    Platt (1999): each class is held to be surer by one example less than it seems, so that classes that are wholly
+    apart still get a curve.
+    """
+    n_positive = int(np.count_nonzero(is_positive))
+    n_negative = len(is_positive) - n_positive
+    target = np.where(is_positive, (n_positive + 1) / (n_positive + 2), 1 / (n_negative + 2))
+
+    def loss(parameters: Float64Array) -> float:
+        logits = parameters[0] * scores + parameters[1]
+        return float(np.mean(target * np.logaddexp(0.0, -logits) + (1 - target) * np.logaddexp(0.0, logits)))
+
+    found = minimize(loss, np.array([1.0, 0.0]), method="Nelder-Mead")
+    return float(found.x[0]), float(found.x[1]), -float(found.fun)
+
+
+def pooled_scores(network: SphereNetwork, data: SphereData, draw: int) -> Float64Array:
+    """Return the (N,) log-odds of each keyframe's most changed sector within reach, as the query pools them."""
+    return within_reach(local_scores(network, data, draw), data)
+
+
+def local_scores(
+    network: SphereNetwork, data: SphereData, draw: int, stored: Callable[[Tensor], Tensor] | None = None
+) -> Float64Array:
+    """Return the (N,) log-odds of each keyframe's own most changed sector, as it and its neighbours agree on it.
+
+    Args:
+        network: Encodes and compares.
+        data: Keyframes, tunnel by tunnel in the order of the path.
+        draw: Which merge error.
+        stored: What storing makes of the descriptors (B, PER_SECTOR, SECTORS); nothing by default.
+    """
+    logits = []
+    with torch.inference_mode():
+        for before, after in zip(torch.split(data.before_m, 256), torch.split(data.after_m[:, draw], 256), strict=True):
+            spheres = network.encode(before)
+            logits.append(network.compare(stored(spheres) if stored else spheres, after))
+    sectors = torch.cat(logits).numpy().astype(np.float64)
+    local = np.empty(len(sectors))
+    for tunnel in np.unique(data.tunnels):
+        members = np.flatnonzero(data.tunnels == tunnel)
+        local[members] = agreed(sectors[members], data.positions[members]).max(axis=1)
+    return local
+
+
+def within_reach(scores: Float64Array, data: SphereData) -> Float64Array:
+    """Return the (N,) best of the scores of a tunnel's keyframes within its score radius of each."""
+    best = np.empty(len(scores))
+    for tunnel in np.unique(data.tunnels):
+        members = np.flatnonzero(data.tunnels == tunnel)
+        best[members] = best_in_reach(scores[members], data.positions[members], data.score_radius_m[members[0]])
+    return best
+
+
+def _as_elsewhere(before: Tensor, after: Tensor, draw: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Return the images as if the tunnel were wider or narrower, and either map sparser.
+
+    Tunnels differ more than those that are trained on. What would lie beyond the renderer's reach is not seen.
+    """
+    factors = np.exp(draw.uniform(-_LOG_SCALE, _LOG_SCALE, size=(len(before), 1, 1)))
+    seen = []
+    for image in (before, after):
+        missing = draw.uniform(0.0, _MAX_MISSING, size=(len(before), 1, 1))
+        is_seen = draw.random(image.shape) >= missing
+        scaled = image * torch.from_numpy((factors * is_seen).astype(np.float32))
+        seen.append(torch.where(scaled <= REACH_M, scaled, 0.0))
+    return seen[0], seen[1]
+
+
+def _pasted(after: Tensor, data: SphereData, donors: Int64Array, shifts: Int64Array) -> tuple[Tensor, Tensor]:
+    """Put the added objects of `donors` into images, moved by rows, and return these with their targets."""
+    images = torch.stack([torch.roll(data.after_m[k, 0], int(s), 0) for k, s in zip(donors, shifts, strict=True)])
+    marks = torch.stack([torch.roll(data.after_marks[k, 0], int(s), 0) for k, s in zip(donors, shifts, strict=True)])
+    is_object = marks == _CHANGED
+    is_put = is_object & ((after == 0) | (images < after - _IN_FRONT_M))
+    stands_out = is_object & (after > 0) & (images < after - _STANDS_OUT_M)
+    changed, touched = _per_sector(stands_out.float()), _per_sector(is_put.float())
+    targets = torch.where(changed >= _MIN_PIXELS, 1.0, torch.where(touched == 0, 0.0, -1.0))
+    return torch.where(is_put, images, after), targets
+
+
+def _per_sector(pixels: Tensor) -> Tensor:
+    own = pixels[..., _OWN_ROWS, :].sum(dim=-2)
+    return own.reshape(*own.shape[:-1], SECTORS, COLUMNS // SECTORS).sum(dim=-1)
+
+
+def _auroc(scores: Float64Array, labels: Int64Array) -> float:
+    """Return the share of (positive, negative) pairs in the right order, ties half; NaN where a class is missing."""
+    used: BoolArray = labels >= 0
+    positive, negative = np.sort(scores[used & (labels == 1)]), np.sort(scores[used & (labels == 0)])
+    if not len(positive) or not len(negative):
+        return float("nan")
+    below = np.searchsorted(negative, positive, "left") + np.searchsorted(negative, positive, "right")
+    return float(below.mean() / (2 * len(negative)))

@@ -1,0 +1,79 @@
+from pathlib import Path
+
+import pytest
+from pydantic import Field
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import Settings, read_yaml, validated, with_settings
+
+
+class Ball(Settings):
+    radius_m: float = Field(gt=0)
+    colour: str = "red"
+
+
+class Box(Settings):
+    name: str
+    balls: tuple[Ball, ...] = ()
+    spare: Ball | None = None
+
+
+def test_all_mistakes_are_told_at_once_by_line() -> None:
+    text = "name: 3\nballs:\n  - radius_m: 1\n  - radius: 2\n    colour: blue\n  - radius_m: -1\nspares: {}\n"
+    with pytest.raises(InputError) as caught:
+        validated(Box, read_yaml(Path("box.yaml"), text))
+    lines = str(caught.value).splitlines()
+    assert lines[0].startswith("box.yaml:1: name = 3: ")
+    assert "box.yaml:4: balls.1.radius_m: missing, a value is required" in lines
+    assert 'box.yaml:4: balls.1.radius = 2: unknown key; did you mean "radius_m"?' in lines
+    assert any(line.startswith("box.yaml:6: balls.2.radius_m = -1: ") and "greater than 0" in line for line in lines)
+    assert 'box.yaml:7: spares = {}: unknown key; did you mean "spare"?' in lines
+    assert len(lines) == 5
+
+
+def test_settings_are_written_over_the_file() -> None:
+    document = read_yaml(Path("box.yaml"), "name: a\nspare: {radius_m: 1}\n")
+    box = validated(Box, with_settings(document, ["spare.radius_m=2.5", "name=b"]))
+    assert box.spare is not None
+    assert (box.name, box.spare.radius_m) == ("b", 2.5)
+    assert document.value == {"name": "a", "spare": {"radius_m": 1}}
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [("name", "expected key=value"), ("name.first=1", "name is a value"), ("name=[1", "not YAML")],
+)
+def test_bad_settings_are_named(setting: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        with_settings(read_yaml(Path("box.yaml"), "name: a\n"), [setting])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("a: [1\n", "box.yaml:2: not YAML"), ("a: 1\na: 2\n", "box.yaml:2: a: the key stands here a second time")],
+)
+def test_files_that_are_not_one_mapping(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_yaml(Path("box.yaml"), text)
+
+
+@pytest.mark.parametrize("text", ["a: !foo b\n", "a: \x07\n", "{[1]: 2}\n", "a: 2020-13-45\n"])
+def test_yaml_that_only_looks_like_yaml(text: str) -> None:
+    with pytest.raises(InputError, match=r"box\.yaml.*: not YAML"):
+        read_yaml(Path("box.yaml"), text)
+
+
+def test_a_file_that_is_no_text(tmp_path: Path) -> None:
+    (tmp_path / "box.yaml").write_bytes(b"name: \xff\xfe\n")
+    with pytest.raises(InputError, match=r"box\.yaml: not YAML"):
+        read_yaml(tmp_path / "box.yaml")
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"nowhere\.yaml: cannot be read"):
+        read_yaml(tmp_path / "nowhere.yaml")
+
+
+def test_a_list_is_not_a_file_of_settings() -> None:
+    with pytest.raises(InputError, match="expected keys and values, got list"):
+        validated(Box, read_yaml(Path("box.yaml"), "- 1\n"))

@@ -1,0 +1,198 @@
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from cdpipe.core.geometry import Float64Array, stream, transform, yaw_pose
+from cdpipe.extract.moves import Move, find_moves
+
+STEP_M = 0.06
+
+
+def face(low: tuple[float, float, float], high: tuple[float, float, float]) -> Float64Array:
+    """An axis-aligned rectangle or block of points."""
+    axes = [np.linspace(a, b, max(1, round((b - a) / STEP_M))) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def chair() -> Float64Array:
+    """Seat, back and legs: 0.5 x 0.5 x 0.95 m."""
+    legs = [face((x, y, 0), (x, y, 0.45)) for x in (0.0, 0.5) for y in (0.0, 0.5)]
+    return np.concatenate([face((0, 0, 0.45), (0.5, 0.5, 0.45)), face((0, 0, 0.5), (0, 0.5, 0.95)), *legs])
+
+
+def barrel(radius_m: float = 0.25, height_m: float = 0.95) -> Float64Array:
+    angles = np.arange(0, 2 * np.pi, STEP_M / radius_m)
+    heights = np.linspace(0, height_m, round(height_m / STEP_M))
+    side = np.array([[radius_m * np.cos(a), radius_m * np.sin(a), z] for a in angles for z in heights])
+    lid = face((-radius_m, -radius_m, height_m), (radius_m, radius_m, height_m))
+    return np.concatenate([side, lid[np.linalg.norm(lid[:, :2], axis=1) < radius_m]])
+
+
+def box(size: tuple[float, float, float], sides: str) -> Float64Array:
+    """The top of a box and some of its sides: l, r at the ends of x, f, b at those of y."""
+    x, y, z = size
+    all_sides = {
+        "l": face((0, 0, 0), (0, y, z)),
+        "r": face((x, 0, 0), (x, y, z)),
+        "f": face((0, 0, 0), (x, 0, z)),
+        "b": face((0, y, 0), (x, y, z)),
+    }
+    return np.concatenate([face((0, 0, z), (x, y, z)), *(all_sides[side] for side in sides)])
+
+
+def shifted(points: Float64Array, x: float, y: float = 0.0) -> Float64Array:
+    return points + np.array([x, y, 0.0])
+
+
+def noisy(points: Float64Array, purpose: str, noise_m: float = 0.01) -> Float64Array:
+    noise: Float64Array = stream(5, "moves", purpose).normal(scale=noise_m, size=points.shape)
+    return points + noise
+
+
+def moves(removed: Sequence[Float64Array], added: Sequence[Float64Array], may_go_far: Sequence[bool]) -> list[Move]:
+    """Moves where nothing but these objects was there."""
+    nothing = np.zeros((0, 3))
+    return find_moves(removed, added, may_go_far, lambda pairs: [(nothing, nothing)] * len(pairs))
+
+
+def test_what_was_turned_and_carried_off_is_one_object_and_where_it_went_is_told() -> None:
+    size = (1.1, 0.7, 0.6)
+    middle = np.array([[0.55, 0.35, 0.3]])
+    whole, pose = box(size, "lrfb"), yaw_pose(1.2, (4.0, -3.0, 0.1))
+    (move,) = moves([noisy(whole, "a")], [noisy(transform(pose, whole), "b")], [True])
+    assert (move.removed, move.added) == (0, 0)
+    np.testing.assert_allclose(move.displacement_map, (transform(pose, middle) - middle)[0], atol=0.03)
+
+
+def test_an_object_seen_from_two_sides_went_where_it_went() -> None:
+    # the top and two sides before, the top and the other long side after: centres of points differ by decimetres
+    size, pose = (1.1, 0.7, 0.6), yaw_pose(-0.5, (2.5, 1.0, 0.0))
+    start, end = noisy(box(size, "lf"), "a"), noisy(transform(pose, box(size, "rb")), "b")
+    middle = np.array([[0.55, 0.35, 0.3]])
+    went = (transform(pose, middle) - middle)[0]
+    assert np.linalg.norm(end.mean(axis=0) - start.mean(axis=0) - went) > 0.15
+    (move,) = moves([start], [end], [True])
+    np.testing.assert_allclose(move.displacement_map, went, atol=0.05)
+
+
+def test_a_chair_is_not_a_barrel_of_the_same_extents() -> None:
+    far = yaw_pose(0.7, (5.0, 2.0, 0.0))
+    assert moves([chair()], [transform(far, barrel())], [True]) == []
+    # where both are, each finds its own, whatever the order and the distance
+    further = yaw_pose(2.0, (12.0, 2.0, 0.0))
+    added = [transform(far, barrel()), transform(further, chair())]
+    found = moves([chair(), barrel()], added, [True, True])
+    assert [(move.removed, move.added) for move in found] == [(0, 1), (1, 0)]
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.7])
+def test_the_same_shape_in_another_size_is_another_object(factor: float) -> None:
+    crate = box((1.0, 0.7, 0.6), "lrfb")
+    assert moves([crate], [shifted(crate * factor, 3.0)], [True]) == []
+
+
+@pytest.mark.parametrize(("length_m", "is_same"), [(1.25, True), (1.7, False)])
+def test_a_longer_box_is_another_object_however_well_they_fit(length_m: float, is_same: bool) -> None:
+    short, long = box((1.0, 0.6, 0.5), "lrfb"), box((length_m, 0.6, 0.5), "lrfb")
+    assert len(moves([short], [shifted(long, 5.0)], [True])) == is_same
+
+
+def test_one_object_moves_once_and_of_two_alike_the_nearer_is_it() -> None:
+    few = chair()
+    copies = [shifted(few, 9.0), noisy(shifted(few, 4.0), "a", 0.004)]  # the farther one fits a little better
+    for nearer, both in ((1, copies), (0, copies[::-1])):
+        (move,) = moves([few], both, [True])
+        assert move.added == nearer
+        np.testing.assert_allclose(move.displacement_map, [4, 0, 0], atol=0.03)
+        (move,) = moves(both, [few], [True, True])
+        assert move.removed == nearer
+
+
+def test_the_best_pairing_is_not_given_up_for_more_pairs() -> None:
+    # the crate went to the crate; that leaves a removed box and an added one which are not alike enough
+    crate, low = box((1.0, 0.7, 0.6), "lrfb"), box((1.05, 0.75, 0.45), "lrfb")
+    barrel_there = transform(yaw_pose(0, (7.0, 0, 0)), barrel(0.42, 0.55))
+    found = moves([crate, low], [barrel_there, shifted(crate, 4.0, 1.0)], [True, True])
+    assert (0, 1) in [(move.removed, move.added) for move in found]
+
+
+def test_what_stuck_out_of_a_short_move_is_paired() -> None:
+    # a box 0.9 m long pushed by 0.5 m along itself: of its top and front only what the other one does not cover, of its
+    # ends both, for each stands clear of the other box or inside of it
+    start, end = box((0.9, 0.6, 0.5), "lrf"), shifted(box((0.9, 0.6, 0.5), "lrf"), 0.5)
+    start = start[(start[:, 0] < 0.45) | (start[:, 0] > 0.899)]
+    end = end[(end[:, 0] > 0.95) | (end[:, 0] < 0.501)]
+    (move,) = moves([start], [end], [False])
+    np.testing.assert_allclose(move.displacement_map, [0.5, 0, 0], atol=0.1)
+
+
+def test_strips_that_are_not_alike_are_one_object_with_what_seems_to_have_stayed() -> None:
+    # A tall box pushed by 0.3 m: what sticks out is a strip of its top and front before, a strip of its top and front
+    # and its end after. The end it had before is inside of where it stands now: no ray tells that it has gone.
+    start = noisy(box((1.2, 1.0, 1.5), "fr"), "a", 0.005)
+    end = noisy(shifted(box((1.2, 1.0, 1.5), "fr"), 0.3), "b", 0.005)
+    gone, come = start[start[:, 0] < 0.25], end[end[:, 0] > 1.25]
+    (alone,) = moves([gone], [come], [False])  # strip on strip
+    assert alone.displacement_map[0] > 1.0
+    (move,) = find_moves([gone], [come], [False], lambda pairs: [(start, end)] * len(pairs))
+    np.testing.assert_allclose(move.displacement_map, [0.3, 0.0, 0.0], atol=0.05)
+
+
+def test_neighbours_that_share_just_enough_points_but_are_hardly_alike_are_two_objects() -> None:
+    # both have a rail of a metre on the floor; the other metre stands in one and lies across in the other
+    rail = face((0, 0, 0), (1.0, 0, 0))
+    post = np.concatenate([rail, face((0, 0, 0), (0, 0, 1.0))])
+    corner = np.concatenate([rail, face((0, 0, 0), (0, 1.0, 0))])
+    assert moves([noisy(post, "a")], [noisy(shifted(corner, 0.3, 0.1), "b")], [False]) == []
+    assert len(moves([noisy(post, "a")], [noisy(shifted(post, 0.3, 0.1), "b")], [False])) == 1
+
+
+def test_what_lies_on_what_stands_around_is_not_what_was_put_beside_it() -> None:
+    # a load off the flank of a heap would lie on the rest of it; the chair put there would not
+    heap = face((0, 0, 0), (2.0, 3.0, 0)) @ np.array([[1, 0, 0.6], [0, 1, 0], [0, 0, 0]])
+    is_load = heap[:, 1] < 1.5
+    put = shifted(chair(), 2.2, 1.0)
+    around = (heap, np.concatenate([heap[~is_load], put]))
+    assert find_moves([heap[is_load]], [put], [True], lambda pairs: [around] * len(pairs)) == []
+
+
+def test_only_neighbours_are_asked_what_stands_around_them() -> None:
+    crate = box((1.0, 0.7, 0.6), "lrfb")
+    asked: list[tuple[int, int]] = []
+
+    def around(pairs: Sequence[tuple[int, int]]) -> list[tuple[Float64Array, Float64Array]]:
+        asked.extend(pairs)
+        return [(np.zeros((0, 3)), np.zeros((0, 3)))] * len(pairs)
+
+    find_moves([crate, shifted(crate, 30.0)], [shifted(crate, 2.0), shifted(crate, 9.0)], [True, True], around)
+    assert asked == [(0, 0)]
+
+
+def test_what_was_only_part_of_something_has_not_gone_far() -> None:
+    crate = box((1.0, 0.7, 0.6), "lrfb")
+    assert moves([crate], [shifted(crate, 4.0)], [False]) == []
+    assert len(moves([crate], [shifted(crate, 0.8)], [False])) == 1
+
+
+def test_turning_the_map_turns_the_displacement() -> None:
+    crate = noisy(box((1.1, 0.7, 0.6), "lf"), "a")
+    there = noisy(transform(yaw_pose(0.9, (3.0, 2.0, 0.0)), box((1.1, 0.7, 0.6), "rf")), "b")
+    (move,) = moves([crate], [there], [True])
+    turn = yaw_pose(2.2, (100.0, -30.0, 4.0))
+    (turned,) = moves([transform(turn, crate)], [transform(turn, there)], [True])
+    np.testing.assert_allclose(turned.displacement_map, turn[:3, :3] @ move.displacement_map, atol=0.02)
+
+
+def test_among_very_many_the_right_one_is_tried() -> None:
+    crate = box((1.0, 0.7, 0.6), "lrfb")
+    others = [shifted(box((1.0 + 0.02 * n, 0.7 - 0.02 * n, 0.6), "lrfb"), 3.0, 2.0 * n) for n in range(1, 12)]
+    (move,) = moves([crate], [*others, shifted(crate, 4.0)], [True])
+    assert move.added == len(others)
+
+
+def test_a_few_points_are_nobody() -> None:
+    few = chair()[:3]
+    assert moves([few], [shifted(few, 2.0)], [True]) == []
+    assert moves([few[:1]], [chair()], [True]) == []
+    assert moves([], [chair()], []) == moves([chair()], [], [True]) == []

@@ -1,0 +1,166 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import yaw_pose
+from cdpipe.io.answer import read_answer, write_answer, write_failure
+from cdpipe.model.types import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
+
+
+def _report() -> ChangeReport:
+    regions = ChangeRegions(
+        centres_map=np.array([[1.0, 2, 3], [4, 5, 6]]),
+        radius_m=4.5,
+        scores=np.array([0.9, 0.1]),
+        pairs=np.array([[0, 1], [2, 3]]),
+        is_reported=np.array([True, False]),
+        keyframe_scores=np.array([0.9, np.nan, 0.1]),
+    )
+    objects = tuple(
+        ChangedObject("after", "added", 0, np.full((n, 2), n, dtype=np.int32), np.full((n, 3), float(n)), 0.5)
+        for n in (3, 0, 2)
+    )
+    return ChangeReport(
+        before_T_after=np.eye(4),
+        evidence={"overlap": 0.9},
+        regions=regions,
+        objects=objects,
+        seconds={"t_cd_s": 0.25},
+        figures={"v_oe_m3": np.array([0.3, np.nan])},
+        keyframe_scans=(np.array([0, 4, 8]), np.array([0, 5])),
+        config={"method": "descriptor"},
+    )
+
+
+def test_an_answer_survives_the_disk(tmp_path: Path) -> None:
+    write_answer(tmp_path / "a", "paper", _report())
+    answer = read_answer(tmp_path / "a")
+    assert (answer.status, answer.method, answer.seconds) == ("ok", "paper", {"t_cd_s": 0.25})
+    assert answer.report is not None
+    assert [len(item.returns) for item in answer.report.objects] == [3, 0, 2]
+    np.testing.assert_array_equal(answer.report.objects[2].points_map, np.full((2, 3), 2.0))
+    np.testing.assert_array_equal(answer.report.regions.keyframe_scores, [0.9, np.nan, 0.1])
+    np.testing.assert_array_equal(answer.report.figures["v_oe_m3"], [0.3, np.nan])
+
+
+def test_a_local_merge_survives_the_disk_and_need_not_be_there(tmp_path: Path) -> None:
+    local = np.stack([yaw_pose(0.1 * index, (index, 2.0, 3.0)) for index in range(2)])
+    write_answer(tmp_path, "paper", replace(_report(), local_before_T_after=local))
+    read = read_answer(tmp_path).report
+    assert read is not None
+    np.testing.assert_array_equal(read.local_before_T_after, local)
+    # and none is left of it by an answer that has none
+    write_answer(tmp_path, "paper", _report())
+    read = read_answer(tmp_path).report
+    assert read is not None
+    assert read.local_before_T_after is None
+
+
+def test_shapes_moves_and_withdrawn_regions_survive_the_disk_and_need_not_be_there(tmp_path: Path) -> None:
+    report = _report()
+    shape = ObjectShape(yaw_pose(0.3, (1.0, 2.0, 3.0)), np.array([1.5, 0.7, 0.4]), 0.25)
+    went = np.array([3.0, -4.0, 0.1])
+    first, second, third = report.objects
+    objects = (
+        replace(first, kind="moved", partner=2, shape=shape, displacement_map=went),
+        second,
+        replace(third, session="before", kind="moved", partner=0, displacement_map=went),
+    )
+    direction = np.array([1, 0], np.uint8)
+    regions = replace(report.regions, is_withdrawn=np.array([False, True]), direction=direction)
+    write_answer(tmp_path, "paper", replace(report, objects=objects, regions=regions))
+    read = read_answer(tmp_path).report
+    assert read is not None
+    stored = read.objects[0].shape
+    assert stored is not None
+    np.testing.assert_array_equal(stored.map_T_box, shape.map_T_box)
+    np.testing.assert_array_equal(stored.box_m, shape.box_m)
+    assert stored.volume_m3 == 0.25
+    assert [item.shape is None for item in read.objects] == [False, True, True]
+    for item in (read.objects[0], read.objects[2]):
+        np.testing.assert_array_equal(item.displacement_map, went)
+    assert read.objects[1].displacement_map is None
+    np.testing.assert_array_equal(read.regions.is_withdrawn, [False, True])
+    np.testing.assert_array_equal(read.regions.direction, direction)
+    np.testing.assert_array_equal(read.regions.is_proposed, [True, True])
+    # an answer without them, as others write it, is as good
+    write_answer(tmp_path, "paper", report)
+    assert "shape" not in (tmp_path / "answer.json").read_text()
+    read = read_answer(tmp_path).report
+    assert read is not None
+    first = read.objects[0]
+    assert all(value is None for value in (first.shape, first.displacement_map, read.regions.is_withdrawn))
+    assert read.regions.direction is None
+
+
+@pytest.mark.parametrize("direction", [np.array([0, 2], np.uint8), np.array([0, 1]), np.array([0], np.uint8)])
+def test_a_direction_that_is_none_is_refused(direction: object) -> None:
+    with pytest.raises(ValueError, match="direction"):
+        replace(_report().regions, direction=direction)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("shape", {"map_T_box": np.eye(3).tolist(), "box_m": [1, 1, 1], "volume_m3": 1}, "map_T_box"),
+        ("shape", {"map_T_box": np.eye(4).tolist(), "box_m": [1, 1], "volume_m3": 1}, "box_m"),
+        ("shape", {"map_T_box": np.eye(4).tolist(), "box_m": [1, 1, 1]}, "volume_m3"),
+        ("displacement_map", [1.0, 2.0], "displacement_map"),
+    ],
+)
+def test_a_damaged_shape_is_named(name: str, value: object, words: str, tmp_path: Path) -> None:
+    write_answer(tmp_path, "other", _report())
+    document = json.loads((tmp_path / "answer.json").read_text())
+    document["objects"][1][name] = value
+    (tmp_path / "answer.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=f"answer.json: objects.1.*{words}"):
+        read_answer(tmp_path)
+
+
+def test_an_answer_says_where_it_ends(tmp_path: Path) -> None:
+    write_answer(tmp_path, "paper", _report())
+    assert "until" not in json.loads((tmp_path / "answer.json").read_text())
+    assert read_answer(tmp_path).until is None
+    write_answer(tmp_path, "paper", _report(), "merge")
+    assert read_answer(tmp_path).until == "merge"
+    write_failure(tmp_path, "paper", "failed", "", {}, {}, "merge")
+    assert read_answer(tmp_path).until == "merge"
+    text = (tmp_path / "answer.json").read_text()
+    (tmp_path / "answer.json").write_text(text.replace('"until": "merge"', '"until": "query"'))
+    with pytest.raises(InputError, match="until = 'query': input should be 'merge'"):
+        read_answer(tmp_path)
+
+
+def test_a_failure_replaces_an_older_answer(tmp_path: Path) -> None:
+    write_answer(tmp_path, "paper", _report())
+    write_failure(tmp_path, "paper", "merge_refused", "no overlap", {"inlier_share": 0.2}, {})
+    answer = read_answer(tmp_path)
+    assert (answer.status, answer.error, answer.report) == ("merge_refused", "no overlap", None)
+    assert not (tmp_path / "answer.npz").exists()
+
+
+def test_a_foreign_answer_may_name_points(tmp_path: Path) -> None:
+    write_answer(tmp_path, "other", _report())
+    arrays = dict(np.load(tmp_path / "answer.npz"))
+    del arrays["object_returns"], arrays["object_return_offsets"]
+    arrays["object_points_odom"] = np.ones((4, 3))
+    arrays["object_point_odom_offsets"] = np.array([0, 1, 1, 4])
+    np.savez(tmp_path / "answer.npz", **arrays)
+    answer = read_answer(tmp_path)
+    assert answer.points_odom is not None
+    assert [len(points) for points in answer.points_odom] == [1, 0, 3]
+
+
+def test_damage_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"answer\.json: missing"):
+        read_answer(tmp_path)
+    write_answer(tmp_path, "paper", _report())
+    document = json.loads((tmp_path / "answer.json").read_text())
+    document["objects"].pop()
+    (tmp_path / "answer.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="object_return_offsets has 4 entries for 2 objects"):
+        read_answer(tmp_path)

@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, make_pose, stream
+from cdpipe.mapping.mapping import build_map
+from cdpipe.mapping.session_check import UNITS, check_session, is_same_session, unit_hint
+from cdpipe.model.config import MapConfig
+from cdpipe.model.types import PosedScan
+
+CAMERA_R_ROBOT = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # x right, y down, z forward
+
+
+class Drive:
+    """Scans of a spinning sensor in a tunnel 4 m wide, 0.5 m apart; lengths in any unit."""
+
+    def __init__(self, n_scans: int = 12, points: float = 1.0, trajectory: float = 1.0) -> None:
+        self.name = "drive"
+        along = 0.5 * np.arange(n_scans)
+        self.odom_T_sensor = np.array([make_pose(translation=(x * trajectory, 0, 0)) for x in along]).reshape(-1, 4, 4)
+        rng = stream(0, "drive")
+        azimuth, elevation = rng.uniform(0, 2 * np.pi, 4000), rng.uniform(-0.37, 0.37, 4000)
+        rays = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
+        reach = np.minimum(2.0 / np.abs(rays[:, 1]), 15.0)
+        self.clouds = [points * (rays * reach[:, None] + rng.normal(0, 0.01, rays.shape)) for _ in along]
+
+    def scan(self, index: int) -> PosedScan:
+        rows = np.arange(len(self.clouds[index]))
+        return PosedScan(index, self.clouds[index], self.odom_T_sensor[index], rows, rows.astype(np.int32))
+
+    def scans(self) -> Iterator[PosedScan]:
+        return (self.scan(index) for index in range(len(self.clouds)))
+
+    def turned(self, points: Float64Array | None = None, odom: Float64Array | None = None) -> Drive:
+        """Express points (and with them the poses' right side), or the odom frame, in another frame."""
+        if points is not None:
+            self.clouds = [cloud @ points.T for cloud in self.clouds]
+            self.odom_T_sensor = self.odom_T_sensor @ make_pose(points.T)
+        if odom is not None:
+            self.odom_T_sensor = make_pose(odom) @ self.odom_T_sensor
+        return self
+
+
+def said(source: Drive, other: Drive | None = None) -> str:
+    with pytest.raises(InputError) as caught:
+        check_session(source, MapConfig(), other)
+    text = str(caught.value)
+    assert text.startswith("drive: ")
+    assert "\n" not in text
+    return text
+
+
+def test_a_drive_in_metres_passes() -> None:
+    check_session(Drive(), MapConfig())
+    check_session(Drive(), MapConfig(), Drive(points=1000.0))
+    check_session(Drive(n_scans=3), MapConfig())
+
+
+def test_a_sensor_upside_down_passes() -> None:
+    check_session(Drive().turned(points=np.diag([1.0, -1, -1])), MapConfig())
+
+
+def test_no_path() -> None:
+    assert "1 scan: expected a drive, at least two scans along a path" in said(Drive(n_scans=1))
+    assert "0 scan: expected a drive" in said(Drive(n_scans=0))
+    short = said(Drive(n_scans=2))
+    assert "its 2 scans lie along 0.5 m: expected a path of at least map.keyframe_spacing_m = 1 m" in short
+    standing = said(Drive(trajectory=0.0))
+    assert "12 scans lie along 0 m" in standing
+    assert "kilometres" not in standing
+    assert "if the trajectory is in kilometres, scale it by 1000" in said(Drive(trajectory=1e-3))
+
+
+def test_a_pose_that_is_no_pose() -> None:
+    bad = Drive()
+    bad.odom_T_sensor[3, 0, 3] = np.inf
+    assert "the pose of scan[3] is not finite: mend it, or leave the scan out" in said(bad)
+    bad = Drive()
+    bad.odom_T_sensor[4, :3, :3] *= 2
+    assert "the pose of scan[4] is not a rigid transform" in said(bad)
+
+
+@pytest.mark.parametrize("unit", ["millimetres", "centimetres", "inches", "kilometres"])
+@pytest.mark.parametrize("trajectory_too", [True, False])
+def test_points_in_another_unit_beside_a_session_in_metres(unit: str, trajectory_too: bool) -> None:
+    per_metre = 1 / UNITS[unit]
+    text = said(Drive(points=per_metre, trajectory=per_metre if trajectory_too else 1.0), Drive())
+    assert f"expected metres; the points look like {unit}: scale by {UNITS[unit]:g}, and the trajectory" in text
+
+
+def test_points_in_another_unit_alone() -> None:
+    assert "the points look like millimetres: scale by 0.001," in said(Drive(points=1000.0))
+    # 2.5 m are 250 cm, and so are 6.4 m in inches: both are tunnels
+    assert "look like centimetres or inches: scale by 0.01 or 0.0254," in said(Drive(points=100.0))
+    assert "find out the unit of the points and scale to metres" in said(Drive(points=1e9))
+
+
+def test_a_trajectory_in_another_unit_than_the_points() -> None:
+    text = said(Drive(trajectory=1000.0))
+    assert "neighbouring scans lie 500 m apart and see" in text
+    assert "expected a trajectory in metres; the trajectory looks like millimetres: scale by 0.001" in text
+    # steps of 50: of 5 cm, half a metre, or 1.3 m
+    text = said(Drive(trajectory=100.0))
+    assert "looks like millimetres or centimetres or inches: scale by 0.001 or 0.01 or 0.0254" in text
+
+
+def test_z_is_up() -> None:
+    both = Drive().turned(points=CAMERA_R_ROBOT, odom=CAMERA_R_ROBOT)
+    assert "the sensor spins about an axis 90 degrees off z of the sensor's frame: expected x forward" in said(both)
+    odom = Drive().turned(odom=CAMERA_R_ROBOT)
+    assert "90 degrees off z of the trajectory's frame" in said(odom)
+    # poses whose positions alone are a camera's
+    climbing = Drive()
+    climbing.odom_T_sensor[:, :3, 3] = climbing.odom_T_sensor[:, :3, 3] @ CAMERA_R_ROBOT.T
+    assert "the path climbs or falls by 90 degrees: expected a trajectory with z up" in said(climbing)
+
+
+def test_a_steep_ramp_passes() -> None:
+    ramp = Drive()
+    ramp.odom_T_sensor[:, 2, 3] = 0.4 * ramp.odom_T_sensor[:, 0, 3]
+    check_session(ramp, MapConfig())
+
+
+def test_feet_are_no_error_but_a_hint() -> None:
+    per_metre = 1 / 0.3048
+    feet = Drive(points=per_metre, trajectory=per_metre)
+    check_session(feet, MapConfig())
+    metres_map, feet_map = build_map(Drive(), MapConfig()), build_map(feet, MapConfig())
+    expected = "session's returns lie 3.3 times as far as the other's: if it is in feet, scale its points"
+    assert f"the after {expected}" in unit_hint(metres_map, feet_map)
+    assert f"the before {expected}" in unit_hint(feet_map, metres_map)
+    assert unit_hint(metres_map, metres_map) == ""
+    assert unit_hint(metres_map, build_map(Drive(points=2.0), MapConfig())) == ""
+
+
+def test_one_recording_twice() -> None:
+    assert is_same_session(Drive(), Drive())
+    other = Drive()
+    other.clouds[0] = other.clouds[0] + 1e-9
+    assert not is_same_session(Drive(), other)
+    assert not is_same_session(Drive(), Drive(n_scans=11))

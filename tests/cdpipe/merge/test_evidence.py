@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cdpipe.core.geometry import Float64Array, make_pose, yaw_pose
+from cdpipe.merge.evidence import SurfaceFit, sampled, surface_fit, why_refused
+from cdpipe.merge.registration import IndexedMap
+from cdpipe.model.config import MergeConfig
+from cdpipe.model.types import MappedSession
+
+CONFIG = MergeConfig()
+GOOD = {"overlap": 0.5, "inlier_share": 0.95, "hessian_ratio": 0.1, "agreement": 0.95, "distinctness": 10.0}
+
+
+def floor(half_m: float = 12.0, step_m: float = 0.25) -> Float64Array:
+    axis = np.arange(-half_m, half_m + 1e-9, step_m)
+    return np.stack(np.meshgrid(axis, axis, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@pytest.fixture
+def floors(tunnel_before: MappedSession) -> tuple[IndexedMap, IndexedMap]:
+    """A flat floor, mapped twice; the second map has points half way between those of the first."""
+    points, near = floor(), np.ones(len(floor()), np.float32)
+    maps = [
+        replace(tunnel_before.map, points=points + np.array([shift, shift, 0.0]), nearest_m=near, seen_from=None)
+        for shift in (0.0, 0.125)
+    ]
+    return IndexedMap(maps[0], CONFIG, is_target=True), IndexedMap(maps[1], CONFIG, is_target=False)
+
+
+def fit_at(maps: tuple[IndexedMap, IndexedMap], pose: Float64Array) -> SurfaceFit:
+    return surface_fit(*maps, pose, sampled(maps[1].sphere(np.zeros(3), 5.0)), np.zeros(3), 5.0)
+
+
+@pytest.mark.parametrize(("lift_m", "share"), [(0.0, 1.0), (0.09, 1.0), (0.11, 0.0)])
+def test_a_lifted_floor_fits_up_to_the_inlier_distance(
+    floors: tuple[IndexedMap, IndexedMap], lift_m: float, share: float
+) -> None:
+    fit = fit_at(floors, make_pose(translation=(0, 0, lift_m)))
+    assert fit.inlier_share(0.1) == share
+    assert fit.residual_m == pytest.approx(lift_m, abs=1e-9)
+
+
+def test_distances_are_along_the_normal_and_not_to_the_next_point(floors: tuple[IndexedMap, IndexedMap]) -> None:
+    # points of the second map lie a decimetre and more from the nearest of the first, but on its surface
+    fit = fit_at(floors, make_pose(translation=(0.1, -0.05, 0.0)))
+    assert fit.residual_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_has_no_counterpart_does_not_fit(floors: tuple[IndexedMap, IndexedMap]) -> None:
+    fit = fit_at(floors, make_pose(translation=(0, 0, 0.6)))
+    assert np.isinf(fit.forward_m).all()
+    assert fit.inlier_share(10.0) == 0.0
+    # where the other map has nothing at all, there is no point of it to look at either
+    assert fit_at(floors, make_pose(translation=(300.0, 0, 0))).inlier_share(0.1) == 0.0
+
+
+def test_the_lower_of_both_directions_counts() -> None:
+    fit = SurfaceFit(np.array([0.0, 0.0, 0.3, 0.3]), np.array([0.0, 0.3, 0.3, np.inf]), np.eye(6))
+    assert fit.inlier_share(0.1) == 0.25
+
+
+def test_a_plane_holds_one_direction_only_whichever_way_the_maps_are_turned(
+    floors: tuple[IndexedMap, IndexedMap],
+) -> None:
+    for pose in (make_pose(), yaw_pose(1.0)):
+        eigenvalues = np.linalg.eigvalsh(fit_at(floors, pose).information[3:, 3:])
+        assert eigenvalues[:2] == pytest.approx(0.0, abs=1e-6)
+        assert eigenvalues[2] > 100
+
+
+def test_samples_are_every_kth_point() -> None:
+    points = np.arange(3000.0).reshape(1000, 3)
+    np.testing.assert_array_equal(sampled(points, 300), points[::3])
+    np.testing.assert_array_equal(sampled(points[:10], 300), points[:10])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("overlap", 0.1, "only 10% of the shorter one"),
+        ("inlier_share", 0.5, "only 50% of the points around the best pair"),
+        ("hessian_ratio", 0.0051, "degenerate"),
+        ("agreement", 0.7, "two places that look alike"),
+        ("distinctness", 1.1, "the tunnel repeats itself"),
+    ],
+)
+def test_each_gate_refuses_alone_and_says_why(name: str, value: float, said: str) -> None:
+    assert why_refused(GOOD, CONFIG) == ""
+    reason = why_refused({**GOOD, name: value}, CONFIG)
+    assert said in reason
+    assert f"merge.min_{name} asks for" in reason
+
+
+def test_what_could_not_be_measured_is_refused() -> None:
+    for name in GOOD:
+        assert why_refused({**GOOD, name: float("nan")}, CONFIG)
+        assert why_refused({key: value for key, value in GOOD.items() if key != name}, CONFIG)
+
+
+def test_the_gate_itself_is_enough() -> None:
+    at_the_gate = {name: getattr(CONFIG, f"min_{name}") for name in GOOD}
+    assert why_refused(at_the_gate, CONFIG) == ""

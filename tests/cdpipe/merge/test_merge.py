@@ -1,0 +1,219 @@
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpipe.core.geometry import Float64Array, invert, make_pose, rotation_angle_rad, stream, transform, yaw_pose
+from cdpipe.io.ply import read_ply_points
+from cdpipe.merge.evidence import why_refused
+from cdpipe.merge.merge import merge_maps
+from cdpipe.merge.registration import register
+from cdpipe.model.config import MergeConfig, load_config
+from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps
+
+CONFIG = MergeConfig(fallback=False)
+Bend = Callable[[MappedSession, float], tuple[MappedSession, Float64Array]]
+FRAME = load_config("frame").merge
+
+
+def map_error_m(found: Float64Array, true: Float64Array, points_after: Float64Array) -> float:
+    """Largest displacement of any point of the after map."""
+    return float(np.linalg.norm(transform(found, points_after) - transform(true, points_after), axis=1).max())
+
+
+def moved(session: MappedSession, new_T_old: Float64Array) -> MappedSession:
+    assert session.map.seen_from is not None
+    point_map = replace(
+        session.map,
+        points=transform(new_T_old, session.map.points),
+        seen_from=transform(new_T_old, session.map.seen_from).astype(np.float32),
+        odom_T_sensor=new_T_old @ session.map.odom_T_sensor,
+    )
+    return MappedSession(point_map, session.descriptors)
+
+
+def path_error_m(merged: MergedMaps, true: Float64Array) -> float:
+    """Largest displacement of any point of the after path."""
+    path = merged.after.odom_T_sensor[:, :3, 3]
+    return float(np.linalg.norm(merged.alignment.to_map(path) - transform(true, path), axis=1).max())
+
+
+def test_the_true_transform_is_found(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
+) -> None:
+    merged = merge_maps(tunnel_before, tunnel_after, CONFIG)
+    assert merged.is_accepted
+    assert merged.reason == ""
+    assert map_error_m(merged.before_T_after, true_before_T_after, tunnel_after.map.points) < 0.05
+    assert path_error_m(merged, true_before_T_after) < 0.02
+    assert merged.evidence["inlier_share"] > 0.95
+    assert merged.evidence["agreement"] > 0.95
+    assert merged.evidence["overlap"] == 1.0
+    assert merged.evidence["residual_m"] < 0.03
+    assert merged.evidence["n_hypotheses"] == 1
+    assert merged.evidence["is_fallback"] == 0
+    assert set(merged.seconds) == {"t_index_s", "t_merge_s", "t_refine_s"}
+
+
+def test_without_refinement_one_transform_holds_everywhere(
+    tunnel_before: MappedSession, tunnel_after: MappedSession
+) -> None:
+    merged = merge_maps(tunnel_before, tunnel_after, CONFIG.model_copy(update={"refine": "none"}))
+    assert merged.is_accepted
+    assert merged.local is None
+    assert "n_refined" not in merged.evidence
+    assert merged.seconds["t_refine_s"] == 0.0
+
+
+def test_maps_that_bend_apart_are_aligned_along_the_path(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array, bent: Bend
+) -> None:
+    # the after odometry turns by 2 degrees over its 52 m: no single transform is nearer than decimetres at both ends
+    drifting, true_at = bent(tunnel_after, np.deg2rad(2.0))
+    merged = merge_maps(tunnel_before, drifting, CONFIG)
+    assert merged.is_accepted
+    path = drifting.map.odom_T_keyframe[:, :3, 3]
+    true_path = transform(true_before_T_after, np.einsum("kij,kj->ki", true_at[:, :3, :3], path) + true_at[:, :3, 3])
+    errors_m = np.linalg.norm(merged.alignment.to_map(path) - true_path, axis=1)
+    rigid_m = np.linalg.norm(transform(merged.before_T_after, path) - true_path, axis=1)
+    assert rigid_m.max() > 0.1
+    assert np.percentile(errors_m, 95) < 0.05
+
+
+def test_frame_as_published_takes_whatever_it_finds(tunnel_before: MappedSession, other_tunnel: MappedSession) -> None:
+    merged = merge_maps(tunnel_before, other_tunnel, FRAME)
+    assert merged.is_accepted
+    assert merged.local is None
+    assert merged.evidence["n_hypotheses"] == 1
+    assert why_refused(merged.evidence, CONFIG)
+
+
+def test_frame_finds_the_tunnel_too(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
+) -> None:
+    merged = merge_maps(tunnel_before, tunnel_after, FRAME)
+    assert map_error_m(merged.before_T_after, true_before_T_after, tunnel_after.map.points) < 0.3
+
+
+def test_what_is_refused_is_left_to_kiss_matcher(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
+) -> None:
+    # descriptors that name the wrong places, too far off for any registration
+    wrong = replace(tunnel_after.descriptors, q=np.roll(tunnel_after.descriptors.q, 26, axis=0), w=None)
+    lost = MappedSession(tunnel_after.map, wrong)
+    assert not merge_maps(tunnel_before, lost, CONFIG).is_accepted
+    merged = merge_maps(tunnel_before, lost, MergeConfig())
+    assert merged.is_accepted
+    assert merged.evidence["is_fallback"] == 1
+    assert path_error_m(merged, true_before_T_after) < 0.02
+
+
+def test_without_the_extra_the_refusal_says_what_was_not_tried(
+    tunnel_before: MappedSession, other_tunnel: MappedSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cdpipe.merge.merge.is_kiss_matcher_installed", lambda: False)
+    merged = merge_maps(tunnel_before, other_tunnel, MergeConfig())
+    assert not merged.is_accepted
+    assert merged.reason.endswith("(KISS-Matcher could not be asked: pip install 'tunnelcd[kiss]')")
+
+
+def test_moving_both_sessions_moves_the_answer(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
+) -> None:
+    g, h = yaw_pose(-2.1, (400.0, -90.0, 7.0)), yaw_pose(1.3, (-50.0, 800.0, -3.0))
+    merged = merge_maps(moved(tunnel_before, g), moved(tunnel_after, h), CONFIG)
+    expected = g @ true_before_T_after @ invert(h)
+    assert map_error_m(merged.before_T_after, expected, transform(h, tunnel_after.map.points)) < 0.05
+
+
+def test_the_same_input_gives_the_same_bits(tunnel_before: MappedSession, tunnel_after: MappedSession) -> None:
+    one, other = (merge_maps(tunnel_before, tunnel_after, MergeConfig()) for _ in range(2))
+    np.testing.assert_array_equal(one.before_T_after, other.before_T_after)
+    assert one.evidence == other.evidence
+
+
+def test_without_orientation_vectors_quarter_turns_are_tried(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
+) -> None:
+    blind = [MappedSession(s.map, replace(s.descriptors, w=None)) for s in (tunnel_before, tunnel_after)]
+    turned = MappedSession(moved(blind[1], yaw_pose(2.0)).map, blind[1].descriptors)
+    merged = merge_maps(blind[0], turned, CONFIG)
+    assert merged.is_accepted
+    assert map_error_m(merged.before_T_after, true_before_T_after @ yaw_pose(-2.0), turned.map.points) < 0.05
+
+
+def test_another_tunnel_is_refused_with_a_reason(tunnel_before: MappedSession, other_tunnel: MappedSession) -> None:
+    merged = merge_maps(tunnel_before, other_tunnel, CONFIG)
+    assert not merged.is_accepted
+    assert "merge.min_" in merged.reason
+    assert merged.local is None
+    assert merged.evidence["agreement"] < 0.6
+
+
+def test_a_smooth_straight_corridor_is_refused_because_it_slides(tunnel_before: MappedSession) -> None:
+    sessions = []
+    for sample in (0, 1):
+        rng = stream(sample, "corridor")
+        along, section = rng.uniform(-20, 20, 60_000), rng.uniform(-1, 1, (60_000, 2))
+        wall = rng.integers(0, 2, 60_000)
+        section[np.arange(60_000), wall] = np.sign(section[np.arange(60_000), wall])
+        points = np.column_stack([along, 3 * section]) + rng.normal(0, 0.01, (60_000, 3))
+        poses = np.array([make_pose(translation=(x, 0, 0)) for x in (-1.0, 0.0, 1.0)])
+        point_map = replace(
+            tunnel_before.map,
+            points=points,
+            nearest_m=np.full(len(points), 3.0, np.float32),
+            odom_T_sensor=poses,
+            keyframe_scans=np.arange(3),
+            scan_offsets=np.zeros(4, np.int64),
+            seen_from=None,
+        )
+        q = np.eye(3, 64, dtype=np.float32)
+        sessions.append(MappedSession(point_map, DescriptorSet(q, None, np.arange(3), "place", "")))
+    merged = merge_maps(*sessions, CONFIG)
+    assert not merged.is_accepted
+    assert "can slide" in merged.reason
+    assert merged.evidence["inlier_share"] > 0.9
+    assert merged.evidence["hessian_ratio"] < CONFIG.min_hessian_ratio
+
+
+def test_maps_too_small_to_register_are_refused(tunnel_before: MappedSession) -> None:
+    no_keyframe = replace(
+        tunnel_before.descriptors,
+        q=np.zeros((0, 64), np.float32),
+        w=np.zeros((0, 64), np.float32),
+        keyframe_scans=np.zeros(0, np.int64),
+    )
+    one, points = tunnel_before.map.nearest_m[:1], tunnel_before.map.points[:1]
+    few_points = MappedSession(
+        replace(tunnel_before.map, points=points, nearest_m=one, seen_from=None), tunnel_before.descriptors
+    )
+    far_off = replace(tunnel_before.map, nearest_m=np.full(len(tunnel_before.map.points), 40.0, np.float32))
+    for before, after in (
+        (tunnel_before, MappedSession(tunnel_before.map, no_keyframe)),
+        (tunnel_before, few_points),
+        (few_points, tunnel_before),
+        (tunnel_before, MappedSession(far_off, tunnel_before.descriptors)),
+    ):
+        merged = merge_maps(before, after, CONFIG)
+        assert not merged.is_accepted
+        assert "enough points" in merged.reason
+        assert set(merged.seconds) == {"t_index_s", "t_merge_s", "t_refine_s"}
+        assert merged.seconds["t_refine_s"] == 0.0
+        np.testing.assert_array_equal(merged.before_T_after, np.eye(4))
+
+
+def test_the_real_pair_is_solved() -> None:
+    if "TUNNELCD_REAL_DATA" not in os.environ:
+        pytest.skip("TUNNELCD_REAL_DATA is unset: the real registration pair is not at hand")
+    folder = Path(os.environ["TUNNELCD_REAL_DATA"]) / "registration_pair"
+    source, target = read_ply_points(folder / "source.ply"), read_ply_points(folder / "target.ply")
+    true = np.loadtxt(folder / "T_target_source.txt")
+    error = invert(true) @ register(source, target, np.eye(4), MergeConfig())
+    assert np.linalg.norm(error[:3, 3]) < 0.02
+    assert np.degrees(rotation_angle_rad(error)) < 0.5

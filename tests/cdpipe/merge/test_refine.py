@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from cdpipe.core.geometry import make_pose
+from cdpipe.merge.merge import merge_maps
+from cdpipe.merge.refine import _held, refined
+from cdpipe.merge.registration import IndexedMap
+from cdpipe.merge.walk import Walk
+from cdpipe.model.config import MergeConfig
+from cdpipe.model.types import MappedSession, PointMap
+
+
+@pytest.mark.parametrize("scales", [(1.005, 0.995), (0.995, 1.005), (1.0, 1.0)])
+def test_maps_that_stretch_differently_are_aligned_where_the_robot_stood(
+    looking_ahead: Callable[[int, float], MappedSession], scales: tuple[float, float]
+) -> None:
+    # a sensor that looks ahead puts every face where the odometry stood some metres before it
+    before, after = (looking_ahead(sample, scale) for sample, scale in enumerate(scales, 1))
+    merged = merge_maps(before, after, MergeConfig(fallback=False))
+    assert merged.is_accepted
+    assert merged.local is not None
+    path = after.map.odom_T_keyframe[:, :3, 3]
+    errors_m = np.linalg.norm(merged.local.to_map(path) - path * scales[0] / scales[1], axis=1)
+    assert np.median(errors_m) < 0.01
+    assert np.percentile(errors_m, 95) < 0.02
+
+
+def test_a_smooth_wall_holds_nothing_along_itself() -> None:
+    # 300 normals across x, each off by some degrees: what they seem to hold along x is their noise
+    rng = np.random.default_rng(0)
+    normals = np.column_stack([rng.normal(0, 0.08, 300), np.repeat(np.eye(3)[1:, 1:], 150, axis=0)])
+    jacobian = np.hstack([np.cross(rng.uniform(-4, 4, (300, 3)), normals), normals])
+    information = jacobian.T @ jacobian
+    held = _held(information[None])[0]
+    assert information[3, 3] > 1.5
+    assert np.linalg.eigvalsh(held[3:, 3:])[0] == pytest.approx(0.0, abs=1e-6)
+    assert np.linalg.eigvalsh(held)[0] > -1e-6
+    np.testing.assert_allclose(np.diag(held)[4:], np.diag(information)[4:], rtol=0.05)
+    np.testing.assert_array_equal(held[:3, :3], information[:3, :3])
+
+
+def wide_drift(sample: int) -> PointMap:
+    """A drift 10.6 m wide flown along its middle: floor and roof are even, only the walls tell the way along."""
+    rng = np.random.default_rng(sample)
+    along, across = rng.uniform(0, 60, 60_000), rng.uniform(-5.3, 5.3, 60_000)
+    floor, roof, left, right = np.arange(60_000).reshape(4, -1)
+    up = rng.uniform(-2.5, 3.5, 60_000)
+    up[floor], up[roof] = -2.5, 3.5
+    rough_m = 0.2 * np.sin(1.3 * along + np.sin(up)) + 0.15 * np.sin(2.9 * along) * np.cos(up)
+    across[left], across[right] = (5.3 + rough_m)[left], (-5.3 + rough_m)[right]
+    points = np.column_stack([along, across, up])
+    poses = np.array([make_pose(translation=(x, 0, 0)) for x in np.arange(5.0, 55.5, 0.5)])
+    nearest_m, _ = cKDTree(poses[:, :3, 3]).query(points)
+    none = np.zeros(0, np.int32)
+    offsets = np.zeros(len(poses) + 1, np.int64)
+    return PointMap(
+        points, np.asarray(nearest_m, np.float32), 0.1, poses, np.arange(0, len(poses), 2), none, none, offsets
+    )
+
+
+def test_the_walls_of_a_wide_drift_are_looked_at() -> None:
+    before, after = (wide_drift(sample) for sample in (1, 2))
+    config = MergeConfig(fallback=False)
+    maps = IndexedMap(before, config, is_target=True), IndexedMap(after, config, is_target=False)
+    keyframes = np.array([10, 25, 40])
+    coarse = np.repeat(make_pose(translation=(0.15, 0, 0))[None], 3, axis=0)
+    found = Walk(keyframes, coarse, np.zeros((3, 6, 6)), np.ones(3), np.zeros(3))
+    alignment, evidence = refined(*maps, found, config)
+    assert alignment is not None
+    assert evidence["n_refined"] > 8
+    path = after.odom_T_keyframe[:, :3, 3]
+    assert np.linalg.norm(alignment.to_map(path) - path, axis=1).max() < 0.01

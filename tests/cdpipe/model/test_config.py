@@ -1,0 +1,99 @@
+from pathlib import Path
+
+import pytest
+
+from cdpipe.core.errors import InputError
+from cdpipe.model.config import PipelineConfig, load_config, preset_names, settings_table
+
+
+def test_every_shipped_preset_is_valid() -> None:
+    named = {"paper", "paper-topn", "paper-paired", "voxel-diff", "c2c", "random-regions", "tunnelcd", "frame"}
+    assert named | {"kiss-matcher", "scan-context", "solid", "untrained", "sphere-difference"} <= set(preset_names())
+    for name in preset_names():
+        assert isinstance(load_config(name), PipelineConfig)
+
+
+def test_every_shipped_preset_says_what_wide_drifts_need() -> None:
+    for name in preset_names():
+        narrow, wide = load_config(name), load_config(name, site="wide")
+        assert (narrow.query.radius_m, wide.query.radius_m) == (4.5, 10.0)
+        scored = narrow.query.n_regions is None
+        assert (wide.query.threshold != narrow.query.threshold) == scored
+        same = {"radius_m": 4.5, "threshold": narrow.query.threshold}
+        assert wide.model_copy(update={"query": wide.query.model_copy(update=same)}) == narrow
+
+
+def test_settings_go_over_either_kind_of_site() -> None:
+    for site in ("narrow", "wide"):
+        assert load_config("tunnelcd", ["query.radius_m=7"], site).query.radius_m == 7
+
+
+def test_mistakes_of_both_kinds_of_site_are_told_at_once(tmp_path: Path) -> None:
+    preset = tmp_path / "mine.yaml"
+    preset.write_text("query: {radius_m: -1}\nwide:\n  query: {radius_m: 10, treshold: 1}\n")
+    with pytest.raises(InputError) as caught:
+        load_config(str(preset))
+    lines = str(caught.value).splitlines()
+    assert [line.partition(":")[2].partition(" =")[0] for line in lines] == ["1: query.radius_m", "3: query.treshold"]
+    assert 'did you mean "threshold"' in lines[1]
+    # a setting goes over either kind of site: no line of the preset is to blame for a `wide` in it
+    with pytest.raises(InputError, match=r"^--set: wide = .*: unknown key$"):
+        load_config("tunnelcd", ["wide.query.threshold=1"])
+    preset.write_text("wide: 10\n")
+    with pytest.raises(InputError, match=r"mine\.yaml:1: wide = 10: expected a group of settings"):
+        load_config(str(preset))
+
+
+def test_a_preset_without_wide_drifts_is_refused_there(tmp_path: Path) -> None:
+    preset = tmp_path / "mine.yaml"
+    preset.write_text("query: {radius_m: 3}\n")
+    assert load_config(str(preset)).query.radius_m == 3
+    with pytest.raises(InputError, match=r"mine\.yaml: wide: missing.*wide: \{query: \{radius_m: 10"):
+        load_config(str(preset), site="wide")
+
+
+def test_paper_preset_holds_the_published_settings() -> None:
+    config = load_config("paper", site="wide")
+    assert (config.query.reading, config.query.radius_m, config.extract.voxel_m) == ("nearest", 10.0, 0.65)
+
+
+def test_presets_of_descriptors_differ_in_the_descriptor_alone() -> None:
+    same = ["query.threshold=0", "merge.refine=local"]
+    learned = load_config("paper-paired", same)
+    for name in ("scan-context", "solid", "untrained"):
+        config = load_config(name, same)
+        assert config.descriptor.method == name
+        assert config.model_copy(update={"descriptor": learned.descriptor}) == learned
+        assert load_config(name).merge == load_config("tunnelcd").merge
+
+
+def test_mistakes_come_with_suggestions() -> None:
+    with pytest.raises(InputError) as caught:
+        load_config("paper", ["extract.voxel=0.4", "query.reading=pairs"])
+    text = str(caught.value)
+    assert '--set: extract.voxel = 0.4: unknown key; did you mean "voxel_m"?' in text
+    assert "query.reading = 'pairs'" in text
+    assert 'did you mean "paired"?' in text
+    with pytest.raises(InputError, match='did you mean "paper"'):
+        load_config("papr")
+
+
+def test_a_key_without_its_group_gets_the_whole_key() -> None:
+    with pytest.raises(InputError, match=r"min_cells = 3: unknown key; did you mean .extract\.min_cells.\?"):
+        load_config("tunnelcd", ["min_cells=3"])
+    with pytest.raises(InputError, match=r"did you mean .map\.voxel_m. or .merge\.voxel_m. or .extract\.voxel_m."):
+        load_config("tunnelcd", ["voxel_m=0.3"])
+
+
+@pytest.mark.parametrize(
+    "setting", ["extract.origin_m=.nan", "extract.origin_m=1e9", "query.threshold=.inf", "extract.voxel_m=1e-7"]
+)
+def test_numbers_that_no_stage_could_use_are_refused(setting: str) -> None:
+    with pytest.raises(InputError, match=f"--set: {setting.partition('=')[0]} = .*: input should be"):
+        load_config("tunnelcd", [setting])
+
+
+def test_every_setting_has_a_meaning() -> None:
+    rows = settings_table()
+    assert ("extract.voxel_m", 0.65) in [row[:2] for row in rows]
+    assert all(meaning for _, _, meaning in rows)

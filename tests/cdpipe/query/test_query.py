@@ -1,0 +1,165 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cdpipe.core.geometry import Float64Array, invert, make_pose, yaw_pose
+from cdpipe.model.config import QueryConfig
+from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap
+from cdpipe.query.query import find_regions, rank_regions
+
+
+def session(positions: list[tuple[float, float, float]], q: list[list[float]]) -> tuple[PointMap, DescriptorSet]:
+    poses = np.array([make_pose(translation=position) for position in positions]).reshape(-1, 4, 4)
+    scans = np.arange(len(positions))
+    nothing = np.zeros(0, np.int32)
+    point_map = PointMap(
+        np.zeros((0, 3)),
+        np.zeros(0, np.float32),
+        0.2,
+        poses,
+        scans,
+        nothing,
+        nothing,
+        np.zeros(len(scans) + 1, np.int64),
+    )
+    vectors = np.array(q, dtype=np.float32).reshape(-1, 2)
+    return point_map, DescriptorSet(vectors, None, scans, "by hand", "")
+
+
+def find(
+    before: tuple[PointMap, DescriptorSet],
+    after: tuple[PointMap, DescriptorSet],
+    before_T_after: Float64Array | None = None,
+    **settings: object,
+) -> dict[tuple[float, ...], tuple[float, tuple[int, int]]]:
+    """Score and pair of every candidate, by its centre."""
+    merged = MergedMaps(before[0], after[0], make_pose() if before_T_after is None else before_T_after, {}, True)
+    regions = find_regions(merged, before[1], after[1], QueryConfig(suppression=1e-9, **settings))
+    return {
+        tuple(np.round(centre, 6).tolist()): (pytest.approx(score, abs=1e-6), (int(pair[0]), int(pair[1])))
+        for centre, score, pair in zip(regions.centres_map, regions.scores, regions.pairs, strict=True)
+    }
+
+
+# Three places 10 m apart. After keyframe 0 looks like place 1, and place 1 itself has changed to (0.6, 0.8).
+BEFORE = session([(0, 0, 0), (10, 0, 0), (20, 0, 0)], [[1, 0], [0, 1], [-1, 0]])
+AFTER = session([(0, 1, 0), (10, 1, 0), (20, 1, 0)], [[0, 1], [0.6, 0.8], [-1, 0]])
+# |(0, 1) - (0.6, 0.8)| = sqrt(0.36 + 0.04); |(1, 0) - (0.6, 0.8)| = sqrt(0.16 + 0.64); |(1, 0) - (0, 1)| = sqrt 2
+S04, S08, S2 = 0.4**0.5, 0.8**0.5, 2.0**0.5
+
+
+def test_reading_a_by_hand() -> None:
+    assert find(BEFORE, AFTER, reading="nearest") == {
+        (0, 1, 0): (0, (1, 0)),
+        (10, 1, 0): (S04, (1, 1)),
+        (20, 1, 0): (0, (2, 2)),
+        (0, 0, 0): (S08, (0, 1)),
+        (10, 0, 0): (0, (1, 0)),
+        (20, 0, 0): (0, (2, 2)),
+    }
+
+
+def test_reading_b_by_hand() -> None:
+    assert find(BEFORE, AFTER, reading="paired") == {
+        (0, 1, 0): (S2, (0, 0)),
+        (10, 1, 0): (S04, (1, 1)),
+        (20, 1, 0): (0, (2, 2)),
+        (0, 0, 0): (S2, (0, 0)),
+        (10, 0, 0): (S04, (1, 1)),
+        (20, 0, 0): (0, (2, 2)),
+    }
+
+
+def test_the_direction_says_whose_keyframe_was_looked_up() -> None:
+    merged = MergedMaps(BEFORE[0], AFTER[0], make_pose(), {}, True)
+    for reading in ("nearest", "paired"):
+        regions = find_regions(merged, BEFORE[1], AFTER[1], QueryConfig(reading=reading, suppression=1e-9))
+        # before keyframes stand at y = 0, after keyframes at y = 1; the centre is where the asking one stands
+        np.testing.assert_array_equal(regions.direction, regions.centres_map[:, 1])
+        own = np.where(regions.direction == 0, regions.pairs[:, 0], regions.pairs[:, 1])
+        np.testing.assert_array_equal(regions.centres_map[:, 0], 10.0 * own)
+    assert sorted(regions.direction.tolist()) == [0, 0, 0, 1, 1, 1]
+
+
+def test_a_direction_is_dropped_and_ordered_with_its_candidate() -> None:
+    centres = np.array([[6.0, 0, 0], [3, 0, 0], [0, 0, 0]])
+    regions = rank_regions(
+        centres,
+        np.array([1.0, 2.0, 3.0]),
+        np.zeros((3, 2), np.int64),
+        np.zeros(0),
+        QueryConfig(radius_m=4.0),
+        np.array([1, 1, 0], np.uint8),
+    )
+    assert regions.direction.tolist() == [0, 1]
+
+
+def test_reading_b_leaves_out_keyframes_without_a_partner_nearby() -> None:
+    far = session([(0, 1, 0), (15, 0.1, 0)], [[1, 0], [0, 1]])
+    assert set(find(BEFORE, far, reading="paired", max_pair_m=5.0)) == {(0, 1, 0), (0, 0, 0)}
+    assert set(find(BEFORE, far, reading="paired", max_pair_m=5.1)) == {
+        (0, 1, 0), (15, 0.1, 0), (0, 0, 0), (10, 0, 0), (20, 0, 0),
+    }  # fmt: skip
+
+
+def test_scores_of_before_keyframes_by_hand() -> None:
+    # after keyframes 1 and 2 are both nearest to before keyframe 1, whose own nearest is after keyframe 1
+    before = session([(0, 0, 0), (10, 0, 0), (40, 0, 0)], [[1, 0], [1, 0], [1, 0]])
+    after = session([(0, 1, 0), (10, 1, 0), (10, 4, 0)], [[1, 0], [0.6, 0.8], [-1, 0]])
+    merged = MergedMaps(before[0], after[0], make_pose(), {}, True)
+    paired = find_regions(merged, before[1], after[1], QueryConfig(reading="paired"))
+    # own scores: 0, |(1, 0) - (0.6, 0.8)|; heard from after keyframe 2: 2; the third place was not visited again
+    np.testing.assert_allclose(paired.keyframe_scores, [0, 2, np.nan], atol=1e-6)
+    nearest = find_regions(merged, before[1], after[1], QueryConfig(reading="nearest"))
+    # reading A: every before keyframe finds (1, 0) again; after keyframe 2 is |(-1, 0) - (1, 0)| from all
+    np.testing.assert_allclose(nearest.keyframe_scores, [0, 2, np.nan], atol=1e-6)
+
+
+def test_moving_both_sessions_moves_the_centres() -> None:
+    g, h = yaw_pose(0.7, (3, -2, 1)), yaw_pose(-1.9, (40, 5, 0))
+    for reading in ("nearest", "paired"):
+        plain = find(BEFORE, AFTER, reading=reading)
+        before = replace(BEFORE[0], odom_T_sensor=g @ BEFORE[0].odom_T_sensor), BEFORE[1]
+        after = replace(AFTER[0], odom_T_sensor=h @ AFTER[0].odom_T_sensor), AFTER[1]
+        moved = find(before, after, g @ invert(h), reading=reading)
+        expected = {
+            tuple(np.round(g[:3, :3] @ np.array(centre) + g[:3, 3], 6).tolist()): value
+            for centre, value in plain.items()
+        }
+        assert moved == expected
+
+
+def test_a_session_without_keyframes() -> None:
+    nothing = session([], [])
+    for before, after in ((nothing, AFTER), (BEFORE, nothing), (nothing, nothing)):
+        for reading in ("nearest", "paired"):
+            assert find(before, after, reading=reading) == {}
+
+
+def ranked(xs: list[float], scores: list[float], **settings: object) -> tuple[list[float], list[bool]]:
+    centres = np.array([[x, 0.0, 0.0] for x in xs]).reshape(-1, 3)
+    pairs = np.zeros((len(xs), 2), np.int64)
+    regions = rank_regions(centres, np.array(scores), pairs, np.zeros(0), QueryConfig(radius_m=4.0, **settings))
+    return regions.centres_map[:, 0].tolist(), regions.is_reported.tolist()
+
+
+def test_suppression_by_hand() -> None:
+    # 3 falls to 0; 6 stays because 3, which it is near to, is gone; 4 is exactly one radius from 0 and stays
+    assert ranked([6, 3, 0], [1, 2, 3])[0] == [0, 6]
+    assert ranked([0, 4], [2, 1])[0] == [0, 4]
+    assert ranked([0, 4], [2, 1], suppression=1.01)[0] == [0]
+
+
+def test_threshold_or_number() -> None:
+    xs, scores = [0.0, 10.0, 20.0, 30.0], [0.1, 0.4, np.nan, 0.3]
+    assert ranked(xs, scores, threshold=0.3) == ([10, 30, 0], [True, True, False])
+    assert ranked(xs, scores, threshold=9.0, n_regions=1) == ([10, 30, 0], [True, False, False])
+    assert ranked(xs, scores, n_regions=9)[1] == [True, True, True]
+    assert ranked([], []) == ([], [])
+
+
+def test_of_equal_scores_the_first_comes_first() -> None:
+    assert ranked([0, 10, 20], [1, 1, 1])[0] == [0, 10, 20]
