@@ -23,5 +23,5 @@ def pipeline_input(pair: Path, session: SessionName) -> ScanSource:
 
 
 def held_input(session: Session) -> ScanSource:
-    """Return one session of a pair held in memory (`sim.held`) as the pipeline sees it; the truth is apart from it."""
+    """Return one session of a pair held in memory (`sim.session.in_memory`) as the pipeline sees it, without its truth."""
     return RecordedScans(session)

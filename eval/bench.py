@@ -1,7 +1,7 @@
 """The speed table: what is measured, each figure beside its rival's of the same run, and the file it goes to.
 
-A later part of the project joins with a dictionary of named functions that return `sim.timing.Contest`, added to
-`contests`. Every ratio says how many times faster than its rival something is.
+A later part of the project joins with a dictionary of named functions that return `sim.studies.timing.Contest`, added
+to `contests`. Every ratio says how many times faster than its rival something is.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from eval.extract_bench import ExtractSite, extract_contests, extract_sites
 from eval.merge_bench import FailedContest, MergeSite, merge_contests, paper_sites
 from eval.output import make_writable, unwritable
 from eval.provenance import machine
-from sim.bench import BenchSite, sensor_contests
-from sim.timing import Contest
+from sim.studies.bench import BenchSite, sensor_contests
+from sim.studies.timing import Contest
 
 Contests = Mapping[str, Callable[[], Contest]]
 Row = dict[str, Any]

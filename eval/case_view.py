@@ -23,9 +23,9 @@ from eval.aligned import alignment_of
 from eval.ground_truth import GroundTruth, load_ground_truth
 from eval.page_run import Row, flag, number, text
 from eval.runfolder import RunFolder
-from sim.returns import CHANGE_RGB, Cloud, Rgb
-from sim.view import Label, Line, View
-from sim.viewer import write_html
+from sim.view.returns import CHANGE_RGB, Cloud, Rgb
+from sim.view.view import Label, Line, View
+from sim.view.viewer import write_html
 
 _BEFORE_RGB, _AFTER_RGB = (120, 165, 205), (222, 180, 110)
 _TRUTH_RGB: dict[str, Rgb] = {"found": (0, 120, 90), "missed": (200, 16, 46), "unobservable": (150, 150, 150)}

@@ -23,7 +23,7 @@ def simulate(
     """Make one pair of sessions with truth: DIR/before, DIR/after, DIR/truth."""
     from eval.output import new_folder
     from scenarios.library import load_scenario
-    from sim.simulate import simulate_pair
+    from sim.session.simulate import simulate_pair
 
     drawn = load_scenario(scenario, seed, settings or ())
     with new_folder(out) as partial, shown_progress(quiet) as progress:
@@ -47,9 +47,9 @@ def survey(
     from cdpipe.core.errors import InputError
     from eval.output import make_writable
     from eval.plan import parse_seeds
-    from sim import survey as surveys
-    from sim.survey_tables import markdown as as_markdown
-    from sim.survey_tables import summary, write_csv
+    from sim.studies import survey as surveys
+    from sim.studies.survey_tables import markdown as as_markdown
+    from sim.studies.survey_tables import summary, write_csv
 
     try:
         numbers = parse_seeds(seeds)
@@ -89,7 +89,7 @@ def view(
 
     from cdpipe.core.errors import InputError
     from eval.looking import view_of
-    from sim.viewer import require_viser, running_server, show, write_html
+    from sim.view.viewer import require_viser, running_server, show, write_html
 
     require_viser()
     if html is not None:

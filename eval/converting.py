@@ -15,7 +15,7 @@ from cdpipe.io.ouster.recording import import_recording
 from cdpipe.io.session import Session, is_session, read_session
 from eval.output import made_parents
 from eval.progress import RunProgress
-from sim.truth import read_labels
+from sim.session.truth import read_labels
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +83,6 @@ def _revolutions(n: int) -> str:
 
 
 def _truth_fields(session: Session) -> Iterator[Fields]:
-    """Yield LABEL (uint16: the change's id, 0 none) and INSTANCE (int16, as in sim.truth) of each chunk."""
+    """Yield LABEL (uint16: the change's id, 0 none) and INSTANCE (int16, as in sim.session.truth) of each chunk."""
     for instance, change in read_labels(session.path, session.n_chunks):
         yield {"LABEL": change.astype(np.uint16), "INSTANCE": instance.astype(np.int16)}

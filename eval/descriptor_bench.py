@@ -14,7 +14,7 @@ from cdpipe.merge.merge import merge_maps
 from cdpipe.model.config import load_config
 from cdpipe.query.query import find_regions
 from eval.merge_bench import MergeSite
-from sim.timing import Contest, timed
+from sim.studies.timing import Contest, timed
 
 _SPHERE_LIMIT_S = 0.003
 _SCAN_LIMIT_S = 0.1  # a 10 Hz sensor

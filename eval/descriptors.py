@@ -33,7 +33,7 @@ from eval.worlds import world_slug
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
-from sim.simulate import simulate_pair
+from sim.session.simulate import simulate_pair
 
 _FAMILIES = ("narrow", "wide", "network")
 _SEEDS = "10300:10304"  # of the validation seeds

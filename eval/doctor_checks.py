@@ -22,8 +22,8 @@ def ray() -> str:
     """Cast a ray from the middle of a box at one of its walls (embreex)."""
     import numpy as np
 
-    from sim.mesh import box_mesh
-    from sim.raycast import Caster
+    from sim.geometry.mesh import box_mesh
+    from sim.geometry.raycast import Caster
 
     ranges_m, _, _ = Caster([box_mesh([_HALF_M] * 3)]).cast(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]))
     _require(abs(ranges_m[0] - _HALF_M) < 1e-4, f"a ray met a wall {_HALF_M} m away at {ranges_m[0]} m")
@@ -162,7 +162,7 @@ def sdk() -> str:
 
 def server() -> str:
     """Run a viewer for a moment (viser)."""
-    from sim.viewer import running_server
+    from sim.view.viewer import running_server
 
     with running_server(0) as running:
         return f"serves a view on a free port ({running.get_port()})"

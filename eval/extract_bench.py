@@ -33,8 +33,8 @@ from cdpipe.pipeline import map_session, refusal
 from eval.adapters import pipeline_input
 from eval.provenance import THREADS
 from scenarios.library import load_scenario
-from sim.simulate import simulate_pair
-from sim.timing import Contest, timed
+from sim.session.simulate import simulate_pair
+from sim.studies.timing import Contest, timed
 
 _REALIGN_LIMIT_S = 0.05
 # Every so many keyframes a sphere is tried; what is timed is typical of those that hold more candidates than this.

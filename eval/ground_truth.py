@@ -13,7 +13,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, re
 from cdpipe.io.session import read_session
 from cdpipe.model.types import SessionName
 from eval.universe import ScoringPoints, load_universe
-from sim.truth import PairTruth, read_pair_truth, read_true_poses
+from sim.session.truth import PairTruth, read_pair_truth, read_true_poses
 
 SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
 

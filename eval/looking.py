@@ -9,7 +9,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import suggestion
 from cdpipe.io.session import is_session
 from scenarios.library import SUFFIXES, load_scenario, scenario_names
-from sim.view import View, is_pair, view_folder, view_scenario
+from sim.view.view import View, is_pair, view_folder, view_scenario
 
 
 def view_of(what: str, seed: int | None = None, settings: Sequence[str] = ()) -> View:

@@ -33,9 +33,9 @@ from cdpipe.model.types import MappedSession, PosedScan, ScanSource, SessionName
 from eval.adapters import pipeline_input
 from eval.provenance import THREADS
 from scenarios.library import load_scenario
-from sim.simulate import simulate_pair
-from sim.timing import Contest, timed
-from sim.truth import read_true_poses
+from sim.session.simulate import simulate_pair
+from sim.session.truth import read_true_poses
+from sim.studies.timing import Contest, timed
 
 _GICP_CELL_M = 0.8
 _GICP_REACH_M = 2.4

@@ -13,7 +13,7 @@ from cdpipe.model.types import ChangedObject
 from eval.ground_truth import GroundTruth
 from eval.object_metrics import ObjectMatches
 from eval.region_metrics import places_in_map
-from sim.truth import Change
+from sim.session.truth import Change
 
 PILE_KIND = "muck_pile"
 

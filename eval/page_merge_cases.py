@@ -24,7 +24,7 @@ from eval.page_columns import fine, share, significant
 from eval.page_objects import Picture
 from eval.page_run import Row, RunData, number, read_document, split_variant, text
 from eval.page_tables import Cell, Table
-from sim.truth import read_true_poses
+from sim.session.truth import read_true_poses
 
 MAX_ROWS = 40
 _ANCHOR_SPACING_M = 1.0

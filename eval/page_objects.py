@@ -16,7 +16,7 @@ from eval.object_figures import Panel, object_panels
 from eval.page_columns import share
 from eval.page_run import SHOWN_PRESETS, Row, RunData, flag, named_variants, number, of, text
 from eval.universe import CELL_M
-from sim.truth import Change
+from sim.session.truth import Change
 
 _CONTEXT_M = 1.5
 

@@ -34,7 +34,7 @@ from eval.scoring import METRICS_VERSION, CaseScore
 from eval.stage_cache import opened_cache
 from eval.stages import Merge, PairStages
 from scenarios.schema import Scenario
-from sim.simulate import simulate_pair
+from sim.session.simulate import simulate_pair
 
 if sys.platform != "win32":
     import fcntl

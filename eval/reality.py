@@ -35,7 +35,7 @@ from eval.rebuilt_scene import Rebuilt, rebuild
 from eval.sensor_measures import Revolutions
 from eval.static_novelty import Novelty, effect_variants, novelty_cases, static_novelty
 from scenarios.schema import Sensor
-from sim.revolution import Drive, cast_revolution
+from sim.session.revolution import Drive, cast_revolution
 
 DATA_VARIABLE = "TUNNELCD_REAL_DATA"
 PROFILE = "os1-32-g"

@@ -15,12 +15,12 @@ from cdpipe.sensor.ouster import SensorMetadata
 from eval.sensor_measures import Revolutions, destaggered
 from scenarios.library import load_scenario
 from scenarios.schema import Sensor
-from sim.lidar import Scan, scan
-from sim.rays import revolution_rays
-from sim.revolution import Drive
+from sim.drive.trajectory import record
 from sim.scene import Scene
-from sim.simulate import plan_drives
-from sim.trajectory import record
+from sim.sensor.lidar import Scan, scan
+from sim.sensor.rays import revolution_rays
+from sim.session.revolution import Drive
+from sim.session.simulate import plan_drives
 
 RECORDING = "OS-1-32-G_v2.1.1_1024x10"
 

@@ -9,10 +9,10 @@ import numpy as np
 from cdpipe.core.geometry import BoolArray, Float64Array, transform
 from cdpipe.sensor.ouster import SensorMetadata
 from eval.sensor_measures import Revolutions
-from sim.mesh import Mesh
-from sim.optics import COUNTS_PER_DOUBLING
-from sim.raycast import Caster
+from sim.geometry.mesh import Mesh
+from sim.geometry.raycast import Caster
 from sim.scene import Scene
+from sim.sensor.optics import COUNTS_PER_DOUBLING
 
 _N_LEVELS = 96
 _LEVELS = np.geomspace(0.002, 200.0, _N_LEVELS)  # reflectivities that a rebuilt scene tells apart

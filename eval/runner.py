@@ -30,7 +30,7 @@ from eval.runfolder import RunFolder, current_results, remove, write_tables
 from eval.worlds import worlds_of
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
-from sim.truth import read_pair_truth
+from sim.session.truth import read_pair_truth
 
 
 @dataclass(frozen=True, slots=True)

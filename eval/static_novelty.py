@@ -20,7 +20,7 @@ from cdpipe.core.geometry import Float64Array, invert, make_pose, stream
 from eval.reality_scenes import standing, with_effects, world_points
 from eval.sensor_measures import novel_shares
 from scenarios.schema import Sensor
-from sim.revolution import Drive, cast_revolution
+from sim.session.revolution import Drive, cast_revolution
 
 CELLS_M = (0.1, 0.2, 0.4)
 # Of a real 32-beam recording of a static scene, half against half; stated to us, not measured here: how many

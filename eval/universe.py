@@ -20,7 +20,7 @@ from cdpipe.core.voxel import cell_keys
 from cdpipe.io.readers import open_scans
 from cdpipe.io.session import Session, chunk_path, load_arrays, read_session
 from cdpipe.model.types import PosedScan
-from sim.truth import Int16Array, read_labels
+from sim.session.truth import Int16Array, read_labels
 
 CELL_M = 0.1
 _CACHE_VERSION = 3

@@ -15,17 +15,17 @@ import numpy as np
 
 from cdpipe.core.geometry import Float32Array, Int32Array
 from scenarios.schema import Scenario
-from sim.arranging import place_props
-from sim.centreline import Centreline, build_centreline
-from sim.foreign import tunnel_mesh
-from sim.furniture import Fixture, furnish
+from sim.furniture.furniture import Fixture, furnish
+from sim.furniture.stones import strew_stones
+from sim.geometry.mesh import Mesh
+from sim.geometry.raycast import Caster, model_meshes
 from sim.materials import REFLECTIVITY
-from sim.mesh import Mesh
-from sim.placing import WALL_GAP_M, Standing, Surroundings, grow, standing_corners
-from sim.raycast import Caster, model_meshes
-from sim.settling import add_solid, quaternion
-from sim.stones import strew_stones
-from sim.tunnel import mesh_tunnel
+from sim.placement.arranging import place_props
+from sim.placement.placing import WALL_GAP_M, Standing, Surroundings, grow, standing_corners
+from sim.placement.settling import add_solid, quaternion
+from sim.rock.centreline import Centreline, build_centreline
+from sim.rock.foreign import tunnel_mesh
+from sim.rock.tunnel import mesh_tunnel
 
 WALL = "wall"
 _STONE_FREE_M = 0.1  # round the footprint of every prop

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim.truth import Change
+from sim.session.truth import Change
 
 
 def change(number: int, session: str = "after", kind: str = "added", **fields: object) -> Change:

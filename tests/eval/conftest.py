@@ -10,7 +10,7 @@ from cdpipe.core.geometry import invert, make_pose, yaw_pose
 from cdpipe.io.session import ScanChunk, SessionWriter
 from cdpipe.sensor.ouster import SensorMetadata
 from eval.cli import main
-from sim.truth import PairTruth, write_labels, write_pair_truth, write_true_poses
+from sim.session.truth import PairTruth, write_labels, write_pair_truth, write_true_poses
 from tests.eval.changes import change
 
 N_SCANS, CHUNK_SCANS, HEIGHT, WIDTH = 14, 5, 4, 64

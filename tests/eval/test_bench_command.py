@@ -11,8 +11,8 @@ from eval import bench
 from eval.bench import chosen, contests, measure, row_of, verdict, write_table
 from eval.cli import main
 from eval.merge_bench import FailedContest
-from sim.bench import BenchSite
-from sim.timing import Contest
+from sim.studies.bench import BenchSite
+from sim.studies.timing import Contest
 
 KEYS = ["name", "value", "unit", "rival", "rival_value", "ratio", "target", "met", "n", "spread", "reason"]
 FAST = Contest("Mray/s", (0.5, 0.25, 0.4, 0.2, 1.0), 2.0, "a rival", (2.0, 1.0, 4.0), 4.5)

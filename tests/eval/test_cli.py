@@ -23,7 +23,7 @@ from eval.cli import main
 from eval.plan import Plan
 from eval.runfolder import RunFolder
 from scenarios.library import load_scenario, scenario_names
-from sim import simulate
+from sim.session import simulate
 
 Result = tuple[int, str, str]
 Command = Callable[..., Result]

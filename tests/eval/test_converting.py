@@ -12,7 +12,7 @@ from cdpipe.io.readers import open_scans
 from cdpipe.io.session import Session, read_session
 from eval import converting
 from eval.cli import main
-from sim.truth import read_labels
+from sim.session.truth import read_labels
 
 pytest.importorskip("ouster.sdk.core", reason="pip install 'tunnelcd[ouster]'")
 from ouster.sdk import osf

@@ -33,8 +33,8 @@ from eval.ground_truth import GroundTruth, load_ground_truth
 from eval.merge_metrics import PAIR_RADIUS_M
 from eval.oracles import OracleMerge, merged_by_truth
 from scenarios.library import load_scenario
-from sim.simulate import simulate_pair
-from sim.truth import read_labels
+from sim.session.simulate import simulate_pair
+from sim.session.truth import read_labels
 
 FAMILY, SEED = "smoke/one_box", 3
 RECIPE = Recipe(draws=2)

@@ -114,7 +114,11 @@ def test_the_extras_that_are_here_do_their_job(extra: str) -> None:
 def test_a_damaged_checkpoint_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: Callable[[bytes], bytes], words: str
 ) -> None:
-    shutil.copytree(ROOT / "cdpipe" / "descriptors" / "weights", tmp_path / "descriptors" / "weights", ignore=shutil.ignore_patterns("*.py"))
+    shutil.copytree(
+        ROOT / "cdpipe" / "descriptors" / "weights",
+        tmp_path / "descriptors" / "weights",
+        ignore=shutil.ignore_patterns("*.py"),
+    )
     file = tmp_path / "descriptors" / "weights" / "sphere.safetensors"
     file.write_bytes(damage(file.read_bytes()))
     monkeypatch.setattr(importlib.resources, "files", lambda _: tmp_path)
@@ -136,7 +140,7 @@ def test_wrong_answers_of_packages_are_found(monkeypatch: pytest.MonkeyPatch) ->
     def align(target: np.ndarray, *_: object, **__: object) -> SimpleNamespace:
         return SimpleNamespace(T_target_source=np.eye(4))
 
-    monkeypatch.setattr("sim.raycast.Caster", Caster)
+    monkeypatch.setattr("sim.geometry.raycast.Caster", Caster)
     with pytest.raises(RuntimeError, match=r"a wall 3\.0 m away at 2\.9 m"):
         doctor_checks.ray()
     monkeypatch.setattr("small_gicp.align", align)

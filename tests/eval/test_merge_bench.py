@@ -16,7 +16,7 @@ from eval import merge_bench
 from eval.bench import contests, measure, row_of, verdict
 from eval.descriptor_bench import descriptor_contests
 from eval.merge_bench import Goals, MergeSite, merge_contests, paper_sites
-from sim.bench import BenchSite
+from sim.studies.bench import BenchSite
 
 needs_kiss_matcher = pytest.mark.skipif(not is_kiss_matcher_installed(), reason="needs the extra `kiss`: KISS-Matcher")
 ROWS = ["merge-tiny", "merge-tiny-raced", "merge-tiny-index", "merge-tiny-all-in", "merge-tiny-refine"]

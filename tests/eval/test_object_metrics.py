@@ -19,7 +19,7 @@ from eval.object_metrics import (
     voxel_iou,
 )
 from eval.universe import ScoringPoints
-from sim.truth import Change, PairTruth
+from sim.session.truth import Change, PairTruth
 from tests.eval.changes import change
 
 N_CELLS = 40

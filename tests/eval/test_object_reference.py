@@ -14,7 +14,7 @@ from cdpipe.model.types import ChangedObject
 from eval.ground_truth import GroundTruth, SessionTruth
 from eval.object_metrics import kinds_right, match_objects, object_columns
 from eval.universe import ScoringPoints
-from sim.truth import Change, PairTruth
+from sim.session.truth import Change, PairTruth
 from tests.eval.changes import change
 
 N_ROWS = 90

@@ -13,7 +13,7 @@ from eval.ground_truth import GroundTruth, SessionTruth
 from eval.object_metrics import match_objects
 from eval.object_sizes import size_columns, size_errors, true_displacements_map, true_volume_m3
 from eval.universe import ScoringPoints
-from sim.truth import Change, PairTruth
+from sim.session.truth import Change, PairTruth
 from tests.eval.changes import change
 
 N_SCANS = 11

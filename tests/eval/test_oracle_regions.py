@@ -16,7 +16,7 @@ from eval.plan import Plan, cells, load_plan
 from eval.plan_changes import changed_plan
 from eval.region_metrics import centres_in_world, match_regions
 from eval.universe import ScoringPoints
-from sim.truth import PairTruth
+from sim.session.truth import PairTruth
 from tests.eval.changes import change
 
 N_SCANS = 40

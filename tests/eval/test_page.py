@@ -23,7 +23,7 @@ from eval.ground_truth import load_ground_truth
 from eval.page import write_page
 from eval.page_site import truth_marks, world_to_odom
 from eval.runfolder import RunFolder
-from sim.truth import PairTruth, write_labels, write_pair_truth, write_true_poses
+from sim.session.truth import PairTruth, write_labels, write_pair_truth, write_true_poses
 from tests.eval.changes import change
 
 SITE, EMPTY = "paper/site1", "unchanged/site1"

@@ -56,8 +56,8 @@ from eval.static_novelty import (
 )
 from scenarios.library import load_scenario
 from scenarios.schema import Sensor
-from sim.revolution import Drive, cast_revolution
-from sim.simulate import plan_drives
+from sim.session.revolution import Drive, cast_revolution
+from sim.session.simulate import plan_drives
 
 SENSOR = load_profile("os1-32-g", "1024x10")
 EVERYWHERE = np.ones((1, SENSOR.height, SENSOR.width), dtype=bool)

@@ -30,8 +30,8 @@ from eval.runner import RunOutcome, run_plan
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
-from sim.simulate import simulate_pair
-from sim.truth import read_pair_truth, write_pair_truth
+from sim.session.simulate import simulate_pair
+from sim.session.truth import read_pair_truth, write_pair_truth
 
 ONE_BOX, UNCHANGED = "smoke/one_box", "smoke/unchanged"
 VARIANTS = ["paper", "tunnelcd", "voxel-diff", "random-regions"]

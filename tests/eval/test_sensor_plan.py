@@ -17,8 +17,8 @@ from eval.statistics import ENOUGH_PAIRS
 from eval.worlds import references, settings_over, worlds_of
 from scenarios.library import load_scenario
 from scenarios.schema import Sensor
-from sim.simulate import simulate_pair
-from sim.truth import PairTruth, read_labels, read_pair_truth, read_true_poses
+from sim.session.simulate import simulate_pair
+from sim.session.truth import PairTruth, read_labels, read_pair_truth, read_true_poses
 
 PLAN = load_plan("sensor")
 WORLDS = worlds_of(PLAN.scenarios)

@@ -24,7 +24,7 @@ from eval.stage_cache import Kept, StageCache, opened_cache
 from eval.stages import PairStages
 from scenarios.library import load_scenario
 from scenarios.schema import Scenario
-from sim.simulate import simulate_pair
+from sim.session.simulate import simulate_pair
 
 SMALL = ("sensor.mode=512x10", "platform.scan_spacing_m=1.0")
 STAGES = ("build_map", "describe_scans", "describe_map", "merge_maps", "find_regions")

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from eval.cli import main
-from sim import survey as surveys
-from sim.survey import Failure, Survey, WorldFigures
+from sim.studies import survey as surveys
+from sim.studies.survey import Failure, Survey, WorldFigures
 
 WORLD = WorldFigures(
     family="narrow", seed=5, before_path_m=100.0, after_path_m=90.0, width_m=4.0, height_m=3.0, n_added=1, n_removed=0,

@@ -11,7 +11,7 @@ from cdpipe.io.readers import open_scans
 from cdpipe.io.session import read_session
 from eval import universe as module
 from eval.universe import build_universe, load_universe
-from sim.truth import read_labels, write_labels
+from sim.session.truth import read_labels, write_labels
 
 
 def universe_by_dictionary(session: Path) -> dict[tuple[int, ...], tuple[int, int, int, int, np.ndarray]]:

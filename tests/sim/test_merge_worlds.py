@@ -17,12 +17,12 @@ from cdpipe.core.yamlfile import read_yaml
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios import library, load_scenario
 from scenarios.schema import SessionPlan, Tunnel
-from sim.centreline import Centreline, build_centreline, resample
-from sim.mesh import Mesh
-from sim.noise import noise_at
+from sim.drive.trajectory import plan_trajectory
+from sim.geometry.mesh import Mesh
+from sim.geometry.noise import noise_at
+from sim.geometry.topology import closed_volume_m3
+from sim.rock.centreline import Centreline, build_centreline, resample
 from sim.scene import build_world
-from sim.topology import closed_volume_m3
-from sim.trajectory import plan_trajectory
 
 NEAR_M = 5.0
 STEP_M = 0.5

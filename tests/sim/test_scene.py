@@ -23,14 +23,14 @@ from scenarios.schema import (
     Stones,
     Tunnel,
 )
-from sim.centreline import build_centreline
-from sim.labels import list_changes
+from sim.geometry.raycast import model_meshes
 from sim.materials import REFLECTIVITY
-from sim.placing import Standing
-from sim.raycast import model_meshes
+from sim.placement.placing import Standing
+from sim.rock.centreline import build_centreline
+from sim.rock.tunnel import mesh_tunnel
 from sim.scene import Scene, World, build_world, compile_model
-from sim.simulate import simulate_pair
-from sim.tunnel import mesh_tunnel
+from sim.session.labels import list_changes
+from sim.session.simulate import simulate_pair
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, invert, make_pose, rotation_angle_rad, stream, transform, yaw_pose
-from cdpipe.merge.global_registration import register_globally, require_kiss_matcher
 from cdpipe.merge import global_registration as coarse
+from cdpipe.merge.global_registration import register_globally, require_kiss_matcher
 
 needs_kiss_matcher = pytest.mark.skipif(
     importlib.util.find_spec("kiss_matcher") is None, reason="needs the extra `kiss`: KISS-Matcher"

@@ -16,7 +16,7 @@ from typing import Any
 
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
-from sim.truth import read_pair_truth, write_pair_truth
+from sim.session.truth import read_pair_truth, write_pair_truth
 
 
 def copied(scenario: Scenario, seed: int, out: Path, on_progress: object = None) -> None:

@@ -1,0 +1,146 @@
+"""What stands in a robot's way: props beside its line, and the rock around it."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array
+from scenarios.schema import Scenario
+from sim.geometry.line import STEP_M
+from sim.geometry.room import room_about
+from sim.placement.lanes import AIR_BELOW_M
+from sim.placement.placing import PROBE_UP_M, floor_heights, standing_corners, standing_height_m
+from sim.rock.centreline import left_of, resample
+from sim.scene import World
+
+# What lies loose is driven over up to this height.
+_STRADDLED_M = 0.15
+# Samples across the drift when stones are looked for, and free way beside the wheels.
+_ACROSS_M = 0.1
+_BESIDE_WHEELS_M = 0.1
+# The body checked against the walls: the true gap may be this share of the clearance where the wall bulges.
+_TIGHTEST_SHARE = 0.5
+
+
+def obstacles(
+    world: World, scenario: Scenario, session: str, line: Float64Array, headings: Float64Array, height_m: float
+) -> list[tuple[str, Float64Array, Float64Array]]:
+    """Return for each prop in the way its name and the offsets it forbids, (N,) to (N,), NaN where it is far."""
+    clearance_m = scenario.platform.clearance_m
+    left = left_of(headings)
+    found = []
+    for item in world.standing:
+        is_low = scenario.platform.kind == "quadrotor" and standing_height_m(item) + AIR_BELOW_M < height_m
+        if session not in item.sessions or is_low:
+            continue
+        outline = resample(np.concatenate([(corners := standing_corners(item)), corners[:1]]), 0.1)
+        reach = float(np.linalg.norm(outline - outline.mean(axis=0), axis=1).max()) + clearance_m
+        near = np.flatnonzero(np.linalg.norm(line[:, :2] - outline.mean(axis=0), axis=1) < reach + 10.0)
+        delta = outline[None] - line[near, None, :2]
+        along = (delta * headings[near, None]).sum(axis=2)
+        across = (delta * left[near, None]).sum(axis=2)
+        reach_m = np.sqrt(np.maximum(clearance_m**2 - along**2, 0.0))
+        is_abreast = np.abs(along) < clearance_m
+        low, high = np.full(len(line), np.nan), np.full(len(line), np.nan)
+        low[near] = np.where(is_abreast, across - reach_m, np.inf).min(axis=1)
+        high[near] = np.where(is_abreast, across + reach_m, -np.inf).max(axis=1)
+        away = ~(low < high)
+        low[away] = high[away] = np.nan
+        found.append((item.prop.name, low, high))
+    return found
+
+
+def pass_by(
+    session: str,
+    name: str,
+    wanted: Float64Array,
+    low: Float64Array,
+    high: Float64Array,
+    near_low: Float64Array,
+    near_high: Float64Array,
+) -> None:
+    """Narrow the bounds `low`, `high` in place so that the line passes a prop on one side, each time it comes by.
+
+    Raises:
+        ScenarioError: It leaves no room on either side.
+    """
+    barred = sidestep(wanted, low, high, near_low, near_high)
+    if barred is not None:
+        raise ScenarioError(
+            f"{session}: prop {name!r} bars the way {barred * STEP_M:.1f} m along the route: "
+            "move it to a side, make it smaller, or lower platform.clearance_m"
+        )
+
+
+def sidestep(
+    wanted: Float64Array, low: Float64Array, high: Float64Array, near_low: Float64Array, near_high: Float64Array
+) -> int | None:
+    """Narrow the bounds as `pass_by` does; return the first sample where there is no room on either side, or None."""
+    stations = np.flatnonzero(np.isfinite(near_low))
+    for visit in np.split(stations, np.flatnonzero(np.diff(stations) > 1 / STEP_M) + 1):
+        if len(visit) == 0 or (near_low[visit] > high[visit]).all() or (near_high[visit] < low[visit]).all():
+            continue
+        shift_left = np.maximum(near_high[visit] - wanted[visit], 0.0).max()
+        shift_right = np.maximum(wanted[visit] - near_low[visit], 0.0).max()
+        fits_left = (near_high[visit] <= high[visit]).all()
+        fits_right = (near_low[visit] >= low[visit]).all()
+        if fits_left and (shift_left <= shift_right or not fits_right):
+            low[visit] = np.maximum(low[visit], near_high[visit])
+        elif fits_right:
+            high[visit] = np.minimum(high[visit], near_low[visit])
+        else:
+            return int(visit[0])
+    return None
+
+
+def boulders(
+    world: World, scenario: Scenario, line: Float64Array, headings: Float64Array, width_m: float
+) -> list[tuple[Float64Array, Float64Array]]:
+    """Return for each loose stone too high to drive over the offsets it forbids, (N,) to (N,), NaN where it is far.
+
+    Found by rays down: where what is fixed lies higher than the bare floor by more than 0.15 m.
+    """
+    if scenario.platform.kind == "quadrotor" or not world.fixtures:
+        return []
+    offsets = np.arange(-width_m / 2, width_m / 2 + _ACROSS_M, _ACROSS_M)
+    places = np.repeat(line[:, None], len(offsets), axis=1)
+    places[:, :, :2] += offsets[:, None] * left_of(headings)[:, None]
+    places[:, :, 2] += PROBE_UP_M
+    over, bare = (floor_heights(caster, places.reshape(-1, 3)) for caster in (world.fixed, world.walls))
+    is_high = (over - bare > _STRADDLED_M).reshape(len(line), len(offsets))
+    numbered, _ = ndimage.label(is_high, structure=np.ones((3, 3)))
+    keep_m = scenario.platform.track_m / 2 + _BESIDE_WHEELS_M
+    ahead = round((scenario.platform.wheelbase_m / 2 + _BESIDE_WHEELS_M) / STEP_M)
+    found = []
+    for along, across in ndimage.find_objects(numbered):
+        low, high = np.full(len(line), np.nan), np.full(len(line), np.nan)
+        stretch = slice(max(0, along.start - ahead), along.stop + ahead)
+        low[stretch] = offsets[across.start] - keep_m
+        high[stretch] = offsets[across.stop - 1] + keep_m
+        found.append((low, high))
+    return found
+
+
+def check_clearance(world: World, scenario: Scenario, session: str, way_m: Float64Array, points: Float64Array) -> None:
+    """Cast level rays all round and one up from every tenth sample: the sensor must keep off rock and furniture.
+
+    Raises:
+        ScenarioError: With the place, its distance (N,) along the route and in the world (N, 3).
+    """
+    clearance_m = scenario.platform.clearance_m
+    angle = np.arange(24) * (2 * np.pi / 24)
+    level = np.stack([np.cos(angle), np.sin(angle), np.zeros(24)], axis=1)
+    directions = np.concatenate([level, [[0.0, 0.0, 1.0]]])
+    stations = points[:: round(0.5 / STEP_M)]
+    gap_m, is_outside = room_about(world.fixed, stations, directions)
+    gap_m[is_outside] = 0.0
+    worst = int(np.argmin(gap_m))
+    if gap_m[worst] < _TIGHTEST_SHARE * clearance_m:
+        x, y, z = stations[worst]
+        raise ScenarioError(
+            f"{session}: the sensor comes within {gap_m[worst]:.2f} m of rock or furniture "
+            f"{way_m[worst * round(0.5 / STEP_M)]:.1f} m along the route, at ({x:.1f}, {y:.1f}, {z:.1f}): "
+            "choose another lateral, start_m, end_m or height"
+        )

@@ -1,0 +1,210 @@
+"""The line a robot drives: along the route's centrelines, on its own side, round props, clear of the walls.
+
+All of it is done in the frame of a reference line (the route with its corners rounded): bounds on the sideways offset
+are collected along it, and a smooth offset is found between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, stream
+from scenarios.schema import Scenario, SessionPlan
+from sim.drive.obstacles import boulders, obstacles, pass_by, sidestep
+from sim.geometry.line import STEP_M, kept_between, smoothed, strictest
+from sim.geometry.noise import smooth_noise
+from sim.placement.placing import free_width
+from sim.rock.centreline import headings_of, left_of, resample
+from sim.scene import World
+
+_SHARPEST_DEG = 150.0
+_WANDER_LENGTH_M = 8.0  # correlation length of the line's way from side to side
+# Takes the edge off turns that tighten where bend and swerve meet; it moves the line by a few centimetres at most.
+_LAST_SMOOTHING_M = 0.7
+# Corners of the route are rounded over this share of the drift's width to either side.
+_CORNER_SHARE = 0.55
+# Inside a bend the line stays this share of the way to the centre of curvature, so that the turn does not tighten.
+_INSIDE_SHARE = 0.35
+# Half lengths tried for a swerve, the gentlest first; a sharper one only where it is needed.
+_SWERVES_M = (2.0, 1.4, 1.0, 0.7, 0.5)
+# Rather than swerve sharply between props on both sides, this share of the clearance is given up.
+_CHICANE_SHARE = 0.3
+# Where no smooth way is found, the stones within this distance are driven over.
+_STONE_REACH_M = 4.0
+# Between the heights of a wary look: no pipe is thinner.
+_WARY_STEP_M = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Path:
+    """A driven line, sampled about every 0.05 m.
+
+    Attributes:
+        distance_m: (N,) horizontal distance travelled.
+        points: (N, 3) world position, metres; z is the centreline's, near the floor.
+        yaw_rad: (N,) heading, unwrapped.
+    """
+
+    distance_m: Float64Array
+    points: Float64Array
+    yaw_rad: Float64Array
+
+
+def plan_path(world: World, scenario: Scenario, seed: int, session: str, is_wary: bool = False) -> Path:
+    """Return the line of one session; the seed draws its wander.
+
+    Args:
+        world: What is driven through.
+        scenario: Its platform and its sessions.
+        seed: What the wander is drawn from.
+        session: "before" or "after".
+        is_wary: Keep off all that hangs or juts out within the clearance above and below the sensor too, not just off
+            what is level with it.
+
+    Raises:
+        ScenarioError: The route turns back on itself, nothing is left of it, or the walls and props leave no room.
+    """
+    plan: SessionPlan = getattr(scenario, session)
+    line, width_m = _reference(world, plan, session)
+    offset_m = _offsets(world, scenario, seed, session, line, width_m, _heights_m(scenario, plan, is_wary))
+    left = left_of(headings_of(line))
+    shifted = resample(np.column_stack([line[:, :2] + offset_m[:, None] * left, line[:, 2]]), STEP_M)
+    xy = smoothed(shifted[:, :2], _LAST_SMOOTHING_M)
+    headings = headings_of(xy)
+    distance_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+    yaw = smoothed(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0])), 4 * STEP_M)
+    return Path(distance_m, np.column_stack([xy, shifted[:, 2]]), yaw)
+
+
+def _reference(world: World, plan: SessionPlan, session: str) -> tuple[Float64Array, Float64Array]:
+    """Return the route (N, 3) with rounded corners, trimmed, and the section's width (N,) along it."""
+    pieces: list[Float64Array] = []
+    widths: list[Float64Array] = []
+    for a, b in pairwise(plan.route):
+        points, section = world.centreline.edge(a, b)
+        pieces.append(points if not pieces else points[1:])
+        widths.append(np.full(len(pieces[-1]), section.width_m))
+        if len(pieces) > 1:
+            turn = _turn_deg(pieces[-2], pieces[-1])
+            if turn > _SHARPEST_DEG:
+                raise ScenarioError(f"{session}.route turns back at node {a!r}: a route may not reverse")
+    points = resample(np.concatenate(pieces), STEP_M)
+    share = np.linspace(0.0, 1.0, len(points))
+    all_widths = np.concatenate(widths)
+    width_m = np.interp(share, np.linspace(0.0, 1.0, len(all_widths)), all_widths)
+    line = smoothed(points, _CORNER_SHARE * float(all_widths.min()))
+    first, last = round(plan.start_m / STEP_M), len(line) - round(plan.end_m / STEP_M)
+    if last - first < 2 / STEP_M:
+        raise ScenarioError(
+            f"{session}: the route is {(len(line) - 1) * STEP_M:.1f} m long and start_m + end_m leave less than 2 m "
+            "of it: shorten them"
+        )
+    return line[first:last], width_m[first:last]
+
+
+def _turn_deg(before: Float64Array, after: Float64Array) -> float:
+    incoming = before[-1, :2] - before[max(-8, -len(before)), :2]
+    outgoing = after[min(7, len(after) - 1), :2] - before[-1, :2]
+    cosine = incoming @ outgoing / max(float(np.linalg.norm(incoming) * np.linalg.norm(outgoing)), 1e-9)
+    return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def _heights_m(scenario: Scenario, plan: SessionPlan, is_wary: bool) -> Float64Array:
+    """Heights (H,) above the floor at which the line looks for walls."""
+    height_m = plan.height_m or scenario.platform.sensor_height_m
+    is_flying = scenario.platform.kind == "quadrotor"
+    heights_m = np.array([height_m] if is_flying else [0.35, max(height_m, 0.4)])
+    if not is_wary:
+        return heights_m
+    reach_m = scenario.platform.clearance_m
+    low_m = max(height_m - reach_m, 0.35) if is_flying else 0.35
+    return np.arange(low_m, heights_m[-1] + reach_m, _WARY_STEP_M)
+
+
+def _offsets(
+    world: World,
+    scenario: Scenario,
+    seed: int,
+    session: str,
+    line: Float64Array,
+    width_m: Float64Array,
+    heights_m: Float64Array,
+) -> Float64Array:
+    """Sideways offset (N,) from the reference line, positive to the left."""
+    plan: SessionPlan = getattr(scenario, session)
+    clearance_m = scenario.platform.clearance_m
+    headings = headings_of(line)
+    height_m = plan.height_m or scenario.platform.sensor_height_m
+    right_m, left_m = free_width(world.fixed, line, left_of(headings), heights_m, float(width_m.max()))
+    room_m = np.maximum(width_m / 2 - clearance_m, 0.0)
+    low = np.maximum(clearance_m - right_m, -room_m)
+    high = np.minimum(left_m - clearance_m, room_m)
+    turn = smoothed(np.gradient(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0]))) / STEP_M, 0.25)
+    high = np.where(turn > 1e-3, np.minimum(high, _INSIDE_SHARE / np.maximum(turn, 1e-3)), high)
+    low = np.where(turn < -1e-3, np.maximum(low, -_INSIDE_SHARE / np.maximum(-turn, 1e-3)), low)
+    wanted = plan.lateral * room_m + scenario.platform.wander_m * _wander(len(line), seed, session)
+    _refuse_narrow(scenario, session, low, high)
+    for name, near_low, near_high in obstacles(world, scenario, session, line, headings, height_m):
+        pass_by(session, name, wanted, low, high, near_low, near_high)
+    stones = boulders(world, scenario, line, headings, float(width_m.max()))
+    return _swerving(session, wanted, low, high, stones, _CHICANE_SHARE * clearance_m)
+
+
+def _swerving(
+    session: str,
+    wanted: Float64Array,
+    low: Float64Array,
+    high: Float64Array,
+    stones: list[tuple[Float64Array, Float64Array]],
+    give_m: float,
+) -> Float64Array:
+    """Smooth offset (N,) between the bounds, `give_m` beyond them at worst; stones are driven over where need be."""
+    while True:
+        inner_low, inner_high = low.copy(), high.copy()
+        for near_low, near_high in stones:
+            sidestep(wanted, inner_low, inner_high, near_low, near_high)
+        offset_m, excess_m = _smoothest(wanted, inner_low, inner_high, give_m)
+        worst = int(np.argmax(excess_m))
+        if excess_m[worst] <= give_m:
+            return offset_m
+        near = slice(max(0, worst - round(_STONE_REACH_M / STEP_M)), worst + round(_STONE_REACH_M / STEP_M))
+        kept = [stone for stone in stones if np.isnan(stone[0][near]).all()]
+        if len(kept) == len(stones):
+            raise ScenarioError(
+                f"{session}: props on both sides leave no smooth way {worst * STEP_M:.1f} m along the route: "
+                "set them farther apart, or lower platform.clearance_m"
+            )
+        stones = kept
+
+
+def _smoothest(
+    wanted: Float64Array, low: Float64Array, high: Float64Array, give_m: float
+) -> tuple[Float64Array, Float64Array]:
+    """Offset (N,) that swerves no more sharply than it must, and how far it is beyond the bounds (N,)."""
+    offset_m = kept_between(wanted, low, high, _SWERVES_M[0])
+    for half_m in _SWERVES_M[1:]:
+        is_bad = np.maximum(low - offset_m, offset_m - high) > give_m
+        if is_bad.any():
+            share = np.clip(smoothed(strictest(is_bad.astype(np.float64), 2.0, np.max), 2.0), 0.0, 1.0)
+            offset_m = share * kept_between(wanted, low, high, half_m) + (1.0 - share) * offset_m
+    return offset_m, np.maximum(low - offset_m, offset_m - high)
+
+
+def _wander(n_samples: int, seed: int, session: str) -> Float64Array:
+    along_m: Float64Array = np.arange(n_samples, dtype=np.float64) * STEP_M
+    return smooth_noise((along_m,), _WANDER_LENGTH_M, int(stream(seed, session, "wander").integers(2**63)))
+
+
+def _refuse_narrow(scenario: Scenario, session: str, low: Float64Array, high: Float64Array) -> None:
+    gap = high - low
+    worst = int(np.argmin(gap))
+    if gap[worst] < 0:
+        needed_m = 2 * scenario.platform.clearance_m
+        raise ScenarioError(
+            f"{session}: the walls leave {gap[worst] + needed_m:.2f} m at {worst * STEP_M:.1f} m along the route: "
+            f"{needed_m:.2f} m are needed for platform.clearance_m"
+        )

@@ -1,0 +1,140 @@
+"""From a line to the sensor's movement: wheels on the floor or a quadrotor's flight, and the speed along the way."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, stream
+from cdpipe.core.motion import Motion, motion_of
+from scenarios.schema import Platform, Scenario
+from sim.drive.path import Path
+from sim.geometry.line import kept_between, smoothed
+from sim.geometry.noise import smooth_noise
+from sim.geometry.raycast import Caster
+from sim.placement.lanes import AIR_BELOW_M
+from sim.placement.placing import PROBE_UP_M, floor_heights
+
+_GRAVITY_MPS2 = 9.81
+# Correlation lengths of what the platform adds: tilt and bounce of suspension or rotors, and the driver's foot.
+_TILT_LENGTH_M = 2.5
+_BOUNCE_LENGTH_M = 2.5
+_SPEED_LENGTH_M = 8.0
+# A tyre touches the floor over about this length, and what is shorter it swallows.
+_CONTACT_M = 0.2
+# A quadrotor holds its height over the floor as averaged over this half width, not over every bump.
+_ALTITUDE_M = 3.0
+# It takes this half width of way to change its lean.
+_LEAN_M = 1.0
+
+
+def ride(path: Path, floor: Caster, standing: Caster, scenario: Scenario, seed: int, session: str) -> Motion:
+    """Return the true movement of the sensor of one session.
+
+    Args:
+        path: The line.
+        floor: What wheels roll on and a quadrotor measures its height to: rock, stones, and whatever else is fixed.
+        standing: The same with the session's props, over which a quadrotor flies.
+        scenario: Names the platform and the session's plan.
+        seed: Draws the noise of tilt, bounce and speed.
+        session: "before" or "after".
+
+    Raises:
+        ScenarioError: A quadrotor finds too little room between floor and roof.
+    """
+    platform, plan = scenario.platform, getattr(scenario, session)
+    height_m = plan.height_m or platform.sensor_height_m
+    time_s = times(path.distance_m, plan.speed_mps or platform.speed_mps, platform.speed_variation, seed, session)
+    keys = stream(seed, session, "tilt").integers(2**63, size=2).tolist()
+    tilt = [np.deg2rad(platform.tilt_deg) * smooth_noise((path.distance_m,), _TILT_LENGTH_M, key) for key in keys]
+    bounce_key = int(stream(seed, session, "bounce").integers(2**63))
+    bounce_m = platform.bounce_m * smooth_noise((path.distance_m,), _BOUNCE_LENGTH_M, bounce_key)
+    if platform.kind == "ground_robot":
+        centre_m, pitch, roll = on_wheels(path, floor, platform)
+        rotations = Rotation.from_euler("ZYX", np.stack([path.yaw_rad, pitch + tilt[0], roll + tilt[1]], axis=1))
+        mast = rotations.as_matrix()[:, :, 2] * height_m
+        points = np.column_stack([path.points[:, :2], centre_m + bounce_m]) + mast
+    else:
+        pitch, roll = lean(path, time_s)
+        rotations = Rotation.from_euler("ZYX", np.stack([path.yaw_rad, pitch + tilt[0], roll + tilt[1]], axis=1))
+        level_m = smoothed(_floor_under(path.points, path.points[:, 2], floor), _ALTITUDE_M)
+        flight_m = _between(path, floor, standing, level_m + height_m + bounce_m, platform.clearance_m, session)
+        points = np.column_stack([path.points[:, :2], flight_m])
+    return motion_of(time_s, path.distance_m, points, rotations)
+
+
+def times(distance_m: Float64Array, speed_mps: float, variation: float, seed: int, session: str) -> Float64Array:
+    """Return the time (N,) at each distance: the integral of ds / v, v being log-normal about `speed_mps`.
+
+    The logarithm of v is smooth noise, so that v has the mean `speed_mps` and the standard deviation `variation` times
+    that, and is never zero.
+    """
+    if variation == 0.0:
+        return distance_m / speed_mps
+    spread = np.sqrt(np.log1p(variation**2))
+    noise = smooth_noise((distance_m,), _SPEED_LENGTH_M, int(stream(seed, session, "speed").integers(2**63)))
+    slowness = np.exp(spread**2 / 2 - spread * noise) / speed_mps
+    steps_s = np.diff(distance_m) * (slowness[1:] + slowness[:-1]) / 2
+    return np.concatenate([[0.0], np.cumsum(steps_s)])
+
+
+def on_wheels(path: Path, floor: Caster, platform: Platform) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Return height (N,) of the robot's middle at the floor, pitch (nose down positive) and roll (left up), radians.
+
+    The chassis lies in the plane through the four wheels' contact points that is nearest to them: middle, rise along
+    and rise across are their means and mean differences, as on a rocker suspension.
+    """
+    forward = np.stack([np.cos(path.yaw_rad), np.sin(path.yaw_rad)], axis=1)
+    left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
+    heights = {}
+    for ahead in (1, -1):
+        for side in (1, -1):
+            offset = ahead * platform.wheelbase_m / 2 * forward + side * platform.track_m / 2 * left
+            wheel = np.column_stack([path.points[:, :2] + offset, path.points[:, 2]])
+            heights[ahead, side] = smoothed(_floor_under(wheel, path.points[:, 2], floor), _CONTACT_M)
+    front, rear = ((heights[ahead, 1] + heights[ahead, -1]) / 2 for ahead in (1, -1))
+    port, starboard = ((heights[1, side] + heights[-1, side]) / 2 for side in (1, -1))
+    pitch = -np.arctan((front - rear) / platform.wheelbase_m)
+    roll = np.arctan((port - starboard) / platform.track_m * np.cos(pitch))
+    return (front + rear) / 2, pitch, roll
+
+
+def lean(path: Path, time_s: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Return pitch and roll (N,) by which a quadrotor turns its thrust into the acceleration it needs, radians."""
+    speed_mps = np.gradient(path.distance_m, time_s)
+    along = smoothed(np.gradient(speed_mps, time_s), _LEAN_M)
+    to_left = smoothed(speed_mps**2 * np.gradient(path.yaw_rad, path.distance_m), _LEAN_M)
+    return np.arctan(along / _GRAVITY_MPS2), -np.arctan(to_left / _GRAVITY_MPS2)
+
+
+def _floor_under(points: Float64Array, level_m: Float64Array, floor: Caster) -> Float64Array:
+    """Floor height (N,) under points (N, 3), bridged where there is none, at `level_m` where there is none at all."""
+    heights = floor_heights(floor, points + np.array([0.0, 0.0, PROBE_UP_M]))
+    known = np.flatnonzero(np.isfinite(heights))
+    return np.interp(np.arange(len(heights)), known, heights[known]) if len(known) else level_m.copy()
+
+
+def _between(
+    path: Path, floor: Caster, standing: Caster, wanted_m: Float64Array, clearance_m: float, session: str
+) -> Float64Array:
+    """Heights (N,) near the wanted ones that keep the clearance to the roof and air to what lies or stands below."""
+    around = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]) * clearance_m / 2
+    low, high = np.full(len(wanted_m), -np.inf), np.full(len(wanted_m), np.inf)
+    for offset in around:
+        origins = np.column_stack([path.points[:, :2] + offset, path.points[:, 2] + PROBE_UP_M])
+        up_m, _, _ = floor.cast(origins, np.tile([0.0, 0.0, 1.0], (len(origins), 1)))
+        roof_m = origins[:, 2] + up_m
+        high = np.minimum(high, roof_m - clearance_m)
+        origins[:, 2] = np.minimum(wanted_m, roof_m - clearance_m / 2)
+        down_m, _, _ = standing.cast(origins, np.tile([0.0, 0.0, -1.0], (len(origins), 1)))
+        low = np.maximum(low, origins[:, 2] - down_m + min(clearance_m, AIR_BELOW_M))
+    if (low > high).any():
+        worst = int(np.argmax(low - high))
+        x, y, z = path.points[worst]
+        raise ScenarioError(
+            f"{session}: roof and floor leave {low[worst] - high[worst]:.2f} m too little for platform.clearance_m "
+            f"{path.distance_m[worst]:.1f} m along the route, at ({x:.1f}, {y:.1f}, {z:.1f}): choose another lateral, "
+            "or lower platform.clearance_m"
+        )
+    return kept_between(wanted_m, low, high, _LEAN_M)

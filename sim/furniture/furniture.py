@@ -1,0 +1,81 @@
+"""What is fixed to the rock in both sessions: pipes, ducts, cable trays, rock bolts and wire mesh.
+
+Everything follows the bare wall as rays find it, so it works in a mesh of someone else's as well. One fixture for each
+item and material, merged over all drifts, to keep the number of geoms small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from scenarios.schema import Furniture, Tunnel
+from sim.furniture.shell import shell_of
+from sim.furniture.support import BOLT_LOWEST_SHARE, SCREEN_LOWEST_SHARE, bolt_mesh, bolt_pins, screen_mesh
+from sim.furniture.utilities import duct_meshes, pipe_meshes, tray_meshes, wall_plans
+from sim.geometry.mesh import Mesh, joined
+from sim.geometry.raycast import Caster
+from sim.rock.axis import Axis, axes_of
+from sim.rock.centreline import Centreline
+
+_PIN_SPACING_M = 1.2  # of what holds a screen where no bolts are asked for
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fixture:
+    """Something fixed, of one material.
+
+    Attributes:
+        name: Unique in the tunnel, e.g. "pipe-1".
+        material: Key of `sim.materials.REFLECTIVITY`.
+        mesh: Its surface, world frame, metres, facing outwards.
+    """
+
+    name: str
+    material: str
+    mesh: Mesh
+
+
+def furnish(tunnel: Tunnel, centreline: Centreline, walls: Caster, seed: int) -> tuple[Fixture, ...]:
+    """Return the furniture of all drifts; nothing in a tunnel that has none, or no drifts to follow.
+
+    Args:
+        tunnel: Its `furniture`; nothing else is read.
+        centreline: Where the drifts run.
+        walls: Caster of the bare rock, facing into the void.
+        seed: What jitter, sag and panels are drawn from.
+    """
+    furniture = tunnel.furniture
+    if furniture == Furniture() or not centreline.drifts:
+        return ()
+    axes = axes_of(centreline, walls)
+    fixtures = (*_hangings(furniture, axes, seed), *_support(furniture, axes, seed))
+    return tuple(fixture for fixture in fixtures if len(fixture.mesh.faces))
+
+
+def _hangings(furniture: Furniture, axes: Sequence[Axis], seed: int) -> Iterator[Fixture]:
+    plans = iter(wall_plans(furniture))
+    for number, pipe in enumerate(furniture.pipes, start=1):
+        yield Fixture(f"pipe-{number}", "steel", joined(list(pipe_meshes(axes, pipe, next(plans)))))
+    for number, duct in enumerate(furniture.ducts, start=1):
+        name = f"duct-{number}"
+        yield Fixture(name, "fabric", joined(list(duct_meshes(axes, duct, name, seed))))
+    for number, tray in enumerate(furniture.cable_trays, start=1):
+        name = f"cable-tray-{number}"
+        *steel, cables = tray_meshes(axes, tray, next(plans), name, seed)
+        yield Fixture(name, "steel", joined(steel))
+        yield Fixture(f"cables-{number}", "rubber", cables)
+
+
+def _support(furniture: Furniture, axes: Sequence[Axis], seed: int) -> Iterator[Fixture]:
+    bolts, screen = furniture.bolts, furniture.screen
+    if bolts is None and screen is None:
+        return
+    shells = [shell_of(axis, BOLT_LOWEST_SHARE) for axis in axes]
+    spacing_m = _PIN_SPACING_M if bolts is None else bolts.spacing_m
+    pins = [bolt_pins(shell, spacing_m, number, seed) for number, shell in enumerate(shells)]
+    if bolts is not None:
+        yield Fixture("bolts", "steel", bolt_mesh(shells, pins, bolts))
+    if screen is not None:
+        shells = [shell_of(axis, SCREEN_LOWEST_SHARE) for axis in axes]
+        yield Fixture("screen", "steel", screen_mesh(shells, pins, screen, seed))

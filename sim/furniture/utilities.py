@@ -1,0 +1,168 @@
+"""Pipes, ventilation ducts and cable trays along the walls and below the roof of every drift."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cdpipe.core.geometry import Float64Array, Int64Array, stream
+from scenarios.schema import CableTray, Duct, Furniture, Pipe
+from sim.furniture.wall_line import Cross, Line, WallPlan, roof_lines, stacked, wall_lines
+from sim.geometry.mesh import Mesh, joined
+from sim.geometry.sweep import EMPTY, bars, circle, frames_along, sweep
+from sim.rock.axis import STATION_M, Axis, distances
+
+FIXING_M = 0.05  # how deep brackets and hangers reach into the rock
+_PIPE_STANDOFF_M = 0.08
+_DUCT_STANDOFF_M = 0.10
+_TRAY_STANDOFF_M = 0.05
+DUCT_LOWEST_M = 1.6
+_TRAY_HALF_HEIGHT_M = 0.05
+_SHEET_M = 0.006
+_COUPLING_M = 6.0
+_HANGER_M = 2.5
+_LONGEST_ARM_M = 0.9
+
+
+def pipe_plan(pipe: Pipe) -> WallPlan:
+    """Where a pipe wants to run."""
+    radius_m = pipe.diameter_m / 2
+    return WallPlan(_sign(pipe.side), pipe.height_share, Cross(radius_m, radius_m, _PIPE_STANDOFF_M))
+
+
+def tray_plan(tray: CableTray) -> WallPlan:
+    """Where a cable tray wants to run."""
+    cross = Cross(tray.width_m / 2, _TRAY_HALF_HEIGHT_M, _TRAY_STANDOFF_M)
+    return WallPlan(_sign(tray.side), tray.height_share, cross)
+
+
+def wall_plans(furniture: Furniture) -> list[WallPlan]:
+    """Plans of all pipes, then of all trays, with their heights over openings."""
+    return stacked([pipe_plan(pipe) for pipe in furniture.pipes] + [tray_plan(tray) for tray in furniture.cable_trays])
+
+
+def pipe_meshes(axes: Sequence[Axis], pipe: Pipe, plan: WallPlan) -> tuple[Mesh, Mesh]:
+    """Return a pipe with its couplings, and its brackets, in all drifts."""
+    radius_m = pipe.diameter_m / 2
+    tubes, brackets = [], []
+    for axis in axes:
+        for line in wall_lines(axis, plan):
+            tubes.append(sweep(thinned(line.path), circle(radius_m, 10)))
+            tubes.extend(_couplings(line, radius_m))
+            brackets.append(_wall_arms(axis, line, plan, every_m=3.0, width_m=0.05))
+    return _joined(tubes), _joined(brackets)
+
+
+def duct_meshes(axes: Sequence[Axis], duct: Duct, name: str, seed: int) -> tuple[Mesh, Mesh]:
+    """Return a flexible duct, which sags between its hangers and has ribs, and the hangers, in all drifts."""
+    radius_m = duct.diameter_m / 2
+    cross = Cross(radius_m, radius_m, _DUCT_STANDOFF_M)
+    tubes, hangers = [], []
+    for number, axis in enumerate(axes):
+        generator = stream(seed, "furniture", name, str(number))
+        for line in roof_lines(axis, duct.lateral, cross, DUCT_LOWEST_M):
+            every = round(_HANGER_M / STATION_M)
+            phase = (np.arange(len(line.path)) % every) / every
+            depth_m = generator.uniform(0.02, 0.08, size=len(line.path) // every + 1)[
+                np.arange(len(line.path)) // every
+            ]
+            path = line.path - np.column_stack([np.zeros((len(phase), 2)), 4 * depth_m * phase * (1 - phase)])
+            ribs = np.where(np.arange(len(path)) % 2, 0.97, 1.0) * generator.uniform(0.985, 1.0, len(path))
+            tubes.append(sweep(path, circle(radius_m, 12), ribs))
+            hangers.append(_roof_wires(axis, path[::every], line.left[::every], radius_m))
+    return _joined(tubes), _joined(hangers)
+
+
+def tray_meshes(axes: Sequence[Axis], tray: CableTray, plan: WallPlan, name: str, seed: int) -> tuple[Mesh, Mesh, Mesh]:
+    """Return a U-shaped tray, its brackets, and the cables that lie in it, in all drifts."""
+    trays, brackets, cables = [], [], []
+    for number, axis in enumerate(axes):
+        generator = stream(seed, "furniture", name, str(number))
+        for line in wall_lines(axis, plan):
+            path = thinned(line.path)
+            trays.append(sweep(path, _u_profile(tray.width_m, 2 * _TRAY_HALF_HEIGHT_M), is_capped=False))
+            brackets.append(_wall_arms(axis, line, plan, every_m=1.5, width_m=0.04))
+            cables.extend(_cables(path, tray.width_m, generator))
+    return _joined(trays), _joined(brackets), _joined(cables)
+
+
+def thinned(path: Float64Array, tolerance_m: float = 0.004) -> Float64Array:
+    """Leave out every second point of a path where it hardly bends, both ends kept."""
+    if len(path) < 4:
+        return path
+    bend_m = np.linalg.norm(path[1:-1] - (path[:-2] + path[2:]) / 2, axis=1)
+    keep = np.ones(len(path), dtype=bool)
+    keep[1:-1] = (np.arange(1, len(path) - 1) % 2 == 0) | (bend_m > tolerance_m)
+    return path[keep]
+
+
+def _couplings(line: Line, radius_m: float) -> list[Mesh]:
+    middles = np.arange(3, len(line.path) - 2, round(_COUPLING_M / STATION_M))
+    collars = []
+    for middle in middles:
+        along = line.path[middle + 1] - line.path[middle - 1]
+        along *= 0.06 / np.linalg.norm(along)
+        ends = np.stack([line.path[middle] - along, line.path[middle] + along])
+        collars.append(sweep(ends, circle(1.2 * radius_m + 0.005, 10)))
+    return collars
+
+
+def _wall_arms(axis: Axis, line: Line, plan: WallPlan, every_m: float, width_m: float) -> Mesh:
+    """Bars from the rock to below a line; where the rock is too far, a wire down from the roof."""
+    chosen = np.arange(2, len(line.path) - 1, round(every_m / STATION_M))
+    below = np.array([0.0, 0.0, plan.cross.half_height_m + 0.5 * width_m])
+    inner = line.path[chosen] - below - plan.side * plan.cross.half_width_m * line.left[chosen]
+    outwards = plan.side * line.left[chosen]
+    reach_m = distances(axis.walls, inner, outwards)
+    is_arm = reach_m < _LONGEST_ARM_M + 2 * plan.cross.half_width_m
+    arms = bars(inner[is_arm], (inner + (reach_m + FIXING_M)[:, None] * outwards)[is_arm], width_m)
+    hung = line.path[chosen][~is_arm]
+    return joined([arms, _wires(axis, hung)])
+
+
+def _roof_wires(axis: Axis, path: Float64Array, left: Float64Array, radius_m: float) -> Mesh:
+    sides = [_wires(axis, path + shift * radius_m * left) for shift in (-0.85, 0.85)]
+    return joined(sides)
+
+
+def _wires(axis: Axis, points: Float64Array) -> Mesh:
+    up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
+    if len(points) == 0:
+        return bars(points, points, 0.012)
+    reach_m = distances(axis.walls, points, up)
+    is_near = reach_m < 3.0
+    return bars(points[is_near], (points + (reach_m + FIXING_M)[:, None] * up)[is_near], 0.012)
+
+
+def _u_profile(width_m: float, height_m: float) -> Float64Array:
+    w, h, t = width_m / 2, height_m / 2, _SHEET_M
+    return np.array([[w, -h], [w, h], [w - t, h], [w - t, t - h], [t - w, t - h], [t - w, h], [-w, h], [-w, -h]])
+
+
+def _cables(path: Float64Array, width_m: float, generator: np.random.Generator) -> list[Mesh]:
+    """Three or so cables side by side on the tray's bottom, wandering a little."""
+    radii_m = generator.uniform(0.015, 0.035, size=max(1, min(4, int(width_m / 0.09))))
+    left, up = frames_along(path)
+    free_m = width_m - 2 * _SHEET_M
+    slots = (np.arange(len(radii_m)) + 0.5) / len(radii_m) - 0.5
+    cables = []
+    for slot, radius_m in zip(slots, radii_m, strict=True):
+        room_m = max(free_m / len(radii_m) / 2 - radius_m, 0.0)
+        wander_m = room_m * np.interp(np.arange(len(path)), *_knots(len(path), generator))
+        bottom_m = radius_m + _SHEET_M - _TRAY_HALF_HEIGHT_M
+        cables.append(sweep(path + (slot * free_m + wander_m)[:, None] * left + bottom_m * up, circle(radius_m, 5)))
+    return cables
+
+
+def _knots(count: int, generator: np.random.Generator) -> tuple[Int64Array, Float64Array]:
+    knots = np.arange(0, count + 6, 6)
+    return knots, generator.uniform(-1.0, 1.0, len(knots))
+
+
+def _joined(meshes: Sequence[Mesh]) -> Mesh:
+    return joined(list(meshes)) if meshes else EMPTY
+
+
+def _sign(side: str) -> float:
+    return 1.0 if side == "left" else -1.0

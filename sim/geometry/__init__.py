@@ -1,0 +1,1 @@
+"""Meshes, noise fields, sweeps and ray casting: geometry that knows no tunnel."""

@@ -1,0 +1,229 @@
+"""All props of a scenario set down in turn: first those with a given place, then those whose place the seed draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+
+import numpy as np
+
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array
+from scenarios.schema import Place, Prop, Scenario
+from sim.placement.fitting import Spot, placed
+from sim.placement.lanes import Lane, build_lanes
+from sim.placement.placing import (
+    Standing,
+    Surroundings,
+    grow,
+    overlap,
+    seen_from_above,
+    standing_corners,
+)
+from sim.placement.settling import settle
+from sim.placement.stations import PLACE_TRIES, Stations, draw_areas, drawn_spots, given_spot, way
+from sim.props.props import shape_of
+from sim.props.shapes import Shape
+from sim.rock.centreline import Centreline
+
+# Between a drawn prop and its neighbours.
+_BETWEEN_M = 0.15
+# A prop that does not come to rest is tried at this many drawn places.
+_DROPS = 8
+_BEFORE, _AFTER = frozenset(("before",)), frozenset(("after",))
+_BOTH = _BEFORE | _AFTER
+Outline = Callable[[Standing], Float64Array]
+
+
+@dataclass(slots=True, eq=False)
+class _Board:
+    """What stands so far, and what it takes of the way: for each lane the spans of each prop."""
+
+    lanes: tuple[Lane, ...]
+    standing: list[Standing] = field(default_factory=list)
+    taken: list[list[Float64Array]] = field(default_factory=list)
+
+    def add(self, items: Sequence[Standing]) -> None:
+        self.standing.extend(items)
+        self.taken.extend([lane.taken_by(item) for lane in self.lanes] for item in items)
+
+    def neighbour(
+        self, item: Standing, apart_m: float, outline: Outline = standing_corners
+    ) -> tuple[Standing, str] | None:
+        """Return a prop that stands in this one's way, and the session."""
+        corners = grow(outline(item), apart_m)
+        for other in self.standing:
+            shared = item.sessions & other.sessions
+            if shared and overlap(corners, outline(other)):
+                return other, max(shared)
+        return None
+
+    def is_passable(self, items: Sequence[Standing]) -> bool:
+        for item in items:
+            for number, lane in enumerate(self.lanes):
+                if not lane.is_open([*(each[number] for each in self.taken), lane.taken_by(item)]):
+                    return False
+        return True
+
+
+def place_props(scenario: Scenario, centreline: Centreline, around: Surroundings, seed: int) -> list[Standing]:
+    """Return every prop at rest at each of its places, in the scenario's order; a moved or reshaped one appears twice.
+
+    Props with a given place come first. A drawn place is drawn again until the prop fits between the walls, stands
+    clear of the others, leaves the robot its way and comes to rest: 80 times, 80 times at the opposite wall, and in an
+    area 160 times more with as much tunnel again to either side; one that leans 160 times more where humps of the
+    floor hide a part of the wall. The draws of one prop depend on no other.
+
+    Raises:
+        ScenarioError: A prop does not fit, stands in another, does not come to rest, or finds no place.
+    """
+    board = _Board(build_lanes(scenario, centreline, around.fixed))
+    areas = draw_areas(scenario, centreline, seed)
+    anywhere = way(scenario, centreline)
+    found: dict[tuple[str, bool], list[Standing]] = {}
+    jobs = list(chain.from_iterable(_jobs(prop, seed) for prop in scenario.props))
+    spots = [given_spot(job.place, scenario, centreline) for job in jobs]
+    for job, spot in zip(jobs, spots, strict=True):
+        if spot is not None:
+            found[job.key] = _set_down(job, spot, around, seed, board)
+            board.add(found[job.key])
+    for job, spot in zip(jobs, spots, strict=True):
+        if spot is None:
+            stretches = (anywhere,) if job.place.area is None else areas[job.place.area]
+            found[job.key] = _find_place(job, stretches, scenario, centreline, around, seed, board)
+            board.add(found[job.key])
+    return [item for job in jobs for item in found[job.key]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    """A prop to set down at one of its places, and what is left of it in the after session if it is reshaped."""
+
+    prop: Prop
+    place: Place
+    sessions: frozenset[str]
+    shape: Shape
+    rest: Shape | None = None
+    is_goal: bool = False
+
+    @property
+    def key(self) -> tuple[str, bool]:
+        return self.prop.name, self.is_goal
+
+
+def _jobs(prop: Prop, seed: int) -> list[_Job]:
+    sessions = {"none": _BOTH, "added": _AFTER}.get(prop.change, _BEFORE)
+    rest = shape_of(prop, seed, is_banked=_is_banked(prop, prop.place), is_loaded=True) if prop.loaded_share else None
+    jobs = [_Job(prop, prop.place, sessions, shape_of(prop, seed, is_banked=_is_banked(prop, prop.place)), rest)]
+    if prop.to is not None:
+        shape = shape_of(prop, seed, is_banked=_is_banked(prop, prop.to))
+        jobs.append(_Job(prop, prop.to, _AFTER, shape, is_goal=True))
+    return jobs
+
+
+def _is_banked(prop: Prop, place: Place) -> bool:
+    return place.posture == "leaning" and prop.kind == "muck_pile"
+
+
+def _at_spot(job: _Job, spot: Spot, around: Surroundings, seed: int) -> list[Standing]:
+    """Return the prop before it settles; with a short shift or reshaped, also as it stands after."""
+    prop, place, shape = job.prop, job.place, job.shape
+    pose, wall = placed(prop, shape, place, spot, around, seed)
+    items = [Standing(prop, shape, job.sessions, pose, place.posture, wall)]
+    if job.rest is not None:
+        items.append(replace(items[0], shape=job.rest, sessions=_AFTER))
+    if prop.shift is not None:
+        heading = np.arctan2(spot.heading[1], spot.heading[0]) + np.deg2rad(prop.shift.heading_deg)
+        goal = pose[:2, 3] + prop.shift.distance_m * np.array([np.cos(heading), np.sin(heading)])
+        moved_to = np.append(goal, np.deg2rad(prop.shift.turn_deg))
+        pose, wall = placed(prop, shape, place, spot, around, seed, moved_to)
+        items.append(Standing(prop, shape, _AFTER, pose, place.posture, wall))
+    return items
+
+
+def _set_down(job: _Job, spot: Spot, around: Surroundings, seed: int, board: _Board) -> list[Standing]:
+    items = _at_spot(job, spot, around, seed)
+    _refuse_overlap(items, board)
+    rested = [settle(item, around) for item in items]
+    _refuse_overlap([item for item in rested if item.posture != "upright"], board)
+    if why := _touching(rested, board):
+        raise ScenarioError(f"prop {job.prop.name!r} cannot come to rest there: {why}: set them farther apart")
+    return rested
+
+
+def _refuse_overlap(items: Sequence[Standing], board: _Board) -> None:
+    for item in items:
+        clash = board.neighbour(item, 0.0)
+        if clash is not None:
+            raise ScenarioError(
+                f"props {clash[0].prop.name!r} and {item.prop.name!r} stand in one another in the {clash[1]} session: "
+                "give one another fraction or lateral"
+            )
+
+
+def _find_place(
+    job: _Job,
+    stretches: Sequence[Stations],
+    scenario: Scenario,
+    centreline: Centreline,
+    around: Surroundings,
+    seed: int,
+    board: _Board,
+) -> list[Standing]:
+    where = "on the way of the sessions" if job.place.area is None else f"in area {job.place.area!r}"
+    if len(stretches[0]) == 0:
+        raise ScenarioError(f"prop {job.prop.name!r}: a mesh without drifts has no stations to draw: give `place.at`")
+    opposite = replace(job, place=job.place.model_copy(update={"lateral": -job.place.lateral}))
+    rounds = [(stations, wanted, False) for stations in stretches for wanted in (job, opposite)]
+    if job.place.posture == "leaning":
+        rounds += [(stretches[-1], wanted, True) for wanted in (job, opposite)]
+    why = ""
+    for number, (stations, wanted, over_humps) in enumerate(rounds):
+        purpose = ("to" if job.is_goal else "place") + (f"-{number}" if number else "")
+        spots = drawn_spots(job.prop.name, purpose, stations, scenario, centreline, seed, over_humps)
+        items, why = _first_fit(wanted, spots, around, seed, board)
+        if items:
+            return items
+    n_tries = len(rounds) * PLACE_TRIES
+    raise ScenarioError(
+        f"prop {job.prop.name!r} finds no place {where} in {n_tries} tries, at the last because {why}: "
+        "make it smaller, give it another lateral, or place fewer props"
+    )
+
+
+def _first_fit(
+    job: _Job, spots: Iterable[Spot], around: Surroundings, seed: int, board: _Board
+) -> tuple[list[Standing], str]:
+    """Return the prop at rest at the first spot that will do; if none does, nothing, and why not the last one."""
+    why, drops = "every one lies in the mouth of a junction", 0
+    for spot in spots:
+        try:
+            items = _at_spot(job, spot, around, seed)
+            why = _clash(items, board)
+            if why:
+                continue
+            drops += 1
+            items = [settle(item, around) for item in items]
+            why = _clash([item for item in items if item.posture != "upright"], board) or _touching(items, board)
+            if not why:
+                return items, ""
+        except ScenarioError as error:
+            why = str(error)
+        if drops >= _DROPS:
+            break
+    return [], why
+
+
+def _touching(items: Sequence[Standing], board: _Board) -> str:
+    """Say which prop one at rest runs into as it tilts on its floor; "" if none."""
+    clashes = [board.neighbour(item, 0.0, seen_from_above) for item in items]
+    return next((f"prop {clash[0].prop.name!r} is in the way" for clash in clashes if clash), "")
+
+
+def _clash(items: Sequence[Standing], board: _Board) -> str:
+    for item in items:
+        clash = board.neighbour(item, _BETWEEN_M)
+        if clash is not None:
+            return f"prop {clash[0].prop.name!r} stands there"
+    return "" if board.is_passable(items) else "the robot could not get by"

@@ -1,0 +1,246 @@
+"""From a prop's place in a scenario to a pose on the floor: across the free width, clear of rock and furniture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float32Array, Float64Array, make_pose, yaw_pose
+from scenarios.schema import Place, Prop
+from sim.geometry.mesh import split
+from sim.geometry.raycast import Caster
+from sim.placement.placing import PROBE_UP_M, WALL_GAP_M, Surroundings, corners_object, floor_heights, free_width
+from sim.props.bed import BEHIND_M
+from sim.props.postures import start_rotation, tilted_towards
+from sim.props.shapes import Shape, footprint, solid_mesh
+
+# A prop may lean on a wall that is this even; at a drift's mouth it is not.
+_UNEVEN_WALL_M = 0.8
+# What rises no more steeply is floor; of a wall at least half must be seen over it.
+_FLOOR_UP = 0.7
+_SEEN_SHARE = 0.5
+_LEAN_GAP_M = 0.01
+_BULGE_M = 0.15  # of rock that a leaning prop may meet between its corners
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spot:
+    """A station in the tunnel.
+
+    Attributes:
+        point: (3,) on the centreline at floor level, or a given point above the floor.
+        heading: (2,) direction of the drift; of the x axis for a given point.
+        width_m, height_m: Nominal size of the drift.
+        where: How a message calls it.
+        is_line: Whether the drift's width is shared out by `lateral`; else the prop stands at the point itself.
+        over_humps: Whether an uneven wall is judged again, by what is seen of it over humps of the floor.
+    """
+
+    point: Float64Array
+    heading: Float64Array
+    width_m: float
+    height_m: float
+    where: str
+    is_line: bool = True
+    over_humps: bool = False
+
+
+def placed(
+    prop: Prop,
+    shape: Shape,
+    place: Place,
+    spot: Spot,
+    around: Surroundings,
+    seed: int,
+    shift_xy: Float64Array | None = None,
+) -> tuple[Float64Array, Float64Array | None]:
+    """Return the pose (4, 4) of a prop at a spot before it settles, and the direction (2,) of its wall, if it has one.
+
+    Args:
+        prop: The prop.
+        shape: What it is made of there.
+        place: Its sideways place, yaw and posture.
+        spot: Where along the tunnel.
+        around: The tunnel.
+        seed: Draws on which side a tipped prop lies and how far one leans.
+        shift_xy: (3,) for a prop moved a little: x, y of where it stands instead, and its turn in radians.
+
+    Raises:
+        ScenarioError: It does not fit there.
+    """
+    yaw = float(np.arctan2(spot.heading[1], spot.heading[0]) + np.deg2rad(place.yaw_deg))
+    start = None if shift_xy is None else shift_xy[:2]
+    yaw += 0.0 if shift_xy is None else float(shift_xy[2])
+    if place.posture == "leaning":
+        return _at_wall(prop, shape, place, spot, around, seed, yaw, start)
+    rotation = start_rotation(prop.name, shape, place.posture, seed)
+    low, high = _bounds(shape, rotation, place.posture)
+    if spot.is_line and start is None:
+        position = _across(prop, (high - low) / 2, place, spot, around)
+    else:
+        position = spot.point[:2] if start is None else start
+        _require_clear(prop, low, high, yaw, position, spot, around)
+    floor_m = _floor_under(prop, low, high, position, yaw, float(spot.point[2]), around.walls)
+    centre = np.append((low[:2] + high[:2]) / 2, low[2])
+    pose = yaw_pose(yaw)
+    origin = np.append(position, floor_m) - pose[:3, :3] @ centre
+    return make_pose(pose[:3, :3] @ rotation, origin), None
+
+
+def _bounds(shape: Shape, rotation: Float64Array, posture: str) -> tuple[Float64Array, Float64Array]:
+    """Low and high corner (3,) of a prop turned into its posture; upright, what is below the floor does not count."""
+    if posture == "upright":
+        length, width, height = shape.size_m
+        return np.array([-length / 2, -width / 2, 0.0]), np.array([length / 2, width / 2, height])
+    points = corners_object(shape) @ rotation.T
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _across(prop: Prop, half: Float64Array, place: Place, spot: Spot, around: Surroundings) -> Float64Array:
+    """Place (2,) of the middle of a prop of this half size (3,) across the drift."""
+    left = np.array([-spot.heading[1], spot.heading[0]])
+    turn = yaw_pose(np.deg2rad(place.yaw_deg))[:2, :2]
+    extent = np.abs(footprint((2 * half[0], 2 * half[1], 0.0)) @ turn.T).max(axis=0)  # half, along and across the drift
+    stations = spot.point[:2] + np.linspace(-extent[0], extent[0], max(7, int(extent[0] / 0.1)))[:, None] * spot.heading
+    origins = np.column_stack([stations, np.full(len(stations), spot.point[2])])
+    top = min(2 * half[2], 0.5 * spot.height_m)
+    heights = np.linspace(0.25, max(0.3, top), max(4, int(top / 0.08)))
+    sides = free_width(around.fixed, origins, np.tile(left, (len(origins), 1)), heights, spot.width_m / 2)
+    right_m, left_m = (float(side.min()) - around.gap_m for side in sides)
+    if right_m + left_m < 2 * extent[1]:
+        raise ScenarioError(
+            f"prop {prop.name!r} is {2 * extent[1]:.2f} m across, but {spot.where} only "
+            f"{max(right_m + left_m, 0.0):.2f} m are free: make it smaller, turn it, or place it elsewhere"
+        )
+    low, high = extent[1] - right_m, left_m - extent[1]
+    return np.asarray(spot.point[:2] + ((low + high) / 2 + place.lateral * (high - low) / 2) * left)
+
+
+def _require_clear(
+    prop: Prop,
+    low: Float64Array,
+    high: Float64Array,
+    yaw: float,
+    position: Float64Array,
+    spot: Spot,
+    around: Surroundings,
+) -> None:
+    """Look from the middle of a prop to its outline, a gap beyond it: no rock may be in between."""
+    half = (high - low)[:2] / 2 + WALL_GAP_M
+    share = np.linspace(-1.0, 1.0, 9)
+    ends = np.concatenate([np.column_stack([share, np.full(9, side)]) for side in (-1.0, 1.0)])
+    outline = np.concatenate([ends, ends[:, ::-1]]) * half @ yaw_pose(yaw)[:2, :2].T
+    reach_m = np.linalg.norm(outline, axis=1)
+    floor = floor_heights(around.walls, np.array([[*position, spot.point[2] + PROBE_UP_M / 2]]))[0]
+    if np.isnan(floor):
+        raise ScenarioError(f"prop {prop.name!r}: there is no floor {spot.where}, looked for from 0.6 m above it")
+    for height in np.linspace(0.25, max(0.3, float(high[2] - low[2])), 5):
+        origins = np.tile([*position, floor + height], (len(outline), 1))
+        directions = np.column_stack([outline / reach_m[:, None], np.zeros(len(outline))])
+        if (around.fixed.cast(origins, directions)[0] < reach_m).any():
+            raise ScenarioError(f"prop {prop.name!r} does not fit {spot.where}: it would stand in rock or pipes")
+
+
+def _floor_under(
+    prop: Prop,
+    low: Float64Array,
+    high: Float64Array,
+    position: Float64Array,
+    yaw: float,
+    level_m: float,
+    walls: Caster,
+) -> float:
+    share = np.linspace(-0.5, 0.5, 7)
+    size = high - low
+    grid = np.stack(np.meshgrid(share * size[0], share * size[1]), axis=-1).reshape(-1, 2)
+    xy = grid @ yaw_pose(yaw)[:2, :2].T + position
+    heights = floor_heights(walls, np.column_stack([xy, np.full(len(xy), level_m + PROBE_UP_M)]))
+    if np.isnan(heights).all():
+        raise ScenarioError(f"prop {prop.name!r}: there is no floor where it should stand, looked for from 1.2 m above")
+    return float(np.nanmedian(heights))
+
+
+def _at_wall(
+    prop: Prop,
+    shape: Shape,
+    place: Place,
+    spot: Spot,
+    around: Surroundings,
+    seed: int,
+    yaw: float,
+    start: Float64Array | None,
+) -> tuple[Float64Array, Float64Array]:
+    """Pose of a prop tilted towards the nearer wall until it all but touches it, or of a pile banked up against it."""
+    base = np.array([*(spot.point[:2] if start is None else start), spot.point[2]])
+    wall = _nearer_wall(prop, place, spot, base, around)
+    aside = np.array([-wall[1], wall[0]])
+    if shape.is_settled:
+        rotation = tilted_towards(prop.name, shape, wall, yaw, seed)
+        meshes = [solid_mesh(solid) for solid in shape.solids]
+        skin = split(np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), _BULGE_M)
+        points = skin.reshape(-1, 3) @ rotation.T
+    else:
+        rotation = yaw_pose(float(np.arctan2(wall[1], wall[0]) - np.pi / 2))[:3, :3]  # +y faces the wall
+        points = _back(shape) @ rotation.T
+    foot_m = points[:, 2].min()
+    level_m = _floor_under(prop, *_span(points), base[:2], 0.0, float(spot.point[2]), around.walls)
+    along = (points[:, :2] @ aside)[:, None] * aside
+    origins = np.column_stack([base[:2] + along, level_m + np.maximum(points[:, 2] - foot_m, 0.1)])
+    is_pile = prop.kind == "muck_pile"
+    caster = around.walls if is_pile else around.fixed
+    reach_m, _, normals = caster.hits(origins, np.tile([*wall, 0.0], (len(origins), 1)))
+    if not _is_even(reach_m, is_pile, spot):
+        # Under a long prop the floor may rise above its foot: a ray from there starts in rock, or meets the floor.
+        is_wall = np.isfinite(reach_m) & (normals[:, :2] @ wall < 0) & (normals[:, 2] < _FLOOR_UP)
+        is_seen = spot.over_humps and is_wall.mean() >= _SEEN_SHARE
+        if not (is_seen and _is_even(reach_m[is_wall], is_pile, spot)):
+            raise ScenarioError(f"prop {prop.name!r}: there is no even wall to lean against {spot.where}")
+        reach_m, points = reach_m[is_wall], points[is_wall]
+    room_m = reach_m - points[:, :2] @ wall
+    # A pile's flat back lies in the mean line of the wall and goes on into the rock; all else stays out of it.
+    position = base[:2] + float(room_m.mean() if is_pile else room_m.min() - _LEAN_GAP_M) * wall
+    if shape.is_settled:
+        return make_pose(rotation, np.append(position, level_m - foot_m)), wall
+    half = np.array([*shape.size_m[:2], 0.0]) / 2
+    yaw = float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+    floor_m = _floor_under(prop, -half, half, position, yaw, float(spot.point[2]), around.walls)
+    return make_pose(rotation, np.append(position, floor_m)), wall
+
+
+def _is_even(reach_m: Float32Array, is_pile: bool, spot: Spot) -> bool:
+    """Tell whether a wall at these distances (N,) is one to lean against, infinite where no rock was met."""
+    if not np.isfinite(reach_m).all() or reach_m.max() > spot.width_m + 2.0:
+        return False
+    # A pile goes on behind its plane, which is put at the mean of the wall.
+    if is_pile:
+        return bool(reach_m.max() - reach_m.mean() <= BEHIND_M)
+    return bool(np.ptp(reach_m) <= _UNEVEN_WALL_M)
+
+
+def _back(shape: Shape) -> Float64Array:
+    """Points (N, 3) on the flat back of a prop that is set against a wall, object frame."""
+    length, width, height = shape.size_m
+    heights, sides = np.linspace(0.1, max(height, 0.2), 5), np.linspace(-0.5, 0.5, 9) * length
+    grid = np.stack(np.meshgrid(sides, heights), axis=-1).reshape(-1, 2)
+    return np.column_stack([grid[:, 0], np.full(len(grid), width / 2), grid[:, 1]])
+
+
+def _span(points: Float64Array) -> tuple[Float64Array, Float64Array]:
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _nearer_wall(prop: Prop, place: Place, spot: Spot, base: Float64Array, around: Surroundings) -> Float64Array:
+    """Direction (2,) of the wall: the side that `lateral` names in a drift, else the nearest rock all round."""
+    if spot.is_line and place.lateral != 0.0:
+        left = np.array([-spot.heading[1], spot.heading[0]])
+        return np.asarray(np.sign(place.lateral) * left)
+    angle = np.arange(32) * (2 * np.pi / 32)
+    if spot.is_line:
+        angle = np.arctan2(spot.heading[1], spot.heading[0]) + np.array([-np.pi / 2, np.pi / 2])
+    level = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
+    reach_m = around.walls.cast(np.tile(base + np.array([0.0, 0.0, 0.6]), (len(level), 1)), level)[0]
+    if not np.isfinite(reach_m).any():
+        raise ScenarioError(f"prop {prop.name!r}: there is no wall to lean against {spot.where}")
+    return np.asarray(level[int(np.argmin(reach_m)), :2])

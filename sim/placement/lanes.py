@@ -1,0 +1,128 @@
+"""Whether a robot still gets by: the room its line has in each session, and what props take of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from cdpipe.core.geometry import Float64Array
+from scenarios.schema import Scenario, SessionPlan
+from sim.drive.recorded import read_tum
+from sim.geometry.raycast import Caster
+from sim.placement.placing import Standing, free_width, standing_corners, standing_height_m
+from sim.rock.centreline import Centreline, headings_of, left_of, resample
+
+_STEP_M = 0.25
+# Of the room that props leave, this much more than the platform needs must be left.
+_SPARE_M = 0.15
+# The line changes sides over this distance, so props count this far before and behind where they stand.
+_SWERVE_M = 1.5
+# A quadrotor keeps this much air below it; what is lower is flown over.
+AIR_BELOW_M = 0.5
+_INSIDE_SHARE = 0.35  # of the radius of a bend: how far the line may go inside
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lane:
+    """Room of one session's line, every 0.25 m along its route.
+
+    Attributes:
+        session: "before" or "after".
+        points: (N, 2) centreline.
+        headings: (N, 2) direction of travel.
+        low_m, high_m: (N,) offsets to the left between which the rock leaves the platform its clearance.
+        clearance_m: Kept to props.
+        flown_over_m: Props lower than this are flown over.
+    """
+
+    session: str
+    points: Float64Array
+    headings: Float64Array
+    low_m: Float64Array
+    high_m: Float64Array
+    clearance_m: float
+    flown_over_m: float
+
+    def taken_by(self, standing: Standing) -> Float64Array:
+        """Return the offsets (N, 2) that a prop bars, low and high, NaN where it is far or not in the way."""
+        span = np.full((len(self.points), 2), np.nan)
+        if self.session not in standing.sessions or standing_height_m(standing) < self.flown_over_m:
+            return span
+        corners = standing_corners(standing)
+        outline = resample(np.concatenate([corners, corners[:1]]), 0.1)
+        middle = outline.mean(axis=0)
+        reach_m = float(np.linalg.norm(outline - middle, axis=1).max()) + self.clearance_m + _SWERVE_M
+        near = np.flatnonzero(np.linalg.norm(self.points - middle, axis=1) < reach_m + 8.0)
+        delta = outline[None] - self.points[near, None]
+        along = (delta * self.headings[near, None]).sum(axis=2)
+        across = (delta * left_of(self.headings)[near, None]).sum(axis=2)
+        is_abreast = np.abs(along) < self.clearance_m + _SWERVE_M
+        rows = is_abreast.any(axis=1)
+        span[near[rows], 0] = np.where(is_abreast, across, np.inf)[rows].min(axis=1) - self.clearance_m
+        span[near[rows], 1] = np.where(is_abreast, across, -np.inf)[rows].max(axis=1) + self.clearance_m
+        return span
+
+    def is_open(self, taken: Sequence[Float64Array]) -> bool:
+        """Tell whether at every station a gap is left between the sides of the drift and what props bar (N, 2)."""
+        if not taken:
+            return True
+        spans = np.stack(taken, axis=1)
+        for row in np.flatnonzero(np.isfinite(spans[:, -1, 0])):
+            # The newest prop is the last one; only where it bars something can it have closed the way.
+            bars = spans[row][np.isfinite(spans[row, :, 0])]
+            bars = bars[np.argsort(bars[:, 0])]
+            edge, widest = self.low_m[row], -np.inf
+            for low, high in bars:
+                widest = max(widest, min(low, self.high_m[row]) - edge)
+                edge = max(edge, high)
+            if max(widest, self.high_m[row] - edge) < _SPARE_M:
+                return False
+        return True
+
+
+def build_lanes(scenario: Scenario, centreline: Centreline, fixed: Caster) -> tuple[Lane, ...]:
+    """Return the lane of each session.
+
+    Raises:
+        InputError: A recorded trajectory cannot be read.
+    """
+    plans: tuple[tuple[str, SessionPlan], ...] = (("before", scenario.before), ("after", scenario.after))
+    return tuple(
+        _recorded(scenario, session, Path(plan.trajectory))
+        if plan.trajectory is not None
+        else _lane(scenario, session, plan, centreline, fixed)
+        for session, plan in plans
+    )
+
+
+def _recorded(scenario: Scenario, session: str, trajectory: Path) -> Lane:
+    """Lane of a recorded trajectory, which swerves for nothing and may be at any height."""
+    line = resample(read_tum(trajectory)[0].points[:, :2], _STEP_M)
+    room_m = np.full(len(line), _SPARE_M / 2)
+    return Lane(session, line, headings_of(line), -room_m, room_m, scenario.platform.clearance_m, 0.0)
+
+
+def _lane(scenario: Scenario, session: str, plan: SessionPlan, centreline: Centreline, fixed: Caster) -> Lane:
+    platform = scenario.platform
+    pieces = [centreline.edge(a, b) for a, b in pairwise(plan.route)]
+    widths = np.concatenate([np.full(len(points), section.width_m) for points, section in pieces])
+    line = np.concatenate([points for points, _ in pieces])
+    dense = resample(line, _STEP_M)
+    width_m = np.interp(np.linspace(0, 1, len(dense)), np.linspace(0, 1, len(line)), widths)
+    headings = headings_of(dense)
+    height_m = plan.height_m or platform.sensor_height_m
+    is_flying = platform.kind == "quadrotor"
+    heights = np.array([height_m] if is_flying else [0.35, max(height_m, 0.4)])
+    right_m, left_m = free_width(fixed, dense, left_of(headings), heights, float(width_m.max()))
+    room_m = np.maximum(width_m / 2 - platform.clearance_m, 0.0)
+    low = np.maximum(platform.clearance_m - right_m, -room_m)
+    high = np.minimum(left_m - platform.clearance_m, room_m)
+    turn = np.gradient(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0]))) / _STEP_M
+    high = np.where(turn > 1e-3, np.minimum(high, _INSIDE_SHARE / np.maximum(turn, 1e-3)), high)
+    low = np.where(turn < -1e-3, np.maximum(low, -_INSIDE_SHARE / np.maximum(-turn, 1e-3)), low)
+    flown_over_m = height_m - AIR_BELOW_M if is_flying else 0.0
+    return Lane(session, dense[:, :2], headings, low, high, platform.clearance_m, flown_over_m)

@@ -1,0 +1,151 @@
+"""What stands where: a prop at its pose, the room it takes on the floor, and the rock round it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+
+from cdpipe.core.geometry import Float64Array, transform
+from scenarios.schema import Prop
+from sim.geometry.raycast import Caster
+from sim.props.shapes import Shape, footprint, solid_mesh
+
+Posture = Literal["upright", "tipped", "leaning"]
+
+# Kept between prop and wall, beside one cell of the mesh: marching cubes bevels the foot of a wall over a cell.
+WALL_GAP_M = 0.05
+# Rays down to the floor start this far above the centreline, below any roof and above any bump.
+PROBE_UP_M = 1.2
+_REMEMBERED = 128  # shapes whose corners are asked for again and again
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Standing:
+    """A prop at one of its places.
+
+    Attributes:
+        prop: The prop.
+        shape: What it is made of here; a reshaped pile has another shape in each session.
+        sessions: The sessions in which it stands here.
+        world_T_object: (4, 4) pose; before settling with its lowest point about at floor level.
+        posture: How it was put there.
+        wall: (2,) unit direction of the wall it leans against or is banked up against, else None.
+    """
+
+    prop: Prop
+    shape: Shape
+    sessions: frozenset[str]
+    world_T_object: Float64Array
+    posture: Posture = "upright"
+    wall: Float64Array | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surroundings:
+    """What props are placed in.
+
+    Attributes:
+        walls: The bare rock: its floor carries them.
+        fixed: Rock and furniture: what they must keep clear of.
+        gap_m: Kept between a prop and the side of the drift.
+    """
+
+    walls: Caster
+    fixed: Caster
+    gap_m: float
+
+
+def floor_heights(walls: Caster, points: Float64Array) -> Float64Array:
+    """Return the floor's z (N,) under points (N, 3) that lie in the void; NaN where no floor faces up below them."""
+    down = np.tile([0.0, 0.0, -1.0], (len(points), 1))
+    ranges_m, _, normals = walls.hits(points, down)
+    return np.where(np.isfinite(ranges_m) & (normals[:, 2] > 0.1), points[:, 2] - ranges_m, np.nan)
+
+
+def free_width(
+    walls: Caster, points: Float64Array, left: Float64Array, heights_m: Float64Array, limit_m: float
+) -> tuple[Float64Array, Float64Array]:
+    """Return how far the void reaches to the right and to the left (N,) of points on the floor line.
+
+    Args:
+        walls: The tunnel.
+        points: (N, 3) points of a centreline.
+        left: (N, 2) unit vectors to the left.
+        heights_m: Heights above the points at which rays are cast; the nearest wall counts.
+        limit_m: What counts as far enough.
+    """
+    origins = points[:, None] + heights_m[None, :, None] * np.array([0.0, 0.0, 1.0])
+    level = np.concatenate([left, np.zeros((len(left), 1))], axis=1)
+    reach = []
+    for side in (-1.0, 1.0):
+        directions = np.broadcast_to(side * level[:, None], origins.shape).reshape(-1, 3)
+        ranges_m, _, _ = walls.cast(origins.reshape(-1, 3), directions)
+        reach.append(np.minimum(ranges_m.reshape(origins.shape[:2]).min(axis=1), limit_m).astype(np.float64))
+    return reach[0], reach[1]
+
+
+def standing_points(standing: Standing) -> Float64Array:
+    """Return the corners (N, 3) of a standing prop's surface, world frame; of one set into the floor those above it."""
+    local = corners_object(standing.shape)
+    if not standing.shape.is_settled:
+        local = local[local[:, 2] >= -0.05]
+    return transform(standing.world_T_object, local)
+
+
+def standing_corners(standing: Standing) -> Float64Array:
+    """Return the corners (4, 2) of a standing prop's bounding rectangle on the floor, world frame.
+
+    The rectangle keeps the object's own direction; of a prop that lies or leans it is that of what is seen from above.
+    """
+    pose = standing.world_T_object
+    if standing.posture == "upright":
+        return np.asarray(footprint(standing.shape.size_m) @ pose[:2, :2].T + pose[:2, 3])
+    return seen_from_above(standing)
+
+
+def seen_from_above(standing: Standing) -> Float64Array:
+    """Return the corners (4, 2) of the rectangle about all of a prop as it tilts on its floor, world frame."""
+    pose = standing.world_T_object
+    # Of the object's axes the one that lies flattest gives the direction of the rectangle.
+    axis = pose[:2, int(np.argmin(np.abs(pose[2, :3])))]
+    along = axis / np.linalg.norm(axis)
+    frame = np.stack([along, [-along[1], along[0]]])
+    points = standing_points(standing)[:, :2] @ frame.T
+    low, high = points.min(axis=0), points.max(axis=0)
+    rectangle = np.array([[high[0], high[1]], [low[0], high[1]], [low[0], low[1]], [high[0], low[1]]])
+    return np.asarray(rectangle @ frame)
+
+
+def standing_height_m(standing: Standing) -> float:
+    """Return how high a standing prop reaches above its foot."""
+    if standing.posture == "upright":
+        return standing.shape.size_m[2]
+    return float(np.ptp(standing_points(standing)[:, 2]))
+
+
+def overlap(a: Float64Array, b: Float64Array) -> bool:
+    """Tell whether two rectangles, given by their corners (4, 2), have a point in common inside: separating axes."""
+    for corners in (a, b):
+        for edge in (corners[1] - corners[0], corners[2] - corners[1]):
+            first, second = a @ edge, b @ edge
+            if first.max() <= second.min() or second.max() <= first.min():
+                return False
+    return True
+
+
+def grow(corners: Float64Array, by_m: float) -> Float64Array:
+    """Return the corners (4, 2) of a rectangle grown on every side."""
+    centre = corners.mean(axis=0)
+    edges = np.stack([corners[0] - corners[1], corners[1] - corners[2]])
+    edges /= np.maximum(np.linalg.norm(edges, axis=1, keepdims=True), 1e-9)
+    sign = np.sign(np.round((corners - centre) @ edges.T, 9))
+    return np.asarray(corners + by_m * sign @ edges)
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def corners_object(shape: Shape) -> Float64Array:
+    """Return the corners (N, 3) of all of a prop's primitives, object frame."""
+    return np.concatenate([solid_mesh(solid).vertices for solid in shape.solids])

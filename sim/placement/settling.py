@@ -1,0 +1,261 @@
+"""Physics, once: a prop dropped on the floor until it rests."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, make_pose, transform
+from sim.geometry.raycast import Caster
+from sim.placement.contact import escapes, surface_points
+from sim.placement.placing import PROBE_UP_M, Standing, Surroundings, floor_heights
+from sim.props.shapes import Solid
+
+DEEPEST_M = 0.01  # of any point of a prop at rest in rock
+_DROP_M = 0.02
+# MuJoCo keeps at most 50 contacts of a geom with a height field and drops the rest: a large box on a fine grid tips.
+_PATCH_STEPS_PER_LENGTH = 3.5
+_WALL_STEP_M = 0.15
+_TIMESTEP_S = 0.002
+_LONGEST_S = 8.0
+# At rest: mean speed over a window; MuJoCo's soft contacts leave a creep of a fraction of a millimetre per second.
+_REST_MPS = 2e-3
+_REST_RADPS = 1e-2
+_FALLEN_DEG = 45.0
+_WINDOW_S = 0.2
+# Rough ground, and contacts damped beyond critical, or a box on three points rocks for ever. Friction against rolling
+# stands for the stones that keep a barrel that lies or leans from rolling away.
+_CONTACT: dict[str, Any] = {"friction": [1.0, 0.01, 0.001], "solref": [0.02, 2.0]}
+_CHOCKED: dict[str, Any] = {"friction": [1.0, 0.05, 0.1], "solref": [0.02, 2.0], "condim": 6}
+_DRAG_HZ = {"upright": (2.0, 20.0), "leaning": (2.0, 8.0), "tipped": (2.0, 5.0)}  # of speed and of turning
+_TOUCH_M = 0.002
+# A prop that leans is no farther from the true wall than the field may be off, and brought to it.
+_NEAR_WALL_M = 0.08
+_LEANING_GAP_M = 0.02
+
+
+def settle(item: Standing, around: Surroundings) -> Standing:
+    """Drop a prop on the floor until it rests, and return it at its frozen pose; one set into the floor stays.
+
+    It drops alone, on height fields cast from the rock below it and from the wall it leans against: the wall itself
+    would collide as its convex hull, a solid plug. So no prop's pose depends on any other. The fields are coarser
+    than the rock; at the end the prop is moved by what its true surface lacks to touch the true rock.
+
+    Raises:
+        ScenarioError: It falls over, is not at rest after 8 s, rolls away, or cannot be freed from the rock.
+    """
+    if not item.shape.is_settled:
+        return item
+    points = surface_points(item.shape)
+    model = _model(item, points, around)
+    data = mujoco.MjData(model)
+    _run_to_rest(model, data, item)
+    return replace(item, world_T_object=_frozen_pose(data, item, points, around))
+
+
+def add_solid(body: mujoco.MjsBody, solid: Solid, mesh_name: str = "", **options: object) -> None:
+    """Add a primitive to a body that has the object frame; a mesh must be in the spec under `mesh_name`."""
+    pose = solid.object_T_solid
+    common = {"pos": pose[:3, 3], "quat": quaternion(pose), **options}
+    if solid.mesh is not None:
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh_name, **common)
+    else:
+        kind = mujoco.mjtGeom.mjGEOM_BOX if solid.kind == "box" else mujoco.mjtGeom.mjGEOM_CYLINDER
+        body.add_geom(type=kind, size=solid.size_m, **common)
+
+
+def quaternion(pose: Float64Array) -> Float64Array:
+    """Return a pose's rotation as MuJoCo writes it: w, x, y, z."""
+    return np.asarray(Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True))
+
+
+def _model(item: Standing, points: Float64Array, around: Surroundings) -> mujoco.MjModel:
+    """One prop above its floor, with the wall it leans against."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = _TIMESTEP_S
+    spec.option.impratio = 10.0
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    contact = _CONTACT if item.posture == "upright" else _CHOCKED
+    _add_floor(spec, item, points, around.walls, contact)
+    if item.wall is not None:
+        _add_wall(spec, item, item.wall, points, around.fixed, contact)
+    pose = item.world_T_object.copy()
+    pose[2, 3] += _DROP_M - _floor_gap_m(pose, points, around.walls)
+    body = spec.worldbody.add_body(name="prop", pos=pose[:3, 3], quat=quaternion(pose))
+    body.add_freejoint()
+    for index, solid in enumerate(item.shape.solids):
+        if solid.mesh is not None:
+            # Its hull collides and has its mass: that serves open surfaces too.
+            spec.add_mesh(
+                name=str(index),
+                uservert=solid.mesh.vertices.ravel(),
+                userface=solid.mesh.faces.ravel(),
+                inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,
+            )
+        add_solid(body, solid, mesh_name=str(index), density=300.0, **contact)
+    model = spec.compile()
+    # Drag ends the rocking that stiff contacts keep alive; it changes no resting pose.
+    speed_hz, turn_hz = _DRAG_HZ[item.posture]
+    model.dof_damping[:3] = speed_hz * model.body_mass[1]
+    model.dof_damping[3:] = turn_hz * model.body_inertia[1]
+    return model
+
+
+def _add_floor(
+    spec: mujoco.MjSpec, item: Standing, points: Float64Array, walls: Caster, contact: dict[str, Any]
+) -> None:
+    """Put a height field of the real floor under a prop; rock is level with the floor beside it."""
+    world = transform(item.world_T_object, points)
+    size = np.ptp(world, axis=0)
+    # One that is not upright may yet turn on any side.
+    reach = size[:2] if item.posture == "upright" else np.full(2, np.ptp(points, axis=0).max())
+    half_m = 0.5 * float(np.hypot(*reach)) + 0.4
+    count = 2 * int(np.ceil(half_m * _PATCH_STEPS_PER_LENGTH / max(item.shape.size_m[:2]))) + 1
+    x, y = (world[:, :2].min(axis=0) + world[:, :2].max(axis=0)) / 2
+    z = world[:, 2].min()
+    axis = np.linspace(-half_m, half_m, count)
+    grid = np.stack(np.meshgrid(x + axis, y + axis), axis=-1).reshape(-1, 2)  # rows along y, as MuJoCo wants
+    heights = floor_heights(walls, np.column_stack([grid, np.full(len(grid), z + PROBE_UP_M)]))
+    heights = np.where(np.isnan(heights) | (np.abs(heights - z) > 0.5), z, heights)
+    low, span = heights.min(), max(float(np.ptp(heights)), 1e-3)
+    spec.add_hfield(
+        name="floor",
+        size=[half_m, half_m, span, 0.5],
+        nrow=count,
+        ncol=count,
+        userdata=((heights - low) / span).astype(np.float32),
+    )
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="floor", pos=[x, y, low], **contact)
+
+
+def _add_wall(
+    spec: mujoco.MjSpec,
+    item: Standing,
+    wall: Float64Array,
+    points: Float64Array,
+    fixed: Caster,
+    contact: dict[str, Any],
+) -> None:
+    """Put up a height field of the wall, and what hangs on it, as level rays from the prop's middle find it."""
+    world = transform(item.world_T_object, points)
+    low, high = world.min(axis=0), world.max(axis=0)
+    middle = (low + high) / 2
+    out = np.append(-wall, 0.0)
+    aside = np.array([wall[1], -wall[0], 0.0])  # aside x up = out of the wall
+    half = np.array([np.ptp(world @ aside) / 2 + 0.3, (high[2] - low[2]) / 2 + 0.25])
+    columns, rows = (2 * int(np.ceil(extent / _WALL_STEP_M)) + 1 for extent in half)
+    u, v = np.meshgrid(np.linspace(-half[0], half[0], columns), np.linspace(-half[1], half[1], rows))
+    origins = middle + u.reshape(-1, 1) * aside + v.reshape(-1, 1) * [0.0, 0.0, 1.0]
+    directions = np.tile(-out, (len(origins), 1))
+    ranges_m, _, normals = fixed.hits(origins, directions)
+    is_wall = ((normals * directions).sum(axis=1) < 0) & (ranges_m < 3.0)
+    depth_m = ranges_m.astype(np.float64)
+    far_m = float(depth_m[is_wall].max(initial=0.5)) + 0.01
+    depth_m = np.where(is_wall, depth_m, far_m)  # below the floor, or through an opening
+    span = max(float(far_m - depth_m.min()), 1e-3)
+    spec.add_hfield(
+        name="wall",
+        size=[half[0], half[1], span, 0.5],
+        nrow=rows,
+        ncol=columns,
+        userdata=((far_m - depth_m) / span).astype(np.float32),
+    )
+    frame = make_pose(np.stack([aside, [0.0, 0.0, 1.0], out], axis=1))
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_HFIELD,
+        hfieldname="wall",
+        pos=middle - far_m * out,
+        quat=quaternion(frame),
+        **contact,
+    )
+
+
+def _floor_gap_m(pose: Float64Array, points: Float64Array, walls: Caster) -> float:
+    """Least height of a prop's lower points above the true floor; the floor under a wall's overhang does not count."""
+    world = transform(pose, points)
+    foot = world[:, 2].min()
+    world = world[world[:, 2] < foot + 0.3]
+    heights = floor_heights(walls, np.column_stack([world[:, :2], np.full(len(world), foot + PROBE_UP_M)]))
+    near = np.abs(heights - foot) < 0.5
+    return float((world[near, 2] - heights[near]).min(initial=0.5))
+
+
+def _wall_gap_m(pose: Float64Array, wall: Float64Array, points: Float64Array, fixed: Caster) -> float:
+    """Least level distance of a prop's upper two thirds to the true wall."""
+    world = transform(pose, points)
+    world = world[world[:, 2] > world[:, 2].min() + np.ptp(world[:, 2]) / 3]
+    return float(fixed.cast(world, np.tile([*wall, 0.0], (len(world), 1)))[0].min())
+
+
+def _run_to_rest(model: mujoco.MjModel, data: mujoco.MjData, item: Standing) -> None:
+    """Step until it has not moved for two windows; contacts chatter from step to step even under a prop at rest."""
+    calm = 0
+    up = np.asarray(Rotation.from_quat(model.body("prop").quat, scalar_first=True).as_matrix()).T[:, 2]
+    for _ in range(int(_LONGEST_S / _WINDOW_S)):
+        start = data.qpos.copy()
+        mujoco.mj_step(model, data, round(_WINDOW_S / _TIMESTEP_S))
+        turned = Rotation.from_quat(data.qpos[3:], scalar_first=True)
+        # Tipped ones may roll on; all others keep what was up at the start up.
+        if item.posture != "tipped" and (turned.as_matrix() @ up)[2] < np.cos(np.deg2rad(_FALLEN_DEG)):
+            raise ScenarioError(f"prop {item.prop.name!r} falls over where it stands: place it on more level floor")
+        speed_mps = np.linalg.norm(data.qpos[:3] - start[:3]) / _WINDOW_S
+        turn = (turned * Rotation.from_quat(start[3:], scalar_first=True).inv()).magnitude() / _WINDOW_S
+        calm = calm + 1 if speed_mps < _REST_MPS and turn < _REST_RADPS else 0
+        if calm == 2:
+            return
+    raise ScenarioError(
+        f"prop {item.prop.name!r} does not come to rest within {_LONGEST_S:g} s: "
+        "place it on more level floor, or give it a wider footprint"
+    )
+
+
+def _frozen_pose(data: mujoco.MjData, item: Standing, points: Float64Array, around: Surroundings) -> Float64Array:
+    body = data.body("prop")
+    rotation = Rotation.from_quat(np.round(body.xquat, 9), scalar_first=True).as_matrix()
+    pose = _touching(make_pose(rotation, body.xpos), item, points, around)
+    # A thousandth of a millimetre: both sessions, and the truth, hold the very same numbers.
+    pose[:3, 3] = np.round(pose[:3, 3], 6)
+    start, end = (transform(each, points) for each in (item.world_T_object, pose))
+    sunk_m = float(start[:, 2].min() - end[:, 2].min())
+    slid_m = float(np.linalg.norm(end[:, :2].mean(axis=0) - start[:, :2].mean(axis=0)))
+    if abs(sunk_m) > 0.5 or slid_m > 0.5:
+        raise ScenarioError(
+            f"prop {item.prop.name!r} moved {slid_m:.2f} m sideways and {sunk_m:.2f} m down while settling: "
+            "place it on more level floor"
+        )
+    if item.wall is not None and _wall_gap_m(pose, item.wall, points, around.fixed) > _LEANING_GAP_M:
+        raise ScenarioError(
+            f"prop {item.prop.name!r} does not come to rest against the wall: place it where wall and floor are evener"
+        )
+    deepest_m = float(escapes(end, around.fixed)[0].max(initial=0.0))
+    if deepest_m > DEEPEST_M:
+        raise ScenarioError(
+            f"prop {item.prop.name!r} rests {deepest_m:.2f} m deep in rock: place it on more level floor, "
+            "or farther from the wall"
+        )
+    return pose
+
+
+def _touching(pose: Float64Array, item: Standing, points: Float64Array, around: Surroundings) -> Float64Array:
+    """Bring a prop to the true floor and wall, then push it the shortest way out of rock until it no more than touches.
+
+    The way is that by which the fields differ from the rock, a few centimetres.
+    """
+    pose = pose.copy()
+    pose[2, 3] -= max(_floor_gap_m(pose, points, around.walls), 0.0)
+    if item.wall is not None:
+        gap_m = _wall_gap_m(pose, item.wall, points, around.fixed)
+        if gap_m < _NEAR_WALL_M:
+            pose[:2, 3] += max(gap_m - _TOUCH_M, 0.0) * item.wall
+    for _ in range(12):
+        depth_m, way_out = escapes(transform(pose, points), around.fixed)
+        worst = int(np.argmax(depth_m))
+        if not _TOUCH_M < depth_m[worst] < 0.3:
+            break
+        pose[:3, 3] += depth_m[worst] * way_out[worst]
+    return pose

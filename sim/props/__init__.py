@@ -1,0 +1,1 @@
+"""The things that stand in a tunnel and may change: one builder for each kind."""

@@ -1,0 +1,159 @@
+"""Muck piles: flanks at the angle of repose, fragments half buried in them, and what a loader leaves.
+
+A pile is a bed, one height for each node of a grid, with closed fragments on it: overlapping closed surfaces, which
+rays meet as one. Its volume is what a surveyor measures from above, the columns between floor and surface. Object
+frame as in `sim.props.shapes`; a banked pile leans on the plane y = +width/2 and goes on behind it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from cdpipe.core.geometry import Float64Array, stream
+from sim.geometry.mesh import Mesh, joined
+from sim.geometry.raycast import Caster
+from sim.props.bed import BEHIND_M, Bed, bed_mesh, build_bed
+from sim.props.rubble import Rubble, confined, draw_sizes, lay, moved_by, together
+from sim.props.shapes import BELOW_FLOOR_M, Shape, Size, solid_mesh, visible_part
+
+_MOST_FRAGMENTS = 900
+_COVERAGE = 1.5
+_MOST_LOOSE = 14
+# Loose blocks lie where the bed would be this far below the floor: up to half a metre from the foot.
+_BESIDE_M = (-0.35, -0.05)
+# Where the middle of a fragment lies along the surface's normal, in its sizes: from nearly buried to nearly free.
+BURIED = (-0.22, 0.08)
+_LOOSE = (0.0, 0.2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Heap:
+    """A pile, whole.
+
+    Attributes:
+        bed: What its fragments lie on.
+        rubble: Its fragments, and the loose blocks at its foot.
+        size_m: Length, width and height above the floor.
+        is_banked: Whether it lies against a wall at y = +width/2.
+    """
+
+    bed: Bed
+    rubble: Rubble
+    size_m: Size
+    is_banked: bool
+
+    def limits(self) -> tuple[Float64Array, Float64Array]:
+        """Return the corners (3,) of the box that no fragment leaves."""
+        return _limits(self.size_m, self.is_banked)
+
+
+def largest_size_m(fragment_m: float, height_m: float) -> float:
+    """Return the size of the largest fragment: 94 % of the law's are smaller, and a pile is three of them high."""
+    return min(1.6 * fragment_m, height_m / 3)
+
+
+def build_heap(size_m: Size, repose_deg: float, fragment_m: float, is_banked: bool, seed: int, name: str) -> Heap:
+    """Build a pile.
+
+    Args:
+        size_m: Length and width of its outline, and its height, which is lowered to what flanks at `repose_deg` reach
+            over this outline.
+        repose_deg: Angle of the flanks.
+        fragment_m: Characteristic size of the fragments; the largest is a third of the height.
+        is_banked: Whether its back, at y = +width/2, lies against a wall.
+        seed: Of the scenario.
+        name: Of the prop; seed and name draw outline, surface and fragments.
+    """
+    bed = build_bed(size_m, repose_deg, is_banked, seed, name)
+    length, width, height = size_m
+    generator = stream(seed, "props", name, "fragments")
+    largest_m = largest_size_m(fragment_m, height)
+    low, high = _limits(size_m, is_banked)
+    cell_m2 = float(bed.x[1] - bed.x[0]) * float(bed.y[1] - bed.y[0])
+    area_m2 = float((bed.z > 0.0).sum()) * cell_m2
+    sizes = draw_sizes(area_m2, _COVERAGE, fragment_m, largest_m, _MOST_FRAGMENTS, generator)
+    pile = lay(sizes, _places(bed, (-0.03, np.inf), low, high, len(sizes), generator), bed.heights, BURIED, generator)
+    n_loose = min(_MOST_LOOSE, 3 + int(length + width))
+    blocks = largest_m * generator.uniform(0.4, 1.0, n_loose)
+    feet = _places(bed, _BESIDE_M, low, np.minimum(high, (np.inf, width / 2, np.inf)), n_loose, generator)
+    loose = lay(blocks, feet, lambda xy: np.zeros(len(xy)), _LOOSE, generator)
+    rubble = confined(together(pile, loose), low, high)
+    return _centred(Heap(bed, rubble, size_m, is_banked))
+
+
+def whole_mesh(heap: Heap) -> Mesh:
+    """Return the surface of a pile: a closed bed and closed fragments, all facing outwards."""
+    return joined([bed_mesh(heap.bed), *heap.rubble.fragments])
+
+
+def column_volume_m3(mesh: Mesh, size_m: Size, columns: int = 60_000) -> float:
+    """Return the volume between the floor and a surface seen from above, over the footprint of `size_m`."""
+    heights, _, area_m2 = _columns(mesh, size_m, 0.0, columns)
+    return float(np.maximum(heights, 0.0).sum() * area_m2)
+
+
+def flank_angle_deg(shape: Shape) -> float:
+    """Return the mean slope of a pile's flanks, measured on its finished surface, degrees.
+
+    Heights from above, smoothed over a twelfth of the pile's height so that fragments do not count as slope; mean of
+    the slope's angle where they lie between a fifth and six tenths of the pile's height.
+    """
+    _, width, height = shape.size_m
+    smooth_m = 0.08 * height
+    heights, y, area_m2 = _columns(joined([solid_mesh(solid) for solid in shape.solids]), shape.size_m, 0.3, 60_000)
+    step_m = float(np.sqrt(area_m2))
+    smooth = gaussian_filter(heights, smooth_m / step_m)
+    slope = np.hypot(*np.gradient(smooth, step_m))
+    # Behind the plane of a banked pile there is no flank.
+    is_flank = (smooth > 0.2 * height) & (smooth < 0.6 * height) & (y < width / 2 - 2 * smooth_m)
+    return float(np.rad2deg(np.arctan(slope[is_flank])).mean())
+
+
+def _columns(mesh: Mesh, size_m: Size, margin_m: float, count: int) -> tuple[Float64Array, Float64Array, float]:
+    """Heights from above over the footprint and a margin, y of each column, and the area of one."""
+    half = np.array(size_m[:2]) / 2 + margin_m
+    numbers = np.ceil(2 * half / np.sqrt(4 * half.prod() / count)).astype(int)
+    axes = [(np.arange(number) + 0.5) / number * 2 * side - side for number, side in zip(numbers, half, strict=True)]
+    x, y = np.meshgrid(*axes, indexing="ij")
+    start_m = float(mesh.vertices[:, 2].max()) + 1.0
+    origins = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, start_m)])
+    ranges_m, _, _ = Caster([mesh]).cast(origins, np.tile([0.0, 0.0, -1.0], (x.size, 1)))
+    heights = np.where(np.isfinite(ranges_m), start_m - ranges_m.astype(np.float64), -BELOW_FLOOR_M)
+    return heights.reshape(x.shape), y, float(4 * half.prod() / x.size)
+
+
+def _places(
+    bed: Bed,
+    between_m: tuple[float, float],
+    low: Float64Array,
+    high: Float64Array,
+    n: int,
+    generator: np.random.Generator,
+) -> Float64Array:
+    """Draw places (n, 2) inside a box where the bed's height lies between two heights."""
+    found = np.empty((0, 2))
+    while len(found) < n:
+        drawn = generator.uniform(low[:2], high[:2], (512, 2))
+        heights = bed.heights(drawn)
+        found = np.concatenate([found, drawn[(heights > between_m[0]) & (heights < between_m[1])]])
+    return found[:n]
+
+
+def _limits(size_m: Size, is_banked: bool) -> tuple[Float64Array, Float64Array]:
+    length, width, height = size_m
+    low = np.array([-length / 2, -width / 2, -np.inf])
+    return low, np.array([length / 2, width / 2 + (BEHIND_M if is_banked else 0.0), height])
+
+
+def _centred(heap: Heap) -> Heap:
+    """Move a pile so that the middle of what is above the floor is at the origin, and measure it."""
+    back_m = heap.size_m[1] / 2 if heap.is_banked else np.inf
+    seen = visible_part(whole_mesh(heap), back_m).reshape(-1, 3)
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    middle = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, 0.0])
+    bed = replace(heap.bed, x=heap.bed.x - middle[0], y=heap.bed.y - middle[1])
+    size_m = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
+    return Heap(bed, moved_by(heap.rubble, -middle), size_m, heap.is_banked)

@@ -1,0 +1,97 @@
+"""The walls: one signed field for drifts and niches, meshed by marching cubes into one closed surface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
+
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, Int64Array
+from scenarios.schema import Tunnel
+from sim.geometry.mesh import Mesh
+from sim.rock.centreline import Centreline
+from sim.rock.field import Field
+
+_BLOCK_CELLS = 48
+_SMALL_PART = 0.02  # share of the largest piece's faces below which a piece is a bubble or a floating stone
+
+
+def mesh_tunnel(tunnel: Tunnel, centreline: Centreline, seed: int) -> Mesh:
+    """Return the closed wall mesh, facing into the void.
+
+    Raises:
+        ScenarioError: The resolution is too coarse for the section.
+    """
+    narrowest_m = min(min(line.section.width_m, line.section.height_m) for line in centreline.drifts)
+    if tunnel.resolution_m > narrowest_m / 4:
+        raise ScenarioError(
+            f"tunnel.resolution_m = {tunnel.resolution_m:g}: too coarse for a drift {narrowest_m:g} m across; "
+            f"at most {narrowest_m / 4:g}"
+        )
+    pieces = list(_block_meshes(tunnel, centreline, seed))
+    keys = np.concatenate([piece[0] for piece in pieces])
+    vertices = np.concatenate([piece[1] for piece in pieces])
+    counts = np.cumsum([0] + [len(piece[0]) for piece in pieces])
+    faces = np.concatenate([piece[2] + start for piece, start in zip(pieces, counts[:-1], strict=True)])
+    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    faces = inverse.reshape(-1)[faces]
+    has_area = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    return _without_small_parts(vertices[first], faces[has_area])
+
+
+def _block_meshes(
+    tunnel: Tunnel, centreline: Centreline, seed: int
+) -> Iterator[tuple[Int64Array, Float64Array, Int64Array]]:
+    """Yield (edge keys, vertices, faces) of each block of the grid that the surface passes through.
+
+    A vertex of marching cubes lies on a grid edge; the edge's integer coordinates name it, so that the vertices two
+    blocks share are found exactly.
+    """
+    cell_m = tunnel.resolution_m
+    field = Field(tunnel, centreline, seed)
+    for block in _blocks_near(centreline, field, cell_m):
+        # One node of overlap on the high side; the planes between blocks belong to both.
+        ix, iy = (np.arange(start, start + _BLOCK_CELLS + 1) for start in block * _BLOCK_CELLS)
+        values, iz = field.evaluate(ix * cell_m, iy * cell_m)
+        if values.size == 0 or not (values < 0).any():
+            continue
+        local, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="ascent")
+        offset = np.array([ix[0], iy[0], iz[0]])
+        floor = np.floor(local).astype(np.int64)
+        fraction = local - floor
+        axis = np.argmax(fraction, axis=1)
+        keys = np.concatenate([floor + offset, axis[:, None]], axis=1)
+        is_inner = (fraction > 0).sum(axis=1) > 1  # the one extra vertex that Lewiner's cases may put in a cell
+        keys[is_inner, 3] = 3
+        yield keys, (local.astype(np.float64) + offset) * cell_m, faces.astype(np.int64)
+
+
+def _blocks_near(centreline: Centreline, field: Field, cell_m: float) -> Int64Array:
+    """Grid blocks (B, 2) that a drift's void and margin may reach, in a fixed order."""
+    size_m = _BLOCK_CELLS * cell_m
+    found = []
+    for line, frame in zip(centreline.drifts, field.frames, strict=True):
+        reach = int(np.ceil(frame.reach_m / size_m))
+        home = np.unique(np.floor(line.points[:, :2] / size_m).astype(np.int64), axis=0)
+        shifts = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+        found.append((home[:, None] + shifts).reshape(-1, 2))
+    return np.unique(np.concatenate(found), axis=0)
+
+
+def _without_small_parts(vertices: Float64Array, faces: Int64Array) -> Mesh:
+    """Drop bubbles in the rock and stones hanging in the air, and the vertices only they use."""
+    links = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = coo_array((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), shape=(len(vertices),) * 2)
+    _, part_of_vertex = connected_components(graph, directed=False)
+    part = part_of_vertex[faces[:, 0]]
+    sizes = np.bincount(part)
+    faces = faces[sizes[part] > _SMALL_PART * sizes.max()]
+    used: npt.NDArray[np.int64] = np.unique(faces)
+    renumber = np.zeros(len(vertices), np.int32)
+    renumber[used] = np.arange(len(used), dtype=np.int32)
+    return Mesh(vertices[used], renumber[faces])

@@ -1,0 +1,1 @@
+"""The Ouster as a ray caster: beams, footprints, photons, returns."""

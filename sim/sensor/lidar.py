@@ -1,0 +1,100 @@
+"""The sensor: the echoes of a revolution's beams, then range noise, dropouts, range steps and false returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cdpipe.core.geometry import BoolArray, Float32Array, Int32Array, stream
+from cdpipe.sensor.ouster import SensorMetadata
+from scenarios.schema import Sensor
+from sim.scene import Scene
+from sim.sensor.footprint import central_echo, spread_echo
+from sim.sensor.optics import (
+    FALSE_PHOTONS,
+    apparent_reflectivity,
+    detection_probability,
+    false_returns,
+    range_channel,
+    range_sigma_m,
+    reflectivity_channel,
+    signal_channel,
+)
+from sim.sensor.rays import Rays
+
+MISS, FALSE_RETURN = -1, -2
+# A blended echo this far from what it is said to come from is a place in mid air: the pixel is mixed. As much as a
+# return must be off the old surface to count as changed.
+MIXED_M = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """One revolution as the sensor reports it, with the truth of each return. All arrays (H, W), staggered.
+
+    Attributes:
+        range_mm: uint32, 0 where nothing returned.
+        reflectivity: uint8, percent of a perfect diffuse reflector up to 100.
+        signal: uint16 photons.
+        true_range_m: float32 distance from the spin axis's point to the surface along the beam, infinite for a miss.
+        geom: int32 geom hit, `MISS` where nothing returned, `FALSE_RETURN` where nothing stands.
+        is_mixed: True for a return whose echo, before noise, is more than 0.1 m off the surface of `geom`: it blends
+            with what is behind or before it. Never so with one ray per beam.
+    """
+
+    range_mm: npt.NDArray[np.uint32]
+    reflectivity: npt.NDArray[np.uint8]
+    signal: npt.NDArray[np.uint16]
+    true_range_m: Float32Array
+    geom: Int32Array
+    is_mixed: BoolArray
+
+
+def scan(
+    scene: Scene, sensor: SensorMetadata, settings: Sensor, rays: Rays, seed: int, session: str, number: int
+) -> Scan:
+    """Cast one revolution and add what the sensor adds.
+
+    The random numbers are drawn for every pixel whatever it hits, so that another prop in the scene changes only the
+    beams that meet it.
+
+    Args:
+        scene: What is there.
+        sensor: Beam table.
+        settings: Range limits, and which effects are on.
+        rays: The revolution's rays.
+        seed: The scenario's seed.
+        session: "before" or "after".
+        number: Index of the revolution in its session.
+    """
+    if settings.sub_rays == 1:
+        echo = central_echo(scene.caster, scene.reflectivity, rays, sensor.beam_origin_m)
+    else:
+        echo = spread_echo(scene.caster, scene.reflectivity, rays, sensor.beam_origin_m, settings.sub_rays)
+    shape = echo.range_m.shape
+    range_m, photons = echo.range_m, echo.photons
+    if settings.range_noise:
+        noise = stream(seed, session, "range-noise", str(number)).standard_normal(shape, dtype=np.float32)
+        noise *= range_sigma_m(range_m, photons, echo.cosine)
+        range_m = range_m + noise
+    is_return = (echo.geom >= 0) & (range_m >= settings.min_range_m) & (range_m <= settings.max_range_m)
+    if settings.dropouts:
+        draw = stream(seed, session, "dropouts", str(number)).random(shape, dtype=np.float32)
+        is_return &= draw < detection_probability(photons)
+    geom = np.where(is_return, echo.geom, np.int32(MISS))
+    range_m, photons = np.where(is_return, range_m, np.float32(0.0)), np.where(is_return, photons, np.float32(0.0))
+    if settings.false_positives:
+        generator = stream(seed, session, "false-positives", str(number))
+        pixels, places_m = false_returns(generator, geom.size, settings.min_range_m, settings.max_range_m)
+        geom.flat[pixels], range_m.flat[pixels], photons.flat[pixels] = FALSE_RETURN, places_m, FALSE_PHOTONS
+    range_mm = range_channel(range_m, settings.range_step_mm)
+    return Scan(
+        range_mm=range_mm.T,
+        reflectivity=reflectivity_channel(apparent_reflectivity(photons, range_m)).T,
+        signal=signal_channel(photons).T,
+        true_range_m=echo.true_range_m.T,
+        geom=geom.T,
+        is_mixed=((geom >= 0) & (np.abs(echo.range_m - echo.true_range_m) > MIXED_M)).T,
+    )

@@ -1,0 +1,277 @@
+"""The truth about changes: which returns belong to one, and whether the other session could have noticed it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import ConvexHull, cKDTree
+
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array
+from scenarios.schema import Scenario
+from sim.geometry.mesh import Mesh, NearSurface, joined, near_part, split
+from sim.geometry.raycast import Caster
+from sim.placement.contact import standing_surface
+from sim.placement.placing import Standing
+from sim.scene import Scene, World
+from sim.sensor.rays import Rays
+from sim.session.truth import Change
+
+CELL_M = 0.1
+NEAR_OLD_SURFACE_M = 0.1
+MIN_CELLS = 10
+MIN_GHOST_RAYS = 10
+GHOST_REACH_M = 50.0
+UNMOVED_M = 1e-3
+_SAME_SURFACE_M = 0.02  # of the two surfaces of a reshaped prop: what is nearer to the other one has not changed
+_SAMPLE_M = 0.03
+_SLACK_M = 0.01  # by which the ball round a ghost is grown, so that rounding loses no ray
+
+
+class Ghost:
+    """An object alone, at the pose it has in one session, against which the other session's rays are cast."""
+
+    def __init__(self, surface: Mesh) -> None:
+        low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+        self._centre = (low + high) / 2
+        self._radius_m = float(np.linalg.norm(surface.vertices - self._centre, axis=1).max())
+        self._caster = Caster([surface])
+
+    def count(self, rays: Rays, ranges_m: Float32Array) -> int:
+        """Count the rays that end in the object or pass through it.
+
+        Args:
+            rays: A revolution's rays, world frame.
+            ranges_m: (W, H) distance from the ray's origin to what it hit, 0 where nothing was recorded.
+        """
+        if np.linalg.norm(rays.origins[0] - self._centre) > GHOST_REACH_M:
+            return 0
+        column, row = self._near(rays, ranges_m)
+        if not len(column):
+            return 0
+        ghost_m, _, _ = self._caster.cast(rays.origins[column], rays.directions[column, row])
+        # A millimetre: a ray that ends on the very same surface counts.
+        return int((ghost_m <= ranges_m[column, row] + 1e-3).sum())
+
+    def _near(self, rays: Rays, ranges_m: Float32Array) -> tuple[Int64Array, Int64Array]:
+        """Columns and rows of the rays that can meet the ball round the object, and of some others.
+
+        A ray that starts within `spread` of the middle column's origin and meets the ball has the direction of a ray
+        that starts at that origin and meets the ball grown by `spread`.
+        """
+        middle = rays.origins[len(rays.origins) // 2]
+        spread_m = float(np.sqrt(((rays.origins - middle) ** 2).sum(axis=1).max()))
+        radius_m = self._radius_m + spread_m + _SLACK_M
+        towards = self._centre - middle
+        distance_m = float(np.linalg.norm(towards))
+        width, height, _ = rays.directions.shape
+        near = np.arange(width * height)
+        if distance_m > radius_m:
+            # How the product is summed is of no matter: the slack covers it, and what is too much is cast in vain.
+            along = rays.directions.reshape(-1, 3) @ (towards / distance_m).astype(np.float32)
+            near = np.flatnonzero(along > np.sqrt(1.0 - (radius_m / distance_m) ** 2) - 1e-6)
+        column, row = np.divmod(near, height)
+        is_within = ranges_m[column, row] > max(0.0, distance_m - radius_m)
+        return column[is_within], row[is_within]
+
+
+@dataclass(slots=True, eq=False)
+class Tally:
+    """One change while the sessions are being simulated.
+
+    Attributes:
+        change: The change, its counts still zero.
+        ghost: The object alone, for the rays of the other session.
+        other_surface: For a partial change, what stands near it in the other session; else None.
+        n_returns: Returns that belong to it so far.
+        cells: Keys of the cells they fill, in the odom frame of its session.
+        n_ghost_rays: Rays of the other session that meet its ghost so far.
+        n_returns_other: Returns of the other session on the same prop so far.
+        cells_other: Keys of the cells these fill, in the odom frame of that session.
+    """
+
+    change: Change
+    ghost: Ghost
+    other_surface: NearSurface | None
+    n_returns: int = 0
+    cells: set[int] = field(default_factory=set)
+    n_ghost_rays: int = 0
+    n_returns_other: int = 0
+    cells_other: set[int] = field(default_factory=set)
+
+    def finished(self) -> Change:
+        """Return the change with its counts and whether it is observable."""
+        reasons = []
+        if len(self.cells) < MIN_CELLS:
+            reasons.append(f"{len(self.cells)} cells of {CELL_M:g} m filled, {MIN_CELLS} needed")
+        if self.n_ghost_rays < MIN_GHOST_RAYS:
+            reasons.append(f"{self.n_ghost_rays} rays of the other session reach it, {MIN_GHOST_RAYS} needed")
+        return replace(
+            self.change,
+            n_returns=self.n_returns,
+            n_cells=len(self.cells),
+            n_ghost_rays=self.n_ghost_rays,
+            is_observable=not reasons,
+            why_not="; ".join(reasons),
+            n_returns_other=self.n_returns_other,
+            n_cells_other=len(self.cells_other),
+        )
+
+
+def list_changes(scenario: Scenario, world: World) -> list[Tally]:
+    """Return every change of a pair, in the order of the props, as found by comparing what stands in the two scenes.
+
+    A prop that stands in one session only was added or removed. One of the same shape, any corner of which differs by
+    more than a millimetre, was moved: a removal and an addition, linked. One whose surface differs was reshaped: what
+    changed is the part that is gone.
+    """
+    tallies: list[Tally] = []
+    for instance, prop in enumerate(scenario.props, start=1):
+        stood = _only(world, prop.name, "before"), _only(world, prop.name, "after")
+        items = [item for item in stood if item is not None]
+        if len(items) < 2:
+            tallies.extend(_tally(len(tallies) + 1, instance, item, world, "full", None) for item in items)
+            continue
+        start, end = items
+        if _is_same(start, end):
+            continue
+        if prop.loaded_share is not None:
+            tallies.append(_reshaped(len(tallies) + 1, instance, start, world))
+            continue
+        group: Literal["full", "partial"] = "partial" if _is_short_move(start, end) else "full"
+        first_id = len(tallies) + 1
+        tallies.append(_tally(first_id, instance, start, world, group, first_id + 1))
+        tallies.append(_tally(first_id + 1, instance, end, world, group, first_id))
+    return tallies
+
+
+def belonging(tally: Tally, points_world: Float64Array) -> BoolArray:
+    """Tell which returns on a changed prop, by their true places (N, 3), belong to its change."""
+    if tally.other_surface is None:
+        return np.ones(len(points_world), dtype=bool)
+    return ~tally.other_surface.marks(points_world)
+
+
+def claim_returns(tally: Tally, points_odom: Float64Array) -> None:
+    """Add returns (N, 3) that belong to a change, as the session measured them in its odom frame, to its tally."""
+    tally.n_returns += len(points_odom)
+    tally.cells.update(cell_keys(points_odom).tolist())
+
+
+def cell_keys(points: Float64Array) -> Int64Array:
+    """Return a number for each 0.1 m cell that points (N, 3) fill."""
+    cells = np.floor(points / CELL_M).astype(np.int64) + (1 << 20)
+    return np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2])
+
+
+def count_other(tally: Tally, points_odom: Float64Array) -> None:
+    """Add returns (N, 3) of the other session on the same prop, as that session measured them, to its tally."""
+    tally.n_returns_other += len(points_odom)
+    tally.cells_other.update(cell_keys(points_odom).tolist())
+
+
+def _only(world: World, name: str, session: str) -> Standing | None:
+    found = [item for item in world.standing if item.prop.name == name and session in item.sessions]
+    return found[0] if found else None
+
+
+def _is_same(start: Standing, end: Standing) -> bool:
+    """Tell whether two surfaces have the same corners to a millimetre."""
+    if start is end:
+        return True
+    a, b = standing_surface(start).vertices, standing_surface(end).vertices
+    return a.shape == b.shape and bool((np.linalg.norm(a - b, axis=1) <= UNMOVED_M).all())
+
+
+def _tally(
+    change_id: int,
+    instance: int,
+    item: Standing,
+    world: World,
+    group: Literal["full", "partial"],
+    partner: int | None,
+) -> Tally:
+    session: Literal["before", "after"] = "before" if "before" in item.sessions else "after"
+    scene, other = (world.before, world.after) if session == "before" else (world.after, world.before)
+    surface = _surface_in(scene, instance)
+    kind: Literal["added", "removed", "moved"] = "added" if session == "after" else "removed"
+    change = Change(
+        id=change_id,
+        name=item.prop.name,
+        prop_kind=item.prop.kind,
+        kind=kind if partner is None else "moved",
+        session=session,
+        partner=partner,
+        group=group,
+        instance=instance,
+        world_T_object=item.world_T_object.tolist(),
+        hull_volume_m3=item.shape.hull_volume_m3,
+        n_returns=0,
+        n_cells=0,
+        n_ghost_rays=0,
+        is_observable=False,
+        why_not="",
+        mesh_volume_m3=item.shape.mesh_volume_m3,
+    )
+    return Tally(change, Ghost(surface), _near(other, surface) if group == "partial" else None)
+
+
+def _reshaped(change_id: int, instance: int, item: Standing, world: World) -> Tally:
+    """Change of a pile partly loaded away.
+
+    Its ghost is the part of the old surface that is gone, left open: a ray that would have met the part removed comes
+    from the outside and meets that skin, for behind its rim the rest of the pile still stands.
+    """
+    full, rest = (compacted(_surface_in(scene, instance)) for scene in (world.before, world.after))
+    near_full, near_rest = _samples(full), _samples(rest)
+    is_gone = np.asarray(near_rest.query(full.vertices[full.faces].mean(axis=1))[0] > NEAR_OLD_SURFACE_M)
+    skin = Mesh(full.vertices, full.faces[is_gone])
+    # The part removed lies between the old skin and the new face below it.
+    floor_m = item.world_T_object[2, 3]
+    ends = np.concatenate([_off(full, near_rest, floor_m), _off(rest, near_full, floor_m)])
+    after = _only(world, item.prop.name, "after")
+    volumes = (item.shape.mesh_volume_m3, after.shape.mesh_volume_m3 if after is not None else None)
+    tally = _tally(change_id, instance, item, world, "partial", None)
+    tally.ghost = Ghost(compacted(skin if is_gone.any() else full))
+    tally.change = replace(
+        tally.change,
+        kind="reshaped",
+        hull_volume_m3=float(ConvexHull(ends).volume) if len(ends) > 3 else 0.0,
+        mesh_volume_m3=None if volumes[0] is None or volumes[1] is None else volumes[0] - volumes[1],
+    )
+    return tally
+
+
+def _off(mesh: Mesh, other: cKDTree, floor_m: float) -> Float64Array:
+    """Corners (N, 3) of a surface above the floor that lie off the samples of another one."""
+    corners = mesh.vertices[mesh.vertices[:, 2] >= floor_m]
+    return np.asarray(corners[other.query(corners)[0] > _SAME_SURFACE_M])
+
+
+def _samples(mesh: Mesh) -> cKDTree:
+    """Points no farther than 1.8 cm from any place on a surface: distances to them are exact to 2 mm at 0.1 m."""
+    middles = split(mesh.vertices[mesh.faces], _SAMPLE_M).mean(axis=1)
+    return cKDTree(np.concatenate([mesh.vertices, middles]), balanced_tree=False, compact_nodes=False)
+
+
+def _surface_in(scene: Scene, instance: int) -> Mesh:
+    return joined([mesh for mesh, owner in zip(scene.meshes, scene.instance, strict=True) if owner == instance])
+
+
+def _near(scene: Scene, surface: Mesh) -> NearSurface:
+    """Return what of a scene lies near a surface."""
+    parts = (near_part(mesh, surface, 2 * NEAR_OLD_SURFACE_M) for mesh in scene.meshes)
+    return NearSurface(joined([compacted(part) for part in parts if len(part.faces)]), NEAR_OLD_SURFACE_M)
+
+
+def compacted(mesh: Mesh) -> Mesh:
+    """Return a mesh without the vertices that none of its faces uses."""
+    used, faces = np.unique(mesh.faces, return_inverse=True)
+    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32))
+
+
+def _is_short_move(start: Standing, end: Standing) -> bool:
+    """Tell whether a prop moved by less than its own length, the longer side of its footprint."""
+    moved_m = np.linalg.norm(end.world_T_object[:3, 3] - start.world_T_object[:3, 3])
+    return bool(moved_m < max(start.shape.size_m[:2]))

@@ -1,0 +1,198 @@
+"""A pair of sessions with its truth, from a drawn scenario to files."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from cdpipe.core.errors import InputError
+from cdpipe.io.session import ScanChunk, SessionWriter
+from cdpipe.mapping.odometry import require_kiss_icp
+from cdpipe.sensor.ouster import SensorMetadata, load_profile
+from scenarios.references import file_digests
+from scenarios.schema import Scenario, SessionPlan
+from sim.drive.odometry import odom_start, registered
+from sim.drive.trajectory import plan_trajectory
+from sim.scene import build_world
+from sim.session.labels import list_changes
+from sim.session.revolution import Drive, Revolution, SessionName, cast_revolution, label_changes, simulate_revolution
+from sim.session.truth import Int16Array, PairTruth, write_labels, write_pair_truth, write_true_poses
+
+CHUNK_SCANS = 64
+_THREADS = 2
+
+Progress = Callable[[str, int, int], None]
+
+
+def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progress | None = None) -> None:
+    """Write `out/before`, `out/after` and `out/truth`; `out` appears under its name only when it is complete.
+
+    The same scenario and seed give the same bytes, whatever the number of threads.
+
+    Args:
+        scenario: The scenario as drawn.
+        seed: Draws everything the scenario leaves open: rock, noise, signs of drift.
+        out: A folder that does not exist or is empty.
+        on_progress: Called with the stage ("world", "before", "after"; "odometry before", "odometry after" first where
+            KISS-ICP estimates it), and how much of how much is done.
+
+    Raises:
+        InputError: `out` is not empty or cannot be written, the sensor profile or a trajectory cannot be read, or
+            KISS-ICP is asked for and not installed.
+        ScenarioError: The world contradicts itself.
+    """
+    report = on_progress or (lambda stage, done, total: None)
+    _refuse_taken(out)
+    if "kiss-icp" in (scenario.before.odometry.source, scenario.after.odometry.source):
+        require_kiss_icp("odometry.source = kiss-icp")
+    files = file_digests(scenario)
+    sensor = load_profile(scenario.sensor.profile, scenario.sensor.mode)
+    report("world", 0, 1)
+    drives = plan_drives(scenario, sensor, seed)
+    report("world", 1, 1)
+    home = out.absolute()
+    partial = home.with_name(f".{home.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        partial.mkdir(parents=True)
+        with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+            for drive in drives:
+                write_session(with_own_odometry(drive, pool, report), partial / drive.name, pool, report)
+        write_pair_truth(partial, pair_truth(scenario, seed, drives, files))
+        partial.replace(home)
+    except OSError as error:
+        raise InputError(f"{out}: cannot write there: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def pair_truth(scenario: Scenario, seed: int, drives: Sequence[Drive], files: Mapping[str, str]) -> PairTruth:
+    """Return what is known about a pair once both of its sessions were simulated."""
+    changes = tuple(tally.finished() for tally in drives[0].tallies)
+    drawn = scenario.model_dump(mode="json")
+    return PairTruth(scenario.family, seed, scenario.score_radius_m, changes, drawn, dict(files))
+
+
+def _refuse_taken(out: Path) -> None:
+    if out.is_dir() and not any(out.iterdir()):
+        return
+    if out.exists() or out.is_symlink():
+        raise InputError(f"{out}: exists and is not an empty folder: name a new one or remove it")
+
+
+def plan_drives(scenario: Scenario, sensor: SensorMetadata, seed: int) -> list[Drive]:
+    """Build the world and plan both sessions; of the world no more is kept than they need.
+
+    Raises:
+        InputError: A trajectory cannot be read.
+        ScenarioError: The world contradicts itself.
+    """
+    world = build_world(scenario, seed)
+    tallies = tuple(list_changes(scenario, world))
+    names: tuple[SessionName, SessionName] = ("before", "after")
+    scenes = (world.before, world.after)
+    return [
+        Drive(
+            name,
+            scenario,
+            scene,
+            np.append(scene.instance, [-2, -1]).astype(np.int16),
+            sensor,
+            plan_trajectory(world, scenario, sensor, seed, name),
+            tallies,
+            seed,
+        )
+        for name, scene in zip(names, scenes, strict=True)
+    ]
+
+
+def with_own_odometry(drive: Drive, pool: Executor, report: Progress) -> Drive:
+    """Let KISS-ICP estimate the drive, where the session asks for it, from the very scans that will be written."""
+    plan: SessionPlan = getattr(drive.scenario, drive.name)
+    if plan.odometry.source != "kiss-icp":
+        return drive
+    trajectory = drive.trajectory
+    start = odom_start(trajectory.true, float(trajectory.revolution_s[0]))
+    estimated = registered(
+        _range_images(drive, pool, report),
+        drive.sensor,
+        trajectory.revolution_s,
+        trajectory.column_s,
+        start,
+        drive.name,
+    )
+    return replace(drive, trajectory=replace(trajectory, estimated=estimated))
+
+
+def _range_images(drive: Drive, pool: Executor, report: Progress) -> Iterator[npt.NDArray[np.uint32]]:
+    n_scans = drive.trajectory.n_scans
+    for start in range(0, n_scans, CHUNK_SCANS):
+        report(f"odometry {drive.name}", start, n_scans)
+        numbers = range(start, min(start + CHUNK_SCANS, n_scans))
+        yield from pool.map(lambda number: cast_revolution(drive, number)[1].range_mm, numbers)
+    report(f"odometry {drive.name}", n_scans, n_scans)
+
+
+def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) -> None:
+    """Simulate one session with its truth into `folder`, the revolutions in the threads of `pool`.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    n_scans = drive.trajectory.n_scans
+    provenance = {
+        "made_by": "tunnelcd simulate",
+        "session": drive.name,
+        "sensor_profile": drive.scenario.sensor.profile,
+    }
+    report(drive.name, 0, n_scans)
+    with (
+        SessionWriter(folder, drive.sensor, CHUNK_SCANS, provenance) as writer,
+        closing(labelled_chunks(drive, pool)) as chunks,
+    ):
+        for index, (chunk, instance, change) in enumerate(chunks):
+            writer.add(chunk)
+            write_labels(writer.folder, index, instance, change)
+            report(drive.name, index * CHUNK_SCANS + len(instance), n_scans)
+        write_true_poses(writer.folder, drive.trajectory.world_T_sensor)
+        writer.close(drive.trajectory.odom_T_sensor)
+
+
+def labelled_chunks(drive: Drive, pool: Executor) -> Generator[tuple[ScanChunk, Int16Array, Int16Array]]:
+    """Yield each chunk of a session with the (s, H, W) instance and change of its returns; the tallies are added to."""
+    with closing(_chunks_ahead(drive, pool)) as chunks:
+        for index, revolutions in enumerate(chunks):
+            start = index * CHUNK_SCANS
+            chunk = ScanChunk(
+                np.stack([each.range_mm for each in revolutions]),
+                np.stack([each.reflectivity for each in revolutions]),
+                np.stack([each.signal for each in revolutions]),
+                drive.trajectory.column_stamps_ns(slice(start, start + len(revolutions))),
+                np.stack([each.column_poses for each in revolutions]),
+            )
+            yield chunk, np.stack([each.instance for each in revolutions]), label_changes(drive, revolutions)
+
+
+def _chunks_ahead(drive: Drive, pool: Executor) -> Generator[list[Revolution]]:
+    """Yield the revolutions of each chunk in order, the next chunk being simulated while this one is written."""
+
+    def begun(start: int) -> list[Future[Revolution]]:
+        numbers = range(start, min(start + CHUNK_SCANS, drive.trajectory.n_scans))
+        return [pool.submit(simulate_revolution, drive, number) for number in numbers]
+
+    running, ahead = [], begun(0)
+    try:
+        for start in range(CHUNK_SCANS, drive.trajectory.n_scans + CHUNK_SCANS, CHUNK_SCANS):
+            running, ahead = ahead, begun(start)
+            yield [each.result() for each in running]
+    finally:
+        for each in (*running, *ahead):
+            each.cancel()

@@ -1,0 +1,1 @@
+"""Measurements of the simulator itself: its speed, its worlds, its sensor."""

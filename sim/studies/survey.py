@@ -1,0 +1,248 @@
+"""What the worlds of a family are like, measured on the worlds themselves: built and driven, but not scanned."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+
+import numpy as np
+
+from cdpipe.core.errors import TunnelcdError
+from cdpipe.core.geometry import Float64Array
+from cdpipe.sensor.ouster import load_profile
+from scenarios.library import load_scenario
+from sim.drive.trajectory import plan_trajectory
+from sim.geometry.raycast import Caster
+from sim.placement.contact import interpenetration_m
+from sim.placement.placing import Standing, standing_points
+from sim.props.heap import flank_angle_deg
+from sim.rock.centreline import headings_of, left_of
+from sim.scene import World, build_world
+from sim.session.labels import list_changes
+from sim.studies.contour import contour_roughness
+
+_KEYFRAME_M = 1.0
+_FIT_M = 8.0  # what is longer along a drift of a foreign mesh counts as its section
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class WorldFigures:
+    """One world in figures; NaN where it has nothing to measure.
+
+    Attributes:
+        family: Scenario family.
+        seed: Its seed.
+        before_path_m, after_path_m: Horizontal way of the sensor.
+        width_m, height_m: Void to the sides of the sensor and above and below it, median over the before path.
+        n_added, n_removed, n_moved, n_reshaped: Changes by kind; a moved prop counts once.
+        hull_m3: Hull volume of every change.
+        distractors_per_100m: Unchanged props within two score radii of the before path, per 100 m of it.
+        far_share: Share of the before path's keyframes, a metre apart, farther than two score radii from the middle of
+            every change; 1 without changes.
+        repose_deg: Angle of repose of every pile, measured on its surface.
+        roughness_m: Contour roughness of the walls.
+        interpenetration_m: Deepest that any settled prop is in rock or another prop.
+        n_triangles: Triangles of the before scene.
+        build_s: CPU time of the world and both lines through it.
+    """
+
+    family: str
+    seed: int
+    before_path_m: float
+    after_path_m: float
+    width_m: float
+    height_m: float
+    n_added: int
+    n_removed: int
+    n_moved: int
+    n_reshaped: int
+    hull_m3: tuple[float, ...]
+    distractors_per_100m: float
+    far_share: float
+    repose_deg: tuple[float, ...]
+    roughness_m: float
+    interpenetration_m: float
+    n_triangles: int
+    build_s: float
+
+    @property
+    def n_changes(self) -> int:
+        """Number of changed props."""
+        return self.n_added + self.n_removed + self.n_moved + self.n_reshaped
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A seed whose world could not be built or driven, and why."""
+
+    family: str
+    seed: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """The worlds of some seeds of one family, in the order of the seeds.
+
+    Attributes:
+        family: Name or file of the scenario.
+        worlds: Those that could be built.
+        failures: Those that could not.
+    """
+
+    family: str
+    worlds: tuple[WorldFigures, ...]
+    failures: tuple[Failure, ...]
+
+
+def survey(family: str, seeds: Sequence[int], workers: int = 1, on_progress: Progress | None = None) -> Survey:
+    """Build and measure the worlds of a family. A seed that fails is a record, whatever the reason.
+
+    Args:
+        family: Name of a scenario, or a YAML file.
+        seeds: Which.
+        workers: Processes; the figures do not depend on it, but for `build_s`.
+        on_progress: Called with the family, the seeds done and their number.
+
+    Raises:
+        ScenarioError: The scenario is unknown, or its file has mistakes.
+    """
+    report = on_progress or (lambda label, done, total: None)
+    load_scenario(family, seeds[0])  # a mistake in the file is no property of a seed
+    report(family, 0, len(seeds))
+    found: dict[int, WorldFigures | Failure] = {}
+    for result in _results(family, seeds, workers):
+        found[result.seed] = result
+        report(family, len(found), len(seeds))
+    in_order = [found[seed] for seed in seeds]
+    return Survey(
+        family,
+        tuple(result for result in in_order if isinstance(result, WorldFigures)),
+        tuple(result for result in in_order if isinstance(result, Failure)),
+    )
+
+
+def survey_seed(family: str, seed: int) -> WorldFigures:
+    """Build and measure one world.
+
+    Raises:
+        ScenarioError: It cannot be built or driven.
+    """
+    scenario = load_scenario(family, seed)
+    start_s = time.process_time()
+    world = build_world(scenario, seed)
+    sensor = load_profile(scenario.sensor.profile, scenario.sensor.mode)
+    before, after = (plan_trajectory(world, scenario, sensor, seed, name).true.points for name in ("before", "after"))
+    build_s = time.process_time() - start_s
+    changes = {tally.change.name: tally.change for tally in list_changes(scenario, world)}
+    kinds = [change.kind for change in changes.values()]
+    places, headings = keyframes(before)
+    width_m, height_m = void_size_m(world.walls, places, headings)
+    far_m = 2 * scenario.score_radius_m
+    return WorldFigures(
+        family=scenario.family,
+        seed=seed,
+        before_path_m=float(_way_m(before)[-1]),
+        after_path_m=float(_way_m(after)[-1]),
+        width_m=width_m,
+        height_m=height_m,
+        n_added=kinds.count("added"),
+        n_removed=kinds.count("removed"),
+        n_moved=kinds.count("moved"),
+        n_reshaped=kinds.count("reshaped"),
+        hull_m3=tuple(change.hull_volume_m3 for change in changes.values()),
+        distractors_per_100m=distractors_per_100m(world, places, far_m),
+        far_share=far_share(world, places, far_m),
+        repose_deg=_repose_deg(world),
+        roughness_m=contour_roughness(world.walls, world.centreline, _FIT_M if scenario.tunnel.mesh else None).rms_m,
+        interpenetration_m=_deepest_m(world),
+        n_triangles=sum(len(mesh.faces) for mesh in world.before.meshes),
+        build_s=build_s,
+    )
+
+
+def far_share(world: World, places: Float64Array, far_m: float) -> float:
+    """Return the share of places (N, 3) farther than `far_m` from the middle of every changed prop."""
+    middles = [_middle(item) for item in world.standing if item.prop.change != "none"]
+    if not middles:
+        return 1.0
+    distance_m = np.linalg.norm(places[:, None] - np.array(middles)[None], axis=2)
+    return float((distance_m.min(axis=1) > far_m).mean())
+
+
+def distractors_per_100m(world: World, places: Float64Array, near_m: float) -> float:
+    """Return the unchanged props within `near_m` of a path, per 100 m of it; places (N, 3) stand for a metre each."""
+    middles = [_middle(item) for item in world.standing if item.prop.change == "none"]
+    near = [bool(np.linalg.norm(places - middle, axis=1).min() <= near_m) for middle in middles]
+    return 100.0 * float(sum(near)) / (len(places) * _KEYFRAME_M)
+
+
+def keyframes(points: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Return places (K, 3) and unit headings (K, 2) a metre apart along a finely sampled path (N, 3)."""
+    way_m = _way_m(points)
+    stations_m: Float64Array = np.arange(0.0, way_m[-1], _KEYFRAME_M)
+    places = np.stack([np.interp(stations_m, way_m, points[:, axis]) for axis in range(3)], axis=1)
+    return places, headings_of(places)
+
+
+def void_size_m(walls: Caster, places: Float64Array, headings: Float64Array) -> tuple[float, float]:
+    """Return the median width and height of the void about places (N, 3) on a path; junctions weigh little."""
+    left = np.column_stack([left_of(headings), np.zeros(len(headings))])
+    up = np.broadcast_to([0.0, 0.0, 1.0], left.shape)
+    reach_m = [walls.cast(places, np.ascontiguousarray(way))[0] for way in (left, -left, up, -up)]
+    return float(np.median(reach_m[0] + reach_m[1])), float(np.median(reach_m[2] + reach_m[3]))
+
+
+def _results(family: str, seeds: Sequence[int], workers: int) -> Iterator[WorldFigures | Failure]:
+    if workers == 1:
+        yield from (_tried(family, seed) for seed in seeds)
+        return
+    # forked children would inherit the locks of the ray caster's threads
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        tasks = {pool.submit(_tried, family, seed): seed for seed in seeds}
+        for task in as_completed(tasks):
+            error = task.exception()
+            yield task.result() if error is None else Failure(family, tasks[task], f"the process died: {error}")
+
+
+def _tried(family: str, seed: int) -> WorldFigures | Failure:
+    try:
+        return survey_seed(family, seed)
+    except TunnelcdError as error:
+        return Failure(family, seed, " ".join(str(error).split()))
+    except Exception as error:  # a bug of one seed is a finding of the survey, told by its type
+        return Failure(family, seed, f"{type(error).__name__}: {' '.join(str(error).split())}")
+
+
+def _way_m(points: Float64Array) -> Float64Array:
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1))])
+
+
+def _middle(item: Standing) -> Float64Array:
+    """Middle (3,) of the bounding box of what stands above the floor."""
+    points = standing_points(item)
+    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
+
+
+def _repose_deg(world: World) -> tuple[float, ...]:
+    """Angles of the whole piles; what a loader left has no angle of its own."""
+    whole = {item.prop.name: item for item in reversed(world.standing) if item.prop.kind == "muck_pile"}
+    return tuple(flank_angle_deg(item.shape) for item in whole.values())
+
+
+def _deepest_m(world: World) -> float:
+    """Deepest that a settled prop is in rock or in a prop of the same session; piles may run into one another."""
+    depths = [0.0]
+    for index, item in enumerate(world.standing):
+        others = [
+            other
+            for other in world.standing[index + 1 :]
+            if item.sessions & other.sessions and (item.shape.is_settled or other.shape.is_settled)
+        ]
+        depths.append(interpenetration_m(item, world.walls, others))
+    return max(depths)

@@ -1,0 +1,259 @@
+"""The pictures of the README: every family from inside, and every kind of prop in every posture from two metres.
+
+python -m sim.view.gallery OUT            all of them
+python -m sim.view.gallery OUT narrow box only these
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, stream, yaw_pose, yaw_rad
+from scenarios.library import load_scenario, scenario_names
+from scenarios.schema import Drift, Place, Prop, Roughness, Scenario, Section, SessionPlan, Tunnel
+from sim.geometry.mesh import moved
+from sim.placement.placing import Standing
+from sim.props.shapes import solid_mesh
+from sim.scene import Scene, World, build_world
+from sim.view.picture import render
+
+SEED = 20000
+_SIZES: dict[str, tuple[float, float, float]] = {
+    "box": (0.8, 0.6, 0.6),
+    "crate": (1.2, 0.8, 0.9),
+    "chair": (0.5, 0.5, 0.9),
+    "trolley": (0.6, 0.55, 1.2),
+    "barrel": (0.58, 0.58, 0.9),
+    "cone": (0.36, 0.36, 0.75),
+    "railing": (3.0, 0.3, 1.1),
+    "pallet": (1.2, 0.8, 0.145),
+    "rock": (1.1, 0.9, 0.7),
+    "vehicle": (4.6, 1.9, 1.9),
+    "muck_pile": (4.0, 3.2, 1.2),
+}
+_SHEET_PX = (480, 360)
+_FAMILY_PX = (1200, 750)
+_DISTANCE_M = 2.0
+_EYE_M = 1.6
+_FRACTIONS = (0.5, 0.4, 0.6, 0.3)
+_QUALITY = 82
+Pixels = npt.NDArray[np.uint8]
+Posture = Literal["upright", "tipped", "leaning"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Case:
+    """One prop of a sheet: its caption, its posture, and what happens to it."""
+
+    caption: str
+    posture: Posture = "upright"
+    loaded_share: float | None = None
+
+
+_CASES = (_Case("upright"), _Case("tipped", "tipped"), _Case("leaning", "leaning"))
+_PILE_CASES = (_Case("in the open"), _Case("against a wall", "leaning"), _Case("partly loaded away", loaded_share=0.45))
+_FIXED_CASES = (_Case("upright"),)
+
+
+def draw_gallery(out: Path, only: Sequence[str] = ()) -> list[Path]:
+    """Write `family-NAME.jpg` and `prop-KIND.jpg` into a folder, and return their paths.
+
+    Args:
+        out: Made if it is not there.
+        only: Names of families and kinds; empty for all.
+
+    Raises:
+        ScenarioError: A family cannot be built.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    written = []
+    families = [name for name in scenario_names() if not name.startswith(("smoke/", "unchanged/"))]
+    for name in families:
+        if not only or name in only:
+            path = out / f"family-{name.replace('/', '-')}.jpg"
+            _save(path, [(family_picture(load_scenario(name, SEED), SEED), "")])
+            written.append(path)
+    for kind in _SIZES:
+        if not only or kind in only:
+            path = out / f"prop-{kind}.jpg"
+            _save(path, prop_pictures(kind))
+            written.append(path)
+    return written
+
+
+def family_picture(scenario: Scenario, seed: int) -> Pixels:
+    """Return a picture of a world as the after session meets it, from the place that shows most of what changed."""
+    world = build_world(scenario, seed)
+    scene = world.after
+    changed = [item for item in world.standing if item.prop.change != "none" and "after" in item.sessions]
+    # a little above a low prop, so that walls and roof come into the picture
+    targets = [_middle(item) + np.array([0.0, 0.0, 0.6]) for item in changed or world.standing]
+    numbers = {prop.name: number for number, prop in enumerate(scenario.props, start=1)}
+    wanted = {numbers[item.prop.name] for item in changed}
+    stations = np.concatenate([line.points[::10] for line in world.centreline.drifts]) + np.array([0.0, 0.0, _EYE_M])
+    best = (-1.0, stations[0], stations[1])
+    for target in targets:
+        distance_m = np.linalg.norm(stations - target, axis=1)
+        for eye in stations[(distance_m > 3.0) & (distance_m < 9.0)]:
+            score = _score(scene, eye, target, wanted)
+            if score > best[0]:
+                best = (score, eye, target)
+    _, eye, target = best
+    return render(scene, eye, target, *_FAMILY_PX, field_of_view_deg=78.0, samples=2)
+
+
+def prop_pictures(kind: str) -> list[tuple[Pixels, str]]:
+    """Return a picture and caption of a kind of prop for each posture it can have, from two metres away.
+
+    Raises:
+        ScenarioError: It can be put down in none.
+    """
+    cases = _PILE_CASES if kind == "muck_pile" else _FIXED_CASES if kind in ("railing", "vehicle") else _CASES
+    pictures: list[tuple[Pixels, str]] = []
+    refused: list[str] = []
+    for case in cases:
+        world = _first_world(kind, case, refused)
+        if world is None:
+            continue
+        session = "before" if case.loaded_share is None else "after"
+        item = next(item for item in world.standing if session in item.sessions)
+        scene = world.before if session == "before" else world.after
+        pictures.append((_close_up(world, scene, item), f"{kind.replace('_', ' ')}, {case.caption}"))
+    if not pictures:
+        raise ScenarioError(refused[0])
+    return pictures
+
+
+def _first_world(kind: str, case: _Case, refused: list[str]) -> World | None:
+    """Return a world at the first place where the prop comes to rest; None, and why, if it does so nowhere."""
+    for fraction in _FRACTIONS:
+        try:
+            return build_world(_stage(kind, case, fraction), SEED)
+        except ScenarioError as error:  # too squat to lean, or the wall is too rough just there
+            refused.append(str(error))
+    return None
+
+
+def _stage(kind: str, case: _Case, fraction: float) -> Scenario:
+    """Return a short drift with one prop."""
+    where: dict[str, Any] = {"between": ("a", "b"), "fraction": fraction}
+    lateral = 0.95 if case.posture == "leaning" else 0.1
+    prop = Prop.model_validate(
+        {
+            "name": kind,
+            "kind": kind,
+            "size_m": _SIZES[kind],
+            "place": Place(**where, lateral=lateral, yaw_deg=20.0 if lateral < 0.5 else 0.0, posture=case.posture),
+            "change": "none" if case.loaded_share is None else "reshaped",
+            "loaded_share": case.loaded_share,
+        }
+    )
+    tunnel = Tunnel(
+        nodes={"a": (0, 0, 0), "b": (18, 0, 0)},
+        drifts=(Drift(nodes=("a", "b")),),
+        section=Section(width_m=7.0, height_m=4.5),
+        roughness=(Roughness(amplitude_m=0.15, length_m=2.5), Roughness(amplitude_m=0.06, length_m=0.7)),
+        resolution_m=0.12,
+    )
+    plan = SessionPlan(route=("a", "b"))
+    return Scenario(family="gallery", tunnel=tunnel, props=(prop,), before=plan, after=plan)
+
+
+def _close_up(world: World, scene: Scene, item: Standing) -> Pixels:
+    """Return a picture from two metres off a prop's side, obliquely, from a place in the open."""
+    middle, half_m = _middle(item), _half_size(item)
+    gone = _middle(world.standing[0]) - middle  # where a loaded pile is missing something
+    best = (-1.0, middle + 1.0)
+    for azimuth in np.deg2rad(np.arange(-180.0, 180.0, 15.0)):
+        away = yaw_pose(azimuth)[:3, 0]
+        # where the line out of the bounding box's middle leaves the box, and two metres on
+        edge_m = float(np.min(half_m[:2] / np.maximum(np.abs(away[:2]), 1e-9)))
+        eye = middle + (edge_m + _DISTANCE_M) * away
+        eye[2] = max(_EYE_M, middle[2] + half_m[2] + 0.2)
+        free_m = _free_m(world, eye)
+        # three quarters on: neither end nor side alone
+        turned = azimuth - yaw_rad(item.world_T_object)
+        oblique = 1.0 - abs(abs(np.sin(turned)) - np.sin(np.deg2rad(55.0)))
+        score = min(free_m, 1.0) + oblique + 0.5 * float(np.sign(away @ gone)) if free_m > 0.2 else -1.0
+        if score > best[0]:
+            best = (score, eye)
+    eye = best[1]
+    spread = np.linalg.norm(half_m) / np.linalg.norm(eye - middle)
+    field_deg = float(np.clip(np.rad2deg(2.3 * np.arctan(spread)), 35.0, 95.0))
+    return render(scene, eye, middle, *_SHEET_PX, field_of_view_deg=field_deg, samples=3)
+
+
+def _score(scene: Scene, eye: Float64Array, target: Float64Array, wanted: set[int]) -> float:
+    """Tell how much of the changes a view shows: every one seen counts, and the area of all."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    side = np.cross(forward, (0.0, 0.0, 1.0))
+    up = np.cross(side, forward)
+    across, along = np.meshgrid(np.linspace(-0.75, 0.75, 40), np.linspace(-0.45, 0.45, 24))
+    rays = forward + across.reshape(-1, 1) * side + along.reshape(-1, 1) * up
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    ranges_m, geom, _ = scene.caster.cast(np.broadcast_to(eye, rays.shape), rays)
+    if np.isinf(ranges_m).any() or (ranges_m < 0.4).mean() > 0.02:
+        return -1.0
+    seen = scene.instance[geom]
+    sizes = [min(float((seen == number).mean()), 0.15) for number in wanted]
+    return sum(1.0 + 20.0 * size for size in sizes if size > 0.003) + 0.1 * len(set(seen.tolist()))
+
+
+def _free_m(world: World, eye: Float64Array) -> float:
+    """Return the distance from a place to the nearest rock or fixture, 0 outside the tunnel."""
+    generator = stream(0, "gallery")
+    rays = generator.normal(size=(64, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    ranges_m, _, normals = world.fixed.hits(np.broadcast_to(eye, rays.shape), rays)
+    is_inside = np.isfinite(ranges_m).all() and ((normals * rays).sum(axis=1) < 0).all()
+    return float(ranges_m.min()) if is_inside else 0.0
+
+
+def _corners(item: Standing) -> Float64Array:
+    """Return the corners (N, 3) of what stands above the floor."""
+    corners = np.concatenate([moved(solid_mesh(solid), item.world_T_object).vertices for solid in item.shape.solids])
+    return np.asarray(corners[corners[:, 2] > item.world_T_object[2, 3] - 0.05])
+
+
+def _middle(item: Standing) -> Float64Array:
+    corners = _corners(item)
+    return np.asarray((corners.min(axis=0) + corners.max(axis=0)) / 2)
+
+
+def _half_size(item: Standing) -> Float64Array:
+    return np.asarray(_corners(item).max(axis=0) - _middle(item))
+
+
+def _save(path: Path, pictures: Sequence[tuple[Pixels, str]]) -> None:
+    """Write pictures side by side as one JPEG, each with its caption below it."""
+    height, width = pictures[0][0].shape[:2]
+    caption_px = 26 if any(caption for _, caption in pictures) else 0
+    dpi = 100
+    figure = Figure(figsize=(width * len(pictures) / dpi, (height + caption_px) / dpi), dpi=dpi, facecolor="white")
+    share = 1.0 / len(pictures)
+    for index, (pixels, caption) in enumerate(pictures):
+        bottom = caption_px / (height + caption_px)
+        axes = figure.add_axes((index * share, bottom, share, 1.0 - bottom))
+        axes.imshow(pixels, aspect="auto", interpolation="nearest")
+        axes.set_axis_off()
+        figure.text((index + 0.5) * share, bottom / 2, caption, ha="center", va="center", fontsize=10)
+    figure.savefig(path, dpi=dpi, pil_kwargs={"quality": _QUALITY, "optimize": True})
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit("usage: python -m sim.view.gallery OUT [FAMILY or KIND ...]")
+    try:
+        for file in draw_gallery(Path(sys.argv[1]), sys.argv[2:]):
+            sys.stdout.write(f"{file}\n")
+    except ScenarioError as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,122 @@
+"""Returns of a recorded session as points to look at: thinned, and coloured by what they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.geometry import Float32Array, Float64Array
+from cdpipe.io.session import ScanChunk, Session
+from sim.session.truth import read_labels
+
+Rgb = tuple[int, int, int]
+MAX_POINTS = 300_000
+_ROCK_RGB = (150, 150, 150)
+# after Okabe and Ito, which the colour-blind can tell apart
+CHANGE_RGB: dict[str, Rgb] = {
+    "added": (0, 158, 115),
+    "removed": (213, 94, 0),
+    "moved": (86, 130, 233),
+    "reshaped": (204, 121, 167),
+}
+SESSION_RGB: dict[str, Rgb] = {"before": (230, 159, 0), "after": (0, 114, 178)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """Points of one session.
+
+    Attributes:
+        name: Its name in the view.
+        points: (N, 3) float32, metres.
+        colours: (N, 3) uint8 by what it shows, e.g. "change"; the first is the usual one.
+        size_m: Edge of a point, metres.
+        is_shown: Whether it is shown from the start, where there are no walls around it.
+    """
+
+    name: str
+    points: Float32Array
+    colours: Mapping[str, npt.NDArray[np.uint8]]
+    size_m: float = 0.025
+    is_shown: bool = True
+
+
+def session_cloud(
+    name: str,
+    session: Session,
+    frame_T_sensor: Float64Array,
+    kinds: Mapping[int, str] | None,
+    max_points: int = MAX_POINTS,
+) -> Cloud:
+    """Return about `max_points` of a session's returns, evenly from all its revolutions.
+
+    Args:
+        name: "group/session".
+        session: The session.
+        frame_T_sensor: (S, 4, 4) pose of each revolution; the points come in its frame.
+        kinds: Kind of each change by id, to colour by truth; None leaves the truth unread.
+        max_points: How many are wanted at most.
+
+    Raises:
+        InputError: A chunk, or its truth, is missing or damaged.
+    """
+    stride = max(1, -(-session.n_scans * session.sensor.height * session.sensor.width // max_points))
+    labels = None if kinds is None else read_labels(session.path, session.n_chunks)
+    points, instances, changes = [], [], []
+    for number, chunk in enumerate(session.chunks()):
+        first = number * session.chunk_scans
+        placed = _placed(session, chunk, frame_T_sensor[first : first + len(chunk.range_mm)])
+        picked = np.flatnonzero(chunk.range_mm.ravel() > 0)[number % stride :: stride]
+        points.append(placed.reshape(-1, 3)[picked])
+        if labels is not None:
+            instance, change = next(labels)
+            instances.append(instance.ravel()[picked])
+            changes.append(change.ravel()[picked])
+    cloud = np.concatenate(points).astype(np.float32)
+    own = SESSION_RGB.get(name.rsplit("/", maxsplit=1)[-1], _ROCK_RGB)
+    by_height = _by_height(cloud)
+    if kinds is None:
+        return Cloud(name, cloud, {"height": by_height})
+    by_change = np.tile(np.array(_ROCK_RGB, np.uint8), (len(cloud), 1))
+    change = np.concatenate(changes)
+    for number, kind in kinds.items():
+        by_change[change == number] = CHANGE_RGB[kind]
+    colours = {
+        "change": by_change,
+        "instance": _by_instance(np.concatenate(instances).astype(np.int64)),
+        "session": np.tile(np.array(own, np.uint8), (len(cloud), 1)),
+        "height": by_height,
+    }
+    return Cloud(name, cloud, colours)
+
+
+def _placed(session: Session, chunk: ScanChunk, frame_T_sensor: Float64Array) -> Float64Array:
+    """Return the places (s, H, W, 3) of a chunk's pixels, every column at its own pose."""
+    poses = chunk.column_poses.astype(np.float64)
+    turns = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).as_matrix().reshape(*poses.shape[:2], 3, 3)
+    placed = np.empty((*chunk.range_mm.shape, 3))
+    for scan, frame_T_here in enumerate(frame_T_sensor):
+        column = session.sensor.project(chunk.range_mm[scan] / 1000.0)
+        sensor = np.einsum("wij,hwj->hwi", turns[scan], column) + poses[scan, :, :3]
+        placed[scan] = sensor @ frame_T_here[:3, :3].T + frame_T_here[:3, 3]
+    return placed
+
+
+def _by_instance(instance: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
+    """Give walls one grey, and every prop a colour of its own, far from its neighbours' (golden angle)."""
+    hue = 2 * np.pi * np.modf(instance * 0.618034)[0]
+    wheel = 140 + 100 * np.cos(hue[:, None] + np.array([0.0, 2.1, 4.2]))
+    return np.where((instance > 0)[:, None], wheel, _ROCK_RGB).astype(np.uint8)
+
+
+def _by_height(points: Float32Array) -> npt.NDArray[np.uint8]:
+    """Colour from blue (low) over green to yellow (high)."""
+    low, high = np.percentile(points[:, 2], (2, 98)) if len(points) else (0.0, 1.0)
+    share = np.clip((points[:, 2] - low) / max(high - low, 1e-6), 0.0, 1.0)
+    stops = np.array([(68, 60, 150), (50, 130, 140), (90, 190, 100), (250, 220, 50)], dtype=np.float64)
+    at = np.linspace(0.0, 1.0, len(stops))
+    return np.column_stack([np.interp(share, at, stops[:, axis]) for axis in range(3)]).astype(np.uint8)

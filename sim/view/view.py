@@ -1,0 +1,264 @@
+"""What there is to look at in a world, a simulated pair or a session: named surfaces, lines, points and labels.
+
+Names are paths: their first word is the group that a viewer shows or hides as a whole, e.g. `changes/added/box`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import ValidationError
+from scipy.spatial import cKDTree
+
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.geometry import Float64Array
+from cdpipe.io.session import is_session, read_session
+from cdpipe.sensor.ouster import load_profile
+from scenarios.schema import Scenario
+from sim.drive.trajectory import plan_trajectory
+from sim.geometry.mesh import Mesh, joined, moved
+from sim.placement.placing import Standing
+from sim.props.shapes import solid_mesh
+from sim.scene import World, build_world
+from sim.session.truth import PairTruth, read_pair_truth, read_true_poses
+from sim.view.picture import material_colour
+from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Rgb, session_cloud
+
+SessionName = Literal["before", "after"]
+SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
+_N_BANDS = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """A mesh in one colour, world frame, metres."""
+
+    name: str
+    mesh: Mesh
+    rgb: Rgb
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Band:
+    """The part of the walls from one height above the floor up to the next band."""
+
+    from_m: float
+    surface: Surface
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Line:
+    """A path (N, 3), world frame, metres."""
+
+    name: str
+    points: Float64Array
+    rgb: Rgb
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Label:
+    """A text at a place (3,), world frame, metres."""
+
+    name: str
+    position: Float64Array
+    text: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """Everything to be shown.
+
+    Attributes:
+        title: What it is.
+        bands: The walls, cut into bands of height above the floor, lowest first.
+        surfaces: Fixtures, props that stay and changed props.
+        lines: Paths of the sensor.
+        clouds: Returns of sessions.
+        labels: Names of the props.
+        eye, target: (3,) where to look from, and at what.
+        notes: What could not be shown, and why.
+    """
+
+    title: str
+    bands: tuple[Band, ...]
+    surfaces: tuple[Surface, ...]
+    lines: tuple[Line, ...]
+    clouds: tuple[Cloud, ...]
+    labels: tuple[Label, ...]
+    eye: Float64Array
+    target: Float64Array
+    notes: tuple[str, ...] = ()
+
+
+def is_pair(path: Path) -> bool:
+    """Tell whether a folder holds a simulated pair with its truth."""
+    return (path / "truth" / "changes.json").is_file()
+
+
+def view_scenario(scenario: Scenario, seed: int) -> View:
+    """Return the world of a drawn scenario, with the paths that would be driven.
+
+    A path that cannot be driven is left out and told in the notes, so that its obstacle can be seen.
+
+    Raises:
+        ScenarioError: The world cannot be built.
+        InputError: The sensor profile cannot be read.
+    """
+    world = build_world(scenario, seed)
+    sensor = load_profile(scenario.sensor.profile, scenario.sensor.mode)
+    lines, notes = [], []
+    for session in SESSIONS:
+        try:
+            poses = plan_trajectory(world, scenario, sensor, seed, session).world_T_sensor
+            lines.append(Line(f"paths/{session}", poses[:, :3, 3], SESSION_RGB[session]))
+        except ScenarioError as error:
+            notes.append(f"no path {session}: {error}")
+    return _world_view(f"{scenario.family}, seed {seed}", world, lines, (), tuple(notes))
+
+
+def view_pair(pair: Path) -> View:
+    """Return the world of a simulated pair, its true paths, and a thinned part of both sessions' returns.
+
+    Raises:
+        InputError: The pair or its truth is missing, damaged, or of a version whose scenario cannot be built here.
+    """
+    truth = read_pair_truth(pair)
+    world = build_world(_scenario_of(pair, truth), truth.seed)
+    poses = {session: read_true_poses(pair / session) for session in SESSIONS}
+    lines = [Line(f"paths/{session}", poses[session][:, :3, 3], SESSION_RGB[session]) for session in SESSIONS]
+    kinds = {change.id: change.kind for change in truth.changes}
+    clouds = tuple(
+        session_cloud(f"returns/{session}", read_session(pair / session), poses[session], kinds) for session in SESSIONS
+    )
+    return _world_view(f"{pair}: {truth.family}, seed {truth.seed}", world, lines, clouds, ())
+
+
+def view_session(folder: Path) -> View:
+    """Return a session as its robot has it, in its odom frame: the path, and a thinned part of its returns.
+
+    Raises:
+        InputError: The session is missing or damaged.
+    """
+    session = read_session(folder)
+    poses = session.odom_T_sensor
+    cloud = session_cloud("returns/session", session, poses, None)
+    middle = poses[len(poses) // 2, :3, 3]
+    line = Line("paths/session", poses[:, :3, 3], SESSION_RGB["after"])
+    eye = middle + np.array([-8.0, -8.0, 10.0])
+    return View(str(folder), (), (), (line,), (cloud,), (), eye, middle)
+
+
+def view_folder(folder: Path) -> View:
+    """Return what a folder holds: a simulated pair or a session.
+
+    Raises:
+        InputError: It holds neither, or what it holds is damaged.
+    """
+    if is_pair(folder):
+        return view_pair(folder)
+    if is_session(folder):
+        return view_session(folder)
+    if is_session(folder / "before"):
+        raise InputError(f"{folder}: a pair without truth: view {folder / 'before'} or {folder / 'after'}")
+    raise InputError(f"{folder}: neither a simulated pair nor a session: expected truth/changes.json or session.json")
+
+
+def wall_bands(wall: Mesh, floor_points: Float64Array, n_bands: int = _N_BANDS) -> tuple[Band, ...]:
+    """Cut walls into bands of equal height above the floor (N, 3) nearest to each face, lowest first."""
+    centres = wall.vertices[wall.faces].mean(axis=1)
+    # A face belongs to the floor below it even where another level runs above.
+    _, nearest = cKDTree(floor_points).query(centres - (0.0, 0.0, 1.0))
+    height_m = centres[:, 2] - floor_points[nearest, 2]
+    top_m = float(np.percentile(height_m, 99.5))
+    step_m = max(0.1, round(top_m / n_bands, 1))
+    number = np.clip(np.floor(height_m / step_m), 0, n_bands - 1).astype(int)
+    rgb = _rgb(material_colour("wall", "rock"))
+    return tuple(
+        Band(band * step_m, Surface(f"walls/from {band * step_m:.1f} m", _part(wall, number == band), rgb))
+        for band in np.unique(number).tolist()
+    )
+
+
+def _world_view(
+    title: str, world: World, lines: Sequence[Line], clouds: tuple[Cloud, ...], notes: tuple[str, ...]
+) -> View:
+    wall = world.before.meshes[0]
+    floor = [line.points for line in world.centreline.drifts]
+    floor += [] if floor else [path.points - (0.0, 0.0, 1.0) for path in lines]
+    floor_points = np.concatenate(floor) if floor else wall.vertices[[int(np.argmin(wall.vertices[:, 2]))]]
+    fixtures = [
+        Surface(
+            f"fixtures/{_kind(fixture.name)}/{fixture.name}",
+            fixture.mesh,
+            _rgb(material_colour(fixture.name, fixture.material)),
+        )
+        for fixture in world.fixtures
+    ]
+    props = [surface for item in world.standing for surface in _prop_surfaces(item)]
+    changed = [item for item in world.standing if item.prop.change != "none"]
+    if changed:
+        target = changed[0].world_T_object[:3, 3]
+    else:
+        target = lines[0].points[len(lines[0].points) // 2] if lines else wall.vertices.mean(axis=0)
+    labels = tuple(_label(item) for item in world.standing)
+    eye = target + np.array([-6.0, -6.0, 8.0])
+    return View(
+        title, wall_bands(wall, floor_points), (*fixtures, *props), tuple(lines), clouds, labels, eye, target, notes
+    )
+
+
+def _prop_surfaces(item: Standing) -> Iterator[Surface]:
+    """Yield a prop that stays material by material, a changed one in the colour of its change."""
+    name, change = item.prop.name, item.prop.change
+    parts: dict[str, list[Mesh]] = {}
+    for solid in item.shape.solids:
+        parts.setdefault(solid.material, []).append(moved(solid_mesh(solid), item.world_T_object))
+    if change != "none":
+        whole = joined([mesh for meshes in parts.values() for mesh in meshes])
+        yield Surface(f"changes/{change}/{name}{_where(item)}", whole, CHANGE_RGB[change])
+        return
+    for material, meshes in parts.items():
+        yield Surface(f"props/{name}/{material}", joined(meshes), _rgb(material_colour(name, material)))
+
+
+def _label(item: Standing) -> Label:
+    vertices = np.concatenate([moved(solid_mesh(s), item.world_T_object).vertices for s in item.shape.solids])
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    change = "" if item.prop.change == "none" else f", {item.prop.change}{_where(item)}"
+    position = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, high[2] + 0.1])
+    return Label(f"labels/{item.prop.name}{_where(item)}", position, f"{item.prop.name}{change}")
+
+
+def _where(item: Standing) -> str:
+    """Tell the two halves of a move, or of a reshaping, apart."""
+    return f" ({min(item.sessions)})" if item.prop.change in ("moved", "reshaped") else ""
+
+
+def _scenario_of(pair: Path, truth: PairTruth) -> Scenario:
+    try:
+        return Scenario.model_validate(truth.scenario)
+    except ValidationError as error:
+        raise InputError(
+            f"{pair / 'truth' / 'changes.json'}: its scenario is not one of this version "
+            f"({error.errors()[0]['msg']}): simulate the pair again, or view its sessions one by one"
+        ) from error
+
+
+def _kind(fixture: str) -> str:
+    return re.split(r"[\W_]*\d", fixture, maxsplit=1)[0]
+
+
+def _part(mesh: Mesh, is_kept: npt.NDArray[np.bool_]) -> Mesh:
+    used, faces = np.unique(mesh.faces[is_kept], return_inverse=True)
+    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32))
+
+
+def _rgb(colour: tuple[float, float, float]) -> Rgb:
+    red, green, blue = (round(255 * value) for value in colour)
+    return red, green, blue

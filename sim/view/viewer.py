@@ -1,0 +1,199 @@
+"""A view in the browser, by viser: live with switches, or as one offline file."""
+
+from __future__ import annotations
+
+import contextlib
+import html
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cdpipe.core.errors import InputError
+from sim.view.returns import CHANGE_RGB, SESSION_RGB
+from sim.view.view import View
+
+_MISSING = "the viewer needs viser: pip install 'tunnelcd[view]'"
+_SIDES = {"from inside only": "front", "from both sides": "double"}
+
+
+def require_viser() -> Any:
+    """Return the module viser.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    try:
+        import viser  # noqa: PLC0415 - an extra, needed by nothing but the viewer
+    except ImportError as error:
+        raise InputError(_MISSING) from error
+    return viser
+
+
+@contextlib.contextmanager
+def running_server(port: int, host: str = "localhost") -> Iterator[Any]:
+    """Run a viser server; port 0 takes any that is free.
+
+    Raises:
+        InputError: viser is not installed, or the port is taken.
+    """
+    viser = require_viser()
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # its banner: only the command line prints
+            server = viser.ViserServer(host=host, port=port, verbose=False)
+    except (OSError, RuntimeError, OverflowError) as error:
+        raise InputError(f"--port {port}: cannot listen there on {host}: {error}") from error
+    try:
+        if port not in (0, server.get_port()):
+            raise InputError(f"--port {port}: taken by another program: name a free one, or end that program")
+        yield server
+    finally:
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
+
+
+def show(server: Any, view: View) -> None:
+    """Put a view into a server's scene, with the switches beside it."""
+    groups = _add_nodes(server, view)
+    _add_switches(server, view, groups)
+
+
+def write_html(view: View, file: Path, legend: str = "") -> None:
+    """Write a view as one file that needs no server and no network; its scene tree shows and hides every part.
+
+    Args:
+        view: What to show.
+        file: Where to write it.
+        legend: Elements of HTML that lie over the scene.
+
+    Raises:
+        InputError: viser is not installed, or the file cannot be written.
+    """
+    with running_server(0) as server:
+        _add_nodes(server, view)
+        text = server.scene.as_html()
+    if legend:
+        before, end, after = text.rpartition("</body>")
+        text = f"{before}{legend}{end}{after}"
+    text = text.replace("<title>Viser</title>", f"<title>{html.escape(view.title)}</title>", 1)
+    try:
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{file}: cannot be written: {error.strerror}") from error
+
+
+def _add_nodes(server: Any, view: View) -> dict[str, Any]:
+    """Add every part under its name, and return the handle of each group and of every part by name."""
+    scene = server.scene
+    server.initial_camera.position = view.eye
+    server.initial_camera.look_at = view.target
+    handles: dict[str, Any] = {}
+    names = [band.surface.name for band in view.bands]
+    names += [part.name for parts in (view.surfaces, view.lines, view.clouds, view.labels) for part in parts]
+    for name in names:
+        words = name.split("/")[:-1]
+        for depth in range(1, len(words) + 1):
+            group = "/".join(words[:depth])
+            if group not in handles:
+                handles[group] = scene.add_frame(f"/{group}", show_axes=False)
+    for surface in (*(band.surface for band in view.bands), *view.surfaces):
+        mesh = surface.mesh
+        # One-sided: whoever looks in from outside looks through the near wall.
+        side = "front" if surface.name.startswith("walls/") else "double"
+        handles[surface.name] = scene.add_mesh_simple(
+            f"/{surface.name}",
+            mesh.vertices,
+            mesh.faces,
+            color=surface.rgb,
+            flat_shading=True,
+            side=side,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+    for line in view.lines:
+        pairs = np.stack([line.points[:-1], line.points[1:]], axis=1).astype(np.float32)
+        handles[line.name] = scene.add_line_segments(f"/{line.name}", pairs, line.rgb, thickness=0.06)
+    for cloud in view.clouds:
+        first = next(iter(cloud.colours.values()))
+        handles[cloud.name] = scene.add_point_cloud(
+            f"/{cloud.name}",
+            cloud.points,
+            first,
+            point_size=cloud.size_m,
+            precision="float32",
+            point_shading="flat",
+            visible=cloud.is_shown and not view.bands,  # they would hide the walls
+        )
+    for label in view.labels:
+        handles[label.name] = scene.add_label(f"/{label.name}", label.text, position=label.position)
+    return handles
+
+
+def _add_switches(server: Any, view: View, handles: dict[str, Any]) -> None:
+    gui = server.gui
+    gui.configure_theme(show_share_button=False)
+    gui.set_panel_label("tunnelcd")
+    gui.add_markdown(_legend(view))
+    if view.bands:
+        _add_wall_switches(gui, view, handles)
+    for group in _switched(handles):
+        _add_switch(gui, group, handles[group])
+    for cloud in view.clouds:
+        _add_switch(gui, cloud.name, handles[cloud.name])
+    if view.clouds and len(view.clouds[0].colours) > 1:
+        choice = gui.add_dropdown("returns by", tuple(view.clouds[0].colours))
+
+        def recolour(_event: Any) -> None:
+            for cloud in view.clouds:
+                handles[cloud.name].colors = cloud.colours[choice.value]
+
+        choice.on_update(recolour)
+
+
+def _add_wall_switches(gui: Any, view: View, handles: dict[str, Any]) -> None:
+    bands = [(band.from_m, handles[band.surface.name]) for band in view.bands]
+    step_m = round(bands[1][0] - bands[0][0], 1) if len(bands) > 1 else 1.0
+    top_m = round(bands[-1][0] + step_m, 1)
+    cut = gui.add_slider("walls up to, m above floor", min=0.0, max=top_m, step=step_m, initial_value=top_m)
+    sides = gui.add_dropdown("walls seen", tuple(_SIDES))
+
+    def cut_off(_event: Any) -> None:
+        for from_m, handle in bands:
+            handle.visible = from_m < cut.value - 1e-6
+
+    def turn(_event: Any) -> None:
+        for _, handle in bands:
+            handle.side = _SIDES[sides.value]
+
+    cut.on_update(cut_off)
+    sides.on_update(turn)
+
+
+def _add_switch(gui: Any, group: str, handle: Any) -> None:
+    box = gui.add_checkbox(group, initial_value=handle.visible)
+
+    def switch(_event: Any) -> None:
+        handle.visible = box.value
+
+    box.on_update(switch)
+
+
+def _switched(handles: dict[str, Any]) -> list[str]:
+    """Return the groups that get a switch: the outermost, and one level below where the kinds are told apart."""
+    groups = [
+        name for name in handles if name.count("/") == 0 and name not in ("fixtures", "changes", "paths", "returns")
+    ]
+    kinds = [name for name in handles if name.count("/") == 1 and name.split("/")[0] in ("fixtures", "changes")]
+    sessions = [name for name in handles if name.count("/") == 1 and name.split("/")[0] == "paths"]
+    return [*groups, *sorted(kinds), *sessions]
+
+
+def _legend(view: View) -> str:
+    swatch = '<span style="color:rgb{}">■</span> {}'
+    kinds = [kind for kind in CHANGE_RGB if any(part.name.startswith(f"changes/{kind}/") for part in view.surfaces)]
+    sessions = [name for name in SESSION_RGB if any(line.name == f"paths/{name}" for line in view.lines)]
+    colours = [(CHANGE_RGB[kind], kind) for kind in kinds] + [(SESSION_RGB[name], f"path {name}") for name in sessions]
+    lines = [f"**{view.title}**", " ".join(swatch.format(rgb, name) for rgb, name in colours), *view.notes]
+    return "\n\n".join(line for line in lines if line)

@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from scenarios.schema import Prop, Scenario
+from sim.materials import REFLECTIVITY
+from sim.scene import build_world
+from sim.view import gallery
+from sim.view.picture import COLOURS, material_colour, part_colours, render
+
+EYE, TARGET = (5.0, 0.0, 0.5), (8.0, 0.0, 0.3)
+
+
+@pytest.fixture
+def boxed(make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop]) -> Scenario:
+    return make_scenario(props=(make_prop("box", 0.4, 0.0, change="added"),))
+
+
+def test_a_picture_highlights_the_prop_in_front_of_rock_and_nothing_else(boxed: Scenario) -> None:
+    world = build_world(boxed, 0)
+    empty = render(world.before, EYE, TARGET, 120, 90).astype(int)
+    plain, red = (render(world.after, EYE, TARGET, 120, 90, highlight=h).astype(int) for h in ((), (1,)))
+    assert plain.shape == (90, 120, 3)
+    differs = (red != plain).any(axis=2)
+    # The box, 0.6 m wide, stands 2.6 m before the lens, whose picture is 2 tan(35 deg) times its distance wide.
+    width_px = 120 * 0.6 / (2 * np.tan(np.deg2rad(35)) * 2.6)
+    assert abs(differs[45].sum() - width_px) <= 2
+    # highlighted pixels are the box's own, and the box changes them against the empty tunnel
+    assert ((plain != empty).any(axis=2) | ~differs).all()
+    assert (red[differs, 0] > 2 * red[differs, 1]).all()
+    np.testing.assert_array_equal(plain, render(world.after, EYE, TARGET, 120, 90).astype(int))
+
+
+def test_a_box_throws_a_shadow_on_the_floor_left_of_it(boxed: Scenario) -> None:
+    world = build_world(boxed, 0)
+    above, floor = (6.0, 0.0, 2.0), (8.0, 0.0, 0.0)
+    empty, full = (render(scene, above, floor, 120, 90).astype(int) for scene in (world.before, world.after))
+    red = render(world.after, above, floor, 120, 90, highlight=(1,)).astype(int)
+    is_box = (red != full).any(axis=2)
+    darker = (full.sum(axis=2) < 0.75 * empty.sum(axis=2)) & ~is_box
+    assert darker.sum() > 100
+    # the lamp hangs to the right of the camera
+    assert np.flatnonzero(darker.any(axis=0)).mean() < np.flatnonzero(is_box.any(axis=0)).mean()
+
+
+def test_more_samples_make_the_same_picture_smoother(boxed: Scenario) -> None:
+    scene = build_world(boxed, 0).before
+    coarse, fine = (render(scene, EYE, TARGET, 60, 45, samples=samples).astype(float) for samples in (1, 4))
+    assert fine.shape == coarse.shape
+    assert abs(fine.mean() - coarse.mean()) < 3
+    assert np.abs(np.diff(fine, axis=1)).mean() < np.abs(np.diff(coarse, axis=1)).mean()
+
+
+def test_every_material_has_a_colour_and_parts_are_drawn_in_theirs(boxed: Scenario) -> None:
+    assert COLOURS.keys() == REFLECTIVITY.keys()
+    scene = build_world(boxed, 0).after
+    colours = part_colours(scene)
+    assert colours.shape == (len(scene.meshes), 3)
+    for row, part, material in zip(colours, scene.parts, scene.materials, strict=True):
+        np.testing.assert_allclose(row ** (1 / 2.2), material_colour(part, material), atol=1e-12)
+    painted = render(replace(scene, materials=("rock", *["rubber"] * (len(scene.parts) - 1))), EYE, TARGET, 60, 45)
+    assert (painted != render(scene, EYE, TARGET, 60, 45)).any()
+
+
+def test_the_gallery_shows_a_family_and_a_prop_from_two_metres(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, boxed: Scenario
+) -> None:
+    monkeypatch.setattr(gallery, "_SHEET_PX", (96, 72))
+    monkeypatch.setattr(gallery, "_FAMILY_PX", (160, 100))
+    monkeypatch.setattr(gallery, "load_scenario", lambda name, seed: boxed)
+    shots: list[tuple[Any, ...]] = []
+    usual = gallery.render
+
+    def noted(scene: Any, eye: Any, target: Any, *size: int, **settings: Any) -> Any:
+        shots.append((scene, eye, target))
+        return usual(scene, eye, target, *size, **(settings | {"samples": 1}))
+
+    monkeypatch.setattr(gallery, "render", noted)
+    paths = gallery.draw_gallery(tmp_path / "new", ["narrow", "barrel"])
+    assert [path.name for path in paths] == ["family-narrow.jpg", "prop-barrel.jpg"]
+    family, barrel = (matplotlib.image.imread(path) for path in paths)
+    assert family.shape[:2] == (100, 160)
+    assert barrel.shape[1] == 3 * 96
+    # the box, 0.8 x 0.6 x 0.7 m, is in sight and near
+    scene, eye, target = shots[0]
+    assert np.linalg.norm(target - eye) < 9
+    ray = target - (0, 0, 0.6) - eye  # the camera points a little above it
+    assert scene.instance[scene.caster.cast(eye[None], ray[None] / np.linalg.norm(ray))[1][0]] == 1
+    for scene, eye, target in shots[1:]:
+        ray = (target - eye) / np.linalg.norm(target - eye)
+        ranges_m, geom, _ = scene.caster.cast(eye[None], ray[None])
+        assert scene.instance[geom[0]] == 1
+        assert 1.5 < ranges_m[0] < 2.9

@@ -1,0 +1,322 @@
+from __future__ import annotations
+
+import builtins
+import re
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.geometry import Float64Array
+from cdpipe.io.readers import open_scans
+from cdpipe.io.session import read_session
+from eval.cli import main
+from eval.looking import view_of
+from scenarios.schema import MeshFile, Place, Prop, Scenario, Shift, Tunnel
+from sim.geometry.mesh import Mesh
+from sim.scene import build_world
+from sim.session.simulate import simulate_pair
+from sim.session.truth import read_pair_truth, read_true_poses
+from sim.view import view as view_module
+from sim.view.returns import CHANGE_RGB, session_cloud
+from sim.view.view import View, view_folder, view_pair, view_scenario, wall_bands
+from sim.view.viewer import require_viser, running_server, show, write_html
+
+viser = pytest.importorskip("viser", reason="the extra `view` is not installed")
+
+
+@pytest.fixture(scope="module")
+def scenario(make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop]) -> Scenario:
+    return make_scenario(
+        props=(
+            make_prop("came", 0.3, change="added"),
+            make_prop("went", 0.5, change="removed"),
+            make_prop("pushed", 0.7, -0.9, change="moved", shift=Shift(distance_m=0.5)),
+            make_prop("stays", 0.85, kind="barrel", size_m=(0.6, 0.6, 0.9)),
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def shown(scenario: Scenario) -> View:
+    return view_scenario(scenario, 3)
+
+
+@pytest.fixture(scope="module")
+def pair(scenario: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("view") / "pair"
+    simulate_pair(scenario, 3, out)
+    return out
+
+
+@pytest.fixture
+def server() -> Iterator[Any]:
+    with running_server(0) as running:
+        yield running
+
+
+def named(view: View) -> dict[str, Any]:
+    parts = (*view.surfaces, *view.lines, *view.clouds, *view.labels, *(band.surface for band in view.bands))
+    names = [part.name for part in parts]
+    assert len(names) == len(set(names))
+    return dict(zip(names, parts, strict=True))
+
+
+def test_a_world_is_shown_with_walls_paths_and_changes_in_their_colours(shown: View, scenario: Scenario) -> None:
+    parts = named(shown)
+    changes = {name: part.rgb for name, part in parts.items() if name.startswith("changes/")}
+    assert changes == {
+        "changes/added/came": CHANGE_RGB["added"],
+        "changes/removed/went": CHANGE_RGB["removed"],
+        "changes/moved/pushed (before)": CHANGE_RGB["moved"],
+        "changes/moved/pushed (after)": CHANGE_RGB["moved"],
+    }
+    assert {name.split("/")[1] for name in parts if name.startswith("props/")} == {"stays"}
+    assert {name for name in parts if name.startswith("paths/")} == {"paths/before", "paths/after"}
+    assert parts["labels/came"].text == "came, added"
+    assert shown.notes == ()
+    for item in build_world(scenario, 3).standing:
+        if item.prop.name == "went":
+            box = parts["changes/removed/went"].mesh.vertices
+            middle = (box.min(axis=0) + box.max(axis=0)) / 2
+            np.testing.assert_allclose(middle, (item.world_T_object @ [0, 0, 0.35, 1])[:3], atol=0.02)
+
+
+def test_bands_hold_every_face_of_the_walls_once_and_by_height(shown: View, scenario: Scenario) -> None:
+    wall = build_world(scenario, 3).before.meshes[0]
+    assert sum(len(band.surface.mesh.faces) for band in shown.bands) == len(wall.faces)
+    corners = np.concatenate([band.surface.mesh.vertices[band.surface.mesh.faces] for band in shown.bands])
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    whole = wall.vertices[wall.faces]
+    cross = np.cross(whole[:, 1] - whole[:, 0], whole[:, 2] - whole[:, 0])
+    assert area == pytest.approx(np.linalg.norm(cross, axis=1).sum())
+    starts = [band.from_m for band in shown.bands]
+    assert starts == sorted(starts)
+    assert starts[0] == 0
+    # the floor of this drift is level, at 0
+    for band, end_m in zip(shown.bands, [*starts[1:], np.inf], strict=True):
+        centres = band.surface.mesh.vertices[band.surface.mesh.faces].mean(axis=1)
+        low_m = band.from_m if band.from_m else -np.inf
+        assert (centres[:, 2] >= low_m - 1e-9).all()
+        assert (centres[:, 2] < end_m + 1e-9).all()
+
+
+def test_heights_follow_the_floor_of_a_ramp() -> None:
+    along = np.arange(0.0, 60.0, 0.1)
+    floor = np.column_stack([along, 0 * along, 0.2 * along])
+    box = trimesh.creation.box(extents=(40, 4, 3)).subdivide_to_size(0.5)
+    vertices = np.asarray(box.vertices) + np.array([30.0, 0.0, 1.5])
+    vertices[:, 2] += 0.2 * vertices[:, 0]
+    bands = wall_bands(Mesh(vertices, np.asarray(box.faces, dtype=np.int32)), floor, 3)
+    roof = bands[-1].surface.mesh
+    # the roof is 3 m above the floor everywhere: all of it is in the last band, from one end to the other
+    assert np.ptp(roof.vertices[:, 0]) == pytest.approx(40)
+    lowest = bands[0].surface.mesh
+    height_m = lowest.vertices[:, 2] - 0.2 * lowest.vertices[:, 0]
+    assert height_m.max() < 2.0
+
+
+def test_a_pair_s_returns_are_thinned_placed_and_coloured_by_truth(pair: Path) -> None:
+    view = view_pair(pair)
+    assert [cloud.name for cloud in view.clouds] == ["returns/before", "returns/after"]
+    truth = read_pair_truth(pair)
+    after = read_session(pair / "after")
+    kinds = {change.id: change.kind for change in truth.changes}
+    poses = read_true_poses(pair / "after")
+    cloud = session_cloud("returns/after", after, poses, kinds, max_points=20_000)
+    assert 5_000 < len(cloud.points) <= 20_000 + after.n_chunks
+    assert {name: len(colours) for name, colours in cloud.colours.items()} == dict.fromkeys(
+        ("change", "instance", "session", "height"), len(cloud.points)
+    )
+    # returns of the added box are green, and lie in its bounding box (noise, and rolling with true column poses)
+    green = (view.clouds[1].colours["change"] == CHANGE_RGB["added"]).all(axis=1)
+    box = next(part for part in view.surfaces if part.name == "changes/added/came").mesh.vertices
+    points = view.clouds[1].points[green]
+    assert len(points) > 50
+    assert (points > box.min(axis=0) - 0.1).all()
+    assert (points < box.max(axis=0) + 0.1).all()
+
+
+def test_a_session_is_placed_as_the_pipeline_places_it(pair: Path) -> None:
+    view = view_folder(pair / "before")
+    session = read_session(pair / "before")
+    full = session_cloud("x", session, session.odom_T_sensor, None, max_points=10**9)
+    scans = list(open_scans(pair / "before").scans())
+    expected: Float64Array = np.concatenate(
+        [scan.points_sensor @ scan.odom_T_sensor[:3, :3].T + scan.odom_T_sensor[:3, 3] for scan in scans]
+    )
+    assert len(full.points) == len(expected)
+    np.testing.assert_allclose(full.points.min(axis=0), expected.min(axis=0), atol=1e-5)
+    np.testing.assert_allclose(full.points.astype(np.float64).mean(axis=0), expected.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(full.points.astype(np.float64).std(axis=0), expected.std(axis=0), atol=1e-6)
+    assert list(view.clouds[0].colours) == ["height"]
+    assert view.bands == ()
+
+
+def test_a_path_that_cannot_be_driven_is_a_note(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    def barred(*_arguments: Any) -> Any:
+        raise ScenarioError("box bars the way")
+
+    monkeypatch.setattr(view_module, "plan_trajectory", barred)
+    view = view_scenario(scenario, 3)
+    assert view.lines == ()
+    assert view.notes == ("no path before: box bars the way", "no path after: box bars the way")
+
+
+def test_the_server_holds_every_part_and_its_switches_work(server: Any, shown: View, pair: Path) -> None:
+    view = view_pair(pair)
+    show(server, view)
+    nodes = {name: server.scene.get_handle_by_name(f"/{name}") for name in named(view)}
+    assert all(handle is not None for handle in nodes.values())
+    switches = {handle.label: handle for handle in server.gui._gui_input_handle_from_uuid.values()}
+    for label in ("walls", "props", "labels", "changes/added", "changes/moved", "paths/before", "returns/after"):
+        handle = server.scene.get_handle_by_name(f"/{label}")
+        before = handle.visible
+        flip(switches[label], not before)
+        assert handle.visible is not before
+    flip(switches["walls up to, m above floor"], 1.0)
+    for band in view.bands:
+        assert nodes[band.surface.name].visible == (band.from_m < 1.0 - 1e-6)
+    flip(switches["walls seen"], "from both sides")
+    assert {nodes[band.surface.name].side for band in view.bands} == {"double"}
+    flip(switches["returns by"], "session")
+    np.testing.assert_array_equal(nodes["returns/after"].colors, view.clouds[1].colours["session"])
+    vertices = nodes["changes/added/came"].vertices
+    assert vertices.dtype == np.float32
+    np.testing.assert_allclose(vertices, named(shown)["changes/added/came"].mesh.vertices, atol=1e-5)
+
+
+def flip(switch: Any, value: Any) -> None:
+    """Set a switch as a browser would, and run what hangs on it."""
+    switch.value = value
+    for callback in switch._impl.update_cb:
+        callback(None)
+
+
+def test_the_page_is_one_file_that_loads_nothing(shown: View, tmp_path: Path) -> None:
+    file = tmp_path / "world.html"
+    write_html(shown, file)
+    text = file.read_text()
+    assert "__VISER_EMBED_DATA__" in text
+    page = text.split("window.__VISER_EMBED_DATA__")[0] + text.split("window.__VISER_EMBED_CONFIG__")[1]
+    assert re.findall(r"""(?:src|href)\s*=\s*["']?(?!data:|#)(?:https?:)?//[^"'\s>]+""", page) == []
+    assert re.findall(r"@import|<iframe|<link[^>]+stylesheet", page) == []
+    small = tmp_path / "small.html"
+    view = View(shown.title, (), (), (), (), (), shown.eye, shown.target)
+    write_html(view, small)
+    # the walls are in the file, not a reference to them
+    assert file.stat().st_size > small.stat().st_size + 10_000
+    with pytest.raises(InputError, match=r"none/x\.html: cannot be written"):
+        write_html(view, tmp_path / "none" / "x.html")
+
+
+def test_a_taken_port_and_a_missing_viser_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket() as other:
+        other.bind(("localhost", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(InputError, match=rf"--port {port}: taken by another program"), running_server(port):
+            pass
+    usual = builtins.__import__
+
+    def without(name: str, *rest: Any, **more: Any) -> Any:
+        if name == "viser":
+            raise ImportError(name)
+        return usual(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(InputError, match=r"pip install 'tunnelcd\[view\]'"):
+        require_viser()
+
+
+def test_what_is_asked_for_is_found_or_named(pair: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert view_of(str(pair)).clouds
+    assert view_of(str(pair / "after")).bands == ()
+    for what, seed, words in (
+        (str(pair / "truth"), None, "neither a simulated pair nor a session"),
+        (str(pair), 3, "leave --seed and --set out"),
+        ("smoke/one_bo", None, 'did you mean "smoke/one_box"'),
+        (str(tmp_path / "gone"), None, "neither a folder nor a scenario"),
+        (str(tmp_path / "gone.yaml"), None, "no such file"),
+    ):
+        with pytest.raises(InputError, match=re.escape(words)):
+            view_of(what, seed)
+    (tmp_path / "two" / "before").mkdir(parents=True)
+    (tmp_path / "two" / "before" / "session.json").write_text("{}")
+    with pytest.raises(InputError, match="a pair without truth"):
+        view_of(str(tmp_path / "two"))
+    # a folder of the same name does not hide a scenario
+    (tmp_path / "smoke" / "one_box").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    assert view_of("smoke/one_box", 4).title == "smoke/one_box, seed 4"
+
+
+def test_the_command_writes_a_page_and_tells_faults_in_one_line(
+    pair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def call(*argv: str) -> tuple[int, str, list[str]]:
+        with pytest.raises(SystemExit) as caught:
+            main(["view", *argv])
+        out, err = capsys.readouterr()
+        return int(caught.value.code or 0), out, err.splitlines()
+
+    file = tmp_path / "pair.html"
+    code, out, err = call(str(pair), "--html", str(file))
+    assert (code, err) == (0, [])
+    assert out.startswith(f"{file}: {pair}, ") and file.stat().st_size > 1_000_000
+    assert call(str(pair), "--html", str(file), "--quiet") == (0, "", [])
+    missing = tmp_path / "none" / "x.html"
+    assert call(str(pair), "--html", str(missing)) == (
+        2,
+        "",
+        [f"error: --html {missing}: there is no folder {missing.parent}"],
+    )
+    code, out, err = call("smoke/one_bo", "--html", str(file))
+    assert (code, out, len(err)) == (2, "", 1)
+
+
+def test_the_server_runs_until_interrupted(
+    pair: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(_seconds: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(time, "sleep", interrupted)
+    with pytest.raises(SystemExit) as caught:
+        main(["view", str(pair / "after"), "--port", "0"])
+    out, err = capsys.readouterr()
+    assert not caught.value.code
+    assert re.fullmatch(rf"{re.escape(str(pair / 'after'))}: http://localhost:\d+ \(Ctrl-C ends\)\n", out)
+    assert err == ""
+
+
+def test_a_foreign_mesh_without_drifts_is_shown(tmp_path: Path, make_scenario: Callable[..., Scenario]) -> None:
+    solid = trimesh.creation.box(extents=(20, 4, 3)).subdivide()
+    solid.apply_translation((10, 0, 1.5))
+    solid.invert()
+    solid.export(tmp_path / "mine.stl")
+    chair = trimesh.creation.box(extents=(0.5, 0.5, 0.9))
+    chair.export(tmp_path / "chair.stl")
+    lines = "".join(f"{i} {2 + 0.5 * i} 0 0.8 0 0 0 1\n" for i in range(30))
+    (tmp_path / "drive.tum").write_text(lines)
+    plan = {"trajectory": str(tmp_path / "drive.tum")}
+    prop = Prop(
+        name="chair",
+        kind="mesh",
+        mesh=MeshFile(path=str(tmp_path / "chair.stl")),
+        place=Place(at=(10, 1.2, 0.5)),
+        change="added",
+    )
+    tunnel = Tunnel(mesh=MeshFile(path=str(tmp_path / "mine.stl")))
+    view = view_scenario(make_scenario(tunnel=tunnel, props=(prop,), before=plan, after=plan), 0)
+    parts = named(view)
+    vertices = parts["changes/added/chair"].mesh.vertices
+    np.testing.assert_allclose(vertices.min(axis=0), [9.75, 0.95, 0.0], atol=0.02)
+    assert np.ptp(parts["paths/after"].points[:, 0]) > 10
+    assert len(view.bands) > 3
