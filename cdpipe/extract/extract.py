@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from time import perf_counter
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
@@ -19,14 +20,17 @@ from cdpipe.extract.objects import PointGroup, assemble_objects
 from cdpipe.extract.point_comparison import cluster_labels, far_points_mask, inlier_mask, new_points_mask
 from cdpipe.extract.surface_rule import cut_by_surface
 from cdpipe.model.config import PipelineConfig
-from cdpipe.model.types import ChangeRegions, MergedMaps
+from cdpipe.model.report import ChangeRegions, ChangeReport
+from cdpipe.model.types import DescriptorSet, MergedMaps
 
 __all__ = [
     "FIGURES",
     "PointGroup",
     "assemble_objects",
     "cut_out",
+    "extract_changes",
     "hull_volume_m3",
+    "local_alignment",
     "region_figures",
     "with_withdrawn",
 ]
@@ -76,6 +80,48 @@ def region_figures(merged: MergedMaps, regions: ChangeRegions, groups: Sequence[
         figures["s_points"][region] = len(points)
         figures["oe_points"][region] = sum(len(group.indices) for group in added)
     return figures
+
+
+def extract_changes(
+    merged: MergedMaps,
+    regions: ChangeRegions,
+    described: tuple[DescriptorSet, DescriptorSet],
+    t_cd_s: float,
+    config: PipelineConfig,
+) -> ChangeReport:
+    """Cut the objects out of some regions, wherever these are from, and take back the regions that hold none.
+
+    Args:
+        merged: Both maps.
+        regions: Candidates; the reported ones are looked at.
+        described: Descriptors of the before and of the after session; only the scans of their keyframes are used.
+        t_cd_s: How long it took to find the regions.
+        config: All settings.
+    """
+    start = perf_counter()
+    groups = cut_out(merged, regions, config)
+    regions = with_withdrawn(regions, groups, config)
+    grouped = perf_counter()
+    objects = assemble_objects(merged, groups)
+    end = perf_counter()
+    return ChangeReport(
+        before_T_after=merged.before_T_after,
+        evidence=merged.evidence,
+        regions=regions,
+        objects=objects,
+        seconds={"t_cd_s": t_cd_s, "t_oe_s": end - start, "t_returns_s": end - grouped},
+        figures=region_figures(merged, regions, groups),
+        keyframe_scans=(described[0].keyframe_scans, described[1].keyframe_scans),
+        config=config.model_dump(),
+        local_before_T_after=local_alignment(merged, described[1]),
+    )
+
+
+def local_alignment(merged: MergedMaps, after: DescriptorSet) -> Float64Array | None:
+    """Return the (Ka, 4, 4) alignment at each after keyframe, for a report; None where it is rigid."""
+    if merged.local is None:
+        return None
+    return merged.local.at(merged.after.odom_T_sensor[after.keyframe_scans, :3, 3])
 
 
 def hull_volume_m3(points: Float64Array) -> float:

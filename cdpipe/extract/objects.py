@@ -14,7 +14,8 @@ from cdpipe.core.voxel import cell_means
 from cdpipe.extract.moves import find_moves
 from cdpipe.extract.remains import is_muck, is_part_of_a_rest
 from cdpipe.extract.shape import ground_heights, object_shape, upright_box
-from cdpipe.model.types import ChangedObject, MergedMaps, PointMap, SessionName
+from cdpipe.model.report import ChangedObject
+from cdpipe.model.types import MergedMaps, PointMap, SessionName
 
 _BLOCK_RETURNS = 1 << 22
 # An object is measured on the means of its returns in cells of this share of the map's, where there are enough in one:

@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from cdpipe.core.geometry import Float64Array, yaw_pose
 from cdpipe.core.voxel import cell_keys
-from cdpipe.model.types import ObjectShape
+from cdpipe.model.report import ObjectShape
 
 # Of so many columns nearest to a place, the median tells its ground: one false return below the floor does not.
 _GROUND_COLUMNS = 5

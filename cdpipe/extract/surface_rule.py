@@ -33,7 +33,8 @@ from cdpipe.extract.surface import (
 from cdpipe.mapping.free_space import REACH_M, free_space_votes, grazing_ray_count, n_through_and_hit
 from cdpipe.merge.registration import MIN_SPHERE_POINTS, Surface, align_to_planes
 from cdpipe.model.config import ExtractConfig
-from cdpipe.model.types import ChangeRegions, MergedMaps, PointMap, SessionName
+from cdpipe.model.report import ChangeRegions
+from cdpipe.model.types import MergedMaps, PointMap, SessionName
 
 # An object that begins inside of a sphere is followed this far out of it.
 BEYOND_M = 1.5

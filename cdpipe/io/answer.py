@@ -46,7 +46,7 @@ from cdpipe.io.answer_parts import (
     checked_document,
 )
 from cdpipe.io.session import load_arrays
-from cdpipe.model.types import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
+from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,8 @@ from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.descriptors.pooling import best_in_reach
 from cdpipe.descriptors.sphere import change_log_odds
 from cdpipe.model.config import QueryConfig
-from cdpipe.model.types import ChangeRegions, DescriptorSet, MergedMaps, UInt8Array
+from cdpipe.model.report import ChangeRegions
+from cdpipe.model.types import DescriptorSet, MergedMaps, UInt8Array
 from cdpipe.query.difference import sphere_difference
 
 # Of `ChangeRegions.direction`: whose keyframe is looked up in the other session.

@@ -15,8 +15,8 @@ from scenarios.schema import Platform, Scenario, SessionPlan
 from sim.drive.obstacles import check_clearance
 from sim.drive.odometry import drifted
 from sim.drive.path import plan_path
-from sim.drive.recorded import check_inside, read_tum
 from sim.drive.ride import ride
+from sim.placement.recorded import check_inside, read_tum
 from sim.scene import Scene, World
 
 # Revolutions and ways are compared with this much slack, so that rounding loses none.

@@ -11,9 +11,9 @@ import numpy as np
 
 from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Scenario, SessionPlan
-from sim.drive.recorded import read_tum
 from sim.geometry.raycast import Caster
 from sim.placement.placing import Standing, free_width, standing_corners, standing_height_m
+from sim.placement.recorded import read_tum
 from sim.rock.centreline import Centreline, headings_of, left_of, resample
 
 _STEP_M = 0.25

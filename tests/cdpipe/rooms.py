@@ -9,7 +9,8 @@ import numpy as np
 from cdpipe.core.geometry import Float64Array, Int64Array, make_pose, stream, transform, yaw_pose
 from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import MapConfig
-from cdpipe.model.types import ChangeRegions, PointMap, PosedScan
+from cdpipe.model.report import ChangeRegions
+from cdpipe.model.types import PointMap, PosedScan
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # its lowest and its highest corner
 

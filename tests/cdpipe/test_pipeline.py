@@ -12,7 +12,8 @@ from cdpipe.core.geometry import Float64Array, stream, yaw_pose
 from cdpipe.io.answer import read_answer, write_answer
 from cdpipe.io.readers import open_scans
 from cdpipe.model.config import ClusterConfig, ExtractConfig, MergeConfig, OutlierConfig, PipelineConfig, QueryConfig
-from cdpipe.model.types import ChangeReport, MappedSession
+from cdpipe.model.report import ChangeReport
+from cdpipe.model.types import MappedSession
 from cdpipe.pipeline import detect_changes, map_session
 
 CONFIG = PipelineConfig(

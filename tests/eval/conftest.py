@@ -9,7 +9,7 @@ import pytest
 from cdpipe.core.geometry import invert, make_pose, yaw_pose
 from cdpipe.io.session import ScanChunk, SessionWriter
 from cdpipe.sensor.ouster import SensorMetadata
-from eval.cli import main
+from eval.cli.main import main
 from sim.session.truth import PairTruth, write_labels, write_pair_truth, write_true_poses
 from tests.eval.changes import change
 

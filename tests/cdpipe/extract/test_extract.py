@@ -10,7 +10,8 @@ from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transf
 from cdpipe.extract.extract import PointGroup, assemble_objects, cut_out, hull_volume_m3, region_figures, with_withdrawn
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import ClusterConfig, ExtractConfig, OutlierConfig, PipelineConfig
-from cdpipe.model.types import ChangedObject, ChangeRegions, MergedMaps, PointMap
+from cdpipe.model.report import ChangedObject, ChangeRegions
+from cdpipe.model.types import MergedMaps, PointMap
 
 CONFIG = PipelineConfig(
     extract=ExtractConfig(method="voxel", voxel_m=0.4),

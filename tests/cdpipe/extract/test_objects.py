@@ -8,7 +8,8 @@ import pytest
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.core.voxel import cell_keys, cell_means
 from cdpipe.extract.objects import PointGroup, _Surroundings, assemble_objects
-from cdpipe.model.types import PLACES, ChangedObject, MergedMaps, PointMap, SessionName
+from cdpipe.model.report import ChangedObject
+from cdpipe.model.types import PLACES, MergedMaps, PointMap, SessionName
 
 VOXEL_M = 0.2
 STEP_M = 0.04

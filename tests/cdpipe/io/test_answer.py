@@ -8,7 +8,7 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import yaw_pose
 from cdpipe.io.answer import read_answer, write_answer, write_failure
-from cdpipe.model.types import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
+from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 
 
 def _report() -> ChangeReport:

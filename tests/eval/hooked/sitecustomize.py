@@ -1,6 +1,6 @@
 """Python imports this at the start of every process that has this folder on its path: here, workers and their children.
 
-Once `eval.pair_run` is imported, `befalling` changes it.
+Once `eval.running.pair_run` is imported, `befalling` changes it.
 """
 
 import importlib.abc
@@ -14,7 +14,7 @@ class _Finder(importlib.abc.MetaPathFinder):
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
-        if name != "eval.pair_run":
+        if name != "eval.running.pair_run":
             return None
         sys.meta_path.remove(self)
         spec = importlib.machinery.PathFinder.find_spec(name, path)

@@ -16,8 +16,8 @@ from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.io.readers import open_scans
 from cdpipe.io.session import read_session
-from eval.cli import main
-from eval.looking import view_of
+from eval.cli.looking import view_of
+from eval.cli.main import main
 from scenarios.schema import MeshFile, Place, Prop, Scenario, Shift, Tunnel
 from sim.geometry.mesh import Mesh
 from sim.scene import build_world

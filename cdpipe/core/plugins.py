@@ -1,0 +1,65 @@
+"""What others add without a change of ours: entry points of installed packages, and folders on `TUNNELCD_PATH`."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from cdpipe.core.errors import InputError
+
+METHODS = "tunnelcd.methods"
+METRICS = "tunnelcd.metrics"
+PRESETS = "tunnelcd.presets"
+SEARCH_PATH = "TUNNELCD_PATH"
+
+
+@cache
+def entry_points(group: str) -> dict[str, metadata.EntryPoint]:
+    """Return the entry points of a group by name, sorted.
+
+    Raises:
+        InputError: Two packages claim one name.
+    """
+    found: dict[str, metadata.EntryPoint] = {}
+    for entry in sorted(metadata.entry_points(group=group), key=lambda each: each.name):
+        other = found.setdefault(entry.name, entry)
+        if other.value != entry.value:
+            raise InputError(
+                f"{group}: {entry.name!r} is claimed by {other.value} and by {entry.value}: rename or uninstall one"
+            )
+    return found
+
+
+@cache
+def load_entry_point(group: str, name: str) -> Any:
+    """Return the object behind an entry point.
+
+    Raises:
+        InputError: Nothing is registered under this name, or it cannot be imported.
+    """
+    entry = entry_points(group).get(name)
+    if entry is None:
+        raise InputError(f"{group}: {name!r} is not registered (registered: {', '.join(entry_points(group))})")
+    try:
+        return entry.load()
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"{group}: {name!r} = {entry.value} cannot be imported: {error}") from error
+
+
+def search_folders(kind: str) -> tuple[Path, ...]:
+    """Return the folders `DIR/kind` of the directories on `TUNNELCD_PATH` that exist, in order.
+
+    Args:
+        kind: `presets`, `plans`, `families` or `props`.
+
+    Raises:
+        InputError: A directory on the path does not exist.
+    """
+    folders = [Path(entry) for entry in os.environ.get(SEARCH_PATH, "").split(os.pathsep) if entry]
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"{SEARCH_PATH}: {folder}: no such folder: mend or unset the variable")
+    return tuple(folder / kind for folder in folders if (folder / kind).is_dir())

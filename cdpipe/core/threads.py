@@ -1,0 +1,17 @@
+"""How many threads numeric libraries may use: one, so that the same input gives the same bytes and honest times."""
+
+from __future__ import annotations
+
+import os
+
+THREADS = 1
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+
+
+def fix_threads() -> None:
+    """Ask every numeric library for one thread, unless the user's environment names a number.
+
+    Works only before numpy and torch are first imported: these variables are read once.
+    """
+    for name in THREAD_VARIABLES:
+        os.environ.setdefault(name, str(THREADS))

@@ -1,0 +1,1 @@
+"""The speed table: each figure beside a rival of the same run."""

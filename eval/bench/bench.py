@@ -1,0 +1,167 @@
+"""The speed table: what is measured, each figure beside its rival's of the same run, and the file it goes to.
+
+A later part of the project joins with a dictionary of named functions that return `sim.studies.timing.Contest`, added
+to `contests`. Every ratio says how many times faster than its rival something is.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import suggestion
+from eval.bench.descriptor import descriptor_contests
+from eval.bench.extract import ExtractSite, extract_contests, extract_sites
+from eval.bench.merge import FailedContest, MergeSite, merge_contests, paper_sites
+from eval.core.output import make_writable, unwritable
+from eval.core.provenance import machine
+from sim.studies.bench import BenchSite, sensor_contests
+from sim.studies.timing import Contest
+
+Contests = Mapping[str, Callable[[], Contest]]
+Row = dict[str, Any]
+
+
+def contests(
+    site: BenchSite | None = None,
+    merge_sites: Sequence[MergeSite] | None = None,
+    spheres: Sequence[ExtractSite] | None = None,
+) -> dict[str, Callable[[], Contest]]:
+    """Return everything that can be measured, by name, in the order of the table."""
+    sites = merge_sites or paper_sites()
+    return {
+        **sensor_contests(site or BenchSite()),
+        **merge_contests(sites),
+        **descriptor_contests(sites),
+        **extract_contests(spheres or extract_sites()),
+    }
+
+
+def chosen(every: Contests, only: Sequence[str]) -> Contests:
+    """Return the contests of some names, or all of them if none is named.
+
+    Raises:
+        InputError: A name is unknown.
+    """
+    unknown = [name for name in only if name not in every]
+    if unknown:
+        wrong = "; ".join(f"{name!r} is no row of the table{suggestion(name, list(every))}" for name in unknown)
+        raise InputError(f"--only: {wrong} (known: {', '.join(every)})")
+    return {name: contest for name, contest in every.items() if not only or name in only}
+
+
+def measure(every: Contests, on_progress: Callable[[str, int, int], None] | None = None) -> dict[str, Any]:
+    """Run the contests one after the other.
+
+    Args:
+        every: What to measure, by name.
+        on_progress: Called with the name, how many are done, and how many there are.
+
+    Returns:
+        `machine` and `rows`, as the file has them.
+    """
+    rows = []
+    for done, (name, contest) in enumerate(every.items()):
+        if on_progress is not None:
+            on_progress(name, done, len(every))
+        rows.append(row_of(name, contest()))
+    return {"machine": machine(), "rows": rows}
+
+
+def row_of(name: str, contest: Contest) -> Row:
+    """Return one row of the table.
+
+    `value` and `rival_value` are medians over the `n` repetitions, `spread` is the distance between the quartiles of
+    `value`; `ratio` tells how many times faster than its rival it is, and `met` whether that reaches `target`. What
+    has no rival that its time can be compared with has None there. What failed has no value, `met` is False and
+    `reason` says why; it is "" everywhere else.
+    """
+    if isinstance(contest, FailedContest):
+        return _failed_row(name, contest)
+    figures = _figures(contest, contest.seconds)
+    value = float(np.median(figures))
+    rival = float(np.median(_figures(contest, contest.rival_seconds))) if contest.rival_seconds else None
+    ratio = None if rival is None else value / rival if contest.work is not None else rival / value
+    low, high = np.quantile(figures, [0.25, 0.75])
+    return {
+        "name": name,
+        "value": value,
+        "unit": contest.unit,
+        "rival": contest.rival,
+        "rival_value": rival,
+        "ratio": ratio,
+        "target": contest.target,
+        "met": None if ratio is None or contest.target is None else ratio >= contest.target,
+        "n": len(figures),
+        "spread": float(high - low),
+        "reason": "",
+    }
+
+
+def verdict(rows: Sequence[Row]) -> str:
+    """Return one line: how many targets are met, which are missed, and which had no rival to be judged by."""
+    judged = [row for row in rows if row["met"] is not None]
+    missed = [row["name"] for row in judged if not row["met"]]
+    open_ones = [row["name"] for row in rows if row["met"] is None and row["target"] is not None]
+    told = f"{len(judged) - len(missed)} of {len(judged)} targets met"
+    if missed:
+        told += f"; missed: {', '.join(missed)}"
+    if open_ones:
+        told += f"; {len(open_ones)} not judged: {', '.join(open_ones)}"
+    return told
+
+
+def reasons(rows: Sequence[Row]) -> list[str]:
+    """Return one line for every row that failed."""
+    return [f"{row['name']}: {row['reason']}" for row in rows if row["reason"]]
+
+
+def make_ready(path: Path) -> None:
+    """Find out whether the table can be written before anything is measured.
+
+    Raises:
+        InputError: It cannot.
+    """
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder: name a file for the table")
+    make_writable(path.absolute().parent)
+
+
+def write_table(table: Mapping[str, Any], path: Path) -> None:
+    """Write the table as JSON; the file appears under its name only when it is whole.
+
+    Raises:
+        InputError: It cannot be written there.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        partial.write_text(json.dumps(table, indent=1) + "\n")
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise unwritable(path, error) from error
+
+
+def _failed_row(name: str, contest: FailedContest) -> Row:
+    return {
+        "name": name,
+        "value": None,
+        "unit": contest.unit,
+        "rival": None,
+        "rival_value": None,
+        "ratio": None,
+        "target": contest.target,
+        "met": False,
+        "n": 0,
+        "spread": None,
+        "reason": contest.reason,
+    }
+
+
+def _figures(contest: Contest, seconds: Sequence[float]) -> list[float]:
+    return [each if contest.work is None else contest.work / each for each in seconds]

@@ -1,0 +1,253 @@
+"""Rows of the speed table for cutting objects out of a region, in this thread's own time.
+
+`extract-voxel-N` is what the paper times: a sphere of N points cut out of two indexed maps, the voxel comparison in one
+direction and the outlier filter on what is new. Of the default rule the comparison of both sessions with each other's
+surface stands against its limit; cutting both spheres out, indexing them as surfaces, the local re-alignment, the look
+for returns, which is one pass over both sessions whatever the number of regions, and the close look at one site have
+rows of their own. The default rule's spheres reach 1.5 m beyond their N points, where objects are followed to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import thread_time
+
+import numpy as np
+
+from cdpipe.core.geometry import Float64Array, Int64Array, transform
+from cdpipe.core.threads import THREADS
+from cdpipe.descriptors import use_threads
+from cdpipe.extract.crops import Crops, Sphere
+from cdpipe.extract.point_comparison import inlier_mask, new_points_mask
+from cdpipe.extract.surface import RIM_M, SITE_M, PlaneTable, candidates, compare_site, groups
+from cdpipe.extract.surface_rule import BEYOND_M, ReturnPool, object_cells, rays_of, realigned
+from cdpipe.mapping.free_space import free_space_votes
+from cdpipe.merge.merge import merge_maps
+from cdpipe.merge.registration import Surface
+from cdpipe.model.config import ExtractConfig, PipelineConfig, load_config
+from cdpipe.model.types import KeyframeViews, MergedMaps, SessionName
+from cdpipe.pipeline import map_session, refusal
+from eval.truth.adapters import pipeline_input
+from scenarios.library import load_scenario
+from sim.session.simulate import simulate_pair
+from sim.studies.timing import Contest, timed
+
+_REALIGN_LIMIT_S = 0.05
+# Every so many keyframes a sphere is tried; what is timed is typical of those that hold more candidates than this.
+_STRIDE, _MIN_TELLING = 2, 10
+
+
+@dataclass(frozen=True)
+class ExtractSite:
+    """A pair of sessions that objects are cut out of, simulated when it is first asked for.
+
+    Attributes:
+        n_points: Points of the after map in the sphere; part of the rows' names.
+        scenario: Name of a scenario.
+        voxel_s: Limit of the paper's rule.
+        surface_s: Limit of the default rule's comparison.
+        paper: What the paper says of its rule.
+        seed: Draws the world: one that nothing is tested on.
+        repeats: How often everything is timed.
+    """
+
+    n_points: int
+    scenario: str
+    voxel_s: float
+    surface_s: float
+    paper: str
+    seed: int = 0
+    repeats: int = 31
+
+    @cached_property
+    def config(self) -> PipelineConfig:
+        """The default method."""
+        use_threads(THREADS)
+        return load_config()
+
+    @cached_property
+    def merged(self) -> MergedMaps:
+        """Both maps, aligned along the path."""
+        with TemporaryDirectory() as folder:
+            pair = Path(folder) / "pair"
+            simulate_pair(load_scenario(self.scenario, self.seed), self.seed, pair)
+            before, after = (map_session(pipeline_input(pair, name), self.config) for name in ("before", "after"))
+        merged = merge_maps(before, after, self.config.merge)
+        if not merged.is_accepted:
+            raise refusal(merged)
+        return merged
+
+    @cached_property
+    def region(self) -> Region:
+        """Of the spheres of `n_points` points along the before path that hold a site, the one of median size."""
+        after_map = self.merged.alignment.to_map(self.merged.after.points)
+        tried = []
+        for centre in self.merged.before.odom_T_keyframe[::_STRIDE, :3, 3]:
+            gaps_m = np.linalg.norm(after_map - centre, axis=1)
+            radius_m = float(np.partition(gaps_m, self.n_points - 1)[self.n_points - 1])
+            tried.append(Region(self.merged, centre, radius_m))
+        changed = sorted(
+            (region for region in tried if len(region.telling) > _MIN_TELLING), key=lambda each: len(each.telling)
+        )
+        return changed[len(changed) // 2]
+
+
+@dataclass(frozen=True)
+class Region:
+    """One sphere of both maps, and what the default rule makes of it step by step."""
+
+    merged: MergedMaps
+    centre_map: Float64Array
+    radius_m: float
+
+    @cached_property
+    def crops(self) -> Crops:
+        """The index of both maps."""
+        return Crops(self.merged, BEYOND_M)
+
+    @cached_property
+    def spheres(self) -> dict[SessionName, Sphere]:
+        """Both spheres with the margin."""
+        return self.crops.around(self.centre_map, self.radius_m)
+
+    @cached_property
+    def before_surface(self) -> Surface:
+        """The before sphere, indexed."""
+        return Surface(self.spheres["before"].points)
+
+    def realigned(self) -> Float64Array:
+        """Align the after sphere (4, 4) with the before one."""
+        return realigned(self.spheres["after"].points, self.centre_map, self.before_surface)
+
+    @cached_property
+    def correction(self) -> Float64Array:
+        """What `realigned` gave."""
+        return self.realigned()
+
+    @cached_property
+    def after_points(self) -> Float64Array:
+        """(N, 3) the after sphere as re-aligned, map frame."""
+        return transform(self.correction, self.spheres["after"].points)
+
+    @cached_property
+    def tables(self) -> tuple[PlaneTable, PlaneTable]:
+        """The before and the after sphere, indexed and with a plane for each cell."""
+        return self.index()
+
+    def index(self) -> tuple[PlaneTable, PlaneTable]:
+        """Index both spheres."""
+        return PlaneTable(Surface(self.spheres["before"].points)), PlaneTable(Surface(self.after_points))
+
+    def compare(self) -> tuple[tuple[Int64Array, float], tuple[Int64Array, float]]:
+        """Return the candidates of the after and of the before sphere, and how well they agree with the other one."""
+        before, after = self.tables
+        return candidates(self.after_points, before), candidates(self.spheres["before"].points, after)
+
+    @cached_property
+    def telling(self) -> Int64Array:
+        """(N,) candidates of the after sphere, without its margin, that the before session saw through."""
+        chosen = self.compared[0][0]
+        chosen = chosen[self.spheres["after"].is_inside[chosen]]
+        return chosen[free_space_votes(self.after_points[chosen], _views(self.merged)) > 0]
+
+    @cached_property
+    def site(self) -> tuple[Int64Array, Int64Array]:
+        """The after and the before map points around the largest group of candidates."""
+        labels, sizes = groups(self.after_points[self.telling], SITE_M)
+        members = self.telling[labels == np.argmax(sizes)]
+        in_map = self.spheres["after"].points[members]
+        return self.crops.near("after", in_map, SITE_M), self.crops.near("before", in_map, SITE_M + RIM_M)
+
+    def pools(self) -> tuple[ReturnPool, ReturnPool]:
+        """Look for the site's returns in both sessions."""
+        own, others = self.site
+        return ReturnPool(self.merged.after, [own]), ReturnPool(self.merged.before, [others])
+
+    @cached_property
+    def returns(self) -> tuple[Int64Array, Int64Array]:
+        """The site's returns of the after and of the before session."""
+        (own, others), (own_pool, other_pool) = self.site, self.pools()
+        return own_pool.of(own), other_pool.of(others)
+
+    def look_closely(self, config: ExtractConfig) -> list[Int64Array]:
+        """Compare the returns of the largest site, look up what was seen through or passed, and grow its objects."""
+        own, others = self.returns
+        in_map = self.merged.alignment.to_map(self.merged.after.positions_of(own))
+        ends = self.merged.before.positions_of(others)
+        site = compare_site(transform(self.correction, in_map), ends)
+        noise_m = max(median_m for _, median_m in self.compared)
+        rays = partial(rays_of, self.merged, "before", others, ends, self.correction)
+        return object_cells(site, free_space_votes(site.points, _views(self.merged)), rays, noise_m, config)
+
+    @cached_property
+    def compared(self) -> tuple[tuple[Int64Array, float], tuple[Int64Array, float]]:
+        """What `compare` gave."""
+        return self.compare()
+
+
+def extract_sites() -> tuple[ExtractSite, ExtractSite]:
+    """Return the sites of the table: spheres as large as those of the paper's two."""
+    return (
+        ExtractSite(2500, "train/narrow", 0.0005, 0.0015, "0.5 ms"),
+        ExtractSite(15000, "train/wide", 0.0025, 0.006, "5.7 to 11 ms"),
+    )
+
+
+def extract_contests(sites: Sequence[ExtractSite]) -> dict[str, Callable[[], Contest]]:
+    """Return what can be measured of the extraction, by name, in the order of the table."""
+    return {name: contest for site in sites for name, contest in _rows(site)}
+
+
+def _rows(site: ExtractSite) -> Iterator[tuple[str, Callable[[], Contest]]]:
+    size = site.n_points
+    yield f"extract-voxel-{size}", partial(_voxel, site, ("after",))
+    yield f"extract-voxel-{size}-both", partial(_voxel, site, ("after", "before"))
+    steps: dict[str, tuple[Callable[[Region], object], float | None]] = {
+        "": (Region.compare, site.surface_s),
+        "-crop": (lambda region: region.crops.around(region.centre_map, region.radius_m), None),
+        "-index": (Region.index, None),
+        "-realign": (Region.realigned, _REALIGN_LIMIT_S),
+        "-returns": (Region.pools, None),
+        "-site": (lambda region: region.look_closely(site.config.extract), None),
+    }
+    for name, (step, limit_s) in steps.items():
+        yield f"extract-surface-{size}{name}", partial(_step, site, step, limit_s)
+
+
+def _step(site: ExtractSite, step: Callable[[Region], object], limit_s: float | None) -> Contest:
+    region = site.region
+    seconds = timed(lambda: step(region), site.repeats, thread_time)
+    return Contest("s", seconds) if limit_s is None else _limited(seconds, limit_s)
+
+
+def _voxel(site: ExtractSite, sessions: Sequence[SessionName]) -> Contest:
+    """Time the paper's rule on the same sphere; its alignment is one for the whole map."""
+    config = load_config("paper")
+    crops = Crops(replace(site.merged, local=None), float(np.sqrt(3.0)) * config.extract.voxel_m)
+    centre_map, radius_m = site.region.centre_map, site.region.radius_m
+
+    def once() -> None:
+        spheres = crops.around(centre_map, radius_m)
+        for session in sessions:
+            _, points = spheres[session].inside
+            others = spheres["before" if session == "after" else "after"].points
+            inlier_mask(points[new_points_mask(points, others, config.extract)], config.outlier)
+
+    seconds = timed(once, site.repeats, thread_time)
+    if len(sessions) > 1:
+        return Contest("s", seconds)
+    return _limited(seconds, site.voxel_s, f" (the paper: {site.paper})")
+
+
+def _limited(seconds: Sequence[float], limit_s: float, more: str = "") -> Contest:
+    return Contest("s", tuple(seconds), None, f"its limit, {1000 * limit_s:g} ms{more}", (limit_s,), 1.0)
+
+
+def _views(merged: MergedMaps) -> KeyframeViews:
+    if merged.before.views is None:
+        raise ValueError("the before map did not keep what its keyframes saw")
+    return merged.before.views

@@ -1,0 +1,86 @@
+"""The command line: the commands by name, and how it ends.
+
+Exit codes: 0 done, 2 the input is at fault (one line each on standard error), 1 a bug (a traceback), 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from cdpipe.core.threads import fix_threads
+from eval.cli import pair as commands_pair
+from eval.cli import run as commands_run
+from eval.cli import tools as commands_tools
+from eval.cli import training as commands_training
+from eval.cli import world as commands_world
+from eval.core.exits import input_errors
+
+
+class _Funnel(TyperGroup):
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command."""
+        try:
+            with input_errors():
+                return super().invoke(ctx)
+        except KeyboardInterrupt as error:
+            kept = _KEPT.get(ctx.invoked_subcommand or "")
+            told = f"finished {kept} are kept, the same command goes on from there" if kept else "nothing was written"
+            sys.stderr.write(f"interrupted; {told}\n")
+            raise typer.Exit(130) from error
+
+
+_KEPT = {"run": "cells", "demo": "cells", "dataset": "tunnels"}
+app = typer.Typer(
+    cls=_Funnel,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="A benchmark for change detection between two LiDAR sessions of a tunnel.",
+)
+
+# in the order in which --help tells them
+_COMMANDS: dict[str, Callable[..., None]] = {
+    "demo": commands_run.demo,
+    "simulate": commands_world.simulate,
+    "survey": commands_world.survey,
+    "view": commands_world.view,
+    "describe": commands_pair.describe,
+    "detect": commands_pair.detect,
+    "convert": commands_world.convert,
+    "score": commands_run.score,
+    "run": commands_run.run_command,
+    "report": commands_run.report,
+    "dataset": commands_training.dataset,
+    "train": commands_training.train,
+    "bench": commands_tools.bench,
+    "list": commands_tools.list_command,
+    "check": commands_tools.check,
+    "doctor": commands_tools.doctor,
+}
+for _name, _command in _COMMANDS.items():
+    app.command(_name)(_command)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line and exit."""
+    fix_threads()
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        code = app(args=words, prog_name="tunnelcd", standalone_mode=False)
+    except typer.TyperException as error:
+        command = " ".join(["tunnelcd", *(word for word in words[:1] if word in _COMMANDS)])
+        _tell_usage(command, error)
+        raise SystemExit(error.exit_code) from error
+    raise SystemExit(code)
+
+
+def _tell_usage(command: str, error: typer.TyperException) -> None:
+    """Write what typer finds wrong with a command as one line, where typer alone would draw a box."""
+    # pydantic's name of the error says nothing; choices stand below one another
+    message = " ".join(error.format_message().replace("Value error, ", "").split()).rstrip(".")
+    if message:  # none for `tunnelcd` alone, which has shown its help by now
+        sys.stderr.write(f"error: {command}: {message}: `{command} --help` tells what it takes\n")

@@ -1,0 +1,182 @@
+"""Commands about run folders: fill one, score it again, report it."""
+
+# ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from eval.cli.options import Quiet, RunOut, SetSettings, ShownViews
+from eval.cli.printed_results import print_comparison, print_results
+from eval.core.printing import print_row, say
+from eval.core.progress import shown_progress
+
+if TYPE_CHECKING:
+    from eval.core.cluster import Where
+    from eval.plans.plan import Plan
+
+
+def demo(out: RunOut, quiet: Quiet = False) -> None:
+    """Both paper sites end to end: simulate, detect, score, report."""
+    from eval.core.cluster import HERE
+    from eval.plans.plan import load_plan
+    from eval.report.page import write_page
+
+    _run(load_plan("paper"), out, HERE, force=False, limit=None, quiet=quiet)
+    page = write_page(out)
+    typer.echo(f"page: {page}")
+
+
+def run_command(
+    plan: Annotated[str, typer.Argument(help="name from `list`, or a .yaml file")],
+    out: RunOut,
+    seeds: Annotated[str | None, typer.Option(metavar="A:B", help="instead of the plan's; B excluded")] = None,
+    settings: SetSettings = None,
+    grid: Annotated[
+        list[str] | None,
+        typer.Option("--grid", metavar="KEY=V1,V2", help="run every variant at each value; repeatable"),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="processes; each takes its own pairs", show_default=False)
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="tcp://HOST:PORT", help="a Dask cluster that sees the run folder", show_default=False),
+    ] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="do at most this many cells")] = None,
+    force: Annotated[bool, typer.Option("--force", help="redo finished cells, simulation included")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="list the cells and what is finished, and stop")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Run a plan: scenarios x seeds x variants. Finished cells are kept and skipped."""
+    from eval.core.cluster import Where, require_reachable, require_usable
+    from eval.plans.changes import changed_plan
+    from eval.plans.plan import load_plan
+
+    chosen = changed_plan(load_plan(plan), seeds=seeds, settings=settings or (), grid=grid or ())
+    where = Where(workers, scheduler)
+    require_usable(where)
+    if dry_run:
+        _list_cells(chosen, out, force=force, limit=limit)
+    else:
+        require_reachable(where)
+        _run(chosen, out, where, force=force, limit=limit, quiet=quiet)
+
+
+def score(
+    folder: Annotated[Path, typer.Argument(help="a run folder; or a simulated pair, with the answer as second folder")],
+    answer: Annotated[
+        Path | None, typer.Argument(help="one answer to score against the pair", show_default=False)
+    ] = None,
+    predictions: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="another program's, DIR/<scenario>/<seed>/answer.json", show_default=False),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option("--as", metavar="NAME", help="what the run calls them", show_default=False)
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Score stored answers against the truth again, or another program's predictions; nothing is run."""
+    from cdpipe.core.errors import InputError
+
+    if (predictions is None) != (name is None):
+        raise InputError("--predictions and --as: a run takes predictions under a name: give both, or neither")
+    if answer is not None:
+        if predictions is not None:
+            raise InputError("--predictions: goes with a run folder alone, not with one pair and its answer")
+        from eval.scoring.scoring import score_pair
+
+        row = score_pair(folder, answer).row
+        if not quiet:
+            print_row(row)
+        return
+    from eval.running.predictions import add_predictions
+    from eval.running.rescoring import rescore
+    from eval.running.runfolder import open_run_folder
+
+    run = open_run_folder(folder)
+    with shown_progress(quiet) as progress:
+        if predictions is not None and name is not None:
+            n_scored, told = add_predictions(run, predictions, name, progress), f"predictions scored as {name}"
+        else:
+            n_scored, told = rescore(run, progress), "answers scored again"
+    print_results(run.path, quiet)
+    say(quiet, f"{folder}: {n_scored} {told}, tables rewritten")
+
+
+def report(
+    folder: Annotated[str, typer.Argument(metavar="RUN", help="a run folder")],
+    other: Annotated[
+        str | None,
+        typer.Argument(metavar="B", help="a second one, judged against the first; RUN:VARIANT is a method of one"),
+    ] = None,
+    against: Annotated[
+        str | None,
+        typer.Option(metavar="VARIANT", help="judge every method of the run against this one", show_default=False),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="of a comparison; else the folder judged", show_default=False)
+    ] = None,
+    views: Annotated[
+        ShownViews, typer.Option(help="3-D views beside the page: the first and the worst pairs, none, or all")
+    ] = ShownViews.chosen,
+    quiet: Quiet = False,
+) -> None:
+    """Write one offline page with tables, plots and pictures of a run; or what moved between two runs."""
+    from cdpipe.core.errors import InputError
+
+    if other is None and against is None:
+        from eval.report.page import write_page
+        from eval.running.runfolder import open_run_folder
+
+        if out is not None:
+            raise InputError("--out: the page of a run lies in its folder: leave --out to a comparison")
+        typer.echo(f"page: {write_page(open_run_folder(Path(folder)).path, views.value)}")
+        return
+    if other is not None and against is not None:
+        raise InputError(f"--against {against}: a second run is named too: write {folder}:{against} {other} instead")
+    from eval.report.comparison import compared, write_comparison
+    from eval.running.sides import read_side
+
+    first, second = (folder, other) if other is not None else (f"{folder}:{against}", folder)
+    a, b = read_side(first), read_side(second)
+    found = compared(a, b)
+    page = write_comparison(found, out or b.path)
+    if not quiet:
+        print_comparison(found)
+    typer.echo(f"page: {page}")
+
+
+def _list_cells(plan: Plan, out: Path, *, force: bool, limit: int | None) -> None:
+    from collections import Counter
+
+    from eval.running.runner import listed
+
+    every = listed(plan, out, force=force, limit=limit)
+    for cell in every:
+        typer.echo(f"{cell.state:<8}  {cell.scenario} {cell.seed} {cell.variant}")
+    count = Counter(cell.state for cell in every)
+    left = f", {count['left']} left by --limit" if count["left"] else ""
+    typer.echo(
+        f"{out}: {len(every)} cells: {count['finished']} finished, {count['to do']} to do{left}; nothing was run"
+    )
+
+
+def _run(plan: Plan, out: Path, where: Where, *, force: bool, limit: int | None, quiet: bool) -> None:
+    from eval.plans.plan import cells
+    from eval.running.runfolder import removed_if_empty, start_run_folder
+    from eval.running.runner import run_plan
+
+    cells(plan)  # settings that contradict each other are refused before a folder is made
+    command = ["tunnelcd", *sys.argv[1:]]
+    with removed_if_empty(out), shown_progress(quiet, rate="cells") as progress:
+        run = start_run_folder(out)
+        outcome = run_plan(plan, run, command=command, force=force, limit=limit, where=where, progress=progress)
+    print_results(out, quiet)
+    left = f", {outcome.n_left} left by --limit" if outcome.n_left else ""
+    died = f", {outcome.n_died} of all killed their workers" if outcome.n_died else ""
+    say(quiet, f"{out}: {outcome.n_done} cells done, {outcome.n_kept} kept from earlier{left}{died}")

@@ -1,0 +1,83 @@
+"""Commands that make training data and descriptors."""
+
+# ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from eval.cli.options import Quiet, SetSettings
+from eval.core.printing import say
+from eval.core.progress import shown_progress
+
+
+def dataset(
+    families: Annotated[list[str], typer.Argument(metavar="FAMILY...", help="names from `list`, or .yaml files")],
+    seeds: Annotated[
+        str, typer.Option(metavar="A:B", help="B excluded; below 10000 to train, 10000 to 19999 to validate")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="data folder: new, empty, or to be continued", show_default=False)],
+    settings: SetSettings = None,
+    draws: Annotated[int, typer.Option(min=1, help="after images of each keyframe; the first is merged exactly")] = 4,
+    error_m: Annotated[float, typer.Option(min=0, help="merge error of the others: shift, per component")] = 0.03,
+    error_deg: Annotated[float, typer.Option(min=0, help="and turn, per component")] = 0.2,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="processes; each takes its own tunnels", show_default=False)
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="tcp://HOST:PORT", help="a Dask cluster instead", show_default=False)
+    ] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="make at most this many tunnels")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Make training data for descriptors, a shard for each tunnel. Finished tunnels are kept and skipped."""
+    from eval.core.cluster import Where
+    from eval.training.dataset import Recipe
+    from eval.training.dataset_run import make_dataset
+
+    recipe = Recipe(draws, error_m, error_deg, tuple(settings or ()))
+    with shown_progress(quiet) as progress:
+        outcome = make_dataset(
+            families,
+            seeds,
+            recipe,
+            out,
+            Where(workers, scheduler),
+            limit,
+            shlex.join(["tunnelcd", *sys.argv[1:]]),
+            progress,
+        )
+    left = f", {outcome.n_left} left by --limit" if outcome.n_left else ""
+    refused = f", {outcome.n_refused} refused (README.md says why)" if outcome.n_refused else ""
+    rate = f"; {outcome.n_pairs} keyframe pairs, {outcome.n_pairs / outcome.seconds:.1f}/s" if outcome.n_made else ""
+    say(quiet, f"{out}: {outcome.n_made} tunnels made, {outcome.n_kept} kept from earlier{refused}{left}{rate}")
+
+
+def train(
+    data: Annotated[Path, typer.Argument(metavar="DIR", help="made by `tunnelcd dataset`, tunnels of both splits")],
+    out: Annotated[Path, typer.Option("--out", help="checkpoint, model card, curves", show_default=False)],
+    descriptor: Annotated[str, typer.Option(help="sphere or 3deg")] = "sphere",
+    steps: Annotated[int, typer.Option(min=1, help="at most")] = 4000,
+    seed: Annotated[int, typer.Option(min=0, help="of the first weights and of every draw")] = 0,
+    threads: Annotated[int, typer.Option(min=1, help="of torch")] = 2,
+    patience: Annotated[int, typer.Option(min=1, help="validations without a better score until it stops")] = 6,
+    quiet: Quiet = False,
+) -> None:
+    """Train a descriptor: checkpoint (safetensors), model card, curves. A run that was cut off goes on."""
+    from cdpipe.core.errors import InputError
+    from cdpipe.training.fit import FitConfig
+    from eval.training.training_run import TASKS, train_descriptor
+
+    if descriptor not in TASKS:
+        raise InputError(f"--descriptor {descriptor}: expected {' or '.join(TASKS)}")
+    command = shlex.join(["tunnelcd", *sys.argv[1:]])
+    with shown_progress(quiet) as progress:
+        trained = train_descriptor(
+            data, out, descriptor, FitConfig(seed, steps, patience=patience), threads, command, progress
+        )
+    scores = ", ".join(f"{name} {value}" for name, value in trained.card["validation"]["trained"].items())
+    say(quiet, f"{trained.checkpoint}: best of step {trained.card['best_step']} on validation tunnels: {scores}")

@@ -1,0 +1,118 @@
+"""What made a result: code, settings, machine and command."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from cdpipe.core.threads import THREAD_VARIABLES
+
+TOOL = "tunnelcd"
+FORMAT_VERSION = 1
+_PACKAGES = (
+    "tunnelcd", "numpy", "scipy", "pandas", "torch", "mujoco", "embreex", "trimesh", "small_gicp", "kiss-matcher",
+    "py4dgeo", "dufomap", "scikit-image", "pydantic", "matplotlib", "plotly", "distributed",
+)  # fmt: skip
+
+
+def digest(value: Any) -> str:
+    """Return a short digest of anything JSON can hold; the order of keys does not matter."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def machine() -> dict[str, Any]:
+    """Return what the machine and its thread settings are."""
+    return {
+        "platform": f"{platform.system()} {platform.machine()}",
+        "cpu": _cpu_model(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "memory_gb": _memory_gb(),
+        "threads": {name: os.environ.get(name, "unset") for name in THREAD_VARIABLES},
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that results depend on; "absent" where not installed."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "absent"
+    return found
+
+
+def describe_run(
+    plan: Mapping[str, Any], configs: Mapping[str, Any], checkpoints: Mapping[str, str], command: Sequence[str]
+) -> dict[str, Any]:
+    """Return the content of provenance.json.
+
+    Args:
+        plan: The plan as run, dumped.
+        configs: Effective settings of every "<scenario> <variant>", dumped.
+        checkpoints: Digest of the weights of every descriptor used.
+        command: The command line.
+    """
+    return {
+        "tool": TOOL,
+        "format_version": FORMAT_VERSION,
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "finished": None,
+        "command": shlex.join(command),
+        "plan": dict(plan),
+        "plan_digest": digest(plan),
+        "seeds": list(plan["seeds"]),
+        "config_digests": {name: digest(config) for name, config in configs.items()},
+        "checkpoints": dict(checkpoints),
+        "versions": versions(),
+        "git_commit": git_commit(),
+        "machine": machine(),
+    }
+
+
+def now() -> str:
+    """Return the present time, UTC, ISO 8601."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def git_commit() -> str | None:
+    """Commit of the source tree this package runs from, with "+" where files differ from it; None outside git."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    try:
+        commit = subprocess.run(
+            ["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=True, timeout=10
+        ).stdout.strip()
+        changed = subprocess.run(
+            ["git", "status", "--porcelain"], cwd=root, capture_output=True, text=True, check=True, timeout=10
+        ).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return commit + ("+" if changed else "")
+
+
+def _cpu_model() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _memory_gb() -> float | None:
+    if sys.platform == "win32":
+        return None
+    return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)

@@ -1,0 +1,155 @@
+"""From rows of results.csv to the numbers of a table: means with intervals whose unit is the session pair."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from cdpipe.core.geometry import Float64Array, stream
+from eval.core.ranking import auroc, average_precision
+
+N_RESAMPLES = 2000
+# 2^(1-6) = 3 %: six fair coins show one side; five do in 6 % of all cases
+ENOUGH_PAIRS = 6
+_NORMAL_95 = 1.959963984540054
+IDENTITY_COLUMNS = (
+    "scenario",
+    "family",
+    "domain",
+    "pair_kind",
+    "seed",
+    "variant",
+    "preset",
+    "status",
+    "error",
+    "metrics_version",
+    "score_radius_m",
+    "commit",
+    "is_contended",
+)
+
+
+def summarise(
+    results: pd.DataFrame,
+    by: Literal["scenario", "family"] = "scenario",
+    seed: int = 0,
+    keyframes: pd.DataFrame | None = None,
+) -> pd.DataFrame:
+    """Summarise every numeric column for each scenario (or family) and variant.
+
+    Args:
+        results: Rows as in results.csv, one per session pair and variant.
+        by: What to group by, beside the variant.
+        seed: Seed of the bootstrap.
+        keyframes: Keyframe rows of the same pairs (score, label, and the columns that name their row), for the AUROC
+            and AP pooled over all keyframes of a group.
+
+    Returns:
+        One row per group and metric: `statistic` (median for times, else mean), `value` over all cases with its 95 %
+        bootstrap interval `low` to `high`, `value_ok` over cases whose status is ok, `n` cases, `n_failed` of them not
+        ok, and how many had a number: `n_used`, `n_used_ok`. An undefined number (NaN) counts in neither.
+    """
+    metrics = [name for name in results.columns if name not in IDENTITY_COLUMNS]
+    rows: list[dict[str, Any]] = []
+    for (group, variant), cases in results.groupby([by, "variant"], sort=False):
+        is_ok = (cases["status"] == "ok").to_numpy()
+        names = {by: group, "variant": variant}
+        counts = {"n": len(cases), "n_failed": int(np.count_nonzero(~is_ok))}
+        for metric in metrics:
+            values = pd.to_numeric(cases[metric], errors="coerce").to_numpy(dtype=np.float64)
+            rows.append({**names, "metric": metric, **_summary(metric, values, is_ok, seed), **counts})
+        if keyframes is not None:
+            of_group = keyframes[(keyframes[by] == group) & (keyframes["variant"] == variant)]
+            rows += [{**names, **pooled, **counts} for pooled in _pooled(of_group)]
+    columns = [by, "variant", "metric", "statistic", "value", "low", "high", "value_ok"]
+    return pd.DataFrame(rows, columns=[*columns, "n", "n_failed", "n_used", "n_used_ok"])
+
+
+def bootstrap_interval(
+    values: Float64Array, statistic: Literal["mean", "median"] = "mean", seed: int = 0
+) -> tuple[float, float]:
+    """Return the 95 % percentile interval of the mean or median of (N,) numbers, one for each session pair.
+
+    Pairs are drawn with replacement; NaN among them is left out after drawing. NaN for fewer than two numbers: one pair
+    says nothing about how pairs vary.
+    """
+    if np.count_nonzero(~np.isnan(values)) < 2:
+        return float("nan"), float("nan")
+    draws = stream(seed, "bootstrap").integers(len(values), size=(N_RESAMPLES, len(values)))
+    samples = values[draws]
+    samples = samples[~np.isnan(samples).all(axis=1)]
+    results = np.nanmean(samples, axis=1) if statistic == "mean" else np.nanmedian(samples, axis=1)
+    low, high = np.percentile(results, (2.5, 97.5))
+    return float(low), float(high)
+
+
+def mean_with_interval(values: Float64Array, seed: int = 0) -> tuple[float, float, float, int]:
+    """Return mean, low and high of its 95 % bootstrap interval, and how many of (N,) numbers are not NaN.
+
+    Without a number all are NaN, and for a single one the interval is.
+    """
+    values = values[~np.isnan(values)]
+    low, high = bootstrap_interval(values, seed=seed)
+    return _of_numbers(values, "mean"), low, high, len(values)
+
+
+def wilson_interval(n_hits: int, n: int) -> tuple[float, float]:
+    """Return the 95 % Wilson score interval of the share of `n` pairs that are hits; NaN for none.
+
+    Unlike the bootstrap it has a width where all pairs agree: 20 of 20 is 0.84 to 1.
+    """
+    if n == 0:
+        return float("nan"), float("nan")
+    share, z2 = n_hits / n, _NORMAL_95**2
+    centre = (share + z2 / (2 * n)) / (1 + z2 / n)
+    half = _NORMAL_95 / (1 + z2 / n) * float(np.sqrt(share * (1 - share) / n + z2 / (4 * n * n)))
+    return max(centre - half, 0.0), min(centre + half, 1.0)
+
+
+def _summary(
+    metric: str, values: Float64Array, is_ok: np.ndarray[Any, np.dtype[np.bool_]], seed: int
+) -> dict[str, Any]:
+    statistic: Literal["mean", "median"] = "median" if metric.startswith("t_") else "mean"
+    low, high = bootstrap_interval(values, statistic, seed)
+    return {
+        "statistic": statistic,
+        "value": _of_numbers(values, statistic),
+        "low": low,
+        "high": high,
+        "value_ok": _of_numbers(values[is_ok], statistic),
+        "n_used": int(np.count_nonzero(~np.isnan(values))),
+        "n_used_ok": int(np.count_nonzero(~np.isnan(values[is_ok]))),
+    }
+
+
+def _of_numbers(values: Float64Array, statistic: Literal["mean", "median"]) -> float:
+    values = values[~np.isnan(values)]
+    if len(values) == 0:
+        return float("nan")
+    return float(values.mean() if statistic == "mean" else np.median(values))
+
+
+def _pooled(keyframes: pd.DataFrame) -> list[dict[str, Any]]:
+    used = keyframes[keyframes["label"] >= 0]
+    scores = used["score"].to_numpy(dtype=np.float64)
+    is_positive = used["label"].to_numpy() == 1
+    n_pairs = int(used.groupby(["scenario", "seed"]).ngroups)
+    nan = float("nan")
+    return [
+        {
+            "metric": f"{name}_pooled",
+            "statistic": "pooled",
+            "value": value,
+            "low": nan,
+            "high": nan,
+            "value_ok": value,
+            "n_used": n_pairs,
+            "n_used_ok": n_pairs,
+        }
+        for name, value in (
+            ("region_auroc", auroc(scores, is_positive)),
+            ("region_ap", average_precision(scores, is_positive)),
+        )
+    ]

@@ -1,0 +1,1 @@
+"""Stages composed from the truth, for upper bounds."""

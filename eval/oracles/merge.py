@@ -1,0 +1,98 @@
+"""Merges composed from the truth, for upper bounds: what the later stages do where the merge is right, or off by E.
+
+For every after keyframe j and its truly nearest before keyframe i, the after odom frame is put where the truth says:
+before_T_after(j) = odomB_T_i (true i_T_j) E (odomA_T_j)^-1, so that `merge_error` at j is E and nothing else. The
+pipeline's stages get the merged maps alone.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.geometry import Float64Array, invert, stream
+from cdpipe.core.yamlfile import Settings
+from cdpipe.model.alignment import PathAlignment
+from cdpipe.model.types import MappedSession, MergedMaps
+from eval.scoring.merge_metrics import PAIR_RADIUS_M
+from eval.truth.ground_truth import SessionTruth
+
+NO_SECONDS = {"t_index_s": 0.0, "t_merge_s": 0.0, "t_refine_s": 0.0}
+
+
+class OracleMerge(Settings):
+    """How far the oracle's merge is off: E of every keyframe has this translation and this angle."""
+
+    noise_m: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    noise_deg: Annotated[float, Field(ge=0, le=180)] = 0.0
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """The noise as `key=value`, both keys; nothing where there is none."""
+        if self.noise_m == self.noise_deg == 0:
+            return ()
+        written = (np.format_float_positional(value, trim="-") for value in (self.noise_m, self.noise_deg))
+        return tuple(f"{key}={value}" for key, value in zip(("noise_m", "noise_deg"), written, strict=True))
+
+
+def merged_by_truth(
+    before: MappedSession,
+    after: MappedSession,
+    truth: tuple[SessionTruth, SessionTruth],
+    noise: OracleMerge,
+    seed: int,
+) -> MergedMaps:
+    """Merge two mapped sessions as the truth says, off by the noise.
+
+    Args:
+        before: The before session.
+        after: The after session.
+        truth: Of both.
+        noise: Size of the error; its direction and axis are drawn from (seed, "oracle-merge") and stand still in the
+            map frame.
+        seed: The pair's.
+
+    Returns:
+        The maps with one alignment for each after keyframe (`local`; one farther than 5 m from every before keyframe
+        takes that of the nearest keyframe, in the world, that is not) and that of the middle one of those as
+        `before_T_after`; refused where no after keyframe has a before keyframe within 5 m.
+    """
+    scans_i, scans_j = before.descriptors.keyframe_scans, after.descriptors.keyframe_scans
+    world_T_i, world_T_j = truth[0].world_T_sensor[scans_i], truth[1].world_T_sensor[scans_j]
+    evidence = {"n_hypotheses": 0.0}
+    distance_m, nearest = (np.asarray(found) for found in cKDTree(world_T_i[:, :3, 3]).query(world_T_j[:, :3, 3]))
+    paired = np.flatnonzero(distance_m <= PAIR_RADIUS_M)
+    if len(paired) == 0:
+        reason = f"by the truth no after keyframe has a before keyframe within {PAIR_RADIUS_M:g} m"
+        return MergedMaps(before.map, after.map, np.eye(4), evidence, False, reason, None, NO_SECONDS)
+    i = nearest[paired]
+    odom_T_i, odom_T_j = truth[0].odom_T_sensor[scans_i[i]], truth[1].odom_T_sensor[scans_j]
+    map_T_j = odom_T_i @ invert(world_T_i[i]) @ world_T_j[paired]
+    of_paired = _displaced(map_T_j, noise, seed) @ invert(odom_T_j[paired])
+    _, taken = cKDTree(world_T_j[paired, :3, 3]).query(world_T_j[:, :3, 3])
+    before_T_after = of_paired[np.asarray(taken)]
+    before_T_after[paired] = of_paired  # of two at the same place each keeps its own
+    return MergedMaps(
+        before.map,
+        after.map,
+        before_T_after[paired[len(paired) // 2]],
+        evidence,
+        True,
+        local=PathAlignment(odom_T_j[:, :3, 3], before_T_after),
+        seconds=NO_SECONDS,
+    )
+
+
+def _displaced(map_T_j: Float64Array, noise: OracleMerge, seed: int) -> Float64Array:
+    """Return (P, 4, 4) poses shifted, and turned about themselves, by the same vectors of the map frame."""
+    draw = stream(seed, "oracle-merge")
+    direction, axis = (vector / np.linalg.norm(vector) for vector in draw.normal(size=(2, 3)))
+    turn = Rotation.from_rotvec(np.deg2rad(noise.noise_deg) * axis).as_matrix()
+    displaced = map_T_j.copy()
+    displaced[:, :3, :3] = turn @ map_T_j[:, :3, :3]
+    displaced[:, :3, 3] += noise.noise_m * direction
+    return displaced

@@ -1,0 +1,69 @@
+"""Regions composed from the truth, for upper bounds: what extraction does where every change has a region around it.
+
+The pipeline's stages get the regions alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from cdpipe.core.geometry import Int64Array
+from cdpipe.extract.extract import extract_changes
+from cdpipe.methods.registry import Method
+from cdpipe.model.config import PipelineConfig, QueryConfig
+from cdpipe.model.report import ChangeRegions, ChangeReport
+from cdpipe.model.types import DescriptorSet, MergedMaps
+from cdpipe.query.query import rank_regions
+from eval.scoring.region_metrics import places_in_map
+from eval.truth.ground_truth import GroundTruth
+
+Regions = Callable[[tuple[Int64Array, Int64Array]], ChangeRegions]
+
+
+def regions_by_truth(
+    truth: GroundTruth, keyframe_scans: tuple[Int64Array, Int64Array], config: QueryConfig
+) -> ChangeRegions:
+    """Return a region around each observable change, but for those that the region of a larger one suppresses.
+
+    A centre is the centroid of the change's truth, carried into the map frame through the true pose of the before
+    keyframe truly nearest to it; its pair are the keyframes truly nearest to it. Changes with more cells of truth come
+    first: what is suppressed is the smaller one, which is likelier to lie whole in the sphere of the larger.
+
+    Args:
+        truth: The pair's truth.
+        keyframe_scans: Scans of the before and of the after keyframes, at least one of each.
+        config: `radius_m` and `suppression` are used.
+
+    Returns:
+        The regions, all reported with score 1; no keyframe has a score, for keyframes were not ranked.
+    """
+    n_cells = np.array([len(rows) for rows in truth.change_rows], dtype=np.int64)
+    chosen = np.flatnonzero(truth.is_observable)
+    chosen = chosen[np.argsort(-n_cells[chosen], kind="stable")]
+    places_world = truth.centroids_world[chosen].reshape(-1, 3)
+    nearest = [
+        np.asarray(cKDTree(session.world_T_sensor[scans, :3, 3]).query(places_world)[1], dtype=np.int64)
+        for session, scans in zip((truth.before, truth.after), keyframe_scans, strict=True)
+    ]
+    return rank_regions(
+        centres_map=places_in_map(places_world, truth.before, keyframe_scans[0]),
+        scores=np.ones(len(chosen)),
+        pairs=np.column_stack(nearest),
+        keyframe_scores=np.zeros(0),
+        config=config.model_copy(update={"threshold": 1.0, "n_regions": None}),
+    )
+
+
+def with_regions(propose: Regions) -> Method:
+    """Return the pipeline's comparison with its regions from elsewhere; finding these takes no time."""
+
+    def compare(
+        merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig
+    ) -> ChangeReport:
+        regions = propose((before.keyframe_scans, after.keyframe_scans))
+        return extract_changes(merged, regions, (before, after), 0.0, config)
+
+    return compare

@@ -1,0 +1,1 @@
+"""What is run: plans, their worlds, variants and grids; the shipped plans lie here."""

@@ -1,0 +1,104 @@
+"""A plan as the command line changes it: --seeds, --set and --grid."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import yaml
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import Document, validated
+from eval.plans.parts import acts_on_true_regions, key_of, valid_setting, valid_settings
+from eval.plans.plan import Plan, parse_seeds
+from eval.plans.worlds import group_of
+
+
+def changed_plan(
+    plan: Plan, *, seeds: str | None = None, settings: Sequence[str] = (), grid: Sequence[str] = ()
+) -> Plan:
+    """Return the plan with --seeds, --set and --grid of the command line applied.
+
+    Args:
+        plan: The plan.
+        seeds: "A:B", replaces the plan's seeds.
+        settings: `key=value`, written over every variant and every grid point.
+        grid: `key=v1,v2`; every variant is run at every combination. The plan's own grids stay as they are. Variants
+            that are merged by the truth get neither settings nor grids of `merge`, those whose regions are the truth's
+            none of `query` but radius and suppression.
+
+    Raises:
+        InputError: One of them cannot be read, or its key or value is wrong.
+    """
+    _refuse_mistakes(seeds, settings, grid)
+    axes = [_grid_axis(text) for text in grid]
+    document = plan.model_dump(mode="json")
+    if seeds is not None:
+        document["seeds"] = parse_seeds(seeds)
+    overridden = {key_of(setting) for setting in (*settings, *itertools.chain(*axes))}
+    document["variants"] = [
+        {
+            **variant,
+            "set": [*_without(variant["set"], overridden), *added],
+            "per_scenario": {name: _without(own, overridden) for name, own in variant["per_scenario"].items()},
+        }
+        for variant in document["variants"]
+        for added in _additions(variant, axes, settings)
+    ]
+    for each in document["grid"]:
+        each["keys"].update({key_of(setting): [yaml.safe_load(setting.partition("=")[2])] for setting in settings})
+    return validated(Plan, Document(f"plan {plan.name} with the settings of the command line", document))
+
+
+def _additions(
+    variant: Mapping[str, Any], axes: Sequence[Sequence[str]], settings: Sequence[str]
+) -> list[tuple[str, ...]]:
+    """Return what the command line adds to a variant, once for each copy of it."""
+    if "oracle_merge" in variant:
+        axes = [axis for axis in axes if group_of(axis[0]) != "merge"]
+        settings = [setting for setting in settings if group_of(setting) != "merge"]
+    if variant.get("oracle_regions"):
+        axes = [axis for axis in axes if acts_on_true_regions(axis[0])]
+        settings = [setting for setting in settings if acts_on_true_regions(setting)]
+    return [(*point, *settings) for point in itertools.product(*axes)]
+
+
+def _refuse_mistakes(seeds: str | None, settings: Sequence[str], grid: Sequence[str]) -> None:
+    """Check every option, and tell all mistakes at once."""
+    checks: list[tuple[str, Callable[[], object]]] = []
+    if seeds is not None:
+        checks.append((f"--seeds {seeds}", partial(parse_seeds, seeds)))
+    checks += [(f"--set {setting}", partial(valid_setting, setting)) for setting in settings]
+    checks += [(f"--grid {text}", partial(_check_axis, text)) for text in grid]
+    axes = [key_of(text) for text in grid if "=" in text]
+    keys = [*axes, *{key_of(setting) for setting in settings}]
+    mistakes = [
+        f"--grid {key}: set twice, by another --grid or by --set, so that cells would be one: leave one out"
+        for key in dict.fromkeys(axes)
+        if keys.count(key) > 1
+    ]
+    for option, check in checks:
+        try:
+            check()
+        except ValueError as error:
+            mistakes.append(f"{option}: {error}")
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+
+
+def _check_axis(text: str) -> None:
+    key, equals, values = text.partition("=")
+    if not equals or not key or not all(values.split(",")):
+        raise ValueError("expected key=v1,v2, e.g. extract.voxel_m=0.2,0.4")
+    valid_settings(_grid_axis(text))
+
+
+def _grid_axis(text: str) -> list[str]:
+    key, _, values = text.partition("=")
+    return [f"{key}={value}" for value in values.split(",")]
+
+
+def _without(settings: Iterable[str], keys: set[str]) -> list[str]:
+    return [setting for setting in settings if key_of(setting) not in keys]

@@ -1,0 +1,142 @@
+"""The parts of a plan that name methods: variants and grids, and whether their settings exist and do anything."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from typing import Annotated, Any
+
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
+
+from cdpipe.core.yamlfile import Document, Settings, suggestion, validated, with_settings
+from cdpipe.model.config import PipelineConfig, load_config, preset_names
+from eval.oracles.merge import OracleMerge
+from eval.plans.worlds import OneOrMore, group_of, known_label, setting_text, told_as_values
+from scenarios.schema import Scenario
+
+# what a region around each change still takes from the query
+_OF_TRUE_REGIONS = ("query.radius_m", "query.suppression")
+
+
+def acts_on_true_regions(setting: str) -> bool:
+    """Tell whether a setting does anything where the regions are the truth's."""
+    return group_of(setting) != "query" or key_of(setting) in _OF_TRUE_REGIONS
+
+
+def key_of(setting: str) -> str:
+    """Return the key of a `key=value`."""
+    return setting.partition("=")[0]
+
+
+def valid_setting(setting: str) -> str:
+    """Return a `key=value` of the method, if there is such a key and it takes this value.
+
+    Raises:
+        ValueError: There is none, or it belongs to the world.
+    """
+    if group_of(setting) in Scenario.model_fields:
+        raise ValueError(
+            "belongs to the world, not to the method: set it in the plan, under scenarios, "
+            f'e.g. {{name: narrow, set: ["{setting}"]}}'
+        )
+    told_as_values(lambda: validated(PipelineConfig, with_settings(Document("", {}), [setting])))
+    return setting
+
+
+def valid_settings(settings: Iterable[str]) -> None:
+    """Check some `key=value` of the method.
+
+    Raises:
+        ValueError: What is wrong with any of them, all in one.
+    """
+    mistakes = []
+    for setting in settings:
+        try:
+            valid_setting(setting)
+        except ValueError as error:
+            mistakes.append(str(error))
+    if mistakes:
+        raise ValueError("; ".join(dict.fromkeys(mistakes)))
+
+
+def _known_preset(name: str) -> str:
+    if name.endswith((".yaml", ".yml")):
+        told_as_values(lambda: load_config(name))
+    elif name not in preset_names():
+        raise ValueError(f"unknown preset{suggestion(name, preset_names())} (known: {', '.join(preset_names())})")
+    return name
+
+
+def _valid_keys(keys: dict[str, tuple[Any, ...]]) -> dict[str, tuple[Any, ...]]:
+    valid_settings(setting_text(key, value) for key, values in keys.items() for value in values)
+    return keys
+
+
+def _not_empty(value: Any) -> Any:
+    # pydantic's own min_length counts only the items that passed, and so repeats their mistakes
+    if isinstance(value, list | dict | tuple) and not value:
+        raise ValueError("at least one is needed")
+    return value
+
+
+def _with_braces(value: Any) -> Any:
+    # a bare `oracle_merge:` would be no oracle at all, and nothing would tell
+    if not isinstance(value, dict | OracleMerge):
+        raise ValueError("expected {noise_m: ..., noise_deg: ...}; {} is without noise")
+    return value
+
+
+Label = Annotated[str, AfterValidator(known_label)]
+PresetName = Annotated[str, AfterValidator(_known_preset)]
+Setting = Annotated[str, AfterValidator(valid_setting)]
+MethodSettings = Annotated[tuple[Setting, ...], OneOrMore]
+NotEmpty = BeforeValidator(_not_empty)
+Values = Annotated[tuple[Any, ...], NotEmpty]
+
+
+class Variant(Settings):
+    """One method to run: a preset and what is set over it, perhaps merged or told its regions by the truth."""
+
+    preset: PresetName
+    set: MethodSettings = ()
+    per_scenario: dict[Label, MethodSettings] = Field(default_factory=dict)
+    scenarios: Annotated[tuple[Label, ...], OneOrMore] = ()
+    oracle_merge: Annotated[OracleMerge | None, BeforeValidator(_with_braces)] = None
+    oracle_regions: bool = False
+
+    @model_validator(mode="after")
+    def _settings_act(self) -> Variant:
+        for setting in self.every_setting:
+            if self.oracle_merge is not None and group_of(setting) == "merge":
+                raise ValueError(f"{setting} does nothing: this variant is merged by the truth; leave it out")
+            if self.oracle_regions and not acts_on_true_regions(setting):
+                raise ValueError(f"{setting} does nothing: this variant's regions are the truth's; leave it out")
+        return self
+
+    @property
+    def every_setting(self) -> tuple[str, ...]:
+        """What is set over the preset anywhere."""
+        return (*self.set, *itertools.chain(*self.per_scenario.values()))
+
+    @model_serializer(mode="wrap")
+    def _as_written(self, handler: SerializerFunctionWrapHandler) -> Any:
+        return {
+            key: value
+            for key, value in handler(self).items()
+            if value is not None and value is not False and (key != "scenarios" or value)
+        }
+
+
+class Grid(Settings):
+    """Every combination of some values of some settings, over one preset."""
+
+    variant: PresetName
+    scenarios: Annotated[tuple[Label, ...], NotEmpty]
+    keys: Annotated[dict[str, Values], NotEmpty, AfterValidator(_valid_keys)]

@@ -1,0 +1,141 @@
+"""Variants and grids spread out over the worlds of a plan: methods with their names, and cells."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from cdpipe.core.errors import InputError
+from cdpipe.model.config import PipelineConfig, Site, load_config
+from eval.oracles.merge import OracleMerge
+from eval.plans.worlds import World, setting_text
+
+if TYPE_CHECKING:
+    from eval.plans.plan import Plan
+
+ORACLE_MERGE, ORACLE_REGIONS = "oracle-merge", "oracle-regions"
+_ORACLE_PRESET = "tunnelcd"
+Until = Literal["merge"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cell:
+    """One scenario, one seed, one variant: one row of results.csv.
+
+    Attributes:
+        scenario: Label of its world: the scenario's name, and what is set over it in brackets.
+        seed: Its seed.
+        preset: Name of the preset.
+        variant: Preset and the settings that name the variant.
+        config: The effective settings.
+        oracle: What merges instead of the method, or None.
+        until: Where it ends, None for the whole method.
+        oracle_regions: Whether the regions are the truth's.
+    """
+
+    scenario: str
+    seed: int
+    preset: str
+    variant: str
+    config: PipelineConfig
+    oracle: OracleMerge | None = None
+    until: Until | None = None
+    oracle_regions: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """A variant or a grid point in one world: settings that make its name, and those that the site asks for."""
+
+    preset: str
+    named: tuple[str, ...]
+    silent: tuple[str, ...] = ()
+    site: Site = "narrow"
+    oracle: OracleMerge | None = None
+    oracle_regions: bool = False
+
+    @property
+    def variant(self) -> str:
+        """What it is called in tables."""
+        return variant_name(self.preset, self.named, self.oracle, oracle_regions=self.oracle_regions)
+
+    def config(self) -> PipelineConfig:
+        """Return its effective settings.
+
+        Raises:
+            InputError: They contradict each other or its preset.
+        """
+        config = load_config(self.preset, [*self.named, *self.silent], self.site)
+        if self.oracle_regions and config.method != "descriptor":
+            raise InputError(f"{self.variant}: oracle_regions is for method: descriptor, this one is {config.method}")
+        return config
+
+    def cell(self, world: World, seed: int, config: PipelineConfig, until: Until | None) -> Cell:
+        """Return what it is to do with one seed of a world."""
+        return Cell(
+            scenario=world.label,
+            seed=seed,
+            preset=_stem(self.preset),
+            variant=self.variant,
+            config=config,
+            oracle=self.oracle,
+            until=until,
+            oracle_regions=self.oracle_regions,
+        )
+
+
+def methods_of(plan: Plan, world: World) -> list[Method]:
+    """Return the methods that a plan runs in one of its worlds: its variants, then the points of the grids there."""
+    places = dict.fromkeys((world.name, world.label))
+    site: Site = "narrow" if places.keys().isdisjoint(plan.wide) else "wide"
+    methods = [
+        Method(
+            preset=variant.preset,
+            named=variant.set,
+            silent=tuple(setting for place in places for setting in variant.per_scenario.get(place, ())),
+            site=site,
+            oracle=variant.oracle_merge,
+            oracle_regions=variant.oracle_regions,
+        )
+        for variant in plan.variants
+        if not variant.scenarios or world.label in variant.scenarios
+    ]
+    for grid in plan.grid:
+        if not places.keys().isdisjoint(grid.scenarios):
+            methods += [Method(grid.variant, point, site=site) for point in _points(grid.keys)]
+    return methods
+
+
+def variant_name(
+    preset: str, settings: Iterable[str], oracle: OracleMerge | None = None, *, oracle_regions: bool = False
+) -> str:
+    """Return the preset's name, followed by its settings in brackets where there are any.
+
+    What takes its merge or its regions from the truth is called `oracle-merge`, `oracle-regions` or, both, joined by a
+    plus; any preset but `tunnelcd` and the noise of the merge come first in the brackets.
+    """
+    stem = _stem(preset)
+    if oracle is not None or oracle_regions:
+        of_preset = [] if stem == _ORACLE_PRESET else [f"preset={stem}"]
+        settings = (*of_preset, *(() if oracle is None else oracle.settings), *settings)
+        stem = "+".join([ORACLE_MERGE] * (oracle is not None) + [ORACLE_REGIONS] * oracle_regions)
+    joined = ",".join(settings)
+    return f"{stem}[{joined}]" if joined else stem
+
+
+def slug(variant: str) -> str:
+    """Return a variant's name as a folder name."""
+    return re.sub(r"[^A-Za-z0-9._=,-]", "_", variant)
+
+
+def _points(keys: Mapping[str, Sequence[Any]]) -> list[tuple[str, ...]]:
+    axes = [[setting_text(key, value) for value in values] for key, values in keys.items()]
+    return list(itertools.product(*axes))
+
+
+def _stem(preset: str) -> str:
+    return Path(preset).stem if preset.endswith((".yaml", ".yml")) else preset

@@ -1,0 +1,91 @@
+"""The figures that two runs, or two methods, are compared by: where each comes from, and which direction is better."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from eval.core.domains import domain_of
+from eval.tables.columns import RESULT_COLUMNS, Column, fine, share, significant
+from eval.tables.merge_table import TARGETS, is_within_target, kinds, numbers, texts
+
+POOLED = "recall_at_0.1"
+POOLED_RATE_PER_100M = 0.1
+# kinds of pair at which a refusal can be right
+_REFUSABLE = ("smooth", "disjoint")
+_SHOWN = {column.key: column for column in RESULT_COLUMNS}
+
+
+def _kilobytes(value: float) -> str:
+    return significant(value / 1000.0)
+
+
+COMPARED = (
+    Column("is_answered", "answered", "high", share,
+           "Share of the pairs with an answer, where refusing the merge is never right.", ""),
+    Column("is_within_target", "merge within target", "high", share,
+           "Share of the pairs whose merge does what their kind asks.", ""),
+    _SHOWN["region_recall"],
+    _SHOWN["region_precision"],
+    _SHOWN["region_recall_at_k"],
+    Column(POOLED, "recall at 0.1 false / 100 m", "high", share,
+           "Changes of all pairs together found at the lowest threshold with at most 0.1 false regions per 100 m, set "
+           "anew in every draw of pairs.", "Undefined without regions.csv and changes.csv."),
+    _SHOWN["region_auroc"],
+    _SHOWN["false_regions_per_100m"],
+    Column("is_alarm", "alarm where nothing changed", "low", share,
+           "Share of the unchanged pairs with a reported region.", "Undefined for changed and refused pairs."),
+    _SHOWN["object_iou_point"],
+    Column("object_iou_voxel", "object voxel IoU", "high", share, "The same with 0.1 m voxels, mean over 8 grids.", ""),
+    _SHOWN["object_f1_50"],
+    _SHOWN["kind_accuracy"],
+    _SHOWN["merge_error_m"],
+    _SHOWN["merge_error_deg"],
+    replace(_SHOWN["merge_error_m"], key="merge_error_m_p95", heading="merge error, 95th percentile [m]", shown=fine),
+    _SHOWN["t_total_s"],
+    Column("t_total_with_merge_s", "time with merge [s]", "low", significant,
+           "The same and indexing, merge, refinement.", ""),
+    Column("bytes_regions_before", "kept of the before map [kB]", "low", _kilobytes,
+           "What a method keeps of the before session to find regions.", ""),
+)  # fmt: skip
+
+
+def figures_of(results: pd.DataFrame) -> pd.DataFrame:
+    """Return the compared figures of every row of results.csv, without the pooled one.
+
+    Args:
+        results: Rows as in results.csv.
+
+    Returns:
+        The same rows with `scenario`, `seed`, `variant`, `domain` and a number for each compared column that is there.
+    """
+    kind = kinds(results)
+    answered = np.where(np.isin(kind, _REFUSABLE), np.nan, (results["status"] == "ok").to_numpy(dtype=np.float64))
+    within = np.where(np.isin(kind, list(TARGETS)), is_within_target(results).astype(np.float64), np.nan)
+    family = texts(results, "family" if "family" in results else "scenario")
+    columns = {
+        "scenario": results["scenario"].astype(str).to_numpy(),
+        "seed": results["seed"].to_numpy().astype(np.int64),
+        "variant": results["variant"].astype(str).to_numpy(),
+        "domain": [domain_of(name) for name in family],
+        "is_answered": answered,
+        "is_within_target": within,
+    }
+    stored = [column.key for column in COMPARED if column.key not in (*columns, POOLED) and column.key in results]
+    return pd.DataFrame({**columns, **{key: _as_numbers(results, key) for key in stored}})
+
+
+def is_time(key: str) -> bool:
+    """Tell whether a column is a time, which says as much about the machine as about the method."""
+    return key.startswith("t_")
+
+
+def _as_numbers(results: pd.DataFrame, key: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Return a column as numbers; truth values that a table held beside empty cells are read back as texts."""
+    if results[key].dtype == bool:
+        return results[key].to_numpy(dtype=np.float64)
+    words = {"true": 1.0, "false": 0.0}
+    mapped = results[key].map(lambda value: words.get(str(value).lower(), value))
+    return numbers(results.assign(**{key: mapped}), key)

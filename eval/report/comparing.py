@@ -1,0 +1,192 @@
+"""What moved between two runs, or between two methods of one, and whether it is more than noise.
+
+Every figure is paired: the difference B - A is taken pair by pair, over the session pairs that both sides have, and its
+interval is a bootstrap over those pairs. A verdict needs an interval that leaves out 0 and six pairs or more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cdpipe.core.errors import InputError
+from eval.core.statistics import ENOUGH_PAIRS, mean_with_interval
+from eval.report.compared_columns import COMPARED, POOLED, POOLED_RATE_PER_100M, figures_of, is_time
+from eval.running.sides import Side, check_versions, matched_variants
+from eval.tables.region_curves import PAIR, interval_of, ranked_pairs, recall_at, resampled_recalls
+from eval.tables.region_table import ALL_DOMAINS, DOMAINS
+
+BETTER, WORSE, NOISE = "better", "worse", "no difference beyond noise"
+SAME, TOO_FEW, NOT_JUDGED = "the same", "too few pairs", "not judged"
+COLUMNS = (
+    "scope", "where", "variant_a", "variant_b", "metric", "good", "n_pairs", "n_used", "n_only_a", "n_only_b",
+    "mean_a", "mean_b", "difference", "low", "high", "verdict",
+)  # fmt: skip
+_ORDER = {column.key: place for place, column in enumerate(COMPARED)}
+# columns of results.csv, regions.csv and changes.csv without which no candidate can be ranked
+_NEEDED = (
+    {"n_observable", "score_radius_m", "after_path_m", "status"}, {"score", "found_changes", *PAIR},
+    {"id", "is_observable", "n_truth_cells", *PAIR},
+)  # fmt: skip
+
+
+def compare(a: Side, b: Side, *, times_count: bool = True, seed: int = 0) -> pd.DataFrame:
+    """Compare every variant that both sides have, or the one of a side with those of the other, pair by pair.
+
+    Args:
+        a: What is compared with.
+        b: What is judged.
+        times_count: Whether times may be judged: both runs are of one machine that did nothing else.
+        seed: Seed of the bootstrap.
+
+    Returns:
+        One row for each scenario and each domain, variant and figure with a number on both sides: `scope` ("domain",
+        "scenario"); `where`, its name, `all` for both domains; `variant_a`, `variant_b`; `metric`; `good`, the
+        direction; `n_pairs` that both sides have, `n_used` of them with a number on both, `n_only_a` and `n_only_b`
+        with one on one side only; `mean_a`, `mean_b` over the used ones, their `difference` (b - a), its 95 % interval
+        `low` to `high` over session pairs; `verdict` on B. Pooled recall has the recalls in place of means.
+
+    Raises:
+        InputError: The sides share no session pair, or their metrics versions differ.
+    """
+    check_versions(a, b)
+    figures = [figures_of(side.results) for side in (a, b)]
+    rows: list[dict[str, Any]] = []
+    for variants in matched_variants(a, b):
+        own = [frame[frame["variant"] == name] for frame, name in zip(figures, variants, strict=True)]
+        for scope, where, pairs in _groups(*own):
+            names = {"scope": scope, "where": where, "variant_a": variants[0], "variant_b": variants[1]}
+            first, second = (frame.set_index(PAIR).loc[pairs] for frame in own)
+            found = paired_differences(first, second, seed)
+            if scope == "domain":
+                found += pooled_difference((a, b), variants, pairs, seed)
+            found.sort(key=lambda row: _ORDER[row["metric"]])
+            rows += [{**names, "n_pairs": len(pairs), **row} for row in found]
+    if not rows:
+        raise InputError(f"{a.name} and {b.name} share no session pair and variant: nothing can be paired")
+    for row in rows:
+        is_judged = times_count or not is_time(row["metric"])
+        row["verdict"] = _verdict(row) if is_judged else NOT_JUDGED
+    rows.sort(key=_place)
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def paired_differences(a: pd.DataFrame, b: pd.DataFrame, seed: int = 0) -> list[dict[str, Any]]:
+    """Return the difference of each compared column over the pairs that have a number on both sides.
+
+    Args:
+        a: (N, columns) figures of one side, a row for each session pair.
+        b: The same pairs in the same order.
+        seed: Seed of the bootstrap.
+
+    Returns:
+        A row for each column that at least one pair has on both sides.
+    """
+    found = []
+    for column in COMPARED:
+        if column.key not in a or column.key not in b:
+            continue
+        values_a, values_b = a[column.key].to_numpy(np.float64), b[column.key].to_numpy(np.float64)
+        has_a, has_b = ~np.isnan(values_a), ~np.isnan(values_b)
+        used = has_a & has_b
+        if not used.any():
+            continue
+        difference, low, high, n = mean_with_interval((values_b - values_a)[used], seed)
+        found.append(
+            {
+                "metric": column.key, "good": column.better, "n_used": n, "n_only_a": int((has_a & ~has_b).sum()),
+                "n_only_b": int((has_b & ~has_a).sum()), "mean_a": float(values_a[used].mean()),
+                "mean_b": float(values_b[used].mean()), "difference": difference, "low": low, "high": high,
+            }
+        )  # fmt: skip
+    return found
+
+
+def verdict(good: str, n_used: int, difference: float, interval: tuple[float, float]) -> str:
+    """Return the word for the difference of a figure whose good direction is "high" or "low".
+
+    Args:
+        good: The direction in which it should move.
+        n_used: Over how many session pairs the difference is.
+        difference: B less A.
+        interval: Its 95 % interval; NaN for none.
+    """
+    low, high = interval
+    if difference == 0.0 and low == 0.0 and high == 0.0:
+        return SAME
+    if n_used < ENOUGH_PAIRS or math.isnan(low):
+        return TOO_FEW
+    if low <= 0.0 <= high:
+        return NOISE
+    return BETTER if (low > 0.0) == (good == "high") else WORSE
+
+
+def _verdict(row: Mapping[str, Any]) -> str:
+    return verdict(row["good"], row["n_used"], row["difference"], (row["low"], row["high"]))
+
+
+def _groups(a: pd.DataFrame, b: pd.DataFrame) -> list[tuple[str, str, pd.MultiIndex]]:
+    """Return scope, name and the pairs that both sides have, for each domain and each scenario."""
+    pairs = pd.MultiIndex.from_frame(a[PAIR]).intersection(pd.MultiIndex.from_frame(b[PAIR])).sort_values()
+    if len(pairs) == 0:
+        return []
+    domain_of_pair = a.set_index(PAIR)["domain"].loc[pairs].to_numpy()
+    present = [name for name in DOMAINS if (domain_of_pair == name).any()]
+    found = [("domain", name, pairs[domain_of_pair == name]) for name in present]
+    if len(present) > 1:
+        found.append(("domain", ALL_DOMAINS, pairs))
+    scenario = pairs.get_level_values("scenario")
+    return found + [("scenario", str(name), pairs[scenario == name]) for name in scenario.unique()]
+
+
+def pooled_difference(
+    sides: tuple[Side, Side], variants: tuple[str, str], pairs: pd.Index[Any], seed: int = 0
+) -> list[dict[str, Any]]:
+    """Return the difference of recall at 0.1 false regions per 100 m, both recalls drawn together.
+
+    Args:
+        sides: Whose candidates and changes.
+        variants: Of which method on each side.
+        pairs: (scenario, seed) of the pairs that both have.
+        seed: Seed of the bootstrap.
+
+    Returns:
+        One row as of `paired_differences`, or none where it is undefined.
+    """
+    ranked = []
+    for side, variant in zip(sides, variants, strict=True):
+        data = side.data
+        tables = [_items(rows, variant, pairs) for rows in (data.results, data.regions, data.changes)]
+        if not all(needed <= set(table) for needed, table in zip(_NEEDED, tables, strict=True)):
+            return []
+        ranked.append(ranked_pairs(*tables))
+    first, second = ranked
+    n_used = int(np.count_nonzero(first.n_observable))
+    if n_used == 0 or first.pairs != second.pairs:
+        return []
+    recalls = [recall_at(each, POOLED_RATE_PER_100M) for each in ranked]
+    drawn = [resampled_recalls(each, POOLED_RATE_PER_100M, seed) for each in ranked]
+    low, high = interval_of(drawn[1] - drawn[0]) if n_used > 1 else (math.nan, math.nan)
+    return [
+        {
+            "metric": POOLED, "good": "high", "n_used": n_used, "n_only_a": 0, "n_only_b": 0, "mean_a": recalls[0],
+            "mean_b": recalls[1], "difference": recalls[1] - recalls[0], "low": low, "high": high,
+        }
+    ]  # fmt: skip
+
+
+def _items(rows: Sequence[Mapping[str, Any]], variant: str, pairs: pd.Index[Any]) -> pd.DataFrame:
+    """Return the rows of one variant on some pairs, in their order."""
+    wanted = set(pairs)
+    kept = [row for row in rows if row["variant"] == variant and (row["scenario"], row["seed"]) in wanted]
+    return pd.DataFrame(kept)
+
+
+def _place(row: Mapping[str, Any]) -> tuple[bool, int, str]:
+    """Return where a row stands: domains first, then scenarios by name; variants and figures keep their order."""
+    is_scenario = row["scope"] == "scenario"
+    return is_scenario, 0 if is_scenario else DOMAINS.index(row["where"]), row["where"]

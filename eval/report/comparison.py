@@ -1,0 +1,261 @@
+"""A comparison of two runs, or of the methods of one, as one offline page, with comparison.csv beside it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from eval.core.output import make_writable
+from eval.core.statistics import ENOUGH_PAIRS
+from eval.report.compared_columns import COMPARED
+from eval.report.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare
+from eval.report.objects.objects import Picture
+from eval.report.regions.plots import domain_name
+from eval.report.render import rendered, written
+from eval.report.settings.effects import signed
+from eval.report.settings.figures import Effect, effect_plot
+from eval.report.story import joined
+from eval.report.tables import Cell, Table
+from eval.running.sides import Side, cautions, only_in, short_names, why_no_times
+from eval.tables.columns import Column, spaced
+from eval.tables.region_table import ALL_DOMAINS
+
+COLOURS = {BETTER: "#d3e7f5", WORSE: "#fbdcc8"}
+MOVED = tuple(COLOURS)
+_COLUMNS = {column.key: column for column in COMPARED}
+_MATRIX = (
+    "region_recall", "region_recall_at_k", "recall_at_0.1", "region_auroc", "region_precision",
+    "false_regions_per_100m", "object_iou_point", "object_f1_50", "kind_accuracy", "merge_error_m", "t_total_s",
+    "bytes_regions_before",
+)  # fmt: skip
+_DRAWN = ("region_recall_at_k", "region_auroc", "object_iou_point", "object_f1_50")
+_MAX_DRAWN = 3
+_MAX_METHODS, _MAX_LINES = 4, 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """Two sides held against each other.
+
+    Attributes:
+        names: What A and B are called.
+        table: As `eval.report.comparing.compare` returns it.
+        only: What is in A only, and in B only, a line each.
+        cautions: What stands against the comparison, a sentence each.
+    """
+
+    names: tuple[str, str]
+    table: pd.DataFrame
+    only: tuple[tuple[str, ...], tuple[str, ...]]
+    cautions: tuple[str, ...]
+
+
+def compared(a: Side, b: Side) -> Comparison:
+    """Hold two sides against each other.
+
+    Raises:
+        InputError: They share no session pair, or their metrics versions differ.
+    """
+    table = compare(a, b, times_count=not why_no_times(a, b))
+    only = (tuple(only_in(a, b)), tuple(only_in(b, a)))
+    return Comparison(short_names(a, b), table, only, tuple(cautions(a, b)))
+
+
+def write_comparison(found: Comparison, folder: Path) -> Path:
+    """Write comparison.csv and comparison.html into a folder, which is made where it is missing.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    make_writable(folder)
+    written(folder / "comparison.csv", found.table.to_csv(index=False))
+    written(folder / "comparison.html", rendered("comparison.html", _content(found)))
+    return folder / "comparison.html"
+
+
+def overview(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows over the widest domain as a terminal shows them: values and differences as texts."""
+    rows = []
+    for row in _widest(table):
+        column = _COLUMNS[row["metric"]]
+        rows.append(
+            {
+                "variant": row["name"], "figure": column.heading, "pairs": row["n_used"],
+                "A": column.shown(row["mean_a"]), "B": column.shown(row["mean_b"]),
+                "B \u2212 A": _signed(column, row["difference"]), "95 % interval": _interval(column, row),
+                "B is": row["verdict"],
+            }
+        )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def sentences(found: Comparison) -> list[str]:
+    """Return the first paragraph: how many figures moved, which, what chance would do, and what is not paired."""
+    name_a, name_b = found.names
+    rows = _widest(found.table)
+    counts = {word: sum(row["verdict"] == word for row in rows) for word in (BETTER, WORSE, NOISE, SAME, TOO_FEW)}
+    n_differ = counts[BETTER] + counts[WORSE] + counts[NOISE]
+    where = "all pairs" if rows[0]["where"] == ALL_DOMAINS else f"the pairs {domain_name(rows[0]['where'])}"
+    told = [
+        f"{name_b} (B) against {name_a} (A), over {where}: of {n_differ + counts[SAME]} figures that can be judged "
+        f"{counts[BETTER]} are better and {counts[WORSE]} worse; {counts[NOISE]} show no difference beyond noise, "
+        f"{counts[SAME]} are the same.",
+        *_moved(rows),
+    ]
+    if counts[BETTER] + counts[WORSE]:
+        told.append(
+            f"Had none of the {n_differ} figures that differ truly moved, about {n_differ / 20:.1f} would be called "
+            "moved all the same."
+        )
+    if counts[TOO_FEW]:
+        told.append(f"{counts[TOO_FEW]} figures have fewer than {ENOUGH_PAIRS} pairs: no verdict on them.")
+    told += found.cautions
+    for letter, lines in zip("AB", found.only, strict=True):
+        if lines:
+            told.append(f"Only in {letter}, and compared with nothing: {_first(lines, '; ')}.")
+    return told
+
+
+def _moved(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say of each variant in which of its main figures it moved, and how many others did."""
+    found: dict[str, dict[str, list[str]]] = {}
+    others: Counter[tuple[str, str]] = Counter()
+    for row in rows:
+        if row["verdict"] in MOVED and row["metric"] in _MATRIX:
+            column = _COLUMNS[row["metric"]]
+            words = f"{column.heading} ({_signed(column, row['difference'])}, {row['n_used']} pairs)"
+            found.setdefault(row["name"], {}).setdefault(row["verdict"], []).append(words)
+        elif row["verdict"] in MOVED:
+            others[row["name"], row["verdict"]] += 1
+    told = []
+    for name, by_word in list(found.items())[:_MAX_METHODS]:
+        parts = []
+        for word, figures in by_word.items():
+            more = [f"{n} more"] if (n := others[name, word]) else []
+            parts.append(f"{word} in {joined([*figures, *more])}")
+        told.append(f"{name}: {'; '.join(parts)}.")
+    if len(found) > _MAX_METHODS:
+        told.append(f"{len(found) - _MAX_METHODS} of the other methods moved too: see the table.")
+    return told
+
+
+def _first(lines: Sequence[str], between: str) -> str:
+    more = f"{between}and {len(lines) - _MAX_LINES} more" if len(lines) > _MAX_LINES else ""
+    return between.join(lines[:_MAX_LINES]) + more
+
+
+def matrix_table(table: pd.DataFrame) -> Table:
+    """Return the difference of every main figure, a row for each variant, grouped by domain."""
+    rows = [row for row in _records(table) if row["scope"] == "domain"]
+    present = [key for key in _MATRIX if any(row["metric"] == key for row in rows)]
+    lines: list[tuple[str, tuple[Cell, ...]]] = []
+    for where in dict.fromkeys(row["where"] for row in rows):
+        here = [row for row in rows if row["where"] == where]
+        for name in dict.fromkeys(row["name"] for row in here):
+            own = {row["metric"]: row for row in here if row["name"] == name}
+            n_pairs = max(int(row["n_pairs"]) for row in own.values())
+            cells = (_difference(_COLUMNS[key], own[key]) if key in own else Cell("") for key in present)
+            lines.append((domain_name(str(where)), (Cell(spaced(name)), Cell(str(n_pairs)), *cells)))
+    headings = ("method", "pairs", *(_COLUMNS[key].heading for key in present))
+    return Table(headings, tuple(lines), "Mean difference B \u2212 A over session pairs, with its 95 % interval")
+
+
+def detail_tables(table: pd.DataFrame) -> list[Table]:
+    """Return every compared figure with both means, a table for each domain and each scenario."""
+    found = []
+    for (scope, where), own in table.groupby(["scope", "where"], sort=False):
+        lines = []
+        for row in _records(own):
+            column = _COLUMNS[row["metric"]]
+            uneven = [f"{row[f'n_only_{side}']} in {side.upper()} only" for side in "ab" if row[f"n_only_{side}"]]
+            cells = (
+                Cell(column.heading), Cell(column.shown(row["mean_a"])), Cell(column.shown(row["mean_b"])),
+                Cell(_signed(column, row["difference"]), interval=_interval(column, row)),
+                Cell(str(row["n_used"]), interval=", ".join(uneven)),
+                Cell(row["verdict"], row["verdict"] in COLOURS, colour=COLOURS.get(row["verdict"], "")),
+            )  # fmt: skip
+            lines.append((row["name"], cells))
+        title = domain_name(str(where)) if scope == "domain" else str(where)
+        found.append(Table(("figure", "A", "B", "B \u2212 A", "pairs", "B is"), tuple(lines), title))
+    return found
+
+
+def picture(table: pd.DataFrame) -> Picture | None:
+    """Return the differences of up to three main figures with their intervals; None where none of them differs."""
+    rows = [row for row in _records(table) if row["scope"] == "domain" and not math.isnan(row["low"])]
+    differ = {row["metric"] for row in rows if row["verdict"] != SAME}
+    drawn = [key for key in _DRAWN if key in differ][:_MAX_DRAWN]
+    if not drawn:
+        return None
+    panels = {
+        _COLUMNS[key].heading: [
+            Effect(spaced(row["name"]), domain_name(row["where"]), row["difference"], row["low"], row["high"])
+            for row in rows
+            if row["metric"] == key
+        ]
+        for key in drawn
+    }
+    caption = "Dots are means of B \u2212 A over session pairs, lines their 95 % intervals; right of 0 B is better."
+    return Picture("What moved, and how surely", effect_plot(panels), caption)
+
+
+def _content(found: Comparison) -> dict[str, Any]:
+    details = detail_tables(found.table)
+    keys = list(dict.fromkeys(found.table["metric"]))
+    return {
+        "names": found.names,
+        "sentences": sentences(found),
+        "only": found.only,
+        "matrix": matrix_table(found.table),
+        "picture": picture(found.table),
+        "details": details,
+        "columns": [column for column in COMPARED if column.key in keys],
+        "enough_pairs": ENOUGH_PAIRS,
+        "colours": COLOURS,
+        "not_judged": NOT_JUDGED in set(found.table["verdict"]),
+    }
+
+
+def _difference(column: Column, row: Mapping[str, Any]) -> Cell:
+    is_moved = row["verdict"] in COLOURS
+    interval = _interval(column, row)
+    return Cell(_signed(column, row["difference"]), is_moved, interval, COLOURS.get(row["verdict"], ""))
+
+
+def _interval(column: Column, row: Mapping[str, Any]) -> str:
+    if math.isnan(row["low"]) or row["verdict"] == SAME:
+        return ""
+    return f"{_signed(column, row['low'])} to {_signed(column, row['high'])}"
+
+
+def _widest(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows over all pairs of each variant, or over its only domain."""
+    rows = [row for row in _records(table) if row["scope"] == "domain"]
+    widest = {row["name"]: row["where"] for row in rows}  # the last one: "all" comes after "in" and "out"
+    return [row for row in rows if row["where"] == widest[row["name"]]]
+
+
+def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows with `name`: the variant, or that of the side that has several."""
+    n_a, n_b = table["variant_a"].nunique(), table["variant_b"].nunique()
+    rows = [{str(key): value for key, value in row.items()} for row in table.to_dict("records")]
+    return [{**row, "name": f"against {row['variant_a']}" if n_a > 1 == n_b else row["variant_b"]} for row in rows]
+
+
+def _signed(column: Column, value: float) -> str:
+    """Write a difference with its sign, with more digits than its column has where these would hide it."""
+    written = signed(column, value)
+    if value == 0.0 or math.isnan(value) or any(digit in written for digit in "123456789"):
+        return written
+    finer = replace(column, shown=lambda size: np.format_float_positional(size, 1, fractional=False, trim="-"))
+    return signed(finer, value)

@@ -1,0 +1,164 @@
+"""The picture of a merge: the aligned maps coloured by the distance between their surfaces."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.patches import Rectangle
+from scipy.spatial import cKDTree
+
+from cdpipe.core.geometry import Float64Array, stream
+from eval.core.figures import (
+    BLACK,
+    VERMILLION,
+    Points,
+    Raster,
+    blank_figure,
+    bulk_mask,
+    data_address,
+)
+
+FULL_M = 0.3
+STRETCH_M = 16.0
+_UNSEEN_M = 1.0
+_MAX_DRAWN = 120_000
+_NEIGHBOURS = 6
+_SQUARE_M = 8.0
+_MARGIN_M = 0.5
+_WIDTH_IN = 9.0
+_COLOURS = LinearSegmentedColormap.from_list(
+    "gap", [(0.0, "#dfe7ee"), (0.2, "#a9c6dc"), (0.4, "#f3d9a4"), (0.65, VERMILLION), (1.0, "#6d0f00")]
+)
+_UNSEEN = "#ececec"
+
+
+def surface_distances(before: Points, points: Points) -> Float64Array:
+    """Return how far (N, 3) points lie from the surface that (M, 3) points of the before map were taken from.
+
+    That is the distance to the plane through the six nearest points: two maps thinned to 0.2 m are 7 cm from each
+    other's nearest point even where they fit exactly. Farther than 0.3 m from every point it is that distance.
+    """
+    nearest_m, index = (
+        np.asarray(found)
+        for found in cKDTree(before, compact_nodes=False, balanced_tree=False).query(
+            points, k=[*range(1, min(_NEIGHBOURS, len(before)) + 1)]
+        )
+    )
+    distances_m = nearest_m[:, 0].copy()
+    near = np.flatnonzero(distances_m < FULL_M)
+    patches = before[index[near]].astype(np.float64)
+    centres = patches.mean(axis=1)
+    offsets = patches - centres[:, None]
+    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
+    to_plane_m = np.abs(np.einsum("ni,ni->n", points[near] - centres, axes[:, :, 0]))
+    distances_m[near] = np.minimum(to_plane_m, distances_m[near])
+    return distances_m
+
+
+def worst_stretch(points: Points, distances_m: Float64Array) -> tuple[float, float] | None:
+    """Return the middle (x, y) of the place that both sessions saw and that fits worst.
+
+    Places are squares of 8 m. One is judged by the median distance of its points, if it holds at least half as many as
+    squares usually do and the before map has something within 1 m of most; None where no square does.
+    """
+    _, square, counts = np.unique(
+        np.floor(points[:, :2] / _SQUARE_M).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+    )
+    order = np.argsort(square.ravel(), kind="stable")
+    best, place = -1.0, None
+    for own in np.split(order, np.cumsum(counts)[:-1]):
+        seen = own[distances_m[own] < _UNSEEN_M]
+        if len(own) < np.median(counts) / 2 or len(seen) <= len(own) / 2:
+            continue
+        value = float(np.median(distances_m[seen]))
+        if value > best:
+            middle = points[own, :2].mean(axis=0)
+            best, place = value, (float(middle[0]), float(middle[1]))
+    return place
+
+
+def alignment_picture(before: Points, aligned: Points) -> str:
+    """Draw the aligned after map seen from above, coloured by its distance to the before map, and where it fits worst.
+
+    Args:
+        before: (N, 3) points of the before map, metres.
+        aligned: (M, 3) points of the after map in the map frame; a fixed random subset of a large map is drawn.
+    """
+    raster = Raster.around(before, aligned)
+    aligned = _subset(aligned[bulk_mask(aligned[:, :2])])
+    distances_m = surface_distances(before, aligned)
+    before = _subset(before[bulk_mask(before[:, :2])])
+    worst = worst_stretch(aligned, distances_m)
+    left, right, bottom, top = raster.extent if worst is None else _around_both(raster.extent, _around(worst))
+    aspect = (right - left) / (top - bottom)
+    height_in = float(np.clip((_WIDTH_IN - 0.9) / (aspect + 1.0), 2.4, 4.4))
+    figure = blank_figure(_WIDTH_IN, height_in + 1.1)
+    whole, zoom = figure.subplots(1, 2, width_ratios=(float(np.clip(aspect, 0.7, 2.4)), 1.0))
+    _points_from_above(whole, before, aligned, distances_m, (left, right, bottom, top))
+    whole.set_title("whole map", fontsize=8)
+    if worst is None:
+        zoom.set_axis_off()
+        zoom.text(0.5, 0.5, "the maps have\nno place in common", ha="center", va="center", fontsize=9)
+    else:
+        window = _around(worst)
+        _points_from_above(zoom, before, aligned, distances_m, window)
+        zoom.set_title(f"where it fits worst ({STRETCH_M:g} m)", fontsize=8)
+        square = Rectangle(window[::2], STRETCH_M, STRETCH_M, fill=False, edgecolor=BLACK, linewidth=1.0)
+        whole.add_patch(square)
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(0.0, FULL_M), _COLOURS), ax=[whole, zoom], extend="max", location="bottom",
+        shrink=0.4, aspect=40, pad=0.02,
+    )  # fmt: skip
+    bar.set_label("distance to the surface of the before map [m]", fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+    return data_address(figure)
+
+
+def _subset(points: Points) -> Points:
+    if len(points) <= _MAX_DRAWN:
+        return points
+    return points[stream(0, "page", "subset").choice(len(points), _MAX_DRAWN, replace=False)]
+
+
+def _around(centre: tuple[float, float]) -> tuple[float, float, float, float]:
+    """Left, right, bottom, top of the square that is shown enlarged."""
+    half = STRETCH_M / 2
+    return centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half
+
+
+def _around_both(
+    extent: tuple[float, float, float, float], square: tuple[float, float, float, float]
+) -> tuple[float, float, float, float]:
+    """Left, right, bottom, top of the smallest window that shows the whole of both, the square's outline too."""
+    return (
+        min(extent[0], square[0] - _MARGIN_M),
+        max(extent[1], square[1] + _MARGIN_M),
+        min(extent[2], square[2] - _MARGIN_M),
+        max(extent[3], square[3] + _MARGIN_M),
+    )
+
+
+def _points_from_above(
+    axes: Axes, before: Points, after: Points, distances_m: Float64Array, window: tuple[float, float, float, float]
+) -> None:
+    """Draw the before map pale and the after map over it, the farthest points on top."""
+    left, right, bottom, top = window
+    span = max(right - left, top - bottom)
+    size = float(np.clip(75.0 / span, 0.25, 6.0))
+    for points, colours in ((before, None), (after, distances_m)):
+        inside = (points[:, 0] >= left) & (points[:, 0] <= right) & (points[:, 1] >= bottom) & (points[:, 1] <= top)
+        own = points[inside]
+        if colours is None:
+            axes.scatter(own[:, 0], own[:, 1], s=size, color=_UNSEEN, linewidths=0)
+        else:
+            order = np.argsort(colours[inside])
+            axes.scatter(
+                own[order, 0], own[order, 1], s=size, c=colours[inside][order], cmap=_COLOURS, vmin=0.0, vmax=FULL_M,
+                linewidths=0,
+            )  # fmt: skip
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+    axes.tick_params(labelsize=7)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)

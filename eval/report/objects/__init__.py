@@ -1,0 +1,1 @@
+"""The changed objects on the page."""

@@ -1,0 +1,1 @@
+"""The changed regions on the page."""

@@ -1,0 +1,1 @@
+"""What single settings do, on the page: of the world, of a method, and grids of two."""

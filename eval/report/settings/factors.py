@@ -1,0 +1,170 @@
+"""Single settings of a method: what each value does, a line for each domain, all else as it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from cdpipe.core.errors import InputError
+from cdpipe.model.config import load_config
+from eval.core.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION
+from eval.core.statistics import bootstrap_interval
+from eval.report.charts import Chart, axes_of, error_bars, in_legend, layout, set_axis
+from eval.report.cost.pareto import with_domain
+from eval.report.regions.plots import domain_name
+from eval.report.settings.grids import N_ACROSS, SHARES
+from eval.running.run_data import (
+    Row,
+    RunData,
+    defined,
+    grid_points,
+    number,
+    of,
+    over_pairs,
+    repeats,
+    split_variant,
+    text,
+)
+from eval.tables.columns import RESULT_COLUMNS
+
+_KEYS = ("region_recall_at_k", "region_auroc", "object_iou_point", "object_f1_50", "t_total_s")
+_COLOURS = (BLACK, BLUE, ORANGE, GREEN, VERMILLION)
+_COLUMNS = {column.key: column for column in RESULT_COLUMNS}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Factor:
+    """One setting of one preset, all else as it is.
+
+    Attributes:
+        preset: The preset, and what else was set to one value.
+        key: The setting.
+        points: Its values, as texts in rising order, and the variant that has it.
+        own: The value that the preset itself has, "" where it was not run or is not known.
+    """
+
+    preset: str
+    key: str
+    points: Mapping[str, str]
+    own: str
+
+
+def factors(data: RunData) -> list[Factor]:
+    """Find the settings that were run with two values or more, the preset's own among them, nothing else differing."""
+    held = repeats(data)
+    cases = ((str(row["scenario"]), str(row["variant"])) for row in data.results)
+    variants = list(dict.fromkeys(name for world, name in cases if (world, name) not in held))
+    on_grid = {name for _, name in grid_points(data)}
+    found: dict[tuple[str, str], dict[str, str]] = {}
+    for name in variants:
+        preset, settings = split_variant(name)
+        if len(settings) == 1 and name not in on_grid:
+            ((key, value),) = settings.items()
+            found.setdefault((preset, key), {})[value] = name
+    result = []
+    for (preset, key), points in found.items():
+        own = _setting_of(preset, key) if preset in variants else ""
+        every = {**points, own: preset} if own else points
+        if len(every) >= 2:
+            order = sorted(every, key=_order)
+            result.append(Factor(preset, key, {value: every[value] for value in order}, own))
+    return result
+
+
+def draw_factors(data: RunData) -> list[Chart]:
+    """Return a chart for every such setting: a panel for each figure, a line for each domain, with 95 % intervals."""
+    results = with_domain(data.results).to_dict("records")
+    rows = [{str(key): value for key, value in row.items()} for row in results]
+    charts = []
+    for place, factor in enumerate(factors(data), start=1):
+        own = _shared(factor, rows)
+        figure = _factor_lines(factor, own)
+        if figure is None:
+            continue
+        n = len({(row["scenario"], row["seed"]) for row in own})
+        star = f" The star is the preset's own value, {factor.own}." if factor.own else ""
+        charts.append(
+            Chart(
+                f"factor_{place}",
+                f"{factor.preset}: {factor.key}",
+                figure,
+                f"Means over the n = {n} session pairs that every value was run on (times: medians), bars: 95 % "
+                f"interval over pairs.{star}",
+            )
+        )
+    return charts
+
+
+def _shared(factor: Factor, rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of a setting's variants on the pairs that all of them were run on."""
+    groups = [of(rows, variant=name) for name in factor.points.values()]
+    shared = set.intersection(*({(row["scenario"], row["seed"]) for row in group} for group in groups))
+    return [row for group in groups for row in group if (row["scenario"], row["seed"]) in shared]
+
+
+def _factor_lines(factor: Factor, rows: Sequence[Row]) -> dict[str, Any] | None:
+    """Return the lines; None where no figure has two values."""
+    shown = [key for key in _KEYS if len(set(np.round(defined(rows, key), 9))) > 1]
+    if not shown:
+        return None
+    domains = list(dict.fromkeys(text(row, "domain") for row in rows))
+    n_across = min(N_ACROSS, len(shown))
+    n_rows = math.ceil(len(shown) / n_across)
+    found = layout(n_across, n_rows, 230, [domain_name(domain) for domain in domains])
+    data: list[dict[str, Any]] = []
+    seen: set[str] = set()
+    for index, key in enumerate(shown):
+        column = _COLUMNS[key]
+        span = {"range": [-0.03, 1.05]} if key in SHARES else {"rangemode": "tozero"}
+        set_axis(found, "x", index, factor.key, type="category")
+        set_axis(found, "y", index, column.heading, **span)
+        for place, domain in enumerate(domains):
+            colour = _COLOURS[place % len(_COLOURS)]
+            data.append(
+                {**_line(factor, of(rows, domain=domain), key, colour), **axes_of(index),
+                 **in_legend(domain_name(domain), seen)}
+            )  # fmt: skip
+    for index in range(len(shown), n_across * n_rows):
+        found[f"xaxis{index + 1}"]["visible"] = found[f"yaxis{index + 1}"]["visible"] = False
+    return {"data": data, "layout": found}
+
+
+def _line(factor: Factor, rows: Sequence[Row], key: str, colour: str) -> dict[str, Any]:
+    groups = [of(rows, variant=name) for name in factor.points.values()]
+    means = [over_pairs(group, key) for group in groups]
+    statistic: Literal["mean", "median"] = "median" if key.startswith("t_") else "mean"
+    ends = [
+        bootstrap_interval(np.array([number(row, key) for row in group], dtype=np.float64), statistic)
+        for group in groups
+    ]
+    low, high = (np.array([end[side] for end in ends]) for side in (0, 1))
+    symbols = ["star" if value == factor.own else "circle" for value in factor.points]
+    sizes = [12 if value == factor.own else 7 for value in factor.points]
+    counts = [f"n {len(defined(group, key))}" for group in groups]
+    return {
+        "x": list(factor.points), "y": means, "mode": "lines+markers", "line": {"color": colour, "width": 1.6},
+        "marker": {"symbol": symbols, "size": sizes, "color": colour},
+        "error_y": error_bars(means, low, high, colour), "text": counts, "hovertemplate": "%{x}: %{y:.3g}, %{text}",
+    }  # fmt: skip
+
+
+def _setting_of(preset: str, key: str) -> str:
+    """Return the value that a preset has, as a variant's name writes it; "" for what is no preset or setting of one."""
+    try:
+        value: Any = load_config(preset).model_dump(mode="json")
+    except InputError:
+        return ""
+    for part in key.split("."):
+        value = value.get(part) if isinstance(value, dict) else None
+    return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _order(value: str) -> tuple[int, float, str]:
+    try:
+        return 0, float(value), value
+    except ValueError:
+        return 1, 0.0, value

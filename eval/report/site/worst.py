@@ -1,0 +1,97 @@
+"""The ten pairs on which one method did worst, each with its map: where its regions lie, and what they missed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from cdpipe.core.errors import InputError
+from cdpipe.io.answer import read_answer
+from cdpipe.io.session import load_arrays
+from eval.core.figures import region_map
+from eval.report.objects.objects import Picture
+from eval.report.site.site import region_caption, region_marks, truth_marks
+from eval.running.run_data import Row, RunData, number, of, scenarios, text
+from eval.tables.columns import share
+from eval.tables.region_table import MAIN_VARIANT
+from eval.truth.ground_truth import load_ground_truth
+
+N_WORST = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WorstPair:
+    """One of the worst pairs: where, in words how bad, and its picture if its files are there."""
+
+    scenario: str
+    seed: int
+    words: str
+    picture: Picture | None
+
+
+def shown_variant(data: RunData) -> str:
+    """Return the method whose cases are shown: `tunnelcd`, or the first that was run."""
+    names = [str(row["variant"]) for row in data.results]
+    return MAIN_VARIANT if MAIN_VARIANT in names else names[0]
+
+
+def worst_rows(data: RunData, variant: str) -> list[Row]:
+    """Return the rows of the ten worst pairs, worst first: lowest object IoU, then region recall, then most changes.
+
+    None where a page shows all pairs anyway, that is where every scenario has one.
+    """
+    worlds = scenarios(data, unchanged=False)
+    rows = [
+        row
+        for row in of(data.results, variant=variant)
+        if row["scenario"] in worlds and not math.isnan(number(row, "object_iou_point"))
+    ]
+    if len(rows) <= len(worlds):
+        return []
+
+    def badness(row: Row) -> tuple[float, ...]:
+        recall = number(row, "region_recall")
+        return number(row, "object_iou_point"), 1.0 if math.isnan(recall) else recall, -number(row, "n_observable")
+
+    return sorted(rows, key=badness)[:N_WORST]
+
+
+def draw_worst(data: RunData, variant: str, rows: Sequence[Row]) -> list[WorstPair]:
+    """Return the worst pairs with what can be drawn of them."""
+    return [
+        WorstPair(str(row["scenario"]), int(row["seed"]), _words(row), _picture(data, variant, row)) for row in rows
+    ]
+
+
+def _words(row: Row) -> str:
+    if text(row, "status") != "ok":
+        error = text(row, "error")
+        return f"no answer ({text(row, 'status').replace('_', ' ')})" + (f": {error}" if error else "")
+    merge = (
+        f", merge error {number(row, 'merge_error_m'):.3f} m" if not math.isnan(number(row, "merge_error_m")) else ""
+    )
+    n = number(row, "n_observable")
+    of_changes = "" if math.isnan(n) else f" of {n:.0f} observable changes"
+    return (
+        f"object IoU {share(number(row, 'object_iou_point'))}, region recall {share(number(row, 'region_recall'))}"
+        f"{of_changes}, false regions per 100 m {share(number(row, 'false_regions_per_100m'))}{merge}"
+    )
+
+
+def _picture(data: RunData, variant: str, row: Row) -> Picture | None:
+    """Return the map with regions and changes; None where answer, maps or truth cannot be read."""
+    scenario, seed = str(row["scenario"]), int(row["seed"])
+    own = {"scenario": scenario, "seed": seed, "variant": variant}
+    try:
+        report = read_answer(data.folder.answer(scenario, seed, variant)).report
+        before = load_arrays(data.folder.maps(scenario, seed))["before_points"]
+        truth = load_ground_truth(data.folder.pair(scenario, seed))
+    except (InputError, KeyError):
+        return None
+    if report is None or len(before) == 0:
+        return None
+    marks = truth_marks(truth, of(data.changes, **own))
+    regions = region_marks(report, of(data.regions, **own))
+    caption = region_caption(regions, report.regions.radius_m, [mark.state for mark in marks])
+    return Picture(f"{scenario}, seed {seed}", region_map(before, regions, report.regions.radius_m, marks), caption)

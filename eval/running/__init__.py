@@ -1,0 +1,1 @@
+"""Running a plan: cells, workers, the run folder, stored answers and their scores."""

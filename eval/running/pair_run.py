@@ -1,0 +1,282 @@
+"""Runs the cells of one pair (a world and a seed), one after the other, into the folder of its run.
+
+The cells share what was simulated, mapped, described and merged. Whoever runs a pair holds its lock, so that a worker
+whose client is gone and the run that goes on from there never write the same files.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cdpipe.core.errors import MergeFailedError, ScenarioError, TunnelcdError
+from cdpipe.core.threads import THREADS
+from cdpipe.descriptors import checkpoint_digest, sphere_digest, use_threads
+from cdpipe.io.answer import write_answer, write_failure
+from cdpipe.merge.global_registration import is_kiss_matcher_installed
+from cdpipe.model.config import MapConfig
+from eval.core.domains import domain_of
+from eval.core.progress import RunProgress
+from eval.core.provenance import digest
+from eval.oracles.merge import merged_by_truth
+from eval.oracles.regions import Regions, regions_by_truth
+from eval.plans.variants import Cell
+from eval.running.rescoring import cell_document, score_stored
+from eval.running.runfolder import RunFolder, remove
+from eval.running.stage_cache import opened_cache
+from eval.running.stages import Merge, PairStages
+from eval.scoring.scoring import METRICS_VERSION, CaseScore
+from eval.truth.adapters import pipeline_input
+from eval.truth.ground_truth import GroundTruth, load_ground_truth
+from scenarios.schema import Scenario
+from sim.session.simulate import simulate_pair
+
+if sys.platform != "win32":
+    import fcntl
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Todo:
+    """A cell, the digest of what it depends on, and its place in the tables (scenario, variant)."""
+
+    cell: Cell
+    key: str
+    place: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """One world and seed, and the cells still to be done.
+
+    Attributes:
+        name: Label of the world.
+        family: Its scenario's.
+        kind: What the plan calls such pairs, or "".
+        seed: The seed.
+        scenario: The scenario as drawn, None where it cannot be drawn.
+        files: Digests of the files that the scenario names.
+        error: Why it cannot be drawn.
+        todo: Its cells.
+    """
+
+    name: str
+    family: str
+    kind: str
+    seed: int
+    scenario: Scenario | None
+    files: Mapping[str, str]
+    error: str
+    todo: tuple[Todo, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """What the rows of a run say of their making: the code, and whether workers shared the machine."""
+
+    commit: str | None
+    is_contended: bool = False
+
+
+class PairRun:
+    """One pair at work; its maps are let go with it."""
+
+    def __init__(self, run: RunFolder, pair: Pair, made: Made, progress: RunProgress) -> None:
+        self._run = run
+        self._pair = pair
+        self._made = made
+        self._progress = progress
+        self._opened: tuple[PairStages, GroundTruth] | str | None = None
+        use_threads(THREADS)
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the simulated pair."""
+        return self._run.pair(self._pair.name, self._pair.seed)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether `open` was called."""
+        return self._opened is not None
+
+    def open(self) -> tuple[PairStages, GroundTruth] | str:
+        """Simulate the pair unless it is there, and open it, once; the text says why it cannot be made."""
+        if self._opened is None:
+            try:
+                self._opened = _open(self._run, self._pair, self._made, self._progress)
+            except ScenarioError as error:
+                self._opened = str(error)
+        return self._opened
+
+    def do(self, each: Todo) -> None:
+        """Run a cell and write its answer and its file; should that fail, nothing of it is left."""
+        opened, cell = self.open(), each.cell
+        if isinstance(opened, str):
+            self._finish(each, _unmade(self._pair, "failed", opened))
+            return
+        stages, truth = opened
+        folder = self._run.answer(self._pair.name, self._pair.seed, cell.variant)
+        try:
+            _answer(stages, cell, truth, folder)
+            self._finish(each, score_stored(truth, folder), is_contended=stages.is_contended)
+        except BaseException as error:
+            remove(folder)
+            if isinstance(error, OSError) and error.filename is None:
+                error.filename = str(folder)  # a full disk does not say who met it
+            raise
+
+    def write_died(self, each: Todo, error: str) -> None:
+        """Make a row of a cell that kills whoever runs it; it scores what a failed one does, where there is a truth."""
+        status, folder = "worker_died", self._run.answer(self._pair.name, self._pair.seed, each.cell.variant)
+        path = self._run.pair(self._pair.name, self._pair.seed)
+        if not path.exists():
+            self._finish(each, _unmade(self._pair, status, error))
+            return
+        settings = each.cell.config.model_dump(mode="json")
+        remove(folder)  # what the dead left
+        write_failure(folder, each.cell.variant, status, error, {}, settings, each.cell.until)
+        self._finish(each, score_stored(load_ground_truth(path), folder))
+
+    def _finish(self, each: Todo, score: CaseScore, *, is_contended: bool = False) -> None:
+        pair, cell = self._pair, each.cell
+        names = {"scenario": pair.name, "seed": pair.seed, "variant": cell.variant, "preset": cell.preset}
+        is_contended |= self._made.is_contended
+        told = {"pair_kind": pair.kind, "commit": self._made.commit, "is_contended": is_contended}
+        path = self._run.cell(pair.name, pair.seed, cell.variant)
+        self._run.write_cell(path, cell_document(score, {**names, **told}, each.key, each.place))
+
+
+def is_finished(run: RunFolder, each: Todo) -> bool:
+    """Tell whether a cell's file is there, whole, and of what would be run now."""
+    cell = each.cell
+    stored = run.read_cell(run.cell(cell.scenario, cell.seed, cell.variant))
+    return stored is not None and stored["key"] == each.key and stored["row"].get("metrics_version") == METRICS_VERSION
+
+
+@contextmanager
+def pair_lock(run: RunFolder, pair: Pair) -> Iterator[None]:
+    """Wait until nobody else runs a pair, and keep it; the system lets go of it when the process dies."""
+    if sys.platform == "win32":
+        yield
+        return
+    path = run.pair(pair.name, pair.seed).with_name(f".{pair.seed}.lock")
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            # who held it before removes the file: the lock of a removed one keeps nobody out
+            if not path.exists() or path.stat().st_ino != os.fstat(file.fileno()).st_ino:
+                continue
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+            return
+
+
+def cell_key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mapping[str, str]) -> str:
+    """Return the digest of all that a cell depends on but the version of the metrics."""
+    merge = cell.config.merge
+    asks_kiss_matcher = merge.method == "kiss-matcher" or (merge.method == "voting" and merge.fallback)
+    is_missed = cell.oracle is None and asks_kiss_matcher and not is_kiss_matcher_installed()
+    return digest(
+        {
+            "scenario": None if scenario is None else scenario.model_dump(mode="json"),
+            "files": dict(files),
+            "seed": cell.seed,
+            "config": cell.config.model_dump(mode="json"),
+            "checkpoint": checkpoint_digest(cell.config.descriptor),
+            **({"sphere": sphere_digest()} if cell.config.query.compare == "sphere" else {}),
+            "oracle": None if cell.oracle is None else cell.oracle.model_dump(mode="json"),
+            **({"oracle_regions": True} if cell.oracle_regions else {}),
+            "until": cell.until,
+            "pair_kind": pair_kind,
+            # what was made without the extra is made again once it is there; nothing is said where it is
+            **({"kiss_matcher": "absent"} if is_missed else {}),
+        }
+    )
+
+
+def _open(run: RunFolder, pair: Pair, made: Made, progress: RunProgress) -> tuple[PairStages, GroundTruth]:
+    """Simulate a pair unless it is there, store its maps for pictures, and open it with what is kept of its stages.
+
+    Raises:
+        ScenarioError: The seed draws no scenario, or one whose world cannot be built.
+    """
+    if pair.scenario is None:
+        raise ScenarioError(pair.error)
+    path = run.pair(pair.name, pair.seed)
+    kept = run.stages(pair.name, pair.seed)
+    if not path.exists():
+        remove(kept)  # `--force` starts from nothing
+        path.parent.mkdir(parents=True, exist_ok=True)
+        simulate_pair(pair.scenario, pair.seed, path, on_progress=progress.stage)
+    cache = opened_cache(kept, (path / "before", path / "after"))
+    sessions = pipeline_input(path, "before"), pipeline_input(path, "after")
+    stages = PairStages(*sessions, progress.stage, cache, is_shared=made.is_contended)
+    picture = run.maps(pair.name, pair.seed)
+    if not picture.exists():
+        _write_maps(picture, stages)
+    return stages, load_ground_truth(path)
+
+
+def _write_maps(path: Path, stages: PairStages) -> None:
+    try:
+        before, after = stages.maps(MapConfig())
+    except TunnelcdError:
+        return  # each cell of the pair meets the same error and records it
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.stem}.partial.npz")
+    try:
+        np.savez_compressed(
+            partial,
+            allow_pickle=False,
+            before_points=before.points.astype(np.float32),
+            after_points=after.points.astype(np.float32),
+        )
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _answer(stages: PairStages, cell: Cell, truth: GroundTruth, folder: Path) -> None:
+    settings = cell.config.model_dump(mode="json")
+    try:
+        if cell.until is None:
+            report = stages.answer(cell.config, _oracle(cell, truth), _true_regions(cell, truth))
+        else:
+            report = stages.merge_answer(cell.config, _oracle(cell, truth))
+    except MergeFailedError as error:
+        measured = error.evidence, settings, cell.until, error.seconds
+        write_failure(folder, cell.variant, "merge_refused", str(error), *measured)
+    except TunnelcdError as error:
+        write_failure(folder, cell.variant, "failed", str(error), {}, settings, cell.until)
+    else:
+        write_answer(folder, cell.variant, report, cell.until)
+
+
+def _oracle(cell: Cell, truth: GroundTruth) -> Merge | None:
+    """Return what merges in the method's place; the stages get its result and never the truth in it."""
+    noise = cell.oracle
+    if noise is None:
+        return None
+    return lambda before, after: merged_by_truth(before, after, (truth.before, truth.after), noise, cell.seed)
+
+
+def _true_regions(cell: Cell, truth: GroundTruth) -> Regions | None:
+    """Return what proposes regions in the method's place; the stages after it get these alone."""
+    if not cell.oracle_regions:
+        return None
+    return lambda scans: regions_by_truth(truth, scans, cell.config.query)
+
+
+def _unmade(pair: Pair, status: str, error: str) -> CaseScore:
+    """Score a case whose world cannot be made: there is no truth, so all but the identity is undefined."""
+    row = {"scenario": "", "family": pair.family, "pair_kind": "", "seed": pair.seed, "variant": "", "preset": ""}
+    outcome = {"status": status, "error": error, "metrics_version": METRICS_VERSION}
+    return CaseScore(row={**row, **outcome, "domain": domain_of(pair.family)}, changes=[], regions=[], objects=[])

@@ -1,0 +1,167 @@
+"""Predictions that another program made for the pairs of a run, taken into the run as a variant.
+
+    DIR/<scenario>/<seed>/answer.json, answer.npz     the format of `cdpipe.io.answer`; eval/README.md has a short
+    script
+
+Every pair of the run needs one, or the means would be over other pairs than everybody else's. A pair that the program
+could not do gets an answer.json of status `failed` and scores as a failure of ours does.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import suggestion
+from cdpipe.model.config import preset_names
+from eval.core.progress import RunProgress, Silent
+from eval.plans.coverage import plan_of
+from eval.plans.plan import planned_cases
+from eval.plans.variants import slug
+from eval.running.rescoring import LAST, NO_KEY, cell_document, foreign_identity, score_stored
+from eval.running.runfolder import RunFolder, remove, write_tables
+from eval.running.sides import versions_of
+from eval.scoring.scoring import METRICS_VERSION
+from eval.truth.ground_truth import load_ground_truth
+
+_FILES = ("answer.json", "answer.npz")
+_TOLD = 5
+
+
+def add_predictions(run: RunFolder, folder: Path, name: str, progress: RunProgress | None = None) -> int:
+    """Score the predictions of a folder, copy them into a run as the variant `name`, and rewrite the tables.
+
+    Nothing is written before all of them are scored.
+
+    Returns:
+        How many were scored.
+
+    Raises:
+        InputError: A case is missing or of no pair of this run, a file cannot be an answer to its pair (all such files
+            at once), the name is taken, or the run was scored by other metrics.
+    """
+    progress = progress or Silent()
+    pairs = sorted(run.path.glob("pairs/*/*/truth"))
+    found = _matched(run, folder, [truth.parent for truth in pairs])
+    _require_free(run, name)
+    _require_current(run)
+    documents: dict[Path, dict[str, Any]] = {}
+    mistakes: list[str] = []
+    for pair, prediction in found.items():
+        identity = foreign_identity(run, pair.parent.name, pair.name, name)
+        progress.cells("{scenario} {seed} {variant}".format(**identity), len(documents), len(found))
+        try:
+            score = score_stored(load_ground_truth(pair), prediction)
+            documents[pair] = cell_document(score, identity, NO_KEY, LAST)
+        except InputError as error:
+            mistakes += str(error).splitlines()
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+    for pair, document in documents.items():
+        scenario, seed = document["row"]["scenario"], int(pair.name)
+        _copy(found[pair], run.answer(scenario, seed, name))
+        run.write_cell(run.cell(scenario, seed, name), document)
+    progress.cells("done", len(documents), len(documents))
+    write_tables(run)
+    return len(documents)
+
+
+def partly_answered(provenance: Mapping[str, Any], results: pd.DataFrame) -> list[str]:
+    """Return one line for each variant outside of the plan that lacks pairs of the run, naming them."""
+    plan = plan_of(provenance)
+    if plan is None:
+        return []
+    planned = {variant for _, _, variant in planned_cases(plan)}
+    cases = [results["scenario"], results["seed"].astype(int)]
+    every = dict.fromkeys(zip(*cases, strict=True))
+    lines = []
+    for variant in dict.fromkeys(set(results["variant"]) - planned):
+        own = set(zip(*(column[results["variant"] == variant] for column in cases), strict=True))
+        missing = [f"{scenario} {seed}" for scenario, seed in every if (scenario, seed) not in own]
+        if missing:
+            lines.append(
+                f"{variant} has no answer for {_listed(missing)}: its means are over the other {len(own)} pairs"
+            )
+    return sorted(lines)
+
+
+def _matched(run: RunFolder, folder: Path, pairs: Sequence[Path]) -> dict[Path, Path]:
+    """Return the folder of the prediction for each pair of a run.
+
+    Raises:
+        InputError: A pair has none, or one is for no pair.
+    """
+    if not pairs:
+        raise InputError(f"{run.path}: holds no simulated pairs: run the plan again, which makes them")
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder: expected {folder}/<scenario>/<seed>/answer.json")
+    given = {file.parent for file in folder.glob("**/answer.json")}
+    found: dict[Path, Path] = {}
+    wanted: dict[Path, str] = {}
+    known: set[Path] = set()
+    mistakes: list[str] = []
+    for pair in pairs:
+        scenario = foreign_identity(run, pair.parent.name, pair.name, "")["scenario"]
+        wanted[pair] = f"{scenario}/{pair.name}"
+        # written as the scenario is called, or as the run calls its folder
+        places = {folder / wanted[pair], folder / pair.parent.name / pair.name} & given
+        if len(places) > 1:
+            mistakes.append(f"{' and '.join(map(str, sorted(places)))}: two predictions for one pair: leave one out")
+        known |= places
+        found.update((pair, place) for place in places)
+    mistakes += _strangers(folder, given - known, list(wanted.values()))
+    if missing := [name for pair, name in wanted.items() if pair not in found]:
+        mistakes.append(
+            f"{folder}: no prediction for {_listed(missing)} of {run.path}: write "
+            f'{folder}/{missing[0]}/answer.json, of status "failed" where there is no answer'
+        )
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+    return found
+
+
+def _strangers(folder: Path, places: set[Path], names: Sequence[str]) -> Iterator[str]:
+    for place in sorted(places):
+        name = str(place.relative_to(folder))
+        yield f"{place}: the run has no such pair{suggestion(name, names) or f'; it has {_listed(names)}'}"
+
+
+def _require_free(run: RunFolder, name: str) -> None:
+    """Refuse a name that stands for a method of the run, or for one of ours."""
+    if not slug(name).strip("._"):
+        raise InputError(f"--as {name!r}: expected a name")
+    if name.partition("[")[0] in preset_names() or name.startswith("oracle-"):
+        raise InputError(f"--as {name}: a preset or an oracle of tunnelcd is called so: choose another")
+    for path in sorted(run.path.glob(f"cells/*/*/{slug(name)}.json")):
+        if (stored := run.read_cell(path)) is not None and stored["key"] != NO_KEY:
+            raise InputError(f"--as {name}: the run has a variant of this name: choose another")
+
+
+def _require_current(run: RunFolder) -> None:
+    """Refuse a run that was scored by other metrics than its predictions would be."""
+    cells = (run.read_cell(path) for path in sorted(run.path.glob("cells/*/*/*.json")))
+    others = versions_of(cell["row"] for cell in cells if cell is not None) - {str(METRICS_VERSION)}
+    if others:
+        told = " and ".join(sorted(others))
+        raise InputError(
+            f"{run.path}: has rows of metrics version {told}, but predictions are scored by {METRICS_VERSION}: "
+            f"`tunnelcd score {run.path}` first, which scores all of it again"
+        )
+
+
+def _copy(prediction: Path, answer: Path) -> None:
+    remove(answer)
+    answer.mkdir(parents=True)
+    for file in _FILES:
+        if (prediction / file).is_file():
+            shutil.copyfile(prediction / file, answer / file)
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
+    return f"{', '.join(names[:_TOLD])}{more}"

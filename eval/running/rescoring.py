@@ -1,0 +1,96 @@
+"""Stored answers into cells: how the runner scores, and how `tunnelcd score` scores again without running anything."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from cdpipe.io.answer import read_answer
+from eval.core.progress import RunProgress, Silent
+from eval.running.runfolder import IDENTITY, ITEM_TABLES, RunFolder, write_tables
+from eval.scoring.answer_check import check_answer
+from eval.scoring.scoring import CaseScore, score_answer
+from eval.truth.ground_truth import GroundTruth, load_ground_truth
+
+# of a cell that no run made: its rows stand behind all others
+NO_KEY, LAST = "", (1_000_000, 1_000_000)
+
+
+def score_stored(truth: GroundTruth, folder: Path) -> CaseScore:
+    """Score the answer stored in a folder.
+
+    Raises:
+        InputError: It is damaged, or cannot be an answer to this pair.
+    """
+    answer = read_answer(folder)
+    check_answer(answer, truth, folder)
+    return score_answer(answer, truth)
+
+
+def cell_document(score: CaseScore, identity: Mapping[str, Any], key: str, place: Sequence[int]) -> dict[str, Any]:
+    """Return a cell's content; every item carries the columns that name its row of results.csv.
+
+    Args:
+        score: What was scored.
+        identity: scenario, seed, variant and preset, whatever the answer calls itself; pair_kind; commit, the code that
+            made it.
+        key: Digest of what the cell depends on.
+        place: Where its rows stand in the tables: scenario, variant.
+    """
+    names = {name: identity[name] for name in IDENTITY}
+    items = {table: [{**names, **item} for item in getattr(score, table)] for table in ITEM_TABLES}
+    return {"key": key, "order": list(place), "row": {**score.row, **identity}, **items}
+
+
+def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
+    """Score every stored answer of a run again, without running anything, and rewrite the tables.
+
+    An answer that no run made (another program's, put beside ours) becomes a variant named like its folder.
+    Nothing is written before all are scored, so that a mistake in one or an interrupt leaves the run as it was.
+
+    Returns:
+        How many answers were scored.
+
+    Raises:
+        InputError: An answer is damaged, or its pair has no truth.
+    """
+    progress = progress or Silent()
+    folders = list(run.answer_folders())
+    documents: dict[Path, dict[str, Any]] = {}
+    place: Sequence[int]
+    for (slug, seed), group in groupby(folders, key=lambda folder: folder.parts[-3:-1]):
+        truth = load_ground_truth(run.path / "pairs" / slug / seed)
+        for folder in group:
+            path = run.path / "cells" / slug / seed / f"{folder.name}.json"
+            stored = run.read_cell(path)
+            if stored is None:
+                identity = foreign_identity(run, slug, seed, folder.name)
+                key, place = NO_KEY, LAST
+            else:
+                identity = {name: stored["row"].get(name) for name in (*IDENTITY, "preset", "commit")}
+                identity["pair_kind"] = stored["row"].get("pair_kind", "")
+                identity["is_contended"] = stored["row"].get("is_contended", False)
+                key, place = stored["key"], stored["order"]
+            progress.cells("{scenario} {seed} {variant}".format(**identity), len(documents), len(folders))
+            documents[path] = cell_document(score_stored(truth, folder), identity, key, place)
+    for path, document in documents.items():
+        run.write_cell(path, document)
+    progress.cells("done", len(documents), len(documents))
+    write_tables(run)
+    return len(documents)
+
+
+def foreign_identity(run: RunFolder, slug: str, seed: str, name: str) -> dict[str, Any]:
+    """Return what `cell_document` wants to know of an answer that no run made.
+
+    The world is called what the run's own cells call it, or like its folder where there are none.
+    """
+    world = {"scenario": slug.replace("__", "/"), "pair_kind": ""}
+    for path in sorted((run.path / "cells" / slug).glob("*/*.json")):
+        if (stored := run.read_cell(path)) is not None:
+            world = {"scenario": stored["row"]["scenario"], "pair_kind": stored["row"].get("pair_kind", "")}
+            break
+    who = {"seed": int(seed), "variant": name, "preset": name, "commit": None, "is_contended": False}
+    return {**world, **who}

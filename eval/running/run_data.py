@@ -1,0 +1,276 @@
+"""A run folder as the page reads it: the tables as plain rows, what belongs to which pair, and what is not there."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array
+from eval.plans.worlds import references
+from eval.running.runfolder import RunFolder
+
+Row = Mapping[str, Any]
+REQUIRED = ("scenario", "seed", "variant", "status")
+BASELINES = ("voxel-diff", "c2c", "random-regions")
+SHOWN_PRESETS = ("paper", "tunnelcd", "voxel-diff")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunData:
+    """The tables of a run.
+
+    Attributes:
+        folder: Where it lies.
+        results: Rows of results.csv, in file order.
+        changes: Rows of changes.csv.
+        regions: Rows of regions.csv.
+        provenance: Content of provenance.json, {} where there is none.
+        missing: What a whole run folder holds and this one does not, one sentence each.
+    """
+
+    folder: RunFolder
+    results: tuple[Row, ...]
+    changes: tuple[Row, ...]
+    regions: tuple[Row, ...]
+    provenance: Mapping[str, Any]
+    missing: tuple[str, ...]
+
+
+def read_run(run: Path) -> RunData:
+    """Read what the page needs from a run folder; everything but results.csv may be missing.
+
+    Raises:
+        InputError: There is no results.csv, it holds no row, lacks a column that names its rows, or one of them twice.
+    """
+    path = run / "results.csv"
+    if not path.is_file():
+        raise InputError(f"{path}: missing: name a folder made by `tunnelcd run` or `tunnelcd demo`")
+    results = _rows(path)
+    if not results:
+        raise InputError(f"{path}: holds no row: no case was finished, run the plan again")
+    absent = [name for name in REQUIRED if name not in results[0]]
+    if absent:
+        raise InputError(f"{path}: column {', '.join(absent)} is missing: expected a table written by `tunnelcd run`")
+    _require_cases(path, results)
+    missing: list[str] = []
+    items = {name: _optional_rows(run / f"{name}.csv", missing) for name in ("changes", "regions")}
+    provenance = _optional_json(run / "provenance.json", missing)
+    return RunData(RunFolder(run), results, items["changes"], items["regions"], provenance, tuple(missing))
+
+
+def _require_cases(path: Path, rows: Iterable[Row]) -> None:
+    """Refuse rows that are no case, or one that stands there twice: every mean would be wrong."""
+    seen = set()
+    for line, row in enumerate(rows, start=2):
+        try:
+            seed = int(row["seed"])
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"{path}:{line}: seed = {row['seed']}: expected a whole number") from error
+        if float(row["seed"]) != seed:
+            raise InputError(f"{path}:{line}: seed = {row['seed']}: expected a whole number")
+        case = (text(row, "scenario"), seed, text(row, "variant"))
+        if case in seen:
+            raise InputError(f"{path}:{line}: {case[0]}, seed {case[1]}, {case[2]} stands there twice")
+        seen.add(case)
+
+
+def number(row: Row, column: str) -> float:
+    """Return a cell as a number; NaN where it is empty, absent or not a number."""
+    value = row.get(column)
+    if value is None or isinstance(value, str):
+        return math.nan
+    return float(value)
+
+
+def flag(row: Row, column: str) -> bool | None:
+    """Return a cell as a truth value; None where it is empty or absent."""
+    value = row.get(column)
+    if isinstance(value, str):
+        return {"true": True, "false": False}.get(value.strip().lower())
+    return None if value is None or math.isnan(float(value)) else bool(value)
+
+
+def text(row: Row, column: str) -> str:
+    """Return a cell as text, "" where it is empty or absent."""
+    value = row.get(column)
+    return "" if value is None or (isinstance(value, float) and math.isnan(value)) else str(value)
+
+
+def defined(rows: Iterable[Row], column: str) -> Float64Array:
+    """Return the (N,) defined values of a column."""
+    values = np.array([number(row, column) for row in rows], dtype=np.float64)
+    return values[~np.isnan(values)]
+
+
+def over_pairs(rows: Iterable[Row], column: str) -> float:
+    """Return the mean of the defined values of a column, their median for times; NaN where there is none."""
+    values = defined(rows, column)
+    if len(values) == 0:
+        return math.nan
+    return float(np.median(values) if column.startswith("t_") else values.mean())
+
+
+def of(rows: Iterable[Row], **wanted: Any) -> list[Row]:
+    """Return the rows whose cells equal what is wanted."""
+    found = list(rows)
+    for name, value in wanted.items():  # column by column: five times faster than cell by cell
+        found = [row for row in found if row.get(name) == value]
+    return found
+
+
+def scenarios(data: RunData, *, unchanged: bool) -> list[str]:
+    """Return the scenarios with changes, or those without, in the order of results.csv.
+
+    Those whose every variant only repeats another world's are left out: `eval.report.settings.effects` shows them.
+    """
+    held = repeats(data)
+    names = dict.fromkeys(world for world, variant, _ in _cases(data) if (world, variant) not in held)
+    return [name for name in names if is_unchanged(data, name) == unchanged]
+
+
+def repeats(data: RunData) -> dict[tuple[str, str], str]:
+    """Return the world that each (world, variant) is held against, where there is one (`eval.plans.worlds`)."""
+    return references(_cases(data))
+
+
+def is_unchanged(data: RunData, scenario: str) -> bool:
+    """Tell whether nothing changed in any pair of a scenario, as far as its rows say."""
+    flags = [flag(row, "is_unchanged_pair") for row in of(data.results, scenario=scenario)]
+    known = [value for value in flags if value is not None]
+    return bool(known) and all(known)
+
+
+def named_variants(data: RunData, scenario: str) -> list[str]:
+    """Return the variants of a scenario that are neither grid point nor repetition, in the order of results.csv."""
+    held = repeats(data)
+    names = dict.fromkeys(name for world, name, _ in _cases(data) if world == scenario and (world, name) not in held)
+    points = grid_points(data)
+    return [name for name in names if (scenario, name) not in points]
+
+
+def first_seed(data: RunData, scenario: str) -> int:
+    """Return the seed of a scenario that the pictures show: the first that is no repetition."""
+    held = repeats(data)
+    return min(seed for world, name, seed in _cases(data) if world == scenario and (world, name) not in held)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GridOf:
+    """The points of one preset on a grid of two settings.
+
+    Attributes:
+        scenario: Where it was run.
+        preset: Over which preset, and what else was set to one value.
+        keys: The two settings; rows first.
+        values: Their values, as texts, in rising order.
+        points: Name of the variant at each pair of values.
+    """
+
+    scenario: str
+    preset: str
+    keys: tuple[str, str]
+    values: tuple[tuple[str, ...], tuple[str, ...]]
+    points: Mapping[tuple[str, str], str]
+
+
+def grids(data: RunData) -> list[GridOf]:
+    """Find the grids: variants of one preset that set the same keys, two of them to several values, the rest to one."""
+    found: dict[tuple[str, str, tuple[str, ...]], dict[str, dict[str, str]]] = {}
+    for row in data.results:
+        preset, settings = split_variant(str(row["variant"]))
+        found.setdefault((str(row["scenario"]), preset, tuple(settings)), {})[str(row["variant"])] = settings
+    result = []
+    for (scenario, preset, keys), variants in found.items():
+        values = {key: _sorted({settings[key] for settings in variants.values()}) for key in keys}
+        varied = [key for key in keys if len(values[key]) >= 2]
+        if len(varied) == 2:
+            row_key, column_key = varied
+            fixed = ", ".join(f"{key}={values[key][0]}" for key in keys if key not in varied)
+            points = {(settings[row_key], settings[column_key]): name for name, settings in variants.items()}
+            axes = (values[row_key], values[column_key])
+            name = f"{preset} with {fixed}" if fixed else preset
+            result.append(GridOf(scenario, name, (row_key, column_key), axes, points))
+    return result
+
+
+def grid_points(data: RunData) -> set[tuple[str, str]]:
+    """Return the scenario and the variant of every point of a grid."""
+    return {(grid.scenario, name) for grid in grids(data) for name in grid.points.values()}
+
+
+def off_grids(table: pd.DataFrame, data: RunData) -> pd.DataFrame:
+    """Return the rows of a table whose `variant` is more than a point of a grid; all rows where none is.
+
+    `eval.report.settings.grids` shows the points of grids, hundreds of them, in less space.
+    """
+    points = grid_points(data)
+    shown = {variant for world, variant, _ in _cases(data) if (world, variant) not in points}
+    rows = table[table["variant"].isin(shown)]
+    return rows if len(rows) else table
+
+
+def split_variant(variant: str) -> tuple[str, dict[str, str]]:
+    """Return the preset of a variant and its settings: "a[k=1,l=2]" gives "a" and {"k": "1", "l": "2"}."""
+    preset, bracket, rest = variant.partition("[")
+    if not bracket or not rest.endswith("]"):
+        return variant, {}
+    settings: dict[str, str] = {}
+    for part in rest[:-1].split(","):
+        key, _, value = part.partition("=")
+        settings[key.strip()] = value.strip()
+    return preset, settings
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """Read a JSON object; {} where it is missing or damaged."""
+    try:
+        document = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return document if isinstance(document, dict) else {}
+
+
+def _cases(data: RunData) -> list[tuple[str, str, int]]:
+    return [(str(row["scenario"]), str(row["variant"]), int(row["seed"])) for row in data.results]
+
+
+def _sorted(values: set[str]) -> tuple[str, ...]:
+    def order(value: str) -> tuple[int, float, str]:
+        try:
+            return 0, float(value), value
+        except ValueError:
+            return 1, 0.0, value
+
+    return tuple(sorted(values, key=order))
+
+
+def _rows(path: Path) -> tuple[Row, ...]:
+    try:
+        frame = pd.read_csv(path)
+    except pd.errors.EmptyDataError:
+        return ()
+    except (OSError, UnicodeDecodeError, pd.errors.ParserError) as error:
+        raise InputError(f"{path}: cannot be read as a table: {error}") from error
+    return tuple({str(key): value for key, value in row.items()} for row in frame.to_dict("records"))
+
+
+def _optional_rows(path: Path, missing: list[str]) -> tuple[Row, ...]:
+    if not path.is_file():
+        missing.append(f"{path.name} is not in the run folder: what it would show is left out.")
+        return ()
+    return _rows(path)
+
+
+def _optional_json(path: Path, missing: list[str]) -> Mapping[str, Any]:
+    document = read_document(path)
+    if not document:
+        missing.append(f"{path.name} is not in the run folder or damaged: machine, command and versions are unknown.")
+    return document

@@ -1,0 +1,256 @@
+"""Runs the pairs of a plan on workers, which write their cells into the run's folder themselves.
+
+A task is a pair with its unfinished cells. What a worker finished is on the disk, whoever dies after that; so workers
+need the folder under the same path as the client (a cluster of several machines, a shared disk). Before a worker
+begins a cell it leaves a trace beside the cell's file and removes it afterwards. A trace that is met names the cell
+in flight when a worker died; that cell is tried once more in a process of its own, and becomes a row of status
+`worker_died` if this dies too. The cells beside it are not suspected, also where a worker has many threads.
+"""
+
+from __future__ import annotations
+
+import pickle
+import socket
+import time
+import uuid
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from cdpipe.core.errors import InputError
+from eval.core.cluster import is_shared, n_slots
+from eval.core.isolation import run_isolated
+from eval.core.progress import RunProgress, Silent
+from eval.running.pair_run import Made, Pair, PairRun, Todo, cell_key, is_finished, pair_lock
+from eval.running.runfolder import RunFolder
+from eval.scoring.scoring import METRICS_VERSION
+from scenarios.references import file_digests
+
+_AHEAD = 2  # pairs that wait in a cluster for each of its threads
+_LOOK_S = 0.5
+_NO_WORKERS_S = 60.0
+_TRIES = 3  # of a suspect: with its worker, and twice alone should a worker be killed that only watches
+_TRACE, _TOKEN = ".begun", ".workers"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """What a worker is given: a pair, the folder to write into, and what tells that the run still goes on."""
+
+    folder: Path
+    token: str
+    pair: Pair
+    made: Made
+    metrics_version: int = METRICS_VERSION
+
+
+def run_on_workers(client: Any, run: RunFolder, pairs: Sequence[Pair], made: Made, progress: RunProgress) -> None:
+    """Run pairs on the workers of a Dask client; returns when all of their cells are finished.
+
+    Raises:
+        InputError: The workers do not see the folder, or go away.
+    """
+    from distributed.comm import CommClosedError  # noqa: PLC0415 - an extra, and slow to import
+
+    folder = run.path.absolute()
+    token = uuid.uuid4().hex
+    (folder / _TOKEN).write_text(token)
+    try:
+        _Dispatch(client, folder, token, pairs, made, progress).run()
+    except (CancelledError, CommClosedError) as error:
+        raise InputError(
+            "the scheduler went away; finished cells are kept, the same command goes on from there"
+        ) from error
+    finally:
+        # workers of a cluster outlive this process: without the token they stop after the cell in flight
+        if _token(folder) == token:
+            (folder / _TOKEN).unlink(missing_ok=True)
+
+
+def remove_traces(run: RunFolder) -> None:
+    """Forget which cells an earlier run left in flight, and stop workers that may still be at it."""
+    (run.path / _TOKEN).unlink(missing_ok=True)
+    for trace in [*run.path.glob(f"cells/*/*/.*{_TRACE}"), *run.path.glob(f"pairs/*/.*{_TRACE}")]:
+        trace.unlink(missing_ok=True)
+
+
+class _Dispatch:
+    """Keeps the workers busy until all pairs are done."""
+
+    def __init__(
+        self, client: Any, folder: Path, token: str, pairs: Sequence[Pair], made: Made, progress: RunProgress
+    ) -> None:
+        self._client = client
+        self._run = RunFolder(folder)
+        self._token = token
+        self._made = made
+        self._progress = progress
+        self._waiting = deque(pairs)
+        self._flying: dict[Any, Pair] = {}
+        self._n_killed: Counter[tuple[str, int]] = Counter()
+        self._n_total = sum(len(pair.todo) for pair in pairs)
+        self._n_done = 0
+
+    def run(self) -> None:
+        from distributed import wait  # noqa: PLC0415 - an extra, and slow to import
+
+        seen = time.monotonic()
+        while self._waiting or self._flying:
+            slots = n_slots(self._client)
+            self._submit(_AHEAD * max(1, slots))
+            self._tell(max(1, slots))
+            if slots:
+                seen = time.monotonic()
+            elif time.monotonic() - seen > _NO_WORKERS_S:
+                raise InputError("the cluster has no workers left: start some, and run the same command again")
+            try:
+                done = wait(list(self._flying), timeout=_LOOK_S, return_when="FIRST_COMPLETED").done
+            except TimeoutError:
+                continue
+            for future in done:
+                self._take(future, self._flying.pop(future))
+
+    def _submit(self, n_flying: int) -> None:
+        while self._waiting and len(self._flying) < n_flying:
+            pair = self._waiting.popleft()
+            made = replace(self._made, is_contended=is_shared(self._client))
+            task = Task(self._run.path, self._token, pair, made)
+            self._flying[self._client.submit(work_on, pickle.dumps(task), pure=False)] = pair
+
+    def _take(self, future: Any, pair: Pair) -> None:
+        from distributed import KilledWorker  # noqa: PLC0415 - as above
+
+        try:
+            problem = future.result()
+        except KilledWorker as error:
+            # Dask gives up a task after some deaths, even one that only waited where others died
+            self._n_killed[pair.name, pair.seed] += 1
+            if self._n_killed[pair.name, pair.seed] > len(pair.todo) + 2:
+                raise InputError(f"{pair.name} {pair.seed}: workers die before they begin one of its cells") from error
+            self._waiting.append(pair)
+            return
+        finally:
+            future.release()  # or a worker that dies later takes a finished pair with it, and it runs again
+        if problem:
+            taken = _token(self._run.path) != self._token
+            raise InputError(f"{self._run.path}: another run has taken the folder" if taken else problem)
+        self._n_done += len(pair.todo)
+
+    def _tell(self, n_named: int) -> None:
+        """Count the files of the cells in flight: whatever else is lost, they are what is finished."""
+        at_work = list(self._flying.values())
+        paths = [self._run.cell(pair.name, pair.seed, each.cell.variant) for pair in at_work for each in pair.todo]
+        n_done = self._n_done + sum(path.exists() for path in paths)
+        names = ", ".join(f"{pair.name} {pair.seed}" for pair in at_work[:n_named])
+        self._progress.cells(names, n_done, self._n_total)
+
+
+def work_on(pickled: bytes) -> str:
+    """Run a pair's unfinished cells; runs on a worker.
+
+    Returns:
+        "", or why this worker cannot.
+    """
+    task: Task = pickle.loads(pickled)
+    if problem := _unfit(task):
+        return problem
+    run, pair = RunFolder(task.folder), task.pair
+    with pair_lock(run, pair):
+        here = PairRun(run, pair, task.made, Silent())
+        death = ""
+        for each in [each for each in pair.todo if not is_finished(run, each)]:
+            if _token(task.folder) != task.token:
+                return "the run was stopped"
+            trace = run.cell(pair.name, pair.seed, each.cell.variant).with_suffix(_TRACE)
+            trace = trace.with_name(f".{trace.name}")
+            if not death and not _n_begun(trace):
+                death = _death_of_opening(task, here)
+            death_of_cell = death or _death_of_cell(task, here, each, trace)
+            if death_of_cell:
+                here.write_died(each, f"killed its worker, and again where it ran alone ({death_of_cell})")
+    return ""
+
+
+def open_or_do(task: Task) -> None:
+    """Open a task's pair, and run its cells."""
+    alone = PairRun(RunFolder(task.folder), task.pair, task.made, Silent())
+    alone.open()
+    for each in task.pair.todo:
+        alone.do(each)
+
+
+def _death_of_opening(task: Task, here: PairRun) -> str:
+    """Simulate and open a pair here, first alone where that has killed a worker; returns what it dies of."""
+    if here.is_open:
+        return ""
+    trace = here.folder.with_name(f".{here.folder.name}{_TRACE}")
+    with _traced(trace) as n_begun:
+        if n_begun >= _TRIES:
+            return "several times"
+        if n_begun and (death := run_isolated(open_or_do, _only(task))):
+            return death
+        here.open()
+    return ""
+
+
+def _death_of_cell(task: Task, here: PairRun, each: Todo, trace: Path) -> str:
+    """Run a cell here, or alone where it was in flight when a worker died; returns what it dies of."""
+    with _traced(trace) as n_begun:
+        if n_begun >= _TRIES:
+            return "several times"
+        if n_begun:
+            return run_isolated(open_or_do, _only(task, each))
+        here.do(each)
+    return ""
+
+
+@contextmanager
+def _traced(trace: Path) -> Iterator[int]:
+    """Leave a trace that only a death leaves behind; yields how often this was begun before."""
+    n_begun = _n_begun(trace)
+    trace.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        trace.write_text(str(n_begun + 1))
+        yield n_begun
+    finally:
+        trace.unlink(missing_ok=True)
+
+
+def _n_begun(trace: Path) -> int:
+    try:
+        return int(trace.read_text() or 1)
+    except FileNotFoundError:
+        return 0
+
+
+def _only(task: Task, *todo: Todo) -> Task:
+    return replace(task, pair=replace(task.pair, todo=todo))
+
+
+def _unfit(task: Task) -> str:
+    """Tell why the process that runs this cannot do what its client would do; "" if it can."""
+    here, pair = socket.gethostname(), task.pair
+    if _token(task.folder) != task.token:
+        return f"{task.folder}: a worker on {here} does not see it: workers need the same folder under the same path"
+    try:
+        files = {} if pair.scenario is None else file_digests(pair.scenario)
+        keys = [cell_key(each.cell, pair.kind, pair.scenario, files) for each in pair.todo]
+    except InputError as error:
+        return f"a worker on {here}: {error}"
+    if keys != [each.key for each in pair.todo] or task.metrics_version != METRICS_VERSION:
+        return (
+            f"{pair.name} {pair.seed}: a worker on {here} has other files, weights, extras or metrics than this "
+            "process: start it anew with the same version of tunnelcd"
+        )
+    return ""
+
+
+def _token(folder: Path) -> str:
+    try:
+        return (folder / _TOKEN).read_text()
+    except OSError:
+        return ""

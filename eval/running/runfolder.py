@@ -1,0 +1,279 @@
+"""A run's folder: where everything lies, what is finished, and the tables that are put together from its cells.
+
+provenance.json                               marks a run folder; written first
+pairs/<world>/<seed>/{before,after,truth}     simulated pairs; a world is a scenario, with what is set over it
+answers/<world>/<seed>/<variant>/             raw answers (cdpipe.io.answer)
+maps/<world>/<seed>.npz                       thinned maps for pictures
+stages/<world>/<seed>/                        what the pipeline's stages gave (eval.running.stage_cache); may be removed
+cells/<world>/<seed>/<variant>.json           a finished cell: key, order, row, items
+results.csv changes.csv regions.csv objects.csv keyframes.csv summary.csv
+merge.csv                                     where pairs have a kind (eval.tables.merge_table)
+regions_table.csv regions_targets.csv regions_by_size.csv roc.csv froc.csv
+                                              where the plan says `report: regions` (eval.tables.region_table)
+objects_table.csv objects_by_group.csv objects_targets.csv
+                                              where it says `report: objects` (eval.tables.object_table)
+effects.csv                                   where a world was run with and without a setting (eval.tables.effects)
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cdpipe.core.errors import InputError
+from eval.core.output import make_writable
+from eval.core.provenance import TOOL
+from eval.core.statistics import summarise
+from eval.plans.coverage import coverage
+from eval.plans.variants import slug
+from eval.plans.worlds import world_slug
+from eval.tables.effects import effects
+from eval.tables.merge_table import merge_table
+from eval.tables.object_table import FILES as OBJECT_FILES
+from eval.tables.object_table import object_tables
+from eval.tables.region_table import FILES as REGION_FILES
+from eval.tables.region_table import region_tables
+
+IDENTITY = ("scenario", "seed", "variant")
+ITEM_TABLES = ("changes", "regions", "objects", "keyframes")
+# what readers of an empty table may ask for
+_MINIMAL_COLUMNS = {"keyframes": ("keyframe", "score", "label")}
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """The folder of one run and the places in it."""
+
+    path: Path
+
+    def pair(self, scenario: str, seed: int) -> Path:
+        """Folder of a simulated pair."""
+        return self.path / "pairs" / world_slug(scenario) / str(seed)
+
+    def answer(self, scenario: str, seed: int, variant: str) -> Path:
+        """Folder of a raw answer."""
+        return self.path / "answers" / world_slug(scenario) / str(seed) / slug(variant)
+
+    def cell(self, scenario: str, seed: int, variant: str) -> Path:
+        """File of a finished cell."""
+        return self.path / "cells" / world_slug(scenario) / str(seed) / f"{slug(variant)}.json"
+
+    def maps(self, scenario: str, seed: int) -> Path:
+        """File of the thinned maps of a pair."""
+        return self.path / "maps" / world_slug(scenario) / f"{seed}.npz"
+
+    def stages(self, scenario: str, seed: int) -> Path:
+        """Folder of what the stages of a pair gave."""
+        return self.path / "stages" / world_slug(scenario) / str(seed)
+
+    def answer_folders(self) -> Iterator[Path]:
+        """Yield the folder of every stored answer, sorted."""
+        yield from sorted(file.parent for file in self.path.glob("answers/*/*/*/answer.json"))
+
+    def read_cell(self, path: Path) -> dict[str, Any] | None:
+        """Read a finished cell; None where there is none, or what is there was cut short."""
+        try:
+            document = json.loads(path.read_text())
+        except (FileNotFoundError, json.JSONDecodeError):
+            return None
+        whole = isinstance(document, dict) and {"key", "order", "row", *ITEM_TABLES} <= set(document)
+        return document if whole else None
+
+    def write_cell(self, path: Path, document: Mapping[str, Any]) -> None:
+        """Write a finished cell; it appears whole or not at all."""
+        write_json(path, document)
+
+    def provenance(self) -> dict[str, Any]:
+        """Read provenance.json.
+
+        Raises:
+            InputError: It is missing, damaged or another program's.
+        """
+        path = self.path / "provenance.json"
+        try:
+            document = json.loads(path.read_text())
+        except FileNotFoundError as error:
+            raise InputError(f"{self.path}: not a run folder (no provenance.json): name one made by `run`") from error
+        except (OSError, json.JSONDecodeError) as error:
+            raise InputError(f"{path}: damaged: {error}") from error
+        if not isinstance(document, dict) or document.get("tool") != TOOL:
+            raise InputError(f"{path}: not written by {TOOL}: name a run folder made by `{TOOL} run`")
+        return document
+
+    def write_provenance(self, document: Mapping[str, Any]) -> None:
+        """Write provenance.json."""
+        write_json(self.path / "provenance.json", document)
+
+
+def start_run_folder(path: Path) -> RunFolder:
+    """Take a folder to run in: a new or empty one, or one that an earlier run left.
+
+    Raises:
+        InputError: It holds something else, or cannot be written.
+    """
+    make_writable(path)
+    run = RunFolder(path)
+    if any(path.iterdir()):
+        if not (path / "provenance.json").exists():
+            raise InputError(f"{path}: not empty and not a run folder: name a new folder, or empty this one")
+        run.provenance()
+    return run
+
+
+@contextmanager
+def removed_if_empty(path: Path) -> Iterator[None]:
+    """Leave no new folder behind where the block fails before it has written anything."""
+    was_there = path.exists()
+    try:
+        yield
+    except BaseException:
+        if not was_there and path.is_dir() and not any(path.iterdir()):
+            path.rmdir()
+        raise
+
+
+def open_run_folder(path: Path) -> RunFolder:
+    """Open the folder of an earlier run.
+
+    Raises:
+        InputError: There is none.
+    """
+    if not path.is_dir():
+        raise InputError(f"{path}: no such run folder")
+    run = RunFolder(path)
+    run.provenance()
+    return run
+
+
+def write_tables(run: RunFolder) -> pd.DataFrame:
+    """Put results.csv, the item tables, summary.csv, merge.csv and effects.csv together from the finished cells.
+
+    Returns:
+        The rows of results.csv.
+
+    Raises:
+        InputError: No cell is finished.
+    """
+    cells = [run.read_cell(path) for path in sorted(run.path.glob("cells/*/*/*.json"))]
+    whole = [cell for cell in cells if cell is not None]
+    if not whole:
+        raise InputError(f"{run.path}: no finished cell: run a plan first")
+    whole.sort(key=lambda cell: (cell["order"][0], cell["row"]["scenario"], cell["row"]["seed"], cell["order"][1]))
+    # cells of before there were workers were run alone
+    results = pd.DataFrame([{**cell["row"], "is_contended": cell["row"].get("is_contended", False)} for cell in whole])
+    _write_csv(run.path / "results.csv", results)
+    items = {table: _items(table, whole) for table in ITEM_TABLES}
+    for table, frame in items.items():
+        _write_csv(run.path / f"{table}.csv", frame)
+    _write_csv(run.path / "summary.csv", summarise(results, keyframes=items["keyframes"]))
+    tables = {"effects": effects(results), "merge": merge_table(results), **_report_tables(run, results, items)}
+    for name, found in tables.items():
+        if len(found):
+            _write_csv(run.path / f"{name}.csv", found)
+        else:
+            remove(run.path / f"{name}.csv")
+    return results
+
+
+def current_results(run: RunFolder, earlier: Mapping[str, Any], now: Mapping[str, Any]) -> pd.DataFrame | None:
+    """Return the rows of results.csv where `write_tables` would write what is there already; None where it might not.
+
+    Args:
+        run: The folder.
+        earlier: The provenance of the run before.
+        now: That of the present one, which must be of the same plan, code and packages. Code that is under change, or
+            whose commit is not known, may have changed.
+    """
+    commit, subjects = now["git_commit"], reported(now)
+    if commit is None or commit.endswith("+") or "finished" not in earlier:
+        return None
+    if _lasting(earlier) != _lasting(json.loads(json.dumps(now, default=_plain))):
+        return None
+    names = ["results", "summary", *ITEM_TABLES]
+    names += [*(REGION_FILES if "regions" in subjects else ()), *(OBJECT_FILES if "objects" in subjects else ())]
+    tables, cells = [run.path / f"{name}.csv" for name in names], [*run.path.glob("cells/*/*/*.json")]
+    if not cells or not all(table.is_file() for table in tables):
+        return None
+    if max(cell.stat().st_mtime_ns for cell in cells) >= min(table.stat().st_mtime_ns for table in tables):
+        return None
+    results = pd.read_csv(run.path / "results.csv", low_memory=False)
+    return results if len(results) == len(cells) else None
+
+
+def _lasting(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in provenance.items() if key not in {"started", "finished", "command", "machine"}}
+
+
+def reported(provenance: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what the plan of a run asks a report of: "regions", "objects", both or nothing."""
+    plan = provenance.get("plan")
+    subjects = (plan.get("report") or ()) if isinstance(plan, Mapping) else ()
+    return (subjects,) if isinstance(subjects, str) else tuple(subjects)
+
+
+def _report_tables(
+    run: RunFolder, results: pd.DataFrame, items: Mapping[str, pd.DataFrame]
+) -> Mapping[str, pd.DataFrame]:
+    """Return the tables that the plan asks for, and empty ones for those that it does not."""
+    tables = {name: pd.DataFrame() for name in (*REGION_FILES, *OBJECT_FILES)}
+    provenance = run.provenance() if (run.path / "provenance.json").is_file() else {}
+    subjects = reported(provenance)
+    if not subjects or "region_auroc" not in results:
+        return tables
+    covered = coverage(
+        provenance, zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
+    )
+    is_whole = covered is None or covered.is_whole
+    if "regions" in subjects:
+        tables |= region_tables(results, items, is_whole=is_whole)
+    if "objects" in subjects:
+        tables |= object_tables(results, items["changes"], is_whole=is_whole)
+    return tables
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write JSON that appears whole or not at all; numpy scalars become plain numbers."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(document, indent=1, default=_plain)
+    _whole(path, lambda partial: partial.write_text(text))
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder, if it is there."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _items(table: str, cells: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    rows = [item for cell in cells for item in cell[table]]
+    return pd.DataFrame(rows) if rows else pd.DataFrame(columns=[*IDENTITY, *_MINIMAL_COLUMNS.get(table, ())])
+
+
+def _write_csv(path: Path, frame: pd.DataFrame) -> None:
+    _whole(path, lambda partial: frame.to_csv(partial, index=False))
+
+
+def _whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file that appears whole or not at all; where the disk is full, nothing is left of it."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        write(partial)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} does not fit into JSON")

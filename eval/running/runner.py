@@ -1,0 +1,236 @@
+"""Runs a plan here or on workers; finished cells are kept, and a run that was cut off goes on where it stopped.
+
+A cell is finished when its file holds the digest of what it depends on: the scenario as drawn, the files it names, the
+effective settings, the weights, the version of the metrics, what the plan says of it (oracles, where it ends, the
+kind of its pair), and whether KISS-Matcher was missing where its merge asks for it. A merge that is refused, a cell
+that kills its worker, and any other error of the input are rows of their own; a bug is not caught.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.descriptors import checkpoint_digest, sphere_digest
+from cdpipe.methods.registry import load_method
+from cdpipe.model.config import DescriptorConfig
+from eval.core.cluster import HERE, Where, connected, require_usable
+from eval.core.progress import RunProgress, Silent
+from eval.core.provenance import describe_run, digest, now
+from eval.plans.plan import Plan, cells
+from eval.plans.variants import Cell
+from eval.plans.worlds import worlds_of
+from eval.running.pair_run import Made, Pair, PairRun, Todo, cell_key, is_finished, pair_lock
+from eval.running.run_workers import remove_traces, run_on_workers
+from eval.running.runfolder import RunFolder, current_results, remove, write_tables
+from scenarios.library import load_scenario
+from scenarios.references import file_digests
+from sim.session.truth import read_pair_truth
+
+
+@dataclass(frozen=True, slots=True)
+class RunOutcome:
+    """How a run ended: cells done now, kept from earlier, left over by --limit, and rows of cells that kill workers."""
+
+    n_done: int
+    n_kept: int
+    n_left: int
+    n_died: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """One cell of a plan, and whether a run would do it: "finished", "to do", or "left" over by --limit."""
+
+    scenario: str
+    seed: int
+    variant: str
+    state: str
+
+
+def run_plan(
+    plan: Plan,
+    run: RunFolder,
+    *,
+    command: Sequence[str] = (),
+    force: bool = False,
+    limit: int | None = None,
+    where: Where = HERE,
+    progress: RunProgress | None = None,
+) -> RunOutcome:
+    """Run the cells of a plan that are not finished, and put the tables together.
+
+    Args:
+        plan: The plan.
+        run: The folder to run in; workers write into it too.
+        command: The command line, for the provenance.
+        force: Start the plan's cells and pairs from nothing.
+        limit: Do at most this many cells.
+        where: In this process, on workers of this machine, or on a cluster.
+        progress: Told what is being done.
+
+    Raises:
+        InputError: A setting is wrong, a method's extra is missing, the folder cannot be written, or the cluster cannot
+            be used.
+    """
+    progress = progress or Silent()
+    require_usable(where)
+    all_cells = cells(plan)
+    provenance = _provenance(plan, all_cells, command)
+    pairs = _pairs(run, plan, all_cells, force)
+    n_todo = sum(len(pair.todo) for pair in pairs)
+    chosen = _limited(pairs, limit)
+    n_run = sum(len(pair.todo) for pair in chosen)
+    _require_extras(chosen)
+    _tell_idle(where, len(chosen), progress)
+    made = Made(provenance["git_commit"])
+    earlier = run.provenance() if (run.path / "provenance.json").is_file() else {}
+    results = None if n_todo else current_results(run, earlier, provenance)
+    # a cluster that cannot be used is told before anything is written
+    with nullcontext() if where == HERE or not chosen else connected(where, len(chosen)) as client:
+        if results is None:
+            run.write_provenance(provenance)
+        remove_traces(run)
+        # what --limit leaves over may be stale too, and no table may hold it
+        for pair in pairs:
+            _remove_stale(run, pair, force)
+        if client is None:
+            _run_here(run, chosen, made, progress, n_run)
+        else:
+            run_on_workers(client, run, chosen, made, progress)
+    progress.cells("done", n_run, n_run)
+    if results is None:
+        results = write_tables(run)
+        run.write_provenance({**provenance, "finished": now()})
+    n_died = int((results["status"] == "worker_died").sum())
+    return RunOutcome(n_run, len(all_cells) - n_todo, n_todo - n_run, n_died)
+
+
+def listed(plan: Plan, path: Path, *, force: bool = False, limit: int | None = None) -> list[Listed]:
+    """Return what `run_plan` would do with every cell of a plan, in their order; nothing is written.
+
+    Raises:
+        InputError: A setting is wrong, or the folder holds something else than a run.
+    """
+    run = RunFolder(path)
+    if path.is_dir() and any(path.iterdir()):
+        run.provenance()
+    elif path.exists() and not path.is_dir():
+        raise InputError(f"{path}: is a file: name a folder to run in")
+    all_cells = cells(plan)
+    pairs = _pairs(run, plan, all_cells, force)
+    todo = {(each.cell.scenario, each.cell.seed, each.cell.variant) for pair in pairs for each in pair.todo}
+    chosen = {
+        (each.cell.scenario, each.cell.seed, each.cell.variant) for pair in _limited(pairs, limit) for each in pair.todo
+    }
+    names = [(cell.scenario, cell.seed, cell.variant) for cell in all_cells]
+    return [Listed(*name, "to do" if name in chosen else "left" if name in todo else "finished") for name in names]
+
+
+def _run_here(run: RunFolder, pairs: Sequence[Pair], made: Made, progress: RunProgress, n_run: int) -> None:
+    n_done = 0
+    for pair in pairs:
+        with pair_lock(run, pair):
+            here = PairRun(run, pair, made, progress)
+            progress.cells(f"{pair.name} {pair.seed}", n_done, n_run)
+            here.open()
+            for each in pair.todo:
+                progress.cells(f"{pair.name} {pair.seed} {each.cell.variant}", n_done, n_run)
+                here.do(each)
+                n_done += 1
+
+
+def _pairs(run: RunFolder, plan: Plan, all_cells: Sequence[Cell], force: bool) -> list[Pair]:
+    variants = list(dict.fromkeys(cell.variant for cell in all_cells))
+    places = {world.label: (place, world) for place, world in enumerate(worlds_of(plan.scenarios))}
+    pairs = []
+    for (label, seed), group in groupby(all_cells, key=lambda cell: (cell.scenario, cell.seed)):
+        place, world = places[label]
+        scenario, files, error = None, {}, ""
+        try:
+            scenario = load_scenario(world.name, seed, world.settings)
+            files = file_digests(scenario)
+        except ScenarioError as mistake:
+            error = str(mistake)
+        every = [
+            Todo(cell, cell_key(cell, world.pair_kind, scenario, files), (place, variants.index(cell.variant)))
+            for cell in group
+        ]
+        todo = [each for each in every if force or not is_finished(run, each)]
+        # cells that share a map setting come one after the other, because only one setting's maps are held
+        todo.sort(key=lambda each: each.cell.config.map.model_dump_json())
+        family = world.name if scenario is None else scenario.family
+        pairs.append(Pair(label, family, world.pair_kind, seed, scenario, files, error, tuple(todo)))
+    return pairs
+
+
+def _limited(pairs: Sequence[Pair], limit: int | None) -> list[Pair]:
+    """Return the pairs that have something to do, with at most so many cells together."""
+    left = sum(len(pair.todo) for pair in pairs) if limit is None else limit
+    chosen = []
+    for pair in pairs:
+        todo = pair.todo[:left]
+        left -= len(todo)
+        if todo:
+            chosen.append(replace(pair, todo=todo))
+    return chosen
+
+
+def _require_extras(pairs: Sequence[Pair]) -> None:
+    """Refuse to begin where methods need packages that are not here; all of them at once."""
+    mistakes = []
+    for method in dict.fromkeys(each.cell.config.method for pair in pairs for each in pair.todo):
+        try:
+            load_method(method)
+        except InputError as error:
+            mistakes.append(str(error))
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+
+
+def _tell_idle(where: Where, n_pairs: int, progress: RunProgress) -> None:
+    """Say so where there are fewer pairs than workers: a pair is not split, since its cells share stages and maps."""
+    if where.workers is not None and 0 < n_pairs < where.workers:
+        pairs = "1 pair is" if n_pairs == 1 else f"{n_pairs} pairs are"
+        progress.note(
+            f"--workers {where.workers}: {pairs} left to do, and each keeps one worker busy (its cells share stages), "
+            f"so {where.workers - n_pairs} will not be started"
+        )
+
+
+def _remove_stale(run: RunFolder, pair: Pair, force: bool) -> None:
+    """Remove what is about to be redone, so that no table can hold it should the run be cut off."""
+    if not pair.todo:
+        return
+    if force or not _is_simulated(run.pair(pair.name, pair.seed), pair):
+        remove(run.pair(pair.name, pair.seed))
+        remove(run.maps(pair.name, pair.seed))
+    for each in pair.todo:
+        remove(run.cell(pair.name, pair.seed, each.cell.variant))
+        remove(run.answer(pair.name, pair.seed, each.cell.variant))
+
+
+def _is_simulated(path: Path, pair: Pair) -> bool:
+    """Tell whether a pair is there, whole, of this very scenario, and made from the files as they are now."""
+    if pair.scenario is None:
+        return False
+    try:
+        truth = read_pair_truth(path)
+    except InputError:
+        return False
+    is_same = digest(truth.scenario) == digest(pair.scenario.model_dump(mode="json"))
+    return is_same and truth.seed == pair.seed and truth.files == pair.files
+
+
+def _provenance(plan: Plan, all_cells: Sequence[Cell], command: Sequence[str]) -> Mapping[str, Any]:
+    configs = {f"{cell.scenario} {cell.variant}": cell.config.model_dump(mode="json") for cell in all_cells}
+    methods = dict.fromkeys(cell.config.descriptor.method for cell in all_cells)
+    checkpoints: dict[str, str] = {method: checkpoint_digest(DescriptorConfig(method=method)) for method in methods}
+    if any(cell.config.query.compare == "sphere" for cell in all_cells):
+        checkpoints["sphere"] = sphere_digest()
+    return describe_run(plan.model_dump(mode="json"), configs, checkpoints, command)

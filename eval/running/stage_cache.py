@@ -1,0 +1,167 @@
+"""What the stages of a pair gave, kept by content: in memory, and in the folder of the run for a later process.
+
+RUN/stages/<world>/<seed>/<root>/<stage>-<digest>.npz holds the arrays and the seconds of one stage. The root is the
+digest of both sessions' files and of the pipeline's code, the name that of all that the stage read
+(eval/running/stage_results.py): what is found is what would be computed now. A file appears whole or not at all; a
+damaged one is none.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+import cdpipe
+from eval.core.provenance import digest
+
+MAPS = "maps"
+# Maps are large: so much of them is stored in a run folder, those of its first pairs.
+MAPS_BYTES = 4 << 30
+_FORMAT = 1  # rises when eval/running/stage_results.py makes something else of the same result
+_SECONDS, _IS_CONTENDED, _N_ARRAYS = "seconds.", "is_contended", "n_arrays"
+# Deflating noise takes as long as computing it, and saves nothing.
+_NOISE = ".return_offsets"
+_DAMAGES = (OSError, EOFError, KeyError, ValueError, RuntimeError, struct.error, zlib.error, zipfile.BadZipFile)
+Arrays = Mapping[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kept:
+    """What a stage gave.
+
+    Attributes:
+        arrays: Its result, by name.
+        seconds: Wall-clock seconds of its parts, as measured when it ran.
+        is_contended: Whether workers shared the machine then.
+    """
+
+    arrays: Arrays
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    is_contended: bool = False
+
+
+class StageCache:
+    """Results of the stages of one pair, by name; maps are not held in memory, only stored.
+
+    Args:
+        folder: Where; without it nothing is stored.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self._folder = folder
+        self._held: dict[str, Kept] = {}
+
+    def find(self, name: str) -> Kept | None:
+        """Return what is kept under a name; None where there is nothing, or something damaged."""
+        kept = self._held.get(name)
+        if kept is None and self._folder is not None:
+            kept = _read(self._folder / f"{name}.npz")
+            if kept is not None:
+                self._hold(name, kept)
+        return kept
+
+    def keep(self, name: str, kept: Kept) -> None:
+        """Keep what a stage gave; what the disk does not take is computed again another time."""
+        self._hold(name, kept)
+        if self._folder is None or (_is_maps(name) and _maps_bytes(self._folder) >= MAPS_BYTES):
+            return
+        path = self._folder / f"{name}.npz"
+        partial = path.with_name(f".{path.name}.partial")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _write(partial, kept)
+            partial.replace(path)
+        except OSError:
+            partial.unlink(missing_ok=True)
+
+    def _hold(self, name: str, kept: Kept) -> None:
+        if not _is_maps(name):
+            self._held[name] = kept
+
+
+def opened_cache(folder: Path, sessions: tuple[Path, Path]) -> StageCache:
+    """Open what is kept of a pair, and remove what is of other sessions or of other code.
+
+    Args:
+        folder: RUN/stages/<world>/<seed>.
+        sessions: Folders of both sessions.
+    """
+    root = digest([_FORMAT, CODE, *(session_digest(session) for session in sessions)])
+    for path in folder.glob("*/*"):
+        if path.parent.name != root:
+            path.unlink()
+    return StageCache(folder / root)
+
+
+def session_digest(session: Path) -> str:
+    """Return the digest of the files of a session that the pipeline may read: all but its truth."""
+    files = (path for path in session.rglob("*") if path.is_file())
+    return _files_digest(session, [path for path in files if path.relative_to(session).parts[0] != "truth"])
+
+
+def _files_digest(folder: Path, paths: Iterable[Path]) -> str:
+    found = {}
+    for path in paths:
+        with path.open("rb") as file:
+            found[path.relative_to(folder).as_posix()] = hashlib.file_digest(file, "sha256").hexdigest()
+    return digest(found)
+
+
+# Of the code as this process has loaded it: read later it might be a newer one's.
+CODE = _files_digest(Path(cdpipe.__path__[0]), Path(cdpipe.__path__[0]).rglob("*.py"))
+
+
+def _write(path: Path, kept: Kept) -> None:
+    arrays = {
+        **{f"{_SECONDS}{name}": np.asarray(seconds) for name, seconds in kept.seconds.items()},
+        _IS_CONTENDED: np.asarray(kept.is_contended),
+        _N_ARRAYS: np.asarray(len(kept.arrays)),
+        **kept.arrays,
+    }
+    noise = [name for name in arrays if name.endswith(_NOISE)]
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
+        _add(file, {name: array for name, array in arrays.items() if name not in noise})
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_STORED) as file:
+        _add(file, {name: arrays[name] for name in noise})
+
+
+def _add(file: zipfile.ZipFile, arrays: Arrays) -> None:
+    for name, array in arrays.items():
+        with file.open(f"{name}.npy", "w", force_zip64=True) as member:
+            np.lib.format.write_array(member, array, allow_pickle=False)
+
+
+def _read(path: Path) -> Kept | None:
+    try:
+        with zipfile.ZipFile(path) as file:
+            # each member as a whole: only at its end its checksum is compared
+            arrays = {
+                name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(file.read(name)), allow_pickle=False)
+                for name in file.namelist()
+            }
+        is_contended, n_arrays = bool(arrays.pop(_IS_CONTENDED)), int(arrays.pop(_N_ARRAYS))
+    except _DAMAGES:
+        return None
+    seconds = {name: arrays.pop(name) for name in list(arrays) if name.startswith(_SECONDS)}
+    told = {name.removeprefix(_SECONDS): float(number) for name, number in seconds.items()}
+    # a damaged list of contents may just end earlier
+    return Kept(arrays, told, is_contended) if len(arrays) == n_arrays else None
+
+
+def _is_maps(name: str) -> bool:
+    return name.startswith(f"{MAPS}-")
+
+
+def _maps_bytes(folder: Path) -> int:
+    """Return how many bytes the maps of all pairs beside one take."""
+    return sum(path.stat().st_size for path in folder.parents[2].glob(f"*/*/*/{MAPS}-*.npz"))

@@ -1,0 +1,211 @@
+"""Checks an answer against the sessions it speaks about before anything is scored; foreign answers come as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, Int64Array, require_poses, require_shape
+from cdpipe.core.yamlfile import suggestion
+from cdpipe.io.answer import Answer
+from cdpipe.model.report import ChangedObject, ChangeRegions
+from cdpipe.model.types import SessionName
+from eval.scoring.answer_rows import POINT_RADIUS_M, rows_near_points
+from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth
+from eval.truth.universe import ScoringPoints
+
+_SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns"))
+_MANY = 100  # so many returns of any place hold the first one of some cell
+# Points lie among the returns they stand for.
+_ASIDE_M = 2.0
+
+
+def check_answer(answer: Answer, truth: GroundTruth, folder: Path) -> None:
+    """Raise `InputError`, naming the folder and the field, unless an ok answer can be scored against this pair.
+
+    Raises:
+        InputError: A number is NaN, an index lies outside of its session, a return is named twice, or nothing that the
+            answer names is there.
+    """
+    report = answer.report
+    try:
+        _check_seconds(answer.seconds)
+        if report is None:
+            return
+        require_poses("before_T_after", report.before_T_after[None])
+        for session, scans in zip(SESSIONS, report.keyframe_scans, strict=True):
+            _check_scans(f"{session}_keyframe_scans", scans, len(truth.sessions[session].odom_T_sensor))
+        _check_local(report.local_before_T_after, len(report.keyframe_scans[1]), len(truth.after.odom_T_sensor))
+        _check_regions(report.regions, len(report.keyframe_scans[0]), len(truth.before.odom_T_sensor))
+        for name, values in report.figures.items():
+            require_shape(f"figure_{name}", values, (len(report.regions.scores),))
+        for index, item in enumerate(report.objects):
+            _check_object(index, item, len(report.objects), len(report.regions.scores))
+        for session in SESSIONS:
+            _check_returns(session, report.objects, truth.sessions[session])
+            _check_points(session, report.objects, answer.points_odom, truth.sessions[session].universe)
+        _check_places(report.objects, truth.before.universe)
+    except ValueError as error:
+        raise InputError(f"{folder}: not an answer to this pair: {error}") from error
+
+
+def _check_seconds(seconds: Mapping[str, float]) -> None:
+    for name, value in seconds.items():
+        if name not in _SECONDS:
+            raise ValueError(f"seconds.{name} is unknown{suggestion(name, _SECONDS)} (known: {', '.join(_SECONDS)})")
+        if not 0 <= value < np.inf:
+            raise ValueError(f"seconds.{name} = {value}: expected seconds, 0 or more; leave out what was not measured")
+
+
+def _check_local(local_before_T_after: Float64Array | None, n_keyframes: int, n_scans: int) -> None:
+    if local_before_T_after is None:
+        return
+    require_poses("local_before_T_after", local_before_T_after)
+    n_wanted = n_keyframes or n_scans
+    if len(local_before_T_after) != n_wanted:
+        raise ValueError(
+            f"local_before_T_after has {len(local_before_T_after)} poses: expected one for each of the {n_wanted} "
+            f"{'after keyframes' if n_keyframes else 'scans of the after session, as no keyframes are named'}"
+        )
+
+
+def _check_regions(regions: ChangeRegions, n_keyframes: int, n_scans: int) -> None:
+    for name, values in (("region_centres_map", regions.centres_map), ("region_scores", regions.scores)):
+        _require_finite(name, values)
+    if not np.isfinite(regions.radius_m):
+        raise ValueError(f"radius_m = {regions.radius_m}: expected a length in metres")
+    if np.isinf(regions.keyframe_scores).any():
+        raise ValueError("keyframe_scores: a score is infinite: expected a number, or NaN where nothing was compared")
+    n_scored = n_keyframes or n_scans
+    if len(regions.keyframe_scores) not in (0, n_scored):
+        raise ValueError(
+            f"keyframe_scores has {len(regions.keyframe_scores)} entries: expected one for each of the {n_scored} "
+            "before keyframes, or none"
+        )
+
+
+def _check_scans(name: str, scans: Int64Array, n_scans: int) -> None:
+    if scans.ndim == 1 and len(scans) == 0:
+        return  # no keyframes named; nothing has a type then
+    if scans.ndim != 1 or not np.issubdtype(scans.dtype, np.integer):
+        raise ValueError(f"{name} must be a list of whole numbers, got {scans.dtype} {scans.shape}")
+    if not (scans.min() >= 0 and scans.max() < n_scans):
+        raise ValueError(f"{name} names scans {scans.min()} to {scans.max()}, the session has 0 to {n_scans - 1}")
+    if len(np.unique(scans)) < len(scans):
+        raise ValueError(f"{name} names a scan twice")
+
+
+def _check_object(index: int, item: ChangedObject, n_objects: int, n_regions: int) -> None:
+    where = f"objects[{index}]"
+    if item.partner == index:
+        raise ValueError(f"{where}.partner = {item.partner}: that is itself; -1 means none")
+    if not -1 <= item.partner < n_objects:
+        raise ValueError(f"{where}.partner = {item.partner}: there are {n_objects} objects; -1 means none")
+    if not -1 <= item.region < n_regions:
+        raise ValueError(f"{where}.region = {item.region}: there are {n_regions} regions; -1 means none")
+    _require_finite(f"{where}: object_points_map", item.points_map)
+    if item.shape is not None:
+        edges = item.shape.box_m.tolist()
+        if not all(np.isfinite(size) and size >= 0 for size in (*edges, item.shape.volume_m3)):
+            raise ValueError(
+                f"{where}.shape: edges {', '.join(f'{edge:g}' for edge in edges)} m and volume "
+                f"{item.shape.volume_m3:g} m3: expected finite numbers, none below 0"
+            )
+    if item.displacement_map is not None:
+        _require_finite(f"{where}.displacement_map", item.displacement_map)
+
+
+def _check_returns(session: SessionName, objects: tuple[ChangedObject, ...], truth: SessionTruth) -> None:
+    n_scans, n_pixels = truth.universe.n_scans, truth.universe.n_pixels
+    taken = []
+    for index, item in enumerate(objects):
+        if item.session != session:
+            continue
+        if not np.issubdtype(item.returns.dtype, np.integer):
+            raise ValueError(f"objects[{index}]: object_returns must be whole numbers, got {item.returns.dtype}")
+        if len(item.returns) == 0:
+            continue
+        if not ((item.returns >= 0).all() and (item.returns < (n_scans, n_pixels)).all()):
+            bad = item.returns[((item.returns < 0) | (item.returns >= (n_scans, n_pixels))).any(axis=1)][0]
+            raise ValueError(
+                f"objects[{index}] names return (scan {bad[0]}, pixel {bad[1]}), outside of the {session} session's "
+                f"{n_scans} scans of {n_pixels} pixels"
+            )
+        taken.append(item.returns[:, 0].astype(np.int64) * n_pixels + item.returns[:, 1])
+    if not taken:
+        return
+    keys, counts = np.unique(np.concatenate(taken), return_counts=True)
+    if len(keys) >= _MANY and len(truth.universe.rows_of_returns(np.column_stack(np.divmod(keys, n_pixels)))) == 0:
+        raise ValueError(
+            f"object_returns of the {session} session: nothing returned at any of their {len(keys)} (scan, pixel): "
+            "a pixel is row * columns + column of the staggered image"
+        )
+    if (counts > 1).any():
+        scan, pixel = divmod(int(keys[counts > 1][0]), n_pixels)
+        raise ValueError(
+            f"object_returns name return (scan {scan}, pixel {pixel}) of the {session} session twice: "
+            "a return belongs to one object at most"
+        )
+
+
+def _check_places(objects: tuple[ChangedObject, ...], universe: ScoringPoints) -> None:
+    """Raise if no object of the before session lies where its returns do; its odom frame is the map frame.
+
+    A pixel that returned in one session mostly did in the other, so nothing else tells when they are swapped.
+    """
+    aside_m = {}
+    for index, item in enumerate(objects):
+        rows = universe.rows_of_returns(item.returns) if item.session == "before" and len(item.returns) else ()
+        if len(rows) and len(item.points_map):
+            points = universe.points_odom[rows]
+            gap = np.maximum(points.min(axis=0) - item.points_map.max(axis=0), 0.0)
+            gap += np.maximum(item.points_map.min(axis=0) - points.max(axis=0), 0.0)
+            aside_m[index] = float(np.linalg.norm(gap))
+    if aside_m and min(aside_m.values()) > _ASIDE_M:
+        index, gap_m = min(aside_m.items(), key=lambda item: item[1])
+        raise ValueError(
+            f"objects[{index}]: object_points_map is {gap_m:.0f} m off the returns that object_returns names in the "
+            "before session: is it an answer to another pair, or to the sessions the other way round?"
+        )
+
+
+def _check_points(
+    session: SessionName,
+    objects: tuple[ChangedObject, ...],
+    points_odom: tuple[Float64Array, ...] | None,
+    universe: ScoringPoints,
+) -> None:
+    if points_odom is None:
+        return
+    owners, all_points = [], []
+    for index, (item, points) in enumerate(zip(objects, points_odom, strict=True)):
+        require_shape(f"objects[{index}]: object_points_odom", points, (None, 3))
+        _require_finite(f"objects[{index}]: object_points_odom", points)
+        if item.session == session:
+            distinct = np.unique(points, axis=0)
+            owners.append(np.full(len(distinct), index))
+            all_points.append(distinct)
+    if sum(map(len, all_points)) == 0:
+        return
+    if not any(len(rows) for rows in rows_near_points(universe, all_points)):
+        raise ValueError(
+            f"object_points_odom of the {session} session: none of its {sum(map(len, all_points))} points is within "
+            f"{POINT_RADIUS_M:g} m of a return of that session: give them in its own odom frame, not in the map's"
+        )
+    _, first, counts = np.unique(np.concatenate(all_points), axis=0, return_index=True, return_counts=True)
+    if (counts > 1).any():
+        owner = int(np.concatenate(owners)[first[counts > 1][0]])
+        raise ValueError(
+            f"objects[{owner}] shares a point of object_points_odom with another object: one owner at most"
+        )
+
+
+def _require_finite(name: str, values: Float64Array) -> None:
+    if not np.isfinite(values).all():
+        raise ValueError(
+            f"{name}: entry {int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))} "
+            "is not a finite number"
+        )

@@ -1,0 +1,66 @@
+"""From what a method answered to rows of the universe it is scored in."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.io.answer import Answer
+from eval.truth.ground_truth import SESSIONS, GroundTruth
+from eval.truth.universe import ScoringPoints
+
+POINT_RADIUS_M = 0.1
+
+
+def answer_rows(answer: Answer, truth: GroundTruth) -> tuple[Int64Array, ...]:
+    """Return, for each object of an answer, the rows of its session's universe that it is made of.
+
+    An answer with returns takes the rows among them. A foreign one with points takes the rows within 0.1 m of its
+    points; a row that is near to two objects belongs to the nearer one.
+    """
+    if answer.report is None:
+        return ()
+    objects = answer.report.objects
+    if answer.points_odom is None:
+        return tuple(truth.sessions[item.session].universe.rows_of_returns(item.returns) for item in objects)
+    rows: list[Int64Array] = [np.zeros(0, dtype=np.int64)] * len(objects)
+    for session in SESSIONS:
+        of_session = [index for index, item in enumerate(objects) if item.session == session]
+        points = [answer.points_odom[index] for index in of_session]
+        near = rows_near_points(truth.sessions[session].universe, points)
+        for index, found in zip(of_session, near, strict=True):
+            rows[index] = found
+    return tuple(rows)
+
+
+def rows_near_points(
+    universe: ScoringPoints, objects_odom: list[Float64Array], radius_m: float = POINT_RADIUS_M
+) -> list[Int64Array]:
+    """Return, for each object, the rows of the universe whose nearest predicted point is its own and within a radius.
+
+    Args:
+        universe: Where to look.
+        objects_odom: Per object, (P, 3) points in the odom frame of the universe, metres.
+        radius_m: How far around it a point stands for.
+    """
+    if not any(len(points) for points in objects_odom):
+        return [np.zeros(0, dtype=np.int64) for _ in objects_odom]
+    tree = cKDTree(np.concatenate(objects_odom))
+    owners = np.repeat(np.arange(len(objects_odom)), [len(points) for points in objects_odom])
+    rows = []
+    for index, points in enumerate(objects_odom):
+        if len(points) == 0:
+            rows.append(np.zeros(0, dtype=np.int64))
+            continue
+        low, high = points.min(axis=0) - radius_m, points.max(axis=0) + radius_m
+        inside = np.ones(len(universe), dtype=np.bool_)
+        for axis in range(3):
+            values = universe.points_odom[:, axis]
+            inside &= (values >= low[axis]) & (values <= high[axis])
+        candidates = np.flatnonzero(inside)
+        points_odom = universe.points_odom[candidates].astype(np.float64)
+        # the bound is exclusive; beyond it the tree answers with an index one past its last point
+        _, nearest = tree.query(points_odom, distance_upper_bound=np.nextafter(radius_m, np.inf))
+        rows.append(candidates[np.append(owners, -1)[nearest] == index])
+    return rows

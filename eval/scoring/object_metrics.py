@@ -1,0 +1,203 @@
+"""Scores of changed objects: which returns of each change were cut out, and what was said to have happened to it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.voxel import cell_keys
+from cdpipe.model.report import ChangedObject
+from eval.truth.ground_truth import SESSIONS, GroundTruth
+from eval.truth.universe import CELL_M
+
+Outcome = Literal["match", "false", "ignored"]
+_PHASES = tuple(itertools.product((0.0, 0.5), repeat=3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectMatches:
+    """Which object stands for which change.
+
+    Attributes:
+        matched_object: (C,) int64 object of each change, -1 for none.
+        matched_change: (O,) int64 change of each object, -1 for none.
+        iou_point: (C,) IoU of the point sets, 0 where unmatched, NaN for unobservable changes.
+        iou_voxel: (C,) likewise for 0.1 m voxels, mean over 8 grid phases.
+        iou_box: (C,) likewise for axis-aligned boxes.
+        is_excused: (O,) objects with more than half of their rows on changes outside of the main group (unobservable or
+            partial), which so cannot be false.
+    """
+
+    matched_object: Int64Array
+    matched_change: Int64Array
+    iou_point: Float64Array
+    iou_voxel: Float64Array
+    iou_box: Float64Array
+    is_excused: BoolArray
+
+    @property
+    def outcomes(self) -> tuple[Outcome, ...]:
+        """What became of each object."""
+        return tuple(
+            "match" if change >= 0 else "ignored" if excused else "false"
+            for change, excused in zip(self.matched_change, self.is_excused, strict=True)
+        )
+
+
+def best_matching(iou: Float64Array) -> list[tuple[int, int]]:
+    """Return the one-to-one pairs (row, column) of an (A, B) matrix with the largest sum; zeros make no pair."""
+    rows, columns = linear_sum_assignment(iou, maximize=True)
+    return [(int(row), int(column)) for row, column in zip(rows, columns, strict=True) if iou[row, column] > 0]
+
+
+def voxel_iou(points_a: Float64Array, points_b: Float64Array, voxel_m: float = CELL_M) -> float:
+    """Return the IoU of the voxels that two sets of points fill, mean over 8 grids half a voxel apart.
+
+    One grid alone would favour answers that happen to be cut along its walls. NaN for two empty sets.
+    """
+    if len(points_a) + len(points_b) == 0:
+        return float("nan")
+    values = []
+    for phase in _PHASES:
+        shift = np.array(phase) * voxel_m
+        cells_a, cells_b = (np.unique(cell_keys(points + shift, voxel_m)) for points in (points_a, points_b))
+        shared = len(np.intersect1d(cells_a, cells_b, assume_unique=True))
+        values.append(shared / (len(cells_a) + len(cells_b) - shared))
+    return float(np.mean(values))
+
+
+def box_iou(points_a: Float64Array, points_b: Float64Array, cell_m: float = CELL_M) -> float:
+    """Return the IoU of the axis-aligned boxes around two sets of points; 0 if either is empty.
+
+    Each point stands for a cell, so boxes reach half a cell beyond their points; a flat object keeps a volume.
+    """
+    if len(points_a) == 0 or len(points_b) == 0:
+        return 0.0
+    low_a, high_a = points_a.min(axis=0) - cell_m / 2, points_a.max(axis=0) + cell_m / 2
+    low_b, high_b = points_b.min(axis=0) - cell_m / 2, points_b.max(axis=0) + cell_m / 2
+    shared = np.prod(np.maximum(np.minimum(high_a, high_b) - np.maximum(low_a, low_b), 0.0))
+    return float(shared / (np.prod(high_a - low_a) + np.prod(high_b - low_b) - shared))
+
+
+def match_objects(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], truth: GroundTruth) -> ObjectMatches:
+    """Match the objects of an answer to the observable changes of their session, by the largest sum of point IoU.
+
+    Args:
+        objects: The answer's O objects.
+        rows: Per object, the rows of its session's universe.
+        truth: The pair's truth, C changes.
+    """
+    changes = truth.pair.changes
+    n_shared = np.zeros((len(changes), len(objects)), dtype=np.int64)
+    iou = np.zeros((len(changes), len(objects)))
+    for column, (item, of_object) in enumerate(zip(objects, rows, strict=True)):
+        labels = truth.sessions[item.session].universe.change[of_object]
+        for row, change in enumerate(changes):
+            n_shared[row, column] = np.count_nonzero(labels == change.id)  # ids are unique in the pair, so 0 elsewhere
+            n_union = len(truth.change_rows[row]) + len(of_object) - n_shared[row, column]
+            iou[row, column] = n_shared[row, column] / n_union if n_union else 0.0
+
+    matched_object = np.full(len(changes), -1, dtype=np.int64)
+    matched_change = np.full(len(objects), -1, dtype=np.int64)
+    ious = {name: np.where(truth.is_observable, 0.0, np.nan) for name in ("point", "voxel", "box")}
+    for session in SESSIONS:
+        of_session = np.array([change.session == session for change in changes], dtype=np.bool_)
+        candidates = np.flatnonzero(truth.is_observable & of_session)
+        for index, column in best_matching(iou[candidates]):
+            row = candidates[index]
+            matched_object[row], matched_change[column] = column, row
+            points = truth.sessions[session].universe.points_odom
+            true, answered = (points[of].astype(np.float64) for of in (truth.change_rows[row], rows[column]))
+            ious["point"][row] = iou[row, column]
+            ious["voxel"][row] = voxel_iou(true, answered)
+            ious["box"][row] = box_iou(true, answered)
+    is_main = truth.is_observable & ~truth.is_partial
+    n_rows = np.array([len(of_object) for of_object in rows], dtype=np.int64)
+    is_excused = 2 * n_shared[~is_main].sum(axis=0) > n_rows
+    return ObjectMatches(matched_object, matched_change, ious["point"], ious["voxel"], ious["box"], is_excused)
+
+
+def kinds_right(objects: Sequence[ChangedObject], matches: ObjectMatches, truth: GroundTruth) -> Float64Array:
+    """Return (C,) whether each matched change was called what it is: 1, 0, or NaN where nothing matched.
+
+    A moved change is right if its object is called moved and is linked with the object matched to the change's other
+    half. If that other half is not observable, the object may also be called what the session alone shows: added in
+    the after session, removed in the before session.
+    """
+    changes = truth.pair.changes
+    place = {change.id: index for index, change in enumerate(changes)}
+    right = np.full(len(changes), np.nan)
+    for index in np.flatnonzero(matches.matched_object >= 0):
+        change, item = changes[index], objects[matches.matched_object[index]]
+        is_right = item.kind == change.kind
+        if change.kind == "moved" and change.partner is not None:
+            other = place[change.partner]
+            if truth.is_observable[other]:
+                is_right = is_right and item.partner >= 0 and item.partner == matches.matched_object[other]
+            else:
+                is_right = is_right or item.kind == ("added" if change.session == "after" else "removed")
+        right[index] = float(is_right)
+    return right
+
+
+def object_columns(matches: ObjectMatches, right: Float64Array, truth: GroundTruth) -> dict[str, float]:
+    """Return the object columns of results.csv; averages are over the observable changes of the main group."""
+    is_main = truth.is_observable & ~truth.is_partial
+    is_partial = truth.is_observable & truth.is_partial
+    n_main = int(np.count_nonzero(is_main))
+    columns = {
+        f"object_iou_{name}": _mean(values[is_main])
+        for name, values in (("point", matches.iou_point), ("voxel", matches.iou_voxel), ("box", matches.iou_box))
+    }
+    f1_25, _, _ = _instance_scores(matches, is_main, 0.25)
+    f1_50, precision_50, quality = _instance_scores(matches, is_main, 0.5)
+    return {
+        **columns,
+        "object_f1_25": f1_25 if n_main else float("nan"),
+        "object_f1_50": f1_50 if n_main else float("nan"),
+        "object_precision_50": precision_50,
+        "object_pq": quality if n_main else float("nan"),
+        "kind_accuracy": _mean(right[~np.isnan(right)]),
+        "n_objects": len(matches.matched_change),
+        "n_matched": int(np.count_nonzero(matches.matched_object >= 0)),
+        "n_ignored_objects": matches.outcomes.count("ignored"),
+        "n_partial": int(np.count_nonzero(is_partial)),
+        "object_iou_point_partial": _mean(matches.iou_point[is_partial]),
+    }
+
+
+def unanswered_objects(truth: GroundTruth) -> tuple[ObjectMatches, dict[str, float]]:
+    """Return the scores of a case without an answer: 0 in every object column wherever there was something to find."""
+    matches = match_objects((), (), truth)
+    columns = object_columns(matches, np.full(len(truth.pair.changes), np.nan), truth)
+    if (truth.is_observable & ~truth.is_partial).any():
+        columns["object_precision_50"] = 0.0
+    if truth.n_observable:
+        columns["kind_accuracy"] = 0.0
+    return matches, columns
+
+
+def _instance_scores(matches: ObjectMatches, is_main: BoolArray, min_iou: float) -> tuple[float, float, float]:
+    """Return F1, precision and panoptic quality at an IoU; NaN where nothing was there and nothing was answered."""
+    is_hit = is_main & (matches.iou_point >= min_iou)
+    n_hit = int(np.count_nonzero(is_hit))
+    n_missed = int(np.count_nonzero(is_main)) - n_hit
+    is_false = ~matches.is_excused
+    is_false[matches.matched_object[is_hit]] = False
+    n_false = int(np.count_nonzero(is_false))
+    weight = n_hit + (n_false + n_missed) / 2
+    return (
+        n_hit / weight if weight else float("nan"),
+        n_hit / (n_hit + n_false) if n_hit + n_false else float("nan"),
+        float(matches.iou_point[is_hit].sum()) / weight if weight else float("nan"),
+    )
+
+
+def _mean(values: Float64Array) -> float:
+    return float(values.mean()) if len(values) else float("nan")

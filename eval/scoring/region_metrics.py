@@ -1,0 +1,241 @@
+"""Scores of change regions: which changes were found, which regions were false, how well keyframes were ranked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert
+from cdpipe.model.report import ChangeReport
+from eval.core.ranking import auroc, average_precision
+from eval.truth.ground_truth import GroundTruth, SessionTruth
+
+Outcome = Literal["true", "duplicate", "false", "ignored", "unreported"]
+NEGATIVE_FACTOR = 1.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RegionMatches:
+    """What became of each of R candidates and C changes.
+
+    Attributes:
+        outcomes: R outcomes, in the order of the candidates.
+        found: R tuples: indices of the changes each candidate's centre is near enough to.
+        best_region: (C,) int64 best-scored reported region that finds each change, -1 for none.
+    """
+
+    outcomes: tuple[Outcome, ...]
+    found: tuple[tuple[int, ...], ...]
+    best_region: Int64Array
+
+    def count(self, outcome: Outcome) -> int:
+        """Return how many candidates had an outcome."""
+        return self.outcomes.count(outcome)
+
+
+def keyframes_or_all(keyframe_scans: Int64Array, n_scans: int) -> Int64Array:
+    """Return the scans an answer names as keyframes; an answer that names none is judged on every scan."""
+    return keyframe_scans if len(keyframe_scans) else np.arange(n_scans)
+
+
+def centres_in_world(centres_map: Float64Array, before: SessionTruth, keyframe_scans: Int64Array) -> Float64Array:
+    """Carry (R, 3) centres from the map frame into the world, each through the true pose of the nearest keyframe.
+
+    The map frame is the before session's odom frame, which drifts against the world: no single transform would do.
+    """
+    if len(centres_map) == 0:
+        return np.zeros((0, 3))
+    tree = cKDTree(before.odom_T_sensor[keyframe_scans, :3, 3])
+    _, nearest = tree.query(centres_map)
+    return before.to_world(centres_map, keyframe_scans[nearest])
+
+
+def places_in_map(places_world: Float64Array, before: SessionTruth, keyframe_scans: Int64Array) -> Float64Array:
+    """Carry (N, 3) true places into the map frame, each through the true pose of the keyframe truly nearest to it."""
+    if len(places_world) == 0:
+        return np.zeros((0, 3))
+    world_T_keyframe = before.world_T_sensor[keyframe_scans]
+    _, nearest = cKDTree(world_T_keyframe[:, :3, 3]).query(places_world)
+    map_T_world = before.odom_T_sensor[keyframe_scans[nearest]] @ invert(world_T_keyframe[nearest])
+    moved = np.einsum("nij,nj->ni", map_T_world[:, :3, :3], places_world) + map_T_world[:, :3, 3]
+    return np.asarray(moved, dtype=np.float64)
+
+
+def match_regions(
+    centres_world: Float64Array,
+    is_reported: BoolArray,
+    centroids_world: Float64Array,
+    is_observable: BoolArray,
+    score_radius_m: float,
+) -> RegionMatches:
+    """Decide the outcome of every candidate, best first.
+
+    A candidate finds the changes whose centroid lies within `score_radius_m` of its centre. A reported region is true
+    if it finds an observable change that no better region found, duplicate if all observable ones it finds were found
+    already, ignored if it finds only unobservable ones, and false if it finds none.
+
+    Args:
+        centres_world: (R, 3) centres of all candidates, best first.
+        is_reported: (R,) which of them are reported.
+        centroids_world: (C, 3) centroids of the changes.
+        is_observable: (C,) which changes count.
+        score_radius_m: The family's distance.
+    """
+    distances = np.linalg.norm(centres_world[:, None] - centroids_world[None], axis=2)
+    is_near = distances <= score_radius_m
+    best_region = np.full(len(centroids_world), -1, dtype=np.int64)
+    outcomes: list[Outcome] = []
+    for region, near in enumerate(is_near):
+        if not is_reported[region]:
+            outcomes.append("unreported")
+            continue
+        is_new = near & (best_region < 0)
+        best_region[is_new] = region
+        if (is_new & is_observable).any():
+            outcomes.append("true")
+        elif (near & is_observable).any():
+            outcomes.append("duplicate")
+        else:
+            outcomes.append("ignored" if near.any() else "false")
+    found = tuple(tuple(int(index) for index in np.flatnonzero(near)) for near in is_near)
+    return RegionMatches(tuple(outcomes), found, best_region)
+
+
+def recall_at_k(found: Sequence[tuple[int, ...]], is_observable: BoolArray) -> float:
+    """Return the share of the K observable changes that the first K of `found` find, best first; NaN for K = 0."""
+    k = int(np.count_nonzero(is_observable))
+    if k == 0:
+        return float("nan")
+    return len({change for changes in found[:k] for change in changes if is_observable[change]}) / k
+
+
+def covered_share(
+    positions_world: Float64Array, travelled_m: Float64Array, centres_world: Float64Array, radius_m: float
+) -> float:
+    """Return the share of a path's length that lies inside spheres; a step between scans counts by its middle.
+
+    Args:
+        positions_world: (S, 3) true positions along the path.
+        travelled_m: (S,) path length up to each of them.
+        centres_world: (R, 3) centres of the spheres.
+        radius_m: Their radius.
+
+    Returns:
+        A share in [0, 1], 0 without spheres; NaN for a path without length.
+    """
+    steps_m = np.diff(travelled_m)
+    if steps_m.sum() == 0:
+        return float("nan")
+    if len(centres_world) == 0:
+        return 0.0
+    distances, _ = cKDTree(centres_world).query((positions_world[1:] + positions_world[:-1]) / 2)
+    return float(steps_m[distances <= radius_m].sum() / steps_m.sum())
+
+
+def keyframe_labels(
+    positions_world: Float64Array, centroids_world: Float64Array, is_observable: BoolArray, score_radius_m: float
+) -> Int64Array:
+    """Label (K, 3) keyframes: 1 near an observable change, 0 farther than 1.5 radii from all, -1 left out."""
+    distances = np.linalg.norm(positions_world[:, None] - centroids_world[None], axis=2)
+    is_positive = (distances[:, is_observable] <= score_radius_m).any(axis=1)
+    is_negative = (distances > NEGATIVE_FACTOR * score_radius_m).all(axis=1)
+    return np.where(is_positive, 1, np.where(is_negative, 0, -1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RegionScores:
+    """Scores of one answer's regions.
+
+    Attributes:
+        columns: Its columns of results.csv.
+        matches: What became of each region and change.
+        keyframe_labels: (K,) 1, 0 or -1 of each scored before keyframe.
+    """
+
+    columns: dict[str, float]
+    matches: RegionMatches
+    keyframe_labels: Int64Array
+
+
+def score_regions(report: ChangeReport, truth: GroundTruth, after_travelled_m: Float64Array) -> RegionScores:
+    """Score the regions of an answer.
+
+    Args:
+        report: The answer, checked.
+        truth: The pair's truth.
+        after_travelled_m: (S,) path length of the after session up to each scan.
+    """
+    regions, radius_m = report.regions, truth.pair.score_radius_m
+    keyframes = keyframes_or_all(report.keyframe_scans[0], len(truth.before.odom_T_sensor))
+    centres = centres_in_world(regions.centres_map, truth.before, keyframes)
+    matches = match_regions(centres, regions.is_reported, truth.centroids_world, truth.is_observable, radius_m)
+    path_m = float(after_travelled_m[-1])
+    is_withdrawn = regions.is_proposed & ~regions.is_reported
+    kept = [found for found, is_gone in zip(matches.found, is_withdrawn, strict=True) if not is_gone]
+    proposed = match_regions(centres, regions.is_proposed, truth.centroids_world, truth.is_observable, radius_m)
+
+    scores = regions.keyframe_scores
+    positions = truth.before.world_T_sensor[keyframes[: len(scores)], :3, 3]
+    labels = keyframe_labels(positions, truth.centroids_world, truth.is_observable, radius_m)
+    used = labels >= 0
+    columns = {
+        **_rates(matches, truth, path_m),
+        **{f"{name}_proposed": value for name, value in _rates(proposed, truth, path_m).items()},
+        "region_recall_at_k": recall_at_k(kept, truth.is_observable),
+        "region_recall_at_k_proposed": recall_at_k(matches.found, truth.is_observable),
+        "region_auroc": auroc(scores[used], labels[used] == 1),
+        "region_ap": average_precision(scores[used], labels[used] == 1),
+        "region_coverage": covered_share(
+            truth.after.world_T_sensor[:, :3, 3], after_travelled_m, centres[regions.is_reported], regions.radius_m
+        ),
+        "n_regions": int(np.count_nonzero(regions.is_reported)),
+        "n_withdrawn": int(np.count_nonzero(is_withdrawn)),
+        "n_true_regions": matches.count("true"),
+        "n_false_regions": matches.count("false"),
+        "n_duplicate_regions": matches.count("duplicate"),
+        "n_ignored_regions": matches.count("ignored"),
+        "n_found_changes": _n_found(matches, truth),
+    }
+    return RegionScores(columns, matches, labels)
+
+
+def _rates(matches: RegionMatches, truth: GroundTruth, path_m: float) -> dict[str, float]:
+    """Return recall, precision and false alarms of the regions that were matched as reported."""
+    n_true, n_false = matches.count("true"), matches.count("false")
+    return {
+        "region_recall": _n_found(matches, truth) / truth.n_observable if truth.n_observable else float("nan"),
+        "region_precision": n_true / (n_true + n_false) if n_true + n_false else float("nan"),
+        "false_regions_per_100m": 100.0 * n_false / path_m if path_m > 0 else float("nan"),
+    }
+
+
+def _n_found(matches: RegionMatches, truth: GroundTruth) -> int:
+    return int(np.count_nonzero(truth.is_observable & (matches.best_region >= 0)))
+
+
+def unanswered_regions(n_changes: int, n_observable: int) -> RegionScores:
+    """Return the scores of a case without an answer: nothing found; rates of what was never reported stay NaN."""
+    nan = float("nan")
+    recall = 0.0 if n_observable else nan
+    undefined = ("region_precision", "region_auroc", "region_ap", "false_regions_per_100m", "region_coverage")
+    rates = dict.fromkeys((*undefined, "region_precision_proposed", "false_regions_per_100m_proposed"), nan)
+    counts = (
+        "regions",
+        "withdrawn",
+        "true_regions",
+        "false_regions",
+        "duplicate_regions",
+        "ignored_regions",
+        "found_changes",
+    )
+    columns = {
+        **dict.fromkeys(("region_recall", "region_recall_at_k"), recall),
+        **dict.fromkeys(("region_recall_proposed", "region_recall_at_k_proposed"), recall),
+        **rates,
+        **dict.fromkeys((f"n_{name}" for name in counts), 0),
+    }
+    return RegionScores(columns, RegionMatches((), (), np.full(n_changes, -1)), np.zeros(0, dtype=np.int64))

@@ -1,0 +1,195 @@
+"""Truth against a stored answer: every column of results.csv and the rows of the item tables.
+
+The specification of every figure, with worked examples, is in eval/README.md. Nothing is run here: an answer can be
+scored again whenever the metrics change, and so can an answer that another program wrote.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cdpipe.core.geometry import Float64Array, travelled_m
+from cdpipe.extract.extract import FIGURES
+from cdpipe.io.answer import Answer, read_answer
+from cdpipe.model.report import ChangeReport
+from eval.core.domains import domain_of
+from eval.scoring.answer_check import check_answer
+from eval.scoring.answer_rows import answer_rows
+from eval.scoring.item_rows import change_rows, figure, object_rows, region_rows
+from eval.scoring.merge_metrics import evidence_columns, merge_columns, merge_errors, overlap_true
+from eval.scoring.object_metrics import kinds_right, match_objects, object_columns, unanswered_objects
+from eval.scoring.object_sizes import SizeErrors, size_columns, size_errors
+from eval.scoring.region_metrics import keyframes_or_all, score_regions, unanswered_regions
+from eval.truth.ground_truth import GroundTruth, load_ground_truth
+
+METRICS_VERSION = 4
+_NAN = float("nan")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CaseScore:
+    """The scores of one answer.
+
+    Attributes:
+        row: Its row of results.csv; scenario, variant and preset are the caller's to overwrite.
+        changes: One dict per change of the truth.
+        regions: One dict per candidate region.
+        objects: One dict per answered object.
+        keyframes: One dict per scored before keyframe: keyframe, score, label (1, 0, or -1 for left out).
+    """
+
+    row: dict[str, Any]
+    changes: list[dict[str, Any]]
+    regions: list[dict[str, Any]]
+    objects: list[dict[str, Any]]
+    keyframes: list[dict[str, Any]] = field(default_factory=list)
+
+
+def score_pair(pair: Path, answer_folder: Path) -> CaseScore:
+    """Score the answer stored in a folder against a simulated pair.
+
+    Raises:
+        InputError: The pair has no truth, a file is damaged, or the answer cannot be an answer to this pair.
+    """
+    truth = load_ground_truth(pair)
+    answer = read_answer(answer_folder)
+    check_answer(answer, truth, answer_folder)
+    return score_answer(answer, truth)
+
+
+def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
+    """Score an answer that was checked (`eval.scoring.answer_check`) against a pair's truth.
+
+    An answer that ends at the merge is scored up to it: region and object columns are NaN, also where it was refused or
+    failed, and there are no items.
+    """
+    after_travelled_m = travelled_m(truth.after.odom_T_sensor)
+    report = answer.report
+    if report is None or answer.until == "merge":
+        regions = unanswered_regions(len(truth.pair.changes), truth.n_observable)
+        objects, object_scores = unanswered_objects(truth)
+        right = np.full(len(truth.pair.changes), np.nan)
+        sizes = SizeErrors(right, right)
+        items: list[dict[str, Any]] = []
+    else:
+        regions = score_regions(report, truth, after_travelled_m)
+        rows = answer_rows(answer, truth)
+        objects = match_objects(report.objects, rows, truth)
+        right = kinds_right(report.objects, objects, truth)
+        object_scores = object_columns(objects, right, truth)
+        before_scans = keyframes_or_all(report.keyframe_scans[0], len(truth.before.odom_T_sensor))
+        sizes = size_errors(report.objects, objects, truth, before_scans)
+        items = object_rows(report.objects, objects, [len(of_object) for of_object in rows], truth)
+    n_regions = int(regions.columns["n_regions"])
+    found: dict[str, float] = {**regions.columns, **object_scores, **size_columns(sizes, truth)}
+    row = {
+        **_identity(answer, truth),
+        **(found if answer.until is None else dict.fromkeys(found, _NAN)),
+        **_merge(answer, truth),
+        **_times(answer, n_regions + int(regions.columns["n_withdrawn"])),
+        **_figure_means(report),
+        **_sizes(answer, truth, n_regions, float(after_travelled_m[-1])),
+    }
+    if answer.until == "merge":
+        return CaseScore(row=row, changes=[], regions=[], objects=[])
+    keyframe_scores = np.zeros(0) if report is None else report.regions.keyframe_scores
+    return CaseScore(
+        row=row,
+        changes=change_rows(regions, (objects, sizes), right, truth, report),
+        regions=region_rows(report, regions, truth),
+        objects=items,
+        keyframes=[
+            {"keyframe": index, "score": float(score), "label": int(label)}
+            for index, (score, label) in enumerate(zip(keyframe_scores, regions.keyframe_labels, strict=True))
+        ],
+    )
+
+
+def _identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
+    return {
+        "scenario": truth.pair.family,
+        "family": truth.pair.family,
+        "pair_kind": "",
+        "seed": truth.pair.seed,
+        "variant": answer.method,
+        "preset": answer.method,
+        "status": answer.status,
+        "error": answer.error,
+        "metrics_version": METRICS_VERSION,
+        "domain": domain_of(truth.pair.family),
+        "n_changes": len(truth.pair.changes),
+        "n_observable": truth.n_observable,
+        "score_radius_m": truth.pair.score_radius_m,
+    }
+
+
+def _merge(answer: Answer, truth: GroundTruth) -> dict[str, float]:
+    report, errors = answer.report, None
+    if report is not None:
+        before_scans, after_scans = (
+            keyframes_or_all(scans, len(session.odom_T_sensor))
+            for scans, session in zip(report.keyframe_scans, (truth.before, truth.after), strict=True)
+        )
+        local = report.local_before_T_after
+        merge = report.before_T_after if local is None else local
+        errors = merge_errors(truth.before, truth.after, merge, (before_scans, after_scans))
+    overlap = overlap_true(truth.before.world_T_sensor, truth.after.world_T_sensor)
+    return {**merge_columns(errors), "overlap_true": overlap, **evidence_columns(answer.evidence)}
+
+
+def _times(answer: Answer, n_proposed: int) -> dict[str, float]:
+    """Return the time columns; whatever an answer does not state is NaN, and so are sums that would need it.
+
+    What was withdrawn was compared and cut out as well, so it counts among the regions that the time was spent on.
+    """
+    seconds = answer.seconds
+    index, merge, refine, descriptor, cd, oe, returns = (
+        float(seconds.get(f"t_{name}_s", _NAN))
+        for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns")
+    )
+    n_keyframes = 0 if answer.report is None else sum(len(scans) for scans in answer.report.keyframe_scans)
+    return {
+        "t_index_s": index,
+        "t_merge_s": merge,
+        "t_refine_s": refine,
+        "t_descriptor_s": descriptor,
+        "t_descriptor_per_keyframe_s": descriptor / n_keyframes if n_keyframes else _NAN,
+        "t_cd_s": cd,
+        "t_cd_per_region_s": cd / n_proposed if n_proposed else _NAN,
+        "t_oe_s": oe,
+        "t_oe_per_region_s": oe / n_proposed if n_proposed else _NAN,
+        "t_returns_s": returns,
+        "t_total_s": descriptor + cd + oe,
+        "t_total_with_merge_s": index + merge + refine + descriptor + cd + oe,
+        "t_total_paper_s": cd + oe,
+    }
+
+
+def _figure_means(report: ChangeReport | None) -> dict[str, float]:
+    return {name: _mean(figure(report, name)[report.regions.is_reported]) if report else _NAN for name in FIGURES}
+
+
+def _sizes(answer: Answer, truth: GroundTruth, n_regions: int, after_path_m: float) -> dict[str, Any]:
+    keyframes = (None, None) if answer.report is None else answer.report.keyframe_scans
+    is_unchanged = len(truth.pair.changes) == 0
+    return {
+        **{f"map_points_{name}": float(answer.evidence.get(f"map_points_{name}", _NAN)) for name in truth.sessions},
+        **{
+            f"n_keyframes_{name}": len(scans) if scans is not None and len(scans) else _NAN
+            for name, scans in zip(truth.sessions, keyframes, strict=True)
+        },
+        **{name: float(answer.evidence.get(name, _NAN)) for name in ("bytes_map_before", "bytes_regions_before")},
+        "after_path_m": after_path_m,
+        "is_unchanged_pair": is_unchanged,
+        # a pair that was refused, or only merged, was neither silent nor an alarm
+        "is_alarm": n_regions > 0 if is_unchanged and answer.report is not None and answer.until is None else _NAN,
+    }
+
+
+def _mean(values: Float64Array) -> float:
+    values = values[~np.isnan(values)]
+    return float(values.mean()) if len(values) else _NAN

@@ -1,0 +1,1 @@
+"""Measurements beside the plans, run as `python -m eval.studies.NAME`: thresholds and gates."""

@@ -1,0 +1,164 @@
+"""Sets the threshold of every method to the same false-alarm rate: 5 % of unchanged validation pairs alarm.
+
+Run as `python -m eval.studies.calibrate RUN`, where RUN is the folder of `tunnelcd run calibrate`. The thresholds are
+printed, with those at which every method has the same 0.1 false regions per 100 m, and written to RUN/thresholds.csv
+and, as presets spell them, to RUN/thresholds.yaml. They are copied by hand, so that no preset changes behind anyone's
+back.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import pandas as pd
+import typer
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array
+from eval.core.exits import input_errors
+
+ALARM_SHARE = 0.05
+FALSE_PER_100M = 0.1
+
+
+def alarm_threshold(best_scores: Float64Array, alarm_share: float = ALARM_SHARE, lowest: float | None = None) -> float:
+    """Return the smallest threshold, rounded up to four digits, that at most `alarm_share` of the pairs reach.
+
+    Args:
+        best_scores: (P,) best candidate's score of every unchanged pair; -inf for a pair without candidates.
+        alarm_share: Share of pairs that may alarm.
+        lowest: What the run let through: below that nothing was looked at, so no threshold is known to hold.
+    """
+    if len(best_scores) == 0 or np.isnan(best_scores).any():
+        raise ValueError("best_scores must hold a number for each of at least one pair")
+    return _just_above(best_scores, int(alarm_share * len(best_scores)), lowest)
+
+
+def rate_threshold(
+    scores: Float64Array, path_m: float, false_per_100m: float = FALSE_PER_100M, lowest: float | None = None
+) -> float:
+    """Return the smallest threshold, rounded up to four digits, that at most so many false regions per 100 m reach.
+
+    Args:
+        scores: (R,) score of every candidate of all unchanged pairs.
+        path_m: Way of their after sessions.
+        false_per_100m: What is allowed.
+        lowest: As above.
+    """
+    return _just_above(scores, int(false_per_100m * path_m / 100.0 + 1e-9), lowest)
+
+
+def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
+    """Return one row per variant and kind of site, with its thresholds at either rate.
+
+    A threshold belongs to a kind of site, as the radius does: what is much change in a narrow drift is little in a
+    wide one. Kinds of site differ in `score_radius_m`. Candidates that were withdrawn cannot alarm; for that to show,
+    the run must let more through than the threshold that is looked for, and no lower one is given.
+
+    Returns:
+        `threshold`, which at most 5 % of the pairs reach, with `n_pairs`, `n_alarms` of them and `n_unanswered` further
+        ones; `threshold_at_rate`, which at most 0.1 false regions per 100 m reach, with the way `km` and `n_false`.
+
+    Raises:
+        InputError: A pair has changes, so that its alarms would not be false; or no pair of a kind has an answer.
+    """
+    changed = results.loc[results["n_changes"] > 0, "scenario"].unique()
+    if len(changed):
+        raise InputError(f"{', '.join(changed)}: has changes: calibration needs unchanged pairs")
+    rows = []
+    for (variant, _), cases in results.groupby(["variant", "score_radius_m"], sort=False):
+        radius_m = float(cases["score_radius_m"].iloc[0])
+        ok = cases[cases["status"] == "ok"]
+        if len(ok) == 0:
+            raise InputError(f"{variant}, {radius_m:g} m: no pair has an answer: nothing to set a threshold by")
+        stands = (regions["variant"] == variant) & ~regions["is_withdrawn"].astype(bool)
+        lowest = _let_through(regions[regions["variant"] == variant].merge(cases[["scenario", "seed"]]))
+        if lowest is not None:
+            stands &= regions["score"] >= lowest
+        of_case = regions[stands].groupby(["scenario", "seed"])["score"]
+        found = {case: scores.to_numpy(dtype=np.float64) for case, scores in of_case}
+        candidates = [found.get(case, np.zeros(0)) for case in zip(ok["scenario"], ok["seed"], strict=True)]
+        best = np.array([scores.max(initial=-np.inf) for scores in candidates])
+        every, path_m = np.concatenate(candidates), float(ok["after_path_m"].sum())
+        threshold = alarm_threshold(best, lowest=lowest)
+        at_rate = rate_threshold(every, path_m, lowest=lowest)
+        rows.append(
+            {
+                "variant": variant,
+                "score_radius_m": radius_m,
+                "threshold": threshold,
+                "n_pairs": len(ok),
+                "n_alarms": int((best >= threshold).sum()),
+                "n_unanswered": len(cases) - len(ok),
+                "threshold_at_rate": at_rate,
+                "km": path_m / 1000.0,
+                "n_false": int((every >= at_rate).sum()),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def as_settings(table: pd.DataFrame) -> str:
+    """Return the thresholds as presets spell them in YAML: by rate and variant, for narrow sites and under `wide`."""
+    lines = []
+    rates = (
+        ("threshold", f"at most {ALARM_SHARE:.0%} of the unchanged pairs alarm"),
+        ("threshold_at_rate", f"at most {FALSE_PER_100M:g} false regions per 100 m"),
+    )
+    for column, meaning in rates:
+        lines += [f"{column}:  # {meaning}"]
+        for variant, own in table.sort_values("score_radius_m", kind="stable").groupby("variant", sort=False):
+            first, *wider = zip(own["score_radius_m"], own[column], strict=True)
+            lines += [f"  {variant}:", f"    preset: {{query: {{threshold: {first[1]:g}}}}}  # {first[0]:g} m"]
+            lines += [
+                f"    wide_{radius_m:g}m: {{query: {{radius_m: {radius_m:g}, threshold: {value:g}}}}}"
+                for radius_m, value in wider
+            ]
+    return "\n".join([*lines, ""])
+
+
+def main(run: Annotated[Path, typer.Argument(help="folder of `tunnelcd run calibrate`")]) -> None:
+    """Print and write the thresholds of a calibration run."""
+    table = thresholds(_read(run / "results.csv"), _read(run / "regions.csv"))
+    table.to_csv(run / "thresholds.csv", index=False)
+    settings = as_settings(table)
+    (run / "thresholds.yaml").write_text(settings)
+    typer.echo(f"{table.to_string(index=False)}\n\n{settings}")
+
+
+def _let_through(regions: pd.DataFrame) -> float | None:
+    """Return the lowest score of what was let through and looked at; None of a method that withdraws nothing."""
+    is_withdrawn = regions["is_withdrawn"].astype(bool)
+    if not is_withdrawn.any():
+        return None
+    return float(regions.loc[is_withdrawn | regions["is_reported"].astype(bool), "score"].min())
+
+
+def _just_above(scores: Float64Array, allowed: int, lowest: float | None) -> float:
+    """Return the smallest number of four digits, `lowest` or more, that no more than `allowed` of (N,) scores reach.
+
+    Without need it is what is lowest, or 0.
+    """
+    silent_best = -np.inf if allowed >= len(scores) else np.sort(scores)[::-1][allowed]
+    if lowest is not None:
+        silent_best = max(silent_best, np.nextafter(lowest, -np.inf))
+    if np.isinf(silent_best):
+        return 0.0
+    digits = 4 - int(np.floor(np.log10(max(abs(float(silent_best)), 1e-12)))) - 1
+    threshold = float(np.ceil(silent_best * 10.0**digits) / 10.0**digits)
+    return threshold if threshold > silent_best else float(round(threshold + 10.0**-digits, digits))
+
+
+def _read(path: Path) -> pd.DataFrame:
+    try:
+        return pd.read_csv(path)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: {reason}: name a folder that `tunnelcd run calibrate` made") from error
+
+
+if __name__ == "__main__":
+    with input_errors():
+        typer.run(main)

@@ -1,0 +1,1 @@
+"""What each descriptor recognises and costs."""

@@ -1,0 +1,148 @@
+"""Which descriptor recognises what, and at which price: the table of cdpipe/README.md.
+
+Run as `python -m eval.studies.descriptors.compare FAMILY... --seeds A:B --out DIR`. Each pair of sessions is simulated
+as `tunnelcd simulate` does, looked at (`eval.studies.descriptors.rows`) and removed again. Written are
+DIR/rows/<family>-<seed>.json, one for each pair, by which a run that was cut off goes on; DIR/descriptors.csv, one row
+for each pair, descriptor and precision; and DIR/places.csv and DIR/spheres.csv, means over pairs with intervals by
+pair. Nothing is chosen by it.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import pandas as pd
+import typer
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.threads import THREADS
+from cdpipe.descriptors import checkpoint_digest, sphere_digest, use_threads
+from cdpipe.model.config import load_config
+from eval.core.exits import input_errors
+from eval.core.output import make_writable
+from eval.core.progress import RunProgress, shown_progress
+from eval.core.provenance import digest, git_commit, machine
+from eval.plans.plan import parse_seeds
+from eval.plans.worlds import world_slug
+from eval.running.runfolder import remove, write_json
+from eval.studies.descriptors.rows import METHODS, pair_rows
+from eval.studies.descriptors.table import places_table, spheres_table
+from scenarios.library import load_scenario
+from scenarios.references import file_digests
+from scenarios.schema import Scenario
+from sim.session.simulate import simulate_pair
+
+_FAMILIES = ("narrow", "wide", "network")
+_SEEDS = "10300:10304"  # of the validation seeds
+_VERSION = 1  # of a row: raised when its figures change, so that stored ones are made anew
+
+
+def measure(
+    families: Sequence[str], seeds: Sequence[int], out: Path, progress: RunProgress, *, keep: bool = False
+) -> pd.DataFrame:
+    """Return one row for each pair, descriptor and precision; pairs that were measured before are not made again.
+
+    Args:
+        families: Names or files of scenarios.
+        seeds: Of each family.
+        out: Folder of the run.
+        progress: Told of each pair and stage.
+        keep: Keep the simulated pairs, in `out`/pairs.
+
+    Raises:
+        ScenarioError: A world cannot be drawn or built.
+        InputError: `out` cannot be written.
+    """
+    make_writable(out)
+    use_threads(THREADS)
+    todo = [(family, seed, load_scenario(family, seed)) for seed in seeds for family in families]
+    rows = []
+    for done, (family, seed, scenario) in enumerate(todo):
+        progress.cells(f"{family} {seed}", done, len(todo))
+        path = out / "rows" / f"{world_slug(family)}-{seed}.json"
+        key = _key(scenario, seed)
+        stored = _stored(path, key)
+        if stored is None:
+            measured = _simulated(scenario, seed, out / "pairs" / path.stem, progress, keep=keep)
+            stored = [{"family": family, "seed": seed, **row} for row in measured]
+            write_json(path, {"key": key, "commit": git_commit(), "machine": machine(), "rows": stored})
+        rows += stored
+    progress.cells("done", len(todo), len(todo))
+    return pd.DataFrame(rows)
+
+
+def _simulated(
+    scenario: Scenario, seed: int, pair: Path, progress: RunProgress, *, keep: bool
+) -> list[dict[str, object]]:
+    try:
+        if not pair.exists():
+            pair.parent.mkdir(parents=True, exist_ok=True)
+            simulate_pair(scenario, seed, pair, on_progress=progress.stage)
+        progress.stage("describe", 0, 1)
+        return pair_rows(pair)
+    finally:
+        if not keep:
+            remove(pair)
+
+
+def _key(scenario: Scenario, seed: int) -> str:
+    config = load_config("tunnelcd")
+    # of the query the scores depend on how they are made, and not on the threshold
+    unasked = {"query": {"threshold", "n_regions", "suppression", "radius_m"}}
+    return digest(
+        {
+            "version": _VERSION,
+            "scenario": scenario.model_dump(mode="json"),
+            "files": file_digests(scenario),
+            "seed": seed,
+            "config": config.model_dump(mode="json", include={"map", "descriptor", "merge", "query"}, exclude=unasked),
+            "checkpoints": [
+                checkpoint_digest(config.descriptor.model_copy(update={"method": method})) for method in METHODS
+            ],
+            "sphere": sphere_digest(),
+        }
+    )
+
+
+def _stored(path: Path, key: str) -> list[dict[str, object]] | None:
+    try:
+        document = json.loads(path.read_text())
+        return list(document["rows"]) if document["key"] == key else None
+    except (FileNotFoundError, json.JSONDecodeError, KeyError, TypeError):
+        return None  # absent, or damaged: it is measured anew
+
+
+def main(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="a new folder, or one to go on with")],
+    families: Annotated[
+        list[str] | None, typer.Argument(metavar="FAMILY...", help="as `tunnelcd list` has them")
+    ] = None,
+    seeds: Annotated[str, typer.Option(metavar="A:B", help="B excluded")] = _SEEDS,
+    keep: Annotated[bool, typer.Option("--keep", help="keep the simulated pairs, about 0.3 GB each")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q")] = False,
+) -> None:
+    """Measure every descriptor on simulated pairs."""
+    try:
+        numbers = parse_seeds(seeds)
+    except ValueError as error:
+        raise InputError(f"--seeds {seeds}: {error}") from error
+    with shown_progress(quiet, "pairs") as progress:
+        rows = measure(families or _FAMILIES, numbers, out, progress, keep=keep)
+    tables = {"descriptors": rows, "places": places_table(rows), "spheres": spheres_table(rows)}
+    for name, table in tables.items():
+        table.to_csv(out / f"{name}.csv", index=False)
+    (out / "command.txt").write_text(
+        shlex.join(["python", "-m", "eval.studies.descriptors.compare", *sys.argv[1:]]) + "\n"
+    )
+    for name in ("places", "spheres"):
+        typer.echo(tables[name].to_string(index=False, float_format="{:.4g}".format, na_rep="-") + "\n")
+
+
+if __name__ == "__main__":
+    with input_errors():
+        typer.run(main)

@@ -1,0 +1,181 @@
+"""Where the limit of the sphere descriptor is: what more numbers, channels, tunnels or bits would buy.
+
+Run as `python -m eval.studies.descriptors.curves DATA --out DIR`, where DATA is a folder of `tunnelcd dataset` with
+tunnels of both splits. Trains one network after another at a short schedule, which is not the shipped one: no early
+stopping, the weights of the last step are taken, so that the validation tunnels choose nothing (they calibrate, as
+ever). The shipped network stands beside them. Writes DIR/curves.csv, a row for each network and precision, and
+DIR/curves.png after every network; the same command goes on where it was cut off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from time import process_time
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+import typer
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import stream
+from cdpipe.descriptors import use_threads
+from cdpipe.descriptors.sphere_network import SphereNetwork, SphereSize, initial_sphere_network, trained_sphere_network
+from cdpipe.training.data import TunnelShard, open_dataset
+from cdpipe.training.fit import FitConfig, fit
+from cdpipe.training.sphere_training import SphereTask, sphere_data
+from eval.core.exits import input_errors
+from eval.core.output import make_writable
+from eval.studies.descriptors.curve_plots import draw_curves
+from eval.studies.descriptors.measures import FLOAT_BITS, HeldOut, held_out, measures
+from eval.training.training_run import data_digest
+
+BITS = (FLOAT_BITS, 8, 4, 2)
+SHIPPED = "shipped"
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One network to train.
+
+    Attributes:
+        size: Of the network.
+        share: Of the training tunnels of each family that it sees.
+        seed: Of weights, draws and the choice of tunnels.
+    """
+
+    size: SphereSize = field(default_factory=SphereSize)
+    share: float = 1.0
+    seed: int = 0
+
+    @property
+    def name(self) -> str:
+        """Return what it is called in the table."""
+        head = "image" if self.size.reads_after else "numbers"
+        return f"{self.size.numbers}-{head}-width{self.size.width:g}-data{self.share:g}-seed{self.seed}"
+
+
+def points(n_seeds: int) -> list[Point]:
+    """Return all networks to train, in the order in which they are: what matters first, then its spread over seeds."""
+    base = SphereSize()
+    others: list[tuple[SphereSize, float]] = [
+        (SphereSize(per_sector=8), 1.0),
+        (SphereSize(per_sector=1), 1.0),
+        (SphereSize(reads_after=False), 1.0),
+        (base, 0.25),
+        (base, 0.5),
+        (SphereSize(width=0.5), 1.0),
+        (SphereSize(per_sector=2), 1.0),
+        (SphereSize(width=2.0), 1.0),
+        (base, 0.125),
+        (SphereSize(per_sector=8, reads_after=False), 1.0),
+        (SphereSize(per_sector=1, reads_after=False), 1.0),
+        (SphereSize(per_sector=2, reads_after=False), 1.0),
+    ]
+    seeds = range(n_seeds)
+    return [Point(seed=seed) for seed in seeds] + [Point(size, share, seed) for seed in seeds for size, share in others]
+
+
+def share_of(tunnels: Sequence[TunnelShard], share: float, seed: int) -> list[TunnelShard]:
+    """Return that share of the tunnels of each family, one at least; a larger share holds all of a smaller one."""
+    kept: set[int] = set()
+    for family in sorted({tunnel.family for tunnel in tunnels}):
+        own = [index for index, tunnel in enumerate(tunnels) if tunnel.family == family]
+        order = stream(seed, "descriptor-curves", family).permutation(len(own))
+        kept |= {own[place] for place in order[: max(1, round(share * len(own)))]}
+    return [tunnel for index, tunnel in enumerate(tunnels) if index in kept]
+
+
+def trained(
+    point: Point, tunnels: Sequence[TunnelShard], held: HeldOut, steps: int, folder: Path, data: str
+) -> SphereNetwork:
+    """Train one network, calibrated on the held-out tunnels; one that lies in `folder` already is taken from there."""
+    network = initial_sphere_network(point.seed, point.size)
+    task = SphereTask(network, sphere_data(tunnels), held.data, point.seed)
+    config = FitConfig(seed=point.seed, steps=steps, validate_every=steps)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made: {error.strerror}") from error
+    fit(task, config, folder, f"{point.name} {data}", lambda *_: None, lambda _: None)
+    task.finish()
+    return network
+
+
+def rows_of(network: SphereNetwork, held: HeldOut, about: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return a row for each precision of the stored numbers."""
+    sizes = asdict(network.size) | {
+        "numbers": network.size.numbers,
+        "n_weights": sum(weight.numel() for weight in network.parameters()),
+    }
+    return [
+        {**about, **sizes, "bits": bits, "bytes": network.size.numbers * bits // 8, **measures(network, held, bits)}
+        for bits in BITS
+    ]
+
+
+def earlier_rows(path: Path, run: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the rows of an earlier call, none where there was none.
+
+    Raises:
+        InputError: The table is damaged, or of other data or another number of steps.
+    """
+    if not path.is_file():
+        return []
+    try:
+        table = pd.read_csv(path)
+        is_same = all((table[name] == value).all() for name, value in run.items())
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: damaged ({error}): remove it; networks that were trained are kept") from error
+    if not is_same:
+        raise InputError(f"{path}: of other data or another number of steps: name another --out")
+    return [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]
+
+
+def main(
+    data: Annotated[Path, typer.Argument(help="folder of `tunnelcd dataset`")],
+    out: Annotated[Path, typer.Option("--out", help="folder for curves.csv, curves.png and the networks")],
+    steps: Annotated[int, typer.Option(min=1, help="of training")] = 600,
+    seeds: Annotated[int, typer.Option(min=1, help="training seeds of each network")] = 3,
+) -> None:
+    """Train and measure networks of many sizes, and draw what each gives."""
+    use_threads(1)
+    make_writable(out)
+    training, validation = open_dataset(data, "train"), open_dataset(data, "validation")
+    digests = f"{data_digest(training)} {data_digest(validation)}"
+    run = {"data": digests, "run_steps": steps}
+    held, path = held_out(validation), out / "curves.csv"
+    rows = earlier_rows(path, run)
+    for point in [None, *points(seeds)]:
+        name = point.name if point else SHIPPED
+        if any(row["point"] == name for row in rows):
+            continue
+        began = process_time()
+        if point is None:
+            network, of_point = trained_sphere_network()[0], dict.fromkeys(("share", "seed", "tunnels"), np.nan)
+        else:
+            own = share_of(training, point.share, point.seed)
+            network = trained(point, own, held, steps, out / "networks" / name, digests)
+            of_point = {"share": point.share, "seed": point.seed, "tunnels": len(own)}
+        cpu_s = round(process_time() - began, 1)
+        found = rows_of(network, held, {"point": name, **run, **of_point, "cpu_s": cpu_s})
+        rows += found
+        _write(pd.DataFrame(rows), path)
+        typer.echo(f"{name}: log-likelihood {found[0]['log_likelihood']:.4f}, AUROC {found[0]['auroc']:.4f}")
+
+
+def _write(table: pd.DataFrame, path: Path) -> None:
+    try:
+        partial = path.with_suffix(".partial")
+        table.to_csv(partial, index=False, float_format="%.5g")
+        partial.replace(path)
+        path.with_suffix(".png").write_bytes(draw_curves(table))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+if __name__ == "__main__":
+    with input_errors():
+        typer.run(main)

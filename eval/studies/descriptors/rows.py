@@ -1,0 +1,147 @@
+"""What each descriptor recognises in one pair of sessions, and its price: bytes of a keyframe, milliseconds to make it.
+
+Descriptors of scans are asked for places and headings (`eval.studies.descriptors.place_metrics`). `sphere` is asked for
+changes: the AUROC of the before keyframes, after the pipeline's own merge, with its numbers kept as float32 and as
+int8. Milliseconds are CPU time of the one thread that describes, reading left out, so that a busy machine does not
+show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import thread_time
+from typing import Any, get_args
+
+import numpy as np
+
+from cdpipe.core.geometry import Float64Array
+from cdpipe.descriptors import checkpoint_digest, describe_map, describe_scan
+from cdpipe.mapping.mapping import build_map
+from cdpipe.merge.merge import merge_maps
+from cdpipe.model.config import DescriptorConfig, PipelineConfig, load_config
+from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, PosedScan, ScanSource
+from cdpipe.query.query import find_regions
+from eval.core.ranking import auroc
+from eval.scoring.region_metrics import keyframe_labels
+from eval.studies.descriptors.place_metrics import place_scores
+from eval.truth.adapters import pipeline_input
+from eval.truth.ground_truth import SESSIONS, GroundTruth, load_ground_truth
+
+POSE_BYTES = 7 * 4
+POINT_BYTES = 3 * 4
+SPHERE = "sphere"
+METHODS: tuple[str, ...] = get_args(DescriptorConfig.model_fields["method"].annotation)
+PRECISIONS: tuple[str, ...] = get_args(DescriptorConfig.model_fields["precision"].annotation)
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Described:
+    """The keyframes of one session by one descriptor of scans, and the seconds each took."""
+
+    descriptors: DescriptorSet
+    seconds: Float64Array
+
+
+def pair_rows(pair: Path) -> list[Row]:
+    """Return one row for each descriptor of scans, and one for each precision of `sphere`.
+
+    Args:
+        pair: Folder of a simulated pair.
+
+    Raises:
+        InputError: A session or its truth is missing or damaged.
+    """
+    truth = load_ground_truth(pair)
+    # what a region's size is belongs to the site, as in the plans
+    config = load_config("tunnelcd", [f"query.radius_m={truth.pair.score_radius_m}"])
+    sources = {name: pipeline_input(pair, name) for name in SESSIONS}
+    maps = {name: build_map(sources[name], config.map) for name in SESSIONS}
+    described = {name: describe_keyframes(sources[name], maps[name], METHODS) for name in SESSIONS}
+    rows = [scan_row(method, described["before"][method], described["after"][method], truth) for method in METHODS]
+    method = config.descriptor.method
+    mapped = [MappedSession(maps[name], described[name][method].descriptors) for name in SESSIONS]
+    merged = merge_maps(mapped[0], mapped[1], config.merge)
+    return rows + sphere_rows(merged, mapped[0].descriptors, mapped[1].descriptors, truth, config)
+
+
+def describe_keyframes(source: ScanSource, thin_map: PointMap, methods: Iterable[str]) -> Mapping[str, Described]:
+    """Describe every keyframe of a session by several descriptors of scans, reading each scan once."""
+    configs = {method: DescriptorConfig(method=method) for method in methods}
+    parts: dict[str, list[tuple[Any, Any, float]]] = {method: [] for method in configs}
+    for index in thin_map.keyframe_scans.tolist():
+        scan = source.scan(index)
+        for method, config in configs.items():
+            parts[method].append(_timed(scan, config))
+    found = {}
+    for method, config in configs.items():
+        q, w, seconds = zip(*parts[method], strict=True)
+        vectors = np.stack(q), np.stack(w), thin_map.keyframe_scans, method, checkpoint_digest(config)
+        found[method] = Described(DescriptorSet(*vectors), np.array(seconds))
+    return found
+
+
+def scan_row(method: str, before: Described, after: Described, truth: GroundTruth) -> Row:
+    """Return what a descriptor of scans recognises, and its price; its vectors are q and w, kept with a pose each."""
+    world_T_before = truth.before.world_T_sensor[before.descriptors.keyframe_scans]
+    world_T_after = truth.after.world_T_sensor[after.descriptors.keyframe_scans]
+    return {
+        "descriptor": method,
+        "precision": before.descriptors.q.dtype.name,
+        "status": "ok",
+        "bytes_per_keyframe": POSE_BYTES + _bytes_each(before.descriptors.q) + _bytes_each(before.descriptors.w),
+        "ms_per_keyframe": 1000 * float(np.median([*before.seconds, *after.seconds])),
+        **place_scores(before.descriptors, after.descriptors, world_T_before, world_T_after),
+    }
+
+
+def sphere_rows(
+    merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, truth: GroundTruth, config: PipelineConfig
+) -> list[Row]:
+    """Return what `sphere` finds with its numbers kept in each precision, and what is kept against the thinned map.
+
+    Args:
+        merged: Both maps; where the merge was refused there is no AUROC.
+        before: Keyframes of the before map; what the map around them looks like is described here.
+        after: Those of the after map.
+        truth: The pair's truth.
+        config: All settings; the precision is replaced.
+    """
+    poses = merged.before.odom_T_keyframe
+    world = truth.before.world_T_sensor[before.keyframe_scans, :3, 3]
+    labels = keyframe_labels(world, truth.centroids_world, truth.is_observable, truth.pair.score_radius_m)
+    used = labels >= 0
+    describe_map(merged.before, poses[:1], config.descriptor)  # loads the network
+    rows = []
+    for precision in PRECISIONS:
+        start = thread_time()
+        of_precision = config.descriptor.model_copy(update={"precision": precision})
+        spheres = describe_map(merged.before, poses, of_precision)
+        scores = find_regions(merged, replace(before, spheres=spheres), after, config.query).keyframe_scores
+        seconds = thread_time() - start
+        rows.append(
+            {
+                "descriptor": SPHERE,
+                "precision": precision,
+                "status": "ok" if merged.is_accepted else "merge_refused",
+                "bytes_per_keyframe": POSE_BYTES + _bytes_each(spheres),
+                "ms_per_keyframe": 1000 * seconds / len(poses),
+                "map_bytes_per_keyframe": POINT_BYTES * len(merged.before.points) / len(poses),
+                "region_auroc": auroc(scores[used], labels[used] == 1) if merged.is_accepted else float("nan"),
+                "n_positive": int(np.count_nonzero(labels == 1)),
+                "n_negative": int(np.count_nonzero(labels == 0)),
+            }
+        )
+    return rows
+
+
+def _timed(scan: PosedScan, config: DescriptorConfig) -> tuple[Any, Any, float]:
+    start = thread_time()
+    q, w = describe_scan(scan, config)
+    return q, w, thread_time() - start
+
+
+def _bytes_each(vectors: Any) -> int:
+    return 0 if vectors is None else vectors.nbytes // max(len(vectors), 1)

@@ -1,0 +1,279 @@
+"""From what right and wrong merges measure to the thresholds of the gates.
+
+Run as `python -m eval.studies.merge_gates RUN --out DIR`, where RUN is the folder of `tunnelcd run merge-gates`: a
+variant with `merge.accept_all`, so that every best hypothesis is kept with its evidence, right or wrong. Writes
+DIR/gates.csv and DIR/gates.png. Thresholds go into cdpipe/model/config.py by hand, so that none changes behind anyone's
+back.
+
+Even under `merge.accept_all` the search itself stops at today's gates: the next candidate, and KISS-Matcher, are tried
+only where the one before is below one of them. So which merge is kept depends on the thresholds that were set; they are
+chosen from one run, and not iterated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+import typer
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import BoolArray, Float64Array, stream
+from cdpipe.merge.evidence import GATES
+from cdpipe.model.config import load_config
+from eval.core.exits import input_errors
+from eval.core.figures import BLACK, BLUE, VERMILLION, blank_figure, png
+from eval.core.output import make_writable
+from eval.plans.coverage import plan_of
+from eval.plans.plan import cells
+from eval.running.run_data import read_document
+from eval.tables.merge_table import TARGETS, is_accepted, is_right, kinds, numbers, texts
+
+KEPT_SHARE = 0.995
+LOGARITHMIC = ("hessian_ratio",)
+_LEAST_SHOWN = 1e-5
+
+
+def committed_thresholds() -> dict[str, float]:
+    """Return the threshold of every gate that the preset `tunnelcd` holds."""
+    merge = load_config("tunnelcd").merge
+    return {name: float(getattr(merge, setting)) for name, setting in GATES}
+
+
+def require_ungated(results: pd.DataFrame, variant: str, provenance: Mapping[str, Any]) -> None:
+    """Make sure that no gate stood between a variant's merges and the table: thresholds of what is left mean nothing.
+
+    Args:
+        results: Rows as in results.csv.
+        variant: The one that accepts everything.
+        provenance: Content of provenance.json.
+
+    Raises:
+        InputError: A merge was refused by a gate, or the plan does not say that the variant accepts all.
+    """
+    refused = results[((results["variant"] == variant) & (results["status"] == "merge_refused")).to_numpy()]
+    for row in refused.assign(error=texts(refused, "error")).to_dict("records"):
+        named = [f"merge.{setting}" for _, setting in GATES if f"merge.{setting}" in row["error"]]
+        if named:
+            raise InputError(
+                f"{row['scenario']}, seed {row['seed']}: refused by {named[0]}: run the plan with merge.accept_all=true"
+            )
+    plan = plan_of(provenance)
+    found = [] if plan is None else [cell.config for cell in cells(plan) if cell.variant == variant]
+    if not found or not all(config.merge.accept_all for config in found):
+        raise InputError(
+            f"provenance.json: variant {variant} is not told to have merge.accept_all=true: "
+            "run a plan whose variant sets it, as `merge-gates` does"
+        )
+
+
+def measured(results: pd.DataFrame, variant: str) -> pd.DataFrame:
+    """Return the accepted merges of a variant with their evidence: `right`, `kind`, and a column for each gate.
+
+    Args:
+        results: Rows as in results.csv.
+        variant: The one that accepts everything; "" where there is but one.
+
+    Raises:
+        InputError: There is no such variant, or the evidence is not in the table.
+    """
+    variant = chosen_variant(results, variant)
+    absent = [f"evidence_{name}" for name, _ in GATES if f"evidence_{name}" not in results]
+    if absent:
+        raise InputError(f"results.csv: column {', '.join(absent)} is missing: `tunnelcd score` the run again")
+    own = results[(results["variant"] == variant).to_numpy() & is_accepted(results)]
+    return pd.DataFrame(
+        {
+            "scenario": own["scenario"].to_numpy(),
+            "seed": own["seed"].to_numpy(),
+            "kind": kinds(own),
+            "right": is_right(own),
+            "merge_error_m": numbers(own, "merge_error_m"),
+            **{name: numbers(own, f"evidence_{name}") for name, _ in GATES},
+        }
+    )
+
+
+def chosen_variant(results: pd.DataFrame, variant: str) -> str:
+    """Return the variant that is meant.
+
+    Raises:
+        InputError: There is no such variant, or none is named and there are several.
+    """
+    names = list(dict.fromkeys(results["variant"].astype(str)))
+    if not variant and len(names) == 1:
+        return names[0]
+    if variant not in names:
+        raise InputError(f"--variant {variant or '(none)'}: name one of the run's: {', '.join(names)}")
+    return variant
+
+
+def gate_table(cases: pd.DataFrame, thresholds: Mapping[str, float]) -> pd.DataFrame:
+    """Return one row for every gate and one for all of them together.
+
+    Args:
+        cases: As `measured` returns them.
+        thresholds: What each gate asks for.
+
+    Returns:
+        `gate`, `setting`, `threshold`; `n_right`, `n_wrong`; `worst_right` and `best_wrong`, the lowest value of a
+        right merge and the highest of a wrong one; how many of each the gate refuses, and how many that no other gate
+        refuses (`..._alone`); `is_separable` and the `suggested` threshold: the middle between worst right and best
+        wrong (of their logarithms, for a ratio), or else the value that keeps 99.5 % of the right ones. The row `all`
+        counts the merges that at least one gate refuses. Evidence that could not be measured is refused.
+    """
+    right = cases["right"].to_numpy(dtype=np.bool_)
+    refused = {name: ~(cases[name].to_numpy(dtype=np.float64) >= thresholds[name]) for name, _ in GATES}
+    rows: list[dict[str, Any]] = []
+    for name, setting in GATES:
+        by_others = np.logical_or.reduce([mask for other, mask in refused.items() if other != name])
+        values = cases[name].to_numpy(dtype=np.float64)
+        suggested, is_separable = suggest(values[right], values[~right], logarithmic=name in LOGARITHMIC)
+        rows.append(
+            {
+                "gate": name,
+                "setting": f"merge.{setting}",
+                "threshold": thresholds[name],
+                **_counts(right, refused[name], refused[name] & ~by_others),
+                "worst_right": _end(values[right], np.min),
+                "best_wrong": _end(values[~right], np.max),
+                "is_separable": is_separable,
+                "suggested": suggested,
+            }
+        )
+    every = np.logical_or.reduce(list(refused.values()))
+    nothing = np.zeros_like(every)
+    return pd.DataFrame([*rows, {"gate": "all", "setting": "", **_counts(right, every, nothing)}])
+
+
+def let_through(cases: pd.DataFrame, thresholds: Mapping[str, float]) -> BoolArray:
+    """Return (N,) whether each merge reaches every gate."""
+    passed = [cases[name].to_numpy(dtype=np.float64) >= thresholds[name] for name, _ in GATES]
+    return np.asarray(np.logical_and.reduce(passed), dtype=np.bool_)
+
+
+def suggest(right: Float64Array, wrong: Float64Array, *, logarithmic: bool) -> tuple[float, bool]:
+    """Return a threshold, and whether it separates all right values from all wrong ones.
+
+    Rounded towards the wrong values to three digits; NaN without a right value.
+    """
+    right, wrong = right[~np.isnan(right)], wrong[~np.isnan(wrong)]
+    if len(right) == 0:
+        return float("nan"), False
+    if len(wrong) and wrong.max() < right.min():
+        low, high = float(wrong.max()), float(right.min())
+        middle = float(np.sqrt(low * high)) if logarithmic and low > 0 else (low + high) / 2
+        rounded = _rounded_down(middle)
+        return (rounded if rounded > low else middle), True
+    return _rounded_down(float(np.sort(right)[int((1.0 - KEPT_SHARE) * len(right))])), False
+
+
+def draw_gates(cases: pd.DataFrame, table: pd.DataFrame) -> bytes:
+    """Draw a panel for each gate: every merge by kind of pair, right and wrong, and the thresholds. Returns a PNG."""
+    figure = blank_figure(9.0, 6.4)
+    panels = figure.subplots(2, -(-len(GATES) // 2), squeeze=False).ravel()
+    by_gate = {str(row["gate"]): row for row in table.to_dict("records")}
+    rows = [kind for kind in (*TARGETS, "") if (cases["kind"] == kind).any()]
+    for axes, (name, setting) in zip(panels, GATES, strict=False):
+        _gate_panel(axes, cases, name, rows)
+        axes.axvline(by_gate[name]["threshold"], color=BLACK, linewidth=1.4)
+        if not np.isnan(by_gate[name]["suggested"]):
+            axes.axvline(by_gate[name]["suggested"], color=BLACK, linewidth=1.0, linestyle=(0, (3, 2)))
+        axes.set_title(f"{name.replace('_', ' ')}\nmerge.{setting} = {by_gate[name]['threshold']:g}", fontsize=9)
+    for axes in panels[len(GATES) :]:
+        axes.set_axis_off()
+    handles = [
+        Line2D([], [], linestyle="none", marker="o", markersize=5, color=BLUE, label="right merge"),
+        Line2D([], [], linestyle="none", marker="x", markersize=6, color=VERMILLION, label="wrong merge"),
+        Line2D([], [], color=BLACK, linewidth=1.4, label="gate"),
+        Line2D([], [], color=BLACK, linewidth=1.0, linestyle=(0, (3, 2)), label="suggested"),
+    ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8, frameon=False)
+    return png(figure)
+
+
+def main(
+    run: Annotated[Path, typer.Argument(help="folder of `tunnelcd run merge-gates`")],
+    out: Annotated[Path, typer.Option("--out", help="folder for gates.csv and gates.png", show_default=False)],
+    variant: Annotated[str, typer.Option(help="the one that accepts everything, where there are several")] = "",
+) -> None:
+    """Print and write what each gate does to the merges of a validation run, and draw where its threshold lies."""
+    path = run / "results.csv"
+    try:
+        results = pd.read_csv(path)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: {reason}: name a folder that `tunnelcd run merge-gates` made") from error
+    require_ungated(results, chosen_variant(results, variant), read_document(run / "provenance.json"))
+    cases, thresholds = measured(results, variant), committed_thresholds()
+    if len(cases) == 0:
+        raise InputError(f"{path}: no merge was accepted: the plan's variant must set merge.accept_all=true")
+    make_writable(out)
+    table = gate_table(cases, thresholds)
+    table.to_csv(out / "gates.csv", index=False)
+    (out / "gates.png").write_bytes(draw_gates(cases, table))
+    typer.echo(table.to_string(index=False, na_rep="-"))
+    n_other = len(results) - len(cases)
+    typer.echo(f"\n{len(cases)} merges; {n_other} further rows of results.csv were not merged or are of other variants")
+    passed, right = let_through(cases, thresholds), cases["right"].to_numpy(dtype=np.bool_)
+    for title, mask in (("wrong, but let through", passed & ~right), ("right, but refused", right & ~passed)):
+        typer.echo(f"\n{title}: {int(mask.sum())}")
+        if mask.any():
+            typer.echo(cases[mask].drop(columns="right").to_string(index=False, na_rep="-"))
+
+
+def _counts(right: BoolArray, refused: BoolArray, alone: BoolArray) -> dict[str, int]:
+    return {
+        "n_right": int(right.sum()),
+        "n_wrong": int((~right).sum()),
+        "n_right_refused": int((refused & right).sum()),
+        "n_right_refused_alone": int((alone & right).sum()),
+        "n_wrong_refused": int((refused & ~right).sum()),
+        "n_wrong_refused_alone": int((alone & ~right).sum()),
+        "n_wrong_let_through": int((~refused & ~right).sum()),
+    }
+
+
+def _end(values: Float64Array, which: Any) -> float:
+    values = values[~np.isnan(values)]
+    return float(which(values)) if len(values) else float("nan")
+
+
+def _rounded_down(value: float) -> float:
+    if value <= 0:
+        return value
+    digits = 2 - int(np.floor(np.log10(value)))
+    # 0.29 * 100 is a hair below 29
+    return float(np.floor(value * 10.0**digits + 1e-9) / 10.0**digits)
+
+
+def _gate_panel(axes: Axes, cases: pd.DataFrame, name: str, rows: Sequence[str]) -> None:
+    is_log = name in LOGARITHMIC
+    for row, kind in enumerate(rows):
+        for is_right_merge, colour, marker, offset in ((True, BLUE, "o", -0.2), (False, VERMILLION, "x", 0.2)):
+            own = cases[(cases["kind"] == kind) & (cases["right"] == is_right_merge)]
+            values = own[name].to_numpy(dtype=np.float64)
+            # what could not be measured is refused, as 0 is
+            values = np.nan_to_num(values, nan=0.0)
+            values = np.maximum(values, _LEAST_SHOWN) if is_log else values
+            shift = offset + stream(0, "gates", "strip").uniform(-0.13, 0.13, len(values))
+            axes.plot(values, row + shift, linestyle="none", marker=marker, markersize=3.5, color=colour, alpha=0.6)
+    if is_log:
+        axes.set_xscale("log")
+    axes.set_yticks(range(len(rows)), [kind or "no kind" for kind in rows])
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.grid(axis="x", color="#e6e6e6", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=8, left=False)
+    for side in ("top", "right", "left"):
+        axes.spines[side].set_visible(False)
+
+
+if __name__ == "__main__":
+    with input_errors():
+        typer.run(main)

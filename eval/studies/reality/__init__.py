@@ -1,0 +1,1 @@
+"""The simulated sensor held against recordings of a real one."""

@@ -1,0 +1,145 @@
+"""The simulated sensor held against a real one: returns, range noise, signal, false and mixed returns, novelty.
+
+python -m eval.studies.reality.reality --out reports/sensor [--data FOLDER]
+
+The real revolution is that of an OS1-32 gradient unit, published with the vendor's SDK (BSD-3); it is looked for below
+--data or $TUNNELCD_REAL_DATA. The simulator answers three times with the same beam table: from a surface made of the
+real revolution itself, so that the scene is the same; and in a narrow and a wide tunnel of a validation seed. What the
+same scene shows with every effect off is what the rebuilding left in it, not the simulated sensor's doing.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import pandas as pd
+import typer
+
+from eval.core.exits import input_errors
+from eval.core.output import make_writable, unwritable
+from eval.studies.reality.plots import draw_measures, draw_novelty, draw_scene
+from eval.studies.reality.rebuilt_scene import Rebuilt, rebuild
+from eval.studies.reality.scenes import (
+    as_revolutions,
+    cast_at_origin,
+    drive_of,
+    find_recording,
+    real_revolution,
+    with_effects,
+)
+from eval.studies.reality.sensor_measures import Revolutions
+from eval.studies.reality.static_novelty import Novelty, effect_variants, novelty_cases, static_novelty
+from eval.studies.reality.tables import markdown, measured, novelty_table, side_by_side, surface_rows
+from scenarios.schema import Sensor
+from sim.session.revolution import Drive, cast_revolution
+
+DATA_VARIABLE = "TUNNELCD_REAL_DATA"
+PROFILE = "os1-32-g"
+WORLDS = (("narrow", 10000), ("wide", 10000))
+REAL, SAME_SCENE = "real", "real scene"
+_N_REPEATS = 10  # revolutions of each simulated source
+# The real unit reports returns to 204 m; a tunnel has none so far.
+_FAR_M = 250.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """What was found.
+
+    Attributes:
+        real: The recording.
+        rebuilt: The scene made of it.
+        recast: One revolution simulated in that scene, default effects.
+        measures: Table of `eval.studies.reality.tables.COLUMNS`.
+        novelty: Every simulated figure of static novelty, in the first of `WORLDS`.
+    """
+
+    real: Revolutions
+    rebuilt: Rebuilt
+    recast: Revolutions
+    measures: pd.DataFrame
+    novelty: tuple[Novelty, ...]
+
+
+def compare(data: Path | None) -> Comparison:
+    """Measure the recording and the simulator alike.
+
+    Args:
+        data: Folder of the recording.
+
+    Raises:
+        InputError: The recording is missing or damaged, or the extra `ouster` is not installed.
+    """
+    real = real_revolution(find_recording(data))
+    drives = [drive_of(family, seed, real.sensor, PROFILE) for family, seed in WORLDS]
+    rebuilt = rebuild(real, drives[0].scene)
+    tables = [measured(real, REAL), surface_rows(real, rebuilt.is_surface, REAL)]
+    recasts = []
+    for name, number in (("", 1), (", 19 sub-rays", 19)):
+        settings = Sensor.model_validate({"profile": PROFILE, "max_range_m": _FAR_M, "sub_rays": number})
+        recast = _recast(rebuilt, real, settings, _N_REPEATS)
+        recasts.append(recast)
+        source = f"{SAME_SCENE}{name}"
+        tables += [measured(recast, source), surface_rows(recast, rebuilt.is_surface, source)]
+        tables += [
+            measured(_driven(drive, settings), f"{family} {seed}{name}")
+            for drive, (family, seed) in zip(drives, WORLDS, strict=True)
+        ]
+    off = effect_variants(Sensor(profile=PROFILE, max_range_m=_FAR_M))["all off"]
+    floor = _recast(rebuilt, real, off, 1)  # nothing is drawn: every further one is the same
+    tables += [
+        measured(floor, f"{SAME_SCENE}, effects off"),
+        surface_rows(floor, rebuilt.is_surface, f"{SAME_SCENE}, effects off"),
+    ]
+    first = Revolutions(real.sensor, recasts[0].range_m[:1], recasts[0].signal[:1], recasts[0].reflectivity[:1])
+    return Comparison(real, rebuilt, first, pd.concat(tables, ignore_index=True), tuple(_novelty(drives[0])))
+
+
+def _recast(rebuilt: Rebuilt, real: Revolutions, settings: Sensor, n_revolutions: int) -> Revolutions:
+    scans = [cast_at_origin(rebuilt.scene, real.sensor, settings, number) for number in range(n_revolutions)]
+    return as_revolutions(real.sensor, scans)
+
+
+def _driven(drive: Drive, settings: Sensor) -> Revolutions:
+    """Return revolutions spread evenly over a drive."""
+    recorded = with_effects(drive, settings)
+    numbers = np.linspace(0, recorded.trajectory.n_scans - 1, _N_REPEATS).astype(int).tolist()
+    return as_revolutions(recorded.sensor, [cast_revolution(recorded, number)[1] for number in numbers])
+
+
+def _novelty(drive: Drive) -> list[Novelty]:
+    first = drive.trajectory.n_scans // 3
+    return [static_novelty(drive, case, first) for case in novelty_cases(drive.scenario.sensor)]
+
+
+def main(
+    out: Annotated[Path, typer.Option(help="folder for reality.csv, reality-novelty.csv, their .md and plots")],
+    data: Annotated[Path | None, typer.Option(help=f"folder of the real recording [${DATA_VARIABLE}]")] = None,
+) -> None:
+    """Print and write the comparison."""
+    given = os.environ.get(DATA_VARIABLE)
+    folder = data or (Path(given) if given else None)
+    find_recording(folder)
+    make_writable(out)
+    comparison = compare(folder)
+    novelty = novelty_table(comparison.novelty)
+    text = "\n".join(markdown(table) for table in (side_by_side(comparison.measures), novelty))
+    try:
+        comparison.measures.to_csv(out / "reality.csv", index=False, float_format="%.5g")
+        novelty.to_csv(out / "reality-novelty.csv", index=False, float_format="%.4g")
+        (out / "reality.md").write_text(text)
+        draw_measures(comparison.measures, out / "reality-measures.png")
+        draw_scene(comparison.real, comparison.recast, out / "reality-scene.png")
+        draw_novelty(comparison.novelty, out / "reality-novelty.png")
+    except OSError as error:
+        raise unwritable(out, error) from error
+    typer.echo(text, nl=False)
+
+
+if __name__ == "__main__":
+    with input_errors():
+        typer.run(main)

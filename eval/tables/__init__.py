@@ -1,0 +1,1 @@
+"""From rows of results.csv to tables: by method, domain, size and setting."""

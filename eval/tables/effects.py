@@ -1,0 +1,51 @@
+"""What a setting of the world does to a method: the same seeds with it and without it, and the mean of the differences.
+
+A world `narrow[sensor.range_noise=false]` is held against `narrow` in the same folder (`eval.plans.worlds.references`).
+A seed draws the same tunnel, the same changes and the same drives in both, so each pair is its own control.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from eval.core.statistics import IDENTITY_COLUMNS, mean_with_interval
+from eval.plans.worlds import references, settings_over
+
+KEYS = ("scenario", "variant", "seed")
+COLUMNS = ("reference", "settings", "variant", "metric", "without", "with", "difference", "low", "high", "n")
+
+
+def effects(results: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
+    """Return what each world's settings do to every figure of each variant.
+
+    Args:
+        results: Rows as in results.csv.
+        seed: Seed of the bootstrap.
+
+    Returns:
+        One row per world and variant with a reference, and metric: `reference`, the other world; `settings`, what
+        the world has on top of it; the means `without` and `with` them, their `difference` (with - without) and its
+        95 % bootstrap interval `low` to `high`; all over the `n` seeds that have a number in both worlds, NaN where
+        there is none. Times are left out: they say more about the machine. Without such worlds there is no row.
+    """
+    metrics = [name for name in results.columns if name not in IDENTITY_COLUMNS and not name.startswith("t_")]
+    numbers = results[metrics].apply(pd.to_numeric, errors="coerce").set_index(results["seed"])
+    cases = dict(list(numbers.groupby([results["scenario"].to_numpy(), results["variant"].to_numpy()])))
+    rows: list[dict[str, Any]] = []
+    for (world, variant), reference in references(zip(*(results[name] for name in KEYS), strict=True)).items():
+        changed, plain = cases[world, variant].align(cases[reference, variant], join="inner", axis=0)
+        names = {"reference": reference, "settings": settings_over(world, reference), "variant": variant}
+        rows += [{**names, "metric": metric, **_effect(plain, changed, metric, seed)} for metric in metrics]
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def _effect(plain: pd.DataFrame, changed: pd.DataFrame, metric: str, seed: int) -> dict[str, Any]:
+    without, with_ = (frame[metric].to_numpy(dtype=np.float64) for frame in (plain, changed))
+    is_used = ~np.isnan(without) & ~np.isnan(with_)
+    difference, low, high, n = mean_with_interval((with_ - without)[is_used], seed)
+    means = (float(values[is_used].mean()) if n else float("nan") for values in (without, with_))
+    found = dict(zip(("without", "with"), means, strict=True))
+    return {**found, "difference": difference, "low": low, "high": high, "n": n}

@@ -1,0 +1,143 @@
+"""Objects by what they are and how large: IoU, volume and displacement of each kind of prop and size of hull."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
+from eval.core.statistics import N_RESAMPLES
+from eval.tables.merge_table import numbers, texts
+from eval.tables.region_curves import PAIR
+from eval.tables.region_sizes import EDGES
+
+HIT_IOU = 0.5
+_MEASURE = "hull_volume_m3"
+Statistic = Literal["mean", "median"]
+
+
+def main_changes(changes: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of changes.csv that the main object columns are over: observable, of the group `full`."""
+    is_main = ~np.isnan(numbers(changes, "iou_point")) & (texts(changes, "group") == "full")
+    return pd.DataFrame(changes[is_main])
+
+
+def pair_numbers(items: pd.DataFrame) -> Int64Array:
+    """Return (N,) a number for the session pair of each row."""
+    return np.asarray(items.groupby(list(PAIR), sort=False).ngroup(), dtype=np.int64)
+
+
+def objects_by_group(changes: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return a row for every kind of prop and every size of hull that one variant's main changes hold.
+
+    Args:
+        changes: Rows of changes.csv of one variant.
+
+    Returns:
+        `measure` (prop_kind or hull_volume_m3), `value` (the kind), `low` and `high` of the bin (low included),
+        `n_changes`, `n_pairs`; `iou_point`, missed ones 0, with its 95 % bootstrap interval over session pairs;
+        `iou_matched_median`; `share_50`, with an IoU of at least 0.5; `share_found`, with a region that finds them;
+        `kind_accuracy`, `displacement_error_m` and `volume_error` (medians; absolute share) over those matched.
+    """
+    own = main_changes(changes)
+    pair = pair_numbers(own)
+    rows = []
+    for names, inside in _groups(own):
+        part, of_pair = own[inside], pair[inside]
+        iou = numbers(part, "iou_point")
+        low, high = clustered_interval(iou, of_pair)
+        rows.append(
+            {
+                **names,
+                "n_changes": len(part),
+                "n_pairs": len(np.unique(of_pair)),
+                "iou_point": float(iou.mean()),
+                "iou_point_low": low,
+                "iou_point_high": high,
+                "iou_matched_median": median(iou[numbers(part, "matched_object") >= 0]),
+                "share_50": float(np.mean(iou >= HIT_IOU)),
+                "share_found": float(part["is_found"].astype(bool).mean()),
+                "kind_accuracy": mean(numbers(part, "is_kind_right")),
+                "displacement_error_m": median(numbers(part, "displacement_error_m")),
+                "volume_error": median(np.abs(numbers(part, "volume_error_share"))),
+            }
+        )
+    return rows
+
+
+def group_overview(groups: pd.DataFrame, variant: str) -> pd.DataFrame:
+    """Return the columns of objects_by_group.csv that a terminal has room for, of one variant."""
+    names = {
+        "domain": "domain", "object": "object", "n_changes": "n", "n_pairs": "pairs", "iou_point": "iou",
+        "iou_point_low": "low", "iou_point_high": "high", "iou_matched_median": "matched", "share_50": "iou>=0.5",
+        "share_found": "found", "kind_accuracy": "kind", "displacement_error_m": "moved_m", "volume_error": "volume",
+    }  # fmt: skip
+    own = groups[groups["variant"] == variant]
+    objects = [
+        str(row.value) if row.measure == "prop_kind" else f"{row.low:g} to {row.high:g} m3"
+        for row in own[["measure", "value", "low", "high"]].itertuples(index=False)
+    ]
+    return pd.DataFrame(own.assign(object=objects)[list(names)].rename(columns=names))
+
+
+def clustered_interval(values: Float64Array, pair: Int64Array, statistic: Statistic = "mean") -> tuple[float, float]:
+    """Return the 95 % bootstrap interval of the mean or median of (N,) numbers; whole session pairs are drawn.
+
+    Args:
+        values: One for each item, without NaN.
+        pair: (N,) which pair each is of; pairs without an item are not drawn.
+        statistic: Over all items of the pairs that were drawn, as often as they were.
+
+    Returns:
+        NaN for fewer than two pairs: one says nothing about how pairs vary.
+    """
+    _, place = np.unique(pair, return_inverse=True)
+    n_pairs = int(place.max(initial=-1)) + 1
+    if n_pairs < 2:
+        return float("nan"), float("nan")
+    draws = stream(0, "bootstrap").integers(n_pairs, size=(N_RESAMPLES, n_pairs))
+    if statistic == "mean":
+        sums, counts = np.bincount(place, values), np.bincount(place)
+        samples = sums[draws].sum(axis=1) / counts[draws].sum(axis=1)
+    else:
+        order = np.argsort(values, kind="stable")
+        times_drawn = np.stack([np.bincount(draw, minlength=n_pairs) for draw in draws])
+        samples = _repeated_medians(values[order], times_drawn[:, place[order]])
+    low, high = np.percentile(samples, (2.5, 97.5))
+    return float(low), float(high)
+
+
+def mean(values: Float64Array) -> float:
+    """Return the mean of the numbers that are not NaN; NaN without one."""
+    values = values[~np.isnan(values)]
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def median(values: Float64Array) -> float:
+    """Return the median of the numbers that are not NaN; NaN without one."""
+    values = values[~np.isnan(values)]
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+def _repeated_medians(rising: Float64Array, times: Int64Array) -> Float64Array:
+    """Return (B,) medians of (N,) rising numbers, each taken (B, N) times; every row takes at least one."""
+    up_to = np.cumsum(times, axis=1)
+    n = up_to[:, -1:]
+    lower, upper = ((up_to <= rank).sum(axis=1) for rank in ((n - 1) // 2, n // 2))
+    return np.asarray((rising[lower] + rising[upper]) / 2)
+
+
+def _groups(changes: pd.DataFrame) -> Iterator[tuple[dict[str, Any], BoolArray]]:
+    """Yield the name of each group that holds a change, and (N,) which it holds."""
+    kinds = texts(changes, "prop_kind")
+    for kind in sorted(set(kinds)):
+        yield {"measure": "prop_kind", "value": kind, "low": np.nan, "high": np.nan}, np.asarray(kinds == kind)
+    volumes_m3 = numbers(changes, _MEASURE)
+    for low, high in pairwise(EDGES[_MEASURE]):
+        inside = (volumes_m3 >= low) & (volumes_m3 < high)
+        if inside.any():
+            yield {"measure": _MEASURE, "value": "", "low": low, "high": high}, inside

@@ -1,0 +1,200 @@
+"""What a run says about objects: every method in and out of the training distribution, and the targets of `tunnelcd`.
+
+Means are over session pairs, as in summary.csv, and a pair without an answer has missed all its objects. What needs an
+answered object (displacement, volume, the median over those matched) is over the changes of all pairs together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cdpipe.core.geometry import Float64Array
+from eval.core.domains import domain_of
+from eval.core.statistics import mean_with_interval
+from eval.scoring.object_sizes import PILE_KIND
+from eval.tables.merge_table import numbers, texts
+from eval.tables.object_groups import clustered_interval, main_changes, median, objects_by_group, pair_numbers
+from eval.tables.region_curves import PAIR
+from eval.tables.region_table import ALL_DOMAINS, DOMAINS, MAIN_VARIANT
+
+FILES = ("objects_table", "objects_by_group", "objects_targets")
+ORACLE_VARIANT = "oracle-merge+oracle-regions"
+_MEANS = (
+    "object_iou_point", "object_iou_voxel", "object_iou_box", "object_f1_25", "object_f1_50", "object_precision_50",
+    "object_pq", "kind_accuracy", "object_iou_point_partial", "region_recall_proposed", "region_recall",
+)  # fmt: skip
+_RATES = ("false_regions_per_100m_proposed", "false_regions_per_100m")
+# what is asked in distribution: column, words, variant, rule, limit
+_TARGETS = (
+    ("object_iou_point", "point IoU (missed: 0)", MAIN_VARIANT, "at least", 0.75),
+    ("object_iou_point", "point IoU with merge and regions by the truth", ORACLE_VARIANT, "at least", 0.85),
+    ("object_iou_voxel", "voxel IoU", MAIN_VARIANT, "at least", 0.65),
+    ("object_f1_50", "F1 at IoU 0.5", MAIN_VARIANT, "at least", 0.90),
+    ("object_f1_25", "F1 at IoU 0.25", MAIN_VARIANT, "at least", 0.95),
+    ("kind_accuracy", "kind right", MAIN_VARIANT, "at least", 0.95),
+    ("displacement_error_m", "median error of displacements [m]", MAIN_VARIANT, "at most", 0.10),
+    ("pile_volume_error", "median error of the volume of muck piles", MAIN_VARIANT, "at most", 0.15),
+    ("object_iou_point_partial", "point IoU of short moves and reshaped piles", MAIN_VARIANT, "at least", 0.5),
+)
+_COUNTS = {
+    "displacement_error_m": "n_displacements", "pile_volume_error": "n_piles", "object_iou_point_partial": "n_partial",
+}  # fmt: skip
+_ROUNDING = 1e-9
+
+
+def object_tables(results: pd.DataFrame, changes: pd.DataFrame, *, is_whole: bool = True) -> dict[str, pd.DataFrame]:
+    """Return the tables of a run about objects, by file name.
+
+    Args:
+        results: Rows as in results.csv.
+        changes: Rows as in changes.csv.
+        is_whole: Whether all that was planned is in them; otherwise nothing is said to be met or not.
+
+    Returns:
+        objects_table: a row for every domain and variant; objects_by_group: by kind of prop and size of hull;
+        objects_targets: what is asked, and what is found.
+    """
+    results = results.assign(domain=[domain_of(family) for family in texts(results, "family")])
+    rows: list[dict[str, Any]] = []
+    groups: list[dict[str, Any]] = []
+    present = [name for name in DOMAINS[:2] if (results["domain"] == name).any()]
+    for domain in [*present, *([ALL_DOMAINS] if len(present) > 1 else [])]:
+        cases = results if domain == ALL_DOMAINS else results[results["domain"] == domain]
+        for variant, own in cases.groupby("variant", sort=False):
+            names = {"domain": domain, "variant": str(variant)}
+            of_cases = _of_cases(changes, own)
+            rows.append({**names, **_counts(own, of_cases), **_means(own), **_over_changes(of_cases)})
+            groups += [{**names, **row} for row in objects_by_group(of_cases)]
+    table = pd.DataFrame(rows)
+    return {
+        "objects_table": table,
+        "objects_by_group": pd.DataFrame(groups),
+        "objects_targets": object_targets(table, is_whole=is_whole),
+    }
+
+
+def object_overview(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the columns of objects_table.csv that a terminal has room for, intervals beside the values."""
+    names = {
+        "domain": "domain", "variant": "variant", "n_pairs": "n", "n_failed": "failed", "n_changes": "changes",
+        "object_iou_point": "iou", "iou_matched_median": "matched", "object_iou_voxel": "voxel",
+        "object_f1_25": "f1@25", "object_f1_50": "f1@50", "kind_accuracy": "kind",
+        "displacement_error_m": "moved_m", "n_displacements": "of",
+        "pile_volume_error": "pile_vol", "n_piles": "of ", "object_iou_point_partial": "partial", "n_partial": "of  ",
+        "region_recall_proposed": "recall_prop", "region_recall": "recall",
+        "false_regions_per_100m_proposed": "false_prop", "false_regions_per_100m": "false",
+        "t_oe_per_region_s": "t_oe/region", "t_returns_per_region_s": "of that returns",
+    }  # fmt: skip
+    shown = {
+        heading: [_with_interval(row, name) for row in table.to_dict("records")]
+        if f"{name}_low" in table
+        else table[name]
+        for name, heading in names.items()
+    }
+    return pd.DataFrame(shown)
+
+
+def _with_interval(row: Mapping[Any, Any], name: str) -> str:
+    value, low, high = (float(row[f"{name}{end}"]) for end in ("", "_low", "_high"))
+    digits = 3 if name.endswith("_m") else 2
+    if math.isnan(value):
+        return "-"
+    return f"{value:.{digits}f}" + ("" if math.isnan(low) else f" ({low:.{digits}f}-{high:.{digits}f})")
+
+
+def object_targets(table: pd.DataFrame, *, is_whole: bool) -> pd.DataFrame:
+    """Return what is asked in distribution, and whether it is met; no row without data.
+
+    Returns:
+        `target`, `domain`, `variant`, `value` with `low` and `high`, `asked` ("at least 0.75"), `n` pairs (changes for
+        displacement, volume and the partial group), and `is_met`: None where no verdict is passed.
+    """
+    found: list[dict[str, Any]] = []
+    for column, words, variant, rule, limit in _TARGETS:
+        for row in table[(table["domain"] == "in") & (table["variant"] == variant)].to_dict("records"):
+            value = float(row[column])
+            if math.isnan(value):
+                continue
+            is_met = value >= limit - _ROUNDING if rule == "at least" else value <= limit + _ROUNDING
+            found.append(
+                {
+                    "target": words,
+                    "domain": "in",
+                    "variant": variant,
+                    "value": value,
+                    "low": float(row[f"{column}_low"]),
+                    "high": float(row[f"{column}_high"]),
+                    "asked": f"{rule} {limit:g}",
+                    "n": int(row[_COUNTS.get(column, "n_pairs")]),
+                    "is_met": is_met if is_whole else None,
+                }
+            )
+    columns = ["target", "domain", "variant", "value", "low", "high", "asked", "n", "is_met"]
+    return pd.DataFrame(found, columns=columns).astype({"is_met": object})
+
+
+def _of_cases(changes: pd.DataFrame, cases: pd.DataFrame) -> pd.DataFrame:
+    """Return the changes of some rows of results.csv."""
+    wanted = [*PAIR, "variant"]
+    if len(changes) == 0:
+        return changes.assign(**{name: [] for name in wanted if name not in changes})
+    return changes.merge(cases[wanted].drop_duplicates(), on=wanted, how="inner")
+
+
+def _counts(own: pd.DataFrame, changes: pd.DataFrame) -> dict[str, Any]:
+    return {
+        "n_pairs": len(own),
+        "n_refused": int((own["status"] == "merge_refused").sum()),
+        "n_failed": int((own["status"] != "ok").sum()),
+        "n_changes": len(main_changes(changes)),
+        "n_partial": int(np.nansum(numbers(own, "n_partial"))),
+        "n_matched": int((numbers(main_changes(changes), "matched_object") >= 0).sum()),
+        "n_withdrawn": int(np.nansum(numbers(own, "n_withdrawn"))),
+    }
+
+
+def _means(own: pd.DataFrame) -> dict[str, float]:
+    """Return means over pairs with their intervals, false regions over the whole way, and the median time."""
+    found: dict[str, float] = {}
+    for name in _MEANS:
+        found[name], found[f"{name}_low"], found[f"{name}_high"], _ = mean_with_interval(numbers(own, name))
+    path_m = numbers(own, "after_path_m")
+    for name in _RATES:
+        rate = numbers(own, name)
+        is_told = ~np.isnan(rate)
+        way_m = float(path_m[is_told].sum())
+        found[name] = float((rate * path_m)[is_told].sum()) / way_m if way_m > 0 else math.nan
+    answered = own[own["status"] == "ok"]
+    per_region_s, whole_s = numbers(answered, "t_oe_per_region_s"), numbers(answered, "t_oe_s")
+    found["t_oe_per_region_s"] = median(per_region_s)
+    # of an answer without an object both are about 0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        found["t_returns_per_region_s"] = median(per_region_s * numbers(answered, "t_returns_s") / whole_s)
+    return found
+
+
+def _over_changes(changes: pd.DataFrame) -> dict[str, float]:
+    """Return medians over the matched changes of all pairs together, with intervals over pairs."""
+    own = main_changes(changes)
+    iou = numbers(own, "iou_point")
+    piles = changes[texts(changes, "prop_kind") == PILE_KIND]
+    n_displaced, displacement = _medians("displacement_error_m", numbers(changes, "displacement_error_m"), changes)
+    n_piles, pile_volume = _medians("pile_volume_error", np.abs(numbers(piles, "volume_error_share")), piles)
+    return {
+        "iou_matched_median": median(iou[numbers(own, "matched_object") >= 0]),
+        **displacement,
+        "n_displacements": n_displaced,
+        **pile_volume,
+        "n_piles": n_piles,
+    }
+
+
+def _medians(name: str, values: Float64Array, changes: pd.DataFrame) -> tuple[int, dict[str, float]]:
+    is_told = ~np.isnan(values)
+    low, high = clustered_interval(values[is_told], pair_numbers(changes[is_told]), "median")
+    return int(is_told.sum()), {name: median(values), f"{name}_low": low, f"{name}_high": high}

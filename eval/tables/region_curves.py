@@ -1,0 +1,252 @@
+"""How many changes are found at which price: the free-response curve over candidates, and the ROC over keyframes.
+
+The free-response curve lets the threshold fall over all candidates that were not withdrawn, reported or not, and counts
+the observable changes found against the false regions per 100 m of after path, over changed and unchanged pairs alike.
+Below a method's own threshold nothing was looked at and nothing withdrawn: there the curve is that of mere proposals.
+Scores of some methods mean something else in a wide drift than in a narrow one, as the radius does, so a threshold
+belongs to one method and one kind of site (`score_radius_m`): at each rate every kind of site has the lowest threshold
+that keeps its own rate.
+A pair without an answer misses all its changes, and its way is not counted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
+from eval.core.statistics import N_RESAMPLES
+
+RATES_PER_100M = (0.1, 0.5)
+PAIR = ["scenario", "seed"]
+_BATCH = 100
+_MAX_ROC_POINTS = 400
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RankedPairs:
+    """What one method gave on P pairs: R candidates that pass suppression, and C observable changes.
+
+    Attributes:
+        pairs: (scenario, seed) of each pair, sorted.
+        site: (P,) int64 kind of site of each, from 0.
+        path_m: (P,) way of the after session, 0 where there is no answer.
+        n_observable: (P,) int64 observable changes.
+        pair: (R,) int64 pair of each candidate.
+        score: (R,) its score.
+        n_new: (R,) int64 observable changes that it finds and no better candidate of its pair does.
+        is_false: (R,) whether it finds no change at all.
+        change_pair: (C,) int64 pair of each change.
+        change_score: (C,) score of the best candidate that finds it, -inf for none.
+        change_rank: (C,) int64 place of that candidate in its pair from 0, R for none.
+        change_rows: (C,) int64 its row in the table of changes.
+    """
+
+    pairs: tuple[tuple[str, int], ...]
+    site: Int64Array
+    path_m: Float64Array
+    n_observable: Int64Array
+    pair: Int64Array
+    score: Float64Array
+    n_new: Int64Array
+    is_false: BoolArray
+    change_pair: Int64Array
+    change_score: Float64Array
+    change_rank: Int64Array
+    change_rows: Int64Array
+
+
+def ranked_pairs(
+    results: pd.DataFrame, regions: pd.DataFrame, changes: pd.DataFrame, *, is_proposal: bool = False
+) -> RankedPairs:
+    """Put together the candidates and changes of one variant.
+
+    Args:
+        results: Its rows of results.csv.
+        regions: Its rows of regions.csv, candidates of a pair best first.
+        changes: Its rows of changes.csv.
+        is_proposal: Count the candidates that were withdrawn as well.
+    """
+    if not is_proposal:
+        regions = regions[~regions["is_withdrawn"].astype(bool)]
+    cases = results[results["n_observable"].notna()].sort_values(PAIR)
+    pairs = [(str(scenario), int(seed)) for scenario, seed in zip(cases["scenario"], cases["seed"], strict=True)]
+    place = {pair: index for index, pair in enumerate(pairs)}
+    is_observable = changes["is_observable"].astype(bool).to_numpy() & (changes["n_truth_cells"].to_numpy() > 0)
+    rows = np.flatnonzero(is_observable)
+    number = {
+        (place[str(scenario), int(seed)], int(change)): index
+        for index, (scenario, seed, change) in enumerate(
+            changes.iloc[rows][[*PAIR, "id"]].itertuples(index=False, name=None)
+        )
+    }
+    of_pair = np.array([place[str(a), int(b)] for a, b in regions[PAIR].itertuples(index=False, name=None)], np.int64)
+    scores = regions["score"].to_numpy(dtype=np.float64)
+    n_new, is_false = np.zeros(len(scores), np.int64), np.zeros(len(scores), np.bool_)
+    change_score = np.full(len(rows), -np.inf)
+    change_rank = np.full(len(rows), len(scores), np.int64)
+    ranks = np.zeros(len(pairs), np.int64)
+    for candidate in np.lexsort((np.arange(len(scores)), -scores, of_pair)).tolist():
+        pair, found = int(of_pair[candidate]), parsed_ids(regions["found_changes"].iloc[candidate])
+        is_false[candidate] = not found
+        new = [i for change in found if (i := number.get((pair, change))) is not None and change_score[i] == -np.inf]
+        change_score[new], change_rank[new] = scores[candidate], ranks[pair]
+        n_new[candidate] = len(new)
+        ranks[pair] += 1
+    is_answered = (cases["status"] == "ok").to_numpy()
+    return RankedPairs(
+        pairs=tuple(pairs),
+        site=np.unique(cases["score_radius_m"].to_numpy(dtype=np.float64), return_inverse=True)[1].astype(np.int64),
+        path_m=np.where(is_answered, cases["after_path_m"].to_numpy(dtype=np.float64), 0.0),
+        n_observable=cases["n_observable"].to_numpy().astype(np.int64),
+        pair=of_pair,
+        score=scores,
+        n_new=n_new,
+        is_false=is_false,
+        change_pair=np.array([pair for pair, _ in number], dtype=np.int64),
+        change_score=change_score,
+        change_rank=change_rank,
+        change_rows=rows,
+    )
+
+
+def parsed_ids(value: object) -> tuple[int, ...]:
+    """Return the ids of a cell of `found_changes`: "1;3", or a number where a table was read back with one id each."""
+    text = "" if value is None or (isinstance(value, float) and np.isnan(value)) else str(value)
+    return tuple(int(float(part)) for part in text.split(";") if part)
+
+
+def free_response(ranked: RankedPairs) -> tuple[Float64Array, Float64Array]:
+    """Return the free-response curve.
+
+    Returns:
+        (N,) false regions per 100 m, rising from 0, and the (N,) recall at each; a step lies at every point. Both empty
+        without an observable change.
+    """
+    n_observable = int(ranked.n_observable.sum())
+    if n_observable == 0:
+        return np.zeros(0), np.zeros(0)
+    ones = np.ones((1, len(ranked.pairs)))
+    steps = []
+    for site in np.unique(ranked.site):
+        n_false, n_found, path_m = (array[0] for array in _cumulated(ranked, int(site), ones)[:3])
+        if path_m > 0:
+            start = np.zeros(1)
+            steps.append((np.append(start, 100.0 * n_false / path_m), np.append(start, n_found)))
+    rates = np.unique(np.concatenate([np.zeros(1), *(rate for rate, _ in steps)]))
+    found = np.zeros(len(rates))
+    for rate, n_found in steps:
+        found += n_found[np.searchsorted(rate, rates + _ROUNDING, side="right") - 1]
+    is_step = np.concatenate([[True], np.diff(found) > 0])
+    is_step[-1] = True  # how far the threshold can fall
+    return rates[is_step], found[is_step] / n_observable
+
+
+def recall_at(ranked: RankedPairs, rate_per_100m: float) -> float:
+    """Return the recall where no kind of site has more false regions per 100 m; NaN without an observable change."""
+    return float(_recalls(ranked, rate_per_100m, np.ones((1, len(ranked.pairs))))[0])
+
+
+def resampled_recalls(ranked: RankedPairs, rate_per_100m: float, seed: int = 0) -> Float64Array:
+    """Return `recall_at` of bootstrap draws of pairs within each kind of site, thresholds set anew in each draw.
+
+    Two methods that ran the same pairs get the same draws, so that their difference can be taken draw by draw.
+    """
+    n_pairs = len(ranked.pairs)
+    weights = np.zeros((N_RESAMPLES, n_pairs))
+    for site in np.unique(ranked.site):
+        own = np.flatnonzero(ranked.site == site)
+        draws = own[stream(seed, "bootstrap", f"site {site}").integers(len(own), size=(N_RESAMPLES, len(own)))]
+        np.add.at(weights, (np.arange(N_RESAMPLES)[:, None], draws), 1.0)
+    batches = range(0, N_RESAMPLES, _BATCH)
+    return np.concatenate([_recalls(ranked, rate_per_100m, weights[first : first + _BATCH]) for first in batches])
+
+
+def interval_of(samples: Float64Array) -> tuple[float, float]:
+    """Return the 95 % percentile interval of bootstrap samples, NaN among them left out."""
+    samples = samples[~np.isnan(samples)]
+    if len(samples) == 0:
+        return float("nan"), float("nan")
+    low, high = np.percentile(samples, (2.5, 97.5))
+    return float(low), float(high)
+
+
+def found_at(ranked: RankedPairs, rate_per_100m: float) -> BoolArray:
+    """Return (C,) which changes are found at the thresholds of `recall_at`."""
+    ones = np.ones((1, len(ranked.pairs)))
+    thresholds = np.full(int(ranked.site.max(initial=-1)) + 1, np.inf)
+    for site in np.unique(ranked.site):
+        n_false, _, path_m, scores = _cumulated(ranked, int(site), ones)
+        allowed = np.flatnonzero(n_false[0] <= rate_per_100m * path_m[0] / 100.0 + _ROUNDING)
+        if len(allowed):
+            thresholds[site] = scores[allowed[-1]]
+    of_change = thresholds[ranked.site[ranked.change_pair]]
+    return np.asarray((ranked.change_score >= of_change) & np.isfinite(ranked.change_score), dtype=np.bool_)
+
+
+def roc_curve(scores: Float64Array, is_positive: BoolArray) -> tuple[Float64Array, Float64Array]:
+    """Return false and true positive rates as the threshold falls, corners first to last, thinned to a few hundred.
+
+    Args:
+        scores: (N,) scores; NaN ranks below every number, and equal scores enter together.
+        is_positive: (N,) which of them are positives.
+
+    Returns:
+        Two (M,) arrays from (0, 0) to (1, 1); both empty if either class is.
+    """
+    n_positive = int(np.count_nonzero(is_positive))
+    n_negative = len(is_positive) - n_positive
+    if n_positive == 0 or n_negative == 0:
+        return np.zeros(0), np.zeros(0)
+    comparable = np.where(np.isnan(scores), -np.inf, scores)
+    order = np.argsort(-comparable, kind="stable")
+    last = _last_of_ties(comparable[order])
+    true = np.concatenate([[0], np.cumsum(is_positive[order])[last]]) / n_positive
+    false = np.concatenate([[0], np.cumsum(~is_positive[order])[last]]) / n_negative
+    # a point on the straight line between its neighbours tells nothing
+    turn = np.diff(false[:-1]) * np.diff(true[1:]) != np.diff(false[1:]) * np.diff(true[:-1])
+    kept = np.flatnonzero(np.concatenate([[True], turn, [True]]))
+    if len(kept) > _MAX_ROC_POINTS:
+        kept = kept[np.unique(np.linspace(0, len(kept) - 1, _MAX_ROC_POINTS).round().astype(np.int64))]
+    return false[kept], true[kept]
+
+
+def _recalls(ranked: RankedPairs, rate_per_100m: float, weights: Float64Array) -> Float64Array:
+    """Return the (B,) recalls of (B, P) weights of the pairs; NaN where no drawn pair has an observable change."""
+    n_found = np.zeros(len(weights))
+    for site in np.unique(ranked.site):
+        n_false, found, path_m, _ = _cumulated(ranked, int(site), weights)
+        is_allowed = n_false <= (rate_per_100m * path_m / 100.0)[:, None] + _ROUNDING
+        n_found += np.where(is_allowed, found, 0.0).max(axis=1, initial=0.0)
+    n_observable = weights @ ranked.n_observable
+    recalls = np.full(len(weights), np.nan)
+    np.divide(n_found, n_observable, out=recalls, where=n_observable > 0)
+    return recalls
+
+
+def _cumulated(
+    ranked: RankedPairs, site: int, weights: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
+    """Let the threshold fall at one kind of site.
+
+    Returns:
+        (B, N) false regions and changes found at each of N thresholds, (B,) way in metres, (N,) thresholds.
+    """
+    own = np.flatnonzero(ranked.site[ranked.pair] == site)
+    own = own[np.argsort(-ranked.score[own], kind="stable")]
+    last = _last_of_ties(ranked.score[own])
+    drawn = weights[:, ranked.pair[own]]
+    n_false = np.cumsum(drawn * ranked.is_false[own], axis=1)[:, last]
+    n_found = np.cumsum(drawn * ranked.n_new[own], axis=1)[:, last]
+    path_m = weights @ np.where(ranked.site == site, ranked.path_m, 0.0)
+    return n_false, n_found, path_m, ranked.score[own][last]
+
+
+def _last_of_ties(falling: Float64Array) -> Int64Array:
+    """Return the places behind which a threshold can lie: the last of each run of equal (N,) scores."""
+    if len(falling) == 0:
+        return np.zeros(0, dtype=np.int64)
+    return np.append(np.flatnonzero(falling[1:] != falling[:-1]), len(falling) - 1)

@@ -1,0 +1,1 @@
+"""Training data for descriptors, and training on them."""

@@ -1,0 +1,347 @@
+"""One tunnel's training data: a pair is simulated, mapped and merged by the truth, all in memory, and becomes a shard.
+
+The images come from the pipeline's own maps and renderer, at the before keyframes. The after map is carried there
+through the true alignment and, for every draw after the first, off by a merge error of its own: a shift in the map
+frame and a turn about the anchor, each component normal, drawn from (seed, "dataset-merge-error").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array, Int64Array, invert, stream, transform, yaw_rad
+from cdpipe.core.grid_index import GridIndex
+from cdpipe.descriptors import sphere_image
+from cdpipe.descriptors.range_image import range_image
+from cdpipe.descriptors.sphere_image import COLUMNS, CROP_M, HALF_LENGTH_M, REACH_M, ROWS, pixels, render
+from cdpipe.mapping.mapping import build_map, keyframes
+from cdpipe.model.config import MapConfig, load_config
+from cdpipe.model.types import DescriptorSet, MappedSession, PointMap, PosedScan, ScanSource
+from cdpipe.training.shard import CHANGE_KINDS, FORMAT_VERSION, shard_bytes, split_of
+from eval.core.provenance import digest
+from eval.oracles.merge import OracleMerge, merged_by_truth
+from eval.scoring.merge_metrics import PAIR_RADIUS_M
+from eval.scoring.region_metrics import keyframe_labels
+from eval.truth.adapters import held_input
+from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth, ground_truth
+from eval.truth.universe import UniverseBuilder
+from scenarios.library import load_scenario
+from scenarios.references import file_digests
+from scenarios.schema import Scenario
+from sim.session.in_memory import LabelledSession, simulate_in_memory
+
+_MAX_CHANGES = 255  # labels are bytes
+# Mapped at a time: their sums stay in the cache, which takes a quarter off the mapping of 64 at a time.
+_BATCH_SCANS = 16
+Arrays = dict[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What every shard of a dataset has in common.
+
+    Attributes:
+        draws: After images of each anchor; the first is merged exactly.
+        error_m: Standard deviation of each component of a draw's shift.
+        error_deg: Standard deviation of each component of a draw's turn.
+        settings: What is set over the scenarios, as `key=value`.
+    """
+
+    draws: int = 4
+    error_m: float = 0.03
+    error_deg: float = 0.2
+    settings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Mapped:
+    """A session as the pipeline mapped it, what its keyframes saw, its truth, and the change each map point bears."""
+
+    map: PointMap
+    truth: SessionTruth
+    ranges_m: npt.NDArray[np.float16]
+    stamps_ns: Int64Array
+    point_changes: npt.NDArray[np.uint8]
+
+
+def shard_digest(scenario: Scenario, seed: int, recipe: Recipe) -> str:
+    """Return the digest of what a shard depends on, code apart: told before anything is simulated."""
+    image = ROWS, COLUMNS, HALF_LENGTH_M, REACH_M, list(sphere_image.sphere_image(np.zeros((0, 3))).shape)
+    return digest(
+        {
+            "format_version": FORMAT_VERSION,
+            "scenario": scenario.model_dump(mode="json"),
+            "files": file_digests(scenario),
+            "seed": seed,
+            "recipe": asdict(recipe),
+            "map": _map_config().model_dump(mode="json"),
+            "image": image,
+        }
+    )
+
+
+def make_shard(family: str, seed: int, recipe: Recipe) -> bytes:
+    """Simulate one tunnel and return its shard (`cdpipe.training.shard`).
+
+    Raises:
+        ScenarioError: The world cannot be built, the sessions never meet, or there are too many changes for a label.
+        InputError: A file that the scenario names cannot be read.
+    """
+    scenario = load_scenario(family, seed, recipe.settings)
+    pair = simulate_in_memory(scenario, seed)
+    if len(pair.truth.changes) > _MAX_CHANGES:
+        raise ScenarioError(f"{family}: {len(pair.truth.changes)} changes, labels can tell {_MAX_CHANGES} apart")
+    before, after = (_mapped(pair.sessions[name]) for name in SESSIONS)
+    truth = ground_truth(pair.truth, {"before": before.truth, "after": after.truth})
+    merged = merged_by_truth(_bare(before), _bare(after), (before.truth, after.truth), OracleMerge(), seed)
+    if not merged.is_accepted:
+        raise ScenarioError(f"{family}: {merged.reason}")
+    arrays = {
+        **_keyframes(before, after),
+        **_images(before, after, merged.alignment.to_map(after.map.points), truth, recipe, seed),
+        **_places(before, after, truth),
+        **_changes(before, truth),
+        **_named("draw", merge_errors(recipe, seed)),
+    }
+    about = {
+        "family": family,
+        "seed": seed,
+        "split": split_of(seed),
+        "digest": shard_digest(scenario, seed, recipe),
+        "recipe": asdict(recipe),
+        "score_radius_m": pair.truth.score_radius_m,
+        "changes": [{"name": change.name, "prop_kind": change.prop_kind} for change in pair.truth.changes],
+        "counts": _counts(arrays),
+    }
+    return shard_bytes(arrays, about)
+
+
+def _map_config() -> MapConfig:
+    return load_config("tunnelcd").map
+
+
+class _Watched:
+    """A source that shows every scan to some watchers on its way to whoever reads it, so that all read it once."""
+
+    def __init__(self, source: ScanSource, watchers: Sequence[Callable[[PosedScan], None]]) -> None:
+        self._source = source
+        self._watchers = watchers
+
+    @property
+    def name(self) -> str:
+        """What to call it in messages."""
+        return self._source.name
+
+    @property
+    def odom_T_sensor(self) -> Float64Array:
+        """(S, 4, 4) pose of each scan."""
+        return self._source.odom_T_sensor
+
+    def scan(self, index: int) -> PosedScan:
+        """Read one scan, unseen by the watchers."""
+        return self._source.scan(index)
+
+    def scans(self) -> Iterator[PosedScan]:
+        """Read all scans in order."""
+        for scan in self._source.scans():
+            for watch in self._watchers:
+                watch(scan)
+            yield scan
+
+
+def _mapped(held: LabelledSession) -> _Mapped:
+    """Map a session, reading it once."""
+    config, session = _map_config(), held.session
+    chosen = set(keyframes(session.odom_T_sensor, config.keyframe_spacing_m).tolist())
+    universe = UniverseBuilder(str(session.path), session.sensor.height, session.sensor.width)
+    ranges_m, stamps_ns = [], []
+
+    def watch(scan: PosedScan) -> None:
+        universe.add(scan, held.instance[scan.index], held.change[scan.index])
+        if scan.index in chosen:
+            ranges_m.append(range_image(scan.points_sensor))
+            stamps_ns.append(int(scan.stamps_ns.min()))
+
+    point_map = build_map(_Watched(held_input(session), [watch]), config, _BATCH_SCANS)
+    truth = SessionTruth(session.odom_T_sensor, held.world_T_sensor, universe.finish(session.n_scans))
+    return _Mapped(
+        point_map,
+        truth,
+        np.array(ranges_m, dtype=np.float16),
+        np.array(stamps_ns, dtype=np.int64),
+        changes_of_points(point_map, held.change),
+    )
+
+
+def changes_of_points(point_map: PointMap, change: npt.NDArray[np.int16]) -> npt.NDArray[np.uint8]:
+    """Return the (N,) change that each map point bears: that of most of its changed returns, 0 where it has none.
+
+    Args:
+        point_map: The map.
+        change: (S, H, W) change of every return.
+    """
+    offsets = point_map.scan_offsets
+    found = []
+    for scan in np.flatnonzero(change.any(axis=(1, 2))):
+        returns = slice(offsets[scan], offsets[scan + 1])
+        ids = change[scan].ravel()[point_map.return_pixels[returns]].astype(np.int64)
+        is_changed = ids > 0
+        found.append(point_map.return_points[returns][is_changed] * np.int64(_MAX_CHANGES + 1) + ids[is_changed])
+    changes = np.zeros(len(point_map.points), dtype=np.uint8)
+    if found:
+        pairs, counts = np.unique(np.concatenate(found), return_counts=True)
+        order = np.argsort(counts, kind="stable")  # the last one written to a point has the most returns
+        points, ids = np.divmod(pairs[order], _MAX_CHANGES + 1)
+        changes[points] = ids
+    return changes
+
+
+def _bare(mapped: _Mapped) -> MappedSession:
+    """Return a mapped session without descriptors: the truth merges by poses alone."""
+    scans = mapped.map.keyframe_scans
+    return MappedSession(mapped.map, DescriptorSet(np.zeros((len(scans), 1), np.float32), None, scans, "none", ""))
+
+
+def _keyframes(before: _Mapped, after: _Mapped) -> Arrays:
+    sessions = {"before": before, "after": after}
+    per_session: dict[str, Callable[[_Mapped], npt.NDArray[Any]]] = {
+        "scans": lambda mapped: mapped.map.keyframe_scans,
+        "stamps_ns": lambda mapped: mapped.stamps_ns,
+        "world_T_keyframe": lambda mapped: mapped.truth.world_T_sensor[mapped.map.keyframe_scans],
+        "odom_T_keyframe": lambda mapped: mapped.map.odom_T_keyframe,
+        "ranges_m": lambda mapped: mapped.ranges_m,
+    }
+    return {f"{name}_{key}": of(mapped) for key, of in per_session.items() for name, mapped in sessions.items()}
+
+
+def merge_errors(recipe: Recipe, seed: int) -> Arrays:
+    """Return the (D, 3) shifts and turns of the draws; those of fewer draws are the first of those of more."""
+    drawn = stream(seed, "dataset-merge-error").normal(size=(recipe.draws, 2, 3))
+    drawn[0] = 0.0
+    return {"shift_m": recipe.error_m * drawn[:, 0], "turn_rad": np.deg2rad(recipe.error_deg) * drawn[:, 1]}
+
+
+def displaced(map_T_anchor: Float64Array, shift_m: Float64Array, turn_rad: Float64Array) -> Float64Array:
+    """Return the poses (K, 4, 4) from which a map looks as one that is off does from the anchors.
+
+    Args:
+        map_T_anchor: (K, 4, 4) the anchors.
+        shift_m: (3,) by which the map's points are shifted, map frame,
+        turn_rad: (3,) after they were turned about the anchor, a rotation vector.
+    """
+    turned = Rotation.from_rotvec(turn_rad).as_matrix()
+    poses = map_T_anchor.copy()
+    poses[:, :3, :3] = turned.T @ map_T_anchor[:, :3, :3]
+    poses[:, :3, 3] -= turned.T @ shift_m
+    return poses
+
+
+def _images(
+    before: _Mapped, after: _Mapped, after_map: Float64Array, truth: GroundTruth, recipe: Recipe, seed: int
+) -> Arrays:
+    anchors = before.map.odom_T_keyframe
+    draws = merge_errors(recipe, seed)
+    poses = [displaced(anchors, *error) for error in zip(draws["shift_m"], draws["turn_rad"], strict=True)]
+    after_index = GridIndex(after_map)
+    before_labels = label_images(before.map.points, before.point_changes, anchors)
+    after_labels = np.stack([label_images(after_map, after.point_changes, each) for each in poses])
+    ids = [change.id for change in truth.pair.changes]
+    return {
+        "before_images": render(GridIndex(before.map.points), anchors),
+        "after_images": np.stack([render(after_index, each) for each in poses]),
+        "before_labels": before_labels,
+        "after_labels": after_labels,
+        "before_visible": _visible(before_labels, ids),
+        "after_visible": _visible(after_labels, ids),
+    }
+
+
+def label_images(
+    points: Float64Array, point_changes: npt.NDArray[np.uint8], map_T_anchor: Float64Array
+) -> npt.NDArray[np.uint8]:
+    """Return (K, ROWS, COLUMNS) the change of the changed points in each pixel, the nearest to the axis where several.
+
+    Args:
+        points: (N, 3) points of a map.
+        point_changes: (N,) change each bears.
+        map_T_anchor: (K, 4, 4) where the map is looked at.
+    """
+    is_changed = point_changes > 0
+    changed, ids = points[is_changed], point_changes[is_changed]
+    labels = np.zeros((len(map_T_anchor), ROWS * COLUMNS), dtype=np.uint8)
+    if len(changed) == 0:
+        return labels.reshape(-1, ROWS, COLUMNS)
+    index = GridIndex(changed)
+    for image, map_T_here, anchor_T_map in zip(labels, map_T_anchor, invert(map_T_anchor), strict=True):
+        near = index.crop(map_T_here[:3, 3], CROP_M)
+        points_anchor = transform(anchor_T_map, changed[near])
+        pixel = pixels(points_anchor)
+        order = np.argsort(-np.hypot(points_anchor[:, 1], points_anchor[:, 2]), kind="stable")
+        order = order[pixel[order] >= 0]
+        image[pixel[order]] = ids[near[order]]
+    return labels.reshape(-1, ROWS, COLUMNS)
+
+
+def _visible(labels: npt.NDArray[np.uint8], ids: Sequence[int]) -> npt.NDArray[np.int32]:
+    counts = [np.count_nonzero(labels == number, axis=(-2, -1)) for number in ids]
+    return np.stack(counts, axis=-1).astype(np.int32) if counts else np.zeros((*labels.shape[:-2], 0), np.int32)
+
+
+def _places(before: _Mapped, after: _Mapped, truth: GroundTruth) -> Arrays:
+    here = before.truth.world_T_sensor[before.map.keyframe_scans]
+    there = after.truth.world_T_sensor[after.map.keyframe_scans]
+    distance_m, nearest = cKDTree(there[:, :3, 3]).query(here[:, :3, 3])
+    turns = [yaw_rad(there[j]) - yaw_rad(here[i]) for i, j in enumerate(np.asarray(nearest))]
+    labels = keyframe_labels(here[:, :3, 3], truth.centroids_world, truth.is_observable, truth.pair.score_radius_m)
+    return {
+        "labels": labels.astype(np.int8),
+        "is_covered": np.asarray(distance_m <= PAIR_RADIUS_M),
+        "nearest_after": np.asarray(nearest, dtype=np.int64),
+        "nearest_m": np.asarray(distance_m, dtype=np.float64),
+        "nearest_yaw_rad": np.angle(np.exp(1j * np.array(turns))),
+    }
+
+
+def _changes(before: _Mapped, truth: GroundTruth) -> Arrays:
+    changes, centroids = truth.pair.changes, truth.centroids_world
+    scans = before.map.keyframe_scans
+    world_T_keyframe, odom_T_keyframe = before.truth.world_T_sensor[scans], before.map.odom_T_keyframe
+    _, nearest = cKDTree(world_T_keyframe[:, :3, 3]).query(centroids)
+    odom_T_world = odom_T_keyframe[nearest] @ invert(world_T_keyframe[nearest])
+    in_odom = np.einsum("nij,nj->ni", odom_T_world[:, :3, :3], centroids) + odom_T_world[:, :3, 3]
+    table: Arrays = {
+        "ids": np.array([change.id for change in changes], dtype=np.int64),
+        "session": np.array([SESSIONS.index(change.session) for change in changes], dtype=np.uint8),
+        "kind": np.array([CHANGE_KINDS.index(change.kind) for change in changes], dtype=np.uint8),
+        "is_partial": truth.is_partial,
+        "is_observable": truth.is_observable,
+        "n_cells": np.array([len(rows) for rows in truth.change_rows], dtype=np.int64),
+        "centroid_world": centroids,
+        "centroid_odom": np.asarray(in_odom, dtype=np.float64),
+    }
+    return _named("change", table)
+
+
+def _named(prefix: str, arrays: Mapping[str, npt.NDArray[Any]]) -> Arrays:
+    return {f"{prefix}_{name}": array for name, array in arrays.items()}
+
+
+def _counts(arrays: Arrays) -> dict[str, int]:
+    labels = arrays["labels"]
+    return {
+        "n_before": len(arrays["before_scans"]),
+        "n_after": len(arrays["after_scans"]),
+        "n_covered": int(arrays["is_covered"].sum()),
+        "n_positive": int(np.count_nonzero(labels == 1)),
+        "n_negative": int(np.count_nonzero(labels == 0)),
+        "n_changes": len(arrays["change_ids"]),
+        "n_observable": int(arrays["change_is_observable"].sum()),
+    }

@@ -1,0 +1,279 @@
+"""Makes the shards of a dataset, one tunnel each: in this process, on workers of this machine, or on a cluster.
+
+Whoever computes a shard hands its bytes back, and this process alone writes: a cluster needs no shared disk. A shard is
+written under a temporary name and renamed; one whose digest is still right is kept, so that a run that was cut off goes
+on where it stopped. A tunnel that cannot be built leaves a file with the reason, which is kept likewise.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.training.shard import FORMAT, FORMAT_VERSION, SUFFIX, read_about
+from eval.core.cluster import HERE, Where, connected, n_slots, require_usable
+from eval.core.output import make_writable
+from eval.core.progress import RunProgress, Silent, duration
+from eval.plans.plan import parse_seeds
+from eval.plans.worlds import world_slug
+from eval.running.runfolder import write_json
+from eval.training.dataset import Recipe, make_shard, shard_digest
+from eval.training.dataset_card import write_card
+from scenarios.library import load_scenario
+
+_AHEAD = 2  # tunnels that wait in a cluster for each worker: more would only hold memory
+
+
+@dataclass(frozen=True, slots=True)
+class Tunnel:
+    """One tunnel to be made; `digest` is of what its shard depends on, "" where the scenario itself is refused."""
+
+    family: str
+    seed: int
+    digest: str = ""
+    refused: str = ""
+
+    @property
+    def file(self) -> str:
+        """Name of its shard."""
+        return f"{world_slug(self.family)}-{self.seed}{SUFFIX}"
+
+    @property
+    def refusal(self) -> str:
+        """Name of the file that says why there is none."""
+        return f"{self.file}.refused.json"
+
+
+@dataclass(frozen=True, slots=True)
+class DatasetOutcome:
+    """How a run ended: tunnels made now, kept from earlier, refused (now or earlier), left over by --limit."""
+
+    n_made: int
+    n_kept: int
+    n_refused: int
+    n_left: int
+    n_pairs: int
+    seconds: float
+
+
+def make_dataset(
+    families: Sequence[str],
+    seeds: str,
+    recipe: Recipe,
+    out: Path,
+    where: Where = HERE,
+    limit: int | None = None,
+    command: str = "",
+    progress: RunProgress | None = None,
+) -> DatasetOutcome:
+    """Make the shards that are missing from `out`, and its index and data card.
+
+    Args:
+        families: Scenario names or files.
+        seeds: "A:B", B excluded.
+        recipe: What all shards of the folder have in common.
+        out: New, empty, or left by an earlier run with the same recipe.
+        where: Where to compute.
+        limit: Compute at most this many tunnels.
+        command: For the data card.
+        progress: Told the rate in keyframe pairs a second, and the time left.
+
+    Raises:
+        InputError: A family, the seeds, the folder or the scheduler is not what it should be.
+    """
+    progress = progress or Silent()
+    require_usable(where)
+    tunnels = _tunnels(families, seeds, recipe)
+    was_there, is_new = out.exists(), not (out / "dataset.json").is_file()
+    _take_folder(out, recipe, command)
+    missing = [tunnel for tunnel in tunnels if not _is_done(out, tunnel)]
+    todo = missing[:limit]
+    pace = _Pace(progress, len(todo))
+    try:
+        for tunnel in todo:
+            (out / tunnel.file).unlink(missing_ok=True)  # of another digest: not to be read while it is made anew
+        with closing(_computed(todo, recipe, where)) as results:
+            for tunnel, result in results:
+                _keep(out, tunnel, result)
+                pace.tell(tunnel, out)
+    finally:
+        if is_new and [path.name for path in out.iterdir()] == ["dataset.json"]:
+            # nothing came of it, as where a scheduler cannot be reached: leave nothing behind
+            (out / "dataset.json").unlink()
+            if not was_there:
+                out.rmdir()
+        else:
+            write_card(out)
+    n_refused = sum((out / tunnel.refusal).is_file() for tunnel in tunnels)
+    n_kept = len(tunnels) - len(missing)
+    return DatasetOutcome(pace.n_made, n_kept, n_refused, len(missing) - len(todo), pace.n_pairs, pace.seconds)
+
+
+def _tunnels(families: Sequence[str], seeds: str, recipe: Recipe) -> list[Tunnel]:
+    """Return the tunnels, seed by seed, so that a run that was cut off has something of every family."""
+    try:
+        numbers = parse_seeds(seeds)
+    except ValueError as error:
+        raise InputError(f"--seeds {seeds}: {error}") from error
+    if len(set(families)) < len(families):
+        raise InputError(f"families {', '.join(families)}: one is named twice")
+    tunnels = [_tunnel(family, seed, recipe) for seed in numbers for family in families]
+    # one bad draw is told in the data card; a family of which nothing can be drawn is a mistake of the command
+    of_family = ([tunnel for tunnel in tunnels if tunnel.family == family] for family in families)
+    if mistakes := [own[0].refused for own in of_family if all(tunnel.refused for tunnel in own)]:
+        raise InputError("\n".join(mistakes))
+    return tunnels
+
+
+def _tunnel(family: str, seed: int, recipe: Recipe) -> Tunnel:
+    try:
+        return Tunnel(family, seed, shard_digest(load_scenario(family, seed, recipe.settings), seed, recipe))
+    except ScenarioError as error:
+        return Tunnel(family, seed, refused=str(error))
+
+
+def _take_folder(out: Path, recipe: Recipe, command: str) -> None:
+    """Make the folder, or check that it is of the same recipe; the command is added to those that filled it."""
+    make_writable(out)
+    path = out / "dataset.json"
+    present = {"format": FORMAT, "format_version": FORMAT_VERSION, "recipe": json.loads(json.dumps(asdict(recipe)))}
+    commands: list[str] = []
+    if path.is_file():
+        try:
+            document = json.loads(path.read_text())
+            commands = list(document.pop("commands"))
+        except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+            raise InputError(f"{path}: damaged ({error}): name a new folder") from error
+        if document != present:
+            raise InputError(
+                f"{out}: made with {_told(document.get('recipe'))}, not with {_told(present['recipe'])}: all shards of "
+                "a folder are made alike; name another folder"
+            )
+    elif any(out.iterdir()):
+        raise InputError(f"{out}: not empty and not a dataset: name a new folder, or empty this one")
+    write_json(path, {**present, "commands": [*commands, *([command] if command not in commands else [])]})
+
+
+def _told(recipe: Any) -> str:
+    """Tell a recipe as the options that ask for it."""
+    try:
+        options = f"--draws {recipe['draws']} --error-m {recipe['error_m']:g} --error-deg {recipe['error_deg']:g}"
+        return " ".join([options, *(f"--set {setting}" for setting in recipe["settings"])])
+    except (KeyError, TypeError, ValueError):
+        return "something else"
+
+
+def _is_done(out: Path, tunnel: Tunnel) -> bool:
+    """Whether a tunnel's shard, or the reason why there is none, is of what would be computed now."""
+    refusal = out / tunnel.refusal
+    if refusal.is_file():
+        try:
+            return bool(json.loads(refusal.read_text())["digest"] == tunnel.digest != "")
+        except (json.JSONDecodeError, KeyError, TypeError):
+            return False
+    if not (out / tunnel.file).is_file():
+        return False
+    try:
+        return bool(read_about(out / tunnel.file)["digest"] == tunnel.digest)
+    except (InputError, KeyError):
+        return False
+
+
+def _keep(out: Path, tunnel: Tunnel, result: bytes | str) -> None:
+    """Write a shard, or the reason why there is none, whole or not at all."""
+    if isinstance(result, str):
+        about = {"family": tunnel.family, "seed": tunnel.seed, "digest": tunnel.digest, "reason": result}
+        write_json(out / tunnel.refusal, about)
+        return
+    partial = out / f".{tunnel.file}.partial"
+    try:
+        partial.write_bytes(result)
+        partial.replace(out / tunnel.file)
+    finally:
+        partial.unlink(missing_ok=True)
+    (out / tunnel.refusal).unlink(missing_ok=True)
+
+
+class _Pace:
+    """Tells how fast tunnels come."""
+
+    def __init__(self, progress: RunProgress, n_todo: int) -> None:
+        self._progress = progress
+        self._n_todo = n_todo
+        self._start = time.perf_counter()
+        self._n_done = self.n_made = self.n_pairs = 0
+        if n_todo:
+            progress.cells("the first tunnel", 0, n_todo)
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock seconds so far."""
+        return time.perf_counter() - self._start
+
+    def tell(self, tunnel: Tunnel, out: Path) -> None:
+        """Count a tunnel that is done and tell the rate of all so far, refused ones included in the time."""
+        self._n_done += 1
+        told = "refused"
+        if (out / tunnel.file).is_file():
+            n_pairs = int(read_about(out / tunnel.file)["counts"]["n_before"])
+            self.n_made += 1
+            self.n_pairs += n_pairs
+            told = f"{n_pairs} pairs"
+        left_s = self.seconds / self._n_done * (self._n_todo - self._n_done)
+        rate = f"{self.n_pairs / self.seconds:.1f} keyframe pairs/s, {duration(left_s)} left"
+        self._progress.cells(f"{tunnel.family} {tunnel.seed}: {told}; {rate}", self._n_done, self._n_todo)
+
+
+def _attempt(tunnel: Tunnel, recipe: Recipe) -> bytes | str:
+    """Return a tunnel's shard, or why it cannot be built; runs wherever the tunnel is computed."""
+    try:
+        return make_shard(tunnel.family, tunnel.seed, recipe)
+    except ScenarioError as error:
+        return str(error)
+
+
+def _computed(tunnels: Sequence[Tunnel], recipe: Recipe, where: Where) -> Generator[tuple[Tunnel, bytes | str]]:
+    """Yield each tunnel with its shard, or with why there is none, as they come."""
+    wanted = []
+    for tunnel in tunnels:
+        if tunnel.refused:
+            yield tunnel, tunnel.refused
+        else:
+            wanted.append(tunnel)
+    if not wanted:
+        return
+    if where == HERE:
+        for tunnel in wanted:
+            yield tunnel, _attempt(tunnel, recipe)
+        return
+    with connected(where, len(wanted)) as client:
+        yield from _from_cluster(client, wanted, recipe)
+
+
+def _from_cluster(client: Any, tunnels: Sequence[Tunnel], recipe: Recipe) -> Iterator[tuple[Tunnel, bytes | str]]:
+    from distributed import as_completed  # noqa: PLC0415 - an extra, and slow to import
+
+    waiting = iter(tunnels)
+    tunnel_of: dict[Any, Tunnel] = {}
+
+    def submitted(n: int) -> list[Any]:
+        futures = []
+        for _, tunnel in zip(range(n), waiting, strict=False):
+            futures.append(client.submit(_attempt, tunnel, recipe, pure=False))
+            tunnel_of[futures[-1].key] = tunnel
+        return futures
+
+    coming = as_completed(submitted(_AHEAD * max(1, n_slots(client))))
+    for future in coming:
+        result = future.result()
+        tunnel = tunnel_of.pop(future.key)
+        future.release()
+        for more in submitted(1):
+            coming.add(more)
+        yield tunnel, result

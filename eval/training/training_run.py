@@ -1,0 +1,178 @@
+"""Trains a descriptor on the folder of `tunnelcd dataset`: checkpoint, model card, curves as CSV and as a plot."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+
+from cdpipe.core.errors import InputError
+from cdpipe.descriptors import use_threads
+from cdpipe.descriptors.network import checkpoint_bytes, digest, initial_network
+from cdpipe.descriptors.sphere_network import SphereNetwork, initial_sphere_network
+from cdpipe.training.data import TunnelShard, open_dataset, place_data
+from cdpipe.training.fit import FitConfig, Progress, Task, fit
+from cdpipe.training.scan_training import PlaceTask
+from cdpipe.training.sphere_training import SphereTask, sphere_data
+from eval.core.figures import BLUE, VERMILLION, blank_figure
+from eval.core.output import make_writable
+from eval.core.progress import RunProgress
+from eval.core.provenance import git_commit
+
+SOURCES = {
+    "sphere": "what the map around a keyframe looks like, 64 numbers (cdpipe.descriptors.sphere_network)",
+    "3deg": "re-implementation of 3DEG, arXiv 2210.07285 (cdpipe.descriptors.network)",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """What came of a training run: the checkpoint, and its model card as written beside it."""
+
+    checkpoint: Path
+    card: Mapping[str, Any]
+
+
+def train_descriptor(
+    data: Path, out: Path, name: str, config: FitConfig, threads: int, command: str, progress: RunProgress
+) -> Trained:
+    """Train one descriptor on the tunnels of split train; those of split validation decide when to stop.
+
+    Args:
+        data: Folder of `tunnelcd dataset` with tunnels of both splits.
+        out: Folder for NAME.safetensors, NAME.json, curves.csv, curves.png and the state to resume from.
+        name: Which descriptor.
+        config: Seed, steps, rates, patience.
+        threads: Of torch.
+        command: What to write into the card.
+        progress: Told of every step.
+
+    Raises:
+        InputError: The folder lacks a split, is damaged, or `out` holds another run.
+    """
+    use_threads(threads)
+    tunnels = open_dataset(data, "train"), open_dataset(data, "validation")
+    digests = tuple(data_digest(part) for part in tunnels)
+    task = TASKS[name](*tunnels, config.seed)
+    make_writable(out)
+    before = task.scores()
+    latest: list[Progress] = []
+
+    def on_step(step: int, losses: Mapping[str, float]) -> None:
+        told = ", ".join(f"{part} {value:.3f}" for part, value in losses.items())
+        scored = next(iter(latest[-1].scores.items())) if latest else None
+        told += f"; {scored[0]} {scored[1]:.4f}" if scored else ""
+        progress.cells(told, step, config.steps)
+
+    def on_validation(done: Progress) -> None:
+        latest.append(done)
+        write_curves(out / "curves.csv", latest)
+
+    history = fit(task, config, out, f"{name} {' '.join(digests)}", on_step, on_validation)
+    draw_curves(out / "curves.png", name, history)
+    finished = task.finish()
+    content = checkpoint_bytes(task.network)
+    best = next(done for done in reversed(history) if done.is_best)
+    card = {
+        "descriptor": f"{name}: {SOURCES[name]}",
+        "checkpoint": digest(content),
+        **({"network": asdict(task.network.size)} if isinstance(task.network, SphereNetwork) else {}),
+        "data": _described(tunnels[0], digests[0]),
+        "validation": {
+            **_described(tunnels[1], digests[1]),
+            "trained": _rounded(best.scores),
+            "untrained": _rounded(before),
+            **({"calibration": _rounded(finished)} if finished else {}),
+        },
+        "settings": asdict(config),
+        "best_step": best.step,
+        "steps_done": history[-1].step,
+        "losses": _rounded(history[-1].losses),
+        "command": command,
+        "commit": git_commit(),
+        "device": f"{platform.machine()} CPU, {threads} threads",
+        "seconds": round(history[-1].seconds, 1),
+    }
+    checkpoint = out / f"{name}.safetensors"
+    try:
+        checkpoint.write_bytes(content)
+        (out / f"{name}.json").write_text(json.dumps(card, indent=1) + "\n")
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+    return Trained(checkpoint, card)
+
+
+def data_digest(tunnels: Sequence[TunnelShard]) -> str:
+    """Return the digest of the shards' bytes, in the order of family and seed."""
+    hasher = hashlib.sha256()
+    for tunnel in sorted(tunnels, key=lambda tunnel: (tunnel.family, tunnel.seed)):
+        hasher.update(hashlib.sha256(tunnel.path.read_bytes()).digest())
+    return hasher.hexdigest()[:16]
+
+
+def write_curves(path: Path, history: Sequence[Progress]) -> None:
+    """Write one row per validation: step, losses, scores, whether it was the best so far."""
+    rows = [{"step": done.step, **done.losses, **done.scores, "is_best": done.is_best} for done in history]
+    try:
+        with path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def draw_curves(path: Path, name: str, history: Sequence[Progress]) -> None:
+    """Draw the loss and the deciding score over the steps."""
+    figure = blank_figure(8.0, 3.2)
+    steps = [done.step for done in history]
+    left, right = figure.subplots(1, 2)
+    left.plot(steps, [sum(done.losses.values()) for done in history], color=BLUE)
+    _labelled(left, "step", "loss on the training tunnels")
+    score = next(iter(history[0].scores))
+    right.plot(steps, [done.scores[score] for done in history], color=VERMILLION)
+    _labelled(right, "step", f"{score} on the validation tunnels")
+    figure.suptitle(f"{name}: training")
+    figure.savefig(path, dpi=150)
+
+
+def _labelled(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(alpha=0.3)
+
+
+def _sphere_task(training: Sequence[TunnelShard], validation: Sequence[TunnelShard], seed: int) -> Task:
+    return SphereTask(initial_sphere_network(seed), sphere_data(training), sphere_data(validation), seed)
+
+
+def _place_task(training: Sequence[TunnelShard], validation: Sequence[TunnelShard], seed: int) -> Task:
+    return PlaceTask(initial_network(seed), place_data(training), place_data(validation), seed)
+
+
+TASKS: dict[str, Callable[[Sequence[TunnelShard], Sequence[TunnelShard], int], Task]] = {
+    "sphere": _sphere_task,
+    "3deg": _place_task,
+}
+
+
+def _described(tunnels: Sequence[TunnelShard], data_digest: str) -> dict[str, Any]:
+    seeds = [tunnel.seed for tunnel in tunnels]
+    return {
+        "families": sorted({tunnel.family for tunnel in tunnels}),
+        "seeds": f"{min(seeds)}:{max(seeds) + 1}",
+        "n_tunnels": len(tunnels),
+        "n_keyframes": sum(tunnel.n_before for tunnel in tunnels),
+        "digest": data_digest,
+    }
+
+
+def _rounded(scores: Mapping[str, float]) -> dict[str, float]:
+    return {name: round(value, 4) for name, value in scores.items()}

@@ -1,0 +1,27 @@
+"""Where a simulated session becomes the pipeline's input: the only such place, so truth cannot leak into a method."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cdpipe.io.readers import RecordedScans, open_scans
+from cdpipe.io.session import Session
+from cdpipe.model.types import ScanSource, SessionName
+
+
+def pipeline_input(pair: Path, session: SessionName) -> ScanSource:
+    """Open one session of a simulated pair as the pipeline sees it: scans and the robot's own poses, never truth.
+
+    Args:
+        pair: Folder of the pair; truth lies in its `truth` folders and is not opened.
+        session: "before" or "after".
+
+    Raises:
+        InputError: The session is missing or damaged.
+    """
+    return open_scans(pair / session)
+
+
+def held_input(session: Session) -> ScanSource:
+    """Return a session held in memory (`sim.session.in_memory`) as the pipeline sees it, without its truth."""
+    return RecordedScans(session)

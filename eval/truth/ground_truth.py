@@ -1,0 +1,133 @@
+"""Everything a pair's scores are measured against: true poses, changes, their cells and their places in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, require_poses, require_shape
+from cdpipe.io.session import read_session
+from cdpipe.model.types import SessionName
+from eval.truth.universe import ScoringPoints, load_universe
+from sim.session.truth import PairTruth, read_pair_truth, read_true_poses
+
+SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionTruth:
+    """One session with its true poses.
+
+    Attributes:
+        odom_T_sensor: (S, 4, 4) poses as the robot believed them.
+        world_T_sensor: (S, 4, 4) poses as they were.
+        universe: The returns that objects are scored against.
+    """
+
+    odom_T_sensor: Float64Array
+    world_T_sensor: Float64Array
+    universe: ScoringPoints
+
+    def __post_init__(self) -> None:
+        require_poses("odom_T_sensor", self.odom_T_sensor)
+        require_poses("world_T_sensor", self.world_T_sensor)
+        require_shape("world_T_sensor", self.world_T_sensor, self.odom_T_sensor.shape)
+
+    def to_world(self, points_odom: Float64Array, scans: Int64Array) -> Float64Array:
+        """Carry (N, 3) odom points into the world, each through the true pose of one of (N,) scans."""
+        world_T_odom = self.world_T_sensor[scans] @ invert(self.odom_T_sensor[scans])
+        moved = np.einsum("nij,nj->ni", world_T_odom[:, :3, :3], points_odom) + world_T_odom[:, :3, 3]
+        return np.asarray(moved, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroundTruth:
+    """A pair's truth, ready to score against.
+
+    Attributes:
+        pair: Family, seed, radius and the C changes.
+        sessions: The two sessions.
+        change_rows: C arrays: the rows of its session's universe that belong to each change.
+        centroids_world: (C, 3) centroid of those rows through the true poses, world frame; the object's own origin for
+            a change that fills no cell.
+        is_observable: (C,) changes that count; one that fills no cell of the universe never does.
+        is_partial: (C,) changes of the group "partial".
+    """
+
+    pair: PairTruth
+    sessions: Mapping[SessionName, SessionTruth]
+    change_rows: tuple[Int64Array, ...]
+    centroids_world: Float64Array
+    is_observable: BoolArray
+    is_partial: BoolArray
+
+    @property
+    def before(self) -> SessionTruth:
+        """The before session."""
+        return self.sessions["before"]
+
+    @property
+    def after(self) -> SessionTruth:
+        """The after session."""
+        return self.sessions["after"]
+
+    def range_m(self, index: int) -> float:
+        """Return the shortest range at which the session that holds a change saw it, metres; NaN where it did not."""
+        change = self.pair.changes[index]
+        return self.sessions[change.session].universe.range_of_change(change.id)
+
+    def points_odom(self, index: int) -> Float64Array:
+        """Return the (N, 3) cells of a change's truth, that session's odom frame, metres."""
+        universe = self.sessions[self.pair.changes[index].session].universe
+        return universe.points_odom[self.change_rows[index]].astype(np.float64)
+
+    @property
+    def n_observable(self) -> int:
+        """Number of observable changes of both groups."""
+        return int(np.count_nonzero(self.is_observable))
+
+
+def load_ground_truth(pair: Path) -> GroundTruth:
+    """Read the truth of a simulated pair.
+
+    Raises:
+        InputError: A session or a part of the truth is missing, damaged or of another session.
+    """
+    return ground_truth(read_pair_truth(pair), {name: _load_session(pair / name) for name in SESSIONS})
+
+
+def ground_truth(truth: PairTruth, sessions: Mapping[SessionName, SessionTruth]) -> GroundTruth:
+    """Put a pair's truth together from the list of its changes and its two sessions."""
+    rows, centroids = [], []
+    for change in truth.changes:
+        session = sessions[change.session]
+        of_change = session.universe.rows_of_change(change.id)
+        rows.append(of_change)
+        if len(of_change) == 0:
+            centroids.append(np.asarray(change.world_T_object, dtype=np.float64)[:3, 3])
+            continue
+        points_odom = session.universe.points_odom[of_change].astype(np.float64)
+        centroids.append(session.to_world(points_odom, session.universe.scans(of_change)).mean(axis=0))
+    return GroundTruth(
+        pair=truth,
+        sessions=sessions,
+        change_rows=tuple(rows),
+        centroids_world=np.array(centroids, dtype=np.float64).reshape(-1, 3),
+        is_observable=np.array(
+            [change.is_observable and len(cells) > 0 for change, cells in zip(truth.changes, rows, strict=True)],
+            dtype=np.bool_,
+        ),
+        is_partial=np.array([change.group == "partial" for change in truth.changes], dtype=np.bool_),
+    )
+
+
+def _load_session(path: Path) -> SessionTruth:
+    odom_T_sensor = read_session(path).odom_T_sensor
+    try:
+        return SessionTruth(odom_T_sensor, read_true_poses(path), load_universe(path))
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path / 'truth'}: not the truth of this session: {error}") from error

@@ -1,0 +1,227 @@
+"""The rivals that need an extra, in a room of known boxes."""
+
+import importlib.util
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, stream, transform, yaw_pose
+from cdpipe.core.plugins import METHODS, entry_points
+from cdpipe.methods import registry
+from cdpipe.methods.dufomap import void_mask
+from cdpipe.methods.m3c2 import m3c2_mask
+from cdpipe.methods.registry import load_method
+from cdpipe.methods.whole_map import PlacedMaps
+from cdpipe.model.config import load_config
+from cdpipe.model.report import ChangeReport
+from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, SessionName
+from eval.running import single
+from eval.running.stages import kept_bytes
+from tests.cdpipe.rooms import Box, RoomScans
+
+Command = Callable[..., tuple[int, str, str]]
+PACKAGES = {"m3c2": "py4dgeo", "dufomap": "dufomap"}
+
+
+def needs(method: str) -> pytest.MarkDecorator:
+    is_missing = importlib.util.find_spec(PACKAGES[method]) is None
+    return pytest.mark.skipif(is_missing, reason=f"needs the extra `{method}`: {PACKAGES[method]}")
+
+
+both = pytest.mark.parametrize("method", [pytest.param(name, marks=needs(name)) for name in PACKAGES])
+
+CRATE: Box = ((1.0, 1.2, 0.0), (1.8, 2.2, 0.9))
+ODOM_T_ROOM = yaw_pose(0.7, (3.0, -2.0, 0.5))
+SETTINGS = ("query.threshold=0", "query.radius_m=6", "map.keyframe_spacing_m=0.5")
+
+
+@pytest.fixture(scope="module", name="empty")
+def empty_fixture() -> PointMap:
+    return RoomScans([], 1).mapped()
+
+
+@pytest.fixture(scope="module", name="crated_scans")
+def crated_scans_fixture() -> RoomScans:
+    return RoomScans([CRATE], 3, odom_T_room=ODOM_T_ROOM)
+
+
+@pytest.fixture(scope="module", name="crated")
+def crated_fixture(crated_scans: RoomScans) -> PointMap:
+    return crated_scans.mapped()
+
+
+def descriptors(point_map: PointMap) -> DescriptorSet:
+    n = len(point_map.keyframe_scans)
+    return DescriptorSet(np.zeros((n, 2), np.float32), None, point_map.keyframe_scans, "none", "")
+
+
+def merged(before: PointMap, after: PointMap, before_T_after: Float64Array) -> MergedMaps:
+    return MergedMaps(before, after, before_T_after, {}, True)
+
+
+def answer(method: str, maps: MergedMaps, settings: Sequence[str] = ()) -> ChangeReport:
+    config = load_config(method, [*SETTINGS, *settings])
+    return load_method(method)(maps, descriptors(maps.before), descriptors(maps.after), config)
+
+
+def returns_of(report: ChangeReport) -> set[tuple[int, int]]:
+    return {(int(scan), int(pixel)) for item in report.objects for scan, pixel in item.returns}
+
+
+@both
+def test_an_added_crate_is_found_and_a_removed_one_too(
+    method: str, empty: PointMap, crated: PointMap, crated_scans: RoomScans
+) -> None:
+    room_T_odom = np.linalg.inv(ODOM_T_ROOM)
+    added = answer(method, merged(empty, crated, room_T_odom))
+    removed = answer(method, merged(crated, empty, ODOM_T_ROOM))
+    truth = crated_scans.returns_on(0)
+    for report, session, kind in ((added, "after", "added"), (removed, "before", "removed")):
+        (item,) = report.objects
+        assert (item.session, item.kind, item.region) == (session, kind, 0)
+        found = returns_of(report)
+        assert len(found & truth) / len(found) > 0.95
+        assert len(found & truth) / len(truth) > 0.6
+        assert report.regions.scores.tolist() == [len(item.points_map)]
+        assert {"t_cd_s", "t_oe_s"} <= set(report.seconds)
+    centres = added.regions.centres_map, transform(room_T_odom, removed.regions.centres_map)
+    for centre in np.concatenate(centres):
+        np.testing.assert_allclose(centre, np.mean(CRATE, axis=0), atol=0.35)
+
+
+@both
+def test_nothing_changed(method: str, empty: PointMap) -> None:
+    again = RoomScans([], 2, odom_T_room=ODOM_T_ROOM).mapped()
+    report = answer(method, merged(empty, again, np.linalg.inv(ODOM_T_ROOM)))
+    assert report.regions.centres_map.shape == (0, 3)
+    assert report.objects == ()
+    assert report.regions.keyframe_scores.tolist() == [0.0] * len(report.keyframe_scans[0])
+
+
+@both
+def test_where_the_odometry_started_matters_little(method: str, empty: PointMap, crated: PointMap) -> None:
+    # maps are thinned, and rays cast, in cells of the session's own odom frame: not the same to the bit
+    elsewhere = yaw_pose(-1.1, (50.0, 7.0, -3.0))
+    first = answer(method, merged(empty, crated, np.linalg.inv(ODOM_T_ROOM)))
+    moved = RoomScans([CRATE], 3, odom_T_room=elsewhere).mapped()
+    second = answer(method, merged(empty, moved, np.linalg.inv(elsewhere)))
+    np.testing.assert_allclose(first.regions.centres_map, second.regions.centres_map, atol=0.15)
+    one, other = returns_of(first), returns_of(second)
+    assert len(one & other) / len(one | other) > 0.7
+
+
+def plane(z_m: float) -> Float64Array:
+    x, y = np.meshgrid(np.arange(-3, 3, 0.2), np.arange(-3, 3, 0.2))
+    # py4dgeo cuts its cylinder into slabs and drops what lies exactly between two
+    roughness_m = stream(1, "plane").normal(0, 0.001, x.size)
+    return np.column_stack([x.ravel(), y.ravel(), z_m + roughness_m])
+
+
+def placed(before: Float64Array, after: Float64Array, path: Float64Array, maps: MergedMaps) -> PlacedMaps:
+    return PlacedMaps(maps, {"before": before, "after": after}, {"before": path, "after": path})
+
+
+@needs("m3c2")
+def test_m3c2_of_a_plane_that_rose_by_hand(empty: PointMap) -> None:
+    turn = yaw_pose(0.4, (1.0, 2.0, 3.0))
+    turn[:3, :3] = turn[:3, :3] @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    settings = ("query.radius_m=9", "m3c2.depth_m=1.5", "extract.distance_m=0.3")
+
+    def share(session: SessionName, rose_m: float, seen_from_m: float, moved_by: Float64Array, *more: str) -> float:
+        before, after, path = (
+            transform(moved_by, cloud) for cloud in (plane(0.0), plane(rose_m), np.array([[0.0, 0.0, seen_from_m]]))
+        )
+        maps = placed(before, after, path, merged(empty, empty, np.eye(4)))
+        other: SessionName = "before" if session == "after" else "after"
+        return float(m3c2_mask(maps, session, other, load_config("m3c2", [*settings, *more])).mean())
+
+    for moved_by in (np.eye(4), turn):
+        assert share("after", 0.29, 2.0, moved_by) == 0.0
+        assert share("after", 0.31, 2.0, moved_by) == 1.0
+        assert share("after", 0.31, 2.0, moved_by, "extract.distance_m=0.32") == 0.0
+        # the plane that was there before is hidden by the one that came, unless one looks from below
+        assert share("before", 0.31, 2.0, moved_by) == 0.0
+        assert share("before", 0.31, -2.0, moved_by) == 1.0
+        assert share("after", 0.31, -2.0, moved_by) == 0.0
+        # beyond the cylinder there is nothing to measure a distance to
+        assert share("after", 1.6, 3.0, moved_by) == 0.0
+    # points that nobody passed near are not asked about
+    assert share("after", 0.31, 2.0, np.eye(4), "query.radius_m=1.5") == 0.0
+
+
+@needs("m3c2")
+def test_m3c2_of_clouds_turned_together_is_the_same(empty: PointMap, crated: PointMap) -> None:
+    turn = yaw_pose(2.0, (-30.0, 12.0, 1.0))
+    config = load_config("m3c2", SETTINGS)
+    maps = merged(empty, crated, np.linalg.inv(ODOM_T_ROOM))
+    before, after = empty.points, transform(maps.before_T_after, crated.points)
+    path = empty.odom_T_sensor[:, :3, 3]
+    first = m3c2_mask(placed(before, after, path, maps), "after", "before", config)
+    turned = placed(transform(turn, before), transform(turn, after), transform(turn, path), maps)
+    second = m3c2_mask(turned, "after", "before", config)
+    assert first.sum() > 50
+    # a point on the rim of a cylinder may be in or out
+    assert np.count_nonzero(first != second) <= 0.001 * len(first)
+
+
+@needs("m3c2")
+def test_m3c2_leaves_no_log(empty: PointMap, caplog: pytest.LogCaptureFixture) -> None:
+    # whatever py4dgeo logs goes to standard output and into a file in the working folder
+    with caplog.at_level(logging.DEBUG):
+        answer("m3c2", merged(empty, empty, np.eye(4)))
+    assert [record.name for record in caplog.records if record.name.startswith("py4dgeo")] == []
+
+
+@needs("dufomap")
+def test_dufomap_by_hand(empty: PointMap) -> None:
+    """The room ends at x = 5: void in front of that wall, but not behind it, nor within the inflation of its hits."""
+    x_m = np.array([0.0, 3.0, 4.45, 4.95, 5.3, 5.9])
+    asked = np.column_stack([x_m, np.zeros(len(x_m)), np.full(len(x_m), 1.5)])
+    maps = placed(asked, asked, np.zeros((1, 3)), merged(empty, empty, np.eye(4)))
+    directions: tuple[tuple[SessionName, SessionName], ...] = (("after", "before"), ("before", "after"))
+
+    def is_void(session: SessionName, other: SessionName, *settings: str) -> list[bool]:
+        given = ("query.radius_m=9", "dufomap.voxel_m=0.1", "dufomap.hit_inflation_m=0.2", *settings)
+        return void_mask(maps, session, other, load_config("dufomap", given)).tolist()
+
+    for session, other in directions:
+        assert is_void(session, other) == [True, True, True, False, False, False]
+    assert is_void("after", "before", "dufomap.hit_inflation_m=1") == [True, True, False, False, False, False]
+    assert not any(is_void("after", "before", "query.radius_m=1"))
+
+
+@needs("dufomap")
+def test_dufomap_says_nothing(empty: PointMap, capfd: pytest.CaptureFixture[str]) -> None:
+    answer("dufomap", merged(empty, empty, np.eye(4)))
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("method", PACKAGES)
+def test_a_missing_extra_is_named_before_anything_is_mapped(
+    method: str, tiny_pair: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(registry.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.delattr(single, "build_map")
+    folders = (tiny_pair / "before", tiny_pair / "after", "--preset", method, "--out", tmp_path / "out")
+    code, out, err = command("detect", *folders)
+    assert code == 2
+    assert f"method {method} needs a package more: pip install 'tunnelcd[{method}]'" in err
+    assert not (tmp_path / "out").exists()
+    assert out == ""
+    for name in entry_points(METHODS).keys() - PACKAGES.keys():
+        load_method(name)
+    with pytest.raises(InputError, match=rf"pip install 'tunnelcd\[{method}\]'"):
+        load_method(method)
+
+
+def test_dufomap_keeps_the_map_and_the_returns_whose_rays_it_casts(empty: PointMap) -> None:
+    kept = kept_bytes(MappedSession(empty, descriptors(empty)), load_config("dufomap", ["dufomap.every_scan=5"]))
+    n_cast = sum(int(np.diff(empty.scan_offsets)[scan]) for scan in range(0, len(empty.odom_T_sensor), 5))
+    assert kept == {
+        "bytes_map_before": 12.0 * len(empty.points),
+        "bytes_regions_before": 12.0 * (len(empty.points) + n_cast),
+    }

@@ -1,0 +1,163 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cdpipe.core.errors import InputError
+from eval.bench import bench
+from eval.bench.bench import chosen, contests, measure, row_of, verdict, write_table
+from eval.bench.merge import FailedContest
+from eval.cli.main import main
+from sim.studies.bench import BenchSite
+from sim.studies.timing import Contest
+
+KEYS = ["name", "value", "unit", "rival", "rival_value", "ratio", "target", "met", "n", "spread", "reason"]
+FAST = Contest("Mray/s", (0.5, 0.25, 0.4, 0.2, 1.0), 2.0, "a rival", (2.0, 1.0, 4.0), 4.5)
+SLOW = Contest("Mray/s", (1.0,), 2.0, "a rival", (1.0,), 1.7)
+ALONE = Contest("s", (3.0,))
+
+
+def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as caught:
+        main(["bench", *argv])
+    out, err = capsys.readouterr()
+    return int(caught.value.code or 0), out, err
+
+
+@pytest.fixture
+def three_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "contests", lambda: {"fast": lambda: FAST, "slow": lambda: SLOW, "alone": lambda: ALONE})
+
+
+def test_a_row_by_hand() -> None:
+    row = row_of("fast", FAST)
+    # Figures 4, 8, 5, 10, 2: median 5, quartiles 4 and 8. The rival's 1, 2, 0.5: median 1.
+    assert row == {
+        "name": "fast", "value": 5.0, "unit": "Mray/s", "rival": "a rival", "rival_value": 1.0, "ratio": 5.0,
+        "target": 4.5, "met": True, "n": 5, "spread": 4.0, "reason": "",
+    }  # fmt: skip
+    assert list(row) == KEYS
+
+
+def test_of_times_the_shorter_one_is_the_faster() -> None:
+    row = row_of("merge", Contest("s", (0.2, 0.2), None, "whole map", (1.0, 1.0), 6.0))
+    assert (row["value"], row["rival_value"], row["ratio"], row["met"]) == (0.2, 1.0, 5.0, False)
+
+
+def test_what_has_no_rival_is_not_judged() -> None:
+    row = row_of("alone", ALONE)
+    assert [row[key] for key in ("value", "rival", "rival_value", "ratio", "target", "met")] == [3.0] + [None] * 5
+    assert verdict([row]) == "0 of 0 targets met"
+
+
+def test_a_target_just_reached_is_met() -> None:
+    assert row_of("even", Contest("Mray/s", (1.0,), 3.0, "a rival", (2.0,), 2.0))["met"] is True
+
+
+@pytest.mark.usefixtures("three_rows")
+def test_the_table_and_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "new" / "speed.json"
+    code, out, err = run(capsys, "--out", str(file))
+    assert code == 0  # though a target is missed
+    lines = [line.split() for line in out.splitlines()]
+    assert KEYS[:-1] in lines
+    assert ["fast", "5", "Mray/s", "a", "rival", "1", "5", "4.5", "met", "5", "4"] in lines
+    assert ["slow", "2", "Mray/s", "a", "rival", "2", "1", "1.7", "missed", "1", "0"] in lines
+    assert ["alone", "3", "s", "-", "-", "-", "-", "-", "1", "0"] in lines
+    assert out.splitlines()[-1] == f"1 of 2 targets met; missed: slow; {file}"
+    assert [line for line in err.splitlines() if line] == ["[0/3] fast", "[1/3] slow", "[2/3] alone"]
+    table = json.loads(file.read_text())
+    assert list(table) == ["machine", "rows"]
+    assert {"cpu", "cores", "threads"} <= set(table["machine"])
+    assert [list(row) for row in table["rows"]] == [KEYS] * 3
+    assert [row["met"] for row in table["rows"]] == [True, False, None]
+    assert [entry.name for entry in file.parent.iterdir()] == ["speed.json"]
+
+
+@pytest.mark.usefixtures("three_rows")
+def test_only_some_rows_and_nothing_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "speed.json"
+    assert run(capsys, "--only", "alone", "--only", "fast", "--quiet", "--out", str(file)) == (0, "", "")
+    assert [row["name"] for row in json.loads(file.read_text())["rows"]] == ["fast", "alone"]
+
+
+def test_a_rival_that_cannot_be_compared_leaves_its_target_open() -> None:
+    row = row_of("raced", Contest("s", (0.2,), None, "a rival: not judged, 7.0 m off", (), 6.0))
+    assert [row[key] for key in ("value", "rival_value", "ratio", "target", "met")] == [0.2, None, None, 6.0, None]
+    told = verdict([row_of("fast", FAST), row, row_of("alone", ALONE)])
+    assert told == "1 of 1 targets met; 1 not judged: raced"
+
+
+def test_what_failed_is_a_row_and_the_rows_before_it_stay(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failed = FailedContest("s", (), target=10.0, reason="it is 3.0 m off")
+    monkeypatch.setattr(bench, "contests", lambda: {"fast": lambda: FAST, "merge": lambda: failed})
+    code, out, _ = run(capsys, "--out", str(tmp_path / "speed.json"))
+    assert code == 0
+    assert out.splitlines()[-2:] == [
+        "merge: it is 3.0 m off",
+        f"1 of 2 targets met; missed: merge; {tmp_path / 'speed.json'}",
+    ]
+    first, last = json.loads((tmp_path / "speed.json").read_text())["rows"]
+    assert first["met"] is True
+    assert [last[key] for key in KEYS] == [
+        "merge",
+        None,
+        "s",
+        None,
+        None,
+        None,
+        10.0,
+        False,
+        0,
+        None,
+        "it is 3.0 m off",
+    ]
+
+
+@pytest.mark.usefixtures("three_rows")
+def test_an_unknown_row_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = run(capsys, "--only", "quick")
+    assert (code, out) == (2, "")
+    assert err == "error: --only: 'quick' is no row of the table (known: fast, slow, alone)\n"
+
+
+def test_where_the_table_cannot_go_is_told_before_anything_is_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never() -> Contest:
+        raise AssertionError("measured")
+
+    monkeypatch.setattr(bench, "contests", lambda: {"never": never})
+    code, _, err = run(capsys, "--out", str(tmp_path))
+    assert (code, err) == (2, f"error: {tmp_path}: is a folder: name a file for the table\n")
+    (tmp_path / "file").touch()
+    code, _, err = run(capsys, "--out", str(tmp_path / "file" / "speed.json"))
+    assert code == 2
+    assert "cannot write there" in err
+
+
+def test_a_table_that_cannot_be_written_leaves_no_half_file(tmp_path: Path) -> None:
+    taken = tmp_path / "speed.json"
+    taken.mkdir()
+    (taken / "inside").touch()
+    with pytest.raises(InputError, match="cannot write there"):
+        write_table({"machine": {}, "rows": []}, taken)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["speed.json"]
+
+
+def test_a_real_row_of_a_small_world() -> None:
+    told: list[Any] = []
+    rows = chosen(contests(BenchSite("smoke/one_box", 0, n_props=3, repeats=2)), ["casting-bare"])
+    table = measure(rows, lambda *args: told.append(args))
+    (row,) = table["rows"]
+    assert told == [("casting-bare", 0, 1)]
+    assert row["ratio"] == pytest.approx(row["value"] / row["rival_value"])
+    assert row["met"] == (row["ratio"] >= row["target"])
+    assert (row["unit"], row["n"]) == ("Mray/s", 2)
+    json.dumps(table)

@@ -1,0 +1,504 @@
+import json
+import runpy
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.errors import InputError
+from cdpipe.io.answer import read_answer
+from cdpipe.io.readers import open_scans
+from cdpipe.model.config import PipelineConfig
+from cdpipe.model.types import DescriptorSet, PointMap, ScanSource
+from eval.cli.main import main
+from eval.plans import plan as plans
+from eval.plans.plan import Plan
+from eval.report import page
+from eval.running import runner, single
+from eval.running.runfolder import RunFolder
+from scenarios.library import load_scenario, scenario_names
+from sim.session import simulate
+
+Result = tuple[int, str, str]
+Command = Callable[..., Result]
+SMALL = ("--set", "sensor.mode=512x10", "--set", "platform.scan_spacing_m=1.0")
+# finds the box with so few returns, which the preset is not tuned for
+FINE = ("--preset", "voxel-diff", "--set", "cluster.min_points=8", "--set", "query.threshold=0")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small pair, made by the command line."""
+    out = tmp_path_factory.mktemp("made") / "new" / "pair"
+    with pytest.raises(SystemExit) as caught:
+        main(["simulate", "smoke/one_box", "--seed", "20000", "--out", str(out), "--quiet", *SMALL])
+    assert not caught.value.code
+    return out
+
+
+@pytest.fixture
+def pair(made: Path, tmp_path: Path) -> Path:
+    shutil.copytree(made, tmp_path / "pair")
+    return tmp_path / "pair"
+
+
+@pytest.fixture(scope="module")
+def recorded(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same pair as folders of PLY scans with a TUM trajectory."""
+    root = tmp_path_factory.mktemp("recorded")
+    for name in ("before", "after"):
+        (root / name).mkdir()
+        lines = ["# stamp tx ty tz qx qy qz qw"]
+        for scan in open_scans(made / name).scans():
+            header = "ply\nformat binary_little_endian 1.0\nelement vertex {}\n" + "".join(
+                f"property float {axis}\n" for axis in "xyz"
+            )
+            points = scan.points_sensor.astype("<f4")
+            (root / name / f"{scan.index:03d}.ply").write_bytes(
+                (header.format(len(points)) + "end_header\n").encode() + points.tobytes()
+            )
+            quaternion = Rotation.from_matrix(scan.odom_T_sensor[:3, :3]).as_quat()
+            numbers = [float(scan.index), *scan.odom_T_sensor[:3, 3], *quaternion]
+            lines.append(" ".join(f"{number:.9f}" for number in numbers))
+        (root / name / "trajectory.txt").write_text("\n".join(lines) + "\n")
+    return root
+
+
+def tree(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+def assert_refused(result: Result, *words: str) -> None:
+    code, _, err = result
+    assert code == 2, err
+    errors = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1, err
+    assert "Traceback" not in err
+    for word in words:
+        assert word in errors[0]
+
+
+def test_simulate_makes_the_pair_of_the_seed(made: Path) -> None:
+    assert {"before/session.json", "after/session.json", "truth/changes.json"} <= tree(made)
+    assert json.loads((made / "truth" / "changes.json").read_text())["seed"] == 20000
+    assert [path.name for path in made.parent.iterdir()] == ["pair"]
+
+
+def test_detect_writes_its_answer_and_needs_no_truth(pair: Path, tmp_path: Path, command: Command) -> None:
+    for folder in pair.rglob("truth"):
+        shutil.rmtree(folder)
+    code, out, err = command("detect", pair / "before", pair / "after", *FINE, "--out", tmp_path / "out")
+    assert (code, "error" in err) == (0, False)
+    report = read_answer(tmp_path / "out").report
+    assert report is not None
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "answer.json", "answer.npz", "regions.csv", "objects.csv", "objects.ply",
+    }  # fmt: skip
+    objects = pd.read_csv(tmp_path / "out" / "objects.csv")
+    assert objects["n_returns"].tolist() == [len(item.returns) for item in report.objects]
+    assert objects["kind"].tolist() == [item.kind for item in report.objects]
+    volumes_m3 = [item.shape.volume_m3 for item in report.objects if item.shape]
+    assert objects["volume_m3"].tolist() == pytest.approx(volumes_m3)
+    assert len(pd.read_csv(tmp_path / "out" / "regions.csv")) == report.regions.is_proposed.sum()
+    content = (tmp_path / "out" / "objects.ply").read_bytes()
+    vertices = np.frombuffer(content[content.index(b"end_header\n") + 11 :], dtype="<f4,<f4,<f4,<i4")
+    assert len(vertices) == objects["n_points"].sum()
+    assert np.bincount(vertices["f3"]).tolist() == objects["n_points"].tolist()
+    assert "added" in out
+    assert "merge: accepted" in out
+    inliers = next(line.split() for line in out.splitlines() if "inlier_share" in line)
+    assert float(inliers[1]) == pytest.approx(report.evidence["inlier_share"], abs=1e-3)
+    assert inliers[3:] == ["yes", "merge.min_inlier_share"]
+    assert {"t_merge_s", "t_descriptor_s", "t_cd_s", "t_oe_s"} <= set(report.seconds)
+
+
+def test_a_silent_detect_says_how_near_the_best_candidate_came(pair: Path, tmp_path: Path, command: Command) -> None:
+    silent = ("--preset", "paper", "--site", "wide", "--set", "query.threshold=9")
+    code, out, _ = command("detect", pair / "before", pair / "after", *silent, "--out", tmp_path / "out")
+    report = read_answer(tmp_path / "out").report
+    assert report is not None
+    assert code == 0
+    assert f"nothing reaches query.threshold = 9; the best of {len(report.regions.scores)} candidates scores" in out
+    assert f"{report.regions.scores[0]:.4g}" in out
+    assert report.regions.radius_m == 10  # what the preset says of wide drifts
+
+
+def test_detect_finds_the_box_in_recorded_files_as_in_the_session(
+    made: Path, recorded: Path, tmp_path: Path, command: Command
+) -> None:
+    options = (*FINE, "--quiet")
+    assert command("detect", made / "before", made / "after", *options, "--out", tmp_path / "a")[:2] == (0, "")
+    assert command("detect", recorded / "before", recorded / "after", *options, "--out", tmp_path / "b")[0] == 0
+    ours, theirs = read_answer(tmp_path / "a").report, read_answer(tmp_path / "b").report
+    assert ours is not None
+    assert theirs is not None
+    assert len(ours.regions.scores) >= 1
+    np.testing.assert_allclose(ours.regions.centres_map[0], theirs.regions.centres_map[0], atol=0.3)
+
+
+def test_describe_stores_what_detect_then_uses(
+    pair: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("before", "after"):
+        code, out, _ = command("describe", pair / name)
+        assert code == 0
+        assert str(pair / name / "descriptors" / "3deg.npz") in out
+    calls: list[str] = []
+    usual = single.describe_mapped
+
+    def counted(source: ScanSource, thin_map: PointMap, config: PipelineConfig) -> DescriptorSet:
+        calls.append(source.name)
+        return usual(source, thin_map, config)
+
+    monkeypatch.setattr(single, "describe_mapped", counted)
+    arguments = ("detect", pair / "before", pair / "after", "--quiet", "--out")
+    assert command(*arguments, tmp_path / "stored")[0] == 0
+    assert calls == []
+    # of other weights, or of other keyframes: not used
+    stored = pair / "before" / "descriptors" / "3deg.npz"
+    with np.load(stored) as arrays:
+        np.savez(stored, **{**arrays, "checkpoint": np.array("other")})
+    assert command(*arguments, tmp_path / "stale")[0] == 0
+    assert calls == [str(pair / "before")]
+    assert command(*arguments, tmp_path / "sparse", "--set", "map.keyframe_spacing_m=2")[0] == 0
+    assert calls[1:] == [str(pair / "before"), str(pair / "after")]
+
+
+def test_score_of_one_answer(pair: Path, tmp_path: Path, command: Command) -> None:
+    command("detect", pair / "before", pair / "after", *FINE, "--out", tmp_path / "out")
+    code, out, _ = command("score", pair, tmp_path / "out")
+    row = dict(line.split(None, 1) for line in out.splitlines() if len(line.split(None, 1)) == 2)
+    assert (code, row["status"], row["n_changes"], row["region_recall"]) == (0, "ok", "1", "1")
+    assert command("score", pair, tmp_path / "out", "--quiet") == (0, "", "")
+
+
+def edit_poses(session: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    with np.load(session / "odometry.npz") as arrays:
+        poses = arrays["odom_T_sensor"]
+    np.savez(session / "odometry.npz", odom_T_sensor=change(poses.copy()))
+
+
+def nan_pose(session: Path) -> None:
+    def change(poses: np.ndarray) -> np.ndarray:
+        poses[3, 0, 3] = np.nan
+        return poses
+
+    edit_poses(session, change)
+
+
+def one_pose_too_few(session: Path) -> None:
+    edit_poses(session, lambda poses: poses[:-1])
+
+
+def empty_scan(session: Path) -> None:
+    path = session / "chunks" / "00000.npz"
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    arrays["range_mm"][2] = 0
+    np.savez(path, **arrays)
+
+
+def cut_chunk(session: Path) -> None:
+    path = session / "chunks" / "00000.npz"
+    path.write_bytes(path.read_bytes()[:1000])
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (shutil.rmtree, ["after", "no such folder"]),
+        (lambda session: (session / "session.json").unlink(), ["no scans in it"]),
+        (lambda session: (session / "session.json").write_text("{"), ["session.json", "damaged"]),
+        (nan_pose, ["odometry.npz", "not finite"]),
+        (one_pose_too_few, ["odometry.npz", "one pose for each scan"]),
+        (empty_scan, ["scan 2", "no return"]),
+        (cut_chunk, ["00000.npz", "damaged or cut short"]),
+    ],
+)
+def test_damaged_sessions_are_refused_and_nothing_is_left(
+    pair: Path, tmp_path: Path, command: Command, damage: Callable[[Path], None], words: list[str]
+) -> None:
+    damage(pair / "after")
+    before = tree(tmp_path)
+    assert_refused(command("detect", pair / "before", pair / "after", "--out", tmp_path / "x" / "out"), *words)
+    assert tree(tmp_path) == before
+
+
+def nan_in_trajectory(folder: Path) -> None:
+    lines = (folder / "trajectory.txt").read_text().splitlines()
+    stamp, _, rest = lines[6].split(None, 2)
+    lines[6] = f"{stamp} nan {rest}"
+    (folder / "trajectory.txt").write_text("\n".join(lines))
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda folder: (folder / "000.ply").unlink(), ["trajectory.txt", "one line for each scan"]),
+        (lambda folder: (folder / "trajectory.txt").unlink(), ["exactly one trajectory"]),
+        (lambda folder: (folder / "001.ply").write_text("solid"), ["001.ply", "PLY"]),
+        (nan_in_trajectory, ["trajectory.txt:7", "not finite"]),
+    ],
+)
+def test_damaged_recordings_are_refused(
+    recorded: Path, tmp_path: Path, command: Command, damage: Callable[[Path], None], words: list[str]
+) -> None:
+    shutil.copytree(recorded, tmp_path / "files")
+    damage(tmp_path / "files" / "before")
+    result = command("detect", tmp_path / "files" / "before", tmp_path / "files" / "after", "--out", tmp_path / "out")
+    assert_refused(result, *words)
+    assert not (tmp_path / "out").exists()
+
+
+def test_sessions_of_different_tunnels_are_refused(pair: Path, tmp_path: Path, command: Command) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    wider = ("--set", "tunnel.section.width_m=7", "--set", "tunnel.section.height_m=5")
+    assert command("simulate", "smoke/one_box", "--out", elsewhere, "--quiet", *SMALL, *wider)[0] == 0
+    before = tree(tmp_path)
+    quiet = command("detect", pair / "before", elsewhere / "after", "--out", tmp_path / "out", "--quiet")
+    assert_refused(quiet, "cannot be merged", str(elsewhere / "after"))
+    code, out, err = command("detect", pair / "before", elsewhere / "after", "--out", tmp_path / "out")
+    assert code == 2
+    assert err.splitlines()[-1] == quiet[2].splitlines()[-1]
+    assert "merge: refused" in out
+    assert any({"no", "merge.min_inlier_share"} <= set(line.split()) for line in out.splitlines())
+    assert tree(tmp_path) == before
+
+
+def test_a_session_beside_itself_is_compared_and_it_is_said(pair: Path, tmp_path: Path, command: Command) -> None:
+    code, _, err = command("detect", pair / "before", pair / "before", *FINE, "--out", tmp_path / "out", "--quiet")
+    same = f"note: {pair / 'before'} and {pair / 'before'} are one and the same recording"
+    assert (code, err) == (0, f"{same}: nothing can have changed between them\n")
+    report = read_answer(tmp_path / "out").report
+    assert report is not None
+    assert report.objects == ()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--preset", "papr"], ["preset", 'did you mean "paper"']),
+        (["--set", "query.radius=3"], ["query.radius", 'did you mean "radius_m"']),
+        (["--set", "query.radius_m=-3"], ["query.radius_m = -3", "greater than 0"]),
+        (["--set", "query.radius_m"], ["expected key=value"]),
+    ],
+)
+def test_mistaken_settings(made: Path, tmp_path: Path, command: Command, options: list[str], words: list[str]) -> None:
+    result = command("detect", made / "before", made / "after", "--out", tmp_path / "out", *options)
+    assert_refused(result, *words)
+    assert tree(tmp_path) == set()
+
+
+def test_output_folders_that_cannot_be_used(made: Path, tmp_path: Path, command: Command) -> None:
+    full, file = tmp_path / "full", tmp_path / "file"
+    full.mkdir()
+    (full / "mine").write_text("x")
+    file.write_text("x")
+    detect = ("detect", made / "before", made / "after", "--out")
+    simulate = ("simulate", "smoke/one_box", "--out")
+    before = tree(tmp_path)
+    for arguments in (detect, simulate):
+        assert_refused(command(*arguments, full), str(full), "not empty", "name a new or empty folder")
+        assert_refused(command(*arguments, file), str(file), "is a file")
+        assert_refused(command(*arguments, file / "below"), "cannot write there")
+    for arguments in (("run", "smoke", "--out"), ("demo", "--out")):
+        assert_refused(command(*arguments, full), str(full), "not a run folder", "name a new folder")
+        assert_refused(command(*arguments, file), str(file), "cannot write there")
+    assert tree(tmp_path) == before
+
+
+def test_unknown_names(tmp_path: Path, command: Command) -> None:
+    assert_refused(command("simulate", "smoke/one_bx", "--out", tmp_path / "out"), 'did you mean "smoke/one_box"')
+    assert_refused(command("run", "smok", "--out", tmp_path / "out"), 'did you mean "smoke"')
+    assert_refused(command("run", "smoke", "--seeds", "9:3", "--out", tmp_path / "out"), "--seeds 9:3")
+    assert_refused(command("run", "smoke", "--grid", "extract.voxl_m=1,2", "--out", tmp_path / "out"), "voxel_m")
+    assert_refused(command("score", tmp_path / "absent"), "no such run folder")
+    assert_refused(command("report", tmp_path), "not a run folder")
+    assert_refused(command("check", "smok"), "no plan, scenario or preset")
+    assert tree(tmp_path) == set()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["detect"], ["tunnelcd detect: Missing argument 'before'", "`tunnelcd detect --help`"]),
+        (["no-such-command"], ["tunnelcd: No such command 'no-such-command'"]),
+        (
+            ["train", "data", "--out"],
+            ["tunnelcd train: Option '--out' requires an argument", "`tunnelcd train --help`"],
+        ),
+        (["run", "null", "--worker", "2"], ["tunnelcd run: No such option: --worker", "--workers"]),
+        (
+            ["simulate", "smoke/one_box", "--seed", "-1", "--out", "x"],
+            ["tunnelcd simulate: Invalid value for '--seed'"],
+        ),
+        (["detect", "a", "b", "--site", "wid", "--out", "x"], ["'--site': 'wid' is not one of 'narrow', 'wide'"]),
+    ],
+)
+def test_usage_errors_are_one_line(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch, arguments: list[str], words: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, out, err = command(*arguments)
+    assert_refused((code, out, err), *words)
+    assert len(err.splitlines()) == 1
+    assert tree(tmp_path) == set()
+
+
+def test_run_score_report_on_one_folder(
+    made: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = [word for word in SMALL if word != "--set"]
+    monkeypatch.setattr(runner, "load_scenario", lambda name, seed, _: load_scenario(name, seed, settings))
+    plan = tmp_path / "mine.yaml"
+    plan.write_text("name: mine\nscenarios: [smoke/one_box]\nseeds: [1]\nvariants: [{preset: voxel-diff}]\n")
+    out = tmp_path / "run"
+    arguments = ("run", plan, "--seeds", "20000:20001", "--grid", "query.radius_m=3,4.5", "--out", out)
+    code, printed, _ = command(*arguments)
+    assert (code, "2 cells done, 0 kept" in printed) == (0, True)
+    assert "voxel-diff[query.radius_m=4.5]" in printed
+    results = pd.read_csv(out / "results.csv")
+    assert results["variant"].tolist() == ["voxel-diff[query.radius_m=3]", "voxel-diff[query.radius_m=4.5]"]
+    assert set(results["seed"]) == {20000}
+    assert "0 cells done, 2 kept" in command(*arguments)[1]
+    assert "2 answers scored again" in command("score", out)[1]
+    code, printed, _ = command("report", out)
+    assert (code, (out / "index.html").is_file()) == (0, True)
+    assert str(out / "index.html") in printed
+
+
+def test_demo_is_the_paper_plan_and_the_page(tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[object] = []
+
+    def run_plan(plan: Plan, run: RunFolder, **options: Any) -> runner.RunOutcome:
+        asked.append((plan.name, options["force"], options["limit"]))
+        pd.DataFrame([{"scenario": "a", "seed": 1, "variant": "b", "status": "ok"}]).to_csv(
+            run.path / "results.csv", index=False
+        )
+        return runner.RunOutcome(1, 0, 0)
+
+    monkeypatch.setattr(runner, "run_plan", run_plan)
+    monkeypatch.setattr(page, "write_page", lambda folder: folder / "index.html")
+    code, printed, _ = command("demo", "--out", tmp_path / "demo")
+    assert (code, asked) == (0, [("paper", False, None)])
+    assert str(tmp_path / "demo" / "index.html") in printed
+
+
+def test_list_names_everything(command: Command) -> None:
+    code, out, _ = command("list")
+    assert code == 0
+    words = out.split()
+    assert {*scenario_names(), "smoke", "paper", "tunnelcd", "voxel-diff", "os1-32-nominal"} <= set(words)
+
+
+def test_check_tells_all_mistakes_of_all_files(tmp_path: Path, command: Command) -> None:
+    plan, preset, scenario = (tmp_path / f"{name}.yaml" for name in ("plan", "preset", "scenario"))
+    plan.write_text("name: x\nscenarios: [smoke/one_bx]\nseeds: [1]\nvariants: [{preset: paper}]\n")
+    preset.write_text("extract: {voxl_m: 0.3}\n")
+    scenario.write_text("extends: smoke/one_box\nscore_radius: 3\n")
+    code, out, err = command("check", "smoke", "paper/site1", "voxel-diff", plan, preset, scenario)
+    assert code == 2
+    assert "smoke: a plan of 8 cells" in out
+    assert "paper/site1: a scenario" in out
+    assert "voxel-diff: a preset" in out
+    lines = err.splitlines()
+    assert len(lines) == 3
+    for line, start in zip(lines, (f"{plan}:2", f"{preset}:1", f"{scenario}:2"), strict=True):
+        assert line.startswith(f"error: {start}: ")
+        assert "did you mean" in line
+
+
+def test_an_interrupt_says_that_cells_are_kept(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(runner, "run_plan", interrupted)
+    for arguments in (("run", "smoke"), ("demo",)):
+        code, _, err = command(*arguments, "--out", tmp_path / "out", "--quiet")
+        assert (code, "finished cells are kept" in err) == (130, True)
+
+
+def test_an_interrupt_elsewhere_says_that_nothing_was_written(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(simulate, "simulate_pair", interrupted)
+    assert command("simulate", "smoke/one_box", "--out", tmp_path / "out", "--quiet") == (
+        130, "", "interrupted; nothing was written\n",
+    )  # fmt: skip
+    assert tree(tmp_path) == set()
+
+
+def test_a_plan_whose_cells_are_refused_leaves_no_folder(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(_: Plan) -> None:
+        raise InputError("settings that contradict each other")
+
+    monkeypatch.setattr(plans, "cells", refused)
+    assert_refused(command("run", "smoke", "--out", tmp_path / "out"), "contradict")
+    assert tree(tmp_path) == set()
+
+
+def test_a_bug_keeps_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def bug(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(runner, "run_plan", bug)
+    with pytest.raises(ZeroDivisionError, match="a bug"):
+        main(["run", "smoke", "--out", str(tmp_path / "out"), "--quiet"])
+
+
+def test_help_loads_nothing_heavy() -> None:
+    script = (
+        "import sys\n"
+        "from eval.cli.main import main\n"
+        "try:\n    main(['--help'])\n"
+        "except SystemExit as end:\n    assert not end.code\n"
+        "heavy = {'numpy', 'torch', 'pandas', 'mujoco', 'scipy', 'matplotlib', 'pydantic'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    root = Path(__file__).parents[3]
+    done = subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    for name in ("demo", "simulate", "describe", "detect", "score", "run", "report", "list", "check"):
+        assert name in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("program", "arguments", "words"),
+    [
+        ("calibrate", ["absent"], ["absent/results.csv", "No such file"]),
+        ("calibrate", ["empty"], ["empty/results.csv", "No such file"]),
+        ("calibrate", ["damaged"], ["damaged/results.csv", "No columns to parse"]),
+    ],
+)
+def test_programs_tell_mistakes_as_the_commands_do(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    program: str,
+    arguments: list[str],
+    words: list[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "damaged").mkdir()
+    (tmp_path / "damaged" / "results.csv").touch()
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(sys, "argv", [program, *arguments])
+    with pytest.raises(SystemExit) as caught:
+        runpy.run_module(f"eval.studies.{program}", run_name="__main__")
+    out, err = capsys.readouterr()
+    assert_refused((int(caught.value.code or 0), out, err), *words)

@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cdpipe.io.readers import open_scans
+from cdpipe.io.session import Session, read_session
+from eval.cli import converting
+from eval.cli.main import main
+from sim.session.truth import read_labels
+
+pytest.importorskip("ouster.sdk.core", reason="pip install 'tunnelcd[ouster]'")
+from ouster.sdk import osf
+
+Result = tuple[int, str, str]
+Command = Callable[..., Result]
+SMALL = ("--set", "sensor.mode=512x10", "--set", "platform.scan_spacing_m=1.0")
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("made") / "pair"
+    with pytest.raises(SystemExit) as caught:
+        main(["simulate", "smoke/one_box", "--seed", "5", "--out", str(out), "--quiet", *SMALL])
+    assert not caught.value.code
+    return out
+
+
+def frames_of(path: Path) -> list[Any]:
+    with osf.OsfFrameSetSource(str(path)) as source:
+        return [frames[0] for frames in source]
+
+
+def refused(result: Result, expected: str) -> None:
+    code, out, err = result
+    lines = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert (code, out, len(lines)) == (2, "", 1)
+    assert expected in lines[0]
+
+
+def test_a_simulated_session_leaves_with_its_truth(pair: Path, tmp_path: Path, command: Command) -> None:
+    path = tmp_path / "new" / "before.osf"
+    code, out, err = command("convert", pair / "before", path)
+    session = read_session(pair / "before")
+    assert (code, err.splitlines()) == (0, ["  write"])
+    assert out.startswith(f"{path}: {session.n_scans} revolutions, with truth as fields LABEL and INSTANCE, ")
+    instance, change = next(read_labels(pair / "before", session.n_chunks))
+    frames = frames_of(path)
+    assert len(frames) == session.n_scans
+    for number, frame in enumerate(frames):
+        np.testing.assert_array_equal(frame.field("LABEL"), change[number])
+        np.testing.assert_array_equal(frame.field("INSTANCE"), instance[number])
+    assert (instance < 0).any()  # negative labels are kept as they are
+    assert change.max() == 0 or (change > 0).any()
+
+
+def test_truth_stays_behind_on_demand(pair: Path, tmp_path: Path, command: Command) -> None:
+    code, out, err = command("convert", pair / "after", tmp_path / "a.osf", "--without-truth", "--quiet")
+    assert (code, out, err) == (0, "", "")
+    assert set(frames_of(tmp_path / "a.osf")[0].fields) == {"RANGE", "REFLECTIVITY", "SIGNAL"}
+    shutil.copytree(pair / "after", tmp_path / "handed_out", ignore=shutil.ignore_patterns("truth"))
+    code, out, _ = command("convert", tmp_path / "handed_out", tmp_path / "b.osf")
+    assert (code, "without truth" in out) == (0, True)
+
+
+def test_a_pair_there_and_back_gives_the_same_answer(pair: Path, tmp_path: Path, command: Command) -> None:
+    for name in ("before", "after"):
+        assert command("convert", pair / name, tmp_path / f"{name}.osf", "--quiet")[0] == 0
+        code, out, _ = command("convert", tmp_path / f"{name}.osf", tmp_path / "back" / name)
+        assert code == 0
+        assert out.endswith("OS-1-32-U, 512x10, poses: own\n")
+        for one, other in zip(
+            open_scans(pair / name).scans(), open_scans(tmp_path / "back" / name).scans(), strict=True
+        ):
+            np.testing.assert_allclose(one.points_sensor, other.points_sensor, atol=1e-5)
+            np.testing.assert_array_equal(one.pixels, other.pixels)
+            np.testing.assert_array_equal(one.stamps_ns, other.stamps_ns)
+    methods = ("--preset", "voxel-diff", "--set", "query.threshold=0", "--set", "cluster.min_points=8", "--quiet")
+    for source, out in ((pair, "one"), (tmp_path / "back", "other")):
+        assert command("detect", source / "before", source / "after", "--out", tmp_path / out, *methods)[0] == 0
+    one, other = (
+        np.genfromtxt(tmp_path / name / "regions.csv", delimiter=",", skip_header=1) for name in ("one", "other")
+    )
+    np.testing.assert_allclose(one, other, atol=1e-3)
+    assert one.size > 0
+
+
+def test_what_is_left_out_is_told(pair: Path, tmp_path: Path, command: Command) -> None:
+    assert command("convert", pair / "before", tmp_path / "whole.osf", "--quiet")[0] == 0
+    frames = frames_of(tmp_path / "whole.osf")
+    frames[3].status[:300] = 0
+    with osf.Writer(str(tmp_path / "part.osf"), frames[0].sensor_info) as writer:
+        for frame in frames:
+            writer.save(0, frame)
+    code, out, _ = command("convert", tmp_path / "part.osf", tmp_path / "s")
+    assert code == 0
+    assert f"session of {len(frames) - 1} revolutions" in out
+    assert out.endswith("poses: own; 1 left out, of which half the columns or fewer arrived\n")
+
+
+def test_detect_says_how_to_bring_a_recording_in(tmp_path: Path, command: Command) -> None:
+    (tmp_path / "a.osf").write_bytes(b"")
+    result = command("detect", tmp_path / "a.osf", tmp_path / "b.osf", "--out", tmp_path / "out")
+    refused(result, f"turn it into a session first, `tunnelcd convert {tmp_path / 'a.osf'} FOLDER`")
+
+
+def test_names_and_options_that_do_not_go_together(pair: Path, tmp_path: Path, command: Command) -> None:
+    there = tmp_path / "there.osf"
+    there.write_bytes(b"mine")
+    before = pair / "before"
+    for arguments, expected in (
+        ((tmp_path / "none", tmp_path / "a.osf"), "no such file or folder: expected a session, or a recording"),
+        ((pair / "truth" / "changes.json", tmp_path / "a"), "expected a session folder, or a recording (.osf, .pcap"),
+        ((pair, tmp_path / "a.osf"), f"a pair of sessions: convert {before} and {pair / 'after'} one by one"),
+        ((tmp_path, tmp_path / "a.osf"), "no session.json in it"),
+        ((before, tmp_path / "a"), "name a new file that ends in .osf"),
+        ((before, there), "there.osf exists already"),
+        ((before, there / "a.osf"), "cannot write there"),
+        ((before, tmp_path / "a.osf", "--odometry", "kiss-icp"), "leave --odometry out"),
+        ((before, tmp_path / "a.osf", "--metadata", "m.json"), "leave --metadata out"),
+        ((there, tmp_path / "b.osf"), "a recording becomes a session: name a new folder"),
+        ((there, tmp_path / "b", "--without-truth"), "leave --without-truth out"),
+        ((there, tmp_path / "new" / "b"), "there.osf: not an OSF file"),
+        ((there, tmp_path / "b", "--odometry", "lio"), "--odometry lio: expected kiss-icp"),
+    ):
+        refused(command("convert", *arguments), expected)
+    assert there.read_bytes() == b"mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["there.osf"]
+
+
+@pytest.mark.parametrize("way", ["out", "in"])
+def test_an_interrupt_leaves_nothing(
+    way: str, pair: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    if way == "out":
+        monkeypatch.setattr(Session, "chunk", interrupted)
+        source, target = pair / "before", tmp_path / "new" / "a.osf"
+    else:
+        source, target = tmp_path.parent / "whole.osf", tmp_path / "new" / "a"
+        converting.convert(pair / "before", source, converting.Options(), _Silent())
+        monkeypatch.setattr(converting.import_recording.__globals__["SessionWriter"], "add", interrupted)
+    assert command("convert", source, target, "--quiet") == (130, "", "interrupted; nothing was written\n")
+    source.with_name("whole.osf").unlink(missing_ok=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+class _Silent:
+    def cells(self, label: str, done: int, total: int) -> None:
+        pass
+
+    def stage(self, name: str, done: int, total: int) -> None:
+        pass

@@ -1,0 +1,26 @@
+"""A disk that does not take what a command writes is the input's fault: one line, exit 2."""
+
+import errno
+import os
+
+import pytest
+
+from eval.core.exits import input_errors
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EFBIG, errno.EACCES])
+def test_the_disk_is_named_in_one_line(number: int, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught, input_errors():
+        raise OSError(number, os.strerror(number), "run/results.csv")
+    assert caught.value.code == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"error: run/results.csv: {os.strerror(number)}: ")
+    assert told.count("\n") == 1
+    with pytest.raises(SystemExit), input_errors():
+        raise OSError(number, os.strerror(number))
+    assert capsys.readouterr().err.startswith(f"error: the output: {os.strerror(number)}: ")
+
+
+def test_any_other_error_of_the_system_is_a_bug() -> None:
+    with pytest.raises(ConnectionResetError), input_errors():
+        raise ConnectionResetError(errno.ECONNRESET, "reset")

@@ -1,0 +1,69 @@
+from pathlib import Path
+
+import pytest
+
+from cdpipe.core.errors import InputError
+from eval.core.output import make_writable, new_folder
+
+
+def tree(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def test_a_folder_appears_whole(tmp_path: Path) -> None:
+    out = tmp_path / "a" / "b"
+    with new_folder(out) as partial:
+        (partial / "file").write_text("x")
+        assert not out.exists()
+    assert tree(tmp_path) == ["a", "a/b", "a/b/file"]
+
+
+def test_an_empty_folder_may_be_there(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    with new_folder(out) as partial:
+        (partial / "file").write_text("x")
+    assert tree(tmp_path) == ["out", "out/file"]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_nothing_is_left_when_the_block_fails(tmp_path: Path, error: type[BaseException]) -> None:
+    with pytest.raises(error), new_folder(tmp_path / "a" / "b") as partial:
+        (partial / "file").write_text("x")
+        raise error
+    assert tree(tmp_path) == []
+
+
+def test_what_a_killed_run_left_does_not_get_into_the_next(tmp_path: Path) -> None:
+    (tmp_path / ".out.partial").mkdir()
+    (tmp_path / ".out.partial" / "old").write_text("x")
+    with new_folder(tmp_path / "out") as partial:
+        assert tree(partial) == []
+    assert tree(tmp_path) == ["out"]
+
+
+def test_a_folder_with_something_in_it_is_refused_and_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("x")
+    with pytest.raises(InputError, match="is not empty: name a new or empty folder"), new_folder(tmp_path):
+        pass
+    assert tree(tmp_path) == ["mine"]
+
+
+def test_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="is a file"), new_folder(tmp_path / "file"):
+        pass
+    for place in (tmp_path / "file" / "below", tmp_path / "file" / "far" / "below"):
+        with pytest.raises(InputError, match="cannot write there"), new_folder(place):
+            pass
+        with pytest.raises(InputError, match="cannot write there"):
+            make_writable(place)
+    assert tree(tmp_path) == ["file"]
+
+
+def test_where_nobody_may_write(tmp_path: Path) -> None:
+    # not even root can make a folder in /proc; elsewhere the test above has covered the branch
+    if not Path("/proc/self").exists():
+        pytest.skip("needs /proc")
+    with pytest.raises(InputError, match="name a folder you may write to"), new_folder(Path("/proc/self/out")):
+        pass

@@ -1,0 +1,66 @@
+"""The plans `main` and `stress`: which methods on which pairs, and what each stress is held against."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from cdpipe.model.config import preset_names
+from eval.plans.plan import cells, load_plan
+from eval.plans.worlds import references, settings_over
+from scenarios import load_scenario
+
+BASE = "stress/narrow"
+
+
+def test_main_runs_every_preset_and_the_bounds_on_the_pairs_of_regions() -> None:
+    found = cells(load_plan("main"))
+    variants = {cell.variant for cell in found}
+    assert variants == {*preset_names(), "oracle-merge", "oracle-merge+oracle-regions"} - {"frame"}
+    pairs = Counter(cell.scenario for cell in found if cell.variant == "paper")
+    names = ("narrow", "wide", "network", "cave", "site1")
+    assert pairs == {f"regions/{name}": 20 for name in names}
+    assert {cell.seed for cell in found} == set(range(20000, 20020))
+    assert load_plan("main").report == ("regions", "objects")
+
+
+def test_main_judges_at_the_radius_and_threshold_of_regions() -> None:
+    ours, theirs = (
+        {(cell.scenario, cell.variant): cell.config for cell in cells(load_plan(name))} for name in ("main", "regions")
+    )
+    shared = ours.keys() & theirs.keys()
+    assert len(shared) == 5 * 12
+    assert all(ours[key] == theirs[key] for key in shared)
+    for (scenario, _), config in ours.items():
+        assert config.query.radius_m == (10.0 if scenario == "regions/wide" else 4.5)
+    for variant in ("kiss-matcher", "oracle-merge"):
+        assert ours["regions/wide", variant].query == ours["regions/wide", "tunnelcd"].query
+
+
+def test_every_stress_is_held_against_the_same_pair_without_it() -> None:
+    plan = load_plan("stress")
+    found = cells(plan)
+    held = references((cell.scenario, cell.variant, cell.seed) for cell in found)
+    worlds = {cell.scenario for cell in found}
+    assert len(worlds) == 9
+    methods = {cell.variant for cell in found if cell.oracle is None}
+    assert held == {(world, variant): BASE for world in worlds - {BASE} for variant in methods}
+    assert {cell.variant.partition("[")[0] for cell in found if cell.scenario != BASE} == {
+        "tunnelcd", "paper-paired", "sphere-difference", "voxel-diff",
+    }  # fmt: skip
+    stresses = {settings_over(world, BASE).split("=")[0] for world in worlds - {BASE}}
+    assert stresses == {"before.odometry.translation_percent", "sensor.mode", "after.route", "before.lateral"}
+    merged = [(cell.preset, cell.oracle.noise_m) for cell in found if cell.oracle is not None and cell.seed == 20300]
+    assert merged == [(name, noise_m) for name in ("tunnelcd", "paper-paired") for noise_m in (0.0, 0.1, 0.3, 0.5)]
+    assert {cell.config.query.n_regions for cell in found} == {6}
+    assert len({cell.seed for cell in found}) >= 6
+    assert all(20000 <= cell.seed < 30000 for cell in found)
+
+
+def test_the_base_of_the_stresses_is_the_easiest_drive_through_the_tunnels_of_narrow() -> None:
+    for seed in range(10600, 10603):
+        base, narrow = load_scenario(BASE, seed), load_scenario("narrow", seed)
+        assert base.tunnel == narrow.tunnel
+        assert base.before.route == base.after.route == narrow.before.route
+        for session in (base.before, base.after):
+            assert (session.lateral, session.start_m, session.end_m) == (0.0, 3.0, 3.0)
+            assert (session.odometry.translation_percent, session.odometry.yaw_deg_per_100m) == (0.0, 0.0)

@@ -1,0 +1,428 @@
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from cdpipe.core.errors import InputError
+from cdpipe.model.config import load_config
+from eval.plans import plan as plan_module
+from eval.plans.changes import changed_plan
+from eval.plans.plan import Plan, cells, load_plan, parse_seeds, plan_names, planned_cases
+from eval.plans.variants import slug, variant_name
+from eval.plans.worlds import setting_text, world_slug
+from eval.running.runfolder import reported
+
+PLAN = """\
+name: two
+scenarios: [smoke/one_box, smoke/unchanged]
+seeds: "7:9"
+variants:
+  - preset: paper
+    per_scenario: {smoke/unchanged: ["query.radius_m=10"]}
+  - preset: tunnelcd
+    set: ["extract.voxel_m=0.4"]
+grid:
+  - variant: tunnelcd
+    scenarios: [smoke/one_box]
+    keys: {extract.voxel_m: [0.2, 0.3], query.radius_m: [3, 4.5]}
+"""
+
+
+def written(folder: Path, text: str) -> str:
+    path = folder / "plan.yaml"
+    path.write_text(text)
+    return str(path)
+
+
+def read(folder: Path, text: str = PLAN) -> Plan:
+    return load_plan(written(folder, text))
+
+
+def mistakes(folder: Path, text: str) -> list[str]:
+    with pytest.raises(InputError) as caught:
+        read(folder, text)
+    return [line.replace(f"{folder}/", "") for line in str(caught.value).splitlines()]
+
+
+def test_cells_by_hand(tmp_path: Path) -> None:
+    found = [(c.scenario, c.seed, c.preset, c.variant) for c in cells(read(tmp_path))]
+    grid = [
+        "tunnelcd[extract.voxel_m=0.2,query.radius_m=3]",
+        "tunnelcd[extract.voxel_m=0.2,query.radius_m=4.5]",
+        "tunnelcd[extract.voxel_m=0.3,query.radius_m=3]",
+        "tunnelcd[extract.voxel_m=0.3,query.radius_m=4.5]",
+    ]
+    plain = [("paper", "paper"), ("tunnelcd", "tunnelcd[extract.voxel_m=0.4]")]
+    one_box = [*plain, *(("tunnelcd", name) for name in grid)]
+    # 2 seeds x (2 variants + 2 x 2 grid points), then 2 seeds x 2 variants
+    assert found == [
+        *(("smoke/one_box", seed, *method) for seed in (7, 8) for method in one_box),
+        *(("smoke/unchanged", seed, *method) for seed in (7, 8) for method in plain),
+    ]
+
+
+def test_settings_of_a_site_change_the_configuration_and_not_the_name(tmp_path: Path) -> None:
+    paper = {c.scenario: c for c in cells(read(tmp_path)) if c.preset == "paper"}
+    assert {c.variant for c in paper.values()} == {"paper"}
+    assert paper["smoke/one_box"].config.query.radius_m == 4.5
+    assert paper["smoke/unchanged"].config.query.radius_m == 10
+
+
+def test_wide_worlds_get_what_the_presets_say_of_them(tmp_path: Path) -> None:
+    text = PLAN.replace('seeds: "7:9"', 'seeds: "7:9"\nwide: smoke/unchanged')
+    text = text.replace("query.radius_m=10", "query.threshold=2").replace("[smoke/one_box]", "[smoke/unchanged]")
+    found = {(c.scenario, c.variant): c.config.query for c in cells(read(tmp_path, text))}
+    wide = load_config("tunnelcd", site="wide").query
+    assert found["smoke/unchanged", "tunnelcd[extract.voxel_m=0.4]"] == wide
+    assert found["smoke/one_box", "tunnelcd[extract.voxel_m=0.4]"] == load_config("tunnelcd").query
+    # what the plan says goes over it
+    paper = found["smoke/unchanged", "paper"]
+    assert (paper.radius_m, paper.threshold) == (10, 2)
+    point = found["smoke/unchanged", "tunnelcd[extract.voxel_m=0.2,query.radius_m=3]"]
+    assert (point.radius_m, point.threshold) == (3, wide.threshold)
+
+
+def test_wide_names_worlds_of_the_plan_and_acts_after_the_merge(tmp_path: Path) -> None:
+    text = PLAN.replace('seeds: "7:9"', 'seeds: "7:9"\nwide: [narrow]')
+    assert mistakes(tmp_path, text) == [
+        "plan.yaml:4: wide.0 = 'narrow': wide names 'narrow', which is not in scenarios"
+    ]
+    text = "{name: m, until: merge, scenarios: [narrow, wide], wide: [wide], seeds: [7], variants: [{preset: paper}]}"
+    assert mistakes(tmp_path, text) == [
+        "plan.yaml:1: wide = 'wide': wide does nothing: the plan ends at the merge; leave it out, or leave out until"
+    ]
+
+
+def test_a_preset_that_says_nothing_of_wide_worlds_is_told(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("query: {radius_m: 3}\n")
+    text = f"{{name: m, scenarios: [wide], wide: [wide], seeds: [7], variants: [{{preset: {tmp_path}/mine.yaml}}]}}"
+    with pytest.raises(InputError, match=r"mine\.yaml: wide: missing"):
+        cells(read(tmp_path, text))
+
+
+def test_grid_points_get_their_values(tmp_path: Path) -> None:
+    config = {c.variant: c.config for c in cells(read(tmp_path))}["tunnelcd[extract.voxel_m=0.3,query.radius_m=3]"]
+    assert (config.extract.voxel_m, config.query.radius_m, config.query.compare) == (0.3, 3.0, "sphere")
+
+
+def test_all_mistakes_of_a_plan_at_once_with_lines(tmp_path: Path) -> None:
+    text = """\
+name: bad
+scenarios: [smoke/one_bx, smoke/unchanged]
+seeds: 12
+variants:
+  - preset: papr
+    set: ["query.radius=3", "extract.voxel_m=-1"]
+  - presset: paper
+grid:
+  - variant: tunnelcd
+    scenarios: [smoke/unchanged]
+    keys: {extract.voxl_m: [0.2]}
+speed: 3
+"""
+    lines = mistakes(tmp_path, text)
+    expected = {
+        2: ["smoke/one_bx", 'did you mean "smoke/one_box"?'],
+        3: ["seeds = 12", '"A:B" in quotes'],
+        5: ["'papr'", 'did you mean "paper"?'],
+        6: ["query.radius", 'did you mean "radius_m"?'],
+        7: ["presset", 'did you mean "preset"?'],
+        11: ["extract.voxl_m", 'did you mean "voxel_m"?'],
+        12: ["speed = 3: unknown key"],
+    }
+    for line, words in expected.items():
+        assert any(text.startswith(f"plan.yaml:{line}:") and all(w in text for w in words) for text in lines), (
+            line,
+            lines,
+        )
+    assert any("extract.voxel_m=-1" in line and "greater than" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("[smoke/one_box, smoke/unchanged]", "[smoke/one_box, smoke/one_box, smoke/unchanged]", "twice"),
+        ("{smoke/unchanged: [", "{unchanged/site1: [", "not in scenarios"),
+        ("    scenarios: [smoke/one_box]", "    scenarios: [unchanged/site1]", "not in scenarios"),
+        ("[0.2, 0.3]", "[0.2, 0.2]", "stands twice"),
+        ("[0.2, 0.3]", "[]", "at least one is needed"),
+    ],
+)
+def test_parts_that_do_not_fit(tmp_path: Path, old: str, new: str, words: str) -> None:
+    assert old in PLAN
+    assert any(words in line for line in mistakes(tmp_path, PLAN.replace(old, new)))
+
+
+def test_seeds_by_hand() -> None:
+    assert parse_seeds("3:6") == (3, 4, 5)
+    assert parse_seeds("7") == (7,)
+    assert parse_seeds([900001, 0]) == (900001, 0)
+
+
+@pytest.mark.parametrize("value", ["6:6", "6:3", "-1:2", "a:b", "1:2:3", "", [], [1, 1], [-1], [1.5], [True], 12, None])
+def test_what_is_no_seeds(value: object) -> None:
+    with pytest.raises(ValueError, match='expected "A:B"'):
+        parse_seeds(value)
+
+
+def test_names_and_slugs() -> None:
+    assert variant_name("paper", ()) == "paper"
+    assert variant_name("tunnelcd", ("a.b=0.3", "c=4")) == "tunnelcd[a.b=0.3,c=4]"
+    assert slug("tunnelcd[a.b=0.3,c=4]") == "tunnelcd_a.b=0.3,c=4_"
+    assert variant_name("my/own.yaml", ()) == "own"
+    assert world_slug("paper/site1") == "paper__site1"
+    assert setting_text("query.n_regions", None) == "query.n_regions=null"
+    assert setting_text("a.b", 4.5) == "a.b=4.5"
+
+
+def test_command_line_replaces_seeds_and_sets_every_variant(tmp_path: Path) -> None:
+    plan = changed_plan(read(tmp_path), seeds="1:2", settings=["query.radius_m=6", "extract.voxel_m=0.5"])
+    found = cells(plan)
+    assert {c.seed for c in found} == {1}
+    # the command line wins over the plan's own set, over what it sets for a site, and over its grid
+    assert {(c.config.query.radius_m, c.config.extract.voxel_m) for c in found} == {(6.0, 0.5)}
+    assert {c.variant for c in found if c.scenario == "smoke/unchanged"} == {
+        "paper[query.radius_m=6,extract.voxel_m=0.5]",
+        "tunnelcd[query.radius_m=6,extract.voxel_m=0.5]",
+    }
+
+
+def test_every_wrong_value_of_a_grid_is_named(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"= 'x': input should be a valid number.*; extract\.voxel_m = -2: input should"
+    ):
+        changed_plan(read(tmp_path), grid=["extract.voxel_m=0.3,x,-2"])
+
+
+@pytest.mark.parametrize(
+    ("settings", "grid"),
+    [(["extract.voxel_m=0.65"], ["extract.voxel_m=0.3,0.5"]), ([], ["extract.voxel_m=0.3", "extract.voxel_m=0.5"])],
+)
+def test_a_grid_that_something_else_writes_over_is_refused(
+    tmp_path: Path, settings: list[str], grid: list[str]
+) -> None:
+    with pytest.raises(InputError, match=r"--grid extract\.voxel_m: set twice"):
+        changed_plan(read(tmp_path), settings=settings, grid=grid)
+
+
+def test_command_line_grid_is_a_product_over_the_variants(tmp_path: Path) -> None:
+    text = PLAN.partition("grid:")[0]
+    plan = changed_plan(read(tmp_path, text), grid=["extract.voxel_m=0.1,0.2", "query.radius_m=3,5"])
+    variants = [c.variant for c in cells(plan) if (c.scenario, c.seed) == ("smoke/one_box", 7)]
+    assert variants == [
+        f"{preset}[extract.voxel_m={voxel},query.radius_m={radius}]"
+        for preset in ("paper", "tunnelcd")
+        for voxel in ("0.1", "0.2")
+        for radius in ("3", "5")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "words"),
+    [
+        ({"seeds": "5:5"}, "--seeds 5:5"),
+        ({"settings": ["query.radius=3"]}, 'did you mean "radius_m"?'),
+        ({"settings": ["query.radius_m"]}, "expected key=value"),
+        ({"grid": ["query.radius_m=3,,4"]}, "--grid"),
+        ({"grid": ["query.radius_m=3,x"]}, "query.radius_m = 'x'"),
+    ],
+)
+def test_mistakes_of_the_command_line(tmp_path: Path, kwargs: dict[str, object], words: str) -> None:
+    with pytest.raises(InputError, match="--") as caught:
+        changed_plan(read(tmp_path), **kwargs)  # type: ignore[arg-type]
+    assert words in str(caught.value)
+
+
+def test_unchanged_plan_stays_equal(tmp_path: Path) -> None:
+    plan = read(tmp_path)
+    assert changed_plan(plan) == plan
+
+
+@pytest.mark.parametrize("name", plan_names())
+def test_shipped_plans_are_valid(name: str) -> None:
+    assert cells(load_plan(name))
+
+
+def test_paper_plan_holds_what_the_page_shows() -> None:
+    found = cells(load_plan("paper"))
+    presets = ["paper", "paper-topn", "paper-paired", "voxel-diff", "untrained", "random-regions", "tunnelcd"]
+    for scenario in ("paper/site1", "paper/site2", "unchanged/site1"):
+        plain = [c for c in found if c.scenario == scenario and "[" not in c.variant]
+        assert sorted(c.variant for c in plain) == sorted(presets)
+        assert {c.config.query.radius_m for c in plain} == {10.0 if scenario == "paper/site2" else 4.5}
+    grid = [c for c in found if "[" in c.variant]
+    assert len({(c.config.extract.voxel_m, c.config.query.radius_m) for c in grid}) == len(grid) == 9
+    assert {(c.scenario, c.preset) for c in grid} == {("paper/site1", "paper-paired")}
+
+
+def test_unknown_plan_names_the_nearest() -> None:
+    with pytest.raises(InputError, match='did you mean "smoke"'):
+        load_plan("smok")
+
+
+def test_the_example_of_the_documentation_is_a_plan(tmp_path: Path) -> None:
+    documentation = plan_module.__doc__ or ""
+    plan = read(tmp_path, textwrap.dedent(documentation.partition("\n\n")[2]))
+    assert set(Plan.model_fields) == plan.model_fields_set
+    assert plan.seeds == (20000, 20001)
+    # of each seed: one variant on both sites and on two more worlds of one, another and four grid points on the other
+    assert len(cells(plan)) == 2 * ((2 + 2) + 1 + 4)
+    assert {cell.variant for cell in cells(plan) if cell.preset == "paper"} == {"paper[extract.voxel_m=0.4]"}
+
+
+ORACLES = """\
+name: merges
+scenarios: [smoke/one_box]
+seeds: [7]
+until: merge
+variants:
+  - {preset: tunnelcd}
+  - {preset: tunnelcd, oracle_merge: {}}
+  - {preset: tunnelcd, oracle_merge: {noise_m: 0.1, noise_deg: 0.2}}
+  - {preset: tunnelcd, oracle_merge: {noise_m: 0.05}, set: ["map.voxel_m=0.3"]}
+  - {preset: paper, oracle_merge: {}}
+"""
+
+
+def test_oracles_are_variants_of_their_own(tmp_path: Path) -> None:
+    found = cells(read(tmp_path, ORACLES))
+    assert [(c.preset, c.variant) for c in found] == [
+        ("tunnelcd", "tunnelcd"),
+        ("tunnelcd", "oracle-merge"),
+        ("tunnelcd", "oracle-merge[noise_m=0.1,noise_deg=0.2]"),
+        ("tunnelcd", "oracle-merge[noise_m=0.05,noise_deg=0,map.voxel_m=0.3]"),
+        ("paper", "oracle-merge[preset=paper]"),
+    ]
+    noises = [None if c.oracle is None else (c.oracle.noise_m, c.oracle.noise_deg) for c in found]
+    assert noises == [None, (0, 0), (0.1, 0.2), (0.05, 0), (0, 0)]
+    # the later stages are the preset's
+    assert found[1].config == found[0].config
+    assert found[3].config.map.voxel_m == 0.3
+
+
+def test_a_plan_may_end_at_the_merge(tmp_path: Path) -> None:
+    assert {c.until for c in cells(read(tmp_path, ORACLES))} == {"merge"}
+    assert {c.until for c in cells(read(tmp_path))} == {None}
+
+
+def test_the_command_line_keeps_oracles_and_the_end(tmp_path: Path) -> None:
+    plan = read(tmp_path, ORACLES)
+    assert changed_plan(plan) == plan
+    found = cells(changed_plan(plan, settings=["map.keyframe_spacing_m=2"], grid=["map.voxel_m=0.1,0.4"]))
+    assert len(found) == 10
+    assert {c.until for c in found} == {"merge"}
+    assert "oracle-merge[noise_m=0.1,noise_deg=0.2,map.voxel_m=0.4,map.keyframe_spacing_m=2]" in {
+        c.variant for c in found
+    }
+    # a provenance holds no key that the plan does not say
+    variants = plan.model_dump(mode="json")["variants"]
+    assert ["oracle_merge" in variant for variant in variants] == [False, True, True, True, True]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("until: merge", "until: merg", ["plan.yaml:4:", "until = 'merg'", 'did you mean "merge"?']),
+        ("noise_deg: 0.2", "noise_dg: 0.2", ["plan.yaml:8:", "noise_dg", 'did you mean "noise_deg"?']),
+        ("noise_m: 0.1", "noise_m: -0.1", ["plan.yaml:8:", "noise_m = -0.1", "greater than or equal to 0"]),
+        ("noise_deg: 0.2", "noise_deg: .nan", ["plan.yaml:8:", "noise_deg"]),
+        # a bare key would be no oracle, and nothing would tell
+        ("oracle_merge: {noise_m: 0.1, noise_deg: 0.2}", "oracle_merge: ", ["plan.yaml:8:", "{} is without noise"]),
+        ("{noise_m: 0.1, noise_deg: 0.2}", "0.1", ["plan.yaml:8:", "expected {noise_m: ..., noise_deg: ...}"]),
+        ("{noise_m: 0.1, noise_deg: 0.2}", "{noise_m: 0}", ["variant oracle-merge stands twice"]),
+        ("oracle_merge: {noise_m: 0.05}", "oracle_merg: {}", ["plan.yaml:9:", 'did you mean "oracle_merge"?']),
+    ],
+)
+def test_mistakes_of_oracles_and_of_the_end(tmp_path: Path, old: str, new: str, words: list[str]) -> None:
+    assert old in ORACLES
+    (line,) = mistakes(tmp_path, ORACLES.replace(old, new))
+    assert all(word in line for word in words), line
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("map.voxel_m=0.3", "merge.inlier_m=0.2", ["plan.yaml:9:", "merge.inlier_m=0.2 does nothing", "by the truth"]),
+        ("map.voxel_m=0.3", "query.radius_m=3", ["query.radius_m=3 of tunnelcd does nothing", "ends at the merge"]),
+        (
+            "{preset: paper,",
+            "{preset: paper, per_scenario: {smoke/one_box: cluster.min_points=9},",
+            ["cluster.min_points"],
+        ),
+        (
+            "  - {preset: paper, oracle_merge: {}}",
+            "grid: [{variant: paper, scenarios: [smoke/one_box], keys: {extract.voxel_m: [0.2]}}]",
+            ["extract.voxel_m of the grid of paper does nothing"],
+        ),
+    ],
+)
+def test_settings_that_nothing_reads(tmp_path: Path, old: str, new: str, words: list[str]) -> None:
+    assert old in ORACLES
+    (line,) = mistakes(tmp_path, ORACLES.replace(old, new))
+    assert all(word in line for word in words), line
+
+
+def test_the_same_settings_are_welcome_where_they_are_read(tmp_path: Path) -> None:
+    text = ORACLES.replace("until: merge\n", "").replace("map.voxel_m=0.3", "query.radius_m=3")
+    assert cells(read(tmp_path, text))[3].config.query.radius_m == 3
+    with pytest.raises(InputError, match=r"query.radius_m=3 of tunnelcd does nothing"):
+        changed_plan(read(tmp_path, ORACLES), settings=["query.radius_m=3"])
+
+
+def test_settings_of_the_merge_on_the_command_line_pass_by_the_oracles(tmp_path: Path) -> None:
+    plan = changed_plan(read(tmp_path, ORACLES), settings=["merge.refine=none"], grid=["merge.inlier_m=0.1,0.2"])
+    assert [c.variant for c in cells(plan)] == [
+        "tunnelcd[merge.inlier_m=0.1,merge.refine=none]",
+        "tunnelcd[merge.inlier_m=0.2,merge.refine=none]",
+        "oracle-merge",
+        "oracle-merge[noise_m=0.1,noise_deg=0.2]",
+        "oracle-merge[noise_m=0.05,noise_deg=0,map.voxel_m=0.3]",
+        "oracle-merge[preset=paper]",
+    ]
+    assert planned_cases(plan) == {(c.scenario, c.seed, c.variant) for c in cells(plan)}
+
+
+def test_a_variant_may_be_for_some_scenarios_alone(tmp_path: Path) -> None:
+    text = PLAN.replace("  - preset: tunnelcd\n", "  - preset: tunnelcd\n    scenarios: smoke/unchanged\n")
+    plan = read(tmp_path, text)
+    found = {(cell.scenario, cell.variant) for cell in cells(plan)}
+    assert ("smoke/unchanged", "tunnelcd[extract.voxel_m=0.4]") in found
+    assert ("smoke/one_box", "tunnelcd[extract.voxel_m=0.4]") not in found
+    assert {(scenario, variant) for scenario, _, variant in planned_cases(plan)} == found
+    assert cells(changed_plan(plan)) != [] and changed_plan(plan) == plan
+    assert mistakes(
+        tmp_path, text.replace("scenarios: smoke/unchanged", "scenarios: [smoke/unchanged, paper/site1]")
+    ) == [
+        "plan.yaml:8: variants.1.scenarios.1 = 'paper/site1': scenarios of tunnelcd names 'paper/site1', which is no "
+        "world of the plan"
+    ]
+
+
+def test_all_mistakes_between_parts_are_told_at_once_with_their_lines(tmp_path: Path) -> None:
+    text = PLAN.replace("{smoke/unchanged: [", "{unchanged/site1: [").replace("[0.2, 0.3]", "[0.2, 0.2]")
+    found = mistakes(tmp_path, text.replace("    scenarios: [smoke/one_box]", "    scenarios: [unchanged/smooth]"))
+    assert [line.partition(": ")[0] for line in found] == ["plan.yaml:6", "plan.yaml:11"]
+    found = mistakes(tmp_path, text)
+    assert [line.partition(": ")[0] for line in found] == ["plan.yaml:6", "plan.yaml:4", "plan.yaml:4"]
+
+
+def test_a_report_may_be_about_both(tmp_path: Path) -> None:
+    for written_as, subjects in (("regions", ("regions",)), ("[regions, objects]", ("regions", "objects")), ("", ())):
+        plan = read(tmp_path, f"{PLAN}report: {written_as}\n")
+        assert plan.report == subjects
+        assert reported({"plan": plan.model_dump(mode="json")}) == subjects
+    assert reported({"plan": {"report": "objects"}}) == ("objects",)  # as runs of before wrote it
+    (told,) = mistakes(tmp_path, f"{PLAN}report: [regions, object]\n")
+    assert 'did you mean "objects"?' in told
+
+
+def test_every_option_of_the_command_line_is_checked_at_once(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        changed_plan(
+            read(tmp_path), seeds="a", settings=["query.radus_m=3", "x"], grid=["extract.voxel=1", "extract.voxel_m"]
+        )
+    lines = str(caught.value).splitlines()
+    assert [line.partition(": ")[0] for line in lines] == [
+        "--seeds a", "--set query.radus_m=3", "--set x", "--grid extract.voxel=1", "--grid extract.voxel_m",
+    ]  # fmt: skip
+    assert [line.count("did you mean") for line in lines] == [0, 1, 0, 1, 0]

@@ -1,0 +1,94 @@
+"""The plans about regions: how many pairs of which family, how long a way, and that thresholds see no test pair."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from itertools import pairwise
+
+import pytest
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import Document, validated
+from eval.core.domains import domain_of
+from eval.plans.plan import Plan, cells, load_plan
+from scenarios import load_scenario
+from scenarios.schema import Scenario
+
+VALIDATION, TEST = range(10000, 20000), range(20000, 30000)
+METHODS = (
+    "paper", "paper-paired", "untrained", "scan-context", "solid", "sphere-difference", "voxel-diff", "c2c", "tunnelcd",
+    "m3c2", "dufomap",
+)  # fmt: skip
+WIDE = ("regions/wide", "regions/site2", "null/wide")
+
+
+def pairs(name: str) -> set[tuple[str, int]]:
+    return {(cell.scenario, cell.seed) for cell in cells(load_plan(name))}
+
+
+def way_m(scenario: Scenario) -> float:
+    """Way of the after session along straight edges; the drive rounds the corners, which makes it a little shorter."""
+    nodes = scenario.tunnel.nodes
+    edges = sum(math.dist(nodes[a], nodes[b]) for a, b in pairwise(scenario.after.route))
+    return edges - scenario.after.start_m - scenario.after.end_m
+
+
+def test_regions_has_a_hundred_test_pairs_in_and_out_of_distribution() -> None:
+    counts = Counter(scenario for scenario, _ in pairs("regions"))
+    assert counts == {
+        "regions/narrow": 30, "regions/wide": 24, "regions/network": 24,
+        "regions/cave": 16, "regions/site1": 10, "regions/site2": 4,
+    }  # fmt: skip
+    assert counts.total() >= 100
+    assert {domain_of(name) for name in counts} == {"in", "out"}
+    assert load_plan("regions").report == ("regions",)
+
+
+def test_null_drives_five_kilometres_where_nothing_changed() -> None:
+    counts = Counter(scenario for scenario, _ in pairs("null"))
+    assert set(counts) == {f"null/{name}" for name in ("narrow", "wide", "network", "cave", "site1")}
+    scenarios = [load_scenario(name, seed) for name, seed in pairs("null")]
+    assert sum(way_m(scenario) for scenario in scenarios) > 1.2 * 5000
+    assert {scenario.after.route[0] == scenario.before.route[-1] for scenario in scenarios} == {True, False}
+    assert min(scenario.after.end_m for scenario in scenarios) < 5 < 40 < max(s.after.end_m for s in scenarios)
+    assert len(scenarios) >= 40  # one in twenty of fewer would be all or none
+    assert load_plan("null").report == ("regions",)
+
+
+def test_thresholds_are_set_on_twenty_validation_pairs_of_each_trained_family() -> None:
+    assert Counter(scenario for scenario, _ in pairs("calibrate")) == dict.fromkeys(
+        ("null/narrow", "null/network", "null/wide"), 20
+    )
+    assert {domain_of(scenario) for scenario, _ in pairs("calibrate")} == {"in"}
+
+
+@pytest.mark.parametrize(
+    ("name", "seeds", "others"),
+    [("regions", TEST, {"random-regions"}), ("null", TEST, set()), ("calibrate", VALIDATION, set())],
+)
+def test_every_method_runs_on_the_seeds_that_are_its(name: str, seeds: range, others: set[str]) -> None:
+    found = cells(load_plan(name))
+    assert {cell.seed for cell in found} <= set(seeds)
+    assert {cell.variant for cell in found} == {*METHODS, *others}
+    for cell in found:
+        assert cell.config.query.radius_m == (10.0 if cell.scenario in WIDE else 4.5)
+
+
+def test_the_two_plans_of_test_pairs_judge_at_the_same_thresholds() -> None:
+    found = {
+        name: {(c.variant, c.scenario.partition("/")[2]): c.config.query for c in cells(load_plan(name))}
+        for name in ("regions", "null")
+    }
+    shared = found["regions"].keys() & found["null"].keys()
+    assert len(shared) == 5 * len(METHODS)
+    assert all(found["regions"][key] == found["null"][key] for key in shared)
+
+
+def test_a_plan_that_ends_at_the_merge_has_no_regions_to_report() -> None:
+    document = {
+        "name": "x", "scenarios": ["narrow"], "seeds": "1", "variants": [{"preset": "tunnelcd"}],
+        "until": "merge", "report": "regions",
+    }  # fmt: skip
+    with pytest.raises(InputError, match="report: regions needs regions"):
+        validated(Plan, Document("x.yaml", document))

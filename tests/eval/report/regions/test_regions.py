@@ -1,0 +1,165 @@
+"""The regions on the page: who wins is said first, whoever it is."""
+
+import html
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from eval.report.page import write_page
+from eval.report.regions.regions import draw_regions
+from eval.running.run_data import read_run
+from eval.running.runfolder import RunFolder
+from eval.tables.region_table import FILES, region_tables
+
+METHODS = ("paper", "voxel-diff", "c2c", "tunnelcd")
+# how surely each method tells a change from none, of which its scores are made
+SKILL = {"paper": 0.3, "voxel-diff": 2.0, "c2c": 3.0, "tunnelcd": 2.5}
+
+
+def made_up(
+    skill: dict[str, float], families: dict[str, int], n_failed: int = 0
+) -> tuple[pd.DataFrame, dict[str, pd.DataFrame]]:
+    """Return results and items of a run whose scores are drawn: two changes and six other candidates in every pair."""
+    rows, items = [], {name: [] for name in ("changes", "regions", "keyframes")}
+    for family, n_pairs in families.items():
+        for seed in range(n_pairs):
+            draw = np.random.default_rng([seed, len(family)])
+            noise, volume = draw.normal(size=48), draw.uniform(0.05, 12, 2)
+            for variant, gain in skill.items():
+                names = {"scenario": family, "seed": seed, "variant": variant}
+                status = "merge_refused" if variant == "paper" and seed < n_failed else "ok"
+                is_hit = np.arange(8) < 2
+                scores = noise[:8] + gain * is_hit
+                order = np.argsort(-scores)
+                is_ok = status == "ok"
+                if is_ok:
+                    items["regions"] += [
+                        {**names, "region": place, "score": scores[i], "is_reported": scores[i] > 1.5,
+                         "is_withdrawn": False,
+                         "outcome": "true" if is_hit[i] else "false", "found_changes": str(i + 1) if is_hit[i] else ""}
+                        for place, i in enumerate(order)
+                    ]  # fmt: skip
+                    items["keyframes"] += [
+                        {**names, "keyframe": i, "score": value + gain * (i < 8), "label": int(i < 8)}
+                        for i, value in enumerate(noise[8:])
+                    ]
+                found = [bool(is_ok and score > 1.5) for score in scores[:2]]
+                items["changes"] += [
+                    {**names, "id": i + 1, "is_observable": True, "n_truth_cells": 20, "is_found": found[i],
+                     "hull_volume_m3": volume[i], "n_returns": 500 * volume[i], "range_m": 1 + volume[i] / 3}
+                    for i in range(2)
+                ]  # fmt: skip
+                at_k = float(is_hit[order[:2]].mean()) if is_ok else 0.0
+                rows.append(
+                    {**names, "family": family, "status": status, "error": "", "n_changes": 2, "n_observable": 2,
+                     "score_radius_m": 10.0 if "wide" in family else 4.5, "after_path_m": 200.0,
+                     "region_auroc": 0.8 if is_ok else np.nan, "region_recall_at_k": at_k,
+                     "region_recall": float(np.mean(found)), "region_precision": np.nan,
+                     "n_false_regions": int((scores[2:] > 1.5).sum()), "n_found_changes": sum(found),
+                     "bytes_map_before": 1.2e6, "bytes_regions_before": 4e4 if variant == "tunnelcd" else 1.2e6,
+                     "t_descriptor_per_keyframe_s": 0.011, "t_cd_per_region_s": 0.02, "is_unchanged_pair": False,
+                     "is_alarm": np.nan, "merge_error_m": 0.01, "merge_error_deg": 0.01}
+                )  # fmt: skip
+    return pd.DataFrame(rows), {name: pd.DataFrame(each) for name, each in items.items()}
+
+
+def write_run(folder: Path, results: pd.DataFrame, items: dict[str, pd.DataFrame], plan: dict[str, object]) -> Path:
+    folder.mkdir()
+    results.to_csv(folder / "results.csv", index=False)
+    for name, found in {**items, **region_tables(results, items)}.items():
+        if len(found):
+            found.to_csv(folder / f"{name}.csv", index=False)
+    RunFolder(folder).write_provenance({"tool": "tunnelcd", "plan": plan, "machine": {}, "command": "tunnelcd run x"})
+    return folder
+
+
+def words(page: Path) -> str:
+    return re.sub(r"\s+", " ", html.unescape(re.sub(r"<[^>]+>", " ", page.read_text())))
+
+
+@pytest.fixture(name="run", scope="module")
+def run_fixture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    results, items = made_up(SKILL, {"regions/narrow": 12, "regions/wide": 8, "regions/cave": 6}, n_failed=1)
+    return write_run(tmp_path_factory.mktemp("page") / "run", results, items, {"name": "made-up", "report": "regions"})
+
+
+def test_the_first_sentences_name_the_winner_even_if_it_is_a_baseline(run: Path) -> None:
+    part = draw_regions(read_run(run))
+    assert part is not None
+    table = pd.read_csv(run / "regions_table.csv")
+    own = table[table["domain"] == "in"].set_index("variant")["recall_at_0.1"].round(2)
+    assert own.idxmax() == "c2c"
+    told = next(line for line in part.sentences if line.startswith("In distribution, recall at 0.1"))
+    assert f"c2c is best with {own['c2c']:.2f}" in told
+    assert f"{own['c2c'] - own['tunnelcd']:.2f} ahead of tunnelcd ({own['tunnelcd']:.2f})" in told
+    assert "A simple baseline wins here" in told
+    assert "missed: " in part.sentences[0]
+    assert "less that of c2c (in" in part.sentences[0]
+    assert any("3 of 104 cases gave no answer" in line for line in part.sentences)
+
+
+def test_tables_and_plots_are_on_the_page_before_anything_else(run: Path) -> None:
+    page = write_page(run)
+    told = words(page)
+    assert told.index("Finding the changed places") < told.index("Every preset on every scenario")
+    for title in ("How keyframe scores tell", "Changes found against false regions", "Recall by what a change is like"):
+        assert title in told
+    part = draw_regions(read_run(run))
+    assert part is not None
+    assert [len(table.rows) for table in part.tables] == [3 * len(METHODS), 8]
+    assert len(part.plots) == 3
+    assert not part.missing
+
+
+def test_what_is_missed_is_bold_and_what_is_met_is_not(run: Path) -> None:
+    part = draw_regions(read_run(run))
+    assert part is not None
+    verdicts = {(cells[0].text, cells[1].text): cells[-1] for _, cells in part.tables[1].rows}
+    cell = verdicts["AUROC (tunnelcd)", "in distribution"]
+    assert (cell.text, cell.is_best) == ("missed", True)
+    met = [each for each in verdicts.values() if each.text == "met"]
+    assert not any(each.is_best for each in met)
+
+
+def test_a_run_of_another_kind_has_no_such_part(run: Path, tmp_path: Path) -> None:
+    results, items = made_up({"tunnelcd": 2.0}, {"narrow": 2})
+    other = write_run(tmp_path / "other", results, items, {"name": "other"})
+    assert draw_regions(read_run(other)) is None
+    assert "Finding the changed places" not in words(write_page(other))
+
+
+def test_tables_that_are_not_there_are_named(run: Path, tmp_path: Path) -> None:
+    results, items = made_up({"tunnelcd": 2.0}, {"narrow": 2})
+    bare = write_run(tmp_path / "bare", results, items, {"name": "x", "report": "regions"})
+    for name in FILES:
+        (bare / f"{name}.csv").unlink()
+    told = words(write_page(bare))
+    assert "regions_table.csv is not in the run folder" in told
+
+
+def test_silence_is_told_of_unchanged_pairs(tmp_path: Path) -> None:
+    results, items = made_up({"tunnelcd": 2.0}, {"null/narrow": 4})
+    results = results.assign(n_changes=0, n_observable=0, is_unchanged_pair=True, is_alarm=[0, 0, 1, 0])
+    items["changes"] = pd.DataFrame()
+    items["regions"] = items["regions"].assign(found_changes="")
+    items["keyframes"] = items["keyframes"].assign(label=0)
+    quiet = write_run(tmp_path / "quiet", results, items, {"name": "x", "report": "regions"})
+    part = draw_regions(read_run(quiet))
+    assert part is not None
+    assert "Silent where nothing changed (0.8 km): tunnelcd 3 of 4." in part.sentences
+    assert json.loads((quiet / "provenance.json").read_text())["plan"]["report"] == "regions"
+    assert "3 of 4" in words(write_page(quiet))
+
+
+def test_unchanged_pairs_among_others_are_not_said_to_be_missing(run: Path) -> None:
+    results = pd.read_csv(run / "results.csv")
+    is_quiet = results["seed"] == results["seed"].min()
+    results.assign(is_unchanged_pair=is_quiet).to_csv(run / "results.csv", index=False)
+    told = words(write_page(run))
+    n = len(results[is_quiet].drop_duplicates(["scenario", "seed"]))
+    assert f"No scenario consists of unchanged pairs alone; the {n} among the others are judged under" in told
+    assert "No unchanged pair was run" not in told

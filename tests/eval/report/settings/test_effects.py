@@ -1,0 +1,185 @@
+"""What the page shows of worlds that repeat another one with something set otherwise."""
+
+import base64
+import html
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.image import imread
+
+from eval.core.figures import BLUE, ORANGE
+from eval.report.page import write_page
+from eval.report.settings.effects import draw_effects, shortened
+from eval.report.settings.figures import Effect, effect_plot
+from eval.running.run_data import first_seed, named_variants, read_run, scenarios
+
+NAN = float("nan")
+PLAIN, NOISE, BOTH = (
+    "n[p.s=1]",
+    "n[p.s=1][sensor.range_noise=false]",
+    "n[p.s=1][sensor.range_noise=false,sensor.sub_rays=7]",
+)
+OTHER = "smoke/unchanged"
+SEEDS = range(6)
+
+
+def rows_of(world: str, variant: str, recalls: list[float], *, unchanged: bool = False) -> list[dict[str, object]]:
+    return [
+        {
+            "scenario": world,
+            "seed": seed,
+            "variant": variant,
+            "status": "ok",
+            "region_recall": recall,
+            "region_recall_at_k": recall,
+            "object_iou_point": recall / 2,
+            "merge_error_m": 0.01,
+            "n_observable": 0 if unchanged else 3,
+            "is_unchanged_pair": unchanged,
+            "is_alarm": False,
+        }
+        for seed, recall in zip(SEEDS, recalls, strict=True)
+    ]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """Seven worlds' rows: six seeds, two variants on three worlds, one variant on an unchanged pair."""
+    plain = [0.2, 0.4, 0.5, 0.2, 0.4, 0.5]
+    rows = [
+        *rows_of(PLAIN, "ours", plain),
+        *rows_of(PLAIN, "theirs", plain),
+        # every pair gains 0.25; three gain and three lose
+        *rows_of(NOISE, "ours", [value + 0.25 for value in plain]),
+        *rows_of(NOISE, "theirs", [value + 0.1 * (-1) ** seed for seed, value in enumerate(plain)]),
+        *rows_of(BOTH, "ours", [value - 0.125 for value in plain]),
+        *rows_of(OTHER, "ours", [NAN] * 6, unchanged=True),
+        *rows_of(f"{OTHER}[frozen=true]", "ours", [NAN] * 6, unchanged=True),
+    ]
+    pd.DataFrame(rows).to_csv(tmp_path / "results.csv", index=False)
+    return tmp_path
+
+
+def test_table_by_hand(run: Path) -> None:
+    first, second = draw_effects(read_run(run))
+    assert (first.reference, second.reference) == (PLAIN, OTHER)
+    assert first.table.headings[:4] == ("setting", "pairs", "observable changes", "region recall")
+    lines = {(group, cells[0].text): cells for group, cells in first.table.rows}
+    assert [cell.text for cell in lines["ours", "as it is: mean"]] == [
+        "as it is: mean",
+        "6",
+        "3",
+        "0.37",
+        "0.37",
+        "0.18",
+        "0.010",
+    ]
+    noise = lines["ours", "range_noise=false"]
+    assert [cell.text for cell in noise[1:]] == ["6", "0", "+0.25", "+0.25", "+0.12", "0.000"]
+    assert noise[3].interval == "+0.25 to +0.25"
+    assert [cell.is_best for cell in noise] == [False, False, False, True, True, True, False]
+    assert lines["ours", "range_noise=false, sub_rays=7"][3].text == "\u22120.12"
+    undecided = lines["theirs", "range_noise=false"][3]
+    assert (undecided.text, undecided.is_best) == ("0.00", False)
+    # a variant that was not run there has no number, and no world is left out
+    assert [cell.text for cell in lines["theirs", "range_noise=false, sub_rays=7"]][1:] == ["0", *["\u2013"] * 5]
+    # nothing to recall where nothing changed
+    assert second.table.headings == ("setting", "pairs", "observable changes", "merge error [m]")
+    assert second.picture is None
+    assert "its sensor" in first.table.caption
+
+
+def test_five_pairs_that_agree_are_not_set_in_bold(run: Path) -> None:
+    results = pd.read_csv(run / "results.csv")
+    results[results["seed"] < 5].to_csv(run / "results.csv", index=False)
+    first, _ = draw_effects(read_run(run))
+    assert not any(cell.is_best for _, cells in first.table.rows for cell in cells)
+    assert "+0.25" in {cell.text for _, cells in first.table.rows for cell in cells}
+
+
+def test_repeated_worlds_stand_under_their_own_heading_and_nowhere_else(run: Path) -> None:
+    assert scenarios(read_run(run), unchanged=False) == [PLAIN]
+    assert scenarios(read_run(run), unchanged=True) == [OTHER]
+    page = html.unescape(write_page(run).read_text())
+    groups = re.findall(r'<th class="group"[^>]*>(.*?)</th>', page)
+    assert groups == [PLAIN, OTHER, "ours", "theirs", "ours"]
+    assert re.findall(r'<h2 id="site-\d+">(.*?)</h2>', page) == [PLAIN]
+    assert '<h2 id="effects">' in page
+    assert "3 further worlds repeat n[p.s=1] and smoke/unchanged" in page
+    assert f"n = 12 session pairs ({PLAIN}: 6, {OTHER}: 6" in page
+    assert NOISE not in (run / "results.tex").read_text()
+
+
+def test_a_page_without_such_worlds_has_no_such_heading(run: Path) -> None:
+    results = pd.read_csv(run / "results.csv")
+    results[results["scenario"].isin([NOISE, OTHER])].to_csv(run / "results.csv", index=False)
+    assert draw_effects(read_run(run)) == []
+    # a world with settings is shown like any other where the one without them was not run
+    assert scenarios(read_run(run), unchanged=False) == [NOISE]
+    page = write_page(run).read_text()
+    assert "effects" not in re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL)
+    assert "further worlds" not in page
+
+
+def test_a_plain_scenario_of_other_seeds_in_the_same_folder_hides_nothing(run: Path) -> None:
+    results = pd.read_csv(run / "results.csv")
+    plain = results[(results["scenario"] == PLAIN) & (results["seed"] == 0)].assign(scenario="n", seed=10000)
+    only_here = plain.head(1).assign(scenario=NOISE, seed=2, variant="foreign")
+    before = draw_effects(read_run(run))
+    pd.concat([results, plain, only_here]).to_csv(run / "results.csv", index=False)
+    data = read_run(run)
+    assert draw_effects(data) == before
+    # what no effect shows stands in the main tables
+    assert scenarios(data, unchanged=False) == [PLAIN, "n", NOISE]
+    assert named_variants(data, NOISE) == ["foreign"]
+    assert first_seed(data, NOISE) == 2
+    assert f"({PLAIN}: 6, {OTHER}: 6, n: 1, {NOISE}: 1;" in write_page(run).read_text()
+    # at the same seeds it is one more thing to be held against, and the others stay with their own
+    pd.concat([results, plain.assign(seed=0)]).to_csv(run / "results.csv", index=False)
+    assert [part.reference for part in draw_effects(read_run(run))] == ["n", PLAIN, OTHER]
+
+
+def test_one_is_not_written_as_many(run: Path) -> None:
+    results = pd.read_csv(run / "results.csv")
+    is_one = results["scenario"].isin([PLAIN, NOISE]) & (results["seed"] == 0)
+    results[is_one].to_csv(run / "results.csv", index=False)
+    page = html.unescape(write_page(run).read_text())
+    assert f"1 further world repeats {PLAIN} with" in page
+    assert "Dots are means over 1 session pair, lines" in page
+
+
+def test_a_label_is_text_and_never_markup(run: Path) -> None:
+    results = pd.read_csv(run / "results.csv")
+    results["scenario"] = results["scenario"].str.replace("frozen=true", "<b>=&x")
+    results.to_csv(run / "results.csv", index=False)
+    page = write_page(run).read_text()
+    assert "<b>=&x" not in page
+    assert "&lt;b&gt;=&amp;x" in page
+
+
+def test_settings_are_shortened_by_the_group_they_share() -> None:
+    assert shortened(["sensor.a=1", "sensor.b=2,sensor.c=3"]) == ("sensor", ["a=1", "b=2, c=3"])
+    assert shortened(["sensor.a=1", "platform.b=2"]) == ("", ["sensor.a=1", "platform.b=2"])
+
+
+def test_the_picture_puts_gains_right_of_zero_and_losses_left() -> None:
+    effects = [Effect("up", "ours", 0.2, 0.1, 0.3), Effect("down", "theirs", -0.2, -0.3, -0.1)]
+    effects += [Effect("up", "undefined", NAN, NAN, NAN)]
+    address = effect_plot({"recall": effects})
+    image = imread(io.BytesIO(base64.b64decode(address.partition(",")[2])))[..., :3]
+    plot = image[image.shape[0] // 5 :]  # below the legend
+
+    def places(colour: str) -> np.ndarray:
+        return np.argwhere(np.abs(plot - np.array(to_rgb(colour))).max(axis=2) < 0.02).mean(axis=0)
+
+    (up_row, up_column), (down_row, down_column) = places(BLUE), places(ORANGE)
+    assert up_row < down_row
+    dark = (plot < 0.2).all(axis=2).sum(axis=0)
+    (zero,) = np.flatnonzero(dark == dark.max())[:1]
+    assert down_column < zero < up_column
+    assert zero - down_column == pytest.approx(up_column - zero, rel=0.05)

@@ -1,0 +1,364 @@
+"""Predictions of other programs: the README's script, a whole run of them, and every way in which they can be wrong."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from cdpipe.core.geometry import transform
+from eval.running.runfolder import RunFolder, write_json
+from eval.scoring import answer_check
+from eval.scoring.scoring import METRICS_VERSION
+from eval.truth.ground_truth import load_ground_truth
+
+Command = Callable[..., tuple[int, str, str]]
+ROOT = Path(__file__).parents[3]
+SEEDS = (3, 4)
+
+
+def arrays_of(pair: Path, merge: np.ndarray) -> dict[str, Any]:
+    """The truth about the after session's changes, as a foreign program writes it: nothing that may be left out."""
+    truth = load_ground_truth(pair)
+    universe = truth.after.universe
+    rows = [universe.rows_of_change(change.id) for change in truth.pair.changes if change.session == "after"]
+    points = [universe.points_odom[own].astype(np.float64) for own in rows]
+    return {
+        "region_centres_map": transform(merge, np.array([cloud.mean(axis=0) for cloud in points])),
+        "region_scores": np.arange(len(rows), 0.0, -1.0),
+        "object_points_odom": np.concatenate(points),
+        "object_point_odom_offsets": np.cumsum([0, *map(len, points)]),
+    }
+
+
+def document_of(n_objects: int, merge: np.ndarray) -> dict[str, Any]:
+    return {
+        "format": "tunnelcd-answer", "format_version": 1, "status": "ok", "method": "theirs",
+        "before_T_after": merge.tolist(), "radius_m": 2.0, "seconds": {"t_merge_s": 0.5, "t_cd_s": 0.25},
+        "objects": [{"session": "after", "kind": "added"}] * n_objects,
+    }  # fmt: skip
+
+
+def write_prediction(folder: Path, document: dict[str, Any], arrays: dict[str, Any]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "answer.json").write_text(json.dumps(document))
+    np.savez(folder / "answer.npz", **arrays)
+    return folder
+
+
+@pytest.fixture
+def good(tiny_pair: Path, tiny_merge: np.ndarray) -> tuple[dict[str, Any], dict[str, Any]]:
+    arrays = arrays_of(tiny_pair, tiny_merge)
+    return document_of(len(arrays["region_scores"]), tiny_merge), arrays
+
+
+@pytest.fixture
+def run(tmp_path: Path, tiny_pair: Path) -> RunFolder:
+    """Two pairs that are one and the same, and one cell that a run made of each."""
+    folder = RunFolder(tmp_path / "run")
+    write_json(folder.path / "provenance.json", {"tool": "tunnelcd", "plan": {"name": "by hand"}})
+    for seed in SEEDS:
+        shutil.copytree(tiny_pair, folder.pair("tiny/pair", seed))
+        names = {"scenario": "tiny/pair", "family": "tiny/pair", "seed": seed, "variant": "ours", "status": "ok"}
+        row = {**names, "preset": "ours", "pair_kind": "clean", "n_observable": 3, "region_recall": 0.5}
+        row["metrics_version"] = METRICS_VERSION
+        cell = {
+            "key": "made",
+            "order": [7, 0],
+            "row": row,
+            "changes": [],
+            "regions": [],
+            "objects": [],
+            "keyframes": [],
+        }
+        folder.write_cell(folder.cell("tiny/pair", seed, "ours"), cell)
+    return folder
+
+
+def test_the_script_of_the_readme_finds_the_box(tmp_path: Path, command: Command) -> None:
+    text = (ROOT / "eval" / "README.md").read_text()
+    section = text.partition("### Bringing an answer of your own\n")[2]
+    script = re.search(r"```python\n(.*?)```", section, re.DOTALL)
+    assert script is not None
+    (tmp_path / "predict.py").write_text(script[1])
+    command("simulate", "smoke/one_box", "--seed", 10600, "--out", tmp_path / "pair", "--quiet")
+    argv = [tmp_path / "pair" / "before", tmp_path / "pair" / "after", tmp_path / "answer"]
+    subprocess.run(
+        [sys.executable, tmp_path / "predict.py", *argv], cwd=ROOT, env={"PYTHONPATH": str(ROOT)}, check=True
+    )
+    code, out, _ = command("score", tmp_path / "pair", tmp_path / "answer")
+    row = dict(line.split(None, 1) for line in out.splitlines() if len(line.split()) > 1)
+    assert code == 0
+    assert [float(row[name]) for name in ("region_recall", "region_precision", "object_f1_50")] == [1, 1, 1]
+    assert row["t_merge_s"] != "-" and row["t_total_s"] != "-"
+
+
+def test_a_run_takes_predictions_in_as_a_variant(
+    tmp_path: Path, run: RunFolder, command: Command, good: tuple[dict[str, Any], dict[str, Any]]
+) -> None:
+    document, arrays = good
+    mine = tmp_path / "mine"
+    write_prediction(mine / "tiny/pair/3", document, arrays)  # as the scenario is called
+    failed = {name: document[name] for name in ("format", "format_version", "method")} | {"status": "failed"}
+    (mine / "tiny__pair/4").mkdir(parents=True)  # and as the run calls its folder
+    (mine / "tiny__pair/4/answer.json").write_text(json.dumps(failed))
+    code, out, _ = command("score", run.path, "--predictions", mine, "--as", "their method")
+    assert code == 0 and "2 predictions scored as their method" in out
+    results = pd.read_csv(run.path / "results.csv")
+    assert results["variant"].tolist() == ["ours", "ours", "their method", "their method"]
+    assert results["seed"].tolist() == [3, 4, 3, 4]
+    theirs = results[results["variant"] == "their method"]
+    assert theirs["status"].tolist() == ["ok", "failed"] and theirs["pair_kind"].tolist() == ["clean"] * 2
+    # the two changes of the after session, whole, of the three that count; nothing of the failed pair
+    n_after, n_all = len(arrays["region_scores"]), int(theirs["n_observable"].iloc[0])
+    assert theirs["region_recall"].tolist() == [n_after / n_all, 0.0]
+    assert theirs["object_iou_point"].tolist() == pytest.approx([n_after / n_all, 0.0])
+    # they are answers of the run now: they can be scored again, and written over
+    for argv in (("score", run.path, "-q"), ("score", run.path, "--predictions", mine, "--as", "their method", "-q")):
+        assert command(*argv)[0] == 0
+        pd.testing.assert_frame_equal(pd.read_csv(run.path / "results.csv"), results)
+
+
+def test_two_predictions_for_one_pair_are_refused(
+    tmp_path: Path, run: RunFolder, command: Command, good: tuple[dict[str, Any], dict[str, Any]]
+) -> None:
+    for folder in ("tiny/pair/3", "tiny__pair/3", "tiny/pair/4"):
+        write_prediction(tmp_path / "mine" / folder, *good)
+    code, _, err = command("score", run.path, "--predictions", tmp_path / "mine", "--as", "theirs")
+    assert code == 2 and err.count("\n") == 1
+    assert "tiny/pair/3 and " in err and "tiny__pair/3: two predictions for one pair: leave one out" in err
+
+
+def test_rows_of_other_metrics_are_scored_again_first(
+    tmp_path: Path, run: RunFolder, command: Command, good: tuple[dict[str, Any], dict[str, Any]]
+) -> None:
+    for seed in SEEDS:
+        write_prediction(tmp_path / f"mine/tiny/pair/{seed}", *good)
+    path = run.cell("tiny/pair", 3, "ours")
+    cell = run.read_cell(path)
+    assert cell is not None
+    cell["row"]["metrics_version"] = METRICS_VERSION - 1
+    run.write_cell(path, cell)
+    code, _, err = command("score", run.path, "--predictions", tmp_path / "mine", "--as", "theirs")
+    assert (
+        code == 2
+        and f"has rows of metrics version {METRICS_VERSION - 1}, but predictions are scored by {METRICS_VERSION}" in err
+    )
+    assert not run.cell("tiny/pair", 3, "theirs").exists()
+
+
+def test_missing_cases_strangers_and_mistakes_are_named_together_and_nothing_is_written(
+    tmp_path: Path, run: RunFolder, command: Command, good: tuple[dict[str, Any], dict[str, Any]]
+) -> None:
+    document, arrays = good
+    mine = tmp_path / "mine"
+    write_prediction(mine / "tiny/pair/3", document, arrays)
+    write_prediction(mine / "tiny/pear/4", document, arrays)
+    code, _, err = command("score", run.path, "--predictions", mine, "--as", "theirs")
+    assert code == 2 and err.splitlines() == [
+        f'error: {mine}/tiny/pear/4: the run has no such pair; did you mean "tiny/pair/4"?',
+        f"error: {mine}: no prediction for tiny/pair/4 of {run.path}: write {mine}/tiny/pair/4/answer.json, of status "
+        '"failed" where there is no answer',
+    ]
+    (mine / "tiny/pear").rename(mine / "tiny/rest")
+    shutil.move(mine / "tiny/rest/4", mine / "tiny/pair/4")
+    for seed in SEEDS:
+        write_prediction(
+            mine / f"tiny/pair/{seed}", document, {**arrays, "region_scores": arrays["region_scores"] * np.nan}
+        )
+    code, _, err = command("score", run.path, "--predictions", mine, "--as", "theirs", "-q")
+    told = "not an answer to this pair: region_scores: entry 0 is not a finite number"
+    assert code == 2 and err.splitlines() == [f"error: {mine}/tiny/pair/{seed}: {told}" for seed in SEEDS]
+    assert sorted(file.name for file in run.path.glob("*")) == ["cells", "pairs", "provenance.json"]
+    assert {file.stem for file in run.path.glob("cells/*/*/*")} == {"ours"}
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (("--predictions", "mine"), "give both, or neither"),
+        (("--as", "theirs"), "give both, or neither"),
+        (("--predictions", "mine", "--as", "ours"), "--as ours: the run has a variant of this name: choose another"),
+        (
+            ("--predictions", "mine", "--as", "tunnelcd"),
+            "--as tunnelcd: a preset or an oracle of tunnelcd is called so",
+        ),
+        (("--predictions", "mine", "--as", "paper[x=1]"), "a preset or an oracle of tunnelcd is called so"),
+        (("--predictions", "mine", "--as", "oracle-merge"), "a preset or an oracle of tunnelcd is called so"),
+        (("--predictions", "mine", "--as", "."), "--as '.': expected a name"),
+        (("--predictions", "absent", "--as", "theirs"), "absent: no such folder: expected absent/<scenario>/<seed>/"),
+        (("answer", "--predictions", "mine", "--as", "theirs"), "goes with a run folder alone"),
+    ],
+)
+def test_what_cannot_be_asked(
+    tmp_path: Path,
+    run: RunFolder,
+    command: Command,
+    good: tuple[dict[str, Any], dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+    argv: tuple[str, ...],
+    words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for seed in SEEDS:
+        write_prediction(Path(f"mine/tiny/pair/{seed}"), *good)
+    code, out, err = command("score", run.path, *argv)
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1 and words in err
+
+
+def test_an_answer_that_was_put_there_for_some_pairs_only_is_told(
+    run: RunFolder, command: Command, good: tuple[dict[str, Any], dict[str, Any]]
+) -> None:
+    plan = {"name": "by hand", "scenarios": ["smoke/one_box"], "seeds": [3], "variants": [{"preset": "paper"}]}
+    write_json(run.path / "provenance.json", {"tool": "tunnelcd", "plan": plan})
+    write_prediction(run.answer("tiny/pair", 3, "theirs"), *good)
+    code, out, _ = command("score", run.path)
+    assert code == 0
+    assert "note: theirs has no answer for tiny/pair 4: its means are over the other 1 pairs" in out
+    assert "note: ours" not in out
+
+
+def without(*names: str) -> Callable[[dict[str, Any]], None]:
+    def change(parts: dict[str, Any]) -> None:
+        for name in names:
+            del parts[name]
+
+    return change
+
+
+def renamed(old: str, new: str) -> Callable[[dict[str, Any]], None]:
+    return lambda parts: parts.update({new: parts.pop(old)})
+
+
+def shifted(parts: dict[str, Any]) -> None:
+    parts["object_points_odom"] = parts["object_points_odom"] + 50.0
+
+
+@pytest.mark.parametrize(
+    ("of_document", "change", "words"),
+    [
+        (True, without("radius_m"), "answer.json: radius_m: missing, a value is required"),
+        (True, without("status"), "answer.json: status: missing, a value is required"),
+        (True, renamed("objects", "object"), 'unknown key; did you mean "objects"?'),
+        (True, lambda d: d.update(status="OK"), "status = 'OK': input should be 'ok', 'failed', 'merge_refused'"),
+        (True, lambda d: d.update(format_version=2), "answer.json: format_version = 2: input should be 1"),
+        (True, lambda d: d.update(seconds={"t_cd": 1.0}), 'seconds.t_cd is unknown; did you mean "t_cd_s"?'),
+        (True, lambda d: d.update(seconds={"t_cd_s": -1.0}), "seconds.t_cd_s = -1.0: expected seconds, 0 or more"),
+        (True, lambda d: d.update(seconds={"t_cd_s": float("nan")}), "seconds.t_cd_s = nan: expected seconds"),
+        (True, lambda d: d["objects"][0].pop("kind"), "objects.0.kind: missing, a value is required"),
+        (True, lambda d: d.update(objects=d["objects"][:1]), "object_point_odom_offsets has 3 entries for 1 objects"),
+        (True, lambda d: d.update(radius_m="4.5"), "answer.json: radius_m = '4.5': input should be a valid number"),
+        (True, lambda d: d.update(radius_m=None), "answer.json: radius_m = None: input should be a valid number"),
+        (True, lambda d: d.update(radius_m=float("inf")), "radius_m = inf: expected a length"),
+        (True, lambda d: d.update(seconds=None), "answer.json: seconds = None: input should be a valid dictionary"),
+        (True, lambda d: d.update(evidence=[1.0]), "answer.json: evidence = [1.0]: input should be a valid dictionary"),
+        (
+            True,
+            lambda d: d["objects"][0].update(partner="1"),
+            "objects.0.partner = '1': input should be a valid integer",
+        ),
+        (True, lambda d: d["objects"][0].update(partner=0), "objects[0].partner = 0: that is itself"),
+        (
+            True,
+            lambda d: d["objects"][0].update(score="high"),
+            "objects.0.score = 'high': input should be a valid number",
+        ),
+        (
+            False,
+            lambda a: a.update(keyframe_scores=np.array(["a"])),
+            "array keyframe_scores: expected numbers, got <U1",
+        ),
+        (False, lambda a: a.update(keyframe_scores=np.array([np.inf])), "keyframe_scores: a score is infinite"),
+        (False, lambda a: a.update(region_is_withdrawn=np.zeros(2)), "region_is_withdrawn: expected true or false"),
+        (False, lambda a: a.update(region_is_reported=np.ones(2, int)), "region_is_reported: expected true or false"),
+        (False, lambda a: a.update(before_keyframe_scans=np.array([3, 3])), "before_keyframe_scans names a scan twice"),
+        (False, lambda a: a.update(region_centres_map=np.zeros(3)), "region_centres_map must be (R, 3), got (3,)"),
+        (True, lambda d: d.update(objects=["box"]), "objects.0 = 'box': input should be a valid dictionary"),
+        (False, without("region_scores"), "answer.npz: array region_scores is missing: expected (R,)"),
+        (
+            False,
+            renamed("region_scores", "region_score"),
+            'answer.npz: array region_score is unknown; did you mean "region_scores"?',
+        ),
+        (
+            False,
+            without("object_points_odom", "object_point_odom_offsets"),
+            "object_points_odom is missing: the 2 objects of answer.json need their points",
+        ),
+        (False, without("object_point_odom_offsets"), "array object_point_odom_offsets is missing: expected (O + 1,)"),
+        (False, lambda a: a["object_point_odom_offsets"].put(-1, 2), "object_point_odom_offsets goes from 0 to 2"),
+        (False, lambda a: a.update(region_scores=a["region_scores"][::-1]), "scores must fall: best candidate first"),
+        (False, lambda a: a.update(region_scores=a["region_scores"][:1]), "must be (1, 3), got (2, 3)"),
+        (False, shifted, "object_points_odom of the after session: none of its"),
+    ],
+)
+def test_every_mistake_is_one_line_with_its_file(
+    tiny_pair: Path,
+    command: Command,
+    good: tuple[dict[str, Any], dict[str, Any]],
+    of_document: bool,
+    change: Callable[[dict[str, Any]], object],
+    words: str,
+) -> None:
+    document, arrays = good
+    change(document if of_document else arrays)
+    folder = write_prediction(tiny_pair.parent / "theirs", document, arrays)
+    code, out, err = command("score", tiny_pair, folder)
+    assert (code, out) == (2, "") and words in err
+    assert all(line.startswith(f"error: {folder}") for line in err.splitlines())
+
+
+@pytest.mark.parametrize(("many", "code"), [(14, 2), (15, 0)])
+def test_returns_where_nothing_returned_are_refused(
+    tiny_pair: Path,
+    command: Command,
+    good: tuple[dict[str, Any], dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+    many: int,
+    code: int,
+) -> None:
+    document, arrays = good
+    arrays = {name: value for name, value in arrays.items() if name.startswith("region")}
+    arrays["object_returns"] = np.column_stack([np.arange(14), np.zeros(14, dtype=np.int64)])  # each scan's only miss
+    arrays["object_return_offsets"] = np.array([0, 14, 14])
+    # fewer of them could by chance be second returns of their cells
+    monkeypatch.setattr(answer_check, "_MANY", many)
+    folder = write_prediction(tiny_pair.parent / "theirs", document, arrays)
+    found, _, err = command("score", tiny_pair, folder)
+    assert found == code
+    assert ("nothing returned at any of their 14 (scan, pixel)" in err) == (code == 2)
+
+
+def test_an_answer_to_the_sessions_the_other_way_round_is_named(
+    tiny_pair: Path, command: Command, good: tuple[dict[str, Any], dict[str, Any]]
+) -> None:
+    document, arrays = good
+    universe = load_ground_truth(tiny_pair).before.universe
+    rows = np.arange(200)
+    own = universe.points_odom[rows].astype(np.float64)
+    returns = np.column_stack([universe.scans(rows), universe.pixels(rows)])
+    whole = {name: value for name, value in arrays.items() if name.startswith("region")} | {
+        "object_returns": returns,
+        "object_return_offsets": np.array([0, 200]),
+        "object_point_offsets": np.array([0, 200]),
+    }
+    document["objects"] = [{"session": "before", "kind": "removed"}]
+    for shift_m, expected in ((0.0, 0), (1.0, 0), (-1000.0, 2), (40.0, 2)):
+        folder = tiny_pair.parent / f"theirs-{shift_m:g}"
+        write_prediction(folder, document, {**whole, "object_points_map": own + shift_m})
+        code, _, err = command("score", tiny_pair, folder)
+        assert code == expected, err
+    extents_m = own.max(axis=0) - own.min(axis=0)
+    gap_m = np.linalg.norm(np.maximum(40.0 - extents_m, 0.0))
+    assert err.count("\n") == 1 and "or to the sessions the other way round?" in err
+    assert f"objects[0]: object_points_map is {gap_m:.0f} m off the returns" in err

@@ -1,0 +1,117 @@
+"""What a run tells before it begins: missing extras, workers that would idle, schedulers that do not answer."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cdpipe.core.errors import InputError
+from cdpipe.methods import registry
+from eval.cli.checking import check_file
+from eval.core import cluster
+from eval.core.cluster import Where, require_reachable
+from eval.core.progress import Lines, Silent
+from eval.plans.plan import Plan, load_plan
+from eval.running import pair_run, runner
+from eval.running.runfolder import start_run_folder
+from eval.running.runner import run_plan
+
+Command = Callable[..., tuple[int, str, str]]
+
+
+def plan_of(folder: Path, variants: str, seeds: str = "[10600]") -> Plan:
+    path = folder / "plan.yaml"
+    path.write_text(f"name: test\nscenarios: [smoke/one_box]\nseeds: {seeds}\nvariants: [{variants}]\n")
+    return load_plan(str(path))
+
+
+def forbidden(*_: object, **__: object) -> None:
+    raise AssertionError("nothing must be made")
+
+
+def test_missing_extras_are_named_all_at_once_before_anything_is_made(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(registry.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(pair_run, "simulate_pair", forbidden)
+    plan_of(tmp_path, "{preset: voxel-diff}, {preset: m3c2}, {preset: dufomap}, {preset: m3c2, set: [map.voxel_m=0.3]}")
+    code, out, err = command("run", tmp_path / "plan.yaml", "--out", tmp_path / "run")
+    assert (code, out) == (2, "")
+    assert err.splitlines() == [
+        f"error: method {name} needs a package more: pip install 'tunnelcd[{name}]'" for name in ("m3c2", "dufomap")
+    ]
+    assert not (tmp_path / "run").exists()
+    # the first cell alone needs neither, and a list of cells needs nothing
+    with pytest.raises(AssertionError, match="nothing must be made"):
+        command("run", tmp_path / "plan.yaml", "--out", tmp_path / "run", "--limit", 1)
+    assert command("run", tmp_path / "plan.yaml", "--out", tmp_path / "list", "--dry-run")[0] == 0
+
+
+class Noted(Silent):
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+
+@pytest.mark.parametrize(
+    ("workers", "seeds", "words"),
+    [
+        (3, "[10600]", "--workers 3: 1 pair is left to do, and each keeps one worker busy"),
+        (3, "[10600, 10601]", "--workers 3: 2 pairs are left to do"),
+        (2, "[10600, 10601]", ""),
+        (None, "[10600]", ""),
+    ],
+)
+def test_workers_that_would_idle_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int | None, seeds: str, words: str
+) -> None:
+    def stopped(*_: object) -> Any:
+        raise InputError("far enough")
+
+    monkeypatch.setattr(cluster.importlib.util, "find_spec", lambda name: object())  # as if the extra were there
+    monkeypatch.setattr(runner, "connected", stopped)
+    monkeypatch.setattr(runner, "_run_here", stopped)
+    progress, plan = Noted(), plan_of(tmp_path, "{preset: voxel-diff}, {preset: c2c}", seeds)
+    with pytest.raises(InputError, match="far enough"):
+        run_plan(plan, start_run_folder(tmp_path / "run"), where=Where(workers), progress=progress)
+    assert len(progress.notes) == bool(words)
+    assert not words or words in progress.notes[0]
+
+
+def test_a_note_is_a_line_of_a_log(capsys: pytest.CaptureFixture[str]) -> None:
+    Lines().note("something")
+    assert capsys.readouterr().err == "note: something\n"
+
+
+def test_what_accepts_and_does_not_speak_is_no_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "_PROBE_S", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        address = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
+        start = time.monotonic()
+        with pytest.raises(InputError, match=rf"--scheduler {address}: cannot be reached \(timed out\)"):
+            require_reachable(Where(scheduler=address))
+        assert 0.4 < time.monotonic() - start < 5
+    require_reachable(Where(workers=2))
+
+
+def test_a_scheduler_is_knocked_at_before_anything_is_loaded(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(runner, "run_plan", forbidden)
+    code, _, err = command("run", "smoke", "--scheduler", "tcp://127.0.0.1:9", "--out", tmp_path / "run")
+    assert code == 2 and "cannot be reached" in err
+
+
+def test_an_unknown_name_is_checked_with_a_suggestion() -> None:
+    with pytest.raises(InputError, match=r'tunelcd: no plan, scenario or preset of this name.*did you mean "tunnelcd"'):
+        check_file("tunelcd")
+    with pytest.raises(InputError, match="see `list`"):
+        check_file("zzzzz")

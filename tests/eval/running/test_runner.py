@@ -1,0 +1,847 @@
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.io.answer import read_answer
+from cdpipe.io.readers import open_scans
+from cdpipe.mapping.mapping import build_map
+from cdpipe.merge.merge import merge_maps
+from cdpipe.model.config import MapConfig, MergeConfig
+from cdpipe.model.types import MappedSession, MergedMaps
+from cdpipe.sensor.ouster import load_profile
+from eval.core import provenance
+from eval.core.progress import Silent
+from eval.plans.plan import Plan, cells, load_plan
+from eval.running import pair_run, runner, stages
+from eval.running.rescoring import rescore
+from eval.running.runfolder import RunFolder, open_run_folder, remove, start_run_folder, write_tables
+from eval.running.runner import RunOutcome, run_plan
+from eval.truth.adapters import pipeline_input
+from scenarios.library import load_scenario
+from scenarios.references import file_digests
+from scenarios.schema import Scenario
+from sim.session.simulate import simulate_pair
+from sim.session.truth import read_pair_truth, write_pair_truth
+
+ONE_BOX, UNCHANGED = "smoke/one_box", "smoke/unchanged"
+VARIANTS = ["paper", "tunnelcd", "voxel-diff", "random-regions"]
+# a quarter of the returns: these tests are about what is run, not about how well
+SMALL = ("sensor.mode=512x10", "platform.scan_spacing_m=1.0")
+
+
+def load_small(name: str, seed: int, settings: Iterable[str] = ()) -> Scenario:
+    return load_scenario(name, seed, [*SMALL, *settings])
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Both smoke scenarios, thinned out and simulated once; every test works on copies."""
+    made = {}
+    for name in (ONE_BOX, UNCHANGED):
+        made[name] = tmp_path_factory.mktemp("pairs") / name.replace("/", "_")
+        simulate_pair(load_small(name, 20000), 20000, made[name])
+    return made
+
+
+@pytest.fixture
+def simulated(pairs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Let the runner copy those pairs instead of simulating; returns the list of what it asked for."""
+    asked: list[str] = []
+
+    def copy(scenario: Scenario, seed: int, out: Path, on_progress: object = None) -> None:
+        asked.append(scenario.family)
+        assert seed == 20000
+        shutil.copytree(pairs[scenario.family], out)
+
+    monkeypatch.setattr(pair_run, "simulate_pair", copy)
+    monkeypatch.setattr(runner, "load_scenario", load_small)
+    return asked
+
+
+def plan_of(folder: Path, *, scenarios: str = ONE_BOX, variants: str = "{preset: voxel-diff}", rest: str = "") -> Plan:
+    path = folder / "plan.yaml"
+    path.write_text(f"name: test\nscenarios: [{scenarios}]\nseeds: [20000]\nvariants: [{variants}]\n{rest}")
+    return load_plan(str(path))
+
+
+def run_in(folder: Path, plan: Plan, **options: Any) -> tuple[RunFolder, RunOutcome]:
+    run = start_run_folder(folder)
+    return run, run_plan(plan, run, **options)
+
+
+def table(run: RunFolder, name: str = "results") -> pd.DataFrame:
+    return pd.read_csv(run.path / f"{name}.csv", keep_default_na=True)
+
+
+@pytest.fixture(scope="module")
+def smoke(pairs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """The smoke plan, run once end to end."""
+
+    def copy(scenario: Scenario, seed: int, out: Path, on_progress: object) -> None:
+        shutil.copytree(pairs[scenario.family], out)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pair_run, "simulate_pair", copy)
+        patch.setattr(runner, "load_scenario", load_small)
+        return run_in(tmp_path_factory.mktemp("smoke") / "run", load_plan("smoke"), command=["tunnelcd", "run", "a b"])[
+            0
+        ]
+
+
+@pytest.fixture
+def smoke_copy(smoke: RunFolder, tmp_path: Path) -> RunFolder:
+    shutil.copytree(smoke.path, tmp_path / "run")
+    return RunFolder(tmp_path / "run")
+
+
+def test_smoke_plan_end_to_end(smoke: RunFolder) -> None:
+    results = table(smoke)
+    assert results["status"].tolist() == ["ok"] * 8
+    # in the plan's order, not the alphabet's
+    assert list(zip(results["scenario"], results["variant"], strict=True)) == [
+        (name, variant) for name in (ONE_BOX, UNCHANGED) for variant in VARIANTS
+    ]
+    assert set(results["seed"]) == {20000}
+    assert results["n_changes"].tolist() == [1] * 4 + [0] * 4
+    assert (results["merge_error_m"] < 0.1).all()
+    # an unchanged pair has nothing to recall
+    assert results["region_recall"].notna().tolist() == [True] * 4 + [False] * 4
+    for name in ("changes", "regions", "objects", "keyframes"):
+        items = table(smoke, name)
+        assert set(items["variant"]) <= set(VARIANTS)
+        assert {"scenario", "seed", "variant"} <= set(items.columns)
+    assert len(table(smoke, "changes")) == len(VARIANTS)
+    assert {"value", "low", "high", "n", "n_failed"} <= set(table(smoke, "summary").columns)
+
+
+def test_the_box_is_found(tmp_path: Path, simulated: list[str]) -> None:
+    # the preset is tuned and calibrated for four times as many returns
+    found = '{preset: voxel-diff, set: ["cluster.min_points=8", "query.threshold=0"]}'
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, variants=found))
+    assert table(run)["region_recall"].tolist() == [1.0]
+
+
+def test_times_and_sizes_of_a_run(smoke: RunFolder) -> None:
+    results = table(smoke)
+    times = results[[name for name in results.columns if name.startswith("t_") and "per_" not in name]]
+    assert np.isfinite(times.to_numpy()).all()
+    for _, cases in results.groupby("scenario"):
+        # one merge serves all variants of a pair that merge alike, one set of descriptors all
+        seconds = cases.set_index("variant")["t_merge_s"]
+        for alike in (["paper", "random-regions"], ["tunnelcd", "voxel-diff"]):
+            assert seconds[alike].nunique() == 1
+        described = cases.set_index("variant")["t_descriptor_s"]
+        assert described["tunnelcd"] > described["paper"] > 0  # the same scans, and spheres beside them
+        assert (cases.set_index("variant").loc[["voxel-diff", "random-regions"], "t_descriptor_s"] == 0).all()
+    np.testing.assert_allclose(results["t_total_s"], results["t_descriptor_s"] + results["t_cd_s"] + results["t_oe_s"])
+    assert (results["map_points_before"] > 1000).all()
+    assert (results["n_keyframes_after"] > 10).all()
+
+
+def test_stored_maps_are_those_of_the_default_settings(smoke: RunFolder) -> None:
+    with np.load(smoke.maps(ONE_BOX, 20000)) as stored:
+        for session in ("before", "after"):
+            expected = build_map(pipeline_input(smoke.pair(ONE_BOX, 20000), session), MapConfig()).points
+            np.testing.assert_array_equal(stored[f"{session}_points"], expected.astype(np.float32))
+
+
+def test_provenance_says_what_made_the_results(smoke: RunFolder) -> None:
+    document = smoke.provenance()
+    assert document["command"] == "tunnelcd run 'a b'"
+    assert document["seeds"] == [20000]
+    assert Plan.model_validate(document["plan"]) == load_plan("smoke")
+    assert set(document["config_digests"]) == {
+        f"{name} {variant}" for name in (ONE_BOX, UNCHANGED) for variant in VARIANTS
+    }
+    assert len(set(document["config_digests"].values())) == 4
+    assert list(document["checkpoints"]) == ["3deg", "sphere"]
+    assert all(document["checkpoints"].values())
+    assert document["finished"] >= document["started"]
+    assert document["machine"]["cores"] >= 1
+    assert document["versions"]["numpy"] == np.__version__
+
+
+def test_finished_cells_are_kept(smoke_copy: RunFolder, simulated: list[str]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in smoke_copy.path.rglob("*") if "cells" in path.parts}
+    outcome = run_plan(load_plan("smoke"), smoke_copy)
+    assert outcome == RunOutcome(n_done=0, n_kept=8, n_left=0)
+    assert simulated == []
+    assert before == {path: path.stat().st_mtime_ns for path in before}
+
+
+def test_a_cell_cut_short_is_done_again_and_no_other(smoke_copy: RunFolder, simulated: list[str]) -> None:
+    cut = smoke_copy.cell(ONE_BOX, 20000, "paper")
+    cut.write_text(cut.read_text()[:-50])
+    row = table(smoke_copy).query("scenario == @ONE_BOX and variant == 'paper'")["region_recall"].item()
+    assert run_plan(load_plan("smoke"), smoke_copy) == RunOutcome(1, 7, 0)
+    assert simulated == []
+    assert table(smoke_copy).query("scenario == @ONE_BOX and variant == 'paper'")["region_recall"].item() == row
+
+
+def test_another_version_of_the_metrics_redoes_all(
+    smoke_copy: RunFolder, simulated: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pair_run, "METRICS_VERSION", -1)
+    assert run_plan(load_plan("smoke"), smoke_copy, limit=1) == RunOutcome(1, 0, 7)
+    # what is stale is in no table
+    assert len(table(smoke_copy)) == 1
+
+
+def test_limit_and_then_the_rest(tmp_path: Path, simulated: list[str]) -> None:
+    plan = plan_of(tmp_path, variants="{preset: voxel-diff}, {preset: random-regions}")
+    run, outcome = run_in(tmp_path / "run", plan, limit=1)
+    assert outcome == RunOutcome(1, 0, 1)
+    assert table(run)["variant"].tolist() == ["voxel-diff"]
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 1, 0)
+    assert table(run)["variant"].tolist() == ["voxel-diff", "random-regions"]
+    assert simulated == [ONE_BOX]
+
+
+def test_a_changed_setting_redoes_its_cells_only(tmp_path: Path, simulated: list[str]) -> None:
+    preset = tmp_path / "own.yaml"
+    preset.write_text("method: voxel-diff\n")
+    plan = plan_of(tmp_path, variants=f"{{preset: {preset}}}, {{preset: random-regions}}")
+    run, _ = run_in(tmp_path / "run", plan)
+    assert table(run)["preset"].tolist() == ["own", "random-regions"]
+    preset.write_text("method: voxel-diff\nquery: {threshold: 1000000}\n")
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 1, 0)
+    assert table(run).set_index("variant").loc["own", "n_regions"] == 0
+    assert simulated == [ONE_BOX]
+
+
+def test_force_redoes_everything(tmp_path: Path, simulated: list[str]) -> None:
+    plan = plan_of(tmp_path)
+    run_in(tmp_path / "run", plan)
+    assert run_in(tmp_path / "run", plan, force=True)[1] == RunOutcome(1, 0, 0)
+    assert simulated == [ONE_BOX, ONE_BOX]
+
+
+def test_a_pair_of_another_scenario_is_simulated_anew(
+    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = plan_of(tmp_path)
+    run_in(tmp_path / "run", plan)
+    changed = load_scenario(ONE_BOX, 20000, [*SMALL, "score_radius_m=5"])
+    monkeypatch.setattr(runner, "load_scenario", lambda name, seed, settings: changed)
+    assert run_in(tmp_path / "run", plan)[1].n_done == 1
+    assert simulated == [ONE_BOX, ONE_BOX]
+
+
+def test_a_refused_merge_is_a_row_that_scores_0(tmp_path: Path, simulated: list[str]) -> None:
+    variants = '{preset: paper, set: ["merge.min_hessian_ratio=1"]}, {preset: voxel-diff}'
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=f"{ONE_BOX}, {UNCHANGED}", variants=variants))
+    results = table(run).set_index(["scenario", "variant"])
+    refused = "paper[merge.min_hessian_ratio=1]"
+    row = results.loc[(ONE_BOX, refused)]
+    assert row["status"] == "merge_refused"
+    assert "cannot be merged" in row["error"]
+    assert row[["region_recall", "region_recall_at_k", "object_iou_point", "object_f1_25"]].tolist() == [0, 0, 0, 0]
+    assert row[["t_refine_s", "t_total_s", "merge_error_m"]].isna().all()
+    assert row["t_merge_s"] > 0
+    assert row["t_index_s"] > 0
+    assert results.loc[(UNCHANGED, refused), "status"] == "merge_refused"
+    assert np.isnan(results.loc[(UNCHANGED, refused), "region_recall"])
+    assert results.loc[(ONE_BOX, "voxel-diff"), "status"] == "ok"
+    answer = read_answer(run.answer(ONE_BOX, 20000, refused))
+    assert answer.report is None
+    assert "hessian_ratio" in answer.evidence
+    assert table(run, "changes").query("variant == @refused")["is_found"].tolist() == [False]
+
+
+def test_an_error_of_the_input_is_a_row_and_a_bug_is_not(
+    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(error: Exception) -> Callable[..., None]:
+        def method(*_: object) -> None:
+            raise error
+
+        return method
+
+    plan = plan_of(tmp_path, variants="{preset: random-regions}, {preset: voxel-diff}")
+    monkeypatch.setitem(stages.METHODS, "random-regions", fails(InputError("no such thing")))
+    run, _ = run_in(tmp_path / "run", plan)
+    results = table(run).set_index("variant")
+    assert results["status"].to_dict() == {"random-regions": "failed", "voxel-diff": "ok"}
+    assert results.loc["random-regions", "error"] == "no such thing"
+    assert results.loc["random-regions", "region_recall"] == 0
+    monkeypatch.setitem(stages.METHODS, "voxel-diff", fails(RuntimeError("a bug")))
+    with pytest.raises(RuntimeError, match="a bug"):
+        run_in(tmp_path / "run", plan, force=True)
+    # what was finished before the bug is kept
+    assert run.read_cell(run.cell(ONE_BOX, 20000, "random-regions")) is not None
+
+
+@pytest.mark.parametrize("stage", ["load_scenario", "simulate_pair"])
+def test_a_world_that_cannot_be_made_is_a_row_and_the_others_go_on(
+    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch, stage: str
+) -> None:
+    module = runner if stage == "load_scenario" else pair_run
+    usual = getattr(module, stage)
+
+    def fails_for_one(what: Any, *rest: Any, **options: Any) -> Any:
+        if ONE_BOX in (what, getattr(what, "family", "")):
+            raise ScenarioError("props stand in each other")
+        return usual(what, *rest, **options)
+
+    monkeypatch.setattr(module, stage, fails_for_one)
+    run, outcome = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=f"{ONE_BOX}, {UNCHANGED}"))
+    assert outcome == RunOutcome(2, 0, 0)
+    results = table(run).set_index("scenario")
+    assert results["status"].to_dict() == {ONE_BOX: "failed", UNCHANGED: "ok"}
+    assert results.loc[ONE_BOX, "error"] == "props stand in each other"
+    assert np.isnan(results.loc[ONE_BOX, "region_recall"])
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, simulated: list[str]) -> None:
+    class Impatient:
+        def cells(self, label: str, done: int, total: int) -> None:
+            if done == 2:
+                raise KeyboardInterrupt
+
+        def stage(self, name: str, done: int, total: int) -> None:
+            pass
+
+    plan = plan_of(
+        tmp_path, scenarios=f"{ONE_BOX}, {UNCHANGED}", variants="{preset: voxel-diff}, {preset: random-regions}"
+    )
+    with pytest.raises(KeyboardInterrupt):
+        run_in(tmp_path / "run", plan, progress=Impatient())
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(2, 2, 0)
+
+
+def test_stages_are_shared_by_the_settings_they_depend_on(
+    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+
+    def counted(name: str) -> Callable[..., Any]:
+        usual = getattr(stages, name)
+
+        def call(*args: Any) -> Any:
+            calls.append(name)
+            return usual(*args)
+
+        return call
+
+    for name in ("build_map", "describe_scans", "merge_maps"):
+        monkeypatch.setattr(stages, name, counted(name))
+    monkeypatch.setattr(stages, "REPEATS", 1)
+    coarse = 'set: ["map.voxel_m=0.3"]'
+    # the two that share a map stand apart in the plan
+    # both presets merge alike
+    alike = 'set: ["merge.refine=local"]'
+    variants = f"{{preset: voxel-diff}}, {{preset: voxel-diff, {coarse}}}, {{preset: random-regions, {alike}}}"
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, variants=variants))
+    assert calls.count("build_map") == 2 * 2
+    # one to warm up, one per session: another map has the same keyframes
+    assert calls.count("describe_scans") == 3
+    # per map setting: once, and once more for the clock
+    assert calls.count("merge_maps") == 2 * 2
+    assert table(run)["variant"].tolist() == [
+        "voxel-diff",
+        "voxel-diff[map.voxel_m=0.3]",
+        "random-regions[merge.refine=local]",
+    ]
+
+
+@pytest.mark.usefixtures("simulated")
+def test_score_runs_nothing_and_gives_the_same(smoke_copy: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*_: object, **__: object) -> None:
+        raise AssertionError("score must not run anything")
+
+    for module, name in (
+        (pair_run, "simulate_pair"),
+        (pair_run, "PairStages"),
+        (stages, "build_map"),
+        (stages, "merge_maps"),
+    ):
+        monkeypatch.setattr(module, name, forbidden)
+    before = table(smoke_copy)
+    (smoke_copy.path / "results.csv").unlink()
+    assert rescore(smoke_copy) == 8
+    pd.testing.assert_frame_equal(table(smoke_copy), before)
+    # and the cells still count as finished
+    assert run_plan(load_plan("smoke"), smoke_copy) == RunOutcome(0, 8, 0)
+
+
+def test_score_takes_in_the_answer_of_another_program(smoke_copy: RunFolder) -> None:
+    shutil.copytree(smoke_copy.answer(ONE_BOX, 20000, "voxel-diff"), smoke_copy.answer(ONE_BOX, 20000, "theirs"))
+    assert rescore(smoke_copy) == 9
+    results = table(smoke_copy).set_index(["scenario", "variant"])
+    columns = ["region_recall", "object_iou_point", "n_regions"]
+    theirs, ours = results.loc[(ONE_BOX, "theirs")], results.loc[(ONE_BOX, "voxel-diff")]
+    assert theirs[columns].tolist() == ours[columns].tolist()
+    assert (theirs["preset"], theirs["seed"]) == ("theirs", 20000)
+    assert table(smoke_copy)["variant"].iloc[-1] == "theirs"
+
+
+def test_folders_that_are_no_run(tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("x")
+    with pytest.raises(InputError, match="not empty and not a run folder"):
+        start_run_folder(tmp_path)
+    with pytest.raises(InputError, match="not a run folder"):
+        open_run_folder(tmp_path)
+    with pytest.raises(InputError, match="no such run folder"):
+        open_run_folder(tmp_path / "absent")
+    (tmp_path / "provenance.json").write_text(json.dumps({"tool": "another"}))
+    for opener in (start_run_folder, open_run_folder):
+        with pytest.raises(InputError, match="not written by tunnelcd"):
+            opener(tmp_path)
+    (tmp_path / "provenance.json").write_text("{")
+    with pytest.raises(InputError, match="damaged"):
+        open_run_folder(tmp_path)
+
+
+def test_the_pipeline_never_sees_truth(pairs: dict[str, Path], tmp_path: Path) -> None:
+    """Without its truth, and with the truth of another pair in its place, a session gives the same input."""
+    bare = tmp_path / "bare"
+    shutil.copytree(pairs[ONE_BOX], bare, ignore=shutil.ignore_patterns("truth"))
+    assert not list(bare.rglob("truth"))
+    with_truth, without = pipeline_input(pairs[ONE_BOX], "after"), pipeline_input(bare, "after")
+    np.testing.assert_array_equal(with_truth.odom_T_sensor, without.odom_T_sensor)
+    for index in (0, 17):
+        ours, theirs = with_truth.scan(index), without.scan(index)
+        for field in ("points_sensor", "odom_T_sensor", "stamps_ns", "pixels"):
+            np.testing.assert_array_equal(getattr(ours, field), getattr(theirs, field))
+    true_poses = np.load(pairs[ONE_BOX] / "after" / "truth" / "poses.npz")["world_T_sensor"]
+    assert np.abs(with_truth.odom_T_sensor - true_poses).max() > 0.1
+    assert type(with_truth) is type(open_scans(bare / "after"))
+
+
+def test_time_is_the_median_of_three_after_a_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = 0.0
+    # the middle one of three in each part, whichever call it was
+    parts = iter([(0.5, 0.4), (0.3, 0.1), (0.2, 0.5), (0.1, 0.3)])
+
+    def call() -> SimpleNamespace:
+        nonlocal clock
+        cd, oe = next(parts)
+        clock += cd + oe
+        return SimpleNamespace(name="first" if cd == 0.5 else "later", seconds={"t_cd_s": cd, "t_oe_s": oe})
+
+    monkeypatch.setattr(stages.time, "perf_counter", lambda: clock)
+    result, seconds = stages.timed_parts(call)
+    assert result.name == "first"
+    assert seconds == {"t_cd_s": 0.2, "t_oe_s": 0.3}
+    assert next(parts, None) is None
+
+
+def test_a_long_call_is_timed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = 0.0
+    calls = 0
+
+    def call() -> SimpleNamespace:
+        nonlocal clock, calls
+        clock += 1.0
+        calls += 1
+        return SimpleNamespace(seconds={"t_cd_s": 0.7})
+
+    monkeypatch.setattr(stages.time, "perf_counter", lambda: clock)
+    assert stages.timed_parts(call)[1] == {"t_cd_s": 0.7}
+    assert calls == 1
+
+
+def test_every_row_names_the_code_that_made_its_answer(
+    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def commits() -> list[tuple[str, str]]:
+        results = table(run).fillna({"commit": ""})
+        return list(zip(results["variant"], results["commit"], strict=True))
+
+    plan = plan_of(tmp_path, variants="{preset: voxel-diff}, {preset: random-regions}")
+    monkeypatch.setattr(provenance, "git_commit", lambda: "older+")
+    run, _ = run_in(tmp_path / "run", plan, limit=1)
+    monkeypatch.setattr(provenance, "git_commit", lambda: "newer")
+    run_in(tmp_path / "run", plan)
+    assert commits() == [("voxel-diff", "older+"), ("random-regions", "newer")]
+    assert "commit" not in set(table(run, "summary")["metric"])
+    # scoring again is not answering again, and what another program answered is of no commit of ours
+    monkeypatch.setattr(provenance, "git_commit", lambda: "newest")
+    shutil.copytree(run.answer(ONE_BOX, 20000, "voxel-diff"), run.answer(ONE_BOX, 20000, "theirs"))
+    rescore(run)
+    assert commits() == [("voxel-diff", "older+"), ("random-regions", "newer"), ("theirs", "")]
+
+
+def test_scoring_again_changes_nothing_before_all_is_scored(smoke_copy: RunFolder) -> None:
+    (smoke_copy.answer(UNCHANGED, 20000, "paper") / "answer.json").write_text("{")
+    cells = {path: path.stat().st_mtime_ns for path in smoke_copy.path.glob("cells/*/*/*.json")}
+    with pytest.raises(InputError, match=r"answer\.json"):
+        rescore(smoke_copy)
+    assert len(cells) == 8
+    assert cells == {path: path.stat().st_mtime_ns for path in cells}
+
+
+@pytest.fixture
+def truthful(simulated: list[str], pairs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> list[Scenario]:
+    """Let the stand-in of the simulator write down what it was asked for, as the simulator does."""
+    asked: list[Scenario] = []
+
+    def copy(scenario: Scenario, seed: int, out: Path, on_progress: object = None) -> None:
+        asked.append(scenario)
+        shutil.copytree(pairs[scenario.family], out)
+        drawn, files = scenario.model_dump(mode="json"), file_digests(scenario)
+        write_pair_truth(out, replace(read_pair_truth(out), seed=seed, scenario=drawn, files=files))
+
+    monkeypatch.setattr(pair_run, "simulate_pair", copy)
+    return asked
+
+
+WORLDS = f"{ONE_BOX}, {{name: {ONE_BOX}, set: [sensor.range_noise=false], each: [sensor.sub_rays=7]}}"
+QUIET = f"{ONE_BOX}[sensor.range_noise=false]"
+BLURRED = f"{ONE_BOX}[sensor.range_noise=false][sensor.sub_rays=7]"
+
+
+def test_worlds_are_simulated_with_their_settings_and_named_by_them(tmp_path: Path, truthful: list[Scenario]) -> None:
+    run, outcome = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+    assert outcome == RunOutcome(3, 0, 0)
+    assert [(each.sensor.range_noise, each.sensor.sub_rays) for each in truthful] == [(True, 1), (False, 1), (False, 7)]
+    results = table(run)
+    assert results["scenario"].tolist() == [ONE_BOX, QUIET, BLURRED]
+    assert set(results["family"]) == {ONE_BOX}
+    assert list(run.provenance()["config_digests"]) == [f"{world} voxel-diff" for world in (ONE_BOX, QUIET, BLURRED)]
+    assert sorted(path.name for path in (run.path / "pairs").iterdir()) == [
+        "smoke__one_box",
+        "smoke__one_box_sensor.range_noise=false_",
+        "smoke__one_box_sensor.range_noise=false__sensor.sub_rays=7_",
+    ]
+    # the stand-in gives every world the same returns
+    effects = table(run, "effects")
+    assert set(effects["settings"]) == {"sensor.range_noise=false", "sensor.sub_rays=7"}
+    assert effects.groupby("settings")["reference"].unique().map(list).tolist() == [[ONE_BOX], [QUIET]]
+    assert (effects["difference"].dropna() == 0).all()
+    assert set(effects.query("metric == 'region_recall'")["n"]) == {1}
+
+
+def test_effects_that_are_no_more_leave_no_table(tmp_path: Path, truthful: list[Scenario]) -> None:
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+    assert (run.path / "effects.csv").exists()
+    for world in (QUIET, BLURRED):
+        remove(run.cell(world, 20000, "voxel-diff"))
+    write_tables(run)
+    assert not (run.path / "effects.csv").exists()
+
+
+def test_scoring_again_names_worlds_as_running_does(tmp_path: Path, truthful: list[Scenario]) -> None:
+    labels: list[str] = []
+
+    class Heard(Silent):
+        def cells(self, label: str, done: int, total: int) -> None:
+            labels.append(label)
+
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+    shutil.copytree(run.answer(QUIET, 20000, "voxel-diff"), run.answer(QUIET, 20000, "foreign"))
+    rescore(run, Heard())
+    named = [f"{world} 20000 voxel-diff" for world in (ONE_BOX, QUIET, BLURRED)]
+    assert sorted(labels) == sorted([*named, f"{QUIET} 20000 foreign", "done"])
+
+
+def test_the_pair_of_a_world_is_kept_while_its_scenario_is_the_same(
+    tmp_path: Path, truthful: list[Scenario], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = plan_of(tmp_path, scenarios=WORLDS)
+    run, _ = run_in(tmp_path / "run", plan)
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(0, 3, 0)
+    run.cell(QUIET, 20000, "voxel-diff").unlink()
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 2, 0)
+    assert len(truthful) == 3
+    # the same label, but the scenario behind it has changed
+    usual = runner.load_scenario
+    monkeypatch.setattr(
+        runner, "load_scenario", lambda name, seed, settings: usual(name, seed, [*settings, "score_radius_m=5"])
+    )
+    run.cell(ONE_BOX, 20000, "voxel-diff").unlink()
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(3, 0, 0)
+    assert len(truthful) == 6
+
+
+def test_a_pair_is_made_again_when_a_file_that_its_scenario_names_has_changed(
+    tmp_path: Path, truthful: list[Scenario]
+) -> None:
+    profile = tmp_path / "sensor.json"
+    profile.write_text(json.dumps(load_profile("os1-32-u0").to_json()))
+    scenario = tmp_path / "mine.yaml"
+    scenario.write_text(f"extends: {ONE_BOX}\nfamily: {ONE_BOX}\nsensor: {{profile: sensor.json}}\n")
+    plan = plan_of(tmp_path, scenarios=str(scenario))
+    run, _ = run_in(tmp_path / "run", plan)
+    content = profile.read_bytes()
+    truth = read_pair_truth(run.pair(str(scenario), 20000))
+    assert list(truth.files.values()) == [hashlib.sha256(content).hexdigest()]
+    assert [Path(name).resolve() for name in truth.files] == [profile.resolve()]
+    # touched, or moved away and back: nothing is redone
+    profile.unlink()
+    profile.write_bytes(content)
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(0, 1, 0)
+    profile.write_bytes(content + b"\n")
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 0, 0)
+    assert len(truthful) == 2
+    # and a pair of before is not taken for one of now when only its cell is lost
+    profile.write_bytes(content)
+    run.cell(str(scenario), 20000, "voxel-diff").unlink()
+    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 0, 0)
+    assert len(truthful) == 3
+
+
+def test_a_world_with_settings_that_cannot_be_made_keeps_its_family(
+    tmp_path: Path, truthful: list[Scenario], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = runner.load_scenario
+
+    def fails_with_settings(name: str, seed: int, settings: tuple[str, ...]) -> Scenario:
+        if settings:
+            raise ScenarioError("props stand in each other")
+        return usual(name, seed, settings)
+
+    monkeypatch.setattr(runner, "load_scenario", fails_with_settings)
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+    results = table(run)
+    assert results["status"].tolist() == ["ok", "failed", "failed"]
+    assert set(results["family"]) == {ONE_BOX}
+    assert table(run, "effects").query("metric == 'region_recall'")["n"].tolist() == [0, 0]
+
+
+def test_an_answer_beside_those_of_a_world_gets_the_name_of_the_world(tmp_path: Path, truthful: list[Scenario]) -> None:
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+    shutil.copytree(run.answer(QUIET, 20000, "voxel-diff"), run.answer(QUIET, 20000, "theirs"))
+    assert rescore(run) == 4
+    theirs = table(run).query("variant == 'theirs'")
+    assert theirs["scenario"].tolist() == [QUIET]
+    # where the run has no cell of the pair left, the folder's name has to do
+    remove(run.path / "cells")
+    rescore(run)
+    assert "smoke/one_box_sensor.range_noise=false_" in set(table(run)["scenario"])
+
+
+MERGES = ", ".join(
+    (
+        "{preset: tunnelcd}",
+        '{preset: tunnelcd, set: ["merge.min_hessian_ratio=1"]}',
+        "{preset: kiss-matcher}",
+        "{preset: tunnelcd, oracle_merge: {}}",
+        "{preset: tunnelcd, oracle_merge: {noise_m: 0.3, noise_deg: 1}}",
+    )
+)
+REFUSED = "tunnelcd[merge.min_hessian_ratio=1]"
+NOISY = "oracle-merge[noise_m=0.3,noise_deg=1]"
+ONE_CLEAN = f"{{name: {ONE_BOX}, pair_kind: clean}}"
+
+
+@pytest.fixture(scope="module")
+def merges(pairs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A plan that ends at the merge; KISS-Matcher is taken to meet an error of its input."""
+
+    def copy(scenario: Scenario, seed: int, out: Path, on_progress: object) -> None:
+        shutil.copytree(pairs[scenario.family], out)
+
+    def merge(before: MappedSession, after: MappedSession, config: MergeConfig) -> MergedMaps:
+        if config.method == "kiss-matcher":
+            raise InputError("not installed")
+        return merge_maps(before, after, config)
+
+    def forbidden(*_: object) -> None:
+        raise AssertionError("nothing comes after the merge")
+
+    folder = tmp_path_factory.mktemp("merges")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pair_run, "simulate_pair", copy)
+        patch.setattr(runner, "load_scenario", load_small)
+        patch.setattr(stages, "merge_maps", merge)
+        patch.setattr(stages, "METHODS", {"descriptor": forbidden})
+        plan = plan_of(folder, scenarios=f"{ONE_CLEAN}, {UNCHANGED}", variants=MERGES, rest="until: merge")
+        return run_in(folder / "run", plan)[0]
+
+
+@pytest.fixture
+def merges_copy(merges: RunFolder, tmp_path: Path) -> RunFolder:
+    shutil.copytree(merges.path, tmp_path / "run")
+    return RunFolder(tmp_path / "run")
+
+
+def test_a_plan_that_ends_at_the_merge_has_every_case_and_no_more_than_the_merge(merges: RunFolder) -> None:
+    results = table(merges).set_index(["scenario", "variant"])
+    assert results["status"].tolist() == ["ok", "merge_refused", "failed", "ok", "ok"] * 2
+    assert results.loc[(ONE_BOX, "kiss-matcher"), "error"] == "not installed"
+    later = [name for name in results.columns if name.startswith(("region_", "object_", "t_cd", "t_oe", "t_total"))]
+    assert len(later) > 15
+    assert results[[*later, "n_regions", "n_objects", "is_alarm"]].isna().all(axis=None)
+    assert results["overlap_true"].notna().all()
+    merged = results[results["status"] == "ok"]
+    assert merged[["merge_error_m", "t_index_s", "t_merge_s", "t_refine_s", "t_descriptor_s"]].notna().all(axis=None)
+    assert (merged["merge_error_m"].loc[:, ["tunnelcd", "oracle-merge"]] < 0.1).all()
+    refused = results.loc[(ONE_BOX, REFUSED)]
+    assert np.isfinite(refused["evidence_hessian_ratio"])
+    for name in ("changes", "regions", "objects", "keyframes"):
+        assert len(table(merges, name)) == 0
+    assert merges.provenance()["plan"]["until"] == "merge"
+    assert read_answer(merges.answer(ONE_BOX, 20000, "tunnelcd")).until == "merge"
+    assert read_answer(merges.answer(ONE_BOX, 20000, "kiss-matcher")).until == "merge"
+
+
+def test_only_a_merge_that_asks_the_descriptors_is_charged_for_them(merges: RunFolder) -> None:
+    seconds = table(merges).set_index(["scenario", "variant"])["t_descriptor_s"]
+    assert seconds[ONE_BOX, "tunnelcd"] > 0
+    assert seconds[ONE_BOX, "oracle-merge"] == 0
+
+
+def test_the_kind_of_a_pair_is_a_column(merges: RunFolder) -> None:
+    results = table(merges)
+    assert list(results.columns)[:4] == ["scenario", "family", "pair_kind", "seed"]
+    kinds = results.fillna({"pair_kind": ""}).groupby("scenario")["pair_kind"].unique().map(list).to_dict()
+    assert kinds == {ONE_BOX: ["clean"], UNCHANGED: [""]}
+    assert "pair_kind" not in set(table(merges, "summary")["metric"])
+
+
+def test_scoring_again_keeps_the_kind_and_the_end(merges_copy: RunFolder) -> None:
+    before = table(merges_copy)
+    shutil.copytree(merges_copy.answer(ONE_BOX, 20000, "tunnelcd"), merges_copy.answer(ONE_BOX, 20000, "theirs"))
+    rescore(merges_copy)
+    after = table(merges_copy)
+    theirs = after[after["variant"] == "theirs"]
+    assert (theirs["pair_kind"].tolist(), theirs["scenario"].tolist()) == (["clean"], [ONE_BOX])
+    pd.testing.assert_frame_equal(after[after["variant"] != "theirs"], before)
+
+
+def test_an_error_of_an_oracle_is_its_noise(merges: RunFolder) -> None:
+    results = table(merges).set_index(["scenario", "variant"])
+    for scenario in (ONE_BOX, UNCHANGED):
+        exact, noisy = results.loc[(scenario, "oracle-merge")], results.loc[(scenario, NOISY)]
+        # the odometry of these pairs drifts, and between keyframes the alignment is blended
+        assert exact["merge_error_m"] < 0.002
+        assert noisy["merge_error_m"] == pytest.approx(0.3, abs=0.01)
+        assert noisy["merge_error_deg"] == pytest.approx(1.0, abs=0.02)
+        assert noisy[["t_index_s", "t_merge_s", "t_refine_s", "evidence_n_hypotheses"]].tolist() == [0, 0, 0, 0]
+
+
+def test_the_page_of_a_run_that_ends_at_the_merge(
+    merges_copy: RunFolder, command: Callable[..., tuple[int, str, str]]
+) -> None:
+    code, _, err = command("report", merges_copy.path)
+    assert (code, err) == (0, "")
+    page = (merges_copy.path / "index.html").read_text()
+    for words in ("merge refused", "not installed", "oracle-merge"):
+        assert words in page
+
+
+def test_what_is_printed_of_a_run_that_ends_at_the_merge(
+    merges_copy: RunFolder, command: Callable[..., tuple[int, str, str]]
+) -> None:
+    code, out, _ = command("score", merges_copy.path)
+    assert code == 0
+    assert "merge_error_m" in out
+    assert "region_recall" not in out
+
+
+def test_an_oracle_runs_the_stages_of_its_preset(tmp_path: Path, simulated: list[str]) -> None:
+    later = 'set: ["query.n_regions=2", "query.threshold=0"]'
+    variants = f"{{preset: tunnelcd, {later}}}, {{preset: tunnelcd, {later}, oracle_merge: {{}}}}"
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, variants=variants))
+    results = table(run)
+    assert results["variant"].str.partition("[")[0].tolist() == ["tunnelcd", "oracle-merge"]
+    assert results["status"].tolist() == ["ok", "ok"]
+    assert (results["n_regions"] + results["n_withdrawn"]).tolist() == [2, 2]
+    assert results["preset"].tolist() == ["tunnelcd", "tunnelcd"]
+    times = results.loc[1, ["t_total_with_merge_s", "t_total_s"]]
+    assert times["t_total_with_merge_s"] == times["t_total_s"] > 0
+    report = read_answer(run.answer(ONE_BOX, 20000, results["variant"][1])).report
+    assert report is not None
+    assert report.local_before_T_after is not None
+    assert len(report.local_before_T_after) == len(report.keyframe_scans[1])
+
+
+@pytest.mark.parametrize(
+    ("scenarios", "variants", "rest"),
+    [
+        (f"{{name: {ONE_BOX}, pair_kind: drift}}", "{preset: voxel-diff}", ""),
+        (ONE_BOX, "{preset: voxel-diff}", "until: merge"),
+    ],
+)
+def test_what_a_plan_says_of_a_cell_redoes_it(
+    tmp_path: Path, simulated: list[str], scenarios: str, variants: str, rest: str
+) -> None:
+    run_in(tmp_path / "run", plan_of(tmp_path, variants="{preset: voxel-diff}"))
+    changed = plan_of(tmp_path, scenarios=scenarios, variants=variants, rest=rest)
+    assert run_in(tmp_path / "run", changed)[1] == RunOutcome(1, 0, 0)
+    assert run_in(tmp_path / "run", changed)[1] == RunOutcome(0, 1, 0)
+    # the pair itself is the same
+    assert simulated == [ONE_BOX]
+
+
+def test_a_world_that_cannot_be_made_keeps_its_kind(
+    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> Scenario:
+        raise ScenarioError("props stand in each other")
+
+    monkeypatch.setattr(runner, "load_scenario", fails)
+    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=ONE_CLEAN, variants=MERGES, rest="until: merge"))
+    results = table(run)
+    assert results["status"].tolist() == ["failed"] * 5
+    assert set(results["pair_kind"]) == {"clean"}
+
+
+def test_cells_made_without_kiss_matcher_are_made_again_once_it_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    def keys(*, is_installed: bool) -> dict[str, str]:
+        monkeypatch.setattr(pair_run, "is_kiss_matcher_installed", lambda: is_installed)
+        found = cells(load_plan("merge"))[:4]
+        return {cell.variant: pair_run.cell_key(cell, "clean", None, {}) for cell in found}
+
+    there, missing = keys(is_installed=True), keys(is_installed=False)
+    changed = {variant: there[variant] != missing[variant] for variant in there}
+    assert changed == {"tunnelcd": True, "frame": False, "kiss-matcher": True, "oracle-merge": False}
+
+
+def test_tables_that_are_there_are_put_together_again_only_where_something_may_have_changed(
+    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commit: list[str | None] = ["a" * 40]
+    written: list[RunFolder] = []
+
+    def write(run: RunFolder) -> pd.DataFrame:
+        written.append(run)
+        return write_tables(run)
+
+    def is_written(plan: Plan) -> bool:
+        written.clear()
+        assert run_plan(plan, run).n_done == 0
+        return bool(written)
+
+    monkeypatch.setattr(provenance, "git_commit", lambda: commit[0])
+    monkeypatch.setattr(runner, "write_tables", write)
+    plan, run = plan_of(tmp_path), start_run_folder(tmp_path / "run")
+    run_plan(plan, run)
+    results, (cell,) = run.path / "results.csv", run.path.glob("cells/*/*/*.json")
+    bytes_before = results.read_bytes()
+    told = run.provenance()
+    assert not is_written(plan)
+    assert not is_written(plan)
+    assert (results.read_bytes(), run.provenance()) == (bytes_before, told)
+    results.unlink()
+    assert is_written(plan)
+    cell.touch()
+    assert is_written(plan)
+    shutil.copy(cell, cell.with_name("another.json"))  # of another plan, and not newer
+    os.utime(cell.with_name("another.json"), ns=(0, 0))
+    assert is_written(plan)
+    cell.with_name("another.json").unlink()
+    assert is_written(plan)
+    assert not is_written(plan)
+    assert is_written(plan.model_copy(update={"description": "another"}))
+    for other in ("b" * 40, "b" * 40 + "+", "b" * 40 + "+", None, None):
+        commit[0] = other
+        assert is_written(plan)
+    document = run.provenance()
+    del document["finished"]
+    run.write_provenance(document)
+    commit[0] = "b" * 40
+    assert is_written(plan)
+    assert not is_written(plan)

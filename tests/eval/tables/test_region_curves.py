@@ -1,0 +1,221 @@
+"""Free response, ROC and recall by size, worked out by hand and against a slow twin."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from eval.core.ranking import auroc
+from eval.tables.region_curves import (
+    RankedPairs,
+    found_at,
+    free_response,
+    interval_of,
+    parsed_ids,
+    ranked_pairs,
+    recall_at,
+    resampled_recalls,
+    roc_curve,
+)
+from eval.tables.region_sizes import recall_by_size, share_interval
+
+CASES = [  # seed, kind of site, status, way, observable changes
+    (1, 4.5, "ok", 1000.0, 2),
+    (2, 4.5, "ok", 1000.0, 0),
+    (3, 4.5, "merge_refused", 1000.0, 1),
+    (4, 10.0, "ok", 500.0, 1),
+]
+CANDIDATES = [  # seed, score, what it finds
+    (1, 9.0, "1"), (1, 8.0, ""), (1, 7.0, "1;2"), (1, 6.0, "3"), (2, 8.5, ""), (4, 300.0, ""), (4, 200.0, "1"),
+]  # fmt: skip
+CHANGES = [  # seed, id, observable, cells, reported, hull, returns
+    (1, 1, True, 20, True, 0.2, 50),
+    (1, 2, True, 20, False, 2.0, 500),
+    (1, 3, False, 5, False, 0.2, 5),
+    (3, 1, True, 20, False, 0.2, 50),
+    (4, 1, True, 20, True, 2.0, 5000),
+]
+
+
+def results(cases: Sequence[tuple[object, ...]] = CASES) -> pd.DataFrame:
+    columns = ["seed", "score_radius_m", "status", "after_path_m", "n_observable"]
+    return pd.DataFrame(cases, columns=columns).assign(scenario="a", variant="ours", family="narrow")
+
+
+def regions(rows: Sequence[tuple[object, ...]] = CANDIDATES) -> pd.DataFrame:
+    names = {"scenario": "a", "variant": "ours", "is_withdrawn": False}
+    return pd.DataFrame(rows, columns=["seed", "score", "found_changes"]).assign(**names)
+
+
+def changes(rows: Sequence[tuple[object, ...]] = CHANGES) -> pd.DataFrame:
+    columns = ["seed", "id", "is_observable", "n_truth_cells", "is_found", "hull_volume_m3", "n_returns"]
+    return pd.DataFrame(rows, columns=columns).assign(scenario="a", variant="ours")
+
+
+def by_hand() -> RankedPairs:
+    return ranked_pairs(results(), regions(), changes())
+
+
+def test_the_free_response_by_hand() -> None:
+    # narrow: 2 km answered, false regions at 8.5 and 8 (0.05, 0.1 per 100 m), changes at 9 and 7; wide: 500 m, a false
+    # one at 300 (0.2 per 100 m) before the change at 200; the refused pair's change is never found: four in all
+    rates, recall = free_response(by_hand())
+    np.testing.assert_allclose(rates, [0.0, 0.1, 0.2])
+    np.testing.assert_allclose(recall, [1 / 4, 2 / 4, 3 / 4])
+    found = {rate: recall_at(by_hand(), rate) for rate in (0.0, 0.099, 0.1, 0.2, 5.0)}
+    assert found == {0.0: 0.25, 0.099: 0.25, 0.1: 0.5, 0.2: 0.75, 5.0: 0.75}
+
+
+def test_what_was_withdrawn_is_no_candidate_but_was_proposed() -> None:
+    # without the false region at 8 the third (7.0), which finds the change 2, costs nothing more; without the one at 7
+    # that change is never found
+    found = regions()
+    gone = found.assign(is_withdrawn=found["score"] == 8.0)
+    rates, recall = free_response(ranked_pairs(results(), gone, changes()))
+    np.testing.assert_allclose([rates[1], recall[1]], [0.05, 2 / 4])
+    assert recall_at(ranked_pairs(results(), gone, changes()), 0.05) == 2 / 4
+    assert recall_at(ranked_pairs(results(), gone, changes(), is_proposal=True), 0.05) == 1 / 4
+    lost = found.assign(is_withdrawn=found["score"] == 7.0)
+    assert recall_at(ranked_pairs(results(), lost, changes()), 10.0) == 2 / 4
+    assert recall_at(ranked_pairs(results(), lost, changes(), is_proposal=True), 10.0) == 3 / 4
+
+
+def test_a_later_candidate_on_a_found_change_counts_nothing_and_an_unobservable_one_is_not_false() -> None:
+    ranked = by_hand()
+    assert ranked.n_new.tolist() == [1, 0, 1, 0, 0, 0, 1]
+    assert ranked.is_false.tolist() == [False, True, False, False, True, True, False]
+    assert ranked.change_rank.tolist() == [0, 2, 7, 1]
+    assert ranked.change_score.tolist() == [9.0, 7.0, -np.inf, 200.0]
+    assert ranked.path_m.tolist() == [1000.0, 1000.0, 0.0, 500.0]
+    assert found_at(ranked, 0.1).tolist() == [True, True, False, False]
+    assert found_at(ranked, 0.2).tolist() == [True, True, False, True]
+
+
+def test_equal_scores_enter_together() -> None:
+    # the false one of the other pair shares the score of the change: both or none
+    rows = [(1, 9.0, "1"), (2, 9.0, "")]
+    ranked = ranked_pairs(results(), regions(rows), changes())
+    assert (recall_at(ranked, 0.0), recall_at(ranked, 0.05)) == (0.0, 0.25)
+    assert not found_at(ranked, 0.0).any()
+
+
+def test_without_changes_there_is_no_recall_and_without_candidates_none_is_found() -> None:
+    unchanged = ranked_pairs(results([(1, 4.5, "ok", 100.0, 0)]), regions([(1, 2.0, "")]), changes([]))
+    assert np.isnan(recall_at(unchanged, 0.1))
+    assert len(free_response(unchanged)[0]) == 0
+    silent = ranked_pairs(results(), regions([]), changes())
+    assert recall_at(silent, 0.1) == 0.0
+    assert [list(part) for part in free_response(silent)] == [[0.0], [0.0]]
+
+
+def test_the_order_of_the_rows_and_the_scale_of_one_kind_of_site_change_nothing() -> None:
+    expected = free_response(by_hand())
+    shuffled = ranked_pairs(results(CASES[::-1]), regions(CANDIDATES[::-1]), changes(CHANGES[::-1]))
+    scaled = regions([(seed, score * (1000.0 if seed == 4 else 1.0), found) for seed, score, found in CANDIDATES])
+    for ranked in (shuffled, ranked_pairs(results(), scaled, changes())):
+        for part, other in zip(free_response(ranked), expected, strict=True):
+            np.testing.assert_array_equal(part, other)
+
+
+def random_case(seed: int) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    draw = np.random.default_rng(seed)
+    cases, found, truth = [], [], []
+    for pair in range(12):
+        n_changes = int(draw.integers(0, 4))
+        cases.append((pair, float(draw.choice([4.5, 10.0])), "ok", float(draw.uniform(50, 300)), n_changes))
+        truth += [(pair, change + 1, True, 20, False, 1.0, 10) for change in range(n_changes)]
+        for _ in range(int(draw.integers(0, 8))):
+            of = [str(change + 1) for change in range(n_changes) if draw.random() < 0.3]
+            found.append((pair, float(draw.integers(0, 10)), ";".join(of)))
+    return results(cases), regions(found), changes(truth)
+
+
+def slow_recall(cases: pd.DataFrame, found: pd.DataFrame, n_observable: int, rate: float) -> float:
+    n_found = 0
+    for _, own in cases.groupby("score_radius_m"):
+        best = 0
+        candidates = found[found["seed"].isin(own["seed"])]
+        for threshold in sorted(set(candidates["score"])):
+            kept = candidates[candidates["score"] >= threshold]
+            if 100 * (kept["found_changes"] == "").sum() / own["after_path_m"].sum() <= rate:
+                hits = {(seed, i) for seed, ids in zip(kept["seed"], kept["found_changes"], strict=True)
+                        for i in ids.split(";") if i}  # fmt: skip
+                best = max(best, len(hits))
+        n_found += best
+    return n_found / n_observable
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_recall_agrees_with_a_slow_twin_at_every_rate(seed: int) -> None:
+    cases, found, truth = random_case(seed)
+    ranked = ranked_pairs(cases, found, truth)
+    rates, recall = free_response(ranked)
+    for rate in (0.0, 0.1, 0.5, 1.0, 2.0, 5.0):
+        expected = slow_recall(cases, found, len(truth), rate)
+        assert recall_at(ranked, rate) == pytest.approx(expected)
+        assert recall[np.searchsorted(rates, rate, side="right") - 1] == pytest.approx(expected)
+        assert found_at(ranked, rate).mean() == pytest.approx(expected)
+
+
+def test_draws_are_of_pairs_within_a_kind_of_site_and_the_same_for_every_method() -> None:
+    cases, found, truth = random_case(0)
+    ours = resampled_recalls(ranked_pairs(cases, found, truth), 0.5)
+    perfect = regions([(seed, 1.0, str(i)) for seed, i in zip(truth["seed"], truth["id"], strict=True)])
+    theirs = resampled_recalls(ranked_pairs(cases, perfect, truth), 0.5)
+    assert np.unique(theirs[~np.isnan(theirs)]).tolist() == [1.0]
+    np.testing.assert_array_equal(ours, resampled_recalls(ranked_pairs(cases, found, truth), 0.5))
+    low, high = interval_of(ours)
+    assert 0 <= low < recall_at(ranked_pairs(cases, found, truth), 0.5) < high <= 1
+    # one wide pair in the example: it is in every draw, so that its change is always among those to be found
+    drawn = resampled_recalls(by_hand(), 0.2)
+    assert drawn.min() > 0
+    assert all(np.isnan(interval_of(np.full(3, np.nan))))
+
+
+@pytest.mark.parametrize(
+    ("cell", "ids"), [("1;12", (1, 12)), ("3", (3,)), (3.0, (3,)), (7, (7,)), ("", ()), (float("nan"), ()), (None, ())]
+)
+def test_found_changes_survive_a_table_that_was_read_back(cell: object, ids: tuple[int, ...]) -> None:
+    assert parsed_ids(cell) == ids
+
+
+def test_a_roc_by_hand() -> None:
+    false, true = roc_curve(np.array([3.0, 2.0, 2.0, 1.0]), np.array([True, True, False, False]))
+    assert (false.tolist(), true.tolist()) == ([0.0, 0.0, 0.5, 1.0], [0.0, 0.5, 1.0, 1.0])
+    assert [len(part) for part in roc_curve(np.ones(3), np.ones(3, dtype=bool))] == [0, 0]
+
+
+@pytest.mark.parametrize("n", [20, 300, 20_000])
+def test_the_area_under_the_curve_is_the_auroc(n: int) -> None:
+    draw = np.random.default_rng(n)
+    positive = draw.random(n) < 0.3
+    scores = np.round(draw.normal(positive, 1.0), 2)
+    scores[draw.random(n) < 0.1] = np.nan
+    false, true = roc_curve(scores, positive)
+    assert len(false) <= 400
+    assert (false[0], true[0], false[-1], true[-1]) == (0, 0, 1, 1)
+    # thinned curves lose what lies between their points
+    assert np.trapezoid(true, false) == pytest.approx(auroc(scores, positive), abs=0.0 if n == 20 else 2e-3, rel=1e-9)
+
+
+def test_recall_by_size_by_hand() -> None:
+    rows = {(row["measure"], row["low"]): row for row in recall_by_size(by_hand(), changes())}
+    assert set(rows) == {("hull_volume_m3", 0.1), ("hull_volume_m3", 1.0), ("n_returns", 0.0), ("n_returns", 300.0),
+                         ("n_returns", 3000.0)}  # fmt: skip
+    # 0.2 m3: found in pair 1, not in the refused pair 3; the unobservable change is no part of any count
+    small = rows["hull_volume_m3", 0.1]
+    assert (small["n_changes"], small["n_pairs"]) == (2, 2)
+    assert (small["recall_at_k"], small["recall_reported"], small["recall_at_rate"]) == (0.5, 0.5, 0.5)
+    # 2 m3: the second of pair 1 (third candidate of K = 2) and that of pair 4 (second of K = 1)
+    large = rows["hull_volume_m3", 1.0]
+    assert (large["recall_at_k"], large["recall_reported"], large["recall_at_rate"]) == (0.0, 0.5, 0.5)
+    assert (large["interval_low"], large["interval_high"]) == (0.0, 1.0)
+    assert sum(row["n_changes"] for key, row in rows.items() if key[0] == "n_returns") == 4
+
+
+def test_the_interval_of_a_share_draws_pairs() -> None:
+    # ten hits of one pair are one draw, not ten: either all, none, or half
+    hits, pair = np.repeat([True, False], 10), np.repeat([3, 8], 10)
+    assert share_interval(hits, pair) == (0.0, 1.0)
+    assert all(np.isnan(share_interval(hits[:10], pair[:10])))

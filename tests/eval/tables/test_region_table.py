@@ -1,0 +1,242 @@
+"""The table of regions and its targets, worked out by hand."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from cdpipe.model.config import load_config
+from cdpipe.model.types import DescriptorSet, MappedSession, PointMap
+from eval.core.statistics import wilson_interval
+from eval.running.stages import kept_bytes
+from eval.tables.region_table import FILES, region_overview, region_tables
+
+NAN = float("nan")
+PER_PAIR = {
+    "region_auroc": NAN, "region_recall_at_k": NAN, "region_recall": NAN, "region_precision": NAN, "n_false_regions": 0,
+    "n_found_changes": 0, "bytes_map_before": 1000.0, "bytes_regions_before": 100.0, "after_path_m": 1000.0,
+    "region_recall_at_k_proposed": NAN, "region_recall_proposed": NAN,
+    "t_descriptor_per_keyframe_s": 0.01, "t_cd_per_region_s": NAN, "is_unchanged_pair": False, "is_alarm": NAN,
+    "score_radius_m": 4.5, "n_observable": 0, "status": "ok",
+}  # fmt: skip
+
+
+def case(family: str, seed: int, variant: str = "tunnelcd", **columns: object) -> dict[str, object]:
+    return {"scenario": family, "family": family, "seed": seed, "variant": variant, **PER_PAIR, **columns}
+
+
+def changed(family: str, seed: int, variant: str = "tunnelcd", **columns: object) -> dict[str, object]:
+    return case(
+        family, seed, variant, **{"n_observable": 1, "region_recall": 0.0, "region_recall_at_k": 0.0, **columns}
+    )
+
+
+def unchanged(family: str, seed: int, *, alarm: float = 0.0, **columns: object) -> dict[str, object]:
+    return case(family, seed, **{"is_unchanged_pair": True, "is_alarm": alarm, **columns})
+
+
+def tables(
+    rows: list[dict[str, object]], *, is_whole: bool = True, **items: list[dict[str, object]]
+) -> dict[str, pd.DataFrame]:
+    """Every changed pair has one change, found by the only candidate of `tunnelcd` and by none of another method."""
+    truth = [row for row in rows if row["n_observable"]]
+    identity = [{name: row[name] for name in ("scenario", "seed", "variant")} for row in truth]
+    change = {"id": 1, "is_observable": True, "n_truth_cells": 20, "is_found": True, "hull_volume_m3": 0.2}
+    found = [
+        {**names, "score": 1.0, "found_changes": "1", "is_withdrawn": False}
+        for names, row in zip(identity, truth, strict=True)
+        if row["status"] == "ok" and row["variant"] == "tunnelcd"
+    ]
+    every = {
+        "changes": [{**names, **change} for names in identity], "regions": found, "keyframes": [], **items,
+    }  # fmt: skip
+    return region_tables(
+        pd.DataFrame(rows), {name: pd.DataFrame(each) for name, each in every.items()}, is_whole=is_whole
+    )
+
+
+def the_row(table: pd.DataFrame, domain: str, variant: str = "tunnelcd") -> dict[str, object]:
+    found = table[(table["domain"] == domain) & (table["variant"] == variant)]
+    assert len(found) == 1
+    return found.iloc[0].to_dict()
+
+
+def the_target(targets: pd.DataFrame, name: str, domain: str) -> dict[str, object]:
+    found = targets[(targets["target"] == name) & (targets["domain"] == domain)]
+    assert len(found) == 1
+    return found.iloc[0].to_dict()
+
+
+def test_a_row_by_hand() -> None:
+    rows = [
+        changed("regions/narrow", 1, region_auroc=0.9, region_recall=1.0, region_recall_at_k=1.0, n_false_regions=2),
+        changed("regions/narrow", 2, region_auroc=0.7, region_recall=1.0, region_recall_at_k=0.0, after_path_m=500.0),
+        changed("regions/narrow", 3, status="merge_refused", bytes_regions_before=NAN),
+        unchanged("regions/narrow", 4),
+        unchanged("regions/narrow", 5, alarm=1.0, n_false_regions=3),
+        unchanged("regions/narrow", 6, alarm=NAN, status="merge_refused"),
+    ]
+    row = the_row(tables(rows)["regions_table"], "in")
+    assert (row["n_pairs"], row["n_refused"], row["n_failed"], row["n_auroc"], row["n_changed"]) == (6, 2, 2, 2, 3)
+    assert row["region_auroc"] == pytest.approx(0.8)
+    assert row["region_recall"] == pytest.approx(2 / 3)  # the refused pair is a 0
+    assert row["region_recall_at_k"] == pytest.approx(1 / 3)
+    # five false regions on 3.5 km of answered pairs, three of them on the 2 km where nothing changed
+    assert row["false_regions_per_100m"] == pytest.approx(100 * 5 / 3500)
+    assert row["false_regions_per_100m_unchanged"] == pytest.approx(100 * 3 / 2000)
+    assert (row["km"], row["km_unchanged"]) == (3.5, 2.0)
+    # one of three silent: a refusal is neither silent nor an alarm, but it is a pair
+    assert (row["n_silent"], row["n_unchanged"], row["silent_share"]) == (1, 3, pytest.approx(1 / 3))
+    assert (row["silent_low"], row["silent_high"]) == wilson_interval(1, 3)
+    assert (row["bytes_map_before"], row["bytes_regions_before"], row["bytes_ratio"]) == (1000.0, 100.0, 10.0)
+    assert row["recall_at_0.1"] == pytest.approx(2 / 3)
+    assert row["t_descriptor_per_keyframe_s"] == 0.01
+
+
+def test_domains_are_apart_and_all_is_both() -> None:
+    rows = [
+        changed("regions/wide", 1, region_auroc=1.0),
+        changed("cave", 1, region_auroc=0.5),
+        changed("paper/site1", 1),
+    ]
+    found = tables(rows)
+    assert found["regions_table"][["domain", "n_pairs"]].to_numpy().tolist() == [["in", 1], ["out", 2], ["all", 3]]
+    assert the_row(found["regions_table"], "all")["region_auroc"] == 0.75
+    assert set(found) == set(FILES)
+    # a single domain is not told twice
+    assert tables(rows[:1])["regions_table"]["domain"].tolist() == ["in"]
+    assert region_overview(found["regions_table"])["n"].tolist() == [1, 2, 3]
+
+
+def test_pooled_auroc_and_curves_are_of_labelled_keyframes_alone() -> None:
+    keyframes = [
+        {"scenario": "narrow", "seed": seed, "variant": "tunnelcd", "score": score, "label": label}
+        for seed, score, label in [(1, 3.0, 1), (1, 2.0, 0), (2, 2.0, 1), (2, 1.0, 0), (2, 99.0, -1)]
+    ]
+    found = tables([changed("narrow", 1), changed("narrow", 2)], keyframes=keyframes)
+    assert the_row(found["regions_table"], "in")["region_auroc_pooled"] == 0.875
+    roc = found["roc"][["false_positive_rate", "true_positive_rate"]].to_numpy()
+    assert roc.tolist() == [[0, 0], [0, 0.5], [0.5, 1], [1, 1]]
+
+
+@pytest.mark.parametrize(("auroc", "is_met"), [(0.97, True), (0.969, False)])
+def test_targets_in_distribution(auroc: float, is_met: bool) -> None:
+    rows = [changed("narrow", seed, region_auroc=auroc, region_recall_at_k=0.95) for seed in range(3)]
+    targets = tables(rows)["regions_targets"]
+    assert the_target(targets, "AUROC", "in")["is_met"] is is_met
+    assert the_target(targets, "recall at K", "in")["is_met"] is True
+    assert tables(rows, is_whole=False)["regions_targets"]["is_met"].tolist() == [None] * len(targets)
+
+
+def test_out_of_distribution_less_is_asked() -> None:
+    targets = tables([changed("cave", seed, region_auroc=0.93, region_recall_at_k=0.89) for seed in range(3)])
+    found = targets["regions_targets"]
+    assert the_target(found, "AUROC", "out")["is_met"] is True
+    assert the_target(found, "recall at K", "out")["is_met"] is False
+
+
+def test_a_rival_that_finds_more_makes_the_target_missed() -> None:
+    ours = [changed("narrow", seed) for seed in range(4)]
+    theirs = [{**row, "variant": "c2c"} for row in ours]
+    found = tables([*ours, *theirs])["regions_targets"]
+    target = the_target(found, "recall at 0.1 false, less that of c2c", "in")
+    assert (target["value"], target["low"], target["high"], target["is_met"]) == (1.0, 1.0, 1.0, True)
+    swapped = [
+        {**row, "variant": {"tunnelcd": "c2c", "c2c": "tunnelcd"}[str(row["variant"])]} for row in [*ours, *theirs]
+    ]
+    regions = [
+        {"scenario": "narrow", "seed": s, "variant": "c2c", "score": 1.0, "found_changes": "1", "is_withdrawn": False}
+        for s in range(4)
+    ]
+    target = the_target(tables(swapped, regions=regions)["regions_targets"], str(target["target"]), "in")
+    assert (target["value"], target["is_met"]) == (-1.0, False)
+
+
+def test_silence_is_judged_over_five_kilometres_and_more() -> None:
+    name = "share of unchanged pairs that are silent"
+    four_km = [unchanged("null/narrow", seed) for seed in range(4)]
+    assert the_target(tables(four_km)["regions_targets"], name, "in")["is_met"] is None
+    twenty = [unchanged("null/narrow", seed) for seed in range(20)]
+    assert the_target(tables(twenty)["regions_targets"], name, "in")["is_met"] is True
+    one_loud = [*twenty[1:], unchanged("null/cave", 0, alarm=1.0, n_false_regions=21)]
+    found = tables(one_loud)["regions_targets"]
+    assert the_target(found, name, "all")["is_met"] is True  # 19 of 20
+    rate = the_target(found, "false regions per 100 m, unchanged pairs", "all")
+    assert (rate["value"], rate["is_met"]) == (pytest.approx(0.105), False)
+    refused = [*twenty[2:], *(unchanged("null/narrow", s, alarm=NAN, status="merge_refused") for s in (30, 31))]
+    assert the_target(tables(refused)["regions_targets"], name, "in")["is_met"] is False
+
+
+def test_bytes_and_the_papers_seconds_are_judged_on_the_papers_sites() -> None:
+    rows = [
+        changed("regions/site1", 1, bytes_map_before=1100.0),
+        changed("regions/site2", 1, bytes_map_before=3400.0),
+        changed("regions/site1", 1, "paper", t_cd_per_region_s=0.016),
+        changed("regions/site2", 1, "paper", t_cd_per_region_s=0.110),
+    ]
+    found = tables(rows)["regions_targets"]
+    verdicts = {
+        (name, site): the_target(found, name, site)["is_met"]
+        for name in ("bytes of the map per byte kept", "t_cd per region [s]")
+        for site in ("site1", "site2")
+    }
+    assert list(verdicts.values()) == [True, False, True, False]
+
+
+def mapped(n_points: int, n_keyframes: int, has_spheres: bool) -> MappedSession:
+    scans = np.arange(n_keyframes)
+    points = np.zeros((n_points, 3))
+    empty = np.zeros(0, dtype=np.int32)
+    pointmap = PointMap(points, np.zeros(n_points, np.float32), 0.2, np.tile(np.eye(4), (n_keyframes, 1, 1)), scans,
+                        empty, empty, np.zeros(n_keyframes + 1, np.int64))  # fmt: skip
+    spheres = np.zeros((n_keyframes, 64), np.float32) if has_spheres else None
+    q = np.zeros((n_keyframes, 32), np.float32)
+    return MappedSession(pointmap, DescriptorSet(q, None, scans, "test", "", spheres))
+
+
+@pytest.mark.parametrize(
+    ("settings", "per_keyframe", "per_point"),
+    [
+        (["query.compare=scan"], 4 * 32 + 28, 0),
+        (["query.compare=sphere"], 4 * 64 + 28, 0),
+        (["query.compare=difference"], 0, 12),
+        (["method=voxel-diff"], 0, 12),
+        (["method=c2c"], 0, 12),
+        (["method=random-regions"], 28, 0),
+    ],
+)
+def test_bytes_kept_by_hand(settings: list[str], per_keyframe: int, per_point: int) -> None:
+    found = kept_bytes(mapped(1000, 10, has_spheres=True), load_config("tunnelcd", settings))
+    assert found == {"bytes_map_before": 12000.0, "bytes_regions_before": 10.0 * per_keyframe + 1000.0 * per_point}
+
+
+PLAN = {
+    "name": "tiny", "scenarios": ["smoke/one_box"], "seeds": [10300], "report": "regions",
+    "variants": [{"preset": "voxel-diff"}, {"preset": "random-regions"}],
+}  # fmt: skip
+
+
+def test_the_run_prints_and_writes_the_tables_only_where_the_plan_asks(
+    tmp_path: Path, command: Callable[..., tuple[int, str, str]]
+) -> None:
+    out = tmp_path / "out"
+    (tmp_path / "with.yaml").write_text(yaml.safe_dump(PLAN))
+    code, told, _ = command("run", tmp_path / "with.yaml", "--out", out)
+    assert code == 0
+    assert "recall@0.1" in told
+    assert all((out / f"{name}.csv").is_file() for name in ("regions_table", "regions_by_size", "roc", "froc"))
+    assert pd.read_csv(out / "regions_table.csv")["variant"].tolist() == ["voxel-diff", "random-regions"]
+    assert pd.read_csv(out / "changes.csv")["range_m"].between(0.5, 10.0).all()
+    kept = pd.read_csv(out / "results.csv").set_index("variant")["bytes_regions_before"]
+    assert kept["voxel-diff"] > 10 * kept["random-regions"] > 0
+    code, _, _ = command("report", out)
+    assert 'id="regions"' in (out / "index.html").read_text()
+    (tmp_path / "without.yaml").write_text(yaml.safe_dump({**PLAN, "report": None}))
+    code, told, _ = command("run", tmp_path / "without.yaml", "--out", out)
+    assert "recall@0.1" not in told
+    assert not any((out / f"{name}.csv").exists() for name in FILES)
+    command("report", out)
+    assert 'id="regions"' not in (out / "index.html").read_text()

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from cdpipe.descriptors.network import digest
+from cdpipe.descriptors.sphere_network import loaded_sphere_network
+from eval.core.progress import Silent
+from eval.training.dataset import Recipe
+from eval.training.dataset_run import Where, make_dataset
+
+Command = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module", name="data")
+def data_fixture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    for seeds in ("3:4", "10003:10004"):
+        make_dataset(["smoke/one_box"], seeds, Recipe(draws=2), folder, Where(None, None), None, "test", Silent())
+    return folder
+
+
+def test_from_a_dataset_to_a_checkpoint_with_its_card(data: Path, tmp_path: Path, command: Command) -> None:
+    out = tmp_path / "trained"
+    arguments = ("train", data, "--out", out, "--steps", "3", "--threads", "1", "--quiet")
+    assert command(*arguments)[0] == 0
+    checkpoint = out / "sphere.safetensors"
+    network = loaded_sphere_network(checkpoint.read_bytes())
+    card = json.loads((out / "sphere.json").read_text())
+    assert card["network"] == asdict(network.size)
+    assert card["checkpoint"] == digest(checkpoint.read_bytes())
+    assert card["data"]["seeds"] == "3:4" and card["validation"]["seeds"] == "10003:10004"
+    assert card["data"]["digest"] != card["validation"]["digest"]
+    assert set(card["validation"]["trained"]) == {"log_likelihood", "auroc", "auroc_pooled"}
+    with (out / "curves.csv").open() as file:
+        assert [row["step"] for row in csv.DictReader(file)] == ["3"]
+    assert (out / "curves.png").stat().st_size > 1000
+    # the same command again has nothing left to do, and says the same
+    content = checkpoint.read_bytes()
+    assert command(*arguments)[0] == 0
+    assert checkpoint.read_bytes() == content
+
+
+def test_the_place_descriptor_is_trained_by_the_same_command(data: Path, tmp_path: Path, command: Command) -> None:
+    out = tmp_path / "trained"
+    arguments = ("--descriptor", "3deg", "--steps", "2", "--threads", "1", "--quiet")
+    assert command("train", data, "--out", out, *arguments)[0] == 0
+    card = json.loads((out / "3deg.json").read_text())
+    assert set(card["validation"]["trained"]) == {"recall_at_1", "yaw_error_deg", "yaw_flip_share"}
+
+
+def test_mistakes_are_one_line(data: Path, tmp_path: Path, command: Command) -> None:
+    def refused(*arguments: object) -> str:
+        code, _, err = command("train", *arguments)
+        assert code == 2 and len(err.strip().splitlines()) == 1
+        return err
+
+    assert "expected sphere or 3deg" in refused(data, "--out", tmp_path / "a", "--descriptor", "spere")
+    assert "made by `tunnelcd dataset`" in refused(tmp_path, "--out", tmp_path / "b")
+    assert not (tmp_path / "b").exists()
+    training = tmp_path / "training"
+    shutil.copytree(data, training)
+    rows = (training / "index.csv").read_text().splitlines()
+    (training / "index.csv").write_text("\n".join(row for row in rows if "10003" not in row) + "\n")
+    assert "split validation" in refused(training, "--out", tmp_path / "c", "--quiet")

@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import invert, make_pose, yaw_pose
+from cdpipe.model.report import ChangeRegions, ChangeReport
+from eval.truth.aligned import alignment_of
+
+RIGID = yaw_pose(0.4, (3.0, -2.0, 0.5))
+POSES = np.array([make_pose(translation=(0.5 * step, 0.0, 1.0)) for step in range(40)])
+KEYFRAMES = np.arange(0, 40, 2)
+
+
+def report(local: np.ndarray | None, after_keyframes: np.ndarray = KEYFRAMES) -> ChangeReport:
+    none = np.zeros(0)
+    regions = ChangeRegions(np.zeros((0, 3)), 4.5, none, np.zeros((0, 2), np.int64), none.astype(bool), none)
+    scans = (np.zeros(0, np.int64), after_keyframes)
+    return ChangeReport(RIGID, {}, regions, (), {}, {}, scans, local_before_T_after=local)
+
+
+def test_a_rigid_answer() -> None:
+    alignment = alignment_of(report(None), POSES)
+    assert alignment.is_rigid
+    np.testing.assert_array_equal(alignment.before_T_after[0], RIGID)
+
+
+@pytest.mark.parametrize("keyframes", [KEYFRAMES, np.zeros(0, np.int64)])
+def test_a_local_answer_lies_along_its_keyframes_or_all_scans(keyframes: np.ndarray) -> None:
+    scans = keyframes if len(keyframes) else np.arange(40)
+    local = np.array([make_pose(translation=(0, 0, 0.01 * scan)) @ RIGID for scan in scans])
+    alignment = alignment_of(report(local, keyframes), POSES)
+    np.testing.assert_array_equal(alignment.anchors_odom, POSES[scans, :3, 3])
+    # 1 cm a scan; far from the ends the blend keeps a straight line, but for the few anchors it leaves out
+    middle = alignment.to_map(POSES[18:23, :3, 3])
+    expected = (RIGID @ POSES[18:23])[:, :3, 3] + np.outer(np.arange(18, 23), (0, 0, 0.01))
+    np.testing.assert_allclose(middle, expected, atol=2e-3)
+
+
+def test_answers_to_another_pair_are_refused() -> None:
+    local = np.stack([RIGID] * len(KEYFRAMES))
+    for wrong in (report(local[:3]), report(local, KEYFRAMES + 30), report(local, KEYFRAMES - 1)):
+        with pytest.raises(InputError, match="is it an answer to this pair"):
+            alignment_of(wrong, POSES)
+    bad = replace(report(local), local_before_T_after=local * 2)
+    with pytest.raises(InputError, match=r"the answer's before_T_after|local_before_T_after\[0\] is not a rigid"):
+        alignment_of(bad, POSES)
+    assert np.isfinite(alignment_of(report(invert(local)), POSES).to_map(np.zeros((1, 3)))).all()

@@ -1,0 +1,91 @@
+"""The universe against a dictionary of cells, its lookups, its cache, and labels that do not belong."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import transform
+from cdpipe.io.readers import open_scans
+from cdpipe.io.session import read_session
+from eval.truth import universe as module
+from eval.truth.universe import build_universe, load_universe
+from sim.session.truth import read_labels, write_labels
+
+
+def universe_by_dictionary(session: Path) -> dict[tuple[int, ...], tuple[int, int, int, int, np.ndarray]]:
+    """First return of each cell in the order of scans and pixels: scan, pixel, change, instance, point."""
+    opened = read_session(session)
+    labels = list(read_labels(session, opened.n_chunks))
+    instance, change = (np.concatenate([chunk[part] for chunk in labels]) for part in (0, 1))
+    first: dict[tuple[int, ...], tuple[int, int, int, int, np.ndarray]] = {}
+    for scan in open_scans(session).scans():
+        points = transform(scan.odom_T_sensor, scan.points_sensor)
+        for pixel, point in zip(scan.pixels.tolist(), points, strict=True):
+            row, column = divmod(pixel, opened.sensor.width)
+            labelled = (int(change[scan.index, row, column]), int(instance[scan.index, row, column]))
+            first.setdefault(tuple(np.floor(point / 0.1)), (scan.index, pixel, *labelled, point))
+    return first
+
+
+@pytest.mark.parametrize(("batch", "pending"), [(500_000, 4_000_000), (300, 10), (1, 1)])
+@pytest.mark.parametrize("name", ["before", "after"])
+def test_equals_a_dictionary_of_cells(
+    tiny_pair: Path, name: str, batch: int, pending: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_BATCH_RETURNS", batch)
+    monkeypatch.setattr(module, "_PENDING_ROWS", pending)
+    session = tiny_pair / name
+    built = build_universe(read_session(session))
+    expected = sorted(universe_by_dictionary(session).values(), key=lambda row: row[:2])
+    every = np.arange(len(built))
+    assert len(built) == len(expected)
+    assert list(zip(built.scans(every), built.pixels(every), strict=True)) == [row[:2] for row in expected]
+    assert built.change.tolist() == [row[2] for row in expected]
+    assert built.instance.tolist() == [row[3] for row in expected]
+    np.testing.assert_allclose(built.points_odom, [row[4] for row in expected], atol=1e-5)
+    assert set(built.change.tolist()) == ({0, 2} if name == "before" else {0, 1, 3})
+
+
+def test_rows_are_found_again_by_their_returns(tiny_pair: Path) -> None:
+    built = load_universe(tiny_pair / "after")
+    chosen = np.array([0, 5, len(built) - 1])
+    returns = np.column_stack([built.scans(chosen), built.pixels(chosen)]).astype(np.int32)
+    assert built.rows_of_returns(returns[::-1]).tolist() == chosen.tolist()
+    assert built.rows_of_returns(np.zeros((0, 2), dtype=np.int32)).tolist() == []
+    # pixel 0 is a miss in every scan
+    assert built.rows_of_returns(np.array([[0, 0], [13, 0]], dtype=np.int32)).tolist() == []
+
+
+def test_the_cache_is_used_until_the_session_changes(tiny_pair: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = tiny_pair / "after"
+    built = load_universe(session)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "build_universe", lambda _: pytest.fail("built again"))
+        cached = load_universe(session)
+    for name in ("returns", "points_odom", "change", "instance"):
+        np.testing.assert_array_equal(getattr(cached, name), getattr(built, name))
+        assert getattr(cached, name).dtype == getattr(built, name).dtype
+    assert (cached.n_scans, cached.n_pixels) == (built.n_scans, built.n_pixels)
+
+    instance, change = next(read_labels(session, 1))
+    write_labels(session, 0, instance, np.where(change == 1, 9, change).astype(np.int16))
+    assert 9 in load_universe(session).change
+
+
+def test_a_damaged_cache_is_built_again(tiny_pair: Path) -> None:
+    session = tiny_pair / "after"
+    built = load_universe(session)
+    (session / "truth" / "universe.npz").write_bytes(b"PK\x03\x04 not an archive")
+    np.testing.assert_array_equal(load_universe(session).returns, built.returns)
+
+
+def test_labels_of_another_session_are_refused(tiny_pair: Path) -> None:
+    session = tiny_pair / "before"
+    write_labels(session, 1, np.zeros((5, 4, 32), np.int16), np.zeros((5, 4, 32), np.int16))
+    with pytest.raises(InputError, match=r"labels of chunk 1 are \(5, 4, 32\)"):
+        load_universe(session)
+    (session / "truth" / "00001.npz").unlink()
+    with pytest.raises(InputError, match=r"00001\.npz: missing"):
+        load_universe(session)
