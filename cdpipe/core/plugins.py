@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from functools import cache
-from importlib import metadata
+from importlib import metadata, resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -63,3 +64,29 @@ def search_folders(kind: str) -> tuple[Path, ...]:
         if not folder.is_dir():
             raise InputError(f"{SEARCH_PATH}: {folder}: no such folder: mend or unset the variable")
     return tuple(folder / kind for folder in folders if (folder / kind).is_dir())
+
+
+def find_yaml(kind: str, *shipped: Traversable, group: str | None = None) -> dict[str, Traversable]:
+    """Return the YAML files of a kind by name (without `.yaml`), sorted: shipped, of plugins, on `TUNNELCD_PATH`.
+
+    Args:
+        kind: Folder looked for on the search path, e.g. `presets`.
+        shipped: Our own folders.
+        group: Entry-point group in which each value names a package that holds such files.
+
+    Raises:
+        InputError: Two files claim one name, or a plugin's package cannot be found.
+    """
+    folders = [*shipped]
+    for entry in entry_points(group).values() if group else ():
+        try:
+            folders.append(resources.files(entry.value))
+        except ImportError as error:
+            raise InputError(f"{group}: {entry.name!r} = {entry.value}: no such package: {error}") from error
+    found: dict[str, Traversable] = {}
+    for file in (file for folder in (*folders, *search_folders(kind)) for file in folder.iterdir()):
+        if file.name.endswith(".yaml") and found.setdefault(file.name.removesuffix(".yaml"), file) is not file:
+            raise InputError(
+                f"{file}: there is another of this name, {found[file.name.removesuffix('.yaml')]}: rename it"
+            )
+    return dict(sorted(found.items()))

@@ -26,7 +26,7 @@ _NUMBERS = re.compile(r"(\d+)")
 _STANDING = 0.1
 
 
-def open_scans(path: Path) -> ScanSource:
+def open_session(path: Path) -> ScanSource:
     """Open a folder of scans.
 
     Args:

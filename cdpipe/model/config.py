@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Mapping
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.plugins import METHODS, PRESETS, entry_points, find_yaml
 from cdpipe.core.yamlfile import Document, Settings, read_yaml, suggestion, validated, with_section, with_settings
 
 Positive = Annotated[float, Field(gt=0)]
@@ -142,8 +144,9 @@ class DufomapConfig(Settings):
 class PipelineConfig(Settings):
     """All settings of one method."""
 
-    method: Literal["descriptor", "voxel-diff", "c2c", "m3c2", "dufomap", "random-regions"] = Field(
-        "descriptor", description="the paper's pipeline, a whole-map rival, or a control"
+    method: str = Field(
+        "descriptor",
+        description="the paper's pipeline, a whole-map rival, a control, or a plugin's; by registered name",
     )
     seed: Annotated[int, Field(ge=0)] = Field(0, description="for methods that draw at random")
     map: MapConfig = MapConfig()
@@ -155,26 +158,46 @@ class PipelineConfig(Settings):
     cluster: ClusterConfig = ClusterConfig()
     m3c2: M3C2Config = M3C2Config()
     dufomap: DufomapConfig = DufomapConfig()
+    options: dict[str, bool | int | float | str] = Field(
+        {}, description="settings of a plugin's method, by its own names"
+    )
+
+    @field_validator("method")
+    @classmethod
+    def _is_registered(cls, method: str) -> str:
+        known = entry_points(METHODS)
+        if method not in known:
+            raise ValueError(f"no such method{suggestion(method, known)} (registered: {', '.join(known)})")
+        return method
+
+    @model_serializer(mode="wrap")
+    def _without_empty_options(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {name: value for name, value in handler(self).items() if name != "options" or value}
 
 
 def preset_names() -> list[str]:
-    """Return the names of the shipped presets."""
-    return sorted(entry.name.removesuffix(".yaml") for entry in _presets().iterdir() if entry.name.endswith(".yaml"))
+    """Return the names of all presets: shipped, of plugins, and on the search path."""
+    return list(_presets())
 
 
-def load_config(preset: str = "tunnelcd", settings: Iterable[str] = (), site: Site = "narrow") -> PipelineConfig:
-    """Read a preset (a shipped name or the path of a .yaml file) and write `a.b=value` settings over it.
+def load_config(
+    preset: str = "tunnelcd", settings: Iterable[str] | Mapping[str, Any] = (), site: Site = "narrow"
+) -> PipelineConfig:
+    """Read a preset (a name or the path of a .yaml file) and write settings over it.
 
     Args:
         preset: What stands in it is for narrow drifts, and under `wide` what is otherwise in wide ones: the radius, and
             with it the threshold.
-        settings: Written over either.
+        settings: Written over either: `["query.radius_m=6"]`, `{"query.radius_m": 6}` or `{"query": {"radius_m": 6}}`.
         site: Which of them.
 
     Raises:
         InputError: The preset is unknown or not made for such a site, or keys or values are wrong; all mistakes of
             both kinds of site at once.
     """
+    if isinstance(settings, Mapping):
+        settings = _as_lines(settings)
+    settings = tuple(settings)
     narrow, wide = with_section(_preset_document(preset), "wide")
     found: dict[str, PipelineConfig] = {}
     mistakes: dict[str, None] = {}
@@ -208,15 +231,24 @@ def settings_table() -> list[tuple[str, Any, str]]:
     return rows
 
 
+def _as_lines(settings: Mapping[str, Any], group: str = "") -> list[str]:
+    """Return settings as `a.b=value` lines."""
+    lines: list[str] = []
+    for key, value in settings.items():
+        lines += (
+            _as_lines(value, f"{group}{key}.") if isinstance(value, Mapping) else [f"{group}{key}={json.dumps(value)}"]
+        )
+    return lines
+
+
 def _preset_document(preset: str) -> Document:
     if preset.endswith((".yaml", ".yml")):
         return read_yaml(Path(preset))
-    names = preset_names()
-    if preset not in names:
-        raise InputError(f"preset {preset!r} is unknown{suggestion(preset, names)} (known: {', '.join(names)})")
-    file = _presets() / f"{preset}.yaml"
-    return read_yaml(Path(f"{preset}.yaml"), file.read_text())
+    presets = _presets()
+    if preset not in presets:
+        raise InputError(f"preset {preset!r} is unknown{suggestion(preset, presets)} (known: {', '.join(presets)})")
+    return read_yaml(Path(f"{preset}.yaml"), presets[preset].read_text())
 
 
-def _presets() -> Traversable:
-    return resources.files("cdpipe") / "methods" / "presets"
+def _presets() -> dict[str, Traversable]:
+    return find_yaml("presets", resources.files("cdpipe") / "methods" / "presets", group=PRESETS)

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, Int64Array, require_poses, require_shape
+from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, Int64Array, require_poses, require_shape, yaw_rad
 from cdpipe.model.types import Kind, SessionName, UInt8Array
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,3 +145,66 @@ class ChangeReport:
     keyframe_scans: tuple[Int64Array, Int64Array]
     config: Mapping[str, object] = field(default_factory=dict)
     local_before_T_after: Float64Array | None = None
+
+    def to_pandas(self, table: Literal["objects", "regions"] = "objects") -> pd.DataFrame:
+        """Return the objects or the reported regions as a table; positions in the map frame, metres.
+
+        `objects`: one row per object: what happened to it, centroid and corners of its points, centre, level edges (the
+        longer one is the length), height and yaw of its upright box, volume, and how far a moved one went. What is not
+        known is empty.
+
+        `regions`: one row per region that the threshold let through, best first. A withdrawn region does not stand in
+        the answer: nothing could be cut out of it.
+
+        Raises:
+            ValueError: There is no such table.
+        """
+        import pandas as pd  # noqa: PLC0415 - importing cdpipe must stay fast
+
+        if table not in ("objects", "regions"):
+            raise ValueError(f"table must be 'objects' or 'regions', got {table!r}")
+        if table == "regions":
+            return pd.DataFrame(_region_columns(self))
+        return pd.DataFrame(
+            [_object_row(index, item) for index, item in enumerate(self.objects)], columns=_OBJECT_COLUMNS
+        )
+
+
+_AXES = "xyz"
+_OBJECT_COLUMNS = [
+    *("object", "session", "kind", "partner", "region", "score", "n_returns", "n_points"),
+    *(f"{axis}_m" for axis in _AXES),
+    *(f"{end}_{axis}_m" for end in ("min", "max") for axis in _AXES),
+    *(f"box_{axis}_m" for axis in _AXES),
+    *("box_length_m", "box_width_m", "box_height_m", "box_yaw_deg", "volume_m3"),
+    *(f"displacement_{axis}_m" for axis in _AXES),
+]
+
+
+def _region_columns(report: ChangeReport) -> dict[str, object]:
+    regions = report.regions
+    shown = np.flatnonzero(regions.is_proposed)
+    return {
+        "region": shown,
+        "score": regions.scores[shown],
+        "is_withdrawn": ~regions.is_reported[shown],
+        **{f"{axis}_m": regions.centres_map[shown, k] for k, axis in enumerate(_AXES)},
+        **{name: values[shown] for name, values in report.figures.items()},
+    }
+
+
+def _object_row(index: int, item: ChangedObject) -> tuple[object, ...]:
+    points = item.points_map if len(item.points_map) else np.full((1, 3), np.nan)
+    identity = index, item.session, item.kind, item.partner, item.region, item.score
+    counts = len(item.returns), len(item.points_map)
+    corners = *points.mean(axis=0), *points.min(axis=0), *points.max(axis=0)
+    shift = np.full(3, np.nan) if item.displacement_map is None else item.displacement_map
+    return (*identity, *counts, *corners, *_box_row(item.shape), *shift)
+
+
+def _box_row(shape: ObjectShape | None) -> tuple[float, ...]:
+    """Return centre (3,), edges (3,), yaw in degrees and volume, NaN where nothing is known."""
+    if shape is None:
+        return (np.nan,) * 8
+    yaw_deg = float(np.rad2deg(yaw_rad(shape.map_T_box)))
+    return (*shape.map_T_box[:3, 3], *shape.box_m, yaw_deg, shape.volume_m3)

@@ -26,11 +26,10 @@ from cdpipe.extract.point_comparison import inlier_mask, new_points_mask
 from cdpipe.extract.surface import RIM_M, SITE_M, PlaneTable, candidates, compare_site, groups
 from cdpipe.extract.surface_rule import BEYOND_M, ReturnPool, object_cells, rays_of, realigned
 from cdpipe.mapping.free_space import free_space_votes
-from cdpipe.merge.merge import merge_maps
 from cdpipe.merge.registration import Surface
 from cdpipe.model.config import ExtractConfig, PipelineConfig, load_config
 from cdpipe.model.types import KeyframeViews, MergedMaps, SessionName
-from cdpipe.pipeline import map_session, refusal
+from cdpipe.pipeline import Hooks, map_session, merge_mapped
 from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
 from sim.session.simulate import simulate_pair
@@ -76,10 +75,7 @@ class ExtractSite:
             pair = Path(folder) / "pair"
             simulate_pair(load_scenario(self.scenario, self.seed), self.seed, pair)
             before, after = (map_session(pipeline_input(pair, name), self.config) for name in ("before", "after"))
-        merged = merge_maps(before, after, self.config.merge)
-        if not merged.is_accepted:
-            raise refusal(merged)
-        return merged
+        return merge_mapped(before, after, self.config, Hooks())
 
     @cached_property
     def region(self) -> Region:

@@ -3,14 +3,20 @@
 # ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from eval.cli.options import KindOfSite, OutFolder, Preset, Quiet, SetSettings
 from eval.core.printing import print_table, say
 from eval.core.progress import shown_progress
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from cdpipe.model.config import PipelineConfig
 
 
 def describe(
@@ -20,10 +26,9 @@ def describe(
     quiet: Quiet = False,
 ) -> None:
     """Compute a session's descriptors and store them beside it, as a robot would while mapping."""
-    from cdpipe.model.config import load_config
-    from eval.running.single import describe_session
+    import cdpipe
 
-    descriptors, path = describe_session(session, load_config(preset, settings or ()))
+    descriptors, path = cdpipe.describe(session, preset, settings or ())
     say(quiet, f"{path}: {len(descriptors.q)} keyframes, {descriptors.name} {descriptors.checkpoint}")
 
 
@@ -37,26 +42,27 @@ def detect(
     quiet: Quiet = False,
 ) -> None:
     """Find what changed between two sessions, simulated or recorded; needs no truth."""
+    import cdpipe
     from cdpipe.core.errors import MergeFailedError
-    from cdpipe.model.config import load_config
+    from cdpipe.mapping.session_check import is_same_session
     from eval.core.output import new_folder
-    from eval.running.single import detect_pair, evidence_table, notes_on, object_table, region_table, write_detection
 
-    config = load_config(preset, settings or (), site)
-    for note in notes_on(before, after):
-        typer.echo(f"note: {note}", err=True)
+    config = cdpipe.load_config(preset, settings or (), site)
+    if is_same_session(cdpipe.open_session(before), cdpipe.open_session(after)):
+        same = f"{before} and {after} are one and the same recording: nothing can have changed between them"
+        typer.echo(f"note: {same}", err=True)
     try:
         with new_folder(out) as partial, shown_progress(quiet) as progress:
-            report = detect_pair(before, after, config, progress.stage)
-            write_detection(partial, preset, report)
+            report = cdpipe.detect(before, after, preset, settings or (), site, cdpipe.Hooks(progress.stage))
+            cdpipe.save_report(report, partial, preset)
     except MergeFailedError as error:
         if not quiet:
-            print_table("merge: refused", evidence_table(error.evidence, config))
+            print_table("merge: refused", _evidence_table(error.evidence, config))
         raise
     if quiet:
         return
-    print_table("merge: accepted", evidence_table(report.evidence, config))
-    print_table("regions (map frame = the before session's odometry)", region_table(report))
+    print_table("merge: accepted", _evidence_table(report.evidence, config))
+    print_table("regions (map frame = the before session's odometry)", report.to_pandas("regions"))
     if not report.regions.is_reported.any():
         scores = report.regions.scores
         typer.echo(
@@ -64,7 +70,25 @@ def detect(
             f"the best of {len(scores)} candidates scores {scores[:1].max(initial=0.0):.4g}; "
             "--set query.n_regions=3 reports the best three whatever they score\n"
         )
-    objects = object_table(report)
+    objects = report.to_pandas("objects")
     print_table("objects", objects[[name for name in objects.columns if not name.startswith(("min_", "max_", "box_"))]])
     times = ", ".join(f"{name[2:-2]} {seconds:.3f} s" for name, seconds in report.seconds.items())
     typer.echo(f"{out}: answer.json, answer.npz, regions.csv, objects.csv, objects.ply ({times})")
+
+
+def _evidence_table(evidence: Mapping[str, float], config: PipelineConfig) -> pd.DataFrame:
+    """Return one row per figure that a merge measured: what it is, from where on it is accepted, and whether it is."""
+    import numpy as np
+    import pandas as pd
+
+    from cdpipe.merge.evidence import GATES
+
+    gates = {name: (f"merge.{setting}", getattr(config.merge, setting)) for name, setting in GATES}
+    rows = []
+    for name, value in evidence.items():
+        if name.startswith("map_points_"):
+            continue
+        setting, least = gates.get(name, ("", np.nan))
+        passed = "-" if name not in gates else ("yes" if value >= least else "no")
+        rows.append((name, float(value), least, passed, setting))
+    return pd.DataFrame(rows, columns=["evidence", "measured", "at least", "passed", "setting"])

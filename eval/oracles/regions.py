@@ -5,22 +5,15 @@ The pipeline's stages get the regions alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Int64Array
-from cdpipe.extract.extract import extract_changes
-from cdpipe.methods.registry import Method
-from cdpipe.model.config import PipelineConfig, QueryConfig
-from cdpipe.model.report import ChangeRegions, ChangeReport
-from cdpipe.model.types import DescriptorSet, MergedMaps
+from cdpipe.model.config import QueryConfig
+from cdpipe.model.report import ChangeRegions
 from cdpipe.query.query import rank_regions
 from eval.scoring.region_metrics import places_in_map
 from eval.truth.ground_truth import GroundTruth
-
-Regions = Callable[[tuple[Int64Array, Int64Array]], ChangeRegions]
 
 
 def regions_by_truth(
@@ -55,15 +48,3 @@ def regions_by_truth(
         keyframe_scores=np.zeros(0),
         config=config.model_copy(update={"threshold": 1.0, "n_regions": None}),
     )
-
-
-def with_regions(propose: Regions) -> Method:
-    """Return the pipeline's comparison with its regions from elsewhere; finding these takes no time."""
-
-    def compare(
-        merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig
-    ) -> ChangeReport:
-        regions = propose((before.keyframe_scans, after.keyframe_scans))
-        return extract_changes(merged, regions, (before, after), 0.0, config)
-
-    return compare

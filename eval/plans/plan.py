@@ -35,6 +35,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.plugins import find_yaml
 from cdpipe.core.yamlfile import Settings, read_yaml, suggestion, validated
 from eval.plans.checks import misfits, refuse, repeated_worlds
 from eval.plans.parts import Grid, Label, NotEmpty, Variant
@@ -102,19 +103,18 @@ def load_plan(name_or_path: str) -> Plan:
     """
     if name_or_path.endswith((".yaml", ".yml")):
         return validated(Plan, read_yaml(Path(name_or_path)))
-    names = plan_names()
-    if name_or_path not in names:
+    plans = _plans()
+    if name_or_path not in plans:
         raise InputError(
-            f"plan {name_or_path!r} is unknown{suggestion(name_or_path, names)} "
-            f"(known: {', '.join(names)}, or the path of a .yaml file)"
+            f"plan {name_or_path!r} is unknown{suggestion(name_or_path, plans)} "
+            f"(known: {', '.join(plans)}, or the path of a .yaml file)"
         )
-    file = _plans() / f"{name_or_path}.yaml"
-    return validated(Plan, read_yaml(Path(f"{name_or_path}.yaml"), file.read_text()))
+    return validated(Plan, read_yaml(Path(f"{name_or_path}.yaml"), plans[name_or_path].read_text()))
 
 
 def plan_names() -> list[str]:
-    """Return the names of the shipped plans."""
-    return sorted(entry.name.removesuffix(".yaml") for entry in _plans().iterdir() if entry.name.endswith(".yaml"))
+    """Return the names of all plans: shipped, and on the search path."""
+    return list(_plans())
 
 
 def cells(plan: Plan) -> list[Cell]:
@@ -152,5 +152,5 @@ def planned_cases(plan: Plan) -> set[tuple[str, int, str]]:
     }
 
 
-def _plans() -> Traversable:
-    return resources.files("eval") / "plans"
+def _plans() -> dict[str, Traversable]:
+    return find_yaml("plans", resources.files("eval") / "plans")

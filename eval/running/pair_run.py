@@ -21,16 +21,17 @@ from cdpipe.descriptors import checkpoint_digest, sphere_digest, use_threads
 from cdpipe.io.answer import write_answer, write_failure
 from cdpipe.merge.global_registration import is_kiss_matcher_installed
 from cdpipe.model.config import MapConfig
+from cdpipe.pipeline import Merge, Propose
 from eval.core.domains import domain_of
 from eval.core.progress import RunProgress
 from eval.core.provenance import digest
 from eval.oracles.merge import merged_by_truth
-from eval.oracles.regions import Regions, regions_by_truth
+from eval.oracles.regions import regions_by_truth
 from eval.plans.variants import Cell
 from eval.running.rescoring import cell_document, score_stored
 from eval.running.runfolder import RunFolder, remove
 from eval.running.stage_cache import opened_cache
-from eval.running.stages import Merge, PairStages
+from eval.running.stages import PairStages
 from eval.scoring.scoring import METRICS_VERSION, CaseScore
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
@@ -268,7 +269,7 @@ def _oracle(cell: Cell, truth: GroundTruth) -> Merge | None:
     return lambda before, after: merged_by_truth(before, after, (truth.before, truth.after), noise, cell.seed)
 
 
-def _true_regions(cell: Cell, truth: GroundTruth) -> Regions | None:
+def _true_regions(cell: Cell, truth: GroundTruth) -> Propose | None:
     """Return what proposes regions in the method's place; the stages after it get these alone."""
     if not cell.oracle_regions:
         return None

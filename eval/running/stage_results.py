@@ -6,9 +6,9 @@ reads. What all stages read, the sessions and the code, is not in it (eval/runni
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -62,6 +62,7 @@ def regions_name(config: PipelineConfig) -> str:
         "regions",
         merge=merge_name(config),
         spheres=spheres_name(config) if config.query.compare == "sphere" else None,
+        method=[config.method, config.seed, config.options],
         settings=config.query.model_dump(mode="json"),
     )
 
@@ -109,7 +110,7 @@ def merged_arrays(merged: MergedMaps) -> Arrays:
     return _packed(merged, without=(*_SESSIONS, "seconds"))
 
 
-def merged_from(arrays: Arrays, maps: Sequence[PointMap], seconds: Mapping[str, float]) -> MergedMaps:
+def merged_from(arrays: Arrays, maps: Sequence[PointMap]) -> MergedMaps:
     """Return the merge of two maps."""
     local = _part(arrays, "local")
     before, after = maps
@@ -119,7 +120,6 @@ def merged_from(arrays: Arrays, maps: Sequence[PointMap], seconds: Mapping[str, 
         **_plain(arrays),
         evidence=_plain(_part(arrays, "evidence")),
         local=PathAlignment(**_plain(local)) if local else None,
-        seconds=seconds,
     )
 
 
@@ -131,6 +131,22 @@ def regions_arrays(regions: ChangeRegions) -> Arrays:
 def regions_from(arrays: Arrays) -> ChangeRegions:
     """Return the regions."""
     return ChangeRegions(**_plain(arrays))
+
+
+class StageResult(NamedTuple):
+    """How a stage's result is named by what it reads, packed into arrays, and made of them and of both maps again."""
+
+    name: Callable[[PipelineConfig], str]
+    pack: Callable[[Any], Arrays]
+    unpack: Callable[[Arrays, Any], Any]
+
+
+STAGES = {
+    "descriptors": StageResult(descriptors_name, descriptors_arrays, lambda arrays, _: descriptors_from(arrays)),
+    "spheres": StageResult(spheres_name, spheres_arrays, lambda arrays, _: spheres_from(arrays)),
+    "merge": StageResult(merge_name, merged_arrays, merged_from),
+    "regions": StageResult(regions_name, regions_arrays, lambda arrays, _: regions_from(arrays)),
+}
 
 
 def _name(stage: str, **read: Any) -> str:

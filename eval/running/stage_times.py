@@ -28,7 +28,7 @@ class HasSeconds(Protocol):
 TimedT = TypeVar("TimedT", bound=HasSeconds)
 
 
-def timed_parts(call: Callable[[], TimedT], repeats: int = REPEATS) -> tuple[TimedT, Mapping[str, float]]:
+def time_parts(call: Callable[[], TimedT], repeats: int = REPEATS) -> tuple[TimedT, Mapping[str, float]]:
     """Return a call's result and the seconds of its parts by the rule of this module."""
     start = time.perf_counter()
     result = call()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cdpipe.io.readers import RecordedScans, open_scans
+from cdpipe.io.readers import RecordedScans, open_session
 from cdpipe.io.session import Session
 from cdpipe.model.types import ScanSource, SessionName
 
@@ -19,7 +19,7 @@ def pipeline_input(pair: Path, session: SessionName) -> ScanSource:
     Raises:
         InputError: The session is missing or damaged.
     """
-    return open_scans(pair / session)
+    return open_session(pair / session)
 
 
 def held_input(session: Session) -> ScanSource:

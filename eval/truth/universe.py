@@ -17,7 +17,7 @@ import numpy as np
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float32Array, Int32Array, Int64Array, require_shape, transform
 from cdpipe.core.voxel import cell_keys
-from cdpipe.io.readers import open_scans
+from cdpipe.io.readers import open_session
 from cdpipe.io.session import Session, chunk_path, load_arrays, read_session
 from cdpipe.model.types import PosedScan
 from sim.session.truth import Int16Array, read_labels
@@ -112,7 +112,7 @@ def build_universe(session: Session) -> ScoringPoints:
     """
     shape = session.sensor.height, session.sensor.width
     builder = UniverseBuilder(str(session.path), *shape)
-    scans = open_scans(session.path).scans()
+    scans = open_session(session.path).scans()
     for index, (instance, change) in enumerate(read_labels(session.path, session.n_chunks)):
         n_scans = min(session.chunk_scans, session.n_scans - index * session.chunk_scans)
         for labels in (instance, change):

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, transform, yaw_pose
-from cdpipe.io.readers import open_scans
+from cdpipe.io.readers import open_session
 from cdpipe.sensor.ouster import SensorMetadata, load_profile
 
 core = pytest.importorskip("ouster.sdk.core", reason="pip install 'tunnelcd[ouster]'")
@@ -94,7 +94,7 @@ def vendor_points(path: Path) -> list[Float64Array]:
 
 
 def our_points(path: Path) -> list[Float64Array]:
-    return [transform(scan.odom_T_sensor, scan.points_sensor) for scan in open_scans(path).scans()]
+    return [transform(scan.odom_T_sensor, scan.points_sensor) for scan in open_session(path).scans()]
 
 
 def said(call: Callable[[], object]) -> str:

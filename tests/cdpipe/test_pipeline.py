@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputError, MergeFailedError
 from cdpipe.core.geometry import Float64Array, stream, yaw_pose
 from cdpipe.io.answer import read_answer, write_answer
-from cdpipe.io.readers import open_scans
+from cdpipe.io.readers import open_session
 from cdpipe.model.config import ClusterConfig, ExtractConfig, MergeConfig, OutlierConfig, PipelineConfig, QueryConfig
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import MappedSession
@@ -86,7 +86,7 @@ def test_a_folder_of_ply_scans_is_mapped(tmp_path: Path) -> None:
         meshio.ply.write(tmp_path / f"{index}.ply", meshio.Mesh(points, []))
     (tmp_path / "poses.tum").write_text("\n".join(lines))
     config = PipelineConfig.model_validate({"descriptor": {"method": "untrained"}})
-    session = map_session(open_scans(tmp_path), config)
+    session = map_session(open_session(tmp_path), config)
     assert session.map.keyframe_scans.tolist() == [0, 2]
     assert session.descriptors.q.shape == (2, 64)
     assert len(session.map.return_points) == 8000
@@ -96,7 +96,7 @@ def test_a_single_scan_is_refused_because_it_has_no_path(tmp_path: Path) -> None
     meshio.ply.write(tmp_path / "0.ply", meshio.Mesh(stream(0, "one").normal(size=(50, 3)), []))
     (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
     with pytest.raises(InputError, match="1 scan: expected a drive, at least two scans along a path"):
-        map_session(open_scans(tmp_path), PipelineConfig())
+        map_session(open_session(tmp_path), PipelineConfig())
 
 
 def test_two_sessions_of_few_points_are_refused_and_not_a_crash(tmp_path: Path) -> None:
@@ -109,6 +109,6 @@ def test_two_sessions_of_few_points_are_refused_and_not_a_crash(tmp_path: Path) 
             meshio.ply.write(folder / f"{index}.ply", meshio.Mesh(cloud, []))
         (folder / "poses.txt").write_text("0 0 0 0 0 0 0 1\n1 1.5 0 0 0 0 0 1\n")
         config = PipelineConfig.model_validate({"descriptor": {"method": "untrained"}})
-        sessions.append(map_session(open_scans(folder), config))
+        sessions.append(map_session(open_session(folder), config))
     with pytest.raises(MergeFailedError, match="enough points"):
         detect_changes(sessions[0], sessions[1], PipelineConfig())

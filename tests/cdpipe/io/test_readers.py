@@ -8,7 +8,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import yaw_pose
-from cdpipe.io.readers import open_scans
+from cdpipe.io.readers import open_session
 from cdpipe.io.session import ScanChunk, Session, SessionWriter
 from cdpipe.sensor.ouster import load_profile
 
@@ -50,7 +50,7 @@ def session(path: Path, n_scans: int = 5, column_pose: tuple[float, ...] = (0, 0
 
 def said(path: Path, read: bool = False) -> str:
     with pytest.raises(InputError) as caught:
-        source = open_scans(path)
+        source = open_session(path)
         if read:
             list(source.scans())
     text = str(caught.value)
@@ -60,7 +60,7 @@ def said(path: Path, read: bool = False) -> str:
 
 def test_ply_scans_with_a_trajectory(tmp_path: Path) -> None:
     text = "# stamp tx ty tz qx qy qz qw\n100.0 0 0 0 0 0 0 1\n\n100.5 1 2 3 0 0 0.70710678 0.70710678\n"
-    source = open_scans(recording(tmp_path / "run", 2, text))
+    source = open_session(recording(tmp_path / "run", 2, text))
     np.testing.assert_allclose(source.odom_T_sensor[1], yaw_pose(np.pi / 2, (1, 2, 3)), atol=1e-8)
     first, second = source.scans()
     np.testing.assert_array_equal(second.points_sensor, first.points_sensor + 1)
@@ -76,7 +76,7 @@ def test_unpadded_numbers_would_pair_scans_with_wrong_poses(tmp_path: Path) -> N
 
 
 def test_each_chunk_is_read_once_when_read_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = open_scans(session(tmp_path / "session"))
+    source = open_session(session(tmp_path / "session"))
     reads: list[int] = []
     original = Session.chunk
 
@@ -167,7 +167,7 @@ def test_standing_still_without_noise_is_no_repetition(tmp_path: Path) -> None:
     folder = recording(tmp_path / "run", trajectory=standing)
     for index in (1, 2):
         (folder / f"scan_00{index}.ply").write_bytes((folder / "scan_000.ply").read_bytes())
-    assert len(list(open_scans(folder).scans())) == 3
+    assert len(list(open_session(folder).scans())) == 3
     # at the same time it is the same scan
     (folder / "trajectory.txt").write_text("\n".join(["0 0 0 0 0 0 0 1"] * 3))
     assert "scan_001.ply repeats scan_000.ply" in said(folder, read=True)

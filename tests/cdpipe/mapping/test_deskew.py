@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, transform, yaw_pose
-from cdpipe.io.readers import open_scans
+from cdpipe.io.readers import open_session
 from cdpipe.io.session import ScanChunk, SessionWriter
 from cdpipe.mapping.deskew import deskew
 from cdpipe.sensor.ouster import SensorMetadata, load_profile
@@ -69,7 +69,7 @@ def test_through_the_session_format_walls_stay_flat_to_the_range_step(sensor: Se
             dark = np.zeros(range_mm[part].shape, dtype=np.uint8)
             writer.add(ScanChunk(range_mm[part], dark, dark.astype(np.uint16), stamps[part], columns))
         writer.close(poses)
-    source = open_scans(tmp_path / "room")
+    source = open_session(tmp_path / "room")
     assert len(source.odom_T_sensor) == 3
     for index, scan in enumerate(source.scans()):
         assert scan.index == index

@@ -3,23 +3,18 @@
 import importlib.util
 import logging
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, stream, transform, yaw_pose
-from cdpipe.core.plugins import METHODS, entry_points
-from cdpipe.methods import registry
 from cdpipe.methods.dufomap import void_mask
 from cdpipe.methods.m3c2 import m3c2_mask
-from cdpipe.methods.registry import load_method
 from cdpipe.methods.whole_map import PlacedMaps
 from cdpipe.model.config import load_config
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, SessionName
-from eval.running import single
+from cdpipe.pipeline import compare_maps
 from eval.running.stages import kept_bytes
 from tests.cdpipe.rooms import Box, RoomScans
 
@@ -65,7 +60,7 @@ def merged(before: PointMap, after: PointMap, before_T_after: Float64Array) -> M
 
 def answer(method: str, maps: MergedMaps, settings: Sequence[str] = ()) -> ChangeReport:
     config = load_config(method, [*SETTINGS, *settings])
-    return load_method(method)(maps, descriptors(maps.before), descriptors(maps.after), config)
+    return compare_maps(maps, descriptors(maps.before), descriptors(maps.after), config)
 
 
 def returns_of(report: ChangeReport) -> set[tuple[int, int]]:
@@ -198,24 +193,6 @@ def test_dufomap_by_hand(empty: PointMap) -> None:
 def test_dufomap_says_nothing(empty: PointMap, capfd: pytest.CaptureFixture[str]) -> None:
     answer("dufomap", merged(empty, empty, np.eye(4)))
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("method", PACKAGES)
-def test_a_missing_extra_is_named_before_anything_is_mapped(
-    method: str, tiny_pair: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(registry.importlib.util, "find_spec", lambda name: None)
-    monkeypatch.delattr(single, "build_map")
-    folders = (tiny_pair / "before", tiny_pair / "after", "--preset", method, "--out", tmp_path / "out")
-    code, out, err = command("detect", *folders)
-    assert code == 2
-    assert f"method {method} needs a package more: pip install 'tunnelcd[{method}]'" in err
-    assert not (tmp_path / "out").exists()
-    assert out == ""
-    for name in entry_points(METHODS).keys() - PACKAGES.keys():
-        load_method(name)
-    with pytest.raises(InputError, match=rf"pip install 'tunnelcd\[{method}\]'"):
-        load_method(method)
 
 
 def test_dufomap_keeps_the_map_and_the_returns_whose_rays_it_casts(empty: PointMap) -> None:

@@ -8,13 +8,14 @@ from scipy.spatial import cKDTree
 from cdpipe.core.geometry import BoolArray, Float64Array, transform, yaw_pose
 from cdpipe.core.plugins import METHODS, entry_points
 from cdpipe.methods.c2c import c2c
-from cdpipe.methods.random_regions import random_regions
+from cdpipe.methods.random_regions import RandomRegions
 from cdpipe.methods.registry import load_method
 from cdpipe.methods.voxel_diff import voxel_diff
 from cdpipe.methods.whole_map import PlacedMaps, whole_map
 from cdpipe.model.config import PipelineConfig, load_config, preset_names
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap, SessionName
+from cdpipe.pipeline import compare_maps
 
 LENGTH_M = 40.0
 SPACING_M = 0.2
@@ -65,7 +66,7 @@ def descriptors(point_map: PointMap) -> DescriptorSet:
 
 
 def answer(merged: MergedMaps, config: PipelineConfig) -> ChangeReport:
-    return load_method(config.method)(merged, descriptors(merged.before), descriptors(merged.after), config)
+    return compare_maps(merged, descriptors(merged.before), descriptors(merged.after), config)
 
 
 def test_one_added_crate_by_hand() -> None:
@@ -185,7 +186,7 @@ def test_random_regions_are_keyframes_and_repeat_with_their_seed() -> None:
     sets = descriptors(merged.before), descriptors(merged.after)
 
     def drawn(seed: int) -> ChangeReport:
-        return random_regions(merged, *sets, load_config("random-regions", [f"seed={seed}"]))
+        return compare_maps(merged, *sets, load_config("random-regions", [f"seed={seed}"]))
 
     first = drawn(0)
     assert int(first.regions.is_reported.sum()) == 3
@@ -203,7 +204,7 @@ def test_random_regions_hit_at_random() -> None:
     merged = pair([], [])
     sets = descriptors(merged.before), descriptors(merged.after)
     best = [
-        random_regions(merged, *sets, load_config("random-regions", [f"seed={seed}"])).regions.centres_map[0, 0]
+        RandomRegions().propose(merged, *sets, load_config("random-regions", [f"seed={seed}"])).centres_map[0, 0]
         for seed in range(200)
     ]
     counts, _ = np.histogram(best, bins=10, range=(0, LENGTH_M))
@@ -217,15 +218,15 @@ def test_random_regions_stay_where_the_after_session_came() -> None:
     half = replace(merged.after, keyframe_scans=merged.after.keyframe_scans[:10])
     config = load_config("random-regions", ["query.max_pair_m=2"])
     sets = descriptors(merged.before), descriptors(half)
-    regions = random_regions(replace(merged, after=half), *sets, config).regions
+    regions = RandomRegions().propose(replace(merged, after=half), *sets, config)
     assert np.isfinite(regions.keyframe_scores).sum() == 12  # 0.5 … 9.5 and those within 2 m behind
     assert regions.centres_map[:, 0].max() <= 11.5
 
 
 def test_every_preset_has_its_method() -> None:
     assert {load_config(name).method for name in preset_names()} <= entry_points(METHODS).keys()
-    assert load_method("voxel-diff") is voxel_diff
-    assert load_method("c2c") is c2c
+    assert load_method("voxel-diff").detect is voxel_diff
+    assert load_method("c2c").detect is c2c
 
 
 def test_figures_are_of_the_after_map() -> None:

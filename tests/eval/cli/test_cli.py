@@ -12,16 +12,18 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cdpipe import pipeline
 from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Int64Array
 from cdpipe.io.answer import read_answer
-from cdpipe.io.readers import open_scans
-from cdpipe.model.config import PipelineConfig
-from cdpipe.model.types import DescriptorSet, PointMap, ScanSource
+from cdpipe.io.readers import open_session
+from cdpipe.model.config import DescriptorConfig
+from cdpipe.model.types import DescriptorSet, ScanSource
 from eval.cli.main import main
 from eval.plans import plan as plans
 from eval.plans.plan import Plan
 from eval.report import page
-from eval.running import runner, single
+from eval.running import runner
 from eval.running.runfolder import RunFolder
 from scenarios.library import load_scenario, scenario_names
 from sim.session import simulate
@@ -56,7 +58,7 @@ def recorded(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("before", "after"):
         (root / name).mkdir()
         lines = ["# stamp tx ty tz qx qy qz qw"]
-        for scan in open_scans(made / name).scans():
+        for scan in open_session(made / name).scans():
             header = "ply\nformat binary_little_endian 1.0\nelement vertex {}\n" + "".join(
                 f"property float {axis}\n" for axis in "xyz"
             )
@@ -151,13 +153,13 @@ def test_describe_stores_what_detect_then_uses(
         assert code == 0
         assert str(pair / name / "descriptors" / "3deg.npz") in out
     calls: list[str] = []
-    usual = single.describe_mapped
+    usual = pipeline.describe_scans
 
-    def counted(source: ScanSource, thin_map: PointMap, config: PipelineConfig) -> DescriptorSet:
-        calls.append(source.name)
-        return usual(source, thin_map, config)
+    def counted(source: ScanSource, chosen: Int64Array, config: DescriptorConfig) -> DescriptorSet:
+        calls.extend([source.name] * (len(chosen) > 1))  # one alone warms up
+        return usual(source, chosen, config)
 
-    monkeypatch.setattr(single, "describe_mapped", counted)
+    monkeypatch.setattr(pipeline, "describe_scans", counted)
     arguments = ("detect", pair / "before", pair / "after", "--quiet", "--out")
     assert command(*arguments, tmp_path / "stored")[0] == 0
     assert calls == []

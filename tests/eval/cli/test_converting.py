@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cdpipe.io.readers import open_scans
+from cdpipe.io.readers import open_session
 from cdpipe.io.session import Session, read_session
 from eval.cli import converting
 from eval.cli.main import main
@@ -75,7 +75,7 @@ def test_a_pair_there_and_back_gives_the_same_answer(pair: Path, tmp_path: Path,
         assert code == 0
         assert out.endswith("OS-1-32-U, 512x10, poses: own\n")
         for one, other in zip(
-            open_scans(pair / name).scans(), open_scans(tmp_path / "back" / name).scans(), strict=True
+            open_session(pair / name).scans(), open_session(tmp_path / "back" / name).scans(), strict=True
         ):
             np.testing.assert_allclose(one.points_sensor, other.points_sensor, atol=1e-5)
             np.testing.assert_array_equal(one.pixels, other.pixels)

@@ -12,18 +12,21 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from cdpipe import pipeline
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.io.answer import read_answer
-from cdpipe.io.readers import open_scans
+from cdpipe.io.readers import open_session
 from cdpipe.mapping.mapping import build_map
 from cdpipe.merge.merge import merge_maps
+from cdpipe.methods import voxel_diff
+from cdpipe.methods.random_regions import RandomRegions
 from cdpipe.model.config import MapConfig, MergeConfig
 from cdpipe.model.types import MappedSession, MergedMaps
 from cdpipe.sensor.ouster import load_profile
 from eval.core import provenance
 from eval.core.progress import Silent
 from eval.plans.plan import Plan, cells, load_plan
-from eval.running import pair_run, runner, stages
+from eval.running import pair_run, runner, stage_times, stages
 from eval.running.rescoring import rescore
 from eval.running.runfolder import RunFolder, open_run_folder, remove, start_run_folder, write_tables
 from eval.running.runner import RunOutcome, run_plan
@@ -269,13 +272,13 @@ def test_an_error_of_the_input_is_a_row_and_a_bug_is_not(
         return method
 
     plan = plan_of(tmp_path, variants="{preset: random-regions}, {preset: voxel-diff}")
-    monkeypatch.setitem(stages.METHODS, "random-regions", fails(InputError("no such thing")))
+    monkeypatch.setattr(RandomRegions, "propose", fails(InputError("no such thing")))
     run, _ = run_in(tmp_path / "run", plan)
     results = table(run).set_index("variant")
     assert results["status"].to_dict() == {"random-regions": "failed", "voxel-diff": "ok"}
     assert results.loc["random-regions", "error"] == "no such thing"
     assert results.loc["random-regions", "region_recall"] == 0
-    monkeypatch.setitem(stages.METHODS, "voxel-diff", fails(RuntimeError("a bug")))
+    monkeypatch.setattr(voxel_diff, "whole_map", fails(RuntimeError("a bug")))
     with pytest.raises(RuntimeError, match="a bug"):
         run_in(tmp_path / "run", plan, force=True)
     # what was finished before the bug is kept
@@ -326,7 +329,7 @@ def test_stages_are_shared_by_the_settings_they_depend_on(
     calls: list[str] = []
 
     def counted(name: str) -> Callable[..., Any]:
-        usual = getattr(stages, name)
+        usual = getattr(pipeline, name)
 
         def call(*args: Any) -> Any:
             calls.append(name)
@@ -335,7 +338,7 @@ def test_stages_are_shared_by_the_settings_they_depend_on(
         return call
 
     for name in ("build_map", "describe_scans", "merge_maps"):
-        monkeypatch.setattr(stages, name, counted(name))
+        monkeypatch.setattr(pipeline, name, counted(name))
     monkeypatch.setattr(stages, "REPEATS", 1)
     coarse = 'set: ["map.voxel_m=0.3"]'
     # the two that share a map stand apart in the plan
@@ -363,8 +366,8 @@ def test_score_runs_nothing_and_gives_the_same(smoke_copy: RunFolder, monkeypatc
     for module, name in (
         (pair_run, "simulate_pair"),
         (pair_run, "PairStages"),
-        (stages, "build_map"),
-        (stages, "merge_maps"),
+        (pipeline, "build_map"),
+        (pipeline, "merge_maps"),
     ):
         monkeypatch.setattr(module, name, forbidden)
     before = table(smoke_copy)
@@ -416,7 +419,7 @@ def test_the_pipeline_never_sees_truth(pairs: dict[str, Path], tmp_path: Path) -
             np.testing.assert_array_equal(getattr(ours, field), getattr(theirs, field))
     true_poses = np.load(pairs[ONE_BOX] / "after" / "truth" / "poses.npz")["world_T_sensor"]
     assert np.abs(with_truth.odom_T_sensor - true_poses).max() > 0.1
-    assert type(with_truth) is type(open_scans(bare / "after"))
+    assert type(with_truth) is type(open_session(bare / "after"))
 
 
 def test_time_is_the_median_of_three_after_a_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -430,8 +433,8 @@ def test_time_is_the_median_of_three_after_a_warm_up(monkeypatch: pytest.MonkeyP
         clock += cd + oe
         return SimpleNamespace(name="first" if cd == 0.5 else "later", seconds={"t_cd_s": cd, "t_oe_s": oe})
 
-    monkeypatch.setattr(stages.time, "perf_counter", lambda: clock)
-    result, seconds = stages.timed_parts(call)
+    monkeypatch.setattr(stage_times.time, "perf_counter", lambda: clock)
+    result, seconds = stage_times.time_parts(call)
     assert result.name == "first"
     assert seconds == {"t_cd_s": 0.2, "t_oe_s": 0.3}
     assert next(parts, None) is None
@@ -447,8 +450,8 @@ def test_a_long_call_is_timed_once(monkeypatch: pytest.MonkeyPatch) -> None:
         calls += 1
         return SimpleNamespace(seconds={"t_cd_s": 0.7})
 
-    monkeypatch.setattr(stages.time, "perf_counter", lambda: clock)
-    assert stages.timed_parts(call)[1] == {"t_cd_s": 0.7}
+    monkeypatch.setattr(stage_times.time, "perf_counter", lambda: clock)
+    assert stage_times.time_parts(call)[1] == {"t_cd_s": 0.7}
     assert calls == 1
 
 
@@ -655,8 +658,8 @@ def merges(pairs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pair_run, "simulate_pair", copy)
         patch.setattr(runner, "load_scenario", load_small)
-        patch.setattr(stages, "merge_maps", merge)
-        patch.setattr(stages, "METHODS", {"descriptor": forbidden})
+        patch.setattr(pipeline, "merge_maps", merge)
+        patch.setattr(pipeline, "compare_maps", forbidden)
         plan = plan_of(folder, scenarios=f"{ONE_CLEAN}, {UNCHANGED}", variants=MERGES, rest="until: merge")
         return run_in(folder / "run", plan)[0]
 

@@ -4,14 +4,17 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
+from cdpipe import pipeline
 from cdpipe.core.errors import MergeFailedError
+from cdpipe.methods import descriptor
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import PipelineConfig, load_config
 from cdpipe.model.report import ChangeRegions
@@ -74,8 +77,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Counts how often each stage runs."""
     counted: Counter[str] = Counter()
 
-    def counting(name: str) -> Callable[..., Any]:
-        usual = getattr(stages, name)
+    def counting(where: ModuleType, name: str) -> Callable[..., Any]:
+        usual = getattr(where, name)
 
         def call(*args: Any) -> Any:
             counted[name] += 1
@@ -84,7 +87,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
         return call
 
     for name in STAGES:
-        monkeypatch.setattr(stages, name, counting(name))
+        where = descriptor if name == "find_regions" else pipeline
+        monkeypatch.setattr(where, name, counting(where, name))
     return counted
 
 
@@ -115,9 +119,8 @@ def test_answers_are_equal_cold_from_memory_and_from_disk(pair: Path, tmp_path: 
 def test_the_query_and_the_extraction_apart_are_the_comparison_of_the_pipeline(pair: Path) -> None:
     config = config_of("tunnelcd")
     here = stages_of(pair)
-    before, after, _ = here.mapped(config)
-    merged, _ = here.merged(config)
-    whole = stages.METHODS["descriptor"](merged, before.descriptors, after.descriptors, config)
+    sources = [pipeline_input(pair, name) for name in ("before", "after")]
+    whole = pipeline.detect_changes(*pipeline.map_pair(sources, config, pipeline.Hooks()).value, config)
     parts = here.answer(config)
     assert_same(whole.regions, parts.regions)
     assert_same(whole.objects, parts.objects)
@@ -320,7 +323,7 @@ def test_results_come_back_as_they_went(tmp_path: Path) -> None:
     assert_same(stage_results.descriptors_from(back["descriptors"]), described)
     assert_same(stage_results.spheres_from(back["spheres"]), spheres)
     for i in (0, 1):
-        assert_same(stage_results.merged_from(back[f"merge-{i}"], maps, {}), merges[i])
+        assert_same(stage_results.merged_from(back[f"merge-{i}"], maps), replace(merges[i], seconds={}))
         assert_same(stage_results.regions_from(back[f"regions-{i}"]), regions[i])
 
 

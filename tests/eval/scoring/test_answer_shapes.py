@@ -13,8 +13,8 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import yaw_pose
 from cdpipe.io.answer import Answer
+from cdpipe.io.report import save_report
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
-from eval.running.single import write_detection
 from eval.scoring.answer_check import check_answer
 from eval.truth.ground_truth import load_ground_truth
 
@@ -46,7 +46,7 @@ def report() -> ChangeReport:
 
 
 def test_the_tables_by_hand(tmp_path: Path) -> None:
-    write_detection(tmp_path, "tunnelcd", report())
+    save_report(report(), tmp_path)
     regions = pd.read_csv(tmp_path / "regions.csv")
     # those the threshold let through; the withdrawn one is told apart
     assert regions[["region", "score", "is_withdrawn", "x_m", "s_points"]].to_numpy().tolist() == [

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import invert, transform
 from cdpipe.io.answer import write_answer, write_failure
-from cdpipe.io.readers import open_scans
+from cdpipe.io.readers import open_session
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 from eval.core.domains import domain_of, is_change_in_distribution
 from eval.scoring.scoring import METRICS_VERSION, CaseScore, score_pair
@@ -167,7 +167,7 @@ def test_centroids_are_true_places_even_when_the_odometry_drifts(write_tiny_pair
     truth = load_ground_truth(pair)
     for change, rows, centroid in zip(truth.pair.changes, truth.change_rows, truth.centroids_world, strict=True):
         session = truth.sessions[change.session]
-        scans = {scan.index: scan for scan in open_scans(pair / change.session).scans()}
+        scans = {scan.index: scan for scan in open_session(pair / change.session).scans()}
         places = []
         for index, pixel in zip(session.universe.scans(rows), session.universe.pixels(rows), strict=True):
             scan = scans[int(index)]

@@ -7,7 +7,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import transform
-from cdpipe.io.readers import open_scans
+from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
 from eval.truth import universe as module
 from eval.truth.universe import build_universe, load_universe
@@ -20,7 +20,7 @@ def universe_by_dictionary(session: Path) -> dict[tuple[int, ...], tuple[int, in
     labels = list(read_labels(session, opened.n_chunks))
     instance, change = (np.concatenate([chunk[part] for chunk in labels]) for part in (0, 1))
     first: dict[tuple[int, ...], tuple[int, int, int, int, np.ndarray]] = {}
-    for scan in open_scans(session).scans():
+    for scan in open_session(session).scans():
         points = transform(scan.odom_T_sensor, scan.points_sensor)
         for pixel, point in zip(scan.pixels.tolist(), points, strict=True):
             row, column = divmod(pixel, opened.sensor.width)

@@ -14,7 +14,7 @@ import trimesh
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array
-from cdpipe.io.readers import open_scans
+from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
 from eval.cli.looking import view_of
 from eval.cli.main import main
@@ -147,7 +147,7 @@ def test_a_session_is_placed_as_the_pipeline_places_it(pair: Path) -> None:
     view = view_folder(pair / "before")
     session = read_session(pair / "before")
     full = session_cloud("x", session, session.odom_T_sensor, None, max_points=10**9)
-    scans = list(open_scans(pair / "before").scans())
+    scans = list(open_session(pair / "before").scans())
     expected: Float64Array = np.concatenate(
         [scan.points_sensor @ scan.odom_T_sensor[:3, :3].T + scan.odom_T_sensor[:3, 3] for scan in scans]
     )

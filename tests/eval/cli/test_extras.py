@@ -1,0 +1,31 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cdpipe import pipeline
+from cdpipe.core.errors import InputError
+from cdpipe.core.plugins import METHODS, entry_points
+from cdpipe.methods import registry
+from cdpipe.methods.registry import load_method
+
+Command = Callable[..., tuple[int, str, str]]
+PACKAGES = {"m3c2": "py4dgeo", "dufomap": "dufomap"}
+
+
+@pytest.mark.parametrize("method", PACKAGES)
+def test_a_missing_extra_is_named_before_anything_is_mapped(
+    method: str, tiny_pair: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(registry.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.delattr(pipeline, "build_map")
+    folders = (tiny_pair / "before", tiny_pair / "after", "--preset", method, "--out", tmp_path / "out")
+    code, out, err = command("detect", *folders)
+    assert code == 2
+    assert f"method {method} needs a package more: pip install 'tunnelcd[{method}]'" in err
+    assert not (tmp_path / "out").exists()
+    assert out == ""
+    for name in entry_points(METHODS).keys() - PACKAGES.keys():
+        load_method(name)
+    with pytest.raises(InputError, match=rf"pip install 'tunnelcd\[{method}\]'"):
+        load_method(method)
