@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from eval.core.domains import domain_name
 from eval.core.output import make_writable
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.report.compared_columns import COMPARED
 from eval.report.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare
 from eval.report.objects.objects import Picture
-from eval.report.regions.plots import domain_name
 from eval.report.render import rendered, written
 from eval.report.settings.effects import signed
 from eval.report.settings.figures import Effect, effect_plot

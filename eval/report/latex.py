@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from eval.core.domains import domain_name
 from eval.core.statistics import bootstrap_interval, mean_with_interval
 from eval.report.compared_columns import COMPARED, POOLED, is_time
 from eval.report.comparing import BETTER, WORSE, pooled_difference, verdict
 from eval.report.cost.pareto import comparable, with_domain
 from eval.report.objects.tables import OBJECT_COLUMNS, is_told_the_truth
-from eval.report.regions.plots import domain_name
 from eval.report.regions.regions import REGION_COLUMNS
 from eval.report.story import is_unmade
 from eval.report.tables import beside, best, escape_latex, used_pairs

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from eval.core.domains import domain_name
 from eval.core.statistics import mean_with_interval
 from eval.report.comparing import BETTER, verdict
 from eval.report.cost.pareto import BYTES, TIME, comparable
 from eval.report.objects.tables import is_told_the_truth
-from eval.report.regions.plots import domain_name
 from eval.report.story import about_failures, about_grids, about_repeated, about_size, about_wrong_merges, joined
 from eval.running.run_data import BASELINES, RunData, flag, is_unchanged, number, scenarios, split_variant, text
 from eval.running.sides import is_contended

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from eval.core.domains import domain_name
 from eval.core.figures import BLACK, BLUE
 from eval.report.charts import add_heading, axes_of, error_bars, in_legend, layout, line_of, set_axis
 from eval.report.cost.plots import COSTS, is_apart, known_costs
-from eval.report.regions.plots import domain_name
 
 _GREY = "#8a8a8a"
 _MAX_IN_LEGEND = 24

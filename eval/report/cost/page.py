@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pandas as pd
 
+from eval.core.domains import domain_name
 from eval.report.charts import Chart
 from eval.report.cost.chart import pareto_figure
 from eval.report.cost.pareto import F1, RECALL_AT_K, RECALL_AT_RATE
 from eval.report.cost.plots import COSTS, pareto_png
-from eval.report.regions.plots import domain_name
 
 _QUALITIES = {
     "regions": {RECALL_AT_RATE: "recall at 0.1 false regions per 100 m", RECALL_AT_K: "recall at K"},

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import Bbox
 
+from eval.core.domains import domain_name
 from eval.core.figures import BLACK, BLUE, blank_figure, png
 from eval.report.cost.pareto import BYTES, TIME
 from eval.report.objects.tables import is_told_the_truth
-from eval.report.regions.plots import domain_name
 from eval.tables.columns import spaced
 
 _GREY = "#8a8a8a"

@@ -11,8 +11,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from cdpipe.core.geometry import Float64Array
+from eval.core.domains import domain_name
 from eval.core.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION, blank_figure, data_address
-from eval.report.regions.plots import domain_name
 
 _DASHED, _DOTS = (0, (4, 2)), "#a8a8a8"
 _LINES: tuple[dict[str, Any], ...] = (

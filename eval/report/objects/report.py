@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from eval.core.domains import domain_of
+from eval.core.domains import domain_name, domain_of
 from eval.report.cost.pareto import with_domain
 from eval.report.merge.merge import covered_by
 from eval.report.objects.cases import object_cases, voxel_variants
 from eval.report.objects.objects import Picture
 from eval.report.objects.plots import SizeLine, SizePanel, iou_by_size_plot
 from eval.report.objects.tables import groups_table, methods_table, records, withdrawal_table
-from eval.report.regions.plots import domain_name
 from eval.report.regions.regions import targets_table
 from eval.report.story import about_failures, joined
 from eval.report.tables import Table

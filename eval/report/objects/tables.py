@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from eval.report.regions.plots import domain_name
+from eval.core.domains import domain_name
 from eval.report.tables import Cell, Table, beside, best, used_pairs
 from eval.tables.columns import EN_DASH, Column, share, significant, spaced
 from eval.tables.object_table import ORACLE_VARIANT

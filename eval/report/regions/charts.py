@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from eval.core.domains import domain_name
 from eval.report.charts import SOFT, add_heading, axes_of, error_bars, in_legend, layout, line_of, set_axis
-from eval.report.regions.plots import LEAST_RATE, MOST_RATE, Bins, Curve, domain_name
+from eval.report.regions.plots import LEAST_RATE, MOST_RATE, Bins, Curve
 
 Figure = dict[str, Any]
 _TICKS = [0.01, 0.03, 0.1, 0.3, 1, 3, 10]

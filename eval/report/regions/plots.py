@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from cdpipe.core.geometry import Float64Array
+from eval.core.domains import domain_name
 from eval.core.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION, blank_figure, png
 
 _WIDTH_IN = 9.0
@@ -37,7 +38,6 @@ _OTHERS: tuple[dict[str, Any], ...] = tuple(
     {"color": colour, "linewidth": 1.2, "linestyle": "dashdot"} for colour in (BLUE, ORANGE, GREEN, VERMILLION, _PURPLE)
 )
 LEAST_RATE, MOST_RATE = 0.01, 10.0
-_DOMAIN_NAMES = {"in": "in distribution", "out": "out of distribution", "all": "all pairs"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,11 +64,6 @@ class Bins:
     recall: Float64Array
     low: Float64Array
     high: Float64Array
-
-
-def domain_name(domain: str) -> str:
-    """Return a domain in words."""
-    return _DOMAIN_NAMES.get(domain, domain)
 
 
 def roc_plot(panels: Mapping[str, Mapping[str, Curve]]) -> bytes:

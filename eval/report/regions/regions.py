@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from eval.core.domains import domain_name
 from eval.report.charts import Chart
 from eval.report.cost.pareto import with_domain
 from eval.report.merge.merge import covered_by
 from eval.report.regions.charts import free_response_figure, roc_figure, size_figure
-from eval.report.regions.plots import Bins, Curve, domain_name, free_response_plot, roc_plot, size_plot
+from eval.report.regions.plots import Bins, Curve, free_response_plot, roc_plot, size_plot
 from eval.report.story import about_failures, joined
 from eval.report.tables import Cell, Table, beside, best, used_pairs
 from eval.running.run_data import BASELINES, RunData, off_grids

@@ -11,11 +11,11 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.model.config import load_config
+from eval.core.domains import domain_name
 from eval.core.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION
 from eval.core.statistics import bootstrap_interval
 from eval.report.charts import Chart, axes_of, error_bars, in_legend, layout, set_axis
 from eval.report.cost.pareto import with_domain
-from eval.report.regions.plots import domain_name
 from eval.report.settings.grids import N_ACROSS, SHARES
 from eval.running.run_data import (
     Row,
