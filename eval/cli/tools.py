@@ -44,6 +44,7 @@ def bench(
 
 def list_command() -> None:
     """Name the scenarios, plans, presets and sensor profiles there are."""
+    from cdpipe.core.plugins import METHODS, METRICS, entry_points
     from cdpipe.model.config import preset_names
     from cdpipe.sensor.ouster import profile_names
     from eval.plans.plan import plan_names
@@ -53,6 +54,8 @@ def list_command() -> None:
         "scenarios": scenario_names(),
         "plans": plan_names(),
         "presets": preset_names(),
+        "methods": list(entry_points(METHODS)),
+        "metrics of plugins": list(entry_points(METRICS)),
         "sensor profiles": profile_names(),
     }
     for title, names in groups.items():

@@ -23,6 +23,7 @@ from eval.scoring.item_rows import change_rows, figure, object_rows, region_rows
 from eval.scoring.merge_metrics import evidence_columns, merge_columns, merge_errors, overlap_true
 from eval.scoring.object_metrics import kinds_right, match_objects, object_columns, unanswered_objects
 from eval.scoring.object_sizes import SizeErrors, size_columns, size_errors
+from eval.scoring.plugins import plugin_columns
 from eval.scoring.region_metrics import keyframes_or_all, score_regions, unanswered_regions
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
@@ -47,6 +48,20 @@ class CaseScore:
     regions: list[dict[str, Any]]
     objects: list[dict[str, Any]]
     keyframes: list[dict[str, Any]] = field(default_factory=list)
+
+
+def score(answer: ChangeReport | Path | str, pair: Path | str) -> dict[str, Any]:
+    """Score a report, or the folder of a stored answer, against a simulated pair: one row of results.csv.
+
+    Raises:
+        InputError: The pair has no truth, a file is damaged, or the answer cannot be an answer to this pair.
+    """
+    if not isinstance(answer, ChangeReport):
+        return score_pair(Path(pair), Path(answer)).row
+    truth = load_ground_truth(Path(pair))
+    whole = Answer("ok", "", str(answer.config.get("method", "")), answer, answer.seconds, answer.evidence)
+    check_answer(whole, truth, Path("report"))
+    return score_answer(whole, truth).row
 
 
 def score_pair(pair: Path, answer_folder: Path) -> CaseScore:
@@ -94,6 +109,7 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
         **_figure_means(report),
         **_sizes(answer, truth, n_regions, float(after_travelled_m[-1])),
     }
+    row |= plugin_columns(truth, answer, row)
     if answer.until == "merge":
         return CaseScore(row=row, changes=[], regions=[], objects=[])
     keyframe_scores = np.zeros(0) if report is None else report.regions.keyframe_scores

@@ -1,0 +1,51 @@
+"""One answer from above: what changed, where, and, beside the truth, whether it is right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cdpipe.model.report import ChangeReport
+from eval.scoring.region_metrics import keyframes_or_all, places_in_map
+from eval.truth.ground_truth import load_ground_truth
+from sim.view.returns import CHANGE_RGB
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def plot(report: ChangeReport, pair: Path | str | None = None) -> Figure:
+    """Draw an answer in the map frame, metres: regions as circles, objects in the colour of their kind.
+
+    Args:
+        report: What `cdpipe.detect` returned.
+        pair: Folder of the simulated pair: draws the before session's path, and a cross at each observable change.
+
+    Returns:
+        A matplotlib figure; `savefig` writes it.
+
+    Raises:
+        InputError: The pair has no truth.
+    """
+    from matplotlib.figure import Figure  # noqa: PLC0415 - a figure only where one is asked for
+
+    figure = Figure(figsize=(8, 6), layout="constrained")
+    axes = figure.add_subplot(aspect="equal", xlabel="x of the map frame [m]", ylabel="y of the map frame [m]")
+    if pair is not None:
+        truth = load_ground_truth(Path(pair))
+        scans = keyframes_or_all(report.keyframe_scans[0], len(truth.before.odom_T_sensor))
+        axes.plot(*truth.before.odom_T_sensor[scans, :2, 3].T, color="0.7", label="path of the before session")
+        changes = truth.centroids_world[truth.is_observable].reshape(-1, 3)
+        axes.plot(*places_in_map(changes, truth.before, scans)[:, :2].T, "kx", markersize=10, label="true change")
+    angle = np.linspace(0.0, 2 * np.pi, 100)
+    circle = report.regions.radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
+    for centre in report.regions.centres_map[report.regions.is_reported, :2]:
+        axes.plot(*(centre + circle).T, color="0.3", linewidth=0.8)
+    for kind, colour in CHANGE_RGB.items():
+        points = [item.points_map[:, :2] for item in report.objects if item.kind == kind]
+        if points:
+            axes.plot(*np.concatenate(points).T, ".", markersize=2, color=np.array(colour) / 255, label=kind)
+    axes.legend(loc="best", fontsize="small")
+    return figure
