@@ -3,9 +3,12 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= demo
+TEST_PROCESSES ?= 2
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
+# One process per core and one thread in each; the tests of one file stay in one process and share what it has set up.
+PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
 
-.PHONY: setup demo test check report clean
+.PHONY: setup demo test soak check report clean
 
 setup: $(VENV)/.installed-dev
 
@@ -26,7 +29,10 @@ demo: $(VENV)/.installed
 	$(BIN)/tunnelcd demo --out $(OUT)
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest
+	$(PYTEST)
+
+soak: $(VENV)/.installed-dev
+	$(PYTEST) -m soak
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

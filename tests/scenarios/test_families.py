@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from itertools import combinations, pairwise
 
@@ -15,6 +15,14 @@ from scenarios.schema import Furniture, Place, Scenario, Tunnel
 
 SEEDS = (*range(10), *range(10000, 10010))
 MANY = range(100)
+swept = pytest.mark.parametrize(
+    "seeds",
+    [pytest.param(SEEDS[::5], id="few"), pytest.param(SEEDS, id="some", marks=pytest.mark.soak)],
+)
+swept_wide = pytest.mark.parametrize(
+    "seeds",
+    [pytest.param(SEEDS[::5], id="few"), pytest.param((*MANY, *SEEDS[10:]), id="many", marks=pytest.mark.soak)],
+)
 TRAINED = ("narrow", "wide", "network", "smooth")
 RANDOM = (*TRAINED, "cave")
 DRAWN = (*RANDOM, "tight")  # tight has no unchanged twin: it is trained and validated on, never tested on
@@ -83,10 +91,11 @@ def test_the_names_are_the_documented_ones() -> None:
     ]  # fmt: skip
 
 
+@swept
 @pytest.mark.parametrize("name", scenario_names())
-def test_every_family_is_valid_for_many_seeds(name: str) -> None:
+def test_every_family_is_valid(name: str, seeds: Sequence[int]) -> None:
     assert check_scenario(name).family == name
-    for seed in SEEDS:
+    for seed in seeds:
         scenario = drawn(name, seed)
         assert scenario.description
         assert all(abs(place.lateral) >= 0.5 for place in places(scenario))
@@ -95,9 +104,10 @@ def test_every_family_is_valid_for_many_seeds(name: str) -> None:
         assert {plan.odometry.source for plan in (scenario.before, scenario.after)} == {"drift"}
 
 
+@swept_wide
 @pytest.mark.parametrize("name", scenario_names())
-def test_no_pile_is_higher_than_its_flanks_allow(name: str) -> None:
-    for seed in MANY if name in RANDOM else SEEDS:
+def test_no_pile_is_higher_than_its_flanks_allow(name: str, seeds: Sequence[int]) -> None:
+    for seed in seeds:
         for prop in drawn(name, seed).props:
             if prop.kind == "muck_pile" and prop.size_m is not None:
                 length_m, width_m, height_m = prop.size_m
@@ -105,9 +115,10 @@ def test_no_pile_is_higher_than_its_flanks_allow(name: str) -> None:
                 assert height_m <= 1.01 * run_m * math.tan(math.radians(prop.repose_deg)), (seed, prop.name)
 
 
+@swept_wide
 @pytest.mark.parametrize("name", [name for name in scenario_names() if not name.startswith(("smoke/", "train/"))])
-def test_at_least_five_distractors_on_100_m(name: str) -> None:
-    for seed in MANY if name in RANDOM else SEEDS:
+def test_at_least_five_distractors_on_100_m(name: str, seeds: Sequence[int]) -> None:
+    for seed in seeds:
         scenario = drawn(name, seed)
         staying = [prop for prop in scenario.props if prop.change == "none" and prop.place.area is None]
         # they stand anywhere on the edges that either session drives
@@ -116,10 +127,11 @@ def test_at_least_five_distractors_on_100_m(name: str) -> None:
         assert len(staying) >= 0.05 * way_m
 
 
+@swept_wide
 @pytest.mark.parametrize("name", ["cave", "smooth", "unchanged/cave", "unchanged/smooth"])
-def test_there_are_enough_to_have_five_on_100_m_of_the_before_path_alone(name: str) -> None:
+def test_there_are_enough_to_have_five_on_100_m_of_the_before_path_alone(name: str, seeds: Sequence[int]) -> None:
     # Part of what may be driven lies beyond where the before session drives: half as many again as needed on average.
-    for seed in MANY:
+    for seed in seeds:
         scenario = drawn(name, seed)
         drives = {frozenset(pair) for plan in (scenario.before, scenario.after) for pair in pairwise(plan.route)}
         way_m = sum(math.dist(*(scenario.tunnel.nodes[node] for node in edge)) for edge in drives)
@@ -153,13 +165,14 @@ def test_most_of_the_way_is_far_from_the_areas_of_change(name: str) -> None:
         assert near_m <= 0.4 * lengths_m(scenario)[0]
 
 
+@swept_wide
 @pytest.mark.parametrize(
     "name",
     [*TRAINED, "tight", *(name for name in scenario_names() if name.startswith("train/"))]
     + [f"unchanged/{name}" for name in TRAINED],
 )
-def test_kinds_held_out_stand_in_no_family_that_is_trained_on(name: str) -> None:
-    for seed in MANY:
+def test_kinds_held_out_stand_in_no_family_that_is_trained_on(name: str, seeds: Sequence[int]) -> None:
+    for seed in seeds:
         scenario = drawn(name, seed)
         assert not {prop.kind for prop in scenario.props} & HELD_OUT
         assert scenario.tunnel.mesh is None

@@ -80,7 +80,10 @@ def parts(mesh: Mesh) -> list[Mesh]:
     return found
 
 
-@pytest.mark.parametrize("name", ["narrow", "wide", "network", "cave", "smooth"])
+@pytest.mark.parametrize(
+    "name",
+    ["smooth", *(pytest.param(name, marks=pytest.mark.soak) for name in ("narrow", "wide", "network", "cave"))],
+)
 def test_neither_session_reaches_anything_that_the_other_one_does(name: str, sensor: SensorMetadata) -> None:
     seed = 10003
     scenario = load_scenario(f"disjoint/{name}", seed, COARSE)

@@ -113,21 +113,29 @@ def _rooms(n_tunnels: int) -> PlaceData:
     )
 
 
-def test_training_lowers_both_losses_and_repeats_by_seed(tmp_path: Path) -> None:
-    data = _rooms(3)
-    config = FitConfig(seed=1, steps=40, validate_every=40)
+def _fitted(folder: Path, data: PlaceData, n_steps: int) -> tuple[torch.nn.Module, list[dict[str, float]]]:
+    """Train on a few rooms; returns the network and the losses of every step."""
     losses: list[dict[str, float]] = []
-    networks = []
-    for name in ("one", "other"):
-        (tmp_path / name).mkdir()
-        task = PlaceTask(initial_network(1), data, data, seed=1)
-        fit(task, config, tmp_path / name, "", lambda _, parts: losses.append(dict(parts)), lambda _: None)
-        networks.append(task.network)
-    at_first = losses[0]
+    folder.mkdir()
+    task = PlaceTask(initial_network(1), data, data, seed=1)
+    config = FitConfig(seed=1, steps=n_steps, validate_every=n_steps)
+    fit(task, config, folder, "", lambda _, parts: losses.append(dict(parts)), lambda _: None)
+    return task.network, losses
+
+
+def test_training_lowers_both_losses(tmp_path: Path) -> None:
+    _, losses = _fitted(tmp_path / "one", _rooms(3), 40)
     for part, share in (("place", 0.1), ("yaw", 0.5)):
-        assert np.mean([step[part] for step in losses[35:40]]) < share * at_first[part]
-    for one, other in zip(networks[0].parameters(), networks[1].parameters(), strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=0)
+        assert np.mean([step[part] for step in losses[35:40]]) < share * losses[0][part]
+
+
+@pytest.mark.parametrize("n_steps", [4, pytest.param(40, marks=pytest.mark.soak)])
+def test_training_repeats_by_seed(tmp_path: Path, n_steps: int) -> None:
+    data = _rooms(3)
+    one, other = (_fitted(tmp_path / name, data, n_steps)[0] for name in ("one", "other"))
+    assert not all(torch.equal(*both) for both in zip(one.parameters(), initial_network(1).parameters(), strict=True))
+    for mine, its in zip(one.parameters(), other.parameters(), strict=True):
+        torch.testing.assert_close(mine, its, rtol=0, atol=0)
 
 
 def test_a_mirrored_image_is_that_of_the_mirrored_scan() -> None:

@@ -177,6 +177,7 @@ def test_rows_are_those_of_a_serial_run(tmp_path: Path, plan: Plan, workers: Wor
     assert run_in(there.path, plan, Where())[1] == run_in(there.path, plan, workers.where)[1] == RunOutcome(0, 6, 0)
 
 
+@pytest.mark.soak
 def test_a_killed_worker_loses_only_the_cell_in_flight(tmp_path: Path, plan: Plan, workers: Workers) -> None:
     workers.befalls("hold", f"20000-{SECOND}")
 
@@ -218,6 +219,7 @@ def test_a_cell_that_kills_its_worker_is_a_row_and_the_others_are_fine(
     assert run_in(run.path, plan, workers.where)[1] == RunOutcome(0, 6, 0, n_died=1)
 
 
+@pytest.mark.soak
 def test_a_simulation_that_kills_its_worker_makes_a_row_of_every_cell(
     tmp_path: Path, plan: Plan, workers: Workers
 ) -> None:

@@ -34,7 +34,6 @@ from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
-from sim.session.simulate import simulate_pair
 from sim.session.truth import read_pair_truth, write_pair_truth
 
 ONE_BOX, UNCHANGED = "smoke/one_box", "smoke/unchanged"
@@ -48,13 +47,9 @@ def load_small(name: str, seed: int, settings: Iterable[str] = ()) -> Scenario:
 
 
 @pytest.fixture(scope="module")
-def pairs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def pairs(simulated_once: Callable[[Scenario, int], Path]) -> dict[str, Path]:
     """Both smoke scenarios, thinned out and simulated once; every test works on copies."""
-    made = {}
-    for name in (ONE_BOX, UNCHANGED):
-        made[name] = tmp_path_factory.mktemp("pairs") / name.replace("/", "_")
-        simulate_pair(load_small(name, 20000), 20000, made[name])
-    return made
+    return {name: simulated_once(load_small(name, 20000), 20000) for name in (ONE_BOX, UNCHANGED)}
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ from eval.training.dataset_run import make_dataset
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 from scenarios.library import load_scenario
-from sim.session.simulate import simulate_pair
+from scenarios.schema import Scenario
 from sim.session.truth import read_labels
 
 FAMILY, SEED = "smoke/one_box", 3
@@ -52,10 +52,9 @@ def shard_fixture(tmp_path_factory: pytest.TempPathFactory) -> Shard:
 
 
 @pytest.fixture(scope="module", name="from_files")
-def from_files_fixture(tmp_path_factory: pytest.TempPathFactory) -> FromFiles:
+def from_files_fixture(simulated_once: Callable[[Scenario, int], Path]) -> FromFiles:
     """The same pair by way of files, as `simulate` and the pipeline make and read them."""
-    pair = tmp_path_factory.mktemp("pair") / "pair"
-    simulate_pair(load_scenario(FAMILY, SEED), SEED, pair)
+    pair = simulated_once(load_scenario(FAMILY, SEED), SEED)
     maps = [build_map(pipeline_input(pair, name), load_config("tunnelcd").map) for name in ("before", "after")]
     return pair, maps, load_ground_truth(pair)
 
@@ -207,6 +206,7 @@ def test_scans_and_changes_are_those_of_the_files(shard: Shard, from_files: From
     assert arrays["change_is_observable"].tolist() == truth.is_observable.tolist()
 
 
+@pytest.mark.soak
 def test_a_dask_cluster_makes_the_same_bytes(tmp_path: Path, shard: Shard, other_shard: bytes) -> None:
     distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
