@@ -23,7 +23,7 @@ from cdpipe.descriptors.describe import describe_scans, load_descriptors, save_d
 from cdpipe.descriptors.sphere import describe_map
 from cdpipe.extract.extract import extract_changes, local_alignment
 from cdpipe.io.readers import open_session
-from cdpipe.mapping.mapping import build_map, keyframes
+from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.session_check import check_session, unit_hint
 from cdpipe.merge.merge import merge_maps
 from cdpipe.methods import registry
@@ -128,7 +128,7 @@ def describe(
     if config.query.compare == "sphere":
         descriptors = map_session(source, config).descriptors
     else:
-        chosen = keyframes(source.odom_T_sensor, config.map.keyframe_spacing_m)
+        chosen = choose_keyframes(source.odom_T_sensor, config.map.keyframe_spacing_m)
         descriptors = describe_scans(source, chosen, config.descriptor)
     return descriptors, save_descriptors(Path(session), descriptors, source.odom_T_sensor, config.map)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import stream
-from cdpipe.core.yamlfile import Document, Key, read_yaml, suggestion, validated, with_settings
+from cdpipe.core.yamlfile import Document, Key, apply_settings, read_yaml, suggest, validate
 from scenarios.distributions import Drawing, dotted, drawing, form_mistakes, is_distribution, merged
 from scenarios.references import contradictions, file_keys, reference_mistakes
 from scenarios.schema import Prop, Scenario
@@ -91,7 +91,7 @@ def _scenario(document: Document, seed: int) -> tuple[Scenario | None, list[str]
     references = reference_mistakes(tree)
     mistakes += [_told(place, key, rule) for key, rule in references]
     try:
-        scenario = validated(Scenario, replace(place, value=tree))
+        scenario = validate(Scenario, replace(place, value=tree))
     except InputError as error:
         return None, mistakes + _without_repetition(str(error).splitlines(), drawn.broken, bool(references))
     mistakes += [_told(place, key, rule) for key, rule in contradictions(scenario)]
@@ -175,7 +175,7 @@ def _line_of(line: str) -> tuple[str, int]:
 
 
 def _document(name_or_path: str, settings: Iterable[str]) -> Document:
-    return with_settings(_extended(_path_of(name_or_path), ()), settings)
+    return apply_settings(_extended(_path_of(name_or_path), ()), settings)
 
 
 def _path_of(name_or_path: str) -> Path:
@@ -187,7 +187,7 @@ def _path_of(name_or_path: str) -> Path:
         return path
     if path.suffix in SUFFIXES:
         raise ScenarioError(f"{path}: no such file; a scenario is a YAML file or a name such as {names[0]}")
-    hint = suggestion(name_or_path, names) or f"; known are {', '.join(names)}"
+    hint = suggest(name_or_path, names) or f"; known are {', '.join(names)}"
     raise ScenarioError(f'scenario "{name_or_path}": unknown{hint}')
 
 

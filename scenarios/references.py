@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import Key, suggestion
+from cdpipe.core.yamlfile import Key, suggest
 from cdpipe.sensor.ouster import load_profile
 from scenarios.schema import Furniture, Scenario, SessionPlan, Tunnel
 
@@ -198,7 +198,7 @@ def _area_mistakes(tree: Any) -> Iterator[Mistake]:
         for place in ("place", "to"):
             area = _mapping(prop, place).get("area")
             if isinstance(area, str) and area not in known:
-                rule = f"no area is called {area}{suggestion(area, known)}" if known else "there are no areas"
+                rule = f"no area is called {area}{suggest(area, known)}" if known else "there are no areas"
                 yield ("props", index, place, "area"), rule
 
 
@@ -230,7 +230,7 @@ def _no_drift(pair: list[str], nodes: list[str]) -> str:
 
 
 def _unknown_node(name: str, nodes: list[str]) -> str:
-    return f"no node of the tunnel is called {name}{suggestion(name, nodes)}"
+    return f"no node of the tunnel is called {name}{suggest(name, nodes)}"
 
 
 def _mapping(tree: Any, key: str) -> dict[str, Any]:

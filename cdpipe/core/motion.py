@@ -58,7 +58,7 @@ class Motion:
         return points.reshape(*time_s.shape, 3), quaternions.reshape(*time_s.shape, 4)
 
 
-def motion_of(time_s: Float64Array, way_m: Float64Array, points: Float64Array, rotations: Rotation) -> Motion:
+def make_motion(time_s: Float64Array, way_m: Float64Array, points: Float64Array, rotations: Rotation) -> Motion:
     """Return a movement through N positions and N rotations."""
     quaternions = rotations.as_quat()
     flips = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)

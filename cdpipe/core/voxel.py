@@ -48,7 +48,7 @@ def cell_corners(keys: Int64Array, cell_m: float) -> Float64Array:
     return np.asarray((((keys[:, None] >> shifts) & ((1 << _BITS) - 1)) - _HALF) * cell_m)
 
 
-def thinned(points: Float64Array, cell_m: float) -> Float64Array:
+def thin(points: Float64Array, cell_m: float) -> Float64Array:
     """Return the first point of each occupied cell, in the order of the cells' keys."""
     _, first = np.unique(cell_keys(points, cell_m), return_index=True)
     return points[first]

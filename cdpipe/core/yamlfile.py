@@ -82,7 +82,7 @@ def _parsed(path: str, text: str) -> Document:
     return Document(path, value, {key: f"{path}:{line}" for key, line in lines.items()})
 
 
-def validated(model: type[ModelT], document: Document) -> ModelT:
+def validate(model: type[ModelT], document: Document) -> ModelT:
     """Check a document against a model.
 
     Raises:
@@ -97,7 +97,7 @@ def validated(model: type[ModelT], document: Document) -> ModelT:
         raise InputError("\n".join(dict.fromkeys(lines))) from error
 
 
-def with_settings(document: Document, settings: Iterable[str]) -> Document:
+def apply_settings(document: Document, settings: Iterable[str]) -> Document:
     """Return the document with `a.b=value` settings written over it; values are YAML scalars or lists.
 
     Raises:
@@ -128,7 +128,7 @@ def with_settings(document: Document, settings: Iterable[str]) -> Document:
     return replace(document, value=value, origins=origins)
 
 
-def with_section(document: Document, name: str) -> tuple[Document, Document | None]:
+def split_section(document: Document, name: str) -> tuple[Document, Document | None]:
     """Split a document in what it says without its section `name`, and the same with that written over it.
 
     Returns:
@@ -148,7 +148,7 @@ def with_section(document: Document, name: str) -> tuple[Document, Document | No
     return rest, replace(rest, value=_overlaid(rest.value, section), origins=below | above)
 
 
-def suggestion(word: str, known: Iterable[str]) -> str:
+def suggest(word: str, known: Iterable[str]) -> str:
     """Return `; did you mean "…"?` for the closest known word, or ""."""
     close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
     return f'; did you mean "{close[0]}"?' if close else ""
@@ -167,7 +167,7 @@ def _mistake(model: type[BaseModel], document: Document, error: Any) -> str:
     hint = ""
     expected = error.get("ctx", {}).get("expected")
     if error["type"] == "literal_error" and isinstance(error["input"], str):
-        hint = suggestion(error["input"], [word.strip(" '\"") for word in expected.replace(" or ", ",").split(",")])
+        hint = suggest(error["input"], [word.strip(" '\"") for word in expected.replace(" or ", ",").split(",")])
     rule = error["msg"].removeprefix("Value error, ")
     rule = rule[0].lower() + rule[1:] if not rule[:2].isupper() else rule
     return f"{where}: {name} = {_brief(error['input'])}: {rule}{hint}" if name else f"{where}: {rule}{hint}"
@@ -180,7 +180,7 @@ def _near_key(model: type[BaseModel], key: Key) -> str:
     grouped = [f'"{group}.{last}"' for group in groups if last in _fields_at(model, (group,))]
     if len(key) == 1 and grouped:
         return f"; did you mean {' or '.join(grouped)}?"
-    return suggestion(last, _fields_at(model, key[:-1]))
+    return suggest(last, _fields_at(model, key[:-1]))
 
 
 def _brief(value: Any) -> str:

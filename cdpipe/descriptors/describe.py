@@ -18,8 +18,8 @@ from cdpipe.descriptors.network import (
     PlaceNetwork,
     checkpoint_bytes,
     digest,
-    initial_network,
-    trained_network,
+    load_trained_network,
+    make_untrained_network,
 )
 from cdpipe.descriptors.range_image import range_image
 from cdpipe.descriptors.sphere import sphere_digest
@@ -136,9 +136,9 @@ def _described(clouds_sensor: Iterable[Float64Array], method: str) -> tuple[Floa
 @cache
 def _network(method: str) -> tuple[PlaceNetwork, str]:
     if method == "untrained":
-        network = initial_network()
+        network = make_untrained_network()
         return network, digest(checkpoint_bytes(network))
-    return trained_network()
+    return load_trained_network()
 
 
 def _apply(network: PlaceNetwork, images: Float32Array) -> tuple[Float32Array, Float32Array]:

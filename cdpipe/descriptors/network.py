@@ -81,14 +81,14 @@ def yaw_correlation(w_a: Tensor, w_b: Tensor) -> Tensor:
     return correlation
 
 
-def initial_network(seed: int = 0) -> PlaceNetwork:
+def make_untrained_network(seed: int = 0) -> PlaceNetwork:
     """Return the untrained network; the same seed gives the same weights, and the global generator is left alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return PlaceNetwork().eval()
 
 
-def trained_network() -> tuple[PlaceNetwork, str]:
+def load_trained_network() -> tuple[PlaceNetwork, str]:
     """Return the shipped network and the digest of its checkpoint."""
     content = (resources.files("cdpipe") / "descriptors" / "weights" / "3deg.safetensors").read_bytes()
     network = PlaceNetwork()

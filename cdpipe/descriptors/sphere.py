@@ -15,7 +15,7 @@ from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, invert
 from cdpipe.core.grid_index import GridIndex
 from cdpipe.descriptors.pooling import agreed
 from cdpipe.descriptors.sphere_image import render
-from cdpipe.descriptors.sphere_network import PER_SECTOR, SECTORS, SphereNetwork, trained_sphere_network
+from cdpipe.descriptors.sphere_network import PER_SECTOR, SECTORS, SphereNetwork, load_trained_sphere_network
 from cdpipe.model.config import DescriptorConfig
 from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap, Spheres
 
@@ -105,4 +105,4 @@ def _in_after_odom(merged: MergedMaps, map_T_anchor: Float64Array) -> Float64Arr
 
 @cache
 def _network() -> tuple[SphereNetwork, str]:
-    return trained_sphere_network()
+    return load_trained_sphere_network()

@@ -127,7 +127,7 @@ class SphereNetwork(nn.Module):
         return torch.tanh(self.kept(features)[:, :, 0])
 
 
-def initial_sphere_network(seed: int = 0, size: SphereSize | None = None) -> SphereNetwork:
+def make_untrained_sphere_network(seed: int = 0, size: SphereSize | None = None) -> SphereNetwork:
     """Return the untrained network; the same seed gives the same weights, and the global generator is left alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -140,7 +140,7 @@ def size_of(tensors: Mapping[str, Tensor]) -> SphereSize:
     return SphereSize(per_sector, channels / _CHANNELS[-1], "seen.weight" in tensors)
 
 
-def loaded_sphere_network(content: bytes) -> SphereNetwork:
+def load_sphere_network(content: bytes) -> SphereNetwork:
     """Return the network of a checkpoint, whatever its size."""
     tensors = load(content)
     network = SphereNetwork(size_of(tensors))
@@ -148,10 +148,10 @@ def loaded_sphere_network(content: bytes) -> SphereNetwork:
     return network.eval()
 
 
-def trained_sphere_network() -> tuple[SphereNetwork, str]:
+def load_trained_sphere_network() -> tuple[SphereNetwork, str]:
     """Return the shipped network and the digest of its checkpoint."""
     content = (resources.files("cdpipe") / "descriptors" / "weights" / "sphere.safetensors").read_bytes()
-    return loaded_sphere_network(content), digest(content)
+    return load_sphere_network(content), digest(content)
 
 
 assert COLUMNS == SECTORS * 6 and ROWS % 4 == 0

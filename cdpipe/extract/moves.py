@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, make_pose, transform, yaw_pose
-from cdpipe.core.voxel import thinned
+from cdpipe.core.voxel import thin
 from cdpipe.extract.shape import upright_box
 
 # An object that went far shows the same faces but for what is hidden: so large a share of both must lie within
@@ -123,14 +123,14 @@ class _Cloud:
 
     def coarse(self) -> _Cloud:
         """Return fewer points, to lie on fewer: for a first guess in a quarter of the time."""
-        whole = thinned(self.whole, _LIKE_WITHIN_M)
+        whole = thin(self.whole, _LIKE_WITHIN_M)
         return replace(self, few=_few(self.few, _MOST_COARSE_POINTS), whole=whole, tree=_tree(whole))
 
 
 def _few(points: Float64Array, most: int) -> Float64Array:
     few, cell_m = points, _LIKE_WITHIN_M
     while len(few) > most:
-        few = thinned(points, cell_m)
+        few = thin(points, cell_m)
         cell_m *= 1.2
     return few
 

@@ -103,7 +103,7 @@ def _candidates(
     """Return how the two spheres fit, and the candidates of both sessions."""
     before, after = spheres["before"].points, spheres["after"].points
     surface = Surface(before)
-    correction = realigned(after, centre, surface) if config.realign else np.eye(4)
+    correction = realign(after, centre, surface) if config.realign else np.eye(4)
     after = transform(correction, after)
     compared = {"after": (after, PlaneTable(surface)), "before": (before, PlaneTable(Surface(after)))}
     found, noise_m = [], {}
@@ -119,7 +119,7 @@ def _candidates(
     return _Agreement(correction, max(noise_m.values())), found
 
 
-def realigned(after: Float64Array, centre: Float64Array, surface: Surface) -> Float64Array:
+def realign(after: Float64Array, centre: Float64Array, surface: Surface) -> Float64Array:
     """Return the (4, 4) correction, map frame, that brings a sphere of the after map onto the before map's surface.
 
     The identity where there is too little to align or where it would carry the sphere farther than a correction may.
@@ -189,8 +189,8 @@ def _objects(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) -> l
         }
         compared = compare_site(points[site.session], points[other])
         n_views = _free_space_votes(compared.points, merged, other, correction)
-        rays = partial(rays_of, merged, other, returns[other], points[other], correction)
-        for cells in object_cells(compared, n_views, rays, site.agreement.noise_m, config):
+        rays = partial(collect_rays, merged, other, returns[other], points[other], correction)
+        for cells in find_object_cells(compared, n_views, rays, site.agreement.noise_m, config):
             is_member = np.zeros(len(compared.points), dtype=np.bool_)
             is_member[cells] = True
             of_object = is_member[compared.cell_of_return]
@@ -235,7 +235,7 @@ def _is_out_of_place(point_map: PointMap, returns: Int64Array) -> bool:
     return bool(np.mean(n_looked > 0) > 0.5)
 
 
-def object_cells(
+def find_object_cells(
     site: Site, n_views: Int64Array, rays: Callable[[], Rays], noise_m: float, config: ExtractConfig
 ) -> list[Int64Array]:
     """Return the cells of each object of a site: what the views tell of, then the low ones, of which only rays do.
@@ -271,7 +271,7 @@ def _free_space_votes(
     return free_space_votes(points_map, views)
 
 
-def rays_of(
+def collect_rays(
     merged: MergedMaps, session: SessionName, returns: Int64Array, ends: Float64Array, correction: Float64Array
 ) -> Rays:
     """Return the (M, 3) ends of some returns as given, where the sensor was (M, 3), and the (M,) scan of each."""

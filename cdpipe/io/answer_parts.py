@@ -11,7 +11,7 @@ import numpy.typing as npt
 from pydantic import ConfigDict, Field, PositiveFloat
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import Document, Settings, suggestion, validated
+from cdpipe.core.yamlfile import Document, Settings, suggest, validate
 from cdpipe.model.types import Kind, SessionName
 
 FORMAT: Literal["tunnelcd-answer"] = "tunnelcd-answer"
@@ -102,7 +102,7 @@ def checked_document(path: Path, value: Any) -> AnswerPart | FailurePart:
     """
     document = Document(str(path), value)
     is_failure = isinstance(value, dict) and value.get("status") in get_args(Failure)
-    return validated(FailurePart if is_failure else AnswerPart, document)
+    return validate(FailurePart if is_failure else AnswerPart, document)
 
 
 def checked_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects: int) -> None:
@@ -115,7 +115,7 @@ def checked_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects
     for name, array in arrays.items():
         shape = ("R",) if name.startswith(_FIGURE) else _SHAPES.get(name)
         if shape is None:
-            near = suggestion(name, _SHAPES) or f" (known: {', '.join(_SHAPES)})"
+            near = suggest(name, _SHAPES) or f" (known: {', '.join(_SHAPES)})"
             mistakes.append(f"array {name} is unknown{near}")
         elif array.dtype.kind not in ("b" if name in _MASKS else "biuf"):
             wanted = "true or false" if name in _MASKS else "numbers"

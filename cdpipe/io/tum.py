@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int64Array
-from cdpipe.core.motion import Motion, motion_of
+from cdpipe.core.motion import Motion, make_motion
 
 TUM_LINE = "stamp tx ty tz qx qy qz qw"
 _UNIT_TOLERANCE = 1e-3
@@ -81,7 +81,7 @@ def motion_along(path: Path, first_ns: int, last_ns: int, slack_s: float) -> Mot
             f"at most {_LONGEST_GAP_S:g} s can be bridged"
         )
     way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1))])
-    return motion_of(time_s, way_m, rows[:, 1:4], Rotation.from_quat(rows[:, 4:]))
+    return make_motion(time_s, way_m, rows[:, 1:4], Rotation.from_quat(rows[:, 4:]))
 
 
 def stamps_from_first_ns(rows: Float64Array) -> Int64Array:

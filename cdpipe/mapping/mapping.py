@@ -37,7 +37,7 @@ def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_S
         InputError: A pose lies too far out for cells of this size, or no return is within range.
     """
     _require_reachable(source, config)
-    keyframe_scans = keyframes(source.odom_T_sensor, config.keyframe_spacing_m)
+    keyframe_scans = choose_keyframes(source.odom_T_sensor, config.keyframe_spacing_m)
     accumulator = _MapAccumulator(config, frozenset(keyframe_scans.tolist()))
     scans = iter(source.scans())
     while batch := list(islice(scans, batch_scans)):
@@ -45,7 +45,7 @@ def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_S
     return accumulator.finish(source, keyframe_scans)
 
 
-def keyframes(odom_T_sensor: Float64Array, spacing_m: float) -> Int64Array:
+def choose_keyframes(odom_T_sensor: Float64Array, spacing_m: float) -> Int64Array:
     """Return the (K,) scans at which each further `spacing_m` of path is complete, the first scan included."""
     travelled = travelled_m(odom_T_sensor)
     chosen = [0]

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, invert
-from cdpipe.core.motion import Motion, motion_of, rotation_matrices
+from cdpipe.core.motion import Motion, make_motion, rotation_matrices
 from cdpipe.sensor.ouster import SensorMetadata
 
 # KISS-ICP's own defaults are made for streets: a map of 1 m voxels, a hundredth of the range. In drifts 4 to 9 m wide
@@ -62,7 +62,7 @@ def estimate_motion(
     poses = np.tile(np.eye(4), (len(revolution_s), 1, 1))
     twist = np.zeros(6)
     for number, range_mm in enumerate(range_images):
-        points = deskewed(sensor.project(range_mm / 1000.0), twist[:3], twist[3:], column_s)
+        points = deskew_at_constant_velocity(sensor.project(range_mm / 1000.0), twist[:3], twist[3:], column_s)
         icp.register_frame(np.ascontiguousarray(points[range_mm > 0]), np.zeros(0))
         poses[number] = icp.last_pose
         if not np.isfinite(poses[number]).all():
@@ -79,10 +79,10 @@ def estimate_motion(
         revolution_s = revolution_s + np.array([0.0, 1.0])
     steps_m = np.linalg.norm(np.diff(odom_T_sensor[:, :3, 3], axis=0), axis=1)
     way_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-    return motion_of(revolution_s, way_m, odom_T_sensor[:, :3, 3], Rotation.from_matrix(odom_T_sensor[:, :3, :3]))
+    return make_motion(revolution_s, way_m, odom_T_sensor[:, :3, 3], Rotation.from_matrix(odom_T_sensor[:, :3, :3]))
 
 
-def deskewed(
+def deskew_at_constant_velocity(
     points: Float64Array, velocity_mps: Float64Array, turn_rad_s: Float64Array, column_s: Float64Array
 ) -> Float64Array:
     """Return points (H, W, 3), each column in its own frame, in the frame of the middle column.

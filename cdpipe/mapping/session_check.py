@@ -10,7 +10,7 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int64Array, require_poses, travelled_m
-from cdpipe.mapping.mapping import keyframes
+from cdpipe.mapping.mapping import choose_keyframes
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PointMap, ScanSource
 
@@ -116,7 +116,7 @@ def _require_metres(source: ScanSource, ranges_m: Float64Array, other: ScanSourc
 
 def _require_path(source: ScanSource, spacing_m: float) -> None:
     poses = source.odom_T_sensor
-    if len(keyframes(poses, spacing_m)) < 2:
+    if len(choose_keyframes(poses, spacing_m)) < 2:
         way_m = float(travelled_m(poses)[-1])
         raise InputError(
             f"{source.name}: its {len(poses)} scans lie along {way_m:.3g} m: expected a path of at least "
@@ -151,7 +151,7 @@ def _require_up(source: ScanSource, directions: Float64Array, spacing_m: float) 
                     f"{source.name}: the sensor spins about an axis {tilt_deg:.0f} degrees off z of {frame}: expected "
                     "x forward and z up (a camera's frame has z forward): turn the points and the poses"
                 )
-    positions = poses[keyframes(poses, spacing_m), :3, 3]
+    positions = poses[choose_keyframes(poses, spacing_m), :3, 3]
     steps = np.diff(positions, axis=0)
     slope_deg = float(np.degrees(np.arctan2(np.abs(steps[:, 2]).sum(), np.linalg.norm(steps[:, :2], axis=1).sum())))
     if slope_deg > _MAX_TILT_DEG:

@@ -13,7 +13,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, field_validator, mode
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.plugins import METHODS, PRESETS, entry_points, find_yaml
-from cdpipe.core.yamlfile import Document, Settings, read_yaml, suggestion, validated, with_section, with_settings
+from cdpipe.core.yamlfile import Document, Settings, apply_settings, read_yaml, split_section, suggest, validate
 
 Positive = Annotated[float, Field(gt=0)]
 # Smaller ones are noise, and could not be numbered a kilometre from the origin.
@@ -167,7 +167,7 @@ class PipelineConfig(Settings):
     def _is_registered(cls, method: str) -> str:
         known = entry_points(METHODS)
         if method not in known:
-            raise ValueError(f"no such method{suggestion(method, known)} (registered: {', '.join(known)})")
+            raise ValueError(f"no such method{suggest(method, known)} (registered: {', '.join(known)})")
         return method
 
     @model_serializer(mode="wrap")
@@ -198,13 +198,13 @@ def load_config(
     if isinstance(settings, Mapping):
         settings = _as_lines(settings)
     settings = tuple(settings)
-    narrow, wide = with_section(_preset_document(preset), "wide")
+    narrow, wide = split_section(_preset_document(preset), "wide")
     found: dict[str, PipelineConfig] = {}
     mistakes: dict[str, None] = {}
     for name, document in (("narrow", narrow), ("wide", wide)):
         try:
             if document is not None:
-                found[name] = validated(PipelineConfig, with_settings(document, settings))
+                found[name] = validate(PipelineConfig, apply_settings(document, settings))
         except InputError as error:
             mistakes |= dict.fromkeys(str(error).splitlines())
     if mistakes:
@@ -246,7 +246,7 @@ def _preset_document(preset: str) -> Document:
         return read_yaml(Path(preset))
     presets = _presets()
     if preset not in presets:
-        raise InputError(f"preset {preset!r} is unknown{suggestion(preset, presets)} (known: {', '.join(presets)})")
+        raise InputError(f"preset {preset!r} is unknown{suggest(preset, presets)} (known: {', '.join(presets)})")
     return read_yaml(Path(f"{preset}.yaml"), presets[preset].read_text())
 
 

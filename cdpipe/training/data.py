@@ -164,7 +164,7 @@ def stacked(tunnels: Sequence[TunnelShard], names: Sequence[str]) -> dict[str, T
     return {name: torch.cat(tensors) for name, tensors in parts.items()}
 
 
-def place_data(tunnels: Sequence[TunnelShard]) -> PlaceData:
+def read_place_data(tunnels: Sequence[TunnelShard]) -> PlaceData:
     """Return the scans of both sessions as the training of the place descriptor takes them."""
     columns: dict[str, list[Any]] = {name: [] for name in PlaceData.__dataclass_fields__}
     for place, tunnel in enumerate(tunnels):

@@ -92,7 +92,7 @@ def split_of(seed: int) -> Split:
     return "test" if seed < 30_000 else "unused"
 
 
-def shard_bytes(arrays: Mapping[str, npt.NDArray[Any]], about: Mapping[str, Any]) -> bytes:
+def encode_shard(arrays: Mapping[str, npt.NDArray[Any]], about: Mapping[str, Any]) -> bytes:
     """Return a shard; the same content gives the same bytes.
 
     Raises:

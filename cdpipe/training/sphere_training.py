@@ -73,7 +73,7 @@ class SphereData:
         return int(self.after_m.shape[1])
 
 
-def sphere_data(tunnels: Sequence[TunnelShard]) -> SphereData:
+def read_sphere_data(tunnels: Sequence[TunnelShard]) -> SphereData:
     """Read the images and labels of some tunnels into memory.
 
     Raises:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import suggestion
+from cdpipe.core.yamlfile import suggest
 from eval.bench.descriptor import descriptor_contests
 from eval.bench.extract import ExtractSite, extract_contests, extract_sites
 from eval.bench.merge import FailedContest, MergeSite, merge_contests, paper_sites
@@ -50,7 +50,7 @@ def chosen(every: Contests, only: Sequence[str]) -> Contests:
     """
     unknown = [name for name in only if name not in every]
     if unknown:
-        wrong = "; ".join(f"{name!r} is no row of the table{suggestion(name, list(every))}" for name in unknown)
+        wrong = "; ".join(f"{name!r} is no row of the table{suggest(name, list(every))}" for name in unknown)
         raise InputError(f"--only: {wrong} (known: {', '.join(every)})")
     return {name: contest for name, contest in every.items() if not only or name in only}
 

@@ -24,7 +24,7 @@ from cdpipe.descriptors import use_threads
 from cdpipe.extract.crops import Crops, Sphere
 from cdpipe.extract.point_comparison import inlier_mask, new_points_mask
 from cdpipe.extract.surface import RIM_M, SITE_M, PlaneTable, candidates, compare_site, groups
-from cdpipe.extract.surface_rule import BEYOND_M, ReturnPool, object_cells, rays_of, realigned
+from cdpipe.extract.surface_rule import BEYOND_M, ReturnPool, collect_rays, find_object_cells, realign
 from cdpipe.mapping.free_space import free_space_votes
 from cdpipe.merge.registration import Surface
 from cdpipe.model.config import ExtractConfig, PipelineConfig, load_config
@@ -117,11 +117,11 @@ class Region:
 
     def realigned(self) -> Float64Array:
         """Align the after sphere (4, 4) with the before one."""
-        return realigned(self.spheres["after"].points, self.centre_map, self.before_surface)
+        return realign(self.spheres["after"].points, self.centre_map, self.before_surface)
 
     @cached_property
     def correction(self) -> Float64Array:
-        """What `realigned` gave."""
+        """What `realign` gave."""
         return self.realigned()
 
     @cached_property
@@ -176,8 +176,8 @@ class Region:
         ends = self.merged.before.positions_of(others)
         site = compare_site(transform(self.correction, in_map), ends)
         noise_m = max(median_m for _, median_m in self.compared)
-        rays = partial(rays_of, self.merged, "before", others, ends, self.correction)
-        return object_cells(site, free_space_votes(site.points, _views(self.merged)), rays, noise_m, config)
+        rays = partial(collect_rays, self.merged, "before", others, ends, self.correction)
+        return find_object_cells(site, free_space_votes(site.points, _views(self.merged)), rays, noise_m, config)
 
     @cached_property
     def compared(self) -> tuple[tuple[Int64Array, float], tuple[Int64Array, float]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import read_yaml, suggestion
+from cdpipe.core.yamlfile import read_yaml, suggest
 from cdpipe.model.config import PipelineConfig, load_config, preset_names
 from eval.plans.plan import Plan, cells, load_plan, plan_names
 from scenarios.library import check_scenario, scenario_names
@@ -35,7 +35,7 @@ def check_file(name_or_path: str) -> str:
         load_config(name_or_path)
         return "a preset"
     if not name_or_path.endswith((".yaml", ".yml")):
-        near = suggestion(name_or_path, [*plan_names(), *scenario_names(), *preset_names()])
+        near = suggest(name_or_path, [*plan_names(), *scenario_names(), *preset_names()])
         raise InputError(
             f"{name_or_path}: no plan, scenario or preset of this name, and no .yaml file{near or '; see `list`'}"
         )

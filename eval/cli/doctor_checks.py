@@ -45,11 +45,11 @@ def weights() -> str:
     """Load the shipped networks, and hold their digests against their model cards (torch, safetensors)."""
     import torch
 
-    from cdpipe.descriptors.network import trained_network
-    from cdpipe.descriptors.sphere_network import trained_sphere_network
+    from cdpipe.descriptors.network import load_trained_network
+    from cdpipe.descriptors.sphere_network import load_trained_sphere_network
 
     told = []
-    for name, load in (("3deg", trained_network), ("sphere", trained_sphere_network)):
+    for name, load in (("3deg", load_trained_network), ("sphere", load_trained_sphere_network)):
         network, digest = load()
         card = json.loads((resources.files("cdpipe") / "descriptors" / "weights" / f"{name}.json").read_text())
         _require(digest == card["checkpoint"], f"{name}.safetensors is {digest}, its model card {card['checkpoint']}")

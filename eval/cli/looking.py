@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import suggestion
+from cdpipe.core.yamlfile import suggest
 from cdpipe.io.session import is_session
 from scenarios.library import SUFFIXES, load_scenario, scenario_names
 from sim.view.view import View, is_pair, view_folder, view_scenario
@@ -30,6 +30,6 @@ def view_of(what: str, seed: int | None = None, settings: Sequence[str] = ()) ->
             raise InputError(f"{what}: a folder shows what was recorded: leave --seed and --set out")
         return view_folder(path)
     if what not in names and path.suffix not in SUFFIXES:
-        hint = suggestion(what, names) or "; `tunnelcd list` names the scenarios"
+        hint = suggest(what, names) or "; `tunnelcd list` names the scenarios"
         raise InputError(f"{what}: neither a folder nor a scenario{hint}")
     return view_scenario(load_scenario(what, seed or 0, settings), seed or 0)

@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import Document, validated
+from cdpipe.core.yamlfile import Document, validate
 from eval.plans.parts import acts_on_true_regions, key_of, valid_setting, valid_settings
 from eval.plans.plan import Plan, parse_seeds
 from eval.plans.worlds import group_of
@@ -49,7 +49,7 @@ def changed_plan(
     ]
     for each in document["grid"]:
         each["keys"].update({key_of(setting): [yaml.safe_load(setting.partition("=")[2])] for setting in settings})
-    return validated(Plan, Document(f"plan {plan.name} with the settings of the command line", document))
+    return validate(Plan, Document(f"plan {plan.name} with the settings of the command line", document))
 
 
 def _additions(

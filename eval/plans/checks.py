@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from pydantic import ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from cdpipe.core.yamlfile import suggestion
+from cdpipe.core.yamlfile import suggest
 from eval.plans.variants import methods_of, slug
 from eval.plans.worlds import ScenarioItem, group_of, world_slug, worlds_of
 
@@ -87,7 +87,7 @@ def _unknown_worlds(plan: Plan) -> Iterator[Mistake]:
         for index, name in enumerate(variant.scenarios):
             if name not in labels:
                 rule = f"scenarios of {variant.preset} names {name!r}, which is no world of the plan"
-                yield Mistake(("variants", place, "scenarios", index), name, rule + suggestion(name, labels))
+                yield Mistake(("variants", place, "scenarios", index), name, rule + suggest(name, labels))
     known = dict.fromkeys(name for world in worlds for name in (world.name, world.label))
     asked: list[tuple[tuple[str | int, ...], str, str]] = [
         (("wide", index), "wide", name) for index, name in enumerate(plan.wide)
@@ -104,7 +104,7 @@ def _unknown_worlds(plan: Plan) -> Iterator[Mistake]:
         ]
     for where, who, name in asked:
         if name not in known:
-            yield Mistake(where, name, f"{who} names {name!r}, which is not in scenarios{suggestion(name, known)}")
+            yield Mistake(where, name, f"{who} names {name!r}, which is not in scenarios{suggest(name, known)}")
 
 
 def _repeated_variants(plan: Plan) -> Iterator[Mistake]:

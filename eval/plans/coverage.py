@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import Document, validated
+from cdpipe.core.yamlfile import Document, validate
 from eval.plans.plan import Plan, planned_cases
 
 
@@ -54,6 +54,6 @@ def plan_of(provenance: Mapping[str, Any]) -> Plan | None:
     if not isinstance(document, dict):
         return None
     try:
-        return validated(Plan, Document("provenance.json", document))
+        return validate(Plan, Document("provenance.json", document))
     except InputError:
         return None

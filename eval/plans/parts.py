@@ -15,7 +15,7 @@ from pydantic import (
     model_validator,
 )
 
-from cdpipe.core.yamlfile import Document, Settings, suggestion, validated, with_settings
+from cdpipe.core.yamlfile import Document, Settings, apply_settings, suggest, validate
 from cdpipe.model.config import PipelineConfig, load_config, preset_names
 from eval.oracles.merge import OracleMerge
 from eval.plans.worlds import OneOrMore, group_of, known_label, setting_text, told_as_values
@@ -46,7 +46,7 @@ def valid_setting(setting: str) -> str:
             "belongs to the world, not to the method: set it in the plan, under scenarios, "
             f'e.g. {{name: narrow, set: ["{setting}"]}}'
         )
-    told_as_values(lambda: validated(PipelineConfig, with_settings(Document("", {}), [setting])))
+    told_as_values(lambda: validate(PipelineConfig, apply_settings(Document("", {}), [setting])))
     return setting
 
 
@@ -70,7 +70,7 @@ def _known_preset(name: str) -> str:
     if name.endswith((".yaml", ".yml")):
         told_as_values(lambda: load_config(name))
     elif name not in preset_names():
-        raise ValueError(f"unknown preset{suggestion(name, preset_names())} (known: {', '.join(preset_names())})")
+        raise ValueError(f"unknown preset{suggest(name, preset_names())} (known: {', '.join(preset_names())})")
     return name
 
 

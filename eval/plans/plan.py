@@ -36,7 +36,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.plugins import find_yaml
-from cdpipe.core.yamlfile import Settings, read_yaml, suggestion, validated
+from cdpipe.core.yamlfile import Settings, read_yaml, suggest, validate
 from eval.plans.checks import misfits, refuse, repeated_worlds
 from eval.plans.parts import Grid, Label, NotEmpty, Variant
 from eval.plans.variants import Cell, Until, methods_of
@@ -102,14 +102,14 @@ def load_plan(name_or_path: str) -> Plan:
         InputError: It is unknown or has mistakes; all of them at once, one line each.
     """
     if name_or_path.endswith((".yaml", ".yml")):
-        return validated(Plan, read_yaml(Path(name_or_path)))
+        return validate(Plan, read_yaml(Path(name_or_path)))
     plans = _plans()
     if name_or_path not in plans:
         raise InputError(
-            f"plan {name_or_path!r} is unknown{suggestion(name_or_path, plans)} "
+            f"plan {name_or_path!r} is unknown{suggest(name_or_path, plans)} "
             f"(known: {', '.join(plans)}, or the path of a .yaml file)"
         )
-    return validated(Plan, read_yaml(Path(f"{name_or_path}.yaml"), plans[name_or_path].read_text()))
+    return validate(Plan, read_yaml(Path(f"{name_or_path}.yaml"), plans[name_or_path].read_text()))
 
 
 def plan_names() -> list[str]:

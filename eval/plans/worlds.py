@@ -36,7 +36,7 @@ from pydantic import (
 )
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import Settings, suggestion
+from cdpipe.core.yamlfile import Settings, suggest
 from cdpipe.model.config import PipelineConfig
 from scenarios.library import check_scenario, scenario_names
 
@@ -51,7 +51,7 @@ def known_scenario(name: str) -> str:
     if name.endswith((".yaml", ".yml")):
         told_as_values(lambda: check_scenario(name))
     elif name not in names:
-        raise ValueError(f"unknown scenario{suggestion(name, names) or ': `tunnelcd list` shows all'}")
+        raise ValueError(f"unknown scenario{suggest(name, names) or ': `tunnelcd list` shows all'}")
     return name
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import suggestion
+from cdpipe.core.yamlfile import suggest
 from cdpipe.model.config import preset_names
 from eval.core.progress import RunProgress, Silent
 from eval.plans.coverage import plan_of
@@ -128,7 +128,7 @@ def _matched(run: RunFolder, folder: Path, pairs: Sequence[Path]) -> dict[Path, 
 def _strangers(folder: Path, places: set[Path], names: Sequence[str]) -> Iterator[str]:
     for place in sorted(places):
         name = str(place.relative_to(folder))
-        yield f"{place}: the run has no such pair{suggestion(name, names) or f'; it has {_listed(names)}'}"
+        yield f"{place}: the run has no such pair{suggest(name, names) or f'; it has {_listed(names)}'}"
 
 
 def _require_free(run: RunFolder, name: str) -> None:

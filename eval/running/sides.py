@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import suggestion
+from cdpipe.core.yamlfile import suggest
 from eval.plans.coverage import coverage
 from eval.running.run_data import Row, RunData, flag, read_run
 from eval.scoring.scoring import METRICS_VERSION
@@ -64,7 +64,7 @@ def read_side(text: str) -> Side:
     data = read_run(folder)
     known = list(dict.fromkeys(str(row["variant"]) for row in data.results))
     if variant and variant not in known:
-        raise InputError(f"{folder}: no variant {variant}{suggestion(variant, known) or ':'} it has {', '.join(known)}")
+        raise InputError(f"{folder}: no variant {variant}{suggest(variant, known) or ':'} it has {', '.join(known)}")
     return Side(data, variant)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int64Array, require_poses, require_shape
-from cdpipe.core.yamlfile import suggestion
+from cdpipe.core.yamlfile import suggest
 from cdpipe.io.answer import Answer
 from cdpipe.model.report import ChangedObject, ChangeRegions
 from cdpipe.model.types import SessionName
@@ -55,7 +55,7 @@ def check_answer(answer: Answer, truth: GroundTruth, folder: Path) -> None:
 def _check_seconds(seconds: Mapping[str, float]) -> None:
     for name, value in seconds.items():
         if name not in _SECONDS:
-            raise ValueError(f"seconds.{name} is unknown{suggestion(name, _SECONDS)} (known: {', '.join(_SECONDS)})")
+            raise ValueError(f"seconds.{name} is unknown{suggest(name, _SECONDS)} (known: {', '.join(_SECONDS)})")
         if not 0 <= value < np.inf:
             raise ValueError(f"seconds.{name} = {value}: expected seconds, 0 or more; leave out what was not measured")
 

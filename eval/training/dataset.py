@@ -22,10 +22,10 @@ from cdpipe.core.grid_index import GridIndex
 from cdpipe.descriptors import sphere_image
 from cdpipe.descriptors.range_image import range_image
 from cdpipe.descriptors.sphere_image import COLUMNS, CROP_M, HALF_LENGTH_M, REACH_M, ROWS, pixels, render
-from cdpipe.mapping.mapping import build_map, keyframes
+from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.model.config import MapConfig, load_config
 from cdpipe.model.types import DescriptorSet, MappedSession, PointMap, PosedScan, ScanSource
-from cdpipe.training.shard import CHANGE_KINDS, FORMAT_VERSION, shard_bytes, split_of
+from cdpipe.training.shard import CHANGE_KINDS, FORMAT_VERSION, encode_shard, split_of
 from eval.core.provenance import digest
 from eval.oracles.merge import OracleMerge, merged_by_truth
 from eval.scoring.merge_metrics import PAIR_RADIUS_M
@@ -121,7 +121,7 @@ def make_shard(family: str, seed: int, recipe: Recipe) -> bytes:
         "changes": [{"name": change.name, "prop_kind": change.prop_kind} for change in pair.truth.changes],
         "counts": _counts(arrays),
     }
-    return shard_bytes(arrays, about)
+    return encode_shard(arrays, about)
 
 
 def _map_config() -> MapConfig:
@@ -160,7 +160,7 @@ class _Watched:
 def _mapped(held: LabelledSession) -> _Mapped:
     """Map a session, reading it once."""
     config, session = _map_config(), held.session
-    chosen = set(keyframes(session.odom_T_sensor, config.keyframe_spacing_m).tolist())
+    chosen = set(choose_keyframes(session.odom_T_sensor, config.keyframe_spacing_m).tolist())
     universe = UniverseBuilder(str(session.path), session.sensor.height, session.sensor.width)
     ranges_m, stamps_ns = [], []
 

@@ -15,12 +15,12 @@ from matplotlib.axes import Axes
 
 from cdpipe.core.errors import InputError
 from cdpipe.descriptors import use_threads
-from cdpipe.descriptors.network import checkpoint_bytes, digest, initial_network
-from cdpipe.descriptors.sphere_network import SphereNetwork, initial_sphere_network
-from cdpipe.training.data import TunnelShard, open_dataset, place_data
+from cdpipe.descriptors.network import checkpoint_bytes, digest, make_untrained_network
+from cdpipe.descriptors.sphere_network import SphereNetwork, make_untrained_sphere_network
+from cdpipe.training.data import TunnelShard, open_dataset, read_place_data
 from cdpipe.training.fit import FitConfig, Progress, Task, fit
 from cdpipe.training.scan_training import PlaceTask
-from cdpipe.training.sphere_training import SphereTask, sphere_data
+from cdpipe.training.sphere_training import SphereTask, read_sphere_data
 from eval.core.figures import BLUE, VERMILLION, blank_figure
 from eval.core.output import make_writable
 from eval.core.progress import RunProgress
@@ -150,11 +150,13 @@ def _labelled(axes: Axes, x: str, y: str) -> None:
 
 
 def _sphere_task(training: Sequence[TunnelShard], validation: Sequence[TunnelShard], seed: int) -> Task:
-    return SphereTask(initial_sphere_network(seed), sphere_data(training), sphere_data(validation), seed)
+    return SphereTask(
+        make_untrained_sphere_network(seed), read_sphere_data(training), read_sphere_data(validation), seed
+    )
 
 
 def _place_task(training: Sequence[TunnelShard], validation: Sequence[TunnelShard], seed: int) -> Task:
-    return PlaceTask(initial_network(seed), place_data(training), place_data(validation), seed)
+    return PlaceTask(make_untrained_network(seed), read_place_data(training), read_place_data(validation), seed)
 
 
 TASKS: dict[str, Callable[[Sequence[TunnelShard], Sequence[TunnelShard], int], Task]] = {

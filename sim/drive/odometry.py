@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array, stream
-from cdpipe.core.motion import Motion, motion_of
+from cdpipe.core.motion import Motion, make_motion
 from cdpipe.mapping.odometry import estimate_motion
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Odometry
@@ -46,7 +46,7 @@ def drifted(true: Motion, start_s: float, odometry: Odometry, seed: int, session
     points = np.concatenate([np.zeros((1, 3)), np.cumsum(scale * turned, axis=0)])
     points -= [np.interp(start_s, true.time_s, points[:, axis]) for axis in range(3)]
     turns = Rotation.from_euler("z", (drift_rad - start_yaw_rad)[:, None])
-    return motion_of(true.time_s, true.way_m, points, turns * Rotation.from_quat(true.quaternions))
+    return make_motion(true.time_s, true.way_m, points, turns * Rotation.from_quat(true.quaternions))
 
 
 def registered(

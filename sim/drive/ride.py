@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, stream
-from cdpipe.core.motion import Motion, motion_of
+from cdpipe.core.motion import Motion, make_motion
 from scenarios.schema import Platform, Scenario
 from sim.drive.path import Path
 from sim.geometry.line import kept_between, smoothed
@@ -61,7 +61,7 @@ def ride(path: Path, floor: Caster, standing: Caster, scenario: Scenario, seed: 
         level_m = smoothed(_floor_under(path.points, path.points[:, 2], floor), _ALTITUDE_M)
         flight_m = _between(path, floor, standing, level_m + height_m + bounce_m, platform.clearance_m, session)
         points = np.column_stack([path.points[:, :2], flight_m])
-    return motion_of(time_s, path.distance_m, points, rotations)
+    return make_motion(time_s, path.distance_m, points, rotations)
 
 
 def times(distance_m: Float64Array, speed_mps: float, variation: float, seed: int, session: str) -> Float64Array:

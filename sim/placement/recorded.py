@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array
-from cdpipe.core.motion import Motion, motion_of
+from cdpipe.core.motion import Motion, make_motion
 from sim.geometry.raycast import Caster
 from sim.geometry.room import room_about
 
@@ -42,7 +42,7 @@ def read_tum(path: Path) -> tuple[Motion, tuple[int, ...]]:
         raise InputError(f"{path}: {len(rows)} poses: a trajectory needs two lines `{_LINE}` or more")
     _check_steps(path, numbers, rows)
     way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1))])
-    return motion_of(rows[:, 0] - rows[0, 0], way_m, rows[:, 1:4], Rotation.from_quat(rows[:, 4:])), numbers
+    return make_motion(rows[:, 0] - rows[0, 0], way_m, rows[:, 1:4], Rotation.from_quat(rows[:, 4:])), numbers
 
 
 def check_inside(motion: Motion, surroundings: Caster, where: str, numbers: tuple[int, ...]) -> None:

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, make_pose, require_poses
-from cdpipe.core.motion import Motion, motion_of
+from cdpipe.core.motion import Motion, make_motion
 from cdpipe.io.ouster.captures import Recording, open_recording
 from cdpipe.io.ouster.revolutions import Revolution
 from cdpipe.io.session import ScanChunk, SessionWriter
@@ -197,7 +197,7 @@ def _own_motion(revolution: Revolution, stamps_s: Float64Array, where: str) -> M
     except ValueError as error:
         raise InputError(f"{where}: {error}: give the poses with --trajectory or --odometry {KISS_ICP}") from error
     known_s = stamps_s[revolution.is_valid]
-    return motion_of(known_s, np.zeros(len(known_s)), poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]))
+    return make_motion(known_s, np.zeros(len(known_s)), poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]))
 
 
 def _column_poses(motion: Motion, stamps_s: Float64Array) -> tuple[Float64Array, Float32Array]:

@@ -22,10 +22,15 @@ import typer
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import stream
 from cdpipe.descriptors import use_threads
-from cdpipe.descriptors.sphere_network import SphereNetwork, SphereSize, initial_sphere_network, trained_sphere_network
+from cdpipe.descriptors.sphere_network import (
+    SphereNetwork,
+    SphereSize,
+    load_trained_sphere_network,
+    make_untrained_sphere_network,
+)
 from cdpipe.training.data import TunnelShard, open_dataset
 from cdpipe.training.fit import FitConfig, fit
-from cdpipe.training.sphere_training import SphereTask, sphere_data
+from cdpipe.training.sphere_training import SphereTask, read_sphere_data
 from eval.core.exits import input_errors
 from eval.core.output import make_writable
 from eval.studies.descriptors.curve_plots import draw_curves
@@ -92,8 +97,8 @@ def trained(
     point: Point, tunnels: Sequence[TunnelShard], held: HeldOut, steps: int, folder: Path, data: str
 ) -> SphereNetwork:
     """Train one network, calibrated on the held-out tunnels; one that lies in `folder` already is taken from there."""
-    network = initial_sphere_network(point.seed, point.size)
-    task = SphereTask(network, sphere_data(tunnels), held.data, point.seed)
+    network = make_untrained_sphere_network(point.seed, point.size)
+    task = SphereTask(network, read_sphere_data(tunnels), held.data, point.seed)
     config = FitConfig(seed=point.seed, steps=steps, validate_every=steps)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -154,7 +159,7 @@ def main(
             continue
         began = process_time()
         if point is None:
-            network, of_point = trained_sphere_network()[0], dict.fromkeys(("share", "seed", "tunnels"), np.nan)
+            network, of_point = load_trained_sphere_network()[0], dict.fromkeys(("share", "seed", "tunnels"), np.nan)
         else:
             own = share_of(training, point.share, point.seed)
             network = trained(point, own, held, steps, out / "networks" / name, digests)

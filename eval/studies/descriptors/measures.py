@@ -20,7 +20,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.descriptors.sphere_network import SphereNetwork
 from cdpipe.training.data import TunnelShard
 from cdpipe.training.shard import read_shard
-from cdpipe.training.sphere_training import SphereData, local_scores, sphere_data, within_reach
+from cdpipe.training.sphere_training import SphereData, local_scores, read_sphere_data, within_reach
 from eval.core.ranking import auroc
 
 FLOAT_BITS = 32
@@ -56,7 +56,7 @@ def held_out(tunnels: Sequence[TunnelShard]) -> HeldOut:
         arrays, _ = read_shard(tunnel.path, ("change_centroid_world", "change_is_observable"))
         centroids.append(arrays["change_centroid_world"][arrays["change_is_observable"]])
     return HeldOut(
-        sphere_data(tunnels),
+        read_sphere_data(tunnels),
         np.array([tunnel.family for tunnel in tunnels]),
         np.concatenate(centroids),
         np.repeat(np.arange(len(tunnels)), [len(own) for own in centroids]),

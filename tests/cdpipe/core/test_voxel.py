@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cdpipe.core.voxel import UniqueCells, cell_corners, cell_keys, max_coordinate_m, thinned
+from cdpipe.core.voxel import UniqueCells, cell_corners, cell_keys, max_coordinate_m, thin
 
 
 def test_keys_by_hand() -> None:
@@ -66,9 +66,9 @@ def test_no_points() -> None:
     cells = UniqueCells()
     assert cells.add(cell_keys(np.zeros((0, 3)), 0.2)).shape == (0,)
     assert len(cells) == len(cells.keys) == len(cells.first_index) == len(cells.counts) == 0
-    assert thinned(np.zeros((0, 3)), 0.2).shape == (0, 3)
+    assert thin(np.zeros((0, 3)), 0.2).shape == (0, 3)
 
 
 def test_thinning_keeps_the_first_point_of_each_cell() -> None:
     points = np.array([[0.9, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [1.1, 0, 0]])
-    np.testing.assert_array_equal(thinned(points, 1.0), points[[0, 3]])
+    np.testing.assert_array_equal(thin(points, 1.0), points[[0, 3]])

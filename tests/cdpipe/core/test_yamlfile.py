@@ -4,7 +4,7 @@ import pytest
 from pydantic import Field
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import Settings, read_yaml, validated, with_settings
+from cdpipe.core.yamlfile import Settings, apply_settings, read_yaml, validate
 
 
 class Ball(Settings):
@@ -21,7 +21,7 @@ class Box(Settings):
 def test_all_mistakes_are_told_at_once_by_line() -> None:
     text = "name: 3\nballs:\n  - radius_m: 1\n  - radius: 2\n    colour: blue\n  - radius_m: -1\nspares: {}\n"
     with pytest.raises(InputError) as caught:
-        validated(Box, read_yaml(Path("box.yaml"), text))
+        validate(Box, read_yaml(Path("box.yaml"), text))
     lines = str(caught.value).splitlines()
     assert lines[0].startswith("box.yaml:1: name = 3: ")
     assert "box.yaml:4: balls.1.radius_m: missing, a value is required" in lines
@@ -33,7 +33,7 @@ def test_all_mistakes_are_told_at_once_by_line() -> None:
 
 def test_settings_are_written_over_the_file() -> None:
     document = read_yaml(Path("box.yaml"), "name: a\nspare: {radius_m: 1}\n")
-    box = validated(Box, with_settings(document, ["spare.radius_m=2.5", "name=b"]))
+    box = validate(Box, apply_settings(document, ["spare.radius_m=2.5", "name=b"]))
     assert box.spare is not None
     assert (box.name, box.spare.radius_m) == ("b", 2.5)
     assert document.value == {"name": "a", "spare": {"radius_m": 1}}
@@ -45,7 +45,7 @@ def test_settings_are_written_over_the_file() -> None:
 )
 def test_bad_settings_are_named(setting: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        with_settings(read_yaml(Path("box.yaml"), "name: a\n"), [setting])
+        apply_settings(read_yaml(Path("box.yaml"), "name: a\n"), [setting])
 
 
 @pytest.mark.parametrize(
@@ -76,4 +76,4 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 def test_a_list_is_not_a_file_of_settings() -> None:
     with pytest.raises(InputError, match="expected keys and values, got list"):
-        validated(Box, read_yaml(Path("box.yaml"), "- 1\n"))
+        validate(Box, read_yaml(Path("box.yaml"), "- 1\n"))

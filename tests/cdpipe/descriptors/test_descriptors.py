@@ -7,7 +7,7 @@ import torch
 
 from cdpipe.core.errors import InputError
 from cdpipe.descriptors import describe_scan, describe_scans, load_descriptors, relative_yaws_rad, save_descriptors
-from cdpipe.descriptors.network import DIMENSIONS, initial_network, yaw_correlation
+from cdpipe.descriptors.network import DIMENSIONS, make_untrained_network, yaw_correlation
 from cdpipe.descriptors.range_image import COLUMNS, ELEVATION_RAD, ROWS, range_image
 from cdpipe.model.config import DescriptorConfig, MapConfig
 from cdpipe.model.types import PosedScan, Spheres
@@ -27,7 +27,7 @@ def test_a_point_falls_where_its_angles_say() -> None:
 
 
 def test_a_turned_sensor_keeps_q_and_shifts_w() -> None:
-    network = initial_network()
+    network = make_untrained_network()
     images = torch.rand(2, ROWS, COLUMNS, generator=torch.Generator().manual_seed(1)) * 20
     turned = torch.roll(images, 2 * COLUMNS // DIMENSIONS * 5, dims=2)
     with torch.inference_mode():
@@ -117,7 +117,7 @@ def _fitted(folder: Path, data: PlaceData, n_steps: int) -> tuple[torch.nn.Modul
     """Train on a few rooms; returns the network and the losses of every step."""
     losses: list[dict[str, float]] = []
     folder.mkdir()
-    task = PlaceTask(initial_network(1), data, data, seed=1)
+    task = PlaceTask(make_untrained_network(1), data, data, seed=1)
     config = FitConfig(seed=1, steps=n_steps, validate_every=n_steps)
     fit(task, config, folder, "", lambda _, parts: losses.append(dict(parts)), lambda _: None)
     return task.network, losses
@@ -133,7 +133,9 @@ def test_training_lowers_both_losses(tmp_path: Path) -> None:
 def test_training_repeats_by_seed(tmp_path: Path, n_steps: int) -> None:
     data = _rooms(3)
     one, other = (_fitted(tmp_path / name, data, n_steps)[0] for name in ("one", "other"))
-    assert not all(torch.equal(*both) for both in zip(one.parameters(), initial_network(1).parameters(), strict=True))
+    assert not all(
+        torch.equal(*both) for both in zip(one.parameters(), make_untrained_network(1).parameters(), strict=True)
+    )
     for mine, its in zip(one.parameters(), other.parameters(), strict=True):
         torch.testing.assert_close(mine, its, rtol=0, atol=0)
 
@@ -162,7 +164,7 @@ def test_place_loss_counts_hard_negatives_of_other_places_alone() -> None:
 def test_places_of_one_session_alone_train_nothing() -> None:
     data = _rooms(2)
     with pytest.raises(InputError, match="both sessions drive through"):
-        PlaceTask(initial_network(0), data.subset(data.sessions == 0), data, seed=0)
+        PlaceTask(make_untrained_network(0), data.subset(data.sessions == 0), data, seed=0)
     # a line 2.5 m aside, keyframes every metre: the nearest one and its neighbours, no farther than 3 m
     along_m, aside_m = np.tile(np.arange(10.0), 2), np.repeat([0.0, 2.5], 10)
     aside = PlaceData(

@@ -18,7 +18,7 @@ from cdpipe.descriptors.sphere_image import (
     render,
     sphere_image,
 )
-from cdpipe.descriptors.sphere_network import SECTORS, initial_sphere_network
+from cdpipe.descriptors.sphere_network import SECTORS, make_untrained_sphere_network
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import DescriptorConfig, QueryConfig
 from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap
@@ -67,7 +67,7 @@ def test_a_rendered_map_is_what_its_points_are_from_each_pose() -> None:
 
 
 def test_the_network_turns_with_the_tunnel() -> None:
-    network = initial_sphere_network()
+    network = make_untrained_sphere_network()
     draw = torch.Generator().manual_seed(0)
     before, after = 2 + 3 * torch.rand(2, 3, ROWS, COLUMNS, generator=draw)
     turn = COLUMNS // SECTORS

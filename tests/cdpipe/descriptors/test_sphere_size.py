@@ -13,9 +13,9 @@ from cdpipe.descriptors.sphere_image import COLUMNS, ROWS
 from cdpipe.descriptors.sphere_network import (
     SECTORS,
     SphereSize,
-    initial_sphere_network,
-    loaded_sphere_network,
-    trained_sphere_network,
+    load_sphere_network,
+    load_trained_sphere_network,
+    make_untrained_sphere_network,
 )
 
 SIZES = (SphereSize(), SphereSize(per_sector=1, width=0.5), SphereSize(per_sector=8, width=2.0, reads_after=False))
@@ -27,8 +27,8 @@ def _walls(seed: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("size", SIZES)
 def test_a_checkpoint_tells_how_large_its_network_is(size: SphereSize) -> None:
-    network = initial_sphere_network(4, size)
-    loaded = loaded_sphere_network(checkpoint_bytes(network))
+    network = make_untrained_sphere_network(4, size)
+    loaded = load_sphere_network(checkpoint_bytes(network))
     assert loaded.size == size
     with torch.inference_mode():
         assert loaded.encode(_walls(0)).shape == (3, size.per_sector, SECTORS)
@@ -37,7 +37,7 @@ def test_a_checkpoint_tells_how_large_its_network_is(size: SphereSize) -> None:
 
 
 def test_layers_are_as_wide_as_asked() -> None:
-    half, shipped, twice = (initial_sphere_network(0, SphereSize(width=width)) for width in (0.5, 1.0, 2.0))
+    half, shipped, twice = (make_untrained_sphere_network(0, SphereSize(width=width)) for width in (0.5, 1.0, 2.0))
     channels = [[conv.conv.out_channels for conv in network.trunk] for network in (half, shipped, twice)]
     assert channels == [[8, 16, 24], [16, 32, 48], [32, 64, 96]]
     # 3 x 4 of the stored numbers, which do not grow, and 64 seen, which do
@@ -45,7 +45,7 @@ def test_layers_are_as_wide_as_asked() -> None:
 
 
 def test_the_shipped_network_has_the_default_size_and_the_weights_of_its_card() -> None:
-    network, digest = trained_sphere_network()
+    network, digest = load_trained_sphere_network()
     card = json.loads((resources.files("cdpipe") / "descriptors" / "weights" / "sphere.json").read_text())
     assert network.size == SphereSize() and digest == card["checkpoint"]
     assert sum(weight.numel() for weight in network.parameters()) == 85_157
@@ -53,7 +53,7 @@ def test_the_shipped_network_has_the_default_size_and_the_weights_of_its_card() 
 
 @pytest.mark.parametrize("reads_after", [True, False])
 def test_numbers_alone_say_nothing_of_what_they_do_not_hold(reads_after: bool) -> None:
-    network = initial_sphere_network(0, SphereSize(reads_after=reads_after))
+    network = make_untrained_sphere_network(0, SphereSize(reads_after=reads_after))
     with torch.inference_mode():
         network.kept.weight.zero_()  # whatever stands there, the numbers are the same
         first, second = (network(_walls(0), _walls(after)) for after in (1, 2))

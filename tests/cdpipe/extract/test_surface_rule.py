@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 import cdpipe.extract.surface_rule
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.extract.objects import PointGroup
-from cdpipe.extract.surface_rule import ReturnPool, cut_by_surface, realigned
+from cdpipe.extract.surface_rule import ReturnPool, cut_by_surface, realign
 from cdpipe.merge.registration import Surface
 from cdpipe.model.config import ExtractConfig
 from cdpipe.model.types import MergedMaps, PointMap, PosedScan
@@ -343,7 +343,7 @@ def room_points(n: int, seed: int) -> Float64Array:
 )
 def test_a_known_error_is_taken_back(error: Float64Array) -> None:
     centre = np.array([0.5, 0.0, 0.0])
-    found = realigned(transform(error, room_points(6000, 1)), centre, Surface(room_points(6000, 2)))
+    found = realign(transform(error, room_points(6000, 1)), centre, Surface(room_points(6000, 2)))
     corners = np.array([[x, y, z] for x in (-4, 4) for y in (-3, 3) for z in (-1.5, 1.5)])
     np.testing.assert_allclose(transform(found @ error, corners), corners, atol=0.005)
 
@@ -353,14 +353,14 @@ def test_a_correction_carries_no_sphere_far() -> None:
     surface = Surface(room_points(6000, 2))
     for far_m in (0.45, 1.0):
         away = room_points(6000, 1) + np.array([far_m, 0.0, 0.0])
-        found = realigned(away, centre, surface)
+        found = realign(away, centre, surface)
         # 0.45 m off it could be pulled back and is not; a metre off nothing pulls it
         assert np.linalg.norm(found[:3, 3]) < 0.1
-    assert (realigned(room_points(6000, 1) + np.array([0.45, 0.0, 0.0]), centre, surface) == np.eye(4)).all()
+    assert (realign(room_points(6000, 1) + np.array([0.45, 0.0, 0.0]), centre, surface) == np.eye(4)).all()
     # 99 points are too few to align
     off = room_points(6000, 1) + np.array([0.1, 0.0, 0.0])
-    assert (realigned(off[:99], centre, surface) == np.eye(4)).all()
-    assert (realigned(off, centre, Surface(room_points(99, 2))) == np.eye(4)).all()
+    assert (realign(off[:99], centre, surface) == np.eye(4)).all()
+    assert (realign(off, centre, Surface(room_points(99, 2))) == np.eye(4)).all()
 
 
 @pytest.mark.parametrize("block_returns", [1, 7, 1 << 22])

@@ -9,7 +9,7 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, invert, make_pose, transform, yaw_pose
 from cdpipe.mapping.free_space import view
-from cdpipe.mapping.mapping import build_map, keyframes
+from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PLACES, PointMap, PosedScan, ScanSource
 
@@ -154,11 +154,11 @@ def test_keyframes_keep_what_they_saw() -> None:
 def test_keyframes_by_hand() -> None:
     # steps of 0.4 m along x: 1 m of path is complete at scans 3, 6, 9
     poses = np.array([make_pose(translation=(0.4 * k, 0, 0)) for k in range(10)])
-    assert keyframes(poses, 1.0).tolist() == [0, 3, 6, 9]
+    assert choose_keyframes(poses, 1.0).tolist() == [0, 3, 6, 9]
     # steps that divide the spacing: rounding must not delay a keyframe
     poses = np.array([make_pose(translation=(0.2 * k, 0, 0)) for k in range(21)])
-    assert keyframes(poses, 0.8).tolist() == [0, 4, 8, 12, 16, 20]
-    assert keyframes(poses[:1], 1.0).tolist() == [0]
+    assert choose_keyframes(poses, 0.8).tolist() == [0, 4, 8, 12, 16, 20]
+    assert choose_keyframes(poses[:1], 1.0).tolist() == [0]
 
 
 def test_a_map_of_one_point() -> None:

@@ -11,8 +11,8 @@ import torch
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import yaw_pose
 from cdpipe.training import data
-from cdpipe.training.data import ChangePairs, open_dataset, place_data, stacked
-from cdpipe.training.shard import FIELDS, read_about, read_shard, shard_bytes, split_of
+from cdpipe.training.data import ChangePairs, open_dataset, read_place_data, stacked
+from cdpipe.training.shard import FIELDS, encode_shard, read_about, read_shard, split_of
 
 SEEDS = (0, 9999, 10000, 19999, 20000, 29999, 900000)
 SIZES = {"K": 3, "J": 2, "C": 2, "D": 2, "R": 4, "W": 8, "V": 5, "U": 6, "I": 7}
@@ -29,7 +29,7 @@ def write_shard(path: Path, seed: int) -> None:
     poses = [yaw_pose(0.1 * k, (k, 2.0, 0.0)) for k in range(sizes["K"])]
     arrays["before_world_T_keyframe"] = np.array(poses)
     arrays["after_world_T_keyframe"] = np.array(poses[: SIZES["J"]])
-    path.write_bytes(shard_bytes(arrays, {"family": "made", "seed": seed}))
+    path.write_bytes(encode_shard(arrays, {"family": "made", "seed": seed}))
 
 
 @pytest.fixture(name="folder")
@@ -139,7 +139,7 @@ def test_what_cannot_be_stacked_is_refused(folder: Path, names: tuple[str, ...],
 
 
 def test_places_are_the_scans_of_both_sessions(folder: Path) -> None:
-    places = place_data(open_dataset(folder, "train"))
+    places = read_place_data(open_dataset(folder, "train"))
     assert places.sessions.tolist() == [0, 0, 0, 1, 1, 0, 0, 0, 0, 1, 1]
     assert places.tunnels.tolist() == [0] * 5 + [1] * 6
     np.testing.assert_allclose(places.headings_rad[:3], [0.0, 0.1, 0.2])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from cdpipe.descriptors.sphere_image import COLUMNS, REACH_M, ROWS
-from cdpipe.descriptors.sphere_network import SECTORS, initial_sphere_network
+from cdpipe.descriptors.sphere_network import SECTORS, make_untrained_sphere_network
 from cdpipe.training import sphere_training
 from cdpipe.training.fit import FitConfig
 from cdpipe.training.sphere_training import (
@@ -68,7 +68,7 @@ def as_simulated_fixture(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_another_width_and_density_change_no_place_and_no_target() -> None:
     data = _walls(12, {0: (6, 2), 1: (7, 9), 2: (5, 14)})
-    task = SphereTask(initial_sphere_network(), data, data, seed=3)
+    task = SphereTask(make_untrained_sphere_network(), data, data, seed=3)
     before, after, targets = task.batch(0)
     seen = (before > 0).float().flatten(1).mean(dim=1), (after > 0).float().flatten(1).mean(dim=1)
     for share in seen:
@@ -84,7 +84,7 @@ def test_another_width_and_density_change_no_place_and_no_target() -> None:
 @pytest.mark.usefixtures("as_simulated")
 def test_a_batch_keeps_images_and_targets_together_under_every_turn() -> None:
     data = _walls(12, {0: (6, 2), 1: (7, 9), 2: (5, 14)})
-    task = SphereTask(initial_sphere_network(), data, data, seed=3)
+    task = SphereTask(make_untrained_sphere_network(), data, data, seed=3)
     n_changed = []
     for step in range(24):
         before, after, targets = task.batch(step)
@@ -103,7 +103,7 @@ def test_a_batch_keeps_images_and_targets_together_under_every_turn() -> None:
 def test_training_tells_where_the_blocks_stand() -> None:
     training = _walls(24, {index: (4 + index % 5, (5 * index) % SECTORS) for index in range(12)})
     validation = _walls(10, {0: (6, 3), 4: (5, 11), 7: (8, 6)})
-    task = SphereTask(initial_sphere_network(), training, validation, seed=0)
+    task = SphereTask(make_untrained_sphere_network(), training, validation, seed=0)
     optimiser = torch.optim.AdamW(task.network.parameters(), lr=FitConfig().learning_rate)
     losses = []
     for step in range(90):
@@ -119,7 +119,7 @@ def test_training_tells_where_the_blocks_stand() -> None:
 def test_scores_are_agreed_on_by_neighbours_and_reach_the_radius() -> None:
     data = _walls(6, {2: (6, 3)})
     near = replace(data, positions=data.positions / 5.0)  # 2 m apart
-    network = initial_sphere_network()
+    network = make_untrained_sphere_network()
     with torch.inference_mode():
         sectors = network(data.before_m, data.after_m[:, 0]).numpy().astype(np.float64)
     # 10 m apart nobody has a neighbour
@@ -133,7 +133,7 @@ def test_scores_are_agreed_on_by_neighbours_and_reach_the_radius() -> None:
 
 def test_what_is_compared_is_what_storing_left() -> None:
     data = _walls(6, {2: (6, 3)})
-    network = initial_sphere_network()
+    network = make_untrained_sphere_network()
     with torch.inference_mode():
         spheres, after = network.encode(data.before_m), data.after_m[:, 0]
         halved = network.compare(spheres / 2, after).amax(dim=1).numpy()
@@ -155,9 +155,9 @@ def test_calibration_by_hand() -> None:
 
 def test_the_calibration_goes_with_the_weights() -> None:
     data = _walls(12, {0: (6, 3), 4: (5, 11), 7: (8, 6)})
-    task = SphereTask(initial_sphere_network(), data, data, seed=0)
+    task = SphereTask(make_untrained_sphere_network(), data, data, seed=0)
     said = task.finish()
-    kept = initial_sphere_network()
+    kept = make_untrained_sphere_network()
     kept.load_state_dict(task.network.state_dict())
     expected = said["slope"] * -2.0 + said["offset"]
     assert float(kept.calibrated(torch.tensor(-2.0))) == pytest.approx(expected)

@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import Document, validated
+from cdpipe.core.yamlfile import Document, validate
 from eval.core.domains import domain_of
 from eval.plans.plan import Plan, cells, load_plan
 from scenarios import load_scenario
@@ -91,4 +91,4 @@ def test_a_plan_that_ends_at_the_merge_has_no_regions_to_report() -> None:
         "until": "merge", "report": "regions",
     }  # fmt: skip
     with pytest.raises(InputError, match="report: regions needs regions"):
-        validated(Plan, Document("x.yaml", document))
+        validate(Plan, Document("x.yaml", document))

@@ -22,7 +22,7 @@ from cdpipe.descriptors.sphere_image import COLUMNS, ROWS, pixels, sphere_image
 from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import load_config
 from cdpipe.model.types import DescriptorSet, MappedSession, PointMap
-from cdpipe.training.shard import FIELDS, read_about, read_shard, shard_bytes
+from cdpipe.training.shard import FIELDS, encode_shard, read_about, read_shard
 from eval.core import cluster
 from eval.core.cluster import Where
 from eval.oracles.merge import OracleMerge, merged_by_truth
@@ -251,7 +251,7 @@ def fake_shards(monkeypatch: pytest.MonkeyPatch, shard: Shard, *, refused: int =
         if seed == refused:
             raise ScenarioError("the rock fell in")
         text = dataset_run.shard_digest(load_scenario(family, seed, recipe.settings), seed, recipe)
-        return shard_bytes(shard[0], {**shard[1], "seed": seed, "digest": text})
+        return encode_shard(shard[0], {**shard[1], "seed": seed, "digest": text})
 
     monkeypatch.setattr(dataset_run, "make_shard", fake)
     return made

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from cdpipe.descriptors.network import digest
-from cdpipe.descriptors.sphere_network import loaded_sphere_network
+from cdpipe.descriptors.sphere_network import load_sphere_network
 from eval.core.progress import Silent
 from eval.training.dataset import Recipe
 from eval.training.dataset_run import Where, make_dataset
@@ -31,7 +31,7 @@ def test_from_a_dataset_to_a_checkpoint_with_its_card(data: Path, tmp_path: Path
     arguments = ("train", data, "--out", out, "--steps", "3", "--threads", "1", "--quiet")
     assert command(*arguments)[0] == 0
     checkpoint = out / "sphere.safetensors"
-    network = loaded_sphere_network(checkpoint.read_bytes())
+    network = load_sphere_network(checkpoint.read_bytes())
     card = json.loads((out / "sphere.json").read_text())
     assert card["network"] == asdict(network.size)
     assert card["checkpoint"] == digest(checkpoint.read_bytes())

@@ -12,7 +12,7 @@ from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import invert, make_pose, rotation_angle_rad, transform, travelled_m, yaw_rad
 from cdpipe.io.session import Session, read_session
 from cdpipe.mapping import odometry
-from cdpipe.mapping.odometry import deskewed
+from cdpipe.mapping.odometry import deskew_at_constant_velocity
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Odometry, Platform, Roughness, Scenario, SessionPlan, Tunnel
 from sim.drive.odometry import registered
@@ -112,7 +112,7 @@ def test_deskewing_undoes_the_motion_within_a_revolution(sensor: SensorMetadata)
         rays = sensor.directions[:, column] @ turns[column].T
         ranges_m, _, _ = room.cast(transform(pose, sensor.origins[:, column]), rays)
         points[:, column] = sensor.origins[:, column] + ranges_m[:, None] * sensor.directions[:, column]
-    straightened = deskewed(points, velocity_mps, turn_rad_s, column_s)
+    straightened = deskew_at_constant_velocity(points, velocity_mps, turn_rad_s, column_s)
     off_wall_m = np.abs(np.abs(straightened) - (6.0, 3.0, 2.0)).min(axis=-1)
     assert off_wall_m.max() < 1e-4
     assert np.abs(np.abs(points) - (6.0, 3.0, 2.0)).min(axis=-1).max() > 0.05

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, invert, require_poses, travelled_m, yaw_rad
-from cdpipe.core.motion import Motion, motion_of
+from cdpipe.core.motion import Motion, make_motion
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Floor, Odometry, Platform, Prop, Scenario, SessionPlan, Stones
 from sim.drive.path import plan_path
@@ -26,7 +26,7 @@ def straight(length_m: float, speed_mps: float = 1.0, heading_rad: float = 0.4) 
     way_m = np.linspace(0.0, length_m, round(length_m / 0.05) + 1)
     points = way_m[:, None] * [np.cos(heading_rad), np.sin(heading_rad), 0.0] + [3.0, -2.0, 1.0]
     heading = Rotation.from_euler("z", np.full((len(way_m), 1), heading_rad))
-    return motion_of(way_m / speed_mps, way_m, points, heading)
+    return make_motion(way_m / speed_mps, way_m, points, heading)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_perfect_odometry_is_the_truth_seen_from_the_first_revolution(recorded: 
 def test_the_odom_frame_is_upright_even_where_the_platform_tilts(recorded: Callable[..., Trajectory]) -> None:
     level = straight(60.0)
     angles = np.array([0.4, 0.0, 0.0]) + 0.05 * np.sin(level.way_m[:, None] * [0.0, 1.1, 1.7] + 0.3)
-    tilted = motion_of(level.time_s, level.way_m, level.points, Rotation.from_euler("ZYX", angles))
+    tilted = make_motion(level.time_s, level.way_m, level.points, Rotation.from_euler("ZYX", angles))
     drive = recorded(tilted, Odometry(yaw_deg_per_100m=1.0), 1)
     first = drive.odom_T_sensor[0]
     np.testing.assert_allclose(first[:3, 3], 0.0, atol=1e-9)
@@ -102,7 +102,7 @@ def test_the_pose_of_a_revolution_is_that_of_its_middle_column(
 def test_column_poses_of_a_sensor_that_tumbles(sensor: SensorMetadata) -> None:
     time_s = np.linspace(0.0, 1.0, 11)
     rotations = Rotation.random(11, random_state=3)
-    motion = motion_of(time_s, time_s, np.random.default_rng(1).normal(size=(11, 3)), rotations)
+    motion = make_motion(time_s, time_s, np.random.default_rng(1).normal(size=(11, 3)), rotations)
     column_s = (np.arange(sensor.width) - sensor.width // 2) / sensor.width * 0.1
     drive = Trajectory(motion, motion, np.array([0.25, 0.55, 0.75]), column_s, sensor.column_offsets_ns())
     columns = drive.sensor_T_column(slice(0, 3))
@@ -118,7 +118,7 @@ def test_stamps_are_true_to_a_speed_that_varies(recorded: Callable[..., Trajecto
     # By hand: speed 1 + t / 50 m/s gives the way t + t^2 / 100.
     time_s = np.linspace(0.0, 20.0, 401)
     way_m = time_s + time_s**2 / 100
-    motion = motion_of(time_s, way_m, way_m[:, None] * [1.0, 0.0, 0.0], Rotation.identity(len(time_s)))
+    motion = make_motion(time_s, way_m, way_m[:, None] * [1.0, 0.0, 0.0], Rotation.identity(len(time_s)))
     drive = recorded(motion, Odometry(), spacing_m=0.5)
     stamps_s = drive.column_stamps_ns(slice(None)) / 1e9 + drive.revolution_s[0] + drive.column_s[0]
     columns = drive.world_T_column(slice(None))
@@ -137,14 +137,14 @@ def test_stamps_are_true_to_a_speed_that_varies(recorded: Callable[..., Trajecto
 def test_a_standing_robot_records_once_where_it_stands(recorded: Callable[..., Trajectory]) -> None:
     time_s = np.array([0.0, 4.0, 14.0, 20.0])
     way_m = np.array([0.0, 4.0, 4.0, 10.0])
-    drive = recorded(motion_of(time_s, way_m, way_m[:, None] * [1.0, 0.0, 0.0], Rotation.identity(4)), Odometry())
+    drive = recorded(make_motion(time_s, way_m, way_m[:, None] * [1.0, 0.0, 0.0], Rotation.identity(4)), Odometry())
     assert drive.n_scans == 1 + 2 * 9 + 1
     assert (np.diff(drive.world_T_sensor[:, 0, 3]) > 0.35).all()
 
 
 def test_rotations_turn_evenly_between_samples_and_beyond() -> None:
     turns = Rotation.from_rotvec(np.outer([0.0, 1.2, 1.2], [0.6, 0.0, 0.8]))
-    motion = motion_of(np.array([0.0, 2.0, 3.0]), np.zeros(3), np.array([[0.0] * 3, [4.0, 0, 0], [4.0, 0, 0]]), turns)
+    motion = make_motion(np.array([0.0, 2.0, 3.0]), np.zeros(3), np.array([[0.0] * 3, [4.0, 0, 0], [4.0, 0, 0]]), turns)
     poses = motion.poses(np.array([-0.5, 0.5, 1.5, 2.5]))
     require_poses("poses", poses)
     expected = Rotation.from_rotvec(np.outer([-0.3, 0.3, 0.9, 1.2], [0.6, 0.0, 0.8])).as_matrix()
@@ -152,7 +152,7 @@ def test_rotations_turn_evenly_between_samples_and_beyond() -> None:
     np.testing.assert_allclose(poses[:, 0, 3], [-1.0, 1.0, 3.0, 4.0], atol=1e-12)
     # q and -q are the same rotation: no way round.
     flipped = Rotation.from_quat(turns.as_quat() * [[1], [-1], [1]])
-    again = motion_of(motion.time_s, motion.way_m, motion.points, flipped)
+    again = make_motion(motion.time_s, motion.way_m, motion.points, flipped)
     np.testing.assert_allclose(again.poses(np.array([1.5]))[0], poses[2], atol=1e-12)
 
 
