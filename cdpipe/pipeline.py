@@ -21,7 +21,7 @@ from cdpipe.core.geometry import Int64Array
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors.describe import describe_scans, load_descriptors, save_descriptors, use_threads
 from cdpipe.descriptors.sphere import describe_map
-from cdpipe.extract.extract import extract_changes, local_alignment
+from cdpipe.extract.extract import extract_changes, make_report
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.session_check import check_session, unit_hint
@@ -247,17 +247,8 @@ def detect_merge(
     regions = ChangeRegions(
         np.zeros((0, 3)), config.query.radius_m, none, np.zeros((0, 2), dtype=np.int64), none.astype(np.bool_), none
     )
-    return ChangeReport(
-        before_T_after=merged.before_T_after,
-        evidence={**merged.evidence, **_sizes(merged)},
-        regions=regions,
-        objects=(),
-        seconds=dict(merged.seconds),
-        figures={},
-        keyframe_scans=(before.descriptors.keyframe_scans, after.descriptors.keyframe_scans),
-        config=config.model_dump(),
-        local_before_T_after=local_alignment(merged, after.descriptors),
-    )
+    report = make_report(merged, (before.descriptors, after.descriptors), regions, (), {}, merged.seconds, config)
+    return replace(report, evidence={**merged.evidence, **_sizes(merged)})
 
 
 def merge_mapped(

@@ -7,7 +7,7 @@ Added is what the after map has and the before map has not; removed is the rever
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter
 
@@ -20,7 +20,7 @@ from cdpipe.extract.objects import PointGroup, assemble_objects
 from cdpipe.extract.point_comparison import cluster_labels, far_points_mask, inlier_mask, new_points_mask
 from cdpipe.extract.surface_rule import cut_by_surface
 from cdpipe.model.config import PipelineConfig
-from cdpipe.model.report import ChangeRegions, ChangeReport
+from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
 from cdpipe.model.types import DescriptorSet, MergedMaps
 
 __all__ = [
@@ -30,7 +30,7 @@ __all__ = [
     "cut_out",
     "extract_changes",
     "hull_volume_m3",
-    "local_alignment",
+    "make_report",
     "region_figures",
     "with_withdrawn",
 ]
@@ -104,13 +104,27 @@ def extract_changes(
     grouped = perf_counter()
     objects = assemble_objects(merged, groups)
     end = perf_counter()
+    seconds = {"t_cd_s": t_cd_s, "t_oe_s": end - start, "t_returns_s": end - grouped}
+    return make_report(merged, described, regions, objects, region_figures(merged, regions, groups), seconds, config)
+
+
+def make_report(
+    merged: MergedMaps,
+    described: tuple[DescriptorSet, DescriptorSet],
+    regions: ChangeRegions,
+    objects: Sequence[ChangedObject],
+    figures: Mapping[str, Float64Array],
+    seconds: Mapping[str, float],
+    config: PipelineConfig,
+) -> ChangeReport:
+    """Return the report on two merged maps; `described` says which scans of each session are keyframes."""
     return ChangeReport(
         before_T_after=merged.before_T_after,
         evidence=merged.evidence,
         regions=regions,
-        objects=objects,
-        seconds={"t_cd_s": t_cd_s, "t_oe_s": end - start, "t_returns_s": end - grouped},
-        figures=region_figures(merged, regions, groups),
+        objects=tuple(objects),
+        seconds=seconds,
+        figures=figures,
         keyframe_scans=(described[0].keyframe_scans, described[1].keyframe_scans),
         config=config.model_dump(),
         local_before_T_after=local_alignment(merged, described[1]),

@@ -14,13 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int64Array, make_pose
-from cdpipe.io.ouster.captures import SUFFIXES
 from cdpipe.io.ply import read_ply_points
 from cdpipe.io.session import ScanChunk, Session, chunk_path, is_session, read_session
 from cdpipe.io.tum import TUM_LINE, read_tum, require_unit_poses, stamps_from_first_ns
 from cdpipe.mapping.deskew import deskew
 from cdpipe.model.types import PosedScan, ScanSource
 
+RECORDING_SUFFIXES = (".osf", ".pcap", ".pcapng")
+"""Of a sensor's own recordings, which `cdpipe.io.ouster` reads."""
 _NUMBERS = re.compile(r"(\d+)")
 # Metres along an axis, or radians: about what odometry makes of standing still.
 _STANDING = 0.1
@@ -39,7 +40,7 @@ def open_session(path: Path) -> ScanSource:
         InputError: The folder is missing or holds neither, or its trajectory does not fit its scans. Mistakes inside a
             single scan are raised when it is read.
     """
-    if path.suffix.lower() in SUFFIXES and not path.is_dir():
+    if path.suffix.lower() in RECORDING_SUFFIXES and not path.is_dir():
         raise InputError(
             f"{path}: a sensor's own recording: turn it into a session first, `tunnelcd convert {path} FOLDER`, and "
             "name that folder"

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.grid_index import GridIndex
-from cdpipe.extract.extract import FIGURES, PointGroup, assemble_objects, hull_volume_m3, local_alignment
+from cdpipe.extract.extract import FIGURES, PointGroup, assemble_objects, hull_volume_m3, make_report
 from cdpipe.extract.point_comparison import cluster_labels, inlier_mask
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
@@ -81,9 +81,10 @@ def whole_map(
     answered = _in_reported_regions(groups, regions, config)
     grouped = perf_counter()
     objects = assemble_objects(merged, answered)
-    seconds = _seconds(start, compared, grouped, perf_counter())
+    end = perf_counter()
+    seconds = {"t_cd_s": compared - start, "t_oe_s": end - compared, "t_returns_s": end - grouped}
     regions = replace(regions, keyframe_scores=_changed_share(maps, is_changed, config))
-    return _report(merged, (before, after), regions, objects, _figures(maps, regions, objects), seconds, config)
+    return make_report(merged, (before, after), regions, objects, _figures(maps, regions, objects), seconds, config)
 
 
 def placed_maps(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet) -> PlacedMaps:
@@ -166,30 +167,3 @@ def _figures(maps: PlacedMaps, regions: ChangeRegions, objects: Sequence[Changed
         figures["s_points"][region] = len(sphere)
         figures["oe_points"][region] = sum(len(points) for points in own)
     return figures
-
-
-def _seconds(start: float, compared: float, grouped: float, end: float) -> dict[str, float]:
-    """Return the times as `cdpipe.methods.descriptor` names them: `t_returns_s` is a part of `t_oe_s`."""
-    return {"t_cd_s": compared - start, "t_oe_s": end - compared, "t_returns_s": end - grouped}
-
-
-def _report(
-    merged: MergedMaps,
-    described: tuple[DescriptorSet, DescriptorSet],
-    regions: ChangeRegions,
-    objects: tuple[ChangedObject, ...],
-    figures: dict[str, Float64Array],
-    seconds: dict[str, float],
-    config: PipelineConfig,
-) -> ChangeReport:
-    return ChangeReport(
-        before_T_after=merged.before_T_after,
-        evidence=merged.evidence,
-        regions=regions,
-        objects=objects,
-        seconds=seconds,
-        figures=figures,
-        keyframe_scans=(described[0].keyframe_scans, described[1].keyframe_scans),
-        config=config.model_dump(),
-        local_before_T_after=local_alignment(merged, described[1]),
-    )

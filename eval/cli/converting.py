@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.io.ouster.captures import SUFFIXES
 from cdpipe.io.ouster.osf import Fields, write_osf
 from cdpipe.io.ouster.recording import import_recording
+from cdpipe.io.readers import RECORDING_SUFFIXES
 from cdpipe.io.session import Session, is_session, read_session
 from eval.core.output import made_parents
 from eval.core.progress import RunProgress
@@ -39,12 +39,12 @@ def convert(source: Path, out: Path, options: Options, progress: RunProgress) ->
     """
     if source.is_dir():
         return _export(source, out, options, progress)
-    if source.suffix.lower() not in SUFFIXES:
+    if source.suffix.lower() not in RECORDING_SUFFIXES:
         what = "expected a session folder" if source.exists() else "no such file or folder: expected a session"
-        raise InputError(f"{source}: {what}, or a recording ({', '.join(SUFFIXES)})")
+        raise InputError(f"{source}: {what}, or a recording ({', '.join(RECORDING_SUFFIXES)})")
     if options.without_truth:
         raise InputError(f"{source}: a recording has no truth: leave --without-truth out")
-    if out.suffix.lower() in SUFFIXES:
+    if out.suffix.lower() in RECORDING_SUFFIXES:
         raise InputError(f"{out}: a recording becomes a session: name a new folder")
     with made_parents(out):
         imported = import_recording(

@@ -20,11 +20,11 @@ import numpy as np
 from cdpipe.core.errors import InputError
 from cdpipe.io.ouster.integrity import require_whole_osf, require_whole_pcap
 from cdpipe.io.ouster.revolutions import Revolution, decode
+from cdpipe.io.readers import RECORDING_SUFFIXES
 from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
 from cdpipe.sensor.ouster_metadata import read_document, require_mode
 
 PCAP_SUFFIXES = (".pcap", ".pcapng")
-SUFFIXES = (".osf", *PCAP_SUFFIXES)
 # A revolution with no more of its columns than this is left out: a recording begins and ends in the middle of one.
 _LEAST_SHARE = 0.5
 # An Ethernet frame carries this much beside what it holds (Ethernet, IP, UDP and PCAP headers), to guess a number.
@@ -119,8 +119,8 @@ def open_recording(path: Path, metadata: Path | None = None) -> Recording:
     """
     core = require_sdk()
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InputError(f"{path}: expected a recording, {', '.join(SUFFIXES)}")
+    if suffix not in RECORDING_SUFFIXES:
+        raise InputError(f"{path}: expected a recording, {', '.join(RECORDING_SUFFIXES)}")
     if not path.is_file():
         raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}: expected a recording")
     if suffix == ".osf":

@@ -5,7 +5,6 @@ import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,11 +21,12 @@ from cdpipe.methods import voxel_diff
 from cdpipe.methods.random_regions import RandomRegions
 from cdpipe.model.config import MapConfig, MergeConfig
 from cdpipe.model.types import MappedSession, MergedMaps
+from cdpipe.pipeline import Done
 from cdpipe.sensor.ouster import load_profile
 from eval.core import provenance
 from eval.core.progress import Silent
 from eval.plans.plan import Plan, cells, load_plan
-from eval.running import pair_run, runner, stage_times, stages
+from eval.running import pair_run, runner, stages
 from eval.running.rescoring import rescore
 from eval.running.runfolder import RunFolder, open_run_folder, remove, start_run_folder, write_tables
 from eval.running.runner import RunOutcome, run_plan
@@ -422,16 +422,16 @@ def test_time_is_the_median_of_three_after_a_warm_up(monkeypatch: pytest.MonkeyP
     # the middle one of three in each part, whichever call it was
     parts = iter([(0.5, 0.4), (0.3, 0.1), (0.2, 0.5), (0.1, 0.3)])
 
-    def call() -> SimpleNamespace:
+    def call() -> Done[str]:
         nonlocal clock
         cd, oe = next(parts)
         clock += cd + oe
-        return SimpleNamespace(name="first" if cd == 0.5 else "later", seconds={"t_cd_s": cd, "t_oe_s": oe})
+        return Done("first" if cd == 0.5 else "later", {"t_cd_s": cd, "t_oe_s": oe})
 
-    monkeypatch.setattr(stage_times.time, "perf_counter", lambda: clock)
-    result, seconds = stage_times.time_parts(call)
-    assert result.name == "first"
-    assert seconds == {"t_cd_s": 0.2, "t_oe_s": 0.3}
+    monkeypatch.setattr(stages.time, "perf_counter", lambda: clock)
+    result = stages.time_parts(call)
+    assert result.value == "first"
+    assert result.seconds == {"t_cd_s": 0.2, "t_oe_s": 0.3}
     assert next(parts, None) is None
 
 
@@ -439,14 +439,14 @@ def test_a_long_call_is_timed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = 0.0
     calls = 0
 
-    def call() -> SimpleNamespace:
+    def call() -> Done[str]:
         nonlocal clock, calls
         clock += 1.0
         calls += 1
-        return SimpleNamespace(seconds={"t_cd_s": 0.7})
+        return Done("", {"t_cd_s": 0.7})
 
-    monkeypatch.setattr(stage_times.time, "perf_counter", lambda: clock)
-    assert stage_times.time_parts(call)[1] == {"t_cd_s": 0.7}
+    monkeypatch.setattr(stages.time, "perf_counter", lambda: clock)
+    assert stages.time_parts(call).seconds == {"t_cd_s": 0.7}
     assert calls == 1
 
 
