@@ -252,7 +252,7 @@ class Prop(Settings):
 class Sensor(Settings):
     """The LiDAR: an Ouster profile (shipped name or metadata .json), its mode, and which effects are on.
 
-    Every effect is a switch, so that what it does to a result can be measured; sim/README.md names the constants.
+    Every effect is a switch, so its influence on a result can be measured. sim/sensor/SENSOR.md names the constants.
     """
 
     profile: str = "os1-32-nominal"

@@ -23,7 +23,7 @@ from cdpipe.merge.walk import Step, Walk, walk
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import MergeConfig
 
-# Every 2 m and thinned to 0.3 m is three times the work for the same centimetres (validation, cdpipe/README.md).
+# Every 2 m and thinned to 0.3 m is three times the work for the same centimetres (validation, reports/merge/notes).
 _SPACING, _SPACING_M = 0.6, 4.0
 # What was seen from afar stands where the odometry of then put it, and so does what is far from the anchor. From afar
 # is 2.5 times as far as the walls pass by, which is the 20th percentile of the map's shortest ranges; 6 m at least.

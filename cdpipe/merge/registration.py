@@ -53,7 +53,7 @@ class IndexedMap:
     """A map prepared for merging, which can be done while it is being built.
 
     Only what was seen from near is used: a return from afar stands where the odometry of then says, which has drifted
-    since. A target is thinned to `merge.target_voxel_m`: half the time, as accurate (cdpipe/README.md).
+    since. A target is thinned to `merge.target_voxel_m`: half the time, as accurate (reports/merge/notes).
 
     Attributes:
         map: The map.

@@ -1,7 +1,7 @@
 """Speed of the merge: against its limits and against KISS-Matcher with GICP, on the maps of both paper sites.
 
 KISS-Matcher runs at the coarsest voxel that found every pair of maps of that size which shared at least 45 % of the way
-(validation seeds; table in cdpipe/README.md). Its GICP is thinned to 0.8 m: against 0.4 m that takes half the time or
+(validation seeds; reports/merge/notes). Its GICP is thinned to 0.8 m: against 0.4 m that takes half the time or
 less and cost 5 mm at most.
 
 Both sides end at an accepted rigid transform: ours from descriptors (all-in), stored vectors or indexed maps, the

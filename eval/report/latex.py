@@ -71,6 +71,8 @@ def latex_tables(data: RunData) -> dict[str, str]:
         if path.is_file():
             groups = _stored_groups(off_grids(pd.read_csv(path), data), every)
             found[f"{name}.tex"] = latex_float(f"tab:{name}", _caption(words, data, every), groups, columns, data)
+    if results.empty:  # every variant is a point of a grid
+        return found
     caption = _caption("Every method over all its session pairs", data, results, " Times are medians, the rest means.")
     found["summary.tex"] = latex_float("tab:summary", caption, _summary_groups(results), SUMMARY_COLUMNS, data)
     return found

@@ -1,7 +1,7 @@
 """Predictions that another program made for the pairs of a run, taken into the run as a variant.
 
-    DIR/<scenario>/<seed>/answer.json, answer.npz     the format of `cdpipe.io.answer`; eval/README.md has a short
-    script
+    DIR/<scenario>/<seed>/answer.json, answer.npz     the format of `cdpipe.io.answer`; a short script is in
+                                                      eval/scoring/ANSWERS.md
 
 Every pair of the run needs one, or the means would be over other pairs than everybody else's. A pair that the program
 could not do gets an answer.json of status `failed` and scores as a failure of ours does.

@@ -1,6 +1,6 @@
 """Truth against a stored answer: every column of results.csv and the rows of the item tables.
 
-The specification of every figure, with worked examples, is in eval/README.md. Nothing is run here: an answer can be
+The specification of every figure, with worked examples, is in METRICS.md. Nothing is run here: an answer can be
 scored again whenever the metrics change, and so can an answer that another program wrote.
 """
 

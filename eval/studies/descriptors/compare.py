@@ -1,4 +1,4 @@
-"""Which descriptor recognises what, and at which price: the table of cdpipe/README.md.
+"""Which descriptor recognises what, and at which price: the table of reports/descriptor/notes.
 
 Run as `python -m eval.studies.descriptors.compare FAMILY... --seeds A:B --out DIR`. Each pair of sessions is simulated
 as `tunnelcd simulate` does, looked at (`eval.studies.descriptors.rows`) and removed again. Written are

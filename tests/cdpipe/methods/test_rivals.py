@@ -244,7 +244,7 @@ def test_figures_are_of_the_after_map() -> None:
 
 
 def test_a_mask_of_ones_own_makes_a_method() -> None:
-    """The example of the guide in eval/README.md."""
+    """A whole-map method is a mask."""
 
     def higher_mask(maps: PlacedMaps, session: SessionName, other: SessionName, config: PipelineConfig) -> BoolArray:
         points, others = maps.points[session], maps.points[other]

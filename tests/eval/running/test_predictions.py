@@ -1,4 +1,4 @@
-"""Predictions of other programs: the README's script, a whole run of them, and every way in which they can be wrong."""
+"""Predictions of other programs: the documented script, a whole run of them, and every way to be wrong."""
 
 from __future__ import annotations
 
@@ -84,10 +84,9 @@ def run(tmp_path: Path, tiny_pair: Path) -> RunFolder:
     return folder
 
 
-def test_the_script_of_the_readme_finds_the_box(tmp_path: Path, command: Command) -> None:
-    text = (ROOT / "eval" / "README.md").read_text()
-    section = text.partition("### Bringing an answer of your own\n")[2]
-    script = re.search(r"```python\n(.*?)```", section, re.DOTALL)
+def test_the_documented_script_finds_the_box(tmp_path: Path, command: Command) -> None:
+    text = (ROOT / "eval" / "scoring" / "ANSWERS.md").read_text()
+    script = re.search(r"```python\n(.*?)```", text, re.DOTALL)
     assert script is not None
     (tmp_path / "predict.py").write_text(script[1])
     command("simulate", "smoke/one_box", "--seed", 10600, "--out", tmp_path / "pair", "--quiet")

@@ -1,0 +1,132 @@
+"""The README: its recipes run, its figures are rows of committed tables, its length stays."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import trimesh
+
+from eval.cli.main import main
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+
+# What makes a recipe small enough for a test; each must stand in the README.
+SMALLER = {
+    "train/narrow train/wide train/network train/tight --seeds 100:121": "smoke/one_box --seeds 3:4 --draws 2",
+    "narrow wide network tight --seeds 10000:10005": "smoke/one_box --seeds 10003:10004 --draws 2",
+    "tunnelcd train data --out trained": "tunnelcd train data --out trained --steps 3 --threads 1",
+    "tunnelcd report bench": "tunnelcd report bench --views none",
+    "tunnelcd report grid": "tunnelcd report grid --views none",
+}
+
+
+def block(title: str) -> str:
+    """Return the code block whose first line ends in this title."""
+    found = re.search(rf"^```\w+ {re.escape(title)}\n(.*?)^```", README, re.DOTALL | re.MULTILINE)
+    assert found is not None, title
+    return found[1]
+
+
+def tunnelcd(*words: str) -> None:
+    """Run a command of ours in this process."""
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert not ended.value.code, words
+
+
+@pytest.fixture(name="recipe")
+def recipe_fixture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Run the commands of a block in an empty folder: ours in this process, others in one of their own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+
+    def run(title: str) -> None:
+        text = block(title)
+        for large, small in SMALLER.items():
+            text = text.replace(large, small)
+        for line in text.splitlines():
+            program, *arguments = shlex.split(line, comments=True)
+            if program == "tunnelcd":
+                tunnelcd(*arguments)
+            else:
+                assert program == "python", line
+                subprocess.run([sys.executable, *arguments], check=True)
+
+    return run
+
+
+def test_every_word_that_makes_a_recipe_small_is_in_it() -> None:
+    for large in SMALLER:
+        assert large in README
+
+
+def test_a_method_of_ones_own_is_benchmarked(recipe: Callable[[str], None]) -> None:
+    page = (ROOT / "eval" / "scoring" / "ANSWERS.md").read_text()
+    (script,) = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    Path("predict.py").write_text(script)
+    recipe("benchmark")
+    rows = pd.read_csv("bench/results.csv").set_index(["scenario", "variant"])
+    assert rows.loc[("smoke/one_box", "my-method"), "region_recall"] == 1
+    assert {variant for _, variant in rows.index} > {"my-method", "tunnelcd", "paper"}
+    assert "my-method" in Path("bench/index.html").read_text()
+
+
+def test_radius_and_voxel_are_ablated(recipe: Callable[[str], None]) -> None:
+    recipe("ablate")
+    rows = pd.read_csv("grid/results.csv")
+    ours = rows[rows["variant"].str.startswith("tunnelcd[") & (rows["scenario"] == "smoke/one_box")]
+    assert len(ours) == 4
+    assert ours["object_iou_point"].nunique() > 1
+    assert Path("grid/index.html").is_file()
+
+
+def test_training_data_is_made_and_trained_on(recipe: Callable[[str], None]) -> None:
+    recipe("train")
+    assert {path.name for path in Path("trained").iterdir()} >= {"sphere.safetensors", "sphere.json", "curves.csv"}
+
+
+def test_recordings_are_compared(recipe: Callable[[str], None]) -> None:
+    pytest.importorskip("ouster.sdk.core", reason="pip install 'tunnelcd[ouster]'")
+    tunnelcd("simulate", "smoke/one_box", "--seed", "10600", "--out", "pair", "--quiet")
+    for session, day in (("before", "monday"), ("after", "friday")):
+        tunnelcd("convert", f"pair/{session}", f"{day}.osf")
+    recipe("record")
+    assert pd.read_csv("changes/objects.csv")["kind"].tolist() == ["added"]
+    assert Path("changes/objects.ply").is_file()
+
+
+def test_a_mine_and_an_object_from_files_are_simulated(recipe: Callable[[str], None]) -> None:
+    rock = trimesh.creation.box(extents=(40.0, 4.0, 3.0)).subdivide().subdivide()
+    rock.apply_translation((20.0, 0.0, 1.5))
+    rock.invert()
+    rock.export("mine.stl")
+    trimesh.creation.box(extents=(0.8, 0.7, 0.6)).export("generator.glb")
+    Path("mine.yaml").write_text(block("mine.yaml"))
+    recipe("mine")
+    assert pd.read_csv("answer/objects.csv")["kind"].tolist() == ["added"]
+
+
+def test_the_table_of_results_is_made_of_committed_rows() -> None:
+    folder = ROOT / "reports" / "main"
+    key = ["domain", "variant"]
+    cost = pd.read_csv(folder / "pareto.csv").query("cost == 't_total_s'").drop_duplicates(key).set_index(key)
+    regions = pd.read_csv(folder / "regions_table.csv").set_index(key)
+    objects = pd.read_csv(folder / "objects_table.csv").set_index(key)
+    section = README[README.index("## Results") : README.index("## Five recipes")]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in section.splitlines() if "| `" in line]
+    assert 0 < len(rows) <= 8
+    for domain, name, *shown in rows:
+        row = domain, name.strip("`")
+        figures = [
+            *regions.loc[row, ["region_auroc", "region_recall", "recall_at_0.1", "false_regions_per_100m"]],
+            *objects.loc[row, ["object_iou_point", "object_f1_50"]],
+        ]
+        assert shown == [*(f"{figure:.2f}" for figure in figures), f"{cost.loc[row, 'cost_value']:.1f}"], row
