@@ -1,26 +1,26 @@
-"""Charts of the page that can be hovered, zoomed and filtered: plotly figures as plain JSON, drawn inside the file.
+"""Charts of the page that can be hovered, zoomed and filtered: drawings as plotly figures, drawn inside the file.
 
-A chart is data and layout as plotly.js takes them. The library itself stands once in a page that has a chart, so that
-nothing is fetched. What a chart shows for papers is a PNG file of its name beside the page, drawn by matplotlib.
+The page holds plotly.js once and fetches nothing. The same drawing as a PNG file for papers is made by
+`eval.core.charts.picture`.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from eval.core.figures import BLACK
-from eval.report.regions.plots import DASHED, DOTTED, line_look
+from eval.core.charts import BAR_SHARE, GRID_COLOUR, HEAT_COLOURS, Axis, Drawing, Heat, Series, picture
+from eval.core.figures import BLACK, png
 
-GRID_COLOUR, SOFT = "#efefef", "#5c5c5c"
-_FONT = {"family": "system-ui, -apple-system, Segoe UI, Roboto, Helvetica Neue, DejaVu Sans, sans-serif", "size": 12}
-_GAP, _ROW_GAP_PX = 0.09, 84
+_FONT = "system-ui, -apple-system, Segoe UI, Roboto, Helvetica Neue, DejaVu Sans, sans-serif"
+_COLUMN_GAP, _ROW_GAP_PX, _ABOVE_PX, _BELOW_PX = 0.09, 84, 34, 56
 _LEGEND_ROW_PX, _NAMES_IN_ROW = 22, 6
+_PX_PER_PT = 1.6
 _SHORT_DIGITS = 5
 
 
@@ -30,22 +30,32 @@ class Chart:
 
     Attributes:
         name: Its place in the page, and the name of its PNG file.
-        title: What stands above it.
-        figure: `data` and `layout` as plotly.js takes them; the layout has a height in pixels.
-        caption: What stands below it: what is shown, over how many, with which intervals.
-        png: The same as a picture file for papers; None where there is none.
+        title: The heading above it.
+        drawing: What it shows.
+        caption: The text below it: what is shown, over how many pairs, with which intervals.
+        has_png: Whether a PNG file for papers is written beside the page.
     """
 
     name: str
     title: str
-    figure: Mapping[str, Any]
+    drawing: Drawing
     caption: str
-    png: bytes | None = None
+    has_png: bool = False
+
+    @property
+    def png(self) -> bytes | None:
+        """The chart as a PNG file for papers; None where there is none."""
+        return png(picture(self.drawing)) if self.has_png else None
+
+    @property
+    def figure(self) -> dict[str, Any]:
+        """The chart as plotly.js takes it."""
+        return plotly_figure(self.drawing)
 
     @property
     def height_px(self) -> int:
-        """Height, pixels."""
-        return int(self.figure["layout"]["height"])
+        """Height on the page, pixels."""
+        return _height_px(self.drawing)
 
     @property
     def json(self) -> str:
@@ -60,89 +70,107 @@ def plotly_script() -> str:
     return str(get_plotlyjs())
 
 
-def line_of(name: str, names: Sequence[str]) -> dict[str, Any]:
-    """Return plotly's look of a method's line: the same colour, width and dashes as in the PNG files."""
-    look = line_look(name, names)
-    dashes = {DASHED: "dash", DOTTED: "dot", "dashdot": "dashdot"}
-    return {"color": look["color"], "width": look["linewidth"], "dash": dashes.get(look.get("linestyle", ""), "solid")}
-
-
-def layout(n_columns: int, n_rows: int, row_px: int, names: Sequence[str] = (), **more: Any) -> dict[str, Any]:
-    """Return a layout of panels with a legend above them.
-
-    Args:
-        n_columns: Panels beside each other.
-        n_rows: Panels below each other; panel i (from 0, row by row) has the axes `x{i + 1}`, `y{i + 1}`.
-        row_px: Height of a row, pixels.
-        names: What stands in the legend, which is as high as they need.
-        more: What else the layout holds, or in place of what is here.
-    """
-    legend_px = _LEGEND_ROW_PX * math.ceil(len(names) / _NAMES_IN_ROW)
-    below_px, above_px = 56, 34 + legend_px
-    height_px = above_px + n_rows * row_px + below_px
-    inner_px = n_rows * row_px
-    found: dict[str, Any] = {
-        "height": height_px, "autosize": True, "font": {**_FONT, "color": BLACK}, "paper_bgcolor": "#fff",
-        "plot_bgcolor": "#fff", "margin": {"l": 58, "r": 12, "t": above_px, "b": below_px}, "hovermode": "closest",
-        "showlegend": bool(names), "annotations": [],
+def plotly_figure(drawing: Drawing) -> dict[str, Any]:
+    """Return `data` and `layout` of plotly.js. A click on a name of the legend acts on its series in every panel."""
+    n_rows, n_columns = len(drawing.rows), drawing.n_columns
+    inner_px = n_rows * drawing.row_px
+    layout: dict[str, Any] = {
+        "height": _height_px(drawing), "autosize": True, "font": {"family": _FONT, "size": 12, "color": BLACK},
+        "paper_bgcolor": "#fff", "plot_bgcolor": "#fff", "hovermode": "closest", "showlegend": bool(drawing.legend),
+        "margin": {"l": 58, "r": 12, "t": _ABOVE_PX + _legend_px(drawing), "b": _BELOW_PX}, "annotations": [],
         "legend": {"orientation": "h", "x": 0, "xanchor": "left", "y": 1 + 28 / inner_px, "yanchor": "bottom",
                    "font": {"size": 11}},
+        "barmode": "group", "bargap": 1.0 - BAR_SHARE,
     }  # fmt: skip
-    for index in range(n_columns * n_rows):
-        row, column = divmod(index, n_columns)
-        x, y = _span(column, n_columns, _GAP), _span(n_rows - 1 - row, n_rows, _ROW_GAP_PX / inner_px)
-        found[_axis("xaxis", index)] = {**_look_of_axis(), "domain": x, "anchor": _axis("y", index)}
-        found[_axis("yaxis", index)] = {**_look_of_axis(), "domain": y, "anchor": _axis("x", index)}
-    return {**found, **more}
+    data: list[dict[str, Any]] = []
+    first = {id(series) for series in drawing.legend.values()}
+    for row, panels in enumerate(drawing.rows):
+        for column, panel in enumerate(panels):
+            index = row * n_columns + column
+            place = str(index + 1) if index else ""
+            ids = {"xaxis": f"x{place}", "yaxis": f"y{place}"}
+            x = _span(column, n_columns, _COLUMN_GAP)
+            y = _span(n_rows - 1 - row, n_rows, _ROW_GAP_PX / inner_px)
+            layout[f"xaxis{place}"] = {**_axis(panel.x), "domain": x, "anchor": ids["yaxis"]}
+            layout[f"yaxis{place}"] = {**_axis(panel.y), "domain": y, "anchor": ids["xaxis"]}
+            if panel.heading:
+                layout["annotations"].append(_heading(panel.heading, x, y))
+            if panel.heat is not None:
+                data.append({**_heat(panel.heat), **ids})
+            data += [{**_trace(series), "showlegend": id(series) in first, **ids} for series in panel.series]
+    return {"data": data, "layout": layout}
 
 
-def set_axis(found: dict[str, Any], axis: str, index: int, title: str = "", **more: Any) -> None:
-    """Change one axis ("x" or "y") of panel `index` (from 0) of a layout that is being built."""
-    found[_axis(f"{axis}axis", index)] |= {"title": {"text": title, "font": {"size": 12}}, **more}
+def _height_px(drawing: Drawing) -> int:
+    return _ABOVE_PX + _legend_px(drawing) + len(drawing.rows) * drawing.row_px + _BELOW_PX
 
 
-def add_heading(found: dict[str, Any], index: int, words: str) -> None:
-    """Write above panel `index` (from 0) of a layout that is being built."""
-    x, y = (found[_axis(f"{axis}axis", index)]["domain"] for axis in "xy")
-    note = {"xref": "paper", "yref": "paper", "showarrow": False, "text": words, "font": {"size": 13}}
-    found["annotations"].append(
-        {**note, "x": (x[0] + x[1]) / 2, "y": y[1], "xanchor": "center", "yanchor": "bottom", "yshift": 4}
-    )
-
-
-def axes_of(index: int) -> dict[str, str]:
-    """Return which axes a trace of panel `index` (from 0) belongs to."""
-    return {"xaxis": _axis("x", index), "yaxis": _axis("y", index)}
-
-
-def in_legend(name: str, seen: set[str]) -> dict[str, Any]:
-    """Return how a method stands in the legend: once, and a click on it acts in every panel."""
-    is_first = name not in seen
-    seen.add(name)
-    return {"name": name, "legendgroup": name, "showlegend": is_first}
-
-
-def error_bars(values: Any, low: Any, high: Any, colour: str = "") -> dict[str, Any]:
-    """Return bars from `low` to `high` around (N,) values; none where they are NaN."""
-    values, low, high = (np.asarray(each, dtype=np.float64) for each in (values, low, high))
-    bars = {"type": "data", "symmetric": False, "array": high - values, "arrayminus": values - low, "thickness": 1.1}
-    return {**bars, "width": 2} | ({"color": colour} if colour else {})
-
-
-def _look_of_axis() -> dict[str, Any]:
-    return {
-        "showline": True, "linecolor": BLACK, "linewidth": 1, "gridcolor": GRID_COLOUR, "zeroline": False,
-        "ticks": "outside", "ticklen": 4, "tickfont": {"size": 11}, "automargin": True,
-    }  # fmt: skip
-
-
-def _axis(word: str, index: int) -> str:
-    return word if index == 0 else f"{word}{index + 1}"
+def _legend_px(drawing: Drawing) -> int:
+    return _LEGEND_ROW_PX * math.ceil(len(drawing.legend) / _NAMES_IN_ROW)
 
 
 def _span(place: int, n: int, gap: float) -> list[float]:
     width = (1.0 - gap * (n - 1)) / n
     return [round(place * (width + gap), 4), round(place * (width + gap) + width, 4)]
+
+
+def _heading(words: str, x: list[float], y: list[float]) -> dict[str, Any]:
+    place = {"x": sum(x) / 2, "y": y[1], "xanchor": "center", "yanchor": "bottom", "yshift": 4}
+    return {"xref": "paper", "yref": "paper", "showarrow": False, "text": words, "font": {"size": 13}, **place}
+
+
+def _axis(axis: Axis) -> dict[str, Any]:
+    found: dict[str, Any] = {
+        "title": {"text": axis.title, "font": {"size": 12}}, "showline": True, "linecolor": BLACK, "linewidth": 1,
+        "gridcolor": GRID_COLOUR, "zeroline": False, "ticks": "outside", "ticklen": 4, "tickangle": 0,
+        "tickfont": {"size": round(_PX_PER_PT * axis.tick_pt)}, "automargin": True,
+    }  # fmt: skip
+    if axis.is_log:
+        found["type"] = "log"
+    if axis.span is not None:
+        found["range"] = [math.log10(end) if axis.is_log else end for end in axis.span]
+    if axis.marks is not None:
+        found |= {"tickvals": list(axis.marks), "ticktext": [_lines(text) for text in axis.marks.values()]}
+    return found
+
+
+def _trace(series: Series) -> dict[str, Any]:
+    look = series.look
+    found: dict[str, Any] = {"x": series.x, "y": series.y, "name": series.name, "legendgroup": series.name}
+    found |= {"hovertemplate": series.hover} if series.hover else {"hoverinfo": "skip"}
+    if series.intervals is not None:
+        below, above = series.intervals
+        bars = {"type": "data", "symmetric": False, "array": above, "arrayminus": below, "thickness": 1.1, "width": 2}
+        colour = "#444" if series.style == "bars" else look.colour
+        found["error_x" if series.is_across else "error_y"] = {**bars, "color": colour}
+    if series.style == "bars":
+        pattern = {"shape": "" if look.dash == "solid" else "/", "solidity": 0.4}
+        return {**found, "type": "bar", "marker": {"color": look.colour, "pattern": pattern}}
+    parts = {"lines": look.width > 0, "markers": bool(look.marker), "text": any(series.labels)}
+    found |= {"mode": "+".join(part for part, is_there in parts.items() if is_there), "opacity": look.opacity}
+    if look.width > 0:
+        shape = "hv" if series.style == "steps" else "linear"
+        found["line"] = {"color": look.colour, "width": look.width, "dash": look.dash, "shape": shape}
+    if look.marker:
+        symbol = look.marker + ("-open" if look.is_hollow else "")
+        found["marker"] = {"size": _PX_PER_PT * look.size, "color": look.colour, "symbol": symbol}
+    if parts["text"]:
+        texts = [f"<b>{_lines(text)}</b>" if text else "" for text in series.labels]
+        font = {"size": 10, "color": BLACK}
+        found |= {"text": texts, "textposition": "top left", "textfont": font, "cliponaxis": False}
+    return found
+
+
+def _heat(heat: Heat) -> dict[str, Any]:
+    return {
+        "type": "heatmap", "z": heat.values, "text": heat.texts, "texttemplate": "%{text}", "zmin": heat.low,
+        "zmax": heat.high, "colorscale": list(enumerate(HEAT_COLOURS)), "showscale": False, "xgap": 1, "ygap": 1,
+        "textfont": {"size": 11, "color": BLACK}, "hovertemplate": heat.hover,
+    }  # fmt: skip
+
+
+def _lines(text: str) -> str:
+    return text.replace("\n", "<br>")
 
 
 def _plain(value: Any) -> Any:

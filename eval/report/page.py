@@ -19,7 +19,7 @@ from cdpipe.model.config import settings_table
 from eval.core.figures import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.report.charts import Chart, plotly_script
-from eval.report.cost.page import draw_pareto
+from eval.report.cost.charts import draw_pareto
 from eval.report.cost.pareto import pareto_table
 from eval.report.latex import latex_tables
 from eval.report.merge.merge import draw_merge, ends_at_merge
@@ -102,7 +102,7 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
         if len(points):
             files["pareto.csv"] = points.to_csv(index=False)
         content = _content(data, tables, draw_pareto(points, is_contended=is_contended(data)), views)
-        files |= {f"{each.name}.png": each.png for each in content["charts"] if each.png is not None}
+        files |= {f"{each.name}.png": each.png for each in content["charts"] if each.has_png}
         files["index.html"] = rendered("page.html", content)
     for name, file in files.items():
         written(run / name, file)

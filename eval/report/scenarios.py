@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from eval.core.charts import Axis, Drawing, Panel, Series, named_ticks
 from eval.core.statistics import bootstrap_interval
-from eval.report.charts import Chart, axes_of, error_bars, in_legend, layout, line_of, set_axis
+from eval.report.charts import Chart
+from eval.report.regions.charts import look_of
 from eval.running.run_data import RunData, named_variants, number, of, over_pairs, scenarios, split_variant
 from eval.tables.columns import RESULT_COLUMNS
 
@@ -25,30 +27,26 @@ def draw_scenarios(data: RunData) -> list[Chart]:
     sizes = {world: len({row["seed"] for row in of(data.results, scenario=world)}) for world in worlds}
     if len(methods) < 2 or max(sizes.values(), default=0) < 2:
         return []
-    places = [f"{world.replace('/', '/<br>')}<br>n {sizes[world]}" for world in worlds]
-    found = layout(1, len(_COLUMNS), 190, methods, barmode="group", bargap=0.25)
+    ticks = named_ticks([f"{world.replace('/', '/' + chr(10))}\nn {sizes[world]}" for world in worlds])
     values: dict[tuple[str, str], list[Any]] = {
         (world, name): of(data.results, scenario=world, variant=name) for world in worlds for name in methods
     }
-    traces: list[dict[str, Any]] = []
-    seen: set[str] = set()
-    for index, column in enumerate(_COLUMNS):
-        set_axis(found, "x", index, type="category", tickangle=0, showticklabels=index == len(_COLUMNS) - 1)
-        set_axis(found, "y", index, column.heading, range=[0, 1.05])
+    rows = []
+    for column in _COLUMNS:
+        series = []
         for name in methods:
             groups = [values[world, name] for world in worlds]
             means = [over_pairs(group, column.key) for group in groups]
             ends = [bootstrap_interval(np.array([number(row, column.key) for row in group])) for group in groups]
-            low, high = (np.array([end[side] for end in ends]) for side in (0, 1))
-            look = line_of(name, methods)
-            shape = "" if look["dash"] == "solid" else "/"
-            marker = {"color": look["color"], "pattern": {"shape": shape, "solidity": 0.4}}
-            traces.append(
-                {"type": "bar", "x": places, "y": means, "marker": marker, "hovertemplate": "%{x}: %{y:.3f}",
-                 "error_y": error_bars(means, low, high, "#444"), **axes_of(index), **in_legend(name, seen)}
-            )  # fmt: skip
+            low, high = np.array(ends).T
+            hover = [f"{world}: {mean:.3f}" for world, mean in zip(worlds, means, strict=True)]
+            look = look_of(name, methods)
+            series.append(Series(list(ticks), means, look, name, "bars", low=low, high=high, hover=hover))
+        is_last = column is _COLUMNS[-1]
+        x = Axis(ticks=ticks if is_last else dict.fromkeys(ticks, ""))
+        rows.append([Panel(x, Axis(column.heading, (0.0, 1.05)), series)])
     caption = (
         "Means over the n session pairs of each scenario, 0 for a pair without an answer (AUROC: left out); bars: 95 % "
         "interval over pairs. A click on a name hides a method, two show it alone."
     )
-    return [Chart("by_scenario", "Every method on every scenario", {"data": traces, "layout": found}, caption)]
+    return [Chart("by_scenario", "Every method on every scenario", Drawing(rows, 190), caption)]

@@ -14,8 +14,7 @@ from eval.core.domains import domain_name
 from eval.report.charts import Chart
 from eval.report.cost.pareto import with_domain
 from eval.report.merge.merge import covered_by
-from eval.report.regions.charts import free_response_figure, roc_figure, size_figure
-from eval.report.regions.plots import Bins, Curve, free_response_plot, roc_plot, size_plot
+from eval.report.regions.charts import Bins, Curve, free_response_chart, roc_chart, size_chart
 from eval.report.story import about_failures, joined
 from eval.report.tables import Cell, Table, beside, best, used_pairs
 from eval.running.run_data import BASELINES, RunData, off_grids
@@ -241,11 +240,11 @@ def _roc(curves: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
     return Chart(
         "roc",
         "How keyframe scores tell changed places from unchanged ones",
-        roc_figure(panels),
+        roc_chart(panels),
         "Over all keyframes of all pairs at once, scores as they are (a keyframe that was never compared comes last). "
         f"Area of {MAIN_VARIANT if MAIN_VARIANT in set(table['variant']) else table['variant'].iloc[0]}: "
         + ", ".join(_areas(table, list(panels))),
-        roc_plot(panels),
+        has_png=True,
     )
 
 
@@ -268,11 +267,11 @@ def _free_response(curves: pd.DataFrame | None, table: pd.DataFrame) -> Chart | 
     return Chart(
         "free_response",
         "Changes found against false regions, as the threshold falls",
-        free_response_figure(panels, RATES_PER_100M),
+        free_response_chart(panels, RATES_PER_100M),
         f"Lines: every candidate, reported or not. Dots: the methods' own thresholds. Vertical: "
         f"{' and '.join(f'{rate:g}' for rate in RATES_PER_100M)} false regions per 100 m; what lies at the left border "
         "has 0.01 or fewer. Changed and unchanged pairs together; a pair without an answer misses all its changes.",
-        free_response_plot(panels, RATES_PER_100M),
+        has_png=True,
     )
 
 
@@ -296,10 +295,10 @@ def _sizes(sizes: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
     return Chart(
         "recall_by_size",
         "Recall by what a change is like",
-        size_figure(panels),
+        size_chart(panels),
         f"At {RATES_PER_100M[0]:g} false regions per 100 m. Under each bin the number of observable changes; bars: "
         f"95 % interval over pairs of {shown[-1]}.{others}",
-        size_plot(panels),
+        has_png=True,
     )
 
 

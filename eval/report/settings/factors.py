@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -11,10 +10,10 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.model.config import load_config
+from eval.core.charts import COLOURS, Axis, Drawing, Look, Panel, Series, named_ticks
 from eval.core.domains import domain_name
-from eval.core.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION
 from eval.core.statistics import bootstrap_interval
-from eval.report.charts import Chart, axes_of, error_bars, in_legend, layout, set_axis
+from eval.report.charts import Chart
 from eval.report.cost.pareto import with_domain
 from eval.report.settings.grids import N_ACROSS, SHARES
 from eval.running.run_data import (
@@ -32,7 +31,6 @@ from eval.running.run_data import (
 from eval.tables.columns import RESULT_COLUMNS
 
 _KEYS = ("region_recall_at_k", "region_auroc", "object_iou_point", "object_f1_50", "t_total_s")
-_COLOURS = (BLACK, BLUE, ORANGE, GREEN, VERMILLION)
 _COLUMNS = {column.key: column for column in RESULT_COLUMNS}
 
 
@@ -82,8 +80,8 @@ def draw_factors(data: RunData) -> list[Chart]:
     charts = []
     for place, factor in enumerate(factors(data), start=1):
         own = _shared(factor, rows)
-        figure = _factor_lines(factor, own)
-        if figure is None:
+        drawing = _drawing(factor, own)
+        if drawing is None:
             continue
         n = len({(row["scenario"], row["seed"]) for row in own})
         star = f" The star is the preset's own value, {factor.own}." if factor.own else ""
@@ -91,7 +89,7 @@ def draw_factors(data: RunData) -> list[Chart]:
             Chart(
                 f"factor_{place}",
                 f"{factor.preset}: {factor.key}",
-                figure,
+                drawing,
                 f"Means over the n = {n} session pairs that every value was run on (times: medians), bars: 95 % "
                 f"interval over pairs.{star}",
             )
@@ -106,50 +104,44 @@ def _shared(factor: Factor, rows: Sequence[Row]) -> list[Row]:
     return [row for group in groups for row in group if (row["scenario"], row["seed"]) in shared]
 
 
-def _factor_lines(factor: Factor, rows: Sequence[Row]) -> dict[str, Any] | None:
-    """Return the lines; None where no figure has two values."""
+def _drawing(factor: Factor, rows: Sequence[Row]) -> Drawing | None:
+    """Return a panel for each figure; None where no figure has two values."""
     shown = [key for key in _KEYS if len(set(np.round(defined(rows, key), 9))) > 1]
     if not shown:
         return None
     domains = list(dict.fromkeys(text(row, "domain") for row in rows))
-    n_across = min(N_ACROSS, len(shown))
-    n_rows = math.ceil(len(shown) / n_across)
-    found = layout(n_across, n_rows, 230, [domain_name(domain) for domain in domains])
-    data: list[dict[str, Any]] = []
-    seen: set[str] = set()
-    for index, key in enumerate(shown):
-        column = _COLUMNS[key]
-        span = {"range": [-0.03, 1.05]} if key in SHARES else {"rangemode": "tozero"}
-        set_axis(found, "x", index, factor.key, type="category")
-        set_axis(found, "y", index, column.heading, **span)
-        for place, domain in enumerate(domains):
-            colour = _COLOURS[place % len(_COLOURS)]
-            data.append(
-                {**_line(factor, of(rows, domain=domain), key, colour), **axes_of(index),
-                 **in_legend(domain_name(domain), seen)}
-            )  # fmt: skip
-    for index in range(len(shown), n_across * n_rows):
-        found[f"xaxis{index + 1}"]["visible"] = found[f"yaxis{index + 1}"]["visible"] = False
-    return {"data": data, "layout": found}
+    ticks = named_ticks(list(factor.points))
+    panels = []
+    for key in shown:
+        series = [
+            each
+            for place, domain in enumerate(domains)
+            for each in _series(factor, of(rows, domain=domain), key, COLOURS[place % len(COLOURS)], domain)
+        ]
+        ends = [np.append(each.y, 0.0 if each.high is None else each.high) for each in series]
+        span = (-0.03, 1.05) if key in SHARES else (0.0, 1.05 * float(np.nanmax(np.concatenate(ends))))
+        panels.append(Panel(Axis(factor.key, ticks=ticks), Axis(_COLUMNS[key].heading, span), series))
+    return Drawing([panels[start : start + N_ACROSS] for start in range(0, len(panels), N_ACROSS)], 230)
 
 
-def _line(factor: Factor, rows: Sequence[Row], key: str, colour: str) -> dict[str, Any]:
+def _series(factor: Factor, rows: Sequence[Row], key: str, colour: str, domain: str) -> list[Series]:
+    """Return the line of a domain, and a star at the value that the preset itself has."""
     groups = [of(rows, variant=name) for name in factor.points.values()]
-    means = [over_pairs(group, key) for group in groups]
+    means = np.array([over_pairs(group, key) for group in groups])
     statistic: Literal["mean", "median"] = "median" if key.startswith("t_") else "mean"
     ends = [
         bootstrap_interval(np.array([number(row, key) for row in group], dtype=np.float64), statistic)
         for group in groups
     ]
-    low, high = (np.array([end[side] for end in ends]) for side in (0, 1))
-    symbols = ["star" if value == factor.own else "circle" for value in factor.points]
-    sizes = [12 if value == factor.own else 7 for value in factor.points]
-    counts = [f"n {len(defined(group, key))}" for group in groups]
-    return {
-        "x": list(factor.points), "y": means, "mode": "lines+markers", "line": {"color": colour, "width": 1.6},
-        "marker": {"symbol": symbols, "size": sizes, "color": colour},
-        "error_y": error_bars(means, low, high, colour), "text": counts, "hovertemplate": "%{x}: %{y:.3g}, %{text}",
-    }  # fmt: skip
+    low, high = np.array(ends).T
+    hover = [
+        f"{value}: {mean:.3g}, n {len(defined(group, key))}"
+        for value, mean, group in zip(factor.points, means, groups, strict=True)
+    ]
+    places, name = np.arange(len(means)), domain_name(domain)
+    line = Series(places, means, Look(colour, 1.6, marker="circle"), name, low=low, high=high, hover=hover)
+    own = [place for place, value in enumerate(factor.points) if value == factor.own]
+    return [line, Series(own, means[own], Look(colour, 0.0, marker="star", size=8.0), name)]
 
 
 def _setting_of(preset: str, key: str) -> str:

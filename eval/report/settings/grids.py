@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from eval.core.charts import Axis, Drawing, Heat, Look, Panel, Series, named_ticks
 from eval.core.figures import BLACK
-from eval.report.charts import Chart, add_heading, axes_of, layout, set_axis
+from eval.report.charts import Chart
 from eval.running.run_data import GridOf, RunData, grids, of, over_pairs
 from eval.tables.columns import RESULT_COLUMNS, Column, share
 
@@ -23,7 +24,6 @@ _GRID_KEYS = (
     "t_total_s",
 )
 SHARES = ("region_recall", "region_recall_at_k", "region_auroc", "object_iou_point", "object_f1_50", "object_pq")
-_WHITE_TO_BLUE = [[0, "#ffffff"], [1, "#6baed6"]]
 # by which settings are chosen: it asks for objects that are whole and for none that are false
 PQ_COLUMN = Column(
     "object_pq", "object PQ", "high", share,
@@ -47,7 +47,7 @@ def draw_grids(data: RunData) -> list[Chart]:
                 Chart(
                     f"grid_{place}",
                     f"{grid.preset} on {grid.scenario}: {grid.keys[0]} and {grid.keys[1]}",
-                    _heat_maps(grid, {_COLUMNS[key]: values[key] for key in shown}),
+                    _drawing(grid, {_COLUMNS[key]: values[key] for key in shown}),
                     f"Means over n = {len(seeds)} session pair{'s' if len(seeds) > 1 else ''}, medians for times; the "
                     "best cell has a frame.",
                 )
@@ -55,43 +55,28 @@ def draw_grids(data: RunData) -> list[Chart]:
     return found
 
 
-def _heat_maps(grid: GridOf, tables: Mapping[Column, Any]) -> dict[str, Any]:
-    n_across = min(N_ACROSS, len(tables))
-    n_rows = math.ceil(len(tables) / n_across)
-    found = layout(n_across, n_rows, 90 + 26 * len(grid.values[0]))
-    data: list[dict[str, Any]] = []
-    found["shapes"] = []
-    for index, (column, table) in enumerate(tables.items()):
-        add_heading(found, index, column.heading)
-        set_axis(found, "x", index, grid.keys[1], type="category", showgrid=False)
-        set_axis(found, "y", index, "" if index % n_across else grid.keys[0], type="category", showgrid=False)
-        is_share = column.key in SHARES
-        low, high = (0.0, 1.0) if is_share else (float(np.nanmin(table)), float(np.nanmax(table)))
-        written = [[column.shown(value) for value in row] for row in table]
-        data.append(
-            {"type": "heatmap", "x": list(grid.values[1]), "y": list(grid.values[0]), "z": table, "text": written,
-             "texttemplate": "%{text}", "zmin": low, "zmax": high, "colorscale": _WHITE_TO_BLUE, "showscale": False,
-             "xgap": 1, "ygap": 1, "textfont": {"size": 11, "color": BLACK},
-             "hovertemplate": f"{grid.keys[0]} %{{y}}, {grid.keys[1]} %{{x}}: %{{text}}<extra></extra>",
-             **axes_of(index)}
-        )  # fmt: skip
-        found["shapes"] += _frames(table, column, index)
-    for index in range(len(tables), n_across * n_rows):
-        found[f"xaxis{index + 1}"]["visible"] = found[f"yaxis{index + 1}"]["visible"] = False
-    return {"data": data, "layout": found}
+def _drawing(grid: GridOf, tables: Mapping[Column, Any]) -> Drawing:
+    x, y = (named_ticks(list(grid.values[place])) for place in (1, 0))
+    panels = []
+    for column, table in tables.items():
+        low, high = (0.0, 1.0) if column.key in SHARES else (float(np.nanmin(table)), float(np.nanmax(table)))
+        texts = [[column.shown(value) for value in row] for row in table]
+        hover = f"{grid.keys[0]} and {grid.keys[1]}: %{{text}}<extra></extra>"
+        axes = Axis(grid.keys[1], (-0.5, len(x) - 0.5), ticks=x), Axis(grid.keys[0], (-0.5, len(y) - 0.5), ticks=y)
+        panels.append(Panel(*axes, _frames(table, column), column.heading, Heat(table, texts, low, high, hover)))
+    rows = [panels[start : start + N_ACROSS] for start in range(0, len(panels), N_ACROSS)]
+    return Drawing(rows, 90 + 26 * len(y))
 
 
-def _frames(table: Any, column: Column, index: int) -> list[dict[str, Any]]:
-    """Return a frame around the best cells, as written."""
+def _frames(table: Any, column: Column) -> list[Series]:
+    """Return a frame around each of the best cells, as written."""
     written = np.array([[float(column.shown(value)) if not math.isnan(value) else math.nan for value in row]
                         for row in table])  # fmt: skip
     top = np.nanmax(written) if column.better == "high" else np.nanmin(written)
-    axes = axes_of(index)
+    around_x, around_y = 0.48 * np.array([[-1, 1, 1, -1, -1], [-1, -1, 1, 1, -1]])
     return [
-        {"type": "rect", "xref": axes["xaxis"], "yref": axes["yaxis"], "x0": x - 0.48, "x1": x + 0.48, "y0": y - 0.48,
-         "y1": y + 0.48, "line": {"color": BLACK, "width": 2}}
-        for y, x in zip(*np.nonzero(written == top), strict=True)
-    ]  # fmt: skip
+        Series(x + around_x, y + around_y, Look(BLACK, 2.0)) for y, x in zip(*np.nonzero(written == top), strict=True)
+    ]
 
 
 def _values(data: RunData, grid: GridOf, key: str) -> Any:

@@ -1,26 +1,28 @@
-"""Charts are figures that plotly itself accepts, and JSON that can stand inside a page."""
+"""A chart is described once: plotly accepts its interactive form, and the picture holds the same numbers."""
 
 import itertools
 import json
-import math
 from pathlib import Path
 
 import numpy as np
 import plotly.graph_objects as go
 import pytest
+from matplotlib.colors import to_hex
 
-from eval.report.charts import Chart, error_bars, layout, line_of, plotly_script
-from eval.report.regions.charts import free_response_figure, roc_figure, size_figure
-from eval.report.regions.plots import Bins, Curve, line_look
+from eval.core.charts import Axis, Drawing, Heat, Panel, Series, picture
+from eval.report.charts import Chart, plotly_figure, plotly_script
+from eval.report.regions.charts import Bins, Curve, free_response_chart, look_of, roc_chart, size_chart
 from eval.report.scenarios import draw_scenarios
 from eval.report.settings.factors import draw_factors, factors
 from eval.report.settings.grids import draw_grids
 from eval.running.run_data import RunData
 from eval.running.runfolder import RunFolder
 
+NAN = float("nan")
 RISING = np.array([0.0, 0.5, 1.0])
 CURVES = {"in": {"tunnelcd": Curve(RISING, RISING**2, (0.2, 0.5)), "paper": Curve(RISING, RISING)},
           "out": {"paper": Curve(np.array([0.0, 40.0]), np.array([0.1, 0.3]))}}  # fmt: skip
+SHARE = Axis("share", (0.0, 1.0))
 
 
 def run(rows: list[dict[str, object]]) -> RunData:
@@ -28,14 +30,18 @@ def run(rows: list[dict[str, object]]) -> RunData:
     return RunData(RunFolder(Path("nowhere")), tuple({**common, **row} for row in rows), (), (), {}, ())
 
 
-def accepted(figure: dict[str, object]) -> go.Figure:
-    """What plotly makes of a figure as the page holds it; it refuses keys and values that it does not know."""
-    return go.Figure(json.loads(Chart("a", "", figure, "").json))
+def accepted(drawing: Drawing) -> go.Figure:
+    """What plotly makes of a chart as the page holds it; it refuses keys and values that it does not know."""
+    return go.Figure(json.loads(Chart("a", "", drawing, "").json))
+
+
+def one_panel(*series: Series, x: Axis = SHARE, y: Axis = SHARE, heat: Heat | None = None) -> Drawing:
+    return Drawing([[Panel(x, y, series, "heading", heat)]], 200)
 
 
 @pytest.mark.parametrize("n_columns", [1, 2, 3])
 def test_panels_share_the_room_and_do_not_overlap(n_columns: int) -> None:
-    found = layout(n_columns, 2, 200)
+    found = plotly_figure(Drawing([[Panel(SHARE, SHARE, [])] * n_columns] * 2, 200))["layout"]
     x = [found[f"xaxis{i + 1}" if i else "xaxis"]["domain"] for i in range(n_columns)]
     assert x[0][0] == 0.0
     assert x[-1][1] == pytest.approx(1.0, abs=1e-3)
@@ -44,38 +50,78 @@ def test_panels_share_the_room_and_do_not_overlap(n_columns: int) -> None:
     assert lower[1] < upper[0]
 
 
-def test_error_bars_reach_from_low_to_high() -> None:
-    bars = error_bars([0.5, 0.7], [0.4, math.nan], [0.8, math.nan])
-    assert (bars["arrayminus"][0], bars["array"][0]) == pytest.approx((0.1, 0.3))
-    assert np.isnan(bars["array"][1])
+@pytest.mark.parametrize("is_across", [False, True])
+def test_intervals_reach_from_low_to_high_on_the_page_and_in_the_picture(is_across: bool) -> None:
+    places, values, low, high = [0.2, 0.6], [0.5, 0.7], [0.4, NAN], [0.8, NAN]
+    xy = (values, places) if is_across else (places, values)
+    drawing = one_panel(Series(*xy, low=low, high=high, is_across=is_across))
+    (trace,) = accepted(drawing).data
+    bars = trace.error_x if is_across else trace.error_y
+    assert (bars.arrayminus[0], bars.array[0]) == pytest.approx((0.1, 0.3))
+    assert bars.array[1] is None
+    (drawn,) = picture(drawing).axes[0].collections
+    ends = drawn.get_segments()[0][:, 0 if is_across else 1]
+    np.testing.assert_allclose(ends, [0.4, 0.8])
 
 
 def test_undefined_is_null_and_no_text_ends_the_script() -> None:
-    figure = {"data": [{"x": np.array([1.23456789, np.nan]), "name": "</script><b>"}], "layout": {"height": 9}}
-    text = Chart("a", "", figure, "").json
+    text = Chart("a", "", one_panel(Series([1.23456789, NAN], [0, 1], name="</script><b>")), "").json
     assert "</" not in text
     found = json.loads(text)["data"][0]
-    assert found == {"x": [1.2346, None], "name": "</script><b>"}
+    assert (found["x"], found["name"]) == ([1.2346, None], "</script><b>")
 
 
-def test_a_method_looks_alike_on_the_page_and_on_paper() -> None:
-    for name in ("tunnelcd", "paper-paired", "random-regions", "mine"):
-        look, line = line_look(name, ["mine"]), line_of(name, ["mine"])
-        assert (line["color"], line["width"]) == (look["color"], look["linewidth"])
-    assert [line_of(name, [])["dash"] for name in ("tunnelcd", "paper-paired", "random-regions")] == [
-        "solid", "dash", "dot"
-    ]  # fmt: skip
+def test_page_and_picture_draw_the_same_numbers_in_the_same_looks() -> None:
+    for drawing in (roc_chart(CURVES), free_response_chart(CURVES, (0.1, 0.5))):
+        traces, panels = accepted(drawing).data, picture(drawing).axes
+        lines = [line for axes in panels for line in axes.get_lines()]
+        assert len(lines) == len(traces)
+        for trace, line in zip(traces, lines, strict=True):
+            np.testing.assert_allclose(line.get_xydata(), np.column_stack([trace.x, trace.y]), rtol=1e-4)
+            colour = trace.line.color if "lines" in trace.mode else trace.marker.color
+            assert to_hex(line.get_color()) == colour.lower()
+            assert line.get_drawstyle() == ("steps-post" if trace.line.shape == "hv" else "default")
+    log_x = accepted(free_response_chart(CURVES, ())).layout.xaxis
+    np.testing.assert_allclose(10.0 ** np.array(log_x.range), panels[0].get_xlim(), rtol=1e-4)
+    assert (log_x.type, panels[0].get_xscale()) == ("log", "log")
 
 
-def test_curves_of_all_panels_are_there_and_each_name_once_in_the_legend() -> None:
-    for figure in (roc_figure(CURVES), free_response_figure(CURVES, (0.1, 0.5))):
-        traces = accepted(figure).data
+def test_each_name_is_once_in_the_legend() -> None:
+    for drawing in (roc_chart(CURVES), free_response_chart(CURVES, (0.1, 0.5))):
+        traces = accepted(drawing).data
         assert sorted(trace.name for trace in traces if trace.showlegend) == ["paper", "tunnelcd"]
         assert {trace.xaxis for trace in traces} == {"x", "x2"}
+        (legend,) = picture(drawing).legends
+        assert sorted(text.get_text() for text in legend.get_texts()) == ["paper", "tunnelcd"]
+
+
+def test_known_methods_keep_their_look_and_others_differ() -> None:
+    assert [look_of(name, []).dash for name in ("tunnelcd", "paper-paired", "random-regions")] == [
+        "solid", "dash", "dot"
+    ]  # fmt: skip
+    assert look_of("mine", ["mine", "yours"]) != look_of("yours", ["mine", "yours"])
+
+
+def test_bars_stand_side_by_side_and_a_heat_map_holds_its_values() -> None:
+    bars = [Series([0, 1], [value, 1.0], style="bars") for value in (0.2, 0.4)]
+    figure, drawn = accepted(one_panel(*bars)), picture(one_panel(*bars)).axes[0].patches
+    assert [list(trace.y) for trace in figure.data] == [[0.2, 1.0], [0.4, 1.0]]
+    assert [bar.get_height() for bar in drawn] == [0.2, 1.0, 0.4, 1.0]
+    assert drawn[0].get_x() + drawn[0].get_width() == pytest.approx(drawn[2].get_x())
+    values = np.array([[0.1, 0.2], [0.3, NAN]])
+    cells = one_panel(heat=Heat(values, [["a", "b"], ["c", "-"]], 0.0, 1.0))
+    (heat,) = accepted(cells).data
+    assert list(heat.z[1]) == [0.3, None]
+    np.testing.assert_array_equal(np.ma.filled(picture(cells).axes[0].images[0].get_array(), NAN), values)
+
+
+def test_a_logarithmic_axis_is_marked_at_one_and_three() -> None:
+    assert list(Axis("", (0.01, 1.0), is_log=True).marks or ()) == pytest.approx([0.01, 0.03, 0.1, 0.3, 1.0, 3.0])
+    assert Axis("", (0.01, 1.0)).marks is None
 
 
 def test_false_regions_without_end_stay_inside_the_picture() -> None:
-    figure = accepted(free_response_figure(CURVES, ()))
+    figure = accepted(free_response_chart(CURVES, ()))
     line = next(trace for trace in figure.data if trace.xaxis == "x2")
     assert line.x == (0.01, 10.0, 10.0)
     dot = next(trace for trace in figure.data if trace.mode == "markers")
@@ -84,7 +130,7 @@ def test_false_regions_without_end_stay_inside_the_picture() -> None:
 
 def test_bins_carry_their_counts_and_only_the_last_method_its_interval() -> None:
     bins = Bins(("<1\n4", "≥1\n2"), np.array([0.5, np.nan]), np.array([0.2, np.nan]), np.array([0.8, np.nan]))
-    figure = accepted(size_figure({"in": {"hull [m³]": {"paper": bins, "tunnelcd": bins}}}))
+    figure = accepted(size_chart({"in": {"hull [m³]": {"paper": bins, "tunnelcd": bins}}}))
     assert figure.layout.xaxis.ticktext == ("<1<br>n 4", "≥1<br>n 2")
     paper, ours = figure.data
     assert paper.error_y.array is None
@@ -103,10 +149,11 @@ def test_a_setting_is_a_line_with_the_presets_own_value_in_its_place() -> None:
     assert (factor.preset, factor.key, factor.own) == ("tunnelcd", "query.radius_m", "4.5")
     assert list(factor.points) == ["3.0", "4.5", "6.0"]
     (chart,) = draw_factors(run(rows))
-    (line,) = accepted(chart.figure).data
-    assert line.x == ("3.0", "4.5", "6.0")
+    figure = accepted(chart.drawing)
+    line, star = figure.data
+    assert figure.layout.xaxis.ticktext == ("3.0", "4.5", "6.0")
     assert line.y == pytest.approx((0.41, 0.91, 0.71))
-    assert line.marker.symbol == ("circle", "star", "circle")
+    assert (star.marker.symbol, star.x, star.y) == ("star", (1,), pytest.approx((0.91,)))
     assert "n = 2 session pairs" in chart.caption
 
 
@@ -122,12 +169,13 @@ def test_a_grid_holds_means_and_frames_the_best_as_written() -> None:
         for a in (1, 2) for b in (1, 2) for seed in (0, 1)
     ]  # fmt: skip
     (chart,) = draw_grids(run(rows))
-    figure = accepted(chart.figure)
-    iou, seconds = figure.data
+    figure = accepted(chart.drawing)
+    iou, seconds = (trace for trace in figure.data if trace.type == "heatmap")
     np.testing.assert_allclose(iou.z, [[0.11, 0.12], [0.21, 0.22]])
     assert [list(row) for row in seconds.text] == [["1", "2"], ["2", "4"]]
     # highest IoU, shortest time
-    assert [(shape.x0 + 0.48, shape.y0 + 0.48) for shape in figure.layout.shapes] == [(1, 1), (0, 0)]
+    frames = [trace for trace in figure.data if trace.type == "scatter"]
+    assert [(np.mean(frame.x[:4]), np.mean(frame.y[:4])) for frame in frames] == [(1, 1), (0, 0)]
     assert "n = 2 session pairs" in chart.caption
 
 
@@ -138,10 +186,11 @@ def test_every_scenario_has_a_bar_for_each_method_over_its_pairs() -> None:
         for world in ("narrow", "wide") for name in ("a", "b") for seed in (1, 3)
     ]  # fmt: skip
     (chart,) = draw_scenarios(run(rows))
-    traces = accepted(chart.figure).data
+    figure = accepted(chart.drawing)
+    traces = figure.data
     assert len(traces) == 6
     auroc = [trace for trace in traces if trace.yaxis == "y2"]
-    assert auroc[0].x == ("narrow<br>n 2", "wide<br>n 2")
+    assert figure.layout.xaxis3.ticktext == ("narrow<br>n 2", "wide<br>n 2")
     assert auroc[0].y == (0.5, 0.5)
     # two pairs of 0.25 and 0.75: some draws hold one of them only
     assert auroc[0].error_y.array == pytest.approx((0.25, 0.25))
