@@ -148,10 +148,10 @@ def split_section(document: Document, name: str) -> tuple[Document, Document | N
     return rest, replace(rest, value=_overlaid(rest.value, section), origins=below | above)
 
 
-def suggest(word: str, known: Iterable[str]) -> str:
-    """Return `; did you mean "…"?` for the closest known word, or ""."""
+def suggest(word: str, known: Iterable[str], prefix: str = "") -> str:
+    """Return `; did you mean "…"?` for the closest known word, written behind a prefix, or "" where none is close."""
     close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
-    return f'; did you mean "{close[0]}"?' if close else ""
+    return f'; did you mean "{prefix}{close[0]}"?' if close else ""
 
 
 def _mistake(model: type[BaseModel], document: Document, error: Any) -> str:
@@ -161,7 +161,7 @@ def _mistake(model: type[BaseModel], document: Document, error: Any) -> str:
     name = ".".join(str(part) for part in key)
     where = document.where(key)
     if error["type"] == "extra_forbidden":
-        return f"{where}: {name} = {_brief(error['input'])}: unknown key{_near_key(model, key)}"
+        return f"{where}: {name} = {_brief(error['input'])}: unknown key{_near_key(model, key, where)}"
     if error["type"] == "missing":
         return f"{where}: {name}: missing, a value is required"
     hint = ""
@@ -173,14 +173,18 @@ def _mistake(model: type[BaseModel], document: Document, error: Any) -> str:
     return f"{where}: {name} = {_brief(error['input'])}: {rule}{hint}" if name else f"{where}: {rule}{hint}"
 
 
-def _near_key(model: type[BaseModel], key: Key) -> str:
-    """Return a suggestion for an unknown key: one of that name in a group, if the group was left out, or a near one."""
+def _near_key(model: type[BaseModel], key: Key, where: str) -> str:
+    """Suggest a key for an unknown one: the same name in a group where the group is missing, else the closest name.
+
+    A file names its group on a line of its own; an option needs the group in the suggestion.
+    """
     last = str(key[-1])
     groups = [name for name, field in model.model_fields.items() if isinstance(field.annotation, type)]
     grouped = [f'"{group}.{last}"' for group in groups if last in _fields_at(model, (group,))]
     if len(key) == 1 and grouped:
         return f"; did you mean {' or '.join(grouped)}?"
-    return suggest(last, _fields_at(model, key[:-1]))
+    group = "".join(f"{part}." for part in key[:-1]) if where == "--set" else ""
+    return suggest(last, _fields_at(model, key[:-1]), group)
 
 
 def _brief(value: Any) -> str:

@@ -172,7 +172,8 @@ def cluster() -> str:
     """Let a worker in this process add two numbers (dask, distributed)."""
     from distributed import Client
 
-    with Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as client:
+    settings = {"processes": False, "n_workers": 1, "threads_per_worker": 1, "silence_logs": 50}
+    with Client(**settings, dashboard_address=":0") as client:  # any free port: another program may hold Dask's own
         found = client.submit(sum, (2, 3)).result(timeout=5)
     _require(found == 5, f"a worker made {found} of 2 + 3")
     return "a worker computes"

@@ -18,7 +18,7 @@ from eval.cli import run as commands_run
 from eval.cli import tools as commands_tools
 from eval.cli import training as commands_training
 from eval.cli import world as commands_world
-from eval.core.exits import input_errors
+from eval.core.exits import input_errors, run_app
 
 
 class _Funnel(TyperGroup):
@@ -68,19 +68,4 @@ for _name, _command in _COMMANDS.items():
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line and exit."""
     fix_threads()
-    words = list(sys.argv[1:] if argv is None else argv)
-    try:
-        code = app(args=words, prog_name="tunnelcd", standalone_mode=False)
-    except typer.TyperException as error:
-        command = " ".join(["tunnelcd", *(word for word in words[:1] if word in _COMMANDS)])
-        _tell_usage(command, error)
-        raise SystemExit(error.exit_code) from error
-    raise SystemExit(code)
-
-
-def _tell_usage(command: str, error: typer.TyperException) -> None:
-    """Write what typer finds wrong with a command as one line, where typer alone would draw a box."""
-    # pydantic's name of the error says nothing; choices stand below one another
-    message = " ".join(error.format_message().replace("Value error, ", "").split()).rstrip(".")
-    if message:  # none for `tunnelcd` alone, which has shown its help by now
-        sys.stderr.write(f"error: {command}: {message}: `{command} --help` tells what it takes\n")
+    run_app(app, "tunnelcd", sys.argv[1:] if argv is None else argv, tuple(_COMMANDS))

@@ -1,7 +1,9 @@
-"""What lies inside and what outside of the distribution that descriptors are trained and thresholds are chosen on."""
+"""Which families and kinds of props lie in the distribution that networks are trained and thresholds chosen on."""
 
 from __future__ import annotations
 
+from functools import cache
+from importlib import resources
 from typing import Literal
 
 Domain = Literal["in", "out"]
@@ -10,9 +12,11 @@ HELD_BACK_KINDS = frozenset({"trolley", "railing", "mesh"})
 _NAMES = {"in": "in distribution", "out": "out of distribution", "all": "all pairs"}
 
 
+@cache
 def domain_of(family: str) -> Domain:
-    """Return "in" for the trained families and their variations (`unchanged/wide`), "out" for all others."""
-    return "in" if family.rpartition("/")[2] in TRAINED_FAMILIES else "out"
+    """Return "in" for the trained families and their shipped variations (`unchanged/wide`), "out" for all others."""
+    is_trained = family.rpartition("/")[2] in TRAINED_FAMILIES
+    return "in" if is_trained and (resources.files("scenarios") / "families" / f"{family}.yaml").is_file() else "out"
 
 
 def domain_name(domain: str) -> str:
@@ -21,5 +25,5 @@ def domain_name(domain: str) -> str:
 
 
 def is_change_in_distribution(family: str, prop_kind: str) -> bool:
-    """Tell whether a change is of a kind that a trained family holds, in such a family."""
+    """Tell whether a change is in a trained family and of a kind that such families hold."""
     return domain_of(family) == "in" and prop_kind not in HELD_BACK_KINDS

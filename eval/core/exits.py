@@ -1,21 +1,24 @@
-"""How a program ends: what a user can cause is one line for each mistake and exit code 2."""
+"""How a program ends: a mistake of the user is one line on standard error with exit code 2."""
 
 from __future__ import annotations
 
 import errno
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import NoReturn
+
+import typer
 
 from cdpipe.core.errors import TunnelcdError
 
-# A full disk, a read-only one, a file too large for it, a folder or file of somebody else's.
+# A full disk, a read-only one, a file too large for it, a folder or file of another user.
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EACCES, errno.EPERM)
 
 
 @contextmanager
 def input_errors() -> Iterator[None]:
-    """Turn what a user can cause into one line for each mistake and exit code 2; anything else stays a traceback."""
+    """Turn mistakes of the user into one line each and exit code 2; any other error stays a traceback."""
     try:
         yield
     except TunnelcdError as error:
@@ -29,3 +32,37 @@ def input_errors() -> Iterator[None]:
             f"error: {error.filename or 'the output'}: {error.strerror}: give it a disk with room and leave to write\n"
         )
         raise SystemExit(2) from error
+
+
+def run_program(command: Callable[..., None], module: str) -> NoReturn:
+    """Run a module's command with the arguments of this process and exit, as `tunnelcd` runs its commands."""
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(command)
+    run_app(app, f"python -m {module}", sys.argv[1:])
+
+
+def run_app(app: typer.Typer, name: str, words: Sequence[str], subcommands: Sequence[str] = ()) -> NoReturn:
+    """Run a typer application and exit.
+
+    Exit codes: 0 done, 2 mistake of the user (one line each), 1 bug (traceback), 130 interrupted.
+
+    Args:
+        app: The application.
+        name: The program as the user calls it, for messages.
+        words: The arguments.
+        subcommands: Names of the application's commands; a mistake in one of them names that command's --help.
+    """
+    try:
+        with input_errors():
+            code = app(args=list(words), prog_name=name, standalone_mode=False)
+    except typer.TyperException as error:
+        command = " ".join([name, *(word for word in words[:1] if word in subcommands)])
+        # typer alone would draw a box; "Value error" is pydantic's, and choices come one a line
+        message = " ".join(error.format_message().replace("Value error, ", "").split()).rstrip(".")
+        if message:  # there is none for `tunnelcd` alone, which has printed its help
+            sys.stderr.write(f"error: {command}: {message}: `{command} --help` lists its arguments\n")
+        raise SystemExit(error.exit_code) from error
+    except typer.Abort as error:
+        sys.stderr.write("interrupted\n")
+        raise SystemExit(130) from error
+    raise SystemExit(code)

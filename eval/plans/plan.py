@@ -7,17 +7,16 @@ scenarios:                           # eval/plans/worlds.py tells more
   - {name: paper/site2, each: [sensor.range_noise=false, sensor.mode=512x10]}  # as it is, and again with each of these
 wide: [paper/site2]                  # wide drifts: presets with what stands under their `wide`
 seeds: "20000:20002"                 # B excluded, in quotes; or a list
-report: [regions, objects]           # also tables and plots: `eval.tables.region_table`, `eval.tables.object_table`; or
-one of them until: null                          # merge: map, describe, merge, and no further; only the columns of the
-merge
+report: [regions, objects]           # tables and plots of regions, of objects, or of both (eval/tables)
+until: null                          # merge: stop after the merge; only the columns of the merge are filled
 variants:
   - preset: paper                    # a shipped preset or the path of a .yaml file
     set: ["extract.voxel_m=0.4"]     # part of the variant's name
-    per_scenario: {paper/site2: ["query.threshold=1"]}   # belongs to the site, whatever is set there; not to the name
+    per_scenario: {paper/site2: ["query.threshold=1"]}   # belongs to the site and not to the variant's name
   - preset: tunnelcd
-    oracle_merge: {noise_m: 0.1, noise_deg: 0.2}         # merged by the truth: eval/oracles/merge.py; {} is without
-    noise oracle_regions: true                                 # a region around each change: eval/oracles/regions.py
-    scenarios: [paper/site1]                             # there alone, not where more is set; everywhere if left out
+    oracle_merge: {noise_m: 0.1, noise_deg: 0.2}         # merged by the truth (eval/oracles/merge.py); {}: no noise
+    oracle_regions: true                                 # a region around each change (eval/oracles/regions.py)
+    scenarios: [paper/site1]                             # only in these worlds; in all worlds if left out
 grid:
   - variant: tunnelcd                # a preset
     scenarios: [paper/site1]         # out of the plan's; one world of several as paper/site2[sensor.mode=512x10]

@@ -1,1 +1,5 @@
-"""From an answer and the truth to the columns of results.csv and the rows of the item tables."""
+"""Truth and answer become the columns of results.csv and the rows of the item tables."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

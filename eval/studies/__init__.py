@@ -1,1 +1,1 @@
-"""Measurements beside the plans, run as `python -m eval.studies.NAME`: thresholds and gates."""
+"""Programs beside the plans, run as `python -m eval.studies.NAME`: thresholds, gates, descriptors, the real sensor."""

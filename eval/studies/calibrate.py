@@ -17,7 +17,7 @@ import typer
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
-from eval.core.exits import input_errors
+from eval.core.exits import run_program
 
 ALARM_SHARE = 0.05
 FALSE_PER_100M = 0.1
@@ -160,5 +160,4 @@ def _read(path: Path) -> pd.DataFrame:
 
 
 if __name__ == "__main__":
-    with input_errors():
-        typer.run(main)
+    run_program(main, "eval.studies.calibrate")

@@ -26,7 +26,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, stream
 from cdpipe.merge.evidence import GATES
 from cdpipe.model.config import load_config
-from eval.core.exits import input_errors
+from eval.core.exits import run_program
 from eval.core.figures import BLACK, BLUE, VERMILLION, blank_figure, png
 from eval.core.output import make_writable
 from eval.plans.coverage import plan_of
@@ -275,5 +275,4 @@ def _gate_panel(axes: Axes, cases: pd.DataFrame, name: str, rows: Sequence[str])
 
 
 if __name__ == "__main__":
-    with input_errors():
-        typer.run(main)
+    run_program(main, "eval.studies.merge_gates")

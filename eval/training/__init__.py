@@ -1,1 +1,5 @@
-"""Training data for descriptors, and training on them."""
+"""Training data for descriptors, and the training of a descriptor on it."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -73,7 +73,7 @@ def test_mistakes_in_settings_are_told_as_such(tmp_path: Path) -> None:
     path = written(tmp_path, WORLD)
     with pytest.raises(ScenarioError, match=r"^--set: platform.speed_mps = -1: input should be greater than 0$"):
         load_scenario(path, 0, ["platform.speed_mps=-1"])
-    with pytest.raises(ScenarioError, match=r'platform.speed = 1: unknown key; did you mean "speed_mps"\?$'):
+    with pytest.raises(ScenarioError, match=r'platform.speed = 1: unknown key; did you mean "platform.speed_mps"\?$'):
         load_scenario(path, 0, ["platform.speed=1"])
     with pytest.raises(InputError, match="expected key=value"):
         load_scenario(path, 0, ["platform"])

@@ -1,1 +1,1 @@
-"""What each descriptor recognises and costs."""
+"""Programs that measure descriptors: what each recognises and costs, and what larger or smaller networks give."""

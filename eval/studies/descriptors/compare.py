@@ -23,7 +23,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import checkpoint_digest, sphere_digest, use_threads
 from cdpipe.model.config import load_config
-from eval.core.exits import input_errors
+from eval.core.exits import run_program
 from eval.core.output import make_writable
 from eval.core.progress import RunProgress, shown_progress
 from eval.core.provenance import digest, git_commit, machine
@@ -144,5 +144,4 @@ def main(
 
 
 if __name__ == "__main__":
-    with input_errors():
-        typer.run(main)
+    run_program(main, "eval.studies.descriptors.compare")

@@ -31,7 +31,7 @@ from cdpipe.descriptors.sphere_network import (
 from cdpipe.training.data import TunnelShard, open_dataset
 from cdpipe.training.fit import FitConfig, fit
 from cdpipe.training.sphere_training import SphereTask, read_sphere_data
-from eval.core.exits import input_errors
+from eval.core.exits import run_program
 from eval.core.output import make_writable
 from eval.studies.descriptors.curve_plots import draw_curves
 from eval.studies.descriptors.measures import FLOAT_BITS, HeldOut, held_out, measures
@@ -182,5 +182,4 @@ def _write(table: pd.DataFrame, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    with input_errors():
-        typer.run(main)
+    run_program(main, "eval.studies.descriptors.curves")

@@ -1,1 +1,5 @@
-"""The simulated sensor held against recordings of a real one."""
+"""The simulated sensor compared with a recording of a real one."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 import typer
 
-from eval.core.exits import input_errors
+from eval.core.exits import run_program
 from eval.core.output import make_writable, unwritable
 from eval.studies.reality.plots import draw_measures, draw_novelty, draw_scene
 from eval.studies.reality.rebuilt_scene import Rebuilt, rebuild
@@ -141,5 +141,4 @@ def main(
 
 
 if __name__ == "__main__":
-    with input_errors():
-        typer.run(main)
+    run_program(main, "eval.studies.reality.reality")

@@ -71,7 +71,7 @@ def test_mistakes_come_with_suggestions() -> None:
     with pytest.raises(InputError) as caught:
         load_config("paper", ["extract.voxel=0.4", "query.reading=pairs"])
     text = str(caught.value)
-    assert '--set: extract.voxel = 0.4: unknown key; did you mean "voxel_m"?' in text
+    assert '--set: extract.voxel = 0.4: unknown key; did you mean "extract.voxel_m"?' in text
     assert "query.reading = 'pairs'" in text
     assert 'did you mean "paired"?' in text
     with pytest.raises(InputError, match='did you mean "paper"'):

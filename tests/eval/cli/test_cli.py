@@ -287,7 +287,7 @@ def test_a_session_beside_itself_is_compared_and_it_is_said(pair: Path, tmp_path
     ("options", "words"),
     [
         (["--preset", "papr"], ["preset", 'did you mean "paper"']),
-        (["--set", "query.radius=3"], ["query.radius", 'did you mean "radius_m"']),
+        (["--set", "query.radius=3"], ["query.radius", 'did you mean "query.radius_m"']),
         (["--set", "query.radius_m=-3"], ["query.radius_m = -3", "greater than 0"]),
         (["--set", "query.radius_m"], ["expected key=value"]),
     ],
@@ -484,6 +484,8 @@ def test_help_loads_nothing_heavy() -> None:
         ("calibrate", ["absent"], ["absent/results.csv", "No such file"]),
         ("calibrate", ["empty"], ["empty/results.csv", "No such file"]),
         ("calibrate", ["damaged"], ["damaged/results.csv", "No columns to parse"]),
+        ("calibrate", ["absent", "--quick"], ["eval.studies.calibrate: No such option: --quick", "--help`"]),
+        ("merge_gates", ["absent"], ["eval.studies.merge_gates: Missing option '--out'"]),
     ],
 )
 def test_programs_tell_mistakes_as_the_commands_do(

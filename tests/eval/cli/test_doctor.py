@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.resources
 import shutil
+import socket
 import sys
 import tomllib
 from collections.abc import Callable
@@ -127,6 +129,16 @@ def test_a_damaged_checkpoint_is_found(
     monkeypatch.setattr(doctor_checks, "OF_PACKAGE", {})
     found = doctor._tried("weights", doctor_checks.weights, "install tunnelcd anew")
     assert found.state == "broken" and faults([found])[0].endswith(": install tunnelcd anew")
+
+
+def test_a_cluster_starts_where_the_port_of_its_dashboard_is_taken() -> None:
+    pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
+    with socket.socket() as other:
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        with contextlib.suppress(OSError):  # another program holds it already, which serves the test as well
+            other.bind(("127.0.0.1", 8787))
+            other.listen()
+        assert doctor_checks.cluster() == "a worker computes"
 
 
 def test_wrong_answers_of_packages_are_found(monkeypatch: pytest.MonkeyPatch) -> None:

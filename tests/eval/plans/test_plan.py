@@ -125,9 +125,9 @@ speed: 3
         2: ["smoke/one_bx", 'did you mean "smoke/one_box"?'],
         3: ["seeds = 12", '"A:B" in quotes'],
         5: ["'papr'", 'did you mean "paper"?'],
-        6: ["query.radius", 'did you mean "radius_m"?'],
+        6: ["query.radius", 'did you mean "query.radius_m"?'],
         7: ["presset", 'did you mean "preset"?'],
-        11: ["extract.voxl_m", 'did you mean "voxel_m"?'],
+        11: ["extract.voxl_m", 'did you mean "extract.voxel_m"?'],
         12: ["speed = 3: unknown key"],
     }
     for line, words in expected.items():
@@ -221,7 +221,7 @@ def test_command_line_grid_is_a_product_over_the_variants(tmp_path: Path) -> Non
     ("kwargs", "words"),
     [
         ({"seeds": "5:5"}, "--seeds 5:5"),
-        ({"settings": ["query.radius=3"]}, 'did you mean "radius_m"?'),
+        ({"settings": ["query.radius=3"]}, 'did you mean "query.radius_m"?'),
         ({"settings": ["query.radius_m"]}, "expected key=value"),
         ({"grid": ["query.radius_m=3,,4"]}, "--grid"),
         ({"grid": ["query.radius_m=3,x"]}, "query.radius_m = 'x'"),

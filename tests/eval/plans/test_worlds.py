@@ -155,13 +155,13 @@ variants: [{preset: papr, set: query.n_region=3}]
     expected = {
         3: ["smoke/one_bx", 'did you mean "smoke/one_box"?'],
         4: ["12", "expected a scenario's name, or {name"],
-        5: ['did you mean "range_noise"?', "300x10", "query.radius_m=3 belongs to the method", "under variants"],
+        5: ['did you mean "sensor.range_noise"?', "300x10", "query.radius_m=3 belongs to the method", "under variants"],
         8: [": sensor.sub_rays = 8: input should be 1, 7 or 19"],
         9: ["'os1-32-q0' is unknown: name one of os1-32-g"],
         10: ["an empty list sets nothing"],
         11: ["sett", 'did you mean "set"?'],
         12: [": tunnel: expected key=value"],
-        13: [": sensor.dropout = False", 'did you mean "dropouts"?'],
+        13: [": sensor.dropout = False", 'did you mean "sensor.dropouts"?'],
         15: ["'papr'"],
     }
     for line, words in expected.items():

@@ -1,0 +1,28 @@
+from .cluster import HERE, Where
+from .domains import domain_of, is_change_in_distribution
+from .exits import run_program
+from .output import make_writable, new_folder
+from .progress import RunProgress, Silent, shown_progress
+from .provenance import git_commit
+from .ranking import auroc, average_precision
+from .statistics import bootstrap_interval, mean_with_interval, summarise, wilson_interval
+
+__all__ = [
+    "HERE",
+    "RunProgress",
+    "Silent",
+    "Where",
+    "auroc",
+    "average_precision",
+    "bootstrap_interval",
+    "domain_of",
+    "git_commit",
+    "is_change_in_distribution",
+    "make_writable",
+    "mean_with_interval",
+    "new_folder",
+    "run_program",
+    "shown_progress",
+    "summarise",
+    "wilson_interval",
+]

@@ -1,0 +1,13 @@
+from .changes import changed_plan
+from .plan import Plan, cells, load_plan, parse_seeds, plan_names
+from .variants import Cell
+
+__all__ = [
+    "Cell",
+    "Plan",
+    "cells",
+    "changed_plan",
+    "load_plan",
+    "parse_seeds",
+    "plan_names",
+]

@@ -1,0 +1,10 @@
+from .dataset import Recipe, make_shard
+from .dataset_run import make_dataset
+from .training_run import train_descriptor
+
+__all__ = [
+    "Recipe",
+    "make_dataset",
+    "make_shard",
+    "train_descriptor",
+]

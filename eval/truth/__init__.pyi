@@ -1,0 +1,15 @@
+from .adapters import held_input, pipeline_input
+from .aligned import alignment_of
+from .ground_truth import GroundTruth, SessionTruth, load_ground_truth
+from .universe import ScoringPoints, load_universe
+
+__all__ = [
+    "GroundTruth",
+    "ScoringPoints",
+    "SessionTruth",
+    "alignment_of",
+    "held_input",
+    "load_ground_truth",
+    "load_universe",
+    "pipeline_input",
+]
