@@ -31,10 +31,9 @@ def open_session(path: Path) -> ScanSource:
     """Open a folder of scans.
 
     Args:
-        path: A session folder (cdpipe.io.session), or a folder of `*.ply` scans, taken in the order of their names,
-        with
-            one trajectory `*.txt` or `*.tum`: one line `stamp tx ty tz qx qy qz qw` for each scan, in the same order.
-            PLY points are in the sensor frame of their pose, metres, deskewed already; `pixels` are rows of the file.
+        path: A session folder (`cdpipe.io.session`), or a folder of `*.ply` scans in the order of their names with one
+            trajectory `*.txt` or `*.tum`: one line `stamp tx ty tz qx qy qz qw` for each scan, in the same order. PLY
+            points are deskewed and in the sensor frame of their pose, metres; `pixels` are rows of the file.
 
     Raises:
         InputError: The folder is missing or holds neither, or its trajectory does not fit its scans. Mistakes inside a

@@ -1,4 +1,8 @@
-"""Where the after session's odom frame lies in the map frame, place by place along the after session's path."""
+"""Alignment of the after session along its path: rigid transforms at anchors, blended between them.
+
+Two drifting odometries fit only locally, so the transform from the after session's odom frame to the map frame depends
+on the position.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +14,12 @@ from scipy.spatial import cKDTree
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, require_poses, require_shape, transform
 from cdpipe.core.voxel import cell_keys
 
-# Anchors stand 4 m apart; a wider blend would iron out real bends, a narrower one tears points apart.
+# Anchors stand 4 m apart. A wider blend smooths real bends away; a narrower one tears neighbouring points apart.
 _BLEND_M = 2.0
-# Twice four blending lengths of path: what is left out weighs 0.0003, so that a step in position is a step no larger.
+# Anchors used per point: four blending lengths to either side. The first one left out has a weight of 0.0003.
 _BLENDED = 16
-# Points are moved by interpolation between the corners of cells of this size: within a millimetre, ten times as fast.
+# Points are moved by trilinear interpolation between the corners of cells of this size: error below a millimetre, ten
+# times as fast.
 _CELL_M = 2.0
 _CORNERS = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 _MIN_POINTS_PER_CELL = 3
@@ -52,7 +57,7 @@ class PathAlignment:
     def at(self, positions_odom: Float64Array) -> Float64Array:
         """Return the (N, 4, 4) before_T_after at each of (N, 3) positions in the after odom frame.
 
-        Each carries its own position to where `to_map` does, but for a millimetre.
+        Each transform agrees with `to_map` at its own position to a millimetre.
         """
         require_shape("positions_odom", positions_odom, (None, 3))
         if self.is_rigid:
@@ -60,11 +65,11 @@ class PathAlignment:
         nearest, weights = _weights(self.anchors_odom, positions_odom)
         poses = np.einsum("nk,nkij->nij", weights, self.before_T_after[nearest])
         moved = np.einsum("nij,nj->ni", poses[:, :3, :3], positions_odom) + poses[:, :3, 3]
-        # the mean of rotations a degree apart is a rotation but for rounding, which the SVD takes out
+        # the mean of rotations a degree apart is nearly a rotation; the SVD projects it onto one
         u, _, v = np.linalg.svd(poses[:, :3, :3])
         poses[:, :3, :3] = u @ v
         poses[:, 3] = 0.0, 0.0, 0.0, 1.0
-        # the frame's origin may be a kilometre off: turned about the position, not about the origin
+        # the frame's origin may be a kilometre away: rotate about the position, not about the origin
         poses[:, :3, 3] = moved - np.einsum("nij,nj->ni", poses[:, :3, :3], positions_odom)
         return np.asarray(poses)
 
@@ -75,14 +80,14 @@ class PathAlignment:
     def to_odom(self, points_map: Float64Array) -> Float64Array:
         """Return (N, 3) points of the map frame in the after odom frame.
 
-        The inverse of `to_map` but for the blend's own bend between two anchors: millimetres.
+        The inverse of `to_map` up to millimetres, the bend of the blend between two anchors.
         """
         rotated = np.einsum("aij,aj->ai", self.before_T_after[:, :3, :3], self.anchors_odom)
         return _moved(points_map, rotated + self.before_T_after[:, :3, 3], invert(self.before_T_after))
 
 
 def _moved(points: Float64Array, anchors: Float64Array, dst_T_src: Float64Array) -> Float64Array:
-    """Move points by the blend at the corners of their cells, linearly in between; exactly where that saves nothing."""
+    """Move points by interpolating the blend between the corners of their cells; exactly where that is no slower."""
     require_shape("points", points, (None, 3))
     if len(anchors) == 1:
         return transform(dst_T_src[0], points)

@@ -58,7 +58,7 @@ class ScanSource(Protocol):
 
     @property
     def name(self) -> str:
-        """What to call it in messages."""
+        """Name of the session in messages."""
 
     @property
     def odom_T_sensor(self) -> Float64Array:
@@ -73,11 +73,12 @@ class ScanSource(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeViews:
-    """How far the sensor saw from each keyframe: what is nearer and not there was seen through.
+    """Range image of each keyframe: space in front of the measured ranges was seen to be free.
 
     Attributes:
         ranges_m: (K, ROWS, COLUMNS) float16 range of the nearest return of each pixel (`cdpipe.mapping.free_space`), 0
-        without. sensor_T_odom: (K, 4, 4) float64 of the keyframes' scans.
+            without a return.
+        sensor_T_odom: (K, 4, 4) float64 inverse pose of each keyframe's scan.
     """
 
     ranges_m: Float16Array
@@ -93,8 +94,8 @@ class PointMap:
     """A thinned map and, for each of its points, the returns it stands for.
 
     Attributes:
-        points: (N, 3) float64 mean of the returns of each occupied cell, the session's odom frame, metres; each return
-            weighs by the inverse square of its range.
+        points: (N, 3) float64 mean of the returns of each occupied cell, weighted by the inverse square of their ranges;
+            session odom frame, metres.
         nearest_m: (N,) float32 shortest range of the returns of each.
         voxel_m: Cell size of the thinning.
         odom_T_sensor: (S, 4, 4) pose of every scan.
@@ -102,11 +103,11 @@ class PointMap:
         return_points: (M,) int32 map point of each return, in scan order.
         return_pixels: (M,) int32 pixel of each return within its scan.
         scan_offsets: (S + 1,) int64; the returns of scan s are scan_offsets[s]:scan_offsets[s + 1].
-        seen_from: (N, 3) float32 mean position of the sensor when each point was seen, weighed as the point is; None
-            where that is not known.
+        seen_from: (N, 3) float32 mean position of the sensor when each point was seen, weighted like the point; None
+            where it is not known.
         return_offsets: (M, 3) uint8 place of each return in its cell, in 1/PLACES of `voxel_m` from the cell's lower
             corner; None where that was not kept.
-        views: What the scans of the keyframes saw, None where that was not kept.
+        views: Range images of the keyframes; None where they were not kept.
     """
 
     points: Float64Array
@@ -160,7 +161,7 @@ class DescriptorSet:
         keyframe_scans: (K,) int64 scan of each keyframe.
         name: Which descriptor.
         checkpoint: Digest of the weights, or "" where there are none.
-        spheres: (K, E) float32 or int8 what the map around each keyframe looks like (`describe_map`), or None.
+        spheres: (K, E) float32 or int8 descriptor of the map around each keyframe (`describe_map`), or None.
     """
 
     q: Float32Array
@@ -181,7 +182,7 @@ class DescriptorSet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedSession:
-    """What a robot brings home: its thinned map and the descriptors of its keyframes, all of them or none."""
+    """What a robot brings home: its thinned map, and descriptors of all of its keyframes or of none."""
 
     map: PointMap
     descriptors: DescriptorSet

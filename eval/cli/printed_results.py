@@ -27,7 +27,7 @@ def print_results(folder: Path, quiet: bool) -> None:
     import pandas as pd
 
     from eval.plans.coverage import coverage
-    from eval.running.predictions import partly_answered
+    from eval.running.predictions import list_incomplete_variants
     from eval.running.runfolder import RunFolder
     from eval.tables.merge_table import merge_overview
 
@@ -47,7 +47,7 @@ def print_results(folder: Path, quiet: bool) -> None:
         typer.echo(f"{covered.sentence}\n")
     if len(targets):
         print_table("merge: share of the pairs within the target of their kind, with its 95 % interval", targets)
-    for line in partly_answered(RunFolder(folder).provenance(), results) if is_told else []:
+    for line in list_incomplete_variants(RunFolder(folder).provenance(), results) if is_told else []:
         typer.echo(f"note: {line}\n")
     if (folder / "regions_table.csv").is_file():
         _region_results(folder)

@@ -154,9 +154,9 @@ def report(
 def _list_cells(plan: Plan, out: Path, *, force: bool, limit: int | None) -> None:
     from collections import Counter
 
-    from eval.running.runner import listed
+    from eval.running.runner import list_cells
 
-    every = listed(plan, out, force=force, limit=limit)
+    every = list_cells(plan, out, force=force, limit=limit)
     for cell in every:
         typer.echo(f"{cell.state:<8}  {cell.scenario} {cell.seed} {cell.variant}")
     count = Counter(cell.state for cell in every)

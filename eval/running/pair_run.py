@@ -1,7 +1,7 @@
-"""Runs the cells of one pair (a world and a seed), one after the other, into the folder of its run.
+"""Runs the cells of one pair (a world and a seed) one after the other and writes them into the run folder.
 
-The cells share what was simulated, mapped, described and merged. Whoever runs a pair holds its lock, so that a worker
-whose client is gone and the run that goes on from there never write the same files.
+The cells share the simulated sessions and the results of the stages. A process that runs a pair holds its lock, so an
+orphaned worker and a resumed run never write the same files.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from eval.oracles.regions import regions_by_truth
 from eval.plans.variants import Cell
 from eval.running.rescoring import cell_document, score_stored
 from eval.running.runfolder import RunFolder, remove
-from eval.running.stage_cache import opened_cache
+from eval.running.stage_cache import open_cache
 from eval.running.stages import PairStages
 from eval.scoring.scoring import METRICS_VERSION, CaseScore
 from eval.truth.adapters import pipeline_input
@@ -44,7 +44,7 @@ if sys.platform != "win32":
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Todo:
-    """A cell, the digest of what it depends on, and its place in the tables (scenario, variant)."""
+    """A cell to run, the digest of what it depends on, and its position in the tables (scenario, variant)."""
 
     cell: Cell
     key: str
@@ -53,16 +53,16 @@ class Todo:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """One world and seed, and the cells still to be done.
+    """One world and seed, and its unfinished cells.
 
     Attributes:
         name: Label of the world.
         family: Its scenario's.
         kind: What the plan calls such pairs, or "".
         seed: The seed.
-        scenario: The scenario as drawn, None where it cannot be drawn.
+        scenario: The drawn scenario, None where the seed draws none.
         files: Digests of the files that the scenario names.
-        error: Why it cannot be drawn.
+        error: Why the scenario cannot be drawn.
         todo: Its cells.
     """
 
@@ -78,14 +78,14 @@ class Pair:
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """What the rows of a run say of their making: the code, and whether workers shared the machine."""
+    """Provenance of the rows of a run: the commit, and whether workers shared the machine."""
 
     commit: str | None
     is_contended: bool = False
 
 
 class PairRun:
-    """One pair at work; its maps are let go with it."""
+    """One pair being run; it owns the maps."""
 
     def __init__(self, run: RunFolder, pair: Pair, made: Made, progress: RunProgress) -> None:
         self._run = run
@@ -106,7 +106,7 @@ class PairRun:
         return self._opened is not None
 
     def open(self) -> tuple[PairStages, GroundTruth] | str:
-        """Simulate the pair unless it is there, and open it, once; the text says why it cannot be made."""
+        """Simulate the pair unless it exists and open it, once; a text says why the pair cannot be made."""
         if self._opened is None:
             try:
                 self._opened = _open(self._run, self._pair, self._made, self._progress)
@@ -115,7 +115,7 @@ class PairRun:
         return self._opened
 
     def do(self, each: Todo) -> None:
-        """Run a cell and write its answer and its file; should that fail, nothing of it is left."""
+        """Run a cell and write its answer and its file; a failure leaves nothing behind."""
         opened, cell = self.open(), each.cell
         if isinstance(opened, str):
             self._finish(each, _unmade(self._pair, "failed", opened))
@@ -128,18 +128,18 @@ class PairRun:
         except BaseException as error:
             remove(folder)
             if isinstance(error, OSError) and error.filename is None:
-                error.filename = str(folder)  # a full disk does not say who met it
+                error.filename = str(folder)  # the error of a full disk names no file
             raise
 
     def write_died(self, each: Todo, error: str) -> None:
-        """Make a row of a cell that kills whoever runs it; it scores what a failed one does, where there is a truth."""
+        """Write the row of a cell that kills its process; it is scored like a failed cell where there is a truth."""
         status, folder = "worker_died", self._run.answer(self._pair.name, self._pair.seed, each.cell.variant)
         path = self._run.pair(self._pair.name, self._pair.seed)
         if not path.exists():
             self._finish(each, _unmade(self._pair, status, error))
             return
         settings = each.cell.config.model_dump(mode="json")
-        remove(folder)  # what the dead left
+        remove(folder)  # left by the process that died
         write_failure(folder, each.cell.variant, status, error, {}, settings, each.cell.until)
         self._finish(each, score_stored(load_ground_truth(path), folder))
 
@@ -153,7 +153,7 @@ class PairRun:
 
 
 def is_finished(run: RunFolder, each: Todo) -> bool:
-    """Tell whether a cell's file is there, whole, and of what would be run now."""
+    """Tell whether a cell's file exists, is complete, and holds the present digest and metrics version."""
     cell = each.cell
     stored = run.read_cell(run.cell(cell.scenario, cell.seed, cell.variant))
     return stored is not None and stored["key"] == each.key and stored["row"].get("metrics_version") == METRICS_VERSION
@@ -161,7 +161,7 @@ def is_finished(run: RunFolder, each: Todo) -> bool:
 
 @contextmanager
 def pair_lock(run: RunFolder, pair: Pair) -> Iterator[None]:
-    """Wait until nobody else runs a pair, and keep it; the system lets go of it when the process dies."""
+    """Hold the lock of a pair, waiting for it; the system releases it when the process dies."""
     if sys.platform == "win32":
         yield
         return
@@ -170,7 +170,7 @@ def pair_lock(run: RunFolder, pair: Pair) -> Iterator[None]:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
-            # who held it before removes the file: the lock of a removed one keeps nobody out
+            # the last holder removes the file; a lock on a removed file excludes nobody
             if not path.exists() or path.stat().st_ino != os.fstat(file.fileno()).st_ino:
                 continue
             try:
@@ -181,7 +181,7 @@ def pair_lock(run: RunFolder, pair: Pair) -> Iterator[None]:
 
 
 def cell_key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mapping[str, str]) -> str:
-    """Return the digest of all that a cell depends on but the version of the metrics."""
+    """Return the digest of everything that a cell depends on, the metrics version apart."""
     merge = cell.config.merge
     asks_kiss_matcher = merge.method == "kiss-matcher" or (merge.method == "voting" and merge.fallback)
     is_missed = cell.oracle is None and asks_kiss_matcher and not is_kiss_matcher_installed()
@@ -197,14 +197,14 @@ def cell_key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mappi
             **({"oracle_regions": True} if cell.oracle_regions else {}),
             "until": cell.until,
             "pair_kind": pair_kind,
-            # what was made without the extra is made again once it is there; nothing is said where it is
+            # a cell made without the extra runs again once it is installed
             **({"kiss_matcher": "absent"} if is_missed else {}),
         }
     )
 
 
 def _open(run: RunFolder, pair: Pair, made: Made, progress: RunProgress) -> tuple[PairStages, GroundTruth]:
-    """Simulate a pair unless it is there, store its maps for pictures, and open it with what is kept of its stages.
+    """Simulate a pair unless it exists, store its maps for pictures, and open it with the kept stage results.
 
     Raises:
         ScenarioError: The seed draws no scenario, or one whose world cannot be built.
@@ -214,10 +214,10 @@ def _open(run: RunFolder, pair: Pair, made: Made, progress: RunProgress) -> tupl
     path = run.pair(pair.name, pair.seed)
     kept = run.stages(pair.name, pair.seed)
     if not path.exists():
-        remove(kept)  # `--force` starts from nothing
+        remove(kept)  # of an earlier simulation
         path.parent.mkdir(parents=True, exist_ok=True)
         simulate_pair(pair.scenario, pair.seed, path, on_progress=progress.stage)
-    cache = opened_cache(kept, (path / "before", path / "after"))
+    cache = open_cache(kept, (path / "before", path / "after"))
     sessions = pipeline_input(path, "before"), pipeline_input(path, "after")
     stages = PairStages(*sessions, progress.stage, cache, is_shared=made.is_contended)
     picture = run.maps(pair.name, pair.seed)
@@ -230,7 +230,7 @@ def _write_maps(path: Path, stages: PairStages) -> None:
     try:
         before, after = stages.maps(MapConfig())
     except TunnelcdError:
-        return  # each cell of the pair meets the same error and records it
+        return  # each cell of the pair records the same error
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.partial.npz")
     try:
@@ -262,7 +262,7 @@ def _answer(stages: PairStages, cell: Cell, truth: GroundTruth, folder: Path) ->
 
 
 def _oracle(cell: Cell, truth: GroundTruth) -> Merge | None:
-    """Return what merges in the method's place; the stages get its result and never the truth in it."""
+    """Return the oracle's merge; the stages get its result and never the truth."""
     noise = cell.oracle
     if noise is None:
         return None
@@ -270,14 +270,14 @@ def _oracle(cell: Cell, truth: GroundTruth) -> Merge | None:
 
 
 def _true_regions(cell: Cell, truth: GroundTruth) -> Propose | None:
-    """Return what proposes regions in the method's place; the stages after it get these alone."""
+    """Return the oracle's regions; the later stages get these and never the truth."""
     if not cell.oracle_regions:
         return None
     return lambda scans: regions_by_truth(truth, scans, cell.config.query)
 
 
 def _unmade(pair: Pair, status: str, error: str) -> CaseScore:
-    """Score a case whose world cannot be made: there is no truth, so all but the identity is undefined."""
+    """Score a case without a world: there is no truth, so every score is undefined."""
     row = {"scenario": "", "family": pair.family, "pair_kind": "", "seed": pair.seed, "variant": "", "preset": ""}
     outcome = {"status": status, "error": error, "metrics_version": METRICS_VERSION}
     return CaseScore(row={**row, **outcome, "domain": domain_of(pair.family)}, changes=[], regions=[], objects=[])

@@ -1,10 +1,9 @@
-"""Predictions that another program made for the pairs of a run, taken into the run as a variant.
+"""Adds the predictions of another program to a run, as a variant.
 
-    DIR/<scenario>/<seed>/answer.json, answer.npz     the format of `cdpipe.io.answer`; a short script is in
-                                                      eval/scoring/ANSWERS.md
+    DIR/<scenario>/<seed>/answer.json, answer.npz     in the format of `cdpipe.io.answer`
 
-Every pair of the run needs one, or the means would be over other pairs than everybody else's. A pair that the program
-could not do gets an answer.json of status `failed` and scores as a failure of ours does.
+Every pair of the run needs a prediction; otherwise its means would be over other pairs than those of the other
+variants. A pair that the program could not do gets an answer.json of status `failed` and scores like our failures.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from eval.plans.plan import planned_cases
 from eval.plans.variants import slug
 from eval.running.rescoring import LAST, NO_KEY, cell_document, foreign_identity, score_stored
 from eval.running.runfolder import RunFolder, remove, write_tables
-from eval.running.sides import versions_of
+from eval.running.sides import list_versions
 from eval.scoring.scoring import METRICS_VERSION
 from eval.truth.ground_truth import load_ground_truth
 
@@ -71,8 +70,8 @@ def add_predictions(run: RunFolder, folder: Path, name: str, progress: RunProgre
     return len(documents)
 
 
-def partly_answered(provenance: Mapping[str, Any], results: pd.DataFrame) -> list[str]:
-    """Return one line for each variant outside of the plan that lacks pairs of the run, naming them."""
+def list_incomplete_variants(provenance: Mapping[str, Any], results: pd.DataFrame) -> list[str]:
+    """Return one line for each variant outside the plan that lacks pairs of the run, naming the pairs."""
     plan = plan_of(provenance)
     if plan is None:
         return []
@@ -108,7 +107,7 @@ def _matched(run: RunFolder, folder: Path, pairs: Sequence[Path]) -> dict[Path, 
     for pair in pairs:
         scenario = foreign_identity(run, pair.parent.name, pair.name, "")["scenario"]
         wanted[pair] = f"{scenario}/{pair.name}"
-        # written as the scenario is called, or as the run calls its folder
+        # by the name of the scenario or by that of its folder in the run
         places = {folder / wanted[pair], folder / pair.parent.name / pair.name} & given
         if len(places) > 1:
             mistakes.append(f"{' and '.join(map(str, sorted(places)))}: two predictions for one pair: leave one out")
@@ -132,7 +131,7 @@ def _strangers(folder: Path, places: set[Path], names: Sequence[str]) -> Iterato
 
 
 def _require_free(run: RunFolder, name: str) -> None:
-    """Refuse a name that stands for a method of the run, or for one of ours."""
+    """Refuse the name of a variant of the run, of a preset or of an oracle."""
     if not slug(name).strip("._"):
         raise InputError(f"--as {name!r}: expected a name")
     if name.partition("[")[0] in preset_names() or name.startswith("oracle-"):
@@ -143,9 +142,9 @@ def _require_free(run: RunFolder, name: str) -> None:
 
 
 def _require_current(run: RunFolder) -> None:
-    """Refuse a run that was scored by other metrics than its predictions would be."""
+    """Refuse a run that was scored by another metrics version."""
     cells = (run.read_cell(path) for path in sorted(run.path.glob("cells/*/*/*.json")))
-    others = versions_of(cell["row"] for cell in cells if cell is not None) - {str(METRICS_VERSION)}
+    others = list_versions(cell["row"] for cell in cells if cell is not None) - {str(METRICS_VERSION)}
     if others:
         told = " and ".join(sorted(others))
         raise InputError(

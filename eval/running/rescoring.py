@@ -1,4 +1,4 @@
-"""Stored answers into cells: how the runner scores, and how `tunnelcd score` scores again without running anything."""
+"""Scores stored answers: for the runner, and for `tunnelcd score`, which runs no method."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from eval.scoring.answer_check import check_answer
 from eval.scoring.scoring import CaseScore, score_answer
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
-# of a cell that no run made: its rows stand behind all others
+# key and position of a cell of another program: its rows come last
 NO_KEY, LAST = "", (1_000_000, 1_000_000)
 
 
@@ -30,14 +30,13 @@ def score_stored(truth: GroundTruth, folder: Path) -> CaseScore:
 
 
 def cell_document(score: CaseScore, identity: Mapping[str, Any], key: str, place: Sequence[int]) -> dict[str, Any]:
-    """Return a cell's content; every item carries the columns that name its row of results.csv.
+    """Return the content of a cell; each item carries the columns that identify its row of results.csv.
 
     Args:
-        score: What was scored.
-        identity: scenario, seed, variant and preset, whatever the answer calls itself; pair_kind; commit, the code that
-            made it.
-        key: Digest of what the cell depends on.
-        place: Where its rows stand in the tables: scenario, variant.
+        score: Its scores.
+        identity: scenario, seed, variant, preset, pair_kind and commit; they replace the answer's own names.
+        key: Digest of everything that the cell depends on.
+        place: Position of its rows in the tables: scenario, variant.
     """
     names = {name: identity[name] for name in IDENTITY}
     items = {table: [{**names, **item} for item in getattr(score, table)] for table in ITEM_TABLES}
@@ -45,10 +44,10 @@ def cell_document(score: CaseScore, identity: Mapping[str, Any], key: str, place
 
 
 def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
-    """Score every stored answer of a run again, without running anything, and rewrite the tables.
+    """Score every stored answer of a run again and rewrite the tables.
 
-    An answer that no run made (another program's, put beside ours) becomes a variant named like its folder.
-    Nothing is written before all are scored, so that a mistake in one or an interrupt leaves the run as it was.
+    An answer of another program becomes a variant named like its folder. Nothing is written before all answers are
+    scored, so a damaged answer or an interrupt leaves the run as it was.
 
     Returns:
         How many answers were scored.
@@ -83,9 +82,9 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
 
 
 def foreign_identity(run: RunFolder, slug: str, seed: str, name: str) -> dict[str, Any]:
-    """Return what `cell_document` wants to know of an answer that no run made.
+    """Return the identity of an answer of another program, for `cell_document`.
 
-    The world is called what the run's own cells call it, or like its folder where there are none.
+    The world gets the name that the run's own cells give it, or that of its folder where there are none.
     """
     world = {"scenario": slug.replace("__", "/"), "pair_kind": ""}
     for path in sorted((run.path / "cells" / slug).glob("*/*.json")):

@@ -1,4 +1,4 @@
-"""A run folder as the page reads it: the tables as plain rows, what belongs to which pair, and what is not there."""
+"""A run folder as the page reads it: tables as plain rows, cases by pair, and what is missing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class RunData:
         changes: Rows of changes.csv.
         regions: Rows of regions.csv.
         provenance: Content of provenance.json, {} where there is none.
-        missing: What a whole run folder holds and this one does not, one sentence each.
+        missing: Files that a complete run folder holds and this one lacks, one sentence each.
     """
 
     folder: RunFolder
@@ -45,7 +45,7 @@ class RunData:
 
 
 def read_run(run: Path) -> RunData:
-    """Read what the page needs from a run folder; everything but results.csv may be missing.
+    """Read a run folder for the page; everything but results.csv may be missing.
 
     Raises:
         InputError: There is no results.csv, it holds no row, lacks a column that names its rows, or one of them twice.
@@ -67,7 +67,7 @@ def read_run(run: Path) -> RunData:
 
 
 def _require_cases(path: Path, rows: Iterable[Row]) -> None:
-    """Refuse rows that are no case, or one that stands there twice: every mean would be wrong."""
+    """Refuse rows without a valid seed and repeated cases: every mean would be wrong."""
     seen = set()
     for line, row in enumerate(rows, start=2):
         try:
@@ -119,7 +119,7 @@ def over_pairs(rows: Iterable[Row], column: str) -> float:
 
 
 def of(rows: Iterable[Row], **wanted: Any) -> list[Row]:
-    """Return the rows whose cells equal what is wanted."""
+    """Return the rows with the given values."""
     found = list(rows)
     for name, value in wanted.items():  # column by column: five times faster than cell by cell
         found = [row for row in found if row.get(name) == value]
@@ -129,7 +129,7 @@ def of(rows: Iterable[Row], **wanted: Any) -> list[Row]:
 def scenarios(data: RunData, *, unchanged: bool) -> list[str]:
     """Return the scenarios with changes, or those without, in the order of results.csv.
 
-    Those whose every variant only repeats another world's are left out: `eval.report.settings.effects` shows them.
+    Scenarios that only repeat another world under a setting are left out; `eval.report.settings.effects` shows them.
     """
     held = repeats(data)
     names = dict.fromkeys(world for world, variant, _ in _cases(data) if (world, variant) not in held)
@@ -137,12 +137,12 @@ def scenarios(data: RunData, *, unchanged: bool) -> list[str]:
 
 
 def repeats(data: RunData) -> dict[tuple[str, str], str]:
-    """Return the world that each (world, variant) is held against, where there is one (`eval.plans.worlds`)."""
+    """Return the reference world of each (world, variant) that has one (`eval.plans.worlds`)."""
     return references(_cases(data))
 
 
 def is_unchanged(data: RunData, scenario: str) -> bool:
-    """Tell whether nothing changed in any pair of a scenario, as far as its rows say."""
+    """Tell whether every pair of a scenario is unchanged, by its rows."""
     flags = [flag(row, "is_unchanged_pair") for row in of(data.results, scenario=scenario)]
     known = [value for value in flags if value is not None]
     return bool(known) and all(known)
@@ -157,7 +157,7 @@ def named_variants(data: RunData, scenario: str) -> list[str]:
 
 
 def first_seed(data: RunData, scenario: str) -> int:
-    """Return the seed of a scenario that the pictures show: the first that is no repetition."""
+    """Return the first seed of a scenario that is no repetition; the pictures show it."""
     held = repeats(data)
     return min(seed for world, name, seed in _cases(data) if world == scenario and (world, name) not in held)
 

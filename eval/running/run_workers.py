@@ -1,10 +1,10 @@
-"""Runs the pairs of a plan on workers, which write their cells into the run's folder themselves.
+"""Runs the pairs of a plan on workers, which write their cells into the run folder themselves.
 
-A task is a pair with its unfinished cells. What a worker finished is on the disk, whoever dies after that; so workers
-need the folder under the same path as the client (a cluster of several machines, a shared disk). Before a worker
-begins a cell it leaves a trace beside the cell's file and removes it afterwards. A trace that is met names the cell
-in flight when a worker died; that cell is tried once more in a process of its own, and becomes a row of status
-`worker_died` if this dies too. The cells beside it are not suspected, also where a worker has many threads.
+A task is a pair with its unfinished cells. Finished cells are on the disk and survive any death, so workers need the
+run folder under the same path as the client (on several machines, a shared disk). A worker leaves a trace file beside
+a cell before it begins the cell and removes it afterwards. A trace that is found names the cell during which a worker
+died. That cell is tried again in a process of its own and becomes a row of status `worker_died` if that process dies
+too. Other cells are not suspected, also where a worker has several threads.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _TRACE, _TOKEN = ".begun", ".workers"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """What a worker is given: a pair, the folder to write into, and what tells that the run still goes on."""
+    """A worker's task: a pair, the run folder, and the token that shows that the run still goes on."""
 
     folder: Path
     token: str
@@ -66,13 +66,13 @@ def run_on_workers(client: Any, run: RunFolder, pairs: Sequence[Pair], made: Mad
             "the scheduler went away; finished cells are kept, the same command goes on from there"
         ) from error
     finally:
-        # workers of a cluster outlive this process: without the token they stop after the cell in flight
+        # workers of a cluster outlive this process; without the token they stop after their present cell
         if _token(folder) == token:
             (folder / _TOKEN).unlink(missing_ok=True)
 
 
 def remove_traces(run: RunFolder) -> None:
-    """Forget which cells an earlier run left in flight, and stop workers that may still be at it."""
+    """Remove the traces of an earlier run, and stop its workers that may still be running."""
     (run.path / _TOKEN).unlink(missing_ok=True)
     for trace in [*run.path.glob(f"cells/*/*/.*{_TRACE}"), *run.path.glob(f"pairs/*/.*{_TRACE}")]:
         trace.unlink(missing_ok=True)
@@ -127,21 +127,21 @@ class _Dispatch:
         try:
             problem = future.result()
         except KilledWorker as error:
-            # Dask gives up a task after some deaths, even one that only waited where others died
+            # Dask gives up a task after some deaths of workers, even a task that only waited on them
             self._n_killed[pair.name, pair.seed] += 1
             if self._n_killed[pair.name, pair.seed] > len(pair.todo) + 2:
                 raise InputError(f"{pair.name} {pair.seed}: workers die before they begin one of its cells") from error
             self._waiting.append(pair)
             return
         finally:
-            future.release()  # or a worker that dies later takes a finished pair with it, and it runs again
+            future.release()  # otherwise a finished pair runs again when its worker dies later
         if problem:
             taken = _token(self._run.path) != self._token
             raise InputError(f"{self._run.path}: another run has taken the folder" if taken else problem)
         self._n_done += len(pair.todo)
 
     def _tell(self, n_named: int) -> None:
-        """Count the files of the cells in flight: whatever else is lost, they are what is finished."""
+        """Report progress by counting the files of finished cells."""
         at_work = list(self._flying.values())
         paths = [self._run.cell(pair.name, pair.seed, each.cell.variant) for pair in at_work for each in pair.todo]
         n_done = self._n_done + sum(path.exists() for path in paths)
@@ -184,7 +184,7 @@ def open_or_do(task: Task) -> None:
 
 
 def _death_of_opening(task: Task, here: PairRun) -> str:
-    """Simulate and open a pair here, first alone where that has killed a worker; returns what it dies of."""
+    """Simulate and open a pair, first in a process of its own where that killed a worker; return the cause of death."""
     if here.is_open:
         return ""
     trace = here.folder.with_name(f".{here.folder.name}{_TRACE}")
@@ -198,7 +198,7 @@ def _death_of_opening(task: Task, here: PairRun) -> str:
 
 
 def _death_of_cell(task: Task, here: PairRun, each: Todo, trace: Path) -> str:
-    """Run a cell here, or alone where it was in flight when a worker died; returns what it dies of."""
+    """Run a cell here, or in a process of its own where a worker died during it; return the cause of death."""
     with _traced(trace) as n_begun:
         if n_begun >= _TRIES:
             return "several times"
@@ -210,7 +210,7 @@ def _death_of_cell(task: Task, here: PairRun, each: Todo, trace: Path) -> str:
 
 @contextmanager
 def _traced(trace: Path) -> Iterator[int]:
-    """Leave a trace that only a death leaves behind; yields how often this was begun before."""
+    """Hold a trace file that only a death leaves behind; yield how often the work was begun before."""
     n_begun = _n_begun(trace)
     trace.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -232,7 +232,7 @@ def _only(task: Task, *todo: Todo) -> Task:
 
 
 def _unfit(task: Task) -> str:
-    """Tell why the process that runs this cannot do what its client would do; "" if it can."""
+    """Return why this process cannot run the client's task, "" if it can."""
     here, pair = socket.gethostname(), task.pair
     if _token(task.folder) != task.token:
         return f"{task.folder}: a worker on {here} does not see it: workers need the same folder under the same path"

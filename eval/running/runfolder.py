@@ -1,4 +1,4 @@
-"""A run's folder: where everything lies, what is finished, and the tables that are put together from its cells.
+"""The run folder: its layout, its finished cells, and the tables made from them.
 
 provenance.json                               marks a run folder; written first
 pairs/<world>/<seed>/{before,after,truth}     simulated pairs; a world is a scenario, with what is set over it
@@ -114,7 +114,7 @@ class RunFolder:
 
 
 def start_run_folder(path: Path) -> RunFolder:
-    """Take a folder to run in: a new or empty one, or one that an earlier run left.
+    """Open a folder to run in: new, empty, or of an earlier run.
 
     Raises:
         InputError: It holds something else, or cannot be written.
@@ -130,7 +130,7 @@ def start_run_folder(path: Path) -> RunFolder:
 
 @contextmanager
 def removed_if_empty(path: Path) -> Iterator[None]:
-    """Leave no new folder behind where the block fails before it has written anything."""
+    """Remove a new folder where the block fails before it writes anything."""
     was_there = path.exists()
     try:
         yield
@@ -154,7 +154,7 @@ def open_run_folder(path: Path) -> RunFolder:
 
 
 def write_tables(run: RunFolder) -> pd.DataFrame:
-    """Put results.csv, the item tables, summary.csv, merge.csv and effects.csv together from the finished cells.
+    """Write results.csv, the item tables, summary.csv and the other tables from the finished cells.
 
     Returns:
         The rows of results.csv.
@@ -167,7 +167,7 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     if not whole:
         raise InputError(f"{run.path}: no finished cell: run a plan first")
     whole.sort(key=lambda cell: (cell["order"][0], cell["row"]["scenario"], cell["row"]["seed"], cell["order"][1]))
-    # cells of before there were workers were run alone
+    # older cells lack the column; they were run without workers
     results = pd.DataFrame([{**cell["row"], "is_contended": cell["row"].get("is_contended", False)} for cell in whole])
     _write_csv(run.path / "results.csv", results)
     items = {table: _items(table, whole) for table in ITEM_TABLES}
@@ -184,13 +184,13 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
 
 
 def current_results(run: RunFolder, earlier: Mapping[str, Any], now: Mapping[str, Any]) -> pd.DataFrame | None:
-    """Return the rows of results.csv where `write_tables` would write what is there already; None where it might not.
+    """Return the rows of results.csv if the tables are up to date; None where they may not be.
 
     Args:
         run: The folder.
         earlier: The provenance of the run before.
-        now: That of the present one, which must be of the same plan, code and packages. Code that is under change, or
-            whose commit is not known, may have changed.
+        now: That of the present run. Plan, code and packages must be the same; code with uncommitted changes or of an
+            unknown commit counts as changed.
     """
     commit, subjects = now["git_commit"], reported(now)
     if commit is None or commit.endswith("+") or "finished" not in earlier:

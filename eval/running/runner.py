@@ -1,9 +1,9 @@
-"""Runs a plan here or on workers; finished cells are kept, and a run that was cut off goes on where it stopped.
+"""Runs a plan in this process or on workers. Finished cells are kept; an interrupted run continues where it stopped.
 
-A cell is finished when its file holds the digest of what it depends on: the scenario as drawn, the files it names, the
-effective settings, the weights, the version of the metrics, what the plan says of it (oracles, where it ends, the
-kind of its pair), and whether KISS-Matcher was missing where its merge asks for it. A merge that is refused, a cell
-that kills its worker, and any other error of the input are rows of their own; a bug is not caught.
+A cell is finished when its file holds the digest of everything that it depends on: the drawn scenario and the files it
+names, the effective settings, the weights, the metrics version, the plan's entries (oracles, `until`, kind of pair),
+and whether KISS-Matcher was missing where the merge needs it. A refused merge, a cell that kills its worker and any
+other error of the input become rows; a bug is not caught.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from sim.session.truth import read_pair_truth
 
 @dataclass(frozen=True, slots=True)
 class RunOutcome:
-    """How a run ended: cells done now, kept from earlier, left over by --limit, and rows of cells that kill workers."""
+    """How a run ended: number of cells done now, kept from before, left by `--limit`, and that kill workers."""
 
     n_done: int
     n_kept: int
@@ -45,7 +45,7 @@ class RunOutcome:
 
 @dataclass(frozen=True, slots=True)
 class Listed:
-    """One cell of a plan, and whether a run would do it: "finished", "to do", or "left" over by --limit."""
+    """One cell of a plan and its state: "finished", "to do", or "left" by `--limit`."""
 
     scenario: str
     seed: int
@@ -63,16 +63,16 @@ def run_plan(
     where: Where = HERE,
     progress: RunProgress | None = None,
 ) -> RunOutcome:
-    """Run the cells of a plan that are not finished, and put the tables together.
+    """Run the unfinished cells of a plan and write the tables.
 
     Args:
         plan: The plan.
         run: The folder to run in; workers write into it too.
         command: The command line, for the provenance.
-        force: Start the plan's cells and pairs from nothing.
-        limit: Do at most this many cells.
+        force: Run all cells again and simulate all pairs again.
+        limit: Run at most this many cells.
         where: In this process, on workers of this machine, or on a cluster.
-        progress: Told what is being done.
+        progress: Receives the progress.
 
     Raises:
         InputError: A setting is wrong, a method's extra is missing, the folder cannot be written, or the cluster cannot
@@ -91,12 +91,12 @@ def run_plan(
     made = Made(provenance["git_commit"])
     earlier = run.provenance() if (run.path / "provenance.json").is_file() else {}
     results = None if n_todo else current_results(run, earlier, provenance)
-    # a cluster that cannot be used is told before anything is written
+    # an unusable cluster is reported before anything is written
     with nullcontext() if where == HERE or not chosen else connected(where, len(chosen)) as client:
         if results is None:
             run.write_provenance(provenance)
         remove_traces(run)
-        # what --limit leaves over may be stale too, and no table may hold it
+        # cells left by --limit may be stale too; no table may hold them
         for pair in pairs:
             _remove_stale(run, pair, force)
         if client is None:
@@ -111,8 +111,8 @@ def run_plan(
     return RunOutcome(n_run, len(all_cells) - n_todo, n_todo - n_run, n_died)
 
 
-def listed(plan: Plan, path: Path, *, force: bool = False, limit: int | None = None) -> list[Listed]:
-    """Return what `run_plan` would do with every cell of a plan, in their order; nothing is written.
+def list_cells(plan: Plan, path: Path, *, force: bool = False, limit: int | None = None) -> list[Listed]:
+    """Return what `run_plan` would do with each cell of a plan, in order; writes nothing.
 
     Raises:
         InputError: A setting is wrong, or the folder holds something else than a run.
@@ -162,7 +162,7 @@ def _pairs(run: RunFolder, plan: Plan, all_cells: Sequence[Cell], force: bool) -
             for cell in group
         ]
         todo = [each for each in every if force or not is_finished(run, each)]
-        # cells that share a map setting come one after the other, because only one setting's maps are held
+        # cells with the same map settings run one after the other: only one pair of maps is held
         todo.sort(key=lambda each: each.cell.config.map.model_dump_json())
         family = world.name if scenario is None else scenario.family
         pairs.append(Pair(label, family, world.pair_kind, seed, scenario, files, error, tuple(todo)))
@@ -170,7 +170,7 @@ def _pairs(run: RunFolder, plan: Plan, all_cells: Sequence[Cell], force: bool) -
 
 
 def _limited(pairs: Sequence[Pair], limit: int | None) -> list[Pair]:
-    """Return the pairs that have something to do, with at most so many cells together."""
+    """Return the pairs that have cells to run, with at most `limit` cells in total."""
     left = sum(len(pair.todo) for pair in pairs) if limit is None else limit
     chosen = []
     for pair in pairs:
@@ -182,7 +182,7 @@ def _limited(pairs: Sequence[Pair], limit: int | None) -> list[Pair]:
 
 
 def _require_extras(pairs: Sequence[Pair]) -> None:
-    """Refuse to begin where methods need packages that are not here; all of them at once."""
+    """Refuse to begin where methods need packages that are not installed; name all of them at once."""
     mistakes = []
     for method in dict.fromkeys(each.cell.config.method for pair in pairs for each in pair.todo):
         try:
@@ -194,7 +194,7 @@ def _require_extras(pairs: Sequence[Pair]) -> None:
 
 
 def _tell_idle(where: Where, n_pairs: int, progress: RunProgress) -> None:
-    """Say so where there are fewer pairs than workers: a pair is not split, since its cells share stages and maps."""
+    """Note that workers stay idle where there are fewer pairs: the cells of a pair share stages and are not split."""
     if where.workers is not None and 0 < n_pairs < where.workers:
         pairs = "1 pair is" if n_pairs == 1 else f"{n_pairs} pairs are"
         progress.note(
@@ -204,7 +204,7 @@ def _tell_idle(where: Where, n_pairs: int, progress: RunProgress) -> None:
 
 
 def _remove_stale(run: RunFolder, pair: Pair, force: bool) -> None:
-    """Remove what is about to be redone, so that no table can hold it should the run be cut off."""
+    """Remove what is about to run again, so that no table holds it if the run is interrupted."""
     if not pair.todo:
         return
     if force or not _is_simulated(run.pair(pair.name, pair.seed), pair):
@@ -216,7 +216,7 @@ def _remove_stale(run: RunFolder, pair: Pair, force: bool) -> None:
 
 
 def _is_simulated(path: Path, pair: Pair) -> bool:
-    """Tell whether a pair is there, whole, of this very scenario, and made from the files as they are now."""
+    """Tell whether the pair exists, is complete, and was made from this scenario and the present files."""
     if pair.scenario is None:
         return False
     try:

@@ -1,4 +1,4 @@
-"""The two sides of a comparison: what they are, which of their rows belong together, and what only one of them has."""
+"""The two sides of a comparison: their runs, matching rows, and rows that only one side has."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Side:
 
     @property
     def name(self) -> str:
-        """What it is called: its folder, and the variant if there is only one."""
+        """Its folder, and the variant if there is only one."""
         return f"{self.path}:{self.variant}" if self.variant else str(self.path)
 
     @property
@@ -69,12 +69,12 @@ def read_side(text: str) -> Side:
 
 
 def check_versions(a: Side, b: Side) -> None:
-    """Refuse sides scored by different metrics versions: their numbers do not mean the same.
+    """Refuse sides that were scored by different metrics versions.
 
     Raises:
-        InputError: They differ, between the sides or within one; one line that says how to mend it.
+        InputError: The versions differ between the sides or within one.
     """
-    found = {side.path: versions_of(side.data.results) for side in (a, b)}
+    found = {side.path: list_versions(side.data.results) for side in (a, b)}
     if len(set().union(*found.values())) <= 1:
         return
     told = " and ".join(f"{path}: metrics version {' and '.join(sorted(each))}" for path, each in found.items())
@@ -83,7 +83,7 @@ def check_versions(a: Side, b: Side) -> None:
 
 
 def matched_variants(a: Side, b: Side) -> list[tuple[str, str]]:
-    """Return which variant of A each variant of B is held against; one that a side names is held against all."""
+    """Return pairs of variants (of A, of B) to compare; a variant that a side names is compared with all others."""
     names = [list(dict.fromkeys(str(row["variant"]) for row in side.data.results)) for side in (a, b)]
     if a.variant and b.variant:
         return [(a.variant, b.variant)]
@@ -100,7 +100,7 @@ def is_one_run(a: Side, b: Side) -> bool:
 
 
 def only_in(own: Side, other: Side) -> list[str]:
-    """Return what `own` has and `other` lacks: variants, then scenarios, then pairs, each named and counted."""
+    """Return the variants, scenarios and pairs that `own` has and `other` lacks, named and counted."""
     cases, others = _cases(own, other), _cases(other, own)
     missing = cases - others
     variants, scenarios = {case[2] for case in others}, {case[0] for case in others}
@@ -124,7 +124,7 @@ def only_in(own: Side, other: Side) -> list[str]:
 
 
 def short_names(a: Side, b: Side) -> tuple[str, str]:
-    """Return what the sides are called: their folders' names where these differ or the run is the same, else paths."""
+    """Return short names of both sides: the folders' names where they differ or the run is the same, else the paths."""
     paths = [side.path.resolve() for side in (a, b)]
     is_short = paths[0] == paths[1] or paths[0].name != paths[1].name
     names = [path.name if is_short else str(side.path) for path, side in zip(paths, (a, b), strict=True)]
@@ -135,18 +135,18 @@ def short_names(a: Side, b: Side) -> tuple[str, str]:
 
 
 def is_one_machine(a: Side, b: Side) -> bool:
-    """Tell whether both runs say that they were made on the same machine with the same threads."""
+    """Tell whether both runs record the same machine and the same threads."""
     machines = [side.data.provenance.get("machine") for side in (a, b)]
     return bool(machines[0]) and machines[0] == machines[1]
 
 
 def is_contended(data: RunData) -> bool:
-    """Tell whether any case of a run was timed beside other work."""
+    """Tell whether any case of a run was timed while workers shared the machine."""
     return any(flag(row, "is_contended") for row in data.results)
 
 
 def why_no_times(a: Side, b: Side) -> str:
-    """Return why times of two sides cannot be judged, "" where they can."""
+    """Return why the times of two sides cannot be compared, "" where they can."""
     if not is_one_machine(a, b):
         return "the runs are of different machines, or one does not say of which"
     names = dict.fromkeys(side.path.resolve().name for side in (a, b) if is_contended(side.data))
@@ -154,7 +154,7 @@ def why_no_times(a: Side, b: Side) -> str:
 
 
 def cautions(a: Side, b: Side) -> list[str]:
-    """Return what stands against comparing two sides, one sentence each."""
+    """Return the reasons against comparing two sides, one sentence each."""
     found = []
     if (worlds := other_worlds(a, b)) and not is_one_run(a, b):
         named = ", ".join(worlds[:_MAX_NAMED]) + (" and others" if len(worlds) > _MAX_NAMED else "")
@@ -172,7 +172,7 @@ def cautions(a: Side, b: Side) -> list[str]:
 
 
 def other_worlds(a: Side, b: Side) -> list[str]:
-    """Return the shared pairs whose number of changes or driven way differs: a seed that drew another world."""
+    """Return the shared pairs with another number of changes or length of path: the seed drew another world."""
     found = []
     worlds = [side.results.groupby(PAIR) for side in (a, b)]
     for key in ("n_changes", "n_observable", "after_path_m"):
@@ -185,8 +185,8 @@ def other_worlds(a: Side, b: Side) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def versions_of(rows: Iterable[Row]) -> set[str]:
-    """Return the metrics versions that some rows of results.csv were scored by."""
+def list_versions(rows: Iterable[Row]) -> set[str]:
+    """Return the metrics versions of some rows of results.csv."""
     values = {row.get("metrics_version") for row in rows}
     return {"unknown" if value is None or pd.isna(value) else f"{float(value):g}" for value in values}
 

@@ -1,9 +1,9 @@
-"""What the stages of a pair gave, kept by content: in memory, and in the folder of the run for a later process.
+"""Results of the stages of a pair, kept by content: in memory, and in the run folder for a later process.
 
 RUN/stages/<world>/<seed>/<root>/<stage>-<digest>.npz holds the arrays and the seconds of one stage. The root is the
-digest of both sessions' files and of the pipeline's code, the name that of all that the stage read
-(eval/running/stage_results.py): what is found is what would be computed now. A file appears whole or not at all; a
-damaged one is none.
+digest of both sessions' files and of the pipeline's code, the name that of everything that the stage reads
+(eval/running/stage_results.py): a result that is found equals the one that would be computed. A file appears whole or
+not at all; a damaged one is ignored.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import cdpipe
 from eval.core.provenance import digest
 
 MAPS = "maps"
-# Maps are large: so much of them is stored in a run folder, those of its first pairs.
+# Maps are large: at most this much of them is stored in a run folder.
 MAPS_BYTES = 4 << 30
 _FORMAT = 1  # rises when eval/running/stage_results.py makes something else of the same result
 _SECONDS, _IS_CONTENDED, _N_ARRAYS = "seconds.", "is_contended", "n_arrays"
@@ -37,7 +37,7 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kept:
-    """What a stage gave.
+    """The result of a stage.
 
     Attributes:
         arrays: Its result, by name.
@@ -62,7 +62,7 @@ class StageCache:
         self._held: dict[str, Kept] = {}
 
     def find(self, name: str) -> Kept | None:
-        """Return what is kept under a name; None where there is nothing, or something damaged."""
+        """Return the result of a name; None where there is none or it is damaged."""
         kept = self._held.get(name)
         if kept is None and self._folder is not None:
             kept = _read(self._folder / f"{name}.npz")
@@ -71,7 +71,7 @@ class StageCache:
         return kept
 
     def keep(self, name: str, kept: Kept) -> None:
-        """Keep what a stage gave; what the disk does not take is computed again another time."""
+        """Keep a result; one that cannot be written is computed again by the next process."""
         self._hold(name, kept)
         if self._folder is None or (_is_maps(name) and _maps_bytes(self._folder) >= MAPS_BYTES):
             return
@@ -89,8 +89,8 @@ class StageCache:
             self._held[name] = kept
 
 
-def opened_cache(folder: Path, sessions: tuple[Path, Path]) -> StageCache:
-    """Open what is kept of a pair, and remove what is of other sessions or of other code.
+def open_cache(folder: Path, sessions: tuple[Path, Path]) -> StageCache:
+    """Open the cache of a pair, and remove results of other sessions or other code.
 
     Args:
         folder: RUN/stages/<world>/<seed>.
@@ -117,7 +117,7 @@ def _files_digest(folder: Path, paths: Iterable[Path]) -> str:
     return digest(found)
 
 
-# Of the code as this process has loaded it: read later it might be a newer one's.
+# Read when the process starts: later the files may be newer than the loaded code.
 CODE = _files_digest(Path(cdpipe.__path__[0]), Path(cdpipe.__path__[0]).rglob("*.py"))
 
 
@@ -144,7 +144,7 @@ def _add(file: zipfile.ZipFile, arrays: Arrays) -> None:
 def _read(path: Path) -> Kept | None:
     try:
         with zipfile.ZipFile(path) as file:
-            # each member as a whole: only at its end its checksum is compared
+            # read each member whole: its checksum is compared at its end
             arrays = {
                 name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(file.read(name)), allow_pickle=False)
                 for name in file.namelist()
@@ -154,7 +154,7 @@ def _read(path: Path) -> Kept | None:
         return None
     seconds = {name: arrays.pop(name) for name in list(arrays) if name.startswith(_SECONDS)}
     told = {name.removeprefix(_SECONDS): float(number) for name, number in seconds.items()}
-    # a damaged list of contents may just end earlier
+    # a damaged table of contents may end early
     return Kept(arrays, told, is_contended) if len(arrays) == n_arrays else None
 
 

@@ -1,7 +1,7 @@
-"""What every stage of a pair reads, as a name, and what it gives, as arrays; arrays come back as they went, bit by bit.
+"""Names and arrays of stage results; arrays survive the disk bit by bit.
 
 A name holds the digest of the settings that the stage reads, of the weights, and of the names of the results that it
-reads. What all stages read, the sessions and the code, is not in it (eval/running/stage_cache.py).
+reads. The sessions and the code, which all stages read, are in the folder's name (eval/running/stage_cache.py).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The pipeline on one pair, each stage run once for all variants that share what it reads, and timed.
+"""The pipeline on one pair: each stage runs once for all variants that share its inputs, and is timed.
 
-What a stage gave is found again by all that it read (eval/running/stage_cache.py), also by a later process: another
-voxel of the extraction runs the extraction alone, another radius the query and the extraction. What is found again has
+A result is found again by its inputs (eval/running/stage_cache.py), also by a later process: another voxel of the
+extraction runs the extraction alone, another radius the query and the extraction. A result that is found again keeps
 the seconds that it took when it ran.
 
 Times are wall clock of one process on fixed threads, one stage after the other. The first call warms up; where it takes
@@ -42,24 +42,24 @@ from eval.running.stage_results import STAGES, maps_arrays, maps_from, maps_name
 REPEAT_BELOW_S = 1.0
 REPEATS = 3
 _POSE_BYTES = 28.0
-# Warmed up by the stage itself, so run once; and of no account where a method does not use descriptors.
+# These stages warm up by themselves and run once; they do not count for a method that uses no descriptors.
 _OF_DESCRIPTORS = ("descriptors", "spheres")
 
 
 class PairStages(Hooks):
-    """Both sessions of a pair and what has been computed from them so far.
+    """Both sessions of a pair and the results of the stages so far.
 
-    Only the maps of one map setting are held at a time; cells that share it should therefore come one after the other.
+    Only the maps of one map setting are held at a time, so cells that share it should run one after the other.
 
     Args:
         before: The before session.
         after: The after session.
-        on_stage: Told what is computed.
-        cache: What is kept of the pair, perhaps of an earlier process.
-        is_shared: Whether workers share the machine, and so the times.
+        on_stage: Told the name of each stage.
+        cache: Results of the pair, perhaps of an earlier process.
+        is_shared: Whether workers share the machine.
 
     Attributes:
-        is_contended: Whether workers shared the machine while any of the times of the last answer was taken.
+        is_contended: Whether workers shared the machine while any time of the last answer was measured.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class PairStages(Hooks):
         self._are_descriptors_contended = False
 
     def run(self, stage: Stage, config: PipelineConfig, compute: Callable[[], Done[T]]) -> Done[T]:
-        """Return what a stage gave earlier, or run and keep it."""
+        """Return the kept result of a stage, or run the stage and keep its result."""
         if stage == "maps":
             maps: Any = self._find_maps(config.map, compute)
             return Done(maps)
@@ -98,7 +98,7 @@ class PairStages(Hooks):
         return Done(unpack(kept.arrays, self._maps), kept.seconds)
 
     def time(self, compute: Callable[[], Done[T]]) -> Done[T]:
-        """Run a step as often as its clock needs."""
+        """Run a step, repeatedly where it is timed."""
         return compute() if self._is_shared else time_parts(compute)
 
     def maps(self, config: MapConfig) -> tuple[PointMap, PointMap]:
@@ -176,9 +176,9 @@ def time_parts(compute: Callable[[], Done[T]]) -> Done[T]:
 def kept_bytes(before: MappedSession, config: PipelineConfig) -> dict[str, float]:
     """Return the bytes of the thinned before map, and of what a method keeps of that session to find regions.
 
-    Both as float32: x, y, z of every map point; for a descriptor one vector and one pose (7 numbers) per keyframe. What
-    compares points, or sees the before map anew from other places, keeps the map; `dufomap` also the returns of the
-    scans whose rays are cast. Random regions keep poses alone.
+    Both as float32: x, y, z of every map point; for a descriptor one vector and one pose (7 numbers) per keyframe. A
+    method that compares points, or renders the before map from new poses, keeps the map; `dufomap` also keeps the
+    returns of the scans that it casts. Random regions keep the poses alone.
     """
     map_bytes = 12.0 * len(before.map.points)
     vectors = {"scan": before.descriptors.q, "sphere": before.descriptors.spheres}.get(config.query.compare)

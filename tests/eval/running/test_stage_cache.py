@@ -23,7 +23,7 @@ from eval.plans.plan import load_plan
 from eval.running import pair_run, runner, stage_cache, stage_results, stages
 from eval.running.runfolder import RunFolder, start_run_folder
 from eval.running.runner import run_plan
-from eval.running.stage_cache import Kept, StageCache, opened_cache
+from eval.running.stage_cache import Kept, StageCache, open_cache
 from eval.running.stages import PairStages
 from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
@@ -94,7 +94,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
 def stages_of(pair: Path, folder: Path | None = None, *, is_shared: bool = True) -> PairStages:
     """Stages as a new process would open them; among workers, so that nothing is repeated for the clock."""
-    cache = StageCache() if folder is None else opened_cache(folder, (pair / "before", pair / "after"))
+    cache = StageCache() if folder is None else open_cache(folder, (pair / "before", pair / "after"))
     return PairStages(pipeline_input(pair, "before"), pipeline_input(pair, "after"), cache=cache, is_shared=is_shared)
 
 
@@ -191,11 +191,11 @@ def test_what_is_of_other_sessions_or_other_code_is_not_found(
     chunk = next((other / "after" / "chunks").iterdir())
     shutil.copy(next((other / "before" / "chunks").iterdir()), chunk)
     before = set(kept.glob("*/*"))
-    opened_cache(kept, (other / "before", other / "after")).keep("merge-0", Kept({}))
+    open_cache(kept, (other / "before", other / "after")).keep("merge-0", Kept({}))
     assert len(before) == 5
     assert [path.name for path in kept.glob("*/*")] == ["merge-0.npz"]
     monkeypatch.setattr(stage_cache, "CODE", "newer")
-    assert opened_cache(kept, (other / "before", other / "after")).find("merge-0") is None
+    assert open_cache(kept, (other / "before", other / "after")).find("merge-0") is None
     assert not list(kept.glob("*/*"))
 
 
