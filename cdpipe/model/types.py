@@ -94,7 +94,7 @@ class PointMap:
     """A thinned map and, for each of its points, the returns it stands for.
 
     Attributes:
-        points: (N, 3) float64 mean of the returns of each occupied cell, weighted by the inverse square of their ranges;
+        points: (N, 3) float64 mean of the returns of each occupied cell, weighted by the inverse square of the ranges;
             session odom frame, metres.
         nearest_m: (N,) float32 shortest range of the returns of each.
         voxel_m: Cell size of the thinning.

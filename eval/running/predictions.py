@@ -1,6 +1,6 @@
 """Adds the predictions of another program to a run, as a variant.
 
-    DIR/<scenario>/<seed>/answer.json, answer.npz     in the format of `cdpipe.io.answer`
+    DIR/<scenario>/<seed>/answer.json, answer.npz     in the format of eval/scoring/ANSWERS.md
 
 Every pair of the run needs a prediction; otherwise its means would be over other pairs than those of the other
 variants. A pair that the program could not do gets an answer.json of status `failed` and scores like our failures.
