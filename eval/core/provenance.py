@@ -54,7 +54,12 @@ def versions() -> dict[str, str]:
 
 
 def describe_run(
-    plan: Mapping[str, Any], configs: Mapping[str, Any], checkpoints: Mapping[str, str], command: Sequence[str]
+    plan: Mapping[str, Any],
+    configs: Mapping[str, Any],
+    checkpoints: Mapping[str, str],
+    command: Sequence[str],
+    commit: str | None,
+    started: str,
 ) -> dict[str, Any]:
     """Return the content of provenance.json.
 
@@ -63,11 +68,13 @@ def describe_run(
         configs: Effective settings of every "<scenario> <variant>", dumped.
         checkpoints: Digest of the weights of every descriptor used.
         command: The command line.
+        commit: The code that runs (`git_commit`).
+        started: When the run began (`now`).
     """
     return {
         "tool": TOOL,
         "format_version": FORMAT_VERSION,
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "started": started,
         "finished": None,
         "command": shlex.join(command),
         "plan": dict(plan),
@@ -76,7 +83,7 @@ def describe_run(
         "config_digests": {name: digest(config) for name, config in configs.items()},
         "checkpoints": dict(checkpoints),
         "versions": versions(),
-        "git_commit": git_commit(),
+        "git_commit": commit,
         "machine": machine(),
     }
 

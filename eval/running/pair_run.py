@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +21,10 @@ from cdpipe.descriptors import checkpoint_digest, sphere_digest, use_threads
 from cdpipe.io.answer import write_answer, write_failure
 from cdpipe.merge.global_registration import is_kiss_matcher_installed
 from cdpipe.model.config import MapConfig
-from cdpipe.pipeline import Merge, Propose
+from cdpipe.pipeline import Merge, OnStage, Propose
 from eval.core.domains import domain_of
 from eval.core.progress import RunProgress
-from eval.core.provenance import digest
+from eval.core.provenance import digest, git_commit, now
 from eval.oracles.merge import merged_by_truth
 from eval.oracles.regions import regions_by_truth
 from eval.plans.variants import Cell
@@ -35,6 +35,7 @@ from eval.running.stages import PairStages
 from eval.scoring.scoring import METRICS_VERSION, CaseScore
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
+from scenarios.library import load_scenario
 from scenarios.schema import Scenario
 from sim.session.simulate import simulate_pair
 
@@ -84,10 +85,36 @@ class Made:
     is_contended: bool = False
 
 
-class PairRun:
-    """One pair being run; it owns the maps."""
+@dataclass(frozen=True, slots=True)
+class Tools:
+    """What a run takes from outside: tests pass their own, everybody else the defaults.
 
-    def __init__(self, run: RunFolder, pair: Pair, made: Made, progress: RunProgress) -> None:
+    Attributes:
+        draw: Draws a scenario from its name, a seed and settings; raises `ScenarioError` where it cannot.
+        simulate: Writes a pair from a scenario, a seed, the pair's folder and a listener to its progress.
+        commit: Names the code that runs, as `git_commit` does.
+        now: The present time, UTC, ISO 8601.
+    """
+
+    draw: Callable[[str, int, tuple[str, ...]], Scenario] = load_scenario
+    simulate: Callable[[Scenario, int, Path, OnStage], None] = simulate_pair
+    commit: Callable[[], str | None] = git_commit
+    now: Callable[[], str] = now
+
+
+TOOLS = Tools()
+
+
+class PairRun:
+    """One pair being run; it owns the maps.
+
+    A worker has no tools but its own: they do not travel with a task.
+    """
+
+    def __init__(
+        self, run: RunFolder, pair: Pair, made: Made, progress: RunProgress, tools: Tools | None = None
+    ) -> None:
+        self._tools = tools or TOOLS
         self._run = run
         self._pair = pair
         self._made = made
@@ -109,7 +136,7 @@ class PairRun:
         """Simulate the pair unless it exists and open it, once; a text says why the pair cannot be made."""
         if self._opened is None:
             try:
-                self._opened = _open(self._run, self._pair, self._made, self._progress)
+                self._opened = _open(self._run, self._pair, self._made, self._progress, self._tools)
             except ScenarioError as error:
                 self._opened = str(error)
         return self._opened
@@ -203,7 +230,9 @@ def cell_key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mappi
     )
 
 
-def _open(run: RunFolder, pair: Pair, made: Made, progress: RunProgress) -> tuple[PairStages, GroundTruth]:
+def _open(
+    run: RunFolder, pair: Pair, made: Made, progress: RunProgress, tools: Tools
+) -> tuple[PairStages, GroundTruth]:
     """Simulate a pair unless it exists, store its maps for pictures, and open it with the kept stage results.
 
     Raises:
@@ -216,7 +245,7 @@ def _open(run: RunFolder, pair: Pair, made: Made, progress: RunProgress) -> tupl
     if not path.exists():
         remove(kept)  # of an earlier simulation
         path.parent.mkdir(parents=True, exist_ok=True)
-        simulate_pair(pair.scenario, pair.seed, path, on_progress=progress.stage)
+        tools.simulate(pair.scenario, pair.seed, path, progress.stage)
     cache = open_cache(kept, (path / "before", path / "after"))
     sessions = pipeline_input(path, "before"), pipeline_input(path, "after")
     stages = PairStages(*sessions, progress.stage, cache, is_shared=made.is_contended)

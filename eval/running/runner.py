@@ -21,14 +21,13 @@ from cdpipe.methods.registry import load_method
 from cdpipe.model.config import DescriptorConfig
 from eval.core.cluster import HERE, Where, connected, require_usable
 from eval.core.progress import RunProgress, Silent
-from eval.core.provenance import describe_run, digest, now
+from eval.core.provenance import describe_run, digest
 from eval.plans.plan import Plan, cells
 from eval.plans.variants import Cell
 from eval.plans.worlds import worlds_of
-from eval.running.pair_run import Made, Pair, PairRun, Todo, cell_key, is_finished, pair_lock
+from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Todo, Tools, cell_key, is_finished, pair_lock
 from eval.running.run_workers import remove_traces, run_on_workers
 from eval.running.runfolder import RunFolder, current_results, remove, write_tables
-from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from sim.session.truth import read_pair_truth
 
@@ -62,6 +61,7 @@ def run_plan(
     limit: int | None = None,
     where: Where = HERE,
     progress: RunProgress | None = None,
+    tools: Tools | None = None,
 ) -> RunOutcome:
     """Run the unfinished cells of a plan and write the tables.
 
@@ -73,16 +73,17 @@ def run_plan(
         limit: Run at most this many cells.
         where: In this process, on workers of this machine, or on a cluster.
         progress: Receives the progress.
+        tools: What draws and simulates worlds, and names the code and the time; workers simulate with their own.
 
     Raises:
         InputError: A setting is wrong, a method's extra is missing, the folder cannot be written, or the cluster cannot
             be used.
     """
-    progress = progress or Silent()
+    progress, tools = progress or Silent(), tools or TOOLS
     require_usable(where)
     all_cells = cells(plan)
-    provenance = _provenance(plan, all_cells, command)
-    pairs = _pairs(run, plan, all_cells, force)
+    provenance = _provenance(plan, all_cells, command, tools)
+    pairs = _pairs(run, plan, all_cells, force, tools)
     n_todo = sum(len(pair.todo) for pair in pairs)
     chosen = _limited(pairs, limit)
     n_run = sum(len(pair.todo) for pair in chosen)
@@ -100,13 +101,13 @@ def run_plan(
         for pair in pairs:
             _remove_stale(run, pair, force)
         if client is None:
-            _run_here(run, chosen, made, progress, n_run)
+            _run_here(run, chosen, made, progress, tools)
         else:
             run_on_workers(client, run, chosen, made, progress)
     progress.cells("done", n_run, n_run)
     if results is None:
         results = write_tables(run)
-        run.write_provenance({**provenance, "finished": now()})
+        run.write_provenance({**provenance, "finished": tools.now()})
     n_died = int((results["status"] == "worker_died").sum())
     return RunOutcome(n_run, len(all_cells) - n_todo, n_todo - n_run, n_died)
 
@@ -123,7 +124,7 @@ def list_cells(plan: Plan, path: Path, *, force: bool = False, limit: int | None
     elif path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file: name a folder to run in")
     all_cells = cells(plan)
-    pairs = _pairs(run, plan, all_cells, force)
+    pairs = _pairs(run, plan, all_cells, force, TOOLS)
     todo = {(each.cell.scenario, each.cell.seed, each.cell.variant) for pair in pairs for each in pair.todo}
     chosen = {
         (each.cell.scenario, each.cell.seed, each.cell.variant) for pair in _limited(pairs, limit) for each in pair.todo
@@ -132,11 +133,11 @@ def list_cells(plan: Plan, path: Path, *, force: bool = False, limit: int | None
     return [Listed(*name, "to do" if name in chosen else "left" if name in todo else "finished") for name in names]
 
 
-def _run_here(run: RunFolder, pairs: Sequence[Pair], made: Made, progress: RunProgress, n_run: int) -> None:
-    n_done = 0
+def _run_here(run: RunFolder, pairs: Sequence[Pair], made: Made, progress: RunProgress, tools: Tools) -> None:
+    n_done, n_run = 0, sum(len(pair.todo) for pair in pairs)
     for pair in pairs:
         with pair_lock(run, pair):
-            here = PairRun(run, pair, made, progress)
+            here = PairRun(run, pair, made, progress, tools)
             progress.cells(f"{pair.name} {pair.seed}", n_done, n_run)
             here.open()
             for each in pair.todo:
@@ -145,7 +146,7 @@ def _run_here(run: RunFolder, pairs: Sequence[Pair], made: Made, progress: RunPr
                 n_done += 1
 
 
-def _pairs(run: RunFolder, plan: Plan, all_cells: Sequence[Cell], force: bool) -> list[Pair]:
+def _pairs(run: RunFolder, plan: Plan, all_cells: Sequence[Cell], force: bool, tools: Tools) -> list[Pair]:
     variants = list(dict.fromkeys(cell.variant for cell in all_cells))
     places = {world.label: (place, world) for place, world in enumerate(worlds_of(plan.scenarios))}
     pairs = []
@@ -153,7 +154,7 @@ def _pairs(run: RunFolder, plan: Plan, all_cells: Sequence[Cell], force: bool) -
         place, world = places[label]
         scenario, files, error = None, {}, ""
         try:
-            scenario = load_scenario(world.name, seed, world.settings)
+            scenario = tools.draw(world.name, seed, world.settings)
             files = file_digests(scenario)
         except ScenarioError as mistake:
             error = str(mistake)
@@ -227,10 +228,10 @@ def _is_simulated(path: Path, pair: Pair) -> bool:
     return is_same and truth.seed == pair.seed and truth.files == pair.files
 
 
-def _provenance(plan: Plan, all_cells: Sequence[Cell], command: Sequence[str]) -> Mapping[str, Any]:
+def _provenance(plan: Plan, all_cells: Sequence[Cell], command: Sequence[str], tools: Tools) -> Mapping[str, Any]:
     configs = {f"{cell.scenario} {cell.variant}": cell.config.model_dump(mode="json") for cell in all_cells}
     methods = dict.fromkeys(cell.config.descriptor.method for cell in all_cells)
     checkpoints: dict[str, str] = {method: checkpoint_digest(DescriptorConfig(method=method)) for method in methods}
     if any(cell.config.query.compare == "sphere" for cell in all_cells):
         checkpoints["sphere"] = sphere_digest()
-    return describe_run(plan.model_dump(mode="json"), configs, checkpoints, command)
+    return describe_run(plan.model_dump(mode="json"), configs, checkpoints, command, tools.commit(), tools.now())

@@ -29,7 +29,7 @@ from eval.core.progress import Lines
 from eval.plans.plan import Plan, cells, load_plan
 from eval.plans.variants import slug
 from eval.running import pair_run, runner
-from eval.running.pair_run import Made
+from eval.running.pair_run import Made, Tools
 from eval.running.run_workers import Task, remove_traces, work_on
 from eval.running.runfolder import RunFolder, start_run_folder, write_json
 from eval.running.runner import RunOutcome, run_plan
@@ -124,7 +124,8 @@ def copies(hook: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(HOOKED)
     befalling = importlib.import_module("befalling")
     monkeypatch.setenv("TUNNELCD_TEST_HOOK", str(hook))
-    monkeypatch.setattr(pair_run, "simulate_pair", befalling.copied)
+    for module in (pair_run, runner):
+        monkeypatch.setattr(module, "TOOLS", Tools(simulate=befalling.copied))
 
 
 @pytest.fixture
@@ -410,7 +411,7 @@ def task_of(folder: Path, plan: Plan, **changes: Any) -> Task:
     """Make the task of the first pair of a plan, in a folder whose token it knows."""
     folder.mkdir(exist_ok=True)
     (folder / ".workers").write_text("token")
-    pair = runner._pairs(RunFolder(folder), plan, cells(plan), False)[0]
+    pair = runner._pairs(RunFolder(folder), plan, cells(plan), False, Tools())[0]
     return replace(Task(folder, "token", pair, Made("commit", is_contended=True)), **changes)
 
 

@@ -17,7 +17,8 @@ from eval.core import cluster
 from eval.core.cluster import Where, require_reachable
 from eval.core.progress import Lines, Silent
 from eval.plans.plan import Plan, load_plan
-from eval.running import pair_run, runner
+from eval.running import runner
+from eval.running.pair_run import Tools
 from eval.running.runfolder import start_run_folder
 from eval.running.runner import run_plan
 
@@ -38,7 +39,7 @@ def test_missing_extras_are_named_all_at_once_before_anything_is_made(
     tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(registry.importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setattr(pair_run, "simulate_pair", forbidden)
+    monkeypatch.setattr(runner, "TOOLS", Tools(simulate=forbidden))
     plan_of(tmp_path, "{preset: voxel-diff}, {preset: m3c2}, {preset: dufomap}, {preset: m3c2, set: [map.voxel_m=0.3]}")
     code, out, err = command("run", tmp_path / "plan.yaml", "--out", tmp_path / "run")
     assert (code, out) == (2, "")

@@ -4,6 +4,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import count, groupby
 from pathlib import Path
 from typing import Any
 
@@ -11,25 +12,21 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cdpipe import pipeline
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.io.answer import read_answer
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.mapping import build_map
-from cdpipe.merge.merge import merge_maps
-from cdpipe.methods import voxel_diff
-from cdpipe.methods.random_regions import RandomRegions
-from cdpipe.model.config import MapConfig, MergeConfig
-from cdpipe.model.types import MappedSession, MergedMaps
+from cdpipe.model.config import MapConfig
 from cdpipe.pipeline import Done
 from cdpipe.sensor.ouster import load_profile
-from eval.core import provenance
 from eval.core.progress import Silent
 from eval.plans.plan import Plan, cells, load_plan
-from eval.running import pair_run, runner, stages
+from eval.running import pair_run
+from eval.running.pair_run import Tools
 from eval.running.rescoring import rescore
 from eval.running.runfolder import RunFolder, open_run_folder, remove, start_run_folder, write_tables
 from eval.running.runner import RunOutcome, run_plan
+from eval.running.stages import time_parts
 from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
@@ -52,30 +49,44 @@ def pairs(simulated_once: Callable[[Scenario, int], Path]) -> dict[str, Path]:
     return {name: simulated_once(load_small(name, 20000), 20000) for name in (ONE_BOX, UNCHANGED)}
 
 
-@pytest.fixture
-def simulated(pairs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Let the runner copy those pairs instead of simulating; returns the list of what it asked for."""
-    asked: list[str] = []
+class Runner:
+    """Runs plans on copies of the pairs instead of simulating them.
 
-    def copy(scenario: Scenario, seed: int, out: Path, on_progress: object = None) -> None:
-        asked.append(scenario.family)
+    Attributes:
+        asked: The scenarios that were to be simulated, in order.
+        tools: What `run` gives to the run; other tools copy pairs too if they are made from these.
+    """
+
+    def __init__(self, pairs: dict[str, Path]) -> None:
+        self._pairs = pairs
+        self.asked: list[Scenario] = []
+        self.tools = Tools(draw=load_small, simulate=self._copy)
+
+    def run(self, folder: Path, plan: Plan, **options: Any) -> tuple[RunFolder, RunOutcome]:
+        run = start_run_folder(folder)
+        return run, run_plan(plan, run, **{"tools": self.tools, **options})
+
+    def families(self) -> list[str]:
+        return [scenario.family for scenario in self.asked]
+
+    def _copy(self, scenario: Scenario, seed: int, out: Path, on_stage: object) -> None:
+        """Copy a pair, and write down what was asked for, as the simulator does."""
+        self.asked.append(scenario)
         assert seed == 20000
-        shutil.copytree(pairs[scenario.family], out)
+        shutil.copytree(self._pairs[scenario.family], out)
+        drawn, files = scenario.model_dump(mode="json"), file_digests(scenario)
+        write_pair_truth(out, replace(read_pair_truth(out), seed=seed, scenario=drawn, files=files))
 
-    monkeypatch.setattr(pair_run, "simulate_pair", copy)
-    monkeypatch.setattr(runner, "load_scenario", load_small)
-    return asked
+
+@pytest.fixture
+def runner(pairs: dict[str, Path]) -> Runner:
+    return Runner(pairs)
 
 
 def plan_of(folder: Path, *, scenarios: str = ONE_BOX, variants: str = "{preset: voxel-diff}", rest: str = "") -> Plan:
     path = folder / "plan.yaml"
     path.write_text(f"name: test\nscenarios: [{scenarios}]\nseeds: [20000]\nvariants: [{variants}]\n{rest}")
     return load_plan(str(path))
-
-
-def run_in(folder: Path, plan: Plan, **options: Any) -> tuple[RunFolder, RunOutcome]:
-    run = start_run_folder(folder)
-    return run, run_plan(plan, run, **options)
 
 
 def table(run: RunFolder, name: str = "results") -> pd.DataFrame:
@@ -85,16 +96,8 @@ def table(run: RunFolder, name: str = "results") -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def smoke(pairs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """The smoke plan, run once end to end."""
-
-    def copy(scenario: Scenario, seed: int, out: Path, on_progress: object) -> None:
-        shutil.copytree(pairs[scenario.family], out)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pair_run, "simulate_pair", copy)
-        patch.setattr(runner, "load_scenario", load_small)
-        return run_in(tmp_path_factory.mktemp("smoke") / "run", load_plan("smoke"), command=["tunnelcd", "run", "a b"])[
-            0
-        ]
+    folder = tmp_path_factory.mktemp("smoke") / "run"
+    return Runner(pairs).run(folder, load_plan("smoke"), command=["tunnelcd", "run", "a b"])[0]
 
 
 @pytest.fixture
@@ -123,10 +126,10 @@ def test_smoke_plan_end_to_end(smoke: RunFolder) -> None:
     assert {"value", "low", "high", "n", "n_failed"} <= set(table(smoke, "summary").columns)
 
 
-def test_the_box_is_found(tmp_path: Path, simulated: list[str]) -> None:
+def test_the_box_is_found(tmp_path: Path, runner: Runner) -> None:
     # the preset is tuned and calibrated for four times as many returns
     found = '{preset: voxel-diff, set: ["cluster.min_points=8", "query.threshold=0"]}'
-    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, variants=found))
+    run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, variants=found))
     assert table(run)["region_recall"].tolist() == [1.0]
 
 
@@ -170,75 +173,73 @@ def test_provenance_says_what_made_the_results(smoke: RunFolder) -> None:
     assert document["versions"]["numpy"] == np.__version__
 
 
-def test_finished_cells_are_kept(smoke_copy: RunFolder, simulated: list[str]) -> None:
+def test_finished_cells_are_kept(smoke_copy: RunFolder, runner: Runner) -> None:
     before = {path: path.stat().st_mtime_ns for path in smoke_copy.path.rglob("*") if "cells" in path.parts}
-    outcome = run_plan(load_plan("smoke"), smoke_copy)
+    outcome = runner.run(smoke_copy.path, load_plan("smoke"))[1]
     assert outcome == RunOutcome(n_done=0, n_kept=8, n_left=0)
-    assert simulated == []
+    assert runner.families() == []
     assert before == {path: path.stat().st_mtime_ns for path in before}
 
 
-def test_a_cell_cut_short_is_done_again_and_no_other(smoke_copy: RunFolder, simulated: list[str]) -> None:
+def test_a_cell_cut_short_is_done_again_and_no_other(smoke_copy: RunFolder, runner: Runner) -> None:
     cut = smoke_copy.cell(ONE_BOX, 20000, "paper")
     cut.write_text(cut.read_text()[:-50])
     row = table(smoke_copy).query("scenario == @ONE_BOX and variant == 'paper'")["region_recall"].item()
-    assert run_plan(load_plan("smoke"), smoke_copy) == RunOutcome(1, 7, 0)
-    assert simulated == []
+    assert runner.run(smoke_copy.path, load_plan("smoke"))[1] == RunOutcome(1, 7, 0)
+    assert runner.families() == []
     assert table(smoke_copy).query("scenario == @ONE_BOX and variant == 'paper'")["region_recall"].item() == row
 
 
-def test_another_version_of_the_metrics_redoes_all(
-    smoke_copy: RunFolder, simulated: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pair_run, "METRICS_VERSION", -1)
-    assert run_plan(load_plan("smoke"), smoke_copy, limit=1) == RunOutcome(1, 0, 7)
+def test_another_version_of_the_metrics_redoes_all(smoke_copy: RunFolder, runner: Runner) -> None:
+    for path in smoke_copy.path.glob("cells/*/*/*.json"):
+        document = json.loads(path.read_text())
+        document["row"]["metrics_version"] -= 1
+        smoke_copy.write_cell(path, document)
+    assert runner.run(smoke_copy.path, load_plan("smoke"), limit=1)[1] == RunOutcome(1, 0, 7)
     # what is stale is in no table
     assert len(table(smoke_copy)) == 1
 
 
-def test_limit_and_then_the_rest(tmp_path: Path, simulated: list[str]) -> None:
+def test_limit_and_then_the_rest(tmp_path: Path, runner: Runner) -> None:
     plan = plan_of(tmp_path, variants="{preset: voxel-diff}, {preset: random-regions}")
-    run, outcome = run_in(tmp_path / "run", plan, limit=1)
+    run, outcome = runner.run(tmp_path / "run", plan, limit=1)
     assert outcome == RunOutcome(1, 0, 1)
     assert table(run)["variant"].tolist() == ["voxel-diff"]
-    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 1, 0)
+    assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(1, 1, 0)
     assert table(run)["variant"].tolist() == ["voxel-diff", "random-regions"]
-    assert simulated == [ONE_BOX]
+    assert runner.families() == [ONE_BOX]
 
 
-def test_a_changed_setting_redoes_its_cells_only(tmp_path: Path, simulated: list[str]) -> None:
+def test_a_changed_setting_redoes_its_cells_only(tmp_path: Path, runner: Runner) -> None:
     preset = tmp_path / "own.yaml"
     preset.write_text("method: voxel-diff\n")
     plan = plan_of(tmp_path, variants=f"{{preset: {preset}}}, {{preset: random-regions}}")
-    run, _ = run_in(tmp_path / "run", plan)
+    run, _ = runner.run(tmp_path / "run", plan)
     assert table(run)["preset"].tolist() == ["own", "random-regions"]
     preset.write_text("method: voxel-diff\nquery: {threshold: 1000000}\n")
-    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 1, 0)
+    assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(1, 1, 0)
     assert table(run).set_index("variant").loc["own", "n_regions"] == 0
-    assert simulated == [ONE_BOX]
+    assert runner.families() == [ONE_BOX]
 
 
-def test_force_redoes_everything(tmp_path: Path, simulated: list[str]) -> None:
+def test_force_redoes_everything(tmp_path: Path, runner: Runner) -> None:
     plan = plan_of(tmp_path)
-    run_in(tmp_path / "run", plan)
-    assert run_in(tmp_path / "run", plan, force=True)[1] == RunOutcome(1, 0, 0)
-    assert simulated == [ONE_BOX, ONE_BOX]
+    runner.run(tmp_path / "run", plan)
+    assert runner.run(tmp_path / "run", plan, force=True)[1] == RunOutcome(1, 0, 0)
+    assert runner.families() == [ONE_BOX, ONE_BOX]
 
 
-def test_a_pair_of_another_scenario_is_simulated_anew(
-    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pair_of_another_scenario_is_simulated_anew(tmp_path: Path, runner: Runner) -> None:
     plan = plan_of(tmp_path)
-    run_in(tmp_path / "run", plan)
-    changed = load_scenario(ONE_BOX, 20000, [*SMALL, "score_radius_m=5"])
-    monkeypatch.setattr(runner, "load_scenario", lambda name, seed, settings: changed)
-    assert run_in(tmp_path / "run", plan)[1].n_done == 1
-    assert simulated == [ONE_BOX, ONE_BOX]
+    runner.run(tmp_path / "run", plan)
+    changed = replace(runner.tools, draw=lambda name, seed, settings: load_small(name, seed, ["score_radius_m=5"]))
+    assert runner.run(tmp_path / "run", plan, tools=changed)[1].n_done == 1
+    assert runner.families() == [ONE_BOX, ONE_BOX]
 
 
-def test_a_refused_merge_is_a_row_that_scores_0(tmp_path: Path, simulated: list[str]) -> None:
+def test_a_refused_merge_is_a_row_that_scores_0(tmp_path: Path, runner: Runner) -> None:
     variants = '{preset: paper, set: ["merge.min_hessian_ratio=1"]}, {preset: voxel-diff}'
-    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=f"{ONE_BOX}, {UNCHANGED}", variants=variants))
+    run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, scenarios=f"{ONE_BOX}, {UNCHANGED}", variants=variants))
     results = table(run).set_index(["scenario", "variant"])
     refused = "paper[merge.min_hessian_ratio=1]"
     row = results.loc[(ONE_BOX, refused)]
@@ -257,43 +258,38 @@ def test_a_refused_merge_is_a_row_that_scores_0(tmp_path: Path, simulated: list[
     assert table(run, "changes").query("variant == @refused")["is_found"].tolist() == [False]
 
 
-def test_an_error_of_the_input_is_a_row_and_a_bug_is_not(
-    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fails(error: Exception) -> Callable[..., None]:
-        def method(*_: object) -> None:
-            raise error
+def test_an_error_of_the_input_is_a_row_and_a_bug_is_not(tmp_path: Path, runner: Runner) -> None:
+    class Broken(Silent):
+        def stage(self, name: str, done: int, total: int) -> None:
+            if name == "merge":
+                raise RuntimeError("a bug")
 
-        return method
-
-    plan = plan_of(tmp_path, variants="{preset: random-regions}, {preset: voxel-diff}")
-    monkeypatch.setattr(RandomRegions, "propose", fails(InputError("no such thing")))
-    run, _ = run_in(tmp_path / "run", plan)
-    results = table(run).set_index("variant")
-    assert results["status"].to_dict() == {"random-regions": "failed", "voxel-diff": "ok"}
-    assert results.loc["random-regions", "error"] == "no such thing"
-    assert results.loc["random-regions", "region_recall"] == 0
-    monkeypatch.setattr(voxel_diff, "whole_map", fails(RuntimeError("a bug")))
+    plan = plan_of(tmp_path, variants=f"{MAPLESS}, {{preset: voxel-diff}}")
+    run, _ = runner.run(tmp_path / "run", plan)
+    results = table(run)
+    failed, fine = results.to_dict("records")
+    assert (failed["status"], fine["status"]) == ("failed", "ok")
+    assert "map.max_range_m" in failed["error"]
+    assert failed["region_recall"] == 0
     with pytest.raises(RuntimeError, match="a bug"):
-        run_in(tmp_path / "run", plan, force=True)
+        runner.run(tmp_path / "run", plan, force=True, progress=Broken())
     # what was finished before the bug is kept
-    assert run.read_cell(run.cell(ONE_BOX, 20000, "random-regions")) is not None
+    assert run.read_cell(run.cell(ONE_BOX, 20000, failed["variant"])) is not None
+    assert run.read_cell(run.cell(ONE_BOX, 20000, fine["variant"])) is None
 
 
-@pytest.mark.parametrize("stage", ["load_scenario", "simulate_pair"])
-def test_a_world_that_cannot_be_made_is_a_row_and_the_others_go_on(
-    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch, stage: str
-) -> None:
-    module = runner if stage == "load_scenario" else pair_run
-    usual = getattr(module, stage)
+@pytest.mark.parametrize("step", ["draw", "simulate"])
+def test_a_world_that_cannot_be_made_is_a_row_and_the_others_go_on(tmp_path: Path, runner: Runner, step: str) -> None:
+    usual = getattr(runner.tools, step)
 
-    def fails_for_one(what: Any, *rest: Any, **options: Any) -> Any:
+    def fails_for_one(what: Any, *rest: Any) -> Any:
         if ONE_BOX in (what, getattr(what, "family", "")):
             raise ScenarioError("props stand in each other")
-        return usual(what, *rest, **options)
+        return usual(what, *rest)
 
-    monkeypatch.setattr(module, stage, fails_for_one)
-    run, outcome = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=f"{ONE_BOX}, {UNCHANGED}"))
+    tools = replace(runner.tools, **{step: fails_for_one})
+    plan = plan_of(tmp_path, scenarios=f"{ONE_BOX}, {UNCHANGED}")
+    run, outcome = runner.run(tmp_path / "run", plan, tools=tools)
     assert outcome == RunOutcome(2, 0, 0)
     results = table(run).set_index("scenario")
     assert results["status"].to_dict() == {ONE_BOX: "failed", UNCHANGED: "ok"}
@@ -301,7 +297,7 @@ def test_a_world_that_cannot_be_made_is_a_row_and_the_others_go_on(
     assert np.isnan(results.loc[ONE_BOX, "region_recall"])
 
 
-def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, simulated: list[str]) -> None:
+def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, runner: Runner) -> None:
     class Impatient:
         def cells(self, label: str, done: int, total: int) -> None:
             if done == 2:
@@ -314,38 +310,33 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, simulated: 
         tmp_path, scenarios=f"{ONE_BOX}, {UNCHANGED}", variants="{preset: voxel-diff}, {preset: random-regions}"
     )
     with pytest.raises(KeyboardInterrupt):
-        run_in(tmp_path / "run", plan, progress=Impatient())
-    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(2, 2, 0)
+        runner.run(tmp_path / "run", plan, progress=Impatient())
+    assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(2, 2, 0)
 
 
-def test_stages_are_shared_by_the_settings_they_depend_on(
-    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[str] = []
+class Told(Silent):
+    """Remembers which stages were begun."""
 
-    def counted(name: str) -> Callable[..., Any]:
-        usual = getattr(pipeline, name)
+    def __init__(self) -> None:
+        self.stages: list[str] = []
 
-        def call(*args: Any) -> Any:
-            calls.append(name)
-            return usual(*args)
+    def stage(self, name: str, done: int, total: int) -> None:
+        self.stages.append(name)
 
-        return call
 
-    for name in ("build_map", "describe_scans", "merge_maps"):
-        monkeypatch.setattr(pipeline, name, counted(name))
-    monkeypatch.setattr(stages, "REPEATS", 1)
+def test_stages_are_shared_by_the_settings_they_depend_on(tmp_path: Path, runner: Runner) -> None:
+    told = Told()
     coarse = 'set: ["map.voxel_m=0.3"]'
     # the two that share a map stand apart in the plan
     # both presets merge alike
     alike = 'set: ["merge.refine=local"]'
     variants = f"{{preset: voxel-diff}}, {{preset: voxel-diff, {coarse}}}, {{preset: random-regions, {alike}}}"
-    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, variants=variants))
-    assert calls.count("build_map") == 2 * 2
-    # one to warm up, one per session: another map has the same keyframes
-    assert calls.count("describe_scans") == 3
-    # per map setting: once, and once more for the clock
-    assert calls.count("merge_maps") == 2 * 2
+    run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, variants=variants), progress=told)
+    assert (told.stages.count("map before"), told.stages.count("map after")) == (2, 2)
+    # another map has the same keyframes
+    assert told.stages.count("describe keyframes") == 1
+    # per map setting, and each of them again for the clock
+    assert [name for name, _ in groupby(told.stages)].count("merge") == 2
     assert table(run)["variant"].tolist() == [
         "voxel-diff",
         "voxel-diff[map.voxel_m=0.3]",
@@ -353,24 +344,17 @@ def test_stages_are_shared_by_the_settings_they_depend_on(
     ]
 
 
-@pytest.mark.usefixtures("simulated")
-def test_score_runs_nothing_and_gives_the_same(smoke_copy: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
-    def forbidden(*_: object, **__: object) -> None:
-        raise AssertionError("score must not run anything")
-
-    for module, name in (
-        (pair_run, "simulate_pair"),
-        (pair_run, "PairStages"),
-        (pipeline, "build_map"),
-        (pipeline, "merge_maps"),
-    ):
-        monkeypatch.setattr(module, name, forbidden)
+def test_score_runs_nothing_and_gives_the_same(smoke_copy: RunFolder, runner: Runner) -> None:
+    made = [path for name in ("answers", "stages", "maps") for path in (smoke_copy.path / name).rglob("*")]
+    stamps = {path: path.stat().st_mtime_ns for path in made}
     before = table(smoke_copy)
     (smoke_copy.path / "results.csv").unlink()
     assert rescore(smoke_copy) == 8
+    # the times too, which no second run would give again
     pd.testing.assert_frame_equal(table(smoke_copy), before)
+    assert stamps == {path: path.stat().st_mtime_ns for path in made}
     # and the cells still count as finished
-    assert run_plan(load_plan("smoke"), smoke_copy) == RunOutcome(0, 8, 0)
+    assert runner.run(smoke_copy.path, load_plan("smoke"))[1] == RunOutcome(0, 8, 0)
 
 
 def test_score_takes_in_the_answer_of_another_program(smoke_copy: RunFolder) -> None:
@@ -417,7 +401,7 @@ def test_the_pipeline_never_sees_truth(pairs: dict[str, Path], tmp_path: Path) -
     assert type(with_truth) is type(open_session(bare / "after"))
 
 
-def test_time_is_the_median_of_three_after_a_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_is_the_median_of_three_after_a_warm_up() -> None:
     clock = 0.0
     # the middle one of three in each part, whichever call it was
     parts = iter([(0.5, 0.4), (0.3, 0.1), (0.2, 0.5), (0.1, 0.3)])
@@ -428,14 +412,13 @@ def test_time_is_the_median_of_three_after_a_warm_up(monkeypatch: pytest.MonkeyP
         clock += cd + oe
         return Done("first" if cd == 0.5 else "later", {"t_cd_s": cd, "t_oe_s": oe})
 
-    monkeypatch.setattr(stages.time, "perf_counter", lambda: clock)
-    result = stages.time_parts(call)
+    result = time_parts(call, clock=lambda: clock)
     assert result.value == "first"
     assert result.seconds == {"t_cd_s": 0.2, "t_oe_s": 0.3}
     assert next(parts, None) is None
 
 
-def test_a_long_call_is_timed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_call_is_timed_once() -> None:
     clock = 0.0
     calls = 0
 
@@ -445,27 +428,21 @@ def test_a_long_call_is_timed_once(monkeypatch: pytest.MonkeyPatch) -> None:
         calls += 1
         return Done("", {"t_cd_s": 0.7})
 
-    monkeypatch.setattr(stages.time, "perf_counter", lambda: clock)
-    assert stages.time_parts(call).seconds == {"t_cd_s": 0.7}
+    assert time_parts(call, clock=lambda: clock).seconds == {"t_cd_s": 0.7}
     assert calls == 1
 
 
-def test_every_row_names_the_code_that_made_its_answer(
-    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_row_names_the_code_that_made_its_answer(tmp_path: Path, runner: Runner) -> None:
     def commits() -> list[tuple[str, str]]:
         results = table(run).fillna({"commit": ""})
         return list(zip(results["variant"], results["commit"], strict=True))
 
     plan = plan_of(tmp_path, variants="{preset: voxel-diff}, {preset: random-regions}")
-    monkeypatch.setattr(provenance, "git_commit", lambda: "older+")
-    run, _ = run_in(tmp_path / "run", plan, limit=1)
-    monkeypatch.setattr(provenance, "git_commit", lambda: "newer")
-    run_in(tmp_path / "run", plan)
+    run, _ = runner.run(tmp_path / "run", plan, limit=1, tools=replace(runner.tools, commit=lambda: "older+"))
+    runner.run(tmp_path / "run", plan, tools=replace(runner.tools, commit=lambda: "newer"))
     assert commits() == [("voxel-diff", "older+"), ("random-regions", "newer")]
     assert "commit" not in set(table(run, "summary")["metric"])
     # scoring again is not answering again, and what another program answered is of no commit of ours
-    monkeypatch.setattr(provenance, "git_commit", lambda: "newest")
     shutil.copytree(run.answer(ONE_BOX, 20000, "voxel-diff"), run.answer(ONE_BOX, 20000, "theirs"))
     rescore(run)
     assert commits() == [("voxel-diff", "older+"), ("random-regions", "newer"), ("theirs", "")]
@@ -480,30 +457,16 @@ def test_scoring_again_changes_nothing_before_all_is_scored(smoke_copy: RunFolde
     assert cells == {path: path.stat().st_mtime_ns for path in cells}
 
 
-@pytest.fixture
-def truthful(simulated: list[str], pairs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> list[Scenario]:
-    """Let the stand-in of the simulator write down what it was asked for, as the simulator does."""
-    asked: list[Scenario] = []
-
-    def copy(scenario: Scenario, seed: int, out: Path, on_progress: object = None) -> None:
-        asked.append(scenario)
-        shutil.copytree(pairs[scenario.family], out)
-        drawn, files = scenario.model_dump(mode="json"), file_digests(scenario)
-        write_pair_truth(out, replace(read_pair_truth(out), seed=seed, scenario=drawn, files=files))
-
-    monkeypatch.setattr(pair_run, "simulate_pair", copy)
-    return asked
-
-
 WORLDS = f"{ONE_BOX}, {{name: {ONE_BOX}, set: [sensor.range_noise=false], each: [sensor.sub_rays=7]}}"
 QUIET = f"{ONE_BOX}[sensor.range_noise=false]"
 BLURRED = f"{ONE_BOX}[sensor.range_noise=false][sensor.sub_rays=7]"
 
 
-def test_worlds_are_simulated_with_their_settings_and_named_by_them(tmp_path: Path, truthful: list[Scenario]) -> None:
-    run, outcome = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+def test_worlds_are_simulated_with_their_settings_and_named_by_them(tmp_path: Path, runner: Runner) -> None:
+    run, outcome = runner.run(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
     assert outcome == RunOutcome(3, 0, 0)
-    assert [(each.sensor.range_noise, each.sensor.sub_rays) for each in truthful] == [(True, 1), (False, 1), (False, 7)]
+    sensors = [scenario.sensor for scenario in runner.asked]
+    assert [(each.range_noise, each.sub_rays) for each in sensors] == [(True, 1), (False, 1), (False, 7)]
     results = table(run)
     assert results["scenario"].tolist() == [ONE_BOX, QUIET, BLURRED]
     assert set(results["family"]) == {ONE_BOX}
@@ -521,8 +484,8 @@ def test_worlds_are_simulated_with_their_settings_and_named_by_them(tmp_path: Pa
     assert set(effects.query("metric == 'region_recall'")["n"]) == {1}
 
 
-def test_effects_that_are_no_more_leave_no_table(tmp_path: Path, truthful: list[Scenario]) -> None:
-    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+def test_effects_that_are_no_more_leave_no_table(tmp_path: Path, runner: Runner) -> None:
+    run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
     assert (run.path / "effects.csv").exists()
     for world in (QUIET, BLURRED):
         remove(run.cell(world, 20000, "voxel-diff"))
@@ -530,48 +493,43 @@ def test_effects_that_are_no_more_leave_no_table(tmp_path: Path, truthful: list[
     assert not (run.path / "effects.csv").exists()
 
 
-def test_scoring_again_names_worlds_as_running_does(tmp_path: Path, truthful: list[Scenario]) -> None:
+def test_scoring_again_names_worlds_as_running_does(tmp_path: Path, runner: Runner) -> None:
     labels: list[str] = []
 
     class Heard(Silent):
         def cells(self, label: str, done: int, total: int) -> None:
             labels.append(label)
 
-    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+    run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
     shutil.copytree(run.answer(QUIET, 20000, "voxel-diff"), run.answer(QUIET, 20000, "foreign"))
     rescore(run, Heard())
     named = [f"{world} 20000 voxel-diff" for world in (ONE_BOX, QUIET, BLURRED)]
     assert sorted(labels) == sorted([*named, f"{QUIET} 20000 foreign", "done"])
 
 
-def test_the_pair_of_a_world_is_kept_while_its_scenario_is_the_same(
-    tmp_path: Path, truthful: list[Scenario], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_pair_of_a_world_is_kept_while_its_scenario_is_the_same(tmp_path: Path, runner: Runner) -> None:
     plan = plan_of(tmp_path, scenarios=WORLDS)
-    run, _ = run_in(tmp_path / "run", plan)
-    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(0, 3, 0)
+    run, _ = runner.run(tmp_path / "run", plan)
+    assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(0, 3, 0)
     run.cell(QUIET, 20000, "voxel-diff").unlink()
-    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 2, 0)
-    assert len(truthful) == 3
+    assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(1, 2, 0)
+    assert len(runner.asked) == 3
     # the same label, but the scenario behind it has changed
-    usual = runner.load_scenario
-    monkeypatch.setattr(
-        runner, "load_scenario", lambda name, seed, settings: usual(name, seed, [*settings, "score_radius_m=5"])
+    changed = replace(
+        runner.tools, draw=lambda name, seed, settings: load_small(name, seed, [*settings, "score_radius_m=5"])
     )
     run.cell(ONE_BOX, 20000, "voxel-diff").unlink()
-    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(3, 0, 0)
-    assert len(truthful) == 6
+    assert runner.run(tmp_path / "run", plan, tools=changed)[1] == RunOutcome(3, 0, 0)
+    assert len(runner.asked) == 6
 
 
-def test_a_pair_is_made_again_when_a_file_that_its_scenario_names_has_changed(
-    tmp_path: Path, truthful: list[Scenario]
-) -> None:
+def test_a_pair_is_made_again_when_a_file_that_its_scenario_names_has_changed(tmp_path: Path, runner: Runner) -> None:
     profile = tmp_path / "sensor.json"
     profile.write_text(json.dumps(load_profile("os1-32-u0").to_json()))
     scenario = tmp_path / "mine.yaml"
     scenario.write_text(f"extends: {ONE_BOX}\nfamily: {ONE_BOX}\nsensor: {{profile: sensor.json}}\n")
     plan = plan_of(tmp_path, scenarios=str(scenario))
-    run, _ = run_in(tmp_path / "run", plan)
+    run, _ = runner.run(tmp_path / "run", plan)
     content = profile.read_bytes()
     truth = read_pair_truth(run.pair(str(scenario), 20000))
     assert list(truth.files.values()) == [hashlib.sha256(content).hexdigest()]
@@ -579,37 +537,33 @@ def test_a_pair_is_made_again_when_a_file_that_its_scenario_names_has_changed(
     # touched, or moved away and back: nothing is redone
     profile.unlink()
     profile.write_bytes(content)
-    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(0, 1, 0)
+    assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(0, 1, 0)
     profile.write_bytes(content + b"\n")
-    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 0, 0)
-    assert len(truthful) == 2
+    assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(1, 0, 0)
+    assert len(runner.asked) == 2
     # and a pair of before is not taken for one of now when only its cell is lost
     profile.write_bytes(content)
     run.cell(str(scenario), 20000, "voxel-diff").unlink()
-    assert run_in(tmp_path / "run", plan)[1] == RunOutcome(1, 0, 0)
-    assert len(truthful) == 3
+    assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(1, 0, 0)
+    assert len(runner.asked) == 3
 
 
-def test_a_world_with_settings_that_cannot_be_made_keeps_its_family(
-    tmp_path: Path, truthful: list[Scenario], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    usual = runner.load_scenario
-
+def test_a_world_with_settings_that_cannot_be_made_keeps_its_family(tmp_path: Path, runner: Runner) -> None:
     def fails_with_settings(name: str, seed: int, settings: tuple[str, ...]) -> Scenario:
         if settings:
             raise ScenarioError("props stand in each other")
-        return usual(name, seed, settings)
+        return load_small(name, seed)
 
-    monkeypatch.setattr(runner, "load_scenario", fails_with_settings)
-    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+    tools = replace(runner.tools, draw=fails_with_settings)
+    run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS), tools=tools)
     results = table(run)
     assert results["status"].tolist() == ["ok", "failed", "failed"]
     assert set(results["family"]) == {ONE_BOX}
     assert table(run, "effects").query("metric == 'region_recall'")["n"].tolist() == [0, 0]
 
 
-def test_an_answer_beside_those_of_a_world_gets_the_name_of_the_world(tmp_path: Path, truthful: list[Scenario]) -> None:
-    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
+def test_an_answer_beside_those_of_a_world_gets_the_name_of_the_world(tmp_path: Path, runner: Runner) -> None:
+    run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
     shutil.copytree(run.answer(QUIET, 20000, "voxel-diff"), run.answer(QUIET, 20000, "theirs"))
     assert rescore(run) == 4
     theirs = table(run).query("variant == 'theirs'")
@@ -620,15 +574,17 @@ def test_an_answer_beside_those_of_a_world_gets_the_name_of_the_world(tmp_path: 
     assert "smoke/one_box_sensor.range_noise=false_" in set(table(run)["scenario"])
 
 
+MAPLESS = "{preset: tunnelcd, set: [map.max_range_m=0.1]}"  # no return is so near
 MERGES = ", ".join(
     (
         "{preset: tunnelcd}",
         '{preset: tunnelcd, set: ["merge.min_hessian_ratio=1"]}',
-        "{preset: kiss-matcher}",
+        MAPLESS,
         "{preset: tunnelcd, oracle_merge: {}}",
         "{preset: tunnelcd, oracle_merge: {noise_m: 0.3, noise_deg: 1}}",
     )
 )
+UNMAPPED = "tunnelcd[map.max_range_m=0.1]"
 REFUSED = "tunnelcd[merge.min_hessian_ratio=1]"
 NOISY = "oracle-merge[noise_m=0.3,noise_deg=1]"
 ONE_CLEAN = f"{{name: {ONE_BOX}, pair_kind: clean}}"
@@ -636,27 +592,12 @@ ONE_CLEAN = f"{{name: {ONE_BOX}, pair_kind: clean}}"
 
 @pytest.fixture(scope="module")
 def merges(pairs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """A plan that ends at the merge; KISS-Matcher is taken to meet an error of its input."""
-
-    def copy(scenario: Scenario, seed: int, out: Path, on_progress: object) -> None:
-        shutil.copytree(pairs[scenario.family], out)
-
-    def merge(before: MappedSession, after: MappedSession, config: MergeConfig) -> MergedMaps:
-        if config.method == "kiss-matcher":
-            raise InputError("not installed")
-        return merge_maps(before, after, config)
-
-    def forbidden(*_: object) -> None:
-        raise AssertionError("nothing comes after the merge")
-
-    folder = tmp_path_factory.mktemp("merges")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pair_run, "simulate_pair", copy)
-        patch.setattr(runner, "load_scenario", load_small)
-        patch.setattr(pipeline, "merge_maps", merge)
-        patch.setattr(pipeline, "compare_maps", forbidden)
-        plan = plan_of(folder, scenarios=f"{ONE_CLEAN}, {UNCHANGED}", variants=MERGES, rest="until: merge")
-        return run_in(folder / "run", plan)[0]
+    """A plan that ends at the merge; one of its variants cannot map the sessions."""
+    folder, told = tmp_path_factory.mktemp("merges"), Told()
+    plan = plan_of(folder, scenarios=f"{ONE_CLEAN}, {UNCHANGED}", variants=MERGES, rest="until: merge")
+    run, _ = Runner(pairs).run(folder / "run", plan, progress=told)
+    assert "merge" in told.stages and "query" not in told.stages
+    return run
 
 
 @pytest.fixture
@@ -668,7 +609,7 @@ def merges_copy(merges: RunFolder, tmp_path: Path) -> RunFolder:
 def test_a_plan_that_ends_at_the_merge_has_every_case_and_no_more_than_the_merge(merges: RunFolder) -> None:
     results = table(merges).set_index(["scenario", "variant"])
     assert results["status"].tolist() == ["ok", "merge_refused", "failed", "ok", "ok"] * 2
-    assert results.loc[(ONE_BOX, "kiss-matcher"), "error"] == "not installed"
+    assert "map.max_range_m = 0.1" in results.loc[(ONE_BOX, UNMAPPED), "error"]
     later = [name for name in results.columns if name.startswith(("region_", "object_", "t_cd", "t_oe", "t_total"))]
     assert len(later) > 15
     assert results[[*later, "n_regions", "n_objects", "is_alarm"]].isna().all(axis=None)
@@ -682,7 +623,7 @@ def test_a_plan_that_ends_at_the_merge_has_every_case_and_no_more_than_the_merge
         assert len(table(merges, name)) == 0
     assert merges.provenance()["plan"]["until"] == "merge"
     assert read_answer(merges.answer(ONE_BOX, 20000, "tunnelcd")).until == "merge"
-    assert read_answer(merges.answer(ONE_BOX, 20000, "kiss-matcher")).until == "merge"
+    assert read_answer(merges.answer(ONE_BOX, 20000, UNMAPPED)).until == "merge"
 
 
 def test_only_a_merge_that_asks_the_descriptors_is_charged_for_them(merges: RunFolder) -> None:
@@ -726,7 +667,7 @@ def test_the_page_of_a_run_that_ends_at_the_merge(
     code, _, err = command("report", merges_copy.path)
     assert (code, err) == (0, "")
     page = (merges_copy.path / "index.html").read_text()
-    for words in ("merge refused", "not installed", "oracle-merge"):
+    for words in ("merge refused", "map.max_range_m = 0.1", "oracle-merge"):
         assert words in page
 
 
@@ -739,10 +680,10 @@ def test_what_is_printed_of_a_run_that_ends_at_the_merge(
     assert "region_recall" not in out
 
 
-def test_an_oracle_runs_the_stages_of_its_preset(tmp_path: Path, simulated: list[str]) -> None:
+def test_an_oracle_runs_the_stages_of_its_preset(tmp_path: Path, runner: Runner) -> None:
     later = 'set: ["query.n_regions=2", "query.threshold=0"]'
     variants = f"{{preset: tunnelcd, {later}}}, {{preset: tunnelcd, {later}, oracle_merge: {{}}}}"
-    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, variants=variants))
+    run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, variants=variants))
     results = table(run)
     assert results["variant"].str.partition("[")[0].tolist() == ["tunnelcd", "oracle-merge"]
     assert results["status"].tolist() == ["ok", "ok"]
@@ -764,24 +705,22 @@ def test_an_oracle_runs_the_stages_of_its_preset(tmp_path: Path, simulated: list
     ],
 )
 def test_what_a_plan_says_of_a_cell_redoes_it(
-    tmp_path: Path, simulated: list[str], scenarios: str, variants: str, rest: str
+    tmp_path: Path, runner: Runner, scenarios: str, variants: str, rest: str
 ) -> None:
-    run_in(tmp_path / "run", plan_of(tmp_path, variants="{preset: voxel-diff}"))
+    runner.run(tmp_path / "run", plan_of(tmp_path, variants="{preset: voxel-diff}"))
     changed = plan_of(tmp_path, scenarios=scenarios, variants=variants, rest=rest)
-    assert run_in(tmp_path / "run", changed)[1] == RunOutcome(1, 0, 0)
-    assert run_in(tmp_path / "run", changed)[1] == RunOutcome(0, 1, 0)
+    assert runner.run(tmp_path / "run", changed)[1] == RunOutcome(1, 0, 0)
+    assert runner.run(tmp_path / "run", changed)[1] == RunOutcome(0, 1, 0)
     # the pair itself is the same
-    assert simulated == [ONE_BOX]
+    assert runner.families() == [ONE_BOX]
 
 
-def test_a_world_that_cannot_be_made_keeps_its_kind(
-    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_world_that_cannot_be_made_keeps_its_kind(tmp_path: Path, runner: Runner) -> None:
     def fails(*_: object) -> Scenario:
         raise ScenarioError("props stand in each other")
 
-    monkeypatch.setattr(runner, "load_scenario", fails)
-    run, _ = run_in(tmp_path / "run", plan_of(tmp_path, scenarios=ONE_CLEAN, variants=MERGES, rest="until: merge"))
+    plan = plan_of(tmp_path, scenarios=ONE_CLEAN, variants=MERGES, rest="until: merge")
+    run, _ = runner.run(tmp_path / "run", plan, tools=replace(runner.tools, draw=fails))
     results = table(run)
     assert results["status"].tolist() == ["failed"] * 5
     assert set(results["pair_kind"]) == {"clean"}
@@ -799,24 +738,19 @@ def test_cells_made_without_kiss_matcher_are_made_again_once_it_is_there(monkeyp
 
 
 def test_tables_that_are_there_are_put_together_again_only_where_something_may_have_changed(
-    tmp_path: Path, simulated: list[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, runner: Runner
 ) -> None:
     commit: list[str | None] = ["a" * 40]
-    written: list[RunFolder] = []
-
-    def write(run: RunFolder) -> pd.DataFrame:
-        written.append(run)
-        return write_tables(run)
+    times = map(str, count())
+    tools = replace(runner.tools, commit=lambda: commit[0], now=lambda: next(times))
 
     def is_written(plan: Plan) -> bool:
-        written.clear()
-        assert run_plan(plan, run).n_done == 0
-        return bool(written)
+        earlier = run.provenance().get("finished")
+        assert runner.run(run.path, plan, tools=tools)[1].n_done == 0
+        return bool(run.provenance()["finished"] != earlier)
 
-    monkeypatch.setattr(provenance, "git_commit", lambda: commit[0])
-    monkeypatch.setattr(runner, "write_tables", write)
-    plan, run = plan_of(tmp_path), start_run_folder(tmp_path / "run")
-    run_plan(plan, run)
+    plan = plan_of(tmp_path)
+    run, _ = runner.run(tmp_path / "run", plan, tools=tools)
     results, (cell,) = run.path / "results.csv", run.path.glob("cells/*/*/*.json")
     bytes_before = results.read_bytes()
     told = run.provenance()

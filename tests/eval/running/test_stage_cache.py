@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -20,7 +20,8 @@ from cdpipe.model.config import PipelineConfig, load_config
 from cdpipe.model.report import ChangeRegions
 from cdpipe.model.types import DescriptorSet, KeyframeViews, MergedMaps, PointMap
 from eval.plans.plan import load_plan
-from eval.running import pair_run, runner, stage_cache, stage_results, stages
+from eval.running import stage_cache, stage_results, stages
+from eval.running.pair_run import Tools
 from eval.running.runfolder import RunFolder, start_run_folder
 from eval.running.runner import run_plan
 from eval.running.stage_cache import Kept, StageCache, open_cache
@@ -28,7 +29,6 @@ from eval.running.stages import PairStages
 from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
 from scenarios.schema import Scenario
-from sim.session.simulate import simulate_pair
 
 SMALL = ("sensor.mode=512x10", "platform.scan_spacing_m=1.0")
 STAGES = ("build_map", "describe_scans", "describe_map", "merge_maps", "find_regions")
@@ -66,10 +66,8 @@ def assert_same(one: Any, other: Any) -> None:
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("pair") / "20000"
-    simulate_pair(load_scenario("smoke/one_box", 20000, SMALL), 20000, path)
-    return path
+def pair(simulated_once: Callable[[Scenario, int], Path]) -> Path:
+    return simulated_once(load_scenario("smoke/one_box", 20000, SMALL), 20000)
 
 
 @pytest.fixture
@@ -232,23 +230,23 @@ def test_workers_call_every_stage_once(pair: Path, calls: Counter[str]) -> None:
 
 
 @pytest.fixture
-def run(pair: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., RunFolder]]:
+def run(pair: Path, tmp_path: Path) -> Callable[..., RunFolder]:
     """Run `tunnelcd` with a voxel on a copy of the pair, as the command does."""
 
-    def copy(scenario: Scenario, seed: int, out: Path, on_progress: object) -> None:
+    def copy(scenario: Scenario, seed: int, out: Path, on_stage: object) -> None:
         shutil.copytree(pair, out)
+
+    tools = Tools(draw=lambda name, seed, settings: load_scenario(name, seed, SMALL), simulate=copy)
 
     def start(voxel_m: float, **options: Any) -> RunFolder:
         plan = tmp_path / "plan.yaml"
         of_variant = f"{{preset: tunnelcd, set: [query.n_regions=2, extract.method=voxel, extract.voxel_m={voxel_m}]}}"
         plan.write_text(f"name: test\nscenarios: [smoke/one_box]\nseeds: [20000]\nvariants: [{of_variant}]\n")
         folder = start_run_folder(tmp_path / "run")
-        run_plan(load_plan(str(plan)), folder, **options)
+        run_plan(load_plan(str(plan)), folder, tools=tools, **options)
         return folder
 
-    monkeypatch.setattr(pair_run, "simulate_pair", copy)
-    monkeypatch.setattr(runner, "load_scenario", lambda name, seed, settings=(): load_scenario(name, seed, SMALL))
-    yield start
+    return start
 
 
 def test_a_finished_folder_run_with_another_voxel(run: Callable[..., RunFolder], calls: Counter[str]) -> None:

@@ -49,5 +49,5 @@ def befall(pair_run: ModuleType) -> None:
             (folder / "answer.json").unlink()
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder / "answer.npz"))
 
-    pair_run.simulate_pair = copied
+    pair_run.TOOLS = pair_run.Tools(simulate=copied)
     pair_run._answer = answered
