@@ -72,9 +72,6 @@ class UniqueCells:
     def __init__(self) -> None:
         self._sorted_keys = np.zeros(0, dtype=np.int64)
         self._sorted_ids = np.zeros(0, dtype=np.int64)
-        self._first: list[Int64Array] = []
-        self._counts = np.zeros(0, dtype=np.int64)
-        self._n_added = 0
 
     def __len__(self) -> int:
         return len(self._sorted_keys)
@@ -84,8 +81,7 @@ class UniqueCells:
         # neighbours in a scan mostly share a cell: sorting what is left of their runs is several times faster
         starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1])[: len(keys)])
         lengths = np.diff(starts, append=len(keys))
-        cells, first, run_cell = np.unique(keys[starts], return_index=True, return_inverse=True)
-        first, counts = starts[first], np.bincount(run_cell, lengths, len(cells)).astype(np.int64)
+        cells, run_cell = np.unique(keys[starts], return_inverse=True)
         place = np.searchsorted(self._sorted_keys, cells)
         is_known = np.zeros(len(cells), dtype=np.bool_)
         inside = place < len(self)
@@ -96,12 +92,8 @@ class UniqueCells:
         ids[is_known] = self._sorted_ids[place[is_known]]
         ids[is_new] = len(self) + np.arange(np.count_nonzero(is_new))
 
-        self._counts = np.concatenate([self._counts, np.zeros(np.count_nonzero(is_new), dtype=np.int64)])
-        self._counts[ids] += counts
-        self._first.append(self._n_added + first[is_new])
         self._sorted_keys = np.insert(self._sorted_keys, place[is_new], cells[is_new])
         self._sorted_ids = np.insert(self._sorted_ids, place[is_new], ids[is_new])
-        self._n_added += len(keys)
         return np.repeat(ids[run_cell], lengths)
 
     @property
@@ -110,13 +102,3 @@ class UniqueCells:
         keys = np.empty(len(self), dtype=np.int64)
         keys[self._sorted_ids] = self._sorted_keys
         return keys
-
-    @property
-    def first_index(self) -> Int64Array:
-        """(C,) position in the whole stream of the first key of each cell."""
-        return np.concatenate(self._first) if self._first else np.zeros(0, dtype=np.int64)
-
-    @property
-    def counts(self) -> Int64Array:
-        """(C,) how many keys of the stream fell into each cell."""
-        return self._counts.copy()

@@ -6,6 +6,7 @@ import difflib
 import types
 import typing
 from collections.abc import Iterable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -61,7 +62,7 @@ def read_yaml(path: Path, text: str | None = None) -> Document:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:  # not text
         raise InputError(f"{path}: not YAML: {error}") from error
-    return replace(document, value=_copied(document.value))
+    return replace(document, value=deepcopy(document.value))
 
 
 @lru_cache(maxsize=64)
@@ -103,7 +104,7 @@ def apply_settings(document: Document, settings: Iterable[str]) -> Document:
     Raises:
         InputError: A setting has no "=" or is not YAML.
     """
-    value = _copied(document.value)
+    value = deepcopy(document.value)
     origins = dict(document.origins)
     for setting in settings:
         name, equals, text = setting.partition("=")
@@ -225,14 +226,8 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 
 def _overlaid(below: Any, above: Any) -> Any:
     if not isinstance(below, dict) or not isinstance(above, dict):
-        return _copied(above)
+        return deepcopy(above)
     return {key: _overlaid(below.get(key), above[key]) if key in above else below[key] for key in {**below, **above}}
-
-
-def _copied(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _copied(item) for key, item in value.items()}
-    return [_copied(item) for item in value] if isinstance(value, list) else value
 
 
 def _plain(node: Any, key: Key, lines: dict[Key, int], mistakes: list[str], source: str) -> Any:

@@ -27,17 +27,26 @@ _FREQUENCIES = 8
 _RANGE_SCALE_M = 10.0
 
 
-class _CircularConv(nn.Module):
-    """3 x 5 convolution, group norm and ReLU; azimuth wraps round, elevation repeats its edge."""
+class CircularConv(nn.Module):
+    """3 x 5 convolution, group norm and ReLU; columns wrap round, rows are padded.
 
-    def __init__(self, inputs: int, outputs: int, stride: tuple[int, int]) -> None:
+    Args:
+        inputs: Channels in.
+        outputs: Channels out.
+        stride: Of rows and columns.
+        row_padding: Rows of zeros beyond either edge; 0 repeats the edge instead.
+    """
+
+    def __init__(self, inputs: int, outputs: int, stride: tuple[int, int], row_padding: int = 0) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(inputs, outputs, (3, 5), stride=stride)
+        self.conv = nn.Conv2d(inputs, outputs, (3, 5), stride=stride, padding=(row_padding, 0))
         self.norm = nn.GroupNorm(8, outputs)
 
     def forward(self, image: Tensor) -> Tensor:
-        wrapped = nn.functional.pad(image, (2, 2, 0, 0), mode="circular")
-        padded = nn.functional.pad(wrapped, (0, 0, 1, 1), mode="replicate")
+        """Return (B, outputs, rows, columns) features of (B, inputs, rows, columns)."""
+        padded = nn.functional.pad(image, (2, 2, 0, 0), mode="circular")
+        if not self.conv.padding[0]:
+            padded = nn.functional.pad(padded, (0, 0, 1, 1), mode="replicate")
         activated: Tensor = torch.relu(self.norm(self.conv(padded)))
         return activated
 
@@ -49,7 +58,7 @@ class PlaceNetwork(nn.Module):
         super().__init__()
         inputs = (2, *_CHANNELS[:-1])
         self.layers = nn.Sequential(
-            *(_CircularConv(a, b, s) for a, b, s in zip(inputs, _CHANNELS, _STRIDES, strict=True))
+            *(CircularConv(a, b, s) for a, b, s in zip(inputs, _CHANNELS, _STRIDES, strict=True))
         )
         self.place = nn.Linear((_FREQUENCIES + 1) * _CHANNELS[-1] * 4, DIMENSIONS)
         self.heading = nn.Conv1d(4 * _CHANNELS[-1], 1, 1)

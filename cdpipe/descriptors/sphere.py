@@ -10,10 +10,10 @@ from functools import cache
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, invert
 from cdpipe.core.grid_index import GridIndex
-from cdpipe.descriptors.pooling import agreed
 from cdpipe.descriptors.sphere_image import render
 from cdpipe.descriptors.sphere_network import PER_SECTOR, SECTORS, SphereNetwork, load_trained_sphere_network
 from cdpipe.model.config import DescriptorConfig
@@ -21,6 +21,8 @@ from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap, Spheres
 
 _BATCH = 64
 _INT8_SCALE = 127.0
+# Keyframes farther apart than this along the path look at different stretches.
+_NEIGHBOUR_M = 2.5
 
 
 def describe_map(thin_map: PointMap, map_T_anchor: Float64Array, config: DescriptorConfig) -> Spheres:
@@ -56,7 +58,9 @@ def change_logits(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArr
     network, _ = _network()
     logits = np.full((len(is_covered), SECTORS), np.nan)
     map_T_anchor = merged.before.odom_T_sensor[before.keyframe_scans[is_covered]]
-    images = render(GridIndex(merged.after.points), _in_after_odom(merged, map_T_anchor))
+    positions_odom = merged.alignment.to_odom(map_T_anchor[:, :3, 3])
+    after_T_anchor = np.asarray(invert(merged.alignment.at(positions_odom)) @ map_T_anchor)
+    images = render(GridIndex(merged.after.points), after_T_anchor)
     spheres = stored_numbers(before.spheres[is_covered])
     with torch.inference_mode():
         batches = (torch.split(torch.from_numpy(array), _BATCH) for array in (spheres, images))
@@ -86,6 +90,31 @@ def change_log_odds(merged: MergedMaps, before: DescriptorSet, is_covered: BoolA
     return log_odds
 
 
+def agreed(logits: Float64Array, positions: Float64Array) -> Float64Array:
+    """Return (K, S) log-odds, each averaged with the same sector of the keyframes before and after, which weigh half.
+
+    Neighbours a metre apart see most of the same wall: what only one of them calls changed is noise. A neighbour that
+    is missing (the end of the path, a gap in it) is replaced by the keyframe itself.
+
+    Args:
+        logits: (K, S), in the order of the path.
+        positions: (K, 3) of the keyframes, metres.
+    """
+    is_apart = np.linalg.norm(np.diff(positions, axis=0), axis=1) > _NEIGHBOUR_M
+    here = np.arange(len(logits))
+    before = np.where(np.concatenate([[True], is_apart]), here, here - 1) if len(here) else here
+    after = np.where(np.concatenate([is_apart, [True]]), here, here + 1) if len(here) else here
+    return np.asarray((logits[before] + 2 * logits + logits[after]) / 4)
+
+
+def best_in_reach(scores: Float64Array, positions: Float64Array, reach_m: float) -> Float64Array:
+    """Return the (K,) highest of the scores of the keyframes within `reach_m` of each, the border included."""
+    if len(scores) == 0:
+        return scores
+    near = cKDTree(positions).query_ball_point(positions, reach_m)
+    return np.array([scores[found].max() for found in near])
+
+
 def stored_numbers(spheres: Spheres) -> Float32Array:
     """Return (K, 64) stored descriptors as float32 numbers in (-1, 1)."""
     if spheres.dtype == np.int8:
@@ -96,11 +125,6 @@ def stored_numbers(spheres: Spheres) -> Float32Array:
 def sphere_digest() -> str:
     """Return the digest of the weights."""
     return _network()[1]
-
-
-def _in_after_odom(merged: MergedMaps, map_T_anchor: Float64Array) -> Float64Array:
-    positions_odom = merged.alignment.to_odom(map_T_anchor[:, :3, 3])
-    return np.asarray(invert(merged.alignment.at(positions_odom)) @ map_T_anchor)
 
 
 @cache

@@ -8,7 +8,6 @@ into 64 numbers. Trained on simulated change (`cdpipe.training.sphere_training`)
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 
@@ -16,7 +15,7 @@ import torch
 from safetensors.torch import load
 from torch import Tensor, nn
 
-from cdpipe.descriptors.network import digest
+from cdpipe.descriptors.network import CircularConv, digest
 from cdpipe.descriptors.sphere_image import COLUMNS, ROWS
 
 SECTORS = 16
@@ -55,20 +54,6 @@ class SphereSize:
         return self.per_sector * SECTORS
 
 
-class _UnrolledConv(nn.Module):
-    """3 x 5 convolution, group norm and ReLU; columns wrap round the tunnel, beyond the rows nothing is seen."""
-
-    def __init__(self, inputs: int, outputs: int, stride: tuple[int, int]) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(inputs, outputs, (3, 5), stride=stride, padding=(1, 0))
-        self.norm = nn.GroupNorm(8, outputs)
-
-    def forward(self, image: Tensor) -> Tensor:
-        wrapped = nn.functional.pad(image, (2, 2, 0, 0), mode="circular")
-        activated: Tensor = torch.relu(self.norm(self.conv(wrapped)))
-        return activated
-
-
 class SphereNetwork(nn.Module):
     """Images (B, ROWS, COLUMNS) of two sessions at the same places -> log-odds of change (B, SECTORS)."""
 
@@ -80,7 +65,7 @@ class SphereNetwork(nn.Module):
         n_seen = int(_SEEN * self.size.width) if self.size.reads_after else 0
         inputs = (2, *channels[:-1])
         self.trunk = nn.Sequential(
-            *(_UnrolledConv(a, b, s) for a, b, s in zip(inputs, channels, _STRIDES, strict=True))
+            *(CircularConv(a, b, s, row_padding=1) for a, b, s in zip(inputs, channels, _STRIDES, strict=True))
         )
         self.kept = nn.Conv2d(channels[-1], self.size.per_sector, (ROWS // 4, 1))
         if n_seen:
@@ -134,16 +119,11 @@ def make_untrained_sphere_network(seed: int = 0, size: SphereSize | None = None)
         return SphereNetwork(size).eval()
 
 
-def size_of(tensors: Mapping[str, Tensor]) -> SphereSize:
-    """Return the size of the network that these weights are of; their shapes say it, so no checkpoint can lack it."""
-    per_sector, channels = tensors["kept.weight"].shape[:2]
-    return SphereSize(per_sector, channels / _CHANNELS[-1], "seen.weight" in tensors)
-
-
 def load_sphere_network(content: bytes) -> SphereNetwork:
     """Return the network of a checkpoint, whatever its size."""
     tensors = load(content)
-    network = SphereNetwork(size_of(tensors))
+    per_sector, channels = tensors["kept.weight"].shape[:2]
+    network = SphereNetwork(SphereSize(per_sector, channels / _CHANNELS[-1], "seen.weight" in tensors))
     network.load_state_dict(tensors)
     return network.eval()
 

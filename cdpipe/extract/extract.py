@@ -23,18 +23,6 @@ from cdpipe.model.config import PipelineConfig
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
 from cdpipe.model.types import DescriptorSet, MergedMaps
 
-__all__ = [
-    "FIGURES",
-    "PointGroup",
-    "assemble_objects",
-    "cut_out",
-    "extract_changes",
-    "hull_volume_m3",
-    "make_report",
-    "region_figures",
-    "with_withdrawn",
-]
-
 FIGURES = ("v_sphere_m3", "v_oe_m3", "s_points", "oe_points")
 
 

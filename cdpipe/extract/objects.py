@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from cdpipe.core.grid_index import GridIndex
 from cdpipe.core.voxel import cell_means
 from cdpipe.extract.moves import find_moves
 from cdpipe.extract.remains import is_muck, is_part_of_a_rest
-from cdpipe.extract.shape import ground_heights, object_shape, upright_box
+from cdpipe.extract.shape import ground_heights, measure_shape, upright_box
 from cdpipe.model.report import ChangedObject
 from cdpipe.model.types import MergedMaps, PointMap, SessionName
 
@@ -76,11 +76,10 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
     points: dict[int, Float64Array] = {}
     for session in _SESSIONS:
         members = [number for number, group in enumerate(groups) if group.session == session]
-        whole = [number for number in members if groups[number].returns is None]
-        chosen = dict(zip(whole, _returns_of_groups(maps[session], [groups[n].indices for n in whole]), strict=True))
+        pool = ReturnPool(maps[session], [groups[n].indices for n in members if groups[n].returns is None])
         for number in members:
             own = groups[number].returns
-            indices = chosen[number] if own is None else np.sort(own)
+            indices = np.sort(pool.of(groups[number].indices) if own is None else own)
             returns[number] = _scan_and_pixel(maps[session], indices)
             points[number] = _measured_points(merged, groups[number], indices)
     surroundings = _Surroundings(merged)
@@ -94,7 +93,7 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
         # a rule that takes whole map points leaves an object's foot behind, which would pass for a rest
         may_be_part = group.session == "before" and group.returns is not None
         is_part[number] = may_be_part and is_part_of_a_rest(taken, around["before"], other)
-        is_fine = maps[group.session].return_offsets is not None
+        column_m = voxel_m if maps[group.session].return_offsets is None else voxel_m / 2
         objects.append(
             ChangedObject(
                 session=group.session,
@@ -103,7 +102,7 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
                 returns=returns[number],
                 points_map=group.points_map,
                 score=float(len(group.indices)),
-                shape=object_shape(points[number], other, voxel_m / 2 if is_fine else voxel_m, voxel_m),
+                shape=measure_shape(points[number], other, column_m, voxel_m),
             )
         )
     return _with_moves(objects, points, is_part, surroundings)
@@ -132,23 +131,28 @@ def _with_moves(
     return tuple(objects)
 
 
-def _returns_of_groups(point_map: PointMap, groups: Sequence[Int64Array]) -> list[Int64Array]:
-    """Return which (M,) returns each group is made of, rising, in one pass over the returns of the map."""
-    if not groups:
-        return []
-    group_of_point = np.full(len(point_map.points), -1, dtype=np.int32)
-    for number, indices in enumerate(groups):
-        group_of_point[indices] = number
-    is_wanted = group_of_point >= 0
-    chosen = np.concatenate(
-        [
-            start + np.flatnonzero(is_wanted[point_map.return_points[start : start + _BLOCK_RETURNS]])
-            for start in range(0, max(1, len(point_map.return_points)), _BLOCK_RETURNS)
+class ReturnPool:
+    """The returns of some map points, found in one pass over all returns of a map."""
+
+    def __init__(self, point_map: PointMap, wanted: Iterable[Int64Array]) -> None:
+        is_wanted = np.zeros(len(point_map.points), dtype=np.bool_)
+        for indices in wanted:
+            is_wanted[indices] = True
+        owners = point_map.return_points
+        chosen = [
+            start + np.flatnonzero(is_wanted[owners[start : start + _BLOCK_RETURNS]])
+            for start in range(0, len(owners) if is_wanted.any() else 0, _BLOCK_RETURNS)
         ]
-    )
-    group = group_of_point[point_map.return_points[chosen]]
-    by_group = chosen[np.argsort(group, kind="stable")]
-    return np.split(by_group, np.cumsum(np.bincount(group, minlength=len(groups)))[:-1])
+        returns = np.concatenate(chosen) if chosen else np.zeros(0, dtype=np.int64)
+        self._returns = returns[np.argsort(owners[returns], kind="stable")]
+        self._owners = owners[self._returns]
+
+    def of(self, indices: Int64Array) -> Int64Array:
+        """Return the returns of some of the wanted map points, by map point."""
+        starts = np.searchsorted(self._owners, indices, side="left")
+        ends = np.searchsorted(self._owners, indices, side="right")
+        parts = [self._returns[start:end] for start, end in zip(starts.tolist(), ends.tolist(), strict=True)]
+        return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
 
 def _scan_and_pixel(point_map: PointMap, returns: Int64Array) -> Int32Array:
@@ -230,10 +234,9 @@ class _Surroundings:
     def _finely(self, session: SessionName, chosen: Sequence[Int64Array]) -> list[Float64Array]:
         """Return the points (P, 3) of sets of map points, map frame: finer than the map's, where that is known."""
         point_map = self._merged.before if session == "before" else self._merged.after
-        if point_map.return_offsets is None or not chosen:
+        if point_map.return_offsets is None:
             points = [point_map.points[indices] for indices in chosen]
         else:
-            (returns,) = _returns_of_groups(point_map, [np.unique(np.concatenate(chosen))])
-            owners = point_map.return_points[returns]
-            points = [_fine_points(point_map, returns[np.isin(owners, indices)]) for indices in chosen]
+            pool = ReturnPool(point_map, chosen)
+            points = [_fine_points(point_map, np.sort(pool.of(indices))) for indices in chosen]
         return [self._merged.alignment.to_map(odom) if session == "after" else odom for odom in points]

@@ -91,19 +91,27 @@ def cluster_labels(points: Float64Array, config: ClusterConfig) -> Int64Array:
         (N,) labels from 0 in falling size (equal sizes: in the order of their first points); -1 for points of groups
         smaller than `min_points`.
     """
-    n = len(points)
-    if n == 0:
-        return np.zeros(0, dtype=np.int64)
-    pairs = cKDTree(points).query_pairs(config.radius_m, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    _, groups = connected_components(graph, directed=False)
-    sizes = np.bincount(groups)
+    groups, sizes = label_groups(points, config.radius_m)
     first = np.unique(groups, return_index=True)[1]
     order = np.lexsort((first, -sizes))
     labels = np.full(len(sizes), -1, dtype=np.int64)
     big = order[sizes[order] >= config.min_points]
     labels[big] = np.arange(len(big))
     return labels[groups]
+
+
+def label_groups(points: Float64Array, link_m: float) -> tuple[Int64Array, Int64Array]:
+    """Return the (N,) connected component of each point and the size of every component.
+
+    Two of the (N, 3) points are neighbours if they are within `link_m` of each other.
+    """
+    n = len(points)
+    if n == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    pairs = cKDTree(points).query_pairs(link_m, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    _, labels = connected_components(graph, directed=False)
+    return labels.astype(np.int64), np.bincount(labels)
 
 
 def _cells(points: Float64Array, config: ExtractConfig) -> list[Float64Array]:

@@ -20,7 +20,7 @@ from cdpipe.model.report import ObjectShape
 _GROUND_COLUMNS = 5
 
 
-def object_shape(
+def measure_shape(
     points_map: Float64Array, other_map: Float64Array, column_m: float = 0.1, ground_m: float = 0.2
 ) -> ObjectShape:
     """Measure an object.
@@ -64,7 +64,7 @@ def upright_box(points: Float64Array) -> tuple[Float64Array, Float64Array]:
 def column_volume_m3(
     points_map: Float64Array, other_map: Float64Array, column_m: float = 0.1, ground_m: float = 0.2
 ) -> float:
-    """Return the volume between an object and what the other session saw below it; arguments as of `object_shape`.
+    """Return the volume between an object and what the other session saw below it; arguments as of `measure_shape`.
 
     A footprint without an area has no volume.
     """

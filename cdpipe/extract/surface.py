@@ -16,12 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.voxel import cell_means
+from cdpipe.extract.point_comparison import label_groups
 from cdpipe.merge.registration import Surface
 from cdpipe.model.config import ExtractConfig
 
@@ -132,7 +131,7 @@ def candidates(points: Float64Array, table: PlaneTable) -> tuple[Int64Array, flo
 
 
 def _are_three_together(points: Float64Array) -> BoolArray:
-    """Mark the (N, 3) points in groups of three or more, as `groups` has them, without making the groups.
+    """Mark the (N, 3) points in groups of three or more, as `label_groups` has them, without making the groups.
 
     Such a point has two neighbours, or one that has another.
     """
@@ -145,17 +144,6 @@ def _are_three_together(points: Float64Array) -> BoolArray:
     is_together[one[is_strong]] = True
     is_together[other[is_strong]] = True
     return is_together
-
-
-def groups(points: Float64Array, link_m: float) -> tuple[Int64Array, Int64Array]:
-    """Return the (N,) group of each point, neighbours being within `link_m`, and the size of every group."""
-    n = len(points)
-    if n == 0:
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    pairs = cKDTree(points).query_pairs(link_m, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    _, labels = connected_components(graph, directed=False)
-    return labels.astype(np.int64), np.bincount(labels)
 
 
 def compare_site(points: Float64Array, reference: Float64Array) -> Site:
@@ -185,7 +173,7 @@ def grow_objects(site: Site, free_space_votes: Int64Array, noise_m: float, confi
     """
     stands_off, is_free = site.distance_m > border_of(noise_m, config), free_space_votes > 0
     core, foot = np.flatnonzero(stands_off & is_free), np.flatnonzero(stands_off & ~is_free)
-    labels, sizes = groups(site.points[core], _LINK_M)
+    labels, sizes = label_groups(site.points[core], _LINK_M)
     n_views = np.bincount(labels, free_space_votes[core], len(sizes))
     is_seen = n_views >= config.min_views * sizes
     kept = np.flatnonzero(is_seen & (_n_clear(site, core, labels, noise_m, config) >= config.min_cells))
@@ -218,7 +206,7 @@ def grow_low_objects(
     """
     is_passed = n_past >= _MIN_SCANS_PAST
     core, foot = left[is_passed], left[~is_passed]
-    labels, sizes = groups(site.points[core], _LINK_M)
+    labels, sizes = label_groups(site.points[core], _LINK_M)
     n_clear = _n_clear(site, core, labels, noise_m, config)
     is_whole = (n_clear >= _MIN_LOW_CELLS) & (2 * n_clear >= sizes)
     if any(len(each) for each in taken):

@@ -14,7 +14,8 @@ import numpy as np
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform, travelled_m
 from cdpipe.core.voxel import cell_means
 from cdpipe.extract.crops import DIRECTIONS, Crops, Sphere
-from cdpipe.extract.objects import PointGroup
+from cdpipe.extract.objects import PointGroup, ReturnPool
+from cdpipe.extract.point_comparison import label_groups
 from cdpipe.extract.surface import (
     CELL_M,
     RIM_M,
@@ -24,7 +25,6 @@ from cdpipe.extract.surface import (
     Site,
     candidates,
     compare_site,
-    groups,
     grow_low_objects,
     grow_objects,
     nearest_of,
@@ -49,7 +49,6 @@ _LOW_M = 0.3
 _DOUBLED = 3.0
 # What keyframes looked at from here is seen by their scans, most of all: half of the reach of views.
 _NEAR_M = REACH_M / 2
-_BLOCK_RETURNS = 1 << 22
 _UNKNOWN_VIEWS = np.int64(1 << 20)
 
 
@@ -158,7 +157,7 @@ def _sites(crops: Crops, found: Iterable[_Found], agreements: dict[int, _Agreeme
         first = order[np.unique(indices[order], return_index=True)[1]]
         indices, is_telling, region = indices[first], is_telling[first], region[first]
         points = crops.points_map(session, indices)
-        labels, sizes = groups(points, 2 * SITE_M)  # nearer ones would look at the same returns
+        labels, sizes = label_groups(points, 2 * SITE_M)  # nearer ones would look at the same returns
         for label in np.flatnonzero(np.bincount(labels, is_telling, len(sizes)) >= _MIN_TELLING):
             members = labels == label
             best = int(region[members & is_telling].min())
@@ -282,27 +281,3 @@ def collect_rays(
     if session == "after":
         origins = transform(correction, merged.alignment.to_map(origins))
     return ends, origins[scan_of_return], scans
-
-
-class ReturnPool:
-    """The returns of some map points, found in one pass over all returns of a map."""
-
-    def __init__(self, point_map: PointMap, wanted: Iterable[Int64Array]) -> None:
-        is_wanted = np.zeros(len(point_map.points), dtype=np.bool_)
-        for indices in wanted:
-            is_wanted[indices] = True
-        owners = point_map.return_points
-        chosen = [
-            start + np.flatnonzero(is_wanted[owners[start : start + _BLOCK_RETURNS]])
-            for start in range(0, len(owners), _BLOCK_RETURNS)
-        ]
-        returns = np.concatenate(chosen) if chosen else np.zeros(0, dtype=np.int64)
-        self._returns = returns[np.argsort(owners[returns], kind="stable")]
-        self._owners = owners[self._returns]
-
-    def of(self, indices: Int64Array) -> Int64Array:
-        """Return the returns of some of the wanted map points, by map point."""
-        starts = np.searchsorted(self._owners, indices, side="left")
-        ends = np.searchsorted(self._owners, indices, side="right")
-        parts = [self._returns[start:end] for start, end in zip(starts.tolist(), ends.tolist(), strict=True)]
-        return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)

@@ -93,12 +93,12 @@ def write_answer(folder: Path, method: str, report: ChangeReport, until: Until |
         "object_point_offsets": _offsets([item.points_map for item in objects]),
         **{f"figure_{name}": values for name, values in report.figures.items()},
     }
-    if regions.is_withdrawn is not None:
-        arrays["region_is_withdrawn"] = regions.is_withdrawn
-    if regions.direction is not None:
-        arrays["region_direction"] = regions.direction
-    if report.local_before_T_after is not None:
-        arrays["local_before_T_after"] = report.local_before_T_after
+    optional = {
+        "region_is_withdrawn": regions.is_withdrawn,
+        "region_direction": regions.direction,
+        "local_before_T_after": report.local_before_T_after,
+    }
+    arrays |= {name: array for name, array in optional.items() if array is not None}
     np.savez_compressed(folder / "answer.npz", allow_pickle=False, **arrays)
     document = {
         "status": "ok",
@@ -147,15 +147,8 @@ def read_answer(folder: Path) -> Answer:
         raise InputError(f"{path}: damaged, not JSON: {error}") from error
     document = checked_document(path, value)
     if not isinstance(document, AnswerPart):
-        return Answer(
-            document.status,
-            document.error,
-            document.method,
-            None,
-            document.seconds,
-            document.evidence,
-            until=document.until,
-        )
+        status, method, seconds, until = document.status, document.method, document.seconds, document.until
+        return Answer(status, document.error, method, None, seconds, document.evidence, until=until)
     arrays = load_arrays(folder / "answer.npz")
     checked_arrays(folder / "answer.npz", arrays, len(document.objects))
     try:

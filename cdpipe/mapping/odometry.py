@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, invert
+from cdpipe.core.geometry import Float64Array, invert, travelled_m
 from cdpipe.core.motion import Motion, make_motion, rotation_matrices
 from cdpipe.sensor.ouster import SensorMetadata
 
@@ -77,9 +77,8 @@ def estimate_motion(
     if len(odom_T_sensor) == 1:
         odom_T_sensor = np.repeat(odom_T_sensor, 2, axis=0)
         revolution_s = revolution_s + np.array([0.0, 1.0])
-    steps_m = np.linalg.norm(np.diff(odom_T_sensor[:, :3, 3], axis=0), axis=1)
-    way_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-    return make_motion(revolution_s, way_m, odom_T_sensor[:, :3, 3], Rotation.from_matrix(odom_T_sensor[:, :3, :3]))
+    positions, rotations = odom_T_sensor[:, :3, 3], Rotation.from_matrix(odom_T_sensor[:, :3, :3])
+    return make_motion(revolution_s, travelled_m(odom_T_sensor), positions, rotations)
 
 
 def deskew_at_constant_velocity(

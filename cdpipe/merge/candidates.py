@@ -18,7 +18,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, ya
 from cdpipe.descriptors.yaw import relative_yaws_rad
 from cdpipe.merge.registration import motion_between
 from cdpipe.model.config import MergeConfig
-from cdpipe.model.types import DescriptorSet, MappedSession, PointMap
+from cdpipe.model.types import DescriptorSet, MappedSession
 
 # After keyframes that are paired at most, before keyframes and yaws for each. Every pair is held against every other.
 _MAX_QUERIES = 100
@@ -184,12 +184,8 @@ def _common_motion(
 
 
 def _poses(session: MappedSession) -> Float64Array:
-    return keyframe_poses(session.map, session.descriptors)
-
-
-def keyframe_poses(point_map: PointMap, descriptors: DescriptorSet) -> Float64Array:
-    """Return the (K, 4, 4) `odom_T_sensor` of the keyframes that were described."""
-    return point_map.odom_T_sensor[descriptors.keyframe_scans]
+    """Return the (K, 4, 4) `odom_T_sensor` of the keyframes of a session that have descriptors."""
+    return session.map.odom_T_sensor[session.descriptors.keyframe_scans]
 
 
 def _turns_rad(before_poses: Float64Array, after_poses: Float64Array, yaws_rad: Float64Array) -> Float64Array:

@@ -27,7 +27,6 @@ from cdpipe.merge.registration import (
     align_by_gicp,
     eigenvalue_ratio,
     motion_between,
-    near_points,
     register,
     rigid_fit,
 )
@@ -78,7 +77,8 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     Returns:
         The best hypothesis, accepted or not and why; identity where nothing could be registered.
     """
-    if min(len(near_points(session.map, config)) for session in (before, after)) < MIN_SPHERE_POINTS:
+    n_near = [np.count_nonzero(session.map.nearest_m <= config.seen_within_m) for session in (before, after)]
+    if min(n_near) < MIN_SPHERE_POINTS:
         none = {"t_index_s": 0.0, "t_merge_s": 0.0, "t_refine_s": 0.0}
         return MergedMaps(before.map, after.map, np.eye(4), {"n_hypotheses": 0.0}, False, _TOO_FEW, seconds=none)
     start = perf_counter()

@@ -18,7 +18,7 @@ import numpy as np
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform, travelled_m
 from cdpipe.merge.evidence import sampled
 from cdpipe.merge.pose_graph import smoothed
-from cdpipe.merge.registration import IndexedMap, plane_jacobian
+from cdpipe.merge.registration import IndexedMap, plane_jacobian, solve_point_to_plane
 from cdpipe.merge.walk import Step, Walk, walk
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import MergeConfig
@@ -37,7 +37,7 @@ _CORRESPONDENCE_M = 1.0
 # validation pairs whose sessions drift apart by 1 %; without drift a larger one averages more.
 _POINT_M = 0.05
 # Points and their counterparts that tell how a stretch misleads a registration; what lies apart counts less.
-_COUNTERPART_M, _ROBUST_M, _DAMPING = 0.5, 0.1, 1e-3
+_COUNTERPART_M = 0.5
 _NOISE_SHARE = 0.02
 # Registrations that fit worse than this are left to their neighbours.
 _MIN_FIT = 0.6
@@ -134,9 +134,6 @@ def _per_stretch(
         normals = before.target.normals[nearest] @ pose[:3, :3]
         seen_from = (after.seen_from[chosen] + transform(invert(pose), before.seen_from[nearest])) / 2
         jacobian = plane_jacobian(after.points[chosen] - centre, normals)
-        weighted = jacobian / (1.0 + (distances_m / _ROBUST_M) ** 2)[:, None]
-        hessian = weighted.T @ jacobian
-        damped = hessian + _DAMPING * np.diag(hessian).reshape(2, 3).max(axis=1).repeat(3) * np.eye(6)
         ahead_m = np.einsum("ij,ij->i", normals, seen_from - centre)
-        result[a] = np.linalg.solve(damped, weighted.T @ ahead_m)
+        result[a] = solve_point_to_plane(jacobian, distances_m, ahead_m)
     return result

@@ -101,11 +101,6 @@ class IndexedMap:
         return self.columns.points_within(centre, radius_m)
 
 
-def near_points(point_map: PointMap, config: MergeConfig) -> Float64Array:
-    """Return the (N, 3) points of a map that were seen from within `merge.seen_within_m`."""
-    return point_map.points[point_map.nearest_m <= config.seen_within_m]
-
-
 def _thinned(
     points: Float64Array, seen_from: Float64Array | Float32Array, voxel_m: float
 ) -> tuple[Float64Array, Float64Array]:
@@ -211,11 +206,7 @@ def align_to_planes(
         chosen = np.asarray(found)[is_pair]
         distances_m = np.einsum("ij,ij->i", moved[is_pair] - target.points[chosen], target.normals[chosen])
         jacobian = plane_jacobian(centred[is_pair], target.normals[chosen] @ pose[:3, :3])
-        weighted = jacobian / (1.0 + (distances_m / _ROBUST_M) ** 2)[:, None]
-        hessian = weighted.T @ jacobian
-        # where nothing holds the points they stay: a thousandth of what holds them best
-        damped = hessian + _DAMPING * np.diag(hessian).reshape(2, 3).max(axis=1).repeat(3) * np.eye(6)
-        step = -np.linalg.solve(damped, weighted.T @ distances_m)
+        step = -solve_point_to_plane(jacobian, distances_m, distances_m)
         pose = pose @ make_pose(Rotation.from_rotvec(step[:3]).as_matrix(), step[3:])
         if np.abs(step).max() < _PLANE_CONVERGED:  # metres, radians
             break
@@ -231,6 +222,23 @@ def plane_jacobian(offsets: Float64Array, normals: Float64Array) -> Float64Array
     """
     (x, y, z), (a, b, c) = offsets.T, normals.T
     return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=1)
+
+
+def solve_point_to_plane(jacobian: Float64Array, distances_m: Float64Array, values_m: Float64Array) -> Float64Array:
+    """Return the (6,) motion, rotation then translation, whose displacements along the normals best match values.
+
+    Weighted least squares: a correspondence weighs 1 / (1 + (d / 0.1 m)^2). Directions that no normal constrains are
+    damped by a thousandth of the largest diagonal entry, so that the motion along them stays zero.
+
+    Args:
+        jacobian: (N, 6) from `plane_jacobian`.
+        distances_m: (N,) point-to-plane distances that set the weights.
+        values_m: (N,) displacements to match.
+    """
+    weighted = jacobian / (1.0 + (distances_m / _ROBUST_M) ** 2)[:, None]
+    hessian = weighted.T @ jacobian
+    damped = hessian + _DAMPING * np.diag(hessian).reshape(2, 3).max(axis=1).repeat(3) * np.eye(6)
+    return np.linalg.solve(damped, weighted.T @ values_m)
 
 
 def eigenvalue_ratio(hessian: Float64Array) -> float:

@@ -15,7 +15,8 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.grid_index import GridIndex
-from cdpipe.extract.extract import FIGURES, PointGroup, assemble_objects, hull_volume_m3, make_report
+from cdpipe.extract.extract import FIGURES, hull_volume_m3, make_report
+from cdpipe.extract.objects import PointGroup, assemble_objects
 from cdpipe.extract.point_comparison import cluster_labels, inlier_mask
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport

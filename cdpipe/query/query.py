@@ -14,8 +14,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.descriptors.pooling import best_in_reach
-from cdpipe.descriptors.sphere import change_log_odds
+from cdpipe.descriptors.sphere import best_in_reach, change_log_odds
 from cdpipe.model.config import QueryConfig
 from cdpipe.model.report import ChangeRegions
 from cdpipe.model.types import DescriptorSet, MergedMaps, UInt8Array

@@ -55,30 +55,9 @@ class PlaceData:
         for name in ("headings_rad", "tunnels", "sessions"):
             require_shape(name, getattr(self, name), (n,))
 
-    def subset(self, mask: BoolArray) -> PlaceData:
-        """Return the marked keyframes."""
-        return PlaceData(
-            self.images_m[mask], self.positions[mask], self.headings_rad[mask], self.tunnels[mask], self.sessions[mask]
-        )
-
 
 TUNNELS_PER_BATCH = 8
 ANCHORS_PER_TUNNEL = 8
-
-
-@dataclass(frozen=True, slots=True)
-class PlaceScores:
-    """How well places and headings are recognised.
-
-    Attributes:
-        recall_at_1: Share of after keyframes whose nearest before descriptor, within its tunnel, lies within 3 m.
-        yaw_error_deg: Median absolute yaw error between true neighbours, best of the correlation's peaks.
-        yaw_flip_share: Share of those errors over 90 deg.
-    """
-
-    recall_at_1: float
-    yaw_error_deg: float
-    yaw_flip_share: float
 
 
 class PlaceTask:
@@ -128,16 +107,21 @@ class PlaceTask:
 
     def scores(self) -> dict[str, float]:
         """Return recall@1 within 3 m, and the yaw's median error and share of flips."""
-        scores = evaluate(self._network, self._validation)
-        return {name: float(getattr(scores, name)) for name in scores.__slots__}
+        return evaluate(self._network, self._validation)
 
     def finish(self) -> dict[str, float]:
         """There is nothing to do."""
         return {}
 
 
-def evaluate(network: PlaceNetwork, data: PlaceData) -> PlaceScores:
-    """Score a network on tunnels it has not seen; every tunnel needs both sessions."""
+def evaluate(network: PlaceNetwork, data: PlaceData) -> dict[str, float]:
+    """Score a network on tunnels it has not seen; every tunnel needs both sessions.
+
+    Returns:
+        `recall_at_1`: share of after keyframes whose nearest before descriptor, within its tunnel, lies within 3 m.
+        `yaw_error_deg`: median absolute yaw error between true neighbours. `yaw_flip_share`: share of these errors
+        over 90 degrees.
+    """
     draw = stream(0, "evaluate-descriptor")
     images, headings = _turned(data, np.arange(len(data.positions)), draw)
     with torch.inference_mode():
@@ -157,7 +141,11 @@ def evaluate(network: PlaceNetwork, data: PlaceData) -> PlaceScores:
             peak = int(yaw_correlation(w[before[near]][None], w[after[row]][None]).argmax())
             error = peak * 2 * np.pi / DIMENSIONS - float(headings[after[row]] - headings[before[near]])
             errors.append(abs(float(np.rad2deg(np.angle(np.exp(1j * error))))))
-    return PlaceScores(float(np.mean(hits)), float(np.median(errors)), float(np.mean(np.array(errors) > 90)))
+    return {
+        "recall_at_1": float(np.mean(hits)),
+        "yaw_error_deg": float(np.median(errors)),
+        "yaw_flip_share": float(np.mean(np.array(errors) > 90)),
+    }
 
 
 def _partners(data: PlaceData) -> list[Int64Array]:

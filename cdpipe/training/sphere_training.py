@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
-from cdpipe.descriptors.pooling import agreed, best_in_reach
+from cdpipe.descriptors.sphere import agreed, best_in_reach
 from cdpipe.descriptors.sphere_image import COLUMNS, REACH_M, ROWS
 from cdpipe.descriptors.sphere_network import SECTORS, SphereNetwork
 from cdpipe.training.data import TunnelShard

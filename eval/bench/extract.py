@@ -22,9 +22,10 @@ from cdpipe.core.geometry import Float64Array, Int64Array, transform
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import use_threads
 from cdpipe.extract.crops import Crops, Sphere
-from cdpipe.extract.point_comparison import inlier_mask, new_points_mask
-from cdpipe.extract.surface import RIM_M, SITE_M, PlaneTable, candidates, compare_site, groups
-from cdpipe.extract.surface_rule import BEYOND_M, ReturnPool, collect_rays, find_object_cells, realign
+from cdpipe.extract.objects import ReturnPool
+from cdpipe.extract.point_comparison import inlier_mask, label_groups, new_points_mask
+from cdpipe.extract.surface import RIM_M, SITE_M, PlaneTable, candidates, compare_site
+from cdpipe.extract.surface_rule import BEYOND_M, collect_rays, find_object_cells, realign
 from cdpipe.mapping.free_space import free_space_votes
 from cdpipe.merge.registration import Surface
 from cdpipe.model.config import ExtractConfig, PipelineConfig, load_config
@@ -153,7 +154,7 @@ class Region:
     @cached_property
     def site(self) -> tuple[Int64Array, Int64Array]:
         """The after and the before map points around the largest group of candidates."""
-        labels, sizes = groups(self.after_points[self.telling], SITE_M)
+        labels, sizes = label_groups(self.after_points[self.telling], SITE_M)
         members = self.telling[labels == np.argmax(sizes)]
         in_map = self.spheres["after"].points[members]
         return self.crops.near("after", in_map, SITE_M), self.crops.near("before", in_map, SITE_M + RIM_M)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import repeat
 from pathlib import Path
@@ -23,13 +23,12 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float32Array, Float64Array
-from cdpipe.io.ouster.captures import one_line, require_sdk
+from cdpipe.io.ouster.captures import Progress, one_line, require_sdk
 from cdpipe.io.session import ScanChunk, Session
 
 _CHANNELS = {"RANGE": "range_mm", "REFLECTIVITY": "reflectivity", "SIGNAL": "signal"}
 
 Fields = Mapping[str, npt.NDArray[Any]]
-Progress = Callable[[str, int, int], None]
 
 
 def write_osf(
@@ -121,7 +120,7 @@ def sensor_info(session: Session) -> Any:
     return info
 
 
-def column_poses(odom_T_sensor: Float64Array, sensor_T_column: Float32Array) -> Float64Array:
+def _column_poses(odom_T_sensor: Float64Array, sensor_T_column: Float32Array) -> Float64Array:
     """Return odom_T_column (W, 4, 4).
 
     Args:
@@ -157,5 +156,5 @@ def _frame(core: Any, info: Any, session: Session, chunk: ScanChunk, fields: Fie
     frame.packet_timestamp[:] = frame.timestamp[:: info.format.columns_per_packet]
     frame.measurement_id[:] = np.arange(frame.w)
     frame.status[:] = 1
-    frame.body_to_world[:] = column_poses(session.odom_T_sensor[number], chunk.column_poses[row])
+    frame.body_to_world[:] = _column_poses(session.odom_T_sensor[number], chunk.column_poses[row])
     return frame

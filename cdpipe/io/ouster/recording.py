@@ -11,7 +11,7 @@ Only the first return of a beam is kept. A column that did not arrive has no ret
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -23,8 +23,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, make_pose, require_poses
 from cdpipe.core.motion import Motion, make_motion
-from cdpipe.io.ouster.captures import Recording, open_recording
-from cdpipe.io.ouster.revolutions import Revolution
+from cdpipe.io.ouster.captures import Progress, Recording, Revolution, open_recording
 from cdpipe.io.session import ScanChunk, SessionWriter
 from cdpipe.io.tum import motion_along
 from cdpipe.mapping.odometry import estimate_motion, require_kiss_icp
@@ -32,8 +31,6 @@ from cdpipe.mapping.odometry import estimate_motion, require_kiss_icp
 CHUNK_SCANS = 64
 KISS_ICP = "kiss-icp"
 _OWN_POSE_TOLERANCE = 1e-9
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)

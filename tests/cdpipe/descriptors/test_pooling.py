@@ -1,6 +1,6 @@
 import numpy as np
 
-from cdpipe.descriptors.pooling import agreed, best_in_reach
+from cdpipe.descriptors.sphere import agreed, best_in_reach
 
 
 def _along(*metres: float) -> np.ndarray:

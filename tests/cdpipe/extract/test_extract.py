@@ -7,7 +7,8 @@ import pytest
 
 import cdpipe.extract.objects
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
-from cdpipe.extract.extract import PointGroup, assemble_objects, cut_out, hull_volume_m3, region_figures, with_withdrawn
+from cdpipe.extract.extract import cut_out, hull_volume_m3, region_figures, with_withdrawn
+from cdpipe.extract.objects import PointGroup, assemble_objects
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import ClusterConfig, ExtractConfig, OutlierConfig, PipelineConfig
 from cdpipe.model.report import ChangedObject, ChangeRegions

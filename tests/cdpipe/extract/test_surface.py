@@ -5,13 +5,13 @@ import pytest
 
 from cdpipe.core.geometry import Float64Array, stream, transform, yaw_pose
 from cdpipe.core.voxel import cell_means
+from cdpipe.extract.point_comparison import label_groups
 from cdpipe.extract.surface import (
     PlaneTable,
     Site,
     candidates,
     compare_site,
     distances_m,
-    groups,
     grow_low_objects,
     grow_objects,
     unassigned_cells,
@@ -96,7 +96,7 @@ def test_a_plane_of_each_cell_by_brute_force() -> None:
 def test_candidates_are_all_of_groups_of_three_and_more(n_points: int) -> None:
     # from scattered pairs to one lump
     above = stream(n_points, "above").uniform((-2.9, -2.9, 0.1), (2.9, 2.9, 0.3), (n_points, 3))
-    labels, sizes = groups(above, 0.5)
+    labels, sizes = label_groups(above, 0.5)
     chosen, _ = candidates(np.concatenate([FLOOR, above]), PlaneTable(Surface(FLOOR)))
     assert chosen.tolist() == (len(FLOOR) + np.flatnonzero(sizes[labels] >= 3)).tolist()
 
@@ -113,10 +113,10 @@ def test_groups_equal_flood_fill(link_m: float) -> None:
                 here = open_ones.pop()
                 expected[here] = start
                 open_ones += np.flatnonzero(is_linked[here] & (expected < 0)).tolist()
-    labels, sizes = groups(points, link_m)
+    labels, sizes = label_groups(points, link_m)
     assert len({(a, b) for a, b in zip(expected.tolist(), labels.tolist(), strict=True)}) == len(set(expected.tolist()))
     assert sizes.tolist() == [np.count_nonzero(labels == label) for label in range(len(set(expected.tolist())))]
-    assert [each.shape for each in groups(points[:0], link_m)] == [(0,), (0,)]
+    assert [each.shape for each in label_groups(points[:0], link_m)] == [(0,), (0,)]
 
 
 def test_cell_means_equal_a_dict_of_cells() -> None:

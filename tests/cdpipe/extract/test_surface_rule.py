@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-import cdpipe.extract.surface_rule
+import cdpipe.extract.objects
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
-from cdpipe.extract.objects import PointGroup
-from cdpipe.extract.surface_rule import ReturnPool, cut_by_surface, realign
+from cdpipe.extract.objects import PointGroup, ReturnPool
+from cdpipe.extract.surface_rule import cut_by_surface, realign
 from cdpipe.merge.registration import Surface
 from cdpipe.model.config import ExtractConfig
 from cdpipe.model.types import MergedMaps, PointMap, PosedScan
@@ -365,7 +365,7 @@ def test_a_correction_carries_no_sphere_far() -> None:
 
 @pytest.mark.parametrize("block_returns", [1, 7, 1 << 22])
 def test_returns_of_map_points(block_returns: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cdpipe.extract.surface_rule, "_BLOCK_RETURNS", block_returns)
+    monkeypatch.setattr(cdpipe.extract.objects, "_BLOCK_RETURNS", block_returns)
     owners = stream(0, "owners").integers(0, 30, 200).astype(np.int32)
     point_map = PointMap(
         np.zeros((30, 3)), np.zeros(30, np.float32), 0.2, np.eye(4)[None], np.zeros(1, np.int64), owners, owners,
