@@ -19,33 +19,47 @@ _LONGEST_GAP_S = 1.0
 
 
 def read_tum(path: Path) -> tuple[Float64Array, tuple[int, ...]]:
-    """Return the rows (N, 8) of a TUM file, and the number of each one's line.
+    """Return the rows (N, 8) of a TUM file, and the line number of each row.
 
     Raises:
         InputError: The file cannot be read, or a line is not eight finite numbers with a unit quaternion.
     """
-    rows, numbers = [], []
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as text: {error}") from error
-    for number, line in enumerate(lines, start=1):
-        text = line.strip()
-        if not text or text.startswith("#"):
-            continue
-        try:
-            row = [float(word) for word in text.split()]
-        except ValueError:
-            row = []
-        if len(row) != 8:
-            raise InputError(f"{path}:{number}: expected eight numbers, {TUM_LINE}; got {text[:60]!r}")
-        rows.append(row)
-        numbers.append(number)
-    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
-    require_unit_poses(table[:, 1:], lambda index: f"{path}:{numbers[index]}")
-    if not np.isfinite(table[:, 0]).all():
-        raise InputError(f"{path}:{numbers[int(np.argmin(np.isfinite(table[:, 0])))]}: the stamp is not finite")
-    return table, tuple(numbers)
+    numbers = tuple(n for n, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith("#"))
+    rows = np.array([_row(f"{path}:{number}", lines[number - 1]) for number in numbers], np.float64).reshape(-1, 8)
+    require_unit_poses(rows[:, 1:], lambda index: f"{path}:{numbers[index]}")
+    is_finite = np.isfinite(rows[:, 0])
+    if not is_finite.all():
+        raise InputError(f"{path}:{numbers[int(np.argmin(is_finite))]}: the stamp is not finite")
+    return rows, numbers
+
+
+def read_trajectory(path: Path) -> tuple[Float64Array, tuple[int, ...]]:
+    """Return the rows (N, 8) and line numbers of a TUM file that holds two poses or more, in the order of time.
+
+    Raises:
+        InputError: As `read_tum`, or there are fewer poses, or a stamp does not come after the one before it.
+    """
+    rows, numbers = read_tum(path)
+    if len(rows) < 2:
+        raise InputError(f"{path}: {len(rows)} poses: a trajectory needs two lines `{TUM_LINE}` or more")
+    is_late = np.diff(rows[:, 0]) > 0
+    if not is_late.all():
+        bad = int(np.argmin(is_late)) + 1
+        raise InputError(
+            f"{path}:{numbers[bad]}: the stamp does not come after the last: {rows[bad, 0]:.6f} s after "
+            f"{rows[bad - 1, 0]:.6f} s: sort the lines by time and leave each stamp once"
+        )
+    return rows, numbers
+
+
+def motion_through(rows: Float64Array, first_s: float) -> Motion:
+    """Return the movement through TUM rows (N, 8), its time counted from the stamp `first_s`."""
+    way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1))])
+    return make_motion(rows[:, 0] - first_s, way_m, rows[:, 1:4], Rotation.from_quat(rows[:, 4:]))
 
 
 def motion_along(path: Path, first_ns: int, last_ns: int, slack_s: float) -> Motion:
@@ -60,12 +74,8 @@ def motion_along(path: Path, first_ns: int, last_ns: int, slack_s: float) -> Mot
     Raises:
         InputError: The file is not a trajectory, its stamps do not rise, or leave part of the time without poses.
     """
-    rows, numbers = read_tum(path)
-    if len(rows) < 2:
-        raise InputError(f"{path}: {len(rows)} poses: a trajectory needs two lines `{TUM_LINE}` or more")
+    rows, numbers = read_trajectory(path)
     steps_s = np.diff(rows[:, 0])
-    if (steps_s <= 0).any():
-        raise InputError(f"{path}:{numbers[int(np.argmax(steps_s <= 0)) + 1]}: the stamp does not come after the last")
     time_s = rows[:, 0] - first_ns / 1e9
     length_s = (last_ns - first_ns) / 1e9
     if time_s[0] > slack_s or time_s[-1] < length_s - slack_s:
@@ -80,8 +90,7 @@ def motion_along(path: Path, first_ns: int, last_ns: int, slack_s: float) -> Mot
             f"{path}:{numbers[gap + 1]}: no pose for {steps_s[gap]:.2f} s before it, in the middle of the recording: "
             f"at most {_LONGEST_GAP_S:g} s can be bridged"
         )
-    way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1))])
-    return make_motion(time_s, way_m, rows[:, 1:4], Rotation.from_quat(rows[:, 4:]))
+    return motion_through(rows, first_ns / 1e9)
 
 
 def stamps_from_first_ns(rows: Float64Array) -> Int64Array:
@@ -101,3 +110,13 @@ def require_unit_poses(poses: Float64Array, where: Callable[[int], str]) -> None
         raise InputError(
             f"{where(index)}: the quaternion's length is {norms[index]:.6g}, expected 1: the order is qx qy qz qw"
         )
+
+
+def _row(where: str, line: str) -> list[float]:
+    words = line.split()
+    if len(words) != 8:
+        raise InputError(f"{where}: {len(words)} fields: expected eight numbers, {TUM_LINE}; got {line.strip()[:60]!r}")
+    try:
+        return [float(word) for word in words]
+    except ValueError as error:
+        raise InputError(f"{where}: expected eight numbers, {TUM_LINE}: {error}") from error

@@ -16,7 +16,7 @@ from sim.drive.obstacles import check_clearance
 from sim.drive.odometry import drifted
 from sim.drive.path import plan_path
 from sim.drive.ride import ride
-from sim.placement.recorded import check_inside, read_tum
+from sim.placement.recorded import check_inside, read_drive
 from sim.scene import Scene, World
 
 # Revolutions and ways are compared with this much slack, so that rounding loses none.
@@ -111,7 +111,7 @@ def plan_trajectory(world: World, scenario: Scenario, sensor: SensorMetadata, se
     plan: SessionPlan = getattr(scenario, session)
     scene = world.before if session == "before" else world.after
     if plan.trajectory is not None:
-        true, lines = read_tum(Path(plan.trajectory))
+        true, lines = read_drive(Path(plan.trajectory))
         check_inside(true, scene.caster, f"{session}: {plan.trajectory}", lines)
     else:
         true = _driven(world, scene, scenario, seed, session)

@@ -13,7 +13,7 @@ from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Scenario, SessionPlan
 from sim.geometry.raycast import Caster
 from sim.placement.placing import Standing, free_width, standing_corners, standing_height_m
-from sim.placement.recorded import read_tum
+from sim.placement.recorded import read_drive
 from sim.rock.centreline import Centreline, headings_of, left_of, resample
 
 _STEP_M = 0.25
@@ -101,7 +101,7 @@ def build_lanes(scenario: Scenario, centreline: Centreline, fixed: Caster) -> tu
 
 def _recorded(scenario: Scenario, session: str, trajectory: Path) -> Lane:
     """Lane of a recorded trajectory, which swerves for nothing and may be at any height."""
-    line = resample(read_tum(trajectory)[0].points[:, :2], _STEP_M)
+    line = resample(read_drive(trajectory)[0].points[:, :2], _STEP_M)
     room_m = np.full(len(line), _SPARE_M / 2)
     return Lane(session, line, headings_of(line), -room_m, room_m, scenario.platform.clearance_m, 0.0)
 

@@ -1,4 +1,4 @@
-"""A recorded trajectory from a TUM file: one line `timestamp x y z qx qy qz qw` for each pose, `#` starts a comment.
+"""A recorded trajectory as a session's drive: read from a TUM file, and checked to run inside the tunnel.
 
 Poses are `world_T_sensor`: metres in the world frame, the sensor's x axis forward and its z axis up. Stamps in seconds.
 """
@@ -8,41 +8,35 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array
-from cdpipe.core.motion import Motion, make_motion
+from cdpipe.core.motion import Motion
+from cdpipe.io.tum import motion_through, read_trajectory
 from sim.geometry.raycast import Caster
 from sim.geometry.room import room_about
 
-_LINE = "timestamp x y z qx qy qz qw"
-# Files carry four to six digits; what is farther off is another order of the columns.
-_UNIT_TOLERANCE = 1e-2
 _FASTEST_MPS = 20.0
 _NEAREST_M = 0.2
-# Between two poses the sensor is looked for on the way, this far apart.
-_CHECK_STEP_M = 0.25
+_CHECK_STEP_M = 0.25  # between the places checked on the straight line from one pose to the next
 
 
-def read_tum(path: Path) -> tuple[Motion, tuple[int, ...]]:
-    """Return the movement of a TUM file, and the number of each pose's line.
+def read_drive(path: Path) -> tuple[Motion, tuple[int, ...]]:
+    """Return the movement of a TUM file, its time counted from the first pose, and the line number of each pose.
 
     Raises:
-        InputError: The file cannot be read, holds fewer than two poses, or a line is not a pose, does not come later
-            than the one before it, or is farther from it than 20 m/s allow.
+        InputError: The file is no trajectory, or two poses are farther apart than 20 m/s allow.
     """
-    try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a trajectory: {error}") from error
-    numbers = tuple(n for n, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith("#"))
-    rows = np.array([_row(path, number, lines[number - 1]) for number in numbers]).reshape(-1, 8)
-    if len(rows) < 2:
-        raise InputError(f"{path}: {len(rows)} poses: a trajectory needs two lines `{_LINE}` or more")
-    _check_steps(path, numbers, rows)
-    way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1))])
-    return make_motion(rows[:, 0] - rows[0, 0], way_m, rows[:, 1:4], Rotation.from_quat(rows[:, 4:])), numbers
+    rows, numbers = read_trajectory(path)
+    seconds, steps_m = np.diff(rows[:, 0]), np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1)
+    is_fast = steps_m > _FASTEST_MPS * seconds
+    if is_fast.any():
+        bad = int(np.argmax(is_fast))
+        raise InputError(
+            f"{path}:{numbers[bad + 1]}: {steps_m[bad]:.2f} m in {seconds[bad]:.3f} s, faster than {_FASTEST_MPS:g} m/s"
+            ": stamps are in seconds and positions in metres"
+        )
+    return motion_through(rows, rows[0, 0]), numbers
 
 
 def check_inside(motion: Motion, surroundings: Caster, where: str, numbers: tuple[int, ...]) -> None:
@@ -81,39 +75,3 @@ def _round_about() -> Float64Array:
     grid = np.stack(np.meshgrid(*[np.arange(-1.0, 2.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     grid = grid[np.abs(grid).sum(axis=1) > 0]
     return np.asarray(grid / np.linalg.norm(grid, axis=1, keepdims=True))
-
-
-def _row(path: Path, number: int, line: str) -> Float64Array:
-    words = line.split()
-    if len(words) != 8:
-        raise InputError(f"{path}:{number}: {len(words)} fields: expected eight, `{_LINE}`")
-    values = np.zeros(8)
-    for place, word in enumerate(words):
-        try:
-            values[place] = float(word)
-        except ValueError as error:
-            raise InputError(f"{path}:{number}: {word!r} is not a number: expected `{_LINE}`") from error
-    if not np.isfinite(values).all():
-        raise InputError(f"{path}:{number}: {words[int(np.argmin(np.isfinite(values)))]!r} is not a finite number")
-    length = float(np.linalg.norm(values[4:]))
-    if abs(length - 1.0) > _UNIT_TOLERANCE:
-        raise InputError(f"{path}:{number}: the quaternion's length is {length:.4g}, expected 1: in `{_LINE}`")
-    return values
-
-
-def _check_steps(path: Path, numbers: tuple[int, ...], rows: Float64Array) -> None:
-    seconds = np.diff(rows[:, 0])
-    if (seconds <= 0).any():
-        bad = int(np.argmax(seconds <= 0)) + 1
-        raise InputError(
-            f"{path}:{numbers[bad]}: stamp {rows[bad, 0]:.6f} s does not come after {rows[bad - 1, 0]:.6f} s: "
-            "sort the lines by time and leave each stamp once"
-        )
-    steps_m = np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1)
-    is_fast = steps_m > _FASTEST_MPS * seconds
-    if is_fast.any():
-        bad = int(np.argmax(is_fast))
-        raise InputError(
-            f"{path}:{numbers[bad + 1]}: {steps_m[bad]:.2f} m in {seconds[bad]:.3f} s, faster than {_FASTEST_MPS:g} m/s"
-            ": stamps are in seconds and positions in metres"
-        )

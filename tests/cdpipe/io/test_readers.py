@@ -119,7 +119,7 @@ def test_no_trajectory_and_two_of_them(tmp_path: Path) -> None:
         ("1 nan 0 0 0 0 0 1", "trajectory.txt:2: the pose is not finite"),
         ("nan 0 0 0 0 0 0 1", "trajectory.txt:2: the stamp is not finite"),
         ("1 0 0 0 0 0 0 2", "trajectory.txt:2: the quaternion's length is 2, expected 1: the order is qx qy qz qw"),
-        ("1 0 0 0 0 0 0", "trajectory.txt:2: expected eight numbers, stamp tx ty tz qx qy qz qw; got"),
+        ("1 0 0 0 0 0 0", "trajectory.txt:2: 7 fields: expected eight numbers, stamp tx ty tz qx qy qz qw; got"),
         ("1 0 0 zero 0 0 0 1", "trajectory.txt:2: expected eight numbers"),
     ],
 )

@@ -16,7 +16,7 @@ from scenarios.schema import MeshFile, Platform, Scenario, SessionPlan, Tunnel
 from sim.drive.trajectory import plan_trajectory
 from sim.geometry.mesh import Mesh, box_mesh
 from sim.geometry.raycast import Caster
-from sim.placement.recorded import check_inside, read_tum
+from sim.placement.recorded import check_inside, read_drive
 from sim.scene import build_world
 from sim.session.simulate import simulate_pair
 from sim.session.truth import read_true_poses
@@ -39,7 +39,7 @@ def test_a_trajectory_is_read_back_with_its_lines(tmp_path: Path) -> None:
     stamps_s = 1.7e9 + np.cumsum(generator.uniform(0.5, 1.0, 20))
     points = np.cumsum(generator.normal(0.0, 0.3, (20, 3)), axis=0)
     turns = Rotation.random(20, rng=generator)
-    motion, lines = read_tum(written(tmp_path / "t.tum", ["# comment", *table(stamps_s, points, turns)]))
+    motion, lines = read_drive(written(tmp_path / "t.tum", ["# comment", *table(stamps_s, points, turns)]))
     assert lines == tuple(range(2, 22))
     poses = motion.poses(stamps_s - stamps_s[0])
     np.testing.assert_allclose(poses[:, :3, 3], points, atol=1e-6)
@@ -50,10 +50,14 @@ def test_a_trajectory_is_read_back_with_its_lines(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "text", "message"),
     [
-        (4, "10.5 0.4 0 1 0 0 0", ":4: 7 fields: expected eight, `timestamp x y z qx qy qz qw`"),
-        (2, "10.0 0 zero 1 0 0 0 1", ":2: 'zero' is not a number"),
-        (4, "10.5 0.4 nan 1 0 0 0 1", ":4: 'nan' is not a finite number"),
-        (5, "10.5 1.2 0.1 1 0 0 0 1", ":5: stamp 10.500000 s does not come after 10.500000 s"),
+        (4, "10.5 0.4 0 1 0 0 0", ":4: 7 fields: expected eight numbers, stamp tx ty tz qx qy qz qw"),
+        (
+            2,
+            "10.0 0 zero 1 0 0 0 1",
+            ":2: expected eight numbers, stamp tx ty tz qx qy qz qw: could not convert string to float: 'zero'",
+        ),
+        (4, "10.5 0.4 nan 1 0 0 0 1", ":4: the pose is not finite"),
+        (5, "10.5 1.2 0.1 1 0 0 0 1", ":5: the stamp does not come after the last: 10.500000 s after 10.500000 s"),
         (5, "11.5 1.2 0.1 1 0 0 0 0.9", ":5: the quaternion's length is 0.9, expected 1"),
         (5, "11.5 21.4 0.1 1 0 0 0 1", ":5: 21.00 m in 1.000 s, faster than 20 m/s"),
     ],
@@ -63,17 +67,17 @@ def test_a_wrong_line_is_named(tmp_path: Path, line: int, text: str, message: st
     lines[line - 1] = text
     path = written(tmp_path / "wrong.tum", lines)
     with pytest.raises(InputError, match=re.escape(f"{path}{message}")):
-        read_tum(path)
+        read_drive(path)
 
 
 def test_a_file_that_is_no_trajectory_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"short\.tum: 1 poses: a trajectory needs two lines"):
-        read_tum(written(tmp_path / "short.tum", GOOD[:2]))
+        read_drive(written(tmp_path / "short.tum", GOOD[:2]))
     with pytest.raises(InputError, match=r"none\.tum: cannot be read"):
-        read_tum(tmp_path / "none.tum")
+        read_drive(tmp_path / "none.tum")
     (tmp_path / "binary.tum").write_bytes(b"\xff\xfe\x00\x80" * 9)
     with pytest.raises(InputError, match=r"binary\.tum: cannot be read"):
-        read_tum(tmp_path / "binary.tum")
+        read_drive(tmp_path / "binary.tum")
 
 
 def test_a_trajectory_stays_in_the_void(tmp_path: Path) -> None:
@@ -83,7 +87,7 @@ def test_a_trajectory_stays_in_the_void(tmp_path: Path) -> None:
     def check(*places: tuple[float, float, float]) -> None:
         points = np.array(places)
         lines = table(np.arange(len(places), dtype=np.float64), points, Rotation.identity(len(places)))
-        check_inside(*_in_order(read_tum(written(tmp_path / "t.tum", ["#", *lines])), room))
+        check_inside(*_in_order(read_drive(written(tmp_path / "t.tum", ["#", *lines])), room))
 
     check((-4, 0, 0), (0, 1.5, 0), (4, -1.5, 1.0))
     with pytest.raises(ScenarioError, match=r"before: t\.tum:2: .* \(0\.00, 3\.00, 0\.00\) lies outside the tunnel"):
