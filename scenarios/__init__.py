@@ -1,5 +1,5 @@
-"""What the world is: the schema of a scenario, and the families that come with the package."""
+"""What the world is: the schema of a scenario, its distributions, and the families that come with the package."""
 
-from scenarios.library import check_scenario, load_scenario, scenario_names
+import lazy_loader
 
-__all__ = ["check_scenario", "load_scenario", "scenario_names"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -10,24 +10,15 @@ from typing import Any
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import stream
-from cdpipe.core.yamlfile import Document, Key, apply_settings, read_yaml, suggest, validate
+from cdpipe.core.yamlfile import Document, Key, read_yaml, suggest, validate, apply_settings
+from scenarios.catalogue import family_files, family_of, prop_files, prop_names, read_prop
+from scenarios.dangling import Mistake, items_at, reference_mistakes
 from scenarios.distributions import Drawing, dotted, drawing, form_mistakes, is_distribution, merged
-from scenarios.references import contradictions, file_keys, reference_mistakes
-from scenarios.schema import Prop, Scenario
+from scenarios.references import contradictions, file_keys
+from scenarios.schema import PROP_KINDS, Prop, Scenario
 
-FAMILIES = Path(__file__).parent / "families"
 CHECKED_SEEDS = range(8)
 SUFFIXES = (".yaml", ".yml")
-
-# what the schema says of a dangling reference without a line of its own; references.py says it with one
-_SAID_WITH_LINES = (
-    "which is not in tunnel.nodes", "which no drift joins", "two props are called", "which is not in areas",
-)  # fmt: skip
-
-
-def scenario_names() -> list[str]:
-    """Return the names of the scenarios that come with the package, e.g. `paper/site1`."""
-    return sorted(path.relative_to(FAMILIES).with_suffix("").as_posix() for path in FAMILIES.rglob("*.yaml"))
 
 
 def load_scenario(name_or_path: str, seed: int, settings: Iterable[str] = ()) -> Scenario:
@@ -86,14 +77,15 @@ def _scenario(document: Document, seed: int) -> tuple[Scenario | None, list[str]
         mistakes.append(_told(document, ("turnover",), "expected a share between 0 and 1"))
         turnover = 0.0
     place = Document(document.source, tree, _drawn_origins(document, drawn))
-    tree, missing = _with_files(place)
+    tree, unknown = _with_props(place)
+    tree, missing = _with_files(replace(place, value=tree))
     mistakes += missing
-    references = reference_mistakes(tree)
+    references = reference_mistakes(tree) + unknown
     mistakes += [_told(place, key, rule) for key, rule in references]
     try:
         scenario = validate(Scenario, replace(place, value=tree))
     except InputError as error:
-        return None, mistakes + _without_repetition(str(error).splitlines(), drawn.broken, bool(references))
+        return None, mistakes + _without_repetition(str(error).splitlines(), drawn.broken, references)
     mistakes += [_told(place, key, rule) for key, rule in contradictions(scenario)]
     return _frozen(scenario) if is_frozen else _turned_over(scenario, turnover, seed), mistakes
 
@@ -114,6 +106,22 @@ def _turned_over(scenario: Scenario, turnover: float, seed: int) -> Scenario:
         update = {"change": "added" if draw < turnover / 2 else "removed"} if is_turned else {}
         props.append(prop.model_copy(update=update))
     return scenario.model_copy(update={"props": tuple(props)})
+
+
+def _with_props(document: Document) -> tuple[dict[Any, Any], list[Mistake]]:
+    """Return the tree with the mesh of every prop whose kind is on the search path, and the kinds that are nowhere."""
+    unknown: list[Mistake] = []
+    tree, files = document.value, prop_files()
+    for index, prop in enumerate(items_at(tree, "props")):
+        kind = prop.get("kind") if isinstance(prop, dict) else None
+        if not isinstance(kind, str) or kind in PROP_KINDS:
+            continue
+        if kind in files:
+            tree = _with_value(tree, ("props", index), read_prop(kind).model_dump(exclude_none=True) | prop)
+        else:
+            hint = suggest(kind, prop_names()) or f"; known are {', '.join(prop_names())}"
+            unknown.append((("props", index, "kind"), f"no prop is called {kind}{hint}"))
+    return tree, unknown
 
 
 def _with_files(document: Document) -> tuple[dict[Any, Any], list[str]]:
@@ -145,13 +153,10 @@ def _drawn_origins(document: Document, drawn: Drawing) -> dict[Key, str]:
     return {key: document.where(source) for key, source in drawn.origins.items()}
 
 
-def _without_repetition(lines: list[str], broken: set[Key], has_references: bool) -> list[str]:
-    """Drop what the schema says of values that could not be drawn, and of references told with their lines already."""
-    names = [f": {dotted(key)} = " for key in broken]
-    silent = _SAID_WITH_LINES if has_references else ()
-    return [
-        line for line in lines if not any(name in line for name in names) and not any(rule in line for rule in silent)
-    ]
+def _without_repetition(lines: list[str], broken: set[Key], told: list[Mistake]) -> list[str]:
+    """Drop what the schema says of values that could not be drawn, and what is told with its own line already."""
+    names = [f": {dotted(key)} = " for key in broken] + [rule.partition(";")[0] for _, rule in told]
+    return [line for line in lines if not any(name in line for name in names)]
 
 
 def _told(document: Document, key: Key, rule: str) -> str:
@@ -179,27 +184,21 @@ def _document(name_or_path: str, settings: Iterable[str]) -> Document:
 
 
 def _path_of(name_or_path: str) -> Path:
-    names = scenario_names()
-    if name_or_path in names:
-        return _shown(FAMILIES / f"{name_or_path}.yaml")
+    files = family_files()
+    if name_or_path in files:
+        return _shown(files[name_or_path])
     path = Path(name_or_path)
     if path.is_file():
         return path
     if path.suffix in SUFFIXES:
-        raise ScenarioError(f"{path}: no such file; a scenario is a YAML file or a name such as {names[0]}")
-    hint = suggest(name_or_path, names) or f"; known are {', '.join(names)}"
+        raise ScenarioError(f"{path}: no such file; a scenario is a YAML file or a name such as {min(files)}")
+    hint = suggest(name_or_path, files) or f"; known are {', '.join(sorted(files))}"
     raise ScenarioError(f'scenario "{name_or_path}": unknown{hint}')
 
 
 def _shown(path: Path) -> Path:
     """Return the path as it is told to the user: short where it lies below the working folder."""
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
-
-
-def _family_of(path: Path) -> str:
-    resolved = path.resolve()
-    root = FAMILIES.resolve()
-    return resolved.relative_to(root).with_suffix("").as_posix() if resolved.is_relative_to(root) else path.stem
 
 
 def _extended(path: Path, children: tuple[Path, ...]) -> Document:
@@ -209,7 +208,7 @@ def _extended(path: Path, children: tuple[Path, ...]) -> Document:
         raise ScenarioError(f"{path}: expected keys and values, got {type(read.value).__name__}")
     origins = dict(read.origins)
     value: dict[Any, Any] = dict(read.value)
-    value.setdefault("family", _family_of(path))
+    value.setdefault("family", family_of(path))
     base_name = value.pop("extends", None)
     if base_name is None:
         return Document(str(path), value, origins)

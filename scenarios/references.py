@@ -1,4 +1,4 @@
-"""What one part of a scenario says about another: nodes, drifts, places and routes that have to agree."""
+"""What a whole scenario says beyond its single values: the files it names, and what cannot be built or driven."""
 
 from __future__ import annotations
 
@@ -10,51 +10,22 @@ from pathlib import Path
 from typing import Any
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import Key, suggest
+from cdpipe.core.yamlfile import Key
 from cdpipe.sensor.ouster import load_profile
+from scenarios.dangling import Mistake, items_at, mapping_at
 from scenarios.schema import Furniture, Scenario, SessionPlan, Tunnel
-
-Mistake = tuple[Key, str]
-
-_NO_DRIFT = "no drift joins"
-
-
-def reference_mistakes(tree: Any) -> list[Mistake]:
-    """Return every dangling reference of a drawn scenario as (key path, rule).
-
-    Takes the plain tree, not the model, so that these mistakes are told together with those of the schema; parts of
-    the wrong type are passed over, the schema speaks of them.
-    """
-    tunnel = _mapping(tree, "tunnel")
-    nodes = [str(name) for name in _mapping(tunnel, "nodes")]
-    edges = {
-        frozenset(pair)
-        for drift in _items(tunnel, "drifts")
-        for pair in pairwise(_names(_items(drift, "nodes")))
-        if len(set(pair)) == 2
-    }
-    of_drifts = list(_drift_mistakes(tunnel, nodes))
-    others = [
-        *_niche_mistakes(tunnel, nodes, edges),
-        *_area_mistakes(tree),
-        *_prop_mistakes(tree, nodes, edges),
-        *_route_mistakes(tree, nodes, edges),
-    ]
-    if of_drifts:  # a misspelt drift joins nothing; what follows from that is not worth telling
-        others = [(key, rule) for key, rule in others if not rule.startswith(_NO_DRIFT)]
-    return of_drifts + others
 
 
 def file_keys(tree: Any) -> list[tuple[Key, str]]:
     """Return every file that a drawn scenario names, as (key path, name)."""
-    places: list[tuple[Key, Any]] = [(("tunnel", "mesh"), _mapping(_mapping(tree, "tunnel"), "mesh").get("path"))]
+    places: list[tuple[Key, Any]] = [(("tunnel", "mesh"), mapping_at(mapping_at(tree, "tunnel"), "mesh").get("path"))]
     places += [
-        (("props", index, "mesh"), _mapping(prop, "mesh").get("path"))
-        for index, prop in enumerate(_items(tree, "props"))
+        (("props", index, "mesh"), mapping_at(prop, "mesh").get("path"))
+        for index, prop in enumerate(items_at(tree, "props"))
     ]
     files = [((*key, "path"), name) for key, name in places]
-    files += [((session, "trajectory"), _mapping(tree, session).get("trajectory")) for session in ("before", "after")]
-    profile = _mapping(tree, "sensor").get("profile")
+    files += [((session, "trajectory"), mapping_at(tree, session).get("trajectory")) for session in ("before", "after")]
+    profile = mapping_at(tree, "sensor").get("profile")
     files += [(("sensor", "profile"), profile)] if str(profile).endswith(".json") else []  # else a shipped one's name
     return [(key, name) for key, name in files if isinstance(name, str)]
 
@@ -168,80 +139,3 @@ def _undrawable(scenario: Scenario) -> Iterator[Mistake]:
         for name, place in (("place", prop.place), ("to", prop.to)):
             if place is not None and place.between is None and place.at is None and place.area is None:
                 yield ("props", index, name), f"a place anywhere {needs}: give at, or between and fraction"
-
-
-def _drift_mistakes(tunnel: Any, nodes: list[str]) -> Iterator[Mistake]:
-    for index, drift in enumerate(_items(tunnel, "drifts")):
-        names = _items(drift, "nodes")
-        for position, name in enumerate(names):
-            key: Key = ("tunnel", "drifts", index, "nodes", position)
-            if isinstance(name, str) and name not in nodes:
-                yield key, _unknown_node(name, nodes)
-            elif position and name == names[position - 1]:
-                yield key, "a drift cannot go from a node to itself"
-
-
-def _niche_mistakes(tunnel: Any, nodes: list[str], edges: set[frozenset[str]]) -> Iterator[Mistake]:
-    for index, niche in enumerate(_items(tunnel, "niches")):
-        pair = _items(niche, "between")
-        if len(_names(pair)) == 2 and frozenset(pair) not in edges:
-            yield ("tunnel", "niches", index, "between"), _no_drift(pair, nodes)
-
-
-def _area_mistakes(tree: Any) -> Iterator[Mistake]:
-    names = [_mapping({"area": area}, "area").get("name") for area in _items(tree, "areas")]
-    for index, name in enumerate(names):
-        if isinstance(name, str) and name in names[:index]:
-            yield ("areas", index, "name"), "another area has this name"
-    known = _names(names)
-    for index, prop in enumerate(_items(tree, "props")):
-        for place in ("place", "to"):
-            area = _mapping(prop, place).get("area")
-            if isinstance(area, str) and area not in known:
-                rule = f"no area is called {area}{suggest(area, known)}" if known else "there are no areas"
-                yield ("props", index, place, "area"), rule
-
-
-def _prop_mistakes(tree: Any, nodes: list[str], edges: set[frozenset[str]]) -> Iterator[Mistake]:
-    seen: set[str] = set()
-    for index, prop in enumerate(_items(tree, "props")):
-        name = prop.get("name") if isinstance(prop, dict) else None
-        if isinstance(name, str):
-            if name in seen:
-                yield ("props", index, "name"), "another prop has this name"
-            seen.add(name)
-        for place in ("place", "to"):
-            pair = _items(_mapping(prop, place), "between")
-            if len(_names(pair)) == 2 and frozenset(pair) not in edges:
-                yield ("props", index, place, "between"), _no_drift(pair, nodes)
-
-
-def _route_mistakes(tree: Any, nodes: list[str], edges: set[frozenset[str]]) -> Iterator[Mistake]:
-    for session in ("before", "after"):
-        route = _items(_mapping(tree, session), "route")
-        for position, pair in enumerate(pairwise(route), start=1):
-            if len(_names(list(pair))) == 2 and frozenset(pair) not in edges:
-                yield (session, "route", position), _no_drift(list(pair), nodes)
-
-
-def _no_drift(pair: list[str], nodes: list[str]) -> str:
-    unknown = [name for name in pair if name not in nodes]
-    return _unknown_node(unknown[0], nodes) if unknown else f"{_NO_DRIFT} {pair[0]} and {pair[1]}"
-
-
-def _unknown_node(name: str, nodes: list[str]) -> str:
-    return f"no node of the tunnel is called {name}{suggest(name, nodes)}"
-
-
-def _mapping(tree: Any, key: str) -> dict[str, Any]:
-    value = tree.get(key) if isinstance(tree, dict) else None
-    return value if isinstance(value, dict) else {}
-
-
-def _items(tree: Any, key: str) -> list[Any]:
-    value = tree.get(key) if isinstance(tree, dict) else None
-    return value if isinstance(value, list) else []
-
-
-def _names(values: list[Any]) -> list[str]:
-    return [value for value in values if isinstance(value, str)]

@@ -7,12 +7,12 @@ from the first to the second node of `between` (drawn places: as driven); of a s
 
 from __future__ import annotations
 
-from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field, model_validator
 
 from cdpipe.core.yamlfile import Settings
+from scenarios.dangling import reference_mistakes
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -24,6 +24,7 @@ Side = Literal["left", "right"]
 PropKind = Literal[
     "box", "crate", "chair", "trolley", "barrel", "cone", "railing", "pallet", "rock", "vehicle", "muck_pile", "mesh"
 ]
+PROP_KINDS: tuple[str, ...] = get_args(PropKind)
 
 
 class Section(Settings):
@@ -165,13 +166,9 @@ class Tunnel(Settings):
     reflectivity: Reflectivity = 0.25
 
     @model_validator(mode="after")
-    def _nodes_exist(self) -> Tunnel:
+    def _has_walls(self) -> Tunnel:
         if not self.drifts and self.mesh is None:
             raise ValueError("a tunnel needs drifts, or a mesh")
-        for drift in self.drifts:
-            for node in drift.nodes:
-                if node not in self.nodes:
-                    raise ValueError(f"drift {list(drift.nodes)} names node {node!r}, which is not in tunnel.nodes")
         return self
 
 
@@ -208,6 +205,13 @@ class Place(Settings):
         return self
 
 
+class PropFile(Settings):
+    """A kind of prop on the search path: a surface, and how much light it sends back."""
+
+    mesh: MeshFile  # a relative path starts at this file
+    reflectivity: Reflectivity | None = None
+
+
 class Shift(Settings):
     """A short move from where a prop stands."""
 
@@ -220,7 +224,7 @@ class Prop(Settings):
     """An object on the floor. What happens to it between the sessions is its `change`."""
 
     name: str
-    kind: PropKind
+    kind: str  # a PropKind, or the name of a prop on the search path, which has a mesh
     size_m: tuple[Positive, Positive, Positive] | None = None  # length, width, height when upright; a mesh has its own
     mesh: MeshFile | None = None
     place: Place = Place()
@@ -234,7 +238,9 @@ class Prop(Settings):
 
     @model_validator(mode="after")
     def _parts_go_together(self) -> Prop:
-        if (self.kind == "mesh") != (self.mesh is not None):
+        if self.mesh is None and self.kind not in PROP_KINDS:
+            raise ValueError(f"prop {self.name!r}: no prop is called {self.kind}")
+        if (self.kind not in PROP_KINDS or self.kind == "mesh") != (self.mesh is not None):
             raise ValueError(f"prop {self.name!r}: kind: mesh and a file `mesh` go together")
         if (self.mesh is None) == (self.size_m is None):
             raise ValueError(f"prop {self.name!r}: give size_m, but not to a mesh, which has its own")
@@ -344,26 +350,7 @@ class Scenario(Settings):
     after: SessionPlan
 
     @model_validator(mode="after")
-    def _places_exist(self) -> Scenario:
-        names = [prop.name for prop in self.props]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"two props are called {name!r}")
-        areas = [area.name for area in self.areas]
-        edges = {frozenset(pair) for drift in self.tunnel.drifts for pair in pairwise(drift.nodes)}
-        for niche in self.tunnel.niches:
-            if frozenset(niche.between) not in edges:
-                raise ValueError(f"a niche lies between {list(niche.between)}, which no drift joins")
-        for prop in self.props:
-            for place in (prop.place, prop.to):
-                if place is None:
-                    continue
-                if place.between is not None and frozenset(place.between) not in edges:
-                    raise ValueError(f"prop {prop.name!r} stands between {list(place.between)}, which no drift joins")
-                if place.area is not None and place.area not in areas:
-                    raise ValueError(f"prop {prop.name!r} stands in area {place.area!r}, which is not in areas")
-        for session, plan in (("before", self.before), ("after", self.after)):
-            for pair in pairwise(plan.route):
-                if frozenset(pair) not in edges:
-                    raise ValueError(f"{session}.route goes from {pair[0]!r} to {pair[1]!r}, which no drift joins")
+    def _references_hold(self) -> Scenario:
+        for key, rule in reference_mistakes(self.model_dump(mode="json")):
+            raise ValueError(f"{'.'.join(map(str, key))}: {rule}")
         return self

@@ -8,7 +8,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import read_yaml, suggest
 from cdpipe.model.config import PipelineConfig, load_config, preset_names
 from eval.plans.plan import Plan, cells, load_plan, plan_names
-from scenarios.library import check_scenario, scenario_names
+from scenarios import check_scenario, scenario_names
 from scenarios.schema import Scenario
 
 _KEYS = {

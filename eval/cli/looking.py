@@ -8,7 +8,8 @@ from pathlib import Path
 from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import suggest
 from cdpipe.io.session import is_session
-from scenarios.library import SUFFIXES, load_scenario, scenario_names
+from scenarios import load_scenario, scenario_names
+from scenarios.library import SUFFIXES
 from sim.view.view import View, is_pair, view_folder, view_scenario
 
 

@@ -48,7 +48,7 @@ def list_command() -> None:
     from cdpipe.model.config import preset_names
     from cdpipe.sensor.ouster import profile_names
     from eval.plans.plan import plan_names
-    from scenarios.library import scenario_names
+    from scenarios import scenario_names
 
     groups = {
         "scenarios": scenario_names(),

@@ -38,7 +38,7 @@ from pydantic import (
 from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import Settings, suggest
 from cdpipe.model.config import PipelineConfig
-from scenarios.library import check_scenario, scenario_names
+from scenarios import check_scenario, scenario_names
 
 
 def known_scenario(name: str) -> str:

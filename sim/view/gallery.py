@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, stream, yaw_pose, yaw_rad
-from scenarios.library import load_scenario, scenario_names
+from scenarios import load_scenario, scenario_names
 from scenarios.schema import Drift, Place, Prop, Roughness, Scenario, Section, SessionPlan, Tunnel
 from sim.geometry.mesh import moved
 from sim.placement.placing import Standing

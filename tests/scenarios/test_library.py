@@ -9,7 +9,7 @@ import pytest
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.sensor.ouster import load_profile, profile_names
 from scenarios import check_scenario, load_scenario, scenario_names
-from scenarios.library import FAMILIES
+from scenarios.catalogue import FAMILIES
 from scenarios.references import file_digests, route_length_m
 from scenarios.schema import Scenario
 

@@ -25,7 +25,7 @@ from eval.plans.plan import Plan
 from eval.report import page
 from eval.running import runner
 from eval.running.runfolder import RunFolder
-from scenarios.library import load_scenario, scenario_names
+from scenarios import load_scenario, scenario_names
 from sim.session import simulate
 
 Result = tuple[int, str, str]

@@ -1,0 +1,77 @@
+"""Which scenario families and props there are: those that come with the package, and those on `TUNNELCD_PATH`.
+
+A folder `families/` on the path adds scenarios, a folder `props/` kinds of prop; a file's name is its path below that
+folder, without `.yaml`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.plugins import SEARCH_PATH, search_folders
+from cdpipe.core.yamlfile import read_yaml, validate
+from scenarios.schema import PROP_KINDS, PropFile
+
+FAMILIES = Path(__file__).parent / "families"
+
+
+def scenario_names() -> list[str]:
+    """Return the names of the scenarios that come with the package or lie on the search path, e.g. `paper/site1`."""
+    return sorted(family_files())
+
+
+def prop_names() -> list[str]:
+    """Return the kinds of prop that a scenario may name beside `mesh`: ours, then those on the search path."""
+    return [*(kind for kind in PROP_KINDS if kind != "mesh"), *sorted(prop_files())]
+
+
+def family_files() -> dict[str, Path]:
+    """Return the file of every scenario by its name.
+
+    Raises:
+        ScenarioError: A file on the search path has the name of another scenario.
+    """
+    return _found("scenario", {}, (FAMILIES, *search_folders("families")))
+
+
+def prop_files() -> dict[str, Path]:
+    """Return the file of every kind of prop on the search path by its name.
+
+    Raises:
+        ScenarioError: A file has the name of another kind of prop.
+    """
+    return _found("prop", dict.fromkeys(PROP_KINDS, Path("the package")), search_folders("props"))
+
+
+def family_of(path: Path) -> str:
+    """Return the family that a scenario's file stands for: its name in the catalogue, else the file's own."""
+    for root in (FAMILIES, *search_folders("families")):
+        if path.resolve().is_relative_to(root.resolve()):
+            return path.resolve().relative_to(root.resolve()).with_suffix("").as_posix()
+    return path.stem
+
+
+def read_prop(kind: str) -> PropFile:
+    """Return a prop of the search path, the path of its mesh made absolute.
+
+    Raises:
+        InputError: Its file has mistakes: one line each.
+    """
+    path = prop_files()[kind]
+    prop = validate(PropFile, read_yaml(path))
+    mesh = prop.mesh.model_copy(update={"path": str((path.parent / prop.mesh.path).resolve())})
+    return prop.model_copy(update={"mesh": mesh})
+
+
+def _found(what: str, taken: dict[str, Path], folders: tuple[Path, ...]) -> dict[str, Path]:
+    known, found = dict(taken), {}
+    for folder in folders:
+        for path in sorted(folder.rglob("*.yaml")):
+            name = path.relative_to(folder).with_suffix("").as_posix()
+            if name in known:
+                raise ScenarioError(
+                    f"{SEARCH_PATH}: {path}: there is a {what} {name!r} already, in {known[name]}: rename the file"
+                )
+            known[name] = found[name] = path
+    return found
