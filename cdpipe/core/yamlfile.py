@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import json
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -96,6 +97,17 @@ def validate(model: type[ModelT], document: Document) -> ModelT:
     except ValidationError as error:
         lines = [_mistake(model, document, item) for item in error.errors()]
         raise InputError("\n".join(dict.fromkeys(lines))) from error
+
+
+def setting_lines(settings: Iterable[str] | Mapping[str, Any]) -> list[str]:
+    """Return settings, given as lines, as `{"a.b": value}` or as `{"a": {"b": value}}`, as `a.b=value` lines."""
+    if not isinstance(settings, Mapping):
+        return list(settings)
+    lines: list[str] = []
+    for key, value in settings.items():
+        inner = setting_lines(value) if isinstance(value, Mapping) else []
+        lines += [f"{key}.{line}" for line in inner] if inner else [f"{key}={json.dumps(value)}"]
+    return lines
 
 
 def apply_settings(document: Document, settings: Iterable[str]) -> Document:

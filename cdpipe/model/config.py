@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -13,7 +12,16 @@ from pydantic import Field, SerializerFunctionWrapHandler, field_validator, mode
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.plugins import METHODS, PRESETS, entry_points, find_yaml
-from cdpipe.core.yamlfile import Document, Settings, apply_settings, read_yaml, split_section, suggest, validate
+from cdpipe.core.yamlfile import (
+    Document,
+    Settings,
+    read_yaml,
+    setting_lines,
+    suggest,
+    validate,
+    split_section,
+    apply_settings,
+)
 
 Positive = Annotated[float, Field(gt=0)]
 # Smaller ones are noise, and could not be numbered a kilometre from the origin.
@@ -195,9 +203,7 @@ def load_config(
         InputError: The preset is unknown or not made for such a site, or keys or values are wrong; all mistakes of
             both kinds of site at once.
     """
-    if isinstance(settings, Mapping):
-        settings = _as_lines(settings)
-    settings = tuple(settings)
+    settings = setting_lines(settings)
     narrow, wide = split_section(_preset_document(preset), "wide")
     found: dict[str, PipelineConfig] = {}
     mistakes: dict[str, None] = {}
@@ -229,16 +235,6 @@ def settings_table() -> list[tuple[str, Any, str]]:
         else:
             rows.append((name, info.default, info.description or ""))
     return rows
-
-
-def _as_lines(settings: Mapping[str, Any], group: str = "") -> list[str]:
-    """Return settings as `a.b=value` lines."""
-    lines: list[str] = []
-    for key, value in settings.items():
-        lines += (
-            _as_lines(value, f"{group}{key}.") if isinstance(value, Mapping) else [f"{group}{key}={json.dumps(value)}"]
-        )
-    return lines
 
 
 def _preset_document(preset: str) -> Document:

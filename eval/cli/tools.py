@@ -43,15 +43,16 @@ def bench(
 
 
 def list_command() -> None:
-    """Name the scenarios, plans, presets and sensor profiles there are."""
+    """Name the scenarios, props, plans, presets and sensor profiles there are."""
     from cdpipe.core.plugins import METHODS, METRICS, entry_points
     from cdpipe.model.config import preset_names
     from cdpipe.sensor.ouster import profile_names
     from eval.plans.plan import plan_names
-    from scenarios import scenario_names
+    from scenarios import prop_names, scenario_names
 
     groups = {
         "scenarios": scenario_names(),
+        "props": prop_names(),
         "plans": plan_names(),
         "presets": preset_names(),
         "methods": list(entry_points(METHODS)),

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import setting_lines
 from cdpipe.io.session import ScanChunk, SessionWriter
 from cdpipe.mapping.odometry import require_kiss_icp
 from cdpipe.sensor.ouster import SensorMetadata, load_profile
+from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario, SessionPlan
 from sim.drive.odometry import odom_start, registered
@@ -30,6 +33,36 @@ CHUNK_SCANS = 64
 _THREADS = 2
 
 Progress = Callable[[str, int, int], None]
+
+
+def simulate(
+    scenario: Scenario | Path | str,
+    seed: int,
+    out: Path | str,
+    settings: Iterable[str] | Mapping[str, Any] | None = None,
+) -> Path:
+    """Simulate a pair of sessions with its truth, as `tunnelcd simulate` does.
+
+    Args:
+        scenario: A name such as "smoke/one_box", the path of a YAML file, or a scenario as drawn.
+        seed: Draws every distribution of the scenario and all noise.
+        out: A folder that does not exist or is empty.
+        settings: Written over the YAML: `["sensor.dropouts=false"]`, `{"sensor.dropouts": False}` or
+            `{"sensor": {"dropouts": False}}`.
+
+    Returns:
+        The folder: `before`, `after` and `truth` stand in it.
+
+    Raises:
+        InputError: As `simulate_pair`; or settings are given for a scenario that is drawn already.
+        ScenarioError: The scenario is unknown, has mistakes, or contradicts itself.
+    """
+    if not isinstance(scenario, Scenario):
+        scenario = load_scenario(str(scenario), seed, setting_lines(settings or ()))
+    elif settings:
+        raise InputError("settings: this scenario is drawn already: give its name or its file")
+    simulate_pair(scenario, seed, Path(out))
+    return Path(out)
 
 
 def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progress | None = None) -> None:
