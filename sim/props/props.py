@@ -10,8 +10,7 @@ from cdpipe.core.geometry import make_pose, stream
 from scenarios.schema import Prop
 from sim.geometry.mesh import moved
 from sim.geometry.topology import closed_volume_m3, edges_of
-from sim.props import equipment
-from sim.props import storage as wares
+from sim.props import equipment, storage
 from sim.props.heap import build_heap, column_volume_m3, whole_mesh
 from sim.props.loading import load_away
 from sim.props.parts import surface
@@ -22,10 +21,10 @@ from sim.rock.foreign import prop_mesh
 
 _ROCK_SUBDIVISIONS = 2
 _CARDBOARD_M = 0.75  # larger boxes are of steel
-_BUILDERS = {
-    "crate": wares.crate,
-    "barrel": wares.barrel,
-    "pallet": wares.pallet,
+BUILDERS = {
+    "crate": storage.crate,
+    "barrel": storage.barrel,
+    "pallet": storage.pallet,
     "chair": equipment.chair,
     "trolley": equipment.trolley,
     "cone": equipment.cone,
@@ -57,13 +56,13 @@ def shape_of(prop: Prop, seed: int, *, is_banked: bool = False, is_loaded: bool 
     if prop.kind == "muck_pile":
         return _pile(prop, prop.size_m, seed, is_banked, is_loaded)
     if prop.kind == "box":
-        solids = wares.box(prop.size_m, is_cardboard=max(prop.size_m) <= _CARDBOARD_M)
+        solids = storage.box(prop.size_m, is_cardboard=max(prop.size_m) <= _CARDBOARD_M)
         return _shape(solids, prop.size_m, float(sum(8.0 * np.prod(solid.size_m) for solid in solids)))
     if prop.kind == "rock":
         key = int(stream(seed, "props", prop.name, "rock").integers(2**31))
         rock = moved(rock_mesh(prop.size_m, key, _ROCK_SUBDIVISIONS), make_pose(translation=(0, 0, prop.size_m[2] / 2)))
         return _shape((surface(rock, "rock"),), prop.size_m, signed_volume_m3(rock))
-    shape = _shape(_BUILDERS[prop.kind](prop.size_m), prop.size_m, None)
+    shape = _shape(BUILDERS[prop.kind](prop.size_m), prop.size_m, None)
     return replace(shape, is_settled=False) if prop.kind == "railing" else shape
 
 
