@@ -10,7 +10,7 @@ from typing import Any
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import stream
-from cdpipe.core.yamlfile import Document, Key, read_yaml, suggest, validate, apply_settings
+from cdpipe.core.yamlfile import Document, Key, apply_settings, read_yaml, suggest, validate
 from scenarios.catalogue import family_files, family_of, prop_files, prop_names, read_prop
 from scenarios.dangling import Mistake, items_at, reference_mistakes
 from scenarios.distributions import Drawing, dotted, drawing, form_mistakes, is_distribution, merged

@@ -15,12 +15,12 @@ from cdpipe.core.plugins import METHODS, PRESETS, entry_points, find_yaml
 from cdpipe.core.yamlfile import (
     Document,
     Settings,
+    apply_settings,
     read_yaml,
     setting_lines,
+    split_section,
     suggest,
     validate,
-    split_section,
-    apply_settings,
 )
 
 Positive = Annotated[float, Field(gt=0)]
