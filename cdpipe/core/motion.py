@@ -31,14 +31,14 @@ class Motion:
 
     def poses(self, time_s: Float64Array) -> Float64Array:
         """Return the poses (..., 4, 4) at times (...)."""
-        points, quaternions = self.sampled(time_s)
+        points, quaternions = self.sample(time_s)
         poses = np.zeros((*time_s.shape, 4, 4))
         poses[..., :3, :3] = rotation_matrices(quaternions)
         poses[..., :3, 3] = points
         poses[..., 3, 3] = 1.0
         return poses
 
-    def sampled(self, time_s: Float64Array) -> tuple[Float64Array, Float64Array]:
+    def sample(self, time_s: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return the positions (..., 3) and unit quaternions (..., 4) at times (...)."""
         flat = time_s.ravel()
         first = np.clip(np.searchsorted(self.time_s, flat, side="right") - 1, 0, len(self.time_s) - 2)

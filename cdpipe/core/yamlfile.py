@@ -58,7 +58,7 @@ def read_yaml(path: Path, text: str | None = None) -> Document:
         InputError: The file is missing, not YAML, or names a key twice.
     """
     try:
-        document = _parsed(str(path), path.read_text() if text is None else text)
+        document = _parse(str(path), path.read_text() if text is None else text)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:  # not text
@@ -67,7 +67,7 @@ def read_yaml(path: Path, text: str | None = None) -> Document:
 
 
 @lru_cache(maxsize=64)
-def _parsed(path: str, text: str) -> Document:
+def _parse(path: str, text: str) -> Document:
     """Parse a text once: a family is drawn with many seeds, and parsing takes longer than drawing."""
     try:
         node = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -95,7 +95,7 @@ def validate(model: type[ModelT], document: Document) -> ModelT:
     try:
         return model.model_validate(document.value)
     except ValidationError as error:
-        lines = [_mistake(model, document, item) for item in error.errors()]
+        lines = [_describe_mistake(model, document, item) for item in error.errors()]
         raise InputError("\n".join(dict.fromkeys(lines))) from error
 
 
@@ -158,7 +158,7 @@ def split_section(document: Document, name: str) -> tuple[Document, Document | N
     below = {key: where for key, where in document.origins.items() if key[:1] != (name,)}
     above = {key[1:]: where for key, where in document.origins.items() if key[:1] == (name,) != key}
     rest = replace(document, value={key: value for key, value in document.value.items() if key != name}, origins=below)
-    return rest, replace(rest, value=_overlaid(rest.value, section), origins=below | above)
+    return rest, replace(rest, value=_overlay(rest.value, section), origins=below | above)
 
 
 def suggest(word: str, known: Iterable[str], prefix: str = "") -> str:
@@ -167,10 +167,10 @@ def suggest(word: str, known: Iterable[str], prefix: str = "") -> str:
     return f'; did you mean "{prefix}{close[0]}"?' if close else ""
 
 
-def _mistake(model: type[BaseModel], document: Document, error: Any) -> str:
+def _describe_mistake(model: type[BaseModel], document: Document, error: Any) -> str:
     key = tuple(error["loc"])
     # union members put the names of their alternatives into the location; keep what exists in the document
-    key = _existing(document.value, key) if error["type"] != "missing" else key
+    key = _existing_key(document.value, key) if error["type"] != "missing" else key
     name = ".".join(str(part) for part in key)
     where = document.where(key)
     if error["type"] == "extra_forbidden":
@@ -205,7 +205,7 @@ def _brief(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _existing(value: Any, key: Key) -> Key:
+def _existing_key(value: Any, key: Key) -> Key:
     found: list[str | int] = []
     for part in key:
         try:
@@ -236,10 +236,10 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
     return [found for inner in typing.get_args(annotation) for found in _models_in(inner)]
 
 
-def _overlaid(below: Any, above: Any) -> Any:
+def _overlay(below: Any, above: Any) -> Any:
     if not isinstance(below, dict) or not isinstance(above, dict):
         return deepcopy(above)
-    return {key: _overlaid(below.get(key), above[key]) if key in above else below[key] for key in {**below, **above}}
+    return {key: _overlay(below.get(key), above[key]) if key in above else below[key] for key in {**below, **above}}
 
 
 def _plain(node: Any, key: Key, lines: dict[Key, int], mistakes: list[str], source: str) -> Any:

@@ -32,7 +32,7 @@ _BATCH = 32
 
 def describe_scan(scan: PosedScan, config: DescriptorConfig) -> tuple[Float32Array, Float32Array]:
     """Return q (D,) and w (64,) of one scan; D is 64, for descriptors made by hand the number of their rings."""
-    q, w = _described([scan.points_sensor], config.method)
+    q, w = _describe([scan.points_sensor], config.method)
     return q[0], w[0]
 
 
@@ -47,7 +47,7 @@ def describe_scans(source: ScanSource, keyframe_scans: Int64Array, config: Descr
     parts = []
     for start in range(0, len(keyframe_scans), _BATCH):
         batch = keyframe_scans[start : start + _BATCH].tolist()
-        parts.append(_described((source.scan(index).points_sensor for index in batch), config.method))
+        parts.append(_describe((source.scan(index).points_sensor for index in batch), config.method))
     q = np.concatenate([part[0] for part in parts])
     w = np.concatenate([part[1] for part in parts])
     return DescriptorSet(q, w, keyframe_scans, config.method, checkpoint_digest(config))
@@ -125,7 +125,7 @@ def use_threads(n_threads: int) -> None:
     torch.set_num_threads(n_threads)
 
 
-def _described(clouds_sensor: Iterable[Float64Array], method: str) -> tuple[Float32Array, Float32Array]:
+def _describe(clouds_sensor: Iterable[Float64Array], method: str) -> tuple[Float32Array, Float32Array]:
     """Return q (N, D) and w (N, 64) of N scans' points."""
     if method in HANDMADE:
         vectors = [HANDMADE[method](points) for points in clouds_sensor]

@@ -57,7 +57,7 @@ def scan_context(points_sensor: Float64Array) -> Vectors:
     np.maximum.at(highest, (ring * SECTORS + _sectors(x, y))[inside], z[inside].astype(np.float32))
     is_occupied = np.isfinite(highest).reshape(CONTEXT_RINGS, SECTORS)
     context = np.where(is_occupied, highest.reshape(CONTEXT_RINGS, SECTORS).astype(np.float64) + LIFT_M, 0.0)
-    return _unit(is_occupied.mean(axis=1)), _centred_unit(context.mean(axis=0))
+    return _normalise(is_occupied.mean(axis=1)), _centre_and_normalise(context.mean(axis=0))
 
 
 def solid(points_sensor: Float64Array) -> Vectors:
@@ -86,7 +86,7 @@ def solid(points_sensor: Float64Array) -> Vectors:
     by_azimuth = np.bincount(sector * SOLID_ROWS + row, minlength=SECTORS * SOLID_ROWS).reshape(SECTORS, -1)
     counts = by_range.sum(axis=0)
     weights = (counts - counts.min()) / max(int(np.ptp(counts)), 1)
-    return _unit(by_range @ weights), _centred_unit(by_azimuth @ weights)
+    return _normalise(by_range @ weights), _centre_and_normalise(by_azimuth @ weights)
 
 
 HANDMADE: Mapping[str, Callable[[Float64Array], Vectors]] = {"scan-context": scan_context, "solid": solid}
@@ -100,25 +100,25 @@ def _sectors(x: Float64Array, y: Float64Array) -> Int64Array:
 def _cell_means(points: Float64Array, cell_m: float) -> Float64Array:
     """Return the mean of the points of each occupied cell."""
     # neighbours in a scan mostly share a cell: of their runs far fewer are left to sort
-    keys, sums = _summed_runs(cell_keys(points, cell_m), np.column_stack([points, np.ones(len(points))]))
+    keys, sums = _sum_runs(cell_keys(points, cell_m), np.column_stack([points, np.ones(len(points))]))
     order = np.argsort(keys)
-    _, sums = _summed_runs(keys[order], sums[order])
+    _, sums = _sum_runs(keys[order], sums[order])
     return sums[:, :3] / sums[:, 3:]
 
 
-def _summed_runs(keys: Int64Array, values: Float64Array) -> tuple[Int64Array, Float64Array]:
+def _sum_runs(keys: Int64Array, values: Float64Array) -> tuple[Int64Array, Float64Array]:
     """Return the key of each run of equal keys (none is negative), and the sum of its rows."""
     starts = np.flatnonzero(np.diff(keys, prepend=-1))
     return keys[starts], np.add.reduceat(values, starts, axis=0) if len(starts) else values
 
 
-def _unit(values: Float64Array) -> Float32Array:
+def _normalise(values: Float64Array) -> Float32Array:
     length = float(np.linalg.norm(values))
     return np.asarray(values / length if length > 0 else np.zeros_like(values), dtype=np.float32)
 
 
-def _centred_unit(values: Float64Array) -> Float32Array:
+def _centre_and_normalise(values: Float64Array) -> Float32Array:
     centred = values - values.mean()
     # an even ring tells no direction: what is left of it is rounding
     is_even = np.abs(centred).max() <= 1e-9 * np.abs(values).max()
-    return _unit(np.zeros_like(centred) if is_even else centred)
+    return _normalise(np.zeros_like(centred) if is_even else centred)

@@ -61,7 +61,7 @@ def change_logits(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArr
     positions_odom = merged.alignment.to_odom(map_T_anchor[:, :3, 3])
     after_T_anchor = np.asarray(invert(merged.alignment.at(positions_odom)) @ map_T_anchor)
     images = render(GridIndex(merged.after.points), after_T_anchor)
-    spheres = stored_numbers(before.spheres[is_covered])
+    spheres = dequantise(before.spheres[is_covered])
     with torch.inference_mode():
         batches = (torch.split(torch.from_numpy(array), _BATCH) for array in (spheres, images))
         parts = [
@@ -85,12 +85,12 @@ def change_log_odds(merged: MergedMaps, before: DescriptorSet, is_covered: BoolA
     log_odds = np.full(len(is_covered), np.nan)
     logits = change_logits(merged, before, is_covered)[is_covered]
     positions = merged.before.odom_T_sensor[before.keyframe_scans[is_covered], :3, 3]
-    most_changed = torch.from_numpy(agreed(logits, positions).max(axis=1))
+    most_changed = torch.from_numpy(average_neighbours(logits, positions).max(axis=1))
     log_odds[is_covered] = _network()[0].calibrated(most_changed).numpy()
     return log_odds
 
 
-def agreed(logits: Float64Array, positions: Float64Array) -> Float64Array:
+def average_neighbours(logits: Float64Array, positions: Float64Array) -> Float64Array:
     """Return (K, S) log-odds, each averaged with the same sector of the keyframes before and after, which weigh half.
 
     Neighbours a metre apart see most of the same wall: what only one of them calls changed is noise. A neighbour that
@@ -107,7 +107,7 @@ def agreed(logits: Float64Array, positions: Float64Array) -> Float64Array:
     return np.asarray((logits[before] + 2 * logits + logits[after]) / 4)
 
 
-def best_in_reach(scores: Float64Array, positions: Float64Array, reach_m: float) -> Float64Array:
+def max_within_reach(scores: Float64Array, positions: Float64Array, reach_m: float) -> Float64Array:
     """Return the (K,) highest of the scores of the keyframes within `reach_m` of each, the border included."""
     if len(scores) == 0:
         return scores
@@ -115,7 +115,7 @@ def best_in_reach(scores: Float64Array, positions: Float64Array, reach_m: float)
     return np.array([scores[found].max() for found in near])
 
 
-def stored_numbers(spheres: Spheres) -> Float32Array:
+def dequantise(spheres: Spheres) -> Float32Array:
     """Return (K, 64) stored descriptors as float32 numbers in (-1, 1)."""
     if spheres.dtype == np.int8:
         return (spheres / np.float32(_INT8_SCALE)).astype(np.float32)

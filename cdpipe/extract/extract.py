@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.extract.crops import DIRECTIONS, Crops
 from cdpipe.extract.objects import PointGroup, assemble_objects
-from cdpipe.extract.point_comparison import cluster_labels, far_points_mask, inlier_mask, new_points_mask
+from cdpipe.extract.point_comparison import far_points_mask, inlier_mask, label_clusters, new_points_mask
 from cdpipe.extract.surface_rule import cut_by_surface
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
@@ -26,7 +26,7 @@ from cdpipe.model.types import DescriptorSet, MergedMaps
 FIGURES = ("v_sphere_m3", "v_oe_m3", "s_points", "oe_points")
 
 
-def cut_out(merged: MergedMaps, regions: ChangeRegions, config: PipelineConfig) -> list[PointGroup]:
+def cut_objects(merged: MergedMaps, regions: ChangeRegions, config: PipelineConfig) -> list[PointGroup]:
     """Compare both maps inside every reported region and group what is in one of them only, best region first.
 
     Args:
@@ -39,7 +39,9 @@ def cut_out(merged: MergedMaps, regions: ChangeRegions, config: PipelineConfig) 
     return _cut_by_points(merged, regions, config)
 
 
-def with_withdrawn(regions: ChangeRegions, groups: Sequence[PointGroup], config: PipelineConfig) -> ChangeRegions:
+def withdraw_empty_regions(
+    regions: ChangeRegions, groups: Sequence[PointGroup], config: PipelineConfig
+) -> ChangeRegions:
     """Take back the reported regions whose sphere holds nothing of what was cut out, if `extract.withdraw` says so."""
     if not config.extract.withdraw:
         return regions
@@ -51,7 +53,9 @@ def with_withdrawn(regions: ChangeRegions, groups: Sequence[PointGroup], config:
     return replace(regions, is_reported=regions.is_reported & ~is_empty, is_withdrawn=is_empty)
 
 
-def region_figures(merged: MergedMaps, regions: ChangeRegions, groups: Sequence[PointGroup]) -> dict[str, Float64Array]:
+def measure_regions(
+    merged: MergedMaps, regions: ChangeRegions, groups: Sequence[PointGroup]
+) -> dict[str, Float64Array]:
     """Return the paper's Table II by our definition, all of the after map: (R,) by name, NaN where not reported.
 
     `v_sphere_m3` volume of the convex hull of its points in the sphere, `v_oe_m3` sum of the volumes of the convex
@@ -87,13 +91,13 @@ def extract_changes(
         config: All settings.
     """
     start = perf_counter()
-    groups = cut_out(merged, regions, config)
-    regions = with_withdrawn(regions, groups, config)
+    groups = cut_objects(merged, regions, config)
+    regions = withdraw_empty_regions(regions, groups, config)
     grouped = perf_counter()
     objects = assemble_objects(merged, groups)
     end = perf_counter()
     seconds = {"t_cd_s": t_cd_s, "t_oe_s": end - start, "t_returns_s": end - grouped}
-    return make_report(merged, described, regions, objects, region_figures(merged, regions, groups), seconds, config)
+    return make_report(merged, described, regions, objects, measure_regions(merged, regions, groups), seconds, config)
 
 
 def make_report(
@@ -153,18 +157,18 @@ def _cut_by_points(merged: MergedMaps, regions: ChangeRegions, config: PipelineC
         spheres = crops.around(regions.centres_map[region], regions.radius_m)
         for session, other in DIRECTIONS:
             indices, points = spheres[session].inside
-            for members in _new_clusters(points, spheres[other].points, is_taken[session][indices], config):
+            for members in _cluster_new_points(points, spheres[other].points, is_taken[session][indices], config):
                 groups.append(PointGroup(session, indices[members], points[members], region))
                 is_taken[session][indices[members]] = True
     return groups
 
 
-def _new_clusters(
+def _cluster_new_points(
     points: Float64Array, reference: Float64Array, is_taken: BoolArray, config: PipelineConfig
 ) -> list[Int64Array]:
     """Return the indices into `points` of each object."""
     is_new = new_points_mask if config.extract.method == "voxel" else far_points_mask
     new = np.flatnonzero(is_new(points, reference, config.extract) & ~is_taken)
     new = new[inlier_mask(points[new], config.outlier)]
-    labels = cluster_labels(points[new], config.cluster)
+    labels = label_clusters(points[new], config.cluster)
     return [new[labels == label] for label in range(labels.max(initial=-1) + 1)]

@@ -94,11 +94,11 @@ def find_moves(
             moves[r, a] = Move(r, a, shift)
 
     for (r, a), (before, after) in zip(beside, around(beside), strict=True):
-        note(r, a, _one_object(gone[r].with_rest(before), come[a].with_rest(after), _BESIDE_SHARE))
+        note(r, a, _match_pair(gone[r].with_rest(before), come[a].with_rest(after), _BESIDE_SHARE))
     for r, start in enumerate(gone):
-        for a in _likely(start, come) if may_go_far[r] else ():
+        for a in _similar(start, come) if may_go_far[r] else ():
             if (r, a) not in beside:
-                note(r, a, _one_object(start, come[a], _SAME_SHARE))
+                note(r, a, _match_pair(start, come[a], _SAME_SHARE))
     rows, columns = linear_sum_assignment(gain, maximize=True)
     return [moves[r, a] for r, a in zip(rows.tolist(), columns.tolist(), strict=True) if (r, a) in moves]
 
@@ -115,7 +115,7 @@ class _Cloud:
 
     @classmethod
     def of(cls, points: Float64Array) -> _Cloud:
-        return cls(points, _few(points, _MOST_POINTS), points, _tree(points), _log_extents(points))
+        return cls(points, _thin_to(points, _MOST_POINTS), points, _tree(points), _log_extents(points))
 
     def with_rest(self, rest: Float64Array) -> _Cloud:
         whole = np.concatenate([self.points, rest])
@@ -124,10 +124,10 @@ class _Cloud:
     def coarse(self) -> _Cloud:
         """Return fewer points, to lie on fewer: for a first guess in a quarter of the time."""
         whole = thin(self.whole, _LIKE_WITHIN_M)
-        return replace(self, few=_few(self.few, _MOST_COARSE_POINTS), whole=whole, tree=_tree(whole))
+        return replace(self, few=_thin_to(self.few, _MOST_COARSE_POINTS), whole=whole, tree=_tree(whole))
 
 
-def _few(points: Float64Array, most: int) -> Float64Array:
+def _thin_to(points: Float64Array, most: int) -> Float64Array:
     few, cell_m = points, _LIKE_WITHIN_M
     while len(few) > most:
         few = thin(points, cell_m)
@@ -147,21 +147,21 @@ def _neighbours(start: _Cloud, come: Sequence[_Cloud]) -> list[int]:
     return [a for a in order if gaps_m[a] < _BESIDE_M][:_MOST_TRIED]
 
 
-def _likely(start: _Cloud, come: Sequence[_Cloud]) -> list[int]:
+def _similar(start: _Cloud, come: Sequence[_Cloud]) -> list[int]:
     """Return the objects that one may have become somewhere else: those of its extents, no more than are tried."""
     misfits = [float(np.abs(start.log_extents - end.log_extents).max()) for end in come]
     order = sorted(range(len(come)), key=lambda a: misfits[a])
     return [a for a in order if misfits[a] <= np.log(_FAR_FACTOR)][:_MOST_TRIED]
 
 
-def _one_object(start: _Cloud, end: _Cloud, least_share: float) -> tuple[float, Float64Array] | None:
+def _match_pair(start: _Cloud, end: _Cloud, least_share: float) -> tuple[float, Float64Array] | None:
     """Return how many points more than they need to two objects share, and the displacement; None if too few.
 
     The displacement is that of the middle of the upright box around both, laid on each other.
     """
     if min(len(start.points), len(end.points)) < _MIN_POINTS:
         return None
-    likeness, end_T_start = _laid_on(start, end)
+    likeness, end_T_start = _align(start, end)
     shares = _shares(start, end, end_T_start)
     excess = likeness * (sum(shares) / 2 - least_share)  # of two that share all, the liker one
     if excess <= 0.0 or min(shares) < _EITHER_SHARE or likeness < _LIKENESS:
@@ -173,7 +173,7 @@ def _one_object(start: _Cloud, end: _Cloud, least_share: float) -> tuple[float, 
     return excess * min(len(start.points), len(end.points)) / (1.0 + _TIE_PER_M * distance_m), shift
 
 
-def _laid_on(start: _Cloud, end: _Cloud) -> tuple[float, Float64Array]:
+def _align(start: _Cloud, end: _Cloud) -> tuple[float, Float64Array]:
     """Return the best likeness and the pose (4, 4), a turn about the vertical and a shift, that reaches it.
 
     The search begins with the middles of both objects on each other and, as those of two strips do not belong there,

@@ -12,7 +12,7 @@ from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array, invert, r
 from cdpipe.core.grid_index import GridIndex
 from cdpipe.core.voxel import cell_means
 from cdpipe.extract.moves import find_moves
-from cdpipe.extract.remains import is_muck, is_part_of_a_rest
+from cdpipe.extract.remains import is_heap, is_part_of_remainder
 from cdpipe.extract.shape import ground_heights, measure_shape, upright_box
 from cdpipe.model.report import ChangedObject
 from cdpipe.model.types import MergedMaps, PointMap, SessionName
@@ -92,7 +92,7 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
         taken, _ = cell_means(group.points_map, voxel_m)  # as dense as its surroundings
         # a rule that takes whole map points leaves an object's foot behind, which would pass for a rest
         may_be_part = group.session == "before" and group.returns is not None
-        is_part[number] = may_be_part and is_part_of_a_rest(taken, around["before"], other)
+        is_part[number] = may_be_part and is_part_of_remainder(taken, around["before"], other)
         column_m = voxel_m if maps[group.session].return_offsets is None else voxel_m / 2
         objects.append(
             ChangedObject(
@@ -105,17 +105,17 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
                 shape=measure_shape(points[number], other, column_m, voxel_m),
             )
         )
-    return _with_moves(objects, points, is_part, surroundings)
+    return _link_moves(objects, points, is_part, surroundings)
 
 
-def _with_moves(
+def _link_moves(
     objects: list[ChangedObject],
     points: Mapping[int, Float64Array],
     is_part: Mapping[int, bool],
     surroundings: _Surroundings,
 ) -> tuple[ChangedObject, ...]:
     before = [number for number, item in enumerate(objects) if item.session == "before"]
-    removed = [number for number in before if not (is_part[number] and is_muck(points[number]))]
+    removed = [number for number in before if not (is_part[number] and is_heap(points[number]))]
     added = [number for number, item in enumerate(objects) if item.session == "after"]
     may_go_far = [not is_part[number] for number in removed]
 

@@ -84,7 +84,7 @@ def inlier_mask(points: Float64Array, config: OutlierConfig) -> BoolArray:
     return np.asarray(np.abs(deviation) <= reach)
 
 
-def cluster_labels(points: Float64Array, config: ClusterConfig) -> Int64Array:
+def label_clusters(points: Float64Array, config: ClusterConfig) -> Int64Array:
     """Label the connected groups of points, neighbours being within `radius_m` of each other.
 
     Returns:

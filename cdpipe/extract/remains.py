@@ -29,7 +29,7 @@ _SLOPE = (0.45, 0.93)
 _LEAST_SLOPE = 0.4
 
 
-def is_part_of_a_rest(taken_map: Float64Array, rest_map: Float64Array, other_map: Float64Array) -> bool:
+def is_part_of_remainder(taken_map: Float64Array, rest_map: Float64Array, other_map: Float64Array) -> bool:
     """Tell whether a removed object was only a part: whether its surface went on in something that has stayed.
 
     The seam is the object's points that have a neighbour which stayed, lies above the ground and on a slope. A whole
@@ -56,7 +56,7 @@ def is_part_of_a_rest(taken_map: Float64Array, rest_map: Float64Array, other_map
     return bool(len(seam) >= _LEAST_SEAM * np.sqrt(len(taken_map)))
 
 
-def is_muck(points_map: Float64Array) -> bool:
+def is_heap(points_map: Float64Array) -> bool:
     """Tell whether much of a surface (P, 3) is slope: that of a heap, not of what could be carried elsewhere."""
     surface, _ = cell_means(points_map, _SLOPE_CELL_M)
     upward, is_known = _upward(surface, surface)

@@ -2,7 +2,7 @@
 
 Two steps, because a map point is the mean of a cell of 0.2 m and an object's foot is not:
 
-1. In every reported sphere map points off the planes through the other map's points are candidates (`candidates`);
+1. In every reported sphere map points off the planes through the other map's points are candidates (`find_candidates`);
    those next to each other are a site.
 2. Around each site all returns of both sessions are compared, in cells of 0.05 and 0.1 m (`compare_site`). Objects grow
    from cells that stand well clear of the surface and were seen through, down to what the surfaces differ by anyway
@@ -72,7 +72,7 @@ def distances_m(points: Float64Array, surface: Surface, plane_m: float) -> Float
     That is the distance from the plane through the nearest of the surface's points, as long as that point is within
     `plane_m` or the plane is nearly met; otherwise it is the distance from the point itself.
     """
-    chosen, nearest_m = nearest_of(points, surface)
+    chosen, nearest_m = find_nearest(points, surface)
     offsets = points - surface.points.take(chosen, axis=0)
     along = np.einsum("ij,ij->i", offsets, surface.normals.take(chosen, axis=0))
     off_plane_m = np.abs(along)
@@ -80,7 +80,7 @@ def distances_m(points: Float64Array, surface: Surface, plane_m: float) -> Float
     return np.asarray(np.where(is_on_plane, off_plane_m, nearest_m))
 
 
-def nearest_of(points: Float64Array, surface: Surface) -> tuple[Int64Array, Float64Array]:
+def find_nearest(points: Float64Array, surface: Surface) -> tuple[Int64Array, Float64Array]:
     """Return the surface's point nearest to each of (N, 3) points, and how far it is."""
     # of one neighbour it returns arrays, where the search for the nearest returns lists that take as long again
     found, squared_m2 = surface.tree.batch_knn_search(points, 1)
@@ -115,7 +115,7 @@ class PlaneTable:
         return np.asarray((cells[0] * self._shape[1] + cells[1]) * self._shape[2] + cells[2])
 
 
-def candidates(points: Float64Array, table: PlaneTable) -> tuple[Int64Array, float]:
+def find_candidates(points: Float64Array, table: PlaneTable) -> tuple[Int64Array, float]:
     """Return the indices of the map points (N, 3) that stand off the other map's surface, three or more together.
 
     A point on the plane of its cell does not; of the others the distance from the nearest plane decides.
@@ -171,21 +171,21 @@ def grow_objects(site: Site, free_space_votes: Int64Array, noise_m: float, confi
         noise_m: Median distance of the two maps' surfaces around here.
         config: Thresholds.
     """
-    stands_off, is_free = site.distance_m > border_of(noise_m, config), free_space_votes > 0
+    stands_off, is_free = site.distance_m > border_threshold_m(noise_m, config), free_space_votes > 0
     core, foot = np.flatnonzero(stands_off & is_free), np.flatnonzero(stands_off & ~is_free)
     labels, sizes = label_groups(site.points[core], _LINK_M)
     n_views = np.bincount(labels, free_space_votes[core], len(sizes))
     is_seen = n_views >= config.min_views * sizes
-    kept = np.flatnonzero(is_seen & (_n_clear(site, core, labels, noise_m, config) >= config.min_cells))
-    return _with_feet(site, core, labels, kept, foot)
+    kept = np.flatnonzero(is_seen & (_count_clear(site, core, labels, noise_m, config) >= config.min_cells))
+    return _attach_feet(site, core, labels, kept, foot)
 
 
 def unassigned_cells(site: Site, taken: list[Int64Array], noise_m: float, config: ExtractConfig) -> Int64Array:
     """Return the cells that stand off the surface and are in no object that was taken; none if few are clear of it."""
-    is_left = site.distance_m > border_of(noise_m, config)
+    is_left = site.distance_m > border_threshold_m(noise_m, config)
     is_left[np.concatenate([*taken, np.zeros(0, dtype=np.int64)])] = False
     left = np.flatnonzero(is_left)
-    is_enough = np.count_nonzero(site.distance_m[left] > seed_of(noise_m, config)) >= _MIN_LOW_CELLS
+    is_enough = np.count_nonzero(site.distance_m[left] > seed_threshold_m(noise_m, config)) >= _MIN_LOW_CELLS
     return left if is_enough else left[:0]
 
 
@@ -207,30 +207,30 @@ def grow_low_objects(
     is_passed = n_past >= _MIN_SCANS_PAST
     core, foot = left[is_passed], left[~is_passed]
     labels, sizes = label_groups(site.points[core], _LINK_M)
-    n_clear = _n_clear(site, core, labels, noise_m, config)
+    n_clear = _count_clear(site, core, labels, noise_m, config)
     is_whole = (n_clear >= _MIN_LOW_CELLS) & (2 * n_clear >= sizes)
     if any(len(each) for each in taken):
         near = cKDTree(site.points[np.concatenate(taken)]).query(site.points[core], distance_upper_bound=_FOOT_M)[0]
         is_whole &= np.bincount(labels, np.isfinite(near), len(sizes)) == 0
-    return _with_feet(site, core, labels, np.flatnonzero(is_whole), foot)
+    return _attach_feet(site, core, labels, np.flatnonzero(is_whole), foot)
 
 
-def border_of(noise_m: float, config: ExtractConfig) -> float:
+def border_threshold_m(noise_m: float, config: ExtractConfig) -> float:
     """Return how far a cell must stand off to be an object's, where surfaces differ by a noise."""
     return float(np.clip(_NOISE_FACTOR * noise_m, config.border_m, _MAX_BORDER * config.border_m))
 
 
-def seed_of(noise_m: float, config: ExtractConfig) -> float:
+def seed_threshold_m(noise_m: float, config: ExtractConfig) -> float:
     """Return how far enough cells of an object must stand off."""
-    return max(config.seed_m, _SEED_FACTOR * border_of(noise_m, config))
+    return max(config.seed_m, _SEED_FACTOR * border_threshold_m(noise_m, config))
 
 
-def _n_clear(site: Site, core: Int64Array, labels: Int64Array, noise_m: float, config: ExtractConfig) -> Int64Array:
-    is_clear = site.distance_m[core] > seed_of(noise_m, config)
+def _count_clear(site: Site, core: Int64Array, labels: Int64Array, noise_m: float, config: ExtractConfig) -> Int64Array:
+    is_clear = site.distance_m[core] > seed_threshold_m(noise_m, config)
     return np.bincount(labels[is_clear], minlength=int(labels.max(initial=-1)) + 1)
 
 
-def _with_feet(
+def _attach_feet(
     site: Site, core: Int64Array, labels: Int64Array, kept: Int64Array, foot: Int64Array
 ) -> list[Int64Array]:
     """Return the cells of some groups of the core, each with those of the foot that are nearest to it."""

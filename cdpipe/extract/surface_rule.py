@@ -23,14 +23,14 @@ from cdpipe.extract.surface import (
     SURFACE_CELL_M,
     PlaneTable,
     Site,
-    candidates,
     compare_site,
+    find_candidates,
+    find_nearest,
     grow_low_objects,
     grow_objects,
-    nearest_of,
     unassigned_cells,
 )
-from cdpipe.mapping.free_space import REACH_M, free_space_votes, grazing_ray_count, n_through_and_hit
+from cdpipe.mapping.free_space import REACH_M, count_through_and_hit, free_space_votes, grazing_ray_count
 from cdpipe.merge.registration import MIN_SPHERE_POINTS, Surface, align_to_planes
 from cdpipe.model.config import ExtractConfig
 from cdpipe.model.report import ChangeRegions
@@ -57,7 +57,7 @@ Rays = tuple[Float64Array, Float64Array, Int64Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Found:
+class _Candidates:
     """Candidates of one session in one region: map points, and whether they make a site worth a closer look.
 
     They do inside of the sphere, where the other session saw through them or they are low.
@@ -80,25 +80,25 @@ class _Agreement:
 def cut_by_surface(merged: MergedMaps, regions: ChangeRegions, config: ExtractConfig) -> list[PointGroup]:
     """Return the objects that stand out of the other session's surface in the reported regions, best region first."""
     crops = Crops(merged, margin_m=BEYOND_M)
-    found: list[_Found] = []
+    found: list[_Candidates] = []
     agreements: dict[int, _Agreement] = {}
     for region in np.flatnonzero(regions.is_reported).tolist():
         spheres = crops.around(regions.centres_map[region], regions.radius_m)
         if min(len(sphere.indices) for sphere in spheres.values()) == 0:
             continue
-        agreements[region], of_region = _candidates(merged, spheres, regions.centres_map[region], region, config)
+        agreements[region], of_region = _compare_region(merged, spheres, regions.centres_map[region], region, config)
         found += of_region
-    sites = _sites(crops, found, agreements)
-    return _objects(merged, sites, config)
+    sites = _find_sites(crops, found, agreements)
+    return _cut_sites(merged, sites, config)
 
 
-def _candidates(
+def _compare_region(
     merged: MergedMaps,
     spheres: dict[SessionName, Sphere],
     centre: Float64Array,
     region: int,
     config: ExtractConfig,
-) -> tuple[_Agreement, list[_Found]]:
+) -> tuple[_Agreement, list[_Candidates]]:
     """Return how the two spheres fit, and the candidates of both sessions."""
     before, after = spheres["before"].points, spheres["after"].points
     surface = Surface(before)
@@ -108,13 +108,13 @@ def _candidates(
     found, noise_m = [], {}
     for session, other in DIRECTIONS:
         points, reference = compared[session]
-        chosen, noise_m[session] = candidates(points, reference)
+        chosen, noise_m[session] = find_candidates(points, reference)
         sphere = spheres[session]
-        is_low = nearest_of(points[chosen], reference.surface)[1] < _LOW_M
+        is_low = find_nearest(points[chosen], reference.surface)[1] < _LOW_M
         is_telling = sphere.is_inside[chosen] & (
             is_low | (_free_space_votes(points[chosen], merged, other, correction) > 0)
         )
-        found.append(_Found(session, region, sphere.indices[chosen], is_telling))
+        found.append(_Candidates(session, region, sphere.indices[chosen], is_telling))
     return _Agreement(correction, max(noise_m.values())), found
 
 
@@ -143,7 +143,7 @@ class _Site:
     agreement: _Agreement
 
 
-def _sites(crops: Crops, found: Iterable[_Found], agreements: dict[int, _Agreement]) -> list[_Site]:
+def _find_sites(crops: Crops, found: Iterable[_Candidates], agreements: dict[int, _Agreement]) -> list[_Site]:
     """Put the candidates of all regions together, session by session; best region first."""
     sites = []
     for session, other in DIRECTIONS:
@@ -167,7 +167,7 @@ def _sites(crops: Crops, found: Iterable[_Found], agreements: dict[int, _Agreeme
     return sorted(sites, key=lambda site: site.region)
 
 
-def _objects(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) -> list[PointGroup]:
+def _cut_sites(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) -> list[PointGroup]:
     maps = {"before": merged.before, "after": merged.after}
     pools = {
         name: ReturnPool(
@@ -221,7 +221,7 @@ def _is_out_of_place(point_map: PointMap, returns: Int64Array) -> bool:
         return False
     points = point_map.positions_of(returns)
     places, _ = cell_means(points, CELL_M)
-    n_through, n_hit = n_through_and_hit(places, point_map.views)
+    n_through, n_hit = count_through_and_hit(places, point_map.views)
     if n_through.sum() > _DOUBLED * n_hit.sum():
         return True
     scans = np.searchsorted(point_map.scan_offsets, returns, side="right") - 1
@@ -230,7 +230,7 @@ def _is_out_of_place(point_map: PointMap, returns: Int64Array) -> bool:
     way_m = np.diff(travelled_m(point_map.odom_T_sensor), prepend=0.0)[scans]
     if way_m[ranges_m > REACH_M].sum() <= way_m[ranges_m <= REACH_M].sum():
         return False
-    n_looked = sum(n_through_and_hit(places, point_map.views, within_m=_NEAR_M))
+    n_looked = sum(count_through_and_hit(places, point_map.views, within_m=_NEAR_M))
     return bool(np.mean(n_looked > 0) > 0.5)
 
 

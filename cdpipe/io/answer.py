@@ -42,8 +42,8 @@ from cdpipe.io.answer_parts import (
     AnswerPart,
     ShapePart,
     Until,
-    checked_arrays,
-    checked_document,
+    check_arrays,
+    check_document,
 )
 from cdpipe.io.session import load_arrays
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
@@ -87,9 +87,9 @@ def write_answer(folder: Path, method: str, report: ChangeReport, until: Until |
         "keyframe_scores": regions.keyframe_scores,
         "before_keyframe_scans": report.keyframe_scans[0],
         "after_keyframe_scans": report.keyframe_scans[1],
-        "object_returns": _stacked([item.returns for item in objects], (0, 2), np.int32),
+        "object_returns": _stack([item.returns for item in objects], (0, 2), np.int32),
         "object_return_offsets": _offsets([item.returns for item in objects]),
-        "object_points_map": _stacked([item.points_map for item in objects], (0, 3), np.float64),
+        "object_points_map": _stack([item.points_map for item in objects], (0, 3), np.float64),
         "object_point_offsets": _offsets([item.points_map for item in objects]),
         **{f"figure_{name}": values for name, values in report.figures.items()},
     }
@@ -145,12 +145,12 @@ def read_answer(folder: Path) -> Answer:
         value = json.loads(path.read_text())
     except ValueError as error:
         raise InputError(f"{path}: damaged, not JSON: {error}") from error
-    document = checked_document(path, value)
+    document = check_document(path, value)
     if not isinstance(document, AnswerPart):
         status, method, seconds, until = document.status, document.method, document.seconds, document.until
         return Answer(status, document.error, method, None, seconds, document.evidence, until=until)
     arrays = load_arrays(folder / "answer.npz")
-    checked_arrays(folder / "answer.npz", arrays, len(document.objects))
+    check_arrays(folder / "answer.npz", arrays, len(document.objects))
     try:
         report, points_odom = _report(document, arrays)
     except ValueError as error:
@@ -245,7 +245,7 @@ def _write_json(folder: Path, document: Mapping[str, Any], until: Until | None) 
     partial.replace(folder / "answer.json")
 
 
-def _stacked(arrays: Sequence[npt.NDArray[Any]], empty: tuple[int, int], dtype: type) -> npt.NDArray[Any]:
+def _stack(arrays: Sequence[npt.NDArray[Any]], empty: tuple[int, int], dtype: type) -> npt.NDArray[Any]:
     return np.concatenate(arrays) if arrays else np.zeros(empty, dtype=dtype)
 
 

@@ -94,7 +94,7 @@ _MASKS = ("region_is_reported", "region_is_withdrawn")
 _FIGURE = "figure_"
 
 
-def checked_document(path: Path, value: Any) -> AnswerPart | FailurePart:
+def check_document(path: Path, value: Any) -> AnswerPart | FailurePart:
     """Return what answer.json says.
 
     Raises:
@@ -105,7 +105,7 @@ def checked_document(path: Path, value: Any) -> AnswerPart | FailurePart:
     return validate(FailurePart if is_failure else AnswerPart, document)
 
 
-def checked_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects: int) -> None:
+def check_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects: int) -> None:
     """Check that the arrays of answer.npz are known, numbers, of the right shape, and all there.
 
     Raises:
@@ -121,9 +121,11 @@ def checked_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects
             wanted = "true or false" if name in _MASKS else "numbers"
             mistakes.append(f"array {name}: expected {wanted}, got {array.dtype}")
         elif array.ndim != len(shape) or array.shape[1:] != shape[1:]:
-            mistakes.append(f"array {name} must be {_spelt(shape)}, got {array.shape}")
+            mistakes.append(f"array {name} must be {_format_shape(shape)}, got {array.shape}")
     needed = [*_REQUIRED, *(_OFFSETS[name] for name in _OFFSETS if name in arrays)]
-    mistakes += [f"array {name} is missing: expected {_spelt(_SHAPES[name])}" for name in needed if name not in arrays]
+    mistakes += [
+        f"array {name} is missing: expected {_format_shape(_SHAPES[name])}" for name in needed if name not in arrays
+    ]
     if n_objects and "object_returns" not in arrays and "object_points_odom" not in arrays:
         mistakes.append(
             f"array object_points_odom is missing: the {n_objects} objects of answer.json need their points, (P, 3), "
@@ -148,5 +150,5 @@ def _offset_mistakes(name: str, offsets: npt.NDArray[Any], values: str, n_values
     return []
 
 
-def _spelt(shape: tuple[str | int, ...]) -> str:
+def _format_shape(shape: tuple[str | int, ...]) -> str:
     return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"

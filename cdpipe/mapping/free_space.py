@@ -30,7 +30,7 @@ _CELL_M = 0.1
 _PAST_M = (0.1, 1.0)
 
 
-def view(points_sensor: Float64Array) -> Float16Array:
+def render_view(points_sensor: Float64Array) -> Float16Array:
     """Return the (ROWS, COLUMNS) float16 range of the nearest return of each pixel, metres, 0 without.
 
     Args:
@@ -53,11 +53,11 @@ def free_space_votes(points_odom: Float64Array, views: KeyframeViews) -> Int64Ar
         points_odom: (N, 3) points in the odom frame of the session that looked, metres.
         views: What its keyframes saw.
     """
-    n_through, n_hit = n_through_and_hit(points_odom, views)
+    n_through, n_hit = count_through_and_hit(points_odom, views)
     return n_through - n_hit
 
 
-def n_through_and_hit(
+def count_through_and_hit(
     points_odom: Float64Array, views: KeyframeViews, within_m: float = REACH_M
 ) -> tuple[Int64Array, Int64Array]:
     """Return how many keyframes saw through each of (N,) places, and how many hit it; as `free_space_votes` takes them.
@@ -74,7 +74,7 @@ def n_through_and_hit(
     for keyframe in np.flatnonzero(distances_m <= within_m + spread_m):
         pixel, ranges_m = _pixels(points_odom @ rotations[keyframe].T + shifts[keyframe])
         in_view = np.flatnonzero((pixel >= 0) & (ranges_m >= _NEAREST_M) & (ranges_m <= within_m))
-        first_m, is_hit = _looked_up(views.ranges_m[keyframe], pixel[in_view], ranges_m[in_view])
+        first_m, is_hit = _look_up(views.ranges_m[keyframe], pixel[in_view], ranges_m[in_view])
         n_through[in_view] += np.isfinite(first_m) & (first_m > ranges_m[in_view] + _MARGIN_M)
         n_hit[in_view] += is_hit
     return n_through, n_hit
@@ -134,7 +134,7 @@ class _Cells:
         return cell_keys(points - self._low, _CELL_M)
 
 
-def _looked_up(image: Float16Array, pixel: Int64Array, ranges_m: Float64Array) -> tuple[Float64Array, BoolArray]:
+def _look_up(image: Float16Array, pixel: Int64Array, ranges_m: Float64Array) -> tuple[Float64Array, BoolArray]:
     """Return the shortest range of the cross about each pixel, infinite without, and whether any is the point's own."""
     column, row_start = pixel % COLUMNS, pixel - pixel % COLUMNS
     cross = (

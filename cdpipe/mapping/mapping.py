@@ -10,7 +10,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array, invert, transform, travelled_m
 from cdpipe.core.grid_index import column_keys
 from cdpipe.core.voxel import UniqueCells, cell_corners, cell_keys, max_coordinate_m
-from cdpipe.mapping.free_space import view
+from cdpipe.mapping.free_space import render_view
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PLACES, Float16Array, KeyframeViews, PointMap, PosedScan, ScanSource, UInt8Array
 
@@ -82,7 +82,7 @@ class _MapAccumulator:
             self._return_pixels.append(scan.pixels[is_near])
             n_near.append(len(clouds[-1]))
             if scan.index in self._keyframe_scans:
-                self._views.append(view(scan.points_sensor))
+                self._views.append(render_view(scan.points_sensor))
         self._n_returns += n_near
         points = np.concatenate(clouds)
         sensors = np.array([scan.odom_T_sensor[:3, 3] for scan in scans])
@@ -109,7 +109,7 @@ class _MapAccumulator:
         cells, sums = np.concatenate(self._batch_cells), np.concatenate(self._batch_sums)
         totals = np.column_stack([np.bincount(cells, column, len(self._cells)) for column in sums.T])
         points, seen_from = totals[:, :3] / totals[:, 6:], totals[:, 3:6] / totals[:, 6:]
-        points = _in_their_cells(points, self._cells.keys, self._config.voxel_m)
+        points = _clip_to_cells(points, self._cells.keys, self._config.voxel_m)
         order = np.lexsort((self._cells.keys, column_keys(points)))
         rank = np.empty(len(order), dtype=np.int32)
         rank[order] = np.arange(len(order), dtype=np.int32)
@@ -129,7 +129,7 @@ class _MapAccumulator:
         )
 
 
-def _in_their_cells(points: Float64Array, keys: Int64Array, voxel_m: float) -> Float64Array:
+def _clip_to_cells(points: Float64Array, keys: Int64Array, voxel_m: float) -> Float64Array:
     """Return the means (N, 3) of the returns of cells; rounding may carry one on a border into the next cell."""
     tipped = np.flatnonzero(cell_keys(points, voxel_m) != keys)
     low = cell_corners(keys[tipped], voxel_m)

@@ -53,9 +53,9 @@ class Candidate:
     before_T_after: Float64Array
 
 
-def closest_pair(before: MappedSession, after: MappedSession) -> list[Candidate]:
+def find_closest_pair(before: MappedSession, after: MappedSession) -> list[Candidate]:
     """Return the closest of all descriptor pairs, FRAME's only candidate; empty where a session has no descriptor."""
-    pairs = _pairs(before.descriptors, after.descriptors, len(after.descriptors.q), nearest=1, n_yaws=1)
+    pairs = _match_descriptors(before.descriptors, after.descriptors, len(after.descriptors.q), nearest=1, n_yaws=1)
     if len(pairs.i) == 0:
         return []
     best = int(np.argmin(pairs.distances))
@@ -65,22 +65,22 @@ def closest_pair(before: MappedSession, after: MappedSession) -> list[Candidate]
     return [Candidate(i, j, float(pairs.distances[best]), guess)]
 
 
-def voted_candidates(before: MappedSession, after: MappedSession, config: MergeConfig) -> list[Candidate]:
+def find_candidates(before: MappedSession, after: MappedSession, config: MergeConfig) -> list[Candidate]:
     """Return up to `n_candidates` pairs, the one with most votes first; each stands for another motion.
 
     The guess of each is the motion that fits the pairs that agree with it. A pair that agrees with a chosen one, or
     whose motion is the same, would repeat its trial and is left out.
     """
-    pairs = _pairs(before.descriptors, after.descriptors, _MAX_QUERIES, _NEAREST, _N_YAWS)
+    pairs = _match_descriptors(before.descriptors, after.descriptors, _MAX_QUERIES, _NEAREST, _N_YAWS)
     before_poses, after_poses = _poses(before)[pairs.i], _poses(after)[pairs.j]
-    agrees, votes = pair_votes(before_poses, after_poses, pairs.yaws_rad)
+    agrees, votes = count_votes(before_poses, after_poses, pairs.yaws_rad)
     is_open = np.ones(len(pairs.i), dtype=np.bool_)
     chosen: list[Candidate] = []
     for pair in np.lexsort((pairs.distances, -votes)).tolist():
         if not is_open[pair]:
             continue
         is_open &= ~agrees[pair]
-        guess = _common_motion(before_poses, after_poses, pairs.yaws_rad, agrees[pair], pair)
+        guess = _fit_common_motion(before_poses, after_poses, pairs.yaws_rad, agrees[pair], pair)
         if any(_is_same(guess, other.before_T_after, after_poses[pair, :3, 3]) for other in chosen):
             continue
         chosen.append(Candidate(int(pairs.i[pair]), int(pairs.j[pair]), float(pairs.distances[pair]), guess))
@@ -89,7 +89,7 @@ def voted_candidates(before: MappedSession, after: MappedSession, config: MergeC
     return chosen
 
 
-def pair_votes(
+def count_votes(
     before_poses: Float64Array, after_poses: Float64Array, yaws_rad: Float64Array
 ) -> tuple[BoolArray, Float64Array]:
     """Return which of P pairs agree, (P, P), and the votes each gets, (P,); every pair agrees with itself.
@@ -140,7 +140,9 @@ class _Pairs:
     yaws_rad: Float64Array
 
 
-def _pairs(before: DescriptorSet, after: DescriptorSet, n_queries: int, nearest: int, n_yaws: int) -> _Pairs:
+def _match_descriptors(
+    before: DescriptorSet, after: DescriptorSet, n_queries: int, nearest: int, n_yaws: int
+) -> _Pairs:
     n_before, n_after = len(before.q), len(after.q)
     if n_before == 0 or n_after == 0:
         return _Pairs(*(np.zeros(0, dtype=np.int64),) * 2, *(np.zeros(0),) * 2)
@@ -162,7 +164,7 @@ def _pairs(before: DescriptorSet, after: DescriptorSet, n_queries: int, nearest:
     return _Pairs(i[which], j[which], distances[which], yaws_rad.ravel()[is_there])
 
 
-def _common_motion(
+def _fit_common_motion(
     before_poses: Float64Array, after_poses: Float64Array, yaws_rad: Float64Array, agrees: BoolArray, pair: int
 ) -> Float64Array:
     """Return before_T_after that fits a pair and those that agree with it, the near ones most: a turn about z, a shift.

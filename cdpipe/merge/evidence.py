@@ -56,7 +56,7 @@ class SurfaceFit:
         return median_m if np.isfinite(median_m) else float("nan")
 
 
-def surface_fit(
+def measure_fit(
     before: IndexedMap,
     after: IndexedMap,
     before_T_after: Float64Array,
@@ -72,7 +72,7 @@ def surface_fit(
         before: The before map, a target.
         after: The after map.
         before_T_after: (4, 4) the alignment that is judged.
-        own: (N, 3) `sampled` after points of the place, after odom frame.
+        own: (N, 3) `sample_evenly` after points of the place, after odom frame.
         centre_after: (3,) the place, after odom frame.
         radius_m: How far around it the before points are taken.
     """
@@ -86,7 +86,7 @@ def surface_fit(
     information = jacobian.T @ jacobian
 
     centre_before = transform(before_T_after, centre_after[None])[0]
-    chosen = sampled(before.columns.crop(centre_before, radius_m))
+    chosen = sample_evenly(before.columns.crop(centre_before, radius_m))
     theirs = transform(invert(before_T_after), before.points[chosen])
     found, squared_m2 = after.tree.batch_nearest_neighbor_search(theirs)
     turned = fine.normals[chosen] @ before_T_after[:3, :3]
@@ -94,12 +94,12 @@ def surface_fit(
     return SurfaceFit(forward_m, backward_m, information)
 
 
-def sampled(of_map: npt.NDArray[Any], n: int = _SAMPLES) -> npt.NDArray[Any]:
+def sample_evenly(of_map: npt.NDArray[Any], n: int = _SAMPLES) -> npt.NDArray[Any]:
     """Return about n of some points of a map; they are ordered by place, so that every k-th covers it evenly."""
     return of_map[:: max(1, len(of_map) // n)]
 
 
-def why_refused(evidence: Mapping[str, float], config: MergeConfig) -> str:
+def explain_refusal(evidence: Mapping[str, float], config: MergeConfig) -> str:
     """Return in plain words which acceptance test fails and what would help, or ""."""
     for name, setting in GATES:
         value, least = evidence.get(name, np.nan), getattr(config, setting)

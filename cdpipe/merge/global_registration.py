@@ -89,7 +89,7 @@ def register_globally(before_points: Float64Array, after_points: Float64Array, v
     require_kiss_matcher("finding a merge by KISS-Matcher")
     clouds, centres = [], []
     for name, points in (("before_points", before_points), ("after_points", after_points)):
-        cloud, centre = _prepared(name, points, voxel_m)
+        cloud, centre = _prepare(name, points, voxel_m)
         if not _has_surfaces(cloud, voxel_m):
             return None
         clouds.append(cloud)
@@ -108,7 +108,7 @@ def register_globally(before_points: Float64Array, after_points: Float64Array, v
     return CoarsePose(before_T_seen @ pose @ seen_T_after, n_inliers, n_correspondences)
 
 
-def _prepared(name: str, points: Float64Array, voxel_m: float) -> tuple[Float64Array, Float64Array]:
+def _prepare(name: str, points: Float64Array, voxel_m: float) -> tuple[Float64Array, Float64Array]:
     """Return a cloud thinned and about its centre, and where the viewpoint stands in the cloud's own frame."""
     require_shape(name, points, (None, 3))
     if len(points) == 0:

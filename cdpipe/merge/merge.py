@@ -17,20 +17,20 @@ from time import perf_counter
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, transform
-from cdpipe.merge.candidates import Candidate, closest_pair, voted_candidates
-from cdpipe.merge.evidence import SurfaceFit, sampled, surface_fit, why_refused
+from cdpipe.merge.candidates import Candidate, find_candidates, find_closest_pair
+from cdpipe.merge.evidence import SurfaceFit, explain_refusal, measure_fit, sample_evenly
 from cdpipe.merge.global_registration import is_kiss_matcher_installed, register_globally
-from cdpipe.merge.refine import refined
+from cdpipe.merge.refine import refine
 from cdpipe.merge.registration import (
     MIN_SPHERE_POINTS,
     IndexedMap,
     align_by_gicp,
     eigenvalue_ratio,
+    fit_rigid,
     motion_between,
     register,
-    rigid_fit,
 )
-from cdpipe.merge.walk import Step, Walk, evenly, is_shared, walk
+from cdpipe.merge.walk import Step, Walk, choose_evenly, is_shared, walk
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import MergeConfig
 from cdpipe.model.types import MappedSession, MergedMaps
@@ -84,11 +84,11 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     start = perf_counter()
     maps = (IndexedMap(before.map, config, is_target=True), IndexedMap(after.map, config, is_target=False))
     indexed = perf_counter()
-    best, n_hypotheses = _hypothesis(before, after, maps, config)
+    best, n_hypotheses = _find_hypothesis(before, after, maps, config)
     reason = _TOO_FEW
     evidence: dict[str, float] = {"n_hypotheses": float(n_hypotheses)}
     if best is not None:
-        reason = "" if config.accept_all else why_refused(best.evidence, config)
+        reason = "" if config.accept_all else explain_refusal(best.evidence, config)
         if reason and config.fallback and not is_kiss_matcher_installed():
             reason += " (KISS-Matcher could not be asked: pip install 'tunnelcd[kiss]')"
         evidence = {**best.evidence, **evidence}
@@ -98,30 +98,30 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
         before_T_after = best.before_T_after
         if not reason and config.refine == "local":
             refining = perf_counter()
-            local, measured = refined(*maps, best.walk, config)
+            local, measured = refine(*maps, best.walk, config)
             evidence |= measured
             if local is not None:
-                before_T_after = rigid_fit(local.anchors_odom, local.before_T_after)
+                before_T_after = fit_rigid(local.anchors_odom, local.before_T_after)
             seconds["t_refine_s"] = perf_counter() - refining
     return MergedMaps(before.map, after.map, before_T_after, evidence, not reason, reason, local, seconds)
 
 
-def _hypothesis(
+def _find_hypothesis(
     before: MappedSession, after: MappedSession, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
 ) -> tuple[_Hypothesis | None, int]:
     """Return the hypothesis that is accepted, or else the best, and how many were followed along the path."""
     if config.method == "frame":
-        return _chosen(_by_frame(closest_pair(before, after), maps, config), maps, config)
+        return _choose_hypothesis(_start_by_frame(find_closest_pair(before, after), maps, config), maps, config)
     best: _Hypothesis | None = None
     n_tried = 0
     if config.method == "voting":
-        starts = _ranked(voted_candidates(before, after, config), maps, config)
-        best, n_tried = _chosen(starts, maps, config)
-        is_accepted = best is not None and not why_refused(best.evidence, config)
+        starts = _rank_starts(find_candidates(before, after, config), maps, config)
+        best, n_tried = _choose_hypothesis(starts, maps, config)
+        is_accepted = best is not None and not explain_refusal(best.evidence, config)
         if is_accepted or not (config.fallback and is_kiss_matcher_installed()):
             return best, n_tried
-    other, n_other = _chosen(_by_kiss_matcher(maps, config), maps, config)
-    if other is not None and (best is None or not why_refused(other.evidence, config)):
+    other, n_other = _choose_hypothesis(_start_by_kiss_matcher(maps, config), maps, config)
+    if other is not None and (best is None or not explain_refusal(other.evidence, config)):
         best = other
     return best, n_tried + n_other
 
@@ -136,7 +136,9 @@ class _Start:
     share: float = 1.0
 
 
-def _ranked(candidates: Iterable[Candidate], maps: tuple[IndexedMap, IndexedMap], config: MergeConfig) -> list[_Start]:
+def _rank_starts(
+    candidates: Iterable[Candidate], maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
+) -> list[_Start]:
     """Register every candidate coarsely and return them, the best fit first; too small spheres are left out."""
     before, after = maps
     found = []
@@ -154,14 +156,14 @@ def _ranked(candidates: Iterable[Candidate], maps: tuple[IndexedMap, IndexedMap]
             config.coarse_voxel_m,
             _RANK_STEPS,
         )
-        fit = surface_fit(before, after, pose, sampled(points, _RANK_SAMPLES), centre, config.sphere_radius_m)
+        fit = measure_fit(before, after, pose, sample_evenly(points, _RANK_SAMPLES), centre, config.sphere_radius_m)
         share = fit.inlier_share(_RANK_INLIER_M)
         distance = {"descriptor_distance": candidate.descriptor_distance, "is_fallback": 0.0}
         found.append(_Start(candidate.after_keyframe, pose, distance, share))
     return sorted(found, key=lambda start: -start.share)
 
 
-def _by_frame(
+def _start_by_frame(
     candidates: Iterable[Candidate], maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
 ) -> list[_Start]:
     """FRAME: the spheres around both keyframes of a pair, GICP, then VGICP."""
@@ -177,7 +179,7 @@ def _by_frame(
     return found
 
 
-def _by_kiss_matcher(maps: tuple[IndexedMap, IndexedMap], config: MergeConfig) -> list[_Start]:
+def _start_by_kiss_matcher(maps: tuple[IndexedMap, IndexedMap], config: MergeConfig) -> list[_Start]:
     """KISS-Matcher on the whole maps; its answer is walked from the after keyframe nearest to the before path.
 
     Odometry knows what is up: an answer that tips the maps is none.
@@ -190,7 +192,7 @@ def _by_kiss_matcher(maps: tuple[IndexedMap, IndexedMap], config: MergeConfig) -
     return [_Start(int(np.argmin(distances_m)), found.before_T_after, {"is_fallback": 1.0})]
 
 
-def _chosen(
+def _choose_hypothesis(
     starts: Iterable[_Start], maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
 ) -> tuple[_Hypothesis | None, int]:
     """Follow one start after the other until one is accepted, and every other that fits its place about as well.
@@ -205,8 +207,8 @@ def _chosen(
         best_share = max(best_share, start.share)
         if accepted and (start.share < _RIVAL_SHARE * best_share or not _is_rival(start, accepted, maps, config)):
             continue
-        judged.append(_judged(start, maps, config))
-        if not why_refused(judged[-1].evidence, config):
+        judged.append(_judge(start, maps, config))
+        if not explain_refusal(judged[-1].evidence, config):
             accepted.append(judged[-1])
     if not accepted:
         return max(judged, key=lambda each: np.nan_to_num(each.evidence["agreement"]), default=None), len(judged)
@@ -235,7 +237,7 @@ def _is_rival(
 
     if not is_other(start.before_T_after):  # most are not, and registering finely takes as long as all the votes
         return False
-    pose, fit = _at_place(start, maps, config)
+    pose, fit = _register_start(start, maps, config)
     return is_other(pose) and fit.inlier_share(config.inlier_m) >= config.min_inlier_share
 
 
@@ -243,10 +245,10 @@ def _path_residual_m(hypothesis: _Hypothesis) -> float:
     return float(np.nanmean(hypothesis.walk.residuals_m))
 
 
-def _judged(start: _Start, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig) -> _Hypothesis:
+def _judge(start: _Start, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig) -> _Hypothesis:
     """Register a start finely and follow it along the path, and again along the shared part where that is short."""
     before, after = maps
-    pose, fit = _at_place(start, maps, config)
+    pose, fit = _register_start(start, maps, config)
     step = Step(_CHECK_RADIUS_M, config.voxel_m, _CHECK_REACH_M, first_try_m=_FIRST_TRY_M)
 
     def along(keyframes: Int64Array) -> tuple[Walk, Float64Array]:
@@ -256,10 +258,10 @@ def _judged(start: _Start, maps: tuple[IndexedMap, IndexedMap], config: MergeCon
         return walked, fits[np.isfinite(fits)]
 
     everywhere = np.arange(len(after.positions))
-    walked, fits = along(evenly(everywhere, _CHECKS, start.keyframe))
+    walked, fits = along(choose_evenly(everywhere, _CHECKS, start.keyframe))
     shared = everywhere[_is_shared_keyframe(walked, before, after)]
     if len(fits) < _CHECKS // 2 < len(shared):
-        walked, fits = along(evenly(shared, _CHECKS, start.keyframe))
+        walked, fits = along(choose_evenly(shared, _CHECKS, start.keyframe))
     evidence = {
         **start.evidence,
         "overlap": min(1.0, len(shared) / min(len(before.positions), len(after.positions))),
@@ -271,11 +273,11 @@ def _judged(start: _Start, maps: tuple[IndexedMap, IndexedMap], config: MergeCon
     }
     is_good = walked.fits >= _GOOD_FIT
     if config.method != "frame" and is_good.any():
-        pose = rigid_fit(after.positions[walked.keyframes[is_good]], walked.before_T_after[is_good])
+        pose = fit_rigid(after.positions[walked.keyframes[is_good]], walked.before_T_after[is_good])
     return _Hypothesis(pose, walked, evidence)
 
 
-def _at_place(
+def _register_start(
     start: _Start, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
 ) -> tuple[Float64Array, SurfaceFit]:
     """Register a start finely, but FRAME's own answer, and hold it against the surface."""
@@ -285,7 +287,7 @@ def _at_place(
     points = after.sphere(centre, _CHECK_RADIUS_M)
     if config.method != "frame" and len(points) >= MIN_SPHERE_POINTS:
         pose = align_by_gicp(points, centre, before.target, pose, config.vgicp_correspondence_m, config.voxel_m)
-    return pose, surface_fit(before, after, pose, sampled(points), centre, _CHECK_RADIUS_M)
+    return pose, measure_fit(before, after, pose, sample_evenly(points), centre, _CHECK_RADIUS_M)
 
 
 def _is_shared_keyframe(walked: Walk, before: IndexedMap, after: IndexedMap) -> BoolArray:

@@ -24,7 +24,7 @@ _STEPS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chain:
+class PoseGraph:
     """Alignments along a path.
 
     Attributes:
@@ -56,18 +56,18 @@ class Chain:
         rotations = (
             rotations @ Rotation.from_rotvec(share[:, None] * Rotation.from_matrix(turn).as_rotvec()).as_matrix()
         )
-        return _poses(rotations, moved, places)
+        return _make_poses(rotations, moved, places)
 
     def _moved(self, anchors: np.ndarray, places: Float64Array) -> Float64Array:
         """Return where each place is in the map frame as seen from its anchor, by index."""
         apart = places - self.positions[anchors]
         stretched = self.positions[anchors] + (1 + self.stretch) * apart
-        return _applied(self.before_T_after[anchors], stretched)
+        return _apply(self.before_T_after[anchors], stretched)
 
 
-def smoothed(
+def solve_pose_graph(
     positions: Float64Array, before_T_after: Float64Array, information: Float64Array, per_stretch: Float64Array
-) -> Chain:
+) -> PoseGraph:
     """Return the likeliest alignments along a path.
 
     Measured is the pose of each anchor with its own information, and that the pose of one anchor relative to the one
@@ -79,7 +79,7 @@ def smoothed(
         information: (A, 6, 6) of each: turn, then shift, in after odom axes about the anchor; zero where not measured.
         per_stretch: (A, 6) by how much each was measured wrong, turn and shift, for a stretch of 1.
     """
-    measured = _State(before_T_after[:, :3, :3], _applied(before_T_after, positions), 0.0)
+    measured = _State(before_T_after[:, :3, :3], _apply(before_T_after, positions), 0.0)
     state = measured
     steps = np.diff(positions, axis=0)
     for _ in range(_STEPS):
@@ -95,13 +95,13 @@ def smoothed(
         corner = 1 / _STRETCH**2 + np.einsum("ai,aij,aj", per_stretch, information, per_stretch)
         slope = state.stretch / _STRETCH**2 + np.einsum("ai,aij,aj", per_stretch, information, residuals)
         of_steps = _add_odometry(system, state, steps)
-        change, stretched = _solved(system, corner + of_steps[0], slope + of_steps[1])
+        change, stretched = _solve(system, corner + of_steps[0], slope + of_steps[1])
         state = _State(
             state.rotations @ Rotation.from_rotvec(change[:, :3]).as_matrix(),
             state.translations + np.einsum("aij,aj->ai", state.rotations, change[:, 3:]),
             state.stretch + stretched,
         )
-    return Chain(positions, _poses(state.rotations, state.translations, positions), state.stretch)
+    return PoseGraph(positions, _make_poses(state.rotations, state.translations, positions), state.stretch)
 
 
 class _State(NamedTuple):
@@ -132,7 +132,7 @@ def _add_odometry(system: _System, state: _State, steps: Float64Array) -> tuple[
     weights = np.repeat([1 / _DRIFT_RAD**2, 1 / _DRIFT_M**2], 3) / length_m[:, None]
     # of the anchor after the step the derivative is one; of the stretch it is the step, back
     here = np.repeat(-np.eye(6)[None], n, axis=0)
-    here[:, 3:, :3] = _cross(steps)
+    here[:, 3:, :3] = _cross_matrices(steps)
     per_stretch = np.hstack([np.zeros((n, 3)), -steps])
     weighted = np.swapaxes(here, 1, 2) * weights[:, None]
     system.blocks[:-1] += weighted @ here
@@ -145,7 +145,7 @@ def _add_odometry(system: _System, state: _State, steps: Float64Array) -> tuple[
     return float(np.sum(weights * per_stretch**2)), float(np.sum(weights * per_stretch * residuals))
 
 
-def _solved(system: _System, corner: float, slope: float) -> tuple[Float64Array, float]:
+def _solve(system: _System, corner: float, slope: float) -> tuple[Float64Array, float]:
     """Solve the block tridiagonal system with its border; return the change of the poses (A, 6) and of the stretch."""
     n = len(system.blocks)
     banded = np.zeros((12, 6 * n))
@@ -162,7 +162,7 @@ def _solved(system: _System, corner: float, slope: float) -> tuple[Float64Array,
     return -(of_gradient + of_border * stretch).reshape(n, 6), float(stretch)
 
 
-def _poses(rotations: Float64Array, translations: Float64Array, positions: Float64Array) -> Float64Array:
+def _make_poses(rotations: Float64Array, translations: Float64Array, positions: Float64Array) -> Float64Array:
     """Return the (N, 4, 4) transforms with these rotations that take the positions to the translations."""
     result = np.repeat(np.eye(4)[None], len(positions), axis=0)
     result[:, :3, :3] = rotations
@@ -170,10 +170,10 @@ def _poses(rotations: Float64Array, translations: Float64Array, positions: Float
     return result
 
 
-def _applied(dst_T_src: Float64Array, points: Float64Array) -> Float64Array:
+def _apply(dst_T_src: Float64Array, points: Float64Array) -> Float64Array:
     return np.asarray(np.einsum("aij,aj->ai", dst_T_src[:, :3, :3], points) + dst_T_src[:, :3, 3])
 
 
-def _cross(vectors: Float64Array) -> Float64Array:
+def _cross_matrices(vectors: Float64Array) -> Float64Array:
     """Return the (N, 3, 3) matrices [v]x of (N, 3) vectors: [v]x @ turn = v x turn."""
     return -np.cross(vectors[:, None, :], np.eye(3)[None])

@@ -16,8 +16,8 @@ from __future__ import annotations
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform, travelled_m
-from cdpipe.merge.evidence import sampled
-from cdpipe.merge.pose_graph import smoothed
+from cdpipe.merge.evidence import sample_evenly
+from cdpipe.merge.pose_graph import solve_pose_graph
 from cdpipe.merge.registration import IndexedMap, plane_jacobian, solve_point_to_plane
 from cdpipe.merge.walk import Step, Walk, walk
 from cdpipe.model.alignment import PathAlignment
@@ -45,7 +45,7 @@ _MIN_FIT = 0.6
 _MIN_GOOD_SHARE = 0.5
 
 
-def refined(
+def refine(
     before: IndexedMap, after: IndexedMap, found: Walk, config: MergeConfig
 ) -> tuple[PathAlignment | None, dict[str, float]]:
     """Return the alignment along the after path, and what was measured of it.
@@ -71,7 +71,7 @@ def refined(
     after = IndexedMap(after.map, closer, is_target=False)
     path_m = travelled_m(after.map.odom_T_keyframe)
     radius_m = max(_RADIUS * wall_m, _RADIUS_M)
-    keyframes, start = _anchors(path_m, found, max(_SPACING * radius_m, _SPACING_M))
+    keyframes, start = _choose_anchors(path_m, found, max(_SPACING * radius_m, _SPACING_M))
     coarse = PathAlignment(after.positions[found.keyframes], found.before_T_after)
     first = int(np.nanargmax(found.fits))
     step = Step(radius_m, max(_VOXEL * radius_m, _VOXEL_M), _CORRESPONDENCE_M)
@@ -80,10 +80,10 @@ def refined(
     evidence = {"n_refined": float(np.count_nonzero(is_good))}
     if np.count_nonzero(is_good) < _MIN_GOOD_SHARE * np.count_nonzero(np.isfinite(walked.fits)) or not is_good.any():
         return None, evidence
-    information = _held(walked.information) * np.where(is_good, 1 / _POINT_M**2, 0.0)[:, None, None]
+    information = _discount_normal_noise(walked.information) * np.where(is_good, 1 / _POINT_M**2, 0.0)[:, None, None]
     positions = after.positions[walked.keyframes]
     per_stretch = _per_stretch(before, after, walked, is_good, radius_m)
-    chain = smoothed(positions, walked.before_T_after, information, per_stretch)
+    chain = solve_pose_graph(positions, walked.before_T_after, information, per_stretch)
     every = chain.at(path_m[walked.keyframes], path_m, after.positions)
     alignment = PathAlignment(after.positions, every)
     moved_m = np.linalg.norm(alignment.to_map(positions) - coarse.to_map(positions), axis=1)
@@ -94,7 +94,7 @@ def refined(
     }
 
 
-def _anchors(path_m: Float64Array, found: Walk, spacing_m: float) -> tuple[Int64Array, int]:
+def _choose_anchors(path_m: Float64Array, found: Walk, spacing_m: float) -> tuple[Int64Array, int]:
     """Return after keyframes about as far apart as that, and where among them the best place of the walk stands."""
     start = int(found.keyframes[np.nanargmax(found.fits)])
     _, first = np.unique(np.floor((path_m - path_m[start]) / spacing_m + 1e-6), return_index=True)
@@ -102,7 +102,7 @@ def _anchors(path_m: Float64Array, found: Walk, spacing_m: float) -> tuple[Int64
     return keyframes, int(np.searchsorted(keyframes, start))
 
 
-def _held(information: Float64Array) -> Float64Array:
+def _discount_normal_noise(information: Float64Array) -> Float64Array:
     """Return (A, 6, 6) information without what the noise of normals alone makes of a smooth wall."""
     values, axes = np.linalg.eigh(information[:, 3:, 3:])
     kept = np.maximum(values - _NOISE_SHARE * values[:, -1:], 0.0)
@@ -125,7 +125,7 @@ def _per_stretch(
     result = np.zeros((len(walked.keyframes), 6))
     for a in np.flatnonzero(is_good):
         centre, pose = after.positions[walked.keyframes[a]], walked.before_T_after[a]
-        chosen = sampled(after.columns.crop(centre, radius_m))
+        chosen = sample_evenly(after.columns.crop(centre, radius_m))
         moved = transform(pose, after.points[chosen])
         nearest, squared_m2 = before.target.tree.batch_nearest_neighbor_search(moved)
         is_pair = np.asarray(squared_m2) < _COUNTERPART_M**2

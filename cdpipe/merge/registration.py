@@ -72,9 +72,7 @@ class IndexedMap:
         is_near = point_map.nearest_m <= config.seen_within_m
         near = point_map.points[is_near]
         seen_from = near if point_map.seen_from is None else point_map.seen_from[is_near]
-        self.points, self.seen_from = (
-            _thinned(near, seen_from, config.target_voxel_m) if is_target else (near, seen_from)
-        )
+        self.points, self.seen_from = _thin(near, seen_from, config.target_voxel_m) if is_target else (near, seen_from)
         self.columns = GridIndex(self.points)
         self.positions = point_map.odom_T_keyframe[:, :3, 3]
         self.path = cKDTree(point_map.odom_T_sensor[:, :3, 3])
@@ -101,7 +99,7 @@ class IndexedMap:
         return self.columns.points_within(centre, radius_m)
 
 
-def _thinned(
+def _thin(
     points: Float64Array, seen_from: Float64Array | Float32Array, voxel_m: float
 ) -> tuple[Float64Array, Float64Array]:
     """Return the means of the points of each cell and of where they were seen from, in the order of `GridIndex`."""
@@ -247,7 +245,7 @@ def eigenvalue_ratio(hessian: Float64Array) -> float:
     return float(eigenvalues[0] / eigenvalues[-1]) if eigenvalues[-1] > 0 else 0.0
 
 
-def rigid_fit(positions: Float64Array, dst_T_src: Float64Array) -> Float64Array:
+def fit_rigid(positions: Float64Array, dst_T_src: Float64Array) -> Float64Array:
     """Return the one (4, 4) transform nearest to several, each of which holds around its own position.
 
     Positions and, 5 m about each, three axes are moved by each transform and fitted, so that a straight path leaves no

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, make_pose, transform
-from cdpipe.merge.evidence import SurfaceFit, sampled, surface_fit
+from cdpipe.merge.evidence import SurfaceFit, measure_fit, sample_evenly
 from cdpipe.merge.registration import MIN_SPHERE_POINTS, IndexedMap, align_by_gicp, align_to_planes, motion_between
 from cdpipe.model.config import MergeConfig
 
@@ -86,12 +86,12 @@ def walk(
         config: `inlier_m`.
     """
     first = _Stop(int(keyframes[start]), before_T_after)
-    first = _stop(before, after, first, first.keyframe, step, config)
+    first = _register_stop(before, after, first, first.keyframe, step, config)
     stops = [first]
     for way in (keyframes[start + 1 :], keyframes[:start][::-1]):
         previous = first
         for keyframe in way.tolist():
-            reached = _reached(before, after, previous, keyframe, step, config)
+            reached = _advance(before, after, previous, keyframe, step, config)
             stops += reached
             previous = reached[-1]
     stops.sort(key=lambda stop: stop.keyframe)
@@ -115,20 +115,20 @@ class _Stop:
     residual_m: float = np.nan
 
 
-def _reached(
+def _advance(
     before: IndexedMap, after: IndexedMap, previous: _Stop, keyframe: int, step: Step, config: MergeConfig
 ) -> list[_Stop]:
     """Go from a stop to a keyframe; if the way is lost, in two halves, as long as there was a way."""
-    stop = _stop(before, after, previous, keyframe, step, config)
+    stop = _register_stop(before, after, previous, keyframe, step, config)
     middle = (previous.keyframe + keyframe) // 2
     is_short = abs(keyframe - previous.keyframe) <= _SHORTEST_STEP
     if not stop.fit < _LOST_FIT or not previous.fit >= _CLEAR_FIT or is_short:
         return [stop]
-    halfway = _reached(before, after, previous, middle, step, config)
-    return [*halfway, *_reached(before, after, halfway[-1], keyframe, step, config)]
+    halfway = _advance(before, after, previous, middle, step, config)
+    return [*halfway, *_advance(before, after, halfway[-1], keyframe, step, config)]
 
 
-def _stop(
+def _register_stop(
     before: IndexedMap, after: IndexedMap, previous: _Stop, keyframe: int, step: Step, config: MergeConfig
 ) -> _Stop:
     centre = after.positions[keyframe]
@@ -136,7 +136,7 @@ def _stop(
     if not is_shared(before, transform(guess, centre[None]))[0]:
         return _Stop(keyframe, guess)
     apart_m = float(np.linalg.norm(centre - after.positions[previous.keyframe]))
-    registered = _registered(before, after, centre, guess, apart_m, step, config)
+    registered = _register_place(before, after, centre, guess, apart_m, step, config)
     if registered is None:
         return _Stop(keyframe, guess, fit=0.0)
     pose, fit, information = registered
@@ -149,13 +149,13 @@ def is_shared(before: IndexedMap, positions_map: Float64Array) -> BoolArray:
     return np.isfinite(distances_m)
 
 
-def evenly(keyframes: Int64Array, n: int, and_also: int) -> Int64Array:
+def choose_evenly(keyframes: Int64Array, n: int, and_also: int) -> Int64Array:
     """Return about n of some keyframes, evenly spaced, and one other."""
     chosen = np.linspace(0, len(keyframes) - 1, min(n, len(keyframes))).round().astype(np.int64)
     return np.unique(np.append(keyframes[chosen], and_also))
 
 
-def _registered(
+def _register_place(
     before: IndexedMap,
     after: IndexedMap,
     centre: Float64Array,
@@ -171,13 +171,13 @@ def _registered(
     points = after.sphere(centre, step.radius_m)
     if len(points) < MIN_SPHERE_POINTS:
         return None
-    own = sampled(points)
+    own = sample_evenly(points)
 
     def judged(found: Float64Array) -> tuple[Float64Array, SurfaceFit, Float64Array] | None:
-        held = _held(found, guess, centre, apart_m)
+        held = _limit_motion(found, guess, centre, apart_m)
         if held is None:
             return None
-        fit = surface_fit(before, after, held, own, centre, step.radius_m)
+        fit = measure_fit(before, after, held, own, centre, step.radius_m)
         information = fit.information
         if held is not found:
             # its turn is the neighbour's
@@ -192,7 +192,9 @@ def _registered(
     return judged(align_by_gicp(points, centre, before.target, guess, step.correspondence_m, step.gicp_voxel_m))
 
 
-def _held(found: Float64Array, guess: Float64Array, centre: Float64Array, apart_m: float) -> Float64Array | None:
+def _limit_motion(
+    found: Float64Array, guess: Float64Array, centre: Float64Array, apart_m: float
+) -> Float64Array | None:
     """Return a pose if odometry can have drifted so far, and without its turn if only that cannot be.
 
     The section of a narrow drift is nearly round, and near a dead end little else holds a sphere against rolling.

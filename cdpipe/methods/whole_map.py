@@ -17,7 +17,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.grid_index import GridIndex
 from cdpipe.extract.extract import FIGURES, hull_volume_m3, make_report
 from cdpipe.extract.objects import PointGroup, assemble_objects
-from cdpipe.extract.point_comparison import cluster_labels, inlier_mask
+from cdpipe.extract.point_comparison import inlier_mask, label_clusters
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
 from cdpipe.model.types import DescriptorSet, MergedMaps, SessionName
@@ -109,7 +109,7 @@ def _changed_clusters(
     new = np.flatnonzero(new_mask(maps, session, other, config))
     new = new[maps.is_comparable(points[new], other, config.query.radius_m)]
     new = new[inlier_mask(points[new], config.outlier)]
-    labels = cluster_labels(points[new], config.cluster)
+    labels = label_clusters(points[new], config.cluster)
     return [new[labels == label] for label in range(labels.max(initial=-1) + 1)]
 
 
@@ -157,7 +157,7 @@ def _changed_share(maps: PlacedMaps, is_changed: dict[SessionName, BoolArray], c
 
 
 def _figures(maps: PlacedMaps, regions: ChangeRegions, objects: Sequence[ChangedObject]) -> dict[str, Float64Array]:
-    """Return the volume table by the definition of `cut_out`: all four figures are of the after map."""
+    """Return the volume table by the definition of `measure_regions`: all four figures are of the after map."""
     figures = {name: np.full(len(regions.scores), np.nan) for name in FIGURES}
     index = GridIndex(maps.points["after"])
     for region in np.flatnonzero(regions.is_reported).tolist():

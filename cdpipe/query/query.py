@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.descriptors.sphere import best_in_reach, change_log_odds
+from cdpipe.descriptors.sphere import change_log_odds, max_within_reach
 from cdpipe.model.config import QueryConfig
 from cdpipe.model.report import ChangeRegions
 from cdpipe.model.types import DescriptorSet, MergedMaps, UInt8Array
@@ -35,9 +35,9 @@ def find_regions(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet
     """
     places = _Places(merged, before, after, config)
     if config.compare == "scan":
-        return _by_scans(places, before, after, config)
+        return _score_by_scans(places, before, after, config)
     if config.compare == "sphere":
-        return _by_spheres(places, change_log_odds(merged, before, places.is_covered_b), config)
+        return _score_by_spheres(places, change_log_odds(merged, before, places.is_covered_b), config)
     scores = sphere_difference(merged, before, after, config)
     return rank_regions(places.before, scores, places.pairs_b, scores, config, _from(BEFORE, scores))
 
@@ -58,7 +58,7 @@ class _Places:
         return np.column_stack([np.arange(len(self.near_a)), self.near_a])
 
 
-def _by_scans(places: _Places, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> ChangeRegions:
+def _score_by_scans(places: _Places, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> ChangeRegions:
     """Score every keyframe of both sessions by descriptor distance to its partner.
 
     Every keyframe is a candidate at its own position: those of the after session queried among the before session's
@@ -91,14 +91,14 @@ def _by_scans(places: _Places, before: DescriptorSet, after: DescriptorSet, conf
     )
 
 
-def _by_spheres(places: _Places, local: Float64Array, config: QueryConfig) -> ChangeRegions:
+def _score_by_spheres(places: _Places, local: Float64Array, config: QueryConfig) -> ChangeRegions:
     """Score every before keyframe by the (K,) log-odds of its own stretch; that of its sphere is the best in reach.
 
     A sphere descriptor tells of the two metres before and behind its keyframe, a region of all within `radius_m`.
     """
     keyframe_scores = np.full(len(local), np.nan)
     covered = np.flatnonzero(places.is_covered_b)
-    keyframe_scores[covered] = best_in_reach(local[covered], places.before[covered], config.radius_m)
+    keyframe_scores[covered] = max_within_reach(local[covered], places.before[covered], config.radius_m)
     return rank_regions(places.before, local, places.pairs_b, keyframe_scores, config, _from(BEFORE, local))
 
 
@@ -122,7 +122,7 @@ def rank_regions(
     """
     order = np.argsort(-scores, kind="stable")
     order = order[~np.isnan(scores[order])]
-    kept = order[_survivors(centres_map[order], config.suppression * config.radius_m)]
+    kept = order[_suppress_neighbours(centres_map[order], config.suppression * config.radius_m)]
     if config.n_regions is None:
         is_reported = scores[kept] >= config.threshold
     else:
@@ -143,7 +143,7 @@ def _from(session: int, candidates: npt.NDArray[Any]) -> UInt8Array:
     return np.full(len(candidates), session, dtype=np.uint8)
 
 
-def _survivors(centres: Float64Array, distance_m: float) -> BoolArray:
+def _suppress_neighbours(centres: Float64Array, distance_m: float) -> BoolArray:
     """Mark, going from best to worst, every centre that is not nearer than `distance_m` to one marked before."""
     is_kept = np.ones(len(centres), dtype=np.bool_)
     for index, centre in enumerate(centres):

@@ -20,7 +20,7 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, require_shape, transform
-from cdpipe.sensor.ouster_metadata import read_document, require_mode, sensor_fields
+from cdpipe.sensor.ouster_metadata import parse_fields, read_document, require_mode
 
 
 @dataclass(frozen=True, slots=False, eq=False)
@@ -163,7 +163,7 @@ def parse_metadata(document: Mapping[str, Any], source: str, mode: str | None = 
     """
     if not isinstance(document, dict):
         raise InputError(f"{source}: Ouster metadata must be a JSON object")
-    return SensorMetadata(**sensor_fields(document, source, mode))
+    return SensorMetadata(**parse_fields(document, source, mode))
 
 
 def _profiles() -> Traversable:

@@ -62,7 +62,7 @@ def read_document(path: Path) -> dict[str, Any]:
     return document
 
 
-def sensor_fields(document: Mapping[str, Any], source: str, mode: str | None = None) -> dict[str, Any]:
+def parse_fields(document: Mapping[str, Any], source: str, mode: str | None = None) -> dict[str, Any]:
     """Return the fields of a `SensorMetadata`.
 
     Args:

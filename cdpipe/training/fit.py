@@ -115,7 +115,7 @@ def fit(
     network = task.network
     optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=1e-3)
     identity = json.dumps({"run": identity, **asdict(config)}, sort_keys=True)
-    history, best = _restored(folder / _STATE, network, optimiser, identity)
+    history, best = _restore(folder / _STATE, network, optimiser, identity)
     for done in history:
         on_validation(done)
     sums: dict[str, float] = {}
@@ -146,7 +146,7 @@ def fit(
         sums = {}
         if is_best:
             best = {name: tensor.clone() for name, tensor in network.state_dict().items()}
-        _keep(folder / _STATE, network, optimiser, best, history, identity)
+        _save(folder / _STATE, network, optimiser, best, history, identity)
         on_validation(history[-1])
     network.load_state_dict(best)
     network.eval()
@@ -157,7 +157,7 @@ def _is_stopped(history: list[Progress], patience: int) -> bool:
     return len(history) > patience and not any(done.is_best for done in history[-patience:])
 
 
-def _keep(
+def _save(
     path: Path,
     network: nn.Module,
     optimiser: torch.optim.Optimizer,
@@ -180,7 +180,7 @@ def _keep(
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def _restored(
+def _restore(
     path: Path, network: nn.Module, optimiser: torch.optim.Optimizer, identity: str
 ) -> tuple[list[Progress], dict[str, Tensor]]:
     """Read a state into network and optimiser; return the validations so far and the best weights."""

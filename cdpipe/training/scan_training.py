@@ -90,10 +90,10 @@ class PlaceTask:
         anchors = self._anchors(draw)
         positives = np.array([draw.choice(self._partners[anchor]) for anchor in anchors])
         chosen = np.concatenate([anchors, positives])
-        images, headings = _turned(self._data, chosen, draw)
+        images, headings = _turn(self._data, chosen, draw)
         # a tunnel in the mirror is another tunnel
         tunnels, index = np.unique(self._data.tunnels[chosen], return_inverse=True)
-        images, headings = _mirrored(images, headings, (draw.random(len(tunnels)) < 0.5)[index])
+        images, headings = _mirror(images, headings, (draw.random(len(tunnels)) < 0.5)[index])
         q, w = self._network(images)
         place_loss = _place_loss(q, _is_other_place(self._data, anchors, chosen))
         return {"place": place_loss, "yaw": _YAW_WEIGHT * _yaw_loss(w, headings)}
@@ -123,7 +123,7 @@ def evaluate(network: PlaceNetwork, data: PlaceData) -> dict[str, float]:
         over 90 degrees.
     """
     draw = stream(0, "evaluate-descriptor")
-    images, headings = _turned(data, np.arange(len(data.positions)), draw)
+    images, headings = _turn(data, np.arange(len(data.positions)), draw)
     with torch.inference_mode():
         parts = [network(batch) for batch in torch.split(images, 64)]
     q = torch.cat([part[0] for part in parts]).numpy()
@@ -162,7 +162,7 @@ def _partners(data: PlaceData) -> list[Int64Array]:
     return partners
 
 
-def _turned(data: PlaceData, chosen: Int64Array, draw: np.random.Generator) -> tuple[Tensor, Float64Array]:
+def _turn(data: PlaceData, chosen: Int64Array, draw: np.random.Generator) -> tuple[Tensor, Float64Array]:
     """Turn every image by a random angle; a shift to the right by k columns is a sensor turned by -k columns."""
     shifts = draw.integers(0, COLUMNS, size=len(chosen))
     columns = (np.arange(COLUMNS)[None, :] - shifts[:, None]) % COLUMNS
@@ -170,7 +170,7 @@ def _turned(data: PlaceData, chosen: Int64Array, draw: np.random.Generator) -> t
     return torch.from_numpy(images), data.headings_rad[chosen] - shifts * 2 * np.pi / COLUMNS
 
 
-def _mirrored(images: Tensor, headings_rad: Float64Array, is_mirrored: BoolArray) -> tuple[Tensor, Float64Array]:
+def _mirror(images: Tensor, headings_rad: Float64Array, is_mirrored: BoolArray) -> tuple[Tensor, Float64Array]:
     """Swap left and right of some images; a mirrored heading turns the other way."""
     flips = torch.from_numpy(is_mirrored)[:, None, None]
     return torch.where(flips, images.flip(2), images), np.where(is_mirrored, -headings_rad, headings_rad)

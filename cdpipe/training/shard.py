@@ -114,7 +114,7 @@ def read_about(path: Path) -> dict[str, Any]:
     Raises:
         InputError: It is missing, damaged, or of another format.
     """
-    with _opened(path) as file:
+    with _open(path) as file:
         return _about(path, file)
 
 
@@ -124,7 +124,7 @@ def read_shard(path: Path, names: tuple[str, ...] = ()) -> tuple[dict[str, npt.N
     Raises:
         InputError: It is missing, damaged, of another format, or has no array of such a name.
     """
-    with _opened(path) as file:
+    with _open(path) as file:
         about = _about(path, file)
         held = set(file.keys())
         for name in names:
@@ -133,7 +133,7 @@ def read_shard(path: Path, names: tuple[str, ...] = ()) -> tuple[dict[str, npt.N
         return {name: file.get_tensor(name) for name in names or [field.name for field in FIELDS]}, about
 
 
-def _opened(path: Path) -> Any:
+def _open(path: Path) -> Any:
     try:
         return safe_open(path, framework="numpy")
     except FileNotFoundError as error:

@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
-from cdpipe.descriptors.sphere import agreed, best_in_reach
+from cdpipe.descriptors.sphere import average_neighbours, max_within_reach
 from cdpipe.descriptors.sphere_image import COLUMNS, REACH_M, ROWS
 from cdpipe.descriptors.sphere_network import SECTORS, SphereNetwork
 from cdpipe.training.data import TunnelShard
@@ -166,8 +166,8 @@ class SphereTask:
         pasted = slice(half, half + int(_PASTED_SHARE * BATCH))
         donors = draw.choice(self._donors, pasted.stop - pasted.start)
         shifts = draw.integers(-_PASTED_SHIFT_ROWS, _PASTED_SHIFT_ROWS, len(donors), endpoint=True)
-        after[pasted], targets[pasted] = _pasted(after[pasted], data, donors, shifts)
-        before, after = _as_elsewhere(before, after, draw)
+        after[pasted], targets[pasted] = _paste(after[pasted], data, donors, shifts)
+        before, after = _augment(before, after, draw)
         if draw.random() < 0.5:
             before, after = after, before
         if draw.random() < 0.5:  # the sensor looks the other way, and right is left
@@ -190,7 +190,7 @@ class SphereTask:
         ]
         used = data.labels >= 0
         return {
-            "log_likelihood": platt(pooled[used], data.labels[used] == 1)[2],
+            "log_likelihood": fit_platt(pooled[used], data.labels[used] == 1)[2],
             "auroc": float(np.nanmean(by_tunnel)),
             "auroc_pooled": _auroc(pooled, data.labels),
         }
@@ -200,13 +200,13 @@ class SphereTask:
         data = self._validation
         used = data.labels >= 0
         pooled = pooled_scores(self._network, data, draw=min(1, data.n_draws - 1))[used]
-        slope, offset, _ = platt(pooled, data.labels[used] == 1)
+        slope, offset, _ = fit_platt(pooled, data.labels[used] == 1)
         self._network.calibration.copy_(torch.tensor([slope, offset], dtype=torch.float64))
         found = torch.sigmoid(self._network.calibrated(torch.from_numpy(pooled))).numpy()
         return {"slope": slope, "offset": offset, "brier": float(np.mean((found - data.labels[used]) ** 2))}
 
 
-def platt(scores: Float64Array, is_positive: BoolArray) -> tuple[float, float, float]:
+def fit_platt(scores: Float64Array, is_positive: BoolArray) -> tuple[float, float, float]:
     """Return slope and offset of the logistic curve that fits N scores best, and the mean log-likelihood it reaches.
 
     Platt (1999): each class is held to be surer by one example less than it seems, so that classes that are wholly
@@ -226,7 +226,7 @@ def platt(scores: Float64Array, is_positive: BoolArray) -> tuple[float, float, f
 
 def pooled_scores(network: SphereNetwork, data: SphereData, draw: int) -> Float64Array:
     """Return the (N,) log-odds of each keyframe's most changed sector within reach, as the query pools them."""
-    return within_reach(local_scores(network, data, draw), data)
+    return pool_within_reach(local_scores(network, data, draw), data)
 
 
 def local_scores(
@@ -249,20 +249,20 @@ def local_scores(
     local = np.empty(len(sectors))
     for tunnel in np.unique(data.tunnels):
         members = np.flatnonzero(data.tunnels == tunnel)
-        local[members] = agreed(sectors[members], data.positions[members]).max(axis=1)
+        local[members] = average_neighbours(sectors[members], data.positions[members]).max(axis=1)
     return local
 
 
-def within_reach(scores: Float64Array, data: SphereData) -> Float64Array:
+def pool_within_reach(scores: Float64Array, data: SphereData) -> Float64Array:
     """Return the (N,) best of the scores of a tunnel's keyframes within its score radius of each."""
     best = np.empty(len(scores))
     for tunnel in np.unique(data.tunnels):
         members = np.flatnonzero(data.tunnels == tunnel)
-        best[members] = best_in_reach(scores[members], data.positions[members], data.score_radius_m[members[0]])
+        best[members] = max_within_reach(scores[members], data.positions[members], data.score_radius_m[members[0]])
     return best
 
 
-def _as_elsewhere(before: Tensor, after: Tensor, draw: np.random.Generator) -> tuple[Tensor, Tensor]:
+def _augment(before: Tensor, after: Tensor, draw: np.random.Generator) -> tuple[Tensor, Tensor]:
     """Return the images as if the tunnel were wider or narrower, and either map sparser.
 
     Tunnels differ more than those that are trained on. What would lie beyond the renderer's reach is not seen.
@@ -277,7 +277,7 @@ def _as_elsewhere(before: Tensor, after: Tensor, draw: np.random.Generator) -> t
     return seen[0], seen[1]
 
 
-def _pasted(after: Tensor, data: SphereData, donors: Int64Array, shifts: Int64Array) -> tuple[Tensor, Tensor]:
+def _paste(after: Tensor, data: SphereData, donors: Int64Array, shifts: Int64Array) -> tuple[Tensor, Tensor]:
     """Put the added objects of `donors` into images, moved by rows, and return these with their targets."""
     images = torch.stack([torch.roll(data.after_m[k, 0], int(s), 0) for k, s in zip(donors, shifts, strict=True)])
     marks = torch.stack([torch.roll(data.after_marks[k, 0], int(s), 0) for k, s in zip(donors, shifts, strict=True)])

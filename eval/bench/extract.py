@@ -24,7 +24,7 @@ from cdpipe.descriptors import use_threads
 from cdpipe.extract.crops import Crops, Sphere
 from cdpipe.extract.objects import ReturnPool
 from cdpipe.extract.point_comparison import inlier_mask, label_groups, new_points_mask
-from cdpipe.extract.surface import RIM_M, SITE_M, PlaneTable, candidates, compare_site
+from cdpipe.extract.surface import RIM_M, SITE_M, PlaneTable, compare_site, find_candidates
 from cdpipe.extract.surface_rule import BEYOND_M, collect_rays, find_object_cells, realign
 from cdpipe.mapping.free_space import free_space_votes
 from cdpipe.merge.registration import Surface
@@ -142,7 +142,7 @@ class Region:
     def compare(self) -> tuple[tuple[Int64Array, float], tuple[Int64Array, float]]:
         """Return the candidates of the after and of the before sphere, and how well they agree with the other one."""
         before, after = self.tables
-        return candidates(self.after_points, before), candidates(self.spheres["before"].points, after)
+        return find_candidates(self.after_points, before), find_candidates(self.spheres["before"].points, after)
 
     @cached_property
     def telling(self) -> Int64Array:

@@ -56,8 +56,8 @@ class Trajectory:
 
     def sensor_T_column(self, scans: slice) -> Float32Array:
         """Return odometry's column poses (s, W, 7) in the frame of their revolution: x, y, z, qx, qy, qz, qw."""
-        points, quaternions = self.estimated.sampled(self.revolution_s[scans, None] + self.column_s)
-        origins, middles = self.estimated.sampled(self.revolution_s[scans])
+        points, quaternions = self.estimated.sample(self.revolution_s[scans, None] + self.column_s)
+        origins, middles = self.estimated.sample(self.revolution_s[scans])
         out = np.empty((*points.shape[:2], 7), dtype=np.float32)
         odom_R_sensor = rotation_matrices(middles)[:, None]
         offsets = points - origins[:, None]

@@ -77,7 +77,7 @@ class Recording:
     def n_guessed(self) -> int:
         """About how many revolutions it holds, for progress."""
         if self.metadata is None:
-            with closing(_opened(self)) as source:
+            with closing(_open_source(self)) as source:
                 return max(len(source), 1)
         packet_bytes = _packet_bytes(self.info) + _PACKET_OVERHEAD_BYTES
         n_packets = max(self.info.format.lidar_packets_per_frame(), 1)
@@ -95,8 +95,8 @@ class Recording:
         n_kept, n_seen, last_ns = 0, 0, None
         mounting = np.asarray(self.info.sensor_to_body, dtype=np.float64)
         window = max(self.info.format.valid_columns_per_frame(), 1)
-        with closing(_opened(self)) as source:
-            for frames in _guarded(source, self.path):
+        with closing(_open_source(self)) as source:
+            for frames in _read_guarded(source, self.path):
                 frame = frames[0]
                 if frame is None:
                     continue
@@ -240,7 +240,7 @@ def _stamps_ns(stamps_ns: Int64Array, is_valid: BoolArray, sensor: SensorMetadat
     return np.where(is_valid, stamps_ns, start_ns + np.round(filled_ns).astype(np.int64))
 
 
-def _opened(recording: Recording) -> Any:
+def _open_source(recording: Recording) -> Any:
     """Return the SDK's source of a recording; close it."""
     from ouster.sdk import osf, pcap
 
@@ -258,7 +258,7 @@ def _sdk_reads(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: the vendor's SDK cannot read it: {one_line(error)}") from error
 
 
-def _guarded(source: Any, path: Path) -> Iterator[Any]:
+def _read_guarded(source: Any, path: Path) -> Iterator[Any]:
     with _sdk_reads(path):
         yield from source
 
@@ -290,7 +290,7 @@ def _check_columns(recording: Recording) -> None:
     with _sdk_reads(recording.path):
         source = pcap.PcapPacketSource(str(recording.path), sensor_info=[recording.info])
     with closing(source):
-        for _, packet in _guarded(source, recording.path):
+        for _, packet in _read_guarded(source, recording.path):
             if isinstance(packet, core.LidarPacket):
                 highest = max(highest, int(layout.packet_header(core.ColHeader.MEASUREMENT_ID, packet.buf).max()))
                 n_looked_at -= 1

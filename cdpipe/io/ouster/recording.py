@@ -91,8 +91,8 @@ def import_recording(
         require_kiss_icp(f"--odometry {odometry}")
     report = on_progress or (lambda stage, done, total: None)
     recording = open_recording(source, metadata)
-    times = _times(recording, report)
-    motion, poses = _motion(recording, times, trajectory, odometry, report)
+    times = _read_times(recording, report)
+    motion, poses = _choose_motion(recording, times, trajectory, odometry, report)
     provenance = {
         "made_by": "tunnelcd convert",
         "recording": source.name,
@@ -106,7 +106,7 @@ def import_recording(
     return Imported(len(times.first_ns), poses, sensor, times.n_left_out)
 
 
-def _times(recording: Recording, report: Progress) -> _Times:
+def _read_times(recording: Recording, report: Progress) -> _Times:
     stamps_ns, has_own_pose = [], []
     left_out: list[int] = []
     middle = recording.sensor.width // 2
@@ -120,7 +120,7 @@ def _times(recording: Recording, report: Progress) -> _Times:
     return _Times(first_ns, middle_ns, last_ns, np.array(has_own_pose), len(left_out))
 
 
-def _motion(
+def _choose_motion(
     recording: Recording, times: _Times, trajectory: Path | None, odometry: str | None, report: Progress
 ) -> tuple[Motion | None, str]:
     """Return the movement, time from the first column on (None: every column has its own pose), and its name."""
@@ -199,7 +199,7 @@ def _own_motion(revolution: Revolution, stamps_s: Float64Array, where: str) -> M
 
 def _column_poses(motion: Motion, stamps_s: Float64Array) -> tuple[Float64Array, Float32Array]:
     """Return odom_T_sensor (4, 4) at the middle column, and sensor_T_column (W, 7) as a session stores it."""
-    points, quaternions = motion.sampled(stamps_s)
+    points, quaternions = motion.sample(stamps_s)
     rotations = Rotation.from_quat(quaternions)
     middle = len(stamps_s) // 2
     sensor_R_odom = rotations[middle].inv()

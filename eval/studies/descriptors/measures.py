@@ -20,7 +20,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.descriptors.sphere_network import SphereNetwork
 from cdpipe.training.data import TunnelShard
 from cdpipe.training.shard import read_shard
-from cdpipe.training.sphere_training import SphereData, local_scores, read_sphere_data, within_reach
+from cdpipe.training.sphere_training import SphereData, local_scores, pool_within_reach, read_sphere_data
 from eval.core.ranking import auroc
 
 FLOAT_BITS = 32
@@ -92,7 +92,7 @@ def measures(network: SphereNetwork, held: HeldOut, bits: int = FLOAT_BITS) -> d
     """
     data = held.data
     local = network.calibrated(torch.from_numpy(local_scores(network, data, DRAW, partial(rounded, bits=bits)))).numpy()
-    log_odds = within_reach(local, data)
+    log_odds = pool_within_reach(local, data)
     is_found = _found(local, held)
     found = _of_group(log_odds, data, is_found, np.ones(len(log_odds), np.bool_))
     for family in np.unique(held.families):

@@ -12,7 +12,7 @@ from cdpipe.descriptors.range_image import COLUMNS, ELEVATION_RAD, ROWS, range_i
 from cdpipe.model.config import DescriptorConfig, MapConfig
 from cdpipe.model.types import PosedScan, Spheres
 from cdpipe.training.fit import FitConfig, fit
-from cdpipe.training.scan_training import PlaceData, PlaceTask, _mirrored, _partners, _place_loss, evaluate
+from cdpipe.training.scan_training import PlaceData, PlaceTask, _mirror, _partners, _place_loss, evaluate
 
 
 def test_a_point_falls_where_its_angles_say() -> None:
@@ -147,7 +147,7 @@ def test_training_repeats_by_seed(tmp_path: Path, n_steps: int) -> None:
 def test_a_mirrored_image_is_that_of_the_mirrored_scan() -> None:
     points = np.random.default_rng(3).normal(size=(400, 3)) * (8, 3, 1)
     image, mirror_image = (torch.from_numpy(range_image(points * (1, side, 1)))[None] for side in (1, -1))
-    both, headings_rad = _mirrored(image.repeat(2, 1, 1), np.array([0.5, 0.5]), np.array([False, True]))
+    both, headings_rad = _mirror(image.repeat(2, 1, 1), np.array([0.5, 0.5]), np.array([False, True]))
     torch.testing.assert_close(both[0], image[0])
     torch.testing.assert_close(both[1], mirror_image[0])
     np.testing.assert_array_equal(headings_rad, [0.5, -0.5])

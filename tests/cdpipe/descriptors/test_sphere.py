@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, transform, yaw_pose
-from cdpipe.descriptors.sphere import change_logits, describe_map, stored_numbers
+from cdpipe.descriptors.sphere import change_logits, dequantise, describe_map
 from cdpipe.descriptors.sphere_image import (
     COLUMNS,
     HALF_LENGTH_M,
@@ -133,7 +133,7 @@ def test_eight_bits_say_about_the_same() -> None:
     fine, coarse = _set_of(merged.before), _set_of(merged.before, "int8")
     assert coarse.spheres is not None and fine.spheres is not None
     assert coarse.spheres.dtype == np.int8 and coarse.spheres.nbytes * 4 == fine.spheres.nbytes
-    np.testing.assert_allclose(stored_numbers(coarse.spheres), fine.spheres, atol=0.5 / 127 + 1e-6)
+    np.testing.assert_allclose(dequantise(coarse.spheres), fine.spheres, atol=0.5 / 127 + 1e-6)
     np.testing.assert_allclose(change_logits(merged, coarse, covered), change_logits(merged, fine, covered), atol=0.5)
 
 

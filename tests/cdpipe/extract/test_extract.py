@@ -7,7 +7,7 @@ import pytest
 
 import cdpipe.extract.objects
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
-from cdpipe.extract.extract import cut_out, hull_volume_m3, region_figures, with_withdrawn
+from cdpipe.extract.extract import cut_objects, hull_volume_m3, measure_regions, withdraw_empty_regions
 from cdpipe.extract.objects import PointGroup, assemble_objects
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import ClusterConfig, ExtractConfig, OutlierConfig, PipelineConfig
@@ -26,8 +26,8 @@ _STEP = 0.1
 def extract_objects(
     pair: MergedMaps, candidates: ChangeRegions, config: PipelineConfig
 ) -> tuple[tuple[ChangedObject, ...], dict[str, np.ndarray]]:
-    groups = cut_out(pair, candidates, config)
-    return assemble_objects(pair, groups), region_figures(pair, candidates, groups)
+    groups = cut_objects(pair, candidates, config)
+    return assemble_objects(pair, groups), measure_regions(pair, candidates, groups)
 
 
 def lattice(low: tuple[float, ...], high: tuple[float, ...]) -> Float64Array:
@@ -279,7 +279,7 @@ def test_regions_that_hold_nothing_are_taken_back() -> None:
     # the box's corner nearest to x = 5.95 is (1.95, 1.75, 1.15): 4 m away, the border included
     centres = [(0, 0, 0.5), (2, 1, 0.5), (-5, -5, 0.5), (5.95, 1.75, 1.15), (5.96, 1.75, 1.15), (1, 1, 1)]
     before = regions(centres, radius_m=4.0, n_reported=5)
-    found = with_withdrawn(before, groups_at(pair, BOX), CONFIG)
+    found = withdraw_empty_regions(before, groups_at(pair, BOX), CONFIG)
     assert found.is_reported.tolist() == [True, True, False, True, False, False]
     assert found.is_withdrawn is not None
     assert found.is_withdrawn.tolist() == [False, False, True, False, True, False]
@@ -288,24 +288,26 @@ def test_regions_that_hold_nothing_are_taken_back() -> None:
         assert getattr(found, same) is getattr(before, same)
     at_origin = groups_at(pair, np.zeros((1, 3)))
     for reach_m, is_held in ((4.0, True), (np.nextafter(4.0, 5.0), False)):
-        assert with_withdrawn(regions([(reach_m, 0, 0)], 4.0), at_origin, CONFIG).is_reported.tolist() == [is_held]
+        assert withdraw_empty_regions(regions([(reach_m, 0, 0)], 4.0), at_origin, CONFIG).is_reported.tolist() == [
+            is_held
+        ]
     # what is far from one object may hold another
-    second = with_withdrawn(before, groups_at(pair, BOX, BOX - (6, 6, 0)), CONFIG)
+    second = withdraw_empty_regions(before, groups_at(pair, BOX, BOX - (6, 6, 0)), CONFIG)
     assert second.is_reported.tolist() == [True, True, True, True, False, False]
 
 
 def test_without_objects_all_regions_are_taken_back_unless_none_is_to_be() -> None:
     before = regions([(0, 0, 0.5), (3, 0, 0.5), (9, 0, 0.5)], n_reported=2)
-    nothing = with_withdrawn(before, [], CONFIG)
+    nothing = withdraw_empty_regions(before, [], CONFIG)
     assert nothing.is_reported.tolist() == [False] * 3
     assert nothing.is_withdrawn is not None
     assert nothing.is_withdrawn.tolist() == [True, True, False]
     kept = CONFIG.model_copy(update={"extract": ExtractConfig(method="voxel", withdraw=False)})
-    assert with_withdrawn(before, [], kept) is before
+    assert withdraw_empty_regions(before, [], kept) is before
     pair = merged([FLOOR], [FLOOR, BOX])
     silent = regions([(0, 0, 0.5)], n_reported=0)
     for proposed in (silent, regions([])):
-        found = with_withdrawn(proposed, groups_at(pair, BOX), CONFIG)
+        found = withdraw_empty_regions(proposed, groups_at(pair, BOX), CONFIG)
         assert not found.is_reported.any()
         assert not found.is_proposed.any()
 
@@ -379,7 +381,7 @@ def test_both_rules_on_points_equal_their_slow_twin(rule: ExtractConfig, seed: i
     config = CONFIG.model_copy(
         update={"extract": rule, "outlier": OutlierConfig(), "cluster": ClusterConfig(radius_m=0.5, min_points=8)}
     )
-    found = [(each.session, each.region, set(each.indices.tolist())) for each in cut_out(pair, candidates, config)]
+    found = [(each.session, each.region, set(each.indices.tolist())) for each in cut_objects(pair, candidates, config)]
     assert {each[0] for each in found} == {"before", "after"}
     assert found == slow_twin(pair, candidates, config)
 

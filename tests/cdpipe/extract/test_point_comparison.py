@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cdpipe.extract.point_comparison
-from cdpipe.extract.point_comparison import cluster_labels, far_points_mask, inlier_mask, is_within, new_points_mask
+from cdpipe.extract.point_comparison import far_points_mask, inlier_mask, is_within, label_clusters, new_points_mask
 from cdpipe.model.config import ClusterConfig, ExtractConfig, OutlierConfig
 
 
@@ -78,11 +78,11 @@ def test_clusters_by_hand() -> None:
     x = np.array([0.0, 5.0, 0.5, 1.0, 1.5, 2.01, 2.2])
     points = np.column_stack([x, 0 * x, 0 * x])
     config = ClusterConfig(radius_m=0.5, min_points=2)
-    assert cluster_labels(points, config).tolist() == [0, -1, 0, 0, 0, 1, 1]
-    assert cluster_labels(points, ClusterConfig(radius_m=0.5, min_points=3)).tolist() == [0, -1, 0, 0, 0, -1, -1]
-    assert cluster_labels(points, ClusterConfig(radius_m=0.51, min_points=2)).tolist() == [0, -1, 0, 0, 0, 0, 0]
+    assert label_clusters(points, config).tolist() == [0, -1, 0, 0, 0, 1, 1]
+    assert label_clusters(points, ClusterConfig(radius_m=0.5, min_points=3)).tolist() == [0, -1, 0, 0, 0, -1, -1]
+    assert label_clusters(points, ClusterConfig(radius_m=0.51, min_points=2)).tolist() == [0, -1, 0, 0, 0, 0, 0]
     # equal sizes: in the order of their first points
-    assert cluster_labels(points[[5, 0, 6, 2]], config).tolist() == [0, 1, 0, 1]
-    assert cluster_labels(points[:0], config).shape == (0,)
-    assert cluster_labels(points[:1], config).tolist() == [-1]
-    assert cluster_labels(points[:1], ClusterConfig(min_points=1)).tolist() == [0]
+    assert label_clusters(points[[5, 0, 6, 2]], config).tolist() == [0, 1, 0, 1]
+    assert label_clusters(points[:0], config).shape == (0,)
+    assert label_clusters(points[:1], config).tolist() == [-1]
+    assert label_clusters(points[:1], ClusterConfig(min_points=1)).tolist() == [0]

@@ -1,7 +1,7 @@
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array
-from cdpipe.extract.remains import is_muck, is_part_of_a_rest
+from cdpipe.extract.remains import is_heap, is_part_of_remainder
 
 STEP_M = 0.2
 AXIS = np.arange(-4.0, 4.0, STEP_M) + 0.1
@@ -28,18 +28,18 @@ def test_a_pile_with_a_bite_out_of_it_is_a_rest() -> None:
     left = np.minimum(whole, np.maximum((0.3 - X) * 1.2, 0.0))  # a face of 50 degrees that rises towards -x
     is_taken = whole - left > 0.1
     taken, rest, after = skin(whole)[is_taken], skin(whole)[~is_taken], skin(left)
-    assert is_part_of_a_rest(taken, rest, after)
+    assert is_part_of_remainder(taken, rest, after)
     # the same skin, but of the rest nothing stands any more
-    assert not is_part_of_a_rest(taken, rest, FLOOR)
+    assert not is_part_of_remainder(taken, rest, FLOOR)
 
 
 def test_a_pile_that_went_as_a_whole_left_no_rest() -> None:
     whole = pile_m()
     is_taken = whole > 0.0
-    assert not is_part_of_a_rest(skin(whole)[is_taken], skin(whole)[~is_taken], FLOOR)
+    assert not is_part_of_remainder(skin(whole)[is_taken], skin(whole)[~is_taken], FLOOR)
     # nor where its outermost ring was not recognised as a part of it
     is_taken = whole > 0.12
-    assert not is_part_of_a_rest(skin(whole)[is_taken], skin(whole)[~is_taken], FLOOR)
+    assert not is_part_of_remainder(skin(whole)[is_taken], skin(whole)[~is_taken], FLOOR)
 
 
 def test_a_wall_is_not_what_is_left_of_a_pile_against_it() -> None:
@@ -48,28 +48,28 @@ def test_a_wall_is_not_what_is_left_of_a_pile_against_it() -> None:
     is_taken = banked > 0.1
     front = Y < 1.0
     rest = np.concatenate([skin(banked)[~is_taken & front], wall])
-    assert not is_part_of_a_rest(skin(banked)[is_taken], rest, np.concatenate([FLOOR[front], wall]))
+    assert not is_part_of_remainder(skin(banked)[is_taken], rest, np.concatenate([FLOOR[front], wall]))
 
 
 def test_a_crate_beside_another_that_stays_was_whole() -> None:
     gone, stays = block((0.0, 0.0, 0.2), (0.8, 0.6, 0.6)), block((1.4, 0.0, 0.2), (2.2, 0.6, 0.6))
     rest = np.concatenate([FLOOR, stays])
-    assert not is_part_of_a_rest(gone, rest, rest)
+    assert not is_part_of_remainder(gone, rest, rest)
 
 
 def test_where_nothing_is_nothing_is_left() -> None:
     nothing = np.zeros((0, 3))
-    assert not is_part_of_a_rest(nothing, FLOOR, FLOOR)
-    assert not is_part_of_a_rest(FLOOR, nothing, FLOOR)
-    assert not is_part_of_a_rest(FLOOR, FLOOR, nothing)
+    assert not is_part_of_remainder(nothing, FLOOR, FLOOR)
+    assert not is_part_of_remainder(FLOOR, nothing, FLOOR)
+    assert not is_part_of_remainder(FLOOR, FLOOR, nothing)
 
 
 def test_a_flank_is_muck_and_a_crate_level_or_upright_is_not() -> None:
     axis = np.arange(0.0, 2.0, 0.05)
     x, y = (grid.ravel() for grid in np.meshgrid(axis, axis))
-    assert is_muck(np.column_stack([x, y, 0.65 * y]))  # 33 degrees
-    assert not is_muck(np.column_stack([x, y, np.full(x.size, 0.6)]))
+    assert is_heap(np.column_stack([x, y, 0.65 * y]))  # 33 degrees
+    assert not is_heap(np.column_stack([x, y, np.full(x.size, 0.6)]))
     sides = [np.column_stack([np.full(x.size, side), x, y]) for side in (0.0, 2.0)]
-    assert not is_muck(np.concatenate([np.column_stack([x, y, np.full(x.size, 2.0)]), *sides]))
+    assert not is_heap(np.concatenate([np.column_stack([x, y, np.full(x.size, 2.0)]), *sides]))
     # too few to have a surface
-    assert not is_muck(np.zeros((2, 3)))
+    assert not is_heap(np.zeros((2, 3)))

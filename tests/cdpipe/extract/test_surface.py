@@ -9,9 +9,9 @@ from cdpipe.extract.point_comparison import label_groups
 from cdpipe.extract.surface import (
     PlaneTable,
     Site,
-    candidates,
     compare_site,
     distances_m,
+    find_candidates,
     grow_low_objects,
     grow_objects,
     unassigned_cells,
@@ -70,14 +70,14 @@ def test_candidates_are_three_together_more_than_eight_centimetres_off() -> None
     table = PlaneTable(Surface(FLOOR))
 
     def found(*places: tuple[float, float, float]) -> list[int]:
-        chosen, _ = candidates(np.concatenate([FLOOR, np.array(places).reshape(-1, 3)]), table)
+        chosen, _ = find_candidates(np.concatenate([FLOOR, np.array(places).reshape(-1, 3)]), table)
         return (chosen - len(FLOOR)).tolist()
 
     assert found((0, 0, 0.09), (0.3, 0, 0.09), (0.6, 0, 0.09)) == [0, 1, 2]
     assert found((0, 0, 0.09), (0.3, 0, 0.09)) == []
     assert found((0, 0, 0.07), (0.3, 0, 0.07), (0.6, 0, 0.07)) == []
     assert found((0, 0, 0.09), (0.3, 0, 0.09), (0.6, 0, 0.09), (2, 2, 0.09), (1.2, 0, 0.09)) == [0, 1, 2]
-    chosen, noise_m = candidates(transform(yaw_pose(0.0, (0, 0, 0.03)), FLOOR), table)
+    chosen, noise_m = find_candidates(transform(yaw_pose(0.0, (0, 0, 0.03)), FLOOR), table)
     assert (len(chosen), noise_m) == (0, pytest.approx(0.03))
 
 
@@ -97,7 +97,7 @@ def test_candidates_are_all_of_groups_of_three_and_more(n_points: int) -> None:
     # from scattered pairs to one lump
     above = stream(n_points, "above").uniform((-2.9, -2.9, 0.1), (2.9, 2.9, 0.3), (n_points, 3))
     labels, sizes = label_groups(above, 0.5)
-    chosen, _ = candidates(np.concatenate([FLOOR, above]), PlaneTable(Surface(FLOOR)))
+    chosen, _ = find_candidates(np.concatenate([FLOOR, above]), PlaneTable(Surface(FLOOR)))
     assert chosen.tolist() == (len(FLOOR) + np.flatnonzero(sizes[labels] >= 3)).tolist()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
-from cdpipe.mapping.free_space import COLUMNS, ROWS, free_space_votes, grazing_ray_count, view
+from cdpipe.mapping.free_space import COLUMNS, ROWS, free_space_votes, grazing_ray_count, render_view
 from cdpipe.model.types import KeyframeViews
 from tests.cdpipe.rooms import ROOM, Box, cast
 
@@ -29,7 +29,7 @@ def looked_from(
     for room_T_sensor in poses:
         beams = directions(elevations_deg)
         ranges_m, _ = cast(room_T_sensor[:3, 3], beams @ room_T_sensor[:3, :3].T, boxes)
-        images.append(view(ranges_m[:, None] * beams))
+        images.append(render_view(ranges_m[:, None] * beams))
     return KeyframeViews(np.stack(images), invert(np.stack(poses)))
 
 
@@ -51,13 +51,13 @@ def test_a_view_holds_the_nearest_return_of_each_pixel() -> None:
         if 0 <= pixel[0] < ROWS:
             expected[pixel] = min(expected.get(pixel, np.inf), float(np.linalg.norm(point)))
     assert 1000 < len(expected) < 3000
-    image = view(points)
+    image = render_view(points)
     assert (image.shape, image.dtype) == ((ROWS, COLUMNS), np.float16)
     assert np.count_nonzero(image) == len(expected)
     for pixel, range_m in expected.items():
         assert image[pixel] == np.float16(np.float32(range_m))
-    assert not view(np.zeros((0, 3))).any()
-    assert not view(np.zeros((1, 3))).any()  # a return at the sensor itself has no direction
+    assert not render_view(np.zeros((0, 3))).any()
+    assert not render_view(np.zeros((1, 3))).any()  # a return at the sensor itself has no direction
 
 
 def test_a_room_is_free_up_to_its_walls_and_unknown_behind_them() -> None:
@@ -80,7 +80,7 @@ def test_a_room_is_free_up_to_its_walls_and_unknown_behind_them() -> None:
 def test_what_is_above_or_below_or_out_of_reach_was_not_looked_at() -> None:
     # in a hall without end every ray comes back from 50 m: all is free that a pixel looks at
     beams = directions((-60, 60))
-    views = KeyframeViews(view(50.0 * beams)[None], np.eye(4)[None])
+    views = KeyframeViews(render_view(50.0 * beams)[None], np.eye(4)[None])
     for elevation_deg, is_free in ((44.0, True), (-44.0, True), (46.0, False), (-46.0, False), (90.0, False)):
         up = np.deg2rad(elevation_deg)
         assert seen_through(np.array([[3 * np.cos(up), 0.0, 3 * np.sin(up)]]), views).tolist() == [is_free]

@@ -8,7 +8,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, invert, make_pose, transform, yaw_pose
-from cdpipe.mapping.free_space import view
+from cdpipe.mapping.free_space import render_view
 from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PLACES, PointMap, PosedScan, ScanSource
@@ -147,7 +147,7 @@ def test_keyframes_keep_what_they_saw() -> None:
     np.testing.assert_array_equal(point_map.views.sensor_T_odom, invert(source.odom_T_sensor[[0, 2, 4, 6]]))
     for image, scan in zip(point_map.views.ranges_m, (0, 2, 4, 6), strict=True):
         # a return that is not mapped was seen through to all the same
-        np.testing.assert_array_equal(image, view(source.scan(scan).points_sensor))
+        np.testing.assert_array_equal(image, render_view(source.scan(scan).points_sensor))
         assert image.max() == 10.01 or image.max() == np.float16(10.01)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import Float64Array, invert, transform, yaw_pose
-from cdpipe.merge.candidates import Candidate, _common_motion, closest_pair, pair_votes, voted_candidates
+from cdpipe.merge.candidates import Candidate, _fit_common_motion, count_votes, find_candidates, find_closest_pair
 from cdpipe.model.config import MergeConfig
 from cdpipe.model.types import MappedSession
 
@@ -20,7 +20,7 @@ def test_only_right_pairs_vote_for_one_another() -> None:
     before = poses_at((0, 0), (10, 0), (25, 5), (40, 0), (7, 0))
     after = yaw_pose(np.pi / 2, (100, 50, 1)) @ before
     after[3:, :2, 3] = [[130.0, 20], [101, 95]]
-    agrees, votes = pair_votes(before, after, np.zeros(5))
+    agrees, votes = count_votes(before, after, np.zeros(5))
     assert agrees.astype(int).tolist() == [
         [1, 1, 1, 0, 0],
         [1, 1, 1, 0, 0],
@@ -38,21 +38,21 @@ def test_only_right_pairs_vote_for_one_another() -> None:
 def test_two_metres_and_two_percent_are_tolerated(stretch_m: float, is_agreed: bool) -> None:
     before, after = poses_at((0, 0), (100, 0)), poses_at((0, 0), (100 + stretch_m, 0))
     # 2 m and 2 % of the after distance: 4.08 m
-    assert bool(pair_votes(before, after, np.zeros(2))[0][0, 1]) is is_agreed
+    assert bool(count_votes(before, after, np.zeros(2))[0][0, 1]) is is_agreed
 
 
 @pytest.mark.parametrize(("turn_deg", "is_agreed"), [(18.0, True), (22.0, False)])
 def test_pairs_of_another_yaw_do_not_agree(turn_deg: float, is_agreed: bool) -> None:
     places = poses_at((0, 0), (5, 0))
-    agrees, _ = pair_votes(places, places, np.deg2rad([0.0, turn_deg]))
+    agrees, _ = count_votes(places, places, np.deg2rad([0.0, turn_deg]))
     assert bool(agrees[0, 1]) is is_agreed
 
 
 def test_a_shift_against_the_yaw_is_no_agreement() -> None:
     # as far apart in both sessions and of the same yaw, but in the other direction
     before, after = poses_at((0, 0), (30, 0)), poses_at((0, 0), (-30, 0))
-    assert not pair_votes(before, after, np.zeros(2))[0][0, 1]
-    assert pair_votes(before, after, np.full(2, np.pi))[0][0, 1]
+    assert not count_votes(before, after, np.zeros(2))[0][0, 1]
+    assert count_votes(before, after, np.full(2, np.pi))[0][0, 1]
 
 
 @pytest.mark.parametrize("is_upside_down", [False, True])
@@ -64,9 +64,9 @@ def test_however_the_sensor_hangs_yaws_and_places_say_the_same(is_upside_down: b
     seen_again = np.array([yaw_pose(h, (x, y, 0.0)) @ mount for h, (x, y) in zip((2.0, 0.1, 3.0), places, strict=True)])
     relative = invert(before) @ seen_again
     yaws_rad = np.arctan2(relative[:, 1, 0], relative[:, 0, 0])
-    agrees, _ = pair_votes(before, yaw_pose(-turn) @ seen_again, yaws_rad)
+    agrees, _ = count_votes(before, yaw_pose(-turn) @ seen_again, yaws_rad)
     assert agrees.all()
-    guess = _common_motion(before, yaw_pose(-turn) @ seen_again, yaws_rad, agrees[0], 0)
+    guess = _fit_common_motion(before, yaw_pose(-turn) @ seen_again, yaws_rad, agrees[0], 0)
     np.testing.assert_allclose(guess, yaw_pose(turn), atol=1e-9)
 
 
@@ -79,7 +79,7 @@ def path_miss_m(found: Candidate, true: Float64Array, session: MappedSession) ->
 def test_where_all_pairs_agree_there_is_one_candidate_and_it_is_near_the_truth(
     tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
 ) -> None:
-    (found,) = voted_candidates(tunnel_before, tunnel_after, MergeConfig(n_candidates=4))
+    (found,) = find_candidates(tunnel_before, tunnel_after, MergeConfig(n_candidates=4))
     assert path_miss_m(found, true_before_T_after, tunnel_after) < 1.0
 
 
@@ -91,7 +91,7 @@ def test_most_pairs_may_be_wrong(
     is_wrong = np.arange(len(q)) % 3 != 0
     q[is_wrong] = np.random.default_rng(0).permutation(q[is_wrong])
     misled = MappedSession(tunnel_after.map, replace(tunnel_after.descriptors, q=q))
-    found = voted_candidates(tunnel_before, misled, MergeConfig(n_candidates=4))
+    found = find_candidates(tunnel_before, misled, MergeConfig(n_candidates=4))
     assert len(found) == 4
     miss_m = [path_miss_m(each, true_before_T_after, tunnel_after) for each in found]
     assert miss_m[0] < 3.0
@@ -102,7 +102,7 @@ def test_most_pairs_may_be_wrong(
 def test_frames_candidate_is_the_closest_of_all_pairs(
     tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
 ) -> None:
-    (found,) = closest_pair(tunnel_before, tunnel_after)
+    (found,) = find_closest_pair(tunnel_before, tunnel_after)
     q_before, q_after = tunnel_before.descriptors.q, tunnel_after.descriptors.q
     distances = np.linalg.norm(q_before[:, None] - q_after[None], axis=2)
     assert distances[found.before_keyframe, found.after_keyframe] == distances.min()
@@ -118,5 +118,5 @@ def test_no_descriptor_no_candidate(tunnel_before: MappedSession) -> None:
         keyframe_scans=np.zeros(0, np.int64),
     )
     empty = MappedSession(tunnel_before.map, nothing)
-    assert voted_candidates(tunnel_before, empty, MergeConfig()) == []
-    assert closest_pair(empty, tunnel_before) == []
+    assert find_candidates(tunnel_before, empty, MergeConfig()) == []
+    assert find_closest_pair(empty, tunnel_before) == []

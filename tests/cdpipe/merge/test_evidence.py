@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import Float64Array, make_pose, yaw_pose
-from cdpipe.merge.evidence import SurfaceFit, sampled, surface_fit, why_refused
+from cdpipe.merge.evidence import SurfaceFit, explain_refusal, measure_fit, sample_evenly
 from cdpipe.merge.registration import IndexedMap
 from cdpipe.model.config import MergeConfig
 from cdpipe.model.types import MappedSession
@@ -32,7 +32,7 @@ def floors(tunnel_before: MappedSession) -> tuple[IndexedMap, IndexedMap]:
 
 
 def fit_at(maps: tuple[IndexedMap, IndexedMap], pose: Float64Array) -> SurfaceFit:
-    return surface_fit(*maps, pose, sampled(maps[1].sphere(np.zeros(3), 5.0)), np.zeros(3), 5.0)
+    return measure_fit(*maps, pose, sample_evenly(maps[1].sphere(np.zeros(3), 5.0)), np.zeros(3), 5.0)
 
 
 @pytest.mark.parametrize(("lift_m", "share"), [(0.0, 1.0), (0.09, 1.0), (0.11, 0.0)])
@@ -74,8 +74,8 @@ def test_a_plane_holds_one_direction_only_whichever_way_the_maps_are_turned(
 
 def test_samples_are_every_kth_point() -> None:
     points = np.arange(3000.0).reshape(1000, 3)
-    np.testing.assert_array_equal(sampled(points, 300), points[::3])
-    np.testing.assert_array_equal(sampled(points[:10], 300), points[:10])
+    np.testing.assert_array_equal(sample_evenly(points, 300), points[::3])
+    np.testing.assert_array_equal(sample_evenly(points[:10], 300), points[:10])
 
 
 @pytest.mark.parametrize(
@@ -89,18 +89,18 @@ def test_samples_are_every_kth_point() -> None:
     ],
 )
 def test_each_gate_refuses_alone_and_says_why(name: str, value: float, said: str) -> None:
-    assert why_refused(GOOD, CONFIG) == ""
-    reason = why_refused({**GOOD, name: value}, CONFIG)
+    assert explain_refusal(GOOD, CONFIG) == ""
+    reason = explain_refusal({**GOOD, name: value}, CONFIG)
     assert said in reason
     assert f"merge.min_{name} asks for" in reason
 
 
 def test_what_could_not_be_measured_is_refused() -> None:
     for name in GOOD:
-        assert why_refused({**GOOD, name: float("nan")}, CONFIG)
-        assert why_refused({key: value for key, value in GOOD.items() if key != name}, CONFIG)
+        assert explain_refusal({**GOOD, name: float("nan")}, CONFIG)
+        assert explain_refusal({key: value for key, value in GOOD.items() if key != name}, CONFIG)
 
 
 def test_the_gate_itself_is_enough() -> None:
     at_the_gate = {name: getattr(CONFIG, f"min_{name}") for name in GOOD}
-    assert why_refused(at_the_gate, CONFIG) == ""
+    assert explain_refusal(at_the_gate, CONFIG) == ""

@@ -10,7 +10,7 @@ import pytest
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, rotation_angle_rad, stream, transform, yaw_pose
 from cdpipe.io.ply import read_ply_points
-from cdpipe.merge.evidence import why_refused
+from cdpipe.merge.evidence import explain_refusal
 from cdpipe.merge.merge import merge_maps
 from cdpipe.merge.registration import register
 from cdpipe.model.config import MergeConfig, load_config
@@ -90,7 +90,7 @@ def test_frame_as_published_takes_whatever_it_finds(tunnel_before: MappedSession
     assert merged.is_accepted
     assert merged.local is None
     assert merged.evidence["n_hypotheses"] == 1
-    assert why_refused(merged.evidence, CONFIG)
+    assert explain_refusal(merged.evidence, CONFIG)
 
 
 def test_frame_finds_the_tunnel_too(

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import make_pose
 from cdpipe.merge.merge import merge_maps
-from cdpipe.merge.refine import _held, refined
+from cdpipe.merge.refine import _discount_normal_noise, refine
 from cdpipe.merge.registration import IndexedMap
 from cdpipe.merge.walk import Walk
 from cdpipe.model.config import MergeConfig
@@ -36,7 +36,7 @@ def test_a_smooth_wall_holds_nothing_along_itself() -> None:
     normals = np.column_stack([rng.normal(0, 0.08, 300), np.repeat(np.eye(3)[1:, 1:], 150, axis=0)])
     jacobian = np.hstack([np.cross(rng.uniform(-4, 4, (300, 3)), normals), normals])
     information = jacobian.T @ jacobian
-    held = _held(information[None])[0]
+    held = _discount_normal_noise(information[None])[0]
     assert information[3, 3] > 1.5
     assert np.linalg.eigvalsh(held[3:, 3:])[0] == pytest.approx(0.0, abs=1e-6)
     assert np.linalg.eigvalsh(held)[0] > -1e-6
@@ -70,7 +70,7 @@ def test_the_walls_of_a_wide_drift_are_looked_at() -> None:
     keyframes = np.array([10, 25, 40])
     coarse = np.repeat(make_pose(translation=(0.15, 0, 0))[None], 3, axis=0)
     found = Walk(keyframes, coarse, np.zeros((3, 6, 6)), np.ones(3), np.zeros(3))
-    alignment, evidence = refined(*maps, found, config)
+    alignment, evidence = refine(*maps, found, config)
     assert alignment is not None
     assert evidence["n_refined"] > 8
     path = after.odom_T_keyframe[:, :3, 3]

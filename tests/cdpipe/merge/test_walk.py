@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import Float64Array, make_pose, transform
-from cdpipe.merge.registration import IndexedMap, eigenvalue_ratio, motion_between, rigid_fit
-from cdpipe.merge.walk import Step, evenly, is_shared, walk
+from cdpipe.merge.registration import IndexedMap, eigenvalue_ratio, fit_rigid, motion_between
+from cdpipe.merge.walk import Step, choose_evenly, is_shared, walk
 from cdpipe.model.config import MergeConfig
 from cdpipe.model.types import MappedSession
 
@@ -22,7 +22,7 @@ def maps(tunnel_before: MappedSession, tunnel_after: MappedSession) -> tuple[Ind
 
 
 def test_a_right_start_fits_all_along(maps: tuple[IndexedMap, IndexedMap], true_before_T_after: Float64Array) -> None:
-    keyframes = evenly(np.arange(len(maps[1].positions)), 8, 3)
+    keyframes = choose_evenly(np.arange(len(maps[1].positions)), 8, 3)
     found = walk(*maps, keyframes, 3, true_before_T_after, STEP, CONFIG)
     assert found.fits.min() > 0.9
     errors = [
@@ -41,7 +41,7 @@ def test_a_start_a_few_metres_along_the_tunnel_is_found_out(
     maps: tuple[IndexedMap, IndexedMap], true_before_T_after: Float64Array
 ) -> None:
     wrong = make_pose(translation=(8.0, 3.0, 0.0)) @ true_before_T_after
-    found = walk(*maps, evenly(np.arange(len(maps[1].positions)), 8, 3), 3, wrong, STEP, CONFIG)
+    found = walk(*maps, choose_evenly(np.arange(len(maps[1].positions)), 8, 3), 3, wrong, STEP, CONFIG)
     assert np.nanmean(found.fits) < 0.6
 
 
@@ -49,7 +49,7 @@ def test_where_the_before_session_never_was_nothing_is_said(
     maps: tuple[IndexedMap, IndexedMap], true_before_T_after: Float64Array
 ) -> None:
     away = make_pose(translation=(0.0, 0.0, 400.0)) @ true_before_T_after
-    found = walk(*maps, evenly(np.arange(len(maps[1].positions)), 5, 0), 0, away, STEP, CONFIG)
+    found = walk(*maps, choose_evenly(np.arange(len(maps[1].positions)), 5, 0), 0, away, STEP, CONFIG)
     assert np.isnan(found.fits).all()
     assert not found.information.any()
     np.testing.assert_array_equal(found.before_T_after, np.repeat(away[None], 5, axis=0))
@@ -60,7 +60,7 @@ def test_a_registration_that_jumps_is_no_drift(
 ) -> None:
     # 1.6 m off: GICP would come back, but between neighbours that are metres apart nothing drifts so far
     off = make_pose(translation=(0.0, 0.0, 1.6)) @ true_before_T_after
-    found = walk(*maps, evenly(np.arange(len(maps[1].positions)), 8, 3), 3, off, STEP, CONFIG)
+    found = walk(*maps, choose_evenly(np.arange(len(maps[1].positions)), 8, 3), 3, off, STEP, CONFIG)
     assert found.fits[3] == 0.0
 
 
@@ -94,20 +94,20 @@ def test_shared_is_within_five_metres_of_the_before_path(tunnel_before: MappedSe
 
 def test_evenly_spaced_keyframes_and_one_more() -> None:
     everywhere = np.arange(11)
-    assert evenly(everywhere, 3, 5).tolist() == [0, 5, 10]
-    assert evenly(everywhere, 3, 7).tolist() == [0, 5, 7, 10]
-    assert evenly(everywhere[4:7], 3, 0).tolist() == [0, 4, 5, 6]
-    assert evenly(everywhere[:2], 10, 0).tolist() == [0, 1]
+    assert choose_evenly(everywhere, 3, 5).tolist() == [0, 5, 10]
+    assert choose_evenly(everywhere, 3, 7).tolist() == [0, 5, 7, 10]
+    assert choose_evenly(everywhere[4:7], 3, 0).tolist() == [0, 4, 5, 6]
+    assert choose_evenly(everywhere[:2], 10, 0).tolist() == [0, 1]
 
 
 def test_one_transform_is_fitted_to_several() -> None:
     rng = np.random.default_rng(0)
     positions = np.column_stack([np.linspace(0, 50, 6), np.zeros(6), np.zeros(6)])
     same = make_pose(translation=rng.normal(size=3))
-    np.testing.assert_allclose(rigid_fit(positions, np.repeat(same[None], 6, axis=0)), same, atol=1e-9)
+    np.testing.assert_allclose(fit_rigid(positions, np.repeat(same[None], 6, axis=0)), same, atol=1e-9)
     # a straight path that is lifted steadily: the nearest rigid motion pitches
     lifted = np.array([make_pose(translation=(0, 0, 0.01 * x)) for x in positions[:, 0]])
-    found = transform(rigid_fit(positions, lifted), positions)
+    found = transform(fit_rigid(positions, lifted), positions)
     assert np.abs(found[:, 2] - 0.01 * positions[:, 0]).max() < 0.03
 
 

@@ -14,8 +14,8 @@ from cdpipe.training.sphere_training import (
     BATCH,
     SphereData,
     SphereTask,
+    fit_platt,
     local_scores,
-    platt,
     pooled_scores,
     sector_targets,
 )
@@ -148,7 +148,7 @@ def test_calibration_by_hand() -> None:
     # of those scored 1 three in four are positive, of those scored -1 one in four. Platt's targets are 5/6 and 1/6:
     # (3 x 5/6 + 1/6) / 4 = 2/3, log-odds log 2 and -log 2
     scores = np.repeat([1.0, -1.0], 4)
-    slope, offset, likelihood = platt(scores, np.array([1, 1, 1, 0, 1, 0, 0, 0], dtype=np.bool_))
+    slope, offset, likelihood = fit_platt(scores, np.array([1, 1, 1, 0, 1, 0, 0, 0], dtype=np.bool_))
     np.testing.assert_allclose([slope, offset], [np.log(2), 0.0], atol=1e-3)
     assert likelihood == pytest.approx(2 / 3 * np.log(2 / 3) + 1 / 3 * np.log(1 / 3), abs=1e-6)
 
@@ -164,6 +164,6 @@ def test_the_calibration_goes_with_the_weights() -> None:
 
 
 def test_classes_that_are_wholly_apart_get_a_curve() -> None:
-    slope, offset, _ = platt(np.array([-4.0, -3.0, 2.0, 3.0]), np.array([0, 0, 1, 1], dtype=np.bool_))
+    slope, offset, _ = fit_platt(np.array([-4.0, -3.0, 2.0, 3.0]), np.array([0, 0, 1, 1], dtype=np.bool_))
     assert 0.1 < slope < 5
     assert -3.0 < -offset / slope < 2.0
