@@ -1,1 +1,1 @@
-"""From the scans of one session to a thinned map with keyframes and the free space around them."""
+"""Mapping: from the scans of one session to a voxel map with keyframes and their free space."""

@@ -1,4 +1,4 @@
-"""Deskewing: a spinning sensor moves while it turns, so every column has a pose of its own."""
+"""Deskewing: a spinning sensor moves during a revolution, so every column has its own pose."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from cdpipe.core.geometry import Float64Array, require_shape
 
 
 def deskew(points_column: Float64Array, column_poses: Float64Array) -> Float64Array:
-    """Carry each column's points into the frame of its revolution, with the session's own odometry.
+    """Transform each column's points into the frame of its revolution by the session's own odometry.
 
     Args:
         points_column: (H, W, 3) points, each column in the sensor frame at its own time, metres.

@@ -1,10 +1,9 @@
-"""What a session saw through: a place is free where its rays went on behind it.
+"""Free space: a place is free if rays of a session passed through it.
 
-What one session has and the other has not is a change only if the other one looked there. Each keyframe keeps one image
-of its scan, the range of the nearest return of every pixel; a point well before all returns of its pixel and of the
-four beside it was seen through, one at their range was hit, and one behind them was hidden (`free_space_votes`). A
-pixel is as high as what lies low: of that only the rays themselves tell, those that came back from the floor just
-behind it (`grazing_ray_count`).
+A difference between the maps is a change only if the other session observed the place. Each keyframe keeps a range
+image of its scan. A point in front of the returns of its pixel and of the four neighbouring pixels was seen through; a
+point at their range was hit; a point behind them was occluded (`free_space_votes`). A low object is not higher than a
+pixel. For it the single rays decide that returned from the floor just behind it (`grazing_ray_count`).
 """
 
 from __future__ import annotations
@@ -17,21 +16,20 @@ from cdpipe.model.types import Float16Array, KeyframeViews
 
 ROWS = 64
 COLUMNS = 512
-# Elevations beyond are not kept: enough for lenses of 90 degrees.
+# Highest elevation of the image: covers a sensor with a vertical field of view of 90 degrees.
 _ELEVATION_RAD = np.deg2rad(45.6)
-# A return this much behind a point went past it, at any range; one this near to it may have come from it.
+# A return farther behind a point than this passed it; a return within this distance may be from it.
 _MARGIN_M = 0.2
 _NEAREST_M = 0.5
-# Farther off, pixels are wider than what is looked for.
+# Beyond this range a pixel is wider than the objects.
 REACH_M = 15.0
-# Rays are followed from their end through cells of this size, from here to there: nearer ones touch what they hit, and
-# who passed farther above the floor was seen through by the views.
+# Grazing rays are traced backwards from their return: cell size, nearest and farthest distance from the return.
 _CELL_M = 0.1
 _PAST_M = (0.1, 1.0)
 
 
 def render_view(points_sensor: Float64Array) -> Float16Array:
-    """Return the (ROWS, COLUMNS) float16 range of the nearest return of each pixel, metres, 0 without.
+    """Return the (ROWS, COLUMNS) float16 range image: nearest return of each pixel, metres, 0 without one.
 
     Args:
         points_sensor: (N, 3) returns of a scan, sensor frame, metres.
@@ -45,13 +43,14 @@ def render_view(points_sensor: Float64Array) -> Float16Array:
 
 
 def free_space_votes(points_odom: Float64Array, views: KeyframeViews) -> Int64Array:
-    """Return how many more keyframes saw through each of (N,) places than hit it.
-
-    It is 0 of what no keyframe looked at, or was hidden from all.
+    """Return for each place the number of keyframes that saw through it minus the number that hit it.
 
     Args:
-        points_odom: (N, 3) points in the odom frame of the session that looked, metres.
-        views: What its keyframes saw.
+        points_odom: (N, 3) places, odom frame of the observing session, metres.
+        views: Range images of its keyframes.
+
+    Returns:
+        (N,) votes; 0 also for a place that no keyframe observed.
     """
     n_through, n_hit = count_through_and_hit(points_odom, views)
     return n_through - n_hit
@@ -60,9 +59,9 @@ def free_space_votes(points_odom: Float64Array, views: KeyframeViews) -> Int64Ar
 def count_through_and_hit(
     points_odom: Float64Array, views: KeyframeViews, within_m: float = REACH_M
 ) -> tuple[Int64Array, Int64Array]:
-    """Return how many keyframes saw through each of (N,) places, and how many hit it; as `free_space_votes` takes them.
+    """Return the (N,) number of keyframes that saw through each place, and the (N,) number that hit it.
 
-    Those farther from a place than `within_m` say nothing about it.
+    Arguments as of `free_space_votes`; keyframes farther than `within_m` from a place are ignored.
     """
     n_through, n_hit = np.zeros((2, len(points_odom)), dtype=np.int64)
     if len(points_odom) == 0 or len(views.ranges_m) == 0:
@@ -81,13 +80,16 @@ def count_through_and_hit(
 
 
 def grazing_ray_count(points: Float64Array, ends: Float64Array, origins: Float64Array, scans: Int64Array) -> Int64Array:
-    """Return how many scans had a ray through the cell of each place just before it came back, less those that hit it.
+    """Return for each place the number of scans with a ray through its cell just before its return, minus hits.
 
     Args:
         points: (N, 3) places, at least one, metres.
-        ends: (M, 3) returns of the session that looked, those about the places, same frame.
-        origins: (M, 3) where its sensor was then.
-        scans: (M,) which scan each is of.
+        ends: (M, 3) returns of the observing session near the places, same frame.
+        origins: (M, 3) sensor position of each return.
+        scans: (M,) scan of each return.
+
+    Returns:
+        (N,) scans that passed the cell minus scans with a return in it.
     """
     cells = _Cells(points)
     is_near = cells.is_within(ends, _PAST_M[1])
@@ -102,22 +104,22 @@ def grazing_ray_count(points: Float64Array, ends: Float64Array, origins: Float64
 
 
 class _Cells:
-    """The cells that some places (N, 3) lie in, and which scans have been in them."""
+    """The cells that hold (N, 3) places, to be looked up by point and scan."""
 
     def __init__(self, points: Float64Array) -> None:
         self._low, self._high = points.min(axis=0) - _CELL_M, points.max(axis=0) + _CELL_M
         self._keys, self._cell_of_point = np.unique(self._keys_of(points), return_inverse=True)
 
     def is_within(self, points: Float64Array, margin_m: float) -> BoolArray:
-        """Mark the points in the box about all cells, or within a margin of it."""
+        """Mark the points within a margin of the bounding box of all cells."""
         is_within = np.ones(len(points), dtype=np.bool_)
-        for axis in range(3):  # `all(axis=1)` over rows of three takes longer than the comparisons
+        for axis in range(3):  # faster than `all(axis=1)` over rows of three
             is_within &= points[:, axis] > self._low[axis] - margin_m
             is_within &= points[:, axis] < self._high[axis] + margin_m
         return is_within
 
     def met(self, points: Float64Array, scans: Int64Array) -> Int64Array:
-        """Return a key of cell and scan for each point in one of the cells."""
+        """Return the key of cell and scan of each point that lies in one of the cells."""
         is_near = self.is_within(points, 0.0)
         keys = self._keys_of(points[is_near])
         cells = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
@@ -125,7 +127,7 @@ class _Cells:
         return np.asarray(scans[is_near][is_met] * len(self._keys) + cells[is_met], dtype=np.int64)
 
     def n_scans(self, keys: Int64Array) -> Int64Array:
-        """Return how many scans have a key in the cell of each place."""
+        """Return the (N,) number of different scans with a key in the cell of each place."""
         n_cells = len(self._keys)
         found = np.bincount(np.unique(keys) % n_cells, minlength=n_cells)
         return np.asarray(found[self._cell_of_point], dtype=np.int64)
@@ -135,7 +137,7 @@ class _Cells:
 
 
 def _look_up(image: Float16Array, pixel: Int64Array, ranges_m: Float64Array) -> tuple[Float64Array, BoolArray]:
-    """Return the shortest range of the cross about each pixel, infinite without, and whether any is the point's own."""
+    """Return the shortest range in each pixel's neighbourhood (inf without one), and whether any equals the point's."""
     column, row_start = pixel % COLUMNS, pixel - pixel % COLUMNS
     cross = (
         pixel,
@@ -152,7 +154,7 @@ def _look_up(image: Float16Array, pixel: Int64Array, ranges_m: Float64Array) -> 
 
 
 def _pixels(points_sensor: Float64Array) -> tuple[Int64Array, Float64Array]:
-    """Return the (N,) pixel of each point, -1 for those above or below the image, and its range."""
+    """Return the (N,) pixel of each point, -1 above or below the image, and its (N,) range, metres."""
     x, y, z = points_sensor.T
     ranges_m = np.sqrt(x * x + y * y + z * z)
     elevation = np.arctan2(z, np.hypot(x, y))

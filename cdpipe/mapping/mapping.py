@@ -1,4 +1,4 @@
-"""From scans to a thinned map in one pass; memory grows with the map and by eleven bytes a return."""
+"""From scans to a voxel map in one pass; memory grows with the map and by eleven bytes per return."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PLACES, Float16Array, KeyframeViews, PointMap, PosedScan, ScanSource, UInt8Array
 
 _BATCH_SCANS = 64
-# Nearer returns weigh no more; the sensor's own shortest range is less.
+# Lower limit of the range in a return's weight.
 _MIN_RANGE_M = 1.0
-# Share of a cell by which a mean that rounding carried out of it is put back.
+# Distance from the border, as a share of the cell, of a mean that rounding moved out of its cell.
 _INSIDE = 1e-6
 
 
 def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_SCANS) -> PointMap:
-    """Thin the returns of a session to one point for each occupied cell of its odom frame, and choose keyframes.
+    """Build the map of a session, one point per occupied voxel of its odom frame, and choose keyframes.
 
-    A map point is the mean of the returns of its cell, weighed by the inverse square of their range: what was seen from
-    near is known best, and odometry has drifted least since. Points are ordered by 2 m columns and then by cell, which
-    is the order `cdpipe.core.grid_index.GridIndex` wants; the order does not depend on `batch_scans`.
+    A map point is the mean of the returns in its voxel, weighted by the inverse square of their range, because near
+    returns have the smallest error. Points are ordered by 2 m columns and then by voxel, as `GridIndex` needs. The
+    order does not depend on `batch_scans`.
 
     Args:
-        source: The session, read once from front to back.
-        config: Cell size, longest range, path between keyframes.
+        source: The session, read once in order.
+        config: Voxel size, longest range, keyframe spacing.
         batch_scans: Scans held in memory at a time.
 
     Raises:
-        InputError: A pose lies too far out for cells of this size, or no return is within range.
+        InputError: A position is too large for this voxel size, or no return is within range.
     """
     _require_reachable(source, config)
     keyframe_scans = choose_keyframes(source.odom_T_sensor, config.keyframe_spacing_m)
@@ -46,18 +46,18 @@ def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_S
 
 
 def choose_keyframes(odom_T_sensor: Float64Array, spacing_m: float) -> Int64Array:
-    """Return the (K,) scans at which each further `spacing_m` of path is complete, the first scan included."""
+    """Return the (K,) indices of the scans that are keyframes: the first, and one per `spacing_m` of path."""
     travelled = travelled_m(odom_T_sensor)
     chosen = [0]
     for index, path_m in enumerate(travelled):
-        # a millionth of slack: paths add up from rounded steps
+        # a relative slack of 1e-6 for the rounding of summed steps
         if path_m - travelled[chosen[-1]] >= spacing_m * (1 - 1e-6):
             chosen.append(index)
     return np.array(chosen, dtype=np.int64)
 
 
 class _MapAccumulator:
-    """Sums of the returns per cell, batch by batch, and what the keyframes saw."""
+    """Weighted sums of the returns per voxel, batch by batch, and the range images of the keyframes."""
 
     def __init__(self, config: MapConfig, keyframe_scans: frozenset[int]) -> None:
         self._config = config
@@ -89,7 +89,7 @@ class _MapAccumulator:
         ids = self._cells.add(cell_keys(points, self._config.voxel_m))
         self._return_cells.append(ids.astype(np.int32))
         in_cells = points / self._config.voxel_m
-        # the difference from a border just above rounds to a whole cell
+        # just below a border the fraction rounds to 1
         places = np.minimum((in_cells - np.floor(in_cells)) * PLACES, PLACES - 1)
         self._return_offsets.append(places.astype(np.uint8))
         n_cells, squared_m2 = len(self._cells), np.concatenate(ranges_m2)
@@ -130,7 +130,7 @@ class _MapAccumulator:
 
 
 def _clip_to_cells(points: Float64Array, keys: Int64Array, voxel_m: float) -> Float64Array:
-    """Return the means (N, 3) of the returns of cells; rounding may carry one on a border into the next cell."""
+    """Return the (N, 3) means, each clipped to its own cell: rounding can move a mean over the border."""
     tipped = np.flatnonzero(cell_keys(points, voxel_m) != keys)
     low = cell_corners(keys[tipped], voxel_m)
     points[tipped] = np.clip(points[tipped], low + _INSIDE * voxel_m, low + (1 - _INSIDE) * voxel_m)

@@ -1,4 +1,4 @@
-"""KISS-ICP on a session's own revolutions: where the sensor was, from nothing but what it saw."""
+"""KISS-ICP odometry (arXiv 2209.15397) from the revolutions of a session."""
 
 # ruff: noqa: PLC0415 - KISS-ICP is an extra, and everybody else must be able to import this
 
@@ -17,9 +17,7 @@ from cdpipe.core.geometry import Float64Array, invert, travelled_m
 from cdpipe.core.motion import Motion, make_motion, rotation_matrices
 from cdpipe.sensor.ouster import SensorMetadata
 
-# KISS-ICP's own defaults are made for streets: a map of 1 m voxels, a hundredth of the range. In drifts 4 to 9 m wide
-# that left the largest errors of the settings tried (0.3, 0.5, 1 m); 0.3 m was no better than 0.5 m at three times the
-# work. Farther than 50 m a ring of the sensor meets the wall at grazing incidence, if at all.
+# Smaller than KISS-ICP's defaults, which are for streets: a drift is 4 to 9 m wide.
 _VOXEL_M = 0.5
 _MAX_RANGE_M = 50.0
 _POINTS_PER_VOXEL = 20
@@ -30,7 +28,7 @@ _CONVERGED = 1e-4
 
 
 def require_kiss_icp(asked_by: str) -> None:
-    """Raise `InputError` with the way out where KISS-ICP is not installed; `asked_by` is the setting that wants it."""
+    """Raise `InputError` unless KISS-ICP is installed; `asked_by` names the setting that needs it."""
     if importlib.util.find_spec("kiss_icp") is None:
         raise InputError(f"{asked_by} needs a package more: pip install 'tunnelcd[odometry]'")
 
@@ -42,18 +40,17 @@ def estimate_motion(
     column_s: Float64Array,
     odom_T_first: Float64Array,
 ) -> Motion:
-    """Return the movement that KISS-ICP finds in a session's own revolutions, a sample at each middle column.
+    """Return the motion that KISS-ICP estimates, with one sample at the middle column of each revolution.
 
-    Each revolution is deskewed to its middle column first, with the speed from its two predecessors. KISS-ICP's own
-    deskewing is off: it takes revolutions to follow each other without a gap, and recorded ones do not. A single
-    revolution stands still.
+    Each revolution is first deskewed to its middle column at the velocity of the preceding step. KISS-ICP's own
+    deskewing is off, because it assumes revolutions without gaps. A single revolution gives a motion at rest.
 
     Args:
-        range_images: Per revolution the staggered ranges (H, W), millimetres, 0 for a miss.
-        sensor: Its beam table.
+        range_images: For each revolution the staggered ranges (H, W), millimetres, 0 for a miss.
+        sensor: Beam table.
         revolution_s: (S,) time of each middle column.
         column_s: (W,) time of each column after the middle one.
-        odom_T_first: (4, 4) pose of the first revolution; KISS-ICP's own frame starts there.
+        odom_T_first: (4, 4) pose of the first revolution, the origin of KISS-ICP's frame.
 
     Raises:
         InputError: A pose is not finite.
@@ -84,12 +81,12 @@ def estimate_motion(
 def deskew_at_constant_velocity(
     points: Float64Array, velocity_mps: Float64Array, turn_rad_s: Float64Array, column_s: Float64Array
 ) -> Float64Array:
-    """Return points (H, W, 3), each column in its own frame, in the frame of the middle column.
+    """Return the (H, W, 3) points of a revolution, each column in its own frame, in the frame of the middle column.
 
     Args:
-        points: Points of one revolution.
-        velocity_mps: (3,) speed in the sensor frame, m/s.
-        turn_rad_s: (3,) turning as a rotation vector, rad/s.
+        points: (H, W, 3) points, metres.
+        velocity_mps: (3,) velocity, sensor frame, m/s.
+        turn_rad_s: (3,) angular velocity as a rotation vector, rad/s.
         column_s: (W,) time of each column after the middle one.
     """
     matrices = rotation_matrices(Rotation.from_rotvec(column_s[:, None] * turn_rad_s).as_quat())
@@ -98,7 +95,7 @@ def deskew_at_constant_velocity(
 
 
 def _kiss_icp() -> Any:
-    """Return KISS-ICP with every setting stated, so that no environment variable of its own changes a session."""
+    """Return KISS-ICP with every setting explicit, so that its environment variables have no effect."""
     from kiss_icp.config import KISSConfig
     from kiss_icp.config.config import AdaptiveThresholdConfig, DataConfig, MappingConfig, RegistrationConfig
     from kiss_icp.kiss_icp import KissICP
@@ -110,7 +107,7 @@ def _kiss_icp() -> Any:
             registration=RegistrationConfig(
                 max_num_iterations=_MAX_ITERATIONS,
                 convergence_criterion=_CONVERGED,
-                max_num_threads=1,  # sums in one order: the same bytes each time
+                max_num_threads=1,  # deterministic summation order
             ),
             adaptive_threshold=AdaptiveThresholdConfig(
                 fixed_threshold=None, initial_threshold=_FIRST_THRESHOLD_M, min_motion_th=_LEAST_MOTION_M

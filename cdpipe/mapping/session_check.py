@@ -1,7 +1,7 @@
-"""What can be wrong with a whole session: no path, a unit that is not the metre, an axis up that is not z.
+"""Checks of a session before it is mapped: path, unit, up axis.
 
-Five scans are looked at before any time is spent. What is impossible in metres in any tunnel is refused here. Feet are
-not impossible; where two sessions then cannot be merged, `unit_hint` says that one looks as if it were in feet.
+Five scans are read. Lengths that no tunnel has in metres are refused. A session in feet passes; if the merge then
+fails, `unit_hint` compares the sizes of the two sessions.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from cdpipe.model.types import PointMap, ScanSource
 
 UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "kilometres": 1000.0}
 _SAMPLED_SCANS = 5
-# The median return of a scan: sensors see nothing nearer, and half of the returns of a tunnel are never farther.
+# Possible and usual median range of a scan, metres.
 _NEAREST_M, _FARTHEST_M = 0.25, 60.0
 _USUAL_M = (0.5, 20.0)
-# Steps between neighbouring scans.
+# Usual distance between neighbouring scans, metres.
 _USUAL_STEP_M = (0.005, 2.0)
-# Mean squares of the directions of a spinning sensor's returns: small along its axis, large across.
+# Eigenvalues of the mean outer product of ray directions: one below _FLAT and two above _ROUND give the spin axis.
 _FLAT, _ROUND = 0.12, 0.25
 _MIN_RETURNS = 100
 _MAX_TILT_DEG = 45.0
-# Median returns of two sessions of one tunnel, one over the other at most.
+# Largest ratio of the median ranges of two sessions of one tunnel.
 _SAME_TUNNEL = 1.4
-# How near a ratio of lengths is to that of two units.
+# Tolerance factor of a ratio of lengths against a ratio of units.
 _SAME_SIZE = 1.2
 
 
@@ -36,12 +36,12 @@ def check_session(source: ScanSource, config: MapConfig, other: ScanSource | Non
 
     Args:
         source: The session; five of its scans are read.
-        config: Path between keyframes.
-        other: A session of the same tunnel: beside it the unit of this one is easier to tell.
+        config: Keyframe spacing.
+        other: Another session of the same tunnel, which narrows down the unit.
 
     Raises:
-        InputError: Poses are not finite; there is one scan, or no path; points or trajectory are not in metres; z is
-            not up. The text says how to mend it.
+        InputError: A pose is not finite; there is one scan or no path; points or trajectory are not in metres; z is
+            not up.
     """
     poses = source.odom_T_sensor
     try:
@@ -63,14 +63,14 @@ def check_session(source: ScanSource, config: MapConfig, other: ScanSource | Non
 
 
 def is_same_session(before: ScanSource, after: ScanSource) -> bool:
-    """Tell whether both are one recording, perhaps copied: the same poses and the same first scan."""
+    """Return whether both sessions have the same poses and the same first scan."""
     return np.array_equal(before.odom_T_sensor, after.odom_T_sensor) and np.array_equal(
         before.scan(0).points_sensor, after.scan(0).points_sensor
     )
 
 
 def unit_hint(before: PointMap, after: PointMap) -> str:
-    """Return what to try where one tunnel is as much larger than the other as a foot is smaller than a metre, or ""."""
+    """Return advice if the sizes of two maps differ by the ratio of a unit to the metre, else ""."""
     before_m, after_m = _median_return_m(before), _median_return_m(after)
     for name, small_m, large_m in (("after", before_m, after_m), ("before", after_m, before_m)):
         for unit, factor in UNITS.items():
@@ -126,7 +126,7 @@ def _require_path(source: ScanSource, spacing_m: float) -> None:
 
 
 def _likely(what: str, length: float, usual_m: tuple[float, float]) -> str:
-    """Say which units would make a length a usual one, and what to scale by."""
+    """Return text that names the units that make a length usual, and their scale factors."""
     units = [unit for unit, factor in UNITS.items() if usual_m[0] <= factor * length <= usual_m[1]]
     verb = "look" if what.endswith("s") else "looks"
     if not units:
@@ -162,7 +162,7 @@ def _require_up(source: ScanSource, directions: Float64Array, spacing_m: float) 
 
 
 def _median_return_m(point_map: PointMap) -> float:
-    """Return the median distance of mapped returns from where they were seen, over some scans."""
+    """Return the median range of mapped returns over five scans, metres."""
     found = [np.zeros(0)]
     for scan in _sampled(len(point_map.odom_T_sensor)):
         returns: Int64Array = np.arange(point_map.scan_offsets[scan], point_map.scan_offsets[scan + 1])

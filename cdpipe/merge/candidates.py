@@ -1,9 +1,9 @@
-"""Which places of two sessions may be the same: FRAME's closest descriptor pairs, and how many others agree with each.
+"""Merge hypotheses from descriptor correspondences: FRAME's closest pair, or a vote among many pairs.
 
-FRAME (arXiv 2301.09213) takes the closest pair of all. In a mine of equal drifts that one is often wrong, and so are
-most pairs; but right ones agree with one another, because the motion between the sessions is one and the same. So every
-pair votes for every other: they must be as far apart in one session as in the other, in the direction that the yaw of
-the pair says, and have about the same yaw.
+FRAME (arXiv 2301.09213) uses only the pair of keyframes with the smallest descriptor distance. In a mine of similar
+drifts most pairs are wrong, the closest one included. Correct pairs imply the same motion between the sessions, so
+every pair votes for every other. Two pairs agree if their keyframes are equally far apart in both sessions, in the
+direction that the yaw of the pair predicts, and if their yaws agree.
 """
 
 from __future__ import annotations
@@ -20,31 +20,31 @@ from cdpipe.merge.registration import motion_between
 from cdpipe.model.config import MergeConfig
 from cdpipe.model.types import DescriptorSet, MappedSession
 
-# After keyframes that are paired at most, before keyframes and yaws for each. Every pair is held against every other.
+# At most this many after keyframes are queried; neighbours and yaws for each. The vote is quadratic in the pairs.
 _MAX_QUERIES = 100
 _NEAREST = 2
 _N_YAWS = 2
-# Without orientation vectors: GICP recovers from about 60 degrees, so quarter turns cover the circle.
+# Yaws to try without orientation vectors: GICP converges from about 60 degrees, so quarter turns cover the circle.
 _BLIND_YAWS_RAD = np.array([0.0, np.pi, np.pi / 2, -np.pi / 2])
-# Keyframes of one place may be a metre or two apart; drift adds with the distance.
+# Tolerance of the distance between two pairs: keyframes of one place are up to 2 m apart; drift grows with distance.
 _APART_M = 2.0
 _APART_SHARE = 0.02
 _YAW_RAD = np.deg2rad(20.0)
-# Motions nearer than this end in the same registration.
+# Motions closer than this converge to the same registration.
 _SAME_M = 3.0
-# Votes count less from farther away, where drift has bent the way between.
+# Decay length of a vote: drift bends the path between distant pairs.
 _VOTE_REACH_M = 40.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A before and an after keyframe that may be the same place.
+    """A merge hypothesis: a before and an after keyframe that may be the same place.
 
     Attributes:
         before_keyframe: Index of the before keyframe.
         after_keyframe: Index of the after keyframe.
-        descriptor_distance: Between their place vectors.
-        before_T_after: (4, 4) where the after odom frame lies if they are.
+        descriptor_distance: Euclidean distance of their place vectors.
+        before_T_after: (4, 4) initial guess of the alignment, after odom to before odom.
     """
 
     before_keyframe: int
@@ -54,7 +54,7 @@ class Candidate:
 
 
 def find_closest_pair(before: MappedSession, after: MappedSession) -> list[Candidate]:
-    """Return the closest of all descriptor pairs, FRAME's only candidate; empty where a session has no descriptor."""
+    """Return FRAME's only candidate, the closest of all descriptor pairs; empty if a session has no descriptor."""
     pairs = _match_descriptors(before.descriptors, after.descriptors, len(after.descriptors.q), nearest=1, n_yaws=1)
     if len(pairs.i) == 0:
         return []
@@ -66,10 +66,10 @@ def find_closest_pair(before: MappedSession, after: MappedSession) -> list[Candi
 
 
 def find_candidates(before: MappedSession, after: MappedSession, config: MergeConfig) -> list[Candidate]:
-    """Return up to `n_candidates` pairs, the one with most votes first; each stands for another motion.
+    """Return up to `n_candidates` pairs in falling order of votes, each with a different motion.
 
-    The guess of each is the motion that fits the pairs that agree with it. A pair that agrees with a chosen one, or
-    whose motion is the same, would repeat its trial and is left out.
+    The initial guess of a pair is the motion that best fits all pairs that agree with it. Pairs that agree with a
+    chosen pair, or have the same motion, are left out.
     """
     pairs = _match_descriptors(before.descriptors, after.descriptors, _MAX_QUERIES, _NEAREST, _N_YAWS)
     before_poses, after_poses = _poses(before)[pairs.i], _poses(after)[pairs.j]
@@ -92,7 +92,7 @@ def find_candidates(before: MappedSession, after: MappedSession, config: MergeCo
 def count_votes(
     before_poses: Float64Array, after_poses: Float64Array, yaws_rad: Float64Array
 ) -> tuple[BoolArray, Float64Array]:
-    """Return which of P pairs agree, (P, P), and the votes each gets, (P,); every pair agrees with itself.
+    """Return the agreement of P pairs, (P, P), and the votes of each, (P,); every pair agrees with itself.
 
     Args:
         before_poses: (P, 4, 4) before keyframe of each pair, its session's odom frame.
@@ -103,17 +103,17 @@ def count_votes(
     before_xy, after_xy = before_poses[:, :2, 3], after_poses[:, :2, 3]
     before_m, after_m = cdist(before_xy, before_xy), cdist(after_xy, after_xy)
     cosines, sines = np.cos(turns_rad), np.sin(turns_rad)
-    # the angle between two turns, by its cosine
+    # compare the cosine of the angle between two rotations
     directions = np.column_stack([cosines, sines])
     is_same_turn = directions @ directions.T > np.cos(_YAW_RAD)
-    # few turn alike and are as far apart in both sessions; only those are looked at further
+    # few pairs pass both tests; only these are tested by direction
     before_m -= after_m
     is_as_far = np.abs(before_m, out=before_m) < _APART_M + _APART_SHARE * after_m
     one, other = np.divmod(np.flatnonzero(is_same_turn & is_as_far), len(turns_rad))
     apart_m = after_m[one, other]
     before_x, before_y = (before_xy[other] - before_xy[one]).T
     after_x, after_y = (after_xy[other] - after_xy[one]).T
-    # where the after shift leads if it is turned as the pair says
+    # difference between the before offset and the after offset rotated by the pair's yaw
     miss_x = before_x - (cosines[one] * after_x - sines[one] * after_y)
     miss_y = before_y - (sines[one] * after_x + cosines[one] * after_y)
     tolerance_m = _APART_M + (_APART_SHARE + np.sin(_YAW_RAD)) * apart_m
@@ -132,7 +132,7 @@ def _is_same(one: Float64Array, other: Float64Array, position: Float64Array) -> 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pairs:
-    """P pairs: before keyframes i, after keyframes j, distances of their q, yaws of j in i."""
+    """P descriptor correspondences: before keyframe i, after keyframe j, distance of q, yaw of j in i, (P,) each."""
 
     i: Int64Array
     j: Int64Array
@@ -156,7 +156,7 @@ def _match_descriptors(
     else:
         yaws_rad = relative_yaws_rad(before.w[i], after.w[j], n_yaws)
         is_blind = np.isnan(yaws_rad).all(axis=1)
-        if is_blind.all():  # vectors without a peak say nothing
+        if is_blind.all():  # no orientation vector has a peak
             yaws_rad = np.repeat(_BLIND_YAWS_RAD[None], len(i), axis=0)
     which = np.repeat(np.arange(len(i)), yaws_rad.shape[1])
     is_there = ~np.isnan(yaws_rad.ravel())
@@ -167,9 +167,9 @@ def _match_descriptors(
 def _fit_common_motion(
     before_poses: Float64Array, after_poses: Float64Array, yaws_rad: Float64Array, agrees: BoolArray, pair: int
 ) -> Float64Array:
-    """Return before_T_after that fits a pair and those that agree with it, the near ones most: a turn about z, a shift.
+    """Return the (4, 4) before_T_after, yaw and translation, that best fits a pair and the pairs that agree with it.
 
-    The turn is the mean of what the yaws say and of what the directions between the places say.
+    Near pairs weigh more. The yaw is the weighted mean of the pairs' yaws and of the directions between their places.
     """
     before_xyz, after_xyz = before_poses[agrees, :3, 3], after_poses[agrees, :3, 3]
     weights = np.exp(-np.linalg.norm(after_xyz - after_poses[pair, :3, 3], axis=1) / _VOTE_REACH_M)
@@ -178,7 +178,7 @@ def _fit_common_motion(
     before_shift, after_shift = before_xyz - before_centre, after_xyz - after_centre
     directions = (after_shift[:, 0] - 1j * after_shift[:, 1]) * (before_shift[:, 0] + 1j * before_shift[:, 1])
     turns_rad = _turns_rad(before_poses[agrees], after_poses[agrees], yaws_rad[agrees])
-    # a place is known to 1 m or so, a yaw to 5 degrees
+    # standard deviations: 1 m of a place, 5 degrees of a yaw
     evidence = weights @ directions / 1.0**2 + weights @ np.exp(1j * turns_rad) / np.deg2rad(5.0) ** 2
     turn = yaw_pose(float(np.angle(evidence)))
     turn[:3, 3] = before_centre - turn[:3, :3] @ after_centre
@@ -191,13 +191,13 @@ def _poses(session: MappedSession) -> Float64Array:
 
 
 def _turns_rad(before_poses: Float64Array, after_poses: Float64Array, yaws_rad: Float64Array) -> Float64Array:
-    """Return (P,) by how much the after odom frame is turned about z in the before odom frame, as each pair says.
+    """Return the (P,) yaw of the after odom frame in the before odom frame that each pair implies.
 
-    Not yaw plus headings: a sensor that hangs upside down sees yaw with the other sign.
+    It is not the sum of yaw and headings: an upside-down sensor measures yaw with the opposite sign.
     """
     cosines, sines = np.cos(yaws_rad), np.sin(yaws_rad)
     x, y, z = np.moveaxis(before_poses[:, :3, :3], 2, 0)
     yawed = np.stack([cosines[:, None] * x + sines[:, None] * y, cosines[:, None] * y - sines[:, None] * x, z], axis=2)
     turns = yawed @ after_poses[:, :3, :3].transpose(0, 2, 1)
-    # the turn about z that is nearest to the whole
+    # the rotation about z that is nearest to the full rotation
     return np.asarray(np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1]))

@@ -1,7 +1,8 @@
-"""What speaks for an alignment of two maps, and which of it must be how good.
+"""The evidence for an alignment of two maps, and the acceptance gates.
 
-Points of one map are held against the *surface* of the other: the distance along the normal of the nearest point. In a
-straight drift the nearest point is near wherever one stands; the surface, rough by decimetres, is not.
+The fit is measured by point-to-plane distances: a point of one map against the plane of the nearest point of the other.
+In a straight drift the distance to the nearest point is small at any shift along the axis. The point-to-plane distance
+is not, because the wall has relief of decimetres.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from cdpipe.core.geometry import Float64Array, invert, transform
 from cdpipe.merge.registration import IndexedMap, plane_jacobian
 from cdpipe.model.config import MergeConfig
 
-# What is measured, and the setting of `merge` that it must reach.
+# Name of the evidence, and the setting of `merge` that is its lower limit.
 GATES = (
     ("overlap", "min_overlap"),
     ("inlier_share", "min_inlier_share"),
@@ -25,20 +26,21 @@ GATES = (
     ("agreement", "min_agreement"),
     ("distinctness", "min_distinctness"),
 )
-# Points of a sphere that are looked at, and how near a counterpart must be for its normal to mean anything.
+# Points sampled from a sphere, and the longest correspondence.
 _SAMPLES = 300
 _COUNTERPART_M = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceFit:
-    """How two maps fit around one place.
+    """The fit of two maps in a sphere around one place.
 
     Attributes:
-        forward_m: (N,) distances of some after points to the before surface, inf where there is none within 0.5 m.
-        backward_m: (M,) the same of before points to the after surface.
-        information: (6, 6) Hessian of the forward distances: turn, then shift, in after odom axes about the place.
-            Where all normals are square to one direction its shift is not held: the maps can slide.
+        forward_m: (N,) point-to-plane distances of after points to the before map, metres; inf if the nearest point
+            is over 0.5 m away.
+        backward_m: (M,) the same for before points to the after map.
+        information: (6, 6) Hessian of the forward distances: rotation, then translation, after odom axes about the
+            place. If all normals are orthogonal to one direction, the translation along it is unconstrained.
     """
 
     forward_m: Float64Array
@@ -46,12 +48,12 @@ class SurfaceFit:
     information: Float64Array
 
     def inlier_share(self, inlier_m: float) -> float:
-        """Return the share of points nearer than `inlier_m` to the other surface, the lower of both directions."""
+        """Return the share of points within `inlier_m` of the other surface, the smaller of both directions."""
         return min(float(np.mean(d < inlier_m)) if len(d) else 0.0 for d in (self.forward_m, self.backward_m))
 
     @property
     def residual_m(self) -> float:
-        """Median distance, both directions together; NaN where there is none."""
+        """Median distance of both directions together, metres; NaN without correspondences."""
         median_m = float(np.median(np.concatenate([self.forward_m, self.backward_m])))
         return median_m if np.isfinite(median_m) else float("nan")
 
@@ -64,17 +66,17 @@ def measure_fit(
     centre_after: Float64Array,
     radius_m: float,
 ) -> SurfaceFit:
-    """Hold some points of each map around a place against the surface of the other.
+    """Measure the point-to-plane distances of both maps around one place.
 
-    Normals are the before map's both ways: the robot that mapped first had the time.
+    Both directions use the normals of the before map, which are estimated while the first session is mapped.
 
     Args:
-        before: The before map, a target.
+        before: The before map, indexed as a target.
         after: The after map.
-        before_T_after: (4, 4) the alignment that is judged.
+        before_T_after: (4, 4) the alignment to judge.
         own: (N, 3) `sample_evenly` after points of the place, after odom frame.
         centre_after: (3,) the place, after odom frame.
-        radius_m: How far around it the before points are taken.
+        radius_m: Radius of the sphere of before points, metres.
     """
     fine = before.target
     moved = transform(before_T_after, own)
@@ -95,15 +97,15 @@ def measure_fit(
 
 
 def sample_evenly(of_map: npt.NDArray[Any], n: int = _SAMPLES) -> npt.NDArray[Any]:
-    """Return about n of some points of a map; they are ordered by place, so that every k-th covers it evenly."""
+    """Return every k-th of the points of a map, about n; map points are ordered by place, so this is even coverage."""
     return of_map[:: max(1, len(of_map) // n)]
 
 
 def explain_refusal(evidence: Mapping[str, float], config: MergeConfig) -> str:
-    """Return in plain words which acceptance test fails and what would help, or ""."""
+    """Return the first gate that fails and what the user can do about it, or "" if all pass."""
     for name, setting in GATES:
         value, least = evidence.get(name, np.nan), getattr(config, setting)
-        # written so that NaN, what could not be measured, is refused as well
+        # this form also refuses NaN, a value that could not be measured
         if not value >= least:
             is_share = name not in ("hessian_ratio", "distinctness")
             said, asked = (f"{value:.0%}", f"{least:.0%}") if is_share else (f"{value:.4g}", f"{least:g}")

@@ -1,9 +1,9 @@
-"""KISS-Matcher (Lim et al., ICRA 2025, arXiv 2409.15615), an extra: two clouds into one frame without a first guess.
+"""Global registration by KISS-Matcher (Lim et al., ICRA 2025, arXiv 2409.15615), an extra: no initial guess.
 
-The library turns every normal towards the origin of its cloud before it describes the neighbourhood by angles between
-normals. In a tunnel two sessions that share a part of the way have their origins elsewhere, so the same wall gets
-opposite normals, and of two maps of a narrow drift that share 45 % no voxel size found the pose. Seen from far below,
-normals depend on the wall alone: with that origin every such pair was found. It asks that both maps be levelled.
+The library orients every normal towards the origin of its cloud, and its features are angles between normals. The
+origins of two sessions of one tunnel differ, so the same wall gets opposite normals in the two maps. This module
+therefore moves the origin 500 m below the cloud, where the orientation depends on the wall alone. Both maps must be
+level (z up).
 """
 
 # ruff: noqa: PLC0415 - KISS-Matcher is an extra, and everybody else must be able to import this
@@ -29,12 +29,12 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, make_pose, require_shape
 from cdpipe.core.voxel import max_coordinate_m
 
-# Far against any mine, near enough for the library's float32: 0.03 mm.
+# Far compared with any mine; the rounding of the library's float32 is 0.03 mm there.
 _VIEWPOINT_M = np.array([0.0, 0.0, -500.0])
-# The library's own advice for large maps, which it otherwise prints.
+# The bound that the library recommends for large maps.
 _MAX_NOISE_BOUND_M = 1.0
-# It reads memory that is not its own where no point has a normal. A point has one if three lie within three voxels;
-# these neighbours of one point are neighbours of each other, and two more than needed.
+# The library reads invalid memory if no point has a normal. A point has a normal if three points lie within three
+# voxels. Five points within 1.5 voxels guarantee that.
 _NEIGHBOURS = 5
 _NEIGHBOURHOOD_VOXELS = 1.5
 _N_PROBED = 1000
@@ -43,13 +43,12 @@ _MIN_INLIERS = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoarsePose:
-    """What KISS-Matcher found, right or wrong.
+    """The unverified result of KISS-Matcher.
 
     Attributes:
         before_T_after: (4, 4) pose of the after cloud in the before cloud's frame.
-        n_inliers: Correspondences that agree with the pose: on validation pairs at voxels that found them all, 21 and
-            more; wrong poses had up to 10.
-        n_correspondences: Pairs of points with like surroundings that it was found among.
+        n_inliers: Correspondences that agree with the pose.
+        n_correspondences: Feature correspondences before outlier rejection.
     """
 
     before_T_after: Float64Array
@@ -58,29 +57,26 @@ class CoarsePose:
 
 
 def is_kiss_matcher_installed() -> bool:
-    """Return whether the extra `kiss` is there."""
+    """Return whether the extra `kiss` is installed."""
     return importlib.util.find_spec("kiss_matcher") is not None
 
 
 def require_kiss_matcher(asked_by: str) -> None:
-    """Raise `InputError` with the way out where KISS-Matcher is missing; `asked_by` is the setting that wants it."""
+    """Raise `InputError` unless KISS-Matcher is installed; `asked_by` names the setting that needs it."""
     if not is_kiss_matcher_installed():
         raise InputError(f"{asked_by} needs a package more: pip install 'tunnelcd[kiss]'")
 
 
 def register_globally(before_points: Float64Array, after_points: Float64Array, voxel_m: float) -> CoarsePose | None:
-    """Find how two clouds fit together, wherever they lie and however they are turned about the vertical.
-
-    The same clouds give the same bits.
+    """Register two level clouds without an initial guess; deterministic.
 
     Args:
         before_points: (N, 3) points, metres, z up.
         after_points: (M, 3) points, metres, z up.
-        voxel_m: Thinning of both clouds; normals are taken over 3, features over 5 voxels.
+        voxel_m: Voxel size of both clouds; normals use a radius of 3 voxels, features of 5.
 
     Returns:
-        None where there is no pose: fewer than three correspondences agree, or a cloud has no surfaces at the scale of
-        the voxel (it is empty, has a few points, or scattered ones).
+        None if fewer than three correspondences agree, or if a cloud is too sparse for normals at this voxel size.
 
     Raises:
         InputError: The extra `kiss` is not installed.
@@ -109,7 +105,7 @@ def register_globally(before_points: Float64Array, after_points: Float64Array, v
 
 
 def _prepare(name: str, points: Float64Array, voxel_m: float) -> tuple[Float64Array, Float64Array]:
-    """Return a cloud thinned and about its centre, and where the viewpoint stands in the cloud's own frame."""
+    """Return a cloud, thinned and relative to its centre, and the (3,) viewpoint in the cloud's own frame."""
     require_shape(name, points, (None, 3))
     if len(points) == 0:
         return points, np.zeros(3)
@@ -140,7 +136,7 @@ def _settings(library: Any, voxel_m: float) -> Any:
 
 @cache
 def _library() -> Any:
-    """Import KISS-Matcher and let TBB start with one thread: several write bits of one byte, and every run differs."""
+    """Import KISS-Matcher and start TBB with one thread: several threads race on shared bytes, and results differ."""
     with _one_processor():
         import kiss_matcher
 
@@ -153,7 +149,7 @@ def _library() -> Any:
 
 @contextmanager
 def _one_processor() -> Iterator[None]:
-    """Leave the main thread one processor: TBB counts its processors at the first use and never again."""
+    """Restrict the main thread to one processor: TBB counts processors only at its first use."""
     if not hasattr(os, "sched_setaffinity"):
         yield
         return
@@ -168,7 +164,7 @@ def _one_processor() -> Iterator[None]:
 
 @contextmanager
 def _one_openmp_thread() -> Iterator[None]:
-    """Hold OpenMP, which may be shared with small_gicp, to one thread where KISS-Matcher's is within reach."""
+    """Limit KISS-Matcher's OpenMP, which small_gicp may share, to one thread if its library exports the setting."""
     openmp = ctypes.CDLL(sys.modules["_kiss_matcher"].__file__)
     if not hasattr(openmp, "omp_set_num_threads"):
         yield

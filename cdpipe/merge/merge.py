@@ -1,11 +1,10 @@
-"""Putting both maps into one frame, with evidence, or refusing to.
+"""Map merging: align both maps with evidence, or refuse.
 
-After FRAME (Stathoulopoulos et al., arXiv 2301.09213), re-implemented from its text: place vectors give pairs of
-places, orientation vectors the yaw between them, and the spheres around a pair are registered. Ours, because FRAME has
-none of it: several candidates that vote for one another (cdpipe/merge/candidates.py), maps indexed once
-(cdpipe/merge/registration.py), a walk along the whole path (cdpipe/merge/walk.py) whose evidence decides
-(cdpipe/merge/evidence.py), a second method where nothing was accepted (cdpipe/merge/global_registration.py), and an
-alignment that follows maps which bend apart (cdpipe/merge/refine.py).
+The method follows FRAME (Stathoulopoulos et al., arXiv 2301.09213), re-implemented from its text: place vectors give
+correspondences of keyframes, orientation vectors give the yaw between them, and the spheres around a pair are
+registered. FRAME has no acceptance test. These parts are ours: a vote among candidates (`candidates`), maps that are
+indexed once (`registration`), a walk along the path (`walk`) that measures the evidence (`evidence`), a global
+registration as fallback (`global_registration`), and a local refinement (`refine`, `pose_graph`).
 """
 
 from __future__ import annotations
@@ -35,30 +34,30 @@ from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import MergeConfig
 from cdpipe.model.types import MappedSession, MergedMaps
 
-# Spheres along the path on which an alignment is judged, and their radius: walls 5 m away must be inside.
+# Number of spheres along the path that measure the evidence, and their radius: walls 5 m away must be inside.
 _CHECKS = 8
 _CHECK_RADIUS_M = 8.0
 _TOO_FEW = "no pair of similar places had enough points to be registered"
-# A hypothesis is ranked where it is only coarsely registered.
+# Coarse registration that ranks the candidates.
 _RANK_INLIER_M = 0.2
 _RANK_STEPS = 10
 _RANK_SAMPLES = 150
-# A start that fits its place this well, against the best one, is followed too.
+# After an acceptance, a start is still tested if its inlier share is at least this share of the best one's.
 _RIVAL_SHARE = 0.95
 _OTHER_MOTION_M = 1.0
-# What distinctness says where nothing else fits.
+# Distinctness without a rival.
 _DISTINCT = 10.0
-# Fewer places than this, the start left out, are no evidence of a path; worse fits than that do not shape the answer.
+# Fewest places besides the start that make evidence; lowest fit of a place that contributes to the alignment.
 _MIN_PLACES, _GOOD_FIT = 3, 0.7
-# Cosine of 15 degrees, the most that an answer may tip the after map.
+# Cosine of 15 degrees, the largest tilt between the two maps.
 _UPRIGHT = 0.966
-# Longest correspondences while walking: what may have drifted since the last stop, less than a narrow drift is wide.
+# Longest correspondences of the walk, metres: above the drift between two stops, below the width of a narrow drift.
 _FIRST_TRY_M, _CHECK_REACH_M = 1.0, 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Hypothesis:
-    """An alignment found at one place, and what was measured of it along the path."""
+    """An alignment, its walk along the path, and the evidence."""
 
     before_T_after: Float64Array
     walk: Walk
@@ -66,16 +65,16 @@ class _Hypothesis:
 
 
 def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig) -> MergedMaps:
-    """Align the after session with the before session from their descriptors and maps alone.
+    """Align the after session with the before session from their descriptors and maps.
 
-    Evidence: `overlap` (share of the shorter path that lies beside the other), `inlier_share` and `residual_m` (share
-    of points within `inlier_m` of the other map's surface, and their median distance, around the pair),
-    `hessian_ratio` (of a shift, along the whole path), `agreement` (mean share of inliers along the path),
-    `distinctness` (residual of the best other alignment that passes, against this one's; 10 where there is none),
-    `descriptor_distance` of the pair, `n_hypotheses` judged along the path, `is_fallback`.
+    Evidence: `overlap` (share of the shorter path within 5 m of the other), `inlier_share` and `residual_m` (share of
+    points within `inlier_m` of the other surface, and median distance, around the start), `hessian_ratio` (smallest to
+    largest eigenvalue of the translation's Hessian, whole path), `agreement` (mean inlier share along the path),
+    `distinctness` (residual of the best rival alignment divided by this one's; 10 without a rival),
+    `descriptor_distance`, `n_hypotheses` walked, `is_fallback`.
 
     Returns:
-        The best hypothesis, accepted or not and why; identity where nothing could be registered.
+        The best hypothesis with the reason of a refusal; the identity if nothing could be registered.
     """
     n_near = [np.count_nonzero(session.map.nearest_m <= config.seen_within_m) for session in (before, after)]
     if min(n_near) < MIN_SPHERE_POINTS:
@@ -109,7 +108,7 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
 def _find_hypothesis(
     before: MappedSession, after: MappedSession, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
 ) -> tuple[_Hypothesis | None, int]:
-    """Return the hypothesis that is accepted, or else the best, and how many were followed along the path."""
+    """Return the accepted hypothesis, or else the best one, and the number of hypotheses that were walked."""
     if config.method == "frame":
         return _choose_hypothesis(_start_by_frame(find_closest_pair(before, after), maps, config), maps, config)
     best: _Hypothesis | None = None
@@ -128,7 +127,7 @@ def _find_hypothesis(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Start:
-    """An alignment found around one after keyframe, how well it fits there, and what is known of it so far."""
+    """An alignment found at one after keyframe, its evidence so far, and its inlier share there."""
 
     keyframe: int
     before_T_after: Float64Array
@@ -139,7 +138,7 @@ class _Start:
 def _rank_starts(
     candidates: Iterable[Candidate], maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
 ) -> list[_Start]:
-    """Register every candidate coarsely and return them, the best fit first; too small spheres are left out."""
+    """Register every candidate coarsely; return them by falling inlier share, without those of too few points."""
     before, after = maps
     found = []
     for candidate in candidates:
@@ -166,7 +165,7 @@ def _rank_starts(
 def _start_by_frame(
     candidates: Iterable[Candidate], maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
 ) -> list[_Start]:
-    """FRAME: the spheres around both keyframes of a pair, GICP, then VGICP."""
+    """Register the spheres around both keyframes of a pair by GICP, then VGICP, as FRAME does."""
     before, after = maps
     found = []
     for candidate in candidates:
@@ -180,9 +179,9 @@ def _start_by_frame(
 
 
 def _start_by_kiss_matcher(maps: tuple[IndexedMap, IndexedMap], config: MergeConfig) -> list[_Start]:
-    """KISS-Matcher on the whole maps; its answer is walked from the after keyframe nearest to the before path.
+    """Register the full maps by KISS-Matcher; the start is the after keyframe nearest to the before path.
 
-    Odometry knows what is up: an answer that tips the maps is none.
+    Odometry observes gravity, so a pose that tilts the after map is rejected.
     """
     before, after = maps
     found = register_globally(before.map.points, after.map.points, config.kiss_voxel_m)
@@ -195,10 +194,10 @@ def _start_by_kiss_matcher(maps: tuple[IndexedMap, IndexedMap], config: MergeCon
 def _choose_hypothesis(
     starts: Iterable[_Start], maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
 ) -> tuple[_Hypothesis | None, int]:
-    """Follow one start after the other until one is accepted, and every other that fits its place about as well.
+    """Walk the starts in order until one is accepted, then the remaining starts that fit about as well.
 
-    A tunnel that repeats itself has several alignments that pass all gates. The one with the smallest residual along
-    the path is taken; `distinctness` says how much smaller it is.
+    In a repetitive tunnel several alignments pass all gates. The one with the smallest residual along the path is
+    chosen; `distinctness` is the ratio to the next one.
     """
     judged: list[_Hypothesis] = []
     accepted: list[_Hypothesis] = []
@@ -224,7 +223,7 @@ def _choose_hypothesis(
 def _is_rival(
     start: _Start, accepted: Iterable[_Hypothesis], maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
 ) -> bool:
-    """Tell whether a start is another motion than the accepted ones, and fits its place well enough to be one."""
+    """Return whether a start differs from every accepted motion and passes the inlier gate at its place."""
     after = maps[1]
     centre = after.positions[start.keyframe]
     known = [
@@ -235,7 +234,7 @@ def _is_rival(
     def is_other(pose: Float64Array) -> bool:
         return all(motion_between(pose, other, centre)[0] >= _OTHER_MOTION_M for other in known)
 
-    if not is_other(start.before_T_after):  # most are not, and registering finely takes as long as all the votes
+    if not is_other(start.before_T_after):  # cheap test first: the fine registration is slow
         return False
     pose, fit = _register_start(start, maps, config)
     return is_other(pose) and fit.inlier_share(config.inlier_m) >= config.min_inlier_share
@@ -246,13 +245,13 @@ def _path_residual_m(hypothesis: _Hypothesis) -> float:
 
 
 def _judge(start: _Start, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig) -> _Hypothesis:
-    """Register a start finely and follow it along the path, and again along the shared part where that is short."""
+    """Register a start finely and walk it along the path; walk again over the shared part if that is short."""
     before, after = maps
     pose, fit = _register_start(start, maps, config)
     step = Step(_CHECK_RADIUS_M, config.voxel_m, _CHECK_REACH_M, first_try_m=_FIRST_TRY_M)
 
     def along(keyframes: Int64Array) -> tuple[Walk, Float64Array]:
-        """Return the walk, and the fits of the places asked for but the start, which was chosen for its fit."""
+        """Return the walk, and the fits at the requested keyframes without the start, which was chosen for its fit."""
         walked = walk(before, after, keyframes, int(np.searchsorted(keyframes, start.keyframe)), pose, step, config)
         fits = walked.fits[np.isin(walked.keyframes, keyframes) & (walked.keyframes != start.keyframe)]
         return walked, fits[np.isfinite(fits)]
@@ -280,7 +279,7 @@ def _judge(start: _Start, maps: tuple[IndexedMap, IndexedMap], config: MergeConf
 def _register_start(
     start: _Start, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
 ) -> tuple[Float64Array, SurfaceFit]:
-    """Register a start finely, but FRAME's own answer, and hold it against the surface."""
+    """Register a start finely (FRAME's result is kept as it is) and measure the surface fit."""
     before, after = maps
     centre = after.positions[start.keyframe]
     pose = start.before_T_after
@@ -291,13 +290,13 @@ def _register_start(
 
 
 def _is_shared_keyframe(walked: Walk, before: IndexedMap, after: IndexedMap) -> BoolArray:
-    """Return for each after keyframe whether the before session passed within 5 m of it."""
+    """Return the (K,) mask of the after keyframes within 5 m of the before path."""
     alignment = PathAlignment(after.positions[walked.keyframes], walked.before_T_after)
     return is_shared(before, alignment.to_map(after.positions))
 
 
 def _hessian_ratio(walked: Walk) -> float:
-    """Return the eigenvalue ratio of the shift's Hessian, all places together: one bend holds the whole path."""
+    """Return the eigenvalue ratio of the translation's Hessian, summed over all places: one bend constrains all."""
     rotations = walked.before_T_after[:, :3, :3]
     hessians = rotations @ walked.information[:, 3:, 3:] @ rotations.transpose(0, 2, 1)
     return eigenvalue_ratio(hessians.sum(axis=0))

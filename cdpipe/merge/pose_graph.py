@@ -1,8 +1,8 @@
-"""The likeliest course of an alignment along a path: registrations against what odometry can drift between them.
+"""Pose graph of the alignment along the path: registrations at anchors, odometry between them.
 
-Unknown are the pose of each anchor in the map frame and one stretch, the ratio of the lengths that two odometries give
-the same way: most of what odometry drifts is such a scale, the same for a whole session. Solved as one banded linear
-system with one more column (Gauss-Newton, three steps).
+The unknowns are the pose of each anchor in the map frame and one stretch, the relative difference of the path lengths
+that the two odometries measure. Most odometry drift is such a scale error, constant over a session. Three Gauss-Newton
+steps solve it; each is a banded linear system with one extra column for the stretch.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array
 
-# What holds an anchor that nothing else holds, so that the system can be solved.
+# Prior on an unconstrained anchor; it keeps the system regular.
 _WEAKEST = 1e-6
-# What two odometries may drift apart over a metre of path, and the stretch between them, one standard deviation each.
+# Standard deviations: relative drift over one metre of path (translation, rotation), and the stretch.
 _DRIFT_M, _DRIFT_RAD, _STRETCH = 0.01, np.deg2rad(0.05), 0.01
 _STEPS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseGraph:
-    """Alignments along a path.
+    """The solved pose graph.
 
     Attributes:
-        positions: (A, 3) anchors in the order of the path, after odom frame, metres.
-        before_T_after: (A, 4, 4) what holds at each.
-        stretch: By what share the way is longer in the before odom frame than in the after odom frame.
+        positions: (A, 3) anchors in path order, after odom frame, metres.
+        before_T_after: (A, 4, 4) alignment at each anchor.
+        stretch: Relative excess of the path length in the before odom frame over that in the after odom frame.
     """
 
     positions: Float64Array
@@ -38,12 +38,12 @@ class PoseGraph:
     stretch: float
 
     def at(self, anchors_m: Float64Array, places_m: Float64Array, places: Float64Array) -> Float64Array:
-        """Return the (K, 4, 4) alignments at places on the same path: both anchors' word, the nearer one's the most.
+        """Return the (K, 4, 4) alignments at places on the path, interpolated between the two neighbouring anchors.
 
         Args:
-            anchors_m: (A,) where on the path the anchors stand, rising.
-            places_m: (K,) where on it the places are.
-            places: (K, 3) the places, after odom frame, metres.
+            anchors_m: (A,) path length of the anchors, rising, metres.
+            places_m: (K,) path length of the places, metres.
+            places: (K, 3) positions of the places, after odom frame, metres.
         """
         after = np.clip(np.searchsorted(anchors_m, places_m), 1, max(len(anchors_m) - 1, 1))
         before = after - 1
@@ -59,7 +59,7 @@ class PoseGraph:
         return _make_poses(rotations, moved, places)
 
     def _moved(self, anchors: np.ndarray, places: Float64Array) -> Float64Array:
-        """Return where each place is in the map frame as seen from its anchor, by index."""
+        """Return the (K, 3) map position of each place as predicted from one anchor, given by index."""
         apart = places - self.positions[anchors]
         stretched = self.positions[anchors] + (1 + self.stretch) * apart
         return _apply(self.before_T_after[anchors], stretched)
@@ -68,16 +68,17 @@ class PoseGraph:
 def solve_pose_graph(
     positions: Float64Array, before_T_after: Float64Array, information: Float64Array, per_stretch: Float64Array
 ) -> PoseGraph:
-    """Return the likeliest alignments along a path.
+    """Return the maximum-likelihood alignments along a path.
 
-    Measured is the pose of each anchor with its own information, and that the pose of one anchor relative to the one
-    before it is what the odometry says, stretched, to within its drift.
+    The measurements are the registration at each anchor and the relative pose between neighbouring anchors, which is
+    the stretched odometry up to its drift.
 
     Args:
         positions: (A, 3) anchors along the path, after odom frame, metres.
-        before_T_after: (A, 4, 4) measured alignments.
-        information: (A, 6, 6) of each: turn, then shift, in after odom axes about the anchor; zero where not measured.
-        per_stretch: (A, 6) by how much each was measured wrong, turn and shift, for a stretch of 1.
+        before_T_after: (A, 4, 4) registrations.
+        information: (A, 6, 6) information of each: rotation, then translation, after odom axes about the anchor; zero
+            without a registration.
+        per_stretch: (A, 6) error of each registration, rotation and translation, per unit of stretch.
     """
     measured = _State(before_T_after[:, :3, :3], _apply(before_T_after, positions), 0.0)
     state = measured
@@ -105,7 +106,7 @@ def solve_pose_graph(
 
 
 class _State(NamedTuple):
-    """Poses (A,) of the anchors in the map frame, turn of the after odom axes and position, and the stretch."""
+    """Rotations (A, 3, 3) and map positions (A, 3) of the anchors, and the stretch."""
 
     rotations: Float64Array
     translations: Float64Array
@@ -113,7 +114,7 @@ class _State(NamedTuple):
 
 
 class _System(NamedTuple):
-    """Normal equations of the poses: (A, 6, 6) blocks and (A - 1, 6, 6) beside them; the stretch's column."""
+    """Normal equations: diagonal blocks (A, 6, 6), coupling (A - 1, 6, 6), the stretch's column and the gradient."""
 
     blocks: Float64Array
     coupling: Float64Array
@@ -122,7 +123,7 @@ class _System(NamedTuple):
 
 
 def _add_odometry(system: _System, state: _State, steps: Float64Array) -> tuple[float, float]:
-    """Add what odometry says of each step; return its share of the stretch's own curvature and slope."""
+    """Add the odometry terms; return their contribution to the stretch's curvature and slope."""
     n = len(steps)
     back = np.swapaxes(state.rotations[:-1], 1, 2)
     bend = Rotation.from_matrix(back @ state.rotations[1:]).as_rotvec() if n else np.zeros((0, 3))
@@ -130,7 +131,7 @@ def _add_odometry(system: _System, state: _State, steps: Float64Array) -> tuple[
     residuals = np.hstack([bend, slip])
     length_m = np.maximum(np.linalg.norm(steps, axis=1), 1e-3)
     weights = np.repeat([1 / _DRIFT_RAD**2, 1 / _DRIFT_M**2], 3) / length_m[:, None]
-    # of the anchor after the step the derivative is one; of the stretch it is the step, back
+    # derivatives: identity for the second anchor, minus the step for the stretch
     here = np.repeat(-np.eye(6)[None], n, axis=0)
     here[:, 3:, :3] = _cross_matrices(steps)
     per_stretch = np.hstack([np.zeros((n, 3)), -steps])
@@ -146,14 +147,14 @@ def _add_odometry(system: _System, state: _State, steps: Float64Array) -> tuple[
 
 
 def _solve(system: _System, corner: float, slope: float) -> tuple[Float64Array, float]:
-    """Solve the block tridiagonal system with its border; return the change of the poses (A, 6) and of the stretch."""
+    """Solve the bordered block-tridiagonal system; return the update of the poses (A, 6) and of the stretch."""
     n = len(system.blocks)
     banded = np.zeros((12, 6 * n))
     for row in range(6):
         for column in range(6):
             if row >= column:
                 banded[row - column, column::6] = system.blocks[:, row, column]
-            # below the diagonal block stands the transpose of the coupling
+            # the block below the diagonal is the transpose of the coupling
             banded[6 + row - column, column : 6 * (n - 1) : 6] = system.coupling[:, column, row]
     sides = np.stack([system.gradient.ravel(), system.border.ravel()], axis=1)
     of_gradient, of_border = np.asarray(solveh_banded(banded, sides, lower=True)).T
@@ -163,7 +164,7 @@ def _solve(system: _System, corner: float, slope: float) -> tuple[Float64Array, 
 
 
 def _make_poses(rotations: Float64Array, translations: Float64Array, positions: Float64Array) -> Float64Array:
-    """Return the (N, 4, 4) transforms with these rotations that take the positions to the translations."""
+    """Return the (N, 4, 4) transforms with the given rotations that map positions to translations."""
     result = np.repeat(np.eye(4)[None], len(positions), axis=0)
     result[:, :3, :3] = rotations
     result[:, :3, 3] = translations - np.einsum("aij,aj->ai", rotations, positions)

@@ -1,14 +1,13 @@
-"""Local refinement: maps of two drifting odometries bend apart by metres, what is compared must agree to centimetres.
+"""Local refinement: an alignment that varies along the path, because two odometries drift apart by metres.
 
-Every few metres along the overlap a sphere of the after map is registered finely with the before map, walking
-outwards from where the merge was found. Each registration is a measurement of its own uncertainty; where a tunnel is
-smooth and straight it knows little about the way along the axis. So all of them are fitted together, each weighed by
-its Hessian, as one chain of poses (cdpipe/merge/pose_graph.py).
+Every few metres along the overlap a sphere of the after map is registered with the before map. The walk starts where
+the merge was found. In a smooth, straight tunnel a registration does not constrain the translation along the axis. All
+registrations are therefore combined in one pose graph, each weighted by its Hessian (`cdpipe.merge.pose_graph`).
 
-A map point stands where the odometry put it when it was seen, not where it would put it on arrival: of two maps that
-stretch differently the faces that look back along the way, seen on approach, lie too near, and those that look ahead
-too far. How a registration errs for it follows from where the points of both maps were seen from, in proportion to the
-stretch, which the chain of all registrations knows best.
+Distant points carry the odometry error at the time they were observed. If the two odometries differ by a scale factor
+(the stretch), surfaces that were seen on approach are displaced along the path. The error of a registration is
+proportional to the stretch and follows from the sensor positions from which the points were seen. The pose graph
+estimates the stretch.
 """
 
 from __future__ import annotations
@@ -23,44 +22,44 @@ from cdpipe.merge.walk import Step, Walk, walk
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import MergeConfig
 
-# Every 2 m and thinned to 0.3 m is three times the work for the same centimetres (validation, reports/merge/notes).
+# Distance between anchors: a multiple of the sphere radius, and its minimum in metres (reports/merge/notes).
 _SPACING, _SPACING_M = 0.6, 4.0
-# What was seen from afar stands where the odometry of then put it, and so does what is far from the anchor. From afar
-# is 2.5 times as far as the walls pass by, which is the 20th percentile of the map's shortest ranges; 6 m at least.
+# Points seen from farther than this are left out: 2.5 wall distances, at least 6 m. The wall distance is the 20th
+# percentile of the shortest range of each map point.
 _SEEN_WITHIN, _WALL_PERCENTILE, _SEEN_WITHIN_M = 2.5, 20, 6.0
-# A sphere of 5 m in a drift 10 m wide holds floor, little of the walls, and hardly anything that tells the way along:
-# 1.8 times as far as the walls pass by, in steps and thinned in proportion.
+# Radius of a sphere: 1.8 wall distances, at least 5 m. A smaller sphere holds too little of the walls. The voxel size
+# is proportional.
 _RADIUS, _RADIUS_M = 1.8, 5.0
 _VOXEL, _VOXEL_M = 0.06, 0.4
 _CORRESPONDENCE_M = 1.0
-# How far a map point is off the surface, one standard deviation. Of 0.03 to 0.4 m the one with the smallest errors on
-# validation pairs whose sessions drift apart by 1 %; without drift a larger one averages more.
+# Standard deviation of a map point's distance to the surface.
 _POINT_M = 0.05
-# Points and their counterparts that tell how a stretch misleads a registration; what lies apart counts less.
+# Longest correspondence of the points that measure the effect of the stretch.
 _COUNTERPART_M = 0.5
+# Share of the best constrained direction's information that noise of the normals alone produces.
 _NOISE_SHARE = 0.02
-# Registrations that fit worse than this are left to their neighbours.
+# Lowest fit of a registration that enters the pose graph.
 _MIN_FIT = 0.6
-# Where fewer of them fit, the whole of it is left alone.
+# Lowest share of good registrations; below it the refinement is skipped.
 _MIN_GOOD_SHARE = 0.5
 
 
 def refine(
     before: IndexedMap, after: IndexedMap, found: Walk, config: MergeConfig
 ) -> tuple[PathAlignment | None, dict[str, float]]:
-    """Return the alignment along the after path, and what was measured of it.
+    """Return the alignment along the after path, and its evidence.
 
-    Evidence: `n_refined` registrations, `refined_inlier_share` (their mean share of inliers), `max_correction_m` (how
-    far the refinement moved any of the places).
+    Evidence: `n_refined` registrations, `refined_inlier_share` (their mean inlier share), `max_correction_m` (largest
+    displacement of an anchor by the refinement).
 
     Args:
-        before: The before map, a target.
+        before: The before map, indexed as a target.
         after: The after map.
-        found: The walk along the path that was accepted.
+        found: The accepted walk.
         config: Settings of the merge.
 
     Returns:
-        The alignment at every after keyframe, or None where fewer than half of the registrations fit.
+        The alignment at every after keyframe, or None if fewer than half of the registrations fit.
     """
     if not np.isfinite(found.fits).any():
         return None, {"n_refined": 0.0}
@@ -95,7 +94,7 @@ def refine(
 
 
 def _choose_anchors(path_m: Float64Array, found: Walk, spacing_m: float) -> tuple[Int64Array, int]:
-    """Return after keyframes about as far apart as that, and where among them the best place of the walk stands."""
+    """Return after keyframes about `spacing_m` apart, and the index among them of the walk's best place."""
     start = int(found.keyframes[np.nanargmax(found.fits)])
     _, first = np.unique(np.floor((path_m - path_m[start]) / spacing_m + 1e-6), return_index=True)
     keyframes = np.unique(np.append(first, start)).astype(np.int64)
@@ -103,7 +102,7 @@ def _choose_anchors(path_m: Float64Array, found: Walk, spacing_m: float) -> tupl
 
 
 def _discount_normal_noise(information: Float64Array) -> Float64Array:
-    """Return (A, 6, 6) information without what the noise of normals alone makes of a smooth wall."""
+    """Return the (A, 6, 6) information without the part that noise of the normals on a smooth wall would produce."""
     values, axes = np.linalg.eigh(information[:, 3:, 3:])
     kept = np.maximum(values - _NOISE_SHARE * values[:, -1:], 0.0)
     shares = np.sqrt(np.divide(kept, values, out=np.zeros_like(values), where=values > 0))
@@ -117,10 +116,10 @@ def _discount_normal_noise(information: Float64Array) -> Float64Array:
 def _per_stretch(
     before: IndexedMap, after: IndexedMap, walked: Walk, is_good: BoolArray, radius_m: float
 ) -> Float64Array:
-    """Return (A, 6) by how much each registration errs, turn and shift, for a stretch of 1; zero where it did not fit.
+    """Return the (A, 6) error of each registration, rotation and translation, per unit of stretch; zero if not good.
 
-    A counterpart that both sessions saw from x metres ahead of the anchor is x times the stretch too far ahead; the
-    registration is the rigid motion that fits those errors best.
+    A correspondence that both sessions saw from x metres ahead of the anchor is displaced by x times the stretch. The
+    registration error is the rigid motion that fits these displacements best.
     """
     result = np.zeros((len(walked.keyframes), 6))
     for a in np.flatnonzero(is_good):

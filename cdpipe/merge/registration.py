@@ -1,8 +1,7 @@
-"""Registration of spheres: FRAME's chain on two clouds, and ours of a sphere against a map indexed once.
+"""Registration: FRAME's GICP and VGICP of two clouds, and ours of a sphere against a map that is indexed once.
 
-FRAME (arXiv 2301.09213) aligns two spheres by GICP (3 m correspondences) and then VGICP (1 m). A whole map can be
-prepared for GICP while it is being built; then each sphere only brings its own points, which is what makes many
-hypotheses and a sphere for every metre of path affordable.
+FRAME (arXiv 2301.09213) aligns two spheres by GICP (correspondences up to 3 m) and then VGICP (1 m). Here the full
+before map is indexed once, with normals and covariances, so a registration only has to prepare the sphere.
 """
 
 from __future__ import annotations
@@ -18,21 +17,21 @@ from cdpipe.core.voxel import cell_keys
 from cdpipe.model.config import MergeConfig
 from cdpipe.model.types import PointMap
 
-# Fewer points than this are not registered.
+# A sphere needs this many points to be registered.
 MIN_SPHERE_POINTS = 100
 _NEIGHBOURS = 10
-# Distances beyond this count less and less; a change is not to pull.
+# Scale of the robust weight: changed objects must not pull.
 _ROBUST_M = 0.1
 _PLANE_STEPS, _PLANE_CONVERGED, _DAMPING, _MIN_PAIRS = 8, 1e-3, 1e-3, 30
-# Gaussian voxels of half the correspondence distance: twice as accurate as 1 m on a real pair of 32-beam scans.
+# Correspondence distance over voxel size of VGICP.
 _VGICP_CELLS = 2.0
 
 
 class Surface:
-    """A cloud that others are registered to: a k-d tree, and covariance and normal of every point's neighbourhood.
+    """A registration target: k-d tree, covariances and normals of a cloud.
 
     Attributes:
-        cloud: The cloud as small_gicp has it.
+        cloud: The cloud as small_gicp's type.
         tree: Its k-d tree.
         points: (N, 3) its points, metres.
         normals: (N, 3) unit normals, of either sign.
@@ -50,17 +49,17 @@ class Surface:
 
 
 class IndexedMap:
-    """A map prepared for merging, which can be done while it is being built.
+    """A map indexed for merging; a robot can do this while it maps.
 
-    Only what was seen from near is used: a return from afar stands where the odometry of then says, which has drifted
-    since. A target is thinned to `merge.target_voxel_m`: half the time, as accurate (reports/merge/notes).
+    Only points that were seen from within `merge.seen_within_m` are used: distant points carry the odometry error at
+    the time they were observed. A target is thinned to `merge.target_voxel_m` (reports/merge/notes).
 
     Attributes:
         map: The map.
-        points: (N, 3) the points that are worked with.
-        seen_from: (N, 3) mean position of the sensor when each was seen; the point itself where that is not known.
-        columns: For cutting spheres out of them.
-        positions: (K, 3) of its keyframes, odom frame, metres.
+        points: (N, 3) the points in use, odom frame, metres.
+        seen_from: (N, 3) mean sensor position that saw each point; the point itself if unknown.
+        columns: Grid index of the points, for cropping spheres.
+        positions: (K, 3) keyframe positions, odom frame, metres.
         path: k-d tree of the positions of all scans.
         tree: k-d tree of the points.
     """
@@ -82,14 +81,14 @@ class IndexedMap:
 
     @property
     def target(self) -> Surface:
-        """The map as a surface to register to, its points in the order of `points`."""
+        """The map as a registration target; its points have the order of `points`."""
         if self._fine is None:
             raise ValueError("this map was not indexed as a target")
         return self._fine
 
     @property
     def coarse_target(self) -> Surface:
-        """The same, thinned to `merge.coarse_voxel_m`."""
+        """The target thinned to `merge.coarse_voxel_m`."""
         if self._coarse is None:
             raise ValueError("this map was not indexed as a target")
         return self._coarse
@@ -102,7 +101,7 @@ class IndexedMap:
 def _thin(
     points: Float64Array, seen_from: Float64Array | Float32Array, voxel_m: float
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the means of the points of each cell and of where they were seen from, in the order of `GridIndex`."""
+    """Return the mean point and mean sensor position of each voxel, in the order of `GridIndex`."""
     keys = cell_keys(points, voxel_m)
     order = np.argsort(keys, kind="stable")
     first = np.flatnonzero(np.diff(keys[order], prepend=keys[order[:1]] - 1))
@@ -121,10 +120,10 @@ def register(
         source_points: (N, 3) points, metres.
         target_points: (M, 3) points, metres.
         initial_guess: (4, 4) `target_T_source` to start from.
-        config: Thinning and correspondence distances.
+        config: Voxel size and correspondence distances.
     """
     target_cloud, target_tree = small_gicp.preprocess_points(target_points, config.voxel_m, num_threads=1)
-    # about the source's centre: small_gicp solves for a turn about the origin, which may be far away
+    # centred: small_gicp solves for a rotation about the origin, which may be far away
     centre = source_points.mean(axis=0)
     source_cloud, _ = small_gicp.preprocess_points(source_points - centre, config.voxel_m, num_threads=1)
     coarse = small_gicp.align(
@@ -157,16 +156,16 @@ def align_by_gicp(
     voxel_m: float,
     max_steps: int = 20,
 ) -> Float64Array:
-    """Return the (4, 4) `target_T_source` of a sphere against an indexed map; finds its way from a metre off and more.
+    """Return the (4, 4) `target_T_source` of a sphere by GICP; it converges from an error of over a metre.
 
     Args:
         points: (N, 3) points of the sphere, source frame, metres.
-        centre: (3,) its centre.
-        target: What it is aligned with.
+        centre: (3,) centre of the sphere, source frame.
+        target: Indexed map.
         initial_guess: (4, 4) `target_T_source` to start from.
-        correspondence_m: Points farther apart than this are no pair.
-        voxel_m: The sphere is thinned to this.
-        max_steps: It ends after as many.
+        correspondence_m: Longest correspondence, metres.
+        voxel_m: Voxel size that thins the sphere, metres.
+        max_steps: Iteration limit.
     """
     source, _ = small_gicp.preprocess_points(points - centre, voxel_m, _NEIGHBOURS, num_threads=1)
     found = small_gicp.align(
@@ -185,11 +184,11 @@ def align_by_gicp(
 def align_to_planes(
     points: Float64Array, centre: Float64Array, target: Surface, initial_guess: Float64Array, correspondence_m: float
 ) -> Float64Array:
-    """Return the (4, 4) `target_T_source` that brings a few hundred points onto the target's planes.
+    """Return the (4, 4) `target_T_source` of a few hundred points by point-to-plane Gauss-Newton.
 
-    Gauss-Newton on the distances along the target's normals. Needs no covariances of the points, which take GICP as
-    long as the registration, but must start within decimetres. Ours, because small_gicp's PLANE_ICP sums the squares of
-    n_x d_x, n_y d_y and n_z d_z instead of squaring n . d: it resists sliding along a plane, and depends on the frame.
+    It needs no covariances of the points and is faster than GICP, but must start within decimetres. small_gicp's
+    PLANE_ICP cannot be used: it sums the squares of n_x d_x, n_y d_y and n_z d_z instead of squaring n . d, so it
+    penalises sliding along a plane and depends on the frame.
 
     Args: as `align_by_gicp`.
     """
@@ -212,10 +211,10 @@ def align_to_planes(
 
 
 def plane_jacobian(offsets: Float64Array, normals: Float64Array) -> Float64Array:
-    """Return (N, 6) by how much each point moves along its normal if the cloud turns, and shifts, in its own axes.
+    """Return the (N, 6) derivative of each point's displacement along its normal by rotation, then translation.
 
     Args:
-        offsets: (N, 3) points about the centre they turn around.
+        offsets: (N, 3) points relative to the centre of rotation.
         normals: (N, 3) normals in the same axes.
     """
     (x, y, z), (a, b, c) = offsets.T, normals.T
@@ -240,20 +239,20 @@ def solve_point_to_plane(jacobian: Float64Array, distances_m: Float64Array, valu
 
 
 def eigenvalue_ratio(hessian: Float64Array) -> float:
-    """Return the smallest to the largest eigenvalue of a symmetric (n, n) matrix; 0 for a zero matrix."""
+    """Return the ratio of the smallest to the largest eigenvalue of a symmetric (n, n) matrix; 0 for a zero matrix."""
     eigenvalues = np.linalg.eigvalsh(hessian)
     return float(eigenvalues[0] / eigenvalues[-1]) if eigenvalues[-1] > 0 else 0.0
 
 
 def fit_rigid(positions: Float64Array, dst_T_src: Float64Array) -> Float64Array:
-    """Return the one (4, 4) transform nearest to several, each of which holds around its own position.
+    """Return the (4, 4) rigid transform that best fits several local transforms.
 
-    Positions and, 5 m about each, three axes are moved by each transform and fitted, so that a straight path leaves no
-    roll open.
+    Each transform moves its position and three points 5 m along the axes; the fit is least squares over all of them.
+    The extra points determine the roll on a straight path.
 
     Args:
-        positions: (A, 3) source frame, metres.
-        dst_T_src: (A, 4, 4) what holds there.
+        positions: (A, 3) where each transform holds, source frame, metres.
+        dst_T_src: (A, 4, 4) local transforms.
     """
     probes = positions[:, None] + np.concatenate([np.zeros((1, 3)), 5.0 * np.eye(3)])[None]
     moved = np.einsum("aij,apj->api", dst_T_src[:, :3, :3], probes) + dst_T_src[:, None, :3, 3]
@@ -265,7 +264,7 @@ def fit_rigid(positions: Float64Array, dst_T_src: Float64Array) -> Float64Array:
 
 
 def motion_between(one: Float64Array, other: Float64Array, position: Float64Array) -> tuple[float, float]:
-    """Return by how many metres and radians two transforms (4, 4) differ at a position (3,) of their source frame."""
+    """Return the difference of two (4, 4) transforms at a (3,) source position: metres and radians."""
     shift = transform(one, position[None]) - transform(other, position[None])
     turn = invert(one)[:3, :3] @ other[:3, :3]
     return float(np.linalg.norm(shift)), float(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0)))

@@ -1,8 +1,7 @@
-"""Following an alignment along the after session's path: whether it goes on to fit, and how it bends.
+"""The walk: register sphere after sphere along the after path, outwards from where the alignment was found.
 
-From the place where it was found, sphere after sphere is registered, each from where its neighbour ended, outwards in
-both directions. So the alignment follows maps that bend apart by metres, each sphere is independent evidence, and a
-wrong alignment is found out where the two tunnels differ.
+Each registration starts from the result of its neighbour, so the alignment follows maps that drift apart by metres.
+Each sphere is independent evidence: a wrong alignment stops fitting where the two tunnels differ.
 """
 
 from __future__ import annotations
@@ -16,28 +15,27 @@ from cdpipe.merge.evidence import SurfaceFit, measure_fit, sample_evenly
 from cdpipe.merge.registration import MIN_SPHERE_POINTS, IndexedMap, align_by_gicp, align_to_planes, motion_between
 from cdpipe.model.config import MergeConfig
 
-# Places farther from the before path were not driven twice.
+# A place is shared by both sessions within this distance of the before path.
 SHARED_M = 5.0
-# A registration that moves a place farther than this against its neighbour is wrong, not drift.
+# Largest change between neighbouring registrations that drift explains: a constant, and a rate over their distance.
 _JUMP_M, _JUMP_SHARE = 1.0, 0.03
 _JUMP_RAD, _JUMP_RAD_PER_M = np.deg2rad(2.0), np.deg2rad(0.03)
-# Below this the way is lost; it is looked for again in steps of half the length, down to so many keyframes.
+# Below this fit the walk is lost; it retries with half the step, down to this many keyframes.
 _LOST_FIT = 0.7
 _SHORTEST_STEP = 3
-# A first try that fits as well as this needs no second.
+# A point-to-plane registration with this fit needs no GICP.
 _CLEAR_FIT = 0.9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """How a place is registered while walking.
+    """Registration settings of one place.
 
     Attributes:
-        radius_m: Sphere around it.
-        gicp_voxel_m: Thinning of the sphere for GICP.
+        radius_m: Radius of the sphere.
+        gicp_voxel_m: Voxel size of the sphere for GICP.
         correspondence_m: Longest correspondence of GICP.
-        first_try_m: Longest correspondence of a registration point to plane that is tried first, and taken where it
-            fits; None: GICP at once.
+        first_try_m: Longest correspondence of the point-to-plane registration that is tried first; None: GICP only.
     """
 
     radius_m: float
@@ -48,14 +46,14 @@ class Step:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Walk:
-    """What was found at A after keyframes, in the order of the path.
+    """The registrations at A after keyframes, in path order.
 
     Attributes:
-        keyframes: (A,) after keyframes: those asked for, and others where the way from one to the next was lost.
-        before_T_after: (A, 4, 4) alignment at each; carried over from its neighbour where nothing was registered.
-        information: (A, 6, 6) Hessian of each, turn then shift in after odom axes; zero where there is none.
-        fits: (A,) share of inliers, 0 where it did not fit or jumped, NaN where the before session never drove.
-        residuals_m: (A,) median distance to the surface, NaN where nothing was registered.
+        keyframes: (A,) after keyframes: the requested ones, and further ones where the step was halved.
+        before_T_after: (A, 4, 4) alignment at each; the neighbour's if nothing was registered.
+        information: (A, 6, 6) Hessian of each, rotation then translation, after odom axes; zero without one.
+        fits: (A,) inlier share; 0 if the registration failed, NaN if the before session never came near.
+        residuals_m: (A,) median point-to-plane distance, metres; NaN if nothing was registered.
     """
 
     keyframes: Int64Array
@@ -74,16 +72,16 @@ def walk(
     step: Step,
     config: MergeConfig,
 ) -> Walk:
-    """Register spheres around some after keyframes, from one of them outwards.
+    """Register spheres around the given after keyframes, outwards from one of them.
 
     Args:
-        before: The before map, a target.
+        before: The before map, indexed as a target.
         after: The after map.
         keyframes: (A,) after keyframes, rising.
-        start: Position in `keyframes` of the one where `before_T_after` was found.
-        before_T_after: (4, 4) what was found there.
-        step: How a place is registered.
-        config: `inlier_m`.
+        start: Index into `keyframes` of the place where `before_T_after` was found.
+        before_T_after: (4, 4) alignment at the start.
+        step: Registration settings.
+        config: `inlier_m` is used.
     """
     first = _Stop(int(keyframes[start]), before_T_after)
     first = _register_stop(before, after, first, first.keyframe, step, config)
@@ -106,7 +104,7 @@ def walk(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stop:
-    """What was found at one after keyframe; see `Walk`."""
+    """The registration at one after keyframe; fields as in `Walk`."""
 
     keyframe: int
     before_T_after: Float64Array
@@ -118,7 +116,7 @@ class _Stop:
 def _advance(
     before: IndexedMap, after: IndexedMap, previous: _Stop, keyframe: int, step: Step, config: MergeConfig
 ) -> list[_Stop]:
-    """Go from a stop to a keyframe; if the way is lost, in two halves, as long as there was a way."""
+    """Register a keyframe from the previous stop; if the fit is lost, halve the step and retry."""
     stop = _register_stop(before, after, previous, keyframe, step, config)
     middle = (previous.keyframe + keyframe) // 2
     is_short = abs(keyframe - previous.keyframe) <= _SHORTEST_STEP
@@ -144,13 +142,13 @@ def _register_stop(
 
 
 def is_shared(before: IndexedMap, positions_map: Float64Array) -> BoolArray:
-    """Return for (N, 3) positions in the map frame whether the before session passed within 5 m."""
+    """Return the (N,) mask of the (N, 3) positions, map frame, within 5 m of the before path."""
     distances_m, _ = before.path.query(positions_map, distance_upper_bound=SHARED_M)
     return np.isfinite(distances_m)
 
 
 def choose_evenly(keyframes: Int64Array, n: int, and_also: int) -> Int64Array:
-    """Return about n of some keyframes, evenly spaced, and one other."""
+    """Return about n evenly spaced keyframes, and `and_also`, rising."""
     chosen = np.linspace(0, len(keyframes) - 1, min(n, len(keyframes))).round().astype(np.int64)
     return np.unique(np.append(keyframes[chosen], and_also))
 
@@ -164,40 +162,40 @@ def _register_place(
     step: Step,
     config: MergeConfig,
 ) -> tuple[Float64Array, SurfaceFit, Float64Array] | None:
-    """Register one place: pose, fit, information.
+    """Register one place; return pose, fit and information.
 
-    None where it has too few points, or ends farther away than odometry can have drifted.
+    None if it has too few points, or if the pose changed by more than drift explains.
     """
     points = after.sphere(centre, step.radius_m)
     if len(points) < MIN_SPHERE_POINTS:
         return None
     own = sample_evenly(points)
 
-    def judged(found: Float64Array) -> tuple[Float64Array, SurfaceFit, Float64Array] | None:
+    def judge(found: Float64Array) -> tuple[Float64Array, SurfaceFit, Float64Array] | None:
         held = _limit_motion(found, guess, centre, apart_m)
         if held is None:
             return None
         fit = measure_fit(before, after, held, own, centre, step.radius_m)
         information = fit.information
         if held is not found:
-            # its turn is the neighbour's
+            # the rotation is the neighbour's and was not measured
             information = information.copy()
             information[:3] = information[:, :3] = 0.0
         return held, fit, information
 
     if step.first_try_m is not None:
-        first = judged(align_to_planes(own, centre, before.target, guess, step.first_try_m))
+        first = judge(align_to_planes(own, centre, before.target, guess, step.first_try_m))
         if first is not None and first[1].inlier_share(config.inlier_m) >= _CLEAR_FIT:
             return first
-    return judged(align_by_gicp(points, centre, before.target, guess, step.correspondence_m, step.gicp_voxel_m))
+    return judge(align_by_gicp(points, centre, before.target, guess, step.correspondence_m, step.gicp_voxel_m))
 
 
 def _limit_motion(
     found: Float64Array, guess: Float64Array, centre: Float64Array, apart_m: float
 ) -> Float64Array | None:
-    """Return a pose if odometry can have drifted so far, and without its turn if only that cannot be.
+    """Return a pose whose change from the guess drift explains, with the guess's rotation if only that is too large.
 
-    The section of a narrow drift is nearly round, and near a dead end little else holds a sphere against rolling.
+    The cross-section of a narrow drift is nearly round, so near a dead end the roll is poorly constrained.
     """
     jump_m, jump_rad = motion_between(found, guess, centre)
     if jump_m > _JUMP_M + _JUMP_SHARE * apart_m:

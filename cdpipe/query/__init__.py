@@ -1,4 +1,4 @@
-"""From descriptors of both sessions to ranked change regions."""
+"""Change query: from the descriptors of both sessions to ranked change regions."""
 
 import lazy_loader
 

@@ -1,6 +1,6 @@
-"""The sphere difference: how much of what stands around a keyframe is in one map only, counted by hand.
+"""The sphere difference, a baseline without learning: share of the points around a keyframe that only one map has.
 
-What a learned descriptor of spheres has to beat. It needs the points of both maps, not 64 numbers a keyframe.
+It requires the points of both maps; the learned sphere descriptor stores 64 numbers per keyframe.
 """
 
 from __future__ import annotations
@@ -15,35 +15,34 @@ from cdpipe.extract.point_comparison import is_within
 from cdpipe.model.config import QueryConfig
 from cdpipe.model.types import DescriptorSet, MergedMaps
 
-# One and a half cells of a map thinned at 0.2 m: nearer, the gaps between the points pass for changes.
+# 1.5 voxels of a map with 0.2 m voxels; below it, gaps between points count as changes.
 NEW_BEYOND_M = 0.3
 
 
 def sphere_difference(
     merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig
 ) -> Float64Array:
-    """Score every before keyframe by the share of the points around it that are farther than 0.3 m from the other map.
+    """Score every before keyframe by the share of points around it that are over 0.3 m from the other map.
 
-    Counted are the points of both maps within `radius_m` of the keyframe; of these only what lies within `radius_m` of
-    a keyframe of the other session too, since farther off the other session saw too little to tell.
+    The share is over the points of both maps within `radius_m` of the keyframe and within `radius_m` of a keyframe of
+    the other session. Beyond that the other session saw too little to compare.
 
     Args:
         merged: Both maps.
-        before: Says which scans of the before session are keyframes.
-        after: Likewise.
+        before: Gives the keyframe scans of the before session.
+        after: Gives those of the after session.
         config: `radius_m` and `max_pair_m` are used.
 
     Returns:
-        (Kb,) shares in [0, 1]; NaN for a keyframe that the after session never came within `max_pair_m` of, or that
-        nothing comparable stands around.
+        (Kb,) shares in [0, 1]; NaN for a keyframe without an after keyframe within `max_pair_m` or without points.
     """
     before_path = merged.before.odom_T_sensor[before.keyframe_scans, :3, 3]
     after_path = merged.alignment.to_map(merged.after.odom_T_sensor[after.keyframe_scans, :3, 3])
     seen_before = merged.before.points[is_within(merged.before.points, after_path, config.radius_m)]
     after_points = merged.alignment.to_map(merged.after.points)
-    # of the after map what is left out stands around no keyframe anyway, and need not be asked for its distance
+    # after points far from every before keyframe are in no sphere, so they need no distance
     seen_after = after_points[is_within(after_points, before_path, config.radius_m)]
-    # against the whole other map: what stands at the edge of the comparable part has its neighbours beyond it
+    # distances are to the full other map: a point at the edge of the shared part has neighbours beyond the edge
     clouds = [
         (seen_before, ~is_within(seen_before, after_points, NEW_BEYOND_M)),
         (seen_after, ~is_within(seen_after, merged.before.points, NEW_BEYOND_M)),
@@ -56,14 +55,12 @@ def sphere_difference(
 def marked_share(
     clouds: Sequence[tuple[Float64Array, BoolArray]], centres: Float64Array, radius_m: float
 ) -> Float64Array:
-    """Return the (K,) share of marked points among those of all clouds within `radius_m` of each of (K, 3) centres.
-
-    NaN where there is none.
+    """Return the (K,) share of marked points in each sphere, all clouds together; NaN for an empty sphere.
 
     Args:
-        clouds: Points (N, 3) and the mask (N,) of the marked ones, of each cloud; one frame, metres.
-        centres: (K, 3) same frame.
-        radius_m: The border counts as inside.
+        clouds: For each cloud its points (N, 3), metres, and the mask (N,) of the marked ones; one frame.
+        centres: (K, 3) sphere centres, same frame, metres.
+        radius_m: Sphere radius, border included.
     """
     n_marked, n_all = np.zeros(len(centres)), np.zeros(len(centres))
     for points, is_marked in clouds:

@@ -1,8 +1,8 @@
-"""From descriptors to changed regions: the inverted query of the paper, in both readings, threshold and suppression.
+"""From descriptors to change regions: the paper's inverted k-d-tree query, threshold and suppression.
 
-The paper asks for the keyframes whose descriptors differ most between the sessions, `argmax f(Q_t,i, Q_t+1,j)`, and
-does not say how i and j are paired. Reading A ("nearest"): j's nearest neighbour in descriptor space, as in their
-FRAME code; the two may be different places. Reading B ("paired"): the keyframe at the same place after alignment.
+The paper selects the keyframes with the largest descriptor distance, `argmax f(Q_t,i, Q_t+1,j)`. It does not say how i
+and j are paired. Reading A ("nearest") pairs each keyframe with its nearest neighbour in descriptor space, as FRAME
+does; the two may be different places. Reading B ("paired") pairs it with the nearest keyframe in space after alignment.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from cdpipe.model.report import ChangeRegions
 from cdpipe.model.types import DescriptorSet, MergedMaps, UInt8Array
 from cdpipe.query.difference import sphere_difference
 
-# Of `ChangeRegions.direction`: whose keyframe is looked up in the other session.
+# Values of `ChangeRegions.direction`: the session whose keyframe is queried in the other session.
 BEFORE, AFTER = 0, 1
 
 
 def find_regions(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> ChangeRegions:
-    """Score the places both sessions came to by what `compare` says, and rank them.
+    """Score the keyframes by the comparison that `query.compare` names, and rank them as regions.
 
     Args:
-        merged: Accepted or not; for `scan` only its poses are used.
+        merged: Both maps and their alignment; `scan` uses only the poses.
         before: Descriptors of the before session; `pairs[:, 0]` indexes its keyframes.
         after: Descriptors of the after session; `pairs[:, 1]` indexes its keyframes.
-        config: What is compared, reading, radius, threshold, suppression.
+        config: Comparison, reading, radius, threshold, suppression.
     """
     places = _Places(merged, before, after, config)
     if config.compare == "scan":
@@ -43,7 +43,7 @@ def find_regions(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet
 
 
 class _Places:
-    """Where the keyframes of both sessions stand in the map, and which of the other session is nearest to each."""
+    """Map positions of all keyframes, and the spatially nearest keyframe of the other session."""
 
     def __init__(self, merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> None:
         self.before = merged.before.odom_T_sensor[before.keyframe_scans, :3, 3]
@@ -54,16 +54,16 @@ class _Places:
 
     @property
     def pairs_b(self) -> Int64Array:
-        """(Kb, 2) each before keyframe and the nearest after keyframe."""
+        """(Kb, 2) index of each before keyframe and of its nearest after keyframe."""
         return np.column_stack([np.arange(len(self.near_a)), self.near_a])
 
 
 def _score_by_scans(places: _Places, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> ChangeRegions:
-    """Score every keyframe of both sessions by descriptor distance to its partner.
+    """Score every keyframe of both sessions by the descriptor distance to its partner.
 
-    Every keyframe is a candidate at its own position: those of the after session queried among the before session's
-    descriptors and, inverted, those of the before session among the after session's. In reading B, keyframes without a
-    partner within `max_pair_m` are no candidates.
+    Every keyframe is a candidate at its own position. After keyframes are queried among the before descriptors and,
+    inverted, before keyframes among the after descriptors. In reading B a candidate needs a partner within
+    `max_pair_m`.
     """
     is_covered_b, is_covered_a = places.is_covered_b, places.is_covered_a
     if config.reading == "nearest":
@@ -92,9 +92,10 @@ def _score_by_scans(places: _Places, before: DescriptorSet, after: DescriptorSet
 
 
 def _score_by_spheres(places: _Places, local: Float64Array, config: QueryConfig) -> ChangeRegions:
-    """Score every before keyframe by the (K,) log-odds of its own stretch; that of its sphere is the best in reach.
+    """Rank before keyframes by the (K,) log-odds of their own stretch.
 
-    A sphere descriptor tells of the two metres before and behind its keyframe, a region of all within `radius_m`.
+    A sphere descriptor covers 2 m of tunnel before and behind its keyframe. A keyframe score covers a region, so it is
+    the maximum of the log-odds within `radius_m`.
     """
     keyframe_scores = np.full(len(local), np.nan)
     covered = np.flatnonzero(places.is_covered_b)
@@ -110,15 +111,15 @@ def rank_regions(
     config: QueryConfig,
     direction: UInt8Array | None = None,
 ) -> ChangeRegions:
-    """Order candidates by score, drop those too near to a better one, and mark what is reported.
+    """Sort candidates by score, suppress those near a better one, and mark the reported ones.
 
     Args:
         centres_map: (N, 3) sphere centres, map frame, metres.
-        scores: (N,) larger means changed more surely; NaN is no candidate. Of equal scores the first comes first.
-        pairs: (N, 2) before and after keyframe of each.
-        keyframe_scores: (K,) passed on.
+        scores: (N,) larger is more surely changed; NaN is no candidate. Ties keep their order.
+        pairs: (N, 2) before and after keyframe of each candidate.
+        keyframe_scores: (K,) copied into the result.
         config: Radius, suppression distance, and threshold or number of regions.
-        direction: (N,) as in `ChangeRegions`, None where no keyframes are looked up.
+        direction: (N,) as in `ChangeRegions`; None if no keyframes are queried.
     """
     order = np.argsort(-scores, kind="stable")
     order = order[~np.isnan(scores[order])]
@@ -144,7 +145,7 @@ def _from(session: int, candidates: npt.NDArray[Any]) -> UInt8Array:
 
 
 def _suppress_neighbours(centres: Float64Array, distance_m: float) -> BoolArray:
-    """Mark, going from best to worst, every centre that is not nearer than `distance_m` to one marked before."""
+    """Mark, from best to worst, every (N, 3) centre that is at least `distance_m` from all centres marked before."""
     is_kept = np.ones(len(centres), dtype=np.bool_)
     for index, centre in enumerate(centres):
         if is_kept[index]:
@@ -153,7 +154,7 @@ def _suppress_neighbours(centres: Float64Array, distance_m: float) -> BoolArray:
 
 
 def _nearest(points: npt.NDArray[Any], others: npt.NDArray[Any]) -> tuple[Float64Array, Int64Array]:
-    """Return distance and index of the nearest of `others` for each point; infinity and 0 where there are none."""
+    """Return distance and index of the nearest of `others` for each point; infinity and 0 if there are none."""
     if len(others) == 0 or len(points) == 0:
         return np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64)
     distances, indices = cKDTree(others.astype(np.float64)).query(points.astype(np.float64))
@@ -163,7 +164,7 @@ def _nearest(points: npt.NDArray[Any], others: npt.NDArray[Any]) -> tuple[Float6
 def _distances(
     queries: DescriptorSet, others: DescriptorSet, partners: Int64Array, is_paired: BoolArray
 ) -> Float64Array:
-    """Return the descriptor distance of each query to its partner, NaN where it has none."""
+    """Return the (N,) descriptor distance of each query to its partner; NaN without a partner."""
     distances = np.full(len(queries.q), np.nan)
     chosen = queries.q[is_paired].astype(np.float64) - others.q[partners[is_paired]]
     distances[is_paired] = np.linalg.norm(chosen, axis=1)
