@@ -68,6 +68,16 @@ def test_every_word_that_makes_a_recipe_small_is_in_it() -> None:
         assert large in README
 
 
+def test_the_lines_of_python_simulate_detect_score_and_plot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    exec(compile(block("api"), "README.md", "exec"), {})
+    assert float(capsys.readouterr().out.split()[-1]) > 0.8
+    assert Path("answer/objects.ply").is_file()
+    assert Path("changes.png").stat().st_size > 1000
+
+
 def test_a_method_of_ones_own_is_benchmarked(recipe: Callable[[str], None]) -> None:
     page = (ROOT / "eval" / "scoring" / "ANSWERS.md").read_text()
     (script,) = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)

@@ -1,0 +1,76 @@
+"""Every Markdown page: its links, paths, modules and commands exist, and pages stay short."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from eval.cli.main import app
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("cdpipe", "eval", "scenarios", "sim")
+PAGES = sorted(path for folder in (*PACKAGES, "reports") for path in (ROOT / folder).rglob("*.md")) + sorted(
+    ROOT.glob("*.md")
+)
+COMMANDS = typer.main.get_command(app).commands
+WORDS = {"README.md": 1200, "cdpipe/GLOSSARY.md": 700, **{f"{package}/README.md": 1500 for package in PACKAGES}}
+PATH = re.compile(r"[\w.-]+(?:/[\w.-]+)*(?:/|\.(?:py|yaml|md|json|toml|png|csv|cff))")
+# what a run makes, and what stands for a name of the reader's
+OTHERS = re.compile(
+    r"^(out|pair|pairs|answer|cells|maps|stages|views|answers|truth|RUN|PAIR|DIR|OUT|presets|plans|families|props|tunnelcd_\w+)/|NAME|<"
+)
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_leads_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if target.startswith("https://"):
+            continue
+        name, _, anchor = target.partition("#")
+        linked = (page.parent / name).resolve() if name else page
+        assert linked.exists(), target
+        if anchor:
+            assert anchor in anchors(linked), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_path_module_and_command_exists(page: Path) -> None:
+    text = page.read_text()
+    quoted = re.findall(r"`([^`\n]+)`", text)
+    package = page.relative_to(ROOT).parts[0]
+    places = (page.parent, ROOT, ROOT / package, ROOT / "tests")
+    for word in quoted:
+        if PATH.fullmatch(word) and "/" in word and not OTHERS.search(word):
+            assert any((place / word).exists() for place in places), word
+    for module in re.findall(r"python -m ([\w.]+)", text):
+        assert module in {"venv"} or importlib.util.find_spec(module) is not None, module
+    for command in re.findall(r"^tunnelcd (\w+)", text, re.MULTILINE) + [
+        word.split()[1] for word in quoted if re.match(r"tunnelcd [a-z]+\b", word)
+    ]:
+        assert command in COMMANDS, command
+
+
+@pytest.mark.parametrize(("name", "most"), WORDS.items())
+def test_pages_that_are_read_first_stay_short(name: str, most: int) -> None:
+    assert len((ROOT / name).read_text().split()) <= most
+
+
+def test_long_options_of_the_commands_in_blocks_exist() -> None:
+    for page in PAGES:
+        for block in re.findall(r"^```[^\n]*\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
+            for line in block.splitlines():
+                found = re.match(r"tunnelcd (\w+) ([^#]*)", line)
+                if found is None or found[1] not in COMMANDS:
+                    continue
+                known = {name for option in COMMANDS[found[1]].params for name in option.opts}
+                assert set(re.findall(r"--[a-z-]+", found[2])) <= known, (page, line)
