@@ -1,9 +1,8 @@
-"""`tunnelcd convert`: a session leaves as OSF, an OSF or a PCAP comes in as a session."""
+"""`tunnelcd convert`: a session becomes an OSF; an OSF or a PCAP becomes a session."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,31 +17,33 @@ from eval.core.progress import RunProgress
 from sim.session.truth import read_labels
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
-    """What the command line says beside the two names."""
-
-    metadata: Path | None = None
-    trajectory: Path | None = None
-    odometry: str | None = None
-    without_truth: bool = False
-
-
-def convert(source: Path, out: Path, options: Options, progress: RunProgress) -> str:
-    """Convert a session folder into an .osf, or a recording into a session folder; return what was done.
+def convert(
+    source: Path,
+    out: Path,
+    progress: RunProgress,
+    *,
+    metadata: Path | None = None,
+    trajectory: Path | None = None,
+    odometry: str | None = None,
+    without_truth: bool = False,
+) -> str:
+    """Convert a session folder to an .osf, or a recording to a session folder; return what was done, in words.
 
     Nothing is left behind where it fails or is interrupted.
 
     Raises:
-        InputError: Either name is of a kind that cannot be converted, `out` exists, or an option belongs to the other
+        InputError: The kind of either file cannot be converted, `out` exists, or an option belongs to the other
             direction.
     """
     if source.is_dir():
-        return _export(source, out, options, progress)
+        for name, value in {"metadata": metadata, "trajectory": trajectory, "odometry": odometry}.items():
+            if value is not None:
+                raise InputError(f"{source}: a session has its own poses and sensor: leave --{name} out")
+        return _export(source, out, progress, without_truth=without_truth)
     if source.suffix.lower() not in RECORDING_SUFFIXES:
         what = "expected a session folder" if source.exists() else "no such file or folder: expected a session"
         raise InputError(f"{source}: {what}, or a recording ({', '.join(RECORDING_SUFFIXES)})")
-    if options.without_truth:
+    if without_truth:
         raise InputError(f"{source}: a recording has no truth: leave --without-truth out")
     if out.suffix.lower() in RECORDING_SUFFIXES:
         raise InputError(f"{out}: a recording becomes a session: name a new folder")
@@ -50,28 +51,23 @@ def convert(source: Path, out: Path, options: Options, progress: RunProgress) ->
         imported = import_recording(
             source,
             out,
-            metadata=options.metadata,
-            trajectory=options.trajectory,
-            odometry=options.odometry,
+            metadata=metadata,
+            trajectory=trajectory,
+            odometry=odometry,
             on_progress=progress.stage,
         )
     told = f"{out}: session of {_revolutions(imported.n_scans)}, {imported.sensor}, poses: {imported.poses}"
-    if imported.n_left_out:
-        told += f"; {imported.n_left_out} left out, of which half the columns or fewer arrived"
-    return told
+    left_out = f"; {imported.n_left_out} left out, of which half the columns or fewer arrived"
+    return told + left_out if imported.n_left_out else told
 
 
-def _export(source: Path, out: Path, options: Options, progress: RunProgress) -> str:
-    given = {name: getattr(options, name) for name in ("metadata", "trajectory", "odometry")}
-    for name, value in given.items():
-        if value is not None:
-            raise InputError(f"{source}: a session has its own poses and sensor: leave --{name} out")
+def _export(source: Path, out: Path, progress: RunProgress, *, without_truth: bool) -> str:
     if out.suffix.lower() != ".osf":
         raise InputError(f"{out}: a session becomes an OSF: name a new file that ends in .osf")
     if is_session(source / "before"):
         raise InputError(f"{source}: a pair of sessions: convert {source / 'before'} and {source / 'after'} one by one")
     session = read_session(source)
-    has_truth = (source / "truth").is_dir() and not options.without_truth
+    has_truth = (source / "truth").is_dir() and not without_truth
     with made_parents(out):
         write_osf(session, out, _truth_fields(session) if has_truth else None, progress.stage)
     also = "with truth as fields LABEL and INSTANCE" if has_truth else "without truth"

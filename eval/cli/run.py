@@ -1,4 +1,4 @@
-"""Commands about run folders: fill one, score it again, report it."""
+"""Commands about run folders: run a plan, score the answers again, write the report."""
 
 # ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
 from __future__ import annotations
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from eval.cli.options import Quiet, RunOut, SetSettings, ShownViews
+from eval.cli.options import Quiet, RunOut, Scheduler, SetSettings, ShownViews, Workers
 from eval.cli.printed_results import print_comparison, print_results
 from eval.core.printing import print_row, say
 from eval.core.progress import shown_progress
@@ -33,25 +33,20 @@ def demo(out: RunOut, quiet: Quiet = False) -> None:
 def run_command(
     plan: Annotated[str, typer.Argument(help="name from `list`, or a .yaml file")],
     out: RunOut,
-    seeds: Annotated[str | None, typer.Option(metavar="A:B", help="instead of the plan's; B excluded")] = None,
+    seeds: Annotated[str | None, typer.Option(metavar="A:B", help="replaces the plan's seeds; B excluded")] = None,
     settings: SetSettings = None,
     grid: Annotated[
         list[str] | None,
-        typer.Option("--grid", metavar="KEY=V1,V2", help="run every variant at each value; repeatable"),
+        typer.Option("--grid", metavar="KEY=V1,V2", help="run every variant at each value; may be repeated"),
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="processes; each takes its own pairs", show_default=False)
-    ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(metavar="tcp://HOST:PORT", help="a Dask cluster that sees the run folder", show_default=False),
-    ] = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="do at most this many cells")] = None,
-    force: Annotated[bool, typer.Option("--force", help="redo finished cells, simulation included")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="list the cells and what is finished, and stop")] = False,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="compute at most this many cells")] = None,
+    force: Annotated[bool, typer.Option("--force", help="compute finished cells again, simulation included")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="list the cells and which are finished; run none")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run a plan: scenarios x seeds x variants. Finished cells are kept and skipped."""
+    """Run a plan: scenarios x seeds x variants. Finished cells are kept."""
     from eval.core.cluster import Where, require_reachable, require_usable
     from eval.plans.changes import changed_plan
     from eval.plans.plan import load_plan
@@ -67,20 +62,18 @@ def run_command(
 
 
 def score(
-    folder: Annotated[Path, typer.Argument(help="a run folder; or a simulated pair, with the answer as second folder")],
-    answer: Annotated[
-        Path | None, typer.Argument(help="one answer to score against the pair", show_default=False)
-    ] = None,
+    folder: Annotated[Path, typer.Argument(help="a run folder; or a simulated pair, followed by an answer")],
+    answer: Annotated[Path | None, typer.Argument(help="folder of one answer to the pair", show_default=False)] = None,
     predictions: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="another program's, DIR/<scenario>/<seed>/answer.json", show_default=False),
+        typer.Option(metavar="DIR", help="answers of others, DIR/<scenario>/<seed>/answer.json", show_default=False),
     ] = None,
     name: Annotated[
-        str | None, typer.Option("--as", metavar="NAME", help="what the run calls them", show_default=False)
+        str | None, typer.Option("--as", metavar="NAME", help="their variant in the tables", show_default=False)
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Score stored answers against the truth again, or another program's predictions; nothing is run."""
+    """Score stored answers against the truth again, or the answers of another program; no method is run."""
     from cdpipe.core.errors import InputError
 
     if (predictions is None) != (name is None):
@@ -112,21 +105,22 @@ def report(
     folder: Annotated[str, typer.Argument(metavar="RUN", help="a run folder")],
     other: Annotated[
         str | None,
-        typer.Argument(metavar="B", help="a second one, judged against the first; RUN:VARIANT is a method of one"),
+        typer.Argument(metavar="B", help="a second run, compared with the first; RUN:VARIANT is one method of a run"),
     ] = None,
     against: Annotated[
         str | None,
-        typer.Option(metavar="VARIANT", help="judge every method of the run against this one", show_default=False),
+        typer.Option(metavar="VARIANT", help="compare every method of the run with this one", show_default=False),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", help="of a comparison; else the folder judged", show_default=False)
+        Path | None,
+        typer.Option("--out", help="folder of a comparison; else the second run's", show_default=False),
     ] = None,
     views: Annotated[
-        ShownViews, typer.Option(help="3-D views beside the page: the first and the worst pairs, none, or all")
+        ShownViews, typer.Option(help="3-D views beside the page: of the first and the worst pairs, none, or all")
     ] = ShownViews.chosen,
     quiet: Quiet = False,
 ) -> None:
-    """Write one offline page with tables, plots and pictures of a run; or what moved between two runs."""
+    """Write one offline page with tables, plots and pictures of a run; or of the differences between two runs."""
     from cdpipe.core.errors import InputError
 
     if other is None and against is None:
@@ -171,7 +165,7 @@ def _run(plan: Plan, out: Path, where: Where, *, force: bool, limit: int | None,
     from eval.running.runfolder import removed_if_empty, start_run_folder
     from eval.running.runner import run_plan
 
-    cells(plan)  # settings that contradict each other are refused before a folder is made
+    cells(plan)  # raises where settings contradict each other, before a folder is made
     command = ["tunnelcd", *sys.argv[1:]]
     with removed_if_empty(out), shown_progress(quiet, rate="cells") as progress:
         run = start_run_folder(out)

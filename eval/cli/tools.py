@@ -1,4 +1,4 @@
-"""Commands about the installation: its speed, what it ships, and whether files are right."""
+"""Commands about the installation: its speed, what it holds, and whether files are valid."""
 
 # ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
 from __future__ import annotations
@@ -16,10 +16,10 @@ def bench(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE.json", help="also write the table", show_default=False)
     ] = None,
-    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="this row alone; repeatable")] = None,
+    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="this row only; may be repeated")] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Measure the speed table, each figure beside its rival in the same run. A missed target is told, not an error."""
+    """Measure the speed table, each figure beside its rival in the same run. A missed target is not an error."""
     import pandas as pd
 
     from eval.bench.bench import chosen, contests, make_ready, measure, reasons, verdict, write_table
@@ -28,7 +28,7 @@ def bench(
     rows = chosen(contests(), only or ())
     if out is not None:
         make_ready(out)
-    # lines, never bars: a thread that redraws them would be measured too
+    # lines, never bars: the time of a thread that redraws bars would be measured as well
     table = measure(rows, (Silent() if quiet else Lines()).cells)
     if out is not None:
         write_table(table, out)
@@ -43,7 +43,7 @@ def bench(
 
 
 def list_command() -> None:
-    """Name the scenarios, props, plans, presets and sensor profiles there are."""
+    """List the scenarios, props, plans, presets, methods, metrics and sensor profiles."""
     from cdpipe.core.plugins import METHODS, METRICS, entry_points
     from cdpipe.model.config import preset_names
     from cdpipe.sensor.ouster import profile_names
@@ -60,13 +60,11 @@ def list_command() -> None:
         "sensor profiles": profile_names(),
     }
     for title, names in groups.items():
-        typer.echo(f"{title}:")
-        for name in names:
-            typer.echo(f"  {name}")
+        typer.echo("\n  ".join([f"{title}:", *names]))
 
 
 def doctor() -> None:
-    """Tell what is installed, whether it works, and what mends it where it does not."""
+    """Print what is installed, whether it works, and how to repair what does not."""
     from cdpipe.core.errors import InputError
     from eval.cli.doctor import examine, faults
 
@@ -82,7 +80,6 @@ def doctor() -> None:
 def check(files: Annotated[list[str], typer.Argument(help="scenario, plan or preset: a name or a .yaml file")]) -> None:
     """Validate scenarios, plans and presets without running anything."""
     from cdpipe.core.errors import InputError
-    from eval.cli.checking import check_file
 
     mistakes: list[str] = []
     for file in files:
@@ -92,3 +89,43 @@ def check(files: Annotated[list[str], typer.Argument(help="scenario, plan or pre
             mistakes += str(error).splitlines()
     if mistakes:
         raise InputError("\n".join(mistakes))
+
+
+def check_file(name_or_path: str) -> str:
+    """Check a scenario, plan or preset, and return its kind in words.
+
+    A file is of the kind with which it shares most keys, so that one misspelt key does not change its kind.
+
+    Raises:
+        InputError: It has mistakes (all of them at once), or it does not exist.
+    """
+    from cdpipe.core.errors import InputError
+    from cdpipe.core.yamlfile import read_yaml, suggest
+    from cdpipe.model.config import PipelineConfig, load_config, preset_names
+    from eval.plans.plan import Plan, cells, load_plan, plan_names
+    from scenarios import check_scenario, scenario_names
+    from scenarios.schema import Scenario
+
+    names = {"plan": plan_names(), "scenario": scenario_names(), "preset": preset_names()}
+    kind = next((kind for kind, known in names.items() if name_or_path in known), "")
+    if not kind:
+        if not name_or_path.endswith((".yaml", ".yml")):
+            near = suggest(name_or_path, [name for known in names.values() for name in known])
+            raise InputError(
+                f"{name_or_path}: no plan, scenario or preset of this name, and no .yaml file{near or '; see `list`'}"
+            )
+        keys = {
+            "preset": {*PipelineConfig.model_fields, "wide"},
+            "plan": set(Plan.model_fields),
+            "scenario": {*Scenario.model_fields, "extends", "frozen"},
+        }
+        content = read_yaml(Path(name_or_path)).value
+        own = set(content) if isinstance(content, dict) else set()
+        kind = max(keys, key=lambda name: len(own & keys[name]))
+    if kind == "plan":
+        return f"a plan of {len(cells(load_plan(name_or_path)))} cells"
+    if kind == "scenario":
+        check_scenario(name_or_path)
+    else:
+        load_config(name_or_path)
+    return f"a {kind}"

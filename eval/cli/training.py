@@ -10,47 +10,35 @@ from typing import Annotated
 
 import typer
 
-from eval.cli.options import Quiet, SetSettings
+from eval.cli.options import Families, Quiet, Scheduler, SetSettings, Workers
 from eval.core.printing import say
 from eval.core.progress import shown_progress
 
 
 def dataset(
-    families: Annotated[list[str], typer.Argument(metavar="FAMILY...", help="names from `list`, or .yaml files")],
+    families: Families,
     seeds: Annotated[
         str, typer.Option(metavar="A:B", help="B excluded; below 10000 to train, 10000 to 19999 to validate")
     ],
-    out: Annotated[Path, typer.Option("--out", help="data folder: new, empty, or to be continued", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", help="data folder: new, empty, or of an earlier run to continue")],
     settings: SetSettings = None,
     draws: Annotated[int, typer.Option(min=1, help="after images of each keyframe; the first is merged exactly")] = 4,
-    error_m: Annotated[float, typer.Option(min=0, help="merge error of the others: shift, per component")] = 0.03,
-    error_deg: Annotated[float, typer.Option(min=0, help="and turn, per component")] = 0.2,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="processes; each takes its own tunnels", show_default=False)
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="tcp://HOST:PORT", help="a Dask cluster instead", show_default=False)
-    ] = None,
+    error_m: Annotated[float, typer.Option(min=0, help="merge error of the other draws: translation, 1 sigma")] = 0.03,
+    error_deg: Annotated[float, typer.Option(min=0, help="rotation, 1 sigma per component")] = 0.2,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     limit: Annotated[int | None, typer.Option(min=1, help="make at most this many tunnels")] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Make training data for descriptors, a shard for each tunnel. Finished tunnels are kept and skipped."""
+    """Make training data for descriptors, one shard per tunnel. Finished tunnels are kept."""
     from eval.core.cluster import Where
     from eval.training.dataset import Recipe
     from eval.training.dataset_run import make_dataset
 
     recipe = Recipe(draws, error_m, error_deg, tuple(settings or ()))
     with shown_progress(quiet) as progress:
-        outcome = make_dataset(
-            families,
-            seeds,
-            recipe,
-            out,
-            Where(workers, scheduler),
-            limit,
-            shlex.join(["tunnelcd", *sys.argv[1:]]),
-            progress,
-        )
+        command, where = shlex.join(["tunnelcd", *sys.argv[1:]]), Where(workers, scheduler)
+        outcome = make_dataset(families, seeds, recipe, out, where, limit, command, progress)
     left = f", {outcome.n_left} left by --limit" if outcome.n_left else ""
     refused = f", {outcome.n_refused} refused (README.md says why)" if outcome.n_refused else ""
     rate = f"; {outcome.n_pairs} keyframe pairs, {outcome.n_pairs / outcome.seconds:.1f}/s" if outcome.n_made else ""
@@ -59,15 +47,15 @@ def dataset(
 
 def train(
     data: Annotated[Path, typer.Argument(metavar="DIR", help="made by `tunnelcd dataset`, tunnels of both splits")],
-    out: Annotated[Path, typer.Option("--out", help="checkpoint, model card, curves", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", help="folder for checkpoint, model card and curves")],
     descriptor: Annotated[str, typer.Option(help="sphere or 3deg")] = "sphere",
-    steps: Annotated[int, typer.Option(min=1, help="at most")] = 4000,
-    seed: Annotated[int, typer.Option(min=0, help="of the first weights and of every draw")] = 0,
-    threads: Annotated[int, typer.Option(min=1, help="of torch")] = 2,
-    patience: Annotated[int, typer.Option(min=1, help="validations without a better score until it stops")] = 6,
+    steps: Annotated[int, typer.Option(min=1, help="largest number of training steps")] = 4000,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the initial weights and of every draw")] = 0,
+    threads: Annotated[int, typer.Option(min=1, help="number of torch's threads")] = 2,
+    patience: Annotated[int, typer.Option(min=1, help="stop after this many validations without a better score")] = 6,
     quiet: Quiet = False,
 ) -> None:
-    """Train a descriptor: checkpoint (safetensors), model card, curves. A run that was cut off goes on."""
+    """Train a descriptor: checkpoint (safetensors), model card, curves. The same command resumes an interrupted run."""
     from cdpipe.core.errors import InputError
     from cdpipe.training.fit import FitConfig
     from eval.training.training_run import TASKS, train_descriptor

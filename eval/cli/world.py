@@ -1,28 +1,32 @@
-"""Commands about worlds and sessions: make them, look at them, bring them from elsewhere."""
+"""Commands about worlds and sessions: simulate, survey, view and convert them."""
 
 # ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from eval.cli.options import OutFolder, Quiet, SetSettings
+from eval.cli.options import Families, OutFolder, Quiet, SetSettings
 from eval.core.printing import print_table, say
 from eval.core.progress import shown_progress
+
+if TYPE_CHECKING:
+    from sim.view.view import View
 
 
 def simulate(
     scenario: Annotated[str, typer.Argument(help="name from `list`, or a .yaml file")],
     out: OutFolder,
-    seed: Annotated[int, typer.Option(min=0, help="draws every distribution and all noise")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="seed of every distribution and of all noise")] = 0,
     settings: SetSettings = None,
     quiet: Quiet = False,
 ) -> None:
-    """Make one pair of sessions with truth: DIR/before, DIR/after, DIR/truth."""
+    """Simulate one pair of sessions with truth: DIR/before, DIR/after, DIR/truth."""
     from eval.core.output import new_folder
-    from scenarios.library import load_scenario
+    from scenarios import load_scenario
     from sim.session.simulate import simulate_pair
 
     drawn = load_scenario(scenario, seed, settings or ())
@@ -32,29 +36,25 @@ def simulate(
 
 
 def survey(
-    families: Annotated[list[str], typer.Argument(metavar="FAMILY...", help="names from `list`, or .yaml files")],
+    families: Families,
     seeds: Annotated[str, typer.Option(metavar="A:B", help="B excluded")] = "0:10",
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE.csv", help="also one row per seed", show_default=False)
+        Path | None, typer.Option("--out", metavar="FILE.csv", help="also write one row per seed", show_default=False)
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, help="processes; each takes its own seeds")] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="number of processes")] = 1,
     markdown: Annotated[bool, typer.Option("--markdown", help="print the table in Markdown")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Build the worlds of families without scanning them, and tell size, density, changes, repose, roughness."""
+    """Build the worlds of families without scanning them; print size, density, changes, repose and roughness."""
     import pandas as pd
 
-    from cdpipe.core.errors import InputError
     from eval.core.output import make_writable
-    from eval.plans.plan import parse_seeds
+    from eval.plans.plan import parse_seeds_option
     from sim.studies import survey as surveys
     from sim.studies.survey_tables import markdown as as_markdown
     from sim.studies.survey_tables import summary, write_csv
 
-    try:
-        numbers = parse_seeds(seeds)
-    except ValueError as error:
-        raise InputError(f"--seeds {seeds}: {error}") from error
+    numbers = parse_seeds_option(seeds)
     if out is not None:
         make_writable(out.absolute().parent)
     with shown_progress(quiet) as progress:
@@ -75,31 +75,32 @@ def survey(
 
 def view(
     what: Annotated[str, typer.Argument(help="scenario (name or .yaml file), simulated pair, or session folder")],
-    seed: Annotated[int | None, typer.Option(min=0, help="of a scenario; 0 if left out", show_default=False)] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="seed of a scenario; 0 if left out", show_default=False)
+    ] = None,
     settings: SetSettings = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="of the server; 0 takes a free one")] = 8080,
-    host: Annotated[str, typer.Option(help="address to listen on; 0.0.0.0 lets other machines look")] = "localhost",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port of the server; 0 takes a free one")] = 8080,
+    host: Annotated[str, typer.Option(help="address of the server; 0.0.0.0 admits other machines")] = "localhost",
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="write one offline page and end", show_default=False)
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Look at a world, a simulated pair or a session in the browser."""
+    """Show a world, a simulated pair or a session in the browser."""
     import time
 
     from cdpipe.core.errors import InputError
-    from eval.cli.looking import view_of
     from sim.view.viewer import require_viser, running_server, show, write_html
 
     require_viser()
     if html is not None:
         if not html.absolute().parent.is_dir():
-            raise InputError(f"--html {html}: there is no folder {html.parent}")
-        write_html(view_of(what, seed, settings or ()), html)
+            raise InputError(f"--html {html}: there is no folder {html.parent}: make it, or name another one")
+        write_html(load_view(what, seed, settings or ()), html)
         say(quiet, f"{html}: {what}, {html.stat().st_size / 1e6:.1f} MB, opens in any browser")
         return
     with running_server(port, host) as server:
-        shown = view_of(what, seed, settings or ())
+        shown = load_view(what, seed, settings or ())
         show(server, shown)
         for note in shown.notes:
             typer.echo(note, err=True)
@@ -111,12 +112,42 @@ def view(
             return
 
 
+def load_view(what: str, seed: int | None = None, settings: Sequence[str] = ()) -> View:
+    """Return the view of a scenario (name or YAML file), of a simulated pair, or of a session.
+
+    Args:
+        what: Name, file or folder. A scenario's name takes precedence over a folder without a session.
+        seed: Seed of a scenario; 0 if None. A folder has its own.
+        settings: `a.b=value` pairs written over a scenario.
+
+    Raises:
+        InputError: It does not exist or is damaged, or a seed or a setting is given for a folder.
+        ScenarioError: The scenario has mistakes, or its world cannot be built.
+    """
+    from cdpipe.core.errors import InputError
+    from cdpipe.core.yamlfile import suggest
+    from cdpipe.io.session import is_session
+    from scenarios import load_scenario, scenario_names
+    from scenarios.library import SUFFIXES
+    from sim.view.view import is_pair, view_folder, view_scenario
+
+    path, names = Path(what), scenario_names()
+    if is_pair(path) or is_session(path) or (path.is_dir() and what not in names):
+        if seed is not None or settings:
+            raise InputError(f"{what}: a folder holds what was recorded: leave --seed and --set out")
+        return view_folder(path)
+    if what not in names and path.suffix not in SUFFIXES:
+        hint = suggest(what, names) or "; `tunnelcd list` names the scenarios"
+        raise InputError(f"{what}: neither a folder nor a scenario{hint}")
+    return view_scenario(load_scenario(what, seed or 0, settings), seed or 0)
+
+
 def convert(
     source: Annotated[Path, typer.Argument(metavar="SRC", help="session folder; or a recording, .osf or .pcap")],
     out: Annotated[Path, typer.Argument(metavar="DST", help="new .osf file; or new session folder")],
     metadata: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.json", help="of a .pcap's sensor; else the .json of its name", show_default=False),
+        typer.Option(metavar="FILE.json", help="sensor of a .pcap; else the .json beside it", show_default=False),
     ] = None,
     trajectory: Annotated[
         Path | None,
@@ -130,10 +161,17 @@ def convert(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a session as OSF for the vendor's SDK, or bring an OSF or PCAP of an Ouster in as a session."""
-    from eval.cli.converting import Options
-    from eval.cli.converting import convert as converted
+    """Convert a session to OSF for the vendor's SDK, or an OSF or PCAP recording of an Ouster to a session."""
+    from eval.cli import converting
 
     with shown_progress(quiet) as progress:
-        told = converted(source, out, Options(metadata, trajectory, odometry, without_truth), progress)
+        told = converting.convert(
+            source,
+            out,
+            progress,
+            metadata=metadata,
+            trajectory=trajectory,
+            odometry=odometry,
+            without_truth=without_truth,
+        )
     say(quiet, told)

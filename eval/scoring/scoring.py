@@ -6,25 +6,24 @@ scored again whenever the metrics change, and so can an answer that another prog
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array, travelled_m
-from cdpipe.extract.extract import FIGURES
+from cdpipe.extract.extract import FIGURES, hull_volume_m3
 from cdpipe.io.answer import Answer, read_answer
-from cdpipe.model.report import ChangeReport
-from eval.core.domains import domain_of
+from cdpipe.model.report import ChangedObject, ChangeReport
+from eval.core.domains import domain_of, is_change_in_distribution
 from eval.scoring.answer_check import check_answer
 from eval.scoring.answer_rows import answer_rows
-from eval.scoring.item_rows import change_rows, figure, object_rows, region_rows
 from eval.scoring.merge_metrics import evidence_columns, merge_columns, merge_errors, overlap_true
-from eval.scoring.object_metrics import kinds_right, match_objects, object_columns, unanswered_objects
+from eval.scoring.object_metrics import ObjectMatches, kinds_right, match_objects, object_columns, unanswered_objects
 from eval.scoring.object_sizes import SizeErrors, size_columns, size_errors
 from eval.scoring.plugins import plugin_columns
-from eval.scoring.region_metrics import keyframes_or_all, score_regions, unanswered_regions
+from eval.scoring.region_metrics import RegionScores, keyframes_or_all, score_regions, unanswered_regions
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
 METRICS_VERSION = 4
@@ -123,6 +122,102 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
             for index, (score, label) in enumerate(zip(keyframe_scores, regions.keyframe_labels, strict=True))
         ],
     )
+
+
+_NAN = float("nan")
+
+
+def change_rows(
+    regions: RegionScores,
+    scored: tuple[ObjectMatches, SizeErrors],
+    right: Float64Array,
+    truth: GroundTruth,
+    report: ChangeReport | None,
+) -> list[dict[str, Any]]:
+    """Return a row of changes.csv for every change, observable or not."""
+    rows = []
+    objects, sizes = scored
+    for index, change in enumerate(truth.pair.changes):
+        fields = {name: value for name, value in asdict(change).items() if name != "world_T_object"}
+        matched = int(objects.matched_object[index])
+        rows.append(
+            {
+                **fields,
+                "is_found": bool(regions.matches.best_region[index] >= 0),
+                "best_region": int(regions.matches.best_region[index]),
+                "iou_point": float(objects.iou_point[index]),
+                "iou_voxel": float(objects.iou_voxel[index]),
+                "iou_box": float(objects.iou_box[index]),
+                "matched_object": matched,
+                "matched_kind": report.objects[matched].kind if report is not None and matched >= 0 else "",
+                "is_kind_right": float(right[index]),
+                "displacement_error_m": float(sizes.displacement_m[index]),
+                "volume_error_share": float(sizes.volume_share[index]),
+                "n_truth_cells": len(truth.change_rows[index]),
+                "seen_hull_volume_m3": hull_volume_m3(truth.points_odom(index)),
+                "range_m": truth.range_m(index),
+                "is_in_distribution": is_change_in_distribution(truth.pair.family, change.prop_kind),
+            }
+        )
+    return rows
+
+
+def region_rows(report: ChangeReport | None, scored: RegionScores, truth: GroundTruth) -> list[dict[str, Any]]:
+    """Return a row of regions.csv for every candidate, best first."""
+    if report is None:
+        return []
+    regions = report.regions
+    is_withdrawn = regions.is_proposed & ~regions.is_reported
+    figures = {name: figure(report, name) for name in FIGURES}
+    return [
+        {
+            "region": index,
+            "score": float(regions.scores[index]),
+            "is_reported": bool(regions.is_reported[index]),
+            "is_withdrawn": bool(is_withdrawn[index]),
+            "outcome": scored.matches.outcomes[index],
+            **dict(zip(("x_m", "y_m", "z_m"), map(float, regions.centres_map[index]), strict=True)),
+            "found_changes": ";".join(str(truth.pair.changes[change].id) for change in scored.matches.found[index]),
+            **{name: float(values[index]) for name, values in figures.items()},
+        }
+        for index in range(len(regions.scores))
+    ]
+
+
+def object_rows(
+    objects: tuple[ChangedObject, ...], matches: ObjectMatches, n_cells: list[int], truth: GroundTruth
+) -> list[dict[str, Any]]:
+    """Return a row of objects.csv for every answered object."""
+    rows = []
+    for index, (item, outcome) in enumerate(zip(objects, matches.outcomes, strict=True)):
+        matched = int(matches.matched_change[index])
+        empty = len(item.points_map) == 0
+        low, high = (np.full(3, np.nan),) * 2 if empty else (item.points_map.min(axis=0), item.points_map.max(axis=0))
+        rows.append(
+            {
+                "object": index,
+                "session": item.session,
+                "kind": item.kind,
+                "region": item.region,
+                "score": float(item.score),
+                "n_returns": len(item.returns),
+                "n_cells": n_cells[index],
+                "matched_change": truth.pair.changes[matched].id if matched >= 0 else -1,
+                "iou_point": float(matches.iou_point[matched]) if matched >= 0 else 0.0,
+                "outcome": outcome,
+                **{f"min_{axis}_m": float(value) for axis, value in zip("xyz", low, strict=True)},
+                **{f"max_{axis}_m": float(value) for axis, value in zip("xyz", high, strict=True)},
+                "hull_volume_m3": hull_volume_m3(item.points_map),
+                "volume_m3": float(item.shape.volume_m3) if item.shape is not None else _NAN,
+                "moved_m": float(np.linalg.norm(item.displacement_map)) if item.displacement_map is not None else _NAN,
+            }
+        )
+    return rows
+
+
+def figure(report: ChangeReport, name: str) -> Float64Array:
+    """Return (R,) a figure of each region, NaN where the answer does not state it."""
+    return np.asarray(report.figures.get(name, np.full(len(report.regions.scores), np.nan)), dtype=np.float64)
 
 
 def _identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:

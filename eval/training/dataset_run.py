@@ -20,7 +20,7 @@ from cdpipe.training.shard import FORMAT, FORMAT_VERSION, SUFFIX, read_about
 from eval.core.cluster import HERE, Where, connected, n_slots, require_usable
 from eval.core.output import make_writable
 from eval.core.progress import RunProgress, Silent, duration
-from eval.plans.plan import parse_seeds
+from eval.plans.plan import parse_seeds_option
 from eval.plans.worlds import world_slug
 from eval.running.runfolder import write_json
 from eval.training.dataset import Recipe, make_shard, shard_digest
@@ -117,10 +117,7 @@ def make_dataset(
 
 def _tunnels(families: Sequence[str], seeds: str, recipe: Recipe) -> list[Tunnel]:
     """Return the tunnels, seed by seed, so that a run that was cut off has something of every family."""
-    try:
-        numbers = parse_seeds(seeds)
-    except ValueError as error:
-        raise InputError(f"--seeds {seeds}: {error}") from error
+    numbers = parse_seeds_option(seeds)
     if len(set(families)) < len(families):
         raise InputError(f"families {', '.join(families)}: one is named twice")
     tunnels = [_tunnel(family, seed, recipe) for seed in numbers for family in families]

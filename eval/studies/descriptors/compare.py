@@ -12,26 +12,28 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import numpy as np
 import pandas as pd
 import typer
 
-from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import checkpoint_digest, sphere_digest, use_threads
 from cdpipe.model.config import load_config
+from eval.core.domains import domain_of
 from eval.core.exits import run_program
 from eval.core.output import make_writable
 from eval.core.progress import RunProgress, shown_progress
 from eval.core.provenance import digest, git_commit, machine
-from eval.plans.plan import parse_seeds
+from eval.core.statistics import bootstrap_interval, mean_with_interval
+from eval.plans.plan import parse_seeds_option
 from eval.plans.worlds import world_slug
 from eval.running.runfolder import remove, write_json
-from eval.studies.descriptors.rows import METHODS, pair_rows
-from eval.studies.descriptors.table import places_table, spheres_table
+from eval.studies.descriptors.rows import METHODS, SPHERE, pair_rows
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
@@ -117,6 +119,99 @@ def _stored(path: Path, key: str) -> list[dict[str, object]] | None:
         return None  # absent, or damaged: it is measured anew
 
 
+_PAIR = ["family", "seed"]
+
+
+def places_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return what each descriptor of scans recognises, by group.
+
+    Returns:
+        `place_recall_at_1` and `yaw_flip_share`, means over pairs, and `yaw_error_deg`, the median over pairs of each
+        pair's median, all with `_low` and `_high`; `n_pairs`, `n_places` that were asked for; `bytes_per_keyframe`,
+        the pose included; `ms_per_keyframe`, the median over pairs.
+    """
+    table = []
+    for group, own in _groups(rows[rows["descriptor"] != SPHERE]):
+        for (descriptor, precision), cases in own.groupby(["descriptor", "precision"], sort=False):
+            yaws_deg = _numbers(cases, "yaw_error_deg")
+            low, high = bootstrap_interval(yaws_deg, "median")
+            table.append(
+                {
+                    "group": group,
+                    "descriptor": descriptor,
+                    "precision": precision,
+                    **_mean(cases, "place_recall_at_1"),
+                    "yaw_error_deg": float(np.nanmedian(yaws_deg)) if not np.isnan(yaws_deg).all() else float("nan"),
+                    "yaw_error_deg_low": low,
+                    "yaw_error_deg_high": high,
+                    **_mean(cases, "yaw_flip_share"),
+                    "n_pairs": len(cases),
+                    "n_places": int(cases["n_places"].sum()),
+                    **_price(cases),
+                }
+            )
+    return pd.DataFrame(table)
+
+
+def spheres_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return what `sphere` finds in each precision, by group.
+
+    Returns:
+        `region_auroc`, mean over the pairs that have one (`n_used` of `n_pairs`), with `_low` and `_high`;
+        `auroc_loss` against float32, mean over the same pairs, with `_low` and `_high`, and the largest of any pair;
+        `n_refused` pairs whose merge was; `map_over_kept`, the bytes of the thinned before map over those kept of it,
+        median over pairs, and `map_over_kept_least`; price as in `places_table`.
+    """
+    table = []
+    for group, own in _groups(rows[rows["descriptor"] == SPHERE]):
+        exact = own[own["precision"] == "float32"].set_index(_PAIR)["region_auroc"]
+        for precision, cases in own.groupby("precision", sort=False):
+            loss = exact - cases.set_index(_PAIR)["region_auroc"]
+            ratio = _numbers(cases, "map_bytes_per_keyframe") / _numbers(cases, "bytes_per_keyframe")
+            table.append(
+                {
+                    "group": group,
+                    "precision": precision,
+                    **_mean(cases, "region_auroc"),
+                    **_mean(loss.to_frame("auroc_loss"), "auroc_loss"),
+                    "auroc_loss_most": float(loss.max()),
+                    "n_pairs": len(cases),
+                    "n_used": int(cases["region_auroc"].notna().sum()),
+                    "n_refused": int((cases["status"] != "ok").sum()),
+                    "map_over_kept": float(np.median(ratio)),
+                    "map_over_kept_least": float(ratio.min()),
+                    **_price(cases),
+                }
+            )
+    return pd.DataFrame(table)
+
+
+def _groups(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    for family, own in rows.groupby("family", sort=False):
+        yield str(family), own
+    domains = rows["family"].map(domain_of)
+    for domain in ("in", "out"):
+        own = rows[domains == domain]
+        if own["family"].nunique() > 1:
+            yield f"all {domain} of distribution" if domain == "out" else "all in distribution", own
+
+
+def _mean(cases: pd.DataFrame, column: str) -> dict[str, float]:
+    value, low, high, _ = mean_with_interval(_numbers(cases, column))
+    return {column: value, f"{column}_low": low, f"{column}_high": high}
+
+
+def _price(cases: pd.DataFrame) -> dict[str, Any]:
+    return {
+        "bytes_per_keyframe": int(cases["bytes_per_keyframe"].iloc[0]),
+        "ms_per_keyframe": float(np.median(_numbers(cases, "ms_per_keyframe"))),
+    }
+
+
+def _numbers(cases: pd.DataFrame, column: str) -> Float64Array:
+    return cases[column].to_numpy(dtype=np.float64)
+
+
 def main(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="a new folder, or one to go on with")],
     families: Annotated[
@@ -127,10 +222,7 @@ def main(
     quiet: Annotated[bool, typer.Option("--quiet", "-q")] = False,
 ) -> None:
     """Measure every descriptor on simulated pairs."""
-    try:
-        numbers = parse_seeds(seeds)
-    except ValueError as error:
-        raise InputError(f"--seeds {seeds}: {error}") from error
+    numbers = parse_seeds_option(seeds)
     with shown_progress(quiet, "pairs") as progress:
         rows = measure(families or _FAMILIES, numbers, out, progress, keep=keep)
     tables = {"descriptors": rows, "places": places_table(rows), "spheres": spheres_table(rows)}

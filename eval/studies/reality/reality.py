@@ -22,13 +22,14 @@ import typer
 from eval.core.exits import run_program
 from eval.core.output import make_writable, unwritable
 from eval.studies.reality.plots import draw_measures, draw_novelty, draw_scene
-from eval.studies.reality.rebuilt_scene import Rebuilt, rebuild
 from eval.studies.reality.scenes import (
+    Rebuilt,
     as_revolutions,
     cast_at_origin,
     drive_of,
     find_recording,
     real_revolution,
+    rebuild,
     with_effects,
 )
 from eval.studies.reality.sensor_measures import Revolutions

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import BoolArray, Float64Array, transform
 from cdpipe.io.ouster.captures import open_recording
 from cdpipe.sensor.ouster import SensorMetadata
 from eval.studies.reality.sensor_measures import Revolutions, destaggered
 from scenarios.library import load_scenario
 from scenarios.schema import Sensor
 from sim.drive.trajectory import record
+from sim.geometry.mesh import Mesh
+from sim.geometry.raycast import Caster
 from sim.scene import Scene
 from sim.sensor.lidar import Scan, scan
+from sim.sensor.optics import COUNTS_PER_DOUBLING
 from sim.sensor.rays import revolution_rays
 from sim.session.revolution import Drive
 from sim.session.simulate import plan_drives
@@ -99,3 +102,149 @@ def world_points(sensor: SensorMetadata, result: Scan, poses: Float64Array) -> F
     points = sensor.project(result.range_mm / 1000.0).swapaxes(0, 1)
     turned = points @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
     return np.asarray(turned[result.range_mm.T > 0])
+
+
+_N_LEVELS = 96
+_LEVELS = np.geomspace(0.002, 200.0, _N_LEVELS)  # reflectivities that a rebuilt scene tells apart
+_ROW_RATIO, _COLUMN_RATIO = 1.3, 1.03  # of ranges: neighbouring pixels of one surface
+_HOLE = 2  # columns
+_SMOOTHING = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0  # Savitzky-Golay, parabola through seven
+# The tip of a patch's triangles, in half steps from its middle: off the beam, which must meet a face and no corner.
+_TIP_ROW, _TIP_COLUMN = 0.15, 0.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rebuilt:
+    """A recorded revolution made into a surface.
+
+    Attributes:
+        scene: One patch for each pixel, as wide as the pixel.
+        is_surface: (H, W) destaggered mask of the pixels that have one: every return, and holes of one or two columns
+            between returns that agree.
+    """
+
+    scene: Scene
+    is_surface: BoolArray
+
+
+def rebuild(real: Revolutions, template: Scene) -> Rebuilt:
+    """Make a surface of the first revolution: what the sensor met, without what the sensor added.
+
+    Each pixel becomes a flat patch that reaches half way to its neighbours and is inclined towards those of similar
+    range; beams of the same table meet it at the recorded range. Noise is taken
+    out along the beam by a parabola through seven columns where the surface is smooth. Holes of one or two columns
+    between returns that agree are closed, for there something did not return that could have. Reflectivity is the
+    recorded channel over the patch's own cosine of incidence, in 96 steps.
+
+    Args:
+        real: The recording, in the sensor frame.
+        template: Any scene: only its caster, instances and reflectivities are replaced.
+    """
+    filled_m, share, is_surface = _closed(real)
+    inverse = np.where(is_surface, 1.0 / np.where(is_surface, filled_m, 1.0), 0.0)
+    vertices = _vertices(real.sensor, inverse)
+    cosine = _patch_cosine(vertices)
+    reflectivity = np.clip(share / np.maximum(cosine, 0.05), _LEVELS[0], _LEVELS[-1])
+    level = np.searchsorted(_LEVELS, reflectivity[is_surface] * (_LEVELS[0] / _LEVELS[1]) ** 0.5)
+    patches = vertices[is_surface]
+    levels = np.unique(level)
+    caster = Caster(_patch_mesh(patches[level == each]) for each in levels)
+    scene = replace(
+        template,
+        caster=caster,
+        instance=np.zeros(len(levels), np.int32),
+        reflectivity=_LEVELS[np.minimum(levels, _N_LEVELS - 1)].astype(np.float32),
+    )
+    return Rebuilt(scene, is_surface)
+
+
+def _closed(real: Revolutions) -> tuple[Float64Array, Float64Array, BoolArray]:
+    """Return ranges, apparent reflectivities and mask (H, W) with small holes closed and the noise taken out."""
+    range_m, counts = real.range_m[0].copy(), np.maximum(real.reflectivity[0], 0.5)
+    share = np.where(counts > 100, 2.0 ** ((counts - 100.0) / COUNTS_PER_DOUBLING), counts / 100.0)
+    smooth_m = sum(weight * np.roll(range_m, place - 3, -1) for place, weight in enumerate(_SMOOTHING))
+    window = np.stack([np.roll(range_m, shift, -1) for shift in range(-3, 4)])
+    is_flat = (window > 0).all(axis=0) & (np.ptp(window, axis=0) < 0.03 * range_m)
+    range_m = np.where(is_flat, smooth_m, range_m)
+    is_surface = range_m > 0
+    known_m, known_share = range_m.copy(), share.copy()
+    for width in range(1, _HOLE + 1):
+        for place in range(width):
+            before, after = place + 1, width - place
+            left_m, right_m = np.roll(known_m, before, -1), np.roll(known_m, -after, -1)
+            is_hole = (range_m == 0) & (left_m > 0) & (right_m > 0)
+            is_hole &= np.abs(left_m - right_m) < (_COLUMN_RATIO - 1.0) * left_m
+            part = before / (before + after)
+            range_m = np.where(is_hole, (1.0 - part) * left_m + part * right_m, range_m)
+            left, right = np.roll(known_share, before, -1), np.roll(known_share, -after, -1)
+            share = np.where(is_hole, left ** (1.0 - part) * right**part, share)
+            is_surface |= is_hole
+    return range_m, share, is_surface
+
+
+def _slopes(inverse: Float64Array, axis: int, ratio: float) -> Float64Array:
+    """Return how much a patch's inverse range (H, W) grows over half a step down (axis 0) or on (axis 1).
+
+    The mean of the slopes to the two neighbours, as far as they are the same surface. Inverse range is linear in the
+    image of a plane.
+    """
+    back, ahead = np.roll(inverse, 1, axis), np.roll(inverse, -1, axis)
+    if axis == 0:
+        back[0] = ahead[-1] = 0.0
+    has_back, has_ahead = (
+        (each > 0) & (np.maximum(each, inverse) < ratio * np.minimum(each, inverse)) for each in (back, ahead)
+    )
+    total = np.where(has_back, inverse - back, 0.0) + np.where(has_ahead, ahead - inverse, 0.0)
+    return np.asarray(total / (2.0 * np.maximum(has_back + 0.0 + has_ahead, 1.0)))
+
+
+def _vertices(sensor: SensorMetadata, inverse: Float64Array) -> Float64Array:
+    """Return the tip and the four corners of each patch's triangles (H, W, 5, 3), sensor frame, metres."""
+    altitude = np.deg2rad(sensor.altitude_deg)
+    padded = np.concatenate([[2 * altitude[0] - altitude[1]], altitude, [2 * altitude[-1] - altitude[-2]]])
+    halves = (padded[:-1] + padded[1:])[:, None] / 2.0
+    above, below = halves[:-1] - altitude[:, None], halves[1:] - altitude[:, None]
+    shift = np.asarray(sensor.pixel_shift)[:, None]
+    measurement = (np.arange(sensor.width, dtype=np.float64)[None, :] - shift) % sensor.width
+    per_row, per_column = _slopes(inverse, 0, _ROW_RATIO), _slopes(inverse, 1, _COLUMN_RATIO)
+    rise = 2.0 * per_row / (below - above)  # per radian, both halves of a patch alike
+    places = [(_TIP_ROW * below, _TIP_COLUMN), *((edge, side) for edge in (above, below) for side in (-1.0, 1.0))]
+    ends = []
+    for turn, side in places:
+        at = np.maximum(inverse + turn * rise + side * per_column, inverse / 2.0)
+        ends.append(_ray_ends(sensor, measurement + 0.5 * side, altitude[:, None] + turn, at))
+    return np.stack(ends, axis=2)
+
+
+def _ray_ends(
+    sensor: SensorMetadata, measurement: Float64Array, altitude: Float64Array, inverse: Float64Array
+) -> Float64Array:
+    """Return the points (H, W, 3) at some inverse ranges along beams of any altitude at any part of a column."""
+    encoder = 2.0 * np.pi * (1.0 - measurement / sensor.width)
+    azimuth = encoder - np.deg2rad(sensor.azimuth_deg)[:, None]
+    reach_m = 1.0 / np.where(inverse > 0, inverse, 1.0) - sensor.beam_origin_m
+    offset_m = sensor.beam_origin_m
+    in_lidar = np.stack(
+        [
+            offset_m * np.cos(encoder) + reach_m * np.cos(azimuth) * np.cos(altitude),
+            offset_m * np.sin(encoder) + reach_m * np.sin(azimuth) * np.cos(altitude),
+            reach_m * np.sin(altitude),
+        ],
+        axis=-1,
+    )
+    return transform(sensor.sensor_T_lidar, in_lidar)
+
+
+def _patch_cosine(vertices: Float64Array) -> Float64Array:
+    """Return the cosine of incidence (H, W) on each patch, from its diagonals."""
+    normal = np.cross(vertices[:, :, 4] - vertices[:, :, 1], vertices[:, :, 3] - vertices[:, :, 2])
+    tip = vertices[:, :, 0]
+    size = np.linalg.norm(normal, axis=-1) * np.linalg.norm(tip, axis=-1)
+    return np.asarray(np.abs((normal * tip).sum(axis=-1)) / np.maximum(size, 1e-12))
+
+
+def _patch_mesh(patches: Float64Array) -> Mesh:
+    """Return the patches (N, 5, 3) as one mesh of four triangles each, round the tip."""
+    fan = np.array([[0, 1, 2], [0, 2, 4], [0, 4, 3], [0, 3, 1]])
+    faces = (5 * np.arange(len(patches))[:, None, None] + fan).reshape(-1, 3)
+    return Mesh(patches.reshape(-1, 3), faces.astype(np.int32))

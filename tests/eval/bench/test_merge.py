@@ -13,8 +13,7 @@ from cdpipe.core.geometry import yaw_pose
 from cdpipe.merge.global_registration import is_kiss_matcher_installed
 from cdpipe.model.types import MergedMaps
 from eval.bench import merge as merge_bench
-from eval.bench.bench import contests, measure, row_of, verdict
-from eval.bench.descriptor import descriptor_contests
+from eval.bench.bench import contests, descriptor_contests, measure, row_of, verdict
 from eval.bench.merge import Goals, MergeSite, merge_contests, paper_sites
 from sim.studies.bench import BenchSite
 

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from cdpipe.core.errors import InputError
-from eval.cli.checking import check_file
+from eval.cli.tools import check_file
 
 
 @pytest.mark.parametrize(

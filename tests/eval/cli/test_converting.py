@@ -145,7 +145,7 @@ def test_an_interrupt_leaves_nothing(
         source, target = pair / "before", tmp_path / "new" / "a.osf"
     else:
         source, target = tmp_path.parent / "whole.osf", tmp_path / "new" / "a"
-        converting.convert(pair / "before", source, converting.Options(), _Silent())
+        converting.convert(pair / "before", source, _Silent())
         monkeypatch.setattr(converting.import_recording.__globals__["SessionWriter"], "add", interrupted)
     assert command("convert", source, target, "--quiet") == (130, "", "interrupted; nothing was written\n")
     source.with_name("whole.osf").unlink(missing_ok=True)

@@ -12,7 +12,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.methods import registry
-from eval.cli.checking import check_file
+from eval.cli.tools import check_file
 from eval.core import cluster
 from eval.core.cluster import Where, require_reachable
 from eval.core.progress import Lines, Silent

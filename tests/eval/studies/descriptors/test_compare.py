@@ -18,9 +18,8 @@ from eval.core.progress import Silent
 from eval.running.stages import kept_bytes
 from eval.scoring.region_metrics import keyframe_labels
 from eval.studies.descriptors import compare as command
-from eval.studies.descriptors.place_metrics import place_scores
-from eval.studies.descriptors.rows import describe_keyframes, pair_rows, scan_row, sphere_rows
-from eval.studies.descriptors.table import places_table, spheres_table
+from eval.studies.descriptors.compare import places_table, spheres_table
+from eval.studies.descriptors.rows import describe_keyframes, pair_rows, place_scores, scan_row, sphere_rows
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import SESSIONS, load_ground_truth
 

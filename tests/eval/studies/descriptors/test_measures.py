@@ -10,7 +10,7 @@ from torch import Tensor
 from cdpipe.descriptors.sphere_image import COLUMNS, ROWS
 from cdpipe.descriptors.sphere_network import SECTORS, SphereNetwork
 from cdpipe.training.sphere_training import SphereData
-from eval.studies.descriptors.measures import HeldOut, measures, rounded
+from eval.studies.descriptors.curves import HeldOut, measures, rounded
 
 # two tunnels, keyframes 10 m apart, so that none has a neighbour
 LOG_ODDS = [2.0, -1.0, 0.5, -3.0, 1.0, -2.0]

@@ -3,7 +3,7 @@ import pytest
 
 from cdpipe.core.geometry import Float64Array, yaw_pose
 from cdpipe.model.types import DescriptorSet
-from eval.studies.descriptors.place_metrics import place_outcomes, place_scores
+from eval.studies.descriptors.rows import place_outcomes, place_scores
 
 SIZE = 64
 BIN_RAD = 2 * np.pi / SIZE

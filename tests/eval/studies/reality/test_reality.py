@@ -18,13 +18,13 @@ from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from eval.studies.reality import scenes as reality_scenes
 from eval.studies.reality.plots import draw_measures, draw_novelty, draw_scene
 from eval.studies.reality.reality import DATA_VARIABLE, main
-from eval.studies.reality.rebuilt_scene import rebuild
 from eval.studies.reality.scenes import (
     as_revolutions,
     cast_at_origin,
     drive_of,
     find_recording,
     real_revolution,
+    rebuild,
     standing,
     with_effects,
     world_points,
