@@ -1,4 +1,4 @@
-"""Descriptors of places, learned and hand-made; with `cdpipe.training` the only part of cdpipe that needs torch."""
+"""Place descriptors, learned and hand-made; besides `cdpipe.training` the only folder of cdpipe that uses torch."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Descriptors of a session's keyframes, as a robot would compute and keep them while mapping."""
+"""Scan descriptors of a session's keyframes; a robot computes and stores them while it maps."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _BATCH = 32
 
 
 def describe_scan(scan: PosedScan, config: DescriptorConfig) -> tuple[Float32Array, Float32Array]:
-    """Return q (D,) and w (64,) of one scan; D is 64, for descriptors made by hand the number of their rings."""
+    """Return q (D,) and w (64,) of one scan; D is 64, or the number of rings of a hand-made descriptor."""
     q, w = _describe([scan.points_sensor], config.method)
     return q[0], w[0]
 
@@ -41,8 +41,8 @@ def describe_scans(source: ScanSource, keyframe_scans: Int64Array, config: Descr
 
     Args:
         source: The session.
-        keyframe_scans: (K,) indices of the scans that are keyframes, rising.
-        config: Which descriptor.
+        keyframe_scans: (K,) indices of the keyframe scans, rising.
+        config: `method` names the descriptor.
     """
     parts = []
     for start in range(0, len(keyframe_scans), _BATCH):
@@ -56,10 +56,13 @@ def describe_scans(source: ScanSource, keyframe_scans: Int64Array, config: Descr
 def save_descriptors(
     folder: Path, descriptors: DescriptorSet, odom_T_sensor: Float64Array, map_config: MapConfig
 ) -> Path:
-    """Store descriptors beside a session, in `folder/descriptors/<name>.npz`, and return the file.
+    """Write descriptors to `folder/descriptors/<name>.npz` and return the file.
 
-    The poses (S, 4, 4) of the session are stored with them, to tell whether they still belong to it, and with sphere
-    descriptors the weights and the map settings they were made with.
+    The file also holds what they are valid for: the (S, 4, 4) poses of the session and, with sphere descriptors, the
+    digest of the weights and the map settings.
+
+    Raises:
+        InputError: The file cannot be written.
     """
     path = folder / "descriptors" / f"{descriptors.name}.npz"
     partial = path.with_suffix(".partial.npz")
@@ -86,9 +89,9 @@ def save_descriptors(
 def load_descriptors(
     folder: Path, config: DescriptorConfig, odom_T_sensor: Float64Array, map_config: MapConfig
 ) -> DescriptorSet | None:
-    """Read stored descriptors; None where there are none, or none of the present checkpoint and of these poses.
+    """Read stored descriptors; None if there are none for this checkpoint and these poses.
 
-    Sphere descriptors come along where they are of the present weights, precision and map settings.
+    Sphere descriptors are included if they are for the current weights, precision and map settings.
 
     Raises:
         InputError: The file is damaged.
@@ -116,17 +119,17 @@ def _spheres_of(map_config: MapConfig) -> str:
 
 
 def checkpoint_digest(config: DescriptorConfig) -> str:
-    """Return the digest of the weights that descriptors made with `config` carry; the version of those without."""
+    """Return the digest of the weights of the descriptor in `config`; of a hand-made one its version."""
     return f"version {VERSION}" if config.method in HANDMADE else _network(config.method)[1]
 
 
 def use_threads(n_threads: int) -> None:
-    """Fix the number of threads the network runs on, so that every run of a case is equal."""
+    """Set the number of threads of the network; results depend on it in the last bits."""
     torch.set_num_threads(n_threads)
 
 
 def _describe(clouds_sensor: Iterable[Float64Array], method: str) -> tuple[Float32Array, Float32Array]:
-    """Return q (N, D) and w (N, 64) of N scans' points."""
+    """Return q (N, D) and w (N, 64) of N scans, each (M, 3) points in the sensor frame."""
     if method in HANDMADE:
         vectors = [HANDMADE[method](points) for points in clouds_sensor]
         return np.stack([q for q, _ in vectors]), np.stack([w for _, w in vectors])

@@ -1,10 +1,9 @@
-"""Scan descriptors made by hand: Scan Context and SOLiD, in the form that the learned one has.
+"""Hand-made scan descriptors: Scan Context and SOLiD, in the form of the learned one.
 
-Both turn a scan into q, a place vector that a turn of the sensor leaves alone, and w, one value per azimuth sector that
-a turn shifts, so that the merge and the query use them as they use `3deg`. Two things differ from both papers. Places
-are compared by the distance of q alone: the merge's votes and its registration do what the papers do by a second,
-slower comparison of whole images. And w has 64 sectors instead of 60, as 3DEG's has 64 values, and is compared by
-circular correlation.
+Each gives a place vector q that is invariant to yaw and an orientation vector w with one value per azimuth sector, so
+merge and query use them as they use `3deg`. Two details differ from both papers. Places are compared by the distance of
+q alone; the papers add a slower comparison of full images, which the merge's vote and registration replace here. And w
+has 64 sectors instead of 60, like 3DEG's, and is compared by circular correlation.
 """
 
 from __future__ import annotations
@@ -16,15 +15,14 @@ import numpy as np
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, require_shape
 from cdpipe.core.voxel import cell_keys
 
-# Of the vectors: raised when they change, so that stored ones are made anew.
+# Raised when the vectors change, so that stored ones are recomputed.
 VERSION = 1
 SECTORS = 64
-# As published, over streets. A drift is 4 to 10 m wide, but its far ends are what tells one place from the next: of 20,
-# 40, 80 and 120 m, 80 m found most places with either descriptor on four validation pairs.
+# As published. Of 20, 40, 80 and 120 m, 80 m found most places on four validation pairs.
 MAX_RANGE_M = 80.0
 
 CONTEXT_RINGS = 20
-# What lies under the sensor counts as height too (the authors' code lifts by 2 m): 3 m, for a drone in a high drift.
+# Height added to all returns, so that those below the sensor count; the authors' code adds 2 m.
 LIFT_M = 3.0
 
 SOLID_RINGS = 40
@@ -38,16 +36,15 @@ Vectors = tuple[Float32Array, Float32Array]
 def scan_context(points_sensor: Float64Array) -> Vectors:
     """Return ring key and sector key of a Scan Context (Kim & Kim, IROS 2018, 10.1109/IROS.2018.8593953).
 
-    The context is the height of the highest return in each of 20 rings by 64 sectors (the paper: 60) about the sensor,
-    seen from above; 0 where there is none. The ring key is the share of each ring's bins that hold a return, as in the
-    paper (the authors' code takes their mean height, which found fewer places here); the sector key, which the paper
-    does not have, is the mean height of each sector, as in the authors' code.
+    The context is the height of the highest return in each bin of 20 rings by 64 sectors (the paper: 60) around the
+    sensor, 0 for an empty bin. The ring key is the share of occupied bins in each ring, as in the paper; the authors'
+    code uses the mean height. The sector key is the mean height of each sector, as in the authors' code.
 
     Args:
         points_sensor: (N, 3) deskewed returns, sensor frame, metres.
 
     Returns:
-        q (20,) of unit length, and w (64,) of zero mean and unit length; zeros for a scan that has nothing to tell.
+        q (20,) of unit length, and w (64,) of zero mean and unit length; zeros for an empty or uniform scan.
     """
     require_shape("points_sensor", points_sensor, (None, 3))
     x, y, z = np.ascontiguousarray(points_sensor.T)
@@ -63,16 +60,16 @@ def scan_context(points_sensor: Float64Array) -> Vectors:
 def solid(points_sensor: Float64Array) -> Vectors:
     """Return R-SOLiD and A-SOLiD of a scan (Kim, Choi, Sim, Kim & Cho, RA-L 2024, arXiv 2408.07330).
 
-    The scan is thinned to the mean of each 0.5 m cell, and its points are counted by range and elevation and by azimuth
-    and elevation. Each row of elevation then weighs by the number of its points, scaled so that the emptiest row counts
-    nothing and the fullest one; the weighted sums over elevation tell of range (R-SOLiD) and of azimuth (A-SOLiD). What
-    lies beyond the last ring counts in it. Rows are the beams of an OS1-32; returns above and below them are left out.
+    The scan is thinned to the mean of each 0.5 m voxel. Its points are counted by range and elevation, and by azimuth
+    and elevation. Elevation rows are weighted by their number of points, scaled to [0, 1]. The weighted sums over
+    elevation are R-SOLiD (range) and A-SOLiD (azimuth). Points beyond the last ring count in it. The rows span the
+    field of view of an OS1-32; returns outside are dropped.
 
     Args:
         points_sensor: (N, 3) deskewed returns, sensor frame, metres.
 
     Returns:
-        q (40,) of unit length, and w (64,) of zero mean and unit length; zeros for a scan that has nothing to tell.
+        q (40,) of unit length, and w (64,) of zero mean and unit length; zeros for an empty or uniform scan.
     """
     require_shape("points_sensor", points_sensor, (None, 3))
     x, y, z = _cell_means(points_sensor, SOLID_VOXEL_M).T
@@ -98,8 +95,8 @@ def _sectors(x: Float64Array, y: Float64Array) -> Int64Array:
 
 
 def _cell_means(points: Float64Array, cell_m: float) -> Float64Array:
-    """Return the mean of the points of each occupied cell."""
-    # neighbours in a scan mostly share a cell: of their runs far fewer are left to sort
+    """Return the (C, 3) mean of the points of each occupied cell."""
+    # neighbours in a scan mostly share a cell, so summing runs first leaves little to sort
     keys, sums = _sum_runs(cell_keys(points, cell_m), np.column_stack([points, np.ones(len(points))]))
     order = np.argsort(keys)
     _, sums = _sum_runs(keys[order], sums[order])
@@ -107,7 +104,7 @@ def _cell_means(points: Float64Array, cell_m: float) -> Float64Array:
 
 
 def _sum_runs(keys: Int64Array, values: Float64Array) -> tuple[Int64Array, Float64Array]:
-    """Return the key of each run of equal keys (none is negative), and the sum of its rows."""
+    """Return the key of each run of equal keys, none negative, and the sum of the rows of the run."""
     starts = np.flatnonzero(np.diff(keys, prepend=-1))
     return keys[starts], np.add.reduceat(values, starts, axis=0) if len(starts) else values
 
@@ -119,6 +116,6 @@ def _normalise(values: Float64Array) -> Float32Array:
 
 def _centre_and_normalise(values: Float64Array) -> Float32Array:
     centred = values - values.mean()
-    # an even ring tells no direction: what is left of it is rounding
+    # a uniform ring has no orientation; the rest is rounding
     is_even = np.abs(centred).max() <= 1e-9 * np.abs(values).max()
     return _normalise(np.zeros_like(centred) if is_even else centred)

@@ -1,9 +1,9 @@
-"""The scan descriptor: a re-implementation of 3DEG (arXiv 2210.07285), after OREOS (arXiv 1903.07918).
+"""The scan descriptor network: a re-implementation of 3DEG (arXiv 2210.07285), after OREOS (arXiv 1903.07918).
 
-Range image -> convolutions with circular padding along the azimuth -> two 64-d vectors: q, the place, from maxima and
-the amplitudes of the lowest azimuth frequencies, which a turn of the sensor leaves alone; w, the orientation, one value
-per 5.6 deg of azimuth, so that a turn of the sensor shifts it. No weights or code of 3DEG are public: layer sizes are
-ours, and both vectors do by construction what fully connected layers have to learn: q stands still, w turns.
+A range image passes through convolutions with circular padding in azimuth and gives two 64-d vectors. The place vector
+q is made of maxima and amplitudes of low azimuth frequencies, so it is invariant to yaw. The orientation vector w has
+one value per 5.6 degrees of azimuth, so yaw shifts it circularly. No weights or code of 3DEG are public; layer sizes
+are ours.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from cdpipe.descriptors.range_image import COLUMNS
 
 DIMENSIONS = 64
 _CHANNELS = (24, 48, 64, 64)
-# Azimuth strides multiply to COLUMNS / DIMENSIONS, so that w has one value per remaining column.
+# (row, azimuth); the azimuth strides multiply to COLUMNS / DIMENSIONS, so w has one value per remaining column.
 _STRIDES = ((2, 2), (2, 2), (2, 1), (1, 1))
-# Azimuth frequencies that q is made of, the mean among them: what is 26 deg wide and wider.
+# Number of azimuth frequencies in q, the mean included: structures 26 degrees wide and wider.
 _FREQUENCIES = 8
 _RANGE_SCALE_M = 10.0
 
@@ -52,7 +52,7 @@ class CircularConv(nn.Module):
 
 
 class PlaceNetwork(nn.Module):
-    """(B, ROWS, COLUMNS) ranges in metres -> q (B, 64) of unit length and w (B, 64) of zero mean and unit length."""
+    """Maps (B, ROWS, COLUMNS) ranges, metres, to q (B, 64), unit length, and w (B, 64), zero mean, unit length."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class PlaceNetwork(nn.Module):
         self.heading = nn.Conv1d(4 * _CHANNELS[-1], 1, 1)
 
     def forward(self, ranges_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (q, w)."""
+        """Return q (B, 64) and w (B, 64)."""
         seen = (ranges_m > 0).float()
         nearness = seen * _RANGE_SCALE_M / (_RANGE_SCALE_M + ranges_m)
         features = self.layers(torch.stack([nearness, seen], dim=1)).flatten(1, 2)
@@ -76,22 +76,22 @@ class PlaceNetwork(nn.Module):
 
 
 def _amplitudes(features: Tensor) -> Tensor:
-    """(B, F, columns) -> (B, F, _FREQUENCIES) amplitudes of the lowest frequencies along the columns, mean first."""
+    """Return the (B, F, _FREQUENCIES) amplitudes of the lowest column frequencies of (B, F, columns) features."""
     spectrum = torch.fft.rfft(features, norm="forward")[..., :_FREQUENCIES]
-    # not abs(): its gradient at 0 is none
+    # abs() has no gradient at 0
     magnitudes = (spectrum.real.square() + spectrum.imag.square() + 1e-6).sqrt()
     return torch.cat([magnitudes[..., :1], 2 * magnitudes[..., 1:]], dim=-1)
 
 
 def yaw_correlation(w_a: Tensor, w_b: Tensor) -> Tensor:
-    """Return (B, 64) circular correlation; its peak s says that b is turned by s * 2 pi / 64 against a."""
+    """Return the (B, 64) circular correlation; a peak at s means that b has yaw s * 2 pi / 64 relative to a."""
     spectrum = torch.fft.rfft(w_a) * torch.fft.rfft(w_b).conj()
     correlation: Tensor = torch.fft.irfft(spectrum, n=w_a.shape[-1])
     return correlation
 
 
 def make_untrained_network(seed: int = 0) -> PlaceNetwork:
-    """Return the untrained network; the same seed gives the same weights, and the global generator is left alone."""
+    """Return a network with random weights from a seed; the global generator is not changed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return PlaceNetwork().eval()
@@ -111,7 +111,7 @@ def checkpoint_bytes(network: nn.Module) -> bytes:
 
 
 def digest(content: bytes) -> str:
-    """Return the short digest by which a checkpoint is named."""
+    """Return the first 16 hex digits of the SHA-256 of a checkpoint, its name."""
     return hashlib.sha256(content).hexdigest()[:16]
 
 

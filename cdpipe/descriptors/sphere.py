@@ -1,7 +1,7 @@
-"""The sphere descriptor: what the map around a keyframe looks like, and how surely that has changed since.
+"""The sphere descriptor: 64 numbers for the map around a keyframe, and the log-odds that it has changed.
 
-The before session's descriptors are made of its map alone, while mapping. After the merge the after map is looked at
-from the same places; each keyframe's log-odds of change are those of its most changed sector.
+The before descriptors are computed while mapping, from the before map alone. After the merge the after map is rendered
+at the before keyframes. The log-odds of a keyframe are the maximum over its sectors.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap, Spheres
 
 _BATCH = 64
 _INT8_SCALE = 127.0
-# Keyframes farther apart than this along the path look at different stretches.
+# Consecutive keyframes farther apart than this are no neighbours.
 _NEIGHBOUR_M = 2.5
 
 
 def describe_map(thin_map: PointMap, map_T_anchor: Float64Array, config: DescriptorConfig) -> Spheres:
-    """Return (K, 64) what a map looks like from each of (K, 4, 4) poses: float32 in (-1, 1), or int8 of 127ths.
+    """Return the (K, 64) sphere descriptors of a map at K poses: float32 in (-1, 1), or int8 in units of 1/127.
 
     Args:
         thin_map: The map.
-        map_T_anchor: Sensor poses in the map's frame.
+        map_T_anchor: (K, 4, 4) sensor poses in the map's frame.
         config: `precision` is used.
     """
     network, _ = _network()
@@ -44,14 +44,17 @@ def describe_map(thin_map: PointMap, map_T_anchor: Float64Array, config: Descrip
 
 
 def change_logits(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArray) -> Float64Array:
-    """Return the (K, SECTORS) log-odds that the surroundings of each before keyframe changed, sector by sector.
+    """Return the (K, SECTORS) log-odds of change of each sector of each before keyframe.
 
-    The after map is not moved: each keyframe's pose is carried into its odom frame by the alignment that holds there.
+    Keyframe poses are transformed into the after odom frame by the local alignment; the after map stays in place.
 
     Args:
         merged: Both maps.
         before: Its `spheres` are compared.
-        is_covered: (K,) which keyframes the after session came near; the others get NaN.
+        is_covered: (K,) whether the after session came near a keyframe; the others get NaN.
+
+    Raises:
+        ValueError: The before session has no sphere descriptors.
     """
     if before.spheres is None:
         raise ValueError("the before session has no sphere descriptors: describe its map")
@@ -73,14 +76,9 @@ def change_logits(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArr
 
 
 def change_log_odds(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArray) -> Float64Array:
-    """Return the (K,) calibrated log-odds that the surroundings of each before keyframe changed, NaN if not covered.
+    """Return the (K,) calibrated log-odds of change around each before keyframe; NaN if not covered.
 
-    Their sigmoid is a probability, as the validation tunnels have it; log-odds rank alike and do not saturate.
-
-    Args:
-        merged: Both maps.
-        before: Its `spheres` are compared.
-        is_covered: (K,) which keyframes the after session came near.
+    Their sigmoid is a probability, calibrated on validation tunnels. Arguments as of `change_logits`.
     """
     log_odds = np.full(len(is_covered), np.nan)
     logits = change_logits(merged, before, is_covered)[is_covered]
@@ -91,14 +89,13 @@ def change_log_odds(merged: MergedMaps, before: DescriptorSet, is_covered: BoolA
 
 
 def average_neighbours(logits: Float64Array, positions: Float64Array) -> Float64Array:
-    """Return (K, S) log-odds, each averaged with the same sector of the keyframes before and after, which weigh half.
+    """Return (K, S) log-odds averaged with those of both neighbouring keyframes, weights 1/4, 1/2, 1/4.
 
-    Neighbours a metre apart see most of the same wall: what only one of them calls changed is noise. A neighbour that
-    is missing (the end of the path, a gap in it) is replaced by the keyframe itself.
+    Neighbours a metre apart see mostly the same wall. At a path end or gap the keyframe replaces its neighbour.
 
     Args:
-        logits: (K, S), in the order of the path.
-        positions: (K, 3) of the keyframes, metres.
+        logits: (K, S) log-odds of each sector, in path order.
+        positions: (K, 3) keyframe positions, metres.
     """
     is_apart = np.linalg.norm(np.diff(positions, axis=0), axis=1) > _NEIGHBOUR_M
     here = np.arange(len(logits))
@@ -108,7 +105,7 @@ def average_neighbours(logits: Float64Array, positions: Float64Array) -> Float64
 
 
 def max_within_reach(scores: Float64Array, positions: Float64Array, reach_m: float) -> Float64Array:
-    """Return the (K,) highest of the scores of the keyframes within `reach_m` of each, the border included."""
+    """Return for each keyframe the maximum of the (K,) scores within `reach_m`, border included."""
     if len(scores) == 0:
         return scores
     near = cKDTree(positions).query_ball_point(positions, reach_m)
@@ -116,7 +113,7 @@ def max_within_reach(scores: Float64Array, positions: Float64Array, reach_m: flo
 
 
 def dequantise(spheres: Spheres) -> Float32Array:
-    """Return (K, 64) stored descriptors as float32 numbers in (-1, 1)."""
+    """Return (K, 64) stored descriptors as float32 in (-1, 1)."""
     if spheres.dtype == np.int8:
         return (spheres / np.float32(_INT8_SCALE)).astype(np.float32)
     return spheres.astype(np.float32)

@@ -1,8 +1,7 @@
-"""The map around a keyframe as the image that the sphere descriptor reads: the tunnel's wall, unrolled.
+"""The input image of the sphere descriptor: the tunnel wall around a keyframe, unrolled on a cylinder.
 
-A sphere's surface seen from its centre shows the wall ten metres off at a grazing angle. Keyframes stand a metre apart,
-so each needs to tell only of its own stretch: rows are metres along the keyframe's forward axis, columns turn about it,
-and the value is the distance of the nearest point from the axis.
+Rows are metres along the keyframe's forward axis, columns are the angle about it, and a pixel is the distance of its
+nearest point from the axis. Keyframes are a metre apart, so an image covers only 2 m of tunnel before and behind.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ ROWS = 16
 COLUMNS = 96
 HALF_LENGTH_M = 2.0
 REACH_M = 12.0
-# Of the ball round a keyframe that holds all of its image.
+# Radius of the sphere around a keyframe that contains its image.
 CROP_M = float(np.hypot(HALF_LENGTH_M, REACH_M))
 
 
 def pixels(points_anchor: Float64Array) -> Int64Array:
-    """Return the (N,) pixel, row * COLUMNS + column, of each point; -1 for those outside the image.
+    """Return the (N,) pixel of each point, row * COLUMNS + column; -1 outside the image.
 
     Args:
         points_anchor: (N, 3) points in the keyframe's sensor frame, metres.
@@ -34,7 +33,7 @@ def pixels(points_anchor: Float64Array) -> Int64Array:
 
 
 def sphere_image(points_anchor: Float64Array) -> Float32Array:
-    """Return the (ROWS, COLUMNS) float32 distance from the axis of the nearest point, metres, 0 where there is none.
+    """Return the (ROWS, COLUMNS) float32 image: distance of the nearest point from the axis, metres, 0 without one.
 
     Args:
         points_anchor: (N, 3) points in the keyframe's sensor frame, metres.
@@ -42,7 +41,7 @@ def sphere_image(points_anchor: Float64Array) -> Float32Array:
     pixel = pixels(points_anchor)
     is_inside = pixel >= 0
     distances_m = np.hypot(points_anchor[is_inside, 1], points_anchor[is_inside, 2]).astype(np.float32)
-    # minimum.at is thirty times as fast where no type has to be converted
+    # `minimum.at` is much faster without a type conversion
     image = np.full(ROWS * COLUMNS, np.inf, dtype=np.float32)
     np.minimum.at(image, pixel[is_inside], distances_m)
     image[np.isinf(image)] = 0.0
@@ -50,11 +49,11 @@ def sphere_image(points_anchor: Float64Array) -> Float32Array:
 
 
 def render(index: GridIndex, map_T_anchor: Float64Array) -> Float32Array:
-    """Return the (K, *image) images of a map at each of (K, 4, 4) poses, float32 as `sphere_image` gives them.
+    """Return the (K, ROWS, COLUMNS) float32 images of a map at K poses.
 
     Args:
-        index: The map.
-        map_T_anchor: (K, 4, 4) poses of the sensor in the map's frame.
+        index: The points of the map.
+        map_T_anchor: (K, 4, 4) sensor poses in the map's frame.
     """
     images = [
         sphere_image(transform(anchor_T_map, index.points_within(map_T_here[:3, 3], CROP_M)))

@@ -1,9 +1,8 @@
-"""The network of the sphere descriptor: what was there in 64 numbers, and what of it is no longer so.
+"""The network of the sphere descriptor: encode the before map in 64 numbers, compare them with the after map.
 
-`encode` reads the unrolled wall around a keyframe and keeps four numbers for each of 16 sectors round the tunnel axis:
-these are stored while mapping. `compare` reads those and the image of the other session from the same place, and gives
-each sector the log-odds that something in it changed. The image is at hand after the merge, so only one side has to fit
-into 64 numbers. Trained on simulated change (`cdpipe.training.sphere_training`).
+`encode` maps the unrolled wall around a keyframe to four numbers for each of 16 sectors around the tunnel axis; these
+are stored while mapping. `compare` reads them and the after image of the same place, and returns the log-odds of change
+of each sector. It is trained on simulated changes (`cdpipe.training.sphere_training`).
 """
 
 from __future__ import annotations
@@ -23,21 +22,21 @@ PER_SECTOR = 4
 _CHANNELS = (16, 32, 48)
 _SEEN = 64
 _HIDDEN = (96, 64)
-# Rows end as ROWS / 4, columns as SECTORS.
+# (row, column); rows end as ROWS / 4, columns as SECTORS.
 _STRIDES = ((1, 2), (2, 3), (2, 1))
 _RANGE_SCALE_M = 6.0
-# Changes are rare: an untrained network says so.
+# Offset of the logits: changes are rare.
 _FIRST_LOGIT = -3.0
 
 
 @dataclass(frozen=True, slots=True)
 class SphereSize:
-    """How large a sphere network is; the defaults are the shipped one's.
+    """The size of a sphere network; the defaults are the shipped one's.
 
     Attributes:
         per_sector: Numbers stored for each of the 16 sectors.
-        width: Channels of every layer but the stored one, as a multiple of the shipped ones; a multiple of 1/2.
-        reads_after: Whether the comparison reads the after image whole, or the same few numbers of it alone.
+        width: Channels of all layers but the stored one, as a multiple of the shipped network's; a multiple of 1/2.
+        reads_after: Whether the comparison reads features of the after image, or only its encoded numbers.
     """
 
     per_sector: int = PER_SECTOR
@@ -55,10 +54,10 @@ class SphereSize:
 
 
 class SphereNetwork(nn.Module):
-    """Images (B, ROWS, COLUMNS) of two sessions at the same places -> log-odds of change (B, SECTORS)."""
+    """Maps two images (B, ROWS, COLUMNS) of the same places to the log-odds of change (B, SECTORS)."""
 
     def __init__(self, size: SphereSize | None = None) -> None:
-        """Take a size, the shipped one's by default."""
+        """Build a network of a size, the shipped one's by default."""
         super().__init__()
         self.size = size or SphereSize()
         channels, hidden = (tuple(int(n * self.size.width) for n in shipped) for shipped in (_CHANNELS, _HIDDEN))
@@ -77,7 +76,7 @@ class SphereNetwork(nn.Module):
         self.register_buffer("calibration", torch.tensor([1.0, 0.0], dtype=torch.float64))
 
     def encode(self, images_m: Tensor) -> Tensor:
-        """Return (B, PER_SECTOR, SECTORS) numbers in (-1, 1): the descriptor."""
+        """Return the (B, PER_SECTOR, SECTORS) descriptors, in (-1, 1), of (B, ROWS, COLUMNS) images, metres."""
         return self._kept(self._features(images_m))
 
     def compare(self, spheres: Tensor, images_m: Tensor) -> Tensor:
@@ -94,7 +93,7 @@ class SphereNetwork(nn.Module):
         return logits
 
     def calibrated(self, logits: Tensor) -> Tensor:
-        """Return the log-odds that a place changed, of those of its most changed sector."""
+        """Return the calibrated log-odds of a place from the log-odds of its most changed sector."""
         log_odds: Tensor = self.calibration[0] * logits.double() + self.calibration[1]
         return log_odds
 
@@ -113,14 +112,14 @@ class SphereNetwork(nn.Module):
 
 
 def make_untrained_sphere_network(seed: int = 0, size: SphereSize | None = None) -> SphereNetwork:
-    """Return the untrained network; the same seed gives the same weights, and the global generator is left alone."""
+    """Return a network with random weights from a seed; the global generator is not changed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return SphereNetwork(size).eval()
 
 
 def load_sphere_network(content: bytes) -> SphereNetwork:
-    """Return the network of a checkpoint, whatever its size."""
+    """Return the network of a checkpoint; its size follows from the shapes of the weights."""
     tensors = load(content)
     per_sector, channels = tensors["kept.weight"].shape[:2]
     network = SphereNetwork(SphereSize(per_sector, channels / _CHANNELS[-1], "seen.weight" in tensors))

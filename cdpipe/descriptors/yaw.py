@@ -1,4 +1,4 @@
-"""Yaw between two keyframes from their orientation vectors w (3DEG, arXiv 2210.07285); numpy alone."""
+"""Yaw between two keyframes from their orientation vectors w (3DEG, arXiv 2210.07285); needs no torch."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from cdpipe.core.geometry import Float32Array, Float64Array
 def relative_yaws_rad(w_before: Float32Array, w_after: Float32Array, n: int = 2) -> Float64Array:
     """Return the (..., n) likeliest yaws of before_sensor_T_after_sensor, best first, in (-pi, pi].
 
-    Peaks of the circular correlation of the two orientation vectors, refined by a parabola through their neighbours;
-    NaN where there are fewer peaks.
+    They are the peaks of the circular correlation, refined by a parabola; NaN if there are fewer peaks.
 
     Args:
         w_before: (..., 64) orientation vectors of before keyframes.
         w_after: (..., 64) orientation vectors of after keyframes.
-        n: How many peaks.
+        n: Number of peaks.
     """
     size = w_before.shape[-1]
     correlation = np.fft.irfft(np.fft.rfft(w_before) * np.conj(np.fft.rfft(w_after)), n=size)

@@ -1,4 +1,4 @@
-"""Spheres out of both merged maps, in the map frame; the after map itself is never moved as a whole."""
+"""Crop spheres from both merged maps, in the map frame; only the cropped after points are transformed."""
 
 from __future__ import annotations
 
@@ -12,15 +12,18 @@ from cdpipe.core.grid_index import GridIndex, is_in_sphere
 from cdpipe.model.types import MergedMaps, SessionName
 
 DIRECTIONS: tuple[tuple[SessionName, SessionName], ...] = (("after", "before"), ("before", "after"))
-# How far the alignment may bend between the centre of a sphere and its border: 1 % drift makes 0.1 m of 10 m.
+# Margin for an alignment that varies inside a sphere: 1 % drift moves a point 10 m from the centre by 0.1 m.
 _BEND_M = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sphere:
-    """Map points (N,) of one session, where they lie in the map frame (N, 3), and which of them the sphere holds.
+    """Map points of one session in a sphere and its margin.
 
-    The others are beside it, up to a margin.
+    Attributes:
+        indices: (N,) map points.
+        points: (N, 3) their positions, map frame, metres.
+        is_inside: (N,) whether a point is in the sphere; the others are in the margin.
     """
 
     indices: Int64Array
@@ -29,13 +32,13 @@ class Sphere:
 
     @property
     def inside(self) -> tuple[Int64Array, Float64Array]:
-        """The map points of the sphere alone, and where they lie."""
+        """The indices and positions of the points in the sphere, without the margin."""
         chosen = np.flatnonzero(self.is_inside)
         return self.indices[chosen], self.points.take(chosen, axis=0)
 
 
 class Crops:
-    """Cuts spheres with a margin out of two merged maps."""
+    """Crops spheres with a margin from two merged maps."""
 
     def __init__(self, merged: MergedMaps, margin_m: float) -> None:
         self._alignment = merged.alignment
@@ -44,11 +47,11 @@ class Crops:
         self._margin_m = margin_m
 
     def around(self, centre_map: Float64Array, radius_m: float) -> dict[SessionName, Sphere]:
-        """Return the spheres of both sessions about (3,) a centre."""
+        """Return the spheres of both sessions around a (3,) centre, map frame."""
         return {name: self._sphere(name, centre_map, radius_m) for name in ("before", "after")}
 
     def near(self, session: SessionName, points_map: Float64Array, reach_m: float) -> Int64Array:
-        """Return the map points of a session within `reach_m` of any of (N, 3) points, map frame."""
+        """Return the indices of the map points of a session within `reach_m` of any of (N, 3) points, map frame."""
         centre = (points_map.min(axis=0) + points_map.max(axis=0)) / 2
         radius_m = float(np.linalg.norm(points_map - centre, axis=1).max()) + reach_m
         indices, points = self._crop(session, centre, radius_m)
@@ -56,7 +59,7 @@ class Crops:
         return indices[np.isfinite(distance_m)]
 
     def points_map(self, session: SessionName, indices: Int64Array) -> Float64Array:
-        """Return the (N, 3) places of some map points of a session, map frame."""
+        """Return the (N, 3) positions of the given map points of a session, map frame, metres."""
         points = self._points[session].take(indices, axis=0)
         return points if session == "before" else self._alignment.to_map(points)
 
@@ -72,7 +75,7 @@ class Crops:
         if self._alignment.is_rigid:
             indices = self._indices["after"].crop(centre_odom, reach_m)
             return indices, self._alignment.to_map(self._points["after"].take(indices, axis=0))
-        # what is a sphere in the map frame is a slightly bent one in the after session's
+        # a sphere of the map frame is slightly deformed in the after odom frame
         indices = self._indices["after"].crop(centre_odom, reach_m + _BEND_M)
         points = self._alignment.to_map(self._points["after"].take(indices, axis=0))
         is_near = is_in_sphere(points, centre_map, reach_m)

@@ -1,8 +1,8 @@
-"""Cutting the changed objects out of the reported regions, in both directions.
+"""Object extraction: cut the changed objects out of the reported regions, in both directions.
 
-Added is what the after map has and the before map has not; removed is the reverse. What "has not" means is up to
-`extract.method`: the paper's point-to-voxel comparison, the distance from the nearest point, or that from the surface
-(`cdpipe.extract.surface_rule`), which also asks whether the other session looked there.
+Points that only the after map has are added, points that only the before map has are removed. `extract.method` chooses
+the comparison: the paper's point-to-voxel comparison (`voxel`), the distance to the nearest point (`nearest`), or the
+distance to the surface together with free space (`surface`, `cdpipe.extract.surface_rule`).
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ FIGURES = ("v_sphere_m3", "v_oe_m3", "s_points", "oe_points")
 
 
 def cut_objects(merged: MergedMaps, regions: ChangeRegions, config: PipelineConfig) -> list[PointGroup]:
-    """Compare both maps inside every reported region and group what is in one of them only, best region first.
+    """Return the groups of points that only one map has inside the reported regions, best region first.
 
     Args:
         merged: Both maps.
-        regions: Candidates; only the reported ones are looked at.
-        config: `extract`, and for `voxel` and `nearest` also `outlier` and `cluster`, are used.
+        regions: Candidates; only the reported ones are used.
+        config: `extract` is used, and for `voxel` and `nearest` also `outlier` and `cluster`.
     """
     if config.extract.method == "surface":
         return cut_by_surface(merged, regions, config.extract)
@@ -42,7 +42,7 @@ def cut_objects(merged: MergedMaps, regions: ChangeRegions, config: PipelineConf
 def withdraw_empty_regions(
     regions: ChangeRegions, groups: Sequence[PointGroup], config: PipelineConfig
 ) -> ChangeRegions:
-    """Take back the reported regions whose sphere holds nothing of what was cut out, if `extract.withdraw` says so."""
+    """Withdraw the reported regions whose sphere holds no extracted point, if `extract.withdraw` is set."""
     if not config.extract.withdraw:
         return regions
     is_empty = regions.is_reported.copy()
@@ -56,11 +56,11 @@ def withdraw_empty_regions(
 def measure_regions(
     merged: MergedMaps, regions: ChangeRegions, groups: Sequence[PointGroup]
 ) -> dict[str, Float64Array]:
-    """Return the paper's Table II by our definition, all of the after map: (R,) by name, NaN where not reported.
+    """Return the figures of the paper's Table II, all of the after map: (R,) by name, NaN if not reported.
 
-    `v_sphere_m3` volume of the convex hull of its points in the sphere, `v_oe_m3` sum of the volumes of the convex
-    hulls of the objects found in the region, `s_points` its points in the sphere, `oe_points` those of the objects. An
-    object counts whole, as far as it reaches out of the sphere, and in the best of the regions that it lies in.
+    `v_sphere_m3` is the volume of the convex hull of the map points in the sphere, `v_oe_m3` the sum of the hull
+    volumes of the region's objects, `s_points` and `oe_points` the numbers of points. An object counts as a whole, in
+    the best region that it lies in.
     """
     crops = Crops(merged, margin_m=0.0)
     figures = {name: np.full(len(regions.scores), np.nan) for name in FIGURES}
@@ -131,7 +131,7 @@ def local_alignment(merged: MergedMaps, after: DescriptorSet) -> Float64Array | 
 
 
 def hull_volume_m3(points: Float64Array) -> float:
-    """Return the volume of the convex hull, 0 for fewer than four points and for flat clouds."""
+    """Return the volume of the convex hull of (N, 3) points; 0 for fewer than four points and flat clouds."""
     if len(points) < 4:
         return 0.0
     try:
@@ -141,12 +141,12 @@ def hull_volume_m3(points: Float64Array) -> float:
 
 
 def _cut_by_points(merged: MergedMaps, regions: ChangeRegions, config: PipelineConfig) -> list[PointGroup]:
-    """Compare map points region by region; a map point belongs to at most one object: the better region takes it.
+    """Compare map points region by region; the best region takes a point that lies in several.
 
-    As in the paper, each sampled area is cut by itself, so an object that lies in two of them is two objects.
+    As in the paper, each region is cut separately, so an object across two regions becomes two objects.
     """
     extract = config.extract
-    # a voxel that reaches into the sphere reaches at most its diagonal out of it
+    # a voxel that intersects the sphere extends at most its diagonal beyond it
     crops = Crops(merged, np.sqrt(3.0) * extract.voxel_m if extract.method == "voxel" else extract.distance_m)
     is_taken = {
         "before": np.zeros(len(merged.before.points), np.bool_),

@@ -1,12 +1,12 @@
-"""Which removed and which added object are one and the same, moved: those that fit onto each other.
+"""Moved objects: match a removed with an added object if their surfaces can be registered.
 
-Each is seen from where its session drove by, so that neither the centres nor the edges of two halves of a move agree.
-What agrees is surface: the one is turned about the vertical and shifted until it lies on the other, and the share of
-both that does so tells whether they are one. The same fit tells how far the object went.
+The two sessions see an object from different sides, so centres and edges do not agree; surfaces do. A removed object is
+registered with an added one by yaw and translation. The share of both surfaces that then coincides decides whether they
+are one object; the registration gives the displacement.
 
-Of an object that moved by less than its own length, only what sticks out of the other place was cut out: two strips
-that need not be alike. The rest of it seems to have stayed, and is part of what else stands around them. So what was
-removed is laid on all that the after session has there, and what was added on all that the before session has.
+If an object moved by less than its own length, only two strips of it were extracted, and these need not be similar. The
+overlap of both poses appears unchanged and is part of the surroundings. Neighbouring objects are therefore registered
+together with the surroundings of the other session.
 """
 
 from __future__ import annotations
@@ -22,41 +22,39 @@ from cdpipe.core.geometry import Float64Array, Int64Array, invert, make_pose, tr
 from cdpipe.core.voxel import thin
 from cdpipe.extract.shape import upright_box
 
-# An object that went far shows the same faces but for what is hidden: so large a share of both must lie within
-# `_SAME_WITHIN_M` of the other, and the extents must agree within so large a factor. On validation pairs that holds for
-# 21 of 21 moves, for a tenth of 638 pairs of objects of other kinds and half of 322 of the same: two barrels are alike.
+# Far moves: least share of both surfaces within `_SAME_WITHIN_M` of the other, and largest factor between extents.
+# On validation pairs 21 of 21 moves pass, 10 % of 638 pairs of different kinds, 50 % of 322 pairs of the same kind.
 _SAME_SHARE, _FAR_FACTOR = 0.55, 1.45
 _SAME_WITHIN_M = 0.05
-# Of two that stand so near, what else stands around may belong to either. On validation pairs, some of them full of
-# short moves, 53 of 54 moves then share 0.46 and more with a likeness of 0.68 and more; neighbours of other kinds share
-# less than 0.4, or one of them next to nothing, or are hardly alike.
+# Near moves, with the surroundings: largest gap, least mean share, least share of either, least likeness. On validation
+# pairs 53 of 54 moves have a share of at least 0.46 and a likeness of at least 0.68.
 _BESIDE_M = 1.5
 _BESIDE_SHARE, _EITHER_SHARE = 0.4, 0.2
 _LIKENESS = 0.62
 _LIKE_WITHIN_M = 0.1
 _MIN_POINTS = 4
-# A whole-map rival may cut out a hundred objects; a fit takes some 20 ms.
+# Largest number of partners to try for one object; a registration takes about 20 ms.
 _MOST_TRIED = 6
-# A coarse fit from each of so many headings, a fine one from the best of them.
+# Yaws of the coarse registration, how many of its results are registered finely, and the robust scales of each.
 _HEADINGS = 16
 _REFINED = 3
 _COARSE_STEPS_M = (0.3, 0.25, 0.2)
 _FINE_STEPS_M = (0.15, 0.14, 0.13, 0.12, 0.11, 0.1, 0.08, 0.07, 0.06, 0.05)
 _MOST_POINTS, _MOST_COARSE_POINTS = 150, 50
-# Half as long for points beside the surface as with the library's own choice.
+# Leaf size of the k-d trees; fastest for points near a surface.
 _LEAF_POINTS = 32
-# A metre takes a hundredth off what two objects are too much alike: it decides between equals only.
+# Penalty of the score per metre of displacement; decides between equally similar objects.
 _TIE_PER_M = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Move:
-    """One object that stands elsewhere.
+    """A removed and an added object that are the same object.
 
     Attributes:
         removed: Index of the object of the before session.
         added: Index of the object of the after session.
-        displacement_map: (3,) from where it stood to where it stands, map frame, metres.
+        displacement_map: (3,) displacement from before to after, map frame, metres.
     """
 
     removed: int
@@ -70,18 +68,14 @@ def find_moves(
     may_go_far: Sequence[bool],
     around: Callable[[Sequence[tuple[int, int]]], Sequence[tuple[Float64Array, Float64Array]]],
 ) -> list[Move]:
-    """Pair removed with added objects that look like one, each in at most one pair.
-
-    Two may be one where enough of their surfaces lies on each other, and, unless they stand beside each other, their
-    extents agree within a factor. All pairs together exceed what is asked for by as many points as they can; of equally
-    like ones the nearer is taken.
+    """Match removed with added objects by their surfaces, one to one, so that the total score is largest.
 
     Args:
         removed: Points (P, 3) of each object of the before session, map frame, metres.
         added: The same of the after session.
-        may_go_far: Whether each of the removed may stand elsewhere than beside where it stood.
-        around: Gives, for pairs (removed, added) of neighbours, the points (Q, 3) and (R, 3) that the before and the
-            after session have around the two, without the ground; those of the objects themselves may be among them.
+        may_go_far: For each removed object, whether partners that are not neighbours are tried.
+        around: Returns, for pairs (removed, added) of neighbours, the points (Q, 3) and (R, 3) above the ground that
+            the before and the after session have around both objects; the objects' own points may be included.
     """
     gone, come = [_Cloud.of(points) for points in removed], [_Cloud.of(points) for points in added]
     beside = [(r, a) for r, start in enumerate(gone) for a in _neighbours(start, come)]
@@ -105,7 +99,7 @@ def find_moves(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cloud:
-    """An object's points, a thinned choice of them, and what the other one may lie on: its points and a rest."""
+    """An object's points, a thinned subset, and the target surface for its partner: its points and surroundings."""
 
     points: Float64Array
     few: Float64Array
@@ -122,7 +116,7 @@ class _Cloud:
         return replace(self, whole=whole, tree=_tree(whole))
 
     def coarse(self) -> _Cloud:
-        """Return fewer points, to lie on fewer: for a first guess in a quarter of the time."""
+        """Return a thinner cloud with a thinner target for the coarse registration."""
         whole = thin(self.whole, _LIKE_WITHIN_M)
         return replace(self, few=_thin_to(self.few, _MOST_COARSE_POINTS), whole=whole, tree=_tree(whole))
 
@@ -140,7 +134,7 @@ def _tree(points: Float64Array) -> cKDTree:
 
 
 def _neighbours(start: _Cloud, come: Sequence[_Cloud]) -> list[int]:
-    """Return the objects that stand beside one, the nearest first, no more than are tried."""
+    """Return the indices of the neighbouring objects, nearest first, at most `_MOST_TRIED`."""
     tree = cKDTree(start.few[:, :2])
     gaps_m = [float(np.min(tree.query(end.few[:, :2])[0])) for end in come]
     order = sorted(range(len(come)), key=lambda a: gaps_m[a])
@@ -148,22 +142,22 @@ def _neighbours(start: _Cloud, come: Sequence[_Cloud]) -> list[int]:
 
 
 def _similar(start: _Cloud, come: Sequence[_Cloud]) -> list[int]:
-    """Return the objects that one may have become somewhere else: those of its extents, no more than are tried."""
+    """Return the indices of the objects of similar extents, most similar first, at most `_MOST_TRIED`."""
     misfits = [float(np.abs(start.log_extents - end.log_extents).max()) for end in come]
     order = sorted(range(len(come)), key=lambda a: misfits[a])
     return [a for a in order if misfits[a] <= np.log(_FAR_FACTOR)][:_MOST_TRIED]
 
 
 def _match_pair(start: _Cloud, end: _Cloud, least_share: float) -> tuple[float, Float64Array] | None:
-    """Return how many points more than they need to two objects share, and the displacement; None if too few.
+    """Return the score of a pair, in points, and its (3,) displacement; None if it is no match.
 
-    The displacement is that of the middle of the upright box around both, laid on each other.
+    The displacement is that of the centre of the upright box around both registered objects.
     """
     if min(len(start.points), len(end.points)) < _MIN_POINTS:
         return None
     likeness, end_T_start = _align(start, end)
     shares = _shares(start, end, end_T_start)
-    excess = likeness * (sum(shares) / 2 - least_share)  # of two that share all, the liker one
+    excess = likeness * (sum(shares) / 2 - least_share)  # the likeness decides between pairs with a full share
     if excess <= 0.0 or min(shares) < _EITHER_SHARE or likeness < _LIKENESS:
         return None
     together = np.concatenate([start.points, transform(invert(end_T_start), end.points)])
@@ -174,10 +168,10 @@ def _match_pair(start: _Cloud, end: _Cloud, least_share: float) -> tuple[float, 
 
 
 def _align(start: _Cloud, end: _Cloud) -> tuple[float, Float64Array]:
-    """Return the best likeness and the pose (4, 4), a turn about the vertical and a shift, that reaches it.
+    """Return the best likeness and its (4, 4) end_T_start, yaw and translation.
 
-    The search begins with the middles of both objects on each other and, as those of two strips do not belong there,
-    with the middles of all that stands around them.
+    The search starts from coinciding box centres of the objects and from coinciding box centres of the objects with
+    their surroundings.
     """
     middles = {(_middle(start.points), _middle(end.points)), (_middle(start.whole), _middle(end.whole))}
     coarse_start, coarse_end = start.coarse(), end.coarse()
@@ -200,7 +194,7 @@ def _align(start: _Cloud, end: _Cloud) -> tuple[float, Float64Array]:
 
 
 def _step(start: _Cloud, end: _Cloud, end_T_start: Float64Array, scale_m: float) -> Float64Array:
-    """Lay each point on its nearest in the other cloud, both ways; what is far beyond the scale hardly counts."""
+    """Do one ICP step, both directions, with robust weights of the given scale; return the new (4, 4) end_T_start."""
     (far_m, in_end), (far_back_m, in_start) = _nearest(start.few, end.few, start, end, end_T_start)
     weights = np.concatenate([_weights(far_m, scale_m) / len(start.few), _weights(far_back_m, scale_m) / len(end.few)])
     sources = np.concatenate([start.few, start.whole[in_start]])
@@ -213,7 +207,7 @@ def _weights(distances_m: Float64Array, scale_m: float) -> Float64Array:
 
 
 def _upright_fit(sources: Float64Array, goals: Float64Array, weights: Float64Array) -> Float64Array:
-    """Return the pose (4, 4), a turn about the vertical and a shift, with the least weighted squared distances."""
+    """Return the (4, 4) pose, yaw and translation, of the weighted least-squares fit of sources to goals, (N, 3)."""
     shares = weights / weights.sum()
     source, goal = shares @ sources, shares @ goals
     a, b = (sources - source)[:, :2] * shares[:, None], (goals - goal)[:, :2]
@@ -224,13 +218,13 @@ def _upright_fit(sources: Float64Array, goals: Float64Array, weights: Float64Arr
 
 
 def _likeness(start: _Cloud, end: _Cloud, end_T_start: Float64Array) -> float:
-    """Return the share of both objects that lies on the other, softly cut off; 1 for two copies."""
+    """Return the mean of 1 / (1 + (d / 0.1 m)^2) over both directions; 1 for identical objects."""
     found = _nearest(start.few, end.few, start, end, end_T_start)
     return sum(float((1.0 / (1.0 + (far_m / _LIKE_WITHIN_M) ** 2)).mean()) for far_m, _ in found) / 2
 
 
 def _shares(start: _Cloud, end: _Cloud, end_T_start: Float64Array) -> tuple[float, float]:
-    """Return the share of either object, all its points, that lies within `_SAME_WITHIN_M` of the other."""
+    """Return the share of the points of either object within `_SAME_WITHIN_M` of the other's target surface."""
     (there_m, _), (back_m, _) = _nearest(start.points, end.points, start, end, end_T_start)
     return float((there_m < _SAME_WITHIN_M).mean()), float((back_m < _SAME_WITHIN_M).mean())
 
@@ -238,22 +232,22 @@ def _shares(start: _Cloud, end: _Cloud, end_T_start: Float64Array) -> tuple[floa
 def _nearest(
     of_start: Float64Array, of_end: Float64Array, start: _Cloud, end: _Cloud, end_T_start: Float64Array
 ) -> tuple[tuple[Float64Array, Int64Array], tuple[Float64Array, Int64Array]]:
-    """Return how far points of the one are from the whole other and the index of the nearest there; and the reverse."""
+    """Return distance and index of the nearest target point, from start to end and from end to start."""
     there = end.tree.query(transform(end_T_start, of_start))
     back = start.tree.query(transform(invert(end_T_start), of_end))
     return (np.asarray(there[0]), np.asarray(there[1])), (np.asarray(back[0]), np.asarray(back[1]))
 
 
 def _middle(points: Float64Array) -> tuple[float, float, float]:
-    """Return the middle of the upright box around (P, 3) points."""
+    """Return the centre of the upright box around (P, 3) points."""
     x, y, z = upright_box(points)[0][:3, 3].tolist()
     return x, y, z
 
 
 def _log_extents(points: Float64Array) -> Float64Array:
-    """Return the logarithms (3,) of the sorted edges of the evenly filled box with the same spread as the points.
+    """Return the (3,) logarithms of the sorted edges of the uniform box with the covariance of the (P, 3) points.
 
-    Unlike the edges of the bounding box they do not change when the object is turned, nor with a stray point.
+    They are invariant to rotation and, unlike a bounding box, robust against single points.
     """
     covariance = np.cov(points.T, bias=True) if len(points) > 1 else np.zeros((3, 3))
     return np.asarray(np.log(np.sqrt(12.0 * np.linalg.eigvalsh(covariance).clip(min=0.0)) + _LIKE_WITHIN_M / 2))

@@ -1,4 +1,4 @@
-"""From groups of map points to the objects of the answer: their returns, kind and shape, the partners of what moved."""
+"""From groups of map points to the objects of the answer: returns, kind, shape, and partners of moved objects."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from cdpipe.model.report import ChangedObject
 from cdpipe.model.types import MergedMaps, PointMap, SessionName
 
 _BLOCK_RETURNS = 1 << 22
-# An object is measured on the means of its returns in cells of this share of the map's, where there are enough in one:
-# single returns are noise, unless there are hardly any others.
+# Shapes use the means of the returns in cells of 1/4 voxel. Cells with fewer returns are dropped as noise, unless less
+# than this share of the cells would remain.
 _FINE_SHARE = 4
 _RETURNS_PER_CELL = 3
 _LEAST_FULL_CELLS = 0.2
-# How far around an object its surroundings are looked at, and how far the alignment may bend there.
+# Margin of an object's surroundings, margin for an alignment that varies, and distance that still is the object.
 _AROUND_M = 1.0
 _BEND_M = 0.5
 _ON_OBJECT_M = 0.1
-# The ground is the lowest of columns this wide, and a bit more.
+# Column width of the ground, and height above it that is not ground.
 _GROUND_M = 0.4
 _ABOVE_GROUND_M = 0.06
 _SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
@@ -35,15 +35,14 @@ _SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointGroup:
-    """Map points that make one object.
+    """The points of one extracted object.
 
     Attributes:
-        session: The session whose map they are of.
+        session: The session whose map holds them.
         indices: (P,) map points.
-        points_map: (P, 3) the same points in the map frame, metres.
-        region: Index of the region they were found in, -1 without.
-        returns: (M,) which returns of the map the object is made of; None: all that its map points stand for. Then
-            `points_map` need not be map points.
+        points_map: (P, 3) their positions, map frame, metres; any (N, 3) points of the object if `returns` is given.
+        region: Index of their region, -1 without one.
+        returns: (M,) returns of the map that form the object; None: all returns of its map points.
     """
 
     session: SessionName
@@ -57,17 +56,15 @@ class PointGroup:
 
 
 def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[ChangedObject, ...]:
-    """Make the objects of an answer out of groups of map points, in the same order.
+    """Return the objects of an answer, one for each group of map points, in the same order.
 
-    Groups of the after map are added, those of the before map removed. Where one of each looks like the other
-    (`cdpipe.extract.moves`), both are moved and name each other. What was taken off something that still stands
-    (`cdpipe.extract.remains`) is reshaped. An object's score is its number of map points, which compares objects of
-    different regions and methods. Shapes and moves are measured on the returns, where the maps know where they are.
+    A group of the after map is added, a group of the before map removed. A matching pair is moved
+    (`cdpipe.extract.moves`). A removed part of an object that remains is reshaped (`cdpipe.extract.remains`). The score
+    of an object is its number of map points. Shapes and moves are measured on the returns if the maps store them.
 
     Args:
         merged: Both maps.
-        groups: None may be empty, and no return may be in two of them. A map point on the border of two objects may
-            stand for returns of both.
+        groups: Not empty; no return may be in two groups. Two objects may share a map point on their border.
     """
     if not groups:
         return ()
@@ -89,8 +86,8 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
         around = surroundings.of(group)
         other = around["after" if group.session == "before" else "before"]
         voxel_m = maps[group.session].voxel_m
-        taken, _ = cell_means(group.points_map, voxel_m)  # as dense as its surroundings
-        # a rule that takes whole map points leaves an object's foot behind, which would pass for a rest
+        taken, _ = cell_means(group.points_map, voxel_m)  # the density of its surroundings
+        # groups of whole map points leave the foot of an object behind, which would look like a remainder
         may_be_part = group.session == "before" and group.returns is not None
         is_part[number] = may_be_part and is_part_of_remainder(taken, around["before"], other)
         column_m = voxel_m if maps[group.session].return_offsets is None else voxel_m / 2
@@ -132,7 +129,7 @@ def _link_moves(
 
 
 class ReturnPool:
-    """The returns of some map points, found in one pass over all returns of a map."""
+    """The returns of chosen map points, collected in one pass over all returns of a map."""
 
     def __init__(self, point_map: PointMap, wanted: Iterable[Int64Array]) -> None:
         is_wanted = np.zeros(len(point_map.points), dtype=np.bool_)
@@ -148,7 +145,7 @@ class ReturnPool:
         self._owners = owners[self._returns]
 
     def of(self, indices: Int64Array) -> Int64Array:
-        """Return the returns of some of the wanted map points, by map point."""
+        """Return the indices of the returns of some of the chosen map points, ordered by map point."""
         starts = np.searchsorted(self._owners, indices, side="left")
         ends = np.searchsorted(self._owners, indices, side="right")
         parts = [self._returns[start:end] for start, end in zip(starts.tolist(), ends.tolist(), strict=True)]
@@ -162,7 +159,7 @@ def _scan_and_pixel(point_map: PointMap, returns: Int64Array) -> Int32Array:
 
 
 def _measured_points(merged: MergedMaps, group: PointGroup, returns: Int64Array) -> Float64Array:
-    """Return the points (P, 3) that a group is measured on, map frame: finer than the map's, where that is known."""
+    """Return the (P, 3) points that measure a group, map frame: means of returns if the map stores their positions."""
     point_map = merged.before if group.session == "before" else merged.after
     if point_map.return_offsets is None or len(returns) == 0:
         return group.points_map
@@ -171,7 +168,7 @@ def _measured_points(merged: MergedMaps, group: PointGroup, returns: Int64Array)
 
 
 def _fine_points(point_map: PointMap, returns: Int64Array) -> Float64Array:
-    """Return the means (P, 3) of some returns in small cells, odometry frame, without the cells of stray ones."""
+    """Return the (P, 3) means of returns in cells of 1/4 voxel, odom frame, without sparse cells."""
     if len(returns) == 0:
         return np.zeros((0, 3))
     means, cells = cell_means(point_map.positions_of(returns), point_map.voxel_m / _FINE_SHARE)
@@ -180,21 +177,21 @@ def _fine_points(point_map: PointMap, returns: Int64Array) -> Float64Array:
 
 
 class _Surroundings:
-    """What both sessions saw around objects."""
+    """The map points of both sessions around objects."""
 
     def __init__(self, merged: MergedMaps) -> None:
         self._merged = merged
         self._before, self._after = GridIndex(merged.before.points), GridIndex(merged.after.points)
 
     def of(self, group: PointGroup) -> dict[SessionName, Float64Array]:
-        """Return the points (N, 3) of each session, map frame, no farther than `_AROUND_M` beside a group's box.
+        """Return the (N, 3) points of each session within `_AROUND_M` of a group's box, without the group's own.
 
-        Without what the group is made of itself.
+        Map frame, metres.
         """
         low, high = group.points_map.min(axis=0) - _AROUND_M, group.points_map.max(axis=0) + _AROUND_M
         found = self._within((low + high) / 2, float(np.linalg.norm(high - low)) / 2)
         points = {name: around for name, (_, around) in found.items()}
-        # a map point on the object's border may stand for returns of both; what lies off the object is its surroundings
+        # a map point on the border may hold returns of object and surroundings; its distance to the object decides
         is_own = np.isin(found[group.session][0], group.indices)
         own = points[group.session]
         is_own[is_own] = cKDTree(group.points_map).query(own[is_own])[0] < _ON_OBJECT_M
@@ -202,10 +199,10 @@ class _Surroundings:
         return {name: around[((around >= low) & (around <= high)).all(axis=1)] for name, around in points.items()}
 
     def standing(self, places: Sequence[Float64Array]) -> list[tuple[Float64Array, Float64Array]]:
-        """Return what either session has above the ground within the upright box around each set of points (P, 3).
+        """Return the points of both sessions above the ground in the upright box around each set of (P, 3) points.
 
         Returns:
-            Points (Q, 3) of the before and (R, 3) of the after session, map frame, fine where the maps know that.
+            Points (Q, 3) of the before and (R, 3) of the after session, map frame; means of returns if stored.
         """
         chosen: dict[SessionName, list[Int64Array]] = {"before": [], "after": []}
         for place in places:
@@ -221,7 +218,7 @@ class _Surroundings:
         return list(zip(self._finely("before", chosen["before"]), self._finely("after", chosen["after"]), strict=True))
 
     def _within(self, centre_map: Float64Array, radius_m: float) -> dict[SessionName, tuple[Int64Array, Float64Array]]:
-        """Return which map points of each session lie about a place, and where (N, 3), map frame."""
+        """Return the map points of each session in a sphere, and their (N, 3) positions, map frame."""
         before = self._before.crop(centre_map, radius_m)
         alignment = self._merged.alignment
         bend_m = 0.0 if alignment.is_rigid else _BEND_M
@@ -232,7 +229,7 @@ class _Surroundings:
         }
 
     def _finely(self, session: SessionName, chosen: Sequence[Int64Array]) -> list[Float64Array]:
-        """Return the points (P, 3) of sets of map points, map frame: finer than the map's, where that is known."""
+        """Return the (P, 3) points of sets of map points, map frame: means of returns if the map stores them."""
         point_map = self._merged.before if session == "before" else self._merged.after
         if point_map.return_offsets is None:
             points = [point_map.points[indices] for indices in chosen]

@@ -1,4 +1,4 @@
-"""What is new in one cloud beside another: the paper's point-to-voxel comparison, outlier removal; clusters."""
+"""The paper's comparison of two clouds: point-to-voxel comparison, outlier removal, clusters."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _MAX_DENSE_CELLS = 1 << 22
 def new_points_mask(points: Float64Array, reference_points: Float64Array, config: ExtractConfig) -> BoolArray:
     """Mark the points that lie in no occupied voxel of the reference.
 
-    The grid is that of the frame, with a corner at `origin_m` on every axis, so it does not depend on the points. A
-    voxel is occupied when it holds at least `min_points` reference points.
+    The grid is fixed to the frame: it has a corner at `origin_m` on every axis. A voxel is occupied if it holds at
+    least `min_points` reference points.
 
     Args:
         points: (N, 3) points, metres.
         reference_points: (M, 3) points of the other session, same frame; they should reach a voxel beyond `points`.
-        config: Voxel size, points to occupy, origin.
+        config: Voxel size, `min_points`, origin.
 
     Returns:
-        (N,) mask, True for what is new.
+        (N,) mask, True for new points.
     """
     if len(points) == 0 or len(reference_points) == 0:
         return np.ones(len(points), dtype=np.bool_)
@@ -41,10 +41,10 @@ def new_points_mask(points: Float64Array, reference_points: Float64Array, config
 
 
 def is_within(points: Float64Array, others: Float64Array, distance_m: float) -> BoolArray:
-    """Mark the (N, 3) points that have one of (M, 3) others within a distance, the border included."""
+    """Mark the (N, 3) points with one of the (M, 3) others within a distance, border included."""
     if len(points) == 0 or len(others) == 0:
         return np.zeros(len(points), dtype=np.bool_)
-    # a bound lets the tree stop early but leaves the border out, so it is set a little wider
+    # the bound of the search excludes the border, so it is slightly larger
     gaps_m, _ = cKDTree(others).query(points, distance_upper_bound=distance_m * (1 + 1e-6))
     return np.asarray(gaps_m) <= distance_m
 
@@ -61,10 +61,10 @@ def far_points_mask(points: Float64Array, reference_points: Float64Array, config
 
 
 def inlier_mask(points: Float64Array, config: OutlierConfig) -> BoolArray:
-    """Mark the points whose neighbourhood is about as dense as the rest of the cloud.
+    """Mark the inliers of the paper's statistical outlier removal (section IV).
 
-    The interval (mu - lambda sigma, mu + lambda sigma) of the mean distance to the k nearest neighbours, section IV.
-    The paper gives neither lambda nor k. Clouds of k points or fewer are too small to judge and kept whole.
+    An inlier's mean distance to its k nearest neighbours lies in (mu - lambda sigma, mu + lambda sigma). The paper
+    gives neither lambda nor k. All points of a cloud of k or fewer points are inliers.
 
     Args:
         points: (N, 3) points, metres.
@@ -79,17 +79,16 @@ def inlier_mask(points: Float64Array, config: OutlierConfig) -> BoolArray:
     spacing = np.asarray(distances)[:, 1:].mean(axis=1)
     mean = spacing.mean()
     deviation = spacing - mean
-    # closed, with room for rounding: in an even cloud sigma is 0 and nothing is an outlier
+    # closed interval with a tolerance for rounding: with sigma = 0 no point is an outlier
     reach = config.sigmas * np.sqrt(np.mean(deviation * deviation)) + 1e-9 * mean
     return np.asarray(np.abs(deviation) <= reach)
 
 
 def label_clusters(points: Float64Array, config: ClusterConfig) -> Int64Array:
-    """Label the connected groups of points, neighbours being within `radius_m` of each other.
+    """Label the clusters: connected components of the points within `radius_m` of each other.
 
     Returns:
-        (N,) labels from 0 in falling size (equal sizes: in the order of their first points); -1 for points of groups
-        smaller than `min_points`.
+        (N,) labels from 0 by falling size (ties: by first point); -1 for clusters smaller than `min_points`.
     """
     groups, sizes = label_groups(points, config.radius_m)
     first = np.unique(groups, return_index=True)[1]
@@ -115,14 +114,14 @@ def label_groups(points: Float64Array, link_m: float) -> tuple[Int64Array, Int64
 
 
 def _cells(points: Float64Array, config: ExtractConfig) -> list[Float64Array]:
-    """Return the (N,) cell of each point along each axis; axis by axis numpy is several times as fast."""
+    """Return the (N,) voxel index of each point for each axis; numpy is faster axis by axis."""
     return [np.floor((points[:, axis] - config.origin_m) / config.voxel_m) for axis in range(3)]
 
 
 def _new_by_grid(
     cells: list[Float64Array], reference: list[Float64Array], low: list[int], shape: list[int], min_points: int
 ) -> BoolArray:
-    """Look cells up in a dense table over the box of all of them."""
+    """Look the voxels up in a dense table over their bounding box."""
     is_in_box = np.ones(len(reference[0]), dtype=np.bool_)
     for each, least, count in zip(reference, low, shape, strict=True):
         is_in_box &= (each >= least) & (each < least + count)
@@ -141,7 +140,7 @@ def _in_table(cells: list[Float64Array], low: list[int], shape: list[int]) -> In
 
 
 def _new_by_keys(points: Float64Array, reference_points: Float64Array, config: ExtractConfig) -> BoolArray:
-    """Look points up among sorted keys: for clouds whose box is too large for a table."""
+    """Look the points up among sorted voxel keys, for clouds whose bounding box is too large for a table."""
     cells, counts = np.unique(cell_keys(reference_points, config.voxel_m, config.origin_m), return_counts=True)
     occupied = cells[counts >= config.min_points]
     return ~np.isin(cell_keys(points, config.voxel_m, config.origin_m), occupied)

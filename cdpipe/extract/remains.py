@@ -1,4 +1,4 @@
-"""Whether something was taken off what still stands, like a load off a muck pile, or removed as a whole."""
+"""Reshaped objects: whether a removed object is only a part of one that remains, such as a load off a muck pile."""
 
 from __future__ import annotations
 
@@ -9,37 +9,37 @@ from cdpipe.core.geometry import BoolArray, Float64Array
 from cdpipe.core.voxel import cell_means
 from cdpipe.extract.shape import ground_heights
 
-# How near a point must be to be the object's neighbour, and how near the other session's to have stayed.
+# Largest distance of a neighbour of the object, and to the other session for a point that stayed.
 _BESIDE_M = 0.35
 _STAYED_M = 0.15
-# The ground is the lowest of columns this wide; the foot of an object and a rut are no farther above it.
+# Column width of the ground, and height above it that may be a foot or a rut.
 _GROUND_M = 0.8
 _ABOVE_GROUND_M = 0.15
-# A flank of muck is not steeper than 57 deg, a wall is.
+# Least vertical component of the normal: a muck slope is at most 53 degrees steep, a wall is steeper.
 _MIN_UPWARD = 0.6
 _NEIGHBOURS = 10
 _NORMAL_RADIUS_M = 0.4
 _MIN_NEIGHBOURS = 4
-# Found on validation pairs, out of what the pipeline cut: whole objects reach 0.23, what was loaded off begins at 0.49.
+# Least length of the seam. On validation pairs whole objects reach 0.23, parts of piles start at 0.49.
 _LEAST_SEAM = 0.36
-# A slope is neither level nor upright: so far its normal points up. On validation pairs 0.49 and more of the surface of
-# every pile is slope, 0.32 at most of 10 of 11 parts of other objects.
+# Vertical component of a slope's normal, and least share of slope in a heap. On validation pairs every pile has at
+# least 0.49, 10 of 11 parts of other objects at most 0.32.
 _SLOPE_CELL_M = 0.1
 _SLOPE = (0.45, 0.93)
 _LEAST_SLOPE = 0.4
 
 
 def is_part_of_remainder(taken_map: Float64Array, rest_map: Float64Array, other_map: Float64Array) -> bool:
-    """Tell whether a removed object was only a part: whether its surface went on in something that has stayed.
+    """Return whether the surface of a removed object continued in an object that stayed.
 
-    The seam is the object's points that have a neighbour which stayed, lies above the ground and on a slope. A whole
-    object meets only the floor, and perhaps a wall. The number of points on the seam is compared with the square root
-    of the number of all, as the length of a seam grows with that.
+    The seam is the set of the object's points with a neighbour that stayed, lies above the ground and is on a slope. A
+    whole object touches only the floor or a wall. The length of a seam grows with the square root of the number of
+    points, so the seam is compared with that.
 
     Args:
-        taken_map: (P, 3) the object's points, map frame, metres.
-        rest_map: (Q, 3) the other points of its session around it.
-        other_map: (R, 3) the points of the other session around it.
+        taken_map: (P, 3) points of the object, map frame, metres.
+        rest_map: (Q, 3) other points of its session around it, map frame.
+        other_map: (R, 3) points of the other session around it, map frame.
     """
     if min(len(taken_map), len(rest_map), len(other_map)) == 0:
         return False
@@ -57,7 +57,7 @@ def is_part_of_remainder(taken_map: Float64Array, rest_map: Float64Array, other_
 
 
 def is_heap(points_map: Float64Array) -> bool:
-    """Tell whether much of a surface (P, 3) is slope: that of a heap, not of what could be carried elsewhere."""
+    """Return whether a large share of the surface of (P, 3) points is slope, as of a heap of muck."""
     surface, _ = cell_means(points_map, _SLOPE_CELL_M)
     upward, is_known = _upward(surface, surface)
     is_slope = (upward > _SLOPE[0]) & (upward < _SLOPE[1])
@@ -65,7 +65,7 @@ def is_heap(points_map: Float64Array) -> bool:
 
 
 def _upward(places: Float64Array, surface: Float64Array) -> tuple[Float64Array, BoolArray]:
-    """Return how far a surface (Q, 3) faces up or down at (N, 3) of its points, 0 to 1, and where that is known."""
+    """Return the (N,) absolute vertical component of the normals of a (Q, 3) surface at (N, 3) places, and if known."""
     wanted = [*range(1, min(_NEIGHBOURS, len(surface)) + 1)]
     found = cKDTree(surface).query(places, k=wanted)
     around, is_near = np.asarray(found[1]), np.asarray(found[0]) < _NORMAL_RADIUS_M

@@ -1,10 +1,8 @@
-"""How large an object is and how it stands: upright boxes, and the volume between it and what the other session saw.
+"""Shape of an object: its upright box, and the volume between it and the ground that the other session saw.
 
-The volume is what a surveyor measures from above. The height of the uppermost points in each column of a level grid,
-above the lowest the other session saw there, is interpolated between the columns over the convex outline of the
-footprint; its integral is the volume. For a pile that came or went the other session saw the floor, for the part
-loaded off a pile what was left of it. Of a box it is the box, as far as its top and sides show how far it reaches, of
-a chair about its hull.
+The volume is the integral of the height over the convex footprint. The height in each column of a horizontal grid is
+that of the uppermost points above the lowest points of the other session; it is interpolated linearly between columns.
+For a removed pile the other session saw the floor; for a removed part of a pile it saw the remainder.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ from cdpipe.core.geometry import Float64Array, yaw_pose
 from cdpipe.core.voxel import cell_keys
 from cdpipe.model.report import ObjectShape
 
-# Of so many columns nearest to a place, the median tells its ground: one false return below the floor does not.
+# The ground at a place is the median over this many nearest columns, robust against a false return below the floor.
 _GROUND_COLUMNS = 5
 
 
@@ -26,11 +24,11 @@ def measure_shape(
     """Measure an object.
 
     Args:
-        points_map: (P, 3) its points, map frame, metres; P of at least 1.
-        other_map: (Q, 3) what the other session saw below and around it; without any the object stands on a level
-            floor at its lowest point.
-        column_m: Columns of the object, not finer than its points are apart.
-        ground_m: Columns of the other session's points.
+        points_map: (P, 3) its points, map frame, metres; P is at least 1.
+        other_map: (Q, 3) points of the other session below and around it; if empty, the floor is level at the
+            object's lowest point.
+        column_m: Column width of the object, at least its point spacing, metres.
+        ground_m: Column width of the ground, metres.
     """
     map_T_box, box_m = upright_box(points_map)
     return ObjectShape(map_T_box, box_m, column_volume_m3(points_map, other_map, column_m, ground_m))
@@ -39,11 +37,11 @@ def measure_shape(
 def upright_box(points: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return the smallest box with a vertical axis around (P, 3) points.
 
-    An edge of the smallest rectangle around a footprint lies on an edge of its convex outline, so all are tried.
+    The smallest rectangle around a footprint has an edge on an edge of the convex hull, so all hull edges are tried.
 
     Returns:
-        (4, 4) its pose, x along the longer level edge, yaw in [-90, 90) degrees, and its (3,) edges: longer level one,
-        shorter one, height.
+        The (4, 4) pose, x along the longer horizontal edge, yaw in [-90, 90) degrees; and the (3,) edges: longer
+        horizontal, shorter horizontal, height, metres.
     """
     outline = _outline(points[:, :2])
     edges = np.roll(outline, -1, axis=0) - outline
@@ -64,10 +62,7 @@ def upright_box(points: Float64Array) -> tuple[Float64Array, Float64Array]:
 def column_volume_m3(
     points_map: Float64Array, other_map: Float64Array, column_m: float = 0.1, ground_m: float = 0.2
 ) -> float:
-    """Return the volume between an object and what the other session saw below it; arguments as of `measure_shape`.
-
-    A footprint without an area has no volume.
-    """
+    """Return the volume between an object and the ground, 0 without a footprint; arguments as of `measure_shape`."""
     columns = _columns(points_map, column_m)
     heights = np.maximum(columns[:, 2] - ground_heights(other_map, columns, ground_m), 0.0)
     try:
@@ -80,9 +75,9 @@ def column_volume_m3(
 
 
 def ground_heights(surface: Float64Array, places: Float64Array, ground_m: float = 0.2) -> Float64Array:
-    """Return (N,) how high the ground lies at (N, 2 or more) places, metres: the lowest points (Q, 3) of a surface.
+    """Return the (N,) height of the ground at (N, 2 or more) places, from the lowest points of a (Q, 3) surface.
 
-    Without any points it lies at the lowest of the places, which then must be (N, 3).
+    Without any surface the ground is at the lowest of the places, which must then be (N, 3).
     """
     if len(surface) == 0:
         return np.full(len(places), places[:, 2].min(initial=np.inf))
@@ -96,9 +91,9 @@ def ground_heights(surface: Float64Array, places: Float64Array, ground_m: float 
 
 
 def _columns(points: Float64Array, column_m: float) -> Float64Array:
-    """Return the mean (C, 3) of the upper points of each column of a level grid: those no deeper than it is wide.
+    """Return the (C, 3) mean of the upper points of each column, those within `column_m` of its top.
 
-    The lower ones are of a side that stands upright.
+    Lower points belong to a vertical side.
     """
     _, column = np.unique(cell_keys(points * (1.0, 1.0, 0.0), column_m), return_inverse=True)
     highest = np.full(column.max(initial=-1) + 1, -np.inf)
@@ -110,7 +105,7 @@ def _columns(points: Float64Array, column_m: float) -> Float64Array:
 
 
 def _outline(xy: Float64Array) -> Float64Array:
-    """Return the corners (C, 2) of the convex hull, in order; of points on a line its ends."""
+    """Return the (C, 2) corners of the convex hull, in order; the two ends for collinear points."""
     try:
         return np.asarray(xy[ConvexHull(xy).vertices])
     except (QhullError, ValueError):

@@ -1,14 +1,11 @@
-"""The surface rule: what stands out of the other session's surface, where that session looked, is a changed object.
+"""The surface rule: an object is changed if it stands out of the other session's surface in observed free space.
 
-Two steps, because a map point is the mean of a cell of 0.2 m and an object's foot is not:
+1. In every reported sphere, map points off the planes of the other map are candidates (`find_candidates`). Connected
+   candidates form a site.
+2. Around each site the returns of both sessions are compared in cells of 0.05 and 0.1 m (`compare_site`). Objects grow
+   from cells that are clear of the surface and were seen through, down to the noise of the surfaces (`grow_objects`).
 
-1. In every reported sphere map points off the planes through the other map's points are candidates (`find_candidates`);
-   those next to each other are a site.
-2. Around each site all returns of both sessions are compared, in cells of 0.05 and 0.1 m (`compare_site`). Objects grow
-   from cells that stand well clear of the surface and were seen through, down to what the surfaces differ by anyway
-   (`grow_objects`).
-
-Whatever the other session never looked at is unknown, and no change by itself.
+A place that the other session did not observe is unknown and no change.
 """
 
 from __future__ import annotations
@@ -24,41 +21,41 @@ from cdpipe.extract.point_comparison import label_groups
 from cdpipe.merge.registration import Surface
 from cdpipe.model.config import ExtractConfig
 
-# Map points this far off are candidates: less than the lowest objects stand out, more than a cell's mean is off.
+# Point-to-plane distance of a candidate: below the height of the lowest objects, above the error of a map point.
 _COARSE_M = 0.08
 _MIN_CANDIDATES = 3  # `_are_three_together` is made for this number
-# Candidates nearer than this are one site, and everything this near to them is looked at closely.
+# Candidates closer than this form one site; the site includes everything within this distance of them.
 SITE_M = 0.5
-# Beyond the site the other session's surface is needed too.
+# Margin of the other session's surface around a site.
 RIM_M = 0.3
 CELL_M = 0.05
 SURFACE_CELL_M = 0.1
 _LINK_M = 0.15
 _TABLE_CELL_M = 0.25
-# A plane holds for as far as the points that it was fitted to.
+# Radius in which the plane of a map point, and of a cell of returns, is valid.
 _COARSE_PLANE_M, _PLANE_M = 0.4, 0.25
-# Nor is what lies this flat beyond its edge off the surface: there the other map has a gap.
+# Near-coplanar points beyond the edge of the map are gaps, not changes: largest ratio of plane to point distance.
 _GRAZING = 0.2
 _MIN_SURFACE = 20
 _NOISE_FACTOR = 5.0
 _SEED_FACTOR = 2.5
 _MAX_BORDER = 5.0
-# An object's foot, which no ray can have passed, reaches this far from what was seen through.
+# Largest distance of an object's foot, which no ray can pass, from its cells in free space.
 _FOOT_M = 0.3
-# Scans with a ray that passed a cell of 0.1 m on its last metre.
+# Least number of scans with a grazing ray through a cell.
 _MIN_SCANS_PAST = 3
-# A quarter of a square metre in cells of 0.05 m: a lesser rise of the floor is the floor's.
+# Least size of a low object: 0.25 m^2 in cells of 0.05 m.
 _MIN_LOW_CELLS = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Site:
-    """Cells around candidates of one session, and what the other session's surface is to them.
+    """The cells around candidates of one session, and their distance to the other session's surface.
 
     Attributes:
-        points: (N, 3) means of the returns of each occupied cell, map frame, metres.
+        points: (N, 3) mean of the returns of each occupied cell, map frame, metres.
         cell_of_return: (M,) cell of each return.
-        distance_m: (N,) how far each stands off the other session's surface; infinite where there is none.
+        distance_m: (N,) distance of each cell to the other session's surface, metres; inf without a surface.
     """
 
     points: Float64Array
@@ -67,10 +64,10 @@ class Site:
 
 
 def distances_m(points: Float64Array, surface: Surface, plane_m: float) -> Float64Array:
-    """Return how far (N, 3) points are from a surface.
+    """Return the (N,) distances of (N, 3) points to a surface, metres.
 
-    That is the distance from the plane through the nearest of the surface's points, as long as that point is within
-    `plane_m` or the plane is nearly met; otherwise it is the distance from the point itself.
+    It is the point-to-plane distance if the nearest surface point is within `plane_m` or the point is near-coplanar;
+    otherwise it is the distance to the nearest surface point.
     """
     chosen, nearest_m = find_nearest(points, surface)
     offsets = points - surface.points.take(chosen, axis=0)
@@ -81,14 +78,14 @@ def distances_m(points: Float64Array, surface: Surface, plane_m: float) -> Float
 
 
 def find_nearest(points: Float64Array, surface: Surface) -> tuple[Int64Array, Float64Array]:
-    """Return the surface's point nearest to each of (N, 3) points, and how far it is."""
-    # of one neighbour it returns arrays, where the search for the nearest returns lists that take as long again
+    """Return the (N,) index of the surface point nearest to each of (N, 3) points, and its distance, metres."""
+    # the k-nearest search returns arrays; the nearest search returns lists, which are slow to convert
     found, squared_m2 = surface.tree.batch_knn_search(points, 1)
     return found[:, 0].astype(np.int64), np.sqrt(squared_m2[:, 0])
 
 
 class PlaneTable:
-    """One plane of a surface for each cell of a grid over it: most points lie on it, which takes one lookup to see."""
+    """One plane of a surface per grid cell: a fast first test, because most points lie on the plane of their cell."""
 
     def __init__(self, surface: Surface) -> None:
         self.surface = surface
@@ -99,7 +96,7 @@ class PlaneTable:
         self._table[self._flat(cells)] = np.arange(len(surface.points), dtype=np.int32)
 
     def distances_m(self, points: Float64Array) -> Float64Array:
-        """Return how far (N, 3) points are from the plane of their cell; infinite where it has none."""
+        """Return the (N,) distances of (N, 3) points to the plane of their cell, metres; inf without a plane."""
         cells = self._cells(points)
         is_inside = ((cells >= 0) & (cells < self._shape[:, None])).all(axis=0)
         found = np.full(len(points), -1, dtype=np.int32)
@@ -116,12 +113,10 @@ class PlaneTable:
 
 
 def find_candidates(points: Float64Array, table: PlaneTable) -> tuple[Int64Array, float]:
-    """Return the indices of the map points (N, 3) that stand off the other map's surface, three or more together.
-
-    A point on the plane of its cell does not; of the others the distance from the nearest plane decides.
+    """Return the map points (N, 3) off the other map's surface, in groups of three or more.
 
     Returns:
-        The indices, and the median distance of all points: how well the two surfaces agree.
+        The indices, and the median distance of all points to the surface, which is the noise of the two surfaces.
     """
     distance_m = table.distances_m(points)
     doubtful = np.flatnonzero(distance_m > _COARSE_M)
@@ -131,9 +126,9 @@ def find_candidates(points: Float64Array, table: PlaneTable) -> tuple[Int64Array
 
 
 def _are_three_together(points: Float64Array) -> BoolArray:
-    """Mark the (N, 3) points in groups of three or more, as `label_groups` has them, without making the groups.
+    """Mark the (N, 3) points in groups of three or more, as `label_groups` finds them, but faster.
 
-    Such a point has two neighbours, or one that has another.
+    Such a point has two neighbours, or a neighbour with two.
     """
     is_together = np.zeros(len(points), dtype=np.bool_)
     if len(points) < _MIN_CANDIDATES:
@@ -147,7 +142,7 @@ def _are_three_together(points: Float64Array) -> BoolArray:
 
 
 def compare_site(points: Float64Array, reference: Float64Array) -> Site:
-    """Compare the (M, 3) returns around a site with the (R, 3) returns of the other session there, map frame."""
+    """Compare the (M, 3) returns around a site with the (R, 3) returns of the other session, map frame, metres."""
     means, cell_of_return = cell_means(points, CELL_M)
     if len(reference) == 0:
         return Site(means, cell_of_return, np.full(len(means), np.inf))
@@ -160,15 +155,15 @@ def compare_site(points: Float64Array, reference: Float64Array) -> Site:
 def grow_objects(site: Site, free_space_votes: Int64Array, noise_m: float, config: ExtractConfig) -> list[Int64Array]:
     """Return the cells of each object of a site.
 
-    What stands off the surface by more than the noise, and was seen through, belongs together where it touches; such a
-    group is an object if enough of it stands well clear, and if `min_views` keyframes in the mean saw through it: where
-    only one or two did, from afar, the edge of what they could see is no change. Its foot, at floor and wall, is too
-    near to the surface for any ray to have passed behind it; it is the object's as far as it also stands off.
+    Connected cells form an object if they stand off the surface by more than the noise and were seen through, if at
+    least `min_cells` of them are clear of the surface, and if on average `min_views` keyframes saw through them. The
+    foot of an object is too close to floor and wall for a ray to pass behind it; cells near the object that stand off
+    the surface are added to it.
 
     Args:
-        site: Its cells.
-        free_space_votes: (N,) keyframes of the other session that saw through each cell, less those that hit it.
-        noise_m: Median distance of the two maps' surfaces around here.
+        site: The cells.
+        free_space_votes: (N,) keyframes of the other session that saw through each cell, minus those that hit it.
+        noise_m: Median distance of the two surfaces in the region, metres.
         config: Thresholds.
     """
     stands_off, is_free = site.distance_m > border_threshold_m(noise_m, config), free_space_votes > 0
@@ -181,7 +176,7 @@ def grow_objects(site: Site, free_space_votes: Int64Array, noise_m: float, confi
 
 
 def unassigned_cells(site: Site, taken: list[Int64Array], noise_m: float, config: ExtractConfig) -> Int64Array:
-    """Return the cells that stand off the surface and are in no object that was taken; none if few are clear of it."""
+    """Return the cells that stand off the surface and are in no object; none if too few are clear of the surface."""
     is_left = site.distance_m > border_threshold_m(noise_m, config)
     is_left[np.concatenate([*taken, np.zeros(0, dtype=np.int64)])] = False
     left = np.flatnonzero(is_left)
@@ -192,16 +187,17 @@ def unassigned_cells(site: Site, taken: list[Int64Array], noise_m: float, config
 def grow_low_objects(
     site: Site, left: Int64Array, n_past: Int64Array, taken: list[Int64Array], noise_m: float, config: ExtractConfig
 ) -> list[Int64Array]:
-    """Return the cells of each low object: no view of a keyframe can tell of it, but rays passed just above its foot.
+    """Return the cells of each low object, which grazing rays reveal and range images do not.
 
-    They pass a surface that is a little off as well. Of that some is clear; of a low object most is.
+    Grazing rays also pass through a surface that is slightly displaced, but there only some cells are clear of the
+    surface; of a low object at least half are.
 
     Args:
-        site: Its cells.
-        left: (L,) cells that may be such an object's (`unassigned_cells`).
-        n_past: (L,) scans of the other session with a ray that passed each of them.
-        taken: Cells of the objects there are; what touches one is what is left of it.
-        noise_m: As above.
+        site: The cells.
+        left: (L,) cells of the site to consider, from `unassigned_cells`.
+        n_past: (L,) scans of the other session with a grazing ray through each cell.
+        taken: Cells of the objects found so far; a group that touches one belongs to it and is dropped.
+        noise_m: Median distance of the two surfaces in the region, metres.
         config: Thresholds.
     """
     is_passed = n_past >= _MIN_SCANS_PAST
@@ -216,12 +212,12 @@ def grow_low_objects(
 
 
 def border_threshold_m(noise_m: float, config: ExtractConfig) -> float:
-    """Return how far a cell must stand off to be an object's, where surfaces differ by a noise."""
+    """Return the distance from the surface above which a cell can belong to an object, metres."""
     return float(np.clip(_NOISE_FACTOR * noise_m, config.border_m, _MAX_BORDER * config.border_m))
 
 
 def seed_threshold_m(noise_m: float, config: ExtractConfig) -> float:
-    """Return how far enough cells of an object must stand off."""
+    """Return the distance from the surface above which a cell is clear of it, metres."""
     return max(config.seed_m, _SEED_FACTOR * border_threshold_m(noise_m, config))
 
 
@@ -233,7 +229,7 @@ def _count_clear(site: Site, core: Int64Array, labels: Int64Array, noise_m: floa
 def _attach_feet(
     site: Site, core: Int64Array, labels: Int64Array, kept: Int64Array, foot: Int64Array
 ) -> list[Int64Array]:
-    """Return the cells of some groups of the core, each with those of the foot that are nearest to it."""
+    """Return the cells of the kept groups of the core, each with the foot cells nearest to it."""
     if len(kept) == 0:
         return []
     is_kept = np.isin(labels, kept)

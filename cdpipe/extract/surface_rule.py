@@ -1,6 +1,6 @@
-"""The surface rule over all reported regions: candidates by sphere, sites over all of them, objects by their returns.
+"""The surface rule over all reported regions: candidates per sphere, sites across spheres, objects from returns.
 
-An object between two regions is one site, and so one object; two objects in one region are two.
+Sites span regions, so an object across two regions is one object.
 """
 
 from __future__ import annotations
@@ -36,31 +36,31 @@ from cdpipe.model.config import ExtractConfig
 from cdpipe.model.report import ChangeRegions
 from cdpipe.model.types import MergedMaps, PointMap, SessionName
 
-# An object that begins inside of a sphere is followed this far out of it.
+# Margin of a sphere: an object that starts inside the sphere is followed this far beyond it.
 BEYOND_M = 1.5
-# Correspondences of the rounds of re-alignment, and how far it may carry a sphere: more is no correction.
+# Longest correspondence of each round of re-alignment, and the largest correction that is accepted.
 _ROUNDS_M = (0.5, 0.25)
 _MAX_SHIFT_M = 0.4
-# A site with fewer such candidates holds no object of a tenth of a cubic metre.
+# Least number of telling candidates of a site; fewer cannot be an object of 0.1 m^3.
 _MIN_TELLING = 2
-# What is nearer to the other map than this may be too low for a view to tell whether it was seen through.
+# Height above the surface below which a range image cannot show free space.
 _LOW_M = 0.3
-# Seen through by keyframes of its own session so many times as often as hit: a wall that drift has doubled.
+# Ratio of seen-through to hit by its own session above which a surface is a double caused by drift.
 _DOUBLED = 3.0
-# What keyframes looked at from here is seen by their scans, most of all: half of the reach of views.
+# Distance within which a keyframe reliably observes a place.
 _NEAR_M = REACH_M / 2
 _UNKNOWN_VIEWS = np.int64(1 << 20)
 
 
-# Ends, origins (both re-aligned map frame) and scans of some returns.
+# End points (M, 3) and origins (M, 3), both in the re-aligned map frame, and scans (M,) of M returns.
 Rays = tuple[Float64Array, Float64Array, Int64Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidates:
-    """Candidates of one session in one region: map points, and whether they make a site worth a closer look.
+    """Candidates of one session in one region: (N,) map points and the mask (N,) of the telling ones.
 
-    They do inside of the sphere, where the other session saw through them or they are low.
+    A candidate is telling if it is inside the sphere, and was seen through by the other session or is low.
     """
 
     session: SessionName
@@ -71,14 +71,14 @@ class _Candidates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Agreement:
-    """How the surfaces of two spheres agree: (4, 4) the correction of the after one, and what distance is left."""
+    """The agreement of two spheres: (4, 4) correction of the after sphere, and the remaining median distance."""
 
     correction: Float64Array
     noise_m: float
 
 
 def cut_by_surface(merged: MergedMaps, regions: ChangeRegions, config: ExtractConfig) -> list[PointGroup]:
-    """Return the objects that stand out of the other session's surface in the reported regions, best region first."""
+    """Return the objects of the surface rule in the reported regions, best region first."""
     crops = Crops(merged, margin_m=BEYOND_M)
     found: list[_Candidates] = []
     agreements: dict[int, _Agreement] = {}
@@ -99,7 +99,7 @@ def _compare_region(
     region: int,
     config: ExtractConfig,
 ) -> tuple[_Agreement, list[_Candidates]]:
-    """Return how the two spheres fit, and the candidates of both sessions."""
+    """Return the agreement of the two spheres, and the candidates of both sessions."""
     before, after = spheres["before"].points, spheres["after"].points
     surface = Surface(before)
     correction = realign(after, centre, surface) if config.realign else np.eye(4)
@@ -119,9 +119,9 @@ def _compare_region(
 
 
 def realign(after: Float64Array, centre: Float64Array, surface: Surface) -> Float64Array:
-    """Return the (4, 4) correction, map frame, that brings a sphere of the after map onto the before map's surface.
+    """Return the (4, 4) correction, map frame, that registers a sphere of the after map with the before surface.
 
-    The identity where there is too little to align or where it would carry the sphere farther than a correction may.
+    The identity if there are too few points or the correction is larger than 0.4 m.
     """
     correction = np.eye(4)
     if min(len(after), len(surface.points)) < MIN_SPHERE_POINTS:
@@ -134,7 +134,7 @@ def realign(after: Float64Array, centre: Float64Array, surface: Surface) -> Floa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Site:
-    """Map points of both sessions around candidates of one, and the region whose correction holds there."""
+    """Map points of both sessions around connected candidates, and the region and agreement that apply there."""
 
     session: SessionName
     region: int
@@ -144,7 +144,7 @@ class _Site:
 
 
 def _find_sites(crops: Crops, found: Iterable[_Candidates], agreements: dict[int, _Agreement]) -> list[_Site]:
-    """Put the candidates of all regions together, session by session; best region first."""
+    """Group the candidates of all regions into sites, per session; return them by region, best first."""
     sites = []
     for session, other in DIRECTIONS:
         of_session = [each for each in found if each.session == session and len(each.indices)]
@@ -153,11 +153,11 @@ def _find_sites(crops: Crops, found: Iterable[_Candidates], agreements: dict[int
         indices = np.concatenate([each.indices for each in of_session])
         is_telling = np.concatenate([each.is_telling for each in of_session])
         region = np.concatenate([np.full(len(each.indices), each.region) for each in of_session])
-        order = np.lexsort((region, ~is_telling, indices))  # of a point's regions the best in which it tells
+        order = np.lexsort((region, ~is_telling, indices))  # a point takes its best region in which it is telling
         first = order[np.unique(indices[order], return_index=True)[1]]
         indices, is_telling, region = indices[first], is_telling[first], region[first]
         points = crops.points_map(session, indices)
-        labels, sizes = label_groups(points, 2 * SITE_M)  # nearer ones would look at the same returns
+        labels, sizes = label_groups(points, 2 * SITE_M)  # closer sites would share returns
         for label in np.flatnonzero(np.bincount(labels, is_telling, len(sizes)) >= _MIN_TELLING):
             members = labels == label
             best = int(region[members & is_telling].min())
@@ -196,7 +196,7 @@ def _cut_sites(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) ->
             chosen = returns[site.session][of_object]
             if _is_out_of_place(maps[site.session], chosen):
                 continue
-            # the answer is in the map frame of the merge
+            # the answer uses the merge's map frame, without the correction
             in_map = (points["before"] if site.session == "before" else after_map)[of_object]
             indices = np.unique(maps[site.session].return_points[chosen]).astype(np.int64)
             thinned, _ = cell_means(in_map, SURFACE_CELL_M)
@@ -205,17 +205,12 @@ def _cut_sites(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) ->
 
 
 def _is_out_of_place(point_map: PointMap, returns: Int64Array) -> bool:
-    """Tell whether some returns of a session stand where there was nothing, by the word of the session itself.
+    """Return whether returns are misplaced by odometry drift, according to free space of their own session.
 
-    Where a session came by twice and its odometry drifted in between, or where it saw a wall from far down another
-    drift, the wall stands twice in its map: the map is wrong there, and nothing changed. Either of two things tells:
+    A wall that is seen twice, after drift or from far away, can be doubled in the map. Returns count as misplaced if
 
-    - the session saw through them, far more often than it hit them. What stands is hit again and again;
-    - it looked at the place from near, and yet most of them, by the way driven, came from afar: from near, something
-      else was there.
-
-    A thing that stands twice because of drift is seen from near on either pass, and hit by one about as often as the
-    other sees through it; so it stays.
+    - keyframes of their own session saw through them over three times as often as they hit them, or
+    - most of them, weighted by path length, were seen from over 15 m although keyframes observed the place from near.
     """
     if point_map.views is None:
         return False
@@ -226,7 +221,7 @@ def _is_out_of_place(point_map: PointMap, returns: Int64Array) -> bool:
         return True
     scans = np.searchsorted(point_map.scan_offsets, returns, side="right") - 1
     ranges_m = np.linalg.norm(points - point_map.odom_T_sensor[scans, :3, 3], axis=1)
-    # of a robot that waits, a thousand scans tell what one tells
+    # weighted by path length, because the scans of a robot at rest are redundant
     way_m = np.diff(travelled_m(point_map.odom_T_sensor), prepend=0.0)[scans]
     if way_m[ranges_m > REACH_M].sum() <= way_m[ranges_m <= REACH_M].sum():
         return False
@@ -237,13 +232,13 @@ def _is_out_of_place(point_map: PointMap, returns: Int64Array) -> bool:
 def find_object_cells(
     site: Site, n_views: Int64Array, rays: Callable[[], Rays], noise_m: float, config: ExtractConfig
 ) -> list[Int64Array]:
-    """Return the cells of each object of a site: what the views tell of, then the low ones, of which only rays do.
+    """Return the cells of each object of a site: objects found by range images, then low objects by grazing rays.
 
     Args:
-        site: Its cells.
-        n_views: (N,) keyframes of the other session that saw through each cell, less those that hit it.
-        rays: The other session's, called where they are needed.
-        noise_m: Median distance of the two maps' surfaces around here.
+        site: The cells.
+        n_views: (N,) keyframes of the other session that saw through each cell, minus those that hit it.
+        rays: Returns the rays of the other session; called only if cells are left for low objects.
+        noise_m: Median distance of the two surfaces in the region, metres.
         config: Thresholds.
     """
     objects = grow_objects(site, n_views, noise_m, config)
@@ -258,9 +253,9 @@ def find_object_cells(
 def _free_space_votes(
     points_map: Float64Array, merged: MergedMaps, other: SessionName, correction: Float64Array
 ) -> Int64Array:
-    """Return how often the other session saw through (N, 3) places in the re-aligned map frame, less how often it hit.
+    """Return the (N,) free-space votes of the other session for (N, 3) places in the re-aligned map frame.
 
-    Of a map that kept no views that is unknown, and more than any number asked for.
+    A map without range images gives a number above every threshold.
     """
     views = (merged.before if other == "before" else merged.after).views
     if views is None:
@@ -273,7 +268,7 @@ def _free_space_votes(
 def collect_rays(
     merged: MergedMaps, session: SessionName, returns: Int64Array, ends: Float64Array, correction: Float64Array
 ) -> Rays:
-    """Return the (M, 3) ends of some returns as given, where the sensor was (M, 3), and the (M,) scan of each."""
+    """Return the rays of M returns: end points (M, 3) as given, sensor positions (M, 3), and scans (M,)."""
     point_map = merged.before if session == "before" else merged.after
     scans = np.searchsorted(point_map.scan_offsets, returns, side="right") - 1
     seen, scan_of_return = np.unique(scans, return_inverse=True)
