@@ -1,7 +1,7 @@
-"""Charts as data, and their picture: series over two axes, in panels, with one legend.
+"""Charts as data: series over two axes, in panels, with one legend.
 
-A chart is described once. `picture` draws it with matplotlib; `eval.report.charts` makes the interactive form of the
-same description for the page.
+A chart is described once. `eval.core.figures.picture` draws it with matplotlib; `eval.report.charts` makes the
+interactive form of the same description for the page.
 """
 
 from __future__ import annotations
@@ -9,31 +9,23 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from cdpipe.core.geometry import Float64Array
-from eval.core.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION, blank_figure
 
 Dash = Literal["solid", "dash", "dot", "dashdot"]
+# after Okabe and Ito, which the colour-blind can tell apart
+BLUE, ORANGE, GREEN, VERMILLION, BLACK = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#1a1a1a"
+CONTEXT = "#c4c4c4"
 COLOURS = (BLACK, BLUE, ORANGE, GREEN, VERMILLION)
 GRID_COLOUR, HEAT_COLOURS = "#efefef", ("#ffffff", "#6baed6")
 BAR_SHARE = 0.75
-_PX_PER_IN = 88.0
-_DASHES: dict[Dash, Any] = {"solid": "solid", "dash": (0, (5, 2)), "dot": (0, (1, 1.5)), "dashdot": "dashdot"}
-_MARKERS = {
-    "": "", "circle": "o", "square": "s", "diamond": "D", "triangle-up": "^", "triangle-down": "v", "pentagon": "p",
-    "star": "*", "hexagon": "h", "x": "X",
-}  # fmt: skip
-SYMBOLS = tuple(_MARKERS)[1:]
+SYMBOLS = (
+    "circle", "square", "diamond", "triangle-up", "triangle-down", "pentagon", "star", "hexagon", "x",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,92 +172,14 @@ def named_ticks(names: Sequence[str]) -> dict[float, str]:
     return {float(place): name for place, name in enumerate(names)}
 
 
-def picture(drawing: Drawing) -> Figure:
-    """Return the chart as a matplotlib figure, 9 inches wide (6 where the panels are in one column)."""
-    n_rows, is_wide = len(drawing.rows), drawing.n_columns > 1
-    figure = blank_figure(9.0 if is_wide else 6.0, 0.5 + n_rows * drawing.row_px / _PX_PER_IN)
-    for row, panels in zip(figure.subplots(n_rows, drawing.n_columns, squeeze=False), drawing.rows, strict=True):
-        for axes, panel in zip_longest(row, panels):
-            if panel is None:
-                axes.set_axis_off()
-            else:
-                _draw_panel(axes, panel)
-    handles = [_legend_entry(name, series) for name, series in drawing.legend.items()]
-    if handles:
-        n_columns = min(len(handles), 5 if is_wide else 3)
-        figure.legend(handles=handles, loc="outside upper center", ncols=n_columns, fontsize=8, frameon=False)
-    return figure
+def log_span(values: npt.ArrayLike, below: float = 1.5, above: float = 1.5) -> tuple[float, float]:
+    """Return the ends of a logarithmic axis around the positive ones of (N,) values; around 1 where there are none.
 
-
-def _draw_panel(axes: Axes, panel: Panel) -> None:
-    axes.grid(color=GRID_COLOUR, linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.set_title(panel.heading, fontsize=9)
-    if panel.heat is not None:
-        _draw_heat(axes, panel.heat)
-    bars = [each for each in panel.series if each.style == "bars"]
-    for series in panel.series:
-        if series.style == "bars":
-            _draw_bars(axes, series, (bars.index(series) - (len(bars) - 1) / 2) / len(bars), BAR_SHARE / len(bars))
-        else:
-            _draw_series(axes, series)
-    for name, axis in (("x", panel.x), ("y", panel.y)):
-        own = axes.xaxis if name == "x" else axes.yaxis
-        axes.set(**{f"{name}scale": "log" if axis.is_log else "linear"})
-        own.set_label_text(axis.title, fontsize=8)
-        if axis.marks is not None:
-            own.set_ticks(list(axis.marks), list(axis.marks.values()))
-        if axis.span is not None:  # after the ticks, which widen it
-            axes.set(**{f"{name}lim": axis.span})
-        own.set_tick_params(labelsize=axis.tick_pt)
-    axes.minorticks_off()
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _draw_series(axes: Axes, series: Series) -> None:
-    x, y = np.asarray(series.x, dtype=np.float64), np.asarray(series.y, dtype=np.float64)
-    look = series.look
-    axes.plot(x, y, drawstyle="steps-post" if series.style == "steps" else "default", **_line(look))
-    if series.intervals is not None:
-        lengths_y, lengths_x = (None, series.intervals) if series.is_across else (series.intervals, None)
-        axes.errorbar(x, y, lengths_y, lengths_x, fmt="none", ecolor=look.colour, elinewidth=1.0, alpha=0.6)
-    for place, label in zip(zip(x, y, strict=True), series.labels, strict=False):
-        axes.annotate(
-            label,
-            place,
-            (-3, 2),
-            textcoords="offset points",
-            ha="right",
-            va="bottom",
-            fontsize=7,
-            annotation_clip=False,
-        )
-
-
-def _draw_bars(axes: Axes, series: Series, offset: float, width: float) -> None:
-    hatch = "" if series.look.dash == "solid" else "///"
-    x = np.asarray(series.x, dtype=np.float64) + BAR_SHARE * offset
-    axes.bar(x, np.asarray(series.y), width, color=series.look.colour, hatch=hatch, edgecolor="white", linewidth=0.0)
-    if series.intervals is not None:
-        axes.errorbar(x, np.asarray(series.y), yerr=series.intervals, fmt="none", ecolor="#444444", elinewidth=1.0)
-
-
-def _draw_heat(axes: Axes, heat: Heat) -> None:
-    colours = LinearSegmentedColormap.from_list("heat", HEAT_COLOURS)
-    axes.imshow(heat.values, cmap=colours, vmin=heat.low, vmax=heat.high, origin="lower", aspect="auto")
-    for (row, column), _ in np.ndenumerate(heat.values):
-        axes.text(column, row, heat.texts[row][column], ha="center", va="center", fontsize=7)
-
-
-def _line(look: Look) -> dict[str, Any]:
-    return {
-        "color": look.colour, "linewidth": look.width, "linestyle": _DASHES[look.dash] if look.width else "none",
-        "marker": _MARKERS[look.marker], "markersize": look.size, "alpha": look.opacity,
-        "markerfacecolor": "white" if look.is_hollow else look.colour,
-    }  # fmt: skip
-
-
-def _legend_entry(name: str, series: Series) -> Line2D | Patch:
-    if series.style == "bars":
-        return Patch(color=series.look.colour, label=name)
-    return Line2D([], [], label=name, **_line(series.look))
+    Args:
+        values: NaN and what is not positive is left out.
+        below: How many times smaller than the least the lower end is.
+        above: How many times larger than the greatest the upper end is.
+    """
+    found = np.asarray(values, dtype=np.float64)
+    found = found[found > 0] if (found > 0).any() else np.ones(1)
+    return float(found.min()) / below, float(found.max()) * above

@@ -1,189 +1,32 @@
-"""The maps of the page, drawn with matplotlib's objects (no pyplot, no global state) into PNG data addresses.
-
-Maps are rasters of points per cell, so that a million points cost no more than a thousand. Colours are those of Okabe
-and Ito, which the colour-blind can tell apart.
-"""
+"""Pictures by matplotlib's objects (no pyplot, no global state): of any chart, and what every figure shares."""
 
 from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from itertools import zip_longest
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch
+from matplotlib.patches import Patch
 from PIL import Image
-from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Float64Array, stream
+from eval.core.charts import BAR_SHARE, GRID_COLOUR, HEAT_COLOURS, SYMBOLS, Dash, Drawing, Heat, Look, Panel, Series
 
-BLUE, ORANGE, GREEN, VERMILLION, BLACK = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#1a1a1a"
-RED = "#C8102E"
-BOTH, CONTEXT = "#555555", "#c4c4c4"
-FAR_M = 1.0
-_MAP_WIDTH_IN, _MAP_HEIGHT_IN = 9.0, 6.0
-_DPI = 130
-_SQUARE_M, _LEAST_IN_SQUARE = 4.0, 20
-_MAX_TESTED = 250_000
-_DASHED = (0, (3, 2))
-_DISTANCE_COLOURS = LinearSegmentedColormap.from_list(
-    # a thinned map is 0.2 m from itself: grey up to there
-    "distance",
-    [(0.0, "#d9d9d9"), (0.2, "#d4d0cb"), (0.45, "#f0b26b"), (0.7, VERMILLION), (1.0, "#7f1d00")],
-)
-
-State = Literal["found", "missed", "unobservable", "not scored"]
-Points = npt.NDArray[Any]
+DPI = 130
+_WIDTH_IN, _PX_PER_IN, _LEGEND_CHARACTERS = 9.0, 88.0, 145
+_DASHES: dict[Dash, Any] = {"solid": "solid", "dash": (0, (5, 2)), "dot": (0, (1, 1.5)), "dashdot": "dashdot"}
+_MARKERS = dict(zip(("", *SYMBOLS), ("", "o", "s", "D", "^", "v", "p", "*", "h", "X"), strict=True))
 
 
-@dataclass(frozen=True, slots=True)
-class TruthMark:
-    """Where a change truly is on the map: x, y in metres, its label, and what became of it."""
-
-    x_m: float
-    y_m: float
-    label: str
-    state: State
-
-
-@dataclass(frozen=True, slots=True)
-class RegionMark:
-    """A reported region on the map: its centre in metres, and whether it finds a change (None: not scored)."""
-
-    x_m: float
-    y_m: float
-    is_false: bool
-
-
-def overlay_map(before: Points, after: Points) -> str:
-    """Draw two maps seen from above: before blue, after orange, dark where both have points.
-
-    Args:
-        before: (N, 3) points, metres.
-        after: (M, 3) points, shown in the same axes.
-    """
-    raster = Raster.around(before, after)
-    n_before, n_after = raster.count(before), raster.count(after)
-    image = _tinted(n_before, BLUE) * (n_before > 0)[..., None]
-    image = np.where(((n_after > 0) & (n_before == 0))[..., None], _tinted(n_after, ORANGE), image)
-    image = np.where(((n_after > 0) & (n_before > 0))[..., None], _tinted(n_before + n_after, BOTH), image)
-    figure, axes = _map_axes(raster)
-    axes.imshow(_on_white(image, (n_before + n_after) > 0), extent=raster.extent, origin="lower")
-    _legend(
-        axes, [Patch(color=BLUE, label="before"), Patch(color=ORANGE, label="after"), Patch(color=BOTH, label="both")]
-    )
-    return data_address(figure)
-
-
-def distance_map(before: Points, after: Points) -> str:
-    """Draw the after map seen from above, coloured by the distance of its points to the before map.
-
-    Args:
-        before: (N, 3) points, metres.
-        after: (M, 3) points in the same frame; a fixed random subset of a large map is tested.
-    """
-    raster = Raster.around(before, after)
-    if len(after) > _MAX_TESTED:
-        after = after[stream(0, "page", "subset").choice(len(after), _MAX_TESTED, replace=False)]
-    tree = cKDTree(before, compact_nodes=False, balanced_tree=False)
-    distances = np.asarray(tree.query(after, distance_upper_bound=2 * FAR_M)[0])
-    rows, columns, inside = raster.cells(after)
-    farthest = np.full(raster.shape, -1.0)
-    np.maximum.at(farthest, (rows, columns), np.minimum(distances[inside], FAR_M))
-    image = _DISTANCE_COLOURS(np.clip(farthest / FAR_M, 0.0, 1.0))
-    n_before = raster.count(before)
-    image = np.where((farthest < 0)[..., None], _on_white(_tinted(n_before, CONTEXT), n_before > 0), image)
-    figure, axes = _map_axes(raster)
-    axes.imshow(image, extent=raster.extent, origin="lower")
-    bar = figure.colorbar(
-        ScalarMappable(Normalize(0.0, FAR_M), _DISTANCE_COLOURS),
-        ax=axes,
-        extend="max",
-        location="top",
-        shrink=0.35,
-        aspect=30,
-        pad=0.02,
-    )
-    bar.set_label("distance to the before map [m]", fontsize=8)
-    bar.ax.tick_params(labelsize=7)
-    return data_address(figure)
-
-
-def region_map(points: Points, regions: Sequence[RegionMark], radius_m: float, truths: Sequence[TruthMark]) -> str:
-    """Draw reported regions as red circles over a grey map seen from above, and where the changes truly are.
-
-    Args:
-        points: (N, 3) map points, metres.
-        regions: Reported regions; false ones are dashed.
-        radius_m: Their radius.
-        truths: True positions; labels of neighbours are joined.
-    """
-    raster = Raster.around(points)
-    counts = raster.count(points)
-    figure, axes = _map_axes(raster)
-    axes.imshow(_on_white(_tinted(counts, "#9a9a9a"), counts > 0), extent=raster.extent, origin="lower")
-    for region in regions:
-        circle = Circle((region.x_m, region.y_m), radius_m, fill=True, facecolor=(*to_rgb(RED), 0.18))
-        circle.set(edgecolor=RED, linewidth=1.5, linestyle=_DASHED if region.is_false else "solid")
-        axes.add_patch(circle)
-    for state, look in _TRUTH_LOOKS.items():
-        marks = [mark for mark in truths if mark.state == state]
-        axes.plot([mark.x_m for mark in marks], [mark.y_m for mark in marks], linestyle="none", **look)
-    for x_m, y_m, label in joined_labels(truths, 0.035 * raster.width_m):
-        axes.annotate(
-            label, (x_m, y_m), xytext=(7, 6), textcoords="offset points", fontsize=8, fontweight="bold",
-            bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
-        )  # fmt: skip
-    handles: list[Any] = [
-        Line2D([], [], color=RED, linewidth=1.5, label="region, finds a change"),
-        Line2D([], [], color=RED, linewidth=1.5, linestyle=_DASHED, label="region, false"),
-        *(
-            Line2D([], [], linestyle="none", label=f"change, {state}", **look)
-            for state, look in _TRUTH_LOOKS.items()
-            if any(mark.state == state for mark in truths)
-        ),
-    ]
-    _legend(axes, handles)
-    return data_address(figure)
-
-
-_TRUTH_LOOKS: dict[State, dict[str, Any]] = {
-    "found": {"marker": "o", "markersize": 7, "color": GREEN, "markeredgecolor": "white"},
-    "missed": {"marker": "X", "markersize": 8, "color": BLACK, "markeredgecolor": "white"},
-    "unobservable": {"marker": "D", "markersize": 6, "color": "white", "markeredgecolor": BLACK},
-    "not scored": {"marker": "s", "markersize": 6, "color": BLUE, "markeredgecolor": "white"},
-}
-
-
-def joined_labels(marks: Sequence[TruthMark], reach_m: float) -> list[tuple[float, float, str]]:
-    """Return (x, y, label) with the labels of marks nearer than `reach_m` to a first one joined by commas."""
-    joined: list[tuple[float, float, list[str]]] = []
-    for mark in marks:
-        for x_m, y_m, labels in joined:
-            if np.hypot(mark.x_m - x_m, mark.y_m - y_m) < reach_m:
-                labels.append(mark.label)
-                break
-        else:
-            joined.append((mark.x_m, mark.y_m, [mark.label]))
-    return [(x_m, y_m, ", ".join(labels)) for x_m, y_m, labels in joined]
-
-
-def data_address(figure: Figure) -> str:
-    """Return a figure as `data:image/png;base64,...`, in 256 colours: a third of the bytes, and no eye sees it."""
-    picture = Image.open(io.BytesIO(png(figure))).convert("RGB")
-    buffer = io.BytesIO()
-    indexed = picture.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    indexed.save(buffer, format="png", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+def blank_figure(width_in: float, height_in: float) -> Figure:
+    """Return an empty figure of a size in inches."""
+    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained", facecolor="white")
 
 
 def png(figure: Figure) -> bytes:
@@ -195,98 +38,106 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-@dataclass(frozen=True, slots=True)
-class Raster:
-    """Square cells over the plan of a map."""
-
-    low: tuple[float, float]
-    cell_m: float
-    shape: tuple[int, int]
-
-    @classmethod
-    def around(cls, *clouds: Points) -> Raster:
-        """Return cells over all points of some (N, 3) clouds but strays."""
-        plans = [cloud[bulk_mask(cloud[:, :2]), :2] for cloud in clouds if len(cloud)]
-        if not plans:
-            raise ValueError("a map to draw must hold points")
-        low = np.min([plan.min(axis=0) for plan in plans], axis=0)
-        high = np.max([plan.max(axis=0) for plan in plans], axis=0)
-        margin = 0.02 * float((high - low).max()) + 0.5
-        low, span = low - margin, (high - low) + 2 * margin
-        # finer than the map's own 0.2 m, cells would only show gaps between its points
-        cell_m = max(0.2, float(span.max()) / (_MAP_WIDTH_IN * _DPI))
-        columns, rows = np.ceil(span / cell_m).astype(int)
-        return cls((float(low[0]), float(low[1])), cell_m, (int(rows), int(columns)))
-
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """Left, right, bottom, top, metres."""
-        (x_m, y_m), (rows, columns) = self.low, self.shape
-        return x_m, x_m + columns * self.cell_m, y_m, y_m + rows * self.cell_m
-
-    @property
-    def width_m(self) -> float:
-        """The longer side, metres."""
-        return max(self.shape) * self.cell_m
-
-    def cells(self, points: Points) -> tuple[Any, Any, Any]:
-        """Return row and column of the points inside, and which those are."""
-        index = np.floor((points[:, :2] - np.array(self.low)) / self.cell_m).astype(np.int64)
-        inside = ((index >= 0) & (index < self.shape[::-1])).all(axis=1)
-        return index[inside, 1], index[inside, 0], inside
-
-    def count(self, points: Points) -> npt.NDArray[np.int64]:
-        """Return the number of points in every cell."""
-        rows, columns, _ = self.cells(points)
-        flat = np.bincount(rows * self.shape[1] + columns, minlength=self.shape[0] * self.shape[1])
-        return flat.reshape(self.shape)
+def data_address(figure: Figure) -> str:
+    """Return a figure as `data:image/png;base64,...`, in 256 colours: a third of the bytes, and no eye sees it."""
+    picture = Image.open(io.BytesIO(png(figure))).convert("RGB")
+    buffer = io.BytesIO()
+    indexed = picture.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    indexed.save(buffer, format="png", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def bulk_mask(plan: Points) -> npt.NDArray[np.bool_]:
-    """Mark points (N, 2) with others in their square: false returns far off must not shrink the picture.
-
-    All of them where every point stands alone.
-    """
-    squares = np.floor(plan / _SQUARE_M).astype(np.int64)
-    # one number for each square: rows of two are sorted twenty times slower
-    numbers = (squares - squares.min(axis=0)) @ np.array([1, int(np.ptp(squares[:, 0])) + 1])
-    _, square, counts = np.unique(numbers, return_inverse=True, return_counts=True)
-    is_bulk = np.asarray(counts[square] >= _LEAST_IN_SQUARE)
-    return is_bulk if is_bulk.any() else np.ones(len(plan), dtype=np.bool_)
+def picture_address(drawing: Drawing) -> str:
+    """Return the picture of a chart as `data:image/png;base64,...`."""
+    return data_address(picture(drawing))
 
 
-def _tinted(counts: npt.NDArray[np.int64], colour: str) -> Float64Array:
-    """RGBA image: the colour, paler where points are few."""
-    weight = 0.45 + 0.55 * np.clip(np.log1p(counts) / np.log(12.0), 0.0, 1.0)
-    rgb = 1.0 - weight[..., None] * (1.0 - np.array(to_rgb(colour)))
-    return np.concatenate([rgb, np.ones_like(weight)[..., None]], axis=-1)
+def picture(drawing: Drawing) -> Figure:
+    """Return a chart as a matplotlib figure, 9 inches wide."""
+    n_rows = len(drawing.rows)
+    figure = blank_figure(_WIDTH_IN, 0.5 + n_rows * drawing.row_px / _PX_PER_IN)
+    for row, panels in zip(figure.subplots(n_rows, drawing.n_columns, squeeze=False), drawing.rows, strict=True):
+        for axes, panel in zip_longest(row, panels):
+            if panel is None:
+                axes.set_axis_off()
+            else:
+                _draw_panel(axes, panel)
+    handles = [_legend_entry(name, series) for name, series in drawing.legend.items()]
+    if handles:
+        n_across = max(1, min(len(handles), 5, _LEGEND_CHARACTERS // (8 + max(map(len, drawing.legend)))))
+        figure.legend(handles=handles, loc="outside upper center", ncols=n_across, fontsize=8, frameon=False)
+    return figure
 
 
-def _on_white(image: Float64Array, is_filled: npt.NDArray[np.bool_]) -> Float64Array:
-    return np.where(is_filled[..., None], image, 1.0)
+def _draw_panel(axes: Axes, panel: Panel) -> None:
+    axes.grid(color=GRID_COLOUR, linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.set_title(panel.heading, fontsize=9)
+    if panel.heat is not None:
+        _draw_heat(axes, panel.heat)
+    bars = [each for each in panel.series if each.style == "bars"]
+    for series in panel.series:
+        if series.style == "bars":
+            _draw_bars(axes, series, (bars.index(series) - (len(bars) - 1) / 2) / len(bars), BAR_SHARE / len(bars))
+        else:
+            _draw_series(axes, series)
+    for name, axis in (("x", panel.x), ("y", panel.y)):
+        own = axes.xaxis if name == "x" else axes.yaxis
+        axes.set(**{f"{name}scale": "log" if axis.is_log else "linear"})
+        own.set_label_text(axis.title, fontsize=8)
+        if axis.marks is not None:
+            own.set_ticks(list(axis.marks), list(axis.marks.values()))
+        if axis.span is not None:  # after the ticks, which widen it
+            axes.set(**{f"{name}lim": axis.span})
+        own.set_tick_params(labelsize=axis.tick_pt)
+    axes.minorticks_off()
+    axes.spines[["top", "right"]].set_visible(False)
 
 
-def blank_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty figure of a size in inches."""
-    return Figure(figsize=(width_in, height_in), dpi=_DPI, layout="constrained", facecolor="white")
+def _draw_series(axes: Axes, series: Series) -> None:
+    x, y = np.asarray(series.x, dtype=np.float64), np.asarray(series.y, dtype=np.float64)
+    look = series.look
+    axes.plot(x, y, drawstyle="steps-post" if series.style == "steps" else "default", **_line(look))
+    if series.intervals is not None:
+        lengths_y, lengths_x = (None, series.intervals) if series.is_across else (series.intervals, None)
+        axes.errorbar(x, y, lengths_y, lengths_x, fmt="none", ecolor=look.colour, elinewidth=1.0, alpha=0.6)
+    for place, label in zip(zip(x, y, strict=True), series.labels, strict=False):
+        axes.annotate(
+            label,
+            place,
+            (-3, 2),
+            textcoords="offset points",
+            ha="right",
+            va="bottom",
+            fontsize=7,
+            annotation_clip=False,
+        )
 
 
-def _map_axes(raster: Raster) -> tuple[Figure, Axes]:
-    rows, columns = raster.shape
-    height_in = float(np.clip(_MAP_WIDTH_IN * rows / columns, 2.0, _MAP_HEIGHT_IN))
-    width_in = float(np.clip(height_in * columns / rows, 6.5, _MAP_WIDTH_IN))
-    figure = blank_figure(width_in, height_in + 0.8)
-    axes = figure.add_subplot()
-    axes.set_aspect("equal")
-    axes.set_xlabel("x [m]", fontsize=8)
-    axes.set_ylabel("y [m]", fontsize=8)
-    axes.tick_params(labelsize=7)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    return figure, axes
+def _draw_bars(axes: Axes, series: Series, offset: float, width: float) -> None:
+    hatch = "" if series.look.dash == "solid" else "///"
+    x = np.asarray(series.x, dtype=np.float64) + BAR_SHARE * offset
+    axes.bar(x, np.asarray(series.y), width, color=series.look.colour, hatch=hatch, edgecolor="white", linewidth=0.0)
+    if series.intervals is not None:
+        axes.errorbar(x, np.asarray(series.y), yerr=series.intervals, fmt="none", ecolor="#444444", elinewidth=1.0)
 
 
-def _legend(axes: Axes, handles: list[Any]) -> None:
-    axes.legend(
-        handles=handles, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(handles), fontsize=8, frameon=False
-    )
+def _draw_heat(axes: Axes, heat: Heat) -> None:
+    colours = LinearSegmentedColormap.from_list("heat", HEAT_COLOURS)
+    axes.imshow(heat.values, cmap=colours, vmin=heat.low, vmax=heat.high, origin="lower", aspect="auto")
+    for (row, column), _ in np.ndenumerate(heat.values):
+        axes.text(column, row, heat.texts[row][column], ha="center", va="center", fontsize=7)
+
+
+def _line(look: Look) -> dict[str, Any]:
+    return {
+        "color": look.colour, "linewidth": look.width, "linestyle": _DASHES[look.dash] if look.width else "none",
+        "marker": _MARKERS[look.marker], "markersize": look.size, "alpha": look.opacity,
+        "markerfacecolor": "white" if look.is_hollow else look.colour,
+    }  # fmt: skip
+
+
+def _legend_entry(name: str, series: Series) -> Line2D | Patch:
+    if series.style == "bars":
+        return Patch(color=series.look.colour, label=name)
+    return Line2D([], [], label=name, **_line(series.look))

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from eval.core.charts import BAR_SHARE, GRID_COLOUR, HEAT_COLOURS, Axis, Drawing, Heat, Series, picture
-from eval.core.figures import BLACK, png
+from eval.core.charts import BAR_SHARE, BLACK, GRID_COLOUR, HEAT_COLOURS, Axis, Drawing, Heat, Series
+from eval.core.figures import picture, png
 
 _FONT = "system-ui, -apple-system, Segoe UI, Roboto, Helvetica Neue, DejaVu Sans, sans-serif"
 _COLUMN_GAP, _ROW_GAP_PX, _ABOVE_PX, _BELOW_PX = 0.09, 84, 34, 56

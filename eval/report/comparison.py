@@ -13,14 +13,15 @@ import numpy as np
 import pandas as pd
 
 from eval.core.domains import domain_name
+from eval.core.figures import picture_address
 from eval.core.output import make_writable
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.report.compared_columns import COMPARED
 from eval.report.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare
 from eval.report.objects.objects import Picture
 from eval.report.render import rendered, written
+from eval.report.settings.charts import Effect, effect_chart
 from eval.report.settings.effects import signed
-from eval.report.settings.figures import Effect, effect_plot
 from eval.report.story import joined
 from eval.report.tables import Cell, Table
 from eval.running.sides import Side, cautions, only_in, short_names, why_no_times
@@ -206,7 +207,7 @@ def picture(table: pd.DataFrame) -> Picture | None:
         for key in drawn
     }
     caption = "Dots are means of B \u2212 A over session pairs, lines their 95 % intervals; right of 0 B is better."
-    return Picture("What moved, and how surely", effect_plot(panels), caption)
+    return Picture("What moved, and how surely", picture_address(effect_chart(panels)), caption)
 
 
 def _content(found: Comparison) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.model.config import settings_table
-from eval.core.figures import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
+from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.report.charts import Chart, plotly_script
 from eval.report.cost.charts import draw_pareto

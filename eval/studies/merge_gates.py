@@ -12,22 +12,21 @@ chosen from one run, and not iterated.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
 import typer
-from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, stream
 from cdpipe.merge.evidence import GATES
 from cdpipe.model.config import load_config
+from eval.core.charts import BLACK, BLUE, VERMILLION, Axis, Drawing, Look, Panel, Series, log_span, named_ticks
 from eval.core.exits import run_program
-from eval.core.figures import BLACK, BLUE, VERMILLION, blank_figure, png
+from eval.core.figures import picture, png
 from eval.core.output import make_writable
 from eval.plans.coverage import plan_of
 from eval.plans.plan import cells
@@ -37,6 +36,10 @@ from eval.tables.merge_table import TARGETS, is_accepted, is_right, kinds, numbe
 KEPT_SHARE = 0.995
 LOGARITHMIC = ("hessian_ratio",)
 _LEAST_SHOWN = 1e-5
+_MARKS = (
+    (True, Look(BLUE, 0.0, marker="circle", size=3.5, opacity=0.6), "right merge", -0.2),
+    (False, Look(VERMILLION, 0.0, marker="x", size=3.5, opacity=0.6), "wrong merge", 0.2),
+)
 
 
 def committed_thresholds() -> dict[str, float]:
@@ -173,28 +176,27 @@ def suggest(right: Float64Array, wrong: Float64Array, *, logarithmic: bool) -> t
     return _rounded_down(float(np.sort(right)[int((1.0 - KEPT_SHARE) * len(right))])), False
 
 
-def draw_gates(cases: pd.DataFrame, table: pd.DataFrame) -> bytes:
-    """Draw a panel for each gate: every merge by kind of pair, right and wrong, and the thresholds. Returns a PNG."""
-    figure = blank_figure(9.0, 6.4)
-    panels = figure.subplots(2, -(-len(GATES) // 2), squeeze=False).ravel()
+def gates_chart(cases: pd.DataFrame, table: pd.DataFrame) -> Drawing:
+    """Draw a panel for each gate: every merge by kind of pair, right and wrong, and the thresholds."""
     by_gate = {str(row["gate"]): row for row in table.to_dict("records")}
-    rows = [kind for kind in (*TARGETS, "") if (cases["kind"] == kind).any()]
-    for axes, (name, setting) in zip(panels, GATES, strict=False):
-        _gate_panel(axes, cases, name, rows)
-        axes.axvline(by_gate[name]["threshold"], color=BLACK, linewidth=1.4)
-        if not np.isnan(by_gate[name]["suggested"]):
-            axes.axvline(by_gate[name]["suggested"], color=BLACK, linewidth=1.0, linestyle=(0, (3, 2)))
-        axes.set_title(f"{name.replace('_', ' ')}\nmerge.{setting} = {by_gate[name]['threshold']:g}", fontsize=9)
-    for axes in panels[len(GATES) :]:
-        axes.set_axis_off()
-    handles = [
-        Line2D([], [], linestyle="none", marker="o", markersize=5, color=BLUE, label="right merge"),
-        Line2D([], [], linestyle="none", marker="x", markersize=6, color=VERMILLION, label="wrong merge"),
-        Line2D([], [], color=BLACK, linewidth=1.4, label="gate"),
-        Line2D([], [], color=BLACK, linewidth=1.0, linestyle=(0, (3, 2)), label="suggested"),
-    ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8, frameon=False)
-    return png(figure)
+    kinds_shown = [kind for kind in (*TARGETS, "") if (cases["kind"] == kind).any()]
+    y_span = (len(kinds_shown) - 0.5, -0.5)
+    y = Axis(span=y_span, ticks=named_ticks([kind or "no kind" for kind in kinds_shown]))
+    panels = []
+    for name, setting in GATES:
+        gate, suggested = by_gate[name]["threshold"], by_gate[name]["suggested"]
+        lines = [Series([gate, gate], y_span, Look(BLACK), "gate")]
+        if not np.isnan(suggested):
+            lines.append(Series([suggested, suggested], y_span, Look(BLACK, 1.0, "dash"), "suggested"))
+        marks = [
+            series for row, kind in enumerate(kinds_shown) for series in _marks(cases[cases["kind"] == kind], name, row)
+        ]
+        drawn = np.concatenate([np.ravel(each.x) for each in (*lines, *marks)])
+        span = log_span(drawn) if name in LOGARITHMIC else None
+        x = Axis(f"{name.replace('_', ' ')}, merge.{setting}", span, is_log=name in LOGARITHMIC)
+        panels.append(Panel(x, y, [*marks, *lines], f"gate at {gate:g}"))
+    n_across = -(-len(GATES) // 2)
+    return Drawing([panels[:n_across], panels[n_across:]], 260)
 
 
 def main(
@@ -216,7 +218,7 @@ def main(
     make_writable(out)
     table = gate_table(cases, thresholds)
     table.to_csv(out / "gates.csv", index=False)
-    (out / "gates.png").write_bytes(draw_gates(cases, table))
+    (out / "gates.png").write_bytes(png(picture(gates_chart(cases, table))))
     typer.echo(table.to_string(index=False, na_rep="-"))
     n_other = len(results) - len(cases)
     typer.echo(f"\n{len(cases)} merges; {n_other} further rows of results.csv were not merged or are of other variants")
@@ -252,26 +254,15 @@ def _rounded_down(value: float) -> float:
     return float(np.floor(value * 10.0**digits + 1e-9) / 10.0**digits)
 
 
-def _gate_panel(axes: Axes, cases: pd.DataFrame, name: str, rows: Sequence[str]) -> None:
-    is_log = name in LOGARITHMIC
-    for row, kind in enumerate(rows):
-        for is_right_merge, colour, marker, offset in ((True, BLUE, "o", -0.2), (False, VERMILLION, "x", 0.2)):
-            own = cases[(cases["kind"] == kind) & (cases["right"] == is_right_merge)]
-            values = own[name].to_numpy(dtype=np.float64)
-            # what could not be measured is refused, as 0 is
-            values = np.nan_to_num(values, nan=0.0)
-            values = np.maximum(values, _LEAST_SHOWN) if is_log else values
-            shift = offset + stream(0, "gates", "strip").uniform(-0.13, 0.13, len(values))
-            axes.plot(values, row + shift, linestyle="none", marker=marker, markersize=3.5, color=colour, alpha=0.6)
-    if is_log:
-        axes.set_xscale("log")
-    axes.set_yticks(range(len(rows)), [kind or "no kind" for kind in rows])
-    axes.set_ylim(len(rows) - 0.5, -0.5)
-    axes.grid(axis="x", color="#e6e6e6", linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.tick_params(labelsize=8, left=False)
-    for side in ("top", "right", "left"):
-        axes.spines[side].set_visible(False)
+def _marks(cases: pd.DataFrame, name: str, row: int) -> list[Series]:
+    """Return the right and the wrong merges of one kind of pair; evidence that is missing is drawn at 0."""
+    found = []
+    for is_right_merge, look, word, offset in _MARKS:
+        values = np.nan_to_num(cases[name].to_numpy(dtype=np.float64)[cases["right"] == is_right_merge], nan=0.0)
+        values = np.maximum(values, _LEAST_SHOWN) if name in LOGARITHMIC else values
+        shifts = stream(0, "gates", "strip").uniform(-0.13, 0.13, len(values))
+        found.append(Series(values, row + offset + shifts, look, word))
+    return found
 
 
 if __name__ == "__main__":

@@ -11,8 +11,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from matplotlib.axes import Axes
-
 from cdpipe.core.errors import InputError
 from cdpipe.descriptors import use_threads
 from cdpipe.descriptors.network import checkpoint_bytes, digest, make_untrained_network
@@ -21,7 +19,8 @@ from cdpipe.training.data import TunnelShard, open_dataset, read_place_data
 from cdpipe.training.fit import FitConfig, Progress, Task, fit
 from cdpipe.training.scan_training import PlaceTask
 from cdpipe.training.sphere_training import SphereTask, read_sphere_data
-from eval.core.figures import BLUE, VERMILLION, blank_figure
+from eval.core.charts import BLUE, VERMILLION, Axis, Drawing, Look, Panel, Series
+from eval.core.figures import picture, png
 from eval.core.output import make_writable
 from eval.core.progress import RunProgress
 from eval.core.provenance import git_commit
@@ -131,22 +130,17 @@ def write_curves(path: Path, history: Sequence[Progress]) -> None:
 
 def draw_curves(path: Path, name: str, history: Sequence[Progress]) -> None:
     """Draw the loss and the deciding score over the steps."""
-    figure = blank_figure(8.0, 3.2)
-    steps = [done.step for done in history]
-    left, right = figure.subplots(1, 2)
-    left.plot(steps, [sum(done.losses.values()) for done in history], color=BLUE)
-    _labelled(left, "step", "loss on the training tunnels")
     score = next(iter(history[0].scores))
-    right.plot(steps, [done.scores[score] for done in history], color=VERMILLION)
-    _labelled(right, "step", f"{score} on the validation tunnels")
-    figure.suptitle(f"{name}: training")
-    figure.savefig(path, dpi=150)
-
-
-def _labelled(axes: Axes, x: str, y: str) -> None:
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    axes.grid(alpha=0.3)
+    drawn = {
+        "loss on the training tunnels": (BLUE, [sum(done.losses.values()) for done in history]),
+        f"{score} on the validation tunnels": (VERMILLION, [done.scores[score] for done in history]),
+    }
+    steps = [done.step for done in history]
+    panels = [
+        Panel(Axis(f"training step of {name}"), Axis(title), [Series(steps, values, Look(colour))])
+        for title, (colour, values) in drawn.items()
+    ]
+    path.write_bytes(png(picture(Drawing([panels], 240))))
 
 
 def _sphere_task(training: Sequence[TunnelShard], validation: Sequence[TunnelShard], seed: int) -> Task:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
-from eval.core.charts import SYMBOLS, Axis, Drawing, Look, Panel, Series
+from eval.core.charts import BLACK, BLUE, SYMBOLS, Axis, Drawing, Look, Panel, Series, log_span
 from eval.core.domains import domain_name
-from eval.core.figures import BLACK, BLUE
 from eval.report.charts import Chart
 from eval.report.cost.pareto import BYTES, F1, RECALL_AT_K, RECALL_AT_RATE, TIME
 from eval.report.objects.tables import is_told_the_truth
@@ -65,7 +63,8 @@ def _drawing(own: pd.DataFrame, words: str) -> Drawing:
             n_pairs = max((int(point["n_pairs"]) for point in points), default=0)
             best = sorted((point for point in points if point["is_on_front"]), key=lambda point: float(point["x"]))
             front_x, front_y = ([each[key] for each in best] for key in ("x", "quality_value"))
-            x = Axis(title, _span(points), is_log=True)
+            # room for names at the left; a cost of 0 has no place on the axis
+            x = Axis(title, log_span([point["x"] for point in points], 4.0, 1.6), is_log=True)
             y = Axis("" if row else words, (-0.06, 1.12))
             series = [
                 Series(front_x, front_y, _FRONT, style="steps"),
@@ -96,12 +95,6 @@ def _is_apart(point: Point, points: Sequence[Point]) -> bool:
     """Tell whether a point does not compete: `eval.report.cost.pareto`."""
     most = max(other["n_pairs"] for other in points if not is_told_the_truth(other["variant"]))
     return is_told_the_truth(point["variant"]) or point["n_pairs"] < most
-
-
-def _span(points: Sequence[Point]) -> tuple[float, float]:
-    """Return the ends of the axis, with room for names at its left; a cost of 0 has no place on it."""
-    x = np.array([point["x"] for point in points if point["x"] > 0] or [1.0])
-    return float(x.min()) / 4.0, float(x.max()) * 1.6
 
 
 def _caption(own: pd.DataFrame) -> str:

@@ -10,15 +10,9 @@ from matplotlib.patches import Rectangle
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, stream
-from eval.core.figures import (
-    BLACK,
-    VERMILLION,
-    Points,
-    Raster,
-    blank_figure,
-    bulk_mask,
-    data_address,
-)
+from eval.core.charts import BLACK, VERMILLION
+from eval.core.figures import blank_figure, data_address
+from eval.report.maps import Points, Raster, bulk_mask
 
 FULL_M = 0.3
 STRETCH_M = 16.0

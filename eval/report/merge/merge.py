@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from eval.core.figures import picture_address
 from eval.plans.coverage import Coverage, coverage
 from eval.report.merge.cases import MAX_ROWS, Case, case_table, distinct_cases, draw_case, read_case
-from eval.report.merge.plots import MergedPairs, error_plot, time_plot
+from eval.report.merge.charts import MergedPairs, error_chart, time_chart
 from eval.report.merge.tables import (
     families_table,
     main_variant,
@@ -124,7 +125,7 @@ def _error_plot(results: pd.DataFrame) -> Picture | None:
         return None
     return Picture(
         "Merge error against the true overlap",
-        error_plot(panels, EXACT_M, RIGHT_M),
+        picture_address(error_chart(panels, EXACT_M, RIGHT_M)),
         f"One mark per pair: dots were accepted, crosses not. Dashed: {EXACT_M:g} m, the target of clean pairs; solid: "
         f"{RIGHT_M:g} m, above which an accepted merge is wrong. Errors below 0.1 mm stand at 0.1 mm.",
     )
@@ -140,7 +141,7 @@ def _time_plot(results: pd.DataFrame) -> Picture | None:
         return None
     return Picture(
         "Time of the merge",
-        time_plot(panels),
+        picture_address(time_chart(panels)),
         "One dot per accepted pair (n of them; refused ones state no time), a bar at the median, logarithmic; one "
         "thread. Indexing can be done while mapping.",
     )

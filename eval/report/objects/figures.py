@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from cdpipe.core.geometry import Float64Array
-from eval.core.figures import BLACK, CONTEXT, blank_figure, data_address
+from eval.core.charts import BLACK, CONTEXT
+from eval.core.figures import blank_figure, data_address
 
 _TURNS_RAD = np.deg2rad([25.0, -25.0, 65.0, -65.0, 90.0])
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.io.answer import Answer
-from eval.core.figures import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
+from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.report.objects.figures import Panel, object_panels
 from eval.running.run_data import SHOWN_PRESETS, Row, RunData, flag, named_variants, number, of, text
 from eval.scoring.answer_rows import answer_rows

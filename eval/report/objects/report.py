@@ -9,11 +9,12 @@ import numpy as np
 import pandas as pd
 
 from eval.core.domains import domain_name, domain_of
+from eval.core.figures import picture_address
 from eval.report.cost.pareto import with_domain
 from eval.report.merge.merge import covered_by
 from eval.report.objects.cases import object_cases, voxel_variants
+from eval.report.objects.charts import SizeLine, SizePanel, iou_by_size_chart
 from eval.report.objects.objects import Picture
-from eval.report.objects.plots import SizeLine, SizePanel, iou_by_size_plot
 from eval.report.objects.tables import groups_table, methods_table, records, withdrawal_table
 from eval.report.regions.regions import targets_table
 from eval.report.story import about_failures, joined
@@ -119,7 +120,7 @@ def _size_plot(groups: pd.DataFrame, data: RunData, main: str) -> Picture | None
         panels[str(name)] = SizePanel(numbers(inside, "hull_volume_m3"), numbers(inside, "iou_point"), lines)
     return Picture(
         "Point IoU by the size of the object",
-        iou_by_size_plot(panels, names),
+        picture_address(iou_by_size_chart(panels, names)),
         f"A dot for every observable object, answered by {main}, missed ones at 0; lines: means of each method in bins "
         f"of the hull's volume; bars: 95 % interval over pairs of {main}.",
     )

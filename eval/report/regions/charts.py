@@ -9,9 +9,21 @@ from typing import Any
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array
-from eval.core.charts import Axis, Drawing, Look, Panel, Series, named_ticks
+from eval.core.charts import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    VERMILLION,
+    Axis,
+    Dash,
+    Drawing,
+    Look,
+    Panel,
+    Series,
+    named_ticks,
+)
 from eval.core.domains import domain_name
-from eval.core.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION
 
 _SKY, _PURPLE, _GREY, _TEAL, _WINE = "#56B4E9", "#CC79A7", "#8a8a8a", "#44AA99", "#882255"
 _LOOKS = {
@@ -29,7 +41,8 @@ _LOOKS = {
     "untrained": Look(_SKY, 1.2),
     "random-regions": Look(_GREY, 1.2, "dot"),
 }
-_OTHERS = tuple(Look(colour, 1.2, "dashdot") for colour in (BLUE, ORANGE, GREEN, VERMILLION, _PURPLE))
+_DASHES: tuple[Dash, ...] = ("dashdot", "dot")
+_OTHERS = tuple(Look(colour, 1.2, dash) for dash in _DASHES for colour in (BLUE, ORANGE, GREEN, VERMILLION, _PURPLE))
 _FAINT, _LIMIT = Look("#d0d0d0", 0.8), Look("#c4c4c4", 0.8)
 _LEAST_RATE, _MOST_RATE = 0.01, 10.0
 

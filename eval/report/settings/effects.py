@@ -9,10 +9,11 @@ from typing import Any
 
 import pandas as pd
 
+from eval.core.figures import picture_address
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.worlds import group_of
 from eval.report.objects.objects import Picture
-from eval.report.settings.figures import Effect, effect_plot
+from eval.report.settings.charts import Effect, effect_chart
 from eval.report.tables import Cell, Table
 from eval.running.run_data import RunData, of, over_pairs
 from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, Column, count
@@ -117,4 +118,4 @@ def _picture(title: str, rows: Sequence[Row], columns: Sequence[Column], names: 
     n = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     pairs = "pair" if n == "1" else "pairs"
     caption = f"Dots are means over {n} session {pairs}, lines their 95 % intervals; right of 0 is better."
-    return Picture(title, effect_plot(panels), caption)
+    return Picture(title, picture_address(effect_chart(panels)), caption)

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from eval.core.charts import Axis, Drawing, Heat, Look, Panel, Series, named_ticks
-from eval.core.figures import BLACK
+from eval.core.charts import BLACK, Axis, Drawing, Heat, Look, Panel, Series, named_ticks
 from eval.report.charts import Chart
 from eval.running.run_data import GridOf, RunData, grids, of, over_pairs
 from eval.tables.columns import RESULT_COLUMNS, Column, share

@@ -14,15 +14,7 @@ from cdpipe.io.answer import Answer, read_answer
 from cdpipe.io.session import load_arrays
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.report import ChangeReport
-from eval.core.figures import (
-    Points,
-    RegionMark,
-    State,
-    TruthMark,
-    distance_map,
-    overlay_map,
-    region_map,
-)
+from eval.report.maps import Points, RegionMark, State, TruthMark, distance_map, overlay_map, region_map
 from eval.report.objects.objects import Picture, object_pictures
 from eval.running.run_data import SHOWN_PRESETS, Row, RunData, first_seed, flag, named_variants, number, of, text
 from eval.truth.aligned import alignment_of

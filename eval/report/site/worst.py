@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from cdpipe.core.errors import InputError
 from cdpipe.io.answer import read_answer
 from cdpipe.io.session import load_arrays
-from eval.core.figures import region_map
+from eval.report.maps import region_map
 from eval.report.objects.objects import Picture
 from eval.report.site.site import region_caption, region_marks, truth_marks
 from eval.running.run_data import Row, RunData, number, of, scenarios, text

@@ -1,14 +1,13 @@
-"""Draws `eval.studies.descriptors.curves`: a column for each thing that was varied, a row for each measure."""
+"""The chart of `eval.studies.descriptors.curves`: a column for each thing that was varied, a row for each measure."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, NullLocator
 
-from eval.core.figures import BLACK, BLUE, VERMILLION, blank_figure, png
+from eval.core.charts import BLUE, VERMILLION, Axis, Drawing, Look, Panel, Series, log_span
 
 _MEASURES = (
     ("log_likelihood", 1.0, "log-likelihood"),
@@ -16,7 +15,7 @@ _MEASURES = (
     ("unchanged_above_0", 100.0, "unchanged above 0 [%]"),
     ("changes_found", 100.0, "changes found at 0 [%]"),
 )
-# column, what stands under it
+# column, title of the axis
 _VARIED = (
     ("numbers", "numbers stored per keyframe"),
     ("width", "channels, shipped = 1"),
@@ -24,37 +23,34 @@ _VARIED = (
     ("bits", "bits of each stored number"),
 )
 _GROUPS = (("", BLUE, "all validation tunnels"), ("_tight", VERMILLION, "family tight"))
+_READERS = ((True, "reads the after image"), (False, "compares the numbers alone"))
 _BASE = {"numbers": 64, "width": 1.0, "share": 1.0, "bits": 32}
 
 
-def draw_curves(table: pd.DataFrame) -> bytes:
-    """Draw every measure against budget, width, data and precision, as far as they were varied. Returns a PNG.
+def curves_chart(table: pd.DataFrame) -> Drawing:
+    """Draw every measure against budget, width, data and precision, as far as they were varied.
 
     Args:
         table: Rows of curves.csv; those without a seed are of the shipped network.
     """
     own, shipped = table[table["seed"].notna()], table[table["seed"].isna()]
     shown = [(name, label) for name, label in _VARIED if name == "bits" or varying(own, name, True)[name].nunique() > 1]
-    figure = blank_figure(max(5.5, 2.75 * len(shown)), 9.5)
-    panels = figure.subplots(len(_MEASURES), len(shown), squeeze=False)
-    for axes_row, (measure, scale, title) in zip(panels, _MEASURES, strict=True):
-        for axes, (name, label) in zip(axes_row, shown, strict=True):
-            if name not in ("bits", shown[0][0]):  # two bits would flatten everything else
-                axes.sharey(axes_row[0])
-            for column, colour in ((measure + group, colour) for group, colour, _ in _GROUPS):
-                if column not in table:
-                    continue
-                for reads_after in (True, False):
-                    chosen = varying(own, name, reads_after)
-                    _curve(axes, chosen[name], scale * chosen[column], colour, reads_after)
-                if name == "bits":
-                    axes.plot(shipped["bits"], scale * shipped[column], "*", color=colour, markersize=8)
-            _dressed(axes, table[name], label if measure == _MEASURES[-1][0] else "")
-        axes_row[0].set_ylabel(title, fontsize=8)
-    figure.legend(
-        handles=_handles(), loc="outside upper center", ncols=2 if len(shown) == 1 else 5, fontsize=8, frameon=False
-    )
-    return png(figure)
+    rows = []
+    for measure, scale, title in _MEASURES:
+        series = {name: list(_lines(own, name, measure, scale)) for name, _ in shown}
+        # two bits a number would flatten everything else: that panel has an axis of its own
+        values = [value for name, _ in shown if name != "bits" for each in series[name] for value in np.ravel(each.y)]
+        room = 0.05 * float(np.ptp(values or [0.0])) or 0.5
+        span = (min(values) - room, max(values) + room) if values else None
+        series["bits"] += _stars(shipped, measure, scale)
+        row: list[Panel] = []
+        for name, label in shown:
+            ticks = {float(tick): f"{tick:g}" for tick in np.unique(table[name].dropna())}
+            x_title = label if measure == _MEASURES[-1][0] else ""
+            x = Axis(x_title, log_span(list(ticks), 1.2, 1.2), is_log=True, ticks=ticks)
+            row.append(Panel(x, Axis("" if row else title, None if name == "bits" else span), series[name]))
+        rows.append(row)
+    return Drawing(rows, 200)
 
 
 def varying(table: pd.DataFrame, varied: str, reads_after: bool) -> pd.DataFrame:
@@ -66,33 +62,21 @@ def varying(table: pd.DataFrame, varied: str, reads_after: bool) -> pd.DataFrame
     return table[mask]
 
 
-def _curve(axes: Axes, x: pd.Series[float], y: pd.Series[float], colour: str, is_filled: bool) -> None:
-    face = colour if is_filled else "white"
-    axes.plot(x, y, linestyle="none", marker="o", markersize=4, color=colour, markerfacecolor=face, alpha=0.75)
-    means = y.groupby(x).mean()
-    axes.plot(means.index, means, color=colour, linewidth=1.2, linestyle="solid" if is_filled else (0, (3, 2)))
+def _lines(table: pd.DataFrame, name: str, measure: str, scale: float) -> Iterator[Series]:
+    """Yield for each group and kind of network every trained network as a dot, and the line of their means."""
+    for group, colour, group_name in _GROUPS:
+        for reads_after, reader in _READERS if measure + group in table else ():
+            chosen = varying(table, name, reads_after)
+            values = scale * chosen[measure + group]
+            means = values.groupby(chosen[name]).mean()
+            dots = Look(colour, 0.0, marker="circle", size=4.0, is_hollow=not reads_after, opacity=0.75)
+            yield Series(chosen[name], values, dots)
+            look = Look(colour, 1.2, "solid" if reads_after else "dash")
+            yield Series(means.index, means, look, f"{group_name}, {reader}")
 
 
-def _dressed(axes: Axes, x: pd.Series[float], label: str) -> None:
-    axes.set_xscale("log", base=2)
-    ticks = np.unique(x.dropna())
-    axes.xaxis.set_major_locator(FixedLocator([float(tick) for tick in ticks]))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.set_xlabel(label, fontsize=8)
-    axes.tick_params(labelsize=7)
-    axes.grid(color="#e6e6e6", linewidth=0.6)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-
-
-def _handles() -> list[Line2D]:
-    return [
-        *(Line2D([], [], color=colour, marker="o", markersize=4, label=name) for _, colour, name in _GROUPS),
-        Line2D([], [], color=BLACK, marker="o", markersize=4, label="reads the after image"),
-        Line2D(
-            [], [], color=BLACK, marker="o", markersize=4, markerfacecolor="white", linestyle=(0, (3, 2)),
-            label="compares the numbers alone",
-        ),
-        Line2D([], [], color=BLACK, marker="*", markersize=8, linestyle="none", label="shipped weights"),
-    ]  # fmt: skip
+def _stars(shipped: pd.DataFrame, measure: str, scale: float) -> Iterator[Series]:
+    for group, colour, group_name in _GROUPS:
+        if measure + group in shipped:
+            look = Look(colour, 0.0, marker="star", size=8.0)
+            yield Series(shipped["bits"], scale * shipped[measure + group], look, f"{group_name}, shipped weights")

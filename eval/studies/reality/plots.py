@@ -7,17 +7,28 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from cdpipe.core.geometry import Float64Array
-from eval.core.figures import BLACK, BLUE, GREEN, ORANGE, VERMILLION
+from eval.core.charts import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    VERMILLION,
+    Axis,
+    Dash,
+    Drawing,
+    Look,
+    Panel,
+    Series,
+    log_span,
+    named_ticks,
+)
+from eval.core.figures import blank_figure, picture, png
 from eval.studies.reality.sensor_measures import Revolutions
 from eval.studies.reality.static_novelty import CELLS_M, REAL_SHARES, Novelty
 from eval.studies.reality.tables import first_number
 
-_DPI = 90
 _PANELS = (
     ("returns by beam", "beam, top to bottom", "share of pixels that return", "linear"),
     ("returns by photons of the neighbours", "photons of the two neighbours", "share that returns", "linear"),
@@ -33,27 +44,28 @@ _COLOURS = (BLACK, BLUE, VERMILLION, ORANGE, GREEN)
 
 def draw_measures(table: pd.DataFrame, path: Path) -> None:
     """Write a panel for each measure; the recording is black, 19 sub-rays dashed, no effects dotted."""
-    figure = Figure(figsize=(12.0, 15.0), layout="constrained")
-    sources = list(dict.fromkeys(table["source"]))
+    sources = [str(source) for source in dict.fromkeys(table["source"])]
     names = list(dict.fromkeys(source.split(",")[0] for source in sources))
-    for axes, (measure, across, up, scale) in zip(figure.subplots(4, 2).ravel(), _PANELS, strict=True):
+    panels = []
+    for measure, across, up, scale in _PANELS:
         rows = table[(table["measure"] == measure) & (table["where"] != "all")]
-        labels = list(dict.fromkeys(rows["where"]))
-        ticks = sorted(labels, key=first_number)
+        bins = sorted(dict.fromkeys(rows["where"]), key=first_number)
+        series = []
         for source in sources:
-            values = rows[rows["source"] == source].set_index("where")["value"].reindex(ticks)
-            colour = _COLOURS[names.index(source.split(",")[0])]
-            style = "--" if "sub-rays" in source else ":" if "off" in source else "-"
-            axes.plot(range(len(ticks)), values, style, marker="o", ms=3, color=colour, label=source)
-        _dress(axes, ticks, across, up, scale)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False)
-    _save(figure, path)
+            values = rows[rows["source"] == source].set_index("where")["value"].reindex(bins)
+            dash: Dash = "dash" if "sub-rays" in source else "dot" if "off" in source else "solid"
+            look = Look(_COLOURS[names.index(source.split(",")[0])], dash=dash, marker="circle", size=3.0)
+            series.append(Series(np.arange(len(bins)), values, look, source))
+        ticks = dict(list(named_ticks([_bin_name(each) for each in bins]).items())[:: max(1, len(bins) // 11)])
+        highest = rows["value"].max()
+        span = log_span(rows["value"]) if scale == "log" else (0.0, 1.05 * highest) if highest > 0 else None
+        panels.append(Panel(Axis(across, ticks=ticks, tick_pt=5.5), Axis(up, span, is_log=scale == "log"), series))
+    path.write_bytes(png(picture(Drawing([panels[start : start + 2] for start in range(0, 8, 2)], 270))))
 
 
 def draw_scene(real: Revolutions, recast: Revolutions, path: Path) -> None:
     """Write the range images of the recording and of the simulator in the scene made of it, and their difference."""
-    figure = Figure(figsize=(12.0, 5.6), layout="constrained")
+    figure = blank_figure(12.0, 5.6)
     images = [np.where(each.range_m[0] > 0, each.range_m[0], np.nan) for each in (real, recast)]
     titles = ("real", "simulated in the scene made of it", "simulated minus real")
     for axes, title, image in zip(figure.subplots(3, 1), titles, (*images, images[1] - images[0]), strict=True):
@@ -64,51 +76,41 @@ def draw_scene(real: Revolutions, recast: Revolutions, path: Path) -> None:
         axes.set_ylabel("beam")
         figure.colorbar(drawn, ax=axes, label="m" if is_difference else "range, m", pad=0.01)
     figure.axes[2].set_xlabel("column")
-    _save(figure, path)
+    path.write_bytes(png(figure))
 
 
 def draw_novelty(results: Sequence[Novelty], path: Path) -> None:
     """Write the share of new returns by the number of revolutions, and by effect."""
-    figure = Figure(figsize=(12.0, 4.6), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.7))
     standing = sorted((r for r in results if r.way == "standing" and r.variant == "default"), key=_n_revolutions)
+    numbers = [each.n_revolutions for each in standing]
+    lines = []
     for index, (cell_m, colour) in enumerate(zip(CELLS_M, (BLUE, VERMILLION, GREEN), strict=True)):
-        shares = 100.0 * np.array([each.shares[index] for each in standing])
-        left.plot(
-            [each.n_revolutions for each in standing], shares, marker="o", ms=3, color=colour, label=f"{cell_m:g} m"
-        )
-        left.axhline(100.0 * REAL_SHARES[index], color=colour, ls=":", lw=1)
-    left.set(xscale="log", yscale="log", xlabel="revolutions in both halves", ylabel="returns in new voxels, %")
-    left.set_title("standing, default effects; dotted: real recording", fontsize=10)
-    left.legend(title="voxel", frameon=False)
+        percent = [100.0 * each.shares[index] for each in standing]
+        lines.append(Series(numbers, percent, Look(colour, marker="circle", size=3.0), f"voxel {cell_m:g} m"))
+        lines.append(Series(numbers, [100.0 * REAL_SHARES[index]] * len(numbers), Look(colour, 1.0, "dot")))
+    x = Axis("revolutions in both halves", is_log=True, ticks={float(number): f"{number}" for number in numbers})
+    heading = "standing, default effects; dotted: real recording"
+    y = Axis("returns in new voxels [%]", log_span([np.ravel(each.y) for each in lines]), is_log=True)
+    by_number = Panel(x, y, lines, heading)
     most = [each for each in results if each.n_revolutions == _most_common(results)]
-    # What a standing sensor has no case of keeps its place among the others.
+    # a variant that the standing sensor was not run with keeps its place among the others
     variants = list(dict.fromkeys(each.variant for each in sorted(most, key=_is_standing)))
-    ways = list(dict.fromkeys(each.way for each in most))
-    for place, (way, colour) in enumerate(zip(ways, (BLUE, ORANGE, VERMILLION), strict=False)):
-        bars = {each.variant: 100.0 * each.shares[0] for each in most if each.way == way}
-        at = np.arange(len(variants)) + (place - 1) * 0.27
-        right.bar(at, [bars.get(name, np.nan) for name in variants], width=0.25, color=colour, label=way)
-    right.axhline(100.0 * REAL_SHARES[0], color=BLACK, ls=":", lw=1, label="real recording")
-    right.set_xticks(range(len(variants)), variants, rotation=35, ha="right")
-    right.set_ylabel("returns in new voxels of 0.1 m, %")
-    right.set_title(f"{_most_common(results)} revolutions", fontsize=10)
-    right.legend(frameon=False, ncols=2, fontsize=8)
-    right.set_ylim(0.0, 1.25 * max(100.0 * each.shares[0] for each in most))
-    _save(figure, path)
+    places = np.arange(len(variants))
+    bars = []
+    for way, colour in zip(dict.fromkeys(each.way for each in most), (BLUE, ORANGE, VERMILLION), strict=False):
+        shares = {each.variant: 100.0 * each.shares[0] for each in most if each.way == way}
+        bars.append(Series(places, [shares.get(name, np.nan) for name in variants], Look(colour), way, "bars"))
+    ends = [-0.5, len(variants) - 0.5]
+    bars.append(Series(ends, [100.0 * REAL_SHARES[0]] * 2, Look(BLACK, 1.0, "dot"), "real recording"))
+    x = Axis(ticks=named_ticks([name.replace("_", "_\n").replace(" ", "\n") for name in variants]), tick_pt=5.5)
+    heading = f"{_most_common(results)} revolutions"
+    by_effect = Panel(x, Axis("returns in new voxels of 0.1 m [%]"), bars, heading)
+    path.write_bytes(png(picture(Drawing([[by_number], [by_effect]], 300))))
 
 
-def _dress(axes: Axes, ticks: Sequence[str], across: str, up: str, scale: str) -> None:
-    shown = [
-        tick.removeprefix("jump ").removesuffix(" photons").removesuffix(" m").replace(" photons or more", "+")
-        for tick in ticks
-    ]
-    step = max(1, len(ticks) // 11)
-    axes.set_xticks(range(0, len(ticks), step), shown[::step], fontsize=8, rotation=20 if step == 1 else 0)
-    axes.set(xlabel=across, ylabel=up, yscale=scale)
-    if scale == "linear" and not up.startswith("share that"):
-        axes.set_ylim(bottom=0.0)
-    axes.grid(visible=True, lw=0.3)
+def _bin_name(where: str) -> str:
+    short = where.removeprefix("jump ").removesuffix(" photons").removesuffix(" m")
+    return short.replace(" photons or more", "+")
 
 
 def _is_standing(novelty: Novelty) -> bool:
@@ -123,8 +125,3 @@ def _most_common(results: Sequence[Novelty]) -> int:
     numbers: Float64Array = np.array([each.n_revolutions for each in results], dtype=np.float64)
     values, counts = np.unique(numbers, return_counts=True)
     return int(values[np.argmax(counts)])
-
-
-def _save(figure: Figure, path: Path) -> None:
-    FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=_DPI)

@@ -9,7 +9,8 @@ import plotly.graph_objects as go
 import pytest
 from matplotlib.colors import to_hex
 
-from eval.core.charts import Axis, Drawing, Heat, Panel, Series, picture
+from eval.core.charts import Axis, Drawing, Heat, Panel, Series, log_span
+from eval.core.figures import picture
 from eval.report.charts import Chart, plotly_figure, plotly_script
 from eval.report.regions.charts import Bins, Curve, free_response_chart, look_of, roc_chart, size_chart
 from eval.report.scenarios import draw_scenarios
@@ -118,6 +119,8 @@ def test_bars_stand_side_by_side_and_a_heat_map_holds_its_values() -> None:
 def test_a_logarithmic_axis_is_marked_at_one_and_three() -> None:
     assert list(Axis("", (0.01, 1.0), is_log=True).marks or ()) == pytest.approx([0.01, 0.03, 0.1, 0.3, 1.0, 3.0])
     assert Axis("", (0.01, 1.0)).marks is None
+    assert log_span([0.0, NAN, 2.0, 8.0], 2.0, 3.0) == (1.0, 24.0)
+    assert log_span([]) == pytest.approx((1 / 1.5, 1.5))
 
 
 def test_false_regions_without_end_stay_inside_the_picture() -> None:

@@ -9,17 +9,8 @@ import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
-from eval.core.figures import (
-    BLUE,
-    ORANGE,
-    RED,
-    RegionMark,
-    TruthMark,
-    distance_map,
-    joined_labels,
-    overlay_map,
-    region_map,
-)
+from eval.core.charts import BLUE, ORANGE
+from eval.report.maps import RED, RegionMark, TruthMark, distance_map, joined_labels, overlay_map, region_map
 from eval.report.objects.figures import Panel, object_panels, oblique_view
 from eval.report.story import rank, sentence
 from eval.report.tables import beside, best, escape_latex, heat_colour

@@ -11,10 +11,11 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.merge.evidence import GATES
+from eval.core.figures import picture
 from eval.studies.merge_gates import (
     committed_thresholds,
-    draw_gates,
     gate_table,
+    gates_chart,
     let_through,
     main,
     measured,
@@ -147,10 +148,25 @@ def test_results_without_evidence_are_refused_in_one_line() -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_every_merge_is_drawn_on_the_row_of_its_kind_beside_the_gate() -> None:
+    cases = measured(table_of(), "")
+    drawing = gates_chart(cases, gate_table(cases, ASKED))
+    panels = [panel for row in drawing.rows for panel in row]
+    assert len(panels) == len(GATES)
+    for panel, (name, _) in zip(panels, GATES, strict=True):
+        (gate,) = (each for each in panel.series if each.name == "gate")
+        assert list(gate.x) == [ASKED[name]] * 2
+        for word, is_right in (("right merge", True), ("wrong merge", False)):
+            own = [each for each in panel.series if each.name == word]
+            assert sum(len(np.ravel(each.x)) for each in own) == (cases["right"] == is_right).sum()
+        rows = {round(float(y)) for each in panel.series if not each.look.width for y in np.ravel(each.y)}
+        assert rows == set(range(cases["kind"].nunique()))
+
+
 def test_one_kind_of_outcome_alone_can_be_drawn() -> None:
     for chosen in (CASES[:2], CASES[3:4], (("", 0.1, {}),)):
         cases = measured(table_of(chosen), "")
-        assert draw_gates(cases, gate_table(cases, ASKED)).startswith(b"\x89PNG")
+        assert len(picture(gates_chart(cases, gate_table(cases, ASKED))).axes) >= len(GATES)
 
 
 def test_the_command_writes_table_and_plot_and_names_what_slips_through(

@@ -9,9 +9,6 @@ from matplotlib.image import imread
 
 from eval.report.merge import figures as merge_figures
 from eval.report.merge.figures import _around_both, alignment_picture, surface_distances, worst_stretch
-from eval.report.merge.plots import MergedPairs, error_plot, time_plot
-
-NAN = float("nan")
 
 
 def pixels(address: str) -> np.ndarray:
@@ -20,14 +17,6 @@ def pixels(address: str) -> np.ndarray:
 
 def near(image: np.ndarray, colour: str) -> np.ndarray:
     return np.argwhere(np.abs(image - np.array(to_rgb(colour))).max(axis=2) < 0.03)
-
-
-def bluish(image: np.ndarray) -> np.ndarray:
-    return np.argwhere(image[..., 2] - image[..., 0] > 0.2)
-
-
-def orange(image: np.ndarray) -> np.ndarray:
-    return np.argwhere(image[..., 0] - image[..., 2] > 0.2)
 
 
 def floor(step_m: float = 0.2, offset_m: float = 0.0, length_m: float = 40.0) -> np.ndarray:
@@ -116,40 +105,3 @@ def test_the_whole_outline_of_the_worst_square_is_drawn(monkeypatch: pytest.Monk
 
 def test_maps_that_never_meet_make_a_picture() -> None:
     assert pixels(alignment_picture(floor(), floor() + np.array([500.0, 0.0, 0.0]))).ndim == 3
-
-
-def test_error_plot_has_exact_merges_low_and_refused_ones_on_top() -> None:
-    pairs = MergedPairs(
-        ["clean"] * 3 + ["drift"] * 2,
-        np.array([0.3, 0.5, 0.9, 0.4, 0.8]),
-        np.array([0.01, 0.012, 0.011, NAN, NAN]),
-        ["accepted"] * 3 + ["refused", "failed"],
-    )
-    image = pixels(error_plot({"ours": pairs}, 0.05, 0.5))
-    plot = image[int(0.12 * image.shape[0]) :]  # below the legend
-    low, high = bluish(plot), orange(plot)
-    assert len(low)
-    assert len(high)
-    assert high[:, 0].max() < low[:, 0].min()
-
-
-def test_accepted_without_an_error_is_drawn_above_every_error() -> None:
-    kinds, overlaps = ["clean", "clean"], np.array([0.2, 0.8])
-    one = MergedPairs(kinds, overlaps, np.array([50.0, NAN]), ["accepted"] * 2)
-    image = pixels(error_plot({"ours": one}, 0.05, 0.5))
-    marks = bluish(image[int(0.12 * image.shape[0]) :])
-    middle = (marks[:, 1].min() + marks[:, 1].max()) / 2
-    left, right = marks[marks[:, 1] < middle], marks[marks[:, 1] > middle]
-    assert right[:, 0].max() < left[:, 0].min()
-
-
-def test_time_plot_puts_slower_variants_farther_right() -> None:
-    times = {"t_merge [s]": {"ours": np.full(5, 0.05), "theirs": np.array([1.0, 1.0, NAN])}}
-    image = pixels(time_plot(times))
-    rows = bluish(image)
-    middle = (rows[:, 0].min() + rows[:, 0].max()) / 2
-    assert rows[rows[:, 0] < middle, 1].mean() < rows[rows[:, 0] > middle, 1].mean()
-
-
-def test_a_variant_without_times_has_an_empty_row() -> None:
-    assert pixels(time_plot({"t_refine [s]": {"ours": np.array([NAN]), "theirs": np.zeros(0)}})).ndim == 3

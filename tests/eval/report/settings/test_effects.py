@@ -1,21 +1,17 @@
 """What the page shows of worlds that repeat another one with something set otherwise."""
 
-import base64
 import html
-import io
 import re
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.colors import to_rgb
-from matplotlib.image import imread
 
-from eval.core.figures import BLUE, ORANGE
+from eval.core.figures import picture
 from eval.report.page import write_page
+from eval.report.settings.charts import Effect, effect_chart
 from eval.report.settings.effects import draw_effects, shortened
-from eval.report.settings.figures import Effect, effect_plot
 from eval.running.run_data import first_seed, named_variants, read_run, scenarios
 
 NAN = float("nan")
@@ -167,19 +163,19 @@ def test_settings_are_shortened_by_the_group_they_share() -> None:
     assert shortened(["sensor.a=1", "platform.b=2"]) == ("", ["sensor.a=1", "platform.b=2"])
 
 
-def test_the_picture_puts_gains_right_of_zero_and_losses_left() -> None:
-    effects = [Effect("up", "ours", 0.2, 0.1, 0.3), Effect("down", "theirs", -0.2, -0.3, -0.1)]
+def test_a_row_for_each_setting_and_a_mark_with_its_interval_for_each_variant() -> None:
+    effects = [Effect("up", "ours", 0.2, 0.1, 0.3), Effect("down, too", "theirs", -0.2, -0.3, -0.1)]
     effects += [Effect("up", "undefined", NAN, NAN, NAN)]
-    address = effect_plot({"recall": effects})
-    image = imread(io.BytesIO(base64.b64decode(address.partition(",")[2])))[..., :3]
-    plot = image[image.shape[0] // 5 :]  # below the legend
-
-    def places(colour: str) -> np.ndarray:
-        return np.argwhere(np.abs(plot - np.array(to_rgb(colour))).max(axis=2) < 0.02).mean(axis=0)
-
-    (up_row, up_column), (down_row, down_column) = places(BLUE), places(ORANGE)
-    assert up_row < down_row
-    dark = (plot < 0.2).all(axis=2).sum(axis=0)
-    (zero,) = np.flatnonzero(dark == dark.max())[:1]
-    assert down_column < zero < up_column
-    assert zero - down_column == pytest.approx(up_column - zero, rel=0.05)
+    drawing = effect_chart({"recall": effects, "IoU": effects[:1]})
+    first, second = drawing.rows[0]
+    zero, ours, theirs, _ = first.series
+    assert np.ravel(zero.x).tolist() == [0.0, 0.0]
+    assert [(each.name, list(each.x), list(each.low), list(each.high)) for each in (ours, theirs)] == [
+        ("ours", [0.2], [0.1], [0.3]), ("theirs", [-0.2], [-0.3], [-0.1]),
+    ]  # fmt: skip
+    assert list((first.y.ticks or {}).values()) == ["up", "down,\ntoo"]
+    assert set((second.y.ticks or {}).values()) == {""}
+    # from top to bottom
+    assert ours.y[0] < theirs.y[0] < first.y.span[0]
+    assert first.y.span[1] == 0.0
+    assert picture(drawing).axes[0].get_ylim() == first.y.span

@@ -14,7 +14,7 @@ from cdpipe.descriptors.sphere_network import SphereSize
 from cdpipe.training.data import TunnelShard
 from eval.core.progress import Silent
 from eval.studies.descriptors import curves as descriptor_curves
-from eval.studies.descriptors.curve_plots import draw_curves, varying
+from eval.studies.descriptors.curve_plots import curves_chart, varying
 from eval.studies.descriptors.curves import BITS, Point, main, points, share_of
 from eval.training.dataset import Recipe
 from eval.training.dataset_run import Where, make_dataset
@@ -83,13 +83,19 @@ def test_a_panel_shows_what_was_varied_and_the_base_point() -> None:
     assert (varying(table, "width", True)["bits"] == 32).all()
 
 
-def test_the_picture_shows_the_numbers() -> None:
+def test_the_chart_shows_every_network_and_the_shipped_one() -> None:
     table = _table()
     shipped = table.head(4).assign(seed=np.nan, share=np.nan, tunnels=np.nan, auroc_tight=0.9)
-    picture = draw_curves(pd.concat([table, shipped], ignore_index=True))
-    assert picture.startswith(b"\x89PNG")
-    moved = draw_curves(pd.concat([table, shipped.assign(auroc_tight=0.7)], ignore_index=True))
-    assert moved != picture
+    rows = curves_chart(pd.concat([table, shipped], ignore_index=True)).rows
+    assert [len(row) for row in rows] == [4] * 4
+    bits = rows[1][3].series
+    (star,) = (each for each in bits if each.name == "family tight, shipped weights")
+    assert sorted(zip(star.x, star.y, strict=True)) == [(2, 0.9), (4, 0.9), (8, 0.9), (32, 0.9)]
+    (line,) = (each for each in bits if each.name == "all validation tunnels, reads the after image")
+    assert list(line.x) == [2, 4, 8, 32]
+    np.testing.assert_allclose(line.y, 0.5 + 0.001 * np.array([2, 4, 8, 32]))
+    # shares are shown in percent
+    assert np.max(rows[2][3].series[0].y) == pytest.approx(100 * 0.532)
 
 
 def test_the_command_goes_on_where_it_was_cut_off(
