@@ -19,6 +19,7 @@ import pandas as pd
 
 from eval.core.domains import domain_name
 from eval.core.statistics import bootstrap_interval, mean_with_interval
+from eval.core.tablefile import table_file
 from eval.report.compared_columns import COMPARED, POOLED, is_time
 from eval.report.comparing import BETTER, WORSE, pooled_difference, verdict
 from eval.report.cost.pareto import comparable, with_domain
@@ -67,7 +68,7 @@ def latex_tables(data: RunData) -> dict[str, str]:
     every, results = with_domain(data.results), comparable(data)
     found = {}
     for name, (words, columns) in _SUBJECTS.items():
-        path = data.folder.path / f"{name}.csv"
+        path = table_file(data.folder.path / f"{name}.csv")
         if path.is_file():
             groups = _stored_groups(off_grids(pd.read_csv(path), data), every)
             found[f"{name}.tex"] = latex_float(f"tab:{name}", _caption(words, data, every), groups, columns, data)

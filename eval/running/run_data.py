@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import lzma
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
+from eval.core.tablefile import table_file
 from eval.plans.worlds import references
 from eval.running.runfolder import RunFolder
 
@@ -50,7 +52,7 @@ def read_run(run: Path) -> RunData:
     Raises:
         InputError: There is no results.csv, it holds no row, lacks a column that names its rows, or one of them twice.
     """
-    path = run / "results.csv"
+    path = table_file(run / "results.csv")
     if not path.is_file():
         raise InputError(f"{path}: missing: name a folder made by `tunnelcd run` or `tunnelcd demo`")
     results = _rows(path)
@@ -61,7 +63,7 @@ def read_run(run: Path) -> RunData:
         raise InputError(f"{path}: column {', '.join(absent)} is missing: expected a table written by `tunnelcd run`")
     _require_cases(path, results)
     missing: list[str] = []
-    items = {name: _optional_rows(run / f"{name}.csv", missing) for name in ("changes", "regions")}
+    items = {name: _optional_rows(table_file(run / f"{name}.csv"), missing) for name in ("changes", "regions")}
     provenance = _optional_json(run / "provenance.json", missing)
     return RunData(RunFolder(run), results, items["changes"], items["regions"], provenance, tuple(missing))
 
@@ -257,7 +259,7 @@ def _rows(path: Path) -> tuple[Row, ...]:
         frame = pd.read_csv(path)
     except pd.errors.EmptyDataError:
         return ()
-    except (OSError, UnicodeDecodeError, pd.errors.ParserError) as error:
+    except (OSError, EOFError, lzma.LZMAError, UnicodeDecodeError, pd.errors.ParserError) as error:
         raise InputError(f"{path}: cannot be read as a table: {error}") from error
     return tuple({str(key): value for key, value in row.items()} for row in frame.to_dict("records"))
 

@@ -18,6 +18,7 @@ import typer
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 from eval.core.exits import run_program
+from eval.core.tablefile import table_file
 
 ALARM_SHARE = 0.05
 FALSE_PER_100M = 0.1
@@ -153,7 +154,7 @@ def _just_above(scores: Float64Array, allowed: int, lowest: float | None) -> flo
 
 def _read(path: Path) -> pd.DataFrame:
     try:
-        return pd.read_csv(path)
+        return pd.read_csv(table_file(path))
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{path}: {reason}: name a folder that `tunnelcd run calibrate` made") from error

@@ -28,6 +28,7 @@ from eval.core.charts import BLACK, BLUE, VERMILLION, Axis, Drawing, Look, Panel
 from eval.core.exits import run_program
 from eval.core.figures import picture, png
 from eval.core.output import make_writable
+from eval.core.tablefile import table_file
 from eval.plans.coverage import plan_of
 from eval.plans.plan import cells
 from eval.running.run_data import read_document
@@ -205,7 +206,7 @@ def main(
     variant: Annotated[str, typer.Option(help="the one that accepts everything, where there are several")] = "",
 ) -> None:
     """Print and write what each gate does to the merges of a validation run, and draw where its threshold lies."""
-    path = run / "results.csv"
+    path = table_file(run / "results.csv")
     try:
         results = pd.read_csv(path)
     except (OSError, ValueError) as error:

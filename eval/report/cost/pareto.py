@@ -17,6 +17,7 @@ import pandas as pd
 from cdpipe.core.geometry import BoolArray, Float64Array
 from eval.core.domains import domain_of
 from eval.core.statistics import mean_with_interval
+from eval.core.tablefile import table_file
 from eval.report.objects.tables import is_told_the_truth
 from eval.running.run_data import Row, RunData, named_variants, scenarios
 from eval.tables.merge_table import numbers, texts
@@ -55,7 +56,7 @@ def pareto_table(data: RunData) -> pd.DataFrame:
         `is_on_front`. No row where fewer than two methods have both.
     """
     results = comparable(data)
-    path = data.folder.path / "regions_table.csv"
+    path = table_file(data.folder.path / "regions_table.csv")
     stored = pd.read_csv(path) if path.is_file() else None
     found: list[dict[str, Any]] = []
     for domain in [name for name in DOMAINS if name != ALL_DOMAINS]:

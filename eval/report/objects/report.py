@@ -10,6 +10,7 @@ import pandas as pd
 
 from eval.core.domains import domain_name, domain_of
 from eval.core.figures import picture_address
+from eval.core.tablefile import table_file
 from eval.report.cost.pareto import with_domain
 from eval.report.merge.merge import covered_by
 from eval.report.objects.cases import object_cases, voxel_variants
@@ -134,7 +135,7 @@ def _line(sizes: pd.DataFrame) -> SizeLine:
 
 def _read(data: RunData, name: str) -> pd.DataFrame:
     """Return a table of the run folder, empty where there is none."""
-    path = data.folder.path / f"{name}.csv"
+    path = table_file(data.folder.path / f"{name}.csv")
     return pd.read_csv(path, keep_default_na=True) if path.is_file() else pd.DataFrame()
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from eval.core.domains import domain_name
+from eval.core.tablefile import table_file
 from eval.report.charts import Chart
 from eval.report.cost.pareto import with_domain
 from eval.report.merge.merge import covered_by
@@ -86,7 +87,7 @@ def draw_regions(data: RunData) -> RegionPart | None:
     """Return tables and plots of the regions; None where the plan of the run does not ask for them."""
     if "regions" not in reported(data.provenance):
         return None
-    files = {name: data.folder.path / f"{name}.csv" for name in FILES}
+    files = {name: table_file(data.folder.path / f"{name}.csv") for name in FILES}
     found = {name: pd.read_csv(path) for name, path in files.items() if path.is_file()}
     missing = tuple(
         f"{name}.csv is not in the run folder: `tunnelcd score` makes it." for name in FILES[:1] if name not in found
