@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
 import typer.main
+import yaml
 
 from eval.cli.main import app
 
@@ -74,3 +76,13 @@ def test_long_options_of_the_commands_in_blocks_exist() -> None:
                     continue
                 known = {name for option in COMMANDS[found[1]].params for name in option.opts}
                 assert set(re.findall(r"--[a-z-]+", found[2])) <= known, (page, line)
+
+
+def test_the_citation_names_the_paper_and_this_version() -> None:
+    document = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert document["version"] == tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    paper = document["preferred-citation"]
+    assert paper["identifiers"][0]["value"] == "arXiv:2306.15416"
+    readme = (ROOT / "README.md").read_text()
+    assert paper["title"] in readme
+    assert all(author["family-names"] in readme for author in paper["authors"])
