@@ -1,7 +1,7 @@
-"""The speed table: what is measured, each figure beside its rival's of the same run, and the file it goes to.
+"""The speed table: its rows, the measurement of each beside its rival in the same run, and the file.
 
-A later part of the project joins with a dictionary of named functions that return `sim.studies.timing.Contest`, added
-to `contests`. Every ratio says how many times faster than its rival something is.
+A new part of the table is a dictionary of named functions that return `sim.studies.timing.Contest`, joined in
+`contests`. A ratio says how many times faster than its rival something is.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cdpipe.merge.merge import merge_maps
 from cdpipe.model.config import load_config
 from cdpipe.query.query import find_regions
 from eval.bench.extract import ExtractSite, extract_contests, extract_sites
-from eval.bench.merge import FailedContest, MergeSite, merge_contests, paper_sites
+from eval.bench.merge import FailedContest, MergeSite, against_limit, merge_contests, paper_sites
 from eval.core.output import make_writable, unwritable
 from eval.core.provenance import machine
 from sim.studies.bench import BenchSite, sensor_contests
@@ -31,6 +31,11 @@ from sim.studies.timing import Contest, timed
 
 Contests = Mapping[str, Callable[[], Contest]]
 Row = dict[str, Any]
+_SPHERE_LIMIT_S = 0.003
+_SCAN_LIMIT_S = 0.1  # a 10 Hz sensor
+_N_REGIONS = 3
+# The paper's t_CD per region (Table I): 0.016 to 0.019 s on site 1, 0.109 to 0.115 s on site 2.
+_QUERY_LIMITS_S = {"60k": 0.016, "1400k": 0.109}
 
 
 def contests(
@@ -38,7 +43,7 @@ def contests(
     merge_sites: Sequence[MergeSite] | None = None,
     spheres: Sequence[ExtractSite] | None = None,
 ) -> dict[str, Callable[[], Contest]]:
-    """Return everything that can be measured, by name, in the order of the table."""
+    """Return every row's measurement by name, in the order of the table."""
     sites = merge_sites or paper_sites()
     return {
         **sensor_contests(site or BenchSite()),
@@ -82,26 +87,25 @@ def measure(every: Contests, on_progress: Callable[[str, int, int], None] | None
 def row_of(name: str, contest: Contest) -> Row:
     """Return one row of the table.
 
-    `value` and `rival_value` are medians over the `n` repetitions, `spread` is the distance between the quartiles of
-    `value`; `ratio` tells how many times faster than its rival it is, and `met` whether that reaches `target`. What
-    has no rival that its time can be compared with has None there. What failed has no value, `met` is False and
-    `reason` says why; it is "" everywhere else.
+    `value` and `rival_value` are medians over `n` repetitions; `spread` is the distance between the quartiles of
+    `value`. `ratio` tells how many times faster than its rival it is, and `met` whether that reaches `target`; both are
+    None without a rival that can be compared. What failed has no value, `met` is False and `reason` says why; `reason`
+    is "" everywhere else.
     """
+    row = dict.fromkeys(("name", "value", "unit", "rival", "rival_value", "ratio", "target", "met", "n", "spread"))
+    row |= {"name": name, "unit": contest.unit, "target": contest.target}
     if isinstance(contest, FailedContest):
-        return _failed_row(name, contest)
+        return row | {"met": False, "n": 0, "reason": contest.reason}
     figures = _figures(contest, contest.seconds)
     value = float(np.median(figures))
     rival = float(np.median(_figures(contest, contest.rival_seconds))) if contest.rival_seconds else None
     ratio = None if rival is None else value / rival if contest.work is not None else rival / value
     low, high = np.quantile(figures, [0.25, 0.75])
-    return {
-        "name": name,
+    return row | {
         "value": value,
-        "unit": contest.unit,
         "rival": contest.rival,
         "rival_value": rival,
         "ratio": ratio,
-        "target": contest.target,
         "met": None if ratio is None or contest.target is None else ratio >= contest.target,
         "n": len(figures),
         "spread": float(high - low),
@@ -128,7 +132,7 @@ def reasons(rows: Sequence[Row]) -> list[str]:
 
 
 def make_ready(path: Path) -> None:
-    """Find out whether the table can be written before anything is measured.
+    """Check before the measurement that the table can be written.
 
     Raises:
         InputError: It cannot.
@@ -153,35 +157,12 @@ def write_table(table: Mapping[str, Any], path: Path) -> None:
         raise unwritable(path, error) from error
 
 
-def _failed_row(name: str, contest: FailedContest) -> Row:
-    return {
-        "name": name,
-        "value": None,
-        "unit": contest.unit,
-        "rival": None,
-        "rival_value": None,
-        "ratio": None,
-        "target": contest.target,
-        "met": False,
-        "n": 0,
-        "spread": None,
-        "reason": contest.reason,
-    }
-
-
 def _figures(contest: Contest, seconds: Sequence[float]) -> list[float]:
     return [each if contest.work is None else contest.work / each for each in seconds]
 
 
-_SPHERE_LIMIT_S = 0.003
-_SCAN_LIMIT_S = 0.1  # a 10 Hz sensor
-_N_REGIONS = 3
-# The paper's t_CD per region (Table I): 0.016 to 0.019 s on site 1, 0.109 to 0.115 s on site 2.
-_QUERY_LIMITS_S = {"60k": 0.016, "1400k": 0.109}
-
-
 def descriptor_contests(sites: Sequence[MergeSite]) -> dict[str, Callable[[], Contest]]:
-    """Return what can be measured of descriptors and query, by name, in the order of the table."""
+    """Return the rows of descriptors and query by name, each against its limit, in the order of the table."""
     return {name: contest for site in sites for name, contest in _rows(site)}
 
 
@@ -194,11 +175,11 @@ def _rows(site: MergeSite) -> Iterator[tuple[str, Callable[[], Contest]]]:
 def _scan(site: MergeSite) -> Contest:
     session = site.sessions[0]
     n = len(session.mapped.map.keyframe_scans)
-    return _limited([seconds / n for seconds in session.descriptor_s], _SCAN_LIMIT_S)
+    return against_limit([seconds / n for seconds in session.descriptor_s], _SCAN_LIMIT_S)
 
 
 def _sphere(site: MergeSite) -> Contest:
-    """Time both halves of a comparison: describing the before map, and looking at the after map from there."""
+    """Time both halves of a comparison: describing the before map, and comparing the after map with it."""
     before, after = (session.mapped for session in site.sessions)
     merged = merge_maps(before, after, site.config.merge)
     poses = before.map.odom_T_keyframe
@@ -208,11 +189,11 @@ def _sphere(site: MergeSite) -> Contest:
         spheres = describe_map(before.map, poses, site.config.descriptor)
         change_log_odds(merged, replace(before.descriptors, spheres=spheres), is_covered)
 
-    return _limited([seconds / len(poses) for seconds in timed(both, site.repeats)], _SPHERE_LIMIT_S)
+    return against_limit([seconds / len(poses) for seconds in timed(both, site.repeats)], _SPHERE_LIMIT_S)
 
 
 def _query(site: MergeSite) -> Contest:
-    """Time the paper's query, as its Table I has it: for each of the regions it gives."""
+    """Time the paper's query per region, as its Table I does."""
     before, after = (session.mapped for session in site.sessions)
     merged = merge_maps(before, after, site.config.merge)
     config = load_config("paper-topn", [f"query.n_regions={_N_REGIONS}"]).query
@@ -222,10 +203,5 @@ def _query(site: MergeSite) -> Contest:
         find_regions(merged, before.descriptors, after.descriptors, config)
         return (perf_counter() - start) / _N_REGIONS
 
-    return _limited(
-        [once() for _ in range(site.repeats + 1)][1:], _QUERY_LIMITS_S.get(site.size, _QUERY_LIMITS_S["60k"])
-    )
-
-
-def _limited(seconds: Sequence[float], limit_s: float) -> Contest:
-    return Contest("s", tuple(seconds), None, f"its limit, {1000 * limit_s:g} ms", (limit_s,), 1.0)
+    seconds = [once() for _ in range(site.repeats + 1)][1:]
+    return against_limit(seconds, _QUERY_LIMITS_S.get(site.size, _QUERY_LIMITS_S["60k"]))

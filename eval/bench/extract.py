@@ -1,10 +1,11 @@
-"""Rows of the speed table for cutting objects out of a region, in this thread's own time.
+"""Rows of the speed table for the extraction of objects from a region, in CPU time of one thread.
 
-`extract-voxel-N` is what the paper times: a sphere of N points cut out of two indexed maps, the voxel comparison in one
-direction and the outlier filter on what is new. Of the default rule the comparison of both sessions with each other's
-surface stands against its limit; cutting both spheres out, indexing them as surfaces, the local re-alignment, the look
-for returns, which is one pass over both sessions whatever the number of regions, and the close look at one site have
-rows of their own. The default rule's spheres reach 1.5 m beyond their N points, where objects are followed to.
+`extract-voxel-N` is what the paper times: cropping a sphere of N points from two indexed maps, the voxel comparison in
+one direction, and the outlier filter on the new points. `extract-surface-N` is the default rule's comparison of both
+sessions with each other's surface, against its limit. Its other steps have rows of their own: cropping both spheres,
+indexing them as surfaces, the local re-alignment, reading the returns (one pass over both sessions, whatever the number
+of regions), and the comparison of one site. The default rule's spheres reach 1.5 m beyond their N points, to which
+objects are followed.
 """
 
 from __future__ import annotations
@@ -31,28 +32,29 @@ from cdpipe.merge.registration import Surface
 from cdpipe.model.config import ExtractConfig, PipelineConfig, load_config
 from cdpipe.model.types import KeyframeViews, MergedMaps, SessionName
 from cdpipe.pipeline import Hooks, map_session, merge_mapped
+from eval.bench.merge import against_limit
 from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
 from sim.session.simulate import simulate_pair
 from sim.studies.timing import Contest, timed
 
 _REALIGN_LIMIT_S = 0.05
-# Every so many keyframes a sphere is tried; what is timed is typical of those that hold more candidates than this.
+# One sphere per so many keyframes; the timed one has the median number of candidates of those with more than ten.
 _STRIDE, _MIN_TELLING = 2, 10
 
 
 @dataclass(frozen=True)
 class ExtractSite:
-    """A pair of sessions that objects are cut out of, simulated when it is first asked for.
+    """A pair of sessions with objects to extract, simulated at first use.
 
     Attributes:
         n_points: Points of the after map in the sphere; part of the rows' names.
         scenario: Name of a scenario.
         voxel_s: Limit of the paper's rule.
         surface_s: Limit of the default rule's comparison.
-        paper: What the paper says of its rule.
-        seed: Draws the world: one that nothing is tested on.
-        repeats: How often everything is timed.
+        paper: The paper's own time, in words.
+        seed: Seed of the world, from the training split.
+        repeats: Number of repetitions of each timing.
     """
 
     n_points: int
@@ -95,7 +97,7 @@ class ExtractSite:
 
 @dataclass(frozen=True)
 class Region:
-    """One sphere of both maps, and what the default rule makes of it step by step."""
+    """One sphere of both maps, with the steps of the default rule."""
 
     merged: MergedMaps
     centre_map: Float64Array
@@ -122,7 +124,7 @@ class Region:
 
     @cached_property
     def correction(self) -> Float64Array:
-        """What `realign` gave."""
+        """Result of `realigned`."""
         return self.realigned()
 
     @cached_property
@@ -160,18 +162,18 @@ class Region:
         return self.crops.near("after", in_map, SITE_M), self.crops.near("before", in_map, SITE_M + RIM_M)
 
     def pools(self) -> tuple[ReturnPool, ReturnPool]:
-        """Look for the site's returns in both sessions."""
+        """Read the returns at the site from both sessions."""
         own, others = self.site
         return ReturnPool(self.merged.after, [own]), ReturnPool(self.merged.before, [others])
 
     @cached_property
     def returns(self) -> tuple[Int64Array, Int64Array]:
-        """The site's returns of the after and of the before session."""
+        """Returns of the after and of the before session at the site."""
         (own, others), (own_pool, other_pool) = self.site, self.pools()
         return own_pool.of(own), other_pool.of(others)
 
     def look_closely(self, config: ExtractConfig) -> list[Int64Array]:
-        """Compare the returns of the largest site, look up what was seen through or passed, and grow its objects."""
+        """Compare the returns of the largest site, count free-space votes and grazing rays, and grow its objects."""
         own, others = self.returns
         in_map = self.merged.alignment.to_map(self.merged.after.positions_of(own))
         ends = self.merged.before.positions_of(others)
@@ -182,7 +184,7 @@ class Region:
 
     @cached_property
     def compared(self) -> tuple[tuple[Int64Array, float], tuple[Int64Array, float]]:
-        """What `compare` gave."""
+        """Result of `compare`."""
         return self.compare()
 
 
@@ -195,7 +197,7 @@ def extract_sites() -> tuple[ExtractSite, ExtractSite]:
 
 
 def extract_contests(sites: Sequence[ExtractSite]) -> dict[str, Callable[[], Contest]]:
-    """Return what can be measured of the extraction, by name, in the order of the table."""
+    """Return the rows of the extraction by name, in the order of the table."""
     return {name: contest for site in sites for name, contest in _rows(site)}
 
 
@@ -218,11 +220,11 @@ def _rows(site: ExtractSite) -> Iterator[tuple[str, Callable[[], Contest]]]:
 def _step(site: ExtractSite, step: Callable[[Region], object], limit_s: float | None) -> Contest:
     region = site.region
     seconds = timed(lambda: step(region), site.repeats, thread_time)
-    return Contest("s", seconds) if limit_s is None else _limited(seconds, limit_s)
+    return Contest("s", seconds) if limit_s is None else against_limit(seconds, limit_s)
 
 
 def _voxel(site: ExtractSite, sessions: Sequence[SessionName]) -> Contest:
-    """Time the paper's rule on the same sphere; its alignment is one for the whole map."""
+    """Time the paper's rule on the same sphere, with one rigid alignment for the whole map."""
     config = load_config("paper")
     crops = Crops(replace(site.merged, local=None), float(np.sqrt(3.0)) * config.extract.voxel_m)
     centre_map, radius_m = site.region.centre_map, site.region.radius_m
@@ -237,14 +239,10 @@ def _voxel(site: ExtractSite, sessions: Sequence[SessionName]) -> Contest:
     seconds = timed(once, site.repeats, thread_time)
     if len(sessions) > 1:
         return Contest("s", seconds)
-    return _limited(seconds, site.voxel_s, f" (the paper: {site.paper})")
-
-
-def _limited(seconds: Sequence[float], limit_s: float, more: str = "") -> Contest:
-    return Contest("s", tuple(seconds), None, f"its limit, {1000 * limit_s:g} ms{more}", (limit_s,), 1.0)
+    return against_limit(seconds, site.voxel_s, f" (the paper: {site.paper})")
 
 
 def _views(merged: MergedMaps) -> KeyframeViews:
     if merged.before.views is None:
-        raise ValueError("the before map did not keep what its keyframes saw")
+        raise ValueError("the before map has no keyframe views")
     return merged.before.views

@@ -1,12 +1,12 @@
-"""Speed of the merge: against its limits and against KISS-Matcher with GICP, on the maps of both paper sites.
+"""Rows of the speed table for the merge: against its limits, and against KISS-Matcher with GICP, on both paper sites.
 
-KISS-Matcher runs at the coarsest voxel that found every pair of maps of that size which shared at least 45 % of the way
+KISS-Matcher runs at the coarsest voxel that merged every pair of maps of that size with at least 45 % shared path
 (validation seeds; reports/merge/notes). Its GICP is thinned to 0.8 m: against 0.4 m that takes half the time or
-less and cost 5 mm at most.
+less and costs 5 mm at most.
 
-Both sides end at an accepted rigid transform: ours from descriptors (all-in), stored vectors or indexed maps, the
-rival's from two clouds. Refinement along the path is a row of its own; the rival has nothing like it. A rival that is
-wrong is no rival: its time is not compared. Where ours is refused or wrong the row says why, and its target is missed.
+Both methods end at an accepted rigid transform: ours starts from descriptors (all-in), stored vectors or indexed maps,
+the rival from two clouds. Refinement along the path is a row of its own, because the rival has no such step. The time
+of a wrong rival is not compared. Where ours is refused or wrong, the row gives the reason and misses its target.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from cdpipe.merge.global_registration import is_kiss_matcher_installed, register
 from cdpipe.merge.merge import merge_maps
 from cdpipe.model.config import PipelineConfig, load_config
 from cdpipe.model.types import MappedSession, PosedScan, ScanSource, SessionName
-from eval.truth.adapters import pipeline_input
+from eval.truth.adapters import WrappedScans, pipeline_input
 from scenarios.library import load_scenario
 from sim.session.simulate import simulate_pair
 from sim.session.truth import read_true_poses
@@ -48,14 +48,14 @@ _ALL_IN = "ours: descriptors + index + merge to a rigid transform, as the rival 
 
 @dataclass(frozen=True, slots=True)
 class FailedContest(Contest):
-    """What could not be timed because ours failed, and why."""
+    """A row that could not be timed because our merge failed, with the reason."""
 
     reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Goals:
-    """What is asked of merging maps of one size: seconds, and how many times faster than KISS-Matcher with GICP."""
+    """Targets for maps of one size: seconds, and how many times faster than KISS-Matcher with GICP."""
 
     merge_s: float
     index_s: float
@@ -70,7 +70,7 @@ class BenchSession:
     Attributes:
         mapped: Its map and descriptors.
         world_T_odom: (K, 4, 4) true pose of its odom frame, as it is at each keyframe.
-        descriptor_s: Seconds that the descriptors of all keyframes take, several times measured.
+        descriptor_s: Seconds that the descriptors of all keyframes take, one for each repetition.
     """
 
     mapped: MappedSession
@@ -80,15 +80,15 @@ class BenchSession:
 
 @dataclass(frozen=True)
 class MergeSite:
-    """A pair of sessions that is merged, simulated when it is first asked for.
+    """A pair of sessions to merge, simulated at first use.
 
     Attributes:
-        size: About how many points its maps have; part of the rows' names.
+        size: Approximate number of points of its maps; part of the rows' names.
         scenario: Name of a scenario.
-        goals: The targets of its rows.
+        goals: Targets of its rows.
         kiss_voxel_m: The rival's voxel.
-        seed: Draws the world: one that nothing is tested on.
-        repeats: How often everything is timed.
+        seed: Seed of the world, from the training split.
+        repeats: Number of repetitions of each timing.
     """
 
     size: str
@@ -118,7 +118,7 @@ class MergeSite:
         chosen = point_map.keyframe_scans
         descriptors = describe_scans(source, chosen, self.config.descriptor)
         some = np.unique(np.linspace(0, len(chosen) - 1, min(len(chosen), _N_DESCRIBED)).round().astype(np.int64))
-        held = _HeldScans(source, chosen[some].tolist())
+        held = _ScansInMemory(source, chosen[some].tolist())
         seconds = timed(lambda: describe_scans(held, chosen[some], self.config.descriptor), self.repeats)
         world_T_odom = read_true_poses(pair / name)[chosen] @ invert(point_map.odom_T_keyframe)
         return BenchSession(
@@ -129,10 +129,10 @@ class MergeSite:
 
     @cached_property
     def raced(self) -> tuple[list[Mapping[str, float]], list[float]]:
-        """Seconds of the parts of each merge, and of the rival's, in turns; the first of either does not count.
+        """Seconds of the parts of each merge and of the rival's merges, timed in turns; the first of each is left out.
 
         Raises:
-            MergeFailedError: Ours is refused, or wrong: its time would mean nothing.
+            MergeFailedError: Our merge is refused or wrong, so that its time says nothing.
         """
         ours, rival = [], []
         for number in range(self.repeats + 1):
@@ -147,7 +147,7 @@ class MergeSite:
 
     @cached_property
     def refined(self) -> list[Mapping[str, float]]:
-        """Seconds of the parts of each merge with local refinement; the first does not count."""
+        """Seconds of the parts of each merge with local refinement; the first is left out."""
         return [self.merge("local") for _ in range(max(3, self.repeats // 2) + 1)][1:]
 
     def merge(self, refine: str) -> Mapping[str, float]:
@@ -162,12 +162,12 @@ class MergeSite:
         return merged.seconds
 
     def rival_pose(self) -> Float64Array | None:
-        """Merge once as the rival does and return before_T_after (4, 4); None where it finds nothing."""
+        """Merge once with the rival and return before_T_after (4, 4); None where it finds nothing."""
         before, after = self.sessions
         return kiss_and_gicp(before.mapped.map.points, after.mapped.map.points, self.kiss_voxel_m)
 
     def missed_m(self, before_T_after: Float64Array) -> float:
-        """Return how far after keyframes are from where they belong, the median, metres."""
+        """Return the median distance of the after keyframes from their true places, metres."""
         before, after = self.sessions
         positions = after.mapped.map.odom_T_keyframe[:, :3, 3]
         places_before = _moved(before.world_T_odom, before.mapped.map.odom_T_keyframe[:, :3, 3])
@@ -177,7 +177,7 @@ class MergeSite:
 
     @cached_property
     def rival(self) -> tuple[str, bool]:
-        """What the rival is, and whether its time can be compared: whether it is there and right."""
+        """Name of the rival, and whether its time can be compared: it is installed and right."""
         if not is_kiss_matcher_installed():
             return _NO_KISS, False
         name, pose = f"KISS-Matcher at {self.kiss_voxel_m} m and GICP", self.rival_pose()
@@ -188,7 +188,7 @@ class MergeSite:
 
 
 def merge_contests(sites: Sequence[MergeSite]) -> dict[str, Callable[[], Contest]]:
-    """Return what can be measured of the merge, by name, in the order of the table."""
+    """Return the rows of the merge by name, in the order of the table."""
     return {name: contest for site in sites for name, contest in _rows(site)}
 
 
@@ -219,12 +219,17 @@ def kiss_and_gicp(before_points: Float64Array, after_points: Float64Array, voxel
     return np.asarray(pose @ found.before_T_after)
 
 
+def against_limit(seconds: Sequence[float], limit_s: float, remark: str = "") -> Contest:
+    """Return the contest of some times against a limit, which stands in for the rival."""
+    return Contest("s", tuple(seconds), None, f"its limit, {1000 * limit_s:g} ms{remark}", (limit_s,), 1.0)
+
+
 def _rows(site: MergeSite) -> Iterator[tuple[str, Callable[[], Contest]]]:
     goals = site.goals
     rows: dict[str, tuple[Callable[[], Contest], float | None]] = {
-        "": (lambda: _limited(_part(site, "t_merge_s"), goals.merge_s), 1.0),
+        "": (lambda: against_limit(_part(site, "t_merge_s"), goals.merge_s), 1.0),
         "-raced": (lambda: _raced(site, _part(site, "t_merge_s"), goals.ratio), goals.ratio),
-        "-index": (lambda: _limited(_part(site, "t_index_s"), goals.index_s), 1.0),
+        "-index": (lambda: against_limit(_part(site, "t_index_s"), goals.index_s), 1.0),
         "-all-in": (lambda: _raced(site, _all_in(site), goals.ratio_all_in, _ALL_IN), goals.ratio_all_in),
         "-refine": (lambda: Contest("s", tuple(each["t_refine_s"] for each in site.refined)), None),
     }
@@ -248,30 +253,18 @@ def _all_in(site: MergeSite) -> tuple[float, ...]:
     return tuple(map(sum, zip(*parts, _part(site, "t_index_s"), _part(site, "t_merge_s"), strict=True)))
 
 
-def _limited(seconds: tuple[float, ...], limit_s: float) -> Contest:
-    return Contest("s", seconds, None, f"its limit, {1000 * limit_s:.0f} ms", (limit_s,), 1.0)
-
-
 def _raced(site: MergeSite, seconds: tuple[float, ...], target: float, ours: str = "") -> Contest:
     rival, is_comparable = site.rival
     told = f"{rival} ({ours})" if ours else rival
     return Contest("s", seconds, None, told, tuple(site.raced[1]) if is_comparable else (), target)
 
 
-class _HeldScans(ScanSource):
-    """Some scans of a session, held in memory: a robot has them there."""
+class _ScansInMemory(WrappedScans):
+    """Some scans of a session in memory, as a robot has them."""
 
     def __init__(self, source: ScanSource, indices: Sequence[int]) -> None:
-        self._source = source
+        super().__init__(source)
         self._scans = {index: source.scan(index) for index in indices}
-
-    @property
-    def name(self) -> str:
-        return self._source.name
-
-    @property
-    def odom_T_sensor(self) -> Float64Array:
-        return self._source.odom_T_sensor
 
     def scan(self, index: int) -> PosedScan:
         return self._scans[index]

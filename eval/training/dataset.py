@@ -1,8 +1,8 @@
-"""One tunnel's training data: a pair is simulated, mapped and merged by the truth, all in memory, and becomes a shard.
+"""Training data of one tunnel: a pair is simulated, mapped and merged by the truth in memory, and becomes a shard.
 
-The images come from the pipeline's own maps and renderer, at the before keyframes. The after map is carried there
-through the true alignment and, for every draw after the first, off by a merge error of its own: a shift in the map
-frame and a turn about the anchor, each component normal, drawn from (seed, "dataset-merge-error").
+The images come from the pipeline's own maps and renderer, at the before keyframes (the anchors). The after map is
+transformed by the true alignment. Every draw after the first adds a merge error of its own: a translation in the map
+frame and a rotation about the anchor, each component normal, drawn from (seed, "dataset-merge-error").
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from eval.core.provenance import digest
 from eval.oracles.merge import OracleMerge, merged_by_truth
 from eval.scoring.merge_metrics import PAIR_RADIUS_M
 from eval.scoring.region_metrics import keyframe_labels
-from eval.truth.adapters import held_input
+from eval.truth.adapters import WrappedScans, held_input
 from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth, ground_truth
 from eval.truth.universe import UniverseBuilder
 from scenarios.library import load_scenario
@@ -46,13 +46,13 @@ Arrays = dict[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """What every shard of a dataset has in common.
+    """Settings that all shards of a dataset share.
 
     Attributes:
         draws: After images of each anchor; the first is merged exactly.
-        error_m: Standard deviation of each component of a draw's shift.
-        error_deg: Standard deviation of each component of a draw's turn.
-        settings: What is set over the scenarios, as `key=value`.
+        error_m: Standard deviation of each component of a draw's translation.
+        error_deg: Standard deviation of each component of a draw's rotation.
+        settings: `key=value` settings written over the scenarios.
     """
 
     draws: int = 4
@@ -63,7 +63,7 @@ class Recipe:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Mapped:
-    """A session as the pipeline mapped it, what its keyframes saw, its truth, and the change each map point bears."""
+    """A mapped session: its map, truth, range images of its keyframes, and the change id of each map point."""
 
     map: PointMap
     truth: SessionTruth
@@ -73,7 +73,7 @@ class _Mapped:
 
 
 def shard_digest(scenario: Scenario, seed: int, recipe: Recipe) -> str:
-    """Return the digest of what a shard depends on, code apart: told before anything is simulated."""
+    """Return the digest of all inputs of a shard except code; known before the simulation."""
     image = ROWS, COLUMNS, HALF_LENGTH_M, REACH_M, list(sphere_image.sphere_image(np.zeros((0, 3))).shape)
     return digest(
         {
@@ -92,7 +92,7 @@ def make_shard(family: str, seed: int, recipe: Recipe) -> bytes:
     """Simulate one tunnel and return its shard (`cdpipe.training.shard`).
 
     Raises:
-        ScenarioError: The world cannot be built, the sessions never meet, or there are too many changes for a label.
+        ScenarioError: The world cannot be built, the sessions do not overlap, or changes exceed the labels.
         InputError: A file that the scenario names cannot be read.
     """
     scenario = load_scenario(family, seed, recipe.settings)
@@ -128,32 +128,17 @@ def _map_config() -> MapConfig:
     return load_config("tunnelcd").map
 
 
-class _Watched:
-    """A source that shows every scan to some watchers on its way to whoever reads it, so that all read it once."""
+class _WatchedScans(WrappedScans):
+    """A source that shows every scan to a watcher while all scans are read, so that they are read only once."""
 
-    def __init__(self, source: ScanSource, watchers: Sequence[Callable[[PosedScan], None]]) -> None:
-        self._source = source
-        self._watchers = watchers
-
-    @property
-    def name(self) -> str:
-        """What to call it in messages."""
-        return self._source.name
-
-    @property
-    def odom_T_sensor(self) -> Float64Array:
-        """(S, 4, 4) pose of each scan."""
-        return self._source.odom_T_sensor
-
-    def scan(self, index: int) -> PosedScan:
-        """Read one scan, unseen by the watchers."""
-        return self._source.scan(index)
+    def __init__(self, source: ScanSource, watch: Callable[[PosedScan], None]) -> None:
+        super().__init__(source)
+        self._watch = watch
 
     def scans(self) -> Iterator[PosedScan]:
-        """Read all scans in order."""
-        for scan in self._source.scans():
-            for watch in self._watchers:
-                watch(scan)
+        """Read all scans in order, each seen by the watcher first."""
+        for scan in super().scans():
+            self._watch(scan)
             yield scan
 
 
@@ -170,7 +155,7 @@ def _mapped(held: LabelledSession) -> _Mapped:
             ranges_m.append(range_image(scan.points_sensor))
             stamps_ns.append(int(scan.stamps_ns.min()))
 
-    point_map = build_map(_Watched(held_input(session), [watch]), config, _BATCH_SCANS)
+    point_map = build_map(_WatchedScans(held_input(session), watch), config, _BATCH_SCANS)
     truth = SessionTruth(session.odom_T_sensor, held.world_T_sensor, universe.finish(session.n_scans))
     return _Mapped(
         point_map,
@@ -182,7 +167,7 @@ def _mapped(held: LabelledSession) -> _Mapped:
 
 
 def changes_of_points(point_map: PointMap, change: npt.NDArray[np.int16]) -> npt.NDArray[np.uint8]:
-    """Return the (N,) change that each map point bears: that of most of its changed returns, 0 where it has none.
+    """Return the (N,) change id of each map point: that of most of its changed returns, 0 where it has none.
 
     Args:
         point_map: The map.
@@ -205,7 +190,7 @@ def changes_of_points(point_map: PointMap, change: npt.NDArray[np.int16]) -> npt
 
 
 def _bare(mapped: _Mapped) -> MappedSession:
-    """Return a mapped session without descriptors: the truth merges by poses alone."""
+    """Return a mapped session without descriptors, which a merge by the truth does not need."""
     scans = mapped.map.keyframe_scans
     return MappedSession(mapped.map, DescriptorSet(np.zeros((len(scans), 1), np.float32), None, scans, "none", ""))
 
@@ -223,19 +208,19 @@ def _keyframes(before: _Mapped, after: _Mapped) -> Arrays:
 
 
 def merge_errors(recipe: Recipe, seed: int) -> Arrays:
-    """Return the (D, 3) shifts and turns of the draws; those of fewer draws are the first of those of more."""
+    """Return the (D, 3) translations and rotation vectors of the draws; fewer draws are the first of more."""
     drawn = stream(seed, "dataset-merge-error").normal(size=(recipe.draws, 2, 3))
     drawn[0] = 0.0
     return {"shift_m": recipe.error_m * drawn[:, 0], "turn_rad": np.deg2rad(recipe.error_deg) * drawn[:, 1]}
 
 
 def displaced(map_T_anchor: Float64Array, shift_m: Float64Array, turn_rad: Float64Array) -> Float64Array:
-    """Return the poses (K, 4, 4) from which a map looks as one that is off does from the anchors.
+    """Return the (K, 4, 4) poses from which a map looks as its displaced copy looks from the anchors.
 
     Args:
         map_T_anchor: (K, 4, 4) the anchors.
-        shift_m: (3,) by which the map's points are shifted, map frame,
-        turn_rad: (3,) after they were turned about the anchor, a rotation vector.
+        shift_m: (3,) translation of the map's points after the rotation, map frame.
+        turn_rad: (3,) rotation vector about the anchor.
     """
     turned = Rotation.from_rotvec(turn_rad).as_matrix()
     poses = map_T_anchor.copy()
@@ -267,12 +252,12 @@ def _images(
 def label_images(
     points: Float64Array, point_changes: npt.NDArray[np.uint8], map_T_anchor: Float64Array
 ) -> npt.NDArray[np.uint8]:
-    """Return (K, ROWS, COLUMNS) the change of the changed points in each pixel, the nearest to the axis where several.
+    """Return the (K, ROWS, COLUMNS) change id of each pixel: that of the changed point nearest to the axis.
 
     Args:
         points: (N, 3) points of a map.
-        point_changes: (N,) change each bears.
-        map_T_anchor: (K, 4, 4) where the map is looked at.
+        point_changes: (N,) change id of each point.
+        map_T_anchor: (K, 4, 4) poses of the images.
     """
     is_changed = point_changes > 0
     changed, ids = points[is_changed], point_changes[is_changed]

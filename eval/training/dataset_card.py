@@ -1,16 +1,17 @@
-"""What a folder of shards says of itself: index.csv, one row for each tunnel, and README.md, its data card.
+"""Index and data card of a folder of shards: index.csv, one row per tunnel, and README.md.
 
-Both are made from the shards that lie there, so that they are right whatever run was cut off when.
+Both are made from the shards in the folder, so that they are right after an interrupted run as well.
 """
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.training.shard import FIELDS, SUFFIX, read_about, split_of
@@ -30,7 +31,7 @@ def write_card(out: Path) -> None:
     """
     rows = [*(_shard_row(path) for path in out.glob(f"*{SUFFIX}")), *_refused_rows(out)]
     rows.sort(key=lambda row: (row["family"], row["seed"]))
-    _write_index(out / "index.csv", rows)
+    _replace(out / "index.csv", pd.DataFrame(rows, columns=list(INDEX_COLUMNS)).to_csv(index=False))
     document = json.loads((out / "dataset.json").read_text())
     _replace(out / "README.md", card(rows, document["recipe"], document["commands"]))
 
@@ -116,21 +117,17 @@ def digest_of(rows: Sequence[Row]) -> str:
 
 
 def _counts_table(made: Sequence[Row]) -> str:
+    counts = [name for name in COUNTS if name != "n_after"]
     lines = [
         "| family | split | seeds | tunnels | pairs | covered | positive | negative | changes | observable |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for family, split in sorted({(row["family"], row["split"]) for row in made}):
-        rows = [row for row in made if (row["family"], row["split"]) == (family, split)]
-        seeds = f"{min(row['seed'] for row in rows)} to {max(row['seed'] for row in rows)}"
-        lines.append(f"| {family} | {split} | {seeds} | {_sums(rows)} |")
-    lines.append(f"| all | | | {_sums(made)} |")
-    return "\n".join(lines)
-
-
-def _sums(rows: Sequence[Row]) -> str:
-    names = [name for name in COUNTS if name != "n_after"]
-    return " | ".join(f"{count:,}" for count in (len(rows), *(sum(row[name] for row in rows) for name in names)))
+    table = pd.DataFrame(made, columns=["family", "split", "seed", *counts])
+    for (family, split), own in table.groupby(["family", "split"]):
+        sums = " | ".join(f"{count:,}" for count in (len(own), *own[counts].sum()))
+        lines.append(f"| {family} | {split} | {own['seed'].min()} to {own['seed'].max()} | {sums} |")
+    sums = " | ".join(f"{count:,}" for count in (len(table), *table[counts].sum()))
+    return "\n".join([*lines, f"| all | | | {sums} |"])
 
 
 def _shard_row(path: Path) -> Row:
@@ -162,15 +159,6 @@ def _refused_rows(out: Path) -> list[Row]:
         row |= {name: about[name] for name in ("family", "seed", "digest", "reason")}
         rows.append(row)
     return rows
-
-
-def _write_index(path: Path, rows: Sequence[Row]) -> None:
-    partial = path.with_name(f".{path.name}.partial")
-    with partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, INDEX_COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    partial.replace(path)
 
 
 def _replace(path: Path, text: str) -> None:

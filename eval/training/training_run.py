@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import platform
@@ -10,6 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.descriptors import use_threads
@@ -33,7 +34,7 @@ SOURCES = {
 
 @dataclass(frozen=True, slots=True)
 class Trained:
-    """What came of a training run: the checkpoint, and its model card as written beside it."""
+    """Result of a training run: the checkpoint and its model card."""
 
     checkpoint: Path
     card: Mapping[str, Any]
@@ -120,10 +121,7 @@ def write_curves(path: Path, history: Sequence[Progress]) -> None:
     """Write one row per validation: step, losses, scores, whether it was the best so far."""
     rows = [{"step": done.step, **done.losses, **done.scores, "is_best": done.is_best} for done in history]
     try:
-        with path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+        pd.DataFrame(rows).to_csv(path, index=False, lineterminator="\r\n")
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
 
