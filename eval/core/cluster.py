@@ -1,7 +1,7 @@
-"""Workers that compute: processes of this machine, or a Dask cluster that is already there. The same code drives both.
+"""Dask workers: processes of this machine, or a running cluster; the same code uses both. Needs the extra `cluster`.
 
-Needs the extra `cluster`. Rows are equal wherever they are made only if the packages and the threads of the numeric
-libraries are, and so a worker that has others is refused.
+Rows are equal on all workers only if packages and threads of the numeric libraries are equal. A worker with others is
+refused.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.threads import THREAD_VARIABLES, THREADS, fix_threads
 from eval.core.provenance import versions
 
-# Dask has its workers give every freed array back to the system at once, which costs a quarter of the time of a pair.
+# By this variable Dask's workers return freed memory to the system at once, which takes a quarter of a pair's time.
 _ENVIRONMENT, _TRIM = "distributed.nanny.pre-spawn-environ", "MALLOC_TRIM_THRESHOLD_"
-_PROBE_S, _CONNECT_S = 3.0, 6.0  # together less than ten seconds until an address that does not answer is named
+_PROBE_S, _CONNECT_S = 3.0, 6.0  # an unreachable address is reported within ten seconds
 
 
 @dataclass(frozen=True, slots=True)
 class Where:
-    """Where to compute: here if both are left out."""
+    """Where to compute; in this process if both are None."""
 
     workers: int | None = None
     scheduler: str | None = None
@@ -39,25 +39,25 @@ HERE = Where()
 
 
 def require_usable(where: Where) -> None:
-    """Check what can be checked before anything is written.
+    """Check the options before anything is written.
 
     Raises:
-        InputError: Both are named, or the extra is not installed.
+        InputError: Both options are given, or the extra is not installed.
     """
     if where.workers is not None and where.scheduler is not None:
-        raise InputError("--workers and --scheduler: a scheduler has workers of its own; leave one of them out")
+        raise InputError("--workers and --scheduler: a scheduler has its own workers: leave one of the two out")
     if where == HERE:
         return
     if importlib.util.find_spec("distributed") is None:
         asked = "--workers" if where.scheduler is None else "--scheduler"
-        raise InputError(f"{asked} needs a package more: pip install 'tunnelcd[cluster]'")
+        raise InputError(f"{asked}: Dask is not installed: pip install 'tunnelcd[cluster]'")
 
 
 def require_reachable(where: Where) -> None:
-    """Knock at the scheduler that is named, if one is; quick, so that it can be done before anything slow is loaded.
+    """Try to reach the scheduler, if one is named; fast enough to run before slow imports.
 
     Raises:
-        InputError: Nobody answers there, or something that is no scheduler.
+        InputError: Nothing answers, or something that is no scheduler.
     """
     if where.scheduler is None:
         return
@@ -69,22 +69,22 @@ def require_reachable(where: Where) -> None:
 
 @contextmanager
 def connected(where: Where, n_tasks: int) -> Iterator[Any]:
-    """Yield a Dask client of the scheduler named, or of as many worker processes here, but no more than tasks.
+    """Yield a Dask client of the named scheduler, or of local worker processes, at most one per task.
 
     Raises:
-        InputError: The scheduler cannot be reached, has no workers, or one of them is not like this process.
+        InputError: The scheduler cannot be reached, has no workers, or a worker differs from this process.
     """
     with _of_scheduler(where.scheduler) if where.scheduler is not None else _of_this_machine(where, n_tasks) as client:
         yield client
 
 
 def n_slots(client: Any) -> int:
-    """Return how many tasks the workers compute at a time, all together."""
+    """Return how many tasks all workers compute at a time."""
     return sum(client.nthreads().values())
 
 
 def is_shared(client: Any) -> bool:
-    """Tell whether any machine of the cluster computes more than one task at a time."""
+    """Return whether any machine of the cluster computes more than one task at a time."""
     slots: Counter[str | None] = Counter()
     for address, n_threads in client.nthreads().items():
         slots[urlsplit(address).hostname] += n_threads
@@ -101,10 +101,10 @@ def _of_this_machine(where: Where, n_tasks: int) -> Iterator[Any]:
     settings = {
         "n_workers": min(where.workers or 1, n_tasks),
         "threads_per_worker": 1,
-        "dashboard_address": ":0",  # any free port: two runs may go on side by side
+        "dashboard_address": ":0",  # any free port, so that two runs can work at the same time
         "memory_limit": None,
         "silence_logs": logging.CRITICAL,
-        # Ctrl-C reaches every process of the terminal: workers leave it to this one, which ends them
+        # Ctrl-C reaches every process of the terminal; workers ignore it and are ended by this process
         "preload": [__name__],
     }
     with dask.config.set({_ENVIRONMENT: environment}), LocalCluster(**settings) as cluster, Client(cluster) as client:
@@ -116,11 +116,11 @@ def _of_scheduler(address: str) -> Iterator[Any]:
     from distributed import Client  # noqa: PLC0415 - as above
 
     for name in ("distributed", "distributed.client"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters is told in one line
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # the error is one line of ours
     try:
         _probe(address)
         client = Client(address, timeout=_CONNECT_S)
-    except (OSError, ValueError, MemoryError) as error:  # the last where what answers speaks another language
+    except (OSError, ValueError, MemoryError) as error:  # MemoryError: the peer speaks another protocol
         raise _unreachable(address, error) from error
     with client:
         if not client.nthreads():
@@ -130,18 +130,18 @@ def _of_scheduler(address: str) -> Iterator[Any]:
 
 
 def _probe(address: str) -> None:
-    """Knock where a scheduler should be: Dask itself goes on trying where nobody answers.
+    """Open a connection to a scheduler: Dask itself would retry where nothing answers.
 
     Raises:
-        OSError: Nobody answers.
-        ValueError: It is no address.
+        OSError: Nothing answers.
+        ValueError: The address is malformed.
     """
     parts = urlsplit(address)
     if parts.scheme in ("tcp", "tls"):
         if not parts.hostname or not parts.port:
             raise ValueError("no host or no port")
         with socket.create_connection((parts.hostname, parts.port), timeout=_PROBE_S) as knocked:
-            # a scheduler speaks first; what accepts and says nothing would hold Dask until its time is up
+            # a scheduler sends first; Dask would wait for its full timeout on a silent peer
             if parts.scheme == "tcp" and not knocked.recv(1):
                 raise OSError("what listens there is no scheduler")
 
@@ -154,12 +154,12 @@ def _unreachable(address: str, error: Exception) -> InputError:
 
 
 def dask_setup(worker: object) -> None:
-    """Let a worker of this machine ignore Ctrl-C; Dask calls this in each that it starts."""
+    """Make a local worker ignore Ctrl-C; Dask calls this function in each worker that it starts."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _about() -> tuple[Mapping[str, str], Mapping[str, str]]:
-    """Return the versions and the threads of the process that runs this."""
+    """Return package versions and thread settings of the process that runs this."""
     return versions(), {name: os.environ.get(name, "unset") for name in THREAD_VARIABLES[:3]}
 
 

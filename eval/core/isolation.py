@@ -1,4 +1,4 @@
-"""Calls a function in a process of its own, so that what kills the process does not kill the caller."""
+"""Calls a function in a separate process, so that a crash of the function does not end the caller."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from typing import Any
 def run_isolated(call: Callable[..., object], *args: object) -> str:
     """Call a function with these arguments in a new Python process, and wait.
 
-    The process ends itself when this one dies. What it returns is not kept.
+    The process ends when this one dies. The return value is dropped. Arguments and exceptions are pickled between this
+    process and its own child; no file and no network is involved.
 
     Args:
-        call: A function that can be imported.
-        *args: What can be pickled.
+        call: An importable function.
+        *args: Arguments that can be pickled.
 
     Returns:
-        "" if the function returned, else what ended its process: "signal 9", "exit code 3".
+        "" if the function returned, else how its process ended: "signal 9", "exit code 3".
 
     Raises:
-        Exception: What the function raised.
+        Exception: The exception that the function raised.
     """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     argv = [sys.executable, "-m", "eval.core.isolation"]
@@ -32,13 +33,13 @@ def run_isolated(call: Callable[..., object], *args: object) -> str:
         if process.stdin is None or process.stdout is None:
             raise RuntimeError("no pipes")
         try:
-            # stays open until it has answered: that it closes tells the process that this one is gone
+            # the pipe stays open until the answer comes: its end tells the child that this process died
             process.stdin.write(pickle.dumps((call, args)))
             process.stdin.flush()
         except BrokenPipeError:
-            pass  # it died before it read
+            pass  # the child died before it read
         told = process.stdout.read()
-    if not told:  # how it ends once it has told does not matter
+    if not told:  # after an answer the exit code does not matter
         code = process.returncode
         return f"signal {-code}" if code < 0 else f"exit code {code}"
     error: Exception | None = pickle.loads(told)
@@ -48,7 +49,7 @@ def run_isolated(call: Callable[..., object], *args: object) -> str:
 
 
 def _serve() -> None:
-    # whatever libraries print must not stand in the answer
+    # keep what libraries print out of the answer
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     call, args = pickle.load(sys.stdin.buffer)

@@ -1,4 +1,4 @@
-"""Output folders that appear whole or not at all."""
+"""Output folders that are complete or absent."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cdpipe.core.errors import InputError
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Yield a hidden empty folder that becomes `path` when the block ends well, and is removed when it does not.
+    """Yield a hidden empty folder that becomes `path` when the block succeeds, and is removed when it fails.
 
     Raises:
         InputError: `path` is a file or a folder with something in it, or cannot be made.
@@ -47,7 +47,7 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def made_parents(path: Path) -> Iterator[None]:
-    """Make the folders above `path`; remove those that are empty again when the block fails.
+    """Make the folders above `path`; when the block fails, remove those that are empty.
 
     Raises:
         InputError: They cannot be made.
@@ -66,7 +66,7 @@ def made_parents(path: Path) -> Iterator[None]:
 
 
 def make_writable(path: Path) -> None:
-    """Make a folder unless it exists, and try whether a file can be made in it.
+    """Make a folder unless it exists, and check that files can be written in it.
 
     Raises:
         InputError: The path is a file, or nothing can be written there.

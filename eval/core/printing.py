@@ -15,7 +15,7 @@ MET = {True: "met", False: "missed", None: "-"}
 
 
 def print_table(title: str, frame: pd.DataFrame) -> None:
-    """Print a table under its title; NaN and None are dashes."""
+    """Print a table under its title, with a dash for NaN and None."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -25,12 +25,12 @@ def print_table(title: str, frame: pd.DataFrame) -> None:
         table.add_column(str(name), no_wrap=True)
     for row in frame.itertuples(index=False):
         table.add_row(*(_cell(value) for value in row))
-    # wider than any table: a narrow terminal wraps the lines, where rich would cut off the numbers
+    # wider than any table: the terminal then wraps long lines, where rich would cut numbers off
     Console(width=500, markup=False).print(table)
 
 
 def print_row(row: dict[str, Any]) -> None:
-    """Print one row, a line for each of its columns."""
+    """Print one row, one line per column."""
     width = max(map(len, row))
     for name, value in row.items():
         typer.echo(f"{name:<{width}}  {_cell(value)}")

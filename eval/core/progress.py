@@ -1,4 +1,4 @@
-"""What a run tells while it works."""
+"""Progress of a run: bars on a terminal, lines in a log."""
 
 from __future__ import annotations
 
@@ -7,43 +7,33 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import TracebackType
-from typing import Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-_PACE_S = 1800.0  # a cell may take minutes, and a pace needs two of them
+_PACE_S = 1800.0  # a cell may take minutes, and a rate needs two cells
 
 
-class RunProgress(Protocol):
-    """Told what is being done."""
-
-    def cells(self, label: str, done: int, total: int) -> None:
-        """So many cells of the run are finished; `label` is what comes next."""
-
-    def stage(self, name: str, done: int, total: int) -> None:
-        """One stage has come so far."""
-
-    def note(self, text: str) -> None:
-        """Something about the run as a whole, told once."""
-
-
-class Silent:
-    """Says nothing."""
+class RunProgress:
+    """Receives the progress of a run; subclasses show it."""
 
     def cells(self, label: str, done: int, total: int) -> None:
-        """Say nothing."""
+        """Take the number of finished cells; `label` names the next one."""
 
     def stage(self, name: str, done: int, total: int) -> None:
-        """Say nothing."""
+        """Take the progress of one stage."""
 
     def note(self, text: str) -> None:
-        """Say nothing."""
+        """Take a remark about the whole run."""
 
 
-class Bars:
-    """Two bars on standard error, cells and the stage in work, with rate and time left. A context manager."""
+class Silent(RunProgress):
+    """Shows nothing."""
+
+
+class Bars(RunProgress):
+    """Two bars on standard error, one for cells and one for the stage, with rate and time left. A context manager."""
 
     def __init__(self) -> None:
         self._progress = Progress(
@@ -85,11 +75,11 @@ class Bars:
         self._progress.console.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)
 
 
-class Lines:
-    """One line on standard error for each cell and stage: for logs, where bars would overwrite nothing.
+class Lines(RunProgress):
+    """One line on standard error for each cell and stage, for logs.
 
     Args:
-        rate: Name of what is counted, to tell how many of them come in a minute and the time left; "" tells neither.
+        rate: Name of what is counted; with a name, lines hold the rate per minute and the time left.
     """
 
     def __init__(self, rate: str = "") -> None:
@@ -127,7 +117,7 @@ class Lines:
 
 @contextmanager
 def shown_progress(quiet: bool, rate: str = "") -> Iterator[RunProgress]:
-    """Yield bars on a terminal, lines in a log (with a rate where what is counted is named), nothing if quiet."""
+    """Yield bars on a terminal, lines in a log (with a rate where one is named), or nothing if quiet."""
     if quiet:
         yield Silent()
     elif not sys.stderr.isatty():
@@ -145,7 +135,7 @@ def duration(seconds: float) -> str:
 
 
 class _Rate(ProgressColumn):
-    """Steps per second, or per minute where they are slow."""
+    """Steps per second; per minute below 0.1 per second."""
 
     def render(self, task: Task) -> Text:
         """Render the speed of a task."""

@@ -1,4 +1,4 @@
-"""How well a score puts positives before negatives, whatever the threshold."""
+"""AUROC and average precision of a score."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from cdpipe.core.geometry import BoolArray, Float64Array
 
 
 def auroc(scores: Float64Array, is_positive: BoolArray) -> float:
-    """Return the chance that a positive scores above a negative, ties counting half.
+    """Return the probability that a positive scores above a negative; ties count half.
 
     Args:
-        scores: (N,) scores; NaN ranks below every number, as a keyframe that was never compared would be reported last.
-        is_positive: (N,) which of them are positives; the others are negatives.
+        scores: (N,) scores; NaN (a keyframe that was not compared) ranks below every number.
+        is_positive: (N,) mask of the positives; the others are negatives.
 
     Returns:
         A number in [0, 1]; NaN if either class is empty.
@@ -27,11 +27,11 @@ def auroc(scores: Float64Array, is_positive: BoolArray) -> float:
 
 
 def average_precision(scores: Float64Array, is_positive: BoolArray) -> float:
-    """Return the sum over falling thresholds of precision times the gain in recall; equal scores enter together.
+    """Return the sum over falling thresholds of precision times gain in recall; equal scores share one threshold.
 
     Args:
         scores: (N,) scores; NaN ranks below every number.
-        is_positive: (N,) which of them are positives.
+        is_positive: (N,) mask of the positives.
 
     Returns:
         A number in (0, 1]; NaN if either class is empty.
@@ -42,7 +42,7 @@ def average_precision(scores: Float64Array, is_positive: BoolArray) -> float:
     comparable = _comparable(scores)
     order = np.argsort(-comparable, kind="stable")
     n_true = np.cumsum(is_positive[order])
-    # thresholds lie behind the last of each run of equal scores
+    # one threshold behind each run of equal scores
     last = np.append(np.flatnonzero(comparable[order][1:] != comparable[order][:-1]), len(order) - 1)
     precision = n_true[last] / (last + 1)
     recall_gain = np.diff(n_true[last], prepend=0) / n_positive

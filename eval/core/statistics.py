@@ -1,4 +1,4 @@
-"""From rows of results.csv to the numbers of a table: means with intervals whose unit is the session pair."""
+"""Means and medians over session pairs, with 95 % intervals whose unit is the session pair."""
 
 from __future__ import annotations
 
@@ -11,24 +11,13 @@ from cdpipe.core.geometry import Float64Array, stream
 from eval.core.ranking import auroc, average_precision
 
 N_RESAMPLES = 2000
-# 2^(1-6) = 3 %: six fair coins show one side; five do in 6 % of all cases
+# sign test: six pairs agree by chance in 2^(1-6) = 3 % of cases, five in 6 %
 ENOUGH_PAIRS = 6
 _NORMAL_95 = 1.959963984540054
 IDENTITY_COLUMNS = (
-    "scenario",
-    "family",
-    "domain",
-    "pair_kind",
-    "seed",
-    "variant",
-    "preset",
-    "status",
-    "error",
-    "metrics_version",
-    "score_radius_m",
-    "commit",
-    "is_contended",
-)
+    "scenario", "family", "domain", "pair_kind", "seed", "variant", "preset", "status", "error", "metrics_version",
+    "score_radius_m", "commit", "is_contended",
+)  # fmt: skip
 
 
 def summarise(
@@ -43,13 +32,13 @@ def summarise(
         results: Rows as in results.csv, one per session pair and variant.
         by: What to group by, beside the variant.
         seed: Seed of the bootstrap.
-        keyframes: Keyframe rows of the same pairs (score, label, and the columns that name their row), for the AUROC
+        keyframes: Keyframe rows of the same pairs (score, label, and the columns that identify the pair), for AUROC
             and AP pooled over all keyframes of a group.
 
     Returns:
         One row per group and metric: `statistic` (median for times, else mean), `value` over all cases with its 95 %
         bootstrap interval `low` to `high`, `value_ok` over cases whose status is ok, `n` cases, `n_failed` of them not
-        ok, and how many had a number: `n_used`, `n_used_ok`. An undefined number (NaN) counts in neither.
+        ok, and the counts of defined numbers (not NaN) `n_used` and `n_used_ok`.
     """
     metrics = [name for name in results.columns if name not in IDENTITY_COLUMNS]
     rows: list[dict[str, Any]] = []
@@ -72,8 +61,8 @@ def bootstrap_interval(
 ) -> tuple[float, float]:
     """Return the 95 % percentile interval of the mean or median of (N,) numbers, one for each session pair.
 
-    Pairs are drawn with replacement; NaN among them is left out after drawing. NaN for fewer than two numbers: one pair
-    says nothing about how pairs vary.
+    Pairs are drawn with replacement; NaN is left out after drawing. The interval is NaN for fewer than two numbers,
+    because one pair holds no information on the variation between pairs.
     """
     if np.count_nonzero(~np.isnan(values)) < 2:
         return float("nan"), float("nan")
@@ -86,9 +75,9 @@ def bootstrap_interval(
 
 
 def mean_with_interval(values: Float64Array, seed: int = 0) -> tuple[float, float, float, int]:
-    """Return mean, low and high of its 95 % bootstrap interval, and how many of (N,) numbers are not NaN.
+    """Return mean, low and high of its 95 % bootstrap interval, and the count of the (N,) numbers that are not NaN.
 
-    Without a number all are NaN, and for a single one the interval is.
+    Mean and interval are NaN without a number; the interval is NaN for a single one.
     """
     values = values[~np.isnan(values)]
     low, high = bootstrap_interval(values, seed=seed)
@@ -98,7 +87,7 @@ def mean_with_interval(values: Float64Array, seed: int = 0) -> tuple[float, floa
 def wilson_interval(n_hits: int, n: int) -> tuple[float, float]:
     """Return the 95 % Wilson score interval of the share of `n` pairs that are hits; NaN for none.
 
-    Unlike the bootstrap it has a width where all pairs agree: 20 of 20 is 0.84 to 1.
+    Unlike the bootstrap, it has a width where all pairs agree: 20 of 20 gives 0.84 to 1.
     """
     if n == 0:
         return float("nan"), float("nan")
@@ -136,18 +125,10 @@ def _pooled(keyframes: pd.DataFrame) -> list[dict[str, Any]]:
     scores = used["score"].to_numpy(dtype=np.float64)
     is_positive = used["label"].to_numpy() == 1
     n_pairs = int(used.groupby(["scenario", "seed"]).ngroups)
-    nan = float("nan")
+    counts = {"n_used": n_pairs, "n_used_ok": n_pairs}
+    unknown = dict.fromkeys(("low", "high"), float("nan"))
     return [
-        {
-            "metric": f"{name}_pooled",
-            "statistic": "pooled",
-            "value": value,
-            "low": nan,
-            "high": nan,
-            "value_ok": value,
-            "n_used": n_pairs,
-            "n_used_ok": n_pairs,
-        }
+        {"metric": f"{name}_pooled", "statistic": "pooled", "value": value, "value_ok": value, **unknown, **counts}
         for name, value in (
             ("region_auroc", auroc(scores, is_positive)),
             ("region_ap", average_precision(scores, is_positive)),

@@ -1,9 +1,8 @@
-"""Sets the threshold of every method to the same false-alarm rate: 5 % of unchanged validation pairs alarm.
+"""Thresholds at which every method has the same false-alarm rate: 5 % of the unchanged validation pairs alarm.
 
-Run as `python -m eval.studies.calibrate RUN`, where RUN is the folder of `tunnelcd run calibrate`. The thresholds are
-printed, with those at which every method has the same 0.1 false regions per 100 m, and written to RUN/thresholds.csv
-and, as presets spell them, to RUN/thresholds.yaml. They are copied by hand, so that no preset changes behind anyone's
-back.
+Run as `python -m eval.studies.calibrate RUN`, where RUN is the folder of `tunnelcd run calibrate`. The program prints
+these thresholds, and those at which every method has 0.1 false regions per 100 m. It writes both to RUN/thresholds.csv
+and, in the form of presets, to RUN/thresholds.yaml. Presets are changed by hand, so that none changes unnoticed.
 """
 
 from __future__ import annotations
@@ -25,12 +24,12 @@ FALSE_PER_100M = 0.1
 
 
 def alarm_threshold(best_scores: Float64Array, alarm_share: float = ALARM_SHARE, lowest: float | None = None) -> float:
-    """Return the smallest threshold, rounded up to four digits, that at most `alarm_share` of the pairs reach.
+    """Return the smallest threshold (four digits, rounded up) that at most `alarm_share` of the pairs reach.
 
     Args:
         best_scores: (P,) best candidate's score of every unchanged pair; -inf for a pair without candidates.
         alarm_share: Share of pairs that may alarm.
-        lowest: What the run let through: below that nothing was looked at, so no threshold is known to hold.
+        lowest: Threshold of the run: lower candidates were not examined, so no lower threshold is known to hold.
     """
     if len(best_scores) == 0 or np.isnan(best_scores).any():
         raise ValueError("best_scores must hold a number for each of at least one pair")
@@ -40,13 +39,13 @@ def alarm_threshold(best_scores: Float64Array, alarm_share: float = ALARM_SHARE,
 def rate_threshold(
     scores: Float64Array, path_m: float, false_per_100m: float = FALSE_PER_100M, lowest: float | None = None
 ) -> float:
-    """Return the smallest threshold, rounded up to four digits, that at most so many false regions per 100 m reach.
+    """Return the smallest threshold (four digits, rounded up) that at most so many false regions per 100 m reach.
 
     Args:
         scores: (R,) score of every candidate of all unchanged pairs.
-        path_m: Way of their after sessions.
-        false_per_100m: What is allowed.
-        lowest: As above.
+        path_m: Summed path length of their after sessions, metres.
+        false_per_100m: Largest allowed rate.
+        lowest: As in `alarm_threshold`.
     """
     return _just_above(scores, int(false_per_100m * path_m / 100.0 + 1e-9), lowest)
 
@@ -54,16 +53,16 @@ def rate_threshold(
 def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
     """Return one row per variant and kind of site, with its thresholds at either rate.
 
-    A threshold belongs to a kind of site, as the radius does: what is much change in a narrow drift is little in a
-    wide one. Kinds of site differ in `score_radius_m`. Candidates that were withdrawn cannot alarm; for that to show,
-    the run must let more through than the threshold that is looked for, and no lower one is given.
+    A threshold belongs to a kind of site, as the radius does: the same change scores differently in narrow and wide
+    drifts. Kinds of site differ in `score_radius_m`. Withdrawn candidates cannot alarm. The run must therefore use a
+    threshold below the one sought; no lower one is returned.
 
     Returns:
-        `threshold`, which at most 5 % of the pairs reach, with `n_pairs`, `n_alarms` of them and `n_unanswered` further
-        ones; `threshold_at_rate`, which at most 0.1 false regions per 100 m reach, with the way `km` and `n_false`.
+        `threshold`, which at most 5 % of the pairs reach, with `n_pairs`, `n_alarms` of them and `n_unanswered` others;
+        `threshold_at_rate`, which at most 0.1 false regions per 100 m reach, with path length `km` and `n_false`.
 
     Raises:
-        InputError: A pair has changes, so that its alarms would not be false; or no pair of a kind has an answer.
+        InputError: A pair has changes, so that its alarms are not false; or no pair of a kind has an answer.
     """
     changed = results.loc[results["n_changes"] > 0, "scenario"].unique()
     if len(changed):
@@ -73,7 +72,7 @@ def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
         radius_m = float(cases["score_radius_m"].iloc[0])
         ok = cases[cases["status"] == "ok"]
         if len(ok) == 0:
-            raise InputError(f"{variant}, {radius_m:g} m: no pair has an answer: nothing to set a threshold by")
+            raise InputError(f"{variant}, {radius_m:g} m: no pair has an answer: a threshold needs at least one")
         stands = (regions["variant"] == variant) & ~regions["is_withdrawn"].astype(bool)
         lowest = _let_through(regions[regions["variant"] == variant].merge(cases[["scenario", "seed"]]))
         if lowest is not None:
@@ -102,7 +101,7 @@ def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
 
 
 def as_settings(table: pd.DataFrame) -> str:
-    """Return the thresholds as presets spell them in YAML: by rate and variant, for narrow sites and under `wide`."""
+    """Return the thresholds in the YAML form of presets: by rate and variant, for narrow sites and under `wide`."""
     lines = []
     rates = (
         ("threshold", f"at most {ALARM_SHARE:.0%} of the unchanged pairs alarm"),
@@ -122,15 +121,28 @@ def as_settings(table: pd.DataFrame) -> str:
 
 def main(run: Annotated[Path, typer.Argument(help="folder of `tunnelcd run calibrate`")]) -> None:
     """Print and write the thresholds of a calibration run."""
-    table = thresholds(_read(run / "results.csv"), _read(run / "regions.csv"))
+    table = thresholds(read_table(run / "results.csv", "calibrate"), read_table(run / "regions.csv", "calibrate"))
     table.to_csv(run / "thresholds.csv", index=False)
     settings = as_settings(table)
     (run / "thresholds.yaml").write_text(settings)
     typer.echo(f"{table.to_string(index=False)}\n\n{settings}")
 
 
+def read_table(path: Path, plan: str) -> pd.DataFrame:
+    """Read a CSV of the folder of `tunnelcd run PLAN`.
+
+    Raises:
+        InputError: The file is missing or is no table.
+    """
+    try:
+        return pd.read_csv(table_file(path))
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: {reason}: name a folder that `tunnelcd run {plan}` made") from error
+
+
 def _let_through(regions: pd.DataFrame) -> float | None:
-    """Return the lowest score of what was let through and looked at; None of a method that withdraws nothing."""
+    """Return the lowest score that was examined; None for a method that withdraws nothing."""
     is_withdrawn = regions["is_withdrawn"].astype(bool)
     if not is_withdrawn.any():
         return None
@@ -138,10 +150,7 @@ def _let_through(regions: pd.DataFrame) -> float | None:
 
 
 def _just_above(scores: Float64Array, allowed: int, lowest: float | None) -> float:
-    """Return the smallest number of four digits, `lowest` or more, that no more than `allowed` of (N,) scores reach.
-
-    Without need it is what is lowest, or 0.
-    """
+    """Return the smallest number of four digits, `lowest` (0 if None) or more, that at most `allowed` scores reach."""
     silent_best = -np.inf if allowed >= len(scores) else np.sort(scores)[::-1][allowed]
     if lowest is not None:
         silent_best = max(silent_best, np.nextafter(lowest, -np.inf))
@@ -150,14 +159,6 @@ def _just_above(scores: Float64Array, allowed: int, lowest: float | None) -> flo
     digits = 4 - int(np.floor(np.log10(max(abs(float(silent_best)), 1e-12)))) - 1
     threshold = float(np.ceil(silent_best * 10.0**digits) / 10.0**digits)
     return threshold if threshold > silent_best else float(round(threshold + 10.0**-digits, digits))
-
-
-def _read(path: Path) -> pd.DataFrame:
-    try:
-        return pd.read_csv(table_file(path))
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{path}: {reason}: name a folder that `tunnelcd run calibrate` made") from error
 
 
 if __name__ == "__main__":

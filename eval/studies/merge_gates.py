@@ -1,13 +1,13 @@
-"""From what right and wrong merges measure to the thresholds of the gates.
+"""Thresholds of the merge's gates, from the evidence of right and wrong merges.
 
-Run as `python -m eval.studies.merge_gates RUN --out DIR`, where RUN is the folder of `tunnelcd run merge-gates`: a
-variant with `merge.accept_all`, so that every best hypothesis is kept with its evidence, right or wrong. Writes
-DIR/gates.csv and DIR/gates.png. Thresholds go into cdpipe/model/config.py by hand, so that none changes behind anyone's
-back.
+Run as `python -m eval.studies.merge_gates RUN --out DIR`, where RUN is the folder of `tunnelcd run merge-gates`. Its
+variant sets `merge.accept_all`, so that every best hypothesis is kept with its evidence, right or wrong. The program
+writes DIR/gates.csv and DIR/gates.png. Thresholds go into cdpipe/model/config.py by hand, so that none changes
+unnoticed.
 
-Even under `merge.accept_all` the search itself stops at today's gates: the next candidate, and KISS-Matcher, are tried
-only where the one before is below one of them. So which merge is kept depends on the thresholds that were set; they are
-chosen from one run, and not iterated.
+The search stops at the present gates even under `merge.accept_all`: the next candidate, and KISS-Matcher, are tried
+only where the previous candidate misses a gate. The kept merge therefore depends on the present thresholds; new ones
+are chosen from one run, without iteration.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from eval.core.charts import BLACK, BLUE, VERMILLION, Axis, Drawing, Look, Panel
 from eval.core.exits import run_program
 from eval.core.figures import picture, png
 from eval.core.output import make_writable
-from eval.core.tablefile import table_file
 from eval.plans.coverage import plan_of
 from eval.plans.plan import cells
 from eval.running.run_data import read_document
+from eval.studies.calibrate import read_table
 from eval.tables.merge_table import TARGETS, is_accepted, is_right, kinds, numbers, texts
 
 KEPT_SHARE = 0.995
@@ -44,21 +44,21 @@ _MARKS = (
 
 
 def committed_thresholds() -> dict[str, float]:
-    """Return the threshold of every gate that the preset `tunnelcd` holds."""
+    """Return the threshold of every gate in the preset `tunnelcd`."""
     merge = load_config("tunnelcd").merge
     return {name: float(getattr(merge, setting)) for name, setting in GATES}
 
 
 def require_ungated(results: pd.DataFrame, variant: str, provenance: Mapping[str, Any]) -> None:
-    """Make sure that no gate stood between a variant's merges and the table: thresholds of what is left mean nothing.
+    """Check that no gate refused merges of a variant: thresholds chosen from the remaining merges would be biased.
 
     Args:
         results: Rows as in results.csv.
-        variant: The one that accepts everything.
+        variant: The variant that accepts every merge.
         provenance: Content of provenance.json.
 
     Raises:
-        InputError: A merge was refused by a gate, or the plan does not say that the variant accepts all.
+        InputError: A gate refused a merge, or the variant does not set `merge.accept_all`.
     """
     refused = results[((results["variant"] == variant) & (results["status"] == "merge_refused")).to_numpy()]
     for row in refused.assign(error=texts(refused, "error")).to_dict("records"):
@@ -81,10 +81,10 @@ def measured(results: pd.DataFrame, variant: str) -> pd.DataFrame:
 
     Args:
         results: Rows as in results.csv.
-        variant: The one that accepts everything; "" where there is but one.
+        variant: The variant that accepts every merge; "" where the run has only one.
 
     Raises:
-        InputError: There is no such variant, or the evidence is not in the table.
+        InputError: There is no such variant, or the table lacks the evidence.
     """
     variant = chosen_variant(results, variant)
     absent = [f"evidence_{name}" for name, _ in GATES if f"evidence_{name}" not in results]
@@ -104,7 +104,7 @@ def measured(results: pd.DataFrame, variant: str) -> pd.DataFrame:
 
 
 def chosen_variant(results: pd.DataFrame, variant: str) -> str:
-    """Return the variant that is meant.
+    """Return the named variant, or the only one where none is named.
 
     Raises:
         InputError: There is no such variant, or none is named and there are several.
@@ -122,14 +122,14 @@ def gate_table(cases: pd.DataFrame, thresholds: Mapping[str, float]) -> pd.DataF
 
     Args:
         cases: As `measured` returns them.
-        thresholds: What each gate asks for.
+        thresholds: Threshold of each gate.
 
     Returns:
         `gate`, `setting`, `threshold`; `n_right`, `n_wrong`; `worst_right` and `best_wrong`, the lowest value of a
-        right merge and the highest of a wrong one; how many of each the gate refuses, and how many that no other gate
+        right merge and the highest of a wrong one; how many of each the gate refuses, and how many no other gate
         refuses (`..._alone`); `is_separable` and the `suggested` threshold: the middle between worst right and best
-        wrong (of their logarithms, for a ratio), or else the value that keeps 99.5 % of the right ones. The row `all`
-        counts the merges that at least one gate refuses. Evidence that could not be measured is refused.
+        wrong (in logarithms, for a ratio), or else the value that keeps 99.5 % of the right merges. The row `all`
+        counts the merges that at least one gate refuses. Undefined evidence is refused.
     """
     right = cases["right"].to_numpy(dtype=np.bool_)
     refused = {name: ~(cases[name].to_numpy(dtype=np.float64) >= thresholds[name]) for name, _ in GATES}
@@ -156,7 +156,7 @@ def gate_table(cases: pd.DataFrame, thresholds: Mapping[str, float]) -> pd.DataF
 
 
 def let_through(cases: pd.DataFrame, thresholds: Mapping[str, float]) -> BoolArray:
-    """Return (N,) whether each merge reaches every gate."""
+    """Return the (N,) mask of the merges that reach every gate."""
     passed = [cases[name].to_numpy(dtype=np.float64) >= thresholds[name] for name, _ in GATES]
     return np.asarray(np.logical_and.reduce(passed), dtype=np.bool_)
 
@@ -164,7 +164,7 @@ def let_through(cases: pd.DataFrame, thresholds: Mapping[str, float]) -> BoolArr
 def suggest(right: Float64Array, wrong: Float64Array, *, logarithmic: bool) -> tuple[float, bool]:
     """Return a threshold, and whether it separates all right values from all wrong ones.
 
-    Rounded towards the wrong values to three digits; NaN without a right value.
+    The threshold is rounded down to three digits; it is NaN without a right value.
     """
     right, wrong = right[~np.isnan(right)], wrong[~np.isnan(wrong)]
     if len(right) == 0:
@@ -203,15 +203,11 @@ def gates_chart(cases: pd.DataFrame, table: pd.DataFrame) -> Drawing:
 def main(
     run: Annotated[Path, typer.Argument(help="folder of `tunnelcd run merge-gates`")],
     out: Annotated[Path, typer.Option("--out", help="folder for gates.csv and gates.png", show_default=False)],
-    variant: Annotated[str, typer.Option(help="the one that accepts everything, where there are several")] = "",
+    variant: Annotated[str, typer.Option(help="variant that accepts every merge, if the run has several")] = "",
 ) -> None:
-    """Print and write what each gate does to the merges of a validation run, and draw where its threshold lies."""
-    path = table_file(run / "results.csv")
-    try:
-        results = pd.read_csv(path)
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{path}: {reason}: name a folder that `tunnelcd run merge-gates` made") from error
+    """Print, write and draw which merges of a validation run each gate accepts and refuses."""
+    path = run / "results.csv"
+    results = read_table(path, "merge-gates")
     require_ungated(results, chosen_variant(results, variant), read_document(run / "provenance.json"))
     cases, thresholds = measured(results, variant), committed_thresholds()
     if len(cases) == 0:

@@ -358,7 +358,7 @@ def test_without_the_extra_one_line_says_what_to_install(
     monkeypatch.setattr(cluster.importlib.util, "find_spec", lambda name: None)
     code, _, err = command("dataset", FAMILY, "--seeds", "0", "--workers", "2", "--out", tmp_path / "d")
     assert code == 2
-    assert err == "error: --workers needs a package more: pip install 'tunnelcd[cluster]'\n"
+    assert err == "error: --workers: Dask is not installed: pip install 'tunnelcd[cluster]'\n"
 
 
 def test_a_run_that_is_interrupted_goes_on_where_it_stopped(
