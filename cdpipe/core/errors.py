@@ -1,4 +1,4 @@
-"""The errors a user can cause. The command line prints each as one line and exits with code 2."""
+"""Errors that a user can cause. The command line prints each as one line and exits with code 2."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 
 class TunnelcdError(Exception):
-    """Base of every error whose cause is the input; its text names the thing, the expectation and the way out."""
+    """Base of every error caused by the input; its text says what is wrong, where, what is expected, how to mend it."""
 
 
 class InputError(TunnelcdError):
@@ -14,15 +14,15 @@ class InputError(TunnelcdError):
 
 
 class ScenarioError(InputError):
-    """A scenario that cannot be built: mistakes in its file, or a world that contradicts itself."""
+    """A scenario that cannot be built: its file has mistakes, or its world is inconsistent."""
 
 
 class MergeFailedError(TunnelcdError):
-    """The two sessions could not be put into one frame with enough evidence.
+    """The evidence does not suffice to merge the two sessions.
 
     Attributes:
-        evidence: What was measured, by name; values that were never reached are absent.
-        seconds: How long it took to find that out, `t_index_s` and `t_merge_s`; empty where that was not measured.
+        evidence: Measured values by name; values that were not measured are absent.
+        seconds: `t_index_s` and `t_merge_s` until the refusal; empty if not measured.
     """
 
     def __init__(self, message: str, evidence: Mapping[str, float], seconds: Mapping[str, float] | None = None) -> None:

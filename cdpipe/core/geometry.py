@@ -1,4 +1,4 @@
-"""Poses, rotations and the array checks that every border of the project uses.
+"""Poses, rotations, seeded random generators and array checks.
 
 A pose `dst_T_src` is a (4, 4) float64 rigid transform: `p_dst = dst_T_src @ p_src`. x is forward, z up, right-handed.
 """
@@ -26,7 +26,7 @@ def stream(seed: int, *purpose: str) -> np.random.Generator:
 
 
 def require_shape(name: str, array: npt.NDArray[Any], shape: tuple[int | None, ...]) -> None:
-    """Raise `ValueError` unless `array` has `shape`; `None` stands for any length."""
+    """Raise `ValueError` unless `array` has `shape`; `None` allows any length."""
     if array.ndim == len(shape) and all(want in (None, got) for want, got in zip(shape, array.shape, strict=True)):
         return
     wanted = ", ".join("N" if want is None else str(want) for want in shape)
@@ -56,7 +56,7 @@ def make_pose(rotation: npt.ArrayLike | None = None, translation: npt.ArrayLike 
 
 
 def yaw_pose(yaw_rad: float, translation: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Float64Array:
-    """Return the (4, 4) pose that turns by `yaw_rad` about z and then translates."""
+    """Return the (4, 4) pose with a rotation by `yaw_rad` about z and a translation in metres."""
     return make_pose(Rotation.from_euler("z", yaw_rad).as_matrix(), translation)
 
 
@@ -76,12 +76,12 @@ def transform(dst_T_src: Float64Array, points: Float64Array) -> Float64Array:
 
 
 def rotation_angle_rad(pose: Float64Array) -> float:
-    """Return the angle of a pose's rotation, in [0, pi]."""
+    """Return the rotation angle of a (4, 4) pose, in [0, pi]."""
     return float(Rotation.from_matrix(pose[:3, :3]).magnitude())
 
 
 def yaw_rad(pose: Float64Array) -> float:
-    """Return the heading of a pose: the angle of its x axis in the x-y plane."""
+    """Return the heading of a (4, 4) pose: the angle of its x axis in the x-y plane, in (-pi, pi]."""
     return float(np.arctan2(pose[1, 0], pose[0, 0]))
 
 

@@ -1,4 +1,4 @@
-"""A movement over time: poses between samples, positions linear, rotations by Slerp."""
+"""Motion: poses over time, interpolated between samples, positions linearly and rotations by Slerp."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array
 
-# Below this angle between two samples (radians) Slerp and a straight line between quaternions agree to the last bit.
+# Below this angle Slerp equals linear interpolation of the quaternions to the last bit.
 _STRAIGHT_RAD = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Where the sensor was, in some frame, at any time; beyond the ends it goes on as in the first and last stretch.
+    """The sensor pose at any time, extrapolated beyond both ends from the first and last interval.
 
     Attributes:
         time_s: (N,) rising times, N at least 2.
-        way_m: (N,) way travelled until then, metres.
+        way_m: (N,) path length up to each sample, metres.
         points: (N, 3) positions, metres.
-        quaternions: (N, 4) unit quaternions x, y, z, w, each in the half of its predecessor.
+        quaternions: (N, 4) unit quaternions x, y, z, w, each in the same hemisphere as its predecessor.
     """
 
     time_s: Float64Array
@@ -44,7 +44,7 @@ class Motion:
         first = np.clip(np.searchsorted(self.time_s, flat, side="right") - 1, 0, len(self.time_s) - 2)
         share = (flat - self.time_s[first]) / (self.time_s[first + 1] - self.time_s[first])
         points = self.points[first] + share[:, None] * (self.points[first + 1] - self.points[first])
-        # What depends on the stretch alone is worked out once for each: a revolution's columns share a few.
+        # terms that depend only on the interval are computed once per interval: columns share intervals
         low, high = int(first.min(initial=len(self.time_s))), int(first.max(initial=0)) + 2
         start, end = self.quaternions[low : high - 1], self.quaternions[low + 1 : high]
         angles = np.arccos(np.clip((start * end).sum(axis=1), -1.0, 1.0))
@@ -59,7 +59,7 @@ class Motion:
 
 
 def make_motion(time_s: Float64Array, way_m: Float64Array, points: Float64Array, rotations: Rotation) -> Motion:
-    """Return a movement through N positions and N rotations."""
+    """Return the motion through N poses, given times (N,), path lengths (N,), positions (N, 3) and N rotations."""
     quaternions = rotations.as_quat()
     flips = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     quaternions[1:] *= np.cumprod(flips)[:, None]

@@ -1,4 +1,4 @@
-"""Cells of a regular grid as single integers, and the distinct cells of a stream of points."""
+"""Voxel grid: integer keys of cells, means per cell, and the distinct cells of a stream of points."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ _HALF = 1 << (_BITS - 1)
 
 
 def max_coordinate_m(cell_m: float) -> float:
-    """Return the coordinate below which `cell_keys` can name every cell of this size."""
+    """Return the largest coordinate for which `cell_keys` can number cells of this size, metres."""
     return (_HALF - 1) * cell_m
 
 
 def cell_keys(points: Float64Array, cell_m: float, origin_m: float = 0.0) -> Int64Array:
-    """Return the key of the grid cell of each point; equal keys are equal cells, and keys order by x, then y, then z.
+    """Return the key of the grid cell of each point; keys sort by x, then y, then z.
 
     Args:
         points: (N, 3) points, metres.
-        cell_m: Edge of a cell.
-        origin_m: Where the grid has a corner, the same along every axis.
+        cell_m: Edge of a cell, metres.
+        origin_m: Coordinate of a grid corner, the same on every axis, metres.
 
     Returns:
         (N,) int64 keys.
@@ -32,7 +32,7 @@ def cell_keys(points: Float64Array, cell_m: float, origin_m: float = 0.0) -> Int
     keys = np.zeros(len(points), dtype=np.int64)
     for axis in range(3):
         cells = np.floor((points[:, axis] - origin_m) / cell_m)
-        # written so that NaN fails the comparison as well
+        # this form also rejects NaN
         if len(cells) and not (cells.min() >= -_HALF and cells.max() < _HALF):
             raise ValueError(
                 f"points must be finite and within {max_coordinate_m(cell_m):.0f} m for cells of {cell_m} m"
@@ -43,13 +43,13 @@ def cell_keys(points: Float64Array, cell_m: float, origin_m: float = 0.0) -> Int
 
 
 def cell_corners(keys: Int64Array, cell_m: float) -> Float64Array:
-    """Return the (N, 3) lower corner of the cell of each key of `cell_keys`, metres from its `origin_m`."""
+    """Return the (N, 3) lower corner of the cell of each key, metres relative to `origin_m`."""
     shifts = np.array([2 * _BITS, _BITS, 0])
     return np.asarray((((keys[:, None] >> shifts) & ((1 << _BITS) - 1)) - _HALF) * cell_m)
 
 
 def thin(points: Float64Array, cell_m: float) -> Float64Array:
-    """Return the first point of each occupied cell, in the order of the cells' keys."""
+    """Return the (C, 3) first point of each occupied cell, in the order of the keys."""
     _, first = np.unique(cell_keys(points, cell_m), return_index=True)
     return points[first]
 
@@ -63,10 +63,9 @@ def cell_means(points: Float64Array, cell_m: float) -> tuple[Float64Array, Int64
 
 
 class UniqueCells:
-    """The distinct keys of a stream that is too long to hold; cells are numbered as they first appear.
+    """The distinct keys of a stream, numbered by first appearance; memory grows with the number of distinct keys.
 
-    Memory grows with the number of distinct cells and not with the stream. Within one batch, new cells are numbered in
-    the order of their keys.
+    New cells of one batch are numbered in the order of their keys.
     """
 
     def __init__(self) -> None:
@@ -77,8 +76,8 @@ class UniqueCells:
         return len(self._sorted_keys)
 
     def add(self, keys: Int64Array) -> Int64Array:
-        """Take the next (N,) keys of the stream and return the (N,) cell numbers they belong to."""
-        # neighbours in a scan mostly share a cell: sorting what is left of their runs is several times faster
+        """Add the next (N,) keys of the stream and return the (N,) number of the cell of each."""
+        # neighbours in a scan mostly share a cell, so sorting one key per run is faster
         starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1])[: len(keys)])
         lengths = np.diff(starts, append=len(keys))
         cells, run_cell = np.unique(keys[starts], return_inverse=True)
@@ -98,7 +97,7 @@ class UniqueCells:
 
     @property
     def keys(self) -> Int64Array:
-        """(C,) key of each cell, by its number."""
+        """(C,) key of each cell, indexed by its number."""
         keys = np.empty(len(self), dtype=np.int64)
         keys[self._sorted_ids] = self._sorted_keys
         return keys

@@ -1,4 +1,4 @@
-"""YAML files checked against pydantic models, with every mistake of a file told at once and by line."""
+"""YAML files checked against pydantic models; all mistakes of a file are reported at once, each with its line."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Key = tuple[str | int, ...]
 
 
 class Settings(BaseModel):
-    """Base of every model read from YAML: frozen; unknown keys and numbers that are none are mistakes."""
+    """Base of every model read from YAML: frozen; unknown keys, NaN and infinity are mistakes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -32,12 +32,12 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """A parsed file and where each of its keys stands.
+    """A parsed file and the origin of each of its keys.
 
     Attributes:
         source: File name or other origin, for messages.
-        value: The content as plain dicts, lists and scalars.
-        origins: "file:line", or "--set", of each key path that has one.
+        value: Content as plain dicts, lists and scalars.
+        origins: "file:line" or "--set" of each key path.
     """
 
     source: str
@@ -45,7 +45,7 @@ class Document:
     origins: Mapping[Key, str] = field(default_factory=dict)
 
     def where(self, key: Key) -> str:
-        """Return the origin of a key, of its nearest known parent if it has none of its own."""
+        """Return the origin of a key, or that of its nearest parent with an origin."""
         while key and key not in self.origins:
             key = key[:-1]
         return self.origins.get(key, self.source)
@@ -68,7 +68,7 @@ def read_yaml(path: Path, text: str | None = None) -> Document:
 
 @lru_cache(maxsize=64)
 def _parse(path: str, text: str) -> Document:
-    """Parse a text once: a family is drawn with many seeds, and parsing takes longer than drawing."""
+    """Parse a text; cached, because one family is drawn with many seeds and parsing is the slow part."""
     try:
         node = yaml.compose(text, Loader=yaml.SafeLoader)
         lines: dict[Key, int] = {}
@@ -111,7 +111,7 @@ def setting_lines(settings: Iterable[str] | Mapping[str, Any]) -> list[str]:
 
 
 def apply_settings(document: Document, settings: Iterable[str]) -> Document:
-    """Return the document with `a.b=value` settings written over it; values are YAML scalars or lists.
+    """Return the document with `a.b=value` settings applied; values are YAML scalars or lists.
 
     Raises:
         InputError: A setting has no "=" or is not YAML.
@@ -142,10 +142,10 @@ def apply_settings(document: Document, settings: Iterable[str]) -> Document:
 
 
 def split_section(document: Document, name: str) -> tuple[Document, Document | None]:
-    """Split a document in what it says without its section `name`, and the same with that written over it.
+    """Return a document without its section `name`, and the same document with the section's settings applied.
 
     Returns:
-        The second is None where there is no such section; its keys keep the lines at which they stand.
+        The second is None without such a section; its keys keep their origins.
 
     Raises:
         InputError: The section is no group of settings.
@@ -169,7 +169,7 @@ def suggest(word: str, known: Iterable[str], prefix: str = "") -> str:
 
 def _describe_mistake(model: type[BaseModel], document: Document, error: Any) -> str:
     key = tuple(error["loc"])
-    # union members put the names of their alternatives into the location; keep what exists in the document
+    # pydantic adds the names of union alternatives to the location; keep the keys that exist in the document
     key = _existing_key(document.value, key) if error["type"] != "missing" else key
     name = ".".join(str(part) for part in key)
     where = document.where(key)
@@ -217,7 +217,7 @@ def _existing_key(value: Any, key: Key) -> Key:
 
 
 def _fields_at(model: type[BaseModel], key: Key) -> list[str]:
-    """Names of the fields a model allows below a key path, looking through lists, dicts and unions."""
+    """Return the field names that a model allows below a key path, through lists, dicts and unions."""
     models: list[type[BaseModel]] = [model]
     for part in key:
         if isinstance(part, int):

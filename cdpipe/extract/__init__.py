@@ -1,1 +1,5 @@
-"""Cutting the changed objects out of the reported regions."""
+"""Object extraction: cut the changed objects out of the reported regions."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,5 @@
-"""Reading and writing sessions, trajectories, point clouds and answers."""
+"""Files: sessions, recordings, trajectories, point clouds and answers."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,25 +1,22 @@
-"""The answer of a method on disk: what `detect` writes and `score` reads, whoever made it.
+"""The answer of a method on disk, written by `detect` or another program and read by `score`.
 
     answer.json   format, status, method, config, seconds, evidence, before_T_after, radius_m, objects (session, kind,
-                  region, score, partner of each; where it is known shape, which is map_T_box (4, 4), box_m (3,) and
-                  volume_m3, and for moved ones displacement_map (3,)); until: "merge" where the method was stopped
-                  after the merge
+                  region, score and partner of each; if known, shape: map_T_box (4, 4), box_m (3,) and volume_m3; for
+                  moved objects displacement_map (3,)); until: "merge" if the method was stopped after the merge
     answer.npz    region_centres_map (R, 3), region_scores (R,), region_pairs (R, 2), region_is_reported (R,),
-                  region_is_withdrawn (R,), where regions were let through that nothing could be cut out of,
-                  region_direction (R,) uint8, whose keyframe was looked up in the other session, 0 before, 1 after,
-                  where keyframes were,
+                  region_is_withdrawn (R,), regions above the threshold without an object (optional),
+                  region_direction (R,) uint8, session of the queried keyframe, 0 before, 1 after (optional),
                   keyframe_scores (Kb,), before_keyframe_scans (Kb,), after_keyframe_scans (Ka,),
                   object_returns (M, 2) int32 with object_return_offsets (O + 1,),
                   object_points_map (P, 3) with object_point_offsets (O + 1,), and figure_<name> (R,) each;
-                  local_before_T_after (Ka, 4, 4), the merge as it holds at each after keyframe, where it is not
-                  before_T_after everywhere
+                  local_before_T_after (Ka, 4, 4), local alignment at each after keyframe (optional)
 
-`seconds` names t_index_s, t_merge_s, t_refine_s, t_descriptor_s, t_cd_s and t_oe_s, as far as they were measured.
+`seconds` holds t_index_s, t_merge_s, t_refine_s, t_descriptor_s, t_cd_s and t_oe_s as far as they were measured.
 
-A refused or failed case is an answer.json with its status and error, and no answer.npz. Another program's answer may
-leave out object_returns and give object_points_odom with object_point_odom_offsets instead: points in the odom frame of
-the session that holds the object, each standing for 0.1 m around it. What else it may leave out, `answer_parts` tells;
-an unknown name is refused, so that a misspelt one is not taken for one left out.
+A refused or failed case has an answer.json with status and error, and no answer.npz. An answer of another program may
+replace object_returns by object_points_odom with object_point_odom_offsets: points in the odom frame of the session
+that holds the object; each covers 0.1 m around it. `answer_parts` lists all optional fields. Unknown names are refused,
+so that a misspelt field does not pass as a missing one.
 """
 
 from __future__ import annotations
@@ -55,14 +52,13 @@ class Answer:
 
     Attributes:
         status: "ok", "merge_refused", "failed" or "worker_died".
-        error: Why it is not ok, or "".
+        error: The message if the status is not ok, else "".
         method: Name of the preset or of the foreign method.
-        report: The answer itself; None when the status is not ok.
+        report: The answer; None if the status is not ok.
         seconds: Seconds per stage.
-        evidence: What the merge measured.
-        points_odom: Per object, the (P, 3) odom points of a foreign answer that names no returns; None otherwise.
-        until: After which stage the method was stopped on purpose, so that it says nothing about what comes later; None
-            where it ran to its end.
+        evidence: Evidence of the merge.
+        points_odom: For each object the (P, 3) odom points of a foreign answer without returns; None otherwise.
+        until: Last stage of a method that was stopped on purpose; None if it ran to its end.
     """
 
     status: str
@@ -76,7 +72,7 @@ class Answer:
 
 
 def write_answer(folder: Path, method: str, report: ChangeReport, until: Until | None = None) -> None:
-    """Write a whole answer into `folder`, which may exist; answer.json comes last and marks it complete."""
+    """Write an answer into `folder`, which may exist; answer.json is written last and marks it complete."""
     folder.mkdir(parents=True, exist_ok=True)
     regions, objects = report.regions, report.objects
     arrays = {
@@ -124,7 +120,7 @@ def write_failure(
     until: Until | None = None,
     seconds: Mapping[str, float] | None = None,
 ) -> None:
-    """Write the record of a case that gave no answer, and the seconds that were measured until then."""
+    """Write the record of a case without an answer, with the seconds measured until then."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "answer.npz").unlink(missing_ok=True)
     document: dict[str, Any] = {"status": status, "error": error, "method": method}

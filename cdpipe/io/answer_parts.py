@@ -1,4 +1,4 @@
-"""What may stand in an answer's two files, checked before anything is made of it; every mistake of a file at once."""
+"""Schema of the two files of an answer; all mistakes of a file are reported at once."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _Pose = Annotated[list[Annotated[list[float], _Four]], _Four]
 
 
 class _Part(Settings):
-    """Numbers are numbers, not text that looks like one."""
+    """Base of the parts: strict types, so text is no number; NaN means not measured."""
 
-    model_config = ConfigDict(strict=True, allow_inf_nan=True)  # NaN: not measured
+    model_config = ConfigDict(strict=True, allow_inf_nan=True)
 
 
 class ShapePart(_Part):
-    """The box around an object, and its volume."""
+    """The upright box of an object, metres, and its volume."""
 
     map_T_box: _Pose
     box_m: _Vector
@@ -39,7 +39,7 @@ class ShapePart(_Part):
 
 
 class ObjectPart(_Part):
-    """One object; its points are in answer.npz."""
+    """One object in answer.json; its points are in answer.npz."""
 
     session: SessionName
     kind: Kind
@@ -51,7 +51,7 @@ class ObjectPart(_Part):
 
 
 class FailurePart(_Part):
-    """answer.json of a case without an answer, and what it has in common with one that has."""
+    """answer.json of a failed or refused case; the base of `AnswerPart`."""
 
     format: Literal["tunnelcd-answer"]
     format_version: Literal[1]
@@ -62,21 +62,21 @@ class FailurePart(_Part):
     seconds: dict[str, float] = Field(default_factory=dict)
     evidence: dict[str, float] = Field(default_factory=dict)
     config: dict[str, Any] = Field(default_factory=dict)
-    # what an answer would have may be there, and is not read
+    # fields of an answer are allowed and ignored
     before_T_after: Any = None
     radius_m: Any = None
     objects: Any = None
 
 
 class AnswerPart(FailurePart):
-    """answer.json."""
+    """answer.json of a case with an answer."""
 
     before_T_after: _Pose
     radius_m: PositiveFloat
     objects: list[ObjectPart] = Field(default_factory=list)
 
 
-# Of answer.npz: candidates R, objects O, keyframes Kb and Ka, and how many returns and points come to.
+# Arrays of answer.npz: R candidates, O objects, Kb before and Ka after keyframes, M returns, P points.
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     "region_centres_map": ("R", 3), "region_scores": ("R",), "region_pairs": ("R", 2), "region_is_reported": ("R",),
     "region_is_withdrawn": ("R",), "region_direction": ("R",), "keyframe_scores": ("Kb",),
@@ -95,7 +95,7 @@ _FIGURE = "figure_"
 
 
 def check_document(path: Path, value: Any) -> AnswerPart | FailurePart:
-    """Return what answer.json says.
+    """Return the checked content of answer.json.
 
     Raises:
         InputError: One line for each mistake.
@@ -106,7 +106,7 @@ def check_document(path: Path, value: Any) -> AnswerPart | FailurePart:
 
 
 def check_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects: int) -> None:
-    """Check that the arrays of answer.npz are known, numbers, of the right shape, and all there.
+    """Check names, types, shapes and completeness of the arrays of answer.npz.
 
     Raises:
         InputError: One line for each mistake.

@@ -1,7 +1,7 @@
-"""The vertices of a PLY file, ascii or binary, whatever other properties and elements it has.
+"""Read the vertices of a PLY file, ascii or binary, with any other properties and elements.
 
-A scan written by PCL carries a `camera` element, others begin with a property that is not x; general mesh readers
-stumble over both.
+General mesh readers do not fit scans: meshio rejects the `camera` element that PCL writes, fails on some ascii files
+and accepts truncated ones.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Opening a recorded session of either kind: a session folder of ours, or PLY scans with a TUM trajectory."""
+"""Open a recorded session: a session folder, or PLY scans with a TUM trajectory."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from cdpipe.mapping.deskew import deskew
 from cdpipe.model.types import PosedScan, ScanSource
 
 RECORDING_SUFFIXES = (".osf", ".pcap", ".pcapng")
-"""Of a sensor's own recordings, which `cdpipe.io.ouster` reads."""
+"""File suffixes of sensor recordings, which `cdpipe.io.ouster` reads."""
 _NUMBERS = re.compile(r"(\d+)")
-# Metres along an axis, or radians: about what odometry makes of standing still.
+# Largest change of a pose entry, metres or radians, that odometry reports for a sensor at rest.
 _STANDING = 0.1
 
 
@@ -50,7 +50,7 @@ def open_session(path: Path) -> ScanSource:
 
 
 class RecordedScans:
-    """The scans of a session folder, deskewed with its own odometry. The chunk read last is kept."""
+    """The scans of a session folder, deskewed by its own odometry; the chunk read last is cached."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -68,7 +68,7 @@ class RecordedScans:
         return self._session.odom_T_sensor
 
     def scan(self, index: int) -> PosedScan:
-        """Read one revolution.
+        """Read and deskew one revolution.
 
         Raises:
             InputError: Its chunk is damaged, its column poses are not rigid, or nothing returned.
@@ -168,7 +168,7 @@ class PlyScans:
 
 
 class _Repeats:
-    """Finds scans that were recorded twice: the same returns to the last bit, which noise never gives twice."""
+    """Detects scans that were recorded twice: noise never gives bit-identical returns."""
 
     def __init__(self) -> None:
         self._seen: dict[bytes, tuple[str, Float64Array, int]] = {}
@@ -176,13 +176,13 @@ class _Repeats:
     def require_new(
         self, where: str, name: str, content: npt.NDArray[Any], odom_T_sensor: Float64Array, stamp_ns: int
     ) -> None:
-        """Remember a scan; raise `InputError` if it is there already, at another pose or at the same time."""
+        """Remember a scan; raise `InputError` if an identical scan has another pose or the same time."""
         digest = hashlib.blake2b(np.ascontiguousarray(content).data, digest_size=16).digest()
         if digest not in self._seen:
             self._seen[digest] = name, odom_T_sensor, stamp_ns
             return
         other, pose, other_ns = self._seen[digest]
-        # a simulated sensor without noise that stands still sees the same again, wherever odometry believes it to be
+        # a simulated noise-free sensor at rest gives identical scans at slightly different poses
         if stamp_ns == other_ns or np.abs(pose - odom_T_sensor).max() > _STANDING:
             raise InputError(
                 f"{where} repeats {other}: the same returns to the last bit, recorded twice: remove one and its pose"

@@ -6,7 +6,7 @@
                         signal (s, H, W) uint16 photons, column_stamps_ns (s, W) int64, column_poses (s, W, 7) float32
 
 `column_poses` hold `sensor_T_column`: translation (m) and quaternion (x, y, z, w) of each column in the frame of its
-revolution, as the session's own odometry saw it. A session is written under a temporary name and renamed when whole.
+revolution, from the session's own odometry. A session is written under a temporary name and renamed when complete.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class ScanChunk:
 
     Attributes:
         range_mm: (s, H, W) uint32 staggered ranges, millimetres, 0 where nothing returned.
-        reflectivity: (s, H, W) uint8, calibrated: percent of a perfect diffuse reflector up to 100.
-        signal: (s, H, W) uint16 photons counted in the return, as the sensor's signal channel; 0 where unknown.
+        reflectivity: (s, H, W) uint8, calibrated; values up to 100 are percent of a perfect diffuse reflector.
+        signal: (s, H, W) uint16 photons of the return, the sensor's signal channel; 0 if unknown.
         column_stamps_ns: (s, W) int64 time of each column since the start of the session.
         column_poses: (s, W, 7) float32 `sensor_T_column` as x, y, z, qx, qy, qz, qw.
     """
@@ -62,14 +62,14 @@ class ScanChunk:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Session:
-    """An opened session; the arrays of its chunks are read when asked for.
+    """An opened session; its chunks are read on demand.
 
     Attributes:
-        path: Its folder.
-        sensor: The sensor that made it.
+        path: Folder of the session.
+        sensor: Its sensor.
         odom_T_sensor: (S, 4, 4) float64 pose of each revolution at its middle column, in the session's own odom frame.
         chunk_scans: Revolutions per chunk; the last chunk may hold fewer.
-        provenance: What made it, as written.
+        provenance: How it was made, as stored.
     """
 
     path: Path
@@ -110,9 +110,9 @@ class Session:
 
 
 class SessionWriter:
-    """Writes a session chunk by chunk; the folder appears under its name only when `close` is reached.
+    """Writes a session chunk by chunk; `close` gives the folder its name.
 
-    Use as a context manager; an exception inside removes what was written.
+    It is a context manager; an exception inside removes the unfinished folder.
     """
 
     def __init__(self, path: Path, sensor: SensorMetadata, chunk_scans: int, provenance: dict[str, Any]) -> None:
@@ -139,14 +139,14 @@ class SessionWriter:
 
     @property
     def folder(self) -> Path:
-        """The unfinished folder, for files that belong beside the session (its truth)."""
+        """The unfinished folder, for further files of the session (its truth)."""
         return self._partial
 
     def add(self, chunk: ScanChunk) -> None:
         """Append one chunk; every chunk but the last must hold `chunk_scans` revolutions.
 
         Raises:
-            InputError: It cannot be written, for example because the disk is full; so do `close`.
+            InputError: It cannot be written, for example because the disk is full.
         """
         arrays = {name: getattr(chunk, name) for name in ScanChunk.__dataclass_fields__}
         with self._writing():
@@ -154,7 +154,12 @@ class SessionWriter:
         self._n_chunks += 1
 
     def close(self, odom_T_sensor: Float64Array) -> None:
-        """Write the poses and the description, and give the folder its name."""
+        """Write the (S, 4, 4) poses and session.json, and rename the folder.
+
+        Raises:
+            InputError: They cannot be written.
+            ValueError: The number of poses does not fit the chunks.
+        """
         require_poses("odom_T_sensor", odom_T_sensor)
         if self._n_chunks != -(-len(odom_T_sensor) // self._chunk_scans):
             raise ValueError(f"{self._n_chunks} chunks of {self._chunk_scans} do not hold {len(odom_T_sensor)} poses")
@@ -182,7 +187,7 @@ class SessionWriter:
 
 
 def is_session(path: Path) -> bool:
-    """Tell whether a folder holds a session of this format."""
+    """Return whether a folder holds a session.json."""
     return (path / "session.json").is_file()
 
 
@@ -190,7 +195,7 @@ def read_session(path: Path) -> Session:
     """Open a session folder.
 
     Raises:
-        InputError: The folder or a file is missing, of another format or version, or its poses are not finite.
+        InputError: The folder or a file is missing, damaged, of another format or version, or a pose is not rigid.
     """
     if not path.is_dir():
         raise InputError(f"{path}: no such session folder")
@@ -233,7 +238,7 @@ def read_session(path: Path) -> Session:
 
 
 def _check_provenance(provenance: Any) -> None:
-    """Raise `ValueError` unless it is a JSON object whose clock, where it names one, fits the stamps."""
+    """Raise `ValueError` unless provenance is a JSON object and its clock start, if given, fits int64 stamps."""
     if not isinstance(provenance, dict):
         raise ValueError(f"provenance = {provenance!r:.40}, expected a JSON object")
     start_ns = provenance.get("sensor_clock_start_ns", 0)
@@ -242,12 +247,12 @@ def _check_provenance(provenance: Any) -> None:
 
 
 def chunk_path(folder: Path, index: int) -> Path:
-    """Return the file of one chunk."""
+    """Return the path of one chunk file."""
     return folder / "chunks" / f"{index:05d}.npz"
 
 
 def load_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """Read an npz file without unpickling anything.
+    """Read the arrays of an npz file; nothing is unpickled.
 
     Raises:
         InputError: The file is missing, cut short or not an npz of plain arrays.

@@ -1,4 +1,4 @@
-"""Putting both maps into one frame, with evidence, or refusing to."""
+"""Map merging: align both maps with evidence, or refuse."""
 
 import lazy_loader
 

@@ -1,8 +1,8 @@
-"""The Ouster beam table: what a sensor's metadata JSON says, and the ray of every pixel.
+"""The Ouster sensor model: metadata, and origin and direction of the ray of every pixel.
 
-Frames and formula follow the vendor's software user manual ("Lidar range to XYZ"): the encoder angle of measurement m
-of W is 2 pi (1 - m / W), so the head spins clockwise seen from above; a beam leaves the head `n` from the axis, and the
-reported range includes that offset.
+Frames and formula follow the vendor's software user manual ("Lidar range to XYZ"). The encoder angle of column m of W
+is 2 pi (1 - m / W), so the head spins clockwise seen from above. A beam starts at distance n from the axis, and the
+reported range includes n.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class SensorMetadata:
 
     @cached_property
     def directions(self) -> Float64Array:
-        """(H, W, 3) unit direction of every staggered pixel, sensor frame."""
+        """(H, W, 3) unit direction of the ray of every staggered pixel, sensor frame."""
         encoder = self._encoder_rad()[None, :]
         azimuth = encoder - np.deg2rad(self.azimuth_deg)[:, None]
         altitude = np.deg2rad(self.altitude_deg)[:, None]
@@ -81,7 +81,7 @@ class SensorMetadata:
 
     @cached_property
     def origins(self) -> Float64Array:
-        """(H, W, 3) point where the beam leaves the head, sensor frame, metres."""
+        """(H, W, 3) origin of the ray of every staggered pixel, sensor frame, metres."""
         encoder = self._encoder_rad()
         ring = np.stack([np.cos(encoder), np.sin(encoder), np.zeros_like(encoder)], axis=-1) * self.beam_origin_m
         in_sensor = transform(self.sensor_T_lidar, ring)
@@ -90,8 +90,11 @@ class SensorMetadata:
     def project(self, ranges_m: Float64Array) -> Float64Array:
         """Return the (..., H, W, 3) points of staggered ranges (..., H, W), sensor frame, metres.
 
-        Each column is in the sensor frame at its own time: deskewing is a separate step. A range of 0 is a miss, and
-        its point is meaningless.
+        Each column is in the sensor frame at its own time; deskewing is a separate step. The point of a miss, range 0,
+        is undefined.
+
+        Raises:
+            ValueError: The last two axes are not (H, W).
         """
         if ranges_m.shape[-2:] != (self.height, self.width):
             raise ValueError(f"ranges_m must be (..., {self.height}, {self.width}), got {ranges_m.shape}")
@@ -102,7 +105,7 @@ class SensorMetadata:
         return np.arange(self.width, dtype=np.float64) * (1e9 / self.rate_hz / self.width)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the metadata under Ouster's own (flat) key names."""
+        """Return the metadata in Ouster's flat JSON layout."""
         transform_mm = self.sensor_T_lidar.copy()
         transform_mm[:3, 3] *= 1000.0
         return {
@@ -133,11 +136,11 @@ def load_profile(name_or_path: str, mode: str | None = None) -> SensorMetadata:
     """Read a shipped profile by name, or any Ouster metadata JSON by path.
 
     Args:
-        name_or_path: A name out of `profile_names()`, or the path of a `.json` file.
-        mode: "<columns>x<Hz>" to use instead of the file's own.
+        name_or_path: One of `profile_names()`, or the path of a `.json` file.
+        mode: "<columns>x<Hz>" that replaces the file's mode.
 
     Raises:
-        InputError: The profile is unknown, the file is not complete Ouster metadata, or the mode is none of `MODES`.
+        InputError: The profile is unknown, the file is no complete Ouster metadata, or the mode is not in `MODES`.
     """
     if name_or_path.endswith(".json"):
         document = read_document(Path(name_or_path))
@@ -154,9 +157,9 @@ def load_profile(name_or_path: str, mode: str | None = None) -> SensorMetadata:
 
 
 def parse_metadata(document: Mapping[str, Any], source: str, mode: str | None = None) -> SensorMetadata:
-    """Build the beam table from parsed metadata, in the flat or in the nested layout of newer firmware.
+    """Build the sensor model from parsed metadata, in the flat or the nested layout of newer firmware.
 
-    Any number of columns and any rate will do here; `load_profile` keeps to what the sensor can.
+    Any number of columns and any rate are accepted; `load_profile` accepts only the sensor's modes.
 
     Raises:
         InputError: A key is missing or the beams are inconsistent; the text names `source` and the key.

@@ -1,7 +1,7 @@
-"""The JSON an Ouster sensor describes itself with, checked: every mistake becomes one line that names file and key.
+"""Parse and check the metadata JSON of an Ouster sensor; an error names file and key on one line.
 
-Two layouts are read: the flat one of first firmwares and of `SensorMetadata.to_json`, and the nested one of newer
-firmware, which is also what the vendor's SDK writes.
+Two layouts are read: the flat one of early firmware and of `SensorMetadata.to_json`, and the nested one of newer
+firmware and of the vendor's SDK.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from cdpipe.core.geometry import Float64Array
 MODES = ("512x10", "512x20", "1024x10", "1024x20", "2048x10")
 
 _SECTIONS = ("sensor_info", "config_params", "beam_intrinsics", "lidar_intrinsics", "imu_intrinsics")
-# Distance of the beam origin from the spin axis where the metadata does not state it: what the vendor's SDK 1.0.1 takes
-# for a product line, first generation included.
+# Default distance of the beam origin from the spin axis by product line, as in the vendor's SDK 1.0.1.
 _BEAM_ORIGIN_MM = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762}
 _OTHER_BEAM_ORIGIN_MM = 12.163
 _FARTHEST_BEAM_ORIGIN_MM = 100.0
@@ -33,7 +32,7 @@ def read_document(path: Path) -> dict[str, Any]:
     """Read a JSON object.
 
     Raises:
-        InputError: There is no such file, it cannot be read, or it holds anything else.
+        InputError: The file is missing, cannot be read, or holds no JSON object.
     """
     if path.is_dir():
         raise InputError(f"{path}: is a folder: name the metadata .json of an Ouster sensor")
@@ -67,11 +66,11 @@ def parse_fields(document: Mapping[str, Any], source: str, mode: str | None = No
 
     Args:
         document: The parsed JSON.
-        source: What to call it in messages.
-        mode: "<columns>x<Hz>" instead of the document's own.
+        source: Name of the document in messages.
+        mode: "<columns>x<Hz>" that replaces the document's mode.
 
     Raises:
-        InputError: A key is missing, or what it holds cannot be or contradicts another.
+        InputError: A key is missing, or its value is impossible or contradicts another.
     """
     flat = dict(document)
     for section in _SECTIONS:
@@ -103,13 +102,13 @@ def parse_fields(document: Mapping[str, Any], source: str, mode: str | None = No
 
 
 def require_mode(mode: str, source: str) -> None:
-    """Raise `InputError` unless a mode is one an OS1-32 has."""
+    """Raise `InputError` unless a mode is one of an OS1-32."""
     if mode not in MODES:
         raise InputError(f"{source}: lidar_mode = {mode!r}: expected one of {', '.join(MODES)}")
 
 
 def _numbers(values: Any, source: str, key: str) -> Float64Array:
-    """Return (N,) finite numbers."""
+    """Return a JSON list as (N,) finite numbers."""
     if not isinstance(values, list | tuple):
         raise InputError(f"{source}: {key} must be a list of numbers, got {values!r:.40}")
     numbers = np.array([_number(value, source, f"{key}[{at}]") for at, value in enumerate(values)], dtype=np.float64)
@@ -120,7 +119,7 @@ def _numbers(values: Any, source: str, key: str) -> Float64Array:
 
 
 def _number(value: Any, source: str, key: str) -> float:
-    """Return a JSON number, which neither text nor true or false is."""
+    """Return a JSON number as float; text and booleans are refused."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{source}: {key} must be a number, got {value!r:.40}")
     try:
@@ -138,7 +137,7 @@ def _beams(flat: Mapping[str, Any], source: str, product: str) -> tuple[Float64A
             f"{source}: beam_altitude_angles and beam_azimuth_angles must be equally long, "
             f"got {len(altitude_deg)} and {len(azimuth_deg)} numbers"
         )
-    # 32-beam units of the first generation list 64 beams and leave the absent ones at zero.
+    # first-generation units with 32 beams list 64 and set the absent ones to zero
     is_absent = (altitude_deg == 0.0) & (azimuth_deg == 0.0)
     if len(altitude_deg) == 64 and is_absent.sum() == 32:
         altitude_deg, azimuth_deg = altitude_deg[~is_absent], azimuth_deg[~is_absent]
@@ -164,7 +163,7 @@ def _columns(mode: str, source: str) -> int:
 
 
 def _pixel_shift(document: Mapping[str, Any], source: str, height: int, columns: int) -> list[int] | None:
-    """Return the shift of each row in the document's own mode, None where it does not say."""
+    """Return the pixel shift of each row in the document's own mode; None if it is not given."""
     layout = document.get("lidar_data_format") or document.get("data_format") or {}
     if not isinstance(layout, dict):
         raise InputError(f"{source}: data_format must be a JSON object")
@@ -182,7 +181,7 @@ def _pixel_shift(document: Mapping[str, Any], source: str, height: int, columns:
 
 
 def _beam_origin_mm(flat: Mapping[str, Any], source: str, product: str) -> float:
-    """Return the beam origin's distance from the axis; the SDK's transform goes before the older single figure."""
+    """Return the distance of the beam origin from the axis, mm; the SDK's transform takes precedence."""
     key, value = "lidar_origin_to_beam_origin_mm", flat.get("lidar_origin_to_beam_origin_mm")
     if flat.get("beam_to_lidar_transform") is not None:
         key = "beam_to_lidar_transform"

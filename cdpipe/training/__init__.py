@@ -1,1 +1,5 @@
-"""Training the learned descriptors on the shards that `tunnelcd dataset` makes."""
+"""Training of the learned descriptors on the shards that `tunnelcd dataset` makes."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,4 +1,4 @@
-"""Loading the training data that `tunnelcd dataset` makes: by split, never a test seed.
+"""Load the training data that `tunnelcd dataset` makes, by split; test seeds are refused.
 
 >>> tunnels = open_dataset(folder, "train")
 >>> pairs = ChangePairs(tunnels)
@@ -33,14 +33,14 @@ _PER_PAIR = ("before_images", "after_images", "before_labels", "after_labels", "
 
 @dataclass(frozen=True, slots=True)
 class TunnelShard:
-    """One tunnel of a dataset, as its index lists it.
+    """One tunnel in the index of a dataset.
 
     Attributes:
         path: The shard.
         family: Scenario family.
-        seed: The tunnel's.
-        n_before: Before keyframes, which are the anchors.
-        n_after: After keyframes.
+        seed: Seed of the tunnel.
+        n_before: Number of before keyframes, the anchors.
+        n_after: Number of after keyframes.
     """
 
     path: Path
@@ -62,11 +62,11 @@ def open_dataset(
     Args:
         folder: Made by `tunnelcd dataset`.
         split: "train" (seeds below 10000) or "validation" (10000 to 19999).
-        families: These alone.
-        seeds: These alone; all must be of the split.
+        families: Only these families.
+        seeds: Only these seeds; all must be of the split.
 
     Raises:
-        InputError: The folder has no index, the split is another one, a seed is of another split, or nothing is left.
+        InputError: The folder has no index, the split is unknown, a seed is of another split, or no tunnel remains.
     """
     if split not in _SPLITS:
         raise InputError(f'split "{split}": expected "train" or "validation"; test seeds are for scoring, by plans')
@@ -86,7 +86,7 @@ def open_dataset(
 
 
 class ChangePairs(torch.utils.data.Dataset[dict[str, Any]]):
-    """Every anchor of some tunnels with its after image, once for each draw of the merge error.
+    """Every anchor of the given tunnels with its after image, once per draw of the merge error.
 
     An item has `before_image`, `after_image`, `before_labels`, `after_labels` (tensors), `label`, `is_covered`,
     `family`, `seed`, `draw` and `anchor`. The tunnel read last is kept, so that a sampler that goes tunnel by tunnel
@@ -94,7 +94,7 @@ class ChangePairs(torch.utils.data.Dataset[dict[str, Any]]):
     """
 
     def __init__(self, tunnels: Sequence[TunnelShard], *, draws: Sequence[int] | None = None) -> None:
-        """Take the tunnels; all draws unless some are named (0 is the exact merge)."""
+        """Open the tunnels; `draws` defaults to all draws (draw 0 is the exact merge)."""
         if not tunnels:
             raise ValueError("tunnels is empty")
         self._tunnels = list(tunnels)
@@ -137,18 +137,18 @@ class ChangePairs(torch.utils.data.Dataset[dict[str, Any]]):
 
 
 def stacked(tunnels: Sequence[TunnelShard], names: Sequence[str]) -> dict[str, Tensor]:
-    """Put arrays of all tunnels together, for training that fits into memory.
+    """Concatenate arrays of all tunnels in memory.
 
     Args:
-        tunnels: In this order.
-        names: Arrays of a shard that are per before keyframe, or all per after keyframe; those with an axis of draws
-            come with the keyframes first, (N, D, ...).
+        tunnels: The shards.
+        names: Arrays of a shard, all per before keyframe or all per after keyframe. Arrays with draws become
+            (N, D, ...).
 
     Returns:
-        A tensor for each name, and `tunnel` (N,) int64: the place in `tunnels` of each row.
+        A tensor for each name, and `tunnel` (N,) int64: the index into `tunnels` of each row.
 
     Raises:
-        InputError: A name is none of a shard, or is per change; or keyframes of both sessions are asked for at once.
+        InputError: A name is no array of a shard or is per change, or the names mix both sessions.
     """
     axes = {name: _keyframe_axis(name) for name in names}
     if len({letter for letter, _ in axes.values()}) != 1:
@@ -165,7 +165,7 @@ def stacked(tunnels: Sequence[TunnelShard], names: Sequence[str]) -> dict[str, T
 
 
 def read_place_data(tunnels: Sequence[TunnelShard]) -> PlaceData:
-    """Return the scans of both sessions as the training of the place descriptor takes them."""
+    """Read the scans of both sessions for the training of the scan descriptor."""
     columns: dict[str, list[Any]] = {name: [] for name in PlaceData.__dataclass_fields__}
     for place, tunnel in enumerate(tunnels):
         for number, session in enumerate(("before", "after")):
@@ -181,7 +181,7 @@ def read_place_data(tunnels: Sequence[TunnelShard]) -> PlaceData:
 
 
 def _keyframe_axis(name: str) -> tuple[str, int]:
-    """Return which keyframes an array is of, K or J, and along which axis."""
+    """Return the kind of keyframes of an array, K (before) or J (after), and their axis."""
     shapes = {field.name: field.shape.split(",") for field in FIELDS}
     if name not in shapes:
         raise InputError(f"{name}: no array of a shard: expected some of {', '.join(shapes)}")

@@ -1,7 +1,7 @@
-"""The training loop of every descriptor: seeded, resumable, stopped early by what the validation tunnels say.
+"""The training loop of all descriptors: seeded, resumable, with early stopping on the validation tunnels.
 
-A task brings the network, the loss of a step and the scores; the loop knows nothing of descriptors. Every draw of a
-step comes from (seed, step), so a run that was cut off goes on as if it had not been.
+A task provides the network, the losses of a step and the scores. Every random draw depends on (seed, step) alone, so a
+resumed run gives the same weights as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _WARM_UP = 0.1
 
 @dataclass(frozen=True, slots=True)
 class FitConfig:
-    """What a training run depends on, beside its data.
+    """The settings of a training run.
 
     Attributes:
-        seed: Of the first weights and of every draw.
-        steps: At most this many; the learning rate falls to nothing over them.
-        learning_rate: Its highest.
+        seed: Seed of the initial weights and of every draw.
+        steps: Largest number of steps; the learning rate falls to zero over them.
+        learning_rate: Peak learning rate.
         validate_every: Steps between two validations.
-        patience: Validations without a new best score after which training stops.
+        patience: Number of validations without a new best score after which training stops.
     """
 
     seed: int = 0
@@ -44,32 +44,32 @@ class FitConfig:
 
 
 class Task(Protocol):
-    """What is trained."""
+    """A network with its losses and scores."""
 
     @property
     def network(self) -> nn.Module:
         """The network; `fit` changes its weights."""
 
     def losses(self, step: int) -> dict[str, Tensor]:
-        """Return the parts of a step's loss by name; their sum is minimised."""
+        """Return the terms of a step's loss by name; their sum is minimised."""
 
     def scores(self) -> dict[str, float]:
-        """Return the scores on the validation tunnels; the first one decides, larger is better."""
+        """Return the validation scores by name; the first one selects the best weights, larger is better."""
 
     def finish(self) -> dict[str, float]:
-        """Do what is done once with the best weights, and return what the model card should say of it."""
+        """Post-process the best weights once; return figures for the model card."""
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Where training stands after a validation.
+    """The state of training after a validation.
 
     Attributes:
-        step: Steps done.
-        losses: Mean of each part of the loss since the last validation.
-        scores: On the validation tunnels.
+        step: Number of steps done.
+        losses: Mean of each term of the loss since the last validation.
+        scores: Validation scores.
         is_best: Whether the first score is the best so far.
-        seconds: Wall clock spent so far, that of runs that were cut off included.
+        seconds: Wall-clock time so far, interrupted runs included.
     """
 
     step: int
@@ -80,7 +80,7 @@ class Progress:
 
 
 def learning_rate(step: int, config: FitConfig) -> float:
-    """Return the rate of a step: a straight rise over the first tenth, then half a cosine down to nothing."""
+    """Return the learning rate of a step: linear warm-up over the first tenth, then a half cosine to zero."""
     warm = _WARM_UP * config.steps
     if step < warm:
         return config.learning_rate * (step + 1) / (warm + 1)
@@ -96,18 +96,18 @@ def fit(
     on_step: Callable[[int, Mapping[str, float]], None],
     on_validation: Callable[[Progress], None],
 ) -> list[Progress]:
-    """Train a task's network and leave the weights of its best validation in it.
+    """Train a task's network; afterwards it has the weights of the best validation.
 
     Args:
         task: Network, losses, scores.
         config: Steps, rates, patience.
-        folder: Where the state is kept after every validation; a state that lies there is gone on from.
-        identity: Digest of data and settings; a state of another identity is refused.
+        folder: Holds the state after every validation; training resumes from a state found there.
+        identity: Digest of data and settings; a state with another identity is refused.
         on_step: Called with the step and its losses.
-        on_validation: Called after every validation, those of a resumed run included.
+        on_validation: Called after every validation, also for those of a resumed run.
 
     Returns:
-        Every validation, in order.
+        All validations, in order.
 
     Raises:
         InputError: The state in `folder` is of another run, or damaged.
@@ -165,7 +165,7 @@ def _save(
     history: list[Progress],
     identity: str,
 ) -> None:
-    """Write everything the next step depends on; safetensors, so that nothing is ever unpickled."""
+    """Write the state that the next step depends on, as safetensors, so that nothing is unpickled."""
     tensors = {f"last.{name}": tensor for name, tensor in network.state_dict().items()}
     tensors |= {f"best.{name}": tensor for name, tensor in best.items()}
     for index, state in optimiser.state_dict()["state"].items():
@@ -183,7 +183,7 @@ def _save(
 def _restore(
     path: Path, network: nn.Module, optimiser: torch.optim.Optimizer, identity: str
 ) -> tuple[list[Progress], dict[str, Tensor]]:
-    """Read a state into network and optimiser; return the validations so far and the best weights."""
+    """Load a state into network and optimiser; return the validations so far and the best weights."""
     if not path.is_file():
         return [], {name: tensor.clone() for name, tensor in network.state_dict().items()}
     try:

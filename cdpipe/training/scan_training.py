@@ -1,10 +1,9 @@
-"""How the place descriptor is trained: every place told from the others of its batch by q, yaw classification on w.
+"""Training of the scan descriptor: InfoNCE on the place vectors q, yaw classification on the orientation vectors w.
 
-3DEG (arXiv 2210.07285, section III) takes triplets with the hardest negative. In tunnels that loss stays at its margin
-for hundreds of steps, as the hardest of hundred places looks like the right one; the cross-entropy over all negatives
-(InfoNCE, arXiv 1807.03748), in which the hard ones count most as well, learns from the first step on. 3DEG's yaw loss
-compares (cos, sin) of a regressed angle; ours is the cross-entropy of the circular correlation of the two w, which does
-not average the two ends of a tunnel.
+3DEG (arXiv 2210.07285, section III) uses triplets with the hardest negative. In tunnels that loss stays at its margin
+for hundreds of steps, because the hardest of a hundred places resembles the correct one. The cross-entropy over all
+negatives (InfoNCE, arXiv 1807.03748) learns from the first step. 3DEG regresses (cos, sin) of the yaw; ours is the
+cross-entropy of the circular correlation of two w, which does not average the two directions of a tunnel.
 """
 
 from __future__ import annotations
@@ -24,23 +23,23 @@ _TEMPERATURE = 0.03
 _YAW_WEIGHT = 0.3
 _YAW_TEMPERATURE = 12.0
 _YAW_SPREAD_RAD = np.deg2rad(5.0)
-# What is recognised: a keyframe as near as this, which may be on another line of the way.
+# Largest distance of two keyframes of the same place.
 SAME_PLACE_M = 3.0
-# A place is learned from the keyframes of the other session that are at most so much farther than the nearest.
+# Positives are the keyframes of the other session at most this much farther than the nearest one.
 _BESIDE_NEAREST_M = 1.0
 OTHER_PLACE_M = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceData:
-    """Keyframes with true poses; sessions of one tunnel share a world frame.
+    """Keyframes with true poses; both sessions of a tunnel share a world frame.
 
     Attributes:
         images_m: (N, ROWS, COLUMNS) float16 or float32 range images, metres.
         positions: (N, 3) float64 sensor positions, world frame, metres.
         headings_rad: (N,) float64 yaw of the sensor in the world frame.
-        tunnels: (N,) int64 which tunnel.
-        sessions: (N,) int64 0 before, 1 after.
+        tunnels: (N,) int64 number of the tunnel.
+        sessions: (N,) int64, 0 before, 1 after.
     """
 
     images_m: Float32Array
@@ -64,7 +63,7 @@ class PlaceTask:
     """Trains a place network on some tunnels and scores it on others.
 
     Raises:
-        InputError: No place of the training tunnels was driven through in both sessions.
+        InputError: No place of the training tunnels was visited by both sessions.
     """
 
     def __init__(self, network: PlaceNetwork, training: PlaceData, validation: PlaceData, seed: int) -> None:
@@ -91,7 +90,7 @@ class PlaceTask:
         positives = np.array([draw.choice(self._partners[anchor]) for anchor in anchors])
         chosen = np.concatenate([anchors, positives])
         images, headings = _turn(self._data, chosen, draw)
-        # a tunnel in the mirror is another tunnel
+        # a mirrored tunnel counts as another tunnel, so all its keyframes are mirrored together
         tunnels, index = np.unique(self._data.tunnels[chosen], return_inverse=True)
         images, headings = _mirror(images, headings, (draw.random(len(tunnels)) < 0.5)[index])
         q, w = self._network(images)
@@ -106,11 +105,11 @@ class PlaceTask:
         )
 
     def scores(self) -> dict[str, float]:
-        """Return recall@1 within 3 m, and the yaw's median error and share of flips."""
+        """Return the scores of `evaluate` on the validation tunnels."""
         return evaluate(self._network, self._validation)
 
     def finish(self) -> dict[str, float]:
-        """There is nothing to do."""
+        """Return no figures: nothing is calibrated."""
         return {}
 
 
@@ -149,7 +148,7 @@ def evaluate(network: PlaceNetwork, data: PlaceData) -> dict[str, float]:
 
 
 def _partners(data: PlaceData) -> list[Int64Array]:
-    """For each keyframe, the nearest of the other session of its tunnel and those beside it; none if all are far."""
+    """Return for each keyframe its positives: the nearest keyframe of the other session and those near that one."""
     partners: list[Int64Array] = [np.zeros(0, dtype=np.int64)] * len(data.positions)
     for tunnel in np.unique(data.tunnels):
         members = np.flatnonzero(data.tunnels == tunnel)
@@ -163,7 +162,7 @@ def _partners(data: PlaceData) -> list[Int64Array]:
 
 
 def _turn(data: PlaceData, chosen: Int64Array, draw: np.random.Generator) -> tuple[Tensor, Float64Array]:
-    """Turn every image by a random angle; a shift to the right by k columns is a sensor turned by -k columns."""
+    """Rotate every image by a random yaw; a shift to the right by k columns is a yaw of -k columns."""
     shifts = draw.integers(0, COLUMNS, size=len(chosen))
     columns = (np.arange(COLUMNS)[None, :] - shifts[:, None]) % COLUMNS
     images = np.take_along_axis(data.images_m[chosen].astype(np.float32), columns[:, None, :], axis=2)
@@ -171,7 +170,7 @@ def _turn(data: PlaceData, chosen: Int64Array, draw: np.random.Generator) -> tup
 
 
 def _mirror(images: Tensor, headings_rad: Float64Array, is_mirrored: BoolArray) -> tuple[Tensor, Float64Array]:
-    """Swap left and right of some images; a mirrored heading turns the other way."""
+    """Mirror the marked images; a mirrored heading changes its sign."""
     flips = torch.from_numpy(is_mirrored)[:, None, None]
     return torch.where(flips, images.flip(2), images), np.where(is_mirrored, -headings_rad, headings_rad)
 
@@ -183,11 +182,11 @@ def _is_other_place(data: PlaceData, anchors: Int64Array, chosen: Int64Array) ->
 
 
 def _place_loss(q: Tensor, is_negative: Tensor) -> Tensor:
-    """Cross-entropy of picking the positive of each anchor among that and all negatives.
+    """Return the InfoNCE loss: the cross-entropy of the positive among itself and all negatives.
 
     Args:
-        q: (2 A, 64) place vectors, the anchors' first, then their positives' in the same order.
-        is_negative: (A, 2 A) which of them are of another place.
+        q: (2 A, 64) place vectors: A anchors, then their positives in the same order.
+        is_negative: (A, 2 A) whether a vector is of another place than an anchor.
     """
     n = len(is_negative)
     likeness = q[:n] @ q.T / _TEMPERATURE

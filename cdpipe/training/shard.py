@@ -1,7 +1,7 @@
-"""One tunnel's training data as a file: what a shard holds, how it is written and how it is read.
+"""Shards: the training data of one tunnel in one safetensors file.
 
-A shard is a safetensors file of named arrays; its metadata has one entry, `tunnelcd`, a JSON object with the family,
-the seed, the split, the digest of what the shard depends on, and what does not fit into arrays (`about`).
+The metadata of the file has one entry, `tunnelcd`: a JSON object with family, seed, split, the digest of all inputs,
+and the values that are no arrays (`about`).
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ class Field:
     """One array of a shard.
 
     Attributes:
-        name: Its name.
-        shape: Its axes: K before keyframes (the anchors), J after keyframes, C changes, D draws, R x W a scan's range
-            image, I the image of the map (as many axes as the renderer makes), V x U the pixels of that image.
-        dtype: As numpy names it.
-        unit: Of its values, or "".
-        frame: Of its values, or "".
-        meaning: In words.
+        name: Name in the file.
+        shape: Axes: K before keyframes (the anchors), J after keyframes, C changes, D draws, R x W range image of a
+            scan, I image of the map (one or more axes), V x U pixels of that image.
+        dtype: numpy name of the type.
+        unit: Unit of the values, or "".
+        frame: Frame of the values, or "".
+        meaning: Description.
     """
 
     name: str
@@ -84,7 +84,7 @@ FIELDS = (
 
 
 def split_of(seed: int) -> Split:
-    """Return what a seed may be used for; a tunnel is of one split alone."""
+    """Return the split of a seed."""
     if seed < 10_000:
         return "train"
     if seed < 20_000:
@@ -93,7 +93,7 @@ def split_of(seed: int) -> Split:
 
 
 def encode_shard(arrays: Mapping[str, npt.NDArray[Any]], about: Mapping[str, Any]) -> bytes:
-    """Return a shard; the same content gives the same bytes.
+    """Return the bytes of a shard; equal content gives equal bytes.
 
     Raises:
         ValueError: The arrays are not those of `FIELDS`, in name, number of axes or type.
@@ -104,12 +104,12 @@ def encode_shard(arrays: Mapping[str, npt.NDArray[Any]], about: Mapping[str, Any
         if arrays[field.name].dtype != field.dtype:
             raise ValueError(f"{field.name} must be {field.dtype}, got {arrays[field.name].dtype}")
     text = json.dumps({"format": FORMAT, "format_version": FORMAT_VERSION, **about}, sort_keys=True)
-    # one entry alone: safetensors writes several in no fixed order
+    # a single entry, because safetensors writes several in no fixed order
     return save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, {"tunnelcd": text})
 
 
 def read_about(path: Path) -> dict[str, Any]:
-    """Read the metadata of a shard alone.
+    """Read only the metadata of a shard.
 
     Raises:
         InputError: It is missing, damaged, or of another format.
@@ -119,10 +119,10 @@ def read_about(path: Path) -> dict[str, Any]:
 
 
 def read_shard(path: Path, names: tuple[str, ...] = ()) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-    """Read some arrays of a shard, all by default, and its metadata.
+    """Read the named arrays of a shard, by default all, and its metadata.
 
     Raises:
-        InputError: It is missing, damaged, of another format, or has no array of such a name.
+        InputError: It is missing, damaged, of another format, or lacks a named array.
     """
     with _open(path) as file:
         about = _about(path, file)

@@ -1,8 +1,8 @@
-"""How the sphere descriptor is trained: which sectors of which keyframes changed, told from simulated change.
+"""Training of the sphere descriptor: classify the changed sectors of keyframes, on simulated changes.
 
-Each step takes as many changed places as unchanged ones. Half of the unchanged ones are changed on the spot: an object
-seen in one tunnel is put into the image of another, in front of what stands there. Both directions, the other heading
-and the mirrored tunnel are as likely as what was simulated; the merge error is another one at every draw.
+A batch holds as many changed as unchanged keyframes. Into half of the unchanged images an object of another tunnel is
+pasted in front of the surface. Augmentation swaps the sessions, reverses the heading, mirrors the tunnel, scales it,
+and draws a merge error for every image.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from cdpipe.training.data import TunnelShard
 from cdpipe.training.shard import read_shard
 
 BATCH = 64
-# Rows whose changes a keyframe answers for: a metre before and behind it, so that neighbours overlap.
+# Rows that decide a keyframe's targets: 1 m before and behind it, so neighbours overlap.
 _OWN_ROWS = slice(ROWS // 4, ROWS - ROWS // 4)
 _MIN_PIXELS = 3
 _POSITIVE_WEIGHT = 3.0
 _PLACE_WEIGHT = 0.5
 _PASTED_SHARE = 0.25
 _PASTED_SHIFT_ROWS = 3
-# What is put in front of a wall must stand out of it: less is neither changed nor unchanged.
+# A pasted pixel counts as changed if it is this much in front of the surface; it is pasted from _IN_FRONT_M on.
 _STANDS_OUT_M = 0.15
 _IN_FRONT_M = 0.05
-# How much wider or narrower a tunnel is made, and which share of an image's pixels may go missing.
+# Largest logarithm of the scale factor, and largest share of missing pixels.
 _LOG_SCALE = float(np.log(1.6))
 _MAX_MISSING = 0.3
 _CHANGED, _UNCOUNTED = 1, 2
@@ -45,17 +45,17 @@ _CHANGED, _UNCOUNTED = 1, 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SphereData:
-    """Before keyframes that the after session came near, D draws of each.
+    """N before keyframes that the after session came near, with D merge errors each.
 
     Attributes:
-        before_m: (N, ROWS, COLUMNS) float32 images of the before maps.
-        after_m: (N, D, ROWS, COLUMNS) float32 images of the after maps.
-        before_marks: (N, ROWS, COLUMNS) uint8 0 unchanged, 1 an observable change, 2 one that does not count.
-        after_marks: (N, D, ROWS, COLUMNS) uint8 the same.
-        positions: (N, 3) float64 of the keyframes, world frame, metres.
-        labels: (N,) int8 1 near an observable change, 0 far from all, -1 left out.
-        tunnels: (N,) int64 which tunnel.
-        score_radius_m: (N,) float64 of its family.
+        before_m: (N, ROWS, COLUMNS) float32 images of the before maps, metres.
+        after_m: (N, D, ROWS, COLUMNS) float32 images of the after maps, metres.
+        before_marks: (N, ROWS, COLUMNS) uint8: 0 unchanged, 1 observable change, 2 unobservable change.
+        after_marks: (N, D, ROWS, COLUMNS) uint8, as `before_marks`.
+        positions: (N, 3) float64 keyframe positions, world frame, metres.
+        labels: (N,) int64: 1 near an observable change, 0 far from all changes, -1 left out.
+        tunnels: (N,) int64 number of the tunnel.
+        score_radius_m: (N,) float64 score radius of the family, metres.
     """
 
     before_m: Tensor
@@ -113,10 +113,10 @@ def read_sphere_data(tunnels: Sequence[TunnelShard]) -> SphereData:
 
 
 def sector_targets(before_marks: Tensor, after_marks: Tensor) -> Tensor:
-    """Return (..., SECTORS) float32 targets: 1 changed, 0 unchanged, -1 neither, of (..., ROWS, COLUMNS) marks.
+    """Return (..., SECTORS) float32 targets of (..., ROWS, COLUMNS) marks: 1 changed, 0 unchanged, -1 ignored.
 
-    A sector has changed where at least three pixels of a keyframe's own rows bear an observable change, in either
-    image; fewer pixels and changes that do not count are neither.
+    A sector is changed if at least three pixels of the keyframe's own rows, both images together, have an observable
+    change. It is ignored if it has fewer, or only unobservable changes.
     """
     changed = _per_sector((before_marks == _CHANGED).float() + (after_marks == _CHANGED).float())
     uncounted = _per_sector((before_marks == _UNCOUNTED).float() + (after_marks == _UNCOUNTED).float())
@@ -143,7 +143,7 @@ class SphereTask:
         return self._network
 
     def losses(self, step: int) -> dict[str, Tensor]:
-        """Return the loss of the sectors, and that of the keyframes by their most changed sector."""
+        """Return the classification loss of the sectors and that of the keyframes."""
         before, after, targets = self.batch(step)
         logits = self._network(before, after)
         is_known = targets >= 0
@@ -170,17 +170,17 @@ class SphereTask:
         before, after = _augment(before, after, draw)
         if draw.random() < 0.5:
             before, after = after, before
-        if draw.random() < 0.5:  # the sensor looks the other way, and right is left
+        if draw.random() < 0.5:  # reversed heading
             before, after = before.flip(1), after.flip(1)
-        if draw.random() < 0.5:  # the tunnel mirrored: column c stands where COLUMNS / 2 - 1 - c stood
+        if draw.random() < 0.5:  # mirrored tunnel: column c moves to COLUMNS / 2 - 1 - c
             before, after = (image.flip(2).roll(COLUMNS // 2, 2) for image in (before, after))
             targets = targets.flip(1).roll(SECTORS // 2, 1)
         return before, after, targets
 
     def scores(self) -> dict[str, float]:
-        """Return the log-likelihood of the keyframes' labels, as best calibrated, and their AUROC, with merge errors.
+        """Return the calibrated log-likelihood of the keyframe labels and their AUROC, both with a merge error.
 
-        AUROC, the mean over tunnels and of all together, soon reaches 1 and tells nothing more; the likelihood does.
+        The log-likelihood selects the weights, because the AUROC saturates at 1.
         """
         data = self._validation
         pooled = pooled_scores(self._network, data, draw=min(1, data.n_draws - 1))
@@ -196,7 +196,7 @@ class SphereTask:
         }
 
     def finish(self) -> dict[str, float]:
-        """Calibrate the log-odds on the validation tunnels (Platt); return slope, offset and Brier score there."""
+        """Calibrate the log-odds on the validation tunnels (Platt); return slope, offset and Brier score."""
         data = self._validation
         used = data.labels >= 0
         pooled = pooled_scores(self._network, data, draw=min(1, data.n_draws - 1))[used]
@@ -207,10 +207,9 @@ class SphereTask:
 
 
 def fit_platt(scores: Float64Array, is_positive: BoolArray) -> tuple[float, float, float]:
-    """Return slope and offset of the logistic curve that fits N scores best, and the mean log-likelihood it reaches.
+    """Return slope, offset and mean log-likelihood of the logistic curve that fits (N,) scores best.
 
-    Platt (1999): each class is held to be surer by one example less than it seems, so that classes that are wholly
-    apart still get a curve.
+    The targets are those of Platt (1999), (n + 1) / (n + 2) and 1 / (n + 2), so separable classes have a finite slope.
     """
     n_positive = int(np.count_nonzero(is_positive))
     n_negative = len(is_positive) - n_positive
@@ -225,20 +224,20 @@ def fit_platt(scores: Float64Array, is_positive: BoolArray) -> tuple[float, floa
 
 
 def pooled_scores(network: SphereNetwork, data: SphereData, draw: int) -> Float64Array:
-    """Return the (N,) log-odds of each keyframe's most changed sector within reach, as the query pools them."""
+    """Return the (N,) maximum log-odds within the score radius of each keyframe, as the query pools them."""
     return pool_within_reach(local_scores(network, data, draw), data)
 
 
 def local_scores(
     network: SphereNetwork, data: SphereData, draw: int, stored: Callable[[Tensor], Tensor] | None = None
 ) -> Float64Array:
-    """Return the (N,) log-odds of each keyframe's own most changed sector, as it and its neighbours agree on it.
+    """Return the (N,) maximum log-odds over the sectors of each keyframe, averaged with its neighbours.
 
     Args:
         network: Encodes and compares.
-        data: Keyframes, tunnel by tunnel in the order of the path.
-        draw: Which merge error.
-        stored: What storing makes of the descriptors (B, PER_SECTOR, SECTORS); nothing by default.
+        data: Keyframes, tunnel by tunnel in path order.
+        draw: Index of the merge error.
+        stored: Function that simulates storage of the descriptors (B, PER_SECTOR, SECTORS); default: identity.
     """
     logits = []
     with torch.inference_mode():
@@ -254,7 +253,7 @@ def local_scores(
 
 
 def pool_within_reach(scores: Float64Array, data: SphereData) -> Float64Array:
-    """Return the (N,) best of the scores of a tunnel's keyframes within its score radius of each."""
+    """Return the (N,) maximum of the scores within the score radius of each keyframe, tunnel by tunnel."""
     best = np.empty(len(scores))
     for tunnel in np.unique(data.tunnels):
         members = np.flatnonzero(data.tunnels == tunnel)
@@ -263,9 +262,9 @@ def pool_within_reach(scores: Float64Array, data: SphereData) -> Float64Array:
 
 
 def _augment(before: Tensor, after: Tensor, draw: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Return the images as if the tunnel were wider or narrower, and either map sparser.
+    """Return the images with a random scale for both and random missing pixels for each.
 
-    Tunnels differ more than those that are trained on. What would lie beyond the renderer's reach is not seen.
+    A scaled pixel beyond the renderer's reach becomes empty.
     """
     factors = np.exp(draw.uniform(-_LOG_SCALE, _LOG_SCALE, size=(len(before), 1, 1)))
     seen = []
@@ -278,7 +277,7 @@ def _augment(before: Tensor, after: Tensor, draw: np.random.Generator) -> tuple[
 
 
 def _paste(after: Tensor, data: SphereData, donors: Int64Array, shifts: Int64Array) -> tuple[Tensor, Tensor]:
-    """Put the added objects of `donors` into images, moved by rows, and return these with their targets."""
+    """Paste the added objects of the donors, shifted by rows, into images; return the images and their targets."""
     images = torch.stack([torch.roll(data.after_m[k, 0], int(s), 0) for k, s in zip(donors, shifts, strict=True)])
     marks = torch.stack([torch.roll(data.after_marks[k, 0], int(s), 0) for k, s in zip(donors, shifts, strict=True)])
     is_object = marks == _CHANGED
@@ -295,7 +294,7 @@ def _per_sector(pixels: Tensor) -> Tensor:
 
 
 def _auroc(scores: Float64Array, labels: Int64Array) -> float:
-    """Return the share of (positive, negative) pairs in the right order, ties half; NaN where a class is missing."""
+    """Return the area under the ROC curve, ties count half; NaN if a class is missing."""
     used: BoolArray = labels >= 0
     positive, negative = np.sort(scores[used & (labels == 1)]), np.sort(scores[used & (labels == 0)])
     if not len(positive) or not len(negative):

@@ -1,6 +1,6 @@
-"""A sensor's own recording, OSF or PCAP, revolution by revolution, read by the vendor's SDK.
+"""Read a sensor recording, OSF or PCAP, revolution by revolution with the vendor's SDK.
 
-The SDK is an extra and imported only here and in `cdpipe.io.ouster.osf`, when a recording is opened.
+The SDK is an extra. It is imported only here and in `cdpipe.io.ouster.osf`, when a recording is opened.
 """
 
 # ruff: noqa: PLC0415 - the vendor's SDK is an extra, and everybody else must be able to import this
@@ -26,27 +26,28 @@ from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
 from cdpipe.sensor.ouster_metadata import read_document, require_mode
 
 PCAP_SUFFIXES = (".pcap", ".pcapng")
-# A revolution with no more of its columns than this is left out: a recording begins and ends in the middle of one.
+# A revolution needs more than this share of its columns: a recording starts and ends inside a revolution.
 _LEAST_SHARE = 0.5
-# An Ethernet frame carries this much beside what it holds (Ethernet, IP, UDP and PCAP headers), to guess a number.
+# Bytes of Ethernet, IP, UDP and PCAP headers per packet, to estimate the number of packets.
 _PACKET_OVERHEAD_BYTES = 58
-# Told the stage, and how many revolutions of how many are done.
+# Called with the stage, the number of finished revolutions, and their (estimated) total.
 Progress = Callable[[str, int, int], None]
-# What the SDK raises where a file is at fault; C++ exceptions arrive as any of these.
+# Exceptions of the SDK for a faulty file; C++ exceptions arrive as any of these.
 SDK_ERRORS = (OSError, RuntimeError, ValueError, LookupError, ArithmeticError)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Revolution:
-    """One revolution as the sensor sent it.
+    """One revolution of a recording.
 
     Attributes:
-        range_mm: (H, W) uint32 first (strongest) return, staggered, 0 where nothing returned or the column is missing.
+        range_mm: (H, W) uint32 staggered range of the first (strongest) return, millimetres; 0 for a miss or a missing
+            column.
         reflectivity: (H, W) uint8.
-        signal: (H, W) uint16 photons; 0 where the recording holds no such channel.
-        column_stamps_ns: (W,) int64 sensor clock; those of missing columns are put in between.
+        signal: (H, W) uint16 photons; 0 if the recording has no such channel.
+        column_stamps_ns: (W,) int64 sensor clock; interpolated for missing columns.
         is_valid: (W,) whether the column arrived.
-        odom_T_column: (W, 4, 4) the recording's own poses of the sensor, meaningless in missing columns.
+        odom_T_column: (W, 4, 4) sensor poses of the recording; undefined for missing columns.
     """
 
     range_mm: npt.NDArray[np.uint32]
@@ -59,13 +60,13 @@ class Revolution:
 
 @dataclass(frozen=True, slots=False, eq=False)
 class Recording:
-    """A recording of one sensor, which can be read as often as wanted.
+    """A recording of one sensor; it can be read several times.
 
     Attributes:
         path: The file.
-        sensor: The sensor that made it.
-        info: The SDK's description of it.
-        metadata: The metadata file that belongs to a PCAP; an OSF has its own.
+        sensor: Its sensor.
+        info: The SDK's description of the sensor.
+        metadata: The metadata file of a PCAP; None for an OSF, which includes its metadata.
     """
 
     path: Path
@@ -75,7 +76,7 @@ class Recording:
 
     @cached_property
     def n_guessed(self) -> int:
-        """About how many revolutions it holds, for progress."""
+        """Estimated number of revolutions, for progress."""
         if self.metadata is None:
             with closing(_open_source(self)) as source:
                 return max(len(source), 1)
@@ -84,13 +85,13 @@ class Recording:
         return max(self.path.stat().st_size // int(packet_bytes * n_packets), 1)
 
     def revolutions(self, on_left_out: Callable[[int], object] = lambda number: None) -> Iterator[Revolution]:
-        """Read all revolutions of which more than half the columns arrived.
+        """Read all revolutions with more than half of their columns.
 
         Args:
-            on_left_out: Told the number of each of the others; one of which nothing arrived is not in the recording.
+            on_left_out: Called with the number of each revolution that is left out.
 
         Raises:
-            InputError: The file is damaged, the clock went backwards, or no such revolution is in it.
+            InputError: The file is damaged, the clock went backwards, or no revolution qualifies.
         """
         n_kept, n_seen, last_ns = 0, 0, None
         mounting = np.asarray(self.info.sensor_to_body, dtype=np.float64)
@@ -138,8 +139,8 @@ def open_recording(path: Path, metadata: Path | None = None) -> Recording:
     """Open an OSF, or a PCAP with its metadata: `metadata`, or the .json of the same name beside it.
 
     Raises:
-        InputError: A file is missing, cut short or of another kind, the metadata is that of another sensor or mode, the
-            OSF holds several sensors, or the vendor's SDK is not installed.
+        InputError: A file is missing, truncated or of another kind, the metadata is of another sensor or mode, the OSF
+            holds several sensors, or the vendor's SDK is not installed.
     """
     core = require_sdk()
     suffix = path.suffix.lower()
@@ -181,28 +182,28 @@ def require_sdk() -> Any:
         from ouster.sdk import core
     except ImportError as error:
         raise InputError("OSF and PCAP need the vendor's SDK: pip install 'tunnelcd[ouster]'") from error
-    core.init_logger("off")  # it raises what it logs, and that is said here, in one line
+    core.init_logger("off")  # the SDK also raises what it logs
     return core
 
 
 def one_line(error: BaseException) -> str:
-    """Return the text of an error of the SDK or the disk in one line."""
+    """Return the text of an error of the SDK or the disk on one line."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return " ".join(str(error).split())
 
 
 def _decode(frame: Any, sensor: SensorMetadata, sensor_to_body: Float64Array, where: str) -> Revolution:
-    """Return one of the SDK's `LidarFrame`s.
+    """Convert one of the SDK's `LidarFrame`s.
 
     Args:
-        frame: It, with at least one column.
+        frame: The frame, with at least one column.
         sensor: The recording's sensor.
-        sensor_to_body: (4, 4) how it is mounted on what the frame's poses are of.
-        where: What to call it in messages.
+        sensor_to_body: (4, 4) pose of the sensor in the body frame, whose poses the frame holds.
+        where: Name of the frame in messages.
 
     Raises:
-        InputError: It has no ranges, is of another size, or the stamps of its columns do not rise.
+        InputError: It has no ranges, another size, or its column stamps do not rise.
     """
     is_valid = (frame.status & 1).astype(bool)
     if not frame.has_field("RANGE"):
@@ -222,14 +223,14 @@ def _decode(frame: Any, sensor: SensorMetadata, sensor_to_body: Float64Array, wh
 
 
 def _channel(frame: Any, name: str, is_valid: BoolArray, most: int) -> npt.NDArray[Any]:
-    """Return a channel (H, W), at most `most`; zeros in missing columns, or where the recording does not hold it."""
+    """Return a channel (H, W), clipped to `most`; zero in missing columns and for a missing channel."""
     if not frame.has_field(name):
         return np.zeros((frame.h, frame.w), np.uint8)
     return np.where(is_valid, np.minimum(frame.field(name), most), 0)
 
 
 def _stamps_ns(stamps_ns: Int64Array, is_valid: BoolArray, sensor: SensorMetadata, where: str) -> Int64Array:
-    """Fill in the stamps of missing columns: evenly between their neighbours, at the nominal rate beyond the ends."""
+    """Return the (W,) stamps, interpolated in missing columns and extrapolated at the nominal rate at the ends."""
     known = np.flatnonzero(is_valid)
     if (np.diff(stamps_ns[known]) <= 0).any():
         raise InputError(f"{where}: the stamps of its columns do not rise: the sensor's clock was set, cut it there")
@@ -241,7 +242,7 @@ def _stamps_ns(stamps_ns: Int64Array, is_valid: BoolArray, sensor: SensorMetadat
 
 
 def _open_source(recording: Recording) -> Any:
-    """Return the SDK's source of a recording; close it."""
+    """Return the SDK's source of a recording; the caller closes it."""
     from ouster.sdk import osf, pcap
 
     with _sdk_reads(recording.path):
@@ -281,7 +282,7 @@ def _packet_bytes(info: Any) -> int:
 
 
 def _check_columns(recording: Recording) -> None:
-    """Refuse metadata of a mode with fewer columns than the packets count: the SDK would drop the rest in silence."""
+    """Raise `InputError` if packets have more columns than the metadata's mode: the SDK would drop them silently."""
     from ouster.sdk import core, pcap
 
     layout = core.PacketFormat.from_info(recording.info)

@@ -1,6 +1,6 @@
-"""Is a recording whole? Looked at here, before the vendor's SDK opens it: cut short, the SDK drops what it cannot read.
+"""Recording integrity: checks of OSF and PCAP files before the vendor's SDK opens them.
 
-A damaged OSF can end the process inside the SDK, so that no message would come at all.
+The SDK silently drops the end of a truncated file, and a damaged OSF can terminate the process inside the SDK.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ _PCAPNG_ORDERS = {b"\x4d\x3c\x2b\x1a": "<", b"\x1a\x2b\x3c\x4d": ">"}
 
 
 def require_whole_osf(path: Path) -> None:
-    """Compare the length an OSF file states in its header with its own, and header and metadata with their checksums.
+    """Check the length of an OSF file against its header, and the checksums of header and metadata.
 
     Raises:
-        InputError: It is no OSF file, was never finished, is cut short, or header or metadata are damaged.
+        InputError: It is no OSF file, was never closed, is truncated, or its header or metadata are damaged.
     """
     n_bytes = _size(path)
     with path.open("rb") as file:
@@ -53,10 +53,10 @@ def require_whole_osf(path: Path) -> None:
 
 
 def require_whole_pcap(path: Path) -> None:
-    """Walk over the packets of a PCAP or PCAPNG file.
+    """Check that a PCAP or PCAPNG file consists of complete packets.
 
     Raises:
-        InputError: It is neither, holds no packet, or ends in the middle of one.
+        InputError: It is neither format, holds no packet, or ends inside a packet.
     """
     if _size(path) < _PCAP_HEADER_BYTES:
         raise InputError(f"{path}: not a PCAP file: {_size(path)} bytes are less than its header")
@@ -86,9 +86,9 @@ def _size(path: Path) -> int:
 
 
 def _osf_header(header: bytes) -> tuple[int, int]:
-    """Return where the metadata begins and how long the file is (0, 0 if it does not say).
+    """Return the offset of the metadata and the length of the file, in bytes; 0 for a missing field.
 
-    The header is a flatbuffer behind its length: the table's third and fourth fields.
+    They are the third and fourth field of the flatbuffer table in the header.
     """
     try:
         table = 4 + struct.unpack_from("<I", header, 4)[0]
@@ -103,7 +103,7 @@ def _osf_header(header: bytes) -> tuple[int, int]:
 
 
 def _is_sound(file: BinaryIO, at: int, n_bytes: int) -> bool:
-    """Check one of the blocks an OSF file is made of: its length, so many bytes, and the CRC-32 of both."""
+    """Return whether the block at an offset is complete and its CRC-32, over length and content, is correct."""
     file.seek(at)
     prefix = file.read(4)
     end = at + 4 + int.from_bytes(prefix, "little")
@@ -113,7 +113,7 @@ def _is_sound(file: BinaryIO, at: int, n_bytes: int) -> bool:
 
 
 def _walk_pcap(data: mmap.mmap, order: str) -> tuple[int, int]:
-    """Return where the last whole packet ends, and the number of packets."""
+    """Return the offset of the end of the last complete packet, and the number of packets."""
     at, n_packets, lengths = _PCAP_HEADER_BYTES, 0, struct.Struct(f"{order}I")
     while at + _PCAP_RECORD_BYTES <= len(data):
         end = at + _PCAP_RECORD_BYTES + lengths.unpack_from(data, at + 8)[0]
@@ -124,7 +124,7 @@ def _walk_pcap(data: mmap.mmap, order: str) -> tuple[int, int]:
 
 
 def _walk_pcapng(data: mmap.mmap, order: str) -> tuple[int, int]:
-    """Return where the last whole block ends, and the number of packets."""
+    """Return the offset of the end of the last complete block, and the number of packets."""
     at, n_packets, block = 0, 0, struct.Struct(f"{order}II")
     while at + 12 <= len(data):
         kind, n_bytes = block.unpack_from(data, at)

@@ -1,7 +1,7 @@
-"""A session leaves as OSF, the format of the vendor's SDK: ranges, reflectivity, signal, stamps and a pose per column.
+"""Write a session as OSF, the format of the vendor's SDK: ranges, reflectivity, signal, stamps and column poses.
 
-The sensor's metadata is complete, `body_to_world` of each column is its `odom_T_column`, and fields of the caller's can
-go along pixel by pixel. Every column counts as valid; one that never arrived simply has no returns.
+The file has the complete sensor metadata, `body_to_world` of a column is its `odom_T_column`, and the caller can add
+fields per pixel. Every column is marked valid; a missing column has no returns.
 """
 
 # ruff: noqa: PLC0415 - the vendor's SDK is an extra, and everybody else must be able to import this
@@ -34,17 +34,17 @@ Fields = Mapping[str, npt.NDArray[Any]]
 def write_osf(
     session: Session, path: Path, fields: Iterable[Fields] | None = None, on_progress: Progress | None = None
 ) -> None:
-    """Write a session as an OSF file, which appears under its name only when it is complete.
+    """Write a session as an OSF file; the file gets its name when it is complete.
 
     Args:
         session: The session.
         path: The new file.
-        fields: For each chunk further fields (s, H, W) by name, written as they are; left out: none.
-        on_progress: Told the stage, and how many revolutions of how many are done.
+        fields: For each chunk, further fields (s, H, W) by name; default: none.
+        on_progress: Called with the stage, the number of finished revolutions and their total.
 
     Raises:
-        InputError: The file exists or cannot be written, a chunk is damaged or its stamps do not rise, the vendor's SDK
-            is not installed or does not take this sensor.
+        InputError: The file exists or cannot be written, a chunk is damaged or its stamps do not rise, or the vendor's
+            SDK is not installed or rejects this sensor.
     """
     core = require_sdk()
     from ouster.sdk.osf import OsfDropFrameError
@@ -77,10 +77,10 @@ def write_osf(
 
 @contextmanager
 def _new_osf(path: Path, info: Any) -> Iterator[Any]:
-    """Yield the SDK's writer of a file in a hidden folder, which gets its name when the block ends well.
+    """Yield the SDK's writer of a file in a hidden folder; the file is renamed if the block succeeds.
 
-    A writer that failed writes what is left once more as it is destroyed, and ends the process if that fails too. It
-    opens the file by its name each time: where that leads nowhere, its last attempt succeeds and leaves nothing.
+    A failed writer writes again when it is destroyed and terminates the process if that fails too. It opens the file by
+    name each time, so after a failure the name is a link to the null device.
     """
     from ouster.sdk import osf
 
@@ -107,7 +107,7 @@ def sensor_info(session: Session) -> Any:
     """Return the SDK's description of a session's sensor.
 
     Raises:
-        InputError: The SDK does not take it, for example because the sensor has a number of beams that none has.
+        InputError: The SDK rejects it, for example because of its number of beams.
     """
     core = require_sdk()
     document = {**session.sensor.to_json(), "status": "RUNNING"}
@@ -121,7 +121,7 @@ def sensor_info(session: Session) -> Any:
 
 
 def _column_poses(odom_T_sensor: Float64Array, sensor_T_column: Float32Array) -> Float64Array:
-    """Return odom_T_column (W, 4, 4).
+    """Return the (W, 4, 4) odom_T_column of a revolution.
 
     Args:
         odom_T_sensor: (4, 4) pose of the revolution.

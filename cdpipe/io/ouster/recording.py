@@ -1,12 +1,12 @@
-"""A sensor's own recording becomes a session: its revolutions, and poses from the recording, a trajectory or KISS-ICP.
+"""Convert a sensor recording to a session: revolutions, and poses from the recording, a trajectory or KISS-ICP.
 
-Where each pose comes from:
+Sources of the poses:
 
-- `own`: an OSF carries a pose for each column (`body_to_world`, with the sensor's mounting `sensor_to_body`);
-- a TUM file of `odom_T_sensor`, its stamps on the sensor's clock, interpolated to every column;
-- `kiss-icp`: one pose for each revolution at its middle column, interpolated; the odom frame is the first one's sensor.
+- `own`: an OSF has a pose for each column (`body_to_world`, with the sensor's mounting `sensor_to_body`);
+- a TUM file of `odom_T_sensor` with stamps of the sensor's clock, interpolated to every column;
+- `kiss-icp`: one pose per revolution at its middle column, interpolated; the odom frame is the first sensor frame.
 
-Only the first return of a beam is kept. A column that did not arrive has no returns, and stamp and pose in between.
+Only the first return of a beam is kept. A missing column has no returns and an interpolated stamp and pose.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ _OWN_POSE_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """What was brought in.
+    """Summary of a converted recording.
 
     Attributes:
-        n_scans: Revolutions of the session.
-        poses: Where their poses come from.
+        n_scans: Number of revolutions in the session.
+        poses: Source of the poses.
         sensor: Product line and mode.
-        n_left_out: Revolutions that are not in the session, because half their columns or fewer arrived.
+        n_left_out: Number of revolutions left out because at most half of their columns arrived.
     """
 
     n_scans: int
@@ -52,7 +52,7 @@ class Imported:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Times:
-    """First, middle and last stamp (S,) of every revolution, and whether any of its columns has a pose of its own."""
+    """First, middle and last stamp (S,) of each revolution, whether it has poses (S,), and the number left out."""
 
     first_ns: Int64Array
     middle_ns: Int64Array
@@ -70,15 +70,15 @@ def import_recording(
     odometry: str | None = None,
     on_progress: Progress | None = None,
 ) -> Imported:
-    """Write an OSF or a PCAP as a session folder, which appears under its name only when it is complete.
+    """Convert an OSF or a PCAP to a session folder; the folder gets its name when it is complete.
 
     Args:
         source: The recording.
         out: The new folder.
-        metadata: The sensor's metadata .json of a PCAP; left out: the file of the same name beside it.
-        trajectory: TUM file with the sensor's poses, instead of the recording's own.
-        odometry: "kiss-icp" to estimate the poses instead.
-        on_progress: Told the stage, and how many revolutions of about how many are done.
+        metadata: The sensor's metadata .json of a PCAP; default: the file of the same name next to it.
+        trajectory: TUM file with the sensor's poses, which replaces the recording's own.
+        odometry: "kiss-icp" estimates the poses instead.
+        on_progress: Called with the stage, the number of finished revolutions and their estimated total.
 
     Raises:
         InputError: A file cannot be used, `out` exists, or there are no poses.
@@ -123,10 +123,10 @@ def _read_times(recording: Recording, report: Progress) -> _Times:
 def _choose_motion(
     recording: Recording, times: _Times, trajectory: Path | None, odometry: str | None, report: Progress
 ) -> tuple[Motion | None, str]:
-    """Return the movement, time from the first column on (None: every column has its own pose), and its name."""
+    """Return the motion, its time counted from the first column (None: each column has a pose), and its name."""
     start_ns = int(times.first_ns[0])
     if trajectory is not None:
-        # The vendor's own tool writes one pose for each revolution, at its first column.
+        # the vendor's tool writes one pose per revolution, at its first column
         slack_s = 1.5 / recording.sensor.rate_hz
         return motion_along(trajectory, start_ns, int(times.last_ns[-1]), slack_s), f"trajectory {trajectory.name}"
     if odometry is not None:
@@ -138,7 +138,7 @@ def _choose_motion(
             return estimate_motion(images, recording.sensor, middle_s, column_s, make_pose()), odometry
         except InputError as error:
             raise InputError(f"{recording.path}: {error}: give the poses with --trajectory") from error
-    # The frame of the poses may begin at the first revolution, which then lies at its origin.
+    # the first revolution may be at the origin of the pose frame, which looks like a missing pose
     bare = 1 + np.flatnonzero(~times.has_own_pose[1:])
     if times.has_own_pose.any() and not bare.size:
         return None, "own"
@@ -161,7 +161,7 @@ def _range_images(recording: Recording, n_scans: int, report: Progress) -> Itera
 def _write(
     writer: SessionWriter, recording: Recording, times: _Times, motion: Motion | None, report: Progress
 ) -> Float64Array:
-    """Write every chunk and return the pose (S, 4, 4) of each revolution at its middle column."""
+    """Write all chunks; return the (S, 4, 4) pose of each revolution at its middle column."""
     start_ns, n_scans = int(times.first_ns[0]), len(times.first_ns)
     odom_T_sensor: list[Float64Array] = []
     revolutions = recording.revolutions()
@@ -187,7 +187,7 @@ def _write(
 
 
 def _own_motion(revolution: Revolution, stamps_s: Float64Array, where: str) -> Motion:
-    """Return the movement through the poses of the columns that arrived, so that it can be asked for the others."""
+    """Return the motion through the poses of the columns that arrived, to interpolate the missing ones."""
     poses = revolution.odom_T_column[revolution.is_valid]
     try:
         require_poses("its column poses", poses)
