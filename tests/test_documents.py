@@ -86,3 +86,30 @@ def test_the_citation_names_the_paper_and_this_version() -> None:
     readme = (ROOT / "README.md").read_text()
     assert paper["title"] in readme
     assert all(author["family-names"] in readme for author in paper["authors"])
+
+
+@pytest.mark.parametrize("package", ["cdpipe", "eval", "sim"])
+def test_the_table_of_folders_has_the_order_of_the_import_contract(package: str) -> None:
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    (layers,) = [each["layers"] for each in contracts if each.get("containers") == [package]]
+    text = (ROOT / package / "README.md").read_text()
+    table = text.partition("## Folders")[2].partition("\n## ")[0]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    named = [[name.removesuffix(".py").rstrip("/") for name in re.findall(r"`([^`]+)`", row)] for row in rows]
+    level = {name: index for index, layer in enumerate(layers) for name in layer.split(" | ")}
+    listed = [name for row in named for name in row]
+    assert sorted(listed) == sorted(level)
+    assert [level[name] for name in listed] == sorted(level.values())
+
+
+def test_names_in_the_pages_of_the_packages_are_names_of_the_code() -> None:
+    files = [path for folder in (*PACKAGES, "tests") for path in (ROOT / folder).rglob("*") if path.is_file()]
+    sources = "\n".join(path.read_text() for path in files if path.suffix in {".py", ".pyi", ".yaml", ".html"})
+    sources += "\n".join(path.stem for path in files)
+    of_others = {"save_trajectory", "regions__narrow", "tunnelcd_higher", "tunnelcd_largest"}
+    for page in PAGES:
+        if page.is_relative_to(ROOT / "reports") or page.name == "CHANGELOG.md":
+            continue  # notes and entries of their day
+        for quoted in re.findall(r"`([^`\n]+)`", page.read_text()):
+            for name in re.findall(r"[A-Za-z]\w*_\w+|[A-Z][a-z]+[A-Z]\w+", quoted):
+                assert name in sources or name in of_others, (page, name)
