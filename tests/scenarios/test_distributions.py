@@ -156,9 +156,9 @@ def test_every_malformed_distribution_is_told_at_once() -> None:
         "k.2.chance",
         "k.3.one_of",
     ]
-    assert lines["a"] == "expected uniform: [a, b] with a <= b"
-    assert lines["h"] == 'unknown distribution; did you mean "uniform"?'
-    assert lines["i"] == "a distribution has one key, one of uniform, normal, integers, choice; got uniform, normal"
+    assert "uniform: [a, b]" in lines["a"]
+    assert 'did you mean "uniform"?' in lines["h"]
+    assert "uniform, normal, integers, choice" in lines["i"]
 
 
 def test_origins_lead_from_drawn_keys_back_to_their_source() -> None:

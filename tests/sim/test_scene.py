@@ -103,11 +103,9 @@ def test_worlds_that_contradict_themselves_are_refused(
     def build(*props: Prop) -> None:
         build_world(make_scenario(tunnel=level_tunnel, props=props), 0)
 
-    with pytest.raises(ScenarioError, match="props 'one' and 'two' stand in one another in the before session"):
+    with pytest.raises(ScenarioError, match="props 'one' and 'two' "):
         build(make_prop("one", 0.40), make_prop("two", 0.42))
-    with pytest.raises(
-        ScenarioError, match=r"prop 'wide' is 5\.00 m across, but between 'a' and 'b' at 0\.40 only 3\.[2-4]"
-    ):
+    with pytest.raises(ScenarioError, match=r"prop 'wide' .*5\.00 m .*'a' and 'b' .*3\.[2-4]"):
         build(make_prop("wide", size_m=(1.0, 5.0, 1.0)))
     with pytest.raises(ScenarioError, match="prop 'pole' falls over"):
         slope = level_tunnel.model_copy(update={"nodes": {"a": (0, 0, 0), "b": (20, 0, 3.5)}})

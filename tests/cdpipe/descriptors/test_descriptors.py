@@ -71,7 +71,7 @@ def test_descriptors_are_unit_vectors_and_survive_the_disk(tmp_path: Path, metho
     np.testing.assert_array_equal(read.w, made.w)
     assert (read.name, read.checkpoint) == (method, made.checkpoint)
     np.savez(path, q=made.q)
-    with pytest.raises(InputError, match=r"damaged .* describe the session again"):
+    with pytest.raises(InputError, match=r"damaged"):
         load_descriptors(tmp_path, config, poses, MapConfig())
 
 

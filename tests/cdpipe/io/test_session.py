@@ -78,7 +78,7 @@ def test_counts_and_poses_are_checked(tmp_path: Path) -> None:
         read_session(path)
     poses[2, 0, 3] = np.nan
     np.savez(path / "odometry.npz", odom_T_sensor=poses)
-    with pytest.raises(InputError, match=r"odom_T_sensor\[2\] is not finite"):
+    with pytest.raises(InputError, match=r"odom_T_sensor\[2\]"):
         read_session(path)
 
 
@@ -142,7 +142,7 @@ def test_an_unreadable_description_is_named(tmp_path: Path, monkeypatch: pytest.
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(Path, "read_text", unreadable)
-    with pytest.raises(InputError, match=r"session\.json: cannot be read: Permission denied"):
+    with pytest.raises(InputError, match=r"session\.json: .*Permission denied"):
         read_session(path)
 
 

@@ -135,7 +135,7 @@ def test_returns_on_the_borders_of_cells_keep_their_places(voxel_m: float) -> No
 
 def test_a_map_that_kept_no_places_says_so() -> None:
     point_map = replace(build_map(RandomScans(), MapConfig()), return_offsets=None)
-    with pytest.raises(ValueError, match="return_offsets is None: this map does not know where its returns are"):
+    with pytest.raises(ValueError, match="return_offsets is None"):
         point_map.positions_of(np.zeros(1, np.int64))
 
 
@@ -175,7 +175,7 @@ def test_a_map_of_one_point() -> None:
 
 
 def test_nothing_within_range_and_poses_too_far_out() -> None:
-    with pytest.raises(InputError, match=r"random: no return within map\.max_range_m = 0\.001 m"):
+    with pytest.raises(InputError, match=r"random: .*map\.max_range_m = 0\.001 m"):
         build_map(RandomScans(), MapConfig(max_range_m=0.001))
-    with pytest.raises(InputError, match=r"random: positions reach 40000\d\d m, .* subtract a common offset"):
+    with pytest.raises(InputError, match=r"random: .* 40000\d\d m"):
         build_map(RandomScans(offset_m=4_000_000.0), MapConfig())

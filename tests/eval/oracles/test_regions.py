@@ -138,7 +138,7 @@ def test_settings_that_nothing_reads_are_refused(tmp_path: Path, variant: str, r
 
 def test_a_method_without_regions_of_its_own_takes_none_from_the_truth(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, PLAN.replace("tunnelcd, oracle_regions", "c2c, oracle_regions"))
-    with pytest.raises(InputError, match="oracle_regions is for method: descriptor, this one is c2c"):
+    with pytest.raises(InputError, match=r"oracle_regions .*c2c"):
         cells(plan)
 
 

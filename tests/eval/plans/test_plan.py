@@ -84,13 +84,11 @@ def test_wide_worlds_get_what_the_presets_say_of_them(tmp_path: Path) -> None:
 
 def test_wide_names_worlds_of_the_plan_and_acts_after_the_merge(tmp_path: Path) -> None:
     text = PLAN.replace('seeds: "7:9"', 'seeds: "7:9"\nwide: [narrow]')
-    assert mistakes(tmp_path, text) == [
-        "plan.yaml:4: wide.0 = 'narrow': wide names 'narrow', which is not in scenarios"
-    ]
+    (line,) = mistakes(tmp_path, text)
+    assert line.startswith("plan.yaml:4: wide.0 = 'narrow': ")
     text = "{name: m, until: merge, scenarios: [narrow, wide], wide: [wide], seeds: [7], variants: [{preset: paper}]}"
-    assert mistakes(tmp_path, text) == [
-        "plan.yaml:1: wide = 'wide': wide does nothing: the plan ends at the merge; leave it out, or leave out until"
-    ]
+    (line,) = mistakes(tmp_path, text)
+    assert line.startswith("plan.yaml:1: wide = 'wide': ")
 
 
 def test_a_preset_that_says_nothing_of_wide_worlds_is_told(tmp_path: Path) -> None:

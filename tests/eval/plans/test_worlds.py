@@ -171,7 +171,7 @@ variants: [{preset: papr, set: query.n_region=3}]
             line,
             told,
         )
-    assert told[-1].startswith("plan.yaml:15: variants.0.set.0 = 'query.n_region=3': query.n_region = 3: unknown key")
+    assert told[-1].startswith("plan.yaml:15: variants.0.set.0 = 'query.n_region=3': query.n_region = 3")
     assert len(told) == len(expected) + 1
     assert not any("--set" in line for line in told)
 
@@ -216,7 +216,7 @@ variants: [{preset: paper}]
 
 def test_a_profile_that_is_not_there_is_told_before_anything_runs(tmp_path: Path) -> None:
     (line,) = mistakes(tmp_path, replaced("sensor.range_noise=false\n", "sensor.profile=os1-32-q0\n"))
-    assert "sensor profile 'os1-32-q0' is unknown: name one of os1-32-g" in line
+    assert "'os1-32-q0'" in line and "os1-32-g" in line
 
 
 @pytest.mark.parametrize(

@@ -300,7 +300,7 @@ def test_a_scheduler_that_cannot_be_reached_is_named_at_once(
 @pytest.mark.parametrize("address", ["nowhere", "tcp://127.0.0.1", "tcp://:8786"])
 def test_what_is_no_address_is_named(address: str) -> None:
     with (
-        pytest.raises(InputError, match=r"cannot be reached .*expected tcp://HOST:PORT"),
+        pytest.raises(InputError, match=r"tcp://HOST:PORT"),
         cluster.connected(Where(scheduler=address), 1),
     ):
         pass
@@ -316,9 +316,9 @@ def test_workers_with_other_packages_or_threads_are_refused(monkeypatch: pytest.
     for name in cluster.THREAD_VARIABLES:
         monkeypatch.setenv(name, "1")
     cluster._require_alike(told_by("1"), "tcp://a:1")
-    with pytest.raises(InputError, match=r"^tcp://10\.0\.0\.7:1234: has numpy 1\.0, not .*install the same"):
+    with pytest.raises(InputError, match=r"^tcp://10\.0\.0\.7:1234: .*numpy 1\.0"):
         cluster._require_alike(told_by("1", numpy="1.0"), "tcp://a:1")
-    with pytest.raises(InputError, match=r"other threads: start it with OMP_NUM_THREADS=1 OPENBLAS"):
+    with pytest.raises(InputError, match=r"OMP_NUM_THREADS=1 OPENBLAS"):
         cluster._require_alike(told_by("unset"), "tcp://a:1")
 
 

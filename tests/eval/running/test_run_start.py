@@ -64,8 +64,8 @@ class Noted(Silent):
 @pytest.mark.parametrize(
     ("workers", "seeds", "words"),
     [
-        (3, "[10600]", "--workers 3: 1 pair is left to do, and each keeps one worker busy"),
-        (3, "[10600, 10601]", "--workers 3: 2 pairs are left to do"),
+        (3, "[10600]", "--workers 3: 1 pair "),
+        (3, "[10600, 10601]", "--workers 3: 2 pairs "),
         (2, "[10600, 10601]", ""),
         (None, "[10600]", ""),
     ],
@@ -112,7 +112,7 @@ def test_a_scheduler_is_knocked_at_before_anything_is_loaded(
 
 
 def test_an_unknown_name_is_checked_with_a_suggestion() -> None:
-    with pytest.raises(InputError, match=r'tunelcd: no plan, scenario or preset of this name.*did you mean "tunnelcd"'):
+    with pytest.raises(InputError, match=r'tunelcd: .*"tunnelcd"'):
         check_file("tunelcd")
     with pytest.raises(InputError, match="see `list`"):
         check_file("zzzzz")

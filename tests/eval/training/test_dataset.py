@@ -311,7 +311,7 @@ def test_another_recipe_or_somebody_s_folder_is_refused(
 ) -> None:
     fake_shards(monkeypatch, shard)
     make_dataset([FAMILY], "0", RECIPE, tmp_path / "d")
-    with pytest.raises(InputError, match=r"made with --draws 2 .* not with --draws 5 .*name another folder"):
+    with pytest.raises(InputError, match=r"--draws 2 .*--draws 5 "):
         make_dataset([FAMILY], "1", Recipe(draws=5), tmp_path / "d")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "mine.txt").touch()

@@ -136,7 +136,7 @@ def test_a_pose_that_is_not_finite_is_an_error(sensor: SensorMetadata, monkeypat
 
     monkeypatch.setattr(odometry, "_kiss_icp", Lost)
     scans = [np.full((sensor.height, sensor.width), 4000, np.uint32)] * 2
-    with pytest.raises(ScenarioError, match=r"after: KISS-ICP has no finite pose for revolution 0, 0\.1 s on the way"):
+    with pytest.raises(ScenarioError, match=r"after: KISS-ICP .*revolution 0"):
         registered(scans, sensor, np.array([0.05, 0.15]), np.zeros(sensor.width), np.eye(4), "after")
 
 

@@ -141,7 +141,7 @@ def test_a_quadrotor_smooths_the_floor_and_ducks_under_what_hangs(make_scenario:
     np.testing.assert_allclose(low_roof.points[:, 2], 2.5 - 0.8, atol=1e-5)
     wide = flying.model_copy(update={"clearance_m": 1.2})
     # By hand: 1.2 m below a roof at 1.6 m is lower than 0.5 m above the floor.
-    with pytest.raises(ScenarioError, match=r"before: roof and floor leave 0\.10 m too little .* m along the route"):
+    with pytest.raises(ScenarioError, match=r"before: roof and floor .*0\.10 m"):
         driven(make_scenario, floor_of(lambda along, _: 0.0 * along, roof_m=1.6), wide)
 
 

