@@ -56,6 +56,9 @@ def test_every_path_module_and_command_exists(page: Path) -> None:
             assert any((place / word).exists() for place in places), word
     for module in re.findall(r"python -m ([\w.]+)", text):
         assert module in {"venv"} or importlib.util.find_spec(module) is not None, module
+    targets = re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    for target in re.findall(r"(?:^|`)make ([a-z][\w-]*)", text, re.MULTILINE):
+        assert target in targets, target
     for command in re.findall(r"^tunnelcd (\w+)", text, re.MULTILINE) + [
         word.split()[1] for word in quoted if re.match(r"tunnelcd [a-z]+\b", word)
     ]:
