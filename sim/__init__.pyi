@@ -1,6 +1,5 @@
 from .scene import Scene, World, build_world
-from .session.in_memory import simulate_in_memory
-from .session.simulate import simulate
+from .session.simulate import simulate, simulate_in_memory
 from .session.truth import Change, PairTruth, read_labels, read_pair_truth, read_true_poses
 
 __all__ = [

@@ -51,8 +51,8 @@ def survey(
     from eval.core.output import make_writable
     from eval.plans.plan import parse_seeds_option
     from sim.studies import survey as surveys
-    from sim.studies.survey_tables import markdown as as_markdown
-    from sim.studies.survey_tables import summary, write_csv
+    from sim.studies.survey import markdown as as_markdown
+    from sim.studies.survey import summary, write_csv
 
     numbers = parse_seeds_option(seeds)
     if out is not None:

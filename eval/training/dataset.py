@@ -36,7 +36,7 @@ from eval.truth.universe import UniverseBuilder
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
-from sim.session.in_memory import LabelledSession, simulate_in_memory
+from sim.session.simulate import LabelledSession, simulate_in_memory
 
 _MAX_CHANGES = 255  # labels are bytes
 # Mapped at a time: their sums stay in the cache, which takes a quarter off the mapping of 64 at a time.

@@ -25,7 +25,7 @@ def pipeline_input(pair: Path, session: SessionName) -> ScanSource:
 
 
 def held_input(session: Session) -> ScanSource:
-    """Return a session held in memory (`sim.session.in_memory`) as the pipeline sees it, without its truth."""
+    """Return a session held in memory (`sim.session.simulate`) as the pipeline sees it, without its truth."""
     return RecordedScans(session)
 
 

@@ -9,10 +9,10 @@ from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Scenario
 from sim.geometry.line import STEP_M
-from sim.geometry.room import room_about
-from sim.placement.lanes import AIR_BELOW_M
-from sim.placement.placing import PROBE_UP_M, floor_heights, standing_corners, standing_height_m
-from sim.rock.centreline import left_of, resample
+from sim.geometry.raycast import room_about
+from sim.placement.lanes import AIR_BELOW_M, seen_from_line
+from sim.placement.placing import PROBE_UP_M, floor_heights, standing_height_m
+from sim.rock.centreline import left_of
 from sim.scene import World
 
 # What lies loose is driven over up to this height.
@@ -29,18 +29,12 @@ def obstacles(
 ) -> list[tuple[str, Float64Array, Float64Array]]:
     """Return for each prop in the way its name and the offsets it forbids, (N,) to (N,), NaN where it is far."""
     clearance_m = scenario.platform.clearance_m
-    left = left_of(headings)
     found = []
     for item in world.standing:
         is_low = scenario.platform.kind == "quadrotor" and standing_height_m(item) + AIR_BELOW_M < height_m
         if session not in item.sessions or is_low:
             continue
-        outline = resample(np.concatenate([(corners := standing_corners(item)), corners[:1]]), 0.1)
-        reach = float(np.linalg.norm(outline - outline.mean(axis=0), axis=1).max()) + clearance_m
-        near = np.flatnonzero(np.linalg.norm(line[:, :2] - outline.mean(axis=0), axis=1) < reach + 10.0)
-        delta = outline[None] - line[near, None, :2]
-        along = (delta * headings[near, None]).sum(axis=2)
-        across = (delta * left[near, None]).sum(axis=2)
+        near, along, across = seen_from_line(item, line[:, :2], headings, (clearance_m, 10.0))
         reach_m = np.sqrt(np.maximum(clearance_m**2 - along**2, 0.0))
         is_abreast = np.abs(along) < clearance_m
         low, high = np.full(len(line), np.nan), np.full(len(line), np.nan)

@@ -17,7 +17,7 @@ from scenarios.schema import Scenario, SessionPlan
 from sim.drive.obstacles import boulders, obstacles, pass_by, sidestep
 from sim.geometry.line import STEP_M, kept_between, smoothed, strictest
 from sim.geometry.noise import smooth_noise
-from sim.placement.placing import free_width
+from sim.placement.lanes import body_heights_m, side_bounds
 from sim.rock.centreline import headings_of, left_of, resample
 from sim.scene import World
 
@@ -27,8 +27,6 @@ _WANDER_LENGTH_M = 8.0  # correlation length of the line's way from side to side
 _LAST_SMOOTHING_M = 0.7
 # Corners of the route are rounded over this share of the drift's width to either side.
 _CORNER_SHARE = 0.55
-# Inside a bend the line stays this share of the way to the centre of curvature, so that the turn does not tighten.
-_INSIDE_SHARE = 0.35
 # Half lengths tried for a swerve, the gentlest first; a sharper one only where it is needed.
 _SWERVES_M = (2.0, 1.4, 1.0, 0.7, 0.5)
 # Rather than swerve sharply between props on both sides, this share of the clearance is given up.
@@ -115,13 +113,11 @@ def _turn_deg(before: Float64Array, after: Float64Array) -> float:
 
 def _heights_m(scenario: Scenario, plan: SessionPlan, is_wary: bool) -> Float64Array:
     """Heights (H,) above the floor at which the line looks for walls."""
-    height_m = plan.height_m or scenario.platform.sensor_height_m
-    is_flying = scenario.platform.kind == "quadrotor"
-    heights_m = np.array([height_m] if is_flying else [0.35, max(height_m, 0.4)])
+    heights_m = body_heights_m(scenario, plan)
     if not is_wary:
         return heights_m
     reach_m = scenario.platform.clearance_m
-    low_m = max(height_m - reach_m, 0.35) if is_flying else 0.35
+    low_m = max(heights_m[0] - reach_m, 0.35) if scenario.platform.kind == "quadrotor" else 0.35
     return np.arange(low_m, heights_m[-1] + reach_m, _WARY_STEP_M)
 
 
@@ -139,13 +135,9 @@ def _offsets(
     clearance_m = scenario.platform.clearance_m
     headings = headings_of(line)
     height_m = plan.height_m or scenario.platform.sensor_height_m
-    right_m, left_m = free_width(world.fixed, line, left_of(headings), heights_m, float(width_m.max()))
     room_m = np.maximum(width_m / 2 - clearance_m, 0.0)
-    low = np.maximum(clearance_m - right_m, -room_m)
-    high = np.minimum(left_m - clearance_m, room_m)
     turn = smoothed(np.gradient(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0]))) / STEP_M, 0.25)
-    high = np.where(turn > 1e-3, np.minimum(high, _INSIDE_SHARE / np.maximum(turn, 1e-3)), high)
-    low = np.where(turn < -1e-3, np.maximum(low, -_INSIDE_SHARE / np.maximum(-turn, 1e-3)), low)
+    low, high = side_bounds(world.fixed, line, headings, turn, heights_m, width_m, clearance_m)
     wanted = plan.lateral * room_m + scenario.platform.wander_m * _wander(len(line), seed, session)
     _refuse_narrow(scenario, session, low, high)
     for name, near_low, near_high in obstacles(world, scenario, session, line, headings, height_m):

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from scenarios.schema import Bolts, Screen
 from sim.furniture.shell import Shell
-from sim.geometry.mesh import Mesh, joined
+from sim.geometry.mesh import Mesh, drop_unused_vertices, joined
 from sim.geometry.sweep import EMPTY, repeated
 from sim.rock.axis import distances, nearest_of
 
@@ -223,8 +223,7 @@ def _strips(ribs: Float64Array, is_good: BoolArray) -> Mesh:
     here = 3 * first[is_good.reshape(first.shape)]
     pattern = np.array([[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4]])
     faces = (here[:, None, None] + pattern).reshape(-1, 3)
-    used, renumbered = np.unique(faces, return_inverse=True)
-    return Mesh(ribs.reshape(-1, 3)[used], renumbered.reshape(-1, 3).astype(np.int32))
+    return drop_unused_vertices(ribs.reshape(-1, 3), faces)
 
 
 def _bolt_faces() -> list[list[int]]:

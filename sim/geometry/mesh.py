@@ -41,6 +41,12 @@ def joined(meshes: list[Mesh]) -> Mesh:
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces).astype(np.int32))
 
 
+def drop_unused_vertices(vertices: Float64Array, faces: npt.NDArray[np.integer]) -> Mesh:
+    """Return faces (M, 3) as a mesh that holds only the vertices (N, 3) they use."""
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return Mesh(vertices[used], renumbered.reshape(-1, 3).astype(np.int32))
+
+
 def box_mesh(half_size_m: npt.ArrayLike) -> Mesh:
     """Return a box about the origin, facing outwards, from its half edges (3,)."""
     return _from_trimesh(trimesh.creation.box(extents=2.0 * np.asarray(half_size_m)))

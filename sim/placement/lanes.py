@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array, Int64Array
 from scenarios.schema import Scenario, SessionPlan
 from sim.geometry.raycast import Caster
 from sim.placement.placing import Standing, free_width, standing_corners, standing_height_m
@@ -23,7 +23,8 @@ _SPARE_M = 0.15
 _SWERVE_M = 1.5
 # A quadrotor keeps this much air below it; what is lower is flown over.
 AIR_BELOW_M = 0.5
-_INSIDE_SHARE = 0.35  # of the radius of a bend: how far the line may go inside
+# Inside a bend the line goes at most this share of the way to the centre of curvature, so that the turn stays gentle.
+_INSIDE_SHARE = 0.35
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,14 +53,7 @@ class Lane:
         span = np.full((len(self.points), 2), np.nan)
         if self.session not in standing.sessions or standing_height_m(standing) < self.flown_over_m:
             return span
-        corners = standing_corners(standing)
-        outline = resample(np.concatenate([corners, corners[:1]]), 0.1)
-        middle = outline.mean(axis=0)
-        reach_m = float(np.linalg.norm(outline - middle, axis=1).max()) + self.clearance_m + _SWERVE_M
-        near = np.flatnonzero(np.linalg.norm(self.points - middle, axis=1) < reach_m + 8.0)
-        delta = outline[None] - self.points[near, None]
-        along = (delta * self.headings[near, None]).sum(axis=2)
-        across = (delta * left_of(self.headings)[near, None]).sum(axis=2)
+        near, along, across = seen_from_line(standing, self.points, self.headings, (self.clearance_m, _SWERVE_M, 8.0))
         is_abreast = np.abs(along) < self.clearance_m + _SWERVE_M
         rows = is_abreast.any(axis=1)
         span[near[rows], 0] = np.where(is_abreast, across, np.inf)[rows].min(axis=1) - self.clearance_m
@@ -106,6 +100,66 @@ def _recorded(scenario: Scenario, session: str, trajectory: Path) -> Lane:
     return Lane(session, line, headings_of(line), -room_m, room_m, scenario.platform.clearance_m, 0.0)
 
 
+def seen_from_line(
+    standing: Standing, points: Float64Array, headings: Float64Array, margins_m: tuple[float, ...]
+) -> tuple[Int64Array, Float64Array, Float64Array]:
+    """Return where a prop's outline lies as seen from the places of a line that are near it.
+
+    Args:
+        standing: The prop.
+        points: (N, 2) places of the line.
+        headings: (N, 2) direction of travel there.
+        margins_m: A place is near that lies within the sum of these of the prop.
+
+    Returns:
+        (M,) numbers of the near places; (M, K) how far ahead of each every point of the outline lies, metres; (M, K)
+        how far to the left.
+    """
+    corners = standing_corners(standing)
+    outline = resample(np.concatenate([corners, corners[:1]]), 0.1)
+    middle = outline.mean(axis=0)
+    reach_m = sum(margins_m, float(np.linalg.norm(outline - middle, axis=1).max()))
+    near = np.flatnonzero(np.linalg.norm(points - middle, axis=1) < reach_m)
+    delta = outline[None] - points[near, None]
+    along = (delta * headings[near, None]).sum(axis=2)
+    return near, along, (delta * left_of(headings)[near, None]).sum(axis=2)
+
+
+def body_heights_m(scenario: Scenario, plan: SessionPlan) -> Float64Array:
+    """Return the heights (H,) above the floor at which a session's platform needs free room to its sides."""
+    height_m = plan.height_m or scenario.platform.sensor_height_m
+    return np.array([height_m] if scenario.platform.kind == "quadrotor" else [0.35, max(height_m, 0.4)])
+
+
+def side_bounds(
+    fixed: Caster,
+    line: Float64Array,
+    headings: Float64Array,
+    turn_per_m: Float64Array,
+    heights_m: Float64Array,
+    width_m: Float64Array,
+    clearance_m: float,
+) -> tuple[Float64Array, Float64Array]:
+    """Return the offsets to the left (N,), lowest and highest, at which a platform keeps its clearance to the sides.
+
+    Args:
+        fixed: Rock and furniture.
+        line: (N, 3) reference line.
+        headings: (N, 2) direction of travel.
+        turn_per_m: (N,) curvature of the line, radians per metre, to the left positive.
+        heights_m: Heights at which the sides are looked for.
+        width_m: (N,) nominal width of the drift.
+        clearance_m: Kept to the sides.
+    """
+    right_m, left_m = free_width(fixed, line, left_of(headings), heights_m, float(width_m.max()))
+    room_m = np.maximum(width_m / 2 - clearance_m, 0.0)
+    low = np.maximum(clearance_m - right_m, -room_m)
+    high = np.minimum(left_m - clearance_m, room_m)
+    high = np.where(turn_per_m > 1e-3, np.minimum(high, _INSIDE_SHARE / np.maximum(turn_per_m, 1e-3)), high)
+    low = np.where(turn_per_m < -1e-3, np.maximum(low, -_INSIDE_SHARE / np.maximum(-turn_per_m, 1e-3)), low)
+    return low, high
+
+
 def _lane(scenario: Scenario, session: str, plan: SessionPlan, centreline: Centreline, fixed: Caster) -> Lane:
     platform = scenario.platform
     pieces = [centreline.edge(a, b) for a, b in pairwise(plan.route)]
@@ -114,15 +168,7 @@ def _lane(scenario: Scenario, session: str, plan: SessionPlan, centreline: Centr
     dense = resample(line, _STEP_M)
     width_m = np.interp(np.linspace(0, 1, len(dense)), np.linspace(0, 1, len(line)), widths)
     headings = headings_of(dense)
-    height_m = plan.height_m or platform.sensor_height_m
-    is_flying = platform.kind == "quadrotor"
-    heights = np.array([height_m] if is_flying else [0.35, max(height_m, 0.4)])
-    right_m, left_m = free_width(fixed, dense, left_of(headings), heights, float(width_m.max()))
-    room_m = np.maximum(width_m / 2 - platform.clearance_m, 0.0)
-    low = np.maximum(platform.clearance_m - right_m, -room_m)
-    high = np.minimum(left_m - platform.clearance_m, room_m)
     turn = np.gradient(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0]))) / _STEP_M
-    high = np.where(turn > 1e-3, np.minimum(high, _INSIDE_SHARE / np.maximum(turn, 1e-3)), high)
-    low = np.where(turn < -1e-3, np.maximum(low, -_INSIDE_SHARE / np.maximum(-turn, 1e-3)), low)
-    flown_over_m = height_m - AIR_BELOW_M if is_flying else 0.0
+    low, high = side_bounds(fixed, dense, headings, turn, body_heights_m(scenario, plan), width_m, platform.clearance_m)
+    flown_over_m = body_heights_m(scenario, plan)[0] - AIR_BELOW_M if platform.kind == "quadrotor" else 0.0
     return Lane(session, dense[:, :2], headings, low, high, platform.clearance_m, flown_over_m)

@@ -95,6 +95,18 @@ def standing_points(standing: Standing) -> Float64Array:
     return transform(standing.world_T_object, local)
 
 
+def standing_box(standing: Standing) -> tuple[Float64Array, Float64Array]:
+    """Return the low and the high corner (3,) of a standing prop's bounding box above the floor, world frame."""
+    points = standing_points(standing)
+    return points.min(axis=0), points.max(axis=0)
+
+
+def standing_middle(standing: Standing) -> Float64Array:
+    """Return the middle (3,) of that box."""
+    low, high = standing_box(standing)
+    return np.asarray((low + high) / 2)
+
+
 def standing_corners(standing: Standing) -> Float64Array:
     """Return the corners (4, 2) of a standing prop's bounding rectangle on the floor, world frame.
 

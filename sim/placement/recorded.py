@@ -13,8 +13,7 @@ from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.core.motion import Motion
 from cdpipe.io.tum import motion_through, read_trajectory
-from sim.geometry.raycast import Caster
-from sim.geometry.room import room_about
+from sim.geometry.raycast import Caster, room_about
 
 _FASTEST_MPS = 20.0
 _NEAREST_M = 0.2

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
-from sim.geometry.mesh import Mesh
+from sim.geometry.mesh import Mesh, drop_unused_vertices
 from sim.geometry.noise import smooth_noise
 from sim.props.shapes import BELOW_FLOOR_M, Size
 
@@ -116,8 +116,7 @@ def bed_mesh(bed: Bed) -> Mesh:
     vertices = np.column_stack([x.ravel(), y.ravel(), bed.z.ravel()])
     low = vertices[rim] * (1, 1, 0) - (0, 0, BELOW_FLOOR_M + _SKIRT_M)
     vertices = np.concatenate([vertices, low, low.mean(axis=0, keepdims=True)])
-    used, faces = np.unique(np.concatenate([top, *sides, floor]), return_inverse=True)
-    return Mesh(vertices[used], faces.reshape(-1, 3).astype(np.int32))
+    return drop_unused_vertices(vertices, np.concatenate([top, *sides, floor]))
 
 
 def _numbered(start: Int64Array, end: Int64Array, first: int) -> tuple[Int64Array, tuple[Int64Array, Int64Array]]:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull
 
 from cdpipe.core.geometry import Float64Array, make_pose
-from sim.geometry.mesh import Mesh
+from sim.geometry.mesh import Mesh, drop_unused_vertices
 from sim.props.shapes import Solid
 
 Point = tuple[float, float, float]
@@ -45,8 +45,8 @@ def surface(mesh: Mesh, material: str) -> Solid:
 def hull_mesh(points: npt.ArrayLike) -> Mesh:
     """Return the convex hull of points (N, 3), facing outwards, without the points inside it."""
     cloud = np.asarray(points, dtype=np.float64)
-    used, simplices = np.unique(ConvexHull(cloud).simplices, return_inverse=True)
-    vertices, faces = cloud[used], simplices.reshape(-1, 3).astype(np.int32)
+    hull = drop_unused_vertices(cloud, ConvexHull(cloud).simplices)
+    vertices, faces = hull.vertices, hull.faces
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     is_inward = (np.cross(b - a, c - a) * (a - vertices.mean(axis=0))).sum(axis=1) < 0
     return Mesh(vertices, np.where(is_inward[:, None], faces[:, ::-1], faces))

@@ -11,8 +11,7 @@ from scenarios.schema import Prop
 from sim.geometry.mesh import moved
 from sim.geometry.topology import closed_volume_m3, edges_of
 from sim.props import equipment, storage
-from sim.props.heap import build_heap, column_volume_m3, whole_mesh
-from sim.props.loading import load_away
+from sim.props.heap import build_heap, column_volume_m3, load_away, whole_mesh
 from sim.props.parts import surface
 from sim.props.rocks import rock_mesh
 from sim.props.shapes import Shape, Size, Solid, hull_volume_m3, signed_volume_m3

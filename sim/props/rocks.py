@@ -1,10 +1,14 @@
-"""Angular rock fragments, and how their sizes are distributed."""
+"""Angular rock fragments, how their sizes are distributed, and how they lie half buried on a pile."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Callable
+from dataclasses import dataclass
 
-from cdpipe.core.geometry import Float64Array, Int32Array, stream
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, stream
 from sim.geometry.mesh import Mesh
 from sim.props.parts import hull_mesh
 
@@ -14,6 +18,13 @@ _EXPONENT = 0.88
 _CORNERS = 13
 # Standard deviation of a vertex's way along the normal, as a share of the edge that it halves.
 _CHIP_SHARE = 0.06
+# Smaller fragments are left out: the rings of the sensor lie 9 cm apart at 4 m.
+_SMALLEST_M = 0.05
+_TEMPLATES = 24
+# Area in plan of a fragment, as a share of the square of its size.
+_PLAN_SHARE = 0.5
+
+Heights = Callable[[Float64Array], Float64Array]
 
 
 def rosin_rammler(n: int, size_m: float, generator: np.random.Generator) -> Float64Array:
@@ -87,3 +98,106 @@ def _chipped(
     a, b, c = faces.T
     split = [np.stack(corners, axis=1) for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
     return np.concatenate([points, middle]), np.concatenate(split).astype(np.int32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rubble:
+    """Fragments, each a closed surface that faces outwards.
+
+    Attributes:
+        fragments: N surfaces, metres.
+        centres: (N, 3) middle of each, metres.
+    """
+
+    fragments: tuple[Mesh, ...]
+    centres: Float64Array
+
+    def kept(self, is_kept: BoolArray) -> Rubble:
+        """Return the fragments marked (N,)."""
+        numbers = np.flatnonzero(is_kept)
+        return Rubble(tuple(self.fragments[number] for number in numbers), self.centres[is_kept])
+
+
+def draw_sizes(
+    plan_m2: float, coverage: float, fragment_m: float, largest_m: float, most: int, generator: np.random.Generator
+) -> Float64Array:
+    """Draw fragments that cover a share of an area, or the largest `most` of them.
+
+    Args:
+        plan_m2: Area to be covered, seen from above.
+        coverage: Sum of the fragments' areas over it; above 1 they overlap.
+        fragment_m: Characteristic size of the Rosin-Rammler law.
+        largest_m: Larger ones are not drawn.
+        most: How many at most.
+        generator: Where the randomness comes from.
+
+    Returns:
+        Sizes from the largest to the smallest, metres; none below 5 cm, or half the largest of a low pile.
+    """
+    smallest_m = min(_SMALLEST_M, 0.5 * fragment_m)
+    if smallest_m >= largest_m:  # a low pile has only fines
+        smallest_m = 0.5 * largest_m
+    sizes = np.empty(0)
+    while _PLAN_SHARE * np.square(sizes).sum() < coverage * plan_m2:
+        drawn = rosin_rammler(256, fragment_m, generator)
+        sizes = np.concatenate([sizes, drawn[(drawn >= smallest_m) & (drawn <= largest_m)]])
+    enough = int(np.searchsorted(_PLAN_SHARE * np.cumsum(np.square(sizes)), coverage * plan_m2)) + 1
+    return np.asarray(np.sort(sizes[:enough])[::-1][:most])
+
+
+def lay(
+    sizes_m: Float64Array,
+    xy: Float64Array,
+    heights: Heights,
+    buried: tuple[float, float],
+    generator: np.random.Generator,
+) -> Rubble:
+    """Lay fragments on a surface.
+
+    Args:
+        sizes_m: (N,) longest side of each.
+        xy: (N, 2) where they lie.
+        heights: The surface.
+        buried: Where their middles lie along its normal, from and to, in their own sizes.
+        generator: Where the randomness comes from.
+    """
+    n = len(sizes_m)
+    keys = generator.integers(2**31, size=_TEMPLATES)
+    shares = np.sort(generator.uniform(0.5, 1.0, (_TEMPLATES, 2)), axis=1)
+    templates = [rock_mesh((1.0, float(b), float(a)), int(key)) for key, (a, b) in zip(keys, shares, strict=True)]
+    turns = Rotation.from_quat(generator.standard_normal((n, 4))).as_matrix()
+    which = generator.integers(_TEMPLATES, size=n)
+    depth = generator.uniform(*buried, n) * sizes_m
+    centres = np.column_stack([xy, heights(xy)]) + depth[:, None] * _normals(xy, heights)
+    fragments = tuple(
+        Mesh(templates[pick].vertices @ (size * turn).T + centre, templates[pick].faces)
+        for pick, size, turn, centre in zip(which, sizes_m, turns, centres, strict=True)
+    )
+    return Rubble(fragments, centres)
+
+
+def confined(rubble: Rubble, low: Float64Array, high: Float64Array) -> Rubble:
+    """Move every fragment that reaches over a box (3,) to (3,), limits may be infinite, back inside it."""
+    fragments, centres = [], rubble.centres.copy()
+    for number, fragment in enumerate(rubble.fragments):
+        over = np.maximum(low - fragment.vertices.min(axis=0), 0) - np.maximum(fragment.vertices.max(axis=0) - high, 0)
+        fragments.append(Mesh(fragment.vertices + over, fragment.faces))
+        centres[number] += over
+    return Rubble(tuple(fragments), centres)
+
+
+def moved_by(rubble: Rubble, shift_m: Float64Array) -> Rubble:
+    """Return the fragments shifted by a vector (3,)."""
+    fragments = tuple(Mesh(fragment.vertices + shift_m, fragment.faces) for fragment in rubble.fragments)
+    return Rubble(fragments, rubble.centres + shift_m)
+
+
+def together(first: Rubble, second: Rubble) -> Rubble:
+    """Return the fragments of both."""
+    return Rubble((*first.fragments, *second.fragments), np.concatenate([first.centres, second.centres]))
+
+
+def _normals(xy: Float64Array, heights: Heights, step_m: float = 0.1) -> Float64Array:
+    slope = [(heights(xy + step) - heights(xy - step)) / (2 * step_m) for step in ((step_m, 0.0), (0.0, step_m))]
+    normals = np.column_stack([-slope[0], -slope[1], np.ones(len(xy))])
+    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))

@@ -1,5 +1,4 @@
-from .in_memory import simulate_in_memory
-from .simulate import simulate_pair
+from .simulate import simulate_in_memory, simulate_pair
 from .truth import read_labels
 
 __all__ = [

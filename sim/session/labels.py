@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array
 from scenarios.schema import Scenario
-from sim.geometry.mesh import Mesh, NearSurface, joined, near_part, split
+from sim.geometry.mesh import Mesh, NearSurface, drop_unused_vertices, joined, near_part, split
 from sim.geometry.raycast import Caster
 from sim.placement.contact import standing_surface
 from sim.placement.placing import Standing
@@ -223,17 +223,17 @@ def _reshaped(change_id: int, instance: int, item: Standing, world: World) -> Ta
     Its ghost is the part of the old surface that is gone, left open: a ray that would have met the part removed comes
     from the outside and meets that skin, for behind its rim the rest of the pile still stands.
     """
-    full, rest = (compacted(_surface_in(scene, instance)) for scene in (world.before, world.after))
+    full, rest = (_compact(_surface_in(scene, instance)) for scene in (world.before, world.after))
     near_full, near_rest = _samples(full), _samples(rest)
     is_gone = np.asarray(near_rest.query(full.vertices[full.faces].mean(axis=1))[0] > NEAR_OLD_SURFACE_M)
-    skin = Mesh(full.vertices, full.faces[is_gone])
+    skin = drop_unused_vertices(full.vertices, full.faces[is_gone])
     # The part removed lies between the old skin and the new face below it.
     floor_m = item.world_T_object[2, 3]
     ends = np.concatenate([_off(full, near_rest, floor_m), _off(rest, near_full, floor_m)])
     after = _only(world, item.prop.name, "after")
     volumes = (item.shape.mesh_volume_m3, after.shape.mesh_volume_m3 if after is not None else None)
     tally = _tally(change_id, instance, item, world, "partial", None)
-    tally.ghost = Ghost(compacted(skin if is_gone.any() else full))
+    tally.ghost = Ghost(skin if len(skin.faces) else full)
     tally.change = replace(
         tally.change,
         kind="reshaped",
@@ -262,13 +262,11 @@ def _surface_in(scene: Scene, instance: int) -> Mesh:
 def _near(scene: Scene, surface: Mesh) -> NearSurface:
     """Return what of a scene lies near a surface."""
     parts = (near_part(mesh, surface, 2 * NEAR_OLD_SURFACE_M) for mesh in scene.meshes)
-    return NearSurface(joined([compacted(part) for part in parts if len(part.faces)]), NEAR_OLD_SURFACE_M)
+    return NearSurface(joined([_compact(part) for part in parts if len(part.faces)]), NEAR_OLD_SURFACE_M)
 
 
-def compacted(mesh: Mesh) -> Mesh:
-    """Return a mesh without the vertices that none of its faces uses."""
-    used, faces = np.unique(mesh.faces, return_inverse=True)
-    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32))
+def _compact(mesh: Mesh) -> Mesh:
+    return drop_unused_vertices(mesh.vertices, mesh.faces)
 
 
 def _is_short_move(start: Standing, end: Standing) -> bool:

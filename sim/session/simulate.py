@@ -1,4 +1,4 @@
-"""A pair of sessions with its truth, from a drawn scenario to files."""
+"""A pair of sessions with its truth, from a drawn scenario to files or into memory."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array
 from cdpipe.core.yamlfile import setting_lines
-from cdpipe.io.session import ScanChunk, SessionWriter
+from cdpipe.io.session import ScanChunk, Session, SessionWriter
 from cdpipe.mapping.odometry import require_kiss_icp
 from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.library import load_scenario
@@ -229,3 +230,71 @@ def _chunks_ahead(drive: Drive, pool: Executor) -> Generator[list[Revolution]]:
     finally:
         for each in (*running, *ahead):
             each.cancel()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldSession(Session):
+    """A session whose chunks lie in memory; `path` names it in messages and is no folder."""
+
+    held: tuple[ScanChunk, ...] = ()
+
+    def chunk(self, index: int) -> ScanChunk:
+        """Return one chunk."""
+        return self.held[index]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelledSession:
+    """A held session with its truth, which is apart from it as it is on disk.
+
+    Attributes:
+        session: What the robot recorded.
+        world_T_sensor: (S, 4, 4) true poses.
+        instance: (S, H, W) int16 as in `sim.session.truth`.
+        change: (S, H, W) int16 as in `sim.session.truth`.
+    """
+
+    session: Session
+    world_T_sensor: Float64Array
+    instance: Int16Array
+    change: Int16Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldPair:
+    """A pair with its truth, in memory."""
+
+    truth: PairTruth
+    sessions: Mapping[SessionName, LabelledSession]
+
+
+def simulate_in_memory(scenario: Scenario, seed: int, n_threads: int = 1) -> HeldPair:
+    """Simulate a pair into memory, about 0.5 MB a revolution; to the byte what `simulate_pair` writes.
+
+    Args:
+        scenario: The scenario as drawn.
+        seed: Draws everything the scenario leaves open.
+        n_threads: Threads that cast revolutions.
+
+    Raises:
+        InputError: The sensor profile, a trajectory or another file cannot be read, or KISS-ICP is asked for and not
+            installed.
+        ScenarioError: The world contradicts itself.
+    """
+    if "kiss-icp" in (scenario.before.odometry.source, scenario.after.odometry.source):
+        require_kiss_icp("odometry.source = kiss-icp")
+    files = file_digests(scenario)
+    drives = plan_drives(scenario, load_profile(scenario.sensor.profile, scenario.sensor.mode), seed)
+    with ThreadPoolExecutor(min(n_threads, os.cpu_count() or 1)) as pool:
+        sessions = {drive.name: _held(drive, pool) for drive in drives}
+    return HeldPair(pair_truth(scenario, seed, drives, files), sessions)
+
+
+def _held(drive: Drive, pool: Executor) -> LabelledSession:
+    drive = with_own_odometry(drive, pool, lambda stage, done, total: None)
+    with closing(labelled_chunks(drive, pool)) as chunks:
+        chunk, instance, change = zip(*chunks, strict=True)
+    session = HeldSession(
+        Path(drive.name), drive.sensor, drive.trajectory.odom_T_sensor, CHUNK_SCANS, {"session": drive.name}, chunk
+    )
+    return LabelledSession(session, drive.trajectory.world_T_sensor, np.concatenate(instance), np.concatenate(change))

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import csv
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from multiprocessing import get_context
+from pathlib import Path
 
 import numpy as np
 
-from cdpipe.core.errors import TunnelcdError
+from cdpipe.core.errors import InputError, TunnelcdError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.sensor.ouster import load_profile
 from scenarios.library import load_scenario
 from sim.drive.trajectory import plan_trajectory
 from sim.geometry.raycast import Caster
 from sim.placement.contact import interpenetration_m
-from sim.placement.placing import Standing, standing_points
+from sim.placement.placing import standing_middle
 from sim.props.heap import flank_angle_deg
 from sim.rock.centreline import headings_of, left_of
 from sim.scene import World, build_world
@@ -28,6 +30,7 @@ _KEYFRAME_M = 1.0
 _FIT_M = 8.0  # what is longer along a drift of a foreign mesh counts as its section
 
 Progress = Callable[[str, int, int], None]
+_KINDS = ("added", "removed", "moved", "reshaped")
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +171,7 @@ def survey_seed(family: str, seed: int) -> WorldFigures:
 
 def far_share(world: World, places: Float64Array, far_m: float) -> float:
     """Return the share of places (N, 3) farther than `far_m` from the middle of every changed prop."""
-    middles = [_middle(item) for item in world.standing if item.prop.change != "none"]
+    middles = [standing_middle(item) for item in world.standing if item.prop.change != "none"]
     if not middles:
         return 1.0
     distance_m = np.linalg.norm(places[:, None] - np.array(middles)[None], axis=2)
@@ -177,7 +180,7 @@ def far_share(world: World, places: Float64Array, far_m: float) -> float:
 
 def distractors_per_100m(world: World, places: Float64Array, near_m: float) -> float:
     """Return the unchanged props within `near_m` of a path, per 100 m of it; places (N, 3) stand for a metre each."""
-    middles = [_middle(item) for item in world.standing if item.prop.change == "none"]
+    middles = [standing_middle(item) for item in world.standing if item.prop.change == "none"]
     near = [bool(np.linalg.norm(places - middle, axis=1).min() <= near_m) for middle in middles]
     return 100.0 * float(sum(near)) / (len(places) * _KEYFRAME_M)
 
@@ -223,12 +226,6 @@ def _way_m(points: Float64Array) -> Float64Array:
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1))])
 
 
-def _middle(item: Standing) -> Float64Array:
-    """Middle (3,) of the bounding box of what stands above the floor."""
-    points = standing_points(item)
-    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
-
-
 def _repose_deg(world: World) -> tuple[float, ...]:
     """Angles of the whole piles; what a loader left has no angle of its own."""
     whole = {item.prop.name: item for item in reversed(world.standing) if item.prop.kind == "muck_pile"}
@@ -246,3 +243,81 @@ def _deepest_m(world: World) -> float:
         ]
         depths.append(interpenetration_m(item, world.walls, others))
     return max(depths)
+
+
+def write_csv(path: Path, surveys: Sequence[Survey]) -> None:
+    """Write one row per seed, failures with their reason; lists are written as their smallest, median and largest.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    rows = [_csv_row(world) for one in surveys for world in one.worlds]
+    rows += [
+        {"family": lost.family, "seed": lost.seed, "failure": lost.reason} for one in surveys for lost in one.failures
+    ]
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    try:
+        with path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, [*(name for name in names if name != "failure"), "failure"])
+            writer.writeheader()
+            writer.writerows(rows)
+    except OSError as error:
+        raise InputError(f"{path}: cannot write there: {error.strerror}") from error
+
+
+def summary(one: Survey) -> dict[str, str]:
+    """Return a family's row of the table: column to text, "-" where nothing was measured."""
+    worlds = one.worlds
+    n_seeds = len(worlds) + len(one.failures)
+    kinds = {kind: sum(getattr(world, f"n_{kind}") for world in worlds) for kind in _KINDS}
+    counts = [float(world.n_changes) for world in worlds]
+    hulls = [volume for world in worlds for volume in world.hull_m3]
+    deepest = [1000 * world.interpenetration_m for world in worlds]
+    return {
+        "family": one.family,
+        "worlds": f"{len(worlds)} of {n_seeds}",
+        "path before, m": _range([world.before_path_m for world in worlds], ".0f"),
+        "path after, m": _range([world.after_path_m for world in worlds], ".0f"),
+        "width, m": _range([world.width_m for world in worlds], ".1f"),
+        "height, m": _range([world.height_m for world in worlds], ".1f"),
+        "changes": _range(counts, ".0f"),
+        "added, removed, moved, reshaped": ", ".join(str(kinds[kind]) for kind in _KINDS),
+        "hull, m3": _range(hulls, ".2f"),
+        "distractors per 100 m": _range([world.distractors_per_100m for world in worlds], ".1f"),
+        "far keyframes": _mean_and_least([world.far_share for world in worlds]),
+        "repose, deg": _range([angle for world in worlds for angle in world.repose_deg], ".1f"),
+        "roughness, m": _range([world.roughness_m for world in worlds], ".3f"),
+        "deepest in rock, mm": f"{max(deepest):.1f}" if deepest else "-",
+        "triangles, 1000": _range([world.n_triangles / 1000 for world in worlds], ".0f"),
+        "build, CPU s": _range([world.build_s for world in worlds], ".1f"),
+    }
+
+
+def markdown(surveys: Sequence[Survey]) -> str:
+    """Return the table of some families in Markdown, one row each; three figures are least - median - largest."""
+    rows = [summary(one) for one in surveys]
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *([f"`{row['family']}`", *list(row.values())[1:]] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _csv_row(world: WorldFigures) -> dict[str, object]:
+    row: dict[str, object] = {}
+    for name in (each.name for each in fields(world)):
+        value = getattr(world, name)
+        if not isinstance(value, tuple):
+            row[name] = value
+            continue
+        spread = (min(value), float(np.median(value)), max(value)) if value else ("", "", "")
+        row |= dict(zip((f"{name}_min", f"{name}_median", f"{name}_max"), spread, strict=True))
+    return row
+
+
+def _range(values: Sequence[float], form: str) -> str:
+    known = [value for value in values if not np.isnan(value)]
+    if not known:
+        return "-"
+    return " - ".join(format(value, form) for value in (min(known), float(np.median(known)), max(known)))
+
+
+def _mean_and_least(shares: Sequence[float]) -> str:
+    return f"{100 * np.mean(shares):.0f} %, least {100 * min(shares):.0f} %" if shares else "-"

@@ -20,9 +20,7 @@ from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, stream, yaw_pose, yaw_rad
 from scenarios import load_scenario, scenario_names
 from scenarios.schema import Drift, Place, Prop, Roughness, Scenario, Section, SessionPlan, Tunnel
-from sim.geometry.mesh import moved
-from sim.placement.placing import Standing
-from sim.props.shapes import solid_mesh
+from sim.placement.placing import Standing, standing_box, standing_middle
 from sim.scene import Scene, World, build_world
 from sim.view.picture import render
 
@@ -96,7 +94,7 @@ def family_picture(scenario: Scenario, seed: int) -> Pixels:
     scene = world.after
     changed = [item for item in world.standing if item.prop.change != "none" and "after" in item.sessions]
     # a little above a low prop, so that walls and roof come into the picture
-    targets = [_middle(item) + np.array([0.0, 0.0, 0.6]) for item in changed or world.standing]
+    targets = [standing_middle(item) + np.array([0.0, 0.0, 0.6]) for item in changed or world.standing]
     numbers = {prop.name: number for number, prop in enumerate(scenario.props, start=1)}
     wanted = {numbers[item.prop.name] for item in changed}
     stations = np.concatenate([line.points[::10] for line in world.centreline.drifts]) + np.array([0.0, 0.0, _EYE_M])
@@ -170,8 +168,8 @@ def _stage(kind: str, case: _Case, fraction: float) -> Scenario:
 
 def _close_up(world: World, scene: Scene, item: Standing) -> Pixels:
     """Return a picture from two metres off a prop's side, obliquely, from a place in the open."""
-    middle, half_m = _middle(item), _half_size(item)
-    gone = _middle(world.standing[0]) - middle  # where a loaded pile is missing something
+    middle, half_m = standing_middle(item), np.ptp(standing_box(item), axis=0) / 2
+    gone = standing_middle(world.standing[0]) - middle  # where a loaded pile is missing something
     best = (-1.0, middle + 1.0)
     for azimuth in np.deg2rad(np.arange(-180.0, 180.0, 15.0)):
         away = yaw_pose(azimuth)[:3, 0]
@@ -216,21 +214,6 @@ def _free_m(world: World, eye: Float64Array) -> float:
     ranges_m, _, normals = world.fixed.hits(np.broadcast_to(eye, rays.shape), rays)
     is_inside = np.isfinite(ranges_m).all() and ((normals * rays).sum(axis=1) < 0).all()
     return float(ranges_m.min()) if is_inside else 0.0
-
-
-def _corners(item: Standing) -> Float64Array:
-    """Return the corners (N, 3) of what stands above the floor."""
-    corners = np.concatenate([moved(solid_mesh(solid), item.world_T_object).vertices for solid in item.shape.solids])
-    return np.asarray(corners[corners[:, 2] > item.world_T_object[2, 3] - 0.05])
-
-
-def _middle(item: Standing) -> Float64Array:
-    corners = _corners(item)
-    return np.asarray((corners.min(axis=0) + corners.max(axis=0)) / 2)
-
-
-def _half_size(item: Standing) -> Float64Array:
-    return np.asarray(_corners(item).max(axis=0) - _middle(item))
 
 
 def _save(path: Path, pictures: Sequence[tuple[Pixels, str]]) -> None:

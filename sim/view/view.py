@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
@@ -22,8 +21,8 @@ from cdpipe.io.session import is_session, read_session
 from cdpipe.sensor.ouster import load_profile
 from scenarios.schema import Scenario
 from sim.drive.trajectory import plan_trajectory
-from sim.geometry.mesh import Mesh, joined, moved
-from sim.placement.placing import Standing
+from sim.geometry.mesh import Mesh, drop_unused_vertices, joined, moved
+from sim.placement.placing import Standing, standing_box
 from sim.props.shapes import solid_mesh
 from sim.scene import World, build_world
 from sim.session.truth import PairTruth, read_pair_truth, read_true_poses
@@ -180,7 +179,14 @@ def wall_bands(wall: Mesh, floor_points: Float64Array, n_bands: int = _N_BANDS) 
     number = np.clip(np.floor(height_m / step_m), 0, n_bands - 1).astype(int)
     rgb = _rgb(material_colour("wall", "rock"))
     return tuple(
-        Band(band * step_m, Surface(f"walls/from {band * step_m:.1f} m", _part(wall, number == band), rgb))
+        Band(
+            band * step_m,
+            Surface(
+                f"walls/from {band * step_m:.1f} m",
+                drop_unused_vertices(wall.vertices, wall.faces[number == band]),
+                rgb,
+            ),
+        )
         for band in np.unique(number).tolist()
     )
 
@@ -228,8 +234,7 @@ def _prop_surfaces(item: Standing) -> Iterator[Surface]:
 
 
 def _label(item: Standing) -> Label:
-    vertices = np.concatenate([moved(solid_mesh(s), item.world_T_object).vertices for s in item.shape.solids])
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low, high = standing_box(item)
     change = "" if item.prop.change == "none" else f", {item.prop.change}{_where(item)}"
     position = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, high[2] + 0.1])
     return Label(f"labels/{item.prop.name}{_where(item)}", position, f"{item.prop.name}{change}")
@@ -252,11 +257,6 @@ def _scenario_of(pair: Path, truth: PairTruth) -> Scenario:
 
 def _kind(fixture: str) -> str:
     return re.split(r"[\W_]*\d", fixture, maxsplit=1)[0]
-
-
-def _part(mesh: Mesh, is_kept: npt.NDArray[np.bool_]) -> Mesh:
-    used, faces = np.unique(mesh.faces[is_kept], return_inverse=True)
-    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32))
 
 
 def _rgb(colour: tuple[float, float, float]) -> Rgb:

@@ -13,8 +13,7 @@ from sim.geometry.mesh import Mesh, joined
 from sim.geometry.raycast import Caster
 from sim.geometry.topology import edges_of
 from sim.props.bed import bed_mesh
-from sim.props.heap import Heap, build_heap, column_volume_m3, flank_angle_deg, whole_mesh
-from sim.props.loading import load_away
+from sim.props.heap import Heap, build_heap, column_volume_m3, flank_angle_deg, load_away, whole_mesh
 from sim.props.parts import block, surface, turned
 from sim.props.props import shape_of
 from sim.props.shapes import BELOW_FLOOR_M, Shape, Size, signed_volume_m3, solid_mesh, visible_part

@@ -8,8 +8,7 @@ import pytest
 
 from cdpipe.core.errors import InputError, ScenarioError
 from sim.studies import survey as surveys
-from sim.studies.survey import Failure, Survey, WorldFigures, survey, survey_seed
-from sim.studies.survey_tables import markdown, summary, write_csv
+from sim.studies.survey import Failure, Survey, WorldFigures, markdown, summary, survey, survey_seed, write_csv
 
 # A straight smooth drift 60 m long, 4 m wide, 3 m high, driven from 2 m to 58 m before and from 5 m to 59 m after.
 SCENARIO = """\
