@@ -24,6 +24,7 @@ from eval.plans import plan as plans
 from eval.plans.plan import Plan
 from eval.report import page
 from eval.running import runner
+from eval.running.pair_run import Tools
 from eval.running.runfolder import RunFolder
 from scenarios import load_scenario, scenario_names
 from sim.session import simulate
@@ -358,7 +359,8 @@ def test_run_score_report_on_one_folder(
     made: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = [word for word in SMALL if word != "--set"]
-    monkeypatch.setattr(runner, "load_scenario", lambda name, seed, _: load_scenario(name, seed, settings))
+    small = Tools(draw=lambda name, seed, _: load_scenario(name, seed, settings))
+    monkeypatch.setattr(runner, "TOOLS", small)
     plan = tmp_path / "mine.yaml"
     plan.write_text("name: mine\nscenarios: [smoke/one_box]\nseeds: [1]\nvariants: [{preset: voxel-diff}]\n")
     out = tmp_path / "run"
@@ -502,6 +504,8 @@ def test_programs_tell_mistakes_as_the_commands_do(
     (tmp_path / "damaged" / "results.csv").touch()
     (tmp_path / "file").touch()
     monkeypatch.setattr(sys, "argv", [program, *arguments])
+    # another test of this process may have imported it, which runpy warns of
+    monkeypatch.delitem(sys.modules, f"eval.studies.{program}", raising=False)
     with pytest.raises(SystemExit) as caught:
         runpy.run_module(f"eval.studies.{program}", run_name="__main__")
     out, err = capsys.readouterr()
