@@ -1,8 +1,7 @@
-"""Merges composed from the truth, for upper bounds: what the later stages do where the merge is right, or off by E.
+"""Merges from the truth, for upper bounds: results of the later stages where the merge is exact or off by E.
 
-For every after keyframe j and its truly nearest before keyframe i, the after odom frame is put where the truth says:
-before_T_after(j) = odomB_T_i (true i_T_j) E (odomA_T_j)^-1, so that `merge_error` at j is E and nothing else. The
-pipeline's stages get the merged maps alone.
+For every after keyframe j and its truly nearest before keyframe i, before_T_after(j) = odomB_T_i (true i_T_j) E
+(odomA_T_j)^-1, so that `merge_error` at j is E alone. The pipeline's stages receive only the merged maps.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ NO_SECONDS = {"t_index_s": 0.0, "t_merge_s": 0.0, "t_refine_s": 0.0}
 
 
 class OracleMerge(Settings):
-    """How far the oracle's merge is off: E of every keyframe has this translation and this angle."""
+    """Error of the oracle's merge: E of every keyframe has this translation and this angle."""
 
     noise_m: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     noise_deg: Annotated[float, Field(ge=0, le=180)] = 0.0
@@ -46,20 +45,20 @@ def merged_by_truth(
     noise: OracleMerge,
     seed: int,
 ) -> MergedMaps:
-    """Merge two mapped sessions as the truth says, off by the noise.
+    """Merge two mapped sessions by the truth, plus an error.
 
     Args:
         before: The before session.
         after: The after session.
         truth: Of both.
-        noise: Size of the error; its direction and axis are drawn from (seed, "oracle-merge") and stand still in the
+        noise: Size of the error; its direction and axis are drawn from (seed, "oracle-merge") and are constant in the
             map frame.
-        seed: The pair's.
+        seed: Seed of the pair.
 
     Returns:
-        The maps with one alignment for each after keyframe (`local`; one farther than 5 m from every before keyframe
-        takes that of the nearest keyframe, in the world, that is not) and that of the middle one of those as
-        `before_T_after`; refused where no after keyframe has a before keyframe within 5 m.
+        The maps with one alignment for each after keyframe as `local`, and that of the middle paired keyframe as
+        `before_T_after`. An after keyframe is paired if a before keyframe lies within 5 m; others take the alignment
+        of the nearest paired keyframe. The merge is refused where no keyframe is paired.
     """
     scans_i, scans_j = before.descriptors.keyframe_scans, after.descriptors.keyframe_scans
     world_T_i, world_T_j = truth[0].world_T_sensor[scans_i], truth[1].world_T_sensor[scans_j]
@@ -75,7 +74,7 @@ def merged_by_truth(
     of_paired = _displaced(map_T_j, noise, seed) @ invert(odom_T_j[paired])
     _, taken = cKDTree(world_T_j[paired, :3, 3]).query(world_T_j[:, :3, 3])
     before_T_after = of_paired[np.asarray(taken)]
-    before_T_after[paired] = of_paired  # of two at the same place each keeps its own
+    before_T_after[paired] = of_paired  # of two keyframes at one place each keeps its own
     return MergedMaps(
         before.map,
         after.map,
@@ -88,7 +87,7 @@ def merged_by_truth(
 
 
 def _displaced(map_T_j: Float64Array, noise: OracleMerge, seed: int) -> Float64Array:
-    """Return (P, 4, 4) poses shifted, and turned about themselves, by the same vectors of the map frame."""
+    """Return the (P, 4, 4) poses, translated and rotated about their origins by constant vectors of the map frame."""
     draw = stream(seed, "oracle-merge")
     direction, axis = (vector / np.linalg.norm(vector) for vector in draw.normal(size=(2, 3)))
     turn = Rotation.from_rotvec(np.deg2rad(noise.noise_deg) * axis).as_matrix()

@@ -1,6 +1,6 @@
-"""Regions composed from the truth, for upper bounds: what extraction does where every change has a region around it.
+"""Regions from the truth, for upper bounds: results of the extraction where every change has a region around it.
 
-The pipeline's stages get the regions alone.
+The pipeline's stages receive only the regions.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from eval.truth.ground_truth import GroundTruth
 def regions_by_truth(
     truth: GroundTruth, keyframe_scans: tuple[Int64Array, Int64Array], config: QueryConfig
 ) -> ChangeRegions:
-    """Return a region around each observable change, but for those that the region of a larger one suppresses.
+    """Return a region around each observable change, except those that the region of a larger change suppresses.
 
-    A centre is the centroid of the change's truth, carried into the map frame through the true pose of the before
+    A centre is the centroid of the change's truth, transformed into the map frame by the true pose of the before
     keyframe truly nearest to it; its pair are the keyframes truly nearest to it. Changes with more cells of truth come
-    first: what is suppressed is the smaller one, which is likelier to lie whole in the sphere of the larger.
+    first, because a smaller change is more likely to lie inside the sphere of a larger one than the reverse.
 
     Args:
         truth: The pair's truth.
@@ -31,7 +31,7 @@ def regions_by_truth(
         config: `radius_m` and `suppression` are used.
 
     Returns:
-        The regions, all reported with score 1; no keyframe has a score, for keyframes were not ranked.
+        The regions, all reported with score 1, and no keyframe scores.
     """
     n_cells = np.array([len(rows) for rows in truth.change_rows], dtype=np.int64)
     chosen = np.flatnonzero(truth.is_observable)

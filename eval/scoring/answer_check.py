@@ -1,4 +1,4 @@
-"""Checks an answer against the sessions it speaks about before anything is scored; foreign answers come as they are."""
+"""Checks an answer against the sessions of its pair before it is scored; another program may write anything."""
 
 from __future__ import annotations
 
@@ -18,17 +18,16 @@ from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth
 from eval.truth.universe import ScoringPoints
 
 _SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns"))
-_MANY = 100  # so many returns of any place hold the first one of some cell
-# Points lie among the returns they stand for.
-_ASIDE_M = 2.0
+_MANY = 100  # so many valid returns include the first return of some cell
+_ASIDE_M = 2.0  # largest gap between an object's points and its returns
 
 
 def check_answer(answer: Answer, truth: GroundTruth, folder: Path) -> None:
     """Raise `InputError`, naming the folder and the field, unless an ok answer can be scored against this pair.
 
     Raises:
-        InputError: A number is NaN, an index lies outside of its session, a return is named twice, or nothing that the
-            answer names is there.
+        InputError: A number is NaN, an index lies outside of its session, a return is named twice, or none of the
+            named returns or points exists.
     """
     report = answer.report
     try:
@@ -152,9 +151,9 @@ def _check_returns(session: SessionName, objects: tuple[ChangedObject, ...], tru
 
 
 def _check_places(objects: tuple[ChangedObject, ...], universe: ScoringPoints) -> None:
-    """Raise if no object of the before session lies where its returns do; its odom frame is the map frame.
+    """Raise if no object of the before session lies near its returns; the before odom frame is the map frame.
 
-    A pixel that returned in one session mostly did in the other, so nothing else tells when they are swapped.
+    This finds swapped sessions: most pixels return in both sessions, so the other checks pass.
     """
     aside_m = {}
     for index, item in enumerate(objects):

@@ -1,4 +1,4 @@
-"""From what a method answered to rows of the universe it is scored in."""
+"""The rows of the scoring points that each object of an answer holds."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ POINT_RADIUS_M = 0.1
 
 
 def answer_rows(answer: Answer, truth: GroundTruth) -> tuple[Int64Array, ...]:
-    """Return, for each object of an answer, the rows of its session's universe that it is made of.
+    """Return, for each object of an answer, its rows of its session's scoring points.
 
-    An answer with returns takes the rows among them. A foreign one with points takes the rows within 0.1 m of its
-    points; a row that is near to two objects belongs to the nearer one.
+    An answer with returns holds the rows among them. An answer with points (of another program) holds the rows within
+    0.1 m of them; a row near two objects belongs to the nearer one.
     """
     if answer.report is None:
         return ()
@@ -37,12 +37,12 @@ def answer_rows(answer: Answer, truth: GroundTruth) -> tuple[Int64Array, ...]:
 def rows_near_points(
     universe: ScoringPoints, objects_odom: list[Float64Array], radius_m: float = POINT_RADIUS_M
 ) -> list[Int64Array]:
-    """Return, for each object, the rows of the universe whose nearest predicted point is its own and within a radius.
+    """Return, for each object, the rows whose nearest predicted point is its own and within a radius.
 
     Args:
-        universe: Where to look.
-        objects_odom: Per object, (P, 3) points in the odom frame of the universe, metres.
-        radius_m: How far around it a point stands for.
+        universe: Scoring points of the session.
+        objects_odom: Per object, (P, 3) points in the session's odom frame, metres.
+        radius_m: Radius that a point stands for.
     """
     if not any(len(points) for points in objects_odom):
         return [np.zeros(0, dtype=np.int64) for _ in objects_odom]
@@ -60,7 +60,7 @@ def rows_near_points(
             inside &= (values >= low[axis]) & (values <= high[axis])
         candidates = np.flatnonzero(inside)
         points_odom = universe.points_odom[candidates].astype(np.float64)
-        # the bound is exclusive; beyond it the tree answers with an index one past its last point
+        # the bound is exclusive; without a neighbour the index is the number of points
         _, nearest = tree.query(points_odom, distance_upper_bound=np.nextafter(radius_m, np.inf))
         rows.append(candidates[np.append(owners, -1)[nearest] == index])
     return rows

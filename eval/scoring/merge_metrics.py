@@ -1,7 +1,7 @@
-"""Errors of a merge, measured where they matter: between keyframes that truly are close to each other.
+"""Errors of a merge between keyframes of both sessions that are close to each other in the world.
 
-Both odometries drift, so no single transform can be right everywhere; the error is that of the relative pose of an
-after keyframe and its truly nearest before keyframe.
+Both odometries drift, so no single transform is right everywhere. The error is that of the relative pose of an after
+keyframe and its truly nearest before keyframe.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ def merge_errors(
     Args:
         before: The before session.
         after: The after session.
-        before_T_after: The merge: the after session's odom frame in the before session's, (4, 4) as it holds everywhere
-            or (Ka, 4, 4) as it holds at each after keyframe.
+        before_T_after: The merge: pose of the after odom frame in the before odom frame, (4, 4) for the whole map or
+            (Ka, 4, 4) for each after keyframe.
         keyframe_scans: Scans of the before and of the Ka after keyframes.
 
     Returns:
@@ -68,7 +68,7 @@ def merge_errors(
     true_i_T_j = invert(before.world_T_sensor[scans_i]) @ world_T_j
     estimated_i_T_j = invert(before.odom_T_sensor[scans_i]) @ before_T_after @ after.odom_T_sensor[scans_j]
     errors = invert(true_i_T_j) @ estimated_i_T_j
-    # E's translation is in the true frame of keyframe j, so the tunnel's direction is turned into it
+    # rotate the tunnel axis into the frame of keyframe j, that of E's translation
     axes_world = travel_directions(after.world_T_sensor)[scans_j]
     axes_j = np.einsum("pji,pj->pi", world_T_j[:, :3, :3], axes_world)
     return MergeErrors(
@@ -92,7 +92,7 @@ def overlap_true(before_world_T_sensor: Float64Array, after_world_T_sensor: Floa
 
 
 def _along(poses: Float64Array) -> Float64Array:
-    """Return the middles of equal steps of at most 0.1 m along a path."""
+    """Return the (N, 3) middles of equal steps of at most 0.1 m along a path."""
     along = travelled_m(poses)
     n_steps = int(np.ceil(along[-1] / _STEP_M))
     middles = (np.arange(n_steps) + 0.5) * along[-1] / max(n_steps, 1)
@@ -100,13 +100,13 @@ def _along(poses: Float64Array) -> Float64Array:
 
 
 def evidence_columns(evidence: Mapping[str, float]) -> dict[str, float]:
-    """Return what the merge measured, whatever came of it; NaN where it was not measured or is not finite."""
+    """Return the merge's evidence, accepted or refused; NaN where a figure is missing or not finite."""
     values = {name: float(evidence.get(name, np.nan)) for name in EVIDENCE}
     return {f"evidence_{name}": value if np.isfinite(value) else float("nan") for name, value in values.items()}
 
 
 def travel_directions(poses: Float64Array) -> Float64Array:
-    """Return the (S, 3) unit direction of travel at each of (S, 4, 4) poses: the chord over a metre of path around it.
+    """Return the (S, 3) unit direction of travel at each of (S, 4, 4) poses: the chord over 1 m of path around it.
 
     NaN where the path has no length.
     """

@@ -1,4 +1,4 @@
-"""Scores of changed objects: which returns of each change were cut out, and what was said to have happened to it."""
+"""Scores of changed objects: overlap of each change with the extracted returns, and accuracy of the kind."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PHASES = tuple(itertools.product((0.0, 0.5), repeat=3))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectMatches:
-    """Which object stands for which change.
+    """One-to-one matching of objects and changes.
 
     Attributes:
         matched_object: (C,) int64 object of each change, -1 for none.
@@ -31,7 +31,7 @@ class ObjectMatches:
         iou_voxel: (C,) likewise for 0.1 m voxels, mean over 8 grid phases.
         iou_box: (C,) likewise for axis-aligned boxes.
         is_excused: (O,) objects with more than half of their rows on changes outside of the main group (unobservable or
-            partial), which so cannot be false.
+            partial); these cannot be false.
     """
 
     matched_object: Int64Array
@@ -43,7 +43,7 @@ class ObjectMatches:
 
     @property
     def outcomes(self) -> tuple[Outcome, ...]:
-        """What became of each object."""
+        """Outcome of each object."""
         return tuple(
             "match" if change >= 0 else "ignored" if excused else "false"
             for change, excused in zip(self.matched_change, self.is_excused, strict=True)
@@ -59,7 +59,7 @@ def best_matching(iou: Float64Array) -> list[tuple[int, int]]:
 def voxel_iou(points_a: Float64Array, points_b: Float64Array, voxel_m: float = CELL_M) -> float:
     """Return the IoU of the voxels that two sets of points fill, mean over 8 grids half a voxel apart.
 
-    One grid alone would favour answers that happen to be cut along its walls. NaN for two empty sets.
+    A single grid would favour answers whose edges lie on cell walls. NaN for two empty sets.
     """
     if len(points_a) + len(points_b) == 0:
         return float("nan")
@@ -75,7 +75,7 @@ def voxel_iou(points_a: Float64Array, points_b: Float64Array, voxel_m: float = C
 def box_iou(points_a: Float64Array, points_b: Float64Array, cell_m: float = CELL_M) -> float:
     """Return the IoU of the axis-aligned boxes around two sets of points; 0 if either is empty.
 
-    Each point stands for a cell, so boxes reach half a cell beyond their points; a flat object keeps a volume.
+    Each point stands for a cell: boxes reach half a cell beyond their points, so that a flat object has a volume.
     """
     if len(points_a) == 0 or len(points_b) == 0:
         return 0.0
@@ -124,11 +124,11 @@ def match_objects(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], 
 
 
 def kinds_right(objects: Sequence[ChangedObject], matches: ObjectMatches, truth: GroundTruth) -> Float64Array:
-    """Return (C,) whether each matched change was called what it is: 1, 0, or NaN where nothing matched.
+    """Return (C,) whether each matched change has the right kind: 1, 0, or NaN where nothing matched.
 
-    A moved change is right if its object is called moved and is linked with the object matched to the change's other
-    half. If that other half is not observable, the object may also be called what the session alone shows: added in
-    the after session, removed in the before session.
+    A moved change is right if its object has the kind moved and is linked with the object matched to the change's other
+    half. If that other half is not observable, the kind that one session alone shows is right as well: added in the
+    after session, removed in the before session.
     """
     changes = truth.pair.changes
     place = {change.id: index for index, change in enumerate(changes)}
@@ -173,7 +173,7 @@ def object_columns(matches: ObjectMatches, right: Float64Array, truth: GroundTru
 
 
 def unanswered_objects(truth: GroundTruth) -> tuple[ObjectMatches, dict[str, float]]:
-    """Return the scores of a case without an answer: 0 in every object column wherever there was something to find."""
+    """Return the scores of a case without an answer: 0 in every object column where observable changes exist."""
     matches = match_objects((), (), truth)
     columns = object_columns(matches, np.full(len(truth.pair.changes), np.nan), truth)
     if (truth.is_observable & ~truth.is_partial).any():
@@ -184,7 +184,7 @@ def unanswered_objects(truth: GroundTruth) -> tuple[ObjectMatches, dict[str, flo
 
 
 def _instance_scores(matches: ObjectMatches, is_main: BoolArray, min_iou: float) -> tuple[float, float, float]:
-    """Return F1, precision and panoptic quality at an IoU; NaN where nothing was there and nothing was answered."""
+    """Return F1, precision and panoptic quality at an IoU; NaN without changes and without objects."""
     is_hit = is_main & (matches.iou_point >= min_iou)
     n_hit = int(np.count_nonzero(is_hit))
     n_missed = int(np.count_nonzero(is_main)) - n_hit

@@ -1,4 +1,4 @@
-"""How far a moved object went and how much a thing takes up, as answered, against the truth."""
+"""Errors of the answered displacements and volumes of objects."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ PILE_KIND = "muck_pile"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SizeErrors:
-    """Errors of the matched changes; NaN where nothing is matched, nothing was answered, or nothing is known.
+    """Errors of the matched changes; NaN without a match, without an answered figure, or without a true one.
 
     Attributes:
-        displacement_m: (C,) length of the answered displacement minus the true one, both halves of a move.
+        displacement_m: (C,) length of the difference of answered and true displacement, for both halves of a move.
         volume_share: (C,) (answered volume - true volume) / true volume.
     """
 
@@ -38,9 +38,9 @@ def size_errors(
 
     Args:
         objects: The answer's objects.
-        matches: Which of them stands for which change.
+        matches: Matching of objects and changes.
         truth: The pair's truth.
-        keyframe_scans: Scans of the before keyframes, through which places are carried into the map frame.
+        keyframe_scans: Scans of the before keyframes, whose poses transform places into the map frame.
     """
     changes = truth.pair.changes
     errors = SizeErrors(*(np.full(len(changes), np.nan) for _ in range(2)))
@@ -56,11 +56,11 @@ def size_errors(
 
 
 def true_displacements_map(truth: GroundTruth, keyframe_scans: Int64Array) -> Float64Array:
-    """Return (C, 3) from where each moved object stood to where it stands, map frame, metres; NaN for what never moved.
+    """Return the (C, 3) displacement of each moved object, map frame, metres; NaN for objects that did not move.
 
-    The middle of the object's bounding box goes from one place to the other. Each of the two places is carried into
-    the map frame through the true pose of the before keyframe that is truly nearest to it: how far the before odometry
-    drifts between them belongs to the map frame and is no error of the answer.
+    A displacement joins the centres of the object's bounding box before and after the move. Each centre is transformed
+    into the map frame by the true pose of the before keyframe nearest to it in the world. The drift of the before
+    odometry between both places belongs to the map frame and is no error of the answer.
     """
     changes = truth.pair.changes
     if not changes:
@@ -80,7 +80,7 @@ def true_displacements_map(truth: GroundTruth, keyframe_scans: Int64Array) -> Fl
 def true_volume_m3(change: Change) -> float:
     """Return the volume of a change: of its closed surface or, for props of several parts, of its convex hull.
 
-    Of a reshaped prop it is that of what is gone. NaN for a short move: only a part of the object is its truth.
+    For a reshaped prop it is the removed volume. NaN for a short move, where only a part of the object is its truth.
     """
     if change.group == "partial" and change.kind == "moved":
         return float("nan")
@@ -97,12 +97,12 @@ def size_columns(errors: SizeErrors, truth: GroundTruth) -> dict[str, float]:
 
 
 def _heights_m(scenario: Mapping[str, Any]) -> dict[str, float]:
-    """Return the height of every prop that says its own."""
+    """Return the height of every prop whose scenario states its size."""
     return {prop["name"]: float(prop["size_m"][2]) for prop in scenario.get("props", ()) if prop.get("size_m")}
 
 
 def _middle_world(change: Change, height_m: float) -> Float64Array:
-    """Return (3,) the middle of an object, whose own origin is on the floor; it may stand, lean or lie."""
+    """Return the (3,) centre of an object, whose own origin is on the floor, in any orientation."""
     pose = np.asarray(change.world_T_object, dtype=np.float64)
     return np.asarray(pose[:3, :3] @ (0.0, 0.0, height_m / 2) + pose[:3, 3])
 

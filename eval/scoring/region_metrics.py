@@ -1,4 +1,4 @@
-"""Scores of change regions: which changes were found, which regions were false, how well keyframes were ranked."""
+"""Scores of change regions: found changes, false regions, and the ranking of keyframes."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ NEGATIVE_FACTOR = 1.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegionMatches:
-    """What became of each of R candidates and C changes.
+    """Outcomes of R candidates and C changes.
 
     Attributes:
         outcomes: R outcomes, in the order of the candidates.
-        found: R tuples: indices of the changes each candidate's centre is near enough to.
+        found: R tuples: indices of the changes within the score radius of each candidate's centre.
         best_region: (C,) int64 best-scored reported region that finds each change, -1 for none.
     """
 
@@ -33,7 +33,7 @@ class RegionMatches:
     best_region: Int64Array
 
     def count(self, outcome: Outcome) -> int:
-        """Return how many candidates had an outcome."""
+        """Return the number of candidates with an outcome."""
         return self.outcomes.count(outcome)
 
 
@@ -43,9 +43,9 @@ def keyframes_or_all(keyframe_scans: Int64Array, n_scans: int) -> Int64Array:
 
 
 def centres_in_world(centres_map: Float64Array, before: SessionTruth, keyframe_scans: Int64Array) -> Float64Array:
-    """Carry (R, 3) centres from the map frame into the world, each through the true pose of the nearest keyframe.
+    """Transform (R, 3) centres from the map frame into the world, each by the true pose of the nearest keyframe.
 
-    The map frame is the before session's odom frame, which drifts against the world: no single transform would do.
+    The map frame is the before session's odom frame, which drifts against the world, so one transform is not enough.
     """
     if len(centres_map) == 0:
         return np.zeros((0, 3))
@@ -55,7 +55,7 @@ def centres_in_world(centres_map: Float64Array, before: SessionTruth, keyframe_s
 
 
 def places_in_map(places_world: Float64Array, before: SessionTruth, keyframe_scans: Int64Array) -> Float64Array:
-    """Carry (N, 3) true places into the map frame, each through the true pose of the keyframe truly nearest to it."""
+    """Transform (N, 3) true places into the map frame, each by the true pose of the keyframe truly nearest to it."""
     if len(places_world) == 0:
         return np.zeros((0, 3))
     world_T_keyframe = before.world_T_sensor[keyframe_scans]
@@ -80,9 +80,9 @@ def match_regions(
 
     Args:
         centres_world: (R, 3) centres of all candidates, best first.
-        is_reported: (R,) which of them are reported.
+        is_reported: (R,) mask of the reported ones.
         centroids_world: (C, 3) centroids of the changes.
-        is_observable: (C,) which changes count.
+        is_observable: (C,) mask of the observable changes.
         score_radius_m: The family's distance.
     """
     distances = np.linalg.norm(centres_world[:, None] - centroids_world[None], axis=2)
@@ -116,7 +116,7 @@ def recall_at_k(found: Sequence[tuple[int, ...]], is_observable: BoolArray) -> f
 def covered_share(
     positions_world: Float64Array, travelled_m: Float64Array, centres_world: Float64Array, radius_m: float
 ) -> float:
-    """Return the share of a path's length that lies inside spheres; a step between scans counts by its middle.
+    """Return the share of a path's length inside spheres; the middle of a step between scans decides for the step.
 
     Args:
         positions_world: (S, 3) true positions along the path.
@@ -152,7 +152,7 @@ class RegionScores:
 
     Attributes:
         columns: Its columns of results.csv.
-        matches: What became of each region and change.
+        matches: Outcome of each region and change.
         keyframe_labels: (K,) 1, 0 or -1 of each scored before keyframe.
     """
 
@@ -204,7 +204,7 @@ def score_regions(report: ChangeReport, truth: GroundTruth, after_travelled_m: F
 
 
 def _rates(matches: RegionMatches, truth: GroundTruth, path_m: float) -> dict[str, float]:
-    """Return recall, precision and false alarms of the regions that were matched as reported."""
+    """Return recall, precision and false alarms of the matched regions."""
     n_true, n_false = matches.count("true"), matches.count("false")
     return {
         "region_recall": _n_found(matches, truth) / truth.n_observable if truth.n_observable else float("nan"),
@@ -218,20 +218,13 @@ def _n_found(matches: RegionMatches, truth: GroundTruth) -> int:
 
 
 def unanswered_regions(n_changes: int, n_observable: int) -> RegionScores:
-    """Return the scores of a case without an answer: nothing found; rates of what was never reported stay NaN."""
+    """Return the scores of a case without an answer: recall 0; rates over reported regions are NaN."""
     nan = float("nan")
     recall = 0.0 if n_observable else nan
     undefined = ("region_precision", "region_auroc", "region_ap", "false_regions_per_100m", "region_coverage")
     rates = dict.fromkeys((*undefined, "region_precision_proposed", "false_regions_per_100m_proposed"), nan)
-    counts = (
-        "regions",
-        "withdrawn",
-        "true_regions",
-        "false_regions",
-        "duplicate_regions",
-        "ignored_regions",
-        "found_changes",
-    )
+    outcomes = ("true_regions", "false_regions", "duplicate_regions", "ignored_regions")
+    counts = ("regions", "withdrawn", *outcomes, "found_changes")
     columns = {
         **dict.fromkeys(("region_recall", "region_recall_at_k"), recall),
         **dict.fromkeys(("region_recall_proposed", "region_recall_at_k_proposed"), recall),

@@ -35,7 +35,7 @@ class CaseScore:
     """The scores of one answer.
 
     Attributes:
-        row: Its row of results.csv; scenario, variant and preset are the caller's to overwrite.
+        row: Its row of results.csv; the caller overwrites scenario, variant and preset.
         changes: One dict per change of the truth.
         regions: One dict per candidate region.
         objects: One dict per answered object.
@@ -78,8 +78,8 @@ def score_pair(pair: Path, answer_folder: Path) -> CaseScore:
 def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
     """Score an answer that was checked (`eval.scoring.answer_check`) against a pair's truth.
 
-    An answer that ends at the merge is scored up to it: region and object columns are NaN, also where it was refused or
-    failed, and there are no items.
+    An answer that ends at the merge has NaN in all region and object columns, also where the merge was refused or
+    failed, and it has no items.
     """
     after_travelled_m = travelled_m(truth.after.odom_T_sensor)
     report = answer.report
@@ -253,9 +253,9 @@ def _merge(answer: Answer, truth: GroundTruth) -> dict[str, float]:
 
 
 def _times(answer: Answer, n_proposed: int) -> dict[str, float]:
-    """Return the time columns; whatever an answer does not state is NaN, and so are sums that would need it.
+    """Return the time columns; a time that the answer does not state is NaN, and so are its sums.
 
-    What was withdrawn was compared and cut out as well, so it counts among the regions that the time was spent on.
+    Withdrawn regions were compared and extracted as well, so times per region count them.
     """
     seconds = answer.seconds
     index, merge, refine, descriptor, cd, oe, returns = (
@@ -296,7 +296,7 @@ def _sizes(answer: Answer, truth: GroundTruth, n_regions: int, after_path_m: flo
         **{name: float(answer.evidence.get(name, _NAN)) for name in ("bytes_map_before", "bytes_regions_before")},
         "after_path_m": after_path_m,
         "is_unchanged_pair": is_unchanged,
-        # a pair that was refused, or only merged, was neither silent nor an alarm
+        # a refused pair, or one that ends at the merge, is neither silent nor an alarm
         "is_alarm": n_regions > 0 if is_unchanged and answer.report is not None and answer.until is None else _NAN,
     }
 

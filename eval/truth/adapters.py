@@ -1,4 +1,4 @@
-"""Where a simulated session becomes the pipeline's input: the only such place, so truth cannot leak into a method."""
+"""The only place where a simulated session becomes input of a method, so that truth cannot leak into it."""
 
 from __future__ import annotations
 

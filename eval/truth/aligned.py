@@ -1,4 +1,4 @@
-"""The alignment that an answer was made with, for pictures of the after map in the map frame."""
+"""The alignment of an answer, for pictures of the after map in the map frame."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cdpipe.model.report import ChangeReport
 
 
 def alignment_of(report: ChangeReport, after_odom_T_sensor: Float64Array) -> PathAlignment:
-    """Return how the after session's odom frame lies in the map frame, as a report has it.
+    """Return the alignment of the after odom frame in the map frame, as a report states it.
 
     Args:
         report: The answer; its merge is rigid, or given at each after keyframe (at each scan where it names none).

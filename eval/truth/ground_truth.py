@@ -1,4 +1,4 @@
-"""Everything a pair's scores are measured against: true poses, changes, their cells and their places in the world."""
+"""Truth of a pair: true poses, changes, their cells and their places in the world."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class SessionTruth:
     """One session with its true poses.
 
     Attributes:
-        odom_T_sensor: (S, 4, 4) poses as the robot believed them.
-        world_T_sensor: (S, 4, 4) poses as they were.
-        universe: The returns that objects are scored against.
+        odom_T_sensor: (S, 4, 4) poses of the robot's odometry.
+        world_T_sensor: (S, 4, 4) true poses.
+        universe: Returns that objects are scored against.
     """
 
     odom_T_sensor: Float64Array
@@ -38,7 +38,7 @@ class SessionTruth:
         require_shape("world_T_sensor", self.world_T_sensor, self.odom_T_sensor.shape)
 
     def to_world(self, points_odom: Float64Array, scans: Int64Array) -> Float64Array:
-        """Carry (N, 3) odom points into the world, each through the true pose of one of (N,) scans."""
+        """Transform (N, 3) odom points into the world, each by the true pose of one of (N,) scans."""
         world_T_odom = self.world_T_sensor[scans] @ invert(self.odom_T_sensor[scans])
         moved = np.einsum("nij,nj->ni", world_T_odom[:, :3, :3], points_odom) + world_T_odom[:, :3, 3]
         return np.asarray(moved, dtype=np.float64)
@@ -54,7 +54,7 @@ class GroundTruth:
         change_rows: C arrays: the rows of its session's universe that belong to each change.
         centroids_world: (C, 3) centroid of those rows through the true poses, world frame; the object's own origin for
             a change that fills no cell.
-        is_observable: (C,) changes that count; one that fills no cell of the universe never does.
+        is_observable: (C,) observable changes; a change that fills no cell is never observable.
         is_partial: (C,) changes of the group "partial".
     """
 
@@ -101,7 +101,7 @@ def load_ground_truth(pair: Path) -> GroundTruth:
 
 
 def ground_truth(truth: PairTruth, sessions: Mapping[SessionName, SessionTruth]) -> GroundTruth:
-    """Put a pair's truth together from the list of its changes and its two sessions."""
+    """Assemble a pair's truth from the list of its changes and its two sessions."""
     rows, centroids = [], []
     for change in truth.changes:
         session = sessions[change.session]

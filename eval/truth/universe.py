@@ -1,8 +1,8 @@
-"""The returns of one session against which objects are scored: one per 0.1 m cell of its own odom frame.
+"""Scoring points of a session: one return per 0.1 m cell of its own odom frame, against which objects are scored.
 
-Both the truth of a change and the answer of a method are subsets of these rows, so an object seen from near by, with a
-hundred returns in a cell, weighs no more than one seen from afar. Cells are fixed in the session's own odometry, so
-that a wrong merge acts only through what the method answers.
+The truth of a change and the answer of a method are both subsets of these rows. An object at close range, with a
+hundred returns per cell, therefore weighs as much as a distant one. Cells are fixed in the session's own odometry, so
+that a wrong merge acts only through the answer.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _PENDING_ROWS = 4_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoringPoints:
-    """One return per occupied cell, in the order they were measured.
+    """One return per occupied cell, in the order of measurement.
 
     Attributes:
         returns: (N,) int64 scan * n_pixels + pixel of each, rising.
@@ -103,9 +103,9 @@ def load_universe(session: Path) -> ScoringPoints:
 
 
 def build_universe(session: Session) -> ScoringPoints:
-    """Take the first return of each 0.1 m cell, in the order of scans and, within one, of row-major pixels.
+    """Return the first return of each 0.1 m cell, in the order of scans and of row-major pixels.
 
-    Streams over the session; memory grows with the number of cells, about 60 bytes each.
+    Reads the session as a stream; memory grows by about 60 bytes per cell.
 
     Raises:
         InputError: The session or its truth is missing or damaged.
@@ -127,7 +127,7 @@ def build_universe(session: Session) -> ScoringPoints:
 
 
 class UniverseBuilder:
-    """Takes the scans of a session one after the other and keeps the first return of each cell."""
+    """Receives the scans of a session in order and keeps the first return of each cell."""
 
     def __init__(self, name: str, height: int, width: int) -> None:
         self._name = name
@@ -150,7 +150,7 @@ class UniverseBuilder:
             cells = cell_keys(points_odom, CELL_M)
         except ValueError as error:
             raise InputError(f"{self._name}: scan {scan.index}: {error}") from error
-        # neighbours on a row mostly share a cell, and of these none but the first can be the cell's first
+        # neighbours on a row mostly share a cell; only the first of them can be the first of the cell
         is_entered = np.append(True, cells[1:] != cells[:-1])[: len(cells)]
         pixels = scan.pixels[is_entered]
         self._batch.append(
@@ -166,7 +166,7 @@ class UniverseBuilder:
             return
         self._pending.append(_first_per_cell(self._batch))
         self._batch = []
-        # folding only once as much is pending as folded keeps the sorting linear in the length of the session
+        # fold once as much is pending as folded: sorting then stays linear in the length of the session
         if _count(self._pending) > max(_PENDING_ROWS, _count(self._folded)):
             self._folded, self._pending = [_first_per_cell([*self._folded, *self._pending])], []
 
@@ -195,7 +195,7 @@ class _Rows:
 
 
 def _nearer(nearest_m: Float32Array, scan: PosedScan, change: Int16Array) -> Float32Array:
-    """Return the shortest ranges by change id with those of one scan taken in."""
+    """Return the shortest ranges by change id, updated with those of one scan."""
     ids = change.ravel()[scan.pixels]
     is_change = ids > 0
     extended = np.full(max(len(nearest_m), int(ids.max(initial=0)) + 1), np.inf, dtype=np.float32)
@@ -210,14 +210,14 @@ def _count(parts: Sequence[_Rows]) -> int:
 
 
 def _first_per_cell(parts: Sequence[_Rows]) -> _Rows:
-    """Keep the first row of each cell; `parts` come in the order of measurement, so the result precedes later ones."""
+    """Keep the first row of each cell; `parts` are in the order of measurement."""
     _, first = np.unique(np.concatenate([part.cells for part in parts]), return_index=True)
     names = [item.name for item in fields(_Rows)]
     return _Rows(**{name: np.concatenate([getattr(part, name) for part in parts])[first] for name in names})
 
 
 def _fingerprint(session: Session) -> str:
-    """Return a digest that changes when any file does that the universe was made from."""
+    """Return a digest that changes with any file that the scoring points depend on."""
     hasher = hashlib.sha256(f"{_CACHE_VERSION} {CELL_M}".encode())
     for name in ("session.json", "odometry.npz"):
         hasher.update((session.path / name).read_bytes())
@@ -237,7 +237,7 @@ def _read_cache(path: Path, fingerprint: str, session: Session) -> ScoringPoints
             return None
         return ScoringPoints(**arrays, n_scans=session.n_scans, n_pixels=session.sensor.height * session.sensor.width)
     except (InputError, KeyError, TypeError, ValueError):
-        return None  # absent or damaged: it is rebuilt from the session
+        return None  # absent or damaged: rebuilt from the session
 
 
 def _write_cache(path: Path, fingerprint: str, universe: ScoringPoints) -> None:
@@ -252,4 +252,4 @@ def _write_cache(path: Path, fingerprint: str, universe: ScoringPoints) -> None:
         )
         partial.replace(path)
     except OSError:
-        partial.unlink(missing_ok=True)  # a folder that cannot be written to is scored all the same, only slower
+        partial.unlink(missing_ok=True)  # a read-only folder is scored without the cache, more slowly
