@@ -1,4 +1,4 @@
-"""A plan as the command line changes it: --seeds, --set and --grid."""
+"""Changes of a plan by the options --seeds, --set and --grid."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from eval.plans.worlds import group_of
 def changed_plan(
     plan: Plan, *, seeds: str | None = None, settings: Sequence[str] = (), grid: Sequence[str] = ()
 ) -> Plan:
-    """Return the plan with --seeds, --set and --grid of the command line applied.
+    """Return the plan with the options --seeds, --set and --grid applied.
 
     Args:
         plan: The plan.
         seeds: "A:B", replaces the plan's seeds.
         settings: `key=value`, written over every variant and every grid point.
-        grid: `key=v1,v2`; every variant is run at every combination. The plan's own grids stay as they are. Variants
-            that are merged by the truth get neither settings nor grids of `merge`, those whose regions are the truth's
-            none of `query` but radius and suppression.
+        grid: `key=v1,v2`; every variant runs at every combination. The plan's own grids stay. Variants merged by the
+            truth get neither settings nor grids of `merge`; variants with regions from the truth get none of `query`
+            except radius and suppression.
 
     Raises:
-        InputError: One of them cannot be read, or its key or value is wrong.
+        InputError: An option is malformed, or its key or value is wrong.
     """
     _refuse_mistakes(seeds, settings, grid)
     axes = [_grid_axis(text) for text in grid]
@@ -55,7 +55,7 @@ def changed_plan(
 def _additions(
     variant: Mapping[str, Any], axes: Sequence[Sequence[str]], settings: Sequence[str]
 ) -> list[tuple[str, ...]]:
-    """Return what the command line adds to a variant, once for each copy of it."""
+    """Return the settings that the options add to a variant, one tuple for each copy of it."""
     if "oracle_merge" in variant:
         axes = [axis for axis in axes if group_of(axis[0]) != "merge"]
         settings = [setting for setting in settings if group_of(setting) != "merge"]
@@ -66,7 +66,7 @@ def _additions(
 
 
 def _refuse_mistakes(seeds: str | None, settings: Sequence[str], grid: Sequence[str]) -> None:
-    """Check every option, and tell all mistakes at once."""
+    """Check every option and raise all mistakes at once."""
     checks: list[tuple[str, Callable[[], object]]] = []
     if seeds is not None:
         checks.append((f"--seeds {seeds}", partial(parse_seeds, seeds)))
@@ -75,7 +75,7 @@ def _refuse_mistakes(seeds: str | None, settings: Sequence[str], grid: Sequence[
     axes = [key_of(text) for text in grid if "=" in text]
     keys = [*axes, *{key_of(setting) for setting in settings}]
     mistakes = [
-        f"--grid {key}: set twice, by another --grid or by --set, so that cells would be one: leave one out"
+        f"--grid {key}: set twice, by another --grid or by --set: leave one of them out"
         for key in dict.fromkeys(axes)
         if keys.count(key) > 1
     ]

@@ -1,4 +1,4 @@
-"""How much of what was planned a run folder holds: while some is missing, no verdict is passed."""
+"""Share of the planned pairs that a run folder holds; an incomplete run gets no verdict."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from eval.plans.plan import Plan, planned_cases
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """Session pairs that the plan of a run names, and how many of them have all of their cells."""
+    """Number of session pairs in the plan of a run, and of those with all of their cells."""
 
     n_done: int
     n_planned: int
 
     @property
     def is_whole(self) -> bool:
-        """Whether nothing is missing."""
+        """Whether all planned pairs are complete."""
         return self.n_done == self.n_planned
 
     @property
     def sentence(self) -> str:
-        """The same in words."""
+        """The counts in words."""
         return f"{self.n_done} of {self.n_planned} planned pairs so far: no verdict before all are there."
 
 
 def coverage(provenance: Mapping[str, Any], cases: Iterable[tuple[str, int, str]]) -> Coverage | None:
-    """Compare what a run holds with the plan that it was last run with.
+    """Compare the rows of a run with its latest plan.
 
     Args:
         provenance: Content of provenance.json.
         cases: Scenario, seed and variant of each row of results.csv.
 
     Returns:
-        None where the plan is not told, or cannot be read any more (a preset's file is gone).
+        None where provenance.json has no plan, or the plan is not valid any more (e.g. a preset's file is gone).
     """
     plan = plan_of(provenance)
     if plan is None:
@@ -49,7 +49,7 @@ def coverage(provenance: Mapping[str, Any], cases: Iterable[tuple[str, int, str]
 
 
 def plan_of(provenance: Mapping[str, Any]) -> Plan | None:
-    """Return the plan that a run was last run with; None where it is not told or cannot be read any more."""
+    """Return the latest plan of a run; None where it is absent or not valid any more."""
     document = provenance.get("plan")
     if not isinstance(document, dict):
         return None

@@ -1,4 +1,4 @@
-"""The parts of a plan that name methods: variants and grids, and whether their settings exist and do anything."""
+"""The parts of a plan that name methods: variants and grids, with checks of their settings."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from eval.oracles.merge import OracleMerge
 from eval.plans.worlds import OneOrMore, group_of, known_label, setting_text, told_as_values
 from scenarios.schema import Scenario
 
-# what a region around each change still takes from the query
+# settings of the query that regions from the truth still use
 _OF_TRUE_REGIONS = ("query.radius_m", "query.suppression")
 
 
 def acts_on_true_regions(setting: str) -> bool:
-    """Tell whether a setting does anything where the regions are the truth's."""
+    """Return whether a setting has an effect on a variant with regions from the truth."""
     return group_of(setting) != "query" or key_of(setting) in _OF_TRUE_REGIONS
 
 
@@ -36,10 +36,10 @@ def key_of(setting: str) -> str:
 
 
 def valid_setting(setting: str) -> str:
-    """Return a `key=value` of the method, if there is such a key and it takes this value.
+    """Return a `key=value` setting of the method if its key exists and accepts the value.
 
     Raises:
-        ValueError: There is none, or it belongs to the world.
+        ValueError: There is no such key, the value is wrong, or the key belongs to the world.
     """
     if group_of(setting) in Scenario.model_fields:
         raise ValueError(
@@ -51,10 +51,10 @@ def valid_setting(setting: str) -> str:
 
 
 def valid_settings(settings: Iterable[str]) -> None:
-    """Check some `key=value` of the method.
+    """Check `key=value` settings of the method.
 
     Raises:
-        ValueError: What is wrong with any of them, all in one.
+        ValueError: All mistakes in one message.
     """
     mistakes = []
     for setting in settings:
@@ -80,14 +80,14 @@ def _valid_keys(keys: dict[str, tuple[Any, ...]]) -> dict[str, tuple[Any, ...]]:
 
 
 def _not_empty(value: Any) -> Any:
-    # pydantic's own min_length counts only the items that passed, and so repeats their mistakes
+    # pydantic's min_length counts only valid items and would report their mistakes twice
     if isinstance(value, list | dict | tuple) and not value:
         raise ValueError("at least one is needed")
     return value
 
 
 def _with_braces(value: Any) -> Any:
-    # a bare `oracle_merge:` would be no oracle at all, and nothing would tell
+    # a bare `oracle_merge:` would silently be no oracle
     if not isinstance(value, dict | OracleMerge):
         raise ValueError("expected {noise_m: ..., noise_deg: ...}; {} is without noise")
     return value
@@ -102,7 +102,7 @@ Values = Annotated[tuple[Any, ...], NotEmpty]
 
 
 class Variant(Settings):
-    """One method to run: a preset and what is set over it, perhaps merged or told its regions by the truth."""
+    """One method to run: a preset, settings over it, and perhaps a merge or regions from the truth."""
 
     preset: PresetName
     set: MethodSettings = ()
@@ -122,7 +122,7 @@ class Variant(Settings):
 
     @property
     def every_setting(self) -> tuple[str, ...]:
-        """What is set over the preset anywhere."""
+        """All settings over the preset, in any scenario."""
         return (*self.set, *itertools.chain(*self.per_scenario.values()))
 
     @model_serializer(mode="wrap")
@@ -135,7 +135,7 @@ class Variant(Settings):
 
 
 class Grid(Settings):
-    """Every combination of some values of some settings, over one preset."""
+    """Every combination of values of some settings over one preset."""
 
     variant: PresetName
     scenarios: Annotated[tuple[Label, ...], NotEmpty]

@@ -1,11 +1,11 @@
-"""What is run: scenarios x seeds x variants, read from a plan file and spread out into cells.
+"""A plan: scenarios x seeds x variants, read from a plan file and expanded into cells.
 
 name: example
 description: what the plan is for
 scenarios:                           # eval/plans/worlds.py tells more
   - paper/site1
-  - {name: paper/site2, each: [sensor.range_noise=false, sensor.mode=512x10]}  # as it is, and again with each of these
-wide: [paper/site2]                  # wide drifts: presets with what stands under their `wide`
+  - {name: paper/site2, each: [sensor.range_noise=false, sensor.mode=512x10]}  # unchanged, and with each of these
+wide: [paper/site2]                  # wide drifts: presets apply their section `wide` there
 seeds: "20000:20002"                 # B excluded, in quotes; or a list
 report: [regions, objects]           # tables and plots of regions, of objects, or of both (eval/tables)
 until: null                          # merge: stop after the merge; only the columns of the merge are filled
@@ -19,7 +19,7 @@ variants:
     scenarios: [paper/site1]                             # only in these worlds; in all worlds if left out
 grid:
   - variant: tunnelcd                # a preset
-    scenarios: [paper/site1]         # out of the plan's; one world of several as paper/site2[sensor.mode=512x10]
+    scenarios: [paper/site1]         # some of the plan's worlds, e.g. paper/site2[sensor.mode=512x10]
     keys: {extract.voxel_m: [0.2, 0.4], query.radius_m: [3, 4.5]}
 """
 
@@ -49,7 +49,7 @@ _AFTER_MERGE = ("query", "extract", "outlier", "cluster", "m3c2", "dufomap")
 
 
 class Mistake(NamedTuple):
-    """One mistake of a plan: the keys that lead to it, what is written there, and the rule that it breaks."""
+    """One mistake of a plan: the keys that lead to it, the written value, and the rule that it breaks."""
 
     where: tuple[str | int, ...]
     written: str
@@ -57,7 +57,7 @@ class Mistake(NamedTuple):
 
 
 def refuse(mistakes: Iterable[Mistake]) -> None:
-    """Raise pydantic's error about all mistakes, if there are any."""
+    """Raise pydantic's error with all mistakes, if there are any."""
     found = [
         InitErrorDetails(type=PydanticCustomError("plan", "{rule}", {"rule": rule}), loc=where, input=written)
         for where, written, rule in mistakes
@@ -67,12 +67,12 @@ def refuse(mistakes: Iterable[Mistake]) -> None:
 
 
 def misfits(plan: Plan) -> list[Mistake]:
-    """Return every mistake that only shows between the parts of a plan."""
+    """Return every mistake in the relations between the parts of a plan."""
     return [*_past_the_end(plan), *_unknown_worlds(plan), *_repeated_variants(plan)]
 
 
 def repeated_worlds(items: Iterable[ScenarioItem]) -> Iterator[Mistake]:
-    """Yield the worlds that are listed twice or cannot be a folder; places are counted from the first item."""
+    """Yield the worlds that are listed twice or whose label is too long for a folder's name."""
     known: set[object] = set()
     for place, item in enumerate(items):
         for index, world in enumerate(worlds_of([item])):
@@ -149,7 +149,7 @@ def parse_seeds(value: Any) -> tuple[int, ...]:
     """Return the seeds of "A:B" (B excluded), of "A", or of a list of non-negative numbers.
 
     Raises:
-        ValueError: It is something else, or names no seed, or one twice.
+        ValueError: It has another form, is empty, or names a seed twice.
     """
     rule = 'expected "A:B" in quotes (B excluded) or a list of seeds, all 0 or larger'
     if isinstance(value, str):
@@ -160,7 +160,7 @@ def parse_seeds(value: Any) -> tuple[int, ...]:
         value = list(range(first, int(match[2]))) if match[2] else [first]
         if not value:
             raise ValueError(f"{rule}; this range is empty")
-    # YAML 1.1 reads an unquoted 1:40 as the number 100, so a bare number is not taken for a seed
+    # YAML 1.1 reads an unquoted 1:40 as the number 100, so a bare number is refused
     if not isinstance(value, list | tuple) or not value:
         raise ValueError(rule)
     if not all(type(seed) is int and seed >= 0 for seed in value) or len(set(value)) < len(value):
@@ -185,7 +185,7 @@ def _subjects(value: Any) -> Any:
 
 
 class Plan(Settings):
-    """What to run; `cells` spreads it out."""
+    """A plan; `cells` expands it."""
 
     name: Annotated[str, Field(min_length=1)]
     description: str = ""
@@ -213,7 +213,7 @@ def load_plan(name_or_path: str) -> Plan:
     """Read a shipped plan by name, or any plan by the path of its .yaml file.
 
     Raises:
-        InputError: It is unknown or has mistakes; all of them at once, one line each.
+        InputError: It is unknown or has mistakes (one line each).
     """
     if name_or_path.endswith((".yaml", ".yml")):
         return validate(Plan, read_yaml(Path(name_or_path)))

@@ -1,4 +1,4 @@
-"""Variants and grids spread out over the worlds of a plan: methods with their names, and cells."""
+"""Variants and grids expanded over the worlds of a plan: methods with their names, and cells."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class Cell:
     """One scenario, one seed, one variant: one row of results.csv.
 
     Attributes:
-        scenario: Label of its world: the scenario's name, and what is set over it in brackets.
+        scenario: Label of its world: the scenario's name, with its settings in brackets.
         seed: Its seed.
         preset: Name of the preset.
         variant: Preset and the settings that name the variant.
         config: The effective settings.
-        oracle: What merges instead of the method, or None.
-        until: Where it ends, None for the whole method.
-        oracle_regions: Whether the regions are the truth's.
+        oracle: The oracle that merges instead of the method, or None.
+        until: Last stage, None for the whole method.
+        oracle_regions: Whether the regions come from the truth.
     """
 
     scenario: str
@@ -49,7 +49,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """A variant or a grid point in one world: settings that make its name, and those that the site asks for."""
+    """A variant or a grid point in one world: settings in its name, and settings of the site."""
 
     preset: str
     named: tuple[str, ...]
@@ -60,14 +60,14 @@ class Method:
 
     @property
     def variant(self) -> str:
-        """What it is called in tables."""
+        """Its name in tables."""
         return variant_name(self.preset, self.named, self.oracle, oracle_regions=self.oracle_regions)
 
     def config(self) -> PipelineConfig:
         """Return its effective settings.
 
         Raises:
-            InputError: They contradict each other or its preset.
+            InputError: The settings contradict each other or the preset.
         """
         config = load_config(self.preset, [*self.named, *self.silent], self.site)
         if self.oracle_regions and config.method != "descriptor":
@@ -75,7 +75,7 @@ class Method:
         return config
 
     def cell(self, world: World, seed: int, config: PipelineConfig, until: Until | None) -> Cell:
-        """Return what it is to do with one seed of a world."""
+        """Return its cell for one seed of a world."""
         return Cell(
             scenario=world.label,
             seed=seed,
@@ -89,7 +89,7 @@ class Method:
 
 
 def methods_of(plan: Plan, world: World) -> list[Method]:
-    """Return the methods that a plan runs in one of its worlds: its variants, then the points of the grids there."""
+    """Return the methods that a plan runs in one of its worlds: variants first, then grid points."""
     places = dict.fromkeys((world.name, world.label))
     site: Site = "narrow" if places.keys().isdisjoint(plan.wide) else "wide"
     methods = [
@@ -115,8 +115,8 @@ def variant_name(
 ) -> str:
     """Return the preset's name, followed by its settings in brackets where there are any.
 
-    What takes its merge or its regions from the truth is called `oracle-merge`, `oracle-regions` or, both, joined by a
-    plus; any preset but `tunnelcd` and the noise of the merge come first in the brackets.
+    With a merge or regions from the truth the name is `oracle-merge`, `oracle-regions` or both joined by a plus. The
+    brackets then begin with the preset (except `tunnelcd`) and the noise of the merge.
     """
     stem = _stem(preset)
     if oracle is not None or oracle_regions:

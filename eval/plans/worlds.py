@@ -1,19 +1,19 @@
-"""The worlds of a plan: a scenario with settings over it, what such a world is called, and what it is held against.
+"""The worlds of a plan: scenarios with settings, the labels of worlds, and the reference of each world.
 
 scenarios:
   - paper/site1                      # a scenario as it is
   - name: narrow
-    set: ["platform.speed_mps=0.5"]  # written over the file before anything is drawn, and part of the world's name
-    each:                            # the same again with each of these on top: one setting, or a list
+    set: ["platform.speed_mps=0.5"]  # written over the file before the draw; part of the world's label
+    each:                            # one more world for each of these, added to `set`: one setting, or a list
       - sensor.range_noise=false
       - [sensor.range_noise=false, sensor.dropouts=false]
-    pair_kind: clean                 # what the plan expects of the merge there: the column of that name, nothing else
+    pair_kind: clean                 # kind of pair for the merge tables; fills the column of that name
     n_seeds: 6                       # only the first six of the plan's seeds
 
 These are four worlds: `paper/site1`, `narrow[platform.speed_mps=0.5]` and
 `narrow[platform.speed_mps=0.5][sensor.range_noise=false]`, and so on. The column `scenario` holds that name; `family`
-is the scenario's own, whatever was set. What comes on top stands in brackets of its own, so that the name alone tells
-what a world is held against, whichever plan ran it.
+is the scenario's own. Settings of `each` have brackets of their own, so that the label alone determines the reference
+of a world in any plan.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ from scenarios import check_scenario, scenario_names
 
 
 def known_scenario(name: str) -> str:
-    """Return the name of a shipped scenario or the path of a scenario's file, if there is such a one without mistakes.
+    """Return the name of a scenario, or the path of a scenario's file, after checking it.
 
     Raises:
-        ValueError: There is none, or the file has mistakes.
+        ValueError: It does not exist, or the file has mistakes.
     """
     names = scenario_names()
     if name.endswith((".yaml", ".yml")):
@@ -56,7 +56,7 @@ def known_scenario(name: str) -> str:
 
 
 def told_as_values(check: Callable[[], object]) -> None:
-    """Run a check of ours inside pydantic, which collects ValueErrors only."""
+    """Run a check that raises InputError inside pydantic, which collects only ValueErrors."""
     try:
         check()
     except InputError as error:
@@ -79,7 +79,7 @@ def _as_list(value: Any) -> Any:
 
 
 def _one_spelling(setting: str) -> str:
-    """Write the value as YAML reads it: `off` and `false ` are the same world as `false`."""
+    """Normalise the value as YAML reads it: `off` and `false ` give the same world as `false`."""
     key, equals, text = setting.partition("=")
     try:
         return setting_text(key, yaml.safe_load(text)) if equals else setting
@@ -102,7 +102,7 @@ WorldSettings = Annotated[tuple[Annotated[str, AfterValidator(_one_spelling)], .
 
 
 class ScenarioItem(Settings):
-    """One item of a plan's scenarios: a name, or a mapping; it stands for one world or for several."""
+    """One item of a plan's scenarios, a name or a mapping; it defines one or several worlds."""
 
     name: ScenarioName
     set: WorldSettings = ()
@@ -134,14 +134,14 @@ class ScenarioItem(Settings):
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """A scenario, and the `a.b=value` settings that are written over it before a seed draws it.
+    """A scenario with `a.b=value` settings that are written over it before the draw.
 
     Attributes:
         name: The scenario.
-        common: What its item sets in all of its worlds.
-        own: What this world has on top.
-        pair_kind: What its item calls its pairs, "" where it does not say; no part of the label.
-        n_seeds: How many of the plan's seeds it is run with, the first ones; None for all.
+        common: Settings that its item applies to all of its worlds.
+        own: Further settings of this world.
+        pair_kind: Kind of its pairs, "" if not given; no part of the label.
+        n_seeds: Number of the plan's seeds used, the first ones; None for all.
     """
 
     name: str
@@ -152,17 +152,17 @@ class World:
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """All that is set, in the order in which it is written over the scenario."""
+        """All settings, in the order in which they are written over the scenario."""
         return (*self.common, *self.own)
 
     @property
     def label(self) -> str:
-        """What it is called in tables: the scenario, and its settings in brackets where there are any."""
+        """Its name in tables: the scenario, with its settings in brackets if it has any."""
         return self.name + "".join(f"[{','.join(part)}]" for part in (self.common, self.own) if part)
 
 
 def worlds_of(items: Iterable[ScenarioItem]) -> list[World]:
-    """Return the worlds that the items of a plan stand for, in their order."""
+    """Return the worlds that the items of a plan define, in order."""
     return [
         World(item.name, item.set, own, item.pair_kind or "", item.n_seeds)
         for item in items
@@ -171,7 +171,7 @@ def worlds_of(items: Iterable[ScenarioItem]) -> list[World]:
 
 
 def known_label(label: str) -> str:
-    """Return a scenario's name, or the label of one with settings, if there is such a scenario.
+    """Return a scenario's name, or the label of one with settings, after checking that the scenario exists.
 
     Raises:
         ValueError: There is none.
@@ -187,16 +187,16 @@ def world_slug(label: str) -> str:
 
 
 def references(cases: Iterable[tuple[str, str, int]]) -> dict[tuple[str, str], str]:
-    """Return the world that each world is held against, for each variant that both were run with.
+    """Return the reference of each world, for each variant that ran in both.
 
-    That is the nearest world whose label is its own less one or more brackets at the end: `narrow[a=1]` for
-    `narrow[a=1][b=2]`, or else `narrow`.
+    The reference is the world whose label lacks the fewest brackets at the end: `narrow[a=1]` for `narrow[a=1][b=2]`,
+    or else `narrow`.
 
     Args:
         cases: World, variant and seed of each row of a run.
 
     Returns:
-        The other world by (world, variant); nothing where there is none with a seed in common.
+        The reference by (world, variant); no entry where no such world shares a seed.
     """
     seeds: dict[tuple[str, str], set[int]] = {}
     for world, variant, seed in cases:
@@ -210,18 +210,18 @@ def references(cases: Iterable[tuple[str, str, int]]) -> dict[tuple[str, str], s
 
 
 def settings_over(world: str, reference: str) -> str:
-    """Return the settings that a world has on top of its reference: "a=1,b=2" for `narrow[a=1][b=2]` over `narrow`."""
+    """Return the settings of a world beyond its reference: "a=1,b=2" for `narrow[a=1][b=2]` over `narrow`."""
     return world[len(reference) + 1 : -1].replace("][", ",")
 
 
 def _barer(label: str) -> Iterator[str]:
-    """Yield what stands before each bracket of a label, longest first; not all of it need be a world."""
+    """Yield the part of a label before each bracket, longest first; not every part is a world."""
     if label.endswith("]"):
         yield from (label[:place] for place in range(len(label) - 1, 0, -1) if label[place] == "[")
 
 
 def _check_draws(name: str, settings: tuple[str, ...]) -> None:
-    """Refuse settings that do not fit a scenario, whatever the seed."""
+    """Raise ValueError for settings that do not fit a scenario, for any seed."""
     of_method = [setting for setting in settings if group_of(setting) in PipelineConfig.model_fields]
     lines = [f"{setting} belongs to the method, not to the world: set it under variants" for setting in of_method]
     try:
@@ -233,5 +233,5 @@ def _check_draws(name: str, settings: tuple[str, ...]) -> None:
 
 
 def _without_option(told: str) -> list[str]:
-    """Return the lines of an error without the option of the command line that they seem to come from."""
+    """Return the lines of an error without a leading `--set`, which is wrong for a plan's file."""
     return [re.sub(r"^(--set)?:? ", "", line) for line in told.splitlines()]
