@@ -16,7 +16,19 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from PIL import Image
 
-from eval.core.charts import BAR_SHARE, GRID_COLOUR, HEAT_COLOURS, SYMBOLS, Dash, Drawing, Heat, Look, Panel, Series
+from eval.core.charts import (
+    BAR_SHARE,
+    BLACK,
+    GRID_COLOUR,
+    HEAT_COLOURS,
+    SYMBOLS,
+    Dash,
+    Drawing,
+    Heat,
+    Look,
+    Panel,
+    Series,
+)
 
 DPI = 130
 _WIDTH_IN, _PX_PER_IN, _LEGEND_CHARACTERS = 9.0, 88.0, 145
@@ -77,10 +89,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         _draw_heat(axes, panel.heat)
     bars = [each for each in panel.series if each.style == "bars"]
     for series in panel.series:
-        if series.style == "bars":
-            _draw_bars(axes, series, (bars.index(series) - (len(bars) - 1) / 2) / len(bars), BAR_SHARE / len(bars))
-        else:
-            _draw_series(axes, series)
+        _draw_series(axes, series, bars)
     for name, axis in (("x", panel.x), ("y", panel.y)):
         own = axes.xaxis if name == "x" else axes.yaxis
         axes.set(**{f"{name}scale": "log" if axis.is_log else "linear"})
@@ -94,32 +103,22 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _draw_series(axes: Axes, series: Series) -> None:
+def _draw_series(axes: Axes, series: Series, bars: list[Series]) -> None:
+    """Draw one series; `bars` are all series of the panel that are bars, which stand side by side."""
     x, y = np.asarray(series.x, dtype=np.float64), np.asarray(series.y, dtype=np.float64)
     look = series.look
-    axes.plot(x, y, drawstyle="steps-post" if series.style == "steps" else "default", **_line(look))
+    if series.style == "bars":
+        x = x + BAR_SHARE * ((bars.index(series) + 0.5) / len(bars) - 0.5)
+        hatch = "" if look.dash == "solid" else "///"
+        axes.bar(x, y, BAR_SHARE / len(bars), color=look.colour, hatch=hatch, edgecolor="white", linewidth=0.0)
+    else:
+        axes.plot(x, y, drawstyle="steps-post" if series.style == "steps" else "default", **_line(look))
     if series.intervals is not None:
         lengths_y, lengths_x = (None, series.intervals) if series.is_across else (series.intervals, None)
-        axes.errorbar(x, y, lengths_y, lengths_x, fmt="none", ecolor=look.colour, elinewidth=1.0, alpha=0.6)
+        colour = BLACK if series.style == "bars" else look.colour
+        axes.errorbar(x, y, lengths_y, lengths_x, fmt="none", ecolor=colour, elinewidth=1.0, alpha=0.6)
     for place, label in zip(zip(x, y, strict=True), series.labels, strict=False):
-        axes.annotate(
-            label,
-            place,
-            (-3, 2),
-            textcoords="offset points",
-            ha="right",
-            va="bottom",
-            fontsize=7,
-            annotation_clip=False,
-        )
-
-
-def _draw_bars(axes: Axes, series: Series, offset: float, width: float) -> None:
-    hatch = "" if series.look.dash == "solid" else "///"
-    x = np.asarray(series.x, dtype=np.float64) + BAR_SHARE * offset
-    axes.bar(x, np.asarray(series.y), width, color=series.look.colour, hatch=hatch, edgecolor="white", linewidth=0.0)
-    if series.intervals is not None:
-        axes.errorbar(x, np.asarray(series.y), yerr=series.intervals, fmt="none", ecolor="#444444", elinewidth=1.0)
+        axes.annotate(label, place, (-3, 2), textcoords="offset points", fontsize=7, ha="right", va="bottom")
 
 
 def _draw_heat(axes: Axes, heat: Heat) -> None:

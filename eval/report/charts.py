@@ -136,7 +136,8 @@ def _axis(axis: Axis) -> dict[str, Any]:
 
 def _trace(series: Series) -> dict[str, Any]:
     look = series.look
-    found: dict[str, Any] = {"x": series.x, "y": series.y, "name": series.name, "legendgroup": series.name}
+    found: dict[str, Any] = {"x": np.asarray(series.x), "y": np.asarray(series.y)}
+    found |= {"name": series.name, "legendgroup": series.name}
     found |= {"hovertemplate": series.hover} if series.hover else {"hoverinfo": "skip"}
     if series.intervals is not None:
         below, above = series.intervals

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 
-from cdpipe.core.geometry import Float64Array
 from eval.core.charts import (
     BLACK,
     BLUE,
@@ -24,6 +24,10 @@ from eval.core.charts import (
     named_ticks,
 )
 from eval.core.domains import domain_name
+from eval.report.charts import Chart
+from eval.tables.columns import EN_DASH, share
+from eval.tables.region_curves import RATES_PER_100M
+from eval.tables.region_table import ALL_DOMAINS, MAIN_VARIANT, RIVALS
 
 _SKY, _PURPLE, _GREY, _TEAL, _WINE = "#56B4E9", "#CC79A7", "#8a8a8a", "#44AA99", "#882255"
 _LOOKS = {
@@ -45,32 +49,8 @@ _DASHES: tuple[Dash, ...] = ("dashdot", "dot")
 _OTHERS = tuple(Look(colour, 1.2, dash) for dash in _DASHES for colour in (BLUE, ORANGE, GREEN, VERMILLION, _PURPLE))
 _FAINT, _LIMIT = Look("#d0d0d0", 0.8), Look("#c4c4c4", 0.8)
 _LEAST_RATE, _MOST_RATE = 0.01, 10.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Curve:
-    """A curve of (N,) points, and where the method's own threshold lies on it or beside it, None where it has none."""
-
-    x: Float64Array
-    y: Float64Array
-    own: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Bins:
-    """Recall of one method in N bins.
-
-    Attributes:
-        names: Text below each bin.
-        recall: (N,) recall, NaN where there is no change.
-        low: (N,) lower end of its interval, NaN for none.
-        high: (N,) upper end.
-    """
-
-    names: Sequence[str]
-    recall: Float64Array
-    low: Float64Array
-    high: Float64Array
+_MEASURES = {"hull_volume_m3": "hull of the object [m³]", "n_returns": "returns", "range_m": "shortest range [m]"}
+_MAX_LINES = 5
 
 
 def look_of(name: str, names: Sequence[str]) -> Look:
@@ -79,65 +59,128 @@ def look_of(name: str, names: Sequence[str]) -> Look:
     return _LOOKS[name] if name in _LOOKS else _OTHERS[unknown.index(name) % len(_OTHERS)]
 
 
-def roc_chart(panels: Mapping[str, Mapping[str, Curve]]) -> Drawing:
-    """Draw true against false positive rate of the keyframes, a panel for each domain and a line for each method."""
-    found: list[Panel] = []
-    for domain, curves in panels.items():
+def draw_roc(curves: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
+    """Return true against false positive rate of the keyframes, a panel for each domain and a line for each method.
+
+    Args:
+        curves: Rows of roc.csv.
+        table: Rows of regions_table.csv.
+    """
+    panels: list[Panel] = []
+    name = MAIN_VARIANT if MAIN_VARIANT in set(table["variant"]) else str(table["variant"].iloc[0])
+    areas = table[table["variant"] == name].set_index("domain")["region_auroc_pooled"]
+    told = []
+    for domain, methods in _domains(curves):
         lines = [
-            Series(curve.x, curve.y, look_of(name, list(curves)), name,
+            Series(own["false_positive_rate"], own["true_positive_rate"], look_of(method, list(methods)), method,
                    hover="%{x:.3f} of the unchanged, %{y:.3f} of the changed keyframes")
-            for name, curve in curves.items()
+            for method, own in methods.items()
         ]  # fmt: skip
         x = Axis("false positive rate (keyframes far from any change)", (0.0, 1.0))
-        y = Axis("" if found else "true positive rate (keyframes near a change)", (0.0, 1.01))
-        found.append(Panel(x, y, [Series([0, 1], [0, 1], _FAINT), *lines], domain_name(domain)))
-    return Drawing([found], 360)
+        y = Axis("" if panels else "true positive rate (keyframes near a change)", (0.0, 1.01))
+        panels.append(Panel(x, y, [Series([0, 1], [0, 1], _FAINT), *lines], domain_name(domain)))
+        told += [f"{share(float(areas[domain]))} {domain_name(domain)}"] if domain in areas.index else []
+    caption = (
+        "All keyframes of all pairs together, scores as they are; a keyframe that was never compared comes last. Area "
+        f"under the curve of {name}: {', '.join(told)}."
+    )
+    title = "How keyframe scores tell changed places from unchanged ones"
+    return Chart("roc", title, Drawing([panels], 360), caption, has_png=True) if panels else None
 
 
-def free_response_chart(panels: Mapping[str, Mapping[str, Curve]], rates: Sequence[float]) -> Drawing:
-    """Draw recall against false regions per 100 m, a panel for each domain; dots: the methods' own thresholds.
+def draw_free_response(curves: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
+    """Return recall against false regions per 100 m, a panel for each domain; dots: the methods' own thresholds.
+
+    A rate below 0.01 is drawn at 0.01, the left border.
 
     Args:
-        panels: Curves by domain and method. A rate below 0.01 is drawn at 0.01, the left border.
-        rates: Places of vertical lines, false regions per 100 m.
+        curves: Rows of froc.csv.
+        table: Rows of regions_table.csv.
     """
-    found: list[Panel] = []
-    for domain, curves in panels.items():
-        series = [Series([rate, rate], [0.0, 1.03], _LIMIT) for rate in rates]
-        for name, curve in curves.items():
-            look = look_of(name, list(curves))
-            common: dict[str, Any] = {"name": name, "hover": "%{x:.3g} false regions per 100 m, recall %{y:.3f}"}
-            x = np.clip(np.append(curve.x, _MOST_RATE), _LEAST_RATE, _MOST_RATE)
-            series.append(Series(x, np.append(curve.y, curve.y[-1:]), look, style="steps", **common))
-            if curve.own is not None:
-                at = float(np.clip(curve.own[0], _LEAST_RATE, _MOST_RATE))
-                series.append(Series([at], [curve.own[1]], replace(look, width=0.0, marker="circle"), **common))
+    panels: list[Panel] = []
+    own_places = table.assign(recall=table["n_found"] / table["n_observable"].where(table["n_observable"] > 0))
+    for domain, methods in _domains(curves):
+        series = [Series([rate, rate], [0.0, 1.03], _LIMIT) for rate in RATES_PER_100M]
+        for name, curve in methods.items():
+            look, hover = look_of(name, list(methods)), "%{x:.3g} false regions per 100 m, recall %{y:.3f}"
+            x = np.append(curve["false_regions_per_100m"], _MOST_RATE).clip(_LEAST_RATE, _MOST_RATE)
+            y = np.append(curve["recall"], curve["recall"].iloc[-1])
+            series.append(Series(x, y, look, name, "steps", hover=hover))
+            own = own_places[(own_places["domain"] == domain) & (own_places["variant"] == name)]
+            own = own[own["false_regions_per_100m"].notna()]
+            if len(own):
+                at = own["false_regions_per_100m"].clip(_LEAST_RATE, _MOST_RATE)
+                dot = replace(look, width=0.0, marker="circle")
+                series.append(Series(at, own["recall"], dot, name, hover=hover))
         x_axis = Axis("false regions per 100 m", (0.93 * _LEAST_RATE, _MOST_RATE), is_log=True)
-        y_axis = Axis("" if found else "recall of observable changes", (0.0, 1.03))
-        found.append(Panel(x_axis, y_axis, series, domain_name(domain)))
-    return Drawing([found], 360)
+        y_axis = Axis("" if panels else "recall of observable changes", (0.0, 1.03))
+        panels.append(Panel(x_axis, y_axis, series, domain_name(domain)))
+    rates = " and ".join(f"{rate:g}" for rate in RATES_PER_100M)
+    caption = (
+        f"Lines: every candidate, reported or not. Dots: the methods' own thresholds. Vertical lines: {rates} false "
+        "regions per 100 m. Rates of 0.01 and less are at the left border. Changed and unchanged pairs "
+        "together; a pair without an answer misses all its changes."
+    )
+    title = "Changes found against false regions, as the threshold falls"
+    return Chart("free_response", title, Drawing([panels], 360), caption, has_png=True) if panels else None
 
 
-def size_chart(panels: Mapping[str, Mapping[str, Mapping[str, Bins]]]) -> Drawing:
-    """Draw recall over bins: a row for each domain, a column for each measure, a line for each method.
+def draw_sizes(sizes: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
+    """Return recall by what a change is like: a row for each domain, a column for each measure, a line for each method.
 
     Args:
-        panels: Bins by domain, heading of the measure, and method; intervals are those of the last method.
+        sizes: Rows of regions_by_size.csv.
+        table: Rows of regions_table.csv.
     """
-    rows = []
-    for domain, measures in panels.items():
+    shown, rows = _shown_methods(table), []
+    for domain, methods in _domains(sizes):
         row: list[Panel] = []
-        for measure, methods in measures.items():
-            series = []
-            for place, (name, own) in enumerate(methods.items()):
-                # side by side, so that equal values do not hide each other
-                x = np.arange(len(own.names)) + 0.07 * (place - (len(methods) - 1) / 2)
-                low, high = (own.low, own.high) if name == list(methods)[-1] else (None, None)
-                look = replace(look_of(name, list(methods)), marker="circle", size=3.5)
-                series.append(Series(x, own.recall, look, name, low=low, high=high, hover="recall %{y:.2f}"))
-            names = [text.replace("\n", "\nn ") for text in next(iter(methods.values())).names]
-            x_axis = Axis(measure, (-0.4, len(names) - 0.6), ticks=named_ticks(names), tick_pt=5.5)
-            y_axis = Axis("" if row else f"recall, {domain_name(domain)}", (-0.02, 1.05))
-            row.append(Panel(x_axis, y_axis, series))
-        rows.append(row)
-    return Drawing(rows, 260)
+        for measure, title in _MEASURES.items():
+            bins = {name: methods[name][methods[name]["measure"] == measure] for name in shown if name in methods}
+            bins = {name: own.sort_values("low") for name, own in bins.items() if len(own)}
+            if bins:
+                row.append(_size_panel(bins, title, "" if row else f"recall, {domain_name(domain)}"))
+        rows += [row] if row else []
+    others = "" if len(shown) == table["variant"].nunique() else " All methods are in regions_by_size.csv."
+    caption = (
+        f"At {RATES_PER_100M[0]:g} false regions per 100 m. n: observable changes of the bin; bars: 95 % interval over "
+        f"pairs of {shown[-1]}.{others}"
+    )
+    title = "Recall by what a change is like"
+    return Chart("recall_by_size", title, Drawing(rows, 260), caption, has_png=True) if rows else None
+
+
+def _size_panel(bins: Mapping[str, pd.DataFrame], title: str, y_title: str) -> Panel:
+    """Return the lines of some methods over the bins of one measure; the interval is that of the last method."""
+    lows = sorted({low for own in bins.values() for low in own["low"]})
+    series = []
+    for place, (name, own) in enumerate(bins.items()):
+        # side by side, so that equal values do not hide each other
+        x = np.array([lows.index(low) for low in own["low"]]) + 0.07 * (place - (len(bins) - 1) / 2)
+        low, high = (own["interval_low"], own["interval_high"]) if name == list(bins)[-1] else (None, None)
+        look = replace(look_of(name, list(bins)), marker="circle", size=3.5)
+        series.append(Series(x, own["recall_at_rate"], look, name, low=low, high=high, hover="recall %{y:.2f}"))
+    every = pd.concat(bins.values()).drop_duplicates("low").sort_values("low")
+    names = [
+        f"{f'≥{low:g}' if math.isinf(high) else f'<{high:g}' if low == 0 else f'{low:g}{EN_DASH}{high:g}'}\nn {n}"
+        for low, high, n in every[["low", "high", "n_changes"]].itertuples(index=False, name=None)
+    ]
+    x_axis = Axis(title, (-0.4, len(names) - 0.6), ticks=named_ticks(names), tick_pt=5.5)
+    return Panel(x_axis, Axis(y_title, (-0.02, 1.05)), series)
+
+
+def _domains(table: pd.DataFrame | None) -> Iterator[tuple[str, dict[str, pd.DataFrame]]]:
+    """Yield every domain but all pairs together, with the rows of each of its methods."""
+    if table is None or len(table) == 0:
+        return
+    for domain, own in table[table["domain"] != ALL_DOMAINS].groupby("domain", sort=False):
+        yield str(domain), {str(name): rows for name, rows in own.groupby("variant", sort=False)}
+
+
+def _shown_methods(table: pd.DataFrame) -> list[str]:
+    """Return up to five methods, the one whose interval is drawn last: ours, the rivals, and the best of the rest."""
+    means = table.drop_duplicates("variant", keep="last").set_index("variant")["recall_at_0.1"]
+    ranked = [str(name) for name in means.sort_values(ascending=False, kind="stable").index]
+    first = [name for name in (MAIN_VARIANT, *RIVALS) if name in ranked]
+    chosen = [*first, *(name for name in ranked if name not in first)][:_MAX_LINES]
+    return chosen[::-1]

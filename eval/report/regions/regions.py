@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from eval.core.domains import domain_name
@@ -15,14 +14,13 @@ from eval.core.tablefile import table_file
 from eval.report.charts import Chart
 from eval.report.cost.pareto import with_domain
 from eval.report.merge.merge import covered_by
-from eval.report.regions.charts import Bins, Curve, free_response_chart, roc_chart, size_chart
+from eval.report.regions.charts import draw_free_response, draw_roc, draw_sizes
 from eval.report.story import about_failures, joined
 from eval.report.tables import Cell, Table, beside, best, used_pairs
 from eval.running.run_data import BASELINES, RunData, off_grids
 from eval.running.runfolder import reported
 from eval.tables.columns import EN_DASH, UNDEFINED, Column, share, significant, spaced
-from eval.tables.region_curves import RATES_PER_100M
-from eval.tables.region_table import ALL_DOMAINS, FILES, MAIN_VARIANT, RIVALS
+from eval.tables.region_table import ALL_DOMAINS, FILES, MAIN_VARIANT
 
 
 def _ms(seconds: float) -> str:
@@ -60,8 +58,6 @@ REGION_COLUMNS = (
            "Undefined where no region was reported."),
 )  # fmt: skip
 _SILENT = Column("silent_share", "silent", "high", share, "", "")
-_MEASURES = {"hull_volume_m3": "hull of the object [m³]", "n_returns": "returns", "range_m": "shortest range [m]"}
-_MAX_LINES = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,9 +95,9 @@ def draw_regions(data: RunData) -> RegionPart | None:
     targets = found.get("regions_targets", pd.DataFrame(columns=["target", "is_met"]))
     tables = (regions_table(table, with_domain(data.results)), silence_table(table), targets_table(targets))
     plots = (
-        _roc(shown.get("roc"), table),
-        _free_response(shown.get("froc"), table),
-        _sizes(shown.get("regions_by_size"), table),
+        draw_roc(shown.get("roc"), table),
+        draw_free_response(shown.get("froc"), table),
+        draw_sizes(shown.get("regions_by_size"), table),
     )
     return RegionPart(
         tuple(story(table, targets, data)),
@@ -232,105 +228,6 @@ def _silence(table: pd.DataFrame) -> list[str]:
     parts = [f"{row['variant']} {row['n_silent']:.0f} of {row['n_unchanged']:.0f}" for row in _records(own)]
     km = float(own["km_unchanged"].max()) if len(own) else 0.0
     return [f"Silent where nothing changed ({significant(km)} km): {', '.join(parts)}."] if parts else []
-
-
-def _roc(curves: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
-    panels = _curves(curves, ("false_positive_rate", "true_positive_rate"))
-    if not panels:
-        return None
-    return Chart(
-        "roc",
-        "How keyframe scores tell changed places from unchanged ones",
-        roc_chart(panels),
-        "Over all keyframes of all pairs at once, scores as they are (a keyframe that was never compared comes last). "
-        f"Area of {MAIN_VARIANT if MAIN_VARIANT in set(table['variant']) else table['variant'].iloc[0]}: "
-        + ", ".join(_areas(table, list(panels))),
-        has_png=True,
-    )
-
-
-def _areas(table: pd.DataFrame, domains: Sequence[str]) -> list[str]:
-    name = MAIN_VARIANT if MAIN_VARIANT in set(table["variant"]) else str(table["variant"].iloc[0])
-    own = table[table["variant"] == name].set_index("domain")["region_auroc_pooled"]
-    return [f"{share(float(own[domain]))} {domain_name(domain)}" for domain in domains if domain in own.index]
-
-
-def _free_response(curves: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
-    panels = _curves(curves, ("false_regions_per_100m", "recall"))
-    if not panels:
-        return None
-    for row in _records(table):
-        curve = panels.get(str(row["domain"]), {}).get(str(row["variant"]))
-        recall = row["n_found"] / row["n_observable"] if row["n_observable"] else math.nan
-        if curve is not None and not math.isnan(row["false_regions_per_100m"]):
-            own = (float(row["false_regions_per_100m"]), float(recall))
-            panels[str(row["domain"])][str(row["variant"])] = Curve(curve.x, curve.y, own)
-    return Chart(
-        "free_response",
-        "Changes found against false regions, as the threshold falls",
-        free_response_chart(panels, RATES_PER_100M),
-        f"Lines: every candidate, reported or not. Dots: the methods' own thresholds. Vertical: "
-        f"{' and '.join(f'{rate:g}' for rate in RATES_PER_100M)} false regions per 100 m; what lies at the left border "
-        "has 0.01 or fewer. Changed and unchanged pairs together; a pair without an answer misses all its changes.",
-        has_png=True,
-    )
-
-
-def _sizes(sizes: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
-    if sizes is None or len(sizes) == 0:
-        return None
-    shown = _shown_methods(table)
-    panels: dict[str, dict[str, dict[str, Bins]]] = {}
-    for domain in [name for name in dict.fromkeys(sizes["domain"]) if name != "all"]:
-        for measure, heading in _MEASURES.items():
-            own = sizes[(sizes["domain"] == domain) & (sizes["measure"] == measure)]
-            ranges = own[["low", "high"]].drop_duplicates().sort_values("low")
-            methods = {
-                name: _bins(own[own["variant"] == name], ranges) for name in shown if (own["variant"] == name).any()
-            }
-            if methods:
-                panels.setdefault(str(domain), {})[heading] = methods
-    if not panels:
-        return None
-    others = "" if len(shown) == table["variant"].nunique() else " All methods are in regions_by_size.csv."
-    return Chart(
-        "recall_by_size",
-        "Recall by what a change is like",
-        size_chart(panels),
-        f"At {RATES_PER_100M[0]:g} false regions per 100 m. Under each bin the number of observable changes; bars: "
-        f"95 % interval over pairs of {shown[-1]}.{others}",
-        has_png=True,
-    )
-
-
-def _shown_methods(table: pd.DataFrame) -> list[str]:
-    """Return up to five methods, the one whose interval is drawn last: ours, the rivals, and the best of the rest."""
-    means = table.drop_duplicates("variant", keep="last").set_index("variant")["recall_at_0.1"]
-    ranked = [str(name) for name in means.sort_values(ascending=False, kind="stable").index]
-    first = [name for name in (MAIN_VARIANT, *RIVALS) if name in ranked]
-    chosen = [*first, *(name for name in ranked if name not in first)][:_MAX_LINES]
-    return chosen[::-1]
-
-
-def _bins(own: pd.DataFrame, ranges: pd.DataFrame) -> Bins:
-    rows = {float(row["low"]): row for row in _records(own)}
-    names, values = [], []
-    for low, high in ranges.itertuples(index=False, name=None):
-        row = rows.get(float(low), {})
-        bounds = f"≥{low:g}" if math.isinf(high) else f"<{high:g}" if low == 0 else f"{low:g}{EN_DASH}{high:g}"
-        names.append(f"{bounds}\n{row.get('n_changes', 0)}")
-        values.append([row.get(key, math.nan) for key in ("recall_at_rate", "interval_low", "interval_high")])
-    return Bins(names, *np.array(values, dtype=np.float64).T)
-
-
-def _curves(curves: pd.DataFrame | None, columns: tuple[str, str]) -> dict[str, dict[str, Curve]]:
-    if curves is None or len(curves) == 0:
-        return {}
-    panels: dict[str, dict[str, Curve]] = {}
-    for (domain, variant), own in curves[curves["domain"] != "all"].groupby(["domain", "variant"], sort=False):
-        x, y = (own[column].to_numpy(dtype=np.float64) for column in columns)
-        panels.setdefault(str(domain), {})[str(variant)] = Curve(x, y)
-    return panels
 
 
 def _cell(

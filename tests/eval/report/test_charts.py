@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import plotly.graph_objects as go
 import pytest
 from matplotlib.colors import to_hex
@@ -12,7 +13,7 @@ from matplotlib.colors import to_hex
 from eval.core.charts import Axis, Drawing, Heat, Panel, Series, log_span
 from eval.core.figures import picture
 from eval.report.charts import Chart, plotly_figure, plotly_script
-from eval.report.regions.charts import Bins, Curve, free_response_chart, look_of, roc_chart, size_chart
+from eval.report.regions.charts import draw_free_response, draw_roc, draw_sizes, look_of
 from eval.report.scenarios import draw_scenarios
 from eval.report.settings.factors import draw_factors, factors
 from eval.report.settings.grids import draw_grids
@@ -20,9 +21,11 @@ from eval.running.run_data import RunData
 from eval.running.runfolder import RunFolder
 
 NAN = float("nan")
-RISING = np.array([0.0, 0.5, 1.0])
-CURVES = {"in": {"tunnelcd": Curve(RISING, RISING**2, (0.2, 0.5)), "paper": Curve(RISING, RISING)},
-          "out": {"paper": Curve(np.array([0.0, 40.0]), np.array([0.1, 0.3]))}}  # fmt: skip
+TABLE = pd.DataFrame(
+    {"domain": ["in", "in", "out"], "variant": ["tunnelcd", "paper", "paper"], "region_auroc_pooled": [0.9, 0.6, 0.5],
+     "n_found": [2, 0, 0], "n_observable": [4, 4, 0], "false_regions_per_100m": [0.2, NAN, NAN],
+     "recall_at_0.1": [0.9, 0.1, 0.1]}
+)  # fmt: skip
 SHARE = Axis("share", (0.0, 1.0))
 
 
@@ -34,6 +37,26 @@ def run(rows: list[dict[str, object]]) -> RunData:
 def accepted(drawing: Drawing) -> go.Figure:
     """What plotly makes of a chart as the page holds it; it refuses keys and values that it does not know."""
     return go.Figure(json.loads(Chart("a", "", drawing, "").json))
+
+
+def curves(x_name: str, y_name: str) -> pd.DataFrame:
+    """Two methods in distribution, one out of it, and all pairs together, which no chart shows."""
+    rows = [("in", "tunnelcd", 0.0, 0.0), ("in", "tunnelcd", 0.5, 0.25), ("in", "tunnelcd", 1.0, 1.0),
+            ("in", "paper", 0.0, 0.0), ("in", "paper", 1.0, 1.0), ("out", "paper", 0.0, 0.1),
+            ("out", "paper", 40.0, 0.3), ("all", "paper", 0.0, 0.5)]  # fmt: skip
+    return pd.DataFrame(rows, columns=["domain", "variant", x_name, y_name])
+
+
+def roc() -> Chart:
+    chart = draw_roc(curves("false_positive_rate", "true_positive_rate"), TABLE)
+    assert chart is not None
+    return chart
+
+
+def free_response() -> Chart:
+    chart = draw_free_response(curves("false_regions_per_100m", "recall"), TABLE)
+    assert chart is not None
+    return chart
 
 
 def one_panel(*series: Series, x: Axis = SHARE, y: Axis = SHARE, heat: Heat | None = None) -> Drawing:
@@ -73,7 +96,7 @@ def test_undefined_is_null_and_no_text_ends_the_script() -> None:
 
 
 def test_page_and_picture_draw_the_same_numbers_in_the_same_looks() -> None:
-    for drawing in (roc_chart(CURVES), free_response_chart(CURVES, (0.1, 0.5))):
+    for drawing in (roc().drawing, free_response().drawing):
         traces, panels = accepted(drawing).data, picture(drawing).axes
         lines = [line for axes in panels for line in axes.get_lines()]
         assert len(lines) == len(traces)
@@ -82,13 +105,13 @@ def test_page_and_picture_draw_the_same_numbers_in_the_same_looks() -> None:
             colour = trace.line.color if "lines" in trace.mode else trace.marker.color
             assert to_hex(line.get_color()) == colour.lower()
             assert line.get_drawstyle() == ("steps-post" if trace.line.shape == "hv" else "default")
-    log_x = accepted(free_response_chart(CURVES, ())).layout.xaxis
+    log_x = accepted(free_response().drawing).layout.xaxis
     np.testing.assert_allclose(10.0 ** np.array(log_x.range), panels[0].get_xlim(), rtol=1e-4)
     assert (log_x.type, panels[0].get_xscale()) == ("log", "log")
 
 
 def test_each_name_is_once_in_the_legend() -> None:
-    for drawing in (roc_chart(CURVES), free_response_chart(CURVES, (0.1, 0.5))):
+    for drawing in (roc().drawing, free_response().drawing):
         traces = accepted(drawing).data
         assert sorted(trace.name for trace in traces if trace.showlegend) == ["paper", "tunnelcd"]
         assert {trace.xaxis for trace in traces} == {"x", "x2"}
@@ -124,20 +147,31 @@ def test_a_logarithmic_axis_is_marked_at_one_and_three() -> None:
 
 
 def test_false_regions_without_end_stay_inside_the_picture() -> None:
-    figure = accepted(free_response_chart(CURVES, ()))
-    line = next(trace for trace in figure.data if trace.xaxis == "x2")
+    figure = accepted(free_response().drawing)
+    line = next(trace for trace in figure.data if trace.xaxis == "x2" and trace.name)
     assert line.x == (0.01, 10.0, 10.0)
     dot = next(trace for trace in figure.data if trace.mode == "markers")
     assert (dot.x, dot.y) == ((0.2,), (0.5,))
 
 
 def test_bins_carry_their_counts_and_only_the_last_method_its_interval() -> None:
-    bins = Bins(("<1\n4", "≥1\n2"), np.array([0.5, np.nan]), np.array([0.2, np.nan]), np.array([0.8, np.nan]))
-    figure = accepted(size_chart({"in": {"hull [m³]": {"paper": bins, "tunnelcd": bins}}}))
+    ends = {"interval_low": 0.2, "interval_high": 0.8}
+    bins = [{"low": low, "high": high, "n_changes": n, "recall_at_rate": recall, **ends}
+            for low, high, n, recall in ((1.0, np.inf, 2, NAN), (0.0, 1.0, 4, 0.5))]  # fmt: skip
+    names = {"measure": "n_returns", "domain": "in"}
+    sizes = pd.DataFrame([{**names, "variant": name, **each} for name in ("paper", "tunnelcd") for each in bins])
+    chart = draw_sizes(sizes, TABLE)
+    assert chart is not None
+    figure = accepted(chart.drawing)
     assert figure.layout.xaxis.ticktext == ("<1<br>n 4", "≥1<br>n 2")
     paper, ours = figure.data
     assert paper.error_y.array is None
-    assert ours.error_y.array == pytest.approx((0.3, None))
+    assert (ours.y, ours.error_y.array) == ((0.5, None), pytest.approx((0.3, None)))
+
+
+def test_what_was_not_scored_has_no_chart() -> None:
+    charts = draw_roc(None, TABLE), draw_free_response(None, TABLE), draw_sizes(pd.DataFrame(), TABLE)
+    assert charts == (None, None, None)
 
 
 def test_a_setting_is_a_line_with_the_presets_own_value_in_its_place() -> None:
