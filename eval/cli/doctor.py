@@ -1,8 +1,7 @@
-"""`tunnelcd doctor`: what is installed, whether it works, and the line that mends it where it does not.
+"""`tunnelcd doctor`: which packages are installed, whether they work, and how to repair those that do not.
 
-A package is looked at in three steps: is it there, is it new enough, and does it do what it is here for
-(`eval.cli.doctor_checks`). Nothing heavy is imported before its own turn, so that a broken package breaks its own row
-only.
+A package is checked in three steps: it is installed, new enough, and passes a small job (`eval.cli.doctor_checks`). It
+is imported in its own check only, so that a broken package affects one row.
 """
 
 from __future__ import annotations
@@ -30,14 +29,14 @@ _MODULES = {"pillow": "PIL", "PyYAML": "yaml", "scikit-image": "skimage", "Jinja
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One row: what was looked at, how it stands, what was found, and what mends it where it must be mended.
+    """One row: a checked item, its state, the findings, and the repair.
 
     Attributes:
         what: A package, an extra, or something about the machine.
         state: "absent" and "broken" matter only where it is required.
-        told: What was found.
-        is_required: Whether nothing works without it.
-        mend: The way out, "" where it is ok.
+        told: The findings in words.
+        is_required: Whether tunnelcd needs it.
+        mend: The repair, "" where the state is ok.
     """
 
     what: str
@@ -63,7 +62,7 @@ def examine() -> Iterator[Finding]:
 
 
 def faults(findings: Sequence[Finding]) -> list[str]:
-    """Return one line for everything that is required and does not work, with what mends it."""
+    """Return one line for every required item that does not work, with its repair."""
     return [f"{each.what}: {each.told}: {each.mend}" for each in findings if each.is_required and each.state != "ok"]
 
 
@@ -83,7 +82,7 @@ def _about_machine() -> Iterator[Finding]:
 
 
 def _requirements() -> tuple[list[str], dict[str, list[str]]]:
-    """Return what tunnelcd requires, and what each extra does; of the source tree where it runs from one."""
+    """Return the requirements of tunnelcd and of each extra, from pyproject.toml if it runs from a source tree."""
     file = Path(__file__).resolve().parents[2] / "pyproject.toml"
     if file.is_file():
         project = tomllib.loads(file.read_text())["project"]
@@ -124,7 +123,7 @@ def _extra(extra: str, requirements: Sequence[str]) -> Finding:
 
 
 def _tried(what: str, check: Callable[[], str], mend: str, told: str = "", *, is_required: bool = True) -> Finding:
-    """Run a check; whatever it raises is what is wrong."""
+    """Run a check; any exception is the fault."""
     try:
         found = check()
     except Exception as error:  # a package that is broken may raise anything
@@ -135,7 +134,7 @@ def _tried(what: str, check: Callable[[], str], mend: str, told: str = "", *, is
 
 
 def _check_of(name: str) -> Callable[[], str]:
-    """Return what shows that a package works; that it can be imported where there is no more to it."""
+    """Return the check of a package; for a package without a check of its own, importing it."""
 
     def imported() -> str:
         importlib.import_module(_MODULES.get(name, name.replace("-", "_")))

@@ -1,6 +1,6 @@
 """Small jobs with a known answer, one for each package that results depend on; `eval.cli.doctor` runs them.
 
-Each returns what it saw, in words, and raises where that is not what it must be.
+Each returns its result in words, and raises where the result is wrong.
 """
 
 # ruff: noqa: PLC0415 - a package that is broken must break its own check only

@@ -1,8 +1,8 @@
-"""Makes the shards of a dataset, one tunnel each: in this process, on workers of this machine, or on a cluster.
+"""Makes the shards of a dataset, one per tunnel: in this process, on workers of this machine, or on a cluster.
 
-Whoever computes a shard hands its bytes back, and this process alone writes: a cluster needs no shared disk. A shard is
-written under a temporary name and renamed; one whose digest is still right is kept, so that a run that was cut off goes
-on where it stopped. A tunnel that cannot be built leaves a file with the reason, which is kept likewise.
+Workers return the bytes of a shard and only this process writes, so that a cluster needs no shared disk. A shard is
+written under a temporary name and renamed. A shard with the right digest is kept, so that an interrupted run continues.
+A tunnel that cannot be built leaves a file with the reason, which is kept as well.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from eval.training.dataset import Recipe, make_shard, shard_digest
 from eval.training.dataset_card import write_card
 from scenarios.library import load_scenario
 
-_AHEAD = 2  # tunnels that wait in a cluster for each worker: more would only hold memory
+_AHEAD = 2  # tunnels that wait in a cluster for each worker; more would only take memory
 
 
 @dataclass(frozen=True, slots=True)
 class Tunnel:
-    """One tunnel to be made; `digest` is of what its shard depends on, "" where the scenario itself is refused."""
+    """One tunnel to make; `digest` is that of its shard's inputs, "" where the scenario itself is refused."""
 
     family: str
     seed: int
@@ -46,13 +46,13 @@ class Tunnel:
 
     @property
     def refusal(self) -> str:
-        """Name of the file that says why there is none."""
+        """Name of the file with the reason why there is no shard."""
         return f"{self.file}.refused.json"
 
 
 @dataclass(frozen=True, slots=True)
 class DatasetOutcome:
-    """How a run ended: tunnels made now, kept from earlier, refused (now or earlier), left over by --limit."""
+    """Outcome of a run: tunnels made now, kept from earlier, refused (now or earlier), left by --limit."""
 
     n_made: int
     n_kept: int
@@ -77,15 +77,15 @@ def make_dataset(
     Args:
         families: Scenario names or files.
         seeds: "A:B", B excluded.
-        recipe: What all shards of the folder have in common.
-        out: New, empty, or left by an earlier run with the same recipe.
+        recipe: Settings that all shards of the folder share.
+        out: New, empty, or of an earlier run with the same recipe.
         where: Where to compute.
         limit: Compute at most this many tunnels.
         command: For the data card.
-        progress: Told the rate in keyframe pairs a second, and the time left.
+        progress: Receives the rate in keyframe pairs per second and the time left.
 
     Raises:
-        InputError: A family, the seeds, the folder or the scheduler is not what it should be.
+        InputError: A family, the seeds, the folder or the scheduler is wrong.
     """
     progress = progress or Silent()
     require_usable(where)
@@ -104,7 +104,7 @@ def make_dataset(
                 pace.tell(tunnel, out)
     finally:
         if is_new and [path.name for path in out.iterdir()] == ["dataset.json"]:
-            # nothing came of it, as where a scheduler cannot be reached: leave nothing behind
+            # no tunnel was made, e.g. where a scheduler cannot be reached: leave nothing behind
             (out / "dataset.json").unlink()
             if not was_there:
                 out.rmdir()
@@ -116,12 +116,12 @@ def make_dataset(
 
 
 def _tunnels(families: Sequence[str], seeds: str, recipe: Recipe) -> list[Tunnel]:
-    """Return the tunnels, seed by seed, so that a run that was cut off has something of every family."""
+    """Return the tunnels seed by seed, so that an interrupted run has tunnels of every family."""
     numbers = parse_seeds_option(seeds)
     if len(set(families)) < len(families):
         raise InputError(f"families {', '.join(families)}: one is named twice")
     tunnels = [_tunnel(family, seed, recipe) for seed in numbers for family in families]
-    # one bad draw is told in the data card; a family of which nothing can be drawn is a mistake of the command
+    # the data card lists single bad draws; a family without any draw is a mistake of the user
     of_family = ([tunnel for tunnel in tunnels if tunnel.family == family] for family in families)
     if mistakes := [own[0].refused for own in of_family if all(tunnel.refused for tunnel in own)]:
         raise InputError("\n".join(mistakes))
@@ -136,7 +136,7 @@ def _tunnel(family: str, seed: int, recipe: Recipe) -> Tunnel:
 
 
 def _take_folder(out: Path, recipe: Recipe, command: str) -> None:
-    """Make the folder, or check that it is of the same recipe; the command is added to those that filled it."""
+    """Make the folder, or check that it has the same recipe, and add the command to its list."""
     make_writable(out)
     path = out / "dataset.json"
     present = {"format": FORMAT, "format_version": FORMAT_VERSION, "recipe": json.loads(json.dumps(asdict(recipe)))}
@@ -158,7 +158,7 @@ def _take_folder(out: Path, recipe: Recipe, command: str) -> None:
 
 
 def _told(recipe: Any) -> str:
-    """Tell a recipe as the options that ask for it."""
+    """Return a recipe as options of the command."""
     try:
         options = f"--draws {recipe['draws']} --error-m {recipe['error_m']:g} --error-deg {recipe['error_deg']:g}"
         return " ".join([options, *(f"--set {setting}" for setting in recipe["settings"])])
@@ -167,7 +167,7 @@ def _told(recipe: Any) -> str:
 
 
 def _is_done(out: Path, tunnel: Tunnel) -> bool:
-    """Whether a tunnel's shard, or the reason why there is none, is of what would be computed now."""
+    """Return whether a tunnel's shard, or its refusal, has the present digest."""
     refusal = out / tunnel.refusal
     if refusal.is_file():
         try:
@@ -183,7 +183,7 @@ def _is_done(out: Path, tunnel: Tunnel) -> bool:
 
 
 def _keep(out: Path, tunnel: Tunnel, result: bytes | str) -> None:
-    """Write a shard, or the reason why there is none, whole or not at all."""
+    """Write a shard, or the reason why there is none, completely or not at all."""
     if isinstance(result, str):
         about = {"family": tunnel.family, "seed": tunnel.seed, "digest": tunnel.digest, "reason": result}
         write_json(out / tunnel.refusal, about)
@@ -198,7 +198,7 @@ def _keep(out: Path, tunnel: Tunnel, result: bytes | str) -> None:
 
 
 class _Pace:
-    """Tells how fast tunnels come."""
+    """Reports the rate at which tunnels are made."""
 
     def __init__(self, progress: RunProgress, n_todo: int) -> None:
         self._progress = progress
@@ -214,7 +214,7 @@ class _Pace:
         return time.perf_counter() - self._start
 
     def tell(self, tunnel: Tunnel, out: Path) -> None:
-        """Count a tunnel that is done and tell the rate of all so far, refused ones included in the time."""
+        """Count a finished tunnel and report the mean rate, with the time of refused tunnels included."""
         self._n_done += 1
         told = "refused"
         if (out / tunnel.file).is_file():
@@ -228,7 +228,7 @@ class _Pace:
 
 
 def _attempt(tunnel: Tunnel, recipe: Recipe) -> bytes | str:
-    """Return a tunnel's shard, or why it cannot be built; runs wherever the tunnel is computed."""
+    """Return a tunnel's shard, or the reason why it cannot be built; runs on the worker."""
     try:
         return make_shard(tunnel.family, tunnel.seed, recipe)
     except ScenarioError as error:
@@ -236,7 +236,7 @@ def _attempt(tunnel: Tunnel, recipe: Recipe) -> bytes | str:
 
 
 def _computed(tunnels: Sequence[Tunnel], recipe: Recipe, where: Where) -> Generator[tuple[Tunnel, bytes | str]]:
-    """Yield each tunnel with its shard, or with why there is none, as they come."""
+    """Yield each tunnel with its shard, or with the reason why there is none, in order of completion."""
     wanted = []
     for tunnel in tunnels:
         if tunnel.refused:

@@ -1,10 +1,9 @@
-"""Which descriptor recognises what, and at which price: the table of reports/descriptor/notes.
+"""Recognition and cost of each descriptor: the table of reports/descriptor/notes.
 
-Run as `python -m eval.studies.descriptors.compare FAMILY... --seeds A:B --out DIR`. Each pair of sessions is simulated
-as `tunnelcd simulate` does, looked at (`eval.studies.descriptors.rows`) and removed again. Written are
-DIR/rows/<family>-<seed>.json, one for each pair, by which a run that was cut off goes on; DIR/descriptors.csv, one row
-for each pair, descriptor and precision; and DIR/places.csv and DIR/spheres.csv, means over pairs with intervals by
-pair. Nothing is chosen by it.
+Run as `python -m eval.studies.descriptors.compare FAMILY... --seeds A:B --out DIR`. Each pair of sessions is simulated,
+measured (`eval.studies.descriptors.rows`) and removed. The program writes DIR/rows/<family>-<seed>.json for each pair,
+from which an interrupted run continues; DIR/descriptors.csv, one row for each pair, descriptor and precision; and
+DIR/places.csv and DIR/spheres.csv, means over session pairs with 95 % intervals. Nothing is tuned with it.
 """
 
 from __future__ import annotations
@@ -41,19 +40,19 @@ from sim.session.simulate import simulate_pair
 
 _FAMILIES = ("narrow", "wide", "network")
 _SEEDS = "10300:10304"  # of the validation seeds
-_VERSION = 1  # of a row: raised when its figures change, so that stored ones are made anew
+_VERSION = 1  # of a row; raised when its figures change, so that stored rows are measured again
 
 
 def measure(
     families: Sequence[str], seeds: Sequence[int], out: Path, progress: RunProgress, *, keep: bool = False
 ) -> pd.DataFrame:
-    """Return one row for each pair, descriptor and precision; pairs that were measured before are not made again.
+    """Return one row for each pair, descriptor and precision; stored pairs are not measured again.
 
     Args:
         families: Names or files of scenarios.
-        seeds: Of each family.
+        seeds: Seeds of each family.
         out: Folder of the run.
-        progress: Told of each pair and stage.
+        progress: Receives each pair and stage.
         keep: Keep the simulated pairs, in `out`/pairs.
 
     Raises:
@@ -94,7 +93,7 @@ def _simulated(
 
 def _key(scenario: Scenario, seed: int) -> str:
     config = load_config("tunnelcd")
-    # of the query the scores depend on how they are made, and not on the threshold
+    # the scores do not depend on these settings of the query
     unasked = {"query": {"threshold", "n_regions", "suppression", "radius_m"}}
     return digest(
         {
@@ -116,7 +115,7 @@ def _stored(path: Path, key: str) -> list[dict[str, object]] | None:
         document = json.loads(path.read_text())
         return list(document["rows"]) if document["key"] == key else None
     except (FileNotFoundError, json.JSONDecodeError, KeyError, TypeError):
-        return None  # absent, or damaged: it is measured anew
+        return None  # absent or damaged: measured again
 
 
 _PAIR = ["family", "seed"]
@@ -213,9 +212,11 @@ def _numbers(cases: pd.DataFrame, column: str) -> Float64Array:
 
 
 def main(
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="a new folder, or one to go on with")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="new folder, or of an earlier run to continue")
+    ],
     families: Annotated[
-        list[str] | None, typer.Argument(metavar="FAMILY...", help="as `tunnelcd list` has them")
+        list[str] | None, typer.Argument(metavar="FAMILY...", help="names from `tunnelcd list`, or .yaml files")
     ] = None,
     seeds: Annotated[str, typer.Option(metavar="A:B", help="B excluded")] = _SEEDS,
     keep: Annotated[bool, typer.Option("--keep", help="keep the simulated pairs, about 0.3 GB each")] = False,

@@ -1,10 +1,10 @@
-"""Where the limit of the sphere descriptor is: what more numbers, channels, tunnels or bits would buy.
+"""Score of the sphere descriptor by its size, its training data and the precision of its numbers.
 
 Run as `python -m eval.studies.descriptors.curves DATA --out DIR`, where DATA is a folder of `tunnelcd dataset` with
-tunnels of both splits. Trains one network after another at a short schedule, which is not the shipped one: no early
-stopping, the weights of the last step are taken, so that the validation tunnels choose nothing (they calibrate, as
-ever). The shipped network stands beside them. Writes DIR/curves.csv, a row for each network and precision, and
-DIR/curves.png after every network; the same command goes on where it was cut off.
+tunnels of both splits. The program trains one network after another at a shorter schedule than the shipped one: without
+early stopping, with the weights of the last step, so that the validation tunnels only calibrate. It measures the
+shipped network as well. It writes DIR/curves.csv, a row for each network and precision, and DIR/curves.png after every
+network; the same command resumes an interrupted run.
 """
 
 from __future__ import annotations
@@ -257,10 +257,10 @@ def earlier_rows(path: Path, run: Mapping[str, Any]) -> list[dict[str, Any]]:
 def main(
     data: Annotated[Path, typer.Argument(help="folder of `tunnelcd dataset`")],
     out: Annotated[Path, typer.Option("--out", help="folder for curves.csv, curves.png and the networks")],
-    steps: Annotated[int, typer.Option(min=1, help="of training")] = 600,
+    steps: Annotated[int, typer.Option(min=1, help="number of training steps")] = 600,
     seeds: Annotated[int, typer.Option(min=1, help="training seeds of each network")] = 3,
 ) -> None:
-    """Train and measure networks of many sizes, and draw what each gives."""
+    """Train networks of many sizes, measure them, and draw their scores."""
     use_threads(1)
     make_writable(out)
     training, validation = open_dataset(data, "train"), open_dataset(data, "validation")

@@ -1,4 +1,4 @@
-"""What each descriptor recognises in one pair of sessions, and its price: bytes of a keyframe, milliseconds to make it.
+"""Recognition of each descriptor in one pair of sessions, and its cost: bytes per keyframe, milliseconds to compute it.
 
 Descriptors of scans are asked for places and headings (`eval.studies.descriptors.place_metrics`). `sphere` is asked for
 changes: the AUROC of the before keyframes, after the pipeline's own merge, with its numbers kept as float32 and as

@@ -1,11 +1,11 @@
-"""The simulated sensor held against a real one: returns, range noise, signal, false and mixed returns, novelty.
+"""The simulated sensor compared with a real one: returns, range noise, signal, false and mixed returns, novelty.
 
 python -m eval.studies.reality.reality --out reports/sensor [--data FOLDER]
 
 The real revolution is that of an OS1-32 gradient unit, published with the vendor's SDK (BSD-3); it is looked for below
---data or $TUNNELCD_REAL_DATA. The simulator answers three times with the same beam table: from a surface made of the
-real revolution itself, so that the scene is the same; and in a narrow and a wide tunnel of a validation seed. What the
-same scene shows with every effect off is what the rebuilding left in it, not the simulated sensor's doing.
+--data or $TUNNELCD_REAL_DATA. The simulator uses the same beam table in three scenes: a surface rebuilt from the real
+revolution, and a narrow and a wide tunnel of a validation seed. The rebuilt scene with every effect off shows what the
+rebuilding itself adds.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _FAR_M = 250.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """What was found.
+    """Result of the comparison.
 
     Attributes:
         real: The recording.
@@ -67,7 +67,7 @@ class Comparison:
 
 
 def compare(data: Path | None) -> Comparison:
-    """Measure the recording and the simulator alike.
+    """Measure the recording and the simulator by the same definitions.
 
     Args:
         data: Folder of the recording.
@@ -91,7 +91,7 @@ def compare(data: Path | None) -> Comparison:
             for drive, (family, seed) in zip(drives, WORLDS, strict=True)
         ]
     off = effect_variants(Sensor(profile=PROFILE, max_range_m=_FAR_M))["all off"]
-    floor = _recast(rebuilt, real, off, 1)  # nothing is drawn: every further one is the same
+    floor = _recast(rebuilt, real, off, 1)  # nothing is random: further revolutions are the same
     tables += [
         measured(floor, f"{SAME_SCENE}, effects off"),
         surface_rows(floor, rebuilt.is_surface, f"{SAME_SCENE}, effects off"),

@@ -1,4 +1,4 @@
-"""What the sensor is held against: the real revolution, and simulated revolutions of a world."""
+"""Sources of the comparison: the real revolution, a scene rebuilt from it, and simulated revolutions of a world."""
 
 from __future__ import annotations
 
@@ -128,13 +128,12 @@ class Rebuilt:
 
 
 def rebuild(real: Revolutions, template: Scene) -> Rebuilt:
-    """Make a surface of the first revolution: what the sensor met, without what the sensor added.
+    """Make a surface from the first revolution, with the noise of the sensor removed.
 
     Each pixel becomes a flat patch that reaches half way to its neighbours and is inclined towards those of similar
-    range; beams of the same table meet it at the recorded range. Noise is taken
-    out along the beam by a parabola through seven columns where the surface is smooth. Holes of one or two columns
-    between returns that agree are closed, for there something did not return that could have. Reflectivity is the
-    recorded channel over the patch's own cosine of incidence, in 96 steps.
+    range; beams of the same table meet it at the recorded range. A parabola through seven columns removes the noise
+    along the beam where the surface is smooth. Holes of one or two columns between returns of similar range are closed,
+    because a surface is there. Reflectivity is the recorded channel divided by the patch's cosine of incidence, in 96 steps.
 
     Args:
         real: The recording, in the sensor frame.
@@ -159,7 +158,7 @@ def rebuild(real: Revolutions, template: Scene) -> Rebuilt:
 
 
 def _closed(real: Revolutions) -> tuple[Float64Array, Float64Array, BoolArray]:
-    """Return ranges, apparent reflectivities and mask (H, W) with small holes closed and the noise taken out."""
+    """Return ranges, apparent reflectivities and mask (H, W), with small holes closed and noise removed."""
     range_m, counts = real.range_m[0].copy(), np.maximum(real.reflectivity[0], 0.5)
     share = np.where(counts > 100, 2.0 ** ((counts - 100.0) / COUNTS_PER_DOUBLING), counts / 100.0)
     smooth_m = sum(weight * np.roll(range_m, place - 3, -1) for place, weight in enumerate(_SMOOTHING))

@@ -1,4 +1,4 @@
-"""How much looks new when nothing changed: the share of returns in voxels that the other half of a session never met.
+"""False novelty of a static scene: the share of returns in voxels without returns of the session's other half.
 
 Two ways to cut a session of N revolutions in halves, both with true poses, so that what is new comes from the sensor
 and not from odometry: a sensor that stands still, its first N/2 revolutions against its last; and a sensor that drives,

@@ -25,25 +25,21 @@ RANGE_BINS_M = (2.4, 4.0, 6.0, 9.0, 13.0, 20.0, 40.0)
 PHOTON_BINS = (3.0, 6.0, 9.0, 12.0, 18.0, 25.0, 35.0, 50.0, 70.0, 100.0, 200.0, 400.0)
 DETECTION_BINS = (4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 48.0, 100.0, 1e4)
 JUMP_BINS_M = (1.0, 2.0, 4.0, 8.0)
-FACING_BINS_M = (4.0, 13.0)  # where noise is told apart by photons
-_LEAST = 20  # pixels that a figure needs
-Row = tuple[str, str, str, str, float, int]
+FACING_BINS_M = (4.0, 13.0)  # ranges at which noise is listed by photons
+_LEAST = 20  # fewest pixels of a figure
+Row = tuple[str, str, str, float, int]  # COLUMNS without the source
 
 
 def measured(revolutions: Revolutions, source: str) -> pd.DataFrame:
-    """Return every measure of some revolutions as rows of `COLUMNS`; what has fewer than 20 pixels is left out."""
-    rows = [
-        *_return_rows(revolutions, source),
-        *_noise_rows(revolutions, source),
-        *_signal_rows(revolutions, source),
-        *_detection_rows(revolutions, source),
-        *_outlier_rows(revolutions, source),
-    ]
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    """Return every measure of some revolutions as rows of `COLUMNS`; bins with fewer than 20 pixels are left out."""
+    parts = (_returns, _noise, _signal, _detection, _outliers)
+    rows = [row for part in parts for row in part(revolutions)]
+    table = pd.DataFrame(rows, columns=[name for name in COLUMNS if name != "source"]).assign(source=source)
+    return table[list(COLUMNS)]
 
 
 def surface_rows(revolutions: Revolutions, is_surface: BoolArray, source: str) -> pd.DataFrame:
-    """Return the share of returns among the pixels (H, W) that a rebuilt scene has a surface for."""
+    """Return the share of returns among the (H, W) pixels with a surface in the rebuilt scene."""
     share = float(revolutions.is_return[:, is_surface].mean())
     row = ("returns where a surface is", "all", "share", source, share, int(is_surface.sum()))
     return pd.DataFrame([row], columns=list(COLUMNS))
@@ -51,11 +47,11 @@ def surface_rows(revolutions: Revolutions, is_surface: BoolArray, source: str) -
 
 def novelty_table(results: Sequence[Novelty]) -> pd.DataFrame:
     """Return one row per simulated session and the real one: way, variant, revolutions, percent new at each cell."""
-    real = ("real recording of a static scene (stated)", "", np.nan, *(100.0 * share for share in REAL_SHARES))
-    rows = [real, *((each.way, each.variant, each.n_revolutions, *_percent(each.shares)) for each in results)]
-    return pd.DataFrame(
-        rows, columns=["way", "variant", "n_revolutions", *(f"new_percent_{cell:g}m" for cell in CELLS_M)]
-    )
+    real = ("real recording of a static scene (stated)", "", np.nan, REAL_SHARES)
+    sources = [real, *((each.way, each.variant, each.n_revolutions, each.shares) for each in results)]
+    rows = [(*source, *(100.0 * share for share in shares)) for *source, shares in sources]
+    columns = ["way", "variant", "n_revolutions", *(f"new_percent_{cell:g}m" for cell in CELLS_M)]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def side_by_side(table: pd.DataFrame) -> pd.DataFrame:
@@ -75,62 +71,62 @@ def side_by_side(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def first_number(where: str) -> float:
-    """Return where a bin begins, by its name; -1 for what has no limits."""
+    """Return the lower limit of a bin from its name; -1 for a name without limits."""
     numbers = [float(word) for word in where.split() if word[0].isdigit()]
     return numbers[0] if numbers else -1.0
 
 
 def markdown(table: pd.DataFrame) -> str:
-    """Return a table as markdown, numbers with three significant digits, what is undefined as a dash."""
+    """Return a table in Markdown: numbers with three significant digits, a dash for NaN."""
     lines = ["| " + " | ".join(str(name) for name in table.columns) + " |", "|---" * len(table.columns) + "|"]
     lines += ["| " + " | ".join(_shown(value) for value in row) + " |" for row in table.itertuples(index=False)]
     return "\n".join(lines) + "\n"
 
 
-def _return_rows(revolutions: Revolutions, source: str) -> Iterator[Row]:
+def _returns(revolutions: Revolutions) -> Iterator[Row]:
     n_pixels = revolutions.range_m[:, 0].size
-    yield "returns", "all", "share", source, float(revolutions.is_return.mean()), revolutions.range_m.size
+    yield "returns", "all", "share", float(revolutions.is_return.mean()), revolutions.range_m.size
     for beam, share in enumerate(return_share(revolutions)):
-        yield "returns by beam", str(beam), "share", source, float(share), n_pixels
+        yield "returns by beam", str(beam), "share", float(share), n_pixels
 
 
-def _noise_rows(revolutions: Revolutions, source: str) -> Iterator[Row]:
-    smooth, facing = revolutions.is_smooth, revolutions.is_smooth & revolutions.is_facing
-    for name, where in (("range noise, smooth", smooth), ("range noise, facing", facing)):
-        for label, inside in _bins(revolutions.range_m, RANGE_BINS_M, "m"):
-            yield from _row(name, label, "mm", source, 1e3 * noise_sigma_m(revolutions, where & inside), where & inside)
-    near = (revolutions.range_m >= FACING_BINS_M[0]) & (revolutions.range_m < FACING_BINS_M[1])
-    for label, inside in _bins(revolutions.signal, PHOTON_BINS, "photons"):
-        where = facing & near & inside
-        yield from _row(
-            "range noise, facing, 4 to 13 m", label, "mm", source, 1e3 * noise_sigma_m(revolutions, where), where
-        )
+def _noise(revolutions: Revolutions) -> Iterator[Row]:
+    def rows(name: str, values: Float64Array, limits: Sequence[float], unit: str, among: BoolArray) -> Iterator[Row]:
+        for label, inside in _bins(values, limits, unit):
+            where = among & inside
+            yield from _row(name, label, "mm", 1e3 * noise_sigma_m(revolutions, where), where)
+
+    range_m, facing = revolutions.range_m, revolutions.is_smooth & revolutions.is_facing
+    yield from rows("range noise, smooth", range_m, RANGE_BINS_M, "m", revolutions.is_smooth)
+    yield from rows("range noise, facing", range_m, RANGE_BINS_M, "m", facing)
+    near = facing & (range_m >= FACING_BINS_M[0]) & (range_m < FACING_BINS_M[1])
+    yield from rows("range noise, facing, 4 to 13 m", revolutions.signal, PHOTON_BINS, "photons", near)
 
 
-def _signal_rows(revolutions: Revolutions, source: str) -> Iterator[Row]:
+def _signal(revolutions: Revolutions) -> Iterator[Row]:
     for label, inside in _bins(revolutions.range_m, (*RANGE_BINS_M, 70.0), "m"):
         values = photons_per_percent(revolutions, inside)
         if len(values) >= _LEAST:
-            yield "photons x range^2 per percent", label, "m^2", source, float(np.median(values)), len(values)
+            yield "photons x range^2 per percent", label, "m^2", float(np.median(values)), len(values)
 
 
-def _detection_rows(revolutions: Revolutions, source: str) -> Iterator[Row]:
+def _detection(revolutions: Revolutions) -> Iterator[Row]:
     for label, inside in _bins(np.nan_to_num(expected_photons(revolutions)), DETECTION_BINS, "photons"):
         share = float(revolutions.is_return[inside].mean()) if inside.any() else np.nan
-        yield from _row("returns by photons of the neighbours", label, "share", source, share, inside)
+        yield from _row("returns by photons of the neighbours", label, "share", share, inside)
 
 
-def _outlier_rows(revolutions: Revolutions, source: str) -> Iterator[Row]:
+def _outliers(revolutions: Revolutions) -> Iterator[Row]:
     is_return, alone = revolutions.is_return, isolated(revolutions)
-    yield from _row("isolated returns", "all", "share", source, _share(alone, is_return), is_return)
+    yield from _row("isolated returns", "all", "share", _share(alone, is_return), is_return)
     for label, inside in _bins(revolutions.range_m, RANGE_BINS_M, "m"):
-        yield from _row("isolated returns", label, "share", source, _share(alone, inside), inside)
+        yield from _row("isolated returns", label, "share", _share(alone, inside), inside)
     jump_m, is_mixed, is_missing = edges(revolutions)
     is_edge = np.isfinite(jump_m)
-    yield from _row("missing at edges", "all", "share", source, _share(is_missing, is_edge), is_edge)
+    yield from _row("missing at edges", "all", "share", _share(is_missing, is_edge), is_edge)
     for label, inside in _bins(np.nan_to_num(jump_m), JUMP_BINS_M, "m"):
         where = inside & is_return
-        yield from _row("mixed at edges", f"jump {label}", "share", source, _share(is_mixed, where), where)
+        yield from _row("mixed at edges", f"jump {label}", "share", _share(is_mixed, where), where)
 
 
 def _bins(values: Float64Array, limits: Sequence[float], unit: str) -> Iterator[tuple[str, BoolArray]]:
@@ -139,19 +135,15 @@ def _bins(values: Float64Array, limits: Sequence[float], unit: str) -> Iterator[
         yield name, (values >= low) & (values < high)
 
 
-def _row(measure: str, where: str, unit: str, source: str, value: float, counted: BoolArray) -> Iterator[Row]:
+def _row(measure: str, where: str, unit: str, value: float, counted: BoolArray) -> Iterator[Row]:
     n = int(np.count_nonzero(counted))
     if n >= _LEAST:
-        yield measure, where, unit, source, value, n
+        yield measure, where, unit, value, n
 
 
 def _share(part: BoolArray, whole: BoolArray) -> float:
     n_whole = int(np.count_nonzero(whole))
     return int(np.count_nonzero(part & whole)) / n_whole if n_whole else float("nan")
-
-
-def _percent(shares: Sequence[float]) -> list[float]:
-    return [100.0 * share for share in shares]
 
 
 def _shown(value: object) -> str:
