@@ -133,7 +133,7 @@ def rebuild(real: Revolutions, template: Scene) -> Rebuilt:
     Each pixel becomes a flat patch that reaches half way to its neighbours and is inclined towards those of similar
     range; beams of the same table meet it at the recorded range. A parabola through seven columns removes the noise
     along the beam where the surface is smooth. Holes of one or two columns between returns of similar range are closed,
-    because a surface is there. Reflectivity is the recorded channel divided by the patch's cosine of incidence, in 96 steps.
+    because a surface is there. Reflectivity is the recorded channel over the patch's cosine of incidence, in 96 steps.
 
     Args:
         real: The recording, in the sensor frame.
