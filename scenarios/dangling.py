@@ -17,7 +17,7 @@ Mistake = tuple[Key, str]
 _NO_DRIFT = "no drift joins"
 
 
-def reference_mistakes(tree: Any) -> list[Mistake]:
+def find_dangling(tree: Any) -> list[Mistake]:
     """Return every dangling reference of a drawn scenario as (key path, rule)."""
     tunnel = mapping_at(tree, "tunnel")
     nodes = [str(name) for name in mapping_at(tunnel, "nodes")]

@@ -42,25 +42,25 @@ def draw(tree: Any, seed: int) -> Any:
     Raises:
         ScenarioError: A distribution, `repeat`, `chance` or `one_of` has no valid form; all of them are told.
     """
-    mistakes = form_mistakes(tree)
+    mistakes = find_malformed(tree)
     if mistakes:
-        raise ScenarioError("\n".join(f"{dotted(key)}: {rule}" for key, rule in mistakes.items()))
-    return drawing(tree, seed).value
+        raise ScenarioError("\n".join(f"{join_key(key)}: {rule}" for key, rule in mistakes.items()))
+    return draw_with_origins(tree, seed).value
 
 
-def drawing(tree: Any, seed: int) -> Drawing:
+def draw_with_origins(tree: Any, seed: int) -> Drawing:
     """Draw like `draw`, but remember where each value came from, and let mistakes stand as None."""
     drawer = _Drawer(seed)
     value = drawer.value(tree, (), (), ())
     return Drawing(value, drawer.origins, drawer.broken)
 
 
-def form_mistakes(tree: Any, key: Key = ()) -> dict[Key, str]:
+def find_malformed(tree: Any, key: Key = ()) -> dict[Key, str]:
     """Return the rule that each malformed distribution, `repeat`, `chance` or `one_of` breaks, by key path."""
     found: dict[Key, str] = {}
     if isinstance(tree, list):
         for index, item in enumerate(tree):
-            found |= form_mistakes(item, (*key, index))
+            found |= find_malformed(item, (*key, index))
             for name, rule_of in (("repeat", _repeat_rule), ("chance", _chance_rule)):
                 if isinstance(item, dict) and name in item and (rule := rule_of(item[name])):
                     found[(*key, index, name)] = rule
@@ -70,7 +70,7 @@ def form_mistakes(tree: Any, key: Key = ()) -> dict[Key, str]:
         elif "one_of" in tree and (rule := _one_of_rule(tree["one_of"])):
             found[(*key, "one_of")] = rule
         for name, item in tree.items():
-            found |= form_mistakes(item, (*key, name))
+            found |= find_malformed(item, (*key, name))
     return found
 
 
@@ -79,14 +79,14 @@ def is_distribution(tree: Any) -> bool:
     return isinstance(tree, dict) and any(name in tree for name in NAMES)
 
 
-def merged(base: Any, over: Any) -> Any:
+def merge_trees(base: Any, over: Any) -> Any:
     """Return `base` with `over` written over it: mappings key by key, lists and distributions as a whole."""
     if not (isinstance(base, dict) and isinstance(over, dict)) or is_distribution(base) or is_distribution(over):
         return over
-    return {**base, **{key: merged(base[key], item) if key in base else item for key, item in over.items()}}
+    return {**base, **{key: merge_trees(base[key], item) if key in base else item for key, item in over.items()}}
 
 
-def dotted(key: Key) -> str:
+def join_key(key: Key) -> str:
     """Return a key path as `a.b.0`."""
     return ".".join(str(part) for part in key)
 
@@ -137,7 +137,7 @@ class _Drawer:
             if key != "one_of"
         }
         self.origins[place] = source
-        return merged(chosen, own)
+        return merge_trees(chosen, own)
 
     def _list(self, items: list[Any], source: Key, place: Key, path: tuple[str, ...]) -> list[Any]:
         result: list[Any] = []

@@ -12,9 +12,9 @@ from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import stream
 from cdpipe.core.yamlfile import Document, Key, apply_settings, read_yaml, suggest, validate
 from scenarios.catalogue import family_files, family_of, prop_files, prop_names, read_prop
-from scenarios.dangling import Mistake, items_at, reference_mistakes
-from scenarios.distributions import Drawing, dotted, drawing, form_mistakes, is_distribution, merged
-from scenarios.references import contradictions, file_keys
+from scenarios.dangling import Mistake, find_dangling, items_at
+from scenarios.distributions import Drawing, draw_with_origins, find_malformed, is_distribution, join_key, merge_trees
+from scenarios.references import file_keys, find_contradictions
 from scenarios.schema import PROP_KINDS, Prop, Scenario
 
 CHECKED_SEEDS = range(8)
@@ -35,8 +35,8 @@ def load_scenario(name_or_path: str, seed: int, settings: Iterable[str] = ()) ->
     """
     if seed < 0:
         raise InputError(f"seed = {seed}: expected a whole number >= 0")
-    scenario, mistakes = _scenario(_document(name_or_path, settings), seed)
-    return _checked(scenario, mistakes)
+    scenario, mistakes = _draw_scenario(_read(name_or_path, settings), seed)
+    return _require_valid(scenario, mistakes)
 
 
 def check_scenario(name_or_path: str, settings: Iterable[str] = ()) -> Scenario:
@@ -50,54 +50,54 @@ def check_scenario(name_or_path: str, settings: Iterable[str] = ()) -> Scenario:
         ScenarioError: The name is unknown, or the file has mistakes, told once each whatever the seed.
         InputError: The file cannot be read, or a setting has no valid form.
     """
-    document = _document(name_or_path, settings)
-    first, mistakes = _scenario(document, CHECKED_SEEDS[0])
+    document = _read(name_or_path, settings)
+    first, mistakes = _draw_scenario(document, CHECKED_SEEDS[0])
     for seed in CHECKED_SEEDS[1:]:
         told = {_key_of(line) for line in mistakes}
-        mistakes += [line for line in _scenario(document, seed)[1] if _key_of(line) not in told]
-    return _checked(first, mistakes)
+        mistakes += [line for line in _draw_scenario(document, seed)[1] if _key_of(line) not in told]
+    return _require_valid(first, mistakes)
 
 
-def _checked(scenario: Scenario | None, mistakes: list[str]) -> Scenario:
+def _require_valid(scenario: Scenario | None, mistakes: list[str]) -> Scenario:
     if scenario is None or mistakes:
         raise ScenarioError("\n".join(sorted(mistakes, key=_line_of)))
     return scenario
 
 
-def _scenario(document: Document, seed: int) -> tuple[Scenario | None, list[str]]:
+def _draw_scenario(document: Document, seed: int) -> tuple[Scenario | None, list[str]]:
     """Draw a scenario; return it and every mistake found, both if the world only contradicts itself."""
-    mistakes = [_told(document, key, rule) for key, rule in form_mistakes(document.value).items()]
-    drawn = drawing(document.value, seed)
+    mistakes = [_format_mistake(document, key, rule) for key, rule in find_malformed(document.value).items()]
+    drawn = draw_with_origins(document.value, seed)
     tree = dict(drawn.value)
     is_frozen = tree.pop("frozen", False)
     if not isinstance(is_frozen, bool):
-        mistakes.append(_told(document, ("frozen",), "expected true or false"))
+        mistakes.append(_format_mistake(document, ("frozen",), "expected true or false"))
     turnover = tree.pop("turnover", 0.0)
     if isinstance(turnover, bool) or not isinstance(turnover, int | float) or not 0 <= turnover <= 1:
-        mistakes.append(_told(document, ("turnover",), "expected a share between 0 and 1"))
+        mistakes.append(_format_mistake(document, ("turnover",), "expected a share between 0 and 1"))
         turnover = 0.0
     place = Document(document.source, tree, _drawn_origins(document, drawn))
-    tree, unknown = _with_props(place)
-    tree, missing = _with_files(replace(place, value=tree))
+    tree, unknown = _resolve_props(place)
+    tree, missing = _resolve_files(replace(place, value=tree))
     mistakes += missing
-    references = reference_mistakes(tree) + unknown
-    mistakes += [_told(place, key, rule) for key, rule in references]
+    references = find_dangling(tree) + unknown
+    mistakes += [_format_mistake(place, key, rule) for key, rule in references]
     try:
         scenario = validate(Scenario, replace(place, value=tree))
     except InputError as error:
-        return None, mistakes + _without_repetition(str(error).splitlines(), drawn.broken, references)
-    mistakes += [_told(place, key, rule) for key, rule in contradictions(scenario)]
-    return _frozen(scenario) if is_frozen else _turned_over(scenario, turnover, seed), mistakes
+        return None, mistakes + _drop_repeated(str(error).splitlines(), drawn.broken, references)
+    mistakes += [_format_mistake(place, key, rule) for key, rule in find_contradictions(scenario)]
+    return _freeze(scenario) if is_frozen else _turn_over(scenario, turnover, seed), mistakes
 
 
-def _frozen(scenario: Scenario) -> Scenario:
+def _freeze(scenario: Scenario) -> Scenario:
     """Return the scenario with nothing changing: the world stays as the before session saw it."""
     stay = {"change": "none", "to": None, "shift": None, "loaded_share": None}
     props: list[Prop] = [prop.model_copy(update=stay) for prop in scenario.props if prop.change != "added"]
     return scenario.model_copy(update={"props": tuple(props)})
 
 
-def _turned_over(scenario: Scenario, turnover: float, seed: int) -> Scenario:
+def _turn_over(scenario: Scenario, turnover: float, seed: int) -> Scenario:
     """Return the scenario with that share of what would stay added or removed instead, one as often as the other."""
     props: list[Prop] = []
     for prop in scenario.props:
@@ -108,7 +108,7 @@ def _turned_over(scenario: Scenario, turnover: float, seed: int) -> Scenario:
     return scenario.model_copy(update={"props": tuple(props)})
 
 
-def _with_props(document: Document) -> tuple[dict[Any, Any], list[Mistake]]:
+def _resolve_props(document: Document) -> tuple[dict[Any, Any], list[Mistake]]:
     """Return the tree with the mesh of every prop whose kind is on the search path, and the kinds that are nowhere."""
     unknown: list[Mistake] = []
     tree, files = document.value, prop_files()
@@ -117,14 +117,14 @@ def _with_props(document: Document) -> tuple[dict[Any, Any], list[Mistake]]:
         if not isinstance(kind, str) or kind in PROP_KINDS:
             continue
         if kind in files:
-            tree = _with_value(tree, ("props", index), read_prop(kind).model_dump(exclude_none=True) | prop)
+            tree = _replace_at(tree, ("props", index), read_prop(kind).model_dump(exclude_none=True) | prop)
         else:
             hint = suggest(kind, prop_names()) or f"; known are {', '.join(prop_names())}"
             unknown.append((("props", index, "kind"), f"no prop is called {kind}{hint}"))
     return tree, unknown
 
 
-def _with_files(document: Document) -> tuple[dict[Any, Any], list[str]]:
+def _resolve_files(document: Document) -> tuple[dict[Any, Any], list[str]]:
     """Return the tree with every file's path as seen from the working folder, and the files that are missing.
 
     A relative path starts at the file that holds its key, one given by --set at the working folder.
@@ -135,17 +135,17 @@ def _with_files(document: Document) -> tuple[dict[Any, Any], list[str]]:
         path = Path(holder).parent / name if colon and line.isdigit() else Path(name)
         if not path.is_file():
             seen = "" if str(path) == name else f": expected {path}"
-            missing.append(_told(document, key, f"no such file{seen}"))
-        tree = _with_value(tree, key, str(path))
+            missing.append(_format_mistake(document, key, f"no such file{seen}"))
+        tree = _replace_at(tree, key, str(path))
     return tree, missing
 
 
-def _with_value(value: Any, key: Key, new: str) -> Any:
+def _replace_at(value: Any, key: Key, new: str) -> Any:
     """Return dicts and lists with one value replaced; what lies beside it is shared, not copied."""
     if not key:
         return new
     parts: Any = dict(value) if isinstance(value, dict) else list(value)
-    parts[key[0]] = _with_value(parts[key[0]], key[1:], new)
+    parts[key[0]] = _replace_at(parts[key[0]], key[1:], new)
     return parts
 
 
@@ -153,21 +153,21 @@ def _drawn_origins(document: Document, drawn: Drawing) -> dict[Key, str]:
     return {key: document.where(source) for key, source in drawn.origins.items()}
 
 
-def _without_repetition(lines: list[str], broken: set[Key], told: list[Mistake]) -> list[str]:
+def _drop_repeated(lines: list[str], broken: set[Key], told: list[Mistake]) -> list[str]:
     """Drop what the schema says of values that could not be drawn, and what is told with its own line already."""
-    names = [f": {dotted(key)} = " for key in broken] + [rule.partition(";")[0] for _, rule in told]
+    names = [f": {join_key(key)} = " for key in broken] + [rule.partition(";")[0] for _, rule in told]
     return [line for line in lines if not any(name in line for name in names)]
 
 
-def _told(document: Document, key: Key, rule: str) -> str:
+def _format_mistake(document: Document, key: Key, rule: str) -> str:
     value = document.value
     for part in key:
         is_there = part in value if isinstance(value, dict) else isinstance(value, list) and part in range(len(value))
         if not is_there:
-            return f"{document.where(key)}: {dotted(key)}: {rule}"
+            return f"{document.where(key)}: {join_key(key)}: {rule}"
         value = value[part]
     text = repr(value)
-    return f"{document.where(key)}: {dotted(key)} = {text if len(text) <= 60 else text[:57] + '...'}: {rule}"
+    return f"{document.where(key)}: {join_key(key)} = {text if len(text) <= 60 else text[:57] + '...'}: {rule}"
 
 
 def _key_of(line: str) -> str:
@@ -179,14 +179,14 @@ def _line_of(line: str) -> tuple[str, int]:
     return (match[1], int(match[2])) if match else (line, 0)
 
 
-def _document(name_or_path: str, settings: Iterable[str]) -> Document:
-    return apply_settings(_extended(_path_of(name_or_path), ()), settings)
+def _read(name_or_path: str, settings: Iterable[str]) -> Document:
+    return apply_settings(_read_extended(_path_of(name_or_path), ()), settings)
 
 
 def _path_of(name_or_path: str) -> Path:
     files = family_files()
     if name_or_path in files:
-        return _shown(files[name_or_path])
+        return _shorten(files[name_or_path])
     path = Path(name_or_path)
     if path.is_file():
         return path
@@ -196,12 +196,12 @@ def _path_of(name_or_path: str) -> Path:
     raise ScenarioError(f'scenario "{name_or_path}": unknown{hint}')
 
 
-def _shown(path: Path) -> Path:
+def _shorten(path: Path) -> Path:
     """Return the path as it is told to the user: short where it lies below the working folder."""
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
-def _extended(path: Path, children: tuple[Path, ...]) -> Document:
+def _read_extended(path: Path, children: tuple[Path, ...]) -> Document:
     """Read a file and write it over the one it extends; `family` is its own name unless it gives one."""
     read = read_yaml(path)
     if not isinstance(read.value, dict):
@@ -212,9 +212,9 @@ def _extended(path: Path, children: tuple[Path, ...]) -> Document:
     base_name = value.pop("extends", None)
     if base_name is None:
         return Document(str(path), value, origins)
-    base = _extended(_base_path(base_name, path, origins[("extends",)], children), (*children, path))
+    base = _read_extended(_base_path(base_name, path, origins[("extends",)], children), (*children, path))
     kept = {key: where for key, where in base.origins.items() if not _is_replaced(key, base.value, value)}
-    return Document(str(path), merged(base.value, value), kept | origins)
+    return Document(str(path), merge_trees(base.value, value), kept | origins)
 
 
 def _base_path(name: Any, path: Path, where: str, children: tuple[Path, ...]) -> Path:

@@ -52,7 +52,7 @@ def route_length_m(tunnel: Tunnel, plan: SessionPlan) -> float:
     return path_m - plan.start_m - plan.end_m
 
 
-def contradictions(scenario: Scenario) -> list[Mistake]:
+def find_contradictions(scenario: Scenario) -> list[Mistake]:
     """Return what cannot be built or driven in a scenario whose references hold, as (key path, rule)."""
     return [
         *_foreign_mistakes(scenario),

@@ -12,7 +12,7 @@ from typing import Annotated, Literal, get_args
 from pydantic import Field, model_validator
 
 from cdpipe.core.yamlfile import Settings
-from scenarios.dangling import reference_mistakes
+from scenarios.dangling import find_dangling
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -351,6 +351,6 @@ class Scenario(Settings):
 
     @model_validator(mode="after")
     def _references_hold(self) -> Scenario:
-        for key, rule in reference_mistakes(self.model_dump(mode="json")):
+        for key, rule in find_dangling(self.model_dump(mode="json")):
             raise ValueError(f"{'.'.join(map(str, key))}: {rule}")
         return self

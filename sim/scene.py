@@ -21,7 +21,7 @@ from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster, model_meshes
 from sim.materials import REFLECTIVITY
 from sim.placement.arranging import place_props
-from sim.placement.placing import WALL_GAP_M, Standing, Surroundings, grow, standing_corners
+from sim.placement.placing import WALL_GAP_M, Standing, Surroundings, grow_rectangle, standing_corners
 from sim.placement.settling import add_solid, quaternion
 from sim.rock.centreline import Centreline, build_centreline
 from sim.rock.foreign import tunnel_mesh
@@ -86,17 +86,17 @@ def build_world(scenario: Scenario, seed: int) -> World:
     walls = Caster([wall])
     furniture = furnish(tunnel, centreline, walls, seed)
     # Compiling takes the most memory: it comes before the other casters are there.
-    rock = [compiled_alone(mesh) for mesh in (wall, *(fixture.mesh for fixture in furniture))]
+    rock = [compile_mesh(mesh) for mesh in (wall, *(fixture.mesh for fixture in furniture))]
     hung = Caster([wall, *(fixture.mesh for fixture in furniture)]) if furniture else walls
     gap_m = WALL_GAP_M + (tunnel.resolution_m if tunnel.mesh is None else 0.0)
     standing = place_props(scenario, centreline, Surroundings(walls, hung, gap_m), seed)
-    outlines = [grow(standing_corners(item), _STONE_FREE_M) for item in standing]
+    outlines = [grow_rectangle(standing_corners(item), _STONE_FREE_M) for item in standing]
     stones = strew_stones(tunnel, centreline, walls, outlines, seed)
     if stones is None:
         fixtures, fixed = furniture, hung
     else:
         fixtures = (*furniture, stones)
-        rock.append(compiled_alone(stones.mesh))
+        rock.append(compile_mesh(stones.mesh))
         fixed = Caster([wall, *(fixture.mesh for fixture in fixtures)])
     scenes = [compile_scene(scenario, rock, fixtures, standing, session) for session in ("before", "after")]
     return World(centreline, walls, fixed, fixtures, tuple(standing), scenes[0], scenes[1])
@@ -109,7 +109,7 @@ def compile_scene(
 
     Args:
         scenario: Numbers the props and says how bright the rock is.
-        rock: The wall and the fixtures as MuJoCo compiled them, see `compiled_alone`.
+        rock: The wall and the fixtures as MuJoCo compiled them, see `compile_mesh`.
         fixtures: What is fixed, in the order of `rock[1:]`.
         standing: Props at their places, of both sessions.
         session: "before" or "after".
@@ -136,7 +136,7 @@ def compile_scene(
     )
 
 
-def compiled_alone(mesh: Mesh) -> Mesh:
+def compile_mesh(mesh: Mesh) -> Mesh:
     """Return a fixed mesh as MuJoCo has it, world frame: its vertices are float32 about the mesh's own middle."""
     return model_meshes(*compile_model([mesh], []))[0]
 

@@ -9,8 +9,8 @@ from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Scenario
 from sim.geometry.line import STEP_M
-from sim.geometry.raycast import room_about
-from sim.placement.lanes import AIR_BELOW_M, seen_from_line
+from sim.geometry.raycast import measure_room
+from sim.placement.lanes import AIR_BELOW_M, project_prop
 from sim.placement.placing import PROBE_UP_M, floor_heights, standing_height_m
 from sim.rock.centreline import left_of
 from sim.scene import World
@@ -24,7 +24,7 @@ _BESIDE_WHEELS_M = 0.1
 _TIGHTEST_SHARE = 0.5
 
 
-def obstacles(
+def find_obstacles(
     world: World, scenario: Scenario, session: str, line: Float64Array, headings: Float64Array, height_m: float
 ) -> list[tuple[str, Float64Array, Float64Array]]:
     """Return for each prop in the way its name and the offsets it forbids, (N,) to (N,), NaN where it is far."""
@@ -34,7 +34,7 @@ def obstacles(
         is_low = scenario.platform.kind == "quadrotor" and standing_height_m(item) + AIR_BELOW_M < height_m
         if session not in item.sessions or is_low:
             continue
-        near, along, across = seen_from_line(item, line[:, :2], headings, (clearance_m, 10.0))
+        near, along, across = project_prop(item, line[:, :2], headings, (clearance_m, 10.0))
         reach_m = np.sqrt(np.maximum(clearance_m**2 - along**2, 0.0))
         is_abreast = np.abs(along) < clearance_m
         low, high = np.full(len(line), np.nan), np.full(len(line), np.nan)
@@ -89,7 +89,7 @@ def sidestep(
     return None
 
 
-def boulders(
+def find_boulders(
     world: World, scenario: Scenario, line: Float64Array, headings: Float64Array, width_m: float
 ) -> list[tuple[Float64Array, Float64Array]]:
     """Return for each loose stone too high to drive over the offsets it forbids, (N,) to (N,), NaN where it is far.
@@ -128,7 +128,7 @@ def check_clearance(world: World, scenario: Scenario, session: str, way_m: Float
     level = np.stack([np.cos(angle), np.sin(angle), np.zeros(24)], axis=1)
     directions = np.concatenate([level, [[0.0, 0.0, 1.0]]])
     stations = points[:: round(0.5 / STEP_M)]
-    gap_m, is_outside = room_about(world.fixed, stations, directions)
+    gap_m, is_outside = measure_room(world.fixed, stations, directions)
     gap_m[is_outside] = 0.0
     worst = int(np.argmin(gap_m))
     if gap_m[worst] < _TIGHTEST_SHARE * clearance_m:

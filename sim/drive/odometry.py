@@ -16,7 +16,7 @@ from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Odometry
 
 
-def odom_start(true: Motion, start_s: float) -> Float64Array:
+def start_pose(true: Motion, start_s: float) -> Float64Array:
     """Return odom_T_sensor (4, 4) at `start_s`: upright as gravity shows it, heading and position zero."""
     first = true.poses(np.array([start_s]))[0]
     yaw = np.arctan2(first[1, 0], first[0, 0])
@@ -25,7 +25,7 @@ def odom_start(true: Motion, start_s: float) -> Float64Array:
     return pose
 
 
-def drifted(true: Motion, start_s: float, odometry: Odometry, seed: int, session: str) -> Motion:
+def drift_motion(true: Motion, start_s: float, odometry: Odometry, seed: int, session: str) -> Motion:
     """Return the movement as odometry has it: its increments scaled, its heading drifting with the way.
 
     The odom frame is upright, with its origin at the sensor and its x axis along the sensor's heading at `start_s`.
@@ -49,7 +49,7 @@ def drifted(true: Motion, start_s: float, odometry: Odometry, seed: int, session
     return make_motion(true.time_s, true.way_m, points, turns * Rotation.from_quat(true.quaternions))
 
 
-def registered(
+def register_scans(
     range_images: Iterable[npt.NDArray[np.uint32]],
     sensor: SensorMetadata,
     revolution_s: Float64Array,

@@ -14,8 +14,8 @@ import numpy as np
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, stream
 from scenarios.schema import Scenario, SessionPlan
-from sim.drive.obstacles import boulders, obstacles, pass_by, sidestep
-from sim.geometry.line import STEP_M, kept_between, smoothed, strictest
+from sim.drive.obstacles import find_boulders, find_obstacles, pass_by, sidestep
+from sim.geometry.line import STEP_M, smooth_between, smooth_line, tighten_bound
 from sim.geometry.noise import smooth_noise
 from sim.placement.lanes import body_heights_m, side_bounds
 from sim.rock.centreline import headings_of, left_of, resample
@@ -67,18 +67,18 @@ def plan_path(world: World, scenario: Scenario, seed: int, session: str, is_wary
         ScenarioError: The route turns back on itself, nothing is left of it, or the walls and props leave no room.
     """
     plan: SessionPlan = getattr(scenario, session)
-    line, width_m = _reference(world, plan, session)
-    offset_m = _offsets(world, scenario, seed, session, line, width_m, _heights_m(scenario, plan, is_wary))
+    line, width_m = _reference_line(world, plan, session)
+    offset_m = _plan_offsets(world, scenario, seed, session, line, width_m, _heights_m(scenario, plan, is_wary))
     left = left_of(headings_of(line))
     shifted = resample(np.column_stack([line[:, :2] + offset_m[:, None] * left, line[:, 2]]), STEP_M)
-    xy = smoothed(shifted[:, :2], _LAST_SMOOTHING_M)
+    xy = smooth_line(shifted[:, :2], _LAST_SMOOTHING_M)
     headings = headings_of(xy)
     distance_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
-    yaw = smoothed(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0])), 4 * STEP_M)
+    yaw = smooth_line(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0])), 4 * STEP_M)
     return Path(distance_m, np.column_stack([xy, shifted[:, 2]]), yaw)
 
 
-def _reference(world: World, plan: SessionPlan, session: str) -> tuple[Float64Array, Float64Array]:
+def _reference_line(world: World, plan: SessionPlan, session: str) -> tuple[Float64Array, Float64Array]:
     """Return the route (N, 3) with rounded corners, trimmed, and the section's width (N,) along it."""
     pieces: list[Float64Array] = []
     widths: list[Float64Array] = []
@@ -94,7 +94,7 @@ def _reference(world: World, plan: SessionPlan, session: str) -> tuple[Float64Ar
     share = np.linspace(0.0, 1.0, len(points))
     all_widths = np.concatenate(widths)
     width_m = np.interp(share, np.linspace(0.0, 1.0, len(all_widths)), all_widths)
-    line = smoothed(points, _CORNER_SHARE * float(all_widths.min()))
+    line = smooth_line(points, _CORNER_SHARE * float(all_widths.min()))
     first, last = round(plan.start_m / STEP_M), len(line) - round(plan.end_m / STEP_M)
     if last - first < 2 / STEP_M:
         raise ScenarioError(
@@ -121,7 +121,7 @@ def _heights_m(scenario: Scenario, plan: SessionPlan, is_wary: bool) -> Float64A
     return np.arange(low_m, heights_m[-1] + reach_m, _WARY_STEP_M)
 
 
-def _offsets(
+def _plan_offsets(
     world: World,
     scenario: Scenario,
     seed: int,
@@ -136,17 +136,17 @@ def _offsets(
     headings = headings_of(line)
     height_m = plan.height_m or scenario.platform.sensor_height_m
     room_m = np.maximum(width_m / 2 - clearance_m, 0.0)
-    turn = smoothed(np.gradient(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0]))) / STEP_M, 0.25)
+    turn = smooth_line(np.gradient(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0]))) / STEP_M, 0.25)
     low, high = side_bounds(world.fixed, line, headings, turn, heights_m, width_m, clearance_m)
     wanted = plan.lateral * room_m + scenario.platform.wander_m * _wander(len(line), seed, session)
     _refuse_narrow(scenario, session, low, high)
-    for name, near_low, near_high in obstacles(world, scenario, session, line, headings, height_m):
+    for name, near_low, near_high in find_obstacles(world, scenario, session, line, headings, height_m):
         pass_by(session, name, wanted, low, high, near_low, near_high)
-    stones = boulders(world, scenario, line, headings, float(width_m.max()))
-    return _swerving(session, wanted, low, high, stones, _CHICANE_SHARE * clearance_m)
+    stones = find_boulders(world, scenario, line, headings, float(width_m.max()))
+    return _swerve_between(session, wanted, low, high, stones, _CHICANE_SHARE * clearance_m)
 
 
-def _swerving(
+def _swerve_between(
     session: str,
     wanted: Float64Array,
     low: Float64Array,
@@ -159,7 +159,7 @@ def _swerving(
         inner_low, inner_high = low.copy(), high.copy()
         for near_low, near_high in stones:
             sidestep(wanted, inner_low, inner_high, near_low, near_high)
-        offset_m, excess_m = _smoothest(wanted, inner_low, inner_high, give_m)
+        offset_m, excess_m = _find_smoothest(wanted, inner_low, inner_high, give_m)
         worst = int(np.argmax(excess_m))
         if excess_m[worst] <= give_m:
             return offset_m
@@ -173,16 +173,16 @@ def _swerving(
         stones = kept
 
 
-def _smoothest(
+def _find_smoothest(
     wanted: Float64Array, low: Float64Array, high: Float64Array, give_m: float
 ) -> tuple[Float64Array, Float64Array]:
     """Offset (N,) that swerves no more sharply than it must, and how far it is beyond the bounds (N,)."""
-    offset_m = kept_between(wanted, low, high, _SWERVES_M[0])
+    offset_m = smooth_between(wanted, low, high, _SWERVES_M[0])
     for half_m in _SWERVES_M[1:]:
         is_bad = np.maximum(low - offset_m, offset_m - high) > give_m
         if is_bad.any():
-            share = np.clip(smoothed(strictest(is_bad.astype(np.float64), 2.0, np.max), 2.0), 0.0, 1.0)
-            offset_m = share * kept_between(wanted, low, high, half_m) + (1.0 - share) * offset_m
+            share = np.clip(smooth_line(tighten_bound(is_bad.astype(np.float64), 2.0, np.max), 2.0), 0.0, 1.0)
+            offset_m = share * smooth_between(wanted, low, high, half_m) + (1.0 - share) * offset_m
     return offset_m, np.maximum(low - offset_m, offset_m - high)
 
 

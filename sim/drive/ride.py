@@ -10,7 +10,7 @@ from cdpipe.core.geometry import Float64Array, stream
 from cdpipe.core.motion import Motion, make_motion
 from scenarios.schema import Platform, Scenario
 from sim.drive.path import Path
-from sim.geometry.line import kept_between, smoothed
+from sim.geometry.line import smooth_between, smooth_line
 from sim.geometry.noise import smooth_noise
 from sim.geometry.raycast import Caster
 from sim.placement.lanes import AIR_BELOW_M
@@ -45,26 +45,30 @@ def ride(path: Path, floor: Caster, standing: Caster, scenario: Scenario, seed: 
     """
     platform, plan = scenario.platform, getattr(scenario, session)
     height_m = plan.height_m or platform.sensor_height_m
-    time_s = times(path.distance_m, plan.speed_mps or platform.speed_mps, platform.speed_variation, seed, session)
+    time_s = integrate_time(
+        path.distance_m, plan.speed_mps or platform.speed_mps, platform.speed_variation, seed, session
+    )
     keys = stream(seed, session, "tilt").integers(2**63, size=2).tolist()
     tilt = [np.deg2rad(platform.tilt_deg) * smooth_noise((path.distance_m,), _TILT_LENGTH_M, key) for key in keys]
     bounce_key = int(stream(seed, session, "bounce").integers(2**63))
     bounce_m = platform.bounce_m * smooth_noise((path.distance_m,), _BOUNCE_LENGTH_M, bounce_key)
     if platform.kind == "ground_robot":
-        centre_m, pitch, roll = on_wheels(path, floor, platform)
+        centre_m, pitch, roll = follow_floor(path, floor, platform)
         rotations = Rotation.from_euler("ZYX", np.stack([path.yaw_rad, pitch + tilt[0], roll + tilt[1]], axis=1))
         mast = rotations.as_matrix()[:, :, 2] * height_m
         points = np.column_stack([path.points[:, :2], centre_m + bounce_m]) + mast
     else:
-        pitch, roll = lean(path, time_s)
+        pitch, roll = lean_angles(path, time_s)
         rotations = Rotation.from_euler("ZYX", np.stack([path.yaw_rad, pitch + tilt[0], roll + tilt[1]], axis=1))
-        level_m = smoothed(_floor_under(path.points, path.points[:, 2], floor), _ALTITUDE_M)
-        flight_m = _between(path, floor, standing, level_m + height_m + bounce_m, platform.clearance_m, session)
+        level_m = smooth_line(_floor_under(path.points, path.points[:, 2], floor), _ALTITUDE_M)
+        flight_m = _keep_between(path, floor, standing, level_m + height_m + bounce_m, platform.clearance_m, session)
         points = np.column_stack([path.points[:, :2], flight_m])
     return make_motion(time_s, path.distance_m, points, rotations)
 
 
-def times(distance_m: Float64Array, speed_mps: float, variation: float, seed: int, session: str) -> Float64Array:
+def integrate_time(
+    distance_m: Float64Array, speed_mps: float, variation: float, seed: int, session: str
+) -> Float64Array:
     """Return the time (N,) at each distance: the integral of ds / v, v being log-normal about `speed_mps`.
 
     The logarithm of v is smooth noise, so that v has the mean `speed_mps` and the standard deviation `variation` times
@@ -79,7 +83,7 @@ def times(distance_m: Float64Array, speed_mps: float, variation: float, seed: in
     return np.concatenate([[0.0], np.cumsum(steps_s)])
 
 
-def on_wheels(path: Path, floor: Caster, platform: Platform) -> tuple[Float64Array, Float64Array, Float64Array]:
+def follow_floor(path: Path, floor: Caster, platform: Platform) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return height (N,) of the robot's middle at the floor, pitch (nose down positive) and roll (left up), radians.
 
     The chassis lies in the plane through the four wheels' contact points that is nearest to them: middle, rise along
@@ -92,7 +96,7 @@ def on_wheels(path: Path, floor: Caster, platform: Platform) -> tuple[Float64Arr
         for side in (1, -1):
             offset = ahead * platform.wheelbase_m / 2 * forward + side * platform.track_m / 2 * left
             wheel = np.column_stack([path.points[:, :2] + offset, path.points[:, 2]])
-            heights[ahead, side] = smoothed(_floor_under(wheel, path.points[:, 2], floor), _CONTACT_M)
+            heights[ahead, side] = smooth_line(_floor_under(wheel, path.points[:, 2], floor), _CONTACT_M)
     front, rear = ((heights[ahead, 1] + heights[ahead, -1]) / 2 for ahead in (1, -1))
     port, starboard = ((heights[1, side] + heights[-1, side]) / 2 for side in (1, -1))
     pitch = -np.arctan((front - rear) / platform.wheelbase_m)
@@ -100,11 +104,11 @@ def on_wheels(path: Path, floor: Caster, platform: Platform) -> tuple[Float64Arr
     return (front + rear) / 2, pitch, roll
 
 
-def lean(path: Path, time_s: Float64Array) -> tuple[Float64Array, Float64Array]:
+def lean_angles(path: Path, time_s: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return pitch and roll (N,) by which a quadrotor turns its thrust into the acceleration it needs, radians."""
     speed_mps = np.gradient(path.distance_m, time_s)
-    along = smoothed(np.gradient(speed_mps, time_s), _LEAN_M)
-    to_left = smoothed(speed_mps**2 * np.gradient(path.yaw_rad, path.distance_m), _LEAN_M)
+    along = smooth_line(np.gradient(speed_mps, time_s), _LEAN_M)
+    to_left = smooth_line(speed_mps**2 * np.gradient(path.yaw_rad, path.distance_m), _LEAN_M)
     return np.arctan(along / _GRAVITY_MPS2), -np.arctan(to_left / _GRAVITY_MPS2)
 
 
@@ -115,7 +119,7 @@ def _floor_under(points: Float64Array, level_m: Float64Array, floor: Caster) -> 
     return np.interp(np.arange(len(heights)), known, heights[known]) if len(known) else level_m.copy()
 
 
-def _between(
+def _keep_between(
     path: Path, floor: Caster, standing: Caster, wanted_m: Float64Array, clearance_m: float, session: str
 ) -> Float64Array:
     """Heights (N,) near the wanted ones that keep the clearance to the roof and air to what lies or stands below."""
@@ -137,4 +141,4 @@ def _between(
             f"{path.distance_m[worst]:.1f} m along the route, at ({x:.1f}, {y:.1f}, {z:.1f}): choose another lateral, "
             "or lower platform.clearance_m"
         )
-    return kept_between(wanted_m, low, high, _LEAN_M)
+    return smooth_between(wanted_m, low, high, _LEAN_M)

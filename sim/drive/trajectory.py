@@ -13,7 +13,7 @@ from cdpipe.core.motion import Motion, rotation_matrices
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Platform, Scenario, SessionPlan
 from sim.drive.obstacles import check_clearance
-from sim.drive.odometry import drifted
+from sim.drive.odometry import drift_motion
 from sim.drive.path import plan_path
 from sim.drive.ride import ride
 from sim.placement.recorded import check_inside, read_drive
@@ -114,11 +114,13 @@ def plan_trajectory(world: World, scenario: Scenario, sensor: SensorMetadata, se
         true, lines = read_drive(Path(plan.trajectory))
         check_inside(true, scene.caster, f"{session}: {plan.trajectory}", lines)
     else:
-        true = _driven(world, scene, scenario, seed, session)
+        true = _drive_route(world, scene, scenario, seed, session)
     return record(true, scenario, sensor, seed, session)
 
 
-def _driven(world: World, scene: Scene, scenario: Scenario, seed: int, session: str, is_wary: bool = False) -> Motion:
+def _drive_route(
+    world: World, scene: Scene, scenario: Scenario, seed: int, session: str, is_wary: bool = False
+) -> Motion:
     """Drive the session's line; where it comes too near to something, a wary one is tried."""
     path = plan_path(world, scenario, seed, session, is_wary)
     true = ride(path, world.fixed, scene.caster, scenario, seed, session)
@@ -128,7 +130,7 @@ def _driven(world: World, scene: Scene, scenario: Scenario, seed: int, session: 
         if is_wary:
             raise
         try:
-            return _driven(world, scene, scenario, seed, session, is_wary=True)
+            return _drive_route(world, scene, scenario, seed, session, is_wary=True)
         except ScenarioError:
             raise too_near from None
     return true
@@ -146,7 +148,7 @@ def record(true: Motion, scenario: Scenario, sensor: SensorMetadata, seed: int, 
     column_s /= sensor.rate_hz * sensor.width
     if not scenario.sensor.rolling_scan:
         column_s[:] = 0.0
-    estimated = drifted(true, float(revolution_s[0]), plan.odometry, seed, session)
+    estimated = drift_motion(true, float(revolution_s[0]), plan.odometry, seed, session)
     return Trajectory(true, estimated, revolution_s, column_s, sensor.column_offsets_ns())
 
 

@@ -10,12 +10,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from scenarios.schema import Furniture, Tunnel
-from sim.furniture.shell import shell_of
+from sim.furniture.shell import measure_shell
 from sim.furniture.support import BOLT_LOWEST_SHARE, SCREEN_LOWEST_SHARE, bolt_mesh, bolt_pins, screen_mesh
 from sim.furniture.utilities import duct_meshes, pipe_meshes, tray_meshes, wall_plans
-from sim.geometry.mesh import Mesh, joined
+from sim.geometry.mesh import Mesh, join_meshes
 from sim.geometry.raycast import Caster
-from sim.rock.axis import Axis, axes_of
+from sim.rock.axis import Axis, measure_axes
 from sim.rock.centreline import Centreline
 
 _PIN_SPACING_M = 1.2  # of what holds a screen where no bolts are asked for
@@ -48,22 +48,22 @@ def furnish(tunnel: Tunnel, centreline: Centreline, walls: Caster, seed: int) ->
     furniture = tunnel.furniture
     if furniture == Furniture() or not centreline.drifts:
         return ()
-    axes = axes_of(centreline, walls)
-    fixtures = (*_hangings(furniture, axes, seed), *_support(furniture, axes, seed))
+    axes = measure_axes(centreline, walls)
+    fixtures = (*_utilities(furniture, axes, seed), *_support(furniture, axes, seed))
     return tuple(fixture for fixture in fixtures if len(fixture.mesh.faces))
 
 
-def _hangings(furniture: Furniture, axes: Sequence[Axis], seed: int) -> Iterator[Fixture]:
+def _utilities(furniture: Furniture, axes: Sequence[Axis], seed: int) -> Iterator[Fixture]:
     plans = iter(wall_plans(furniture))
     for number, pipe in enumerate(furniture.pipes, start=1):
-        yield Fixture(f"pipe-{number}", "steel", joined(list(pipe_meshes(axes, pipe, next(plans)))))
+        yield Fixture(f"pipe-{number}", "steel", join_meshes(list(pipe_meshes(axes, pipe, next(plans)))))
     for number, duct in enumerate(furniture.ducts, start=1):
         name = f"duct-{number}"
-        yield Fixture(name, "fabric", joined(list(duct_meshes(axes, duct, name, seed))))
+        yield Fixture(name, "fabric", join_meshes(list(duct_meshes(axes, duct, name, seed))))
     for number, tray in enumerate(furniture.cable_trays, start=1):
         name = f"cable-tray-{number}"
         *steel, cables = tray_meshes(axes, tray, next(plans), name, seed)
-        yield Fixture(name, "steel", joined(steel))
+        yield Fixture(name, "steel", join_meshes(steel))
         yield Fixture(f"cables-{number}", "rubber", cables)
 
 
@@ -71,11 +71,11 @@ def _support(furniture: Furniture, axes: Sequence[Axis], seed: int) -> Iterator[
     bolts, screen = furniture.bolts, furniture.screen
     if bolts is None and screen is None:
         return
-    shells = [shell_of(axis, BOLT_LOWEST_SHARE) for axis in axes]
+    shells = [measure_shell(axis, BOLT_LOWEST_SHARE) for axis in axes]
     spacing_m = _PIN_SPACING_M if bolts is None else bolts.spacing_m
     pins = [bolt_pins(shell, spacing_m, number, seed) for number, shell in enumerate(shells)]
     if bolts is not None:
         yield Fixture("bolts", "steel", bolt_mesh(shells, pins, bolts))
     if screen is not None:
-        shells = [shell_of(axis, SCREEN_LOWEST_SHARE) for axis in axes]
+        shells = [measure_shell(axis, SCREEN_LOWEST_SHARE) for axis in axes]
         yield Fixture("screen", "steel", screen_mesh(shells, pins, screen, seed))

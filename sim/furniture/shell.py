@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, map_coordinates, minimum_filter, uniform_filter
 
 from cdpipe.core.geometry import BoolArray, Float64Array
-from sim.rock.axis import STATION_M, Axis, distances, is_opening, spread
+from sim.rock.axis import STATION_M, Axis, fill_from_nearest, is_opening, wall_distances
 
 _ANGLES = np.deg2rad(np.linspace(-120.0, 120.0, 97))  # from the crown, to the left positive
 _ARC_STEP_M = 0.1
@@ -71,16 +71,16 @@ class Shell:
         return np.asarray(map_coordinates(grid, where, order=1, mode="nearest").reshape(column.shape))
 
 
-def shell_of(axis: Axis, lowest_share: float) -> Shell:
+def measure_shell(axis: Axis, lowest_share: float) -> Shell:
     """Measure the surface of a drift from its crown down to a share of its height."""
     eye = axis.at(0.0, _EYE_SHARE * axis.height_m)
     n_stations, n_angles = len(eye), len(_ANGLES)
     across = np.concatenate([axis.left, np.zeros((n_stations, 1))], axis=1)
     directions = np.sin(_ANGLES)[None, :, None] * across[:, None] + np.cos(_ANGLES)[None, :, None] * [0.0, 0.0, 1.0]
     origins = np.repeat(eye, n_angles, axis=0)
-    rock_m = distances(axis.walls, origins, directions.reshape(-1, 3)).reshape(n_stations, n_angles)
+    rock_m = wall_distances(axis.walls, origins, directions.reshape(-1, 3)).reshape(n_stations, n_angles)
     rock_m = np.minimum(rock_m, 4 * max(axis.section.width_m, axis.section.height_m))
-    rock_m = spread(rock_m, axis.is_inside)
+    rock_m = fill_from_nearest(rock_m, axis.is_inside)
     is_open = is_opening(rock_m)
     # Half a metre to every side: a stiff mat lies on what stands out.
     half_angle = round(0.35 / (_ANGLES[1] - _ANGLES[0]) / (0.4 * axis.section.width_m))

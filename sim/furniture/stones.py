@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from scenarios.schema import Stones, Tunnel
 from sim.furniture.furniture import Fixture
-from sim.geometry.mesh import Mesh, joined
+from sim.geometry.mesh import Mesh, join_meshes
 from sim.geometry.noise import lattice_values
 from sim.geometry.raycast import Caster
 from sim.props.rocks import passing_share, rock_mesh
-from sim.rock.axis import Axis, axes_of, distances, nearest_of
+from sim.rock.axis import Axis, find_nearest, measure_axes, wall_distances
 from sim.rock.centreline import Centreline
 
 SMALLEST_SHARE = 1 / 3  # of the characteristic size; smaller ones are part of the floor
@@ -59,19 +59,19 @@ def strew_stones(
         zip(_DRAWS, stream(seed, "furniture", "stones").integers(2**63, size=len(_DRAWS)).tolist(), strict=True)
     )
     niche_m = max((niche.depth_m for niche in tunnel.niches), default=0.0)
-    found = [_spots_of(axis, stones, niche_m, keys) for axis in axes_of(centreline, walls)]
+    found = [_spots_of(axis, stones, niche_m, keys) for axis in measure_axes(centreline, walls)]
     if not found:
         return None
-    spots = _once(found)
-    size_m = sizes(_uniform(spots.cell, keys["size"]), stones)
+    spots = _drop_repeats(found)
+    size_m = draw_stone_sizes(_uniform(spots.cell, keys["size"]), stones)
     keep = ~_touches_any(spots.floor[:, :2], size_m / 2, outlines)
     if not keep.any():
         return None
     spots = _Spots(spots.cell[keep], spots.floor[keep], spots.eye_z[keep], spots.from_axis_m[keep])
-    return Fixture("stones", "rock", _lying(spots, size_m[keep], walls, keys, seed))
+    return Fixture("stones", "rock", _lay_stones(spots, size_m[keep], walls, keys, seed))
 
 
-def sizes(uniform: Float64Array, stones: Stones) -> Float64Array:
+def draw_stone_sizes(uniform: Float64Array, stones: Stones) -> Float64Array:
     """Return stone sizes (N,) from uniform numbers (N,): Rosin-Rammler between a third of `size_m` and `max_size_m`."""
     smallest_m = min(SMALLEST_SHARE * stones.size_m, 0.5 * stones.max_size_m)
     grid_m = np.geomspace(smallest_m, stones.max_size_m, 512)
@@ -93,12 +93,12 @@ def _spots_of(axis: Axis, stones: Stones, niche_m: float, keys: dict[str, int]) 
     cell = np.column_stack([np.repeat(cells, n_slots, axis=0), slots])
     cell = cell[_uniform(cell, keys["is-there"]) < expected / n_slots]
     xy = _CELL_M * (cell[:, :2] + np.stack([_uniform(cell, keys["x"]), _uniform(cell, keys["y"])], axis=1))
-    from_axis_m, nearest = nearest_of(stations[:, :2], xy, reach_m)
+    from_axis_m, nearest = find_nearest(stations[:, :2], xy, reach_m)
     near = np.isfinite(from_axis_m)
     cell, xy, from_axis_m, nearest = cell[near], xy[near], from_axis_m[near], nearest[near]
     eye = stations[nearest] + 0.5 * axis.height_m[axis.is_inside][nearest][:, None] * _UP
     towards = np.column_stack([xy - eye[:, :2], np.zeros(len(xy))]) / np.maximum(from_axis_m, 1e-9)[:, None]
-    share = from_axis_m / distances(axis.walls, eye, towards)
+    share = from_axis_m / wall_distances(axis.walls, eye, towards)
     wanted = _AT_MIDDLE + 3 * (1 - _AT_MIDDLE) * share**2
     stays = (share < 1.0) & (_uniform(cell, keys["stays"]) < wanted / _AT_WALL)
     above = np.column_stack([xy, eye[:, 2]])[stays]
@@ -109,7 +109,7 @@ def _spots_of(axis: Axis, stones: Stones, niche_m: float, keys: dict[str, int]) 
     return _Spots(cell[stays][is_floor], floor[is_floor], above[is_floor, 2], from_axis_m[stays][is_floor])
 
 
-def _once(found: Sequence[_Spots]) -> _Spots:
+def _drop_repeats(found: Sequence[_Spots]) -> _Spots:
     """Join the drifts' spots; a cell that two drifts share on one level counts for the nearer of them."""
     cell, floor, eye_z, from_axis_m = (
         np.concatenate([getattr(spots, name) for spots in found]) for name in ("cell", "floor", "eye_z", "from_axis_m")
@@ -123,7 +123,7 @@ def _once(found: Sequence[_Spots]) -> _Spots:
     return _Spots(cell[~is_repeat], floor[~is_repeat], eye_z[~is_repeat], from_axis_m[~is_repeat])
 
 
-def _lying(spots: _Spots, size_m: Float64Array, walls: Caster, keys: dict[str, int], seed: int) -> Mesh:
+def _lay_stones(spots: _Spots, size_m: Float64Array, walls: Caster, keys: dict[str, int], seed: int) -> Mesh:
     """Turn, scale and bury one of a few shapes at every spot."""
     shapes = _shapes(seed)
     shape = (_uniform(spots.cell, keys["shape"]) * _N_SHAPES).astype(np.int64)
@@ -144,7 +144,7 @@ def _lying(spots: _Spots, size_m: Float64Array, walls: Caster, keys: dict[str, i
         vertices[..., 2] -= (bottom + sunk_m)[:, None]
         starts = np.arange(len(chosen))[:, None, None] * len(mesh.vertices)
         parts.append(Mesh(vertices.reshape(-1, 3), (starts + mesh.faces).reshape(-1, 3).astype(np.int32)))
-    return joined(parts)
+    return join_meshes(parts)
 
 
 def _lowest_floor(spots: _Spots, size_m: Float64Array, walls: Caster) -> Float64Array:
@@ -153,7 +153,7 @@ def _lowest_floor(spots: _Spots, size_m: Float64Array, walls: Caster) -> Float64
     above = np.column_stack([spots.floor[:, :2], spots.eye_z])[:, None].repeat(4, axis=1)
     above[..., :2] += 0.4 * size_m[:, None, None] * sides
     flat = above.reshape(-1, 3)
-    floor_z = (flat[:, 2] - distances(walls, flat, np.broadcast_to(-_UP, flat.shape))).reshape(-1, 4)
+    floor_z = (flat[:, 2] - wall_distances(walls, flat, np.broadcast_to(-_UP, flat.shape))).reshape(-1, 4)
     # Near a wall a ray may start in the rock: what it finds below is no floor.
     floor_z = np.where(np.abs(floor_z - spots.floor[:, 2:]) < size_m[:, None], floor_z, spots.floor[:, 2:])
     return np.asarray(np.minimum(floor_z.min(axis=1), spots.floor[:, 2]))

@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from scenarios.schema import Bolts, Screen
 from sim.furniture.shell import Shell
-from sim.geometry.mesh import Mesh, drop_unused_vertices, joined
-from sim.geometry.sweep import EMPTY, repeated
-from sim.rock.axis import distances, nearest_of
+from sim.geometry.mesh import Mesh, drop_unused_vertices, join_meshes
+from sim.geometry.sweep import EMPTY, repeat_body
+from sim.rock.axis import find_nearest, wall_distances
 
 BOLT_LOWEST_SHARE = 0.45  # of the drift's height: no bolts below
 SCREEN_LOWEST_SHARE = 0.55
@@ -74,7 +74,7 @@ def screen_mesh(shells: Sequence[Shell], pins: Sequence[Pins], screen: Screen, s
         for number, (shell, pin) in enumerate(zip(shells, pins, strict=True))
     ]
     parts = [part for part in parts if len(part.faces)]
-    return joined(parts) if parts else EMPTY
+    return join_meshes(parts) if parts else EMPTY
 
 
 def covered_rows(n_rows: int, share: float, generator: np.random.Generator) -> BoolArray:
@@ -100,7 +100,7 @@ def _seats(shell: Shell, pins: Pins) -> tuple[Float64Array, Float64Array]:
     """Middle of each plate's underside (N, 3) and its normal (N, 3) into the void, from five rays a bolt."""
     angle = shell.angles_at(pins.along_m, pins.arc_m)
     eye, outwards = shell.rays_at(pins.along_m, angle)
-    first_m = distances(shell.axis.walls, eye, outwards)
+    first_m = wall_distances(shell.axis.walls, eye, outwards)
     aside = np.stack([outwards[:, 1], -outwards[:, 0], np.zeros(len(eye))], axis=1)
     flat = np.linalg.norm(aside, axis=1) < 0.1
     aside[flat] = (1.0, 0.0, 0.0)
@@ -111,7 +111,7 @@ def _seats(shell: Shell, pins: Pins) -> tuple[Float64Array, Float64Array]:
     half_m = PLATE_M / 2
     shifts = half_m * np.array([[0, 0], [1, 1], [-1, 1], [-1, -1], [1, -1]])
     origins = start[:, None] + shifts[None, :, :1] * aside[:, None] + shifts[None, :, 1:] * other[:, None]
-    depth_m = distances(shell.axis.walls, origins.reshape(-1, 3), np.repeat(outwards, 5, axis=0)).reshape(-1, 5)
+    depth_m = wall_distances(shell.axis.walls, origins.reshape(-1, 3), np.repeat(outwards, 5, axis=0)).reshape(-1, 5)
     is_sound = (np.abs(depth_m - 0.3).max(axis=1) < 0.2) & (first_m > 0.6)
     tilt_a = (depth_m @ [0, 1, -1, -1, 1]) / (4 * half_m)
     tilt_b = (depth_m @ [0, 1, 1, -1, -1]) / (4 * half_m)
@@ -134,7 +134,7 @@ def _bolts_at(seats: Float64Array, normals: Float64Array) -> Mesh:
     flat = np.concatenate([corners, corners, [[0, 0]], ring, ring])
     high = np.repeat([0.0, _RIM_M, _DOME_M, 0.5 * _DOME_M, STUB_M], [4, 4, 1, 5, 5])
     offsets = flat[None, :, :1] * aside[:, None] + flat[None, :, 1:] * other[:, None] + high[:, None] * normals[:, None]
-    return repeated(seats[:, None] + offsets, _BOLT_FACES)
+    return repeat_body(seats[:, None] + offsets, _BOLT_FACES)
 
 
 def _screen_of(shell: Shell, pins: Pins, screen: Screen, generator: np.random.Generator) -> Mesh:
@@ -153,7 +153,7 @@ def _screen_of(shell: Shell, pins: Pins, screen: Screen, generator: np.random.Ge
     wires = [
         _wire_mesh(shell, pins, low, lift_m, long_m, wide_m, screen.opening_m, is_along) for is_along in (True, False)
     ]
-    return joined(wires)
+    return join_meshes(wires)
 
 
 def _wire_mesh(
@@ -180,7 +180,7 @@ def _wire_mesh(
     angle = shell.angles_at(along_m, arc_m)
     eye, outwards = shell.rays_at(along_m, angle)
     reach_m = _hung_at(shell, pins, along_m, arc_m, angle) - lift_m[:, None, None]
-    rock_m = distances(shell.axis.walls, eye.reshape(-1, 3), outwards.reshape(-1, 3)).reshape(reach_m.shape)
+    rock_m = wall_distances(shell.axis.walls, eye.reshape(-1, 3), outwards.reshape(-1, 3)).reshape(reach_m.shape)
     reach_m = np.minimum(reach_m, rock_m - _PINNED_M)
     middle = eye + reach_m[..., None] * outwards
     is_good = _is_in_sight(shell, eye, middle)
@@ -200,7 +200,7 @@ def _is_in_sight(shell: Shell, eye: Float64Array, middle: Float64Array) -> BoolA
     start, end = ((part[:, :, :-1] + part[:, :, 1:]) / 2 for part in (eye, middle))
     length_m = np.linalg.norm(end - start, axis=-1)
     rays = (end - start) / length_m[..., None]
-    rock_m = distances(shell.axis.walls, start.reshape(-1, 3), rays.reshape(-1, 3)).reshape(length_m.shape)
+    rock_m = wall_distances(shell.axis.walls, start.reshape(-1, 3), rays.reshape(-1, 3)).reshape(length_m.shape)
     return np.asarray(rock_m > length_m - _PINNED_M)
 
 
@@ -210,7 +210,7 @@ def _hung_at(shell: Shell, pins: Pins, along_m: Float64Array, arc_m: Float64Arra
     if len(pins.along_m) == 0:
         return taut_m
     places = np.stack([along_m, arc_m], axis=-1).reshape(-1, 2)
-    distance_m, _ = nearest_of(np.stack([pins.along_m, pins.arc_m], axis=1), places, _PIN_REACH_M)
+    distance_m, _ = find_nearest(np.stack([pins.along_m, pins.arc_m], axis=1), places, _PIN_REACH_M)
     pull = np.clip(1 - distance_m.reshape(along_m.shape) / _PIN_REACH_M, 0, 1)
     pull = pull**2 * (3 - 2 * pull)
     return np.asarray(taut_m + pull * (shell.radii_at(shell.rock_m, along_m, angle) - _PINNED_M - taut_m))

@@ -8,10 +8,10 @@ import numpy as np
 
 from cdpipe.core.geometry import Float64Array, Int64Array, stream
 from scenarios.schema import CableTray, Duct, Furniture, Pipe
-from sim.furniture.wall_line import Cross, Line, WallPlan, roof_lines, stacked, wall_lines
-from sim.geometry.mesh import Mesh, joined
+from sim.furniture.wall_line import Cross, Line, WallPlan, roof_lines, stack_plans, wall_lines
+from sim.geometry.mesh import Mesh, join_meshes
 from sim.geometry.sweep import EMPTY, bars, circle, frames_along, sweep
-from sim.rock.axis import STATION_M, Axis, distances
+from sim.rock.axis import STATION_M, Axis, wall_distances
 
 FIXING_M = 0.05  # how deep brackets and hangers reach into the rock
 _PIPE_STANDOFF_M = 0.08
@@ -39,7 +39,9 @@ def tray_plan(tray: CableTray) -> WallPlan:
 
 def wall_plans(furniture: Furniture) -> list[WallPlan]:
     """Plans of all pipes, then of all trays, with their heights over openings."""
-    return stacked([pipe_plan(pipe) for pipe in furniture.pipes] + [tray_plan(tray) for tray in furniture.cable_trays])
+    return stack_plans(
+        [pipe_plan(pipe) for pipe in furniture.pipes] + [tray_plan(tray) for tray in furniture.cable_trays]
+    )
 
 
 def pipe_meshes(axes: Sequence[Axis], pipe: Pipe, plan: WallPlan) -> tuple[Mesh, Mesh]:
@@ -48,10 +50,10 @@ def pipe_meshes(axes: Sequence[Axis], pipe: Pipe, plan: WallPlan) -> tuple[Mesh,
     tubes, brackets = [], []
     for axis in axes:
         for line in wall_lines(axis, plan):
-            tubes.append(sweep(thinned(line.path), circle(radius_m, 10)))
+            tubes.append(sweep(thin_path(line.path), circle(radius_m, 10)))
             tubes.extend(_couplings(line, radius_m))
             brackets.append(_wall_arms(axis, line, plan, every_m=3.0, width_m=0.05))
-    return _joined(tubes), _joined(brackets)
+    return _join(tubes), _join(brackets)
 
 
 def duct_meshes(axes: Sequence[Axis], duct: Duct, name: str, seed: int) -> tuple[Mesh, Mesh]:
@@ -71,7 +73,7 @@ def duct_meshes(axes: Sequence[Axis], duct: Duct, name: str, seed: int) -> tuple
             ribs = np.where(np.arange(len(path)) % 2, 0.97, 1.0) * generator.uniform(0.985, 1.0, len(path))
             tubes.append(sweep(path, circle(radius_m, 12), ribs))
             hangers.append(_roof_wires(axis, path[::every], line.left[::every], radius_m))
-    return _joined(tubes), _joined(hangers)
+    return _join(tubes), _join(hangers)
 
 
 def tray_meshes(axes: Sequence[Axis], tray: CableTray, plan: WallPlan, name: str, seed: int) -> tuple[Mesh, Mesh, Mesh]:
@@ -80,14 +82,14 @@ def tray_meshes(axes: Sequence[Axis], tray: CableTray, plan: WallPlan, name: str
     for number, axis in enumerate(axes):
         generator = stream(seed, "furniture", name, str(number))
         for line in wall_lines(axis, plan):
-            path = thinned(line.path)
+            path = thin_path(line.path)
             trays.append(sweep(path, _u_profile(tray.width_m, 2 * _TRAY_HALF_HEIGHT_M), is_capped=False))
             brackets.append(_wall_arms(axis, line, plan, every_m=1.5, width_m=0.04))
             cables.extend(_cables(path, tray.width_m, generator))
-    return _joined(trays), _joined(brackets), _joined(cables)
+    return _join(trays), _join(brackets), _join(cables)
 
 
-def thinned(path: Float64Array, tolerance_m: float = 0.004) -> Float64Array:
+def thin_path(path: Float64Array, tolerance_m: float = 0.004) -> Float64Array:
     """Leave out every second point of a path where it hardly bends, both ends kept."""
     if len(path) < 4:
         return path
@@ -114,23 +116,23 @@ def _wall_arms(axis: Axis, line: Line, plan: WallPlan, every_m: float, width_m: 
     below = np.array([0.0, 0.0, plan.cross.half_height_m + 0.5 * width_m])
     inner = line.path[chosen] - below - plan.side * plan.cross.half_width_m * line.left[chosen]
     outwards = plan.side * line.left[chosen]
-    reach_m = distances(axis.walls, inner, outwards)
+    reach_m = wall_distances(axis.walls, inner, outwards)
     is_arm = reach_m < _LONGEST_ARM_M + 2 * plan.cross.half_width_m
     arms = bars(inner[is_arm], (inner + (reach_m + FIXING_M)[:, None] * outwards)[is_arm], width_m)
     hung = line.path[chosen][~is_arm]
-    return joined([arms, _wires(axis, hung)])
+    return join_meshes([arms, _wires(axis, hung)])
 
 
 def _roof_wires(axis: Axis, path: Float64Array, left: Float64Array, radius_m: float) -> Mesh:
     sides = [_wires(axis, path + shift * radius_m * left) for shift in (-0.85, 0.85)]
-    return joined(sides)
+    return join_meshes(sides)
 
 
 def _wires(axis: Axis, points: Float64Array) -> Mesh:
     up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     if len(points) == 0:
         return bars(points, points, 0.012)
-    reach_m = distances(axis.walls, points, up)
+    reach_m = wall_distances(axis.walls, points, up)
     is_near = reach_m < 3.0
     return bars(points[is_near], (points + (reach_m + FIXING_M)[:, None] * up)[is_near], 0.012)
 
@@ -160,8 +162,8 @@ def _knots(count: int, generator: np.random.Generator) -> tuple[Int64Array, Floa
     return knots, generator.uniform(-1.0, 1.0, len(knots))
 
 
-def _joined(meshes: Sequence[Mesh]) -> Mesh:
-    return joined(list(meshes)) if meshes else EMPTY
+def _join(meshes: Sequence[Mesh]) -> Mesh:
+    return join_meshes(list(meshes)) if meshes else EMPTY
 
 
 def _sign(side: str) -> float:

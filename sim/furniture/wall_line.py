@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from sim.rock.axis import STATION_M, Axis, bridged, envelope, is_opening, nearest_of, runs_of
+from sim.rock.axis import STATION_M, Axis, bridge_openings, find_nearest, find_runs, is_opening, lower_envelope
 
 PASSING_M = 2.1  # clear height under whatever crosses an opening, or in a high drift ...
 PASSING_SHARE = 0.6  # ... this share of its height
@@ -63,7 +63,7 @@ class WallPlan:
     above_passing_m: float = 0.0  # of its axis, where it crosses an opening
 
 
-def stacked(plans: Sequence[WallPlan]) -> list[WallPlan]:
+def stack_plans(plans: Sequence[WallPlan]) -> list[WallPlan]:
     """Give the lines of each wall heights to cross openings at, one above the other as they lie on the wall."""
     answer = list(plans)
     for side in (1.0, -1.0):
@@ -84,7 +84,7 @@ def wall_lines(axis: Axis, plan: WallPlan) -> list[Line]:
     is_open = is_opening(wall_m) & axis.is_inside
     if is_open.all():
         return []
-    usual_m = bridged(wall_m, is_open)
+    usual_m = bridge_openings(wall_m, is_open)
     passing_m = max(PASSING_M, PASSING_SHARE * axis.section.height_m)
     over_m = np.maximum(base_m, passing_m + plan.above_passing_m)
     can_pass = (_nearest(axis, over_m, plan) > 0.6 * usual_m) & (
@@ -100,10 +100,10 @@ def wall_lines(axis: Axis, plan: WallPlan) -> list[Line]:
             stations = np.arange(len(up_m))
             away = np.maximum(np.maximum(first - stations, stations - end + 1) - _SHOULDER, 0)
             up_m = np.maximum(up_m, base_m + (over_m - base_m) * np.clip(1 - away / _RAMP, 0, 1))
-    up_m = _smoothed(up_m, 1)
+    up_m = _smooth(up_m, 1)
     wall_m = _nearest(axis, up_m, plan)
     is_open = binary_dilation(is_opening(wall_m), iterations=2) & axis.is_inside
-    limit_m = bridged(wall_m, is_open) - cross.half_width_m - cross.standoff_m
+    limit_m = bridge_openings(wall_m, is_open) - cross.half_width_m - cross.standoff_m
     across_m = _inside_only(limit_m, axis.is_inside)
     is_low = up_m - cross.half_height_m < PASSING_M - 0.05
     is_usable &= ~(is_low & _is_on_a_way(axis, axis.at(plan.side * across_m, up_m)))
@@ -138,7 +138,7 @@ def roof_lines(axis: Axis, lateral: float, cross: Cross, lowest_m: float) -> lis
 def _is_on_a_way(axis: Axis, points: Float64Array) -> BoolArray:
     """Mark the points (S, 3) in the middle of any drift, where a robot passes."""
     widest_m = float(axis.ways[:, 3].max())
-    distance_m, which = nearest_of(axis.ways[:, :2], points[:, :2], _WAY_SHARE * widest_m)
+    distance_m, which = find_nearest(axis.ways[:, :2], points[:, :2], _WAY_SHARE * widest_m)
     which = np.minimum(which, len(axis.ways) - 1)
     is_level = np.abs(points[:, 2] - axis.ways[which, 2]) < 1.5 * axis.section.height_m
     return np.asarray((distance_m < _WAY_SHARE * axis.ways[which, 3]) & is_level)
@@ -153,7 +153,7 @@ def _nearest(axis: Axis, up_m: Float64Array, plan: WallPlan) -> Float64Array:
 def _reach(axis: Axis, up_m: Float64Array, side: float, cross: Cross, share: float) -> Float64Array:
     """How far sideways (S,) the axis of a round line may lie, by the wall at `share` of its half height above it."""
     wall_m = axis.to_side(up_m, side)
-    wall_m = bridged(wall_m, is_opening(wall_m))
+    wall_m = bridge_openings(wall_m, is_opening(wall_m))
     return np.asarray(wall_m - np.sqrt(1 - share**2) * cross.half_width_m - cross.standoff_m)
 
 
@@ -169,16 +169,16 @@ def _below_roof(axis: Axis, across_m: Float64Array, cross: Cross) -> Float64Arra
 def _openings(is_open: BoolArray) -> list[tuple[int, int]]:
     """Return the openings too long to span, those less than a metre apart taken as one."""
     closed = is_open.copy()
-    for first, end in runs_of(~is_open):
+    for first, end in find_runs(~is_open):
         if end - first < 1.0 / STATION_M and first > 0 and end < len(is_open):
             closed[first:end] = True
-    return list(runs_of(closed, _SHORT_OPENING))
+    return list(find_runs(closed, _SHORT_OPENING))
 
 
 def _touches_end(is_barred: BoolArray) -> BoolArray:
     """Mark the stations (S,) of the barred stretches at both ends."""
     touches = np.zeros(len(is_barred), dtype=bool)
-    for first, end in runs_of(is_barred):
+    for first, end in find_runs(is_barred):
         touches[first:end] = first == 0 or end == len(is_barred)
     return touches
 
@@ -186,10 +186,10 @@ def _touches_end(is_barred: BoolArray) -> BoolArray:
 def _inside_only(values: Float64Array, is_inside: BoolArray, reach: int = _STIFFNESS) -> Float64Array:
     """Envelope (S,) of the stations in the void, the others standing for nothing."""
     stations = np.arange(len(values))
-    return envelope(np.interp(stations, stations[is_inside], values[is_inside]), reach)
+    return lower_envelope(np.interp(stations, stations[is_inside], values[is_inside]), reach)
 
 
-def _smoothed(values: Float64Array, reach: int) -> Float64Array:
+def _smooth(values: Float64Array, reach: int) -> Float64Array:
     width = 2 * reach + 1
     return np.convolve(np.pad(values, reach, mode="edge"), np.ones(width) / width, mode="valid")
 
@@ -198,7 +198,7 @@ def _pieces(axis: Axis, across_m: Float64Array, up_m: Float64Array, is_usable: B
     points = axis.at(across_m, up_m)
     left = np.column_stack([axis.left, np.zeros(len(points))])
     pieces = []
-    for first, end in runs_of(is_usable, _SHORTEST_RUN):
+    for first, end in find_runs(is_usable, _SHORTEST_RUN):
         path, stations = points[first:end], np.arange(first, end)
         # On the inner side of a sharp corner the offset line would run backwards for a while.
         progress = (np.diff(path[:, :2], axis=0) * axis.forward[first : end - 1]).sum(axis=1)

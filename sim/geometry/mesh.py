@@ -29,12 +29,12 @@ class Mesh:
         require_shape("faces", self.faces, (None, 3))
 
 
-def moved(mesh: Mesh, dst_T_src: Float64Array) -> Mesh:
+def move_mesh(mesh: Mesh, dst_T_src: Float64Array) -> Mesh:
     """Return the mesh of frame src in frame dst."""
     return Mesh(transform(dst_T_src, mesh.vertices), mesh.faces)
 
 
-def joined(meshes: list[Mesh]) -> Mesh:
+def join_meshes(meshes: list[Mesh]) -> Mesh:
     """Return several meshes as one."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
@@ -57,7 +57,7 @@ def cylinder_mesh(radius_m: float, half_height_m: float, segments: int) -> Mesh:
     return _from_trimesh(trimesh.creation.cylinder(radius=radius_m, height=2.0 * half_height_m, sections=segments))
 
 
-def near_part(mesh: Mesh, target: Mesh, within_m: float) -> Mesh:
+def crop_near(mesh: Mesh, target: Mesh, within_m: float) -> Mesh:
     """Return the triangles of a mesh whose bounding box comes within `within_m` of the bounding box of another."""
     low, high = target.vertices.min(axis=0) - within_m, target.vertices.max(axis=0) + within_m
     # By corner, not by triangle: a screen has millions of them.
@@ -71,7 +71,7 @@ class NearSurface:
 
     def __init__(self, mesh: Mesh, within_m: float) -> None:
         # Small pieces have small bounding spheres, so that few candidates stand for each point.
-        self._triangles = split(mesh.vertices[mesh.faces], within_m)
+        self._triangles = split_triangles(mesh.vertices[mesh.faces], within_m)
         self._within_m = within_m
         centres = self._triangles.mean(axis=1)
         spread_m = np.linalg.norm(self._triangles - centres[:, None], axis=2).max(initial=0.0)
@@ -105,7 +105,7 @@ def _from_trimesh(solid: trimesh.Trimesh) -> Mesh:
     return Mesh(np.asarray(solid.vertices, dtype=np.float64), np.asarray(solid.faces, dtype=np.int32))
 
 
-def split(triangles: Float64Array, edge_m: float) -> Float64Array:
+def split_triangles(triangles: Float64Array, edge_m: float) -> Float64Array:
     """Halve triangles at their longest edge until none is longer than `edge_m`; the surface stays the same."""
     done = []
     while len(triangles):

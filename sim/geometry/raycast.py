@@ -10,7 +10,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array
-from sim.geometry.mesh import Mesh, box_mesh, cylinder_mesh, moved
+from sim.geometry.mesh import Mesh, box_mesh, cylinder_mesh, move_mesh
 
 _CYLINDER_SEGMENTS = 64
 
@@ -129,10 +129,10 @@ def _geom_mesh(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Mesh:
     world_T_geom = np.eye(4)
     world_T_geom[:3, :3] = data.geom_xmat[geom].reshape(3, 3)
     world_T_geom[:3, 3] = data.geom_xpos[geom]
-    return moved(local, world_T_geom)
+    return move_mesh(local, world_T_geom)
 
 
-def room_about(caster: Caster, points: Float64Array, directions: Float64Array) -> tuple[Float64Array, BoolArray]:
+def measure_room(caster: Caster, points: Float64Array, directions: Float64Array) -> tuple[Float64Array, BoolArray]:
     """Return how near the surfaces round some points come, and which points lie in rock or outside everything.
 
     Args:

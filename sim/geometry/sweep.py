@@ -63,10 +63,10 @@ def bars(starts: Float64Array, ends: Float64Array, width_m: float) -> Mesh:
     corners = 0.5 * width_m * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
     offsets = corners[None, :, :1] * aside[:, None] + corners[None, :, 1:] * above[:, None]
     vertices = np.concatenate([starts[:, None] + offsets, ends[:, None] + offsets], axis=1)
-    return repeated(vertices, _BAR_FACES)
+    return repeat_body(vertices, _BAR_FACES)
 
 
-def repeated(vertices: Float64Array, faces: Int64Array) -> Mesh:
+def repeat_body(vertices: Float64Array, faces: Int64Array) -> Mesh:
     """Return N copies of one body as one mesh: vertices (N, V, 3), faces (F, 3) of the body."""
     starts = np.arange(len(vertices)) * vertices.shape[1]
     return Mesh(vertices.reshape(-1, 3), (starts[:, None, None] + faces).reshape(-1, 3).astype(np.int32))

@@ -11,14 +11,14 @@ import numpy as np
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Place, Prop, Scenario
-from sim.placement.fitting import Spot, placed
+from sim.placement.fitting import Spot, place_prop
 from sim.placement.lanes import Lane, build_lanes
 from sim.placement.placing import (
     Standing,
     Surroundings,
-    grow,
-    overlap,
-    seen_from_above,
+    bounding_rectangle,
+    grow_rectangle,
+    rectangles_overlap,
     standing_corners,
 )
 from sim.placement.settling import settle
@@ -52,10 +52,10 @@ class _Board:
         self, item: Standing, apart_m: float, outline: Outline = standing_corners
     ) -> tuple[Standing, str] | None:
         """Return a prop that stands in this one's way, and the session."""
-        corners = grow(outline(item), apart_m)
+        corners = grow_rectangle(outline(item), apart_m)
         for other in self.standing:
             shared = item.sessions & other.sessions
-            if shared and overlap(corners, outline(other)):
+            if shared and rectangles_overlap(corners, outline(other)):
                 return other, max(shared)
         return None
 
@@ -129,7 +129,7 @@ def _is_banked(prop: Prop, place: Place) -> bool:
 def _at_spot(job: _Job, spot: Spot, around: Surroundings, seed: int) -> list[Standing]:
     """Return the prop before it settles; with a short shift or reshaped, also as it stands after."""
     prop, place, shape = job.prop, job.place, job.shape
-    pose, wall = placed(prop, shape, place, spot, around, seed)
+    pose, wall = place_prop(prop, shape, place, spot, around, seed)
     items = [Standing(prop, shape, job.sessions, pose, place.posture, wall)]
     if job.rest is not None:
         items.append(replace(items[0], shape=job.rest, sessions=_AFTER))
@@ -137,7 +137,7 @@ def _at_spot(job: _Job, spot: Spot, around: Surroundings, seed: int) -> list[Sta
         heading = np.arctan2(spot.heading[1], spot.heading[0]) + np.deg2rad(prop.shift.heading_deg)
         goal = pose[:2, 3] + prop.shift.distance_m * np.array([np.cos(heading), np.sin(heading)])
         moved_to = np.append(goal, np.deg2rad(prop.shift.turn_deg))
-        pose, wall = placed(prop, shape, place, spot, around, seed, moved_to)
+        pose, wall = place_prop(prop, shape, place, spot, around, seed, moved_to)
         items.append(Standing(prop, shape, _AFTER, pose, place.posture, wall))
     return items
 
@@ -217,7 +217,7 @@ def _first_fit(
 
 def _touching(items: Sequence[Standing], board: _Board) -> str:
     """Say which prop one at rest runs into as it tilts on its floor; "" if none."""
-    clashes = [board.neighbour(item, 0.0, seen_from_above) for item in items]
+    clashes = [board.neighbour(item, 0.0, bounding_rectangle) for item in items]
     return next((f"prop {clash[0].prop.name!r} is in the way" for clash in clashes if clash), "")
 
 

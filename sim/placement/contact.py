@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, transform
-from sim.geometry.mesh import Mesh, joined, moved, split
+from sim.geometry.mesh import Mesh, join_meshes, move_mesh, split_triangles
 from sim.geometry.raycast import Caster
 from sim.placement.placing import Standing, corners_object, standing_points
 from sim.props.shapes import Shape, solid_mesh
@@ -23,11 +23,11 @@ def surface_points(shape: Shape) -> Float64Array:
     """Return points (N, 3) on a prop's surface, object frame: its corners (to 1 cm) and others at most 6 cm apart."""
     meshes = [solid_mesh(solid) for solid in shape.solids]
     corners = corners_object(shape)
-    pieces = split(np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), _STEP_M).reshape(-1, 3)
-    return np.concatenate([corners[_one_a_cell(corners, _CELL_M / 3)], pieces[_one_a_cell(pieces, _CELL_M)]])
+    pieces = split_triangles(np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), _STEP_M).reshape(-1, 3)
+    return np.concatenate([corners[_pick_one_a_cell(corners, _CELL_M / 3)], pieces[_pick_one_a_cell(pieces, _CELL_M)]])
 
 
-def _one_a_cell(points: Float64Array, cell_m: float) -> Int64Array:
+def _pick_one_a_cell(points: Float64Array, cell_m: float) -> Int64Array:
     """Numbers of the first of the points (N, 3) in every cell that has any."""
     cells = np.floor(points / cell_m).astype(np.int64) + (1 << 20)
     return np.asarray(np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2], return_index=True)[1])
@@ -45,7 +45,7 @@ def interpenetration_m(standing: Standing, walls: Caster, others: Sequence[Stand
     """
     deepest = 0.0
     if standing.shape.is_settled:
-        deepest = float(escapes(_points(standing), walls)[0].max(initial=0.0))
+        deepest = float(find_way_out(_points(standing), walls)[0].max(initial=0.0))
     own = standing_points(standing)
     low, high = own.min(axis=0), own.max(axis=0)
     for other in others:
@@ -53,7 +53,7 @@ def interpenetration_m(standing: Standing, walls: Caster, others: Sequence[Stand
         if (theirs.min(axis=0) > high).any() or (theirs.max(axis=0) < low).any():
             continue
         for inner, outer in ((standing, other), (other, standing)):
-            depth_m, _ = escapes(_points(inner), Caster([standing_surface(outer)]), is_solid_inside=True)
+            depth_m, _ = find_way_out(_points(inner), Caster([standing_surface(outer)]), is_solid_inside=True)
             deepest = max(deepest, float(depth_m.max(initial=0.0)))
     return deepest
 
@@ -64,10 +64,12 @@ def _points(standing: Standing) -> Float64Array:
 
 def standing_surface(standing: Standing) -> Mesh:
     """Return all of a standing prop's surface as one mesh, world frame."""
-    return joined([moved(solid_mesh(solid), standing.world_T_object) for solid in standing.shape.solids])
+    return join_meshes([move_mesh(solid_mesh(solid), standing.world_T_object) for solid in standing.shape.solids])
 
 
-def escapes(points: Float64Array, caster: Caster, is_solid_inside: bool = False) -> tuple[Float64Array, Float64Array]:
+def find_way_out(
+    points: Float64Array, caster: Caster, is_solid_inside: bool = False
+) -> tuple[Float64Array, Float64Array]:
     """Return how deep points (N, 3) are inside the solid, 0 outside, and the direction (N, 3) of the shortest way out.
 
     A point is in the rock when most rays from it meet no surface that faces them, and in a closed solid when most

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float32Array, Float64Array, make_pose, stream, yaw_pose
 from scenarios.schema import Place, Prop
-from sim.geometry.mesh import split
+from sim.geometry.mesh import split_triangles
 from sim.geometry.raycast import Caster
 from sim.placement.placing import PROBE_UP_M, WALL_GAP_M, Surroundings, corners_object, floor_heights, free_width
 from sim.props.bed import BEHIND_M
-from sim.props.shapes import Shape, footprint, solid_mesh
+from sim.props.shapes import Shape, footprint_corners, solid_mesh
 
 # A prop may lean on a wall that is this even; at a drift's mouth it is not.
 _UNEVEN_WALL_M = 0.8
@@ -54,7 +54,7 @@ class Spot:
     over_humps: bool = False
 
 
-def placed(
+def place_prop(
     prop: Prop,
     shape: Shape,
     place: Place,
@@ -82,7 +82,7 @@ def placed(
     yaw += 0.0 if shift_xy is None else float(shift_xy[2])
     if place.posture == "leaning":
         return _at_wall(prop, shape, place, spot, around, seed, yaw, start)
-    rotation = start_rotation(prop.name, shape, place.posture, seed)
+    rotation = draw_rotation(prop.name, shape, place.posture, seed)
     low, high = _bounds(shape, rotation, place.posture)
     if spot.is_line and start is None:
         position = _across(prop, (high - low) / 2, place, spot, around)
@@ -109,7 +109,9 @@ def _across(prop: Prop, half: Float64Array, place: Place, spot: Spot, around: Su
     """Place (2,) of the middle of a prop of this half size (3,) across the drift."""
     left = np.array([-spot.heading[1], spot.heading[0]])
     turn = yaw_pose(np.deg2rad(place.yaw_deg))[:2, :2]
-    extent = np.abs(footprint((2 * half[0], 2 * half[1], 0.0)) @ turn.T).max(axis=0)  # half, along and across the drift
+    extent = np.abs(footprint_corners((2 * half[0], 2 * half[1], 0.0)) @ turn.T).max(
+        axis=0
+    )  # half, along and across the drift
     stations = spot.point[:2] + np.linspace(-extent[0], extent[0], max(7, int(extent[0] / 0.1)))[:, None] * spot.heading
     origins = np.column_stack([stations, np.full(len(stations), spot.point[2])])
     top = min(2 * half[2], 0.5 * spot.height_m)
@@ -184,9 +186,9 @@ def _at_wall(
     wall = _nearer_wall(prop, place, spot, base, around)
     aside = np.array([-wall[1], wall[0]])
     if shape.is_settled:
-        rotation = tilted_towards(prop.name, shape, wall, yaw, seed)
+        rotation = lean_towards(prop.name, shape, wall, yaw, seed)
         meshes = [solid_mesh(solid) for solid in shape.solids]
-        skin = split(np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), _BULGE_M)
+        skin = split_triangles(np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), _BULGE_M)
         points = skin.reshape(-1, 3) @ rotation.T
     else:
         rotation = yaw_pose(float(np.arctan2(wall[1], wall[0]) - np.pi / 2))[:3, :3]  # +y faces the wall
@@ -253,7 +255,7 @@ def _nearer_wall(prop: Prop, place: Place, spot: Spot, base: Float64Array, aroun
     return np.asarray(level[int(np.argmin(reach_m)), :2])
 
 
-def start_rotation(name: str, shape: Shape, posture: str, seed: int) -> Float64Array:
+def draw_rotation(name: str, shape: Shape, posture: str, seed: int) -> Float64Array:
     """Return the rotation (3, 3) in which a prop is put down before its yaw: none, or on a side that its name draws."""
     if posture == "upright" or not shape.is_settled:
         return np.eye(3)
@@ -262,7 +264,7 @@ def start_rotation(name: str, shape: Shape, posture: str, seed: int) -> Float64A
     return np.asarray(Rotation.from_rotvec(np.pi / 2 * np.array([np.cos(axis), np.sin(axis), 0.0])).as_matrix())
 
 
-def tilted_towards(name: str, shape: Shape, wall: Float64Array, yaw_rad: float, seed: int) -> Float64Array:
+def lean_towards(name: str, shape: Shape, wall: Float64Array, yaw_rad: float, seed: int) -> Float64Array:
     """Return the rotation (3, 3) of a prop that leans towards a wall in direction `wall` (2,).
 
     A flat one (a pallet) is stood on its longer edge first. Of its four sides it turns that one to the wall which is

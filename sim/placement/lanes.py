@@ -53,7 +53,7 @@ class Lane:
         span = np.full((len(self.points), 2), np.nan)
         if self.session not in standing.sessions or standing_height_m(standing) < self.flown_over_m:
             return span
-        near, along, across = seen_from_line(standing, self.points, self.headings, (self.clearance_m, _SWERVE_M, 8.0))
+        near, along, across = project_prop(standing, self.points, self.headings, (self.clearance_m, _SWERVE_M, 8.0))
         is_abreast = np.abs(along) < self.clearance_m + _SWERVE_M
         rows = is_abreast.any(axis=1)
         span[near[rows], 0] = np.where(is_abreast, across, np.inf)[rows].min(axis=1) - self.clearance_m
@@ -86,21 +86,21 @@ def build_lanes(scenario: Scenario, centreline: Centreline, fixed: Caster) -> tu
     """
     plans: tuple[tuple[str, SessionPlan], ...] = (("before", scenario.before), ("after", scenario.after))
     return tuple(
-        _recorded(scenario, session, Path(plan.trajectory))
+        _recorded_lane(scenario, session, Path(plan.trajectory))
         if plan.trajectory is not None
-        else _lane(scenario, session, plan, centreline, fixed)
+        else _route_lane(scenario, session, plan, centreline, fixed)
         for session, plan in plans
     )
 
 
-def _recorded(scenario: Scenario, session: str, trajectory: Path) -> Lane:
+def _recorded_lane(scenario: Scenario, session: str, trajectory: Path) -> Lane:
     """Lane of a recorded trajectory, which swerves for nothing and may be at any height."""
     line = resample(read_drive(trajectory)[0].points[:, :2], _STEP_M)
     room_m = np.full(len(line), _SPARE_M / 2)
     return Lane(session, line, headings_of(line), -room_m, room_m, scenario.platform.clearance_m, 0.0)
 
 
-def seen_from_line(
+def project_prop(
     standing: Standing, points: Float64Array, headings: Float64Array, margins_m: tuple[float, ...]
 ) -> tuple[Int64Array, Float64Array, Float64Array]:
     """Return where a prop's outline lies as seen from the places of a line that are near it.
@@ -160,7 +160,7 @@ def side_bounds(
     return low, high
 
 
-def _lane(scenario: Scenario, session: str, plan: SessionPlan, centreline: Centreline, fixed: Caster) -> Lane:
+def _route_lane(scenario: Scenario, session: str, plan: SessionPlan, centreline: Centreline, fixed: Caster) -> Lane:
     platform = scenario.platform
     pieces = [centreline.edge(a, b) for a, b in pairwise(plan.route)]
     widths = np.concatenate([np.full(len(points), section.width_m) for points, section in pieces])

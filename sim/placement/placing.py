@@ -11,7 +11,7 @@ import numpy as np
 from cdpipe.core.geometry import Float64Array, transform
 from scenarios.schema import Prop
 from sim.geometry.raycast import Caster
-from sim.props.shapes import Shape, footprint, solid_mesh
+from sim.props.shapes import Shape, footprint_corners, solid_mesh
 
 Posture = Literal["upright", "tipped", "leaning"]
 
@@ -114,11 +114,11 @@ def standing_corners(standing: Standing) -> Float64Array:
     """
     pose = standing.world_T_object
     if standing.posture == "upright":
-        return np.asarray(footprint(standing.shape.size_m) @ pose[:2, :2].T + pose[:2, 3])
-    return seen_from_above(standing)
+        return np.asarray(footprint_corners(standing.shape.size_m) @ pose[:2, :2].T + pose[:2, 3])
+    return bounding_rectangle(standing)
 
 
-def seen_from_above(standing: Standing) -> Float64Array:
+def bounding_rectangle(standing: Standing) -> Float64Array:
     """Return the corners (4, 2) of the rectangle about all of a prop as it tilts on its floor, world frame."""
     pose = standing.world_T_object
     # Of the object's axes the one that lies flattest gives the direction of the rectangle.
@@ -138,7 +138,7 @@ def standing_height_m(standing: Standing) -> float:
     return float(np.ptp(standing_points(standing)[:, 2]))
 
 
-def overlap(a: Float64Array, b: Float64Array) -> bool:
+def rectangles_overlap(a: Float64Array, b: Float64Array) -> bool:
     """Tell whether two rectangles, given by their corners (4, 2), have a point in common inside: separating axes."""
     for corners in (a, b):
         for edge in (corners[1] - corners[0], corners[2] - corners[1]):
@@ -148,7 +148,7 @@ def overlap(a: Float64Array, b: Float64Array) -> bool:
     return True
 
 
-def grow(corners: Float64Array, by_m: float) -> Float64Array:
+def grow_rectangle(corners: Float64Array, by_m: float) -> Float64Array:
     """Return the corners (4, 2) of a rectangle grown on every side."""
     centre = corners.mean(axis=0)
     edges = np.stack([corners[0] - corners[1], corners[1] - corners[2]])

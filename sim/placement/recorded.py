@@ -13,7 +13,7 @@ from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.core.motion import Motion
 from cdpipe.io.tum import motion_through, read_trajectory
-from sim.geometry.raycast import Caster, room_about
+from sim.geometry.raycast import Caster, measure_room
 
 _FASTEST_MPS = 20.0
 _NEAREST_M = 0.2
@@ -56,7 +56,7 @@ def check_inside(motion: Motion, surroundings: Caster, where: str, numbers: tupl
     share = (np.arange(len(sample)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[sample]
     points = np.concatenate([motion.points[sample] + share[:, None] * steps[sample], motion.points[-1:]])
     sample = np.append(sample, len(steps))
-    gap_m, is_outside = room_about(surroundings, points, _round_about())
+    gap_m, is_outside = measure_room(surroundings, points, _round_about())
     is_bad = is_outside | (gap_m < _NEAREST_M)
     if not is_bad.any():
         return

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, make_pose, transform
 from sim.geometry.raycast import Caster
-from sim.placement.contact import escapes, surface_points
+from sim.placement.contact import find_way_out, surface_points
 from sim.placement.placing import PROBE_UP_M, Standing, Surroundings, floor_heights
 from sim.props.shapes import Solid
 
@@ -55,7 +55,7 @@ def settle(item: Standing, around: Surroundings) -> Standing:
     model = _model(item, points, around)
     data = mujoco.MjData(model)
     _run_to_rest(model, data, item)
-    return replace(item, world_T_object=_frozen_pose(data, item, points, around))
+    return replace(item, world_T_object=_freeze_pose(data, item, points, around))
 
 
 def add_solid(body: mujoco.MjsBody, solid: Solid, mesh_name: str = "", **options: object) -> None:
@@ -214,10 +214,10 @@ def _run_to_rest(model: mujoco.MjModel, data: mujoco.MjData, item: Standing) -> 
     )
 
 
-def _frozen_pose(data: mujoco.MjData, item: Standing, points: Float64Array, around: Surroundings) -> Float64Array:
+def _freeze_pose(data: mujoco.MjData, item: Standing, points: Float64Array, around: Surroundings) -> Float64Array:
     body = data.body("prop")
     rotation = Rotation.from_quat(np.round(body.xquat, 9), scalar_first=True).as_matrix()
-    pose = _touching(make_pose(rotation, body.xpos), item, points, around)
+    pose = _bring_to_contact(make_pose(rotation, body.xpos), item, points, around)
     # A thousandth of a millimetre: both sessions, and the truth, hold the very same numbers.
     pose[:3, 3] = np.round(pose[:3, 3], 6)
     start, end = (transform(each, points) for each in (item.world_T_object, pose))
@@ -232,7 +232,7 @@ def _frozen_pose(data: mujoco.MjData, item: Standing, points: Float64Array, arou
         raise ScenarioError(
             f"prop {item.prop.name!r} does not come to rest against the wall: place it where wall and floor are evener"
         )
-    deepest_m = float(escapes(end, around.fixed)[0].max(initial=0.0))
+    deepest_m = float(find_way_out(end, around.fixed)[0].max(initial=0.0))
     if deepest_m > DEEPEST_M:
         raise ScenarioError(
             f"prop {item.prop.name!r} rests {deepest_m:.2f} m deep in rock: place it on more level floor, "
@@ -241,7 +241,7 @@ def _frozen_pose(data: mujoco.MjData, item: Standing, points: Float64Array, arou
     return pose
 
 
-def _touching(pose: Float64Array, item: Standing, points: Float64Array, around: Surroundings) -> Float64Array:
+def _bring_to_contact(pose: Float64Array, item: Standing, points: Float64Array, around: Surroundings) -> Float64Array:
     """Bring a prop to the true floor and wall, then push it the shortest way out of rock until it no more than touches.
 
     The way is that by which the fields differ from the rock, a few centimetres.
@@ -253,7 +253,7 @@ def _touching(pose: Float64Array, item: Standing, points: Float64Array, around: 
         if gap_m < _NEAR_WALL_M:
             pose[:2, 3] += max(gap_m - _TOUCH_M, 0.0) * item.wall
     for _ in range(12):
-        depth_m, way_out = escapes(transform(pose, points), around.fixed)
+        depth_m, way_out = find_way_out(transform(pose, points), around.fixed)
         worst = int(np.argmax(depth_m))
         if not _TOUCH_M < depth_m[worst] < 0.3:
             break

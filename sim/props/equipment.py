@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.props.parts import block, rod, surface, turned
+from sim.props.parts import block, revolve, rod, surface
 from sim.props.shapes import BELOW_FLOOR_M, Size, Solid
 
 
@@ -68,11 +68,11 @@ def cone(size_m: Size) -> tuple[Solid, ...]:
     shell = [(0.0, 0.5 * foot), (low + 0.05, 0.5 * foot), (low + 0.05, foot), (low, foot), (high, height), *inner]
     solids = [
         block((-length / 2, -width / 2, 0.0), (length / 2, width / 2, foot), "rubber"),
-        surface(turned(shell, length, width), "plastic"),
+        surface(revolve(shell, length, width), "plastic"),
     ]
     for start, stop in ((0.42, 0.58), (0.72, 0.82)):
         band = [(radius(z * height) + 0.012, z * height) for z in (start, stop)]
-        solids.append(surface(turned([(0.0, band[0][1]), *band, (0.0, band[1][1])], length, width), "reflector"))
+        solids.append(surface(revolve([(0.0, band[0][1]), *band, (0.0, band[1][1])], length, width), "reflector"))
     return tuple(solids)
 
 

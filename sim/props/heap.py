@@ -13,11 +13,11 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from cdpipe.core.geometry import Float64Array, stream
-from sim.geometry.mesh import Mesh, joined
+from sim.geometry.mesh import Mesh, join_meshes
 from sim.geometry.noise import smooth_noise
 from sim.geometry.raycast import Caster
 from sim.props.bed import BEHIND_M, Bed, bed_mesh, build_bed
-from sim.props.rocks import Rubble, confined, draw_sizes, lay, moved_by, together
+from sim.props.rocks import Rubble, confine, draw_sizes, join_rubble, lay_fragments, shift_rubble
 from sim.props.shapes import BELOW_FLOOR_M, Shape, Size, solid_mesh, visible_part
 
 _MOST_FRAGMENTS = 900
@@ -85,18 +85,20 @@ def build_heap(size_m: Size, repose_deg: float, fragment_m: float, is_banked: bo
     cell_m2 = float(bed.x[1] - bed.x[0]) * float(bed.y[1] - bed.y[0])
     area_m2 = float((bed.z > 0.0).sum()) * cell_m2
     sizes = draw_sizes(area_m2, _COVERAGE, fragment_m, largest_m, _MOST_FRAGMENTS, generator)
-    pile = lay(sizes, _places(bed, (-0.03, np.inf), low, high, len(sizes), generator), bed.heights, BURIED, generator)
+    pile = lay_fragments(
+        sizes, _places(bed, (-0.03, np.inf), low, high, len(sizes), generator), bed.heights, BURIED, generator
+    )
     n_loose = min(_MOST_LOOSE, 3 + int(length + width))
     blocks = largest_m * generator.uniform(0.4, 1.0, n_loose)
     feet = _places(bed, _BESIDE_M, low, np.minimum(high, (np.inf, width / 2, np.inf)), n_loose, generator)
-    loose = lay(blocks, feet, lambda xy: np.zeros(len(xy)), _LOOSE, generator)
-    rubble = confined(together(pile, loose), low, high)
-    return _centred(Heap(bed, rubble, size_m, is_banked))
+    loose = lay_fragments(blocks, feet, lambda xy: np.zeros(len(xy)), _LOOSE, generator)
+    rubble = confine(join_rubble(pile, loose), low, high)
+    return _centre(Heap(bed, rubble, size_m, is_banked))
 
 
 def whole_mesh(heap: Heap) -> Mesh:
     """Return the surface of a pile: a closed bed and closed fragments, all facing outwards."""
-    return joined([bed_mesh(heap.bed), *heap.rubble.fragments])
+    return join_meshes([bed_mesh(heap.bed), *heap.rubble.fragments])
 
 
 def column_volume_m3(mesh: Mesh, size_m: Size, columns: int = 60_000) -> float:
@@ -113,7 +115,9 @@ def flank_angle_deg(shape: Shape) -> float:
     """
     _, width, height = shape.size_m
     smooth_m = 0.08 * height
-    heights, y, area_m2 = _columns(joined([solid_mesh(solid) for solid in shape.solids]), shape.size_m, 0.3, 60_000)
+    heights, y, area_m2 = _columns(
+        join_meshes([solid_mesh(solid) for solid in shape.solids]), shape.size_m, 0.3, 60_000
+    )
     step_m = float(np.sqrt(area_m2))
     smooth = gaussian_filter(heights, smooth_m / step_m)
     slope = np.hypot(*np.gradient(smooth, step_m))
@@ -158,7 +162,7 @@ def _limits(size_m: Size, is_banked: bool) -> tuple[Float64Array, Float64Array]:
     return low, np.array([length / 2, width / 2 + (BEHIND_M if is_banked else 0.0), height])
 
 
-def _centred(heap: Heap) -> Heap:
+def _centre(heap: Heap) -> Heap:
     """Move a pile so that the middle of what is above the floor is at the origin, and measure it."""
     back_m = heap.size_m[1] / 2 if heap.is_banked else np.inf
     seen = visible_part(whole_mesh(heap), back_m).reshape(-1, 3)
@@ -166,7 +170,7 @@ def _centred(heap: Heap) -> Heap:
     middle = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, 0.0])
     bed = replace(heap.bed, x=heap.bed.x - middle[0], y=heap.bed.y - middle[1])
     size_m = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
-    return Heap(bed, moved_by(heap.rubble, -middle), size_m, heap.is_banked)
+    return Heap(bed, shift_rubble(heap.rubble, -middle), size_m, heap.is_banked)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,7 +225,7 @@ def load_away(heap: Heap, share: float, fragment_m: float, seed: int, name: str)
     low, high = -reach_m, reach_m
     for _ in range(_STEPS):
         foot_m = (low + high) / 2
-        left = _bitten(heap, replace(face, foot_m=foot_m), fresh)
+        left = _bite(heap, replace(face, foot_m=foot_m), fresh)
         excess = column_volume_m3(whole_mesh(left), heap.size_m) / whole_m3 - (1.0 - share)
         if abs(excess) < _CLOSE_SHARE:
             break
@@ -252,10 +256,10 @@ def _fresh_rubble(heap: Heap, face: Face, fragment_m: float, seed: int, name: st
     )
     along_m = generator.uniform(-reach_m, reach_m, len(sizes))
     xy = face.places(along_m, generator.uniform(0.0, height, len(sizes)))
-    return lay(sizes, xy, face.heights, BURIED, generator)
+    return lay_fragments(sizes, xy, face.heights, BURIED, generator)
 
 
-def _bitten(heap: Heap, face: Face, fresh: Rubble) -> Heap:
+def _bite(heap: Heap, face: Face, fresh: Rubble) -> Heap:
     bed = heap.bed
     nodes = np.stack(np.meshgrid(bed.x, bed.y, indexing="ij"), axis=-1)
     face_z = face.heights(nodes.reshape(-1, 2)).reshape(bed.z.shape)
@@ -264,5 +268,5 @@ def _bitten(heap: Heap, face: Face, fresh: Rubble) -> Heap:
     old = old.kept(old.centres[:, 2] < face.heights(old.centres[:, :2]))
     shift = np.append(face.foot_m * face.into, 0.0)
     is_cut = bed.heights(fresh.centres[:, :2] + shift[:2]) > fresh.centres[:, 2] + _FRESH_BELOW_M
-    new = confined(moved_by(fresh.kept(is_cut), shift), *heap.limits())
-    return replace(heap, bed=left, rubble=together(old, new))
+    new = confine(shift_rubble(fresh.kept(is_cut), shift), *heap.limits())
+    return replace(heap, bed=left, rubble=join_rubble(old, new))

@@ -58,7 +58,7 @@ def prism(outline: Sequence[tuple[float, float]], half_width: float, material: s
     return surface(hull_mesh(ends), material)
 
 
-def turned(profile: Sequence[tuple[float, float]], length: float, width: float, segments: int = 40) -> Mesh:
+def revolve(profile: Sequence[tuple[float, float]], length: float, width: float, segments: int = 40) -> Mesh:
     """Return the closed surface of revolution about the z axis of a profile of (radius, z).
 
     The profile runs from the axis at the bottom, up the outside, to the axis at the top. Radii are shares of the half

@@ -8,7 +8,7 @@ import numpy as np
 
 from cdpipe.core.geometry import make_pose, stream
 from scenarios.schema import Prop
-from sim.geometry.mesh import moved
+from sim.geometry.mesh import move_mesh
 from sim.geometry.topology import closed_volume_m3, edges_of
 from sim.props import equipment, storage
 from sim.props.heap import build_heap, column_volume_m3, load_away, whole_mesh
@@ -59,7 +59,9 @@ def shape_of(prop: Prop, seed: int, *, is_banked: bool = False, is_loaded: bool 
         return _shape(solids, prop.size_m, float(sum(8.0 * np.prod(solid.size_m) for solid in solids)))
     if prop.kind == "rock":
         key = int(stream(seed, "props", prop.name, "rock").integers(2**31))
-        rock = moved(rock_mesh(prop.size_m, key, _ROCK_SUBDIVISIONS), make_pose(translation=(0, 0, prop.size_m[2] / 2)))
+        rock = move_mesh(
+            rock_mesh(prop.size_m, key, _ROCK_SUBDIVISIONS), make_pose(translation=(0, 0, prop.size_m[2] / 2))
+        )
         return _shape((surface(rock, "rock"),), prop.size_m, signed_volume_m3(rock))
     shape = _shape(BUILDERS[prop.kind](prop.size_m), prop.size_m, None)
     return replace(shape, is_settled=False) if prop.kind == "railing" else shape

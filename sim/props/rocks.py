@@ -67,7 +67,7 @@ def rock_mesh(size_m: tuple[float, float, float], key: int, subdivisions: int = 
     hull = hull_mesh(points)
     points, faces = hull.vertices, hull.faces
     for _ in range(subdivisions):
-        points, faces = _chipped(points, faces, generator)
+        points, faces = _chip(points, faces, generator)
     low, high = points.min(axis=0), points.max(axis=0)
     return Mesh((points - (low + high) / 2) / (high - low) * np.asarray(size_m), faces)
 
@@ -82,9 +82,7 @@ def _scattered_directions(generator: np.random.Generator) -> Float64Array:
     return np.asarray(shaken / np.linalg.norm(shaken, axis=1, keepdims=True))
 
 
-def _chipped(
-    points: Float64Array, faces: Int32Array, generator: np.random.Generator
-) -> tuple[Float64Array, Int32Array]:
+def _chip(points: Float64Array, faces: Int32Array, generator: np.random.Generator) -> tuple[Float64Array, Int32Array]:
     """Split every triangle into four; new corners leave the middle of their edge a little, in and out."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     edges, which = np.unique(edges, axis=0, return_inverse=True)
@@ -145,7 +143,7 @@ def draw_sizes(
     return np.asarray(np.sort(sizes[:enough])[::-1][:most])
 
 
-def lay(
+def lay_fragments(
     sizes_m: Float64Array,
     xy: Float64Array,
     heights: Heights,
@@ -176,7 +174,7 @@ def lay(
     return Rubble(fragments, centres)
 
 
-def confined(rubble: Rubble, low: Float64Array, high: Float64Array) -> Rubble:
+def confine(rubble: Rubble, low: Float64Array, high: Float64Array) -> Rubble:
     """Move every fragment that reaches over a box (3,) to (3,), limits may be infinite, back inside it."""
     fragments, centres = [], rubble.centres.copy()
     for number, fragment in enumerate(rubble.fragments):
@@ -186,13 +184,13 @@ def confined(rubble: Rubble, low: Float64Array, high: Float64Array) -> Rubble:
     return Rubble(tuple(fragments), centres)
 
 
-def moved_by(rubble: Rubble, shift_m: Float64Array) -> Rubble:
+def shift_rubble(rubble: Rubble, shift_m: Float64Array) -> Rubble:
     """Return the fragments shifted by a vector (3,)."""
     fragments = tuple(Mesh(fragment.vertices + shift_m, fragment.faces) for fragment in rubble.fragments)
     return Rubble(fragments, rubble.centres + shift_m)
 
 
-def together(first: Rubble, second: Rubble) -> Rubble:
+def join_rubble(first: Rubble, second: Rubble) -> Rubble:
     """Return the fragments of both."""
     return Rubble((*first.fragments, *second.fragments), np.concatenate([first.centres, second.centres]))
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from cdpipe.core.geometry import Float64Array
-from sim.geometry.mesh import Mesh, box_mesh, cylinder_mesh, joined, moved
+from sim.geometry.mesh import Mesh, box_mesh, cylinder_mesh, join_meshes, move_mesh
 
 # Posts of a railing and the foot of a heap go this far below the floor's level, so that no gap opens on rough floor.
 BELOW_FLOOR_M = 0.6
@@ -63,12 +63,12 @@ class Shape:
 def solid_mesh(solid: Solid) -> Mesh:
     """Return a primitive's surface in the object frame."""
     if solid.mesh is not None:
-        return moved(solid.mesh, solid.object_T_solid)
+        return move_mesh(solid.mesh, solid.object_T_solid)
     local = box_mesh(solid.size_m) if solid.kind == "box" else cylinder_mesh(solid.size_m[0], solid.size_m[1], 32)
-    return moved(local, solid.object_T_solid)
+    return move_mesh(local, solid.object_T_solid)
 
 
-def footprint(size_m: tuple[float, float, float]) -> Float64Array:
+def footprint_corners(size_m: tuple[float, float, float]) -> Float64Array:
     """Return the four corners (4, 2) of a prop's bounding rectangle, object frame, counter-clockwise."""
     half = np.array([size_m[0], size_m[1]]) / 2
     return np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half
@@ -82,7 +82,7 @@ def visible_part(mesh: Mesh, back_y_m: float = np.inf) -> Float64Array:
 
 def hull_volume_m3(solids: Iterable[Solid], back_y_m: float = np.inf) -> float:
     """Return the volume of the convex hull of what is above the floor and before the plane y = `back_y_m`."""
-    part = visible_part(joined([solid_mesh(solid) for solid in solids]), back_y_m)
+    part = visible_part(join_meshes([solid_mesh(solid) for solid in solids]), back_y_m)
     return float(ConvexHull(part.reshape(-1, 3)).volume)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sim.props.parts import beam, block, rod, surface, turned
+from sim.props.parts import beam, block, revolve, rod, surface
 from sim.props.shapes import Size, Solid
 
 _EUR_PALLET_M = 0.144
@@ -73,7 +73,7 @@ def barrel(size_m: Size) -> tuple[Solid, ...]:
         rod((share * length, 0.0, height - sunk), (share * length, 0.0, height - 0.4 * sunk), radius, "steel")
         for share, radius in ((0.33, 0.06 * length), (-0.36, 0.035 * length))
     ]
-    return (surface(turned(profile, length, width), "paint"), *bungs)
+    return (surface(revolve(profile, length, width), "paint"), *bungs)
 
 
 def pallet(size_m: Size) -> tuple[Solid, ...]:

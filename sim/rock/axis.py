@@ -58,16 +58,16 @@ class Axis:
         """Return the (S,) distance to the wall at a height above the floor; side 1 is left, -1 right."""
         up = np.minimum(up_m, self.clear_m - 0.1)
         sideways = np.column_stack([side * self.left, np.zeros(len(self.left))])
-        return spread(distances(self.walls, self.at(0.0, up), sideways), self.is_inside)
+        return fill_from_nearest(wall_distances(self.walls, self.at(0.0, up), sideways), self.is_inside)
 
     def to_roof(self, across_m: Float64Array | float) -> Float64Array:
         """Return the (S,) height of the roof above the floor, seen from half the drift's height."""
         middle_m = 0.5 * self.height_m
         up = np.broadcast_to([0.0, 0.0, 1.0], self.points.shape)
-        return spread(middle_m + distances(self.walls, self.at(across_m, middle_m), up), self.is_inside)
+        return fill_from_nearest(middle_m + wall_distances(self.walls, self.at(across_m, middle_m), up), self.is_inside)
 
 
-def axes_of(centreline: Centreline, walls: Caster) -> list[Axis]:
+def measure_axes(centreline: Centreline, walls: Caster) -> list[Axis]:
     """Measure the drifts of a centreline; a drift that lies in the rock of a foreign mesh is left out.
 
     The line is rounded where drifts meet at an angle, so that what runs beside it never turns back on itself.
@@ -75,20 +75,20 @@ def axes_of(centreline: Centreline, walls: Caster) -> list[Axis]:
     axes: list[Axis] = []
     ways = [np.insert(line.points, 3, line.section.width_m, axis=1) for line in centreline.drifts]
     for index, line in enumerate(centreline.drifts):
-        points = resample(_rounded(resample(line.points, STATION_M), line.section.width_m), STATION_M)
-        axis = _measured(points, line.section, walls, _given_way(points, index, centreline), np.concatenate(ways))
+        points = resample(_round_corners(resample(line.points, STATION_M), line.section.width_m), STATION_M)
+        axis = _measure(points, line.section, walls, _given_way(points, index, centreline), np.concatenate(ways))
         if axis.is_inside.sum() * STATION_M > 2.0:
             axes.append(axis)
     return axes
 
 
-def distances(walls: Caster, origins: Float64Array, directions: Float64Array) -> Float64Array:
+def wall_distances(walls: Caster, origins: Float64Array, directions: Float64Array) -> Float64Array:
     """Return the (N,) float64 distance to the rock, 1000 m where there is none."""
     ranges_m, _ = _hits(walls, origins, directions)
     return np.where(np.isfinite(ranges_m), ranges_m, _NOTHING_M)
 
 
-def spread(values: Float64Array, is_inside: BoolArray) -> Float64Array:
+def fill_from_nearest(values: Float64Array, is_inside: BoolArray) -> Float64Array:
     """Give the stations (S, ...) in the rock, where rays mean nothing, the value of the nearest station in the void."""
     inside = np.flatnonzero(is_inside)
     after = np.minimum(np.searchsorted(inside, np.arange(len(values))), len(inside) - 1)
@@ -98,7 +98,7 @@ def spread(values: Float64Array, is_inside: BoolArray) -> Float64Array:
     return np.asarray(values[np.where(is_before, inside[before], inside[after])])
 
 
-def nearest_of(known: Float64Array, points: Float64Array, within_m: float) -> tuple[Float64Array, Int64Array]:
+def find_nearest(known: Float64Array, points: Float64Array, within_m: float) -> tuple[Float64Array, Int64Array]:
     """Return the distance (N,) to the nearest known point, infinite beyond `within_m`, and which one (N,) it is."""
     distance_m, which = cKDTree(known).query(points, distance_upper_bound=within_m)
     return np.asarray(distance_m), np.asarray(which, dtype=np.int64)
@@ -113,7 +113,7 @@ def is_opening(distance_m: Float64Array) -> BoolArray:
     return np.asarray(distance_m > 1.25 * usual_m + 0.5)
 
 
-def bridged(distance_m: Float64Array, is_open: BoolArray) -> Float64Array:
+def bridge_openings(distance_m: Float64Array, is_open: BoolArray) -> Float64Array:
     """Return the distances (S,) with openings spanned by straight lines, never farther than the rock."""
     if is_open.all():
         return distance_m
@@ -121,14 +121,14 @@ def bridged(distance_m: Float64Array, is_open: BoolArray) -> Float64Array:
     return np.minimum(distance_m, np.interp(stations, stations[~is_open], distance_m[~is_open]))
 
 
-def envelope(values: Float64Array, reach: int) -> Float64Array:
+def lower_envelope(values: Float64Array, reach: int) -> Float64Array:
     """Return a smooth line (S,) nowhere above the values (S,): where they dip, it dips `reach` stations before."""
     lowest = minimum_filter1d(values, 2 * reach + 1, mode="nearest")
     window = np.hanning(2 * reach + 3)[1:-1]
     return np.convolve(np.pad(lowest, reach, mode="edge"), window / window.sum(), mode="valid")
 
 
-def runs_of(mask: BoolArray, shortest: int = 1) -> Iterator[tuple[int, int]]:
+def find_runs(mask: BoolArray, shortest: int = 1) -> Iterator[tuple[int, int]]:
     """Yield (first, end) of every run of True, end excluded, that has at least `shortest` entries."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     for first, end in edges.reshape(-1, 2):
@@ -136,7 +136,7 @@ def runs_of(mask: BoolArray, shortest: int = 1) -> Iterator[tuple[int, int]]:
             yield int(first), int(end)
 
 
-def _rounded(points: Float64Array, width_m: float) -> Float64Array:
+def _round_corners(points: Float64Array, width_m: float) -> Float64Array:
     sigma = 0.25 * width_m / STATION_M
     pad = min(int(4 * sigma), len(points) - 1)
     padded = np.pad(points, ((pad, pad), (0, 0)), mode="reflect", reflect_type="odd")
@@ -150,16 +150,16 @@ def _given_way(points: Float64Array, index: int, centreline: Centreline) -> Bool
         if number == index:
             continue
         reach_m = 0.5 * other.section.width_m
-        distance_m, nearest = nearest_of(other.points, points, reach_m)
+        distance_m, nearest = find_nearest(other.points, points, reach_m)
         samples_to_end: Int64Array = np.minimum(nearest, len(other.points) - 1 - nearest)
         is_in_other = np.isfinite(distance_m) & (samples_to_end * STEP_M > reach_m)
-        for first, end in runs_of(is_in_other):
+        for first, end in find_runs(is_in_other):
             if number < index or first == 0 or end == len(points):
                 gives_way[first:end] = True
     return gives_way
 
 
-def _measured(points: Float64Array, section: Section, walls: Caster, gives_way: BoolArray, ways: Float64Array) -> Axis:
+def _measure(points: Float64Array, section: Section, walls: Caster, gives_way: BoolArray, ways: Float64Array) -> Axis:
     forward = headings_of(points)
     middle = points + np.array([0.0, 0.0, 0.5 * section.height_m])
     level = np.column_stack([forward, np.zeros(len(points))])

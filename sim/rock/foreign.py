@@ -104,7 +104,7 @@ def _read(file: MeshFile, key: str) -> Mesh:
         raise ScenarioError(f"{say}: empty: export it again")
     if size > _MAX_BYTES:
         raise ScenarioError(f"{say}: {size / 1e9:.1f} GB: decimate it to {MAX_TRIANGLES:,} triangles at most")
-    vertices, faces = _parsed(path, say)
+    vertices, faces = _parse(path, say)
     if len(faces) == 0:
         raise ScenarioError(f"{say}: no triangles in it: cut short, or points and lines only? export a surface")
     if len(faces) > MAX_TRIANGLES:
@@ -114,13 +114,13 @@ def _read(file: MeshFile, key: str) -> Mesh:
     is_bad = ~np.isfinite(vertices).all(axis=1)
     if is_bad.any():
         raise ScenarioError(f"{say}: {int(is_bad.sum())} vertices are not finite numbers: export it again")
-    mesh = _welded(vertices @ _WORLD_R_FILE[file.up].T * UNIT_M[file.units], faces)
+    mesh = _weld(vertices @ _WORLD_R_FILE[file.up].T * UNIT_M[file.units], faces)
     if len(mesh.faces) == 0:
         raise ScenarioError(f"{say}: its triangles have no area at {_WELD_M * 1e6:g} micrometre: is units right?")
     return Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1])) if file.flip else mesh
 
 
-def _parsed(path: Path, say: str) -> tuple[Float64Array, Int64Array]:
+def _parse(path: Path, say: str) -> tuple[Float64Array, Int64Array]:
     """Return all triangles of a file, its scene graph applied, in its own units and axes."""
     try:
         scene = trimesh.load_scene(path, process=False, skip_materials=True)
@@ -136,7 +136,7 @@ def _parsed(path: Path, say: str) -> tuple[Float64Array, Int64Array]:
     return np.concatenate(vertices), np.concatenate([part + at for part, at in zip(faces, starts[:-1], strict=True)])
 
 
-def _welded(vertices: Float64Array, faces: Int64Array) -> Mesh:
+def _weld(vertices: Float64Array, faces: Int64Array) -> Mesh:
     """Merge vertices at the same place, and drop triangles without area and vertices without triangle."""
     keys = np.round(vertices / _WELD_M).astype(np.int64)
     # one number for the three is sorted ten times as fast; should two places ever share it, the slow way is taken

@@ -65,7 +65,7 @@ def spread_echo(
     centres = np.repeat(rays.origins, shape[1], axis=0)
     directions = rays.directions.reshape(-1, 3)
     right, up = _across(directions)
-    places, weights = footprint(sub_rays)
+    places, weights = sub_ray_pattern(sub_rays)
     for ray, ((x, y), weight) in enumerate(zip(places, weights, strict=True)):
         aside = right * np.float32(x) + up * np.float32(y)
         origins = centres + aside * np.float32(WAIST_M / 2)
@@ -76,14 +76,14 @@ def spread_echo(
         ranges_m[ray] += np.float32(beam_origin_m)
         power = reflectivity[geoms[ray]] * cosines[ray]
         photons[ray] = np.float32(weight) * received_photons(power, ranges_m[ray])
-    range_m, strength, strongest = blended(ranges_m, photons)
+    range_m, strength, strongest = blend_echoes(ranges_m, photons)
     pixels = np.arange(n_pixels)
     parts = (cosines, ranges_m, geoms)
     cosine, true_range_m, geom = (part[strongest, pixels].reshape(shape) for part in parts)
     return Echo(range_m.reshape(shape), strength.reshape(shape), cosine, true_range_m, geom)
 
 
-def footprint(sub_rays: int) -> tuple[Float64Array, Float64Array]:
+def sub_ray_pattern(sub_rays: int) -> tuple[Float64Array, Float64Array]:
     """Return where a beam's rays lie and how much of its light each carries.
 
     A round Gaussian whose half-brightness circle has radius 1. Seven rays: the rule that integrates polynomials of
@@ -106,7 +106,7 @@ def footprint(sub_rays: int) -> tuple[Float64Array, Float64Array]:
     return places, weights / weights.sum()
 
 
-def blended(ranges_m: Float32Array, photons: Float32Array) -> tuple[Float32Array, Float32Array, Int64Array]:
+def blend_echoes(ranges_m: Float32Array, photons: Float32Array) -> tuple[Float32Array, Float32Array, Int64Array]:
     """Blend the echoes of each pixel's rays.
 
     Args:

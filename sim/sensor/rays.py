@@ -34,16 +34,16 @@ def revolution_rays(sensor: SensorMetadata, world_T_column: Float64Array) -> Ray
     ring = sensor.origins[0]  # the same for every beam of a column
     # Written out by component, here and below: no library may split the sums differently from run to run.
     origins = positions + sum(rotations[:, :, axis] * ring[:, axis, None] for axis in range(3))
-    return Rays(origins, turned(rotations, direction_parts(sensor)))
+    return Rays(origins, rotate_directions(rotations, direction_parts(sensor)))
 
 
 @lru_cache(maxsize=4)
 def direction_parts(sensor: SensorMetadata) -> Float32Array:
-    """Return a sensor's beam directions as (3, W, H) float32 components, as `turned` takes them."""
+    """Return a sensor's beam directions as (3, W, H) float32 components, as `rotate_directions` takes them."""
     return np.ascontiguousarray(sensor.directions.transpose(2, 1, 0), dtype=np.float32)
 
 
-def turned(rotations: Float64Array, parts: Float32Array) -> Float32Array:
+def rotate_directions(rotations: Float64Array, parts: Float32Array) -> Float32Array:
     """Turn the vectors of each column by that column's rotation.
 
     Args:

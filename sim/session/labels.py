@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array
 from scenarios.schema import Scenario
-from sim.geometry.mesh import Mesh, NearSurface, drop_unused_vertices, joined, near_part, split
+from sim.geometry.mesh import Mesh, NearSurface, crop_near, drop_unused_vertices, join_meshes, split_triangles
 from sim.geometry.raycast import Caster
 from sim.placement.contact import standing_surface
 from sim.placement.placing import Standing
@@ -128,7 +128,7 @@ def list_changes(scenario: Scenario, world: World) -> list[Tally]:
     """
     tallies: list[Tally] = []
     for instance, prop in enumerate(scenario.props, start=1):
-        stood = _only(world, prop.name, "before"), _only(world, prop.name, "after")
+        stood = _standing_in(world, prop.name, "before"), _standing_in(world, prop.name, "after")
         items = [item for item in stood if item is not None]
         if len(items) < 2:
             tallies.extend(_tally(len(tallies) + 1, instance, item, world, "full", None) for item in items)
@@ -137,7 +137,7 @@ def list_changes(scenario: Scenario, world: World) -> list[Tally]:
         if _is_same(start, end):
             continue
         if prop.loaded_share is not None:
-            tallies.append(_reshaped(len(tallies) + 1, instance, start, world))
+            tallies.append(_tally_reshaped(len(tallies) + 1, instance, start, world))
             continue
         group: Literal["full", "partial"] = "partial" if _is_short_move(start, end) else "full"
         first_id = len(tallies) + 1
@@ -146,7 +146,7 @@ def list_changes(scenario: Scenario, world: World) -> list[Tally]:
     return tallies
 
 
-def belonging(tally: Tally, points_world: Float64Array) -> BoolArray:
+def mark_belonging(tally: Tally, points_world: Float64Array) -> BoolArray:
     """Tell which returns on a changed prop, by their true places (N, 3), belong to its change."""
     if tally.other_surface is None:
         return np.ones(len(points_world), dtype=bool)
@@ -171,7 +171,7 @@ def count_other(tally: Tally, points_odom: Float64Array) -> None:
     tally.cells_other.update(cell_keys(points_odom).tolist())
 
 
-def _only(world: World, name: str, session: str) -> Standing | None:
+def _standing_in(world: World, name: str, session: str) -> Standing | None:
     found = [item for item in world.standing if item.prop.name == name and session in item.sessions]
     return found[0] if found else None
 
@@ -217,7 +217,7 @@ def _tally(
     return Tally(change, Ghost(surface), _near(other, surface) if group == "partial" else None)
 
 
-def _reshaped(change_id: int, instance: int, item: Standing, world: World) -> Tally:
+def _tally_reshaped(change_id: int, instance: int, item: Standing, world: World) -> Tally:
     """Change of a pile partly loaded away.
 
     Its ghost is the part of the old surface that is gone, left open: a ray that would have met the part removed comes
@@ -229,8 +229,8 @@ def _reshaped(change_id: int, instance: int, item: Standing, world: World) -> Ta
     skin = drop_unused_vertices(full.vertices, full.faces[is_gone])
     # The part removed lies between the old skin and the new face below it.
     floor_m = item.world_T_object[2, 3]
-    ends = np.concatenate([_off(full, near_rest, floor_m), _off(rest, near_full, floor_m)])
-    after = _only(world, item.prop.name, "after")
+    ends = np.concatenate([_corners_off(full, near_rest, floor_m), _corners_off(rest, near_full, floor_m)])
+    after = _standing_in(world, item.prop.name, "after")
     volumes = (item.shape.mesh_volume_m3, after.shape.mesh_volume_m3 if after is not None else None)
     tally = _tally(change_id, instance, item, world, "partial", None)
     tally.ghost = Ghost(skin if len(skin.faces) else full)
@@ -243,7 +243,7 @@ def _reshaped(change_id: int, instance: int, item: Standing, world: World) -> Ta
     return tally
 
 
-def _off(mesh: Mesh, other: cKDTree, floor_m: float) -> Float64Array:
+def _corners_off(mesh: Mesh, other: cKDTree, floor_m: float) -> Float64Array:
     """Corners (N, 3) of a surface above the floor that lie off the samples of another one."""
     corners = mesh.vertices[mesh.vertices[:, 2] >= floor_m]
     return np.asarray(corners[other.query(corners)[0] > _SAME_SURFACE_M])
@@ -251,18 +251,18 @@ def _off(mesh: Mesh, other: cKDTree, floor_m: float) -> Float64Array:
 
 def _samples(mesh: Mesh) -> cKDTree:
     """Points no farther than 1.8 cm from any place on a surface: distances to them are exact to 2 mm at 0.1 m."""
-    middles = split(mesh.vertices[mesh.faces], _SAMPLE_M).mean(axis=1)
+    middles = split_triangles(mesh.vertices[mesh.faces], _SAMPLE_M).mean(axis=1)
     return cKDTree(np.concatenate([mesh.vertices, middles]), balanced_tree=False, compact_nodes=False)
 
 
 def _surface_in(scene: Scene, instance: int) -> Mesh:
-    return joined([mesh for mesh, owner in zip(scene.meshes, scene.instance, strict=True) if owner == instance])
+    return join_meshes([mesh for mesh, owner in zip(scene.meshes, scene.instance, strict=True) if owner == instance])
 
 
 def _near(scene: Scene, surface: Mesh) -> NearSurface:
     """Return what of a scene lies near a surface."""
-    parts = (near_part(mesh, surface, 2 * NEAR_OLD_SURFACE_M) for mesh in scene.meshes)
-    return NearSurface(joined([_compact(part) for part in parts if len(part.faces)]), NEAR_OLD_SURFACE_M)
+    parts = (crop_near(mesh, surface, 2 * NEAR_OLD_SURFACE_M) for mesh in scene.meshes)
+    return NearSurface(join_meshes([_compact(part) for part in parts if len(part.faces)]), NEAR_OLD_SURFACE_M)
 
 
 def _compact(mesh: Mesh) -> Mesh:

@@ -15,7 +15,7 @@ from sim.drive.trajectory import Trajectory
 from sim.scene import Scene
 from sim.sensor.lidar import Scan, scan
 from sim.sensor.rays import Rays, revolution_rays
-from sim.session.labels import Tally, belonging, claim_returns, count_other
+from sim.session.labels import Tally, claim_returns, count_other, mark_belonging
 from sim.session.truth import Int16Array
 
 SessionName = Literal["before", "after"]
@@ -91,8 +91,8 @@ def simulate_revolution(drive: Drive, number: int) -> Revolution:
         if len(row):
             is_own = change.session == drive.name
             points_world = rays.points(row, column, reach_m[row, column])
-            belongs = belonging(tally, points_world) if is_own else np.ones(len(row), dtype=bool)
-            hits[change.id] = Hits(row, column, _measured(drive, number, result, row, column), belongs)
+            belongs = mark_belonging(tally, points_world) if is_own else np.ones(len(row), dtype=bool)
+            hits[change.id] = Hits(row, column, _measure(drive, number, result, row, column), belongs)
     column_poses = drive.trajectory.sensor_T_column(slice(number, number + 1))[0]
     return Revolution(result.range_mm, result.reflectivity, result.signal, instance, column_poses, hits, ghost_rays)
 
@@ -127,7 +127,7 @@ def label_changes(drive: Drive, revolutions: list[Revolution]) -> Int16Array:
     return labels
 
 
-def _measured(drive: Drive, number: int, result: Scan, row: Int64Array, column: Int64Array) -> Float64Array:
+def _measure(drive: Drive, number: int, result: Scan, row: Int64Array, column: Int64Array) -> Float64Array:
     """Place (N, 3) of some returns of a revolution as the session has them, odom frame."""
     sensor, trajectory = drive.sensor, drive.trajectory
     reach = result.range_mm[row, column][:, None] / 1000.0 - sensor.beam_origin_m

@@ -23,7 +23,7 @@ from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario, SessionPlan
-from sim.drive.odometry import odom_start, registered
+from sim.drive.odometry import register_scans, start_pose
 from sim.drive.trajectory import plan_trajectory
 from sim.scene import build_world
 from sim.session.labels import list_changes
@@ -99,8 +99,8 @@ def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progres
         partial.mkdir(parents=True)
         with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
             for drive in drives:
-                write_session(with_own_odometry(drive, pool, report), partial / drive.name, pool, report)
-        write_pair_truth(partial, pair_truth(scenario, seed, drives, files))
+                write_session(estimate_odometry(drive, pool, report), partial / drive.name, pool, report)
+        write_pair_truth(partial, collect_truth(scenario, seed, drives, files))
         partial.replace(home)
     except OSError as error:
         raise InputError(f"{out}: cannot write there: {error.strerror or error}") from error
@@ -108,7 +108,7 @@ def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progres
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def pair_truth(scenario: Scenario, seed: int, drives: Sequence[Drive], files: Mapping[str, str]) -> PairTruth:
+def collect_truth(scenario: Scenario, seed: int, drives: Sequence[Drive], files: Mapping[str, str]) -> PairTruth:
     """Return what is known about a pair once both of its sessions were simulated."""
     changes = tuple(tally.finished() for tally in drives[0].tallies)
     drawn = scenario.model_dump(mode="json")
@@ -148,14 +148,14 @@ def plan_drives(scenario: Scenario, sensor: SensorMetadata, seed: int) -> list[D
     ]
 
 
-def with_own_odometry(drive: Drive, pool: Executor, report: Progress) -> Drive:
+def estimate_odometry(drive: Drive, pool: Executor, report: Progress) -> Drive:
     """Let KISS-ICP estimate the drive, where the session asks for it, from the very scans that will be written."""
     plan: SessionPlan = getattr(drive.scenario, drive.name)
     if plan.odometry.source != "kiss-icp":
         return drive
     trajectory = drive.trajectory
-    start = odom_start(trajectory.true, float(trajectory.revolution_s[0]))
-    estimated = registered(
+    start = start_pose(trajectory.true, float(trajectory.revolution_s[0]))
+    estimated = register_scans(
         _range_images(drive, pool, report),
         drive.sensor,
         trajectory.revolution_s,
@@ -190,7 +190,7 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
     report(drive.name, 0, n_scans)
     with (
         SessionWriter(folder, drive.sensor, CHUNK_SCANS, provenance) as writer,
-        closing(labelled_chunks(drive, pool)) as chunks,
+        closing(simulate_chunks(drive, pool)) as chunks,
     ):
         for index, (chunk, instance, change) in enumerate(chunks):
             writer.add(chunk)
@@ -200,9 +200,9 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
         writer.close(drive.trajectory.odom_T_sensor)
 
 
-def labelled_chunks(drive: Drive, pool: Executor) -> Generator[tuple[ScanChunk, Int16Array, Int16Array]]:
+def simulate_chunks(drive: Drive, pool: Executor) -> Generator[tuple[ScanChunk, Int16Array, Int16Array]]:
     """Yield each chunk of a session with the (s, H, W) instance and change of its returns; the tallies are added to."""
-    with closing(_chunks_ahead(drive, pool)) as chunks:
+    with closing(_simulate_ahead(drive, pool)) as chunks:
         for index, revolutions in enumerate(chunks):
             start = index * CHUNK_SCANS
             chunk = ScanChunk(
@@ -215,7 +215,7 @@ def labelled_chunks(drive: Drive, pool: Executor) -> Generator[tuple[ScanChunk, 
             yield chunk, np.stack([each.instance for each in revolutions]), label_changes(drive, revolutions)
 
 
-def _chunks_ahead(drive: Drive, pool: Executor) -> Generator[list[Revolution]]:
+def _simulate_ahead(drive: Drive, pool: Executor) -> Generator[list[Revolution]]:
     """Yield the revolutions of each chunk in order, the next chunk being simulated while this one is written."""
 
     def begun(start: int) -> list[Future[Revolution]]:
@@ -286,13 +286,13 @@ def simulate_in_memory(scenario: Scenario, seed: int, n_threads: int = 1) -> Hel
     files = file_digests(scenario)
     drives = plan_drives(scenario, load_profile(scenario.sensor.profile, scenario.sensor.mode), seed)
     with ThreadPoolExecutor(min(n_threads, os.cpu_count() or 1)) as pool:
-        sessions = {drive.name: _held(drive, pool) for drive in drives}
-    return HeldPair(pair_truth(scenario, seed, drives, files), sessions)
+        sessions = {drive.name: _hold_session(drive, pool) for drive in drives}
+    return HeldPair(collect_truth(scenario, seed, drives, files), sessions)
 
 
-def _held(drive: Drive, pool: Executor) -> LabelledSession:
-    drive = with_own_odometry(drive, pool, lambda stage, done, total: None)
-    with closing(labelled_chunks(drive, pool)) as chunks:
+def _hold_session(drive: Drive, pool: Executor) -> LabelledSession:
+    drive = estimate_odometry(drive, pool, lambda stage, done, total: None)
+    with closing(simulate_chunks(drive, pool)) as chunks:
         chunk, instance, change = zip(*chunks, strict=True)
     session = HeldSession(
         Path(drive.name), drive.sensor, drive.trajectory.odom_T_sensor, CHUNK_SCANS, {"session": drive.name}, chunk

@@ -104,8 +104,8 @@ def sensor_contests(site: BenchSite) -> dict[str, Callable[[], Contest]]:
         f"casting-{site.n_props}-props": lambda: against_mujoco(site, site.n_props, 20.0),
         "casting-bare": lambda: against_embree(site),
         "casting-two-threads": lambda: two_threads(site),
-        "session": lambda: session_written(site, site.drive, 15.0),
-        "session-19-sub-rays": lambda: session_written(site, spread_drive(site), 1.0),
+        "session": lambda: time_session(site, site.drive, 15.0),
+        "session-19-sub-rays": lambda: time_session(site, spread_drive(site), 1.0),
     }
 
 
@@ -208,7 +208,7 @@ def spread_drive(site: BenchSite) -> Drive:
     return replace(drive, scenario=spread, trajectory=trajectory)
 
 
-def session_written(site: BenchSite, drive: Drive, target: float) -> Contest:
+def time_session(site: BenchSite, drive: Drive, target: float) -> Contest:
     """Time one session, truth included, from its planned drive to files, with two threads against the clock it kept."""
     names = count()
     with TemporaryDirectory() as folder, ThreadPoolExecutor(THREADS) as pool:

@@ -203,17 +203,17 @@ def void_size_m(walls: Caster, places: Float64Array, headings: Float64Array) -> 
 
 def _results(family: str, seeds: Sequence[int], workers: int) -> Iterator[WorldFigures | Failure]:
     if workers == 1:
-        yield from (_tried(family, seed) for seed in seeds)
+        yield from (_try_seed(family, seed) for seed in seeds)
         return
     # forked children would inherit the locks of the ray caster's threads
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        tasks = {pool.submit(_tried, family, seed): seed for seed in seeds}
+        tasks = {pool.submit(_try_seed, family, seed): seed for seed in seeds}
         for task in as_completed(tasks):
             error = task.exception()
             yield task.result() if error is None else Failure(family, tasks[task], f"the process died: {error}")
 
 
-def _tried(family: str, seed: int) -> WorldFigures | Failure:
+def _try_seed(family: str, seed: int) -> WorldFigures | Failure:
     try:
         return survey_seed(family, seed)
     except TunnelcdError as error:

@@ -69,7 +69,7 @@ def session_cloud(
     points, instances, changes = [], [], []
     for number, chunk in enumerate(session.chunks()):
         first = number * session.chunk_scans
-        placed = _placed(session, chunk, frame_T_sensor[first : first + len(chunk.range_mm)])
+        placed = _place_returns(session, chunk, frame_T_sensor[first : first + len(chunk.range_mm)])
         picked = np.flatnonzero(chunk.range_mm.ravel() > 0)[number % stride :: stride]
         points.append(placed.reshape(-1, 3)[picked])
         if labels is not None:
@@ -94,7 +94,7 @@ def session_cloud(
     return Cloud(name, cloud, colours)
 
 
-def _placed(session: Session, chunk: ScanChunk, frame_T_sensor: Float64Array) -> Float64Array:
+def _place_returns(session: Session, chunk: ScanChunk, frame_T_sensor: Float64Array) -> Float64Array:
     """Return the places (s, H, W, 3) of a chunk's pixels, every column at its own pose."""
     poses = chunk.column_poses.astype(np.float64)
     turns = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).as_matrix().reshape(*poses.shape[:2], 3, 3)

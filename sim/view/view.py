@@ -21,7 +21,7 @@ from cdpipe.io.session import is_session, read_session
 from cdpipe.sensor.ouster import load_profile
 from scenarios.schema import Scenario
 from sim.drive.trajectory import plan_trajectory
-from sim.geometry.mesh import Mesh, drop_unused_vertices, joined, moved
+from sim.geometry.mesh import Mesh, drop_unused_vertices, join_meshes, move_mesh
 from sim.placement.placing import Standing, standing_box
 from sim.props.shapes import solid_mesh
 from sim.scene import World, build_world
@@ -224,13 +224,13 @@ def _prop_surfaces(item: Standing) -> Iterator[Surface]:
     name, change = item.prop.name, item.prop.change
     parts: dict[str, list[Mesh]] = {}
     for solid in item.shape.solids:
-        parts.setdefault(solid.material, []).append(moved(solid_mesh(solid), item.world_T_object))
+        parts.setdefault(solid.material, []).append(move_mesh(solid_mesh(solid), item.world_T_object))
     if change != "none":
-        whole = joined([mesh for meshes in parts.values() for mesh in meshes])
+        whole = join_meshes([mesh for meshes in parts.values() for mesh in meshes])
         yield Surface(f"changes/{change}/{name}{_where(item)}", whole, CHANGE_RGB[change])
         return
     for material, meshes in parts.items():
-        yield Surface(f"props/{name}/{material}", joined(meshes), _rgb(material_colour(name, material)))
+        yield Surface(f"props/{name}/{material}", join_meshes(meshes), _rgb(material_colour(name, material)))
 
 
 def _label(item: Standing) -> Label:

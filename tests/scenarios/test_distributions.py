@@ -7,7 +7,7 @@ import pytest
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import stream
-from scenarios.distributions import draw, drawing, merged
+from scenarios.distributions import draw, draw_with_origins, merge_trees
 
 
 @pytest.mark.parametrize("seed", [0, 7, 2_000_000_000])
@@ -163,7 +163,7 @@ def test_every_malformed_distribution_is_told_at_once() -> None:
 
 def test_origins_lead_from_drawn_keys_back_to_their_source() -> None:
     tree = {"l": [{"n": 1, "repeat": 2}, {"v": {"choice": [{"w": 5}]}}, {"one_of": [{"q": [7]}]}]}
-    drawn = drawing(tree, 0)
+    drawn = draw_with_origins(tree, 0)
     assert drawn.value == {"l": [{"n": 1}, {"n": 1}, {"v": {"w": 5}}, {"q": [7]}]}
     assert drawn.origins["l", 1, "n"] == ("l", 0, "n")
     assert drawn.origins["l", 2, "v", "w"] == ("l", 1, "v", "choice", 0, "w")
@@ -173,6 +173,6 @@ def test_origins_lead_from_drawn_keys_back_to_their_source() -> None:
 def test_merging_goes_into_mappings_but_not_into_lists_or_distributions() -> None:
     base = {"a": {"x": 1, "y": 2}, "l": [1, 2], "d": {"uniform": [0, 1]}, "s": 3}
     over = {"a": {"y": 5}, "l": [9], "d": {"normal": [0, 1]}, "s": {"choice": [1, 2]}, "new": 1}
-    assert merged(base, over) == {
+    assert merge_trees(base, over) == {
         "a": {"x": 1, "y": 5}, "l": [9], "d": {"normal": [0, 1]}, "s": {"choice": [1, 2]}, "new": 1,
     }  # fmt: skip

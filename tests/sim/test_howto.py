@@ -11,7 +11,7 @@ import sim
 from cdpipe.core.errors import ScenarioError
 from eval.plans.plan import load_plan
 from scenarios.schema import PROP_KINDS, Prop
-from sim.geometry.mesh import joined
+from sim.geometry.mesh import join_meshes
 from sim.props import props, storage
 from sim.props.shapes import solid_mesh
 
@@ -54,7 +54,7 @@ def test_a_builder_as_shown_fills_its_size(monkeypatch: pytest.MonkeyPatch) -> N
     assert not entry.keys() & set(PROP_KINDS)
     monkeypatch.setattr(props, "BUILDERS", props.BUILDERS | entry)
     shape = props.shape_of(Prop.model_construct(name="it", kind="locker", size_m=size, mesh=None), seed=0)
-    corners = joined([solid_mesh(solid) for solid in shape.solids]).vertices
+    corners = join_meshes([solid_mesh(solid) for solid in shape.solids]).vertices
     np.testing.assert_allclose(np.ptp(corners, axis=0), size, atol=1e-9)
     assert corners[:, 2].min() == pytest.approx(0.0, abs=1e-9)
 

@@ -15,7 +15,7 @@ from cdpipe.mapping import odometry
 from cdpipe.mapping.odometry import deskew_at_constant_velocity
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Odometry, Platform, Roughness, Scenario, SessionPlan, Tunnel
-from sim.drive.odometry import registered
+from sim.drive.odometry import register_scans
 from sim.geometry.mesh import Mesh, box_mesh
 from sim.geometry.raycast import Caster
 from sim.session.simulate import simulate_pair
@@ -123,7 +123,7 @@ def test_one_revolution_has_the_first_pose_and_an_empty_one_gives_a_finite_pose(
     column_s = (np.arange(sensor.width) - sensor.width // 2) / sensor.width / 10
     start = make_pose(Rotation.from_euler("y", 0.1).as_matrix())
     empty = np.zeros((sensor.height, sensor.width), np.uint32)
-    motion = registered([empty], sensor, np.array([0.05]), column_s, start, "before")
+    motion = register_scans([empty], sensor, np.array([0.05]), column_s, start, "before")
     np.testing.assert_allclose(motion.poses(np.array([0.0, 0.05, 0.1])), np.tile(start, (3, 1, 1)), atol=1e-12)
 
 
@@ -137,7 +137,7 @@ def test_a_pose_that_is_not_finite_is_an_error(sensor: SensorMetadata, monkeypat
     monkeypatch.setattr(odometry, "_kiss_icp", Lost)
     scans = [np.full((sensor.height, sensor.width), 4000, np.uint32)] * 2
     with pytest.raises(ScenarioError, match=r"after: KISS-ICP .*revolution 0"):
-        registered(scans, sensor, np.array([0.05, 0.15]), np.zeros(sensor.width), np.eye(4), "after")
+        register_scans(scans, sensor, np.array([0.05, 0.15]), np.zeros(sensor.width), np.eye(4), "after")
 
 
 def test_without_the_package_nothing_is_simulated(

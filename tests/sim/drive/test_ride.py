@@ -11,7 +11,7 @@ from cdpipe.core.geometry import Float64Array
 from cdpipe.core.motion import Motion
 from scenarios.schema import Platform, Scenario, SessionPlan
 from sim.drive.path import Path
-from sim.drive.ride import lean, on_wheels, ride, times
+from sim.drive.ride import follow_floor, integrate_time, lean_angles, ride
 from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 
@@ -64,7 +64,7 @@ def test_a_plane_gives_its_slope_as_pitch_and_its_crossfall_as_roll(make_scenari
 
 
 def test_a_step_lifts_the_front_first_and_the_middle_by_half(make_scenario: Callable[..., Scenario]) -> None:
-    height_m, pitch, roll = on_wheels(straight(), floor_of(lambda along, _: 0.1 * (along > 9.99)), ROBOT)
+    height_m, pitch, roll = follow_floor(straight(), floor_of(lambda along, _: 0.1 * (along > 9.99)), ROBOT)
     way_m = straight().distance_m
     # The front axle is 0.3 m ahead: over the step from 9.7 m on, the rear one from 10.3 m on.
     expected = np.select([way_m < 9.4, np.abs(way_m - 10.0) < 0.05, way_m > 10.6], [0.0, 0.05, 0.1], np.nan)
@@ -79,27 +79,29 @@ def test_a_bump_under_the_left_wheels_heaves_by_a_quarter_each_time_and_rolls() 
     def bump(along: Float64Array, across: Float64Array) -> Float64Array:
         return 0.08 * ((np.abs(along - 10.0) < 0.26) & (across > 0.1))
 
-    height_m, _, roll = on_wheels(straight(), floor_of(bump), ROBOT)
+    height_m, _, roll = follow_floor(straight(), floor_of(bump), ROBOT)
     for place_m in (9.7, 10.3):  # front wheel on top, then the rear one
         at = round(place_m / 0.05)
         assert height_m[at] == pytest.approx(0.02, abs=1e-3)
         assert roll[at] == pytest.approx(np.arctan(0.04 / 0.5), abs=2e-3)  # left side up
     assert height_m.max() < 0.025
     # A gravel of 1 cm and 10 cm long is swallowed by the tyres for the most part.
-    gravel, _, _ = on_wheels(straight(), floor_of(lambda along, _: 0.01 * np.sign(np.sin(62.8 * along + 0.5))), ROBOT)
+    gravel, _, _ = follow_floor(
+        straight(), floor_of(lambda along, _: 0.01 * np.sign(np.sin(62.8 * along + 0.5))), ROBOT
+    )
     assert gravel[20:-20].std() < 0.002
 
 
 def test_speed_is_the_integral_of_the_way_over_time() -> None:
     distance_m = np.linspace(0.0, 4000.0, 80001)
-    np.testing.assert_array_equal(times(distance_m, 1.6, 0.0, 3, "before"), distance_m / 1.6)
-    time_s = times(distance_m, 1.6, 0.3, 3, "before")
+    np.testing.assert_array_equal(integrate_time(distance_m, 1.6, 0.0, 3, "before"), distance_m / 1.6)
+    time_s = integrate_time(distance_m, 1.6, 0.3, 3, "before")
     speed_mps = np.diff(distance_m) / np.diff(time_s)
     assert speed_mps.min() > 0.4
     assert speed_mps.mean() == pytest.approx(1.6, rel=0.03)
     assert speed_mps.std() == pytest.approx(0.3 * 1.6, rel=0.1)
     assert (np.abs(np.diff(speed_mps)) < 0.05).all()
-    assert not np.allclose(time_s, times(distance_m, 1.6, 0.3, 3, "after"))
+    assert not np.allclose(time_s, integrate_time(distance_m, 1.6, 0.3, 3, "after"))
 
 
 def test_tilt_and_bounce_have_their_standard_deviation_and_their_own_draws(
@@ -123,11 +125,11 @@ def test_a_quadrotor_leans_into_its_turn_and_into_its_acceleration() -> None:
     distance_m = np.arange(0.0, 20.0, 0.05)
     turn = distance_m / radius_m
     points = radius_m * np.column_stack([np.sin(turn), 1 - np.cos(turn), np.zeros(len(turn))])
-    pitch, roll = lean(Path(distance_m, points, turn), distance_m / speed_mps)
+    pitch, roll = lean_angles(Path(distance_m, points, turn), distance_m / speed_mps)
     np.testing.assert_allclose(pitch, 0.0, atol=1e-9)
     np.testing.assert_allclose(roll, -np.arctan(4.0 / 8.0 / 9.81), rtol=1e-6)  # to the left: right side up
     # v^2 = 1 + 2 a s is a constant acceleration a: nose down by atan(a / g).
-    pitch, roll = lean(straight(), (np.sqrt(1 + straight().distance_m) - 1) / 0.5)
+    pitch, roll = lean_angles(straight(), (np.sqrt(1 + straight().distance_m) - 1) / 0.5)
     np.testing.assert_allclose(pitch[30:-30], np.arctan(0.5 / 9.81), rtol=1e-3)
     np.testing.assert_allclose(roll, 0.0, atol=1e-12)
 

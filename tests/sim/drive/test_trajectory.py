@@ -13,9 +13,9 @@ from cdpipe.core.motion import Motion, make_motion
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Floor, Odometry, Platform, Prop, Scenario, SessionPlan, Stones
 from sim.drive.path import plan_path
-from sim.drive.ride import on_wheels
+from sim.drive.ride import follow_floor
 from sim.drive.trajectory import Trajectory, plan_trajectory, record
-from sim.geometry.line import kept_between, smoothed
+from sim.geometry.line import smooth_between, smooth_line
 from sim.geometry.raycast import Caster
 from sim.geometry.sweep import bars
 from sim.placement.placing import standing_corners
@@ -276,12 +276,12 @@ def test_a_line_that_comes_too_near_to_something_hung_is_planned_anew(
 
 def test_smoothing_keeps_straight_lines_and_ends() -> None:
     ramp = np.linspace(2.0, 9.0, 200)
-    np.testing.assert_allclose(smoothed(ramp, 1.0), ramp, atol=1e-12)
+    np.testing.assert_allclose(smooth_line(ramp, 1.0), ramp, atol=1e-12)
     bent = np.abs(np.linspace(-1, 1, 201))
-    assert smoothed(bent, 1.0)[[0, -1]] == pytest.approx([1.0, 1.0])
-    assert smoothed(bent, 1.0)[100] > 0.02
+    assert smooth_line(bent, 1.0)[[0, -1]] == pytest.approx([1.0, 1.0])
+    assert smooth_line(bent, 1.0)[100] > 0.02
     low, high = np.where(np.arange(200) == 100, 0.5, -1.0), np.full(200, 1.0)
-    kept = kept_between(np.zeros(200), low, high, 0.5)
+    kept = smooth_between(np.zeros(200), low, high, 0.5)
     assert (kept >= low - 1e-12).all()
     assert np.abs(kept[[0, 60, 140, 199]]).max() < 1e-12
 
@@ -293,8 +293,8 @@ def test_a_line_goes_round_high_stones_and_over_low_ones(make_scenario: Callable
         scenario = base.model_copy(update={"tunnel": base.tunnel.model_copy(update={"floor": floor})})
         world = build_world(scenario, 3)
         path = plan_path(world, scenario, 3, "before")
-        heave_m, _, _ = on_wheels(path, world.fixed, scenario.platform)
-        level_m, _, _ = on_wheels(path, world.walls, scenario.platform)
+        heave_m, _, _ = follow_floor(path, world.fixed, scenario.platform)
+        level_m, _, _ = follow_floor(path, world.walls, scenario.platform)
         return float(np.ptp(path.points[:, 1])), float(np.abs(heave_m - level_m).max())
 
     wind_m, heave_m = driven(0.6, 0.8, 0.4)

@@ -24,7 +24,7 @@ from sim.furniture.wall_line import PASSING_M, wall_lines
 from sim.geometry.mesh import Mesh, point_triangle_distance
 from sim.geometry.raycast import Caster
 from sim.geometry.sweep import bars, circle, sweep
-from sim.rock.axis import Axis, axes_of, envelope, is_opening
+from sim.rock.axis import Axis, is_opening, lower_envelope, measure_axes
 from sim.rock.centreline import Centreline, build_centreline
 from sim.rock.tunnel import mesh_tunnel
 
@@ -120,7 +120,7 @@ def test_a_pipe_runs_at_its_height_its_side_and_its_stand_off(side: str) -> None
         Furniture(pipes=(pipe,)), section=Section(shape="rectangle", width_m=4.0, height_m=3.0), resolution_m=0.1
     )
     centreline, _, walls = built(tunnel)
-    (axis,) = axes_of(centreline, walls)
+    (axis,) = measure_axes(centreline, walls)
     (line,) = wall_lines(axis, wall_plans(tunnel.furniture)[0])
     wall_y = 2.0 if side == "left" else -2.0
     np.testing.assert_allclose(line.path[:, 1], wall_y - np.sign(wall_y) * (0.08 + 0.1), atol=0.01)
@@ -158,7 +158,7 @@ def test_nothing_but_fixings_lies_in_the_rock(network: Network) -> None:
 def test_tubes_and_trays_themselves_stay_out_of_the_rock(network: Network) -> None:
     tunnel, centreline, _, walls, _ = network
     n_lines = 0
-    for axis in axes_of(centreline, walls):
+    for axis in measure_axes(centreline, walls):
         for plan in wall_plans(tunnel.furniture):
             for line in wall_lines(axis, plan):
                 n_lines += 1
@@ -193,7 +193,7 @@ def test_a_pipe_climbs_over_an_opening_and_comes_down_again(width_m: float, heig
         section=Section(width_m=width_m, height_m=height_m),
     )
     centreline, _, walls = built(tunnel)
-    (line,) = wall_lines(axes_of(centreline, walls)[0], wall_plans(tunnel.furniture)[0])
+    (line,) = wall_lines(measure_axes(centreline, walls)[0], wall_plans(tunnel.furniture)[0])
     is_over = np.abs(line.path[:, 0] - 14.0) < width_m / 2
     assert (line.path[is_over, 2] > passing_m).all()
     is_far = np.abs(line.path[:, 0] - 14.0) > width_m / 2 + 3.5
@@ -209,7 +209,7 @@ def test_lines_end_where_the_roof_is_too_low_to_pass() -> None:
         section=Section(width_m=3.0, height_m=2.1),
     )
     centreline, _, walls = built(tunnel)
-    main, branch = axes_of(centreline, walls)
+    main, branch = measure_axes(centreline, walls)
     plan = wall_plans(tunnel.furniture)[0]
     before, after = wall_lines(main, plan)
     assert before.path[-1, 0] < 12.0 - 1.5 < 12.0 + 1.5 < after.path[0, 0]
@@ -368,12 +368,12 @@ def test_no_furniture_or_no_drifts_is_nothing() -> None:
 
 
 def test_envelope_by_hand() -> None:
-    line = envelope(np.array([3.0, 3, 3, 1, 3, 3, 3, 3, 3]), 1)
+    line = lower_envelope(np.array([3.0, 3, 3, 1, 3, 3, 3, 3, 3]), 1)
     assert line[3] == 1.0
     # The dip widens to three values of 1; weights are 1/4, 1/2, 1/4.
     np.testing.assert_allclose(line, [3.0, 2.5, 1.5, 1.0, 1.5, 2.5, 3.0, 3.0, 3.0])
     rough = np.random.default_rng(0).normal(size=200)
-    assert (envelope(rough, 4) <= rough + 1e-12).all()
+    assert (lower_envelope(rough, 4) <= rough + 1e-12).all()
     flat = np.full(40, 2.0)
     flat[20:24] = 9.0
     np.testing.assert_array_equal(np.flatnonzero(is_opening(flat)), [20, 21, 22, 23])
@@ -382,7 +382,7 @@ def test_envelope_by_hand() -> None:
 def test_axis_measures_the_drift() -> None:
     tunnel = straight(Furniture(), nodes={"a": (0, 0, 0), "b": (24, 0, 2.4)}, resolution_m=0.1)
     centreline, _, walls = built(tunnel)
-    axis: Axis = axes_of(centreline, walls)[0]
+    axis: Axis = measure_axes(centreline, walls)[0]
     inner = (axis.points[:, 0] > 3) & (axis.points[:, 0] < 21)
     np.testing.assert_allclose(axis.points[inner, 2], 0.1 * axis.points[inner, 0], atol=0.02)
     np.testing.assert_allclose(axis.clear_m[inner], 3.2, atol=0.02)

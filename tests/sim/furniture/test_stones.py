@@ -8,7 +8,7 @@ from scipy.spatial.distance import pdist
 
 from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Drift, Floor, Roughness, Section, Stones, Tunnel
-from sim.furniture.stones import SMALLEST_SHARE, sizes, strew_stones
+from sim.furniture.stones import SMALLEST_SHARE, draw_stone_sizes, strew_stones
 from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 from sim.props.rocks import passing_share
@@ -63,7 +63,7 @@ def names_of(stones: list[Float64Array]) -> set[bytes]:
 
 def test_sizes_follow_the_law_between_its_bounds() -> None:
     law = Stones(per_m2=1.0, size_m=0.15, max_size_m=0.4)
-    drawn = np.sort(sizes(np.random.default_rng(0).random(20_000), law))
+    drawn = np.sort(draw_stone_sizes(np.random.default_rng(0).random(20_000), law))
     low, high = SMALLEST_SHARE * 0.15, 0.4
     assert (drawn[0] >= low) & (drawn[-1] <= high)
     bounds = passing_share(np.array([low, high]), 0.15)

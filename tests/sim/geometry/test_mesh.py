@@ -7,10 +7,10 @@ from sim.geometry.mesh import (
     Mesh,
     NearSurface,
     box_mesh,
+    crop_near,
     cylinder_mesh,
-    joined,
-    moved,
-    near_part,
+    join_meshes,
+    move_mesh,
     point_triangle_distance,
 )
 
@@ -42,7 +42,7 @@ def test_distance_to_a_triangle_by_hand() -> None:
 
 def test_near_surface_agrees_with_every_triangle_tried() -> None:
     rng = np.random.default_rng(0)
-    mesh = joined([box_mesh((2.0, 0.3, 0.2)), moved(cylinder_mesh(0.4, 1.0, 12), np.diag([1.0, 1, 1, 1]))])
+    mesh = join_meshes([box_mesh((2.0, 0.3, 0.2)), move_mesh(cylinder_mesh(0.4, 1.0, 12), np.diag([1.0, 1, 1, 1]))])
     points = rng.uniform(-2.4, 2.4, (5000, 3)) * (1.0, 0.5, 0.6)
     triangles = mesh.vertices[mesh.faces]
     distances = np.min([point_triangle_distance(points, np.broadcast_to(t, (5000, 3, 3))) for t in triangles], axis=0)
@@ -62,8 +62,8 @@ def test_near_a_surface_without_triangles_is_nothing() -> None:
 
 
 def test_near_part_keeps_only_what_comes_close() -> None:
-    far = moved(box_mesh((1, 1, 1)), np.array([[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
-    part = near_part(joined([box_mesh((1, 1, 1)), far]), box_mesh((0.5, 0.5, 0.5)), 0.6)
+    far = move_mesh(box_mesh((1, 1, 1)), np.array([[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
+    part = crop_near(join_meshes([box_mesh((1, 1, 1)), far]), box_mesh((0.5, 0.5, 0.5)), 0.6)
     np.testing.assert_array_equal(part.faces, box_mesh((1, 1, 1)).faces)
 
 
@@ -71,7 +71,7 @@ def test_near_part_is_every_triangle_whose_bounding_box_comes_close() -> None:
     rng = np.random.default_rng(3)
     triangles = rng.uniform(-6, 6, (4000, 1, 3)) + rng.uniform(-3, 3, (4000, 3, 3))  # some span the target, corners out
     mesh = Mesh(triangles.reshape(-1, 3), np.arange(12000, dtype=np.int32).reshape(-1, 3))
-    part = near_part(mesh, box_mesh((0.5, 0.4, 0.3)), 0.6)
+    part = crop_near(mesh, box_mesh((0.5, 0.4, 0.3)), 0.6)
     reach = np.array([1.1, 1.0, 0.9])
     is_near = ((triangles.max(axis=1) >= -reach) & (triangles.min(axis=1) <= reach)).all(axis=1)
     np.testing.assert_array_equal(part.faces, mesh.faces[is_near])

@@ -8,7 +8,7 @@ import pytest
 
 from cdpipe.core.geometry import Float64Array, Int64Array, make_pose
 from scenarios.schema import Prop, Scenario
-from sim.geometry.mesh import Mesh, box_mesh, cylinder_mesh, moved
+from sim.geometry.mesh import Mesh, box_mesh, cylinder_mesh, move_mesh
 from sim.geometry.raycast import Caster, model_meshes
 from sim.rock.centreline import build_centreline
 from sim.rock.tunnel import mesh_tunnel
@@ -43,7 +43,7 @@ def test_meshes_are_numbered_in_their_order() -> None:
     meshes = []
     for place in (0.0, 4.0, 8.0):
         shift[0, 3] = place
-        meshes.append(moved(box_mesh((1, 1, 1)), shift))
+        meshes.append(move_mesh(box_mesh((1, 1, 1)), shift))
     ranges_m, ids, _ = Caster(meshes).cast(np.array([[0, 0, 9.0], [4, 0, 9], [8, 0, 9]]), np.tile([0, 0, -1.0], (3, 1)))
     assert ids.tolist() == [0, 1, 2]
     np.testing.assert_allclose(ranges_m, 8.0, atol=1e-5)
@@ -52,7 +52,7 @@ def test_meshes_are_numbered_in_their_order() -> None:
 def test_far_from_the_origin_ranges_keep_their_precision() -> None:
     far = np.eye(4)
     far[:3, 3] = (40_000.0, -25_000.0, 300.0)
-    ranges_m, _, _ = Caster([moved(box_mesh((1, 1, 1)), far)]).cast(
+    ranges_m, _, _ = Caster([move_mesh(box_mesh((1, 1, 1)), far)]).cast(
         far[None, :3, 3] + [[0.0, 0.0, 3.3]], np.array([[0, 0, -1.0]])
     )
     assert ranges_m[0] == pytest.approx(2.3, abs=1e-5)
@@ -85,8 +85,10 @@ def slow_hits(
 
 
 def test_both_ways_of_casting_agree_with_every_triangle_tried() -> None:
-    meshes = [moved(cylinder_mesh(0.7, 1.5, 9), make_pose(translation=place)) for place in ((300, 2, 0), (303, 0, 1))]
-    meshes.append(moved(box_mesh((1.0, 0.4, 0.3)), make_pose(translation=(301, -2, 0.5))))
+    meshes = [
+        move_mesh(cylinder_mesh(0.7, 1.5, 9), make_pose(translation=place)) for place in ((300, 2, 0), (303, 0, 1))
+    ]
+    meshes.append(move_mesh(box_mesh((1.0, 0.4, 0.3)), make_pose(translation=(301, -2, 0.5))))
     caster = Caster(meshes)
     width, height = 40, 30
     origins = np.random.default_rng(5).uniform((300.5, -1.5, -1.0), (302.0, 1.0, 1.0), size=(width, 3))

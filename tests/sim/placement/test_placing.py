@@ -22,7 +22,7 @@ from scenarios.schema import (
     Tunnel,
 )
 from sim.placement import fitting, stations
-from sim.placement.placing import Standing, grow, overlap, standing_corners
+from sim.placement.placing import Standing, grow_rectangle, rectangles_overlap, standing_corners
 from sim.placement.stations import draw_areas
 from sim.rock.centreline import Centreline, build_centreline
 from sim.scene import World, build_world
@@ -157,12 +157,12 @@ def test_a_prop_keeps_clear_of_a_pipe(make_scenario: MakeScenario, make_prop: Ma
 
 def test_rectangles_grow_and_overlap_by_hand() -> None:
     square = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-    np.testing.assert_allclose(grow(square, 0.5), 1.5 * square)
+    np.testing.assert_allclose(grow_rectangle(square, 0.5), 1.5 * square)
     turned = square @ np.array([[0.6, 0.8], [-0.8, 0.6]])
-    np.testing.assert_allclose(np.linalg.norm(grow(turned, 0.5), axis=1), 1.5 * np.sqrt(2))
-    assert overlap(square, square + np.array([1.9, 0.0]))
-    assert not overlap(square, square + np.array([2.1, 0.0]))
-    assert not overlap(square, grow(square, 0.5) + np.array([2.6, 0.0]))
+    np.testing.assert_allclose(np.linalg.norm(grow_rectangle(turned, 0.5), axis=1), 1.5 * np.sqrt(2))
+    assert rectangles_overlap(square, square + np.array([1.9, 0.0]))
+    assert not rectangles_overlap(square, square + np.array([2.1, 0.0]))
+    assert not rectangles_overlap(square, grow_rectangle(square, 0.5) + np.array([2.6, 0.0]))
 
 
 def area_scenario(make_scenario: MakeScenario, tunnel: Tunnel, count: int, **plans: SessionPlan) -> Scenario:

@@ -12,7 +12,7 @@ from scenarios.schema import Drift, Floor, Place, Prop, Roughness, Scenario, Sec
 from sim.geometry.mesh import Mesh, box_mesh
 from sim.geometry.raycast import Caster
 from sim.placement.contact import interpenetration_m, surface_points
-from sim.placement.placing import Standing, overlap, seen_from_above
+from sim.placement.placing import Standing, bounding_rectangle, rectangles_overlap
 from sim.scene import World, build_world
 
 MakeScenario = Callable[..., Scenario]
@@ -201,9 +201,10 @@ def test_props_that_tilt_into_one_another_at_rest_are_refused(
         pair = [make_prop(f"box{n}", size_m=size_m, place=Place(at=(8.0 + 0.51 * n, 0.3, 0.5))) for n in range(2)]
         try:
             a, b = (
-                seen_from_above(item) for item in build_world(make_scenario(tunnel=tunnel, props=pair), seed).standing
+                bounding_rectangle(item)
+                for item in build_world(make_scenario(tunnel=tunnel, props=pair), seed).standing
             )
-            assert not overlap(a, b)
+            assert not rectangles_overlap(a, b)
         except ScenarioError as error:
             assert "is in the way: set them farther apart" in str(error)
             refused += 1

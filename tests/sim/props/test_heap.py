@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from scenarios.schema import Prop
-from sim.geometry.mesh import Mesh, joined
+from sim.geometry.mesh import Mesh, join_meshes
 from sim.geometry.raycast import Caster
 from sim.geometry.topology import edges_of
 from sim.props.bed import bed_mesh
 from sim.props.heap import Heap, build_heap, column_volume_m3, flank_angle_deg, load_away, whole_mesh
-from sim.props.parts import block, surface, turned
+from sim.props.parts import block, revolve, surface
 from sim.props.props import shape_of
 from sim.props.shapes import BELOW_FLOOR_M, Shape, Size, signed_volume_m3, solid_mesh, visible_part
 
@@ -39,7 +39,7 @@ def cone(angle_deg: float) -> tuple[Mesh, Size]:
     rise = 2.0 * float(np.tan(np.deg2rad(angle_deg)))
     below = 1.0 + 0.3 / rise * 1.0
     profile = [(0.0, -0.6), (below, -0.6), (below, -0.3), (0.0, rise)]
-    return turned(profile, 4.0, 4.0, segments=240), (4.0, 4.0, rise)
+    return revolve(profile, 4.0, 4.0, segments=240), (4.0, 4.0, rise)
 
 
 def test_the_flank_of_a_cone() -> None:
@@ -124,7 +124,7 @@ def test_fragments_have_the_sizes_of_the_law_and_cover_the_pile(case: Case) -> N
     largest_m = min(1.6 * case[2], case[0][2] / 3)
     assert np.quantile(sizes, 0.99) < 2.0 * largest_m
     seen = np.random.default_rng(0).uniform(-0.35, 0.35, (4000, 2)) * case[0][:2]
-    owner = Caster([bed_mesh(heap.bed), joined(list(heap.rubble.fragments))])
+    owner = Caster([bed_mesh(heap.bed), join_meshes(list(heap.rubble.fragments))])
     _, part, _ = owner.cast(np.column_stack([seen, np.full(4000, 9.0)]), np.tile([0.0, 0.0, -1.0], (4000, 1)))
     assert 0.4 < (part == 1).mean() < 0.9
 

@@ -11,11 +11,11 @@ import pytest
 import trimesh
 
 from scenarios.schema import MeshFile, Prop, PropKind
-from sim.geometry.mesh import box_mesh, joined, moved
+from sim.geometry.mesh import box_mesh, join_meshes, move_mesh
 from sim.geometry.raycast import Caster
 from sim.geometry.topology import edges_of
 from sim.materials import REFLECTIVITY
-from sim.props.parts import beam, block, surface, turned
+from sim.props.parts import beam, block, revolve, surface
 from sim.props.props import shape_of
 from sim.props.shapes import Shape, hull_volume_m3, signed_volume_m3, solid_mesh, visible_part
 
@@ -48,7 +48,7 @@ MATERIALS = {
 
 
 def visible_extent(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
-    corners = visible_part(joined([solid_mesh(solid) for solid in shape.solids])).reshape(-1, 3)
+    corners = visible_part(join_meshes([solid_mesh(solid) for solid in shape.solids])).reshape(-1, 3)
     return corners.min(axis=0), corners.max(axis=0)
 
 
@@ -178,7 +178,7 @@ def test_a_hull_counts_only_what_is_above_the_floor_and_before_the_plane() -> No
 
 
 def test_cutting_keeps_the_area_of_what_is_left() -> None:
-    tilted = moved(box_mesh((0.5, 0.5, 0.5)), beam((0, 0, 0), (1, 2, 3), 1, 1, "steel").object_T_solid)
+    tilted = move_mesh(box_mesh((0.5, 0.5, 0.5)), beam((0, 0, 0), (1, 2, 3), 1, 1, "steel").object_T_solid)
     cut = visible_part(tilted, back_y_m=0.3)
     area = 0.5 * np.linalg.norm(np.cross(cut[:, 1] - cut[:, 0], cut[:, 2] - cut[:, 0]), axis=1).sum()
     solid = trimesh.Trimesh(tilted.vertices, tilted.faces).subdivide_loop(0)
@@ -190,7 +190,7 @@ def test_cutting_keeps_the_area_of_what_is_left() -> None:
 
 
 def test_a_turned_cone_has_the_volume_of_its_polygon() -> None:
-    mesh = turned([(0.0, 0.0), (1.0, 0.0), (0.0, 1.5)], 2.0, 2.0, segments=40)
+    mesh = revolve([(0.0, 0.0), (1.0, 0.0), (0.0, 1.5)], 2.0, 2.0, segments=40)
     assert edges_of(mesh).is_closed
     # A pyramid over a regular polygon: area n/2 sin(2 pi/n), a third of the height.
     assert signed_volume_m3(mesh) == pytest.approx(20 * np.sin(2 * np.pi / 40) * 1.5 / 3)

@@ -9,7 +9,16 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.geometry import Float64Array
 from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
-from sim.sensor.footprint import DIVERGENCE_RAD, PULSE_M, WAIST_M, Echo, blended, central_echo, footprint, spread_echo
+from sim.sensor.footprint import (
+    DIVERGENCE_RAD,
+    PULSE_M,
+    WAIST_M,
+    Echo,
+    blend_echoes,
+    central_echo,
+    spread_echo,
+    sub_ray_pattern,
+)
 from sim.sensor.optics import received_photons
 from sim.sensor.rays import Rays
 
@@ -54,7 +63,7 @@ def sideways_m() -> Float64Array:
 
 
 def test_seven_rays_have_the_gaussians_moments_to_degree_five() -> None:
-    places, weights = footprint(7)
+    places, weights = sub_ray_pattern(7)
     x, y = places.T
     variance = 1.0 / (2.0 * np.log(2.0))  # of a Gaussian with half its brightness at radius 1
     moments = {(0, 0): 1.0, (2, 0): variance, (0, 2): variance, (4, 0): 3 * variance**2, (2, 2): variance**2}
@@ -68,7 +77,7 @@ def test_seven_rays_have_the_gaussians_moments_to_degree_five() -> None:
 
 
 def test_nineteen_rays_are_a_hexagonal_lattice_with_the_gaussians_brightness() -> None:
-    places, weights = footprint(19)
+    places, weights = sub_ray_pattern(19)
     assert places.shape == (19, 2)
     apart = np.linalg.norm(places[:, None] - places[None], axis=2)[np.triu_indices(19, 1)]
     assert apart.min() == pytest.approx(1.0)
@@ -92,7 +101,7 @@ def test_a_wall_met_squarely_is_seen_as_by_one_ray(sub_rays: Literal[7, 19]) -> 
 
 def expected_at_step(depth_m: float, sub_rays: int) -> tuple[Float64Array, Float64Array]:
     """Light from the near and from the far surface at each ray of the fan, by geometry in float64."""
-    places, weights = footprint(sub_rays)
+    places, weights = sub_ray_pattern(sub_rays)
     # The fan's rays are level, so the first of the two directions across is along -y.
     aside_m = sideways_m()[:, None] - places[:, 0] * half_width_m(10.0)
     near = (weights * (aside_m < 0)).sum(axis=1)
@@ -104,7 +113,7 @@ def expected_at_step(depth_m: float, sub_rays: int) -> tuple[Float64Array, Float
 def test_at_a_step_of_a_decimetre_pixels_blend_as_the_light_divides(sub_rays: Literal[7, 19]) -> None:
     echo = many_rays(sub_rays, *step(0.1))
     range_m = (echo.range_m[:, 0] - 0.015) * np.cos(np.arctan(sideways_m() / 10.0))
-    outermost = 2.0 if sub_rays == 19 else footprint(7)[0][:, 0].max()
+    outermost = 2.0 if sub_rays == 19 else sub_ray_pattern(7)[0][:, 0].max()
     is_edge = np.abs(sideways_m()) < outermost * half_width_m(10.0) - 1e-4
     is_mixed = (range_m > 10.0005) & (range_m < 10.0995)
     np.testing.assert_array_equal(is_mixed[is_edge], True)
@@ -114,7 +123,7 @@ def test_at_a_step_of_a_decimetre_pixels_blend_as_the_light_divides(sub_rays: Li
     near, far = expected_at_step(0.1, sub_rays)
     # A sub-ray within rounding of the edge may fall to either side.
     off = np.abs(range_m - (10.0 * near + 10.1 * far) / (near + far))
-    assert np.sort(off)[: -len(footprint(sub_rays)[0])].max() < 1.5e-3
+    assert np.sort(off)[: -len(sub_ray_pattern(sub_rays)[0])].max() < 1.5e-3
 
 
 def test_at_a_step_of_five_metres_the_stronger_surface_wins() -> None:
@@ -206,7 +215,7 @@ def test_blending_equals_its_slow_twin() -> None:
     ranges_m[rng.random(ranges_m.shape) < 0.1] = np.inf
     ranges_m[:, -3:] = np.inf
     photons = np.where(np.isinf(ranges_m), 0.0, rng.random(ranges_m.shape) + 0.01).astype(np.float32)
-    range_m, light, strongest = blended(ranges_m, photons)
+    range_m, light, strongest = blend_echoes(ranges_m, photons)
     expected = np.array([brute_force(ranges_m[:, i], photons[:, i]) for i in range(n_pixels)])
     np.testing.assert_allclose(range_m, expected[:, 0], rtol=2e-6)
     np.testing.assert_allclose(light, expected[:, 1], rtol=2e-6)
@@ -215,6 +224,6 @@ def test_blending_equals_its_slow_twin() -> None:
     several = np.isfinite(ranges_m).any(axis=0)
     assert (np.abs(chosen - range_m)[several] < 4.0).all()
     order = rng.permutation(n_rays)
-    again = blended(ranges_m[order], photons[order])
+    again = blend_echoes(ranges_m[order], photons[order])
     np.testing.assert_allclose(again[0], range_m, rtol=2e-6)
     np.testing.assert_array_equal(order[again[2]][several], strongest[several])

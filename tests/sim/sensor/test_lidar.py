@@ -14,7 +14,7 @@ from cdpipe.io.session import read_session
 from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.schema import Prop, Scenario, Sensor
 from sim.drive.trajectory import plan_trajectory
-from sim.geometry.mesh import Mesh, box_mesh, moved
+from sim.geometry.mesh import Mesh, box_mesh, move_mesh
 from sim.geometry.raycast import Caster
 from sim.scene import Scene, build_world
 from sim.sensor import lidar, optics
@@ -283,7 +283,7 @@ def test_a_pixel_is_mixed_when_its_echo_lies_off_what_it_is_said_to_hit(
     walls = Mesh(behind.vertices, behind.faces[:, ::-1])
     for depth_m, is_any in ((0.08, False), (0.7, True)):
         # A post's face in front of the wall at +x.
-        post = moved(box_mesh((0.05, 1.0, 1.5)), make_pose(translation=(5.95 - depth_m, 0.0, 0.0)))
+        post = move_mesh(box_mesh((0.05, 1.0, 1.5)), make_pose(translation=(5.95 - depth_m, 0.0, 0.0)))
         shares: Float32Array = np.full(2, 0.5, np.float32)
         meshes = (walls, post)
         scene = Scene(meshes, Caster(meshes), np.array([0, 1], np.int32), shares, ("wall", "post"), ("rock", "wood"))

@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, make_pose, transform
 from cdpipe.sensor.ouster import SensorMetadata
-from sim.sensor.rays import direction_parts, revolution_rays, turned
+from sim.sensor.rays import direction_parts, revolution_rays, rotate_directions
 
 
 def tumbling(width: int) -> Float64Array:
@@ -51,6 +51,6 @@ def test_turned_by_columns_of_the_matrices(sensor: SensorMetadata) -> None:
     rotations = Rotation.random(6, random_state=1).as_matrix()
     vectors = generator.normal(size=(6, 4, 3))
     parts = np.ascontiguousarray(vectors.transpose(2, 0, 1), dtype=np.float32)
-    np.testing.assert_allclose(turned(rotations, parts), vectors @ rotations.transpose(0, 2, 1), atol=2e-6)
+    np.testing.assert_allclose(rotate_directions(rotations, parts), vectors @ rotations.transpose(0, 2, 1), atol=2e-6)
     assert direction_parts(sensor).shape == (3, sensor.width, sensor.height)
     assert direction_parts(sensor) is direction_parts(sensor)

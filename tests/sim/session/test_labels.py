@@ -9,18 +9,18 @@ import pytest
 from cdpipe.core.geometry import make_pose
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Drift, Place, Platform, Prop, Scenario, Section, Sensor, SessionPlan, Shift, Tunnel
-from sim.geometry.mesh import Mesh, box_mesh, moved, point_triangle_distance
+from sim.geometry.mesh import Mesh, box_mesh, move_mesh, point_triangle_distance
 from sim.geometry.raycast import Caster
 from sim.scene import World, build_world
 from sim.sensor.lidar import scan
 from sim.sensor.rays import Rays, revolution_rays
-from sim.session.labels import Ghost, belonging, cell_keys, claim_returns, list_changes
+from sim.session.labels import Ghost, cell_keys, claim_returns, list_changes, mark_belonging
 from sim.session.simulate import simulate_pair
 from sim.session.truth import Change, read_pair_truth
 
 
 def box_at(x: float, y: float, z: float, half_m: float = 0.5) -> Mesh:
-    return moved(box_mesh((half_m,) * 3), make_pose(translation=(x, y, z)))
+    return move_mesh(box_mesh((half_m,) * 3), make_pose(translation=(x, y, z)))
 
 
 def fan(count: int) -> Rays:
@@ -141,12 +141,12 @@ def test_of_a_short_move_only_what_is_off_the_old_surface_counts(
         ]
     )
     points = local @ end[:3, :3].T + end[:3, 3]
-    belongs = belonging(added, points)
+    belongs = mark_belonging(added, points)
     np.testing.assert_array_equal(belongs, [True, False, True, False, False, True])
     claim_returns(added, points[belongs])
     assert (added.n_returns, len(added.cells)) == (3, 3)
     assert np.linalg.norm(end[:3, 3] - start[:3, 3]) < 0.8
-    assert belonging(removed, np.empty((0, 3))).shape == (0,)
+    assert mark_belonging(removed, np.empty((0, 3))).shape == (0,)
     claim_returns(removed, np.empty((0, 3)))
     assert (removed.n_returns, removed.cells) == (0, set())
 
@@ -274,7 +274,7 @@ def test_returns_on_what_is_left_of_a_pile_are_no_change(
     is_pile = ((world.before.instance[result.geom] == 1) & (result.geom >= 0)).T
     column, row = np.nonzero(is_pile)
     points = rays.points(row, column, (result.true_range_m - sensor.beam_origin_m)[row, column])
-    belongs = belonging(tally, points)
+    belongs = mark_belonging(tally, points)
     # By brute force: every return against every triangle of the after session near it.
     triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in world.after.meshes])
     triangles = triangles[np.linalg.norm(triangles.mean(axis=1) - points.mean(axis=0), axis=1) < 4.0]

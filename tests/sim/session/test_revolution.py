@@ -12,8 +12,8 @@ from cdpipe.io.session import read_session
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Odometry, Prop, Scenario, Sensor, SessionPlan, Shift
 from sim.drive.trajectory import record
-from sim.geometry.mesh import Mesh, joined, point_triangle_distance
-from sim.session.labels import belonging
+from sim.geometry.mesh import Mesh, join_meshes, point_triangle_distance
+from sim.session.labels import mark_belonging
 from sim.session.revolution import Drive, cast_revolution, label_changes, simulate_revolution, true_reach_m
 from sim.session.simulate import plan_drives, simulate_pair
 from sim.session.truth import read_labels, read_pair_truth
@@ -48,7 +48,7 @@ def with_sensor(drive: Drive, settings: Sensor) -> Drive:
 
 def surface_of(drive: Drive, instance: int) -> Mesh:
     owners = zip(drive.scene.meshes, drive.scene.instance, strict=True)
-    return joined([mesh for mesh, owner in owners if owner == instance])
+    return join_meshes([mesh for mesh, owner in owners if owner == instance])
 
 
 def off_surface_m(points: Float64Array, mesh: Mesh) -> Float64Array:
@@ -106,10 +106,10 @@ def test_labelled_returns_of_a_partial_change_lie_off_what_the_other_session_hol
             row, column = row[some], column[some]
             points = rays.points(row, column, reach_m[row, column])
             # What stands there in the other session is the same prop, the floor under it or the wall behind it.
-            everything = joined([near_to(mesh, points) for mesh in other.scene.meshes])
+            everything = join_meshes([near_to(mesh, points) for mesh in other.scene.meshes])
             is_off = off_surface_m(points, everything) > 0.1
             np.testing.assert_array_equal(labels[row, column] == change.id, is_off)
-            np.testing.assert_array_equal(belonging(tally, points), is_off)
+            np.testing.assert_array_equal(mark_belonging(tally, points), is_off)
 
 
 def near_to(mesh: Mesh, points: Float64Array) -> Mesh:

@@ -9,7 +9,7 @@ import pytest
 from sim.geometry.raycast import Caster, model_meshes
 from sim.props.shapes import solid_mesh
 from sim.scene import compile_model
-from sim.studies.bench import BenchSite, crowd, mujoco_hits, sensor_contests, session_written, spread_drive
+from sim.studies.bench import BenchSite, crowd, mujoco_hits, sensor_contests, spread_drive, time_session
 from sim.studies.timing import Contest
 
 
@@ -76,7 +76,7 @@ def test_a_session_is_held_against_the_time_it_took_to_record(site: BenchSite) -
     assert drive.scenario.sensor.sub_rays == 19
     assert 2 <= drive.trajectory.n_scans < site.drive.trajectory.n_scans / 5
     assert drive.trajectory.true is site.drive.trajectory.true  # the same way
-    contest = session_written(site, drive, 1.0)
+    contest = time_session(site, drive, 1.0)
     n_scans = drive.trajectory.n_scans
     assert (contest.unit, contest.work, contest.target) == ("revolutions/s", n_scans, 1.0)
     assert contest.rival_seconds == (pytest.approx(n_scans * 0.1),)
@@ -85,6 +85,6 @@ def test_a_session_is_held_against_the_time_it_took_to_record(site: BenchSite) -
 
 def test_measuring_leaves_nothing_behind(site: BenchSite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    contest = session_written(site, spread_drive(site), 1.0)
+    contest = time_session(site, spread_drive(site), 1.0)
     assert isinstance(contest, Contest)
     assert list(tmp_path.iterdir()) == []
