@@ -1,8 +1,8 @@
 """The world as MuJoCo compiles it: props dropped once and frozen, then the surfaces of each session's static scene.
 
-A kilometre of drift under wire mesh has five million triangles, and MuJoCo needs 0.65 kB for each of them while it
-compiles and 0.2 kB afterwards. So what is fixed is compiled once for both sessions, mesh by mesh, and of every model
-only the surfaces are kept, in the order of the geoms of the one model that all of them would make.
+One kilometre of drift under wire mesh has five million triangles. MuJoCo needs 0.65 kB per triangle while it compiles
+and 0.2 kB afterwards. The fixed meshes are therefore compiled one by one, once for both sessions, and only the compiled
+surfaces are kept. Their order is the order of the geoms in a single model of the whole scene.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ _STONE_FREE_M = 0.1  # round the footprint of every prop
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What stands in the tunnel in one session. Geom 0 is the wall, then come the fixtures, then the props.
+    """The surfaces of one session. Geom 0 is the wall; the fixtures follow, then the props.
 
     Attributes:
-        meshes: Surface of every geom as MuJoCo has it, world frame, by geom id; both sessions share what is fixed.
-        caster: Embree over the same geoms under the same ids.
-        instance: (G,) prop number (1-based, order of the scenario) of each geom, 0 for the wall and what is fixed.
-        reflectivity: (G,) share of light sent back.
-        parts: Whose each geom is: "wall", a fixture's name, or a prop's name.
-        materials: What each geom is made of, keys of `sim.materials.REFLECTIVITY`.
+        meshes: Compiled surface of every geom, world frame, by geom id; both sessions share the fixed ones.
+        caster: Ray caster over the same geoms with the same ids.
+        instance: (G,) prop number (1-based, order of the scenario) of each geom, 0 for the wall and the fixtures.
+        reflectivity: (G,) share of the light that each geom reflects.
+        parts: The owner of each geom: "wall", a fixture's name, or a prop's name.
+        materials: Material of each geom, keys of `sim.materials.REFLECTIVITY`.
     """
 
     meshes: tuple[Mesh, ...]
@@ -59,7 +59,7 @@ class World:
     Attributes:
         centreline: Where the drifts run.
         walls: Ray caster of the bare tunnel.
-        fixed: Ray caster of the tunnel and everything fixed to it, stones included: what a robot must respect.
+        fixed: Ray caster of the tunnel and everything fixed to it, stones included: the obstacles of a robot.
         fixtures: Furniture and stones.
         standing: Every prop at each of its places, settled.
         before, after: The two scenes.
@@ -85,7 +85,7 @@ def build_world(scenario: Scenario, seed: int) -> World:
     wall = mesh_tunnel(tunnel, centreline, seed) if tunnel.mesh is None else tunnel_mesh(tunnel.mesh)
     walls = Caster([wall])
     furniture = furnish(tunnel, centreline, walls, seed)
-    # Compiling takes the most memory: it comes before the other casters are there.
+    # Compiling takes the most memory, so it is done before the other ray casters exist.
     rock = [compile_mesh(mesh) for mesh in (wall, *(fixture.mesh for fixture in furniture))]
     hung = Caster([wall, *(fixture.mesh for fixture in furniture)]) if furniture else walls
     gap_m = WALL_GAP_M + (tunnel.resolution_m if tunnel.mesh is None else 0.0)
@@ -105,16 +105,16 @@ def build_world(scenario: Scenario, seed: int) -> World:
 def compile_scene(
     scenario: Scenario, rock: Sequence[Mesh], fixtures: Sequence[Fixture], standing: Sequence[Standing], session: str
 ) -> Scene:
-    """Return the scene of one session: the wall, what is fixed to it, then every prop that stands in it.
+    """Return the scene of one session: the wall, the fixtures, then every prop that stands in this session.
 
     Args:
         scenario: Numbers the props and says how bright the rock is.
-        rock: The wall and the fixtures as MuJoCo compiled them, see `compile_mesh`.
-        fixtures: What is fixed, in the order of `rock[1:]`.
+        rock: The wall and the fixtures after compilation, see `compile_mesh`.
+        fixtures: The fixtures, in the order of `rock[1:]`.
         standing: Props at their places, of both sessions.
         session: "before" or "after".
     """
-    shares = REFLECTIVITY | {"rock": scenario.tunnel.reflectivity}  # what lies loose was blasted from the walls
+    shares = REFLECTIVITY | {"rock": scenario.tunnel.reflectivity}  # loose stones were blasted from the walls
     numbers = {prop.name: number for number, prop in enumerate(scenario.props, start=1)}
     parts, materials = [WALL, *(each.name for each in fixtures)], ["rock", *(each.material for each in fixtures)]
     instance, reflectivity = [0] * len(rock), [shares[material] for material in materials]
@@ -137,14 +137,14 @@ def compile_scene(
 
 
 def compile_mesh(mesh: Mesh) -> Mesh:
-    """Return a fixed mesh as MuJoCo has it, world frame: its vertices are float32 about the mesh's own middle."""
+    """Return a fixed mesh after MuJoCo compiled it, world frame: float32 vertices relative to the mesh's centre."""
     return model_meshes(*compile_model([mesh], []))[0]
 
 
 def compile_model(fixed: Iterable[Mesh], standing: Iterable[Standing]) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Compile a static model, and bring its data forward: one geom for each fixed mesh, then those of every prop.
+    """Compile a static model and compute its poses: one geom for each fixed mesh, then the geoms of every prop.
 
-    A geom comes out the same, to the bit, whatever else is in the model.
+    A compiled geom does not depend, to the bit, on the other geoms of the model.
     """
     spec = mujoco.MjSpec()
     for number, mesh in enumerate(fixed):

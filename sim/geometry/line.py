@@ -1,4 +1,4 @@
-"""What can be done to a line sampled every 0.05 m: smoothing it, and keeping a bound through the smoothing."""
+"""Smoothing of a line sampled every 0.05 m, and bounds that still hold after the smoothing."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def smooth_line(values: Float64Array, half_m: float) -> Float64Array:
 
 
 def tighten_bound(bound: Float64Array, half_m: float, of: Callable[..., Any]) -> Float64Array:
-    """Take the strictest bound within `half_m` of each sample: a Hann average over that window then keeps the bound."""
+    """Return the strictest bound within `half_m` of each sample: a Hann average over that window keeps the bound."""
     half = round(half_m / STEP_M)
     padded = np.pad(bound, half, mode="edge")
     return np.asarray(of(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1), axis=1))
 
 
 def smooth_between(wanted: Float64Array, low: Float64Array, high: Float64Array, half_m: float) -> Float64Array:
-    """Return smooth values (N,) near the wanted ones; they keep the bounds wherever these agree within `half_m`."""
+    """Return smooth values (N,) near the wanted ones, inside the bounds where these do not cross within `half_m`."""
     inner_low, inner_high = tighten_bound(low, half_m, np.max), tighten_bound(high, half_m, np.min)
     middle = (inner_low + inner_high) / 2
     is_crossed = inner_low > inner_high

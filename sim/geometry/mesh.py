@@ -60,17 +60,17 @@ def cylinder_mesh(radius_m: float, half_height_m: float, segments: int) -> Mesh:
 def crop_near(mesh: Mesh, target: Mesh, within_m: float) -> Mesh:
     """Return the triangles of a mesh whose bounding box comes within `within_m` of the bounding box of another."""
     low, high = target.vertices.min(axis=0) - within_m, target.vertices.max(axis=0) + within_m
-    # By corner, not by triangle: a screen has millions of them.
+    # Compares corners and not triangles: a screen has millions of triangles.
     is_below, is_above = mesh.vertices < low, mesh.vertices > high
     is_beside = is_below[mesh.faces].all(axis=1) | is_above[mesh.faces].all(axis=1)
     return Mesh(mesh.vertices, mesh.faces[~is_beside.any(axis=1)])
 
 
 class NearSurface:
-    """Tells which points lie near a surface; made once, asked for every revolution, by any thread."""
+    """An index that marks the points near a surface; built once and shared by all threads."""
 
     def __init__(self, mesh: Mesh, within_m: float) -> None:
-        # Small pieces have small bounding spheres, so that few candidates stand for each point.
+        # Small pieces have small bounding spheres, so that each point has few candidates.
         self._triangles = split_triangles(mesh.vertices[mesh.faces], within_m)
         self._within_m = within_m
         centres = self._triangles.mean(axis=1)

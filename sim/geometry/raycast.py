@@ -18,8 +18,8 @@ _CYLINDER_SEGMENTS = 64
 class Caster:
     """An Embree scene of one or more meshes, numbered in the order given.
 
-    Embree works in float32; coordinates are taken from the middle of the scene, so that a mine of 400 m keeps steps
-    of 0.02 mm.
+    Embree works in float32. Coordinates are relative to the centre of the scene, so that a mine of 400 m is resolved
+    to 0.02 mm.
     """
 
     def __init__(self, meshes: Iterable[Mesh]) -> None:
@@ -31,7 +31,7 @@ class Caster:
             TriangleMesh(self._scene, (mesh.vertices - self._centre_m).astype(np.float32), mesh.faces)
             for mesh in meshes
         ]
-        # The scene is built on its first use, which must not happen in two threads at once.
+        # Embree builds the scene at its first use, which must not happen in two threads at once.
         self.cast(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))
 
     def cast(
@@ -52,7 +52,7 @@ class Caster:
     def cast_columns(
         self, origins: Float64Array, directions: Float32Array
     ) -> tuple[Float32Array, Int32Array, Float32Array]:
-        """Return what `cast` does for a revolution, each (W, H); the fast way.
+        """Cast a whole revolution; the results of `cast`, each (W, H).
 
         Args:
             origins: (W, 3) float64 point where all beams of a column start, world frame, metres.
@@ -79,7 +79,7 @@ class Caster:
         return np.ascontiguousarray(origins - self._centre_m, dtype=np.float32)
 
     def _first(self, origins: Float32Array, directions: Float32Array) -> tuple[Float32Array, Int32Array, Float32Array]:
-        """First hits of rays (N, 3) that start at local points; few passes over memory, for every pixel comes here."""
+        """First hits of rays (N, 3) that start at local points; written with few passes over memory for speed."""
         answer = self._scene.run(origins, directions, output=1)
         ranges_m, ids, normals = answer["tfar"], answer["geomID"], answer["Ng"]
         products = normals * directions
@@ -118,7 +118,7 @@ def _geom_mesh(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Mesh:
         mesh_id = model.geom_dataid[geom]
         vertices = slice(model.mesh_vertadr[mesh_id], model.mesh_vertadr[mesh_id] + model.mesh_vertnum[mesh_id])
         faces = slice(model.mesh_faceadr[mesh_id], model.mesh_faceadr[mesh_id] + model.mesh_facenum[mesh_id])
-        # A copy: a view of its faces would keep the whole model.
+        # A copy, because a view of its faces would keep the whole model in memory.
         local = Mesh(model.mesh_vert[vertices].astype(np.float64), model.mesh_face[faces].copy())
     elif kind == mujoco.mjtGeom.mjGEOM_BOX:
         local = box_mesh(size)
@@ -133,7 +133,7 @@ def _geom_mesh(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Mesh:
 
 
 def measure_room(caster: Caster, points: Float64Array, directions: Float64Array) -> tuple[Float64Array, BoolArray]:
-    """Return how near the surfaces round some points come, and which points lie in rock or outside everything.
+    """Return the distance from points to the nearest surface, and which points lie in rock or outside everything.
 
     Args:
         caster: Surfaces that face the void.
@@ -141,8 +141,8 @@ def measure_room(caster: Caster, points: Float64Array, directions: Float64Array)
         directions: (M, 3) unit vectors to look along from every point.
 
     Returns:
-        (N,) smallest distance along the directions, metres; (N,) whether most of what is seen is seen from behind, or
-        nothing at all is seen. Thin fixtures and foreign meshes show their backs here and there, so most must.
+        (N,) smallest distance along the directions, metres; (N,) True if most hits are on the back of a surface, or if
+        there is no hit. A majority is needed because thin fixtures and foreign meshes show some back faces.
     """
     rays = np.tile(directions, (len(points), 1))
     ranges_m, _, normals = caster.hits(np.repeat(points, len(directions), axis=0), rays)

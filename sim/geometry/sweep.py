@@ -1,4 +1,4 @@
-"""Long thin things as meshes: profiles swept along lines, and straight bars."""
+"""Meshes of long thin objects: profiles swept along lines, and straight bars."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ EMPTY = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
 def circle(radius_m: float, sides: int) -> Float64Array:
     """Return a regular polygon (sides, 2) whose area is that of the circle, counter-clockwise."""
     angles = 2 * np.pi * (np.arange(sides) + 0.5) / sides
-    # A polygon with its corners on the circle would be thinner than the pipe it stands for.
+    # A polygon with its corners on the circle would be thinner than the pipe.
     corner_m = radius_m * np.sqrt(2 * np.pi / sides / np.sin(2 * np.pi / sides))
     return np.asarray(corner_m * np.stack([np.cos(angles), np.sin(angles)], axis=1))
 

@@ -1,4 +1,4 @@
-"""The truth about changes: which returns belong to one, and whether the other session could have noticed it."""
+"""The truth about changes: which returns belong to each change, and whether the other session could observe it."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ MIN_CELLS = 10
 MIN_GHOST_RAYS = 10
 GHOST_REACH_M = 50.0
 UNMOVED_M = 1e-3
-_SAME_SURFACE_M = 0.02  # of the two surfaces of a reshaped prop: what is nearer to the other one has not changed
+_SAME_SURFACE_M = 0.02  # parts of a reshaped prop's surface nearer than this to its other surface have not changed
 _SAMPLE_M = 0.03
-_SLACK_M = 0.01  # by which the ball round a ghost is grown, so that rounding loses no ray
+_SLACK_M = 0.01  # added to the radius of the ball around a ghost, so that rounding loses no ray
 
 
 class Ghost:
-    """An object alone, at the pose it has in one session, against which the other session's rays are cast."""
+    """An object at its pose in one session, without its surroundings; the other session's rays are cast against it."""
 
     def __init__(self, surface: Mesh) -> None:
         low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
@@ -51,11 +51,11 @@ class Ghost:
         if not len(column):
             return 0
         ghost_m, _, _ = self._caster.cast(rays.origins[column], rays.directions[column, row])
-        # A millimetre: a ray that ends on the very same surface counts.
+        # One millimetre of tolerance: a ray that ends on the same surface counts.
         return int((ghost_m <= ranges_m[column, row] + 1e-3).sum())
 
     def _near(self, rays: Rays, ranges_m: Float32Array) -> tuple[Int64Array, Int64Array]:
-        """Columns and rows of the rays that can meet the ball round the object, and of some others.
+        """Columns and rows of all rays that can meet the ball around the object, and of a few others.
 
         A ray that starts within `spread` of the middle column's origin and meets the ball has the direction of a ray
         that starts at that origin and meets the ball grown by `spread`.
@@ -68,7 +68,7 @@ class Ghost:
         width, height, _ = rays.directions.shape
         near = np.arange(width * height)
         if distance_m > radius_m:
-            # How the product is summed is of no matter: the slack covers it, and what is too much is cast in vain.
+            # The rounding of this product does not matter: the slack covers it, and extra rays only cost time.
             along = rays.directions.reshape(-1, 3) @ (towards / distance_m).astype(np.float32)
             near = np.flatnonzero(along > np.sqrt(1.0 - (radius_m / distance_m) ** 2) - 1e-6)
         column, row = np.divmod(near, height)
@@ -78,13 +78,13 @@ class Ghost:
 
 @dataclass(slots=True, eq=False)
 class Tally:
-    """One change while the sessions are being simulated.
+    """The running counts of one change while the sessions are simulated.
 
     Attributes:
         change: The change, its counts still zero.
-        ghost: The object alone, for the rays of the other session.
-        other_surface: For a partial change, what stands near it in the other session; else None.
-        n_returns: Returns that belong to it so far.
+        ghost: The object, to be met by the rays of the other session.
+        other_surface: For a partial change, the surfaces near it in the other session; else None.
+        n_returns: Returns that belong to the change so far.
         cells: Keys of the cells they fill, in the odom frame of its session.
         n_ghost_rays: Rays of the other session that meet its ghost so far.
         n_returns_other: Returns of the other session on the same prop so far.
@@ -120,11 +120,11 @@ class Tally:
 
 
 def list_changes(scenario: Scenario, world: World) -> list[Tally]:
-    """Return every change of a pair, in the order of the props, as found by comparing what stands in the two scenes.
+    """Compare the props of both scenes and return every change of the pair, in the order of the props.
 
-    A prop that stands in one session only was added or removed. One of the same shape, any corner of which differs by
-    more than a millimetre, was moved: a removal and an addition, linked. One whose surface differs was reshaped: what
-    changed is the part that is gone.
+    A prop that stands in one session only was added or removed. A prop of the same shape was moved if any of its
+    corners differs by more than one millimetre; a move is a removal and an addition, linked. A prop whose surface
+    differs was reshaped; its change is the removed part.
     """
     tallies: list[Tally] = []
     for instance, prop in enumerate(scenario.props, start=1):
@@ -147,14 +147,14 @@ def list_changes(scenario: Scenario, world: World) -> list[Tally]:
 
 
 def mark_belonging(tally: Tally, points_world: Float64Array) -> BoolArray:
-    """Tell which returns on a changed prop, by their true places (N, 3), belong to its change."""
+    """Mark the returns on a changed prop, given by their true positions (N, 3), that belong to its change."""
     if tally.other_surface is None:
         return np.ones(len(points_world), dtype=bool)
     return ~tally.other_surface.marks(points_world)
 
 
 def claim_returns(tally: Tally, points_odom: Float64Array) -> None:
-    """Add returns (N, 3) that belong to a change, as the session measured them in its odom frame, to its tally."""
+    """Add returns (N, 3) that belong to a change, as measured in the session's odom frame, to its tally."""
     tally.n_returns += len(points_odom)
     tally.cells.update(cell_keys(points_odom).tolist())
 
@@ -166,7 +166,7 @@ def cell_keys(points: Float64Array) -> Int64Array:
 
 
 def count_other(tally: Tally, points_odom: Float64Array) -> None:
-    """Add returns (N, 3) of the other session on the same prop, as that session measured them, to its tally."""
+    """Add returns (N, 3) of the other session on the same prop, as measured in that session, to the tally."""
     tally.n_returns_other += len(points_odom)
     tally.cells_other.update(cell_keys(points_odom).tolist())
 
@@ -218,10 +218,10 @@ def _tally(
 
 
 def _tally_reshaped(change_id: int, instance: int, item: Standing, world: World) -> Tally:
-    """Change of a pile partly loaded away.
+    """Return the change of a pile that was partly loaded away.
 
-    Its ghost is the part of the old surface that is gone, left open: a ray that would have met the part removed comes
-    from the outside and meets that skin, for behind its rim the rest of the pile still stands.
+    Its ghost is the missing part of the old surface. This surface is open, which is enough: a ray that would have met
+    the removed part comes from outside and meets it, because the rest of the pile still stands behind its rim.
     """
     full, rest = (_compact(_surface_in(scene, instance)) for scene in (world.before, world.after))
     near_full, near_rest = _samples(full), _samples(rest)
@@ -250,7 +250,7 @@ def _corners_off(mesh: Mesh, other: cKDTree, floor_m: float) -> Float64Array:
 
 
 def _samples(mesh: Mesh) -> cKDTree:
-    """Points no farther than 1.8 cm from any place on a surface: distances to them are exact to 2 mm at 0.1 m."""
+    """Sample a surface so that every place on it has a sample within 1.8 cm: distances of 0.1 m are exact to 2 mm."""
     middles = split_triangles(mesh.vertices[mesh.faces], _SAMPLE_M).mean(axis=1)
     return cKDTree(np.concatenate([mesh.vertices, middles]), balanced_tree=False, compact_nodes=False)
 
@@ -260,7 +260,7 @@ def _surface_in(scene: Scene, instance: int) -> Mesh:
 
 
 def _near(scene: Scene, surface: Mesh) -> NearSurface:
-    """Return what of a scene lies near a surface."""
+    """Return the surfaces of a scene that lie near a surface."""
     parts = (crop_near(mesh, surface, 2 * NEAR_OLD_SURFACE_M) for mesh in scene.meshes)
     return NearSurface(join_meshes([_compact(part) for part in parts if len(part.faces)]), NEAR_OLD_SURFACE_M)
 

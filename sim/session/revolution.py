@@ -1,4 +1,4 @@
-"""One revolution of a session: what the sensor reports, whose each return is, and which rays meet what is gone."""
+"""One revolution of a session: the sensor's channels, the prop behind each return, and the rays that meet a ghost."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Hits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Revolution:
-    """One simulated revolution as it is written, and what it says about each change.
+    """One simulated revolution as it is written, and its contribution to each change.
 
     Attributes:
         range_mm, reflectivity, signal: (H, W) as in `ScanChunk`.
@@ -63,7 +63,7 @@ class Drive:
     """Everything that stays the same while one session is simulated.
 
     Attributes:
-        labels: `instance` of each geom, int16; then -2 and -1, which is where geoms -2 and -1 look it up.
+        labels: `instance` of each geom, int16; two entries -2 and -1 at the end serve the geom numbers -2 and -1.
     """
 
     name: SessionName
@@ -77,7 +77,7 @@ class Drive:
 
 
 def simulate_revolution(drive: Drive, number: int) -> Revolution:
-    """Simulate one revolution; depends on nothing but its number, so any thread may do it."""
+    """Simulate one revolution. The result depends on its number alone, so revolutions may run in any thread."""
     rays, result = cast_revolution(drive, number)
     reach_m = true_reach_m(drive.sensor, result)
     instance = drive.labels.take(result.geom, mode="wrap")
@@ -98,14 +98,14 @@ def simulate_revolution(drive: Drive, number: int) -> Revolution:
 
 
 def cast_revolution(drive: Drive, number: int) -> tuple[Rays, Scan]:
-    """Return the rays of one revolution and what the sensor makes of them."""
+    """Return the rays of one revolution and the scan that the sensor reports."""
     world_T_column = drive.trajectory.world_T_column(slice(number, number + 1))[0]
     rays = revolution_rays(drive.sensor, world_T_column)
     return rays, scan(drive.scene, drive.sensor, drive.scenario.sensor, rays, drive.seed, drive.name, number)
 
 
 def true_reach_m(sensor: SensorMetadata, result: Scan) -> Float32Array:
-    """Return how far (H, W) float32 each ray goes from its origin to what it hit, 0 where nothing real returned."""
+    """Return the length (H, W) float32 of each ray from its origin to its hit, metres, 0 without a true return."""
     return np.where(result.geom >= 0, result.true_range_m - np.float32(sensor.beam_origin_m), np.float32(0.0))
 
 
@@ -128,7 +128,7 @@ def label_changes(drive: Drive, revolutions: list[Revolution]) -> Int16Array:
 
 
 def _measure(drive: Drive, number: int, result: Scan, row: Int64Array, column: Int64Array) -> Float64Array:
-    """Place (N, 3) of some returns of a revolution as the session has them, odom frame."""
+    """Return the positions (N, 3) of some returns of a revolution as the session measured them, odom frame."""
     sensor, trajectory = drive.sensor, drive.trajectory
     reach = result.range_mm[row, column][:, None] / 1000.0 - sensor.beam_origin_m
     points_sensor = sensor.origins[row, column] + reach * sensor.directions[row, column]

@@ -109,7 +109,7 @@ def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progres
 
 
 def collect_truth(scenario: Scenario, seed: int, drives: Sequence[Drive], files: Mapping[str, str]) -> PairTruth:
-    """Return what is known about a pair once both of its sessions were simulated."""
+    """Return the truth of a pair after both sessions were simulated."""
     changes = tuple(tally.finished() for tally in drives[0].tallies)
     drawn = scenario.model_dump(mode="json")
     return PairTruth(scenario.family, seed, scenario.score_radius_m, changes, drawn, dict(files))
@@ -123,7 +123,7 @@ def _refuse_taken(out: Path) -> None:
 
 
 def plan_drives(scenario: Scenario, sensor: SensorMetadata, seed: int) -> list[Drive]:
-    """Build the world and plan both sessions; of the world no more is kept than they need.
+    """Build the world and plan both sessions; only the parts of the world that they need stay in memory.
 
     Raises:
         InputError: A trajectory cannot be read.
@@ -149,7 +149,7 @@ def plan_drives(scenario: Scenario, sensor: SensorMetadata, seed: int) -> list[D
 
 
 def estimate_odometry(drive: Drive, pool: Executor, report: Progress) -> Drive:
-    """Let KISS-ICP estimate the drive, where the session asks for it, from the very scans that will be written."""
+    """Let KISS-ICP estimate the poses of a session that asks for it, from the scans that will be written."""
     plan: SessionPlan = getattr(drive.scenario, drive.name)
     if plan.odometry.source != "kiss-icp":
         return drive
@@ -201,7 +201,7 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
 
 
 def simulate_chunks(drive: Drive, pool: Executor) -> Generator[tuple[ScanChunk, Int16Array, Int16Array]]:
-    """Yield each chunk of a session with the (s, H, W) instance and change of its returns; the tallies are added to."""
+    """Yield each chunk of a session with the (s, H, W) instance and change of its returns, and update the tallies."""
     with closing(_simulate_ahead(drive, pool)) as chunks:
         for index, revolutions in enumerate(chunks):
             start = index * CHUNK_SCANS
@@ -216,7 +216,7 @@ def simulate_chunks(drive: Drive, pool: Executor) -> Generator[tuple[ScanChunk, 
 
 
 def _simulate_ahead(drive: Drive, pool: Executor) -> Generator[list[Revolution]]:
-    """Yield the revolutions of each chunk in order, the next chunk being simulated while this one is written."""
+    """Yield the revolutions of each chunk in order; the next chunk is simulated while the caller writes this one."""
 
     def begun(start: int) -> list[Future[Revolution]]:
         numbers = range(start, min(start + CHUNK_SCANS, drive.trajectory.n_scans))
@@ -234,7 +234,7 @@ def _simulate_ahead(drive: Drive, pool: Executor) -> Generator[list[Revolution]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldSession(Session):
-    """A session whose chunks lie in memory; `path` names it in messages and is no folder."""
+    """A session whose chunks are in memory; `path` is its name in messages, not a folder."""
 
     held: tuple[ScanChunk, ...] = ()
 
@@ -245,7 +245,7 @@ class HeldSession(Session):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledSession:
-    """A held session with its truth, which is apart from it as it is on disk.
+    """A session in memory and, apart from it, its truth.
 
     Attributes:
         session: What the robot recorded.
@@ -269,7 +269,7 @@ class HeldPair:
 
 
 def simulate_in_memory(scenario: Scenario, seed: int, n_threads: int = 1) -> HeldPair:
-    """Simulate a pair into memory, about 0.5 MB a revolution; to the byte what `simulate_pair` writes.
+    """Simulate a pair into memory, about 0.5 MB per revolution. The arrays equal, to the byte, those on disk.
 
     Args:
         scenario: The scenario as drawn.

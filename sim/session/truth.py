@@ -8,9 +8,9 @@
 `instance`: -1 no return, -2 a false return where nothing stands, 0 walls, floor and fixtures, n the n-th prop
 (1-based). `change`: 0 (always for a false return), or the id of the change the return belongs to. For a change of
 group "partial" (moved by less than its own length, or reshaped) only returns farther than 0.1 m from the other
-session's true surface belong to it. With several rays per beam a pixel may blend an object with what is behind it:
-`instance` is what sent most of the light back, but where the place that comes out is more than 0.1 m off that surface
-(range noise not counted) the pixel is a point in mid air and belongs to no change: `change` 0, and no count holds it.
+session's true surface belong to it. With several rays per beam a pixel may blend an object with its background.
+`instance` then names the surface that reflected most of the light. If the blended position is more than 0.1 m off that
+surface (without range noise), the pixel is a point in mid-air: its `change` is 0, and it is not counted.
 """
 
 from __future__ import annotations
@@ -46,15 +46,16 @@ class Change:
         instance: Value of its returns in `instance`.
         world_T_object: (4, 4) pose as nested lists.
         hull_volume_m3: Volume of its convex hull; of a reshaped prop that of the removed part.
-        n_returns: Returns that belong to the change, as many as bear its id in `change`.
+        n_returns: Number of returns with its id in `change`.
         n_cells: Cells of 0.1 m (that session's odom frame) they fill.
-        n_ghost_rays: Rays of the other session that end in it or pass through it, were it there.
+        n_ghost_rays: Rays of the other session that would meet it if it stood there.
         is_observable: At least 10 cells and 10 ghost rays.
         why_not: The rule that failed, or "".
-        mesh_volume_m3: Volume of a closed surface, None for props of several parts; of a reshaped prop what is gone.
-        n_returns_other: Returns of the other session on the same prop, where it stands in both (moved, reshaped), but
-            for those in mid air.
-        n_cells_other: Cells of 0.1 m they fill, in that session's odom frame.
+        mesh_volume_m3: Volume of a closed surface, None for props of several parts; of a reshaped prop the volume that
+            was removed.
+        n_returns_other: Returns of the other session on the same prop if it stands in both (moved, reshaped), without
+            points in mid-air.
+        n_cells_other: Cells of 0.1 m that these fill, in that session's odom frame.
     """
 
     id: int
