@@ -23,6 +23,7 @@ SMALLER = {
     "train/narrow train/wide train/network train/tight --seeds 100:121": "smoke/one_box --seeds 3:4 --draws 2",
     "narrow wide network tight --seeds 10000:10005": "smoke/one_box --seeds 10003:10004 --draws 2",
     "tunnelcd train data --out trained": "tunnelcd train data --out trained --steps 3 --threads 1",
+    "--out grid\n": "--out grid --limit 16\n",
     "tunnelcd report bench": "tunnelcd report bench --views none",
     "tunnelcd report grid": "tunnelcd report grid --views none",
 }
