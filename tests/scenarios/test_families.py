@@ -77,20 +77,6 @@ def is_reversed(scenario: Scenario) -> bool:
     return scenario.after.route[0] == scenario.before.route[-1]
 
 
-def test_the_names_are_the_documented_ones() -> None:
-    assert scenario_names() == [
-        "cave", "disjoint/cave", "disjoint/narrow", "disjoint/network", "disjoint/smooth", "disjoint/wide",
-        "drift/cave", "drift/narrow", "drift/network", "drift/site1", "drift/site2", "drift/wide",
-        "merge/cave", "merge/narrow", "merge/network", "merge/site1", "merge/site2", "merge/smooth", "merge/wide",
-        "narrow", "network", "null/cave", "null/narrow", "null/network", "null/site1", "null/wide",
-        "paper/site1", "paper/site2", "regions/cave", "regions/narrow", "regions/network", "regions/site1",
-        "regions/site2", "regions/wide", "smoke/one_box", "smoke/unchanged", "smooth",
-        "stress/narrow", "tight", "train/narrow", "train/network", "train/tight", "train/wide",
-        "unchanged/cave", "unchanged/narrow", "unchanged/network", "unchanged/site1", "unchanged/smooth",
-        "unchanged/wide", "wide",
-    ]  # fmt: skip
-
-
 @swept
 @pytest.mark.parametrize("name", scenario_names())
 def test_every_family_is_valid(name: str, seeds: Sequence[int]) -> None:

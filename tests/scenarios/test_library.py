@@ -430,14 +430,14 @@ def test_the_readme_s_first_file_is_valid_and_its_families_exist(tmp_path: Path)
 
 
 def test_a_sensor_that_is_not_there_is_told_with_its_line(tmp_path: Path) -> None:
-    assert mistakes_of(written(tmp_path, WORLD + "sensor: {profile: os1-33}\n")) == [
-        ":21: sensor.profile = 'os1-33': sensor profile 'os1-33' is unknown: name one of "
-        f"{', '.join(profile_names())}, or the path of an Ouster metadata .json"
-    ]
+    (line,) = mistakes_of(written(tmp_path, WORLD + "sensor: {profile: os1-33}\n"))
+    assert line.startswith(":21: sensor.profile = 'os1-33': ")
+    assert ", ".join(profile_names()) in line
     (line,) = mistakes_of(written(tmp_path, WORLD + "sensor:\n  mode: 333x10\n"))
     assert line.startswith(":22: sensor.mode = '333x10': ")
     (line,) = mistakes_of(written(tmp_path, WORLD + "sensor: {profile: own.json}\n"))
-    assert line == f":21: sensor.profile = 'own.json': no such file: expected {tmp_path / 'own.json'}"
+    assert line.startswith(":21: sensor.profile = 'own.json': ")
+    assert str(tmp_path / "own.json") in line
 
 
 def test_a_profile_is_looked_for_beside_the_file_that_names_it(tmp_path: Path) -> None:

