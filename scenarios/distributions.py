@@ -1,7 +1,7 @@
 """Distributions in a scenario's YAML, and their replacement by draws of the seed.
 
-Every draw has its own generator, `stream(seed, "scenario", path)`, where path is the dotted key; items of a list stand
-in it by their `name` where they have one, else by their index. So no draw depends on any other key of the file.
+Every draw has its own generator, `stream(seed, "scenario", path)`. The path is the dotted key; an item of a list is
+named by its `name`, or by its index if it has none. So no draw depends on any other key of the file.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def draw(tree: Any, seed: int) -> Any:
     """Return the tree with every distribution replaced by its draw, and repeated list items written out.
 
     Raises:
-        ScenarioError: A distribution, `repeat`, `chance` or `one_of` has no valid form; all of them are told.
+        ScenarioError: A distribution, `repeat`, `chance` or `one_of` is malformed; the message lists all of them.
     """
     mistakes = find_malformed(tree)
     if mistakes:
@@ -49,7 +49,7 @@ def draw(tree: Any, seed: int) -> Any:
 
 
 def draw_with_origins(tree: Any, seed: int) -> Drawing:
-    """Draw like `draw`, but remember where each value came from, and let mistakes stand as None."""
+    """Draw as `draw` does, record the origin of each value, and put None where a distribution is malformed."""
     drawer = _Drawer(seed)
     value = drawer.value(tree, (), (), ())
     return Drawing(value, drawer.origins, drawer.broken)
@@ -80,7 +80,7 @@ def is_distribution(tree: Any) -> bool:
 
 
 def merge_trees(base: Any, over: Any) -> Any:
-    """Return `base` with `over` written over it: mappings key by key, lists and distributions as a whole."""
+    """Return `base` overwritten by `over`: mappings key by key, lists and distributions as a whole."""
     if not (isinstance(base, dict) and isinstance(over, dict)) or is_distribution(base) or is_distribution(over):
         return over
     return {**base, **{key: merge_trees(base[key], item) if key in base else item for key, item in over.items()}}
@@ -92,7 +92,7 @@ def join_key(key: Key) -> str:
 
 
 class _Drawer:
-    """One walk over a tree; `source` is a value's place there, `place` its place in the result, `path` its stream."""
+    """Draws a tree: `source` is the key path of a value in the tree, `place` in the result, `path` names its stream."""
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
@@ -169,7 +169,7 @@ class _Drawer:
 
 
 def _distribution_rule(tree: dict[str, Any]) -> str:
-    """Return what is wrong with a mapping that is, or seems meant as, a distribution; "" if nothing is."""
+    """Return the rule that a mapping breaks which is, or seems meant as, a distribution; "" if it breaks none."""
     named = [name for name in NAMES if name in tree]
     if not named:
         (key, *others) = tree or [""]

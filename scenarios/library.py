@@ -1,4 +1,4 @@
-"""Scenarios by name or file: read, extended, drawn with a seed, checked and, where asked for, frozen or turned over."""
+"""Scenarios by name or file: read, merged with what they extend, drawn with a seed, and checked."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _require_valid(scenario: Scenario | None, mistakes: list[str]) -> Scenario:
 
 
 def _draw_scenario(document: Document, seed: int) -> tuple[Scenario | None, list[str]]:
-    """Draw a scenario; return it and every mistake found, both if the world only contradicts itself."""
+    """Draw a scenario, and return it with every mistake found; None if it does not fit the schema."""
     mistakes = [_format_mistake(document, key, rule) for key, rule in find_malformed(document.value).items()]
     drawn = draw_with_origins(document.value, seed)
     tree = dict(drawn.value)
@@ -91,14 +91,14 @@ def _draw_scenario(document: Document, seed: int) -> tuple[Scenario | None, list
 
 
 def _freeze(scenario: Scenario) -> Scenario:
-    """Return the scenario with nothing changing: the world stays as the before session saw it."""
+    """Return the scenario without its changes: the world stays as in the before session."""
     stay = {"change": "none", "to": None, "shift": None, "loaded_share": None}
     props: list[Prop] = [prop.model_copy(update=stay) for prop in scenario.props if prop.change != "added"]
     return scenario.model_copy(update={"props": tuple(props)})
 
 
 def _turn_over(scenario: Scenario, turnover: float, seed: int) -> Scenario:
-    """Return the scenario with that share of what would stay added or removed instead, one as often as the other."""
+    """Return the scenario with this share of its unchanged props added or removed instead, in equal parts."""
     props: list[Prop] = []
     for prop in scenario.props:
         draw = stream(seed, "turnover", prop.name).random()
@@ -141,7 +141,7 @@ def _resolve_files(document: Document) -> tuple[dict[Any, Any], list[str]]:
 
 
 def _replace_at(value: Any, key: Key, new: str) -> Any:
-    """Return dicts and lists with one value replaced; what lies beside it is shared, not copied."""
+    """Return dicts and lists with one value replaced; all other values are shared, not copied."""
     if not key:
         return new
     parts: Any = dict(value) if isinstance(value, dict) else list(value)
@@ -154,7 +154,7 @@ def _drawn_origins(document: Document, drawn: Drawing) -> dict[Key, str]:
 
 
 def _drop_repeated(lines: list[str], broken: set[Key], told: list[Mistake]) -> list[str]:
-    """Drop what the schema says of values that could not be drawn, and what is told with its own line already."""
+    """Drop the schema's mistakes about values that could not be drawn, and those reported with their line already."""
     names = [f": {join_key(key)} = " for key in broken] + [rule.partition(";")[0] for _, rule in told]
     return [line for line in lines if not any(name in line for name in names)]
 
@@ -197,7 +197,7 @@ def _path_of(name_or_path: str) -> Path:
 
 
 def _shorten(path: Path) -> Path:
-    """Return the path as it is told to the user: short where it lies below the working folder."""
+    """Return the path for messages: relative if it lies below the working folder."""
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 

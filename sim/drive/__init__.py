@@ -1,1 +1,1 @@
-"""How the sensor moves: the robot's line, its ride along it, and what its odometry makes of it."""
+"""Drives: the line of a robot, its movement over the floor, its odometry, and the poses of every revolution."""

@@ -1,4 +1,4 @@
-"""What stands in a robot's way: props beside its line, and the rock around it."""
+"""Obstacles of a robot: props beside its line, and the rock around it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sim.placement.placing import PROBE_UP_M, floor_heights, standing_height_m
 from sim.rock.centreline import left_of
 from sim.scene import World
 
-# What lies loose is driven over up to this height.
+# Loose stones up to this height are driven over.
 _STRADDLED_M = 0.15
 # Samples across the drift when stones are looked for, and free way beside the wheels.
 _ACROSS_M = 0.1

@@ -1,4 +1,4 @@
-"""What a session's own odometry makes of its movement: truth with a systematic drift, or KISS-ICP on its own scans."""
+"""A session's own estimate of its movement: truth with a systematic drift, or KISS-ICP on its own scans."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def start_pose(true: Motion, start_s: float) -> Float64Array:
 
 
 def drift_motion(true: Motion, start_s: float, odometry: Odometry, seed: int, session: str) -> Motion:
-    """Return the movement as odometry has it: its increments scaled, its heading drifting with the way.
+    """Return the movement with the errors of odometry: scaled increments, and a heading error that grows with the way.
 
     The odom frame is upright, with its origin at the sensor and its x axis along the sensor's heading at `start_s`.
     The error is the same all along: after 100 m the path is `translation_percent` too long or short and the heading

@@ -1,7 +1,7 @@
 """The line a robot drives: along the route's centrelines, on its own side, round props, clear of the walls.
 
-All of it is done in the frame of a reference line (the route with its corners rounded): bounds on the sideways offset
-are collected along it, and a smooth offset is found between them.
+The reference line is the route with rounded corners. Bounds on the sideways offset from it are collected along the
+route, and a smooth offset is found between them.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def plan_path(world: World, scenario: Scenario, seed: int, session: str, is_wary
         scenario: Its platform and its sessions.
         seed: What the wander is drawn from.
         session: "before" or "after".
-        is_wary: Keep off all that hangs or juts out within the clearance above and below the sensor too, not just off
-            what is level with it.
+        is_wary: Keep clear also of obstacles within the clearance above and below the sensor, not only of those level
+            with it.
 
     Raises:
         ScenarioError: The route turns back on itself, nothing is left of it, or the walls and props leave no room.
@@ -154,7 +154,7 @@ def _swerve_between(
     stones: list[tuple[Float64Array, Float64Array]],
     give_m: float,
 ) -> Float64Array:
-    """Smooth offset (N,) between the bounds, `give_m` beyond them at worst; stones are driven over where need be."""
+    """Smooth offset (N,) at most `give_m` beyond the bounds; stones are driven over if there is no other way."""
     while True:
         inner_low, inner_high = low.copy(), high.copy()
         for near_low, near_high in stones:
@@ -176,7 +176,7 @@ def _swerve_between(
 def _find_smoothest(
     wanted: Float64Array, low: Float64Array, high: Float64Array, give_m: float
 ) -> tuple[Float64Array, Float64Array]:
-    """Offset (N,) that swerves no more sharply than it must, and how far it is beyond the bounds (N,)."""
+    """Return the gentlest offset (N,) found, and how far it lies beyond the bounds (N,)."""
     offset_m = smooth_between(wanted, low, high, _SWERVES_M[0])
     for half_m in _SWERVES_M[1:]:
         is_bad = np.maximum(low - offset_m, offset_m - high) > give_m

@@ -1,4 +1,4 @@
-"""From a drive to poses: when and where each column of each recorded revolution was taken, and as odometry has it."""
+"""From a drive to poses: time and pose of each column of each recorded revolution, true and as estimated."""
 
 from __future__ import annotations
 

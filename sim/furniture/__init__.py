@@ -1,1 +1,1 @@
-"""What is fixed to the rock in both sessions: pipes, ducts, cable trays, rock support, loose stones."""
+"""Fixtures of both sessions, never a change: pipes, ducts, cable trays, rock support, loose stones."""

@@ -1,7 +1,7 @@
 """What is fixed to the rock in both sessions: pipes, ducts, cable trays, rock bolts and wire mesh.
 
-Everything follows the bare wall as rays find it, so it works in a mesh of someone else's as well. One fixture for each
-item and material, merged over all drifts, to keep the number of geoms small.
+Everything follows the bare wall as measured by rays, so it also works in a foreign mesh. Each item and material is one
+fixture over all drifts, which keeps the number of geoms small.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sim.geometry.raycast import Caster
 from sim.rock.axis import Axis, measure_axes
 from sim.rock.centreline import Centreline
 
-_PIN_SPACING_M = 1.2  # of what holds a screen where no bolts are asked for
+_PIN_SPACING_M = 1.2  # of the pins that hold a screen in a tunnel without bolts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +37,7 @@ class Fixture:
 
 
 def furnish(tunnel: Tunnel, centreline: Centreline, walls: Caster, seed: int) -> tuple[Fixture, ...]:
-    """Return the furniture of all drifts; nothing in a tunnel that has none, or no drifts to follow.
+    """Return the furniture of all drifts; empty if the tunnel has no furniture or no drifts.
 
     Args:
         tunnel: Its `furniture`; nothing else is read.

@@ -1,6 +1,6 @@
 """Loose stones on the floor of every drift, partly buried, more of them towards the walls.
 
-Every stone is drawn from the place of its cell in the world alone: an outline that bars some changes no other.
+Every stone is drawn from the position of its cell alone: a prop that displaces some stones changes no other.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def _lay_stones(spots: _Spots, size_m: Float64Array, walls: Caster, keys: dict[s
     """Turn, scale and bury one of a few shapes at every spot."""
     shapes = _shapes(seed)
     shape = (_uniform(spots.cell, keys["shape"]) * _N_SHAPES).astype(np.int64)
-    # Flat side down, more or less: a fragment that came to rest.
+    # A fragment at rest lies roughly on its flat side.
     tilts = [np.deg2rad(50.0) * (_uniform(spots.cell, keys[name]) - 0.5) for name in ("roll", "pitch")]
     angles = np.stack([2 * np.pi * _uniform(spots.cell, keys["yaw"]), *tilts], axis=1)
     turns = Rotation.from_euler("ZXY", angles).as_matrix()
@@ -138,7 +138,7 @@ def _lay_stones(spots: _Spots, size_m: Float64Array, walls: Caster, keys: dict[s
         chosen = np.flatnonzero(shape == number)
         vertices = np.einsum("nij,vj->nvi", turns[chosen], mesh.vertices) * size_m[chosen, None, None]
         bottom, height_m = vertices[..., 2].min(axis=1), np.ptp(vertices[..., 2], axis=1)
-        # On uneven floor it sinks until no edge floats, but at least 30 % stay in sight.
+        # On uneven floor it sinks until no edge floats, but at least 30 % of its height stays visible.
         sunk_m = np.minimum(spots.floor[chosen, 2] - lowest_z[chosen] + depth_share[chosen] * height_m, 0.7 * height_m)
         vertices += spots.floor[chosen, None]
         vertices[..., 2] -= (bottom + sunk_m)[:, None]

@@ -1,9 +1,9 @@
-"""Where pipes, trays and ducts run: lines with a stand-off to the real wall or roof, and what they do at openings.
+"""The lines of pipes, trays and ducts: their stand-off to the measured wall or roof, and their path at openings.
 
-A line on a wall spans short openings straight through the air. Where a longer one (branch, niche, crossing) opens it
-climbs to a passing height within 1.5 m, crosses there, and comes down again; where the roof is too low for that it ends
-before the opening and starts again behind it, as wherever it would hang lower over the middle of a drift. A drift that
-crosses one named earlier hands nothing across.
+A line on a wall spans short openings in a straight line. At a longer opening (branch, niche, crossing) it climbs to a
+passing height within 1.5 m, crosses, and descends. If the roof is too low for that, or if the line would hang too low
+over the middle of a drift, it ends before the opening and starts again behind it. Where two drifts cross, only the
+lines of the drift that the scenario names first continue.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _STACK_GAP_M = 0.08
 
 @dataclass(frozen=True, slots=True)
 class Cross:
-    """What a line keeps free of rock about its axis: half its breadth and half its height, and the gap beyond."""
+    """The room of a line around its axis: half its width, half its height, and its gap to the rock."""
 
     half_width_m: float
     half_height_m: float
@@ -64,7 +64,7 @@ class WallPlan:
 
 
 def stack_plans(plans: Sequence[WallPlan]) -> list[WallPlan]:
-    """Give the lines of each wall heights to cross openings at, one above the other as they lie on the wall."""
+    """Set the heights at which the lines of each wall cross openings, in their order on the wall."""
     answer = list(plans)
     for side in (1.0, -1.0):
         free_m = 0.0

@@ -1,1 +1,1 @@
-"""Meshes, noise fields, sweeps and ray casting: geometry that knows no tunnel."""
+"""Geometry without tunnels: meshes, noise fields, sweeps, lines, and ray casting with Embree."""

@@ -1,4 +1,4 @@
-"""All props of a scenario set down in turn: first those with a given place, then those whose place the seed draws."""
+"""Places all props of a scenario in turn: first those with a given place, then those whose place the seed draws."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Outline = Callable[[Standing], Float64Array]
 
 @dataclass(slots=True, eq=False)
 class _Board:
-    """What stands so far, and what it takes of the way: for each lane the spans of each prop."""
+    """The props placed so far, and for each lane the span of the way that each of them bars."""
 
     lanes: tuple[Lane, ...]
     standing: list[Standing] = field(default_factory=list)
@@ -71,9 +71,9 @@ def place_props(scenario: Scenario, centreline: Centreline, around: Surroundings
     """Return every prop at rest at each of its places, in the scenario's order; a moved or reshaped one appears twice.
 
     Props with a given place come first. A drawn place is drawn again until the prop fits between the walls, stands
-    clear of the others, leaves the robot its way and comes to rest: 80 times, 80 times at the opposite wall, and in an
-    area 160 times more with as much tunnel again to either side; one that leans 160 times more where humps of the
-    floor hide a part of the wall. The draws of one prop depend on no other.
+    clear of the others, leaves the robot a way and comes to rest. There are 80 tries, 80 at the opposite wall, and for
+    a place in an area 160 more on a stretch three times as long. A leaning prop gets 160 further tries at places where
+    humps of the floor hide a part of the wall. The draws of one prop do not depend on other props.
 
     Raises:
         ScenarioError: A prop does not fit, stands in another, does not come to rest, or finds no place.
@@ -195,7 +195,7 @@ def _find_place(
 def _first_fit(
     job: _Job, spots: Iterable[Spot], around: Surroundings, seed: int, board: _Board
 ) -> tuple[list[Standing], str]:
-    """Return the prop at rest at the first spot that will do; if none does, nothing, and why not the last one."""
+    """Return the prop at rest at the first suitable spot, or an empty list and why the last spot failed."""
     why, drops = "every one lies in the mouth of a junction", 0
     for spot in spots:
         try:
@@ -216,7 +216,7 @@ def _first_fit(
 
 
 def _touching(items: Sequence[Standing], board: _Board) -> str:
-    """Say which prop one at rest runs into as it tilts on its floor; "" if none."""
+    """Return which prop a prop at rest collides with after tilting on its floor; "" if none."""
     clashes = [board.neighbour(item, 0.0, bounding_rectangle) for item in items]
     return next((f"prop {clash[0].prop.name!r} is in the way" for clash in clashes if clash), "")
 

@@ -1,4 +1,4 @@
-"""How deep a standing prop is in the rock or in another prop, measured on the true surfaces."""
+"""Penetration of a standing prop into rock or another prop, measured on the true surfaces."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from sim.geometry.raycast import Caster
 from sim.placement.placing import Standing, corners_object, standing_points
 from sim.props.shapes import Shape, solid_mesh
 
-_STEP_M = 0.06  # between the points that stand for a surface
-_CELL_M = 0.03  # of several points in one cell one is enough
+_STEP_M = 0.06  # between the sample points of a surface
+_CELL_M = 0.03  # one sample point per cell is kept
 _TELLTALES = np.array([[0.1, 0.2, 1], [0.9, 0.3, 0.5], [-0.7, 0.6, 0.4], [0.2, -0.9, 0.3], [-0.4, -0.5, 0.8]])
 
 
@@ -34,9 +34,9 @@ def _pick_one_a_cell(points: Float64Array, cell_m: float) -> Int64Array:
 
 
 def interpenetration_m(standing: Standing, walls: Caster, others: Sequence[Standing] = ()) -> float:
-    """Return how deep a prop's surface is in the rock, or its and another prop's in one another, at the deepest.
+    """Return the largest depth of a prop's surface in the rock, in another prop, or of another prop's surface in it.
 
-    Piles and railings are set into floor and wall on purpose; of them only what is in other props counts.
+    Piles and railings are set into floor and wall on purpose; for them only the depth in other props counts.
 
     Args:
         standing: The prop.

@@ -1,4 +1,4 @@
-"""Whether a robot still gets by: the room its line has in each session, and what props take of it."""
+"""Whether a robot still gets past the props: the free width of its line in each session, and what props bar of it."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from sim.placement.recorded import read_drive
 from sim.rock.centreline import Centreline, headings_of, left_of, resample
 
 _STEP_M = 0.25
-# Of the room that props leave, this much more than the platform needs must be left.
+# Spare width that props must leave beyond the need of the platform.
 _SPARE_M = 0.15
 # The line changes sides over this distance, so props count this far before and behind where they stand.
 _SWERVE_M = 1.5
-# A quadrotor keeps this much air below it; what is lower is flown over.
+# A quadrotor keeps this vertical distance to what it flies over.
 AIR_BELOW_M = 0.5
 # Inside a bend the line goes at most this share of the way to the centre of curvature, so that the turn stays gentle.
 _INSIDE_SHARE = 0.35
@@ -29,7 +29,7 @@ _INSIDE_SHARE = 0.35
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lane:
-    """Room of one session's line, every 0.25 m along its route.
+    """Free width for one session's line, every 0.25 m along its route.
 
     Attributes:
         session: "before" or "after".

@@ -1,4 +1,4 @@
-"""What stands where: a prop at its pose, the room it takes on the floor, and the rock round it."""
+"""A prop at its pose, its footprint on the floor, and the rock around it."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ class Standing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """What props are placed in.
+    """The surroundings in which props are placed.
 
     Attributes:
-        walls: The bare rock: its floor carries them.
-        fixed: Rock and furniture: what they must keep clear of.
-        gap_m: Kept between a prop and the side of the drift.
+        walls: The bare rock, whose floor carries them.
+        fixed: Rock and furniture, from which they keep clear.
+        gap_m: Distance between a prop and the side of the drift.
     """
 
     walls: Caster
@@ -88,7 +88,7 @@ def free_width(
 
 
 def standing_points(standing: Standing) -> Float64Array:
-    """Return the corners (N, 3) of a standing prop's surface, world frame; of one set into the floor those above it."""
+    """Return the corners (N, 3) of a standing prop's surface, world frame; without those set into the floor."""
     local = corners_object(standing.shape)
     if not standing.shape.is_settled:
         local = local[local[:, 2] >= -0.05]
@@ -139,7 +139,7 @@ def standing_height_m(standing: Standing) -> float:
 
 
 def rectangles_overlap(a: Float64Array, b: Float64Array) -> bool:
-    """Tell whether two rectangles, given by their corners (4, 2), have a point in common inside: separating axes."""
+    """Tell whether the interiors of two rectangles, given by their corners (4, 2), meet: separating axis test."""
     for corners in (a, b):
         for edge in (corners[1] - corners[0], corners[2] - corners[1]):
             first, second = a @ edge, b @ edge

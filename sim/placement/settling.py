@@ -1,4 +1,4 @@
-"""Physics, once: a prop dropped on the floor until it rests."""
+"""Physics, run once per prop: it is dropped on the floor until it rests."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ _LEANING_GAP_M = 0.02
 def settle(item: Standing, around: Surroundings) -> Standing:
     """Drop a prop on the floor until it rests, and return it at its frozen pose; one set into the floor stays.
 
-    It drops alone, on height fields cast from the rock below it and from the wall it leans against: the wall itself
-    would collide as its convex hull, a solid plug. So no prop's pose depends on any other. The fields are coarser
-    than the rock; at the end the prop is moved by what its true surface lacks to touch the true rock.
+    It drops alone, so that its pose depends on no other prop. It drops on height fields cast from the rock below it and
+    from the wall it leans against, because MuJoCo would collide the wall mesh as its convex hull, a solid plug. The
+    fields are coarser than the rock; at the end the prop is moved until its true surface touches the true rock.
 
     Raises:
         ScenarioError: It falls over, is not at rest after 8 s, rolls away, or cannot be freed from the rock.

@@ -1,4 +1,4 @@
-"""Where along the tunnel a prop may be set down: given stations, and those that the seed draws on the sessions' way."""
+"""Stations along the tunnel for props: given ones, and those that the seed draws on the way of both sessions."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def drawn_spots(
     seed: int,
     over_humps: bool = False,
 ) -> Iterator[Spot]:
-    """Yield up to 80 spots drawn for one prop, none in the mouth of a junction; no other prop touches these draws."""
+    """Yield up to 80 spots drawn for one prop, none in the mouth of a junction, independent of all other props."""
     generator = stream(seed, "props", name, purpose)
     is_free = ~_in_mouth(stations.points, scenario)
     for index in (generator.random(PLACE_TRIES) * len(stations)).astype(int).tolist():
@@ -106,10 +106,10 @@ def way(scenario: Scenario, centreline: Centreline) -> Stations:
 
 
 def draw_areas(scenario: Scenario, centreline: Centreline, seed: int) -> dict[str, tuple[Stations, Stations]]:
-    """Return the stretch of each area, and the same with as much again to either side; both sessions drive them.
+    """Return the stretch of each area, and the stretch extended by its own length to either side; both are driven.
 
-    Of up to 64 centres drawn for an area the first is taken that keeps it four score radii from the areas before it,
-    else the one farthest from them.
+    Up to 64 centres are drawn for an area. The first that keeps four score radii to the areas before it is taken, else
+    the one farthest from them.
 
     Raises:
         ScenarioError: The sessions have no stretch in common that is long enough.

@@ -1,1 +1,1 @@
-"""The things that stand in a tunnel and may change: one builder for each kind."""
+"""Props, the objects that may change: boxes, chairs, vehicles, rocks, muck piles, meshes from files; see HOWTO.md."""

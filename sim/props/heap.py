@@ -175,7 +175,7 @@ def _centre(heap: Heap) -> Heap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Face:
-    """The surface of a bite, which rises into the pile; what lies above it is taken.
+    """The surface of a bite, which rises into the pile; everything above it is removed.
 
     Attributes:
         into: (2,) unit vector, level, from the bite into the pile.
@@ -192,7 +192,7 @@ class Face:
     foot_m: float
 
     def heights(self, xy: Float64Array) -> Float64Array:
-        """Return the height of the face at places (N, 2); below the floor where all is taken."""
+        """Return the height of the face at places (N, 2); below the floor where everything is removed."""
         across = xy @ np.array([-self.into[1], self.into[0]])
         return np.asarray(self.rise * (xy @ self.into - self.foot_m - np.interp(across, self.along_m, self.wander_m)))
 
@@ -203,10 +203,10 @@ class Face:
 
 
 def load_away(heap: Heap, share: float, fragment_m: float, seed: int, name: str) -> Heap:
-    """Take a share of a pile's volume from one side, never from its back.
+    """Remove a share of a pile's volume from one side, never from its back.
 
-    The face meets the bed where it lies below it, and the bed keeps its heights everywhere else; a fragment goes if
-    its middle lies above the face; the others stay as they are. The face gets fragments of its own.
+    The bed is lowered to the face wherever the face lies below it. A fragment is removed if its centre lies above the
+    face; the others stay unchanged. The face gets fragments of its own.
 
     Args:
         heap: The whole pile.

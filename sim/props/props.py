@@ -1,4 +1,4 @@
-"""The things that stand in a tunnel: which builder makes each kind, and the measures of the finished shape."""
+"""Props, the objects in a tunnel: the builder of each kind, and the measures of the finished shape."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a prop's shape is: its primitives, their surfaces, and the measures of what stands above the floor.
+"""The shape of a prop: its primitives, their surfaces, and the measures of its part above the floor.
 
 Object frame: origin on the floor in the middle of the footprint, x along the length, y across, z up.
 """
@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 from cdpipe.core.geometry import Float64Array
 from sim.geometry.mesh import Mesh, box_mesh, cylinder_mesh, join_meshes, move_mesh
 
-# Posts of a railing and the foot of a heap go this far below the floor's level, so that no gap opens on rough floor.
+# Posts of a railing and the foot of a heap reach this far below floor level, so that no gap opens on rough floor.
 BELOW_FLOOR_M = 0.6
 
 Size = tuple[float, float, float]

@@ -1,1 +1,1 @@
-"""The tunnel: centrelines, sections and roughness, meshed into one closed surface; or a mesh made by others."""
+"""The rock: centrelines, cross-sections, floor and roughness of drifts, their wall mesh, and foreign meshes."""

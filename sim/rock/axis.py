@@ -1,4 +1,4 @@
-"""The middle of a drift as rays see it: where floor, roof and walls really are at stations along the way."""
+"""The middle of a drift measured by rays: floor, roof and walls at stations along its length."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Axis:
         height_m: (S,) height of the drift, smoothed over some metres, at most the nominal one.
         section: Nominal section.
         is_inside: (S,) in the void, and not just before the face of a blind drift.
-        gives_way: (S,) inside another drift that runs on here while this one ends, or that was named earlier.
+        gives_way: (S,) inside another drift that continues where this one ends, or that the scenario names earlier.
         ways: (M, 4) samples of all drifts' centrelines, x, y, z, and the width of the drift there.
         walls: Caster of the bare rock.
     """
@@ -49,7 +49,7 @@ class Axis:
     walls: Caster
 
     def at(self, across_m: Float64Array | float, up_m: Float64Array | float) -> Float64Array:
-        """Return the (S, 3) world points that lie so far to the left and so far above the floor."""
+        """Return the (S, 3) world points at a distance to the left of the axis and a height above the floor."""
         across = np.broadcast_to(across_m, len(self.points))
         up = np.broadcast_to(up_m, len(self.points))
         return np.asarray(self.points + np.column_stack([self.left * across[:, None], up]))
@@ -70,7 +70,7 @@ class Axis:
 def measure_axes(centreline: Centreline, walls: Caster) -> list[Axis]:
     """Measure the drifts of a centreline; a drift that lies in the rock of a foreign mesh is left out.
 
-    The line is rounded where drifts meet at an angle, so that what runs beside it never turns back on itself.
+    The line is rounded where drifts meet at an angle, so that a line parallel to it never turns back on itself.
     """
     axes: list[Axis] = []
     ways = [np.insert(line.points, 3, line.section.width_m, axis=1) for line in centreline.drifts]
@@ -89,7 +89,7 @@ def wall_distances(walls: Caster, origins: Float64Array, directions: Float64Arra
 
 
 def fill_from_nearest(values: Float64Array, is_inside: BoolArray) -> Float64Array:
-    """Give the stations (S, ...) in the rock, where rays mean nothing, the value of the nearest station in the void."""
+    """Give the stations (S, ...) in the rock, where rays measure nothing, the value of the nearest one in the void."""
     inside = np.flatnonzero(is_inside)
     after = np.minimum(np.searchsorted(inside, np.arange(len(values))), len(inside) - 1)
     before = np.maximum(after - 1, 0)
@@ -105,7 +105,7 @@ def find_nearest(known: Float64Array, points: Float64Array, within_m: float) -> 
 
 
 def is_opening(distance_m: Float64Array) -> BoolArray:
-    """Mark the stations (S, ...) where the rock is much farther than around: a branch, a niche, a crossing."""
+    """Mark the stations (S, ...) where the rock is much farther than at their neighbours: branch, niche, crossing."""
     every = 4
     thin = distance_m[::every]
     size = (17,) + (1,) * (distance_m.ndim - 1)  # 17 m
@@ -122,7 +122,7 @@ def bridge_openings(distance_m: Float64Array, is_open: BoolArray) -> Float64Arra
 
 
 def lower_envelope(values: Float64Array, reach: int) -> Float64Array:
-    """Return a smooth line (S,) nowhere above the values (S,): where they dip, it dips `reach` stations before."""
+    """Return a smooth line (S,) nowhere above the values (S,); it descends `reach` stations before they do."""
     lowest = minimum_filter1d(values, 2 * reach + 1, mode="nearest")
     window = np.hanning(2 * reach + 3)[1:-1]
     return np.convolve(np.pad(lowest, reach, mode="edge"), window / window.sum(), mode="valid")
@@ -184,7 +184,7 @@ def _face(walls: Caster, origins: Float64Array, directions: Float64Array) -> Flo
 
 
 def _hits(walls: Caster, origins: Float64Array, directions: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Return distances (N,), infinite for a miss, and normals (N, 3); a ray lost in an edge goes again askew."""
+    """Return distances (N,), infinite for a miss, and normals (N, 3); a miss is cast again slightly tilted."""
     ranges_m, _, normals = walls.hits(origins, np.ascontiguousarray(directions))
     missed = np.flatnonzero(~np.isfinite(ranges_m))
     if len(missed):

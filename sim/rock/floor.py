@@ -13,12 +13,12 @@ from sim.rock.frame import Frame
 # Floors less than the first share of a drift's height apart are one floor; beyond the second share, two levels.
 _SAME_LEVEL = 0.3
 _OTHER_LEVEL = 0.8
-_OWN_WEIGHT = 1e-6  # lets a drift far from all others have its own floor
+_OWN_WEIGHT = 1e-6  # gives a drift far from all others its own floor
 _RUTS_END_M = 1.5  # ruts fade over this distance before the face of a blind drift
 
 
 def level_shares(frames: Sequence[Frame]) -> list[list[Float64Array]]:
-    """Return for every drift how much (M,) each other is on its level: 1 there, 0 on another level or far away."""
+    """Return for every drift and every other the share (M,) of being on one level: 1 same, 0 other level or far."""
     return [[_share(mine, other) for other in frames] for mine in frames]
 
 

@@ -1,4 +1,4 @@
-"""Surfaces that someone else made: read, converted to metres with z up, and refused where they cannot be meant."""
+"""Foreign surfaces: read from a file, converted to metres with z up, and refused if their size cannot be right."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Where columns of a grid lie in the frame of a drift: how far aside, how high the floor is there, how wide the drift.
+"""Columns of a grid in the frame of a drift: distance to the side, height of the floor, width of the drift.
 
-Distances to walls are those to the nearest sample of the centreline. Everything else is a Gaussian-weighted mean over
-the samples around: where two samples are equally near (inside a bend, beyond a corner, at the end of a drift) a value
-of the nearest one would jump, and floor and walls with it.
+Distances to walls are measured from the nearest sample of the centreline. All other values are Gaussian-weighted means
+over the samples nearby. The value of the nearest sample alone would jump where two samples are equally near (inside a
+bend, beyond a corner, at the end of a drift), and floor and walls would jump with it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from sim.rock.centreline import STEP_M, DriftLine, Recess
 
-MOUTH_SHARE = 1.3  # of the half width: how far from its line a drift has a say in the floor of others
+MOUTH_SHARE = 1.3  # of the half width: within this distance a drift takes part in the floor of other drifts
 _EVERY = 3  # samples of the centreline that take part in the mean
 _KERNEL_SHARE = 0.15  # of the width
 _SMALLEST_KERNEL_M = 0.45  # 1.5 times the distance of those samples: their sum is smooth to 1e-9
@@ -29,7 +29,7 @@ class Frame:
     Attributes:
         line: The drift.
         recesses: Its niches near the columns.
-        is_near: Whether the drift's void and margin reach the column at all; elsewhere the rest means nothing.
+        is_near: Whether the drift's void and margin reach the column; elsewhere the other values are undefined.
         side_m: Distance to the centreline, positive to the left.
         lateral_m: The same, but smooth also beyond the end of a line.
         beyond_m: Distance behind the face of a blind end, negative before it, -inf far from one.

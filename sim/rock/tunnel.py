@@ -49,8 +49,8 @@ def _block_meshes(
 ) -> Iterator[tuple[Int64Array, Float64Array, Int64Array]]:
     """Yield (edge keys, vertices, faces) of each block of the grid that the surface passes through.
 
-    A vertex of marching cubes lies on a grid edge; the edge's integer coordinates name it, so that the vertices two
-    blocks share are found exactly.
+    A vertex of marching cubes lies on a grid edge. The edge's integer coordinates identify it, so that the vertices
+    shared by two blocks are matched exactly.
     """
     cell_m = tunnel.resolution_m
     field = Field(tunnel, centreline, seed)

@@ -1,1 +1,1 @@
-"""The Ouster as a ray caster: beams, footprints, photons, returns."""
+"""The LiDAR: rays of a beam table, echoes, photons, noise, dropouts and false returns."""

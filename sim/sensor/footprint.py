@@ -1,4 +1,4 @@
-"""What one beam meets: its middle alone, or several rays over its width, whose echoes blend as in the receiver."""
+"""The echo of a beam: of its central ray alone, or blended from several rays over its width as in the receiver."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ PULSE_M = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Echo:
-    """What comes back to each pixel of a revolution, before anything is measured. All arrays (W, H).
+    """The light that returns to each pixel of a revolution, before the receiver measures it. All arrays (W, H).
 
     Attributes:
-        range_m: float32 distance as the receiver has it, beam-origin offset included, 0 where nothing comes back.
-        photons: float32 expected photons, 0 where nothing comes back.
+        range_m: float32 distance in the receiver, beam-origin offset included, 0 for a miss.
+        photons: float32 expected photons, 0 for a miss.
         cosine: float32 of the incidence on `geom`, 0 for a miss.
         true_range_m: float32 distance to `geom` along the ray that met it, infinite for a miss.
-        geom: int32 what sent most of it back, -1 for a miss.
+        geom: int32 geom that reflected most of the light, -1 for a miss.
     """
 
     range_m: Float32Array
@@ -53,10 +53,10 @@ def central_echo(caster: Caster, reflectivity: Float32Array, rays: Rays, beam_or
 def spread_echo(
     caster: Caster, reflectivity: Float32Array, rays: Rays, beam_origin_m: float, sub_rays: Literal[7, 19]
 ) -> Echo:
-    """Cast several rays over the width of every beam and blend what comes back.
+    """Cast several rays over the width of every beam and blend their echoes.
 
     Echoes of a pixel that follow one another by less than `PULSE_M` are one group; its range is the mean weighted with
-    the photons. Of several groups the strongest is reported. What was hit is what the strongest ray of that group met.
+    the photons. The strongest group is reported. Its geom is the one that the strongest ray of the group met.
     """
     shape = rays.directions.shape[:2]
     n_pixels = shape[0] * shape[1]

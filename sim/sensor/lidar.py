@@ -25,8 +25,8 @@ from sim.sensor.optics import (
 from sim.sensor.rays import Rays
 
 MISS, FALSE_RETURN = -1, -2
-# A blended echo this far from what it is said to come from is a place in mid air: the pixel is mixed. As much as a
-# return must be off the old surface to count as changed.
+# A blended echo farther than this from its reported surface is a point in mid-air: the pixel is mixed. It is the same
+# distance by which a return must be off the old surface to count as changed.
 MIXED_M = 0.1
 
 
@@ -40,8 +40,8 @@ class Scan:
         signal: uint16 photons.
         true_range_m: float32 distance from the spin axis's point to the surface along the beam, infinite for a miss.
         geom: int32 geom hit, `MISS` where nothing returned, `FALSE_RETURN` where nothing stands.
-        is_mixed: True for a return whose echo, before noise, is more than 0.1 m off the surface of `geom`: it blends
-            with what is behind or before it. Never so with one ray per beam.
+        is_mixed: True for a return whose echo, before noise, is more than 0.1 m off the surface of `geom`, because it
+            blends two surfaces. Always False with one ray per beam.
     """
 
     range_mm: npt.NDArray[np.uint32]
@@ -55,10 +55,9 @@ class Scan:
 def scan(
     scene: Scene, sensor: SensorMetadata, settings: Sensor, rays: Rays, seed: int, session: str, number: int
 ) -> Scan:
-    """Cast one revolution and add what the sensor adds.
+    """Cast one revolution and apply the effects of the sensor.
 
-    The random numbers are drawn for every pixel whatever it hits, so that another prop in the scene changes only the
-    beams that meet it.
+    Random numbers are drawn for every pixel, whatever it hits. So another prop changes only the beams that meet it.
 
     Args:
         scene: What is there.

@@ -1,1 +1,1 @@
-"""Measurements of the simulator itself: its speed, its worlds, its sensor."""
+"""Measurements of the simulator itself: figures of worlds, roughness of walls, charts of the sensor, speed."""

@@ -1,4 +1,4 @@
-"""What the worlds of a family are like, measured on the worlds themselves: built and driven, but not scanned."""
+"""Figures of the worlds of a family, measured on worlds that are built and driven but not scanned."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class Survey:
 
 
 def survey(family: str, seeds: Sequence[int], workers: int = 1, on_progress: Progress | None = None) -> Survey:
-    """Build and measure the worlds of a family. A seed that fails is a record, whatever the reason.
+    """Build and measure the worlds of a family. A seed that fails is recorded with its reason.
 
     Args:
         family: Name of a scenario, or a YAML file.

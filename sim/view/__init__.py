@@ -1,1 +1,1 @@
-"""Looking at worlds and sessions: named surfaces and points, in the browser or as pictures."""
+"""Views of worlds and sessions: in the browser, as one HTML file, or as pictures."""

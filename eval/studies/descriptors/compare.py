@@ -212,9 +212,7 @@ def _numbers(cases: pd.DataFrame, column: str) -> Float64Array:
 
 
 def main(
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="new folder, or of an earlier run to continue")
-    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="new folder, or of an earlier run to continue")],
     families: Annotated[
         list[str] | None, typer.Argument(metavar="FAMILY...", help="names from `tunnelcd list`, or .yaml files")
     ] = None,
