@@ -3,12 +3,15 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= demo
+comma := ,
 TEST_PROCESSES ?= 2
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
+EXTRAS := cluster,dufomap,kiss,m3c2,odometry,ouster,view
+LOWEST := .venv-lowest
 # One process per core and one thread in each; the tests of one file stay in one process and share what it has set up.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
 
-.PHONY: setup demo test soak check report clean
+.PHONY: setup demo test test-lowest lowest soak check report clean
 
 setup: $(VENV)/.installed-dev
 
@@ -22,7 +25,7 @@ $(VENV)/.installed: $(BIN)/python pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(PIP) --editable '.[dev,cluster,dufomap,kiss,m3c2,odometry,ouster,view]'
+	$(PIP) --editable '.[dev,$(EXTRAS)]'
 	touch $@
 
 demo: $(VENV)/.installed
@@ -30,6 +33,25 @@ demo: $(VENV)/.installed
 
 test: $(VENV)/.installed-dev
 	$(PYTEST)
+
+# All tests with the oldest version of every package that pyproject.toml allows. Old packages that warn of one another
+# are no failure.
+test-lowest: $(LOWEST)/.installed
+	OMP_NUM_THREADS=1 $(LOWEST)/bin/python -m pytest -n $(TEST_PROCESSES) --dist loadfile \
+		-W default::DeprecationWarning -W default::PendingDeprecationWarning
+
+$(LOWEST)/.installed: pyproject.toml .constraints-lowest.txt
+	$(PYTHON) -m venv $(LOWEST)
+	$(LOWEST)/bin/python -m pip --disable-pip-version-check install --quiet --constraint .constraints-lowest.txt \
+		--editable '.[test,$(EXTRAS)]'
+	touch $@
+
+# Write .constraints-lowest.txt again, after a bound in pyproject.toml has moved.
+lowest: $(BIN)/python
+	$(BIN)/python -m pip --disable-pip-version-check install --quiet uv
+	$(BIN)/uv pip compile pyproject.toml --quiet --resolution lowest-direct --python-version 3.11 --only-binary :all: \
+		$(foreach extra,test $(subst $(comma), ,$(EXTRAS)),--extra $(extra)) \
+		--no-annotate --custom-compile-command 'make lowest' --output-file .constraints-lowest.txt
 
 soak: $(VENV)/.installed-dev
 	$(PYTEST) -m soak
@@ -44,5 +66,5 @@ report: $(VENV)/.installed
 	$(BIN)/tunnelcd report $(OUT)
 
 clean:
-	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) $(LOWEST) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

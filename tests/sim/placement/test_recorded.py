@@ -38,7 +38,7 @@ def test_a_trajectory_is_read_back_with_its_lines(tmp_path: Path) -> None:
     generator = np.random.default_rng(3)
     stamps_s = 1.7e9 + np.cumsum(generator.uniform(0.5, 1.0, 20))
     points = np.cumsum(generator.normal(0.0, 0.3, (20, 3)), axis=0)
-    turns = Rotation.random(20, rng=generator)
+    turns = Rotation.random(20, random_state=generator)
     motion, lines = read_drive(written(tmp_path / "t.tum", ["# comment", *table(stamps_s, points, turns)]))
     assert lines == tuple(range(2, 22))
     poses = motion.poses(stamps_s - stamps_s[0])
