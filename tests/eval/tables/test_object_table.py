@@ -13,7 +13,7 @@ from cdpipe.core.geometry import stream
 from eval.core.domains import domain_of
 from eval.core.statistics import N_RESAMPLES, mean_with_interval
 from eval.plans.plan import cells, load_plan
-from eval.tables.object_groups import clustered_interval, group_overview, main_changes, objects_by_group
+from eval.tables.groups import clustered_interval, group_overview, main_changes, objects_by_group
 from eval.tables.object_table import FILES, ORACLE_VARIANT, object_overview, object_tables
 
 NAN = float("nan")

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from eval.core.ranking import auroc
+from eval.tables.groups import recall_by_size, share_interval
 from eval.tables.region_curves import (
     RankedPairs,
     found_at,
@@ -18,7 +19,6 @@ from eval.tables.region_curves import (
     resampled_recalls,
     roc_curve,
 )
-from eval.tables.region_sizes import recall_by_size, share_interval
 
 CASES = [  # seed, kind of site, status, way, observable changes
     (1, 4.5, "ok", 1000.0, 2),

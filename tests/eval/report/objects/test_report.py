@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from eval.report.cost.pareto import with_domain
 from eval.report.objects.cases import N_WORST, chosen_cases, voxel_variants, why
 from eval.report.objects.report import draw_objects
 from eval.report.objects.tables import methods_table, withdrawal_table
@@ -16,6 +15,7 @@ from eval.report.page import write_page
 from eval.running.run_data import RunData, read_run
 from eval.running.runfolder import RunFolder
 from eval.tables.object_table import FILES, ORACLE_VARIANT, object_tables
+from eval.tables.rows import with_domain
 
 NAN = float("nan")
 VOXEL = "tunnelcd[extract.method=voxel,extract.voxel_m=0.65]"
