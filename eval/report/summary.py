@@ -169,8 +169,10 @@ def _sentence(data: RunData, merges: pd.DataFrame) -> str:
         parts.append(f"{n_unmade} have no world and are left out")
     wrong = (numbers(results, "merge_error_m") > RIGHT_M) | (numbers(results, "merge_error_deg") > RIGHT_DEG)
     if n_wrong := int(wrong.sum()):
-        words = f"{n_wrong} accepted merges are wrong by more than {RIGHT_M:g} m or {RIGHT_DEG:g} deg"
-        parts.append(f"{words}, which spoils every later figure of their cases")
+        words = f"{_counted(n_wrong, 'accepted merge')} {'is' if n_wrong == 1 else 'are'} wrong"
+        parts.append(
+            f"{words} by more than {RIGHT_M:g} m or {RIGHT_DEG:g} deg, and with it all later figures of the case"
+        )
     verdicts = [] if len(merges) == 0 else list(merges[merges["family"] == ALL_FAMILIES]["is_met"])
     for name in ("regions", "objects"):
         targets = stored_table(data, f"{name}_targets")

@@ -58,7 +58,7 @@ def kinds_table(table: pd.DataFrame, *, is_whole: bool = True) -> Table:
         for row in records(table[table["family"] == ALL_FAMILIES] if len(table) else table)
     ]
     headings = ("variant", *_TARGET_HEADINGS)
-    return Table(headings, tuple(rows), "Every kind of pair: what is asked, and what each variant does")
+    return Table(headings, tuple(rows), "Kinds of pair: one row is one method; the group says what the kind asks for")
 
 
 def families_table(table: pd.DataFrame, name: str, *, is_whole: bool = True) -> Table:
