@@ -164,22 +164,23 @@ def _sentence(data: RunData, merges: pd.DataFrame) -> str:
     bad = [row for row in data.results if text(row, "status") != "ok"]
     n_unmade = sum(is_unmade(row) for row in bad)
     if len(bad) > n_unmade:
-        parts.append(f"{len(bad) - n_unmade} of {len(results)} cases gave no answer and count as finding nothing")
+        meaning = "ended without a merge" if ends_at_merge(data) else "gave no answer and count as finding nothing"
+        parts.append(f"{len(bad) - n_unmade} of {len(results)} cases {meaning}")
     if n_unmade:
         parts.append(f"{n_unmade} have no world and are left out")
+    own = merges[merges["family"] == ALL_FAMILIES] if len(merges) else merges
     wrong = (numbers(results, "merge_error_m") > RIGHT_M) | (numbers(results, "merge_error_deg") > RIGHT_DEG)
-    if n_wrong := int(wrong.sum()):
-        words = f"{_counted(n_wrong, 'accepted merge')} {'is' if n_wrong == 1 else 'are'} wrong"
-        parts.append(
-            f"{words} by more than {RIGHT_M:g} m or {RIGHT_DEG:g} deg, and with it all later figures of the case"
-        )
-    verdicts = [] if len(merges) == 0 else list(merges[merges["family"] == ALL_FAMILIES]["is_met"])
+    # where pairs have a kind, a merge of sessions without a common place is wrong too
+    if n_wrong := int(own["n_wrong_accepted"].sum() if len(own) else wrong.sum()):
+        told = f"{_counted(n_wrong, 'accepted merge')} {'is' if n_wrong == 1 else 'are'} wrong"
+        parts.append(f"{told} (over {RIGHT_M:g} m or {RIGHT_DEG:g} deg)")
+    verdicts = list(own[own["variant"] == shown_variant(data)]["is_met"]) if len(own) else []
     for name in ("regions", "objects"):
         targets = stored_table(data, f"{name}_targets")
         verdicts += list(targets["is_met"]) if len(targets) else []
     verdicts = [bool(value) for value in verdicts if not pd.isna(value)]
     if verdicts and is_whole:
-        parts.append(f"{sum(verdicts)} of {len(verdicts)} targets are met")
+        parts.append(f"{sum(verdicts)} of {len(verdicts)} targets of the plan are met")
     if is_contended(data):
         parts.append("times were measured beside other work")
     return f"{'; '.join(parts)}."
