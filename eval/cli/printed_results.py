@@ -27,6 +27,7 @@ def print_results(folder: Path, quiet: bool) -> None:
     import pandas as pd
 
     from eval.plans.coverage import coverage
+    from eval.plans.targets import targets_of
     from eval.running.predictions import list_incomplete_variants
     from eval.running.runfolder import RunFolder
     from eval.tables.merge_table import merge_overview
@@ -40,14 +41,15 @@ def print_results(folder: Path, quiet: bool) -> None:
     print_table("means over pairs", counts.join(groups[shown].mean()).reset_index())
     cases = zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
     is_told = (folder / "provenance.json").is_file()
-    covered = coverage(RunFolder(folder).provenance(), cases) if is_told else None
+    provenance = RunFolder(folder).provenance() if is_told else {}
+    covered = coverage(provenance, cases)
     is_whole = covered is None or covered.is_whole
-    targets = merge_overview(results, is_whole=is_whole)
+    targets = merge_overview(results, targets_of(provenance), is_whole=is_whole)
     if covered is not None and not is_whole:
         typer.echo(f"{covered.sentence}\n")
     if len(targets):
         print_table("merge: share of the pairs within the target of their kind, with its 95 % interval", targets)
-    for line in list_incomplete_variants(RunFolder(folder).provenance(), results) if is_told else []:
+    for line in list_incomplete_variants(provenance, results) if is_told else []:
         typer.echo(f"note: {line}\n")
     if (folder / "regions_table.csv").is_file():
         _region_results(folder)
@@ -70,7 +72,7 @@ def _region_results(folder: Path) -> None:
 def _object_results(folder: Path) -> None:
     import pandas as pd
 
-    from eval.tables.object_groups import group_overview
+    from eval.tables.groups import group_overview
     from eval.tables.object_table import object_overview
 
     table = pd.read_csv(folder / "objects_table.csv")

@@ -8,6 +8,7 @@ scenarios:                           # eval/plans/worlds.py tells more
 wide: [paper/site2]                  # wide drifts: presets apply their section `wide` there
 seeds: "20000:20002"                 # B excluded, in quotes; or a list
 report: [regions, objects]           # tables and plots of regions, of objects, or of both (eval/tables)
+targets: main                        # what is asked: those of another plan, or of its own (eval/plans/targets.py)
 until: null                          # merge: stop after the merge; only the columns of the merge are filled
 variants:
   - preset: paper                    # a shipped preset or the path of a .yaml file
@@ -40,6 +41,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.plugins import find_yaml
 from cdpipe.core.yamlfile import Settings, read_yaml, suggest, validate
 from eval.plans.parts import Grid, Label, NotEmpty, Variant
+from eval.plans.targets import PlanTargets, Targets
 from eval.plans.variants import Cell, Until, methods_of, slug
 from eval.plans.worlds import OneOrMore, ScenarioItem, group_of, world_slug, worlds_of
 
@@ -194,6 +196,7 @@ class Plan(Settings):
     seeds: Annotated[tuple[int, ...], BeforeValidator(parse_seeds)]
     until: Until | None = None
     report: Annotated[tuple[Literal["regions", "objects"], ...], BeforeValidator(_subjects)] = ()
+    targets: PlanTargets = Targets()
     variants: Annotated[tuple[Variant, ...], NotEmpty]
     grid: tuple[Grid, ...] = ()
 

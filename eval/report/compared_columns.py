@@ -9,7 +9,8 @@ import pandas as pd
 
 from eval.core.domains import domain_of
 from eval.tables.columns import RESULT_COLUMNS, Column, fine, share, significant
-from eval.tables.merge_table import TARGETS, is_within_target, kinds, numbers, texts
+from eval.tables.merge_table import RULES, is_within_target, kinds
+from eval.tables.rows import numbers, texts
 
 POOLED = "recall_at_0.1"
 POOLED_RATE_PER_100M = 0.1
@@ -63,7 +64,7 @@ def figures_of(results: pd.DataFrame) -> pd.DataFrame:
     """
     kind = kinds(results)
     answered = np.where(np.isin(kind, _REFUSABLE), np.nan, (results["status"] == "ok").to_numpy(dtype=np.float64))
-    within = np.where(np.isin(kind, list(TARGETS)), is_within_target(results).astype(np.float64), np.nan)
+    within = np.where(np.isin(kind, list(RULES)), is_within_target(results).astype(np.float64), np.nan)
     family = texts(results, "family" if "family" in results else "scenario")
     columns = {
         "scenario": results["scenario"].astype(str).to_numpy(),

@@ -17,8 +17,8 @@ from cdpipe.core.errors import InputError
 from eval.core.statistics import ENOUGH_PAIRS, mean_with_interval
 from eval.report.compared_columns import COMPARED, POOLED, POOLED_RATE_PER_100M, figures_of, is_time
 from eval.running.sides import Side, check_versions, matched_variants
-from eval.tables.region_curves import PAIR, interval_of, ranked_pairs, recall_at, resampled_recalls
-from eval.tables.region_table import ALL_DOMAINS, DOMAINS
+from eval.tables.region_curves import interval_of, ranked_pairs, recall_at, resampled_recalls
+from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR
 
 BETTER, WORSE, NOISE = "better", "worse", "no difference beyond noise"
 SAME, TOO_FEW, NOT_JUDGED = "the same", "too few pairs", "not judged"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,15 +18,13 @@ from eval.core.output import make_writable
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.report.compared_columns import COMPARED
 from eval.report.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare
-from eval.report.objects.objects import Picture
 from eval.report.render import rendered, written
 from eval.report.settings.charts import Effect, effect_chart
 from eval.report.settings.effects import signed
-from eval.report.story import joined
-from eval.report.tables import Cell, Table
+from eval.report.tables import Cell, Picture, Table
 from eval.running.sides import Side, cautions, only_in, short_names, why_no_times
 from eval.tables.columns import Column, spaced
-from eval.tables.region_table import ALL_DOMAINS
+from eval.tables.rows import records
 
 COLOURS = {BETTER: "#d3e7f5", WORSE: "#fbdcc8"}
 MOVED = tuple(COLOURS)
@@ -38,7 +36,7 @@ _MATRIX = (
 )  # fmt: skip
 _DRAWN = ("region_recall_at_k", "region_auroc", "object_iou_point", "object_f1_50")
 _MAX_DRAWN = 3
-_MAX_METHODS, _MAX_LINES = 4, 8
+_MAX_LINES = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,58 +99,16 @@ def overview(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def sentences(found: Comparison) -> list[str]:
-    """Return the first paragraph: how many figures moved, which, what chance would do, and what is not paired."""
-    name_a, name_b = found.names
+    """Return how many figures moved, then what stands against the comparison and what is on one side only."""
     rows = _widest(found.table)
-    counts = {word: sum(row["verdict"] == word for row in rows) for word in (BETTER, WORSE, NOISE, SAME, TOO_FEW)}
-    n_differ = counts[BETTER] + counts[WORSE] + counts[NOISE]
-    where = "all pairs" if rows[0]["where"] == ALL_DOMAINS else f"the pairs {domain_name(rows[0]['where'])}"
-    told = [
-        f"{name_b} (B) against {name_a} (A), over {where}: of {n_differ + counts[SAME]} figures that can be judged "
-        f"{counts[BETTER]} are better and {counts[WORSE]} worse; {counts[NOISE]} show no difference beyond noise, "
-        f"{counts[SAME]} are the same.",
-        *_moved(rows),
+    counts = Counter(row["verdict"] for row in rows)
+    told = ", ".join(f"{counts[word]} {word}" for word in (BETTER, WORSE, NOISE, SAME, TOO_FEW) if counts[word])
+    only = [
+        f"Only in {letter}: {'; '.join(lines[:_MAX_LINES])}{f'; and {n_more} more' if n_more > 0 else ''}."
+        for letter, lines in zip("AB", found.only, strict=True)
+        if lines and (n_more := len(lines) - _MAX_LINES) is not None
     ]
-    if counts[BETTER] + counts[WORSE]:
-        told.append(
-            f"Had none of the {n_differ} figures that differ truly moved, about {n_differ / 20:.1f} would be called "
-            "moved all the same."
-        )
-    if counts[TOO_FEW]:
-        told.append(f"{counts[TOO_FEW]} figures have fewer than {ENOUGH_PAIRS} pairs: no verdict on them.")
-    told += found.cautions
-    for letter, lines in zip("AB", found.only, strict=True):
-        if lines:
-            told.append(f"Only in {letter}, and compared with nothing: {_first(lines, '; ')}.")
-    return told
-
-
-def _moved(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Say of each variant in which of its main figures it moved, and how many others did."""
-    found: dict[str, dict[str, list[str]]] = {}
-    others: Counter[tuple[str, str]] = Counter()
-    for row in rows:
-        if row["verdict"] in MOVED and row["metric"] in _MATRIX:
-            column = _COLUMNS[row["metric"]]
-            words = f"{column.heading} ({_signed(column, row['difference'])}, {row['n_used']} pairs)"
-            found.setdefault(row["name"], {}).setdefault(row["verdict"], []).append(words)
-        elif row["verdict"] in MOVED:
-            others[row["name"], row["verdict"]] += 1
-    told = []
-    for name, by_word in list(found.items())[:_MAX_METHODS]:
-        parts = []
-        for word, figures in by_word.items():
-            more = [f"{n} more"] if (n := others[name, word]) else []
-            parts.append(f"{word} in {joined([*figures, *more])}")
-        told.append(f"{name}: {'; '.join(parts)}.")
-    if len(found) > _MAX_METHODS:
-        told.append(f"{len(found) - _MAX_METHODS} of the other methods moved too: see the table.")
-    return told
-
-
-def _first(lines: Sequence[str], between: str) -> str:
-    more = f"{between}and {len(lines) - _MAX_LINES} more" if len(lines) > _MAX_LINES else ""
-    return between.join(lines[:_MAX_LINES]) + more
+    return [f"{found.names[1]} (B) against {found.names[0]} (A), {len(rows)} figures: {told}.", *found.cautions, *only]
 
 
 def matrix_table(table: pd.DataFrame) -> Table:
@@ -249,8 +205,9 @@ def _widest(table: pd.DataFrame) -> list[dict[str, Any]]:
 def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
     """Return the rows with `name`: the variant, or that of the side that has several."""
     n_a, n_b = table["variant_a"].nunique(), table["variant_b"].nunique()
-    rows = [{str(key): value for key, value in row.items()} for row in table.to_dict("records")]
-    return [{**row, "name": f"against {row['variant_a']}" if n_a > 1 == n_b else row["variant_b"]} for row in rows]
+    return [
+        {**row, "name": f"against {row['variant_a']}" if n_a > 1 == n_b else row["variant_b"]} for row in records(table)
+    ]
 
 
 def _signed(column: Column, value: float) -> str:

@@ -18,16 +18,17 @@ import pandas as pd
 from cdpipe.model.config import settings_table
 from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.core.statistics import ENOUGH_PAIRS
+from eval.plans.targets import targets_of
 from eval.report.charts import Chart, plotly_script
 from eval.report.cost.charts import draw_pareto
 from eval.report.cost.pareto import pareto_table
-from eval.report.latex import latex_tables
-from eval.report.merge.merge import draw_merge, ends_at_merge
+from eval.report.latex import latex_tables, to_latex
+from eval.report.merge.merge import draw_merge
 from eval.report.merge.tables import MERGE_COLUMNS
-from eval.report.objects.report import ObjectPart, draw_objects
+from eval.report.objects.report import draw_objects
 from eval.report.objects.tables import OBJECT_COLUMNS
 from eval.report.paper import time_table, volume_table
-from eval.report.regions.regions import REGION_COLUMNS, RegionPart, draw_regions
+from eval.report.regions.regions import REGION_COLUMNS, draw_regions
 from eval.report.render import rendered, written
 from eval.report.scenarios import draw_scenarios
 from eval.report.settings.effects import draw_effects
@@ -35,19 +36,12 @@ from eval.report.settings.factors import draw_factors
 from eval.report.settings.grids import PQ_COLUMN, draw_grids
 from eval.report.site.site import draw_site
 from eval.report.site.views import Views, write_views
-from eval.report.site.worst import draw_worst, shown_variant, worst_rows
-from eval.report.story import about_wrong_merges, story
-from eval.report.tables import (
-    Cell,
-    Table,
-    results_table,
-    to_csv,
-    to_latex,
-    unchanged_table,
-)
-from eval.report.verdict import is_judged, verdict_sentences
+from eval.report.site.worst import draw_worst, worst_rows
+from eval.report.summary import draw_summary
+from eval.report.tables import Cell, Table, results_table, to_csv, unchanged_table
 from eval.running.run_data import (
     RunData,
+    ends_at_merge,
     first_seed,
     flag,
     named_variants,
@@ -55,6 +49,7 @@ from eval.running.run_data import (
     read_document,
     read_run,
     scenarios,
+    shown_variant,
     text,
 )
 from eval.running.sides import Side, check_versions, is_contended
@@ -88,10 +83,10 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
     data = read_run(run)
     check_versions(Side(data), Side(data))
     files: dict[str, str | bytes] = {**latex_tables(data)}
-    if len(merges := merge_table(pd.DataFrame(list(data.results)))):
+    if len(merges := merge_table(pd.DataFrame(list(data.results)), targets_of(data.provenance))):
         files["merge.csv"] = merges.to_csv(index=False)
     if ends_at_merge(data):
-        files["index.html"] = rendered("page.html", _merge_content(data))
+        files["index.html"] = rendered("page.html", _merge_content(data, merges))
     else:
         tables = {"results": results_table(data), "table1": time_table(data), "table2": volume_table(data)}
         files["results.tex"] = to_latex(tables["results"])
@@ -101,7 +96,7 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
         points = pareto_table(data)
         if len(points):
             files["pareto.csv"] = points.to_csv(index=False)
-        content = _content(data, tables, draw_pareto(points, is_contended=is_contended(data)), views)
+        content = _content(data, merges, tables, draw_pareto(points, is_contended=is_contended(data)), views)
         files |= {f"{each.name}.png": each.png for each in content["charts"] if each.has_png}
         files["index.html"] = rendered("page.html", content)
     for name, file in files.items():
@@ -109,7 +104,9 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
     return run / "index.html"
 
 
-def _content(data: RunData, tables: Mapping[str, Table], pareto: Sequence[Chart], views: Views) -> dict[str, Any]:
+def _content(
+    data: RunData, merges: pd.DataFrame, tables: Mapping[str, Table], pareto: Sequence[Chart], views: Views
+) -> dict[str, Any]:
     regions, objects = draw_regions(data), draw_objects(data)
     worlds = scenarios(data, unchanged=False)
     # a run about objects alone shows its best and worst in their own section, and no maps
@@ -132,7 +129,7 @@ def _content(data: RunData, tables: Mapping[str, Table], pareto: Sequence[Chart]
     charts = [*(regions.plots if regions is not None else ()), *pareto, *by_scenario, *grids, *factors]
     return {
         **_about(data, missing),
-        "sentences": _first_paragraph(data, regions, objects),
+        "summary": draw_summary(data, merges),
         "regions": regions,
         "region_columns": [] if regions is None else REGION_COLUMNS,
         "objects": objects,
@@ -161,25 +158,14 @@ def _content(data: RunData, tables: Mapping[str, Table], pareto: Sequence[Chart]
     }
 
 
-def _first_paragraph(data: RunData, regions: RegionPart | None, objects: ObjectPart | None) -> list[str]:
-    """Return what is said first: of a run about one subject how that went, of any other who wins where."""
-    if (regions is None) != (objects is None):
-        part = regions or objects
-        return [*(part.sentences if part is not None else ()), *about_wrong_merges(data)]
-    told = verdict_sentences(data) if is_judged(data) else story(data)
-    found = {"Regions": regions.judged if regions else (), "Objects": objects.judged if objects else ()}
-    judged = [f"{name}: {line}" for name, lines in found.items() for line in lines]
-    return [told[0], *judged, *told[1:]]
-
-
-def _merge_content(data: RunData) -> dict[str, Any]:
+def _merge_content(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
     """Return the content of a page that shows the merge alone."""
     merge = draw_merge(data)
     # what a run without regions and objects does not hold is not missing
     missing = [line for line in data.missing if line.startswith("provenance.json")]
     return {
         **_about(data, [*missing, *merge.missing]),
-        "sentences": merge.sentences,
+        "summary": draw_summary(data, merges),
         "merge": merge,
         "columns": MERGE_COLUMNS,
         "views": None,

@@ -1,24 +1,22 @@
-"""The tables of the page, from rows to cells, and the same tables as CSV and LaTeX."""
+"""The tables of the page, from rows to cells."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from eval.core.domains import domain_name
 from eval.core.statistics import ENOUGH_PAIRS, bootstrap_interval
 from eval.running.run_data import (
-    GridOf,
     Row,
     RunData,
     defined,
     flag,
-    grids,
     named_variants,
     number,
     of,
@@ -33,17 +31,10 @@ from eval.tables.columns import (
     UNCHANGED_COLUMNS,
     UNDEFINED,
     Column,
-    share,
+    significant,
     spaced,
 )
-from eval.tables.merge_table import numbers
-from eval.tables.region_curves import PAIR
-
-_LATEX = {
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", EN_DASH: "--", THIN_SPACE: r"\,", "³": r"$^3$",
-    "↓": r"$\downarrow$", "→": r"$\rightarrow$",
-}  # fmt: skip
+from eval.tables.rows import ALL_DOMAINS, PAIR, is_told_the_truth, numbers, records
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +55,11 @@ class Table:
         headings: One per column.
         rows: (group, cells) of each row.
         caption: What stands above it.
-        n_text: How many columns at the left hold text.
     """
 
     headings: tuple[str, ...]
     rows: tuple[tuple[str, tuple[Cell, ...]], ...]
     caption: str = ""
-    n_text: int = 1
 
     def groups(self) -> list[tuple[str, list[tuple[Cell, ...]]]]:
         """Return the rows by group, in order."""
@@ -78,6 +67,15 @@ class Table:
         for group, cells in self.rows:
             found.setdefault(group, []).append(cells)
         return list(found.items())
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture with its title and caption; `address` holds it."""
+
+    title: str
+    address: str
+    caption: str
 
 
 def results_table(data: RunData) -> Table:
@@ -189,72 +187,95 @@ def _counted(counts: dict[str, int]) -> str:
     return ", ".join(f"{n} {word}" for word, n in counts.items())
 
 
-def grid_tables(data: RunData) -> list[Table]:
-    """Return a table of object IoU and one of region recall for every grid of two settings."""
-    return [
-        _grid_table(data, grid, column)
-        for grid in grids(data)
-        for column in RESULT_COLUMNS
-        if column.key in ("object_iou_point", "region_recall")
-    ]
-
-
-def _grid_table(data: RunData, grid: GridOf, column: Column) -> Table:
-    values = {
-        point: over_pairs(of(data.results, scenario=grid.scenario, variant=name), column.key)
-        for point, name in grid.points.items()
-    }
-    marks = dict(zip(values, best(list(values.values()), column), strict=True))
-    rows = []
-    for a in grid.values[0]:
-        cells = [Cell(a)]
-        for b in grid.values[1]:
-            value = values.get((a, b), math.nan)
-            cells.append(Cell(share(value), marks.get((a, b), False), colour=heat_colour(value)))
-        rows.append(("", tuple(cells)))
-    caption = f"{column.heading} of {grid.preset} on {grid.scenario}"
-    return Table((f"{grid.keys[0]} ↓  {grid.keys[1]} →", *grid.values[1]), tuple(rows), caption)
-
-
-def heat_colour(value: float) -> str:
-    """Return the background of a share: white at 0, blue at 1, "" where undefined."""
-    if math.isnan(value):
-        return ""
-    weight = min(max(value, 0.0), 1.0)
-    red, green, blue = (round(255 + weight * (end - 255)) for end in (107, 174, 214))
-    return f"#{red:02x}{green:02x}{blue:02x}"
+def to_frame(table: Table) -> pd.DataFrame:
+    """Return the texts of a table as they are on the page, the group as the first column, `scenario`."""
+    rows = [(group, *(cell.text for cell in cells)) for group, cells in table.rows]
+    return pd.DataFrame(rows, columns=["scenario", *table.headings])
 
 
 def to_csv(table: Table) -> str:
     """Return a table as CSV, the group as its first column; "–" is left empty, numbers hold no thin spaces."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(("scenario", *table.headings))
-    for group, cells in table.rows:
-        texts = (cell.text.replace(THIN_SPACE, "") for cell in cells)
-        writer.writerow((group, *("" if word == UNDEFINED else word for word in texts)))
-    return stream.getvalue()
+    frame = to_frame(table).map(lambda word: "" if word == UNDEFINED else word.replace(THIN_SPACE, ""))
+    return str(frame.to_csv(index=False))
 
 
-def to_latex(table: Table) -> str:
-    """Return a table as a LaTeX tabular in the style of booktabs, best values in bold."""
-    width = len(table.headings)
-    lines = [
-        "% needs \\usepackage{booktabs}",
-        f"\\begin{{tabular}}{{{'l' * table.n_text}{'r' * (width - table.n_text)}}}",
-        "\\toprule",
-        " & ".join(escape_latex(heading) for heading in table.headings) + r" \\",
-    ]
-    for group, rows in table.groups():
-        lines += ["\\midrule", f"\\multicolumn{{{width}}}{{l}}{{\\textit{{{escape_latex(group)}}}}} \\\\"]
-        lines += [" & ".join(_latex_cell(cell) for cell in cells) + r" \\" for cells in rows]
-    return "\n".join([*lines, "\\bottomrule", "\\end{tabular}", ""])
+def methods_table(
+    table: pd.DataFrame,
+    columns: Sequence[Column],
+    cases: pd.DataFrame,
+    caption: str,
+    *,
+    counts: Mapping[str, str] | None = None,
+) -> Table:
+    """Return a row for each method in each domain; the best that is not told the truth is marked.
+
+    Args:
+        table: Rows with `domain`, `variant`, `n_pairs`, and for each column its value and perhaps `_low`, `_high`.
+        columns: The columns.
+        cases: Rows of results.csv with their `domain`, which tell over how many pairs a mean is.
+        caption: What stands above the table.
+        counts: Columns that are over items of all pairs together, and the column that counts these items.
+    """
+    rows: list[tuple[str, tuple[Cell, ...]]] = []
+    for domain, own in table.groupby("domain", sort=False):
+        of_domain = cases if domain == ALL_DOMAINS else cases[cases["domain"] == domain]
+        group = records(own)
+        of_columns = [_cells(group, column, of_domain, (counts or {}).get(column.key)) for column in columns]
+        for index, row in enumerate(group):
+            failed = f"{row['n_failed']} failed" if row.get("n_failed") else ""
+            cells = (Cell(spaced(str(row["variant"]))), Cell(str(row["n_pairs"]), interval=failed))
+            rows.append((group_name(str(domain), group), (*cells, *(column[index] for column in of_columns))))
+    return Table(("method", "pairs", *(column.heading for column in columns)), tuple(rows), caption)
 
 
-def escape_latex(words: str) -> str:
-    """Return text with the characters that LaTeX treats as commands escaped."""
-    return "".join(_LATEX.get(letter, letter) for letter in words)
+def group_name(domain: str, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a domain, and over how many pairs and observable changes the rows of its methods are."""
+    n_pairs = max(int(row["n_pairs"]) for row in rows)
+    n_changes = max(int(row.get("n_observable", row.get("n_changes", 0))) for row in rows)
+    found = f", {n_changes} observable changes" if n_changes else ""
+    return f"{domain_name(domain)}: {n_pairs} {'pair' if n_pairs == 1 else 'pairs'}{found}"
 
 
-def _latex_cell(cell: Cell) -> str:
-    return f"\\textbf{{{escape_latex(cell.text)}}}" if cell.is_best else escape_latex(cell.text)
+def best_rows(rows: Sequence[Mapping[str, Any]], column: Column, n_used: Sequence[int]) -> list[bool]:
+    """Mark the best of the rows that are not told the truth; over how many pairs each is says `n_used`."""
+    fair = [place for place, row in enumerate(rows) if not is_told_the_truth(str(row["variant"]))]
+    marks = best([float(rows[place][column.key]) for place in fair], column, [n_used[place] for place in fair])
+    winners = {place for place, is_best in zip(fair, marks, strict=True) if is_best}
+    return [place in winners for place in range(len(rows))]
+
+
+def interval_of_row(row: Mapping[str, Any], key: str, shown: Callable[[float], str]) -> str:
+    """Return the interval of a column of a row, "" where it has none."""
+    low, high = (float(row.get(f"{key}_{end}", math.nan)) for end in ("low", "high"))
+    return "" if math.isnan(low) else f"{shown(low)}{EN_DASH}{shown(high)}"
+
+
+def targets_table(targets: pd.DataFrame) -> Table:
+    """Return what the plan asks for and whether it is met; what is missed is bold."""
+    rows = []
+    for row in records(targets):
+        word = UNDEFINED if pd.isna(row["is_met"]) else "met" if bool(row["is_met"]) else "missed"
+        interval = "" if math.isnan(row["low"]) else f"{significant(row['low'])} to {significant(row['high'])}"
+        cells = (
+            Cell(f"{row['target']} ({row['variant']})"), Cell(domain_name(str(row["domain"]))), Cell(str(row["asked"])),
+            Cell(significant(row["value"]), interval=interval), Cell(str(row["n"])), Cell(word, word == "missed"),
+        )  # fmt: skip
+        rows.append(("", cells))
+    caption = "Targets of the plan: one row is one target of one method"
+    return Table(("target", "where", "asked", "found", "pairs", ""), tuple(rows), caption)
+
+
+def _cells(
+    rows: Sequence[Mapping[str, Any]], column: Column, cases: pd.DataFrame, count_column: str | None
+) -> list[Cell]:
+    if count_column is not None:
+        used = [(int(row[count_column]), int(row[count_column])) for row in rows]
+    else:
+        used = [used_pairs(cases, str(row["variant"]), column.key) for row in rows]
+    cells = []
+    for row, n, is_best in zip(rows, used, best_rows(rows, column, [n for n, _ in used]), strict=True):
+        below = beside(interval_of_row(row, column.key, column.shown), *n)
+        if count_column is not None:
+            below = "\n".join(filter(None, (below, f"n {n[0]}")))
+        cells.append(Cell(column.shown(float(row[column.key])), is_best, below))
+    return cells

@@ -16,12 +16,14 @@ import pandas as pd
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 from eval.core.tablefile import table_file
+from eval.plans.coverage import Coverage, coverage
+from eval.plans.targets import targets_of
 from eval.plans.worlds import references
 from eval.running.runfolder import RunFolder
+from eval.tables.rows import with_domain
 
 Row = Mapping[str, Any]
 REQUIRED = ("scenario", "seed", "variant", "status")
-BASELINES = ("voxel-diff", "c2c", "random-regions")
 SHOWN_PRESETS = ("paper", "tunnelcd", "voxel-diff")
 
 
@@ -66,6 +68,36 @@ def read_run(run: Path) -> RunData:
     items = {name: _optional_rows(table_file(run / f"{name}.csv"), missing) for name in ("changes", "regions")}
     provenance = _optional_json(run / "provenance.json", missing)
     return RunData(RunFolder(run), results, items["changes"], items["regions"], provenance, tuple(missing))
+
+
+def stored_table(data: RunData, name: str) -> pd.DataFrame:
+    """Return a table of the run folder, empty where it is not there."""
+    path = table_file(data.folder.path / f"{name}.csv")
+    return pd.read_csv(path) if path.is_file() else pd.DataFrame()
+
+
+def ends_at_merge(data: RunData) -> bool:
+    """Tell whether a run's plan ended every method at the merge."""
+    plan = data.provenance.get("plan")
+    return isinstance(plan, Mapping) and plan.get("until") == "merge"
+
+
+def shown_variant(data: RunData) -> str:
+    """Return the variant whose cases a page shows: the one that the plan is about, or the first that was run."""
+    return targets_of(data.provenance).shown_method([str(row["variant"]) for row in data.results])
+
+
+def comparable(data: RunData) -> pd.DataFrame:
+    """Return the rows of results.csv of methods that are neither grid points nor repetitions, with their `domain`."""
+    names = [*scenarios(data, unchanged=False), *scenarios(data, unchanged=True)]
+    wanted = {(scenario, variant) for scenario in names for variant in named_variants(data, scenario)}
+    return with_domain([row for row in data.results if (row["scenario"], row["variant"]) in wanted])
+
+
+def covered_by(data: RunData) -> Coverage | None:
+    """Return how much of its plan a run holds; None where that is not known."""
+    cases = ((str(row["scenario"]), int(row["seed"]), str(row["variant"])) for row in data.results)
+    return coverage(data.provenance, cases)
 
 
 def _require_cases(path: Path, rows: Iterable[Row]) -> None:
@@ -213,6 +245,8 @@ def off_grids(table: pd.DataFrame, data: RunData) -> pd.DataFrame:
 
     `eval.report.settings.grids` shows the points of grids, hundreds of them, in less space.
     """
+    if "variant" not in table:
+        return table
     points = grid_points(data)
     shown = {variant for world, variant, _ in _cases(data) if (world, variant) not in points}
     rows = table[table["variant"].isin(shown)]

@@ -33,6 +33,7 @@ from eval.core.output import make_writable
 from eval.core.provenance import TOOL
 from eval.core.statistics import summarise
 from eval.plans.coverage import coverage
+from eval.plans.targets import targets_of
 from eval.plans.variants import slug
 from eval.plans.worlds import world_slug
 from eval.tables.effects import effects
@@ -174,7 +175,11 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     for table, frame in items.items():
         _write_csv(run.path / f"{table}.csv", frame)
     _write_csv(run.path / "summary.csv", summarise(results, keyframes=items["keyframes"]))
-    tables = {"effects": effects(results), "merge": merge_table(results), **_report_tables(run, results, items)}
+    tables = {
+        "effects": effects(results),
+        "merge": merge_table(results, targets_of(_provenance(run))),
+        **_report_tables(run, results, items),
+    }
     for name, found in tables.items():
         if len(found):
             _write_csv(run.path / f"{name}.csv", found)
@@ -224,8 +229,8 @@ def _report_tables(
 ) -> Mapping[str, pd.DataFrame]:
     """Return the tables that the plan asks for, and empty ones for those that it does not."""
     tables = {name: pd.DataFrame() for name in (*REGION_FILES, *OBJECT_FILES)}
-    provenance = run.provenance() if (run.path / "provenance.json").is_file() else {}
-    subjects = reported(provenance)
+    provenance = _provenance(run)
+    subjects, targets = reported(provenance), targets_of(provenance)
     if not subjects or "region_auroc" not in results:
         return tables
     covered = coverage(
@@ -233,10 +238,14 @@ def _report_tables(
     )
     is_whole = covered is None or covered.is_whole
     if "regions" in subjects:
-        tables |= region_tables(results, items, is_whole=is_whole)
+        tables |= region_tables(results, items, targets, is_whole=is_whole)
     if "objects" in subjects:
-        tables |= object_tables(results, items["changes"], is_whole=is_whole)
+        tables |= object_tables(results, items["changes"], targets, is_whole=is_whole)
     return tables
+
+
+def _provenance(run: RunFolder) -> Mapping[str, Any]:
+    return run.provenance() if (run.path / "provenance.json").is_file() else {}
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

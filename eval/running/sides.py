@@ -14,7 +14,7 @@ from cdpipe.core.yamlfile import suggest
 from eval.plans.coverage import coverage
 from eval.running.run_data import Row, RunData, flag, read_run
 from eval.scoring.scoring import METRICS_VERSION
-from eval.tables.region_curves import PAIR
+from eval.tables.rows import PAIR
 
 _MAX_NAMED = 6
 

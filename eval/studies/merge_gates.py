@@ -32,7 +32,8 @@ from eval.plans.coverage import plan_of
 from eval.plans.plan import cells
 from eval.running.run_data import read_document
 from eval.studies.calibrate import read_table
-from eval.tables.merge_table import TARGETS, is_accepted, is_right, kinds, numbers, texts
+from eval.tables.merge_table import RULES, is_accepted, is_right, kinds
+from eval.tables.rows import numbers, texts
 
 KEPT_SHARE = 0.995
 LOGARITHMIC = ("hessian_ratio",)
@@ -180,7 +181,7 @@ def suggest(right: Float64Array, wrong: Float64Array, *, logarithmic: bool) -> t
 def gates_chart(cases: pd.DataFrame, table: pd.DataFrame) -> Drawing:
     """Draw a panel for each gate: every merge by kind of pair, right and wrong, and the thresholds."""
     by_gate = {str(row["gate"]): row for row in table.to_dict("records")}
-    kinds_shown = [kind for kind in (*TARGETS, "") if (cases["kind"] == kind).any()]
+    kinds_shown = [kind for kind in (*RULES, "") if (cases["kind"] == kind).any()]
     y_span = (len(kinds_shown) - 0.5, -0.5)
     y = Axis(span=y_span, ticks=named_ticks([kind or "no kind" for kind in kinds_shown]))
     panels = []

@@ -6,15 +6,15 @@ within a target only where the target says that refusing is right.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from cdpipe.core.geometry import BoolArray, Float64Array
+from cdpipe.core.geometry import BoolArray
 from eval.core.statistics import wilson_interval
-from eval.plans.variants import ORACLE_MERGE
+from eval.plans.targets import Targets, is_oracle
+from eval.tables.rows import numbers, texts
 
 RIGHT_M, RIGHT_DEG = 0.5, 2.0
 EXACT_M, EXACT_DEG = 0.05, 0.3
@@ -27,25 +27,13 @@ TIMES = ("t_index_s", "t_merge_s", "t_refine_s")
 DEGENERACY = "min_hessian_ratio"
 
 
-@dataclass(frozen=True, slots=True)
-class Target:
-    """What is asked of one kind of pair: the rule for a single one, in words, and the share that must meet it."""
-
-    rule: str
-    share: float
-
-
-TARGETS = {
-    "clean": Target(f"accepted, median error at most {EXACT_M:g} m and {EXACT_DEG:g} deg", 0.99),
-    "drift": Target(f"accepted, 95th percentile of the error along the path at most {EXACT_M:g} m", 0.95),
-    "smooth": Target(f"refused because it can slide, or right to {RIGHT_M:g} m and {RIGHT_DEG:g} deg", 1.0),
-    "disjoint": Target("refused", 1.0),
+# what each kind of pair asks of a merge; a plan says which share of the pairs must do so
+RULES = {
+    "clean": f"accepted, median error at most {EXACT_M:g} m and {EXACT_DEG:g} deg",
+    "drift": f"accepted, 95th percentile of the error along the path at most {EXACT_M:g} m",
+    "smooth": f"refused because it can slide, or right to {RIGHT_M:g} m and {RIGHT_DEG:g} deg",
+    "disjoint": "refused",
 }
-
-
-def is_oracle(variant: str) -> bool:
-    """Tell whether a variant merges by the truth."""
-    return ORACLE_MERGE in variant.partition("[")[0].split("+")
 
 
 def is_accepted(results: pd.DataFrame) -> BoolArray:
@@ -91,25 +79,12 @@ def kinds(results: pd.DataFrame) -> np.ndarray[Any, np.dtype[np.object_]]:
     return texts(results, "pair_kind")
 
 
-def texts(results: pd.DataFrame, column: str) -> np.ndarray[Any, np.dtype[np.object_]]:
-    """Return an (N,) column as texts, "" where it is empty or absent."""
-    if column not in results:
-        return np.full(len(results), "", dtype=object)
-    return np.array(["" if pd.isna(value) else str(value) for value in results[column]], dtype=object)
-
-
-def numbers(results: pd.DataFrame, column: str) -> Float64Array:
-    """Return an (N,) column as numbers, NaN where it is empty or absent."""
-    if column not in results:
-        return np.full(len(results), np.nan)
-    return pd.to_numeric(results[column], errors="coerce").to_numpy(dtype=np.float64)
-
-
-def merge_table(results: pd.DataFrame) -> pd.DataFrame:
+def merge_table(results: pd.DataFrame, targets: Targets) -> pd.DataFrame:
     """Return one row for each kind of pair and variant, and the same for each family.
 
     Args:
         results: Rows as in results.csv.
+        targets: What the plan of the run asks for.
 
     Returns:
         `pair_kind`; `family`, "all" in the rows over all; `variant`; the counts `n_pairs`, `n_accepted`, `n_refused`,
@@ -130,7 +105,7 @@ def merge_table(results: pd.DataFrame) -> pd.DataFrame:
     for keys in (["pair_kind", "variant"], ["pair_kind", "family", "variant"]):
         for values, group in cases.groupby(keys, sort=False):
             names = {"family": ALL_FAMILIES, **dict(zip(keys, values, strict=True))}
-            rows.append({**{key: names[key] for key in ("pair_kind", "family", "variant")}, **_counts(group)})
+            rows.append({**{key: names[key] for key in ("pair_kind", "family", "variant")}, **_counts(group, targets)})
     return (
         pd.DataFrame(rows).sort_values("pair_kind", key=_kind_order, kind="stable", ignore_index=True)
         if rows
@@ -138,14 +113,15 @@ def merge_table(results: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def merge_overview(results: pd.DataFrame, *, is_whole: bool = True) -> pd.DataFrame:
+def merge_overview(results: pd.DataFrame, targets: Targets, *, is_whole: bool = True) -> pd.DataFrame:
     """Return the rows of `merge_table` over all families with the columns that a terminal has room for.
 
     Args:
         results: Rows as in results.csv.
+        targets: What the plan of the run asks for.
         is_whole: Whether all that was planned is in them; otherwise nothing is said to be met or not.
     """
-    table = merge_table(results)
+    table = merge_table(results, targets)
     if len(table) == 0:
         return table
     shown = table[table["family"] == ALL_FAMILIES]
@@ -161,13 +137,14 @@ def merge_overview(results: pd.DataFrame, *, is_whole: bool = True) -> pd.DataFr
     return overview if is_whole else overview.assign(met=None)
 
 
-def _counts(group: pd.DataFrame) -> dict[str, Any]:
+def _counts(group: pd.DataFrame, targets: Targets) -> dict[str, Any]:
     accepted, status = is_accepted(group), group["status"]
     n_within, n_wrong = int(is_within_target(group).sum()), int(is_wrong(group).sum())
-    target = TARGETS.get(str(group["pair_kind"].iloc[0]))
-    share = n_within / len(group) if target else float("nan")
-    is_asked = target is not None and not is_oracle(str(group["variant"].iloc[0]))
-    low, high = wilson_interval(n_within, len(group)) if target else (float("nan"), float("nan"))
+    kind, nan = str(group["pair_kind"].iloc[0]), float("nan")
+    has_rule = kind in RULES
+    share = n_within / len(group) if has_rule else nan
+    low, high = wilson_interval(n_within, len(group)) if has_rule else (nan, nan)
+    asked = None if is_oracle(str(group["variant"].iloc[0])) else targets.share(kind)
     n_refused = int((status == "merge_refused").sum())
     return {
         "n_pairs": len(group),
@@ -178,10 +155,10 @@ def _counts(group: pd.DataFrame) -> dict[str, Any]:
         "share_within_target": share,
         "low": low,
         "high": high,
-        "target_share": target.share if target and is_asked else float("nan"),
+        "target_share": nan if asked is None else asked,
         "n_wrong_accepted": n_wrong,
         "n_p95_over_half_m": int((accepted & (numbers(group, "merge_error_m_p95") > RIGHT_M)).sum()),
-        "is_met": bool(share >= target.share and n_wrong == 0) if target and is_asked else None,
+        "is_met": None if asked is None else bool(share >= asked and n_wrong == 0),
         "n_named_degeneracy": int((names_degeneracy(group) & np.asarray(status == "merge_refused")).sum()),
         **{name: value for column in ERRORS for name, value in _spread(column, group[accepted]).items()},
         **{name: value for column in TIMES for name, value in _spread(column, group).items()},
@@ -196,5 +173,5 @@ def _spread(column: str, group: pd.DataFrame) -> dict[str, float]:
 
 
 def _kind_order(column: pd.Series[str]) -> pd.Series[int]:
-    order = {name: place for place, name in enumerate(TARGETS)}
+    order = {name: place for place, name in enumerate(RULES)}
     return column.map(lambda name: order.get(name, len(order)))

@@ -1,4 +1,4 @@
-"""What a run says about objects: every method in and out of the training distribution, and the targets of `tunnelcd`.
+"""What a run says about objects: a row for every method, in and out of the training distribution.
 
 Means are over session pairs, as in summary.csv, and a pair without an answer has missed all its objects. What needs an
 answered object (displacement, volume, the median over those matched) is over the changes of all pairs together.
@@ -14,13 +14,12 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
-from eval.core.domains import domain_of
 from eval.core.statistics import mean_with_interval
+from eval.plans.targets import Targets
 from eval.scoring.object_sizes import PILE_KIND
-from eval.tables.merge_table import numbers, texts
-from eval.tables.object_groups import clustered_interval, main_changes, median, objects_by_group, pair_numbers
-from eval.tables.region_curves import PAIR
-from eval.tables.region_table import ALL_DOMAINS, DOMAINS, MAIN_VARIANT
+from eval.tables.groups import clustered_interval, main_changes, objects_by_group, pair_numbers
+from eval.tables.rows import by_domain, median, numbers, of_cases, texts, with_domain
+from eval.tables.targets import judged_targets
 
 FILES = ("objects_table", "objects_by_group", "objects_targets")
 ORACLE_VARIANT = "oracle-merge+oracle-regions"
@@ -29,52 +28,36 @@ _MEANS = (
     "object_pq", "kind_accuracy", "object_iou_point_partial", "region_recall_proposed", "region_recall",
 )  # fmt: skip
 _RATES = ("false_regions_per_100m_proposed", "false_regions_per_100m")
-# what is asked in distribution: column, words, variant, rule, limit
-_TARGETS = (
-    ("object_iou_point", "point IoU (missed: 0)", MAIN_VARIANT, "at least", 0.75),
-    ("object_iou_point", "point IoU with merge and regions by the truth", ORACLE_VARIANT, "at least", 0.85),
-    ("object_iou_voxel", "voxel IoU", MAIN_VARIANT, "at least", 0.65),
-    ("object_f1_50", "F1 at IoU 0.5", MAIN_VARIANT, "at least", 0.90),
-    ("object_f1_25", "F1 at IoU 0.25", MAIN_VARIANT, "at least", 0.95),
-    ("kind_accuracy", "kind right", MAIN_VARIANT, "at least", 0.95),
-    ("displacement_error_m", "median error of displacements [m]", MAIN_VARIANT, "at most", 0.10),
-    ("pile_volume_error", "median error of the volume of muck piles", MAIN_VARIANT, "at most", 0.15),
-    ("object_iou_point_partial", "point IoU of short moves and reshaped piles", MAIN_VARIANT, "at least", 0.5),
-)
-_COUNTS = {
-    "displacement_error_m": "n_displacements", "pile_volume_error": "n_piles", "object_iou_point_partial": "n_partial",
-}  # fmt: skip
-_ROUNDING = 1e-9
 
 
-def object_tables(results: pd.DataFrame, changes: pd.DataFrame, *, is_whole: bool = True) -> dict[str, pd.DataFrame]:
+def object_tables(
+    results: pd.DataFrame, changes: pd.DataFrame, targets: Targets, *, is_whole: bool = True
+) -> dict[str, pd.DataFrame]:
     """Return the tables of a run about objects, by file name.
 
     Args:
         results: Rows as in results.csv.
         changes: Rows as in changes.csv.
+        targets: What the plan of the run asks for.
         is_whole: Whether all that was planned is in them; otherwise nothing is said to be met or not.
 
     Returns:
         objects_table: a row for every domain and variant; objects_by_group: by kind of prop and size of hull;
         objects_targets: what is asked, and what is found.
     """
-    results = results.assign(domain=[domain_of(family) for family in texts(results, "family")])
     rows: list[dict[str, Any]] = []
     groups: list[dict[str, Any]] = []
-    present = [name for name in DOMAINS[:2] if (results["domain"] == name).any()]
-    for domain in [*present, *([ALL_DOMAINS] if len(present) > 1 else [])]:
-        cases = results if domain == ALL_DOMAINS else results[results["domain"] == domain]
+    for domain, cases in by_domain(with_domain(results)):
         for variant, own in cases.groupby("variant", sort=False):
             names = {"domain": domain, "variant": str(variant)}
-            of_cases = _of_cases(changes, own)
-            rows.append({**names, **_counts(own, of_cases), **_means(own), **_over_changes(of_cases)})
-            groups += [{**names, **row} for row in objects_by_group(of_cases)]
+            own_changes = of_cases(changes, own)
+            rows.append({**names, **_counts(own, own_changes), **_means(own), **_over_changes(own_changes)})
+            groups += [{**names, **row} for row in objects_by_group(own_changes)]
     table = pd.DataFrame(rows)
     return {
         "objects_table": table,
         "objects_by_group": pd.DataFrame(groups),
-        "objects_targets": object_targets(table, is_whole=is_whole),
+        "objects_targets": judged_targets(targets.objects, targets.method, table, results, is_whole=is_whole),
     }
 
 
@@ -105,45 +88,6 @@ def _with_interval(row: Mapping[Any, Any], name: str) -> str:
     if math.isnan(value):
         return "-"
     return f"{value:.{digits}f}" + ("" if math.isnan(low) else f" ({low:.{digits}f}-{high:.{digits}f})")
-
-
-def object_targets(table: pd.DataFrame, *, is_whole: bool) -> pd.DataFrame:
-    """Return what is asked in distribution, and whether it is met; no row without data.
-
-    Returns:
-        `target`, `domain`, `variant`, `value` with `low` and `high`, `asked` ("at least 0.75"), `n` pairs (changes for
-        displacement, volume and the partial group), and `is_met`: None where no verdict is passed.
-    """
-    found: list[dict[str, Any]] = []
-    for column, words, variant, rule, limit in _TARGETS:
-        for row in table[(table["domain"] == "in") & (table["variant"] == variant)].to_dict("records"):
-            value = float(row[column])
-            if math.isnan(value):
-                continue
-            is_met = value >= limit - _ROUNDING if rule == "at least" else value <= limit + _ROUNDING
-            found.append(
-                {
-                    "target": words,
-                    "domain": "in",
-                    "variant": variant,
-                    "value": value,
-                    "low": float(row[f"{column}_low"]),
-                    "high": float(row[f"{column}_high"]),
-                    "asked": f"{rule} {limit:g}",
-                    "n": int(row[_COUNTS.get(column, "n_pairs")]),
-                    "is_met": is_met if is_whole else None,
-                }
-            )
-    columns = ["target", "domain", "variant", "value", "low", "high", "asked", "n", "is_met"]
-    return pd.DataFrame(found, columns=columns).astype({"is_met": object})
-
-
-def _of_cases(changes: pd.DataFrame, cases: pd.DataFrame) -> pd.DataFrame:
-    """Return the changes of some rows of results.csv."""
-    wanted = [*PAIR, "variant"]
-    if len(changes) == 0:
-        return changes.assign(**{name: [] for name in wanted if name not in changes})
-    return changes.merge(cases[wanted].drop_duplicates(), on=wanted, how="inner")
 
 
 def _counts(own: pd.DataFrame, changes: pd.DataFrame) -> dict[str, Any]:

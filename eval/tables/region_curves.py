@@ -18,9 +18,9 @@ import pandas as pd
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from eval.core.statistics import N_RESAMPLES
+from eval.tables.rows import PAIR
 
 RATES_PER_100M = (0.1, 0.5)
-PAIR = ["scenario", "seed"]
 _BATCH = 100
 _MAX_ROC_POINTS = 400
 _ROUNDING = 1e-9

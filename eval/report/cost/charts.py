@@ -11,8 +11,8 @@ from eval.core.charts import BLACK, BLUE, SYMBOLS, Axis, Drawing, Look, Panel, S
 from eval.core.domains import domain_name
 from eval.report.charts import Chart
 from eval.report.cost.pareto import BYTES, F1, RECALL_AT_K, RECALL_AT_RATE, TIME
-from eval.report.objects.tables import is_told_the_truth
 from eval.report.regions.charts import look_of
+from eval.tables.rows import is_told_the_truth
 
 _QUALITIES = {
     "regions": {RECALL_AT_RATE: "recall at 0.1 false regions per 100 m", RECALL_AT_K: "recall at K"},

@@ -8,20 +8,15 @@ anything compete, and none that is told the truth does.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import BoolArray, Float64Array
-from eval.core.domains import domain_of
 from eval.core.statistics import mean_with_interval
-from eval.core.tablefile import table_file
-from eval.report.objects.tables import is_told_the_truth
-from eval.running.run_data import Row, RunData, named_variants, scenarios
-from eval.tables.merge_table import numbers, texts
-from eval.tables.region_table import ALL_DOMAINS, DOMAINS
+from eval.running.run_data import RunData, comparable, stored_table
+from eval.tables.rows import ALL_DOMAINS, DOMAINS, is_told_the_truth, numbers
 
 RECALL_AT_RATE, RECALL_AT_K, F1 = "recall_at_0.1", "region_recall_at_k", "object_f1_50"
 TIME, BYTES = "t_total_s", "bytes_regions_before"
@@ -56,13 +51,12 @@ def pareto_table(data: RunData) -> pd.DataFrame:
         `is_on_front`. No row where fewer than two methods have both.
     """
     results = comparable(data)
-    path = table_file(data.folder.path / "regions_table.csv")
-    stored = pd.read_csv(path) if path.is_file() else None
+    stored = stored_table(data, "regions_table")
     found: list[dict[str, Any]] = []
     for domain in [name for name in DOMAINS if name != ALL_DOMAINS]:
         cases = results[results["domain"] == domain] if len(results) else results
         methods = {str(name): own for name, own in cases.groupby("variant", sort=False)} if len(cases) else {}
-        regions = RECALL_AT_K if stored is None else RECALL_AT_RATE
+        regions = RECALL_AT_RATE if len(stored) else RECALL_AT_K
         for quality in (regions, F1):
             values = {name: _quality(own, quality, stored, domain, name) for name, own in methods.items()}
             for cost in (TIME, BYTES):
@@ -75,25 +69,9 @@ def pareto_table(data: RunData) -> pd.DataFrame:
     return pd.DataFrame(found, columns=list(COLUMNS))
 
 
-def comparable(data: RunData) -> pd.DataFrame:
-    """Return the rows of results.csv of methods that are neither grid points nor repetitions, with their `domain`."""
-    names = [*scenarios(data, unchanged=False), *scenarios(data, unchanged=True)]
-    wanted = {(scenario, variant) for scenario in names for variant in named_variants(data, scenario)}
-    return with_domain([row for row in data.results if (row["scenario"], row["variant"]) in wanted])
-
-
-def with_domain(rows: Sequence[Row]) -> pd.DataFrame:
-    """Return rows of results.csv as a table, with their `domain`."""
-    frame = pd.DataFrame(list(rows))
-    family = texts(frame, "family" if "family" in frame else "scenario")
-    return frame.assign(domain=[domain_of(name) for name in family])
-
-
-def _quality(
-    own: pd.DataFrame, quality: str, stored: pd.DataFrame | None, domain: str, variant: str
-) -> dict[str, float]:
+def _quality(own: pd.DataFrame, quality: str, stored: pd.DataFrame, domain: str, variant: str) -> dict[str, float]:
     """Return value, interval and number of pairs; recall at a rate is looked up, everything else is a mean."""
-    if quality != RECALL_AT_RATE or stored is None:
+    if quality != RECALL_AT_RATE:
         values = mean_with_interval(numbers(own, quality))
     else:
         row = stored[(stored["domain"] == domain) & (stored["variant"] == variant)]

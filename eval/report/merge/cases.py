@@ -18,8 +18,7 @@ from cdpipe.io.session import load_arrays, read_session
 from cdpipe.merge.evidence import GATES
 from cdpipe.model.alignment import PathAlignment
 from eval.report.merge.figures import FULL_M, alignment_picture
-from eval.report.objects.objects import Picture
-from eval.report.tables import Cell, Table
+from eval.report.tables import Cell, Picture, Table
 from eval.running.run_data import Row, RunData, number, read_document, split_variant, text
 from eval.scoring.merge_metrics import PAIR_RADIUS_M
 from eval.tables.columns import fine, share, significant

@@ -8,33 +8,29 @@ import numpy as np
 import pandas as pd
 
 from eval.core.figures import picture_address
-from eval.plans.coverage import Coverage, coverage
+from eval.plans.targets import is_oracle, targets_of
 from eval.report.merge.cases import MAX_ROWS, Case, case_table, distinct_cases, draw_case, read_case
 from eval.report.merge.charts import MergedPairs, error_chart, time_chart
 from eval.report.merge.tables import (
     families_table,
-    main_variant,
+    kinds_table,
     refusals_table,
     stated_seconds,
-    story,
-    targets_table,
     times_table,
 )
-from eval.report.objects.objects import Picture
-from eval.report.tables import Table
-from eval.running.run_data import RunData, repeats, text
+from eval.report.tables import Picture, Table
+from eval.running.run_data import RunData, covered_by, ends_at_merge, repeats, shown_variant, text
 from eval.tables.merge_table import (
     EXACT_M,
     RIGHT_DEG,
     RIGHT_M,
-    TARGETS,
+    RULES,
     TIMES,
-    is_oracle,
     is_within_target,
     kinds,
     merge_table,
-    numbers,
 )
+from eval.tables.rows import numbers
 
 N_WORST = 10
 MAX_PICTURES = 24
@@ -47,7 +43,6 @@ class MergePart:
 
     Attributes:
         is_main: Whether the run ended at the merge, so that this is all there is.
-        sentences: The first paragraph of such a page.
         tables: Of the targets: over all families, by family; of the reasons for refusals; of the times.
         plots: Errors against overlap, times.
         cases: What was measured of single merges: the worst accepted ones and all outside their target, or all of an
@@ -58,7 +53,6 @@ class MergePart:
     """
 
     is_main: bool
-    sentences: tuple[str, ...]
     tables: tuple[Table, ...]
     plots: tuple[Picture, ...]
     cases: tuple[Table, ...]
@@ -67,42 +61,29 @@ class MergePart:
     missing: tuple[str, ...]
 
 
-def ends_at_merge(data: RunData) -> bool:
-    """Tell whether a run's plan ended every method at the merge."""
-    plan = data.provenance.get("plan")
-    return isinstance(plan, dict) and plan.get("until") == "merge"
-
-
-def covered_by(data: RunData) -> Coverage | None:
-    """Return how much of its plan a run holds; None where that is not known."""
-    cases = ((str(row["scenario"]), int(row["seed"]), str(row["variant"])) for row in data.results)
-    return coverage(data.provenance, cases)
-
-
 def draw_merge(data: RunData) -> MergePart:
     """Return tables and pictures of the merges of a run."""
     results = pd.DataFrame(list(data.results))
     missing: list[str] = []
     notes: list[str] = []
     by_kind = bool((kinds(results) != "").any())
-    table = merge_table(results)
-    is_main, covered = ends_at_merge(data), covered_by(data)
+    table = merge_table(results, targets_of(data.provenance))
+    is_main, covered, name = ends_at_merge(data), covered_by(data), shown_variant(data)
     is_whole = covered is None or covered.is_whole
     tables: tuple[Table, ...] = (times_table(results),) if by_kind or is_main else ()
     if by_kind:
-        of_targets = targets_table(table, is_whole=is_whole), families_table(table, is_whole=is_whole)
+        of_targets = kinds_table(table, is_whole=is_whole), families_table(table, name, is_whole=is_whole)
         tables = (*of_targets, refusals_table(results), *tables)
     plots = (_error_plot(results), _time_plot(results)) if by_kind else ()
     if by_kind:
-        cases, shown = _chosen_cases(data, results, notes)
+        cases, shown = _chosen_cases(data, results, name, notes)
     else:
-        cases, shown = _every_case(data, notes)
+        cases, shown = _every_case(data, name, notes)
     drawn = [draw_case(data, case, missing) for case in shown[:MAX_PICTURES]]
     if len(shown) > MAX_PICTURES:
         notes.append(f"The aligned maps of {len(shown) - MAX_PICTURES} further cases are left out of this page.")
     return MergePart(
         is_main,
-        tuple(story(table, results, covered)) if is_main else (),
         tuple(part for part in tables if part.rows),
         tuple(plot for plot in plots if plot is not None),
         tuple(part for part in cases if part.rows),
@@ -147,9 +128,8 @@ def _time_plot(results: pd.DataFrame) -> Picture | None:
     )
 
 
-def _chosen_cases(data: RunData, results: pd.DataFrame, notes: list[str]) -> tuple[list[Table], list[Case]]:
+def _chosen_cases(data: RunData, results: pd.DataFrame, name: str, notes: list[str]) -> tuple[list[Table], list[Case]]:
     """Return the worst accepted merges of the variant that is shown, and all of its pairs outside their target."""
-    name = main_variant([str(variant) for variant in results["variant"]])
     mine = np.flatnonzero((results["variant"] == name).to_numpy())
     badness = np.fmax(numbers(results, "merge_error_m") / RIGHT_M, numbers(results, "merge_error_deg") / RIGHT_DEG)
     # an error that is undefined is the worst: the sessions share no place
@@ -157,7 +137,7 @@ def _chosen_cases(data: RunData, results: pd.DataFrame, notes: list[str]) -> tup
     status, kind = results["status"].to_numpy(), kinds(results)
     accepted = mine[status[mine] == "ok"]
     worst = accepted[np.argsort(-badness[accepted], kind="stable")][:N_WORST].tolist()
-    outside = mine[~is_within_target(results)[mine] & np.isin(kind[mine], list(TARGETS))]
+    outside = mine[~is_within_target(results)[mine] & np.isin(kind[mine], list(RULES))]
     # not merged first, in the order of the table; then the worst of those that were accepted
     outside = outside[np.lexsort((-badness[outside], status[outside] == "ok"))].tolist()
     cases = {index: read_case(data, data.results[index]) for index in dict.fromkeys([*outside, *worst])}
@@ -174,7 +154,7 @@ def _chosen_cases(data: RunData, results: pd.DataFrame, notes: list[str]) -> tup
     return tables, list(cases.values())
 
 
-def _every_case(data: RunData, notes: list[str]) -> tuple[list[Table], list[Case]]:
+def _every_case(data: RunData, name: str, notes: list[str]) -> tuple[list[Table], list[Case]]:
     """Return every distinct merge of an ordinary run and, of each scenario, one whose maps are shown.
 
     Worlds that only repeat another one are left out, and merges of which nothing is told. Where there are too many for
@@ -182,7 +162,6 @@ def _every_case(data: RunData, notes: list[str]) -> tuple[list[Table], list[Case
     """
     held = repeats(data)
     rows = [row for row in data.results if (row["scenario"], row["variant"]) not in held]
-    name = main_variant([str(row["variant"]) for row in data.results])
     cases = distinct_cases(data, rows, name)
     shown = [case for case in cases if case.evidence or text(case.row, "status") != "ok"]
     if len(shown) > MAX_ROWS:

@@ -1,9 +1,8 @@
-"""The tables of the merge on the page, and the sentences made from them."""
+"""The tables of the merge on the page."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,24 +10,12 @@ import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
 from cdpipe.merge.evidence import GATES
-from eval.plans.coverage import Coverage
-from eval.report.story import joined
+from eval.plans.targets import is_oracle
 from eval.report.tables import Cell, Table
 from eval.tables.columns import EN_DASH, UNDEFINED, Column, fine, significant
-from eval.tables.merge_table import (
-    ALL_FAMILIES,
-    RIGHT_DEG,
-    RIGHT_M,
-    TARGETS,
-    TIMES,
-    is_oracle,
-    is_wrong,
-    kinds,
-    numbers,
-    texts,
-)
+from eval.tables.merge_table import ALL_FAMILIES, RIGHT_DEG, RIGHT_M, RULES, TIMES, kinds
+from eval.tables.rows import numbers, records, texts
 
-MAIN_VARIANT = "tunnelcd"
 # a variant that leaves a part out is done with it in microseconds
 _NOTHING_S = 1e-4
 MERGE_COLUMNS = (
@@ -56,40 +43,32 @@ MERGE_COLUMNS = (
 
 
 _TARGET_HEADINGS = (
-    "target", "within target", "wrong, accepted", "pairs", "accepted", "refused", "failed", "error [m]", "error [deg]",
-    "along [m]", "p95 along path [m]", "p95 over 0.5 m",
+    "target", "verdict", "within target", "wrong, accepted", "pairs", "accepted", "refused", "failed",
+    "error [m]", "error [deg]", "along [m]", "p95 along path [m]", "p95 over 0.5 m",
 )  # fmt: skip
 
 
-def main_variant(names: Sequence[str]) -> str:
-    """Return the variant whose cases are shown: `tunnelcd`, else the first that is no oracle, else the first."""
-    if MAIN_VARIANT in names:
-        return MAIN_VARIANT
-    return next((name for name in names if not is_oracle(name)), names[0])
-
-
-def targets_table(table: pd.DataFrame, *, is_whole: bool = True) -> Table:
+def kinds_table(table: pd.DataFrame, *, is_whole: bool = True) -> Table:
     """Return a row for every kind of pair and variant: counts, share within the target, errors, met or not.
 
     Nothing is said to be met or not where the table does not hold the whole of what was planned.
     """
     rows = [
         (_kind_text(str(row["pair_kind"])), (Cell(str(row["variant"])), *_target_cells(row, is_whole=is_whole)))
-        for row in _records(table[table["family"] == ALL_FAMILIES] if len(table) else table)
+        for row in records(table[table["family"] == ALL_FAMILIES] if len(table) else table)
     ]
     headings = ("variant", *_TARGET_HEADINGS)
-    return Table(headings, tuple(rows), "Every kind of pair: what is asked, and what each variant does")
+    return Table(headings, tuple(rows), "Kinds of pair: one row is one method; the group says what the kind asks for")
 
 
-def families_table(table: pd.DataFrame, *, is_whole: bool = True) -> Table:
-    """Return the same for the variant that is shown, family by family."""
+def families_table(table: pd.DataFrame, name: str, *, is_whole: bool = True) -> Table:
+    """Return the same for one variant, family by family."""
     if len(table) == 0:
         return Table((), ())
-    name = main_variant(list(dict.fromkeys(table["variant"])))
     own = table[(table["family"] != ALL_FAMILIES) & (table["variant"] == name)]
     rows = [
         (str(row["pair_kind"]), (Cell(str(row["family"])), *_target_cells(row, is_whole=is_whole)))
-        for row in _records(own)
+        for row in records(own)
     ]
     return Table(
         ("family", *_TARGET_HEADINGS), tuple(rows), f"The same by family: {name}; all variants are in merge.csv"
@@ -101,7 +80,7 @@ def refusals_table(results: pd.DataFrame) -> Table:
     refused = results[results["status"] == "merge_refused"]
     refused = refused.assign(pair_kind=kinds(refused), error=texts(refused, "error"))
     rows: list[tuple[str, tuple[Cell, ...]]] = []
-    for kind in [name for name in TARGETS if (refused["pair_kind"] == name).any()]:
+    for kind in [name for name in RULES if (refused["pair_kind"] == name).any()]:
         for variant, group in refused[refused["pair_kind"] == kind].groupby("variant", sort=False):
             named = [[setting in error for _, setting in GATES] for error in group["error"]]
             counts = [sum(column) for column in zip(*named, strict=True)]
@@ -135,71 +114,16 @@ def stated_seconds(results: pd.DataFrame, column: str) -> Float64Array:
     return values[values >= _NOTHING_S]
 
 
-def story(table: pd.DataFrame, results: pd.DataFrame, covered: Coverage | None = None) -> list[str]:
-    """Return the sentences of the first paragraph of a run that ends at the merge.
-
-    Args:
-        table: As `merge_table` returns it.
-        results: Rows as in results.csv.
-        covered: How much of its plan the run holds; while some is missing, that comes first and no verdict is passed.
-    """
-    is_whole = covered is None or covered.is_whole
-    n_pairs = results.groupby(["scenario", "seed"]).ngroups
-    variants = list(dict.fromkeys(str(name) for name in results["variant"]))
-    name = main_variant(variants)
-    sentences = [covered.sentence] if covered is not None and not is_whole else []
-    if len(table):
-        own = _records(table[(table["variant"] == name) & (table["family"] == ALL_FAMILIES)])
-        missed = [str(row["pair_kind"]) for row in own if row["is_met"] is False]
-        n_wrong = sum(int(row["n_wrong_accepted"]) for row in own)
-        every = [str(row["pair_kind"]) for row in own]
-        verdict = f"misses its target on {joined(missed)}" if missed else f"meets its target on {joined(every)}"
-        wrong_text = f"wrong and accepted: {n_wrong} of {sum(row['n_pairs'] for row in own)} pairs."
-        has_verdict = is_whole and not is_oracle(name)
-        sentences.append(f"{name} {verdict}; {wrong_text}" if has_verdict else f"{name}: {wrong_text}")
-        sentences += [_target_sentence(row, has_verdict=has_verdict) for row in own]
-    else:
-        sentences.append(f"{name}: no pair of this run has a kind, so there is no target to hold it to.")
-    rivals = [other for other in variants if other != name and not is_oracle(other)]
-    for other in rivals:
-        wrong = int(is_wrong(results[results["variant"] == other]).sum())
-        n = int((results["variant"] == other).sum())
-        sentences.append(f"{other}: wrong and accepted {wrong} of {n}.")
-    n_failed = int((results["status"] == "failed").sum())
-    if n_failed:
-        sentences.append(f"{n_failed} of {len(results)} cases failed; they count as pairs that miss their target.")
-    pairs = "1 session pair" if n_pairs == 1 else f"{n_pairs} session pairs"
-    sentences.append(f"n = {pairs}, {len(variants)} variants; intervals are Wilson's 95 % over pairs.")
-    return sentences
-
-
-def _target_sentence(row: dict[str, Any], *, has_verdict: bool) -> str:
-    kind = str(row["pair_kind"])
-    target = TARGETS.get(kind)
-    if target is None:
-        return f"{kind}: {row['n_pairs']} pairs, no target."
-    low, high = _percent(row["low"]), _percent(row["high"])
-    found = (
-        f"{row['n_within_target']} of {row['n_pairs']} pairs ({_percent(row['share_within_target'])}, {low} to {high})"
-    )
-    verdict = (", met" if row["is_met"] else ", not met") if has_verdict else ""
-    return f"{kind}: {found} {target.rule}; target {_percent(target.share)}{verdict}."
-
-
-def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    return [{str(key): value for key, value in row.items()} for row in table.to_dict("records")]
-
-
 def _kind_text(kind: str) -> str:
-    target = TARGETS.get(kind)
-    return kind if target is None else f"{kind}: {target.rule}; target {_percent(target.share)} of the pairs"
+    return f"{kind}: {RULES[kind]}" if kind in RULES else kind
 
 
 def _target_cells(row: dict[str, Any], *, is_whole: bool) -> tuple[Cell, ...]:
-    has_target = is_whole and not is_oracle(str(row["variant"])) and str(row["pair_kind"]) in TARGETS
+    has_target = is_whole and not math.isnan(float(row["target_share"]))
     low, high = _percent(row["low"]).removesuffix(" %"), _percent(row["high"])
     n_wrong = int(row["n_wrong_accepted"])
     return (
+        Cell(_percent(float(row["target_share"]))),
         Cell(("met" if row["is_met"] else "not met") if has_target else UNDEFINED, has_target and not row["is_met"]),
         Cell(_percent(row["share_within_target"]), interval=f"{low}{EN_DASH}{high}"),
         Cell(str(n_wrong), n_wrong > 0),

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Int64Array
 from cdpipe.io.answer import Answer, read_answer
-from eval.report.objects.objects import Picture, Shown, change_panels, object_title
+from eval.report.objects.objects import Shown, change_panels, object_title
+from eval.report.tables import Picture
 from eval.running.run_data import Row, RunData, flag, number, of, split_variant, text
 from eval.scoring.answer_rows import answer_rows
 from eval.tables.columns import count, significant

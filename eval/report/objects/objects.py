@@ -11,6 +11,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.io.answer import Answer
 from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.report.objects.figures import Panel, object_panels
+from eval.report.tables import Picture
 from eval.running.run_data import SHOWN_PRESETS, Row, RunData, flag, named_variants, number, of, text
 from eval.scoring.answer_rows import answer_rows
 from eval.tables.columns import share
@@ -19,15 +20,6 @@ from eval.truth.universe import CELL_M
 from sim.session.truth import Change
 
 _CONTEXT_M = 1.5
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """A picture with its title and caption; `address` holds it."""
-
-    title: str
-    address: str
-    caption: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pandas as pd
 
 from eval.core.domains import domain_name
-from eval.report.tables import Cell, Table, beside, best, used_pairs
-from eval.tables.columns import EN_DASH, Column, share, significant, spaced
+from eval.report.tables import Cell, Table, interval_of_row
+from eval.tables.columns import EN_DASH, Column, count, share, significant
 from eval.tables.object_table import ORACLE_VARIANT
-from eval.tables.region_table import ALL_DOMAINS
+from eval.tables.rows import records
 
 
 def _cm(metres: float) -> str:
@@ -52,11 +52,12 @@ OBJECT_COLUMNS = (
     Column("object_iou_point_partial", "short moves, reshaped: IoU", "high", share,
            "Point IoU of the group `partial`, which is in no other column but kind and displacement.", ""),
 )  # fmt: skip
-_COUNTS = {
+OBJECT_COUNTS = {
     "iou_matched_median": "n_matched", "displacement_error_m": "n_displacements",
     "pile_volume_error": "n_piles", "object_iou_point_partial": "n_partial",
 }  # fmt: skip
-_REGION_COLUMNS = (
+WITHDRAWAL_COLUMNS = (
+    Column("n_withdrawn", "withdrawn", None, count, "", ""),
     Column("region_recall_proposed", "recall, proposed", "high", share, "", ""),
     Column("region_recall", "recall, kept", "high", share, "", ""),
     Column("false_regions_per_100m_proposed", "false / 100 m, proposed", "low", share, "", ""),
@@ -64,43 +65,6 @@ _REGION_COLUMNS = (
     Column("t_oe_per_region_s", "t_oe / region [ms]", None, _ms, "", ""),
     Column("t_returns_per_region_s", "of that returns, kinds, shapes [ms]", None, _ms, "", ""),
 )  # fmt: skip
-
-
-def methods_table(table: pd.DataFrame, cases: pd.DataFrame) -> Table:
-    """Return every method in and out of distribution; the best that asks no truth is marked.
-
-    Args:
-        table: Rows of objects_table.csv.
-        cases: Rows of results.csv with their `domain`, which tell over how many pairs a mean is.
-    """
-    rows: list[tuple[str, tuple[Cell, ...]]] = []
-    for domain, own in _by_domain(table):
-        marks = {column.key: _marks(own, column, cases) for column in OBJECT_COLUMNS}
-        for index, row in enumerate(own):
-            cells = (_cell(row, column, marks[column.key][index], cases) for column in OBJECT_COLUMNS)
-            failed = f"{row['n_failed']} failed" if row["n_failed"] else ""
-            rows.append(
-                (domain, (Cell(spaced(str(row["variant"]))), Cell(str(row["n_pairs"]), interval=failed), *cells))
-            )
-    headings = ("method", "pairs", *(column.heading for column in OBJECT_COLUMNS))
-    return Table(headings, tuple(rows), "Objects: every rule, in and out of the training distribution")
-
-
-def withdrawal_table(table: pd.DataFrame, cases: pd.DataFrame) -> Table:
-    """Return recall and false alarms of the regions before and after those without an object were withdrawn.
-
-    Args:
-        table: As of `methods_table`.
-        cases: As there.
-    """
-    rows: list[tuple[str, tuple[Cell, ...]]] = []
-    for domain, own in _by_domain(table):
-        marks = {column.key: _marks(own, column, cases) for column in _REGION_COLUMNS}
-        for index, row in enumerate(own):
-            cells = (_cell(row, column, marks[column.key][index], cases) for column in _REGION_COLUMNS)
-            rows.append((domain, (Cell(spaced(str(row["variant"]))), Cell(str(row["n_withdrawn"])), *cells)))
-    headings = ("method", "withdrawn", *(column.heading for column in _REGION_COLUMNS))
-    return Table(headings, tuple(rows), "Regions before and after those in which nothing survives are withdrawn")
 
 
 def groups_table(groups: pd.DataFrame, domain: str, main: str, rivals: Sequence[str]) -> Table:
@@ -116,7 +80,7 @@ def groups_table(groups: pd.DataFrame, domain: str, main: str, rivals: Sequence[
         of_others = [_same_group(own[own["variant"] == name], row) for name in others]
         cells = (
             Cell(_group_name(row)), Cell(str(row["n_changes"]), interval=_pairs(int(row["n_pairs"]))),
-            Cell(share(row["iou_point"]), interval=_interval(row, "iou_point", share)),
+            Cell(share(row["iou_point"]), interval=interval_of_row(row, "iou_point", share)),
             Cell(share(row["iou_matched_median"])), Cell(share(row["share_50"])), Cell(share(row["share_found"])),
             Cell(share(row["kind_accuracy"])), Cell(_cm(row["displacement_error_m"])),
             Cell(_percent(row["volume_error"])),
@@ -127,56 +91,7 @@ def groups_table(groups: pd.DataFrame, domain: str, main: str, rivals: Sequence[
     return Table((*headings, *names), tuple(rows), f"By what an object is and how large, {domain_name(domain)}")
 
 
-def records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return the rows of a table as dictionaries."""
-    return [{str(key): value for key, value in row.items()} for row in table.to_dict("records")]
-
-
 _MEASURES = {"prop_kind": "kind of prop", "hull_volume_m3": "hull of the object [m³]"}
-
-
-def is_told_the_truth(variant: str) -> bool:
-    """Tell whether a variant takes its merge or its regions from the truth."""
-    return variant.startswith("oracle-")
-
-
-def _by_domain(table: pd.DataFrame) -> list[tuple[str, list[dict[str, Any]]]]:
-    """Return the rows of each domain under a line that says how much they are over."""
-    found = []
-    for domain, own in table.groupby("domain", sort=False):
-        rows = records(own)
-        n_objects = max(int(row["n_changes"]) for row in rows)
-        pairs = _pairs(max(int(row["n_pairs"]) for row in rows))
-        found.append((f"{domain_name(str(domain))}: {pairs}, {n_objects} observable objects", rows))
-    return found
-
-
-def _marks(rows: Sequence[Mapping[str, Any]], column: Column, cases: pd.DataFrame) -> list[bool]:
-    """Mark the best of the rows that are not told the truth."""
-    fair = [index for index, row in enumerate(rows) if not is_told_the_truth(str(row["variant"]))]
-    counts = [_used(rows[index], column, cases)[0] for index in fair]
-    is_best = best([float(rows[index][column.key]) for index in fair], column, counts)
-    return [index in fair and is_best[fair.index(index)] for index in range(len(rows))]
-
-
-def _used(row: Mapping[str, Any], column: Column, cases: pd.DataFrame) -> tuple[int, int]:
-    """Return over how many pairs a figure is and of how many it could be; of a median over objects their number."""
-    if column.key in _COUNTS:
-        return int(row[_COUNTS[column.key]]), int(row[_COUNTS[column.key]])
-    of_domain = cases if row["domain"] == ALL_DOMAINS else cases[cases["domain"] == row["domain"]]
-    return used_pairs(of_domain, str(row["variant"]), column.key)
-
-
-def _cell(row: Mapping[str, Any], column: Column, is_best: bool, cases: pd.DataFrame) -> Cell:
-    below = beside(_interval(row, column.key, column.shown), *_used(row, column, cases))
-    if column.key in _COUNTS:
-        below = "\n".join(filter(None, (below, f"n {row[_COUNTS[column.key]]}")))
-    return Cell(column.shown(float(row[column.key])), is_best, below)
-
-
-def _interval(row: Mapping[str, Any], name: str, shown: Callable[[float], str]) -> str:
-    low, high = (float(row.get(f"{name}_{end}", math.nan)) for end in ("low", "high"))
-    return "" if math.isnan(low) else f"{shown(low)}{EN_DASH}{shown(high)}"
 
 
 def _pairs(n_pairs: int) -> str:

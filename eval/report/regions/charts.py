@@ -27,7 +27,7 @@ from eval.core.domains import domain_name
 from eval.report.charts import Chart
 from eval.tables.columns import EN_DASH, share
 from eval.tables.region_curves import RATES_PER_100M
-from eval.tables.region_table import ALL_DOMAINS, MAIN_VARIANT, RIVALS
+from eval.tables.rows import ALL_DOMAINS
 
 _SKY, _PURPLE, _GREY, _TEAL, _WINE = "#56B4E9", "#CC79A7", "#8a8a8a", "#44AA99", "#882255"
 _LOOKS = {
@@ -59,16 +59,16 @@ def look_of(name: str, names: Sequence[str]) -> Look:
     return _LOOKS[name] if name in _LOOKS else _OTHERS[unknown.index(name) % len(_OTHERS)]
 
 
-def draw_roc(curves: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
+def draw_roc(curves: pd.DataFrame, table: pd.DataFrame, main: str) -> Chart | None:
     """Return true against false positive rate of the keyframes, a panel for each domain and a line for each method.
 
     Args:
         curves: Rows of roc.csv.
         table: Rows of regions_table.csv.
+        main: The method whose areas are named.
     """
     panels: list[Panel] = []
-    name = MAIN_VARIANT if MAIN_VARIANT in set(table["variant"]) else str(table["variant"].iloc[0])
-    areas = table[table["variant"] == name].set_index("domain")["region_auroc_pooled"]
+    areas = table[table["variant"] == main].set_index("domain")["region_auroc_pooled"]
     told = []
     for domain, methods in _domains(curves):
         lines = [
@@ -82,13 +82,13 @@ def draw_roc(curves: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
         told += [f"{share(float(areas[domain]))} {domain_name(domain)}"] if domain in areas.index else []
     caption = (
         "All keyframes of all pairs together, scores as they are; a keyframe that was never compared comes last. Area "
-        f"under the curve of {name}: {', '.join(told)}."
+        f"under the curve of {main}: {', '.join(told)}."
     )
     title = "How keyframe scores tell changed places from unchanged ones"
     return Chart("roc", title, Drawing([panels], 360), caption, has_png=True) if panels else None
 
 
-def draw_free_response(curves: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
+def draw_free_response(curves: pd.DataFrame, table: pd.DataFrame) -> Chart | None:
     """Return recall against false regions per 100 m, a panel for each domain; dots: the methods' own thresholds.
 
     A rate below 0.01 is drawn at 0.01, the left border.
@@ -125,14 +125,15 @@ def draw_free_response(curves: pd.DataFrame | None, table: pd.DataFrame) -> Char
     return Chart("free_response", title, Drawing([panels], 360), caption, has_png=True) if panels else None
 
 
-def draw_sizes(sizes: pd.DataFrame | None, table: pd.DataFrame) -> Chart | None:
+def draw_sizes(sizes: pd.DataFrame, table: pd.DataFrame, first: Sequence[str]) -> Chart | None:
     """Return recall by what a change is like: a row for each domain, a column for each measure, a line for each method.
 
     Args:
         sizes: Rows of regions_by_size.csv.
         table: Rows of regions_table.csv.
+        first: Methods that are shown before any other; the interval is that of the first.
     """
-    shown, rows = _shown_methods(table), []
+    shown, rows = _shown_methods(table, first), []
     for domain, methods in _domains(sizes):
         row: list[Panel] = []
         for measure, title in _MEASURES.items():
@@ -169,18 +170,18 @@ def _size_panel(bins: Mapping[str, pd.DataFrame], title: str, y_title: str) -> P
     return Panel(x_axis, Axis(y_title, (-0.02, 1.05)), series)
 
 
-def _domains(table: pd.DataFrame | None) -> Iterator[tuple[str, dict[str, pd.DataFrame]]]:
+def _domains(table: pd.DataFrame) -> Iterator[tuple[str, dict[str, pd.DataFrame]]]:
     """Yield every domain but all pairs together, with the rows of each of its methods."""
-    if table is None or len(table) == 0:
+    if len(table) == 0:
         return
     for domain, own in table[table["domain"] != ALL_DOMAINS].groupby("domain", sort=False):
         yield str(domain), {str(name): rows for name, rows in own.groupby("variant", sort=False)}
 
 
-def _shown_methods(table: pd.DataFrame) -> list[str]:
+def _shown_methods(table: pd.DataFrame, wanted: Sequence[str]) -> list[str]:
     """Return up to five methods, the one whose interval is drawn last: ours, the rivals, and the best of the rest."""
     means = table.drop_duplicates("variant", keep="last").set_index("variant")["recall_at_0.1"]
     ranked = [str(name) for name in means.sort_values(ascending=False, kind="stable").index]
-    first = [name for name in (MAIN_VARIANT, *RIVALS) if name in ranked]
+    first = [name for name in dict.fromkeys(wanted) if name in ranked]
     chosen = [*first, *(name for name in ranked if name not in first)][:_MAX_LINES]
     return chosen[::-1]

@@ -12,9 +12,8 @@ import pandas as pd
 from eval.core.figures import picture_address
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.worlds import group_of
-from eval.report.objects.objects import Picture
 from eval.report.settings.charts import Effect, effect_chart
-from eval.report.tables import Cell, Table
+from eval.report.tables import Cell, Picture, Table
 from eval.running.run_data import RunData, of, over_pairs
 from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, Column, count
 from eval.tables.effects import effects

@@ -14,7 +14,6 @@ from eval.core.charts import COLOURS, Axis, Drawing, Look, Panel, Series, named_
 from eval.core.domains import domain_name
 from eval.core.statistics import bootstrap_interval
 from eval.report.charts import Chart
-from eval.report.cost.pareto import with_domain
 from eval.report.settings.grids import N_ACROSS, SHARES
 from eval.running.run_data import (
     Row,
@@ -29,6 +28,7 @@ from eval.running.run_data import (
     text,
 )
 from eval.tables.columns import RESULT_COLUMNS
+from eval.tables.rows import with_domain
 
 _KEYS = ("region_recall_at_k", "region_auroc", "object_iou_point", "object_f1_50", "t_total_s")
 _COLUMNS = {column.key: column for column in RESULT_COLUMNS}

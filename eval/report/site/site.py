@@ -15,7 +15,8 @@ from cdpipe.io.session import load_arrays
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.report import ChangeReport
 from eval.report.maps import Points, RegionMark, State, TruthMark, distance_map, overlay_map, region_map
-from eval.report.objects.objects import Picture, object_pictures
+from eval.report.objects.objects import object_pictures
+from eval.report.tables import Picture
 from eval.running.run_data import SHOWN_PRESETS, Row, RunData, first_seed, flag, named_variants, number, of, text
 from eval.truth.aligned import alignment_of
 from eval.truth.ground_truth import GroundTruth, SessionTruth, load_ground_truth

@@ -10,11 +10,10 @@ from cdpipe.core.errors import InputError
 from cdpipe.io.answer import read_answer
 from cdpipe.io.session import load_arrays
 from eval.report.maps import region_map
-from eval.report.objects.objects import Picture
 from eval.report.site.site import region_caption, region_marks, truth_marks
+from eval.report.tables import Picture
 from eval.running.run_data import Row, RunData, number, of, scenarios, text
 from eval.tables.columns import share
-from eval.tables.region_table import MAIN_VARIANT
 from eval.truth.ground_truth import load_ground_truth
 
 N_WORST = 10
@@ -28,12 +27,6 @@ class WorstPair:
     seed: int
     words: str
     picture: Picture | None
-
-
-def shown_variant(data: RunData) -> str:
-    """Return the method whose cases are shown: `tunnelcd`, or the first that was run."""
-    names = [str(row["variant"]) for row in data.results]
-    return MAIN_VARIANT if MAIN_VARIANT in names else names[0]
 
 
 def worst_rows(data: RunData, variant: str) -> list[Row]:

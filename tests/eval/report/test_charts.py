@@ -48,7 +48,7 @@ def curves(x_name: str, y_name: str) -> pd.DataFrame:
 
 
 def roc() -> Chart:
-    chart = draw_roc(curves("false_positive_rate", "true_positive_rate"), TABLE)
+    chart = draw_roc(curves("false_positive_rate", "true_positive_rate"), TABLE, "tunnelcd")
     assert chart is not None
     return chart
 
@@ -160,7 +160,7 @@ def test_bins_carry_their_counts_and_only_the_last_method_its_interval() -> None
             for low, high, n, recall in ((1.0, np.inf, 2, NAN), (0.0, 1.0, 4, 0.5))]  # fmt: skip
     names = {"measure": "n_returns", "domain": "in"}
     sizes = pd.DataFrame([{**names, "variant": name, **each} for name in ("paper", "tunnelcd") for each in bins])
-    chart = draw_sizes(sizes, TABLE)
+    chart = draw_sizes(sizes, TABLE, ["tunnelcd"])
     assert chart is not None
     figure = accepted(chart.drawing)
     assert figure.layout.xaxis.ticktext == ("<1<br>n 4", "≥1<br>n 2")
@@ -170,7 +170,8 @@ def test_bins_carry_their_counts_and_only_the_last_method_its_interval() -> None
 
 
 def test_what_was_not_scored_has_no_chart() -> None:
-    charts = draw_roc(None, TABLE), draw_free_response(None, TABLE), draw_sizes(pd.DataFrame(), TABLE)
+    none = pd.DataFrame()
+    charts = draw_roc(none, TABLE, ""), draw_free_response(none, TABLE), draw_sizes(none, TABLE, ())
     assert charts == (None, None, None)
 
 

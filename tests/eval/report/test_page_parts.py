@@ -12,8 +12,7 @@ from matplotlib.image import imread
 from eval.core.charts import BLUE, ORANGE
 from eval.report.maps import RED, RegionMark, TruthMark, distance_map, joined_labels, overlay_map, region_map
 from eval.report.objects.figures import Panel, object_panels, oblique_view
-from eval.report.story import rank, sentence
-from eval.report.tables import beside, best, escape_latex, heat_colour
+from eval.report.tables import beside, best
 from eval.running.run_data import RunData, grids, off_grids, split_variant
 from eval.running.runfolder import RunFolder
 from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, count, significant
@@ -87,20 +86,6 @@ def test_a_mean_over_hardly_any_pair_is_not_the_best() -> None:
     assert [beside("", n, 60) for n in (0, 60)] == ["", ""]
 
 
-def test_ranking_names_ties_margins_and_nothing() -> None:
-    assert sentence(rank("here", "object IoU", {"a": 0.5, "b": 0.2, "c": NAN})) == (
-        "On here, object IoU: a is best with 0.50, 0.30 ahead of b (0.20)."
-    )
-    assert sentence(rank("here", "object IoU", {"a": 0.502, "b": 0.498, "c": 0.1})) == (
-        "On here, object IoU: a and b tie at 0.50, 0.40 ahead of c (0.10)."
-    )
-    assert (
-        sentence(rank("here", "object IoU", {"a": 0.001, "b": 0.0})) == "On here, object IoU: no preset gets above 0."
-    )
-    assert sentence(rank("here", "object IoU", {"a": NAN})) == "On here, object IoU: undefined for every preset."
-    assert sentence(rank("here", "object IoU", {"a": 1.0})) == "On here, object IoU: a is best with 1.00."
-
-
 def test_variants_are_taken_apart() -> None:
     assert split_variant("tunnelcd[extract.voxel_m=0.3,query.radius_m=4.5]") == (
         "tunnelcd",
@@ -129,16 +114,6 @@ def test_a_grid_varies_two_settings_and_may_fix_others(tmp_path: Path) -> None:
     assert (grid.preset, grid.keys) == ("p with c.n=8", ("a.x", "b.y"))
     assert grid.values == (("0.3", "10.0"), ("1", "2"))
     assert grid.points["10.0", "1"] == points[2]
-
-
-def test_latex_commands_in_names_are_harmless() -> None:
-    assert escape_latex(r"50 % of {a_b} & \c ~^#$") == (
-        r"50 \% of \{a\_b\} \& \textbackslash{}c \textasciitilde{}\textasciicircum{}\#\$"
-    )
-
-
-def test_heat_runs_from_white_to_blue() -> None:
-    assert [heat_colour(value) for value in (0.0, 1.0, 2.0, NAN)] == ["#ffffff", "#6baed6", "#6baed6", ""]
 
 
 def test_overlay_shows_each_map_in_its_colour_and_equal_areas_alike() -> None:

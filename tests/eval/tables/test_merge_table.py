@@ -5,9 +5,11 @@ import pandas as pd
 import pytest
 
 from eval.core.statistics import wilson_interval
+from eval.plans.targets import Targets
 from eval.tables.merge_table import ALL_FAMILIES, is_within_target, is_wrong, merge_overview, merge_table
 
 NAN = float("nan")
+TARGETS = Targets(merge={"clean": 0.99, "drift": 0.95, "smooth": 1.0, "disjoint": 1.0})
 SLIDES = "the sessions cannot be merged: it can slide; merge.min_hessian_ratio asks for 0.01"
 UNLIKE = "the sessions cannot be merged: it does not fit; merge.min_agreement asks for 80%"
 
@@ -34,7 +36,7 @@ def case(
 
 
 def the_row(rows: list[dict[str, object]], kind: str, family: str = ALL_FAMILIES) -> dict[str, object]:
-    table = merge_table(pd.DataFrame(rows))
+    table = merge_table(pd.DataFrame(rows), TARGETS)
     found = table[(table["pair_kind"] == kind) & (table["family"] == family)]
     assert len(found) == 1
     return found.iloc[0].to_dict()
@@ -75,6 +77,12 @@ def test_ninety_nine_of_a_hundred_meet_the_target_unless_the_other_is_wrong_and_
     assert the_row([*right[1:], *[case("clean", "failed")] * 2], "clean")["is_met"] is False
 
 
+def test_without_a_target_there_is_no_verdict_and_the_share_stays() -> None:
+    table = merge_table(pd.DataFrame([case("clean", metres=0.01)]), Targets())
+    assert (table["is_met"][0], table["share_within_target"][0]) == (None, 1.0)
+    assert np.isnan(table["target_share"][0])
+
+
 def test_drift_is_judged_along_the_path() -> None:
     rows = [case("drift", metres=0.02, p95=0.05), case("drift", metres=0.02, p95=0.06), case("drift", "merge_refused")]
     row = the_row(rows, "drift")
@@ -98,13 +106,13 @@ def test_smooth_may_be_refused_for_sliding_or_be_right() -> None:
 def test_a_merge_by_the_truth_has_a_row_and_no_verdict() -> None:
     rows = [case("clean", metres=0.01, variant=f"oracle-merge{noise}") for noise in ("", "[noise_m=0.1,noise_deg=0]")]
     rows.append(case("clean", metres=0.01))
-    table = merge_table(pd.DataFrame(rows))
+    table = merge_table(pd.DataFrame(rows), TARGETS)
     assert table["is_met"].tolist() == [None, None, True] * 2
     assert table["target_share"].isna().tolist() == [True, True, False] * 2
     assert table["n_within_target"].tolist() == [1] * 6
-    shown = merge_overview(pd.DataFrame(rows))
+    shown = merge_overview(pd.DataFrame(rows), TARGETS)
     assert shown["met"].tolist() == [None, None, True]
-    assert merge_overview(pd.DataFrame(rows), is_whole=False)["met"].tolist() == [None] * 3
+    assert merge_overview(pd.DataFrame(rows), TARGETS, is_whole=False)["met"].tolist() == [None] * 3
 
 
 def test_accepted_pairs_that_are_off_somewhere_along_the_path_are_counted() -> None:
@@ -140,7 +148,7 @@ def test_every_family_and_variant_has_its_row_and_no_pair_is_lost() -> None:
         case("clean", metres=0.01, family="wide", variant="theirs"),
         case("", metres=9.0),
     ]
-    table = merge_table(pd.DataFrame(rows))
+    table = merge_table(pd.DataFrame(rows), TARGETS)
     found = [tuple(row) for row in table[["pair_kind", "family", "variant", "n_pairs"]].itertuples(index=False)]
     assert found == [
         ("clean", "all", "ours", 5),
@@ -152,7 +160,7 @@ def test_every_family_and_variant_has_its_row_and_no_pair_is_lost() -> None:
         ("disjoint", "wide", "ours", 3),
     ]
     assert (table["n_accepted"] + table["n_refused"] + table["n_failed"] == table["n_pairs"]).all()
-    assert merge_overview(pd.DataFrame(rows))["n"].tolist() == [5, 1, 3]
+    assert merge_overview(pd.DataFrame(rows), TARGETS)["n"].tolist() == [5, 1, 3]
 
 
 def test_the_order_of_the_rows_changes_no_number() -> None:
@@ -164,13 +172,13 @@ def test_the_order_of_the_rows_changes_no_number() -> None:
     ]
     results = pd.DataFrame(rows)
     shuffled = results.iloc[draw.permutation(len(results))]
-    pd.testing.assert_frame_equal(merge_table(results), merge_table(shuffled))
+    pd.testing.assert_frame_equal(merge_table(results, TARGETS), merge_table(shuffled, TARGETS))
 
 
 def test_a_run_without_kinds_has_no_row(tmp_path: object) -> None:
     for rows in ([case("", metres=0.1)], [{"scenario": "a", "variant": "b", "status": "ok"}]):
-        assert len(merge_table(pd.DataFrame(rows))) == 0
-        assert len(merge_overview(pd.DataFrame(rows))) == 0
+        assert len(merge_table(pd.DataFrame(rows), TARGETS)) == 0
+        assert len(merge_overview(pd.DataFrame(rows), TARGETS)) == 0
 
 
 @pytest.mark.parametrize(("n_hits", "n"), [(0, 10), (3, 7), (20, 20), (59, 60), (1, 1)])

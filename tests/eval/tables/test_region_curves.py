@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from eval.core.ranking import auroc
+from eval.tables.groups import clustered_interval, recall_by_size
 from eval.tables.region_curves import (
     RankedPairs,
     found_at,
@@ -18,7 +19,6 @@ from eval.tables.region_curves import (
     resampled_recalls,
     roc_curve,
 )
-from eval.tables.region_sizes import recall_by_size, share_interval
 
 CASES = [  # seed, kind of site, status, way, observable changes
     (1, 4.5, "ok", 1000.0, 2),
@@ -216,6 +216,6 @@ def test_recall_by_size_by_hand() -> None:
 
 def test_the_interval_of_a_share_draws_pairs() -> None:
     # ten hits of one pair are one draw, not ten: either all, none, or half
-    hits, pair = np.repeat([True, False], 10), np.repeat([3, 8], 10)
-    assert share_interval(hits, pair) == (0.0, 1.0)
-    assert all(np.isnan(share_interval(hits[:10], pair[:10])))
+    hits, pair = np.repeat([1.0, 0.0], 10), np.repeat([3, 8], 10)
+    assert clustered_interval(hits, pair) == (0.0, 1.0)
+    assert all(np.isnan(clustered_interval(hits[:10], pair[:10])))

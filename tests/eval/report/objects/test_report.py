@@ -8,17 +8,26 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from eval.report.cost.pareto import with_domain
+from eval.plans.targets import Target, Targets
 from eval.report.objects.cases import N_WORST, chosen_cases, voxel_variants, why
 from eval.report.objects.report import draw_objects
-from eval.report.objects.tables import methods_table, withdrawal_table
+from eval.report.objects.tables import OBJECT_COLUMNS, OBJECT_COUNTS, WITHDRAWAL_COLUMNS
 from eval.report.page import write_page
+from eval.report.tables import methods_table
 from eval.running.run_data import RunData, read_run
 from eval.running.runfolder import RunFolder
 from eval.tables.object_table import FILES, ORACLE_VARIANT, object_tables
+from eval.tables.rows import with_domain
 
 NAN = float("nan")
 VOXEL = "tunnelcd[extract.method=voxel,extract.voxel_m=0.65]"
+TARGETS = Targets(
+    method="tunnelcd",
+    objects=(
+        Target(column="object_iou_point", name="IoU", domain="in", at_least=0.5),
+        Target(column="object_f1_50", name="F1", domain="in", at_least=0.99),
+    ),
+)
 SKILL = {"tunnelcd": 0.8, VOXEL: 0.4, "tunnelcd[extract.method=nearest]": 0.6, ORACLE_VARIANT: 0.9}
 
 
@@ -104,9 +113,9 @@ def run_fixture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder.mkdir()
     results, changes = made_up(6)
     results.to_csv(folder / "results.csv", index=False)
-    for name, table in {"changes": changes, **object_tables(results, changes)}.items():
+    for name, table in {"changes": changes, **object_tables(results, changes, TARGETS)}.items():
         table.to_csv(folder / f"{name}.csv", index=False)
-    plan = {"name": "made-up", "report": "objects"}
+    plan = {"name": "made-up", "report": "objects", "targets": TARGETS.model_dump()}
     RunFolder(folder).write_provenance({"tool": "tunnelcd", "plan": plan, "machine": {}, "command": "tunnelcd run x"})
     return folder
 
@@ -116,23 +125,26 @@ def test_the_section_says_what_the_tables_say(run: Path) -> None:
     assert part is not None
     table = pd.read_csv(run / "objects_table.csv")
     own = table[(table["domain"] == "in") & (table["variant"] == "tunnelcd")].iloc[0]
-    told = next(line for line in part.sentences if line.startswith("In distribution, point IoU"))
-    assert f"tunnelcd {own['object_iou_point']:.2f}" in told
-    assert "oracle-merge + oracle-regions" in told
-    assert "targets that this run can judge are met" in part.sentences[0]
+    first = part.tables[0].rows[0][1]
+    assert (first[0].text, first[2].text) == ("tunnelcd", f"{own['object_iou_point']:.2f}")
+    assert [cells[-1].text for _, cells in part.tables[2].rows] == ["met", "missed"]
     # methods, withdrawal, targets, and kinds and sizes of either domain
-    assert [len(each.rows) for each in part.tables] == [12, 12, 8, 6, 6]
+    assert [len(each.rows) for each in part.tables] == [12, 12, 2, 6, 6]
     assert len(part.plots) == 1
 
 
 def test_the_best_is_among_those_that_ask_no_truth(run: Path) -> None:
     table = pd.read_csv(run / "objects_table.csv")
     rows = with_domain(read_run(run).results)
-    bold = [cells[0].text for _, cells in methods_table(table, rows).rows if cells[2].is_best]
+    bold = [
+        cells[0].text
+        for _, cells in methods_table(table, OBJECT_COLUMNS, rows, "", counts=OBJECT_COUNTS).rows
+        if cells[2].is_best
+    ]
     assert bold == ["tunnelcd"] * 3
-    first = withdrawal_table(table, rows).rows[0][1]
+    first = methods_table(table, WITHDRAWAL_COLUMNS, rows, "").rows[0][1]
     # the time of an answer whose returns are a third of it: 3 ms a region, 1 ms of them
-    assert [cell.text for cell in first] == ["tunnelcd", "6", "1.00", "0.50", "0.50", "0.00", "3", "1"]
+    assert [cell.text for cell in first] == ["tunnelcd", "6", "6", "1.00", "0.50", "0.50", "0.00", "3", "1"]
 
 
 def test_the_rivals_iou_stands_beside_in_every_group(run: Path) -> None:
@@ -151,9 +163,8 @@ def test_the_rivals_iou_stands_beside_in_every_group(run: Path) -> None:
 def test_pairs_that_are_gone_are_named_and_nothing_else_breaks(run: Path) -> None:
     page = write_page(run).read_text()
     words = re.sub(r"\s+", " ", html.unescape(re.sub(r"<[^>]+>", " ", page)))
-    assert "Cutting out the objects" in words
     assert "The simulated pair regions/cave, seed" in words
-    assert words.index("Cutting out the objects") < words.index("Every preset on every scenario")
+    assert page.index('id="objects"') < page.index('id="results"')
     assert not re.search(r'(?:src|href)="https?:', re.sub(r"<script\b.*?</script>", "", page, flags=re.DOTALL))
 
 

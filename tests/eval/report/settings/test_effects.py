@@ -103,11 +103,11 @@ def test_repeated_worlds_stand_under_their_own_heading_and_nowhere_else(run: Pat
     assert scenarios(read_run(run), unchanged=True) == [OTHER]
     page = html.unescape(write_page(run).read_text())
     groups = re.findall(r'<th class="group"[^>]*>(.*?)</th>', page)
-    assert groups == [PLAIN, OTHER, "ours", "theirs", "ours"]
+    # the summary, then the results, then the effects
+    assert groups[-5:] == [PLAIN, OTHER, "ours", "theirs", "ours"]
+    assert not any(NOISE in group for group in groups)
     assert re.findall(r'<h2 id="site-\d+">(.*?)</h2>', page) == [PLAIN]
     assert '<h2 id="effects">' in page
-    assert "3 further worlds repeat n[p.s=1] and smoke/unchanged" in page
-    assert f"n = 12 session pairs ({PLAIN}: 6, {OTHER}: 6" in page
     assert NOISE not in (run / "results.tex").read_text()
 
 
@@ -119,7 +119,6 @@ def test_a_page_without_such_worlds_has_no_such_heading(run: Path) -> None:
     assert scenarios(read_run(run), unchanged=False) == [NOISE]
     page = write_page(run).read_text()
     assert "effects" not in re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL)
-    assert "further worlds" not in page
 
 
 def test_a_plain_scenario_of_other_seeds_in_the_same_folder_hides_nothing(run: Path) -> None:
@@ -134,7 +133,6 @@ def test_a_plain_scenario_of_other_seeds_in_the_same_folder_hides_nothing(run: P
     assert scenarios(data, unchanged=False) == [PLAIN, "n", NOISE]
     assert named_variants(data, NOISE) == ["foreign"]
     assert first_seed(data, NOISE) == 2
-    assert f"({PLAIN}: 6, {OTHER}: 6, n: 1, {NOISE}: 1;" in write_page(run).read_text()
     # at the same seeds it is one more thing to be held against, and the others stay with their own
     pd.concat([results, plain.assign(seed=0)]).to_csv(run / "results.csv", index=False)
     assert [part.reference for part in draw_effects(read_run(run))] == ["n", PLAIN, OTHER]
@@ -144,9 +142,7 @@ def test_one_is_not_written_as_many(run: Path) -> None:
     results = pd.read_csv(run / "results.csv")
     is_one = results["scenario"].isin([PLAIN, NOISE]) & (results["seed"] == 0)
     results[is_one].to_csv(run / "results.csv", index=False)
-    page = html.unescape(write_page(run).read_text())
-    assert f"1 further world repeats {PLAIN} with" in page
-    assert "Dots are means over 1 session pair, lines" in page
+    assert "1 session pair," in html.unescape(write_page(run).read_text())
 
 
 def test_a_label_is_text_and_never_markup(run: Path) -> None:

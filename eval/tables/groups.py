@@ -1,8 +1,8 @@
-"""Objects by what they are and how large: IoU, volume and displacement of each kind of prop and size of hull."""
+"""Changes by what they are and how large: recall, IoU, volume and displacement of each kind of prop and size."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -11,11 +11,16 @@ import pandas as pd
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from eval.core.statistics import N_RESAMPLES
-from eval.tables.merge_table import numbers, texts
-from eval.tables.region_curves import PAIR
-from eval.tables.region_sizes import EDGES
+from eval.tables.region_curves import RankedPairs, found_at
+from eval.tables.rows import PAIR, mean, median, numbers, texts
 
-HIT_IOU = 0.5
+RATE_PER_100M = 0.1
+EDGES: Mapping[str, tuple[float, ...]] = {
+    "hull_volume_m3": (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, np.inf),
+    "n_returns": (0.0, 100.0, 300.0, 1000.0, 3000.0, 10000.0, np.inf),
+    "range_m": (0.0, 1.0, 1.5, 2.0, 3.0, 5.0, np.inf),
+}
+_HIT_IOU = 0.5
 _MEASURE = "hull_volume_m3"
 Statistic = Literal["mean", "median"]
 
@@ -59,13 +64,58 @@ def objects_by_group(changes: pd.DataFrame) -> list[dict[str, Any]]:
                 "iou_point_low": low,
                 "iou_point_high": high,
                 "iou_matched_median": median(iou[numbers(part, "matched_object") >= 0]),
-                "share_50": float(np.mean(iou >= HIT_IOU)),
+                "share_50": float(np.mean(iou >= _HIT_IOU)),
                 "share_found": float(part["is_found"].astype(bool).mean()),
                 "kind_accuracy": mean(numbers(part, "is_kind_right")),
                 "displacement_error_m": median(numbers(part, "displacement_error_m")),
                 "volume_error": median(np.abs(numbers(part, "volume_error_share"))),
             }
         )
+    return rows
+
+
+def recall_by_size(ranked: RankedPairs, changes: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return a row for every measure and bin that holds a change.
+
+    Args:
+        ranked: One variant's candidates and changes.
+        changes: The table that `ranked.change_rows` index.
+
+    Returns:
+        `measure`, `low` and `high` of the bin (low included), `n_changes`, `n_pairs`, and three recalls: `recall_at_k`
+        over the K best candidates of each pair, `recall_reported` at the method's own threshold, `recall_at_rate` at
+        0.1 false regions per 100 m with its 95 % interval over session pairs, `interval_low` to `interval_high`.
+    """
+    own = changes.iloc[ranked.change_rows]
+    found = {
+        "recall_at_k": ranked.change_rank < ranked.n_observable[ranked.change_pair],
+        "recall_reported": own["is_found"].astype(bool).to_numpy(),
+        "recall_at_rate": found_at(ranked, RATE_PER_100M),
+    }
+    rows: list[dict[str, Any]] = []
+    for measure, edges in EDGES.items():
+        if measure not in own:
+            continue
+        values = numbers(own, measure)
+        for low, high in pairwise(edges):
+            inside = (values >= low) & (values < high)
+            if not inside.any():
+                continue
+            interval = clustered_interval(
+                found["recall_at_rate"][inside].astype(np.float64), ranked.change_pair[inside]
+            )
+            rows.append(
+                {
+                    "measure": measure,
+                    "low": low,
+                    "high": high,
+                    "n_changes": int(inside.sum()),
+                    "n_pairs": len(np.unique(ranked.change_pair[inside])),
+                    **{name: float(is_hit[inside].mean()) for name, is_hit in found.items()},
+                    "interval_low": interval[0],
+                    "interval_high": interval[1],
+                }
+            )
     return rows
 
 
@@ -109,18 +159,6 @@ def clustered_interval(values: Float64Array, pair: Int64Array, statistic: Statis
         samples = _repeated_medians(values[order], times_drawn[:, place[order]])
     low, high = np.percentile(samples, (2.5, 97.5))
     return float(low), float(high)
-
-
-def mean(values: Float64Array) -> float:
-    """Return the mean of the numbers that are not NaN; NaN without one."""
-    values = values[~np.isnan(values)]
-    return float(values.mean()) if len(values) else float("nan")
-
-
-def median(values: Float64Array) -> float:
-    """Return the median of the numbers that are not NaN; NaN without one."""
-    values = values[~np.isnan(values)]
-    return float(np.median(values)) if len(values) else float("nan")
 
 
 def _repeated_medians(rising: Float64Array, times: Int64Array) -> Float64Array:

@@ -1,0 +1,127 @@
+"""What a plan asks of the method it is about: bounds on figures of its tables, and shares of right merges."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.yamlfile import Document, Settings, validate
+from eval.plans.variants import ORACLE_MERGE
+from eval.plans.worlds import PairKind
+
+RATE_COLUMN = "recall_at_"
+
+
+class Target(Settings):
+    """A bound on one column of regions_table.csv or objects_table.csv.
+
+    Attributes:
+        column: The column.
+        name: What the target is called in tables.
+        domain: In or out of the training distribution; all pairs where neither this nor a site is set.
+        site: Over the pairs with changes of the families whose name ends so, e.g. site1; the column is of results.csv.
+        at_least: The lower bound.
+        at_most: The upper bound; exactly one of the two is set.
+        method: Of which method, where it is not the one that the targets are about.
+        less: A rival whose value is subtracted first; for the columns `recall_at_...`.
+        least_km: No verdict where the unchanged pairs are shorter than this together.
+    """
+
+    column: str
+    name: str
+    domain: Literal["in", "out"] | None = None
+    site: str = ""
+    at_least: float | None = None
+    at_most: float | None = None
+    method: str = ""
+    less: str = ""
+    least_km: float = 0.0
+
+    @model_validator(mode="after")
+    def _is_complete(self) -> Target:
+        if (self.at_least is None) == (self.at_most is None):
+            raise ValueError("expected one of at_least and at_most")
+        if self.domain and self.site:
+            raise ValueError("expected one of domain and site")
+        if self.less and not (self.domain and self.column.startswith(RATE_COLUMN)):
+            raise ValueError(f"less: for a column {RATE_COLUMN}... of one domain")
+        return self
+
+    @property
+    def asked(self) -> str:
+        """The bound in words."""
+        return f"at least {self.at_least:g}" if self.at_least is not None else f"at most {self.at_most:g}"
+
+    def is_met_by(self, value: float) -> bool:
+        """Tell whether a value keeps the bound, but for rounding."""
+        return value >= self.at_least - 1e-9 if self.at_least is not None else value <= (self.at_most or 0.0) + 1e-9
+
+
+class Targets(Settings):
+    """What a plan asks for.
+
+    Attributes:
+        method: The method that the plan is about; pages show its cases.
+        regions: Bounds on regions.
+        objects: Bounds on objects.
+        merge: By kind of pair, the share of the pairs that must do what the kind asks for
+            (`eval.tables.merge_table.RULES`).
+    """
+
+    method: str = ""
+    regions: tuple[Target, ...] = ()
+    objects: tuple[Target, ...] = ()
+    merge: dict[PairKind, Annotated[float, Field(gt=0, le=1)]] = Field(default_factory=dict)
+
+    def share(self, pair_kind: str) -> float | None:
+        """Return which share of the pairs of a kind must do what it asks for; None where no target is set."""
+        return next((value for kind, value in self.merge.items() if kind == pair_kind), None)
+
+    def shown_method(self, variants: Sequence[str]) -> str:
+        """Return the variant whose cases are shown: the method, else the first that is no oracle, else the first."""
+        if self.method in variants:
+            return self.method
+        return next((name for name in variants if not is_oracle(name)), variants[0])
+
+
+def is_oracle(variant: str) -> bool:
+    """Tell whether a variant merges by the truth."""
+    return ORACLE_MERGE in variant.partition("[")[0].split("+")
+
+
+def targets_of(provenance: Mapping[str, Any]) -> Targets:
+    """Return the targets of the plan that a run was last run with.
+
+    A run from before plans held targets has those of the shipped plan of the same name; none where there is no such
+    plan.
+    """
+    plan = provenance.get("plan")
+    if not isinstance(plan, Mapping):
+        return Targets()
+    document = plan.get("targets", plan.get("name"))
+    try:
+        return validate(_Section, Document("provenance.json", {"targets": document})).targets
+    except InputError:
+        return Targets()
+
+
+def _of_plan(value: Any) -> Any:
+    """Take the name of a shipped plan for the targets of that plan."""
+    if not isinstance(value, str):
+        return {} if value is None else value
+    from eval.plans.plan import load_plan  # noqa: PLC0415 - a plan holds targets, and may name another plan's
+
+    try:
+        return load_plan(value).targets
+    except InputError as error:
+        raise ValueError(str(error)) from error
+
+
+PlanTargets = Annotated[Targets, BeforeValidator(_of_plan)]
+
+
+class _Section(Settings):
+    targets: PlanTargets

@@ -1,0 +1,190 @@
+"""The summary of a run: the headline figures of every method, best first, under one sentence about the run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cdpipe.core.geometry import Float64Array
+from eval.core.statistics import bootstrap_interval
+from eval.report.compared_columns import COMPARED, POOLED, figures_of, is_time
+from eval.report.tables import Cell, Table, methods_table
+from eval.running.run_data import (
+    Row,
+    RunData,
+    comparable,
+    covered_by,
+    ends_at_merge,
+    number,
+    shown_variant,
+    stored_table,
+    text,
+)
+from eval.running.sides import is_contended
+from eval.tables.columns import Column, fine, share, spaced
+from eval.tables.merge_table import ALL_FAMILIES, RIGHT_DEG, RIGHT_M
+from eval.tables.rows import ALL_DOMAINS, PAIR, by_domain, is_told_the_truth, numbers, records
+
+_KEYS = (
+    POOLED, "region_recall", "region_auroc", "false_regions_per_100m", "is_alarm", "object_iou_point", "object_f1_50",
+    "merge_error_m", "t_total_s", "bytes_regions_before",
+)  # fmt: skip
+_MAX_METHODS = 8
+HEADLINES = tuple(column for key in _KEYS for column in COMPARED if column.key == key)
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a page shows first."""
+
+    sentence: str
+    table: Table
+
+
+def draw_summary(data: RunData, merges: pd.DataFrame) -> Summary:
+    """Return the summary of a run.
+
+    Args:
+        data: The run.
+        merges: As `eval.tables.merge_table.merge_table` returns it.
+    """
+    table = _merge_headlines(merges) if ends_at_merge(data) else _headlines(data)
+    return Summary(_sentence(data, merges), table)
+
+
+def means_by_method(results: pd.DataFrame, columns: Sequence[Column]) -> pd.DataFrame:
+    """Return the mean of each column over the pairs of each method, of times the median.
+
+    Args:
+        results: Rows of results.csv with their `domain`.
+        columns: The columns.
+
+    Returns:
+        A row for each domain and variant: `n_pairs`, and each column with the 95 % interval `..._low` to `..._high`.
+    """
+    rows: list[dict[str, Any]] = []
+    for domain, cases in by_domain(results):
+        for variant, own in cases.groupby("variant", sort=False):
+            row: dict[str, Any] = {"domain": domain, "variant": str(variant), "n_pairs": len(own)}
+            for column in columns:
+                row |= _mean(numbers(own, column.key), column.key)
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def is_unmade(row: Row) -> bool:
+    """Tell whether a case has no truth: its world could not be made, or its worker died over it."""
+    return text(row, "status") != "ok" and "n_observable" in row and math.isnan(number(row, "n_observable"))
+
+
+def _mean(values: Float64Array, key: str) -> dict[str, float]:
+    values = values[~np.isnan(values)]
+    low, high = bootstrap_interval(values, "median" if is_time(key) else "mean")
+    value = (np.median(values) if is_time(key) else values.mean()) if len(values) else math.nan
+    return {key: float(value), f"{key}_low": low, f"{key}_high": high}
+
+
+def _headlines(data: RunData) -> Table:
+    """Return the headline figures of each method, best first; what is told the truth comes last."""
+    cases = comparable(data)
+    if len(cases) == 0:
+        return Table((), ())
+    figures = figures_of(cases)
+    table = means_by_method(figures, HEADLINES)
+    if table["domain"].nunique() > 1:  # all pairs together stand in the tables below
+        table = table[table["domain"] != ALL_DOMAINS]
+    stored = stored_table(data, "regions_table")
+    if len(stored):
+        names = ["domain", "variant"]
+        stored = stored[[*names, POOLED, f"{POOLED}_low", f"{POOLED}_high"]]
+        table = table.drop(columns=stored.columns.difference(names)).merge(stored, on=names, how="left")
+    shown = [column for column in HEADLINES if table[column.key].notna().any()]
+    oracle = table["variant"].map(is_told_the_truth)
+    ranks = {f"rank{place}": _rank(table, column) for place, column in enumerate(shown) if column.better == "high"}
+    ranked = table.assign(oracle=oracle, **ranks).sort_values(["oracle", *ranks], kind="stable")
+    first = pd.concat([_first(own, shown_variant(data)) for _, own in ranked.groupby("domain") if len(own)])
+    caption = (
+        f"Headline figures: one row is one method, best first, at most {_MAX_METHODS} for each domain; means over "
+        "session pairs (times: median)"
+    )
+    return methods_table(first, shown, figures, caption)
+
+
+def _first(ranked: pd.DataFrame, main: str) -> pd.DataFrame:
+    """Return the first rows of a domain, and that of the method that the plan is about."""
+    is_shown = np.arange(len(ranked)) < _MAX_METHODS
+    return ranked[is_shown | (ranked["variant"] == main).to_numpy()]
+
+
+def _rank(table: pd.DataFrame, column: Column) -> pd.Series[float]:
+    return -table[column.key].round(2).fillna(-math.inf)
+
+
+def _merge_headlines(merges: pd.DataFrame) -> Table:
+    """Return the share of the pairs of each kind that each method merges as the kind asks, best first."""
+    if len(merges) == 0:
+        return Table((), ())
+    own = merges[merges["family"] == ALL_FAMILIES]
+    kinds = list(dict.fromkeys(own["pair_kind"]))
+    rows: list[tuple[float, tuple[Cell, ...]]] = []
+    for variant, group in own.groupby("variant", sort=False):
+        by_kind = {str(row["pair_kind"]): row for row in records(group)}
+        cells = [_share_cell(by_kind.get(kind, {})) for kind in kinds]
+        counts = (group["n_wrong_accepted"].sum(), group["n_refused"].sum(), group["n_failed"].sum())
+        error_m = by_kind.get("clean", {}).get("median_merge_error_m", math.nan)
+        head = (Cell(spaced(str(variant))), Cell(str(group["n_pairs"].sum())))
+        tail = (*(Cell(str(n)) for n in counts), Cell(fine(error_m)))
+        rank = -float(group["n_within_target"].sum() / group["n_pairs"].sum()) + 10 * is_told_the_truth(str(variant))
+        rows.append((rank, (*head, *cells, *tail)))
+    rows.sort(key=lambda row: row[0])
+    headings = ("method", "pairs", *(f"{kind}, right" for kind in kinds), "wrong, accepted", "refused", "failed",
+                "error, clean pairs [m]")  # fmt: skip
+    caption = "Headline figures: one row is one method, best first; share of the pairs merged as their kind asks"
+    return Table(headings, tuple(("", cells) for _, cells in rows), caption)
+
+
+def _share_cell(row: Mapping[str, Any]) -> Cell:
+    value, low, high = (float(row.get(name, math.nan)) for name in ("share_within_target", "low", "high"))
+    return Cell(share(value), interval="" if math.isnan(low) else f"{share(low)}\u2013{share(high)}")
+
+
+def _sentence(data: RunData, merges: pd.DataFrame) -> str:
+    """Return how much the run holds, what went wrong in it, and how many targets are met."""
+    results = pd.DataFrame(list(data.results))
+    covered = covered_by(data)
+    n_pairs, n_methods = len(results[PAIR].drop_duplicates()), results["variant"].nunique()
+    is_whole = covered is None or covered.is_whole
+    parts = [] if covered is None or is_whole else [covered.sentence.removesuffix(".")]
+    parts.append(f"{_counted(n_pairs, 'session pair')}, {_counted(n_methods, 'variant')}")
+    bad = [row for row in data.results if text(row, "status") != "ok"]
+    n_unmade = sum(is_unmade(row) for row in bad)
+    if len(bad) > n_unmade:
+        meaning = "ended without a merge" if ends_at_merge(data) else "gave no answer and count as finding nothing"
+        parts.append(f"{len(bad) - n_unmade} of {len(results)} cases {meaning}")
+    if n_unmade:
+        parts.append(f"{n_unmade} have no world and are left out")
+    own = merges[merges["family"] == ALL_FAMILIES] if len(merges) else merges
+    wrong = (numbers(results, "merge_error_m") > RIGHT_M) | (numbers(results, "merge_error_deg") > RIGHT_DEG)
+    # where pairs have a kind, a merge of sessions without a common place is wrong too
+    if n_wrong := int(own["n_wrong_accepted"].sum() if len(own) else wrong.sum()):
+        told = f"{_counted(n_wrong, 'accepted merge')} {'is' if n_wrong == 1 else 'are'} wrong"
+        parts.append(f"{told} (over {RIGHT_M:g} m or {RIGHT_DEG:g} deg)")
+    verdicts = list(own[own["variant"] == shown_variant(data)]["is_met"]) if len(own) else []
+    for name in ("regions", "objects"):
+        targets = stored_table(data, f"{name}_targets")
+        verdicts += list(targets["is_met"]) if len(targets) else []
+    verdicts = [bool(value) for value in verdicts if not pd.isna(value)]
+    if verdicts and is_whole:
+        parts.append(f"{sum(verdicts)} of {len(verdicts)} targets of the plan are met")
+    if is_contended(data):
+        parts.append("times were measured beside other work")
+    return f"{'; '.join(parts)}."
+
+
+def _counted(n: int, word: str) -> str:
+    return f"{n} {word}" if n == 1 else f"{n} {word}s"

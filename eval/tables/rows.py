@@ -1,0 +1,84 @@
+"""Rows of results.csv and of the item tables: their columns as arrays, the pairs and domains they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cdpipe.core.geometry import Float64Array
+from eval.core.domains import domain_of
+
+PAIR = ["scenario", "seed"]
+ALL_DOMAINS = "all"
+DOMAINS = ("in", "out", ALL_DOMAINS)
+
+
+def records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows of a table as dictionaries."""
+    return [{str(key): value for key, value in row.items()} for row in table.to_dict("records")]
+
+
+def texts(table: pd.DataFrame, column: str) -> np.ndarray[Any, np.dtype[np.object_]]:
+    """Return an (N,) column as texts, "" where it is empty or absent."""
+    if column not in table:
+        return np.full(len(table), "", dtype=object)
+    return np.array(["" if pd.isna(value) else str(value) for value in table[column]], dtype=object)
+
+
+def numbers(table: pd.DataFrame, column: str) -> Float64Array:
+    """Return an (N,) column as numbers, NaN where it is empty or absent."""
+    if column not in table:
+        return np.full(len(table), np.nan)
+    return pd.to_numeric(table[column], errors="coerce").to_numpy(dtype=np.float64)
+
+
+def mean(values: Float64Array) -> float:
+    """Return the mean of the finite numbers; NaN without one."""
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def median(values: Float64Array) -> float:
+    """Return the median of the numbers that are not NaN; NaN without one."""
+    values = values[~np.isnan(values)]
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+def is_told_the_truth(variant: str) -> bool:
+    """Tell whether a variant takes its merge or its regions from the truth."""
+    return variant.startswith("oracle-")
+
+
+def with_domain(rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Return rows of results.csv as a table, with their `domain`."""
+    table = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows))
+    family = texts(table, "family" if "family" in table else "scenario")
+    return table.assign(domain=[domain_of(name) for name in family])
+
+
+def by_domain(results: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield the rows of each domain that is present, and all rows where both are.
+
+    Args:
+        results: Rows of results.csv with their `domain`.
+    """
+    present = [name for name in DOMAINS if (results["domain"] == name).any()]
+    yield from ((name, results[results["domain"] == name]) for name in present)
+    if len(present) > 1:
+        yield ALL_DOMAINS, results
+
+
+def of_cases(items: pd.DataFrame, cases: pd.DataFrame, needed: Sequence[str] = ()) -> pd.DataFrame:
+    """Return the items (changes, regions, keyframes) of some rows of results.csv, in their order.
+
+    Args:
+        items: Rows of an item table.
+        cases: Rows of results.csv.
+        needed: Columns that an empty answer must have.
+    """
+    wanted = [*PAIR, "variant"]
+    own = items.merge(cases[wanted].drop_duplicates(), on=wanted, how="inner") if len(items) else items
+    return own.assign(**{name: [] for name in (*wanted, *needed) if name not in own}) if len(own) == 0 else own

@@ -1,0 +1,112 @@
+"""What a plan asks of regions and objects, and what its run found: regions_targets.csv and objects_targets.csv."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from eval.core.statistics import mean_with_interval
+from eval.plans.targets import RATE_COLUMN, Target
+from eval.tables.region_curves import RankedPairs, interval_of, recall_at, resampled_recalls
+from eval.tables.rows import median, numbers, records, texts
+
+COLUMNS = ("target", "domain", "variant", "value", "low", "high", "asked", "n", "is_met")
+# what a column is over, where that is not every pair of its row
+_COUNTS = {
+    "region_auroc": "n_auroc", "region_recall_at_k": "n_changed", "silent_share": "n_unchanged",
+    "false_regions_per_100m_unchanged": "n_unchanged", "displacement_error_m": "n_displacements",
+    "pile_volume_error": "n_piles", "object_iou_point_partial": "n_partial",
+}  # fmt: skip
+_ENDS = {"silent_share": ("silent_low", "silent_high")}
+
+
+def judged_targets(
+    targets: Sequence[Target],
+    method: str,
+    table: pd.DataFrame,
+    results: pd.DataFrame,
+    ranked: Mapping[tuple[str, str], RankedPairs] | None = None,
+    *,
+    is_whole: bool = True,
+) -> pd.DataFrame:
+    """Return what is asked and whether it is met; no row for a figure that is undefined.
+
+    Args:
+        targets: What is asked.
+        method: The variant that the targets are about.
+        table: regions_table or objects_table.
+        results: Rows as in results.csv.
+        ranked: Candidates and changes of each domain and variant, for targets against a rival.
+        is_whole: Whether all that was planned is in the tables; otherwise nothing is said to be met or not.
+
+    Returns:
+        `target`, its name; `domain` (or site), `variant`, `value` with `low` and `high` where there is an interval,
+        `asked` ("at least 0.97"), `n` pairs (changes, where the figure is a median over changes), and `is_met`: None
+        where no verdict is passed.
+    """
+    rows = []
+    for target in targets:
+        variant = target.method or method
+        found: dict[str, Any] | None
+        if target.site:
+            found = _on_site(target, variant, results)
+        elif target.less:
+            found = _against(target, variant, ranked or {})
+        else:
+            found = _of_table(target, variant, table)
+        if found is not None and not math.isnan(found["value"]):
+            is_long = found.pop("km", math.inf) >= target.least_km
+            verdict = target.is_met_by(found["value"]) if is_whole and is_long else None
+            rows.append({"target": target.name, "variant": variant, "asked": target.asked, **found, "is_met": verdict})
+    return pd.DataFrame(rows, columns=list(COLUMNS)).astype({"is_met": object})
+
+
+def _of_table(target: Target, variant: str, table: pd.DataFrame) -> dict[str, Any] | None:
+    """Return the figure of a row of the table; the last row of a variant is that over all of its pairs."""
+    own = table[table["variant"] == variant]
+    rows = records(own if target.domain is None else own[own["domain"] == target.domain])
+    if not rows or target.column not in rows[-1]:
+        return None
+    row = rows[-1]
+    low, high = _ENDS.get(target.column, (f"{target.column}_low", f"{target.column}_high"))
+    return {
+        "domain": str(row["domain"]), "value": float(row[target.column]), "low": float(row.get(low, math.nan)),
+        "high": float(row.get(high, math.nan)), "n": int(row[_COUNTS.get(target.column, "n_pairs")]),
+        "km": float(row.get("km_unchanged", math.inf)),
+    }  # fmt: skip
+
+
+def _against(target: Target, variant: str, ranked: Mapping[tuple[str, str], RankedPairs]) -> dict[str, Any] | None:
+    """Return the recall of a variant at a rate of false regions less that of a rival, with its paired interval."""
+    ours, theirs = (ranked.get((str(target.domain), name)) for name in (variant, target.less))
+    if ours is None or theirs is None:
+        return None
+    rate = float(target.column.removeprefix(RATE_COLUMN))
+    difference = recall_at(ours, rate) - recall_at(theirs, rate)
+    low = high = math.nan
+    if ours.pairs == theirs.pairs and np.count_nonzero(ours.n_observable) > 1:
+        low, high = interval_of(resampled_recalls(ours, rate) - resampled_recalls(theirs, rate))
+    return {"domain": target.domain, "value": difference, "low": low, "high": high, "n": len(ours.pairs)}
+
+
+def _on_site(target: Target, variant: str, results: pd.DataFrame) -> dict[str, Any]:
+    """Return the mean over the changed pairs of a site with its interval; of a time the median, without one."""
+    is_there = np.array([family.rpartition("/")[2] == target.site for family in texts(results, "family")], np.bool_)
+    own = results[is_there & (results["variant"] == variant).to_numpy() & ~is_unchanged_pair(results)]
+    if target.column == "bytes_ratio":
+        values = numbers(own, "bytes_map_before") / numbers(own, "bytes_regions_before")
+    else:
+        values = numbers(own, target.column)
+    value, low, high, n = mean_with_interval(values)
+    if target.column.startswith("t_"):
+        value, low, high = median(values), math.nan, math.nan
+    return {"domain": target.site, "value": value, "low": low, "high": high, "n": n}
+
+
+def is_unchanged_pair(results: pd.DataFrame) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Return (N,) whether nothing changed in each pair of results.csv."""
+    return results["is_unchanged_pair"].astype("boolean").fillna(value=False).to_numpy(dtype=bool)

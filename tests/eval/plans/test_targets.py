@@ -1,0 +1,64 @@
+"""Targets of a plan: its own, another plan's, or those of the shipped plan of an older run."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from cdpipe.core.errors import InputError
+from eval.plans.changes import changed_plan
+from eval.plans.plan import load_plan, plan_names
+from eval.plans.targets import Target, Targets, targets_of
+
+PLAN = {"name": "tiny", "scenarios": ["smoke/one_box"], "seeds": [1], "variants": [{"preset": "paper"}]}
+
+
+def written(folder: Path, **more: object) -> str:
+    path = folder / "tiny.yaml"
+    path.write_text(yaml.safe_dump({**PLAN, **more}))
+    return str(path)
+
+
+def test_a_plan_takes_those_of_another_by_its_name(tmp_path: Path) -> None:
+    assert load_plan(written(tmp_path, targets="main")).targets == load_plan("main").targets
+    assert load_plan(written(tmp_path)).targets == Targets()
+
+
+@pytest.mark.parametrize("name", plan_names())
+def test_a_run_finds_its_targets_whether_its_plan_was_stored_with_them_or_before_there_were_any(name: str) -> None:
+    plan = changed_plan(load_plan(name), seeds="1:3")
+    document = plan.model_dump(mode="json")
+    assert targets_of({"plan": document}) == plan.targets
+    assert targets_of({"plan": {key: value for key, value in document.items() if key != "targets"}}) == plan.targets
+
+
+def test_a_run_of_an_unknown_plan_has_none() -> None:
+    assert targets_of({"plan": {"name": "of my own"}}) == targets_of({}) == Targets()
+
+
+@pytest.mark.parametrize(
+    ("targets", "rule"),
+    [
+        ("mian", "unknown"),
+        ({"regions": [{"column": "region_auroc", "name": "a"}]}, "at_least and at_most"),
+        ({"regions": [{"column": "region_auroc", "name": "a", "at_least": 1, "at_most": 1}]}, "at_least and at_most"),
+        ({"regions": [{"column": "region_auroc", "name": "a", "at_least": 1, "less": "c2c"}]}, "less"),
+        ({"merge": {"clean": 1.1}}, "less than or equal to 1"),
+    ],
+)
+def test_mistakes_are_told(tmp_path: Path, targets: object, rule: str) -> None:
+    with pytest.raises(InputError, match=rule):
+        load_plan(written(tmp_path, targets=targets))
+
+
+def test_bounds_hold_at_their_value() -> None:
+    low, high = Target(column="a", name="a", at_least=0.5), Target(column="a", name="a", at_most=0.0)
+    assert [low.is_met_by(value) for value in (0.5, 0.4999)] == [True, False]
+    assert [high.is_met_by(value) for value in (0.0, 0.0001)] == [True, False]
+
+
+def test_the_shown_method_is_the_plans_or_the_first_that_merges_by_itself() -> None:
+    targets = Targets(method="ours")
+    assert targets.shown_method(["a", "ours"]) == "ours"
+    assert targets.shown_method(["oracle-merge", "a"]) == "a"
+    assert targets.shown_method(["oracle-merge"]) == "oracle-merge"
