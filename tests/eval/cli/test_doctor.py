@@ -65,7 +65,7 @@ def test_every_fault_is_told_with_what_mends_it(command: Command, monkeypatch: p
     assert code == 2
     wanted = {line.partition(">")[0]: line for line in PROJECT["dependencies"]}
     assert err.splitlines() == [
-        f"error: numpy: 1.26.4 is older than 2.0: pip install --upgrade '{wanted['numpy']}'",
+        f"error: numpy: 1.26.4 is older than 2.2: pip install --upgrade '{wanted['numpy']}'",
         f"error: mujoco: not installed: pip install '{wanted['mujoco']}'",
         "error: small_gicp: 99.0; ModuleNotFoundError: import of small_gicp halted; None in sys.modules: "
         f"pip install --force-reinstall '{wanted['small_gicp']}'",

@@ -328,7 +328,7 @@ def test_another_recipe_or_somebody_s_folder_is_refused(
         ((FAMILY, "--seeds", "x"), "error: --seeds x: expected"),
         ((FAMILY, FAMILY, "--seeds", "0"), "one is named twice"),
         ((FAMILY, "--seeds", "0", "--set", "tunel=1"), "tunel"),
-        ((FAMILY, "--seeds", "0", "--workers", "2", "--scheduler", "tcp://a:1"), "leave one of them out"),
+        ((FAMILY, "--seeds", "0", "--workers", "2", "--scheduler", "tcp://a:1"), "leave one of the two out"),
     ],
 )
 def test_mistakes_are_one_line_and_leave_no_folder(command: Callable, tmp_path: Path, argv: tuple, told: str) -> None:
