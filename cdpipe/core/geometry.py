@@ -75,11 +75,6 @@ def transform(dst_T_src: Float64Array, points: Float64Array) -> Float64Array:
     return points @ dst_T_src[:3, :3].T + dst_T_src[:3, 3]
 
 
-def rotation_angle_rad(pose: Float64Array) -> float:
-    """Return the rotation angle of a (4, 4) pose, in [0, pi]."""
-    return float(Rotation.from_matrix(pose[:3, :3]).magnitude())
-
-
 def yaw_rad(pose: Float64Array) -> float:
     """Return the heading of a (4, 4) pose: the angle of its x axis in the x-y plane, in (-pi, pi]."""
     return float(np.arctan2(pose[1, 0], pose[0, 0]))

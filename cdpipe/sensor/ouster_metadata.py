@@ -34,30 +34,17 @@ def read_document(path: Path) -> dict[str, Any]:
     Raises:
         InputError: The file is missing, cannot be read, or holds no JSON object.
     """
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder: name the metadata .json of an Ouster sensor")
+    expected = "expected the metadata .json of an Ouster sensor"
     try:
-        text = path.read_text(encoding="utf-8")
+        document = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such sensor metadata file") from error
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not text: expected the metadata .json of an Ouster sensor") from error
-    if not text.strip():
-        raise InputError(f"{path}: is empty: expected the metadata .json of an Ouster sensor")
-    try:
-        document = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: not JSON (line {error.lineno}: {error.msg})") from error
-    except ValueError as error:
-        raise InputError(
-            f"{path}: holds a whole number of thousands of digits: expected the metadata of an Ouster sensor"
-        ) from error
-    except RecursionError as error:
-        raise InputError(f"{path}: nested too deeply to be the metadata of an Ouster sensor") from error
+        raise InputError(f"{path}: cannot be read ({error.strerror}): {expected}") from error
+    except (ValueError, RecursionError) as error:  # not text, not JSON, numbers too long or nesting too deep
+        raise InputError(f"{path}: not JSON ({error}): {expected}") from error
     if not isinstance(document, dict):
-        raise InputError(f"{path}: holds a JSON {type(document).__name__}: expected the metadata of an Ouster sensor")
+        raise InputError(f"{path}: holds a JSON {type(document).__name__}: {expected}")
     return document
 
 

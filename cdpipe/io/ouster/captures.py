@@ -25,7 +25,6 @@ from cdpipe.io.readers import RECORDING_SUFFIXES
 from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
 from cdpipe.sensor.ouster_metadata import read_document, require_mode
 
-PCAP_SUFFIXES = (".pcap", ".pcapng")
 # A revolution needs more than this share of its columns: a recording starts and ends inside a revolution.
 _LEAST_SHARE = 0.5
 # Bytes of Ethernet, IP, UDP and PCAP headers per packet, to estimate the number of packets.

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import (
     invert,
     make_pose,
     require_poses,
     require_shape,
-    rotation_angle_rad,
     stream,
     transform,
     travelled_m,
@@ -20,7 +20,7 @@ def test_yaw_pose_turns_then_moves() -> None:
         transform(yaw_pose(np.pi / 2, (1, 2, 3)), np.array([[1.0, 0, 0]])), [[1, 3, 3]], atol=1e-15
     )
     assert yaw_rad(yaw_pose(0.3)) == pytest.approx(0.3)
-    assert rotation_angle_rad(yaw_pose(-0.3)) == pytest.approx(0.3)
+    assert Rotation.from_matrix((yaw_pose(-0.3))[:3, :3]).magnitude() == pytest.approx(0.3)
 
 
 def test_inverse_of_one_pose_and_of_a_stack() -> None:
