@@ -1,7 +1,7 @@
-from .bench import contests, measure, write_table
+from .bench import list_contests, measure, write_table
 
 __all__ = [
-    "contests",
+    "list_contests",
     "measure",
     "write_table",
 ]

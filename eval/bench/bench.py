@@ -1,7 +1,7 @@
 """The speed table: its rows, the measurement of each beside its rival in the same run, and the file.
 
 A new part of the table is a dictionary of named functions that return `sim.studies.timing.Contest`, joined in
-`contests`. A ratio says how many times faster than its rival something is.
+`list_contests`. A ratio says how many times faster than its rival something is.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _N_REGIONS = 3
 _QUERY_LIMITS_S = {"60k": 0.016, "1400k": 0.109}
 
 
-def contests(
+def list_contests(
     site: BenchSite | None = None,
     merge_sites: Sequence[MergeSite] | None = None,
     spheres: Sequence[ExtractSite] | None = None,
@@ -53,7 +53,7 @@ def contests(
     }
 
 
-def chosen(every: Contests, only: Sequence[str]) -> Contests:
+def choose(every: Contests, only: Sequence[str]) -> Contests:
     """Return the contests of some names, or all of them if none is named.
 
     Raises:
@@ -80,11 +80,11 @@ def measure(every: Contests, on_progress: Callable[[str, int, int], None] | None
     for done, (name, contest) in enumerate(every.items()):
         if on_progress is not None:
             on_progress(name, done, len(every))
-        rows.append(row_of(name, contest()))
+        rows.append(make_row(name, contest()))
     return {"machine": machine(), "rows": rows}
 
 
-def row_of(name: str, contest: Contest) -> Row:
+def make_row(name: str, contest: Contest) -> Row:
     """Return one row of the table.
 
     `value` and `rival_value` are medians over `n` repetitions; `spread` is the distance between the quartiles of
@@ -113,7 +113,7 @@ def row_of(name: str, contest: Contest) -> Row:
     }
 
 
-def verdict(rows: Sequence[Row]) -> str:
+def summarise(rows: Sequence[Row]) -> str:
     """Return one line: how many targets are met, which are missed, and which had no rival to be judged by."""
     judged = [row for row in rows if row["met"] is not None]
     missed = [row["name"] for row in judged if not row["met"]]
@@ -126,12 +126,12 @@ def verdict(rows: Sequence[Row]) -> str:
     return told
 
 
-def reasons(rows: Sequence[Row]) -> list[str]:
+def list_reasons(rows: Sequence[Row]) -> list[str]:
     """Return one line for every row that failed."""
     return [f"{row['name']}: {row['reason']}" for row in rows if row["reason"]]
 
 
-def make_ready(path: Path) -> None:
+def require_writable(path: Path) -> None:
     """Check before the measurement that the table can be written.
 
     Raises:

@@ -22,12 +22,12 @@ def bench(
     """Measure the speed table, each figure beside its rival in the same run. A missed target is not an error."""
     import pandas as pd
 
-    from eval.bench.bench import chosen, contests, make_ready, measure, reasons, verdict, write_table
+    from eval.bench.bench import choose, list_contests, list_reasons, measure, require_writable, summarise, write_table
     from eval.core.progress import Lines, Silent
 
-    rows = chosen(contests(), only or ())
+    rows = choose(list_contests(), only or ())
     if out is not None:
-        make_ready(out)
+        require_writable(out)
     # lines, never bars: the time of a thread that redraws bars would be measured as well
     table = measure(rows, (Silent() if quiet else Lines()).cells)
     if out is not None:
@@ -37,9 +37,9 @@ def bench(
     shown = pd.DataFrame(table["rows"]).assign(met=[MET[row["met"]] for row in table["rows"]]).drop(columns="reason")
     cpu, cores = table["machine"]["cpu"], table["machine"]["cores"]
     print_table(f"speed, {cpu}, {cores} cores; ratio: times faster than the rival", shown)
-    for line in reasons(table["rows"]):
+    for line in list_reasons(table["rows"]):
         typer.echo(line)
-    typer.echo(f"{verdict(table['rows'])}{'' if out is None else f'; {out}'}")
+    typer.echo(f"{summarise(table['rows'])}{'' if out is None else f'; {out}'}")
 
 
 def list_command() -> None:

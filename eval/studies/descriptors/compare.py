@@ -32,7 +32,7 @@ from eval.core.statistics import bootstrap_interval, mean_with_interval
 from eval.plans.plan import parse_seeds_option
 from eval.plans.worlds import world_slug
 from eval.running.runfolder import remove, write_json
-from eval.studies.descriptors.rows import METHODS, SPHERE, pair_rows
+from eval.studies.descriptors.rows import METHODS, SPHERE, measure_pair
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
@@ -85,7 +85,7 @@ def _simulated(
             pair.parent.mkdir(parents=True, exist_ok=True)
             simulate_pair(scenario, seed, pair, on_progress=progress.stage)
         progress.stage("describe", 0, 1)
-        return pair_rows(pair)
+        return measure_pair(pair)
     finally:
         if not keep:
             remove(pair)
@@ -121,7 +121,7 @@ def _stored(path: Path, key: str) -> list[dict[str, object]] | None:
 _PAIR = ["family", "seed"]
 
 
-def places_table(rows: pd.DataFrame) -> pd.DataFrame:
+def tabulate_places(rows: pd.DataFrame) -> pd.DataFrame:
     """Return what each descriptor of scans recognises, by group.
 
     Returns:
@@ -152,14 +152,14 @@ def places_table(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(table)
 
 
-def spheres_table(rows: pd.DataFrame) -> pd.DataFrame:
+def tabulate_spheres(rows: pd.DataFrame) -> pd.DataFrame:
     """Return what `sphere` finds in each precision, by group.
 
     Returns:
         `region_auroc`, mean over the pairs that have one (`n_used` of `n_pairs`), with `_low` and `_high`;
         `auroc_loss` against float32, mean over the same pairs, with `_low` and `_high`, and the largest of any pair;
         `n_refused` pairs whose merge was; `map_over_kept`, the bytes of the thinned before map over those kept of it,
-        median over pairs, and `map_over_kept_least`; price as in `places_table`.
+        median over pairs, and `map_over_kept_least`; price as in `tabulate_places`.
     """
     table = []
     for group, own in _groups(rows[rows["descriptor"] == SPHERE]):
@@ -224,7 +224,7 @@ def main(
     numbers = parse_seeds_option(seeds)
     with shown_progress(quiet, "pairs") as progress:
         rows = measure(families or _FAMILIES, numbers, out, progress, keep=keep)
-    tables = {"descriptors": rows, "places": places_table(rows), "spheres": spheres_table(rows)}
+    tables = {"descriptors": rows, "places": tabulate_places(rows), "spheres": tabulate_spheres(rows)}
     for name, table in tables.items():
         table.to_csv(out / f"{name}.csv", index=False)
     (out / "command.txt").write_text(

@@ -87,7 +87,7 @@ class HeldOut:
     change_tunnels: Int64Array
 
 
-def held_out(tunnels: Sequence[TunnelShard]) -> HeldOut:
+def read_held_out(tunnels: Sequence[TunnelShard]) -> HeldOut:
     """Read tunnels into memory.
 
     Raises:
@@ -198,7 +198,7 @@ def points(n_seeds: int) -> list[Point]:
     return [Point(seed=seed) for seed in seeds] + [Point(size, share, seed) for seed in seeds for size, share in others]
 
 
-def share_of(tunnels: Sequence[TunnelShard], share: float, seed: int) -> list[TunnelShard]:
+def select_share(tunnels: Sequence[TunnelShard], share: float, seed: int) -> list[TunnelShard]:
     """Return that share of the tunnels of each family, one at least; a larger share holds all of a smaller one."""
     kept: set[int] = set()
     for family in sorted({tunnel.family for tunnel in tunnels}):
@@ -224,7 +224,7 @@ def trained(
     return network
 
 
-def rows_of(network: SphereNetwork, held: HeldOut, about: Mapping[str, Any]) -> list[dict[str, Any]]:
+def make_rows(network: SphereNetwork, held: HeldOut, about: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return a row for each precision of the stored numbers."""
     sizes = asdict(network.size) | {
         "numbers": network.size.numbers,
@@ -236,7 +236,7 @@ def rows_of(network: SphereNetwork, held: HeldOut, about: Mapping[str, Any]) -> 
     ]
 
 
-def earlier_rows(path: Path, run: Mapping[str, Any]) -> list[dict[str, Any]]:
+def read_rows(path: Path, run: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the rows of an earlier call, none where there was none.
 
     Raises:
@@ -266,8 +266,8 @@ def main(
     training, validation = open_dataset(data, "train"), open_dataset(data, "validation")
     digests = f"{data_digest(training)} {data_digest(validation)}"
     run = {"data": digests, "run_steps": steps}
-    held, path = held_out(validation), out / "curves.csv"
-    rows = earlier_rows(path, run)
+    held, path = read_held_out(validation), out / "curves.csv"
+    rows = read_rows(path, run)
     for point in [None, *points(seeds)]:
         name = point.name if point else SHIPPED
         if any(row["point"] == name for row in rows):
@@ -276,11 +276,11 @@ def main(
         if point is None:
             network, of_point = load_trained_sphere_network()[0], dict.fromkeys(("share", "seed", "tunnels"), np.nan)
         else:
-            own = share_of(training, point.share, point.seed)
+            own = select_share(training, point.share, point.seed)
             network = trained(point, own, held, steps, out / "networks" / name, digests)
             of_point = {"share": point.share, "seed": point.seed, "tunnels": len(own)}
         cpu_s = round(process_time() - began, 1)
-        found = rows_of(network, held, {"point": name, **run, **of_point, "cpu_s": cpu_s})
+        found = make_rows(network, held, {"point": name, **run, **of_point, "cpu_s": cpu_s})
         rows += found
         _write(pd.DataFrame(rows), path)
         typer.echo(f"{name}: log-likelihood {found[0]['log_likelihood']:.4f}, AUROC {found[0]['auroc']:.4f}")

@@ -45,7 +45,7 @@ class Described:
     seconds: Float64Array
 
 
-def pair_rows(pair: Path) -> list[Row]:
+def measure_pair(pair: Path) -> list[Row]:
     """Return one row for each descriptor of scans, and one for each precision of `sphere`.
 
     Args:
@@ -60,11 +60,11 @@ def pair_rows(pair: Path) -> list[Row]:
     sources = {name: pipeline_input(pair, name) for name in SESSIONS}
     maps = {name: build_map(sources[name], config.map) for name in SESSIONS}
     described = {name: describe_keyframes(sources[name], maps[name], METHODS) for name in SESSIONS}
-    rows = [scan_row(method, described["before"][method], described["after"][method], truth) for method in METHODS]
+    rows = [measure_scans(method, described["before"][method], described["after"][method], truth) for method in METHODS]
     method = config.descriptor.method
     mapped = [MappedSession(maps[name], described[name][method].descriptors) for name in SESSIONS]
     merged = merge_maps(mapped[0], mapped[1], config.merge)
-    return rows + sphere_rows(merged, mapped[0].descriptors, mapped[1].descriptors, truth, config)
+    return rows + measure_spheres(merged, mapped[0].descriptors, mapped[1].descriptors, truth, config)
 
 
 def describe_keyframes(source: ScanSource, thin_map: PointMap, methods: Iterable[str]) -> Mapping[str, Described]:
@@ -83,7 +83,7 @@ def describe_keyframes(source: ScanSource, thin_map: PointMap, methods: Iterable
     return found
 
 
-def scan_row(method: str, before: Described, after: Described, truth: GroundTruth) -> Row:
+def measure_scans(method: str, before: Described, after: Described, truth: GroundTruth) -> Row:
     """Return what a descriptor of scans recognises, and its price; its vectors are q and w, kept with a pose each."""
     world_T_before = truth.before.world_T_sensor[before.descriptors.keyframe_scans]
     world_T_after = truth.after.world_T_sensor[after.descriptors.keyframe_scans]
@@ -93,11 +93,11 @@ def scan_row(method: str, before: Described, after: Described, truth: GroundTrut
         "status": "ok",
         "bytes_per_keyframe": POSE_BYTES + _bytes_each(before.descriptors.q) + _bytes_each(before.descriptors.w),
         "ms_per_keyframe": 1000 * float(np.median([*before.seconds, *after.seconds])),
-        **place_scores(before.descriptors, after.descriptors, world_T_before, world_T_after),
+        **score_places(before.descriptors, after.descriptors, world_T_before, world_T_after),
     }
 
 
-def sphere_rows(
+def measure_spheres(
     merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, truth: GroundTruth, config: PipelineConfig
 ) -> list[Row]:
     """Return what `sphere` finds with its numbers kept in each precision, and what is kept against the thinned map.
@@ -168,7 +168,7 @@ class PlaceOutcomes:
         }
 
 
-def place_outcomes(
+def find_places(
     before: DescriptorSet, after: DescriptorSet, world_T_before: Float64Array, world_T_after: Float64Array
 ) -> PlaceOutcomes:
     """Look every after keyframe up among the before keyframes, and compare with the truth.
@@ -200,11 +200,11 @@ def place_outcomes(
     return PlaceOutcomes(np.linalg.norm(places_b[found] - places_a[j], axis=1), errors_deg)
 
 
-def place_scores(
+def score_places(
     before: DescriptorSet, after: DescriptorSet, world_T_before: Float64Array, world_T_after: Float64Array
 ) -> dict[str, float]:
-    """Return recall at 1, median yaw error and share of flipped yaws of one pair; arguments as `place_outcomes`."""
-    return place_outcomes(before, after, world_T_before, world_T_after).columns
+    """Return recall at 1, median yaw error and share of flipped yaws of one pair; arguments as `find_places`."""
+    return find_places(before, after, world_T_before, world_T_after).columns
 
 
 def _heading_rad(poses: Float64Array) -> Float64Array:

@@ -8,7 +8,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from eval.bench import bench
-from eval.bench.bench import chosen, contests, measure, row_of, verdict, write_table
+from eval.bench.bench import choose, list_contests, make_row, measure, summarise, write_table
 from eval.bench.merge import FailedContest
 from eval.cli.main import main
 from sim.studies.bench import BenchSite
@@ -30,11 +30,13 @@ def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:
 
 @pytest.fixture
 def three_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench, "contests", lambda: {"fast": lambda: FAST, "slow": lambda: SLOW, "alone": lambda: ALONE})
+    monkeypatch.setattr(
+        bench, "list_contests", lambda: {"fast": lambda: FAST, "slow": lambda: SLOW, "alone": lambda: ALONE}
+    )
 
 
 def test_a_row_by_hand() -> None:
-    row = row_of("fast", FAST)
+    row = make_row("fast", FAST)
     # Figures 4, 8, 5, 10, 2: median 5, quartiles 4 and 8. The rival's 1, 2, 0.5: median 1.
     assert row == {
         "name": "fast", "value": 5.0, "unit": "Mray/s", "rival": "a rival", "rival_value": 1.0, "ratio": 5.0,
@@ -44,18 +46,18 @@ def test_a_row_by_hand() -> None:
 
 
 def test_of_times_the_shorter_one_is_the_faster() -> None:
-    row = row_of("merge", Contest("s", (0.2, 0.2), None, "whole map", (1.0, 1.0), 6.0))
+    row = make_row("merge", Contest("s", (0.2, 0.2), None, "whole map", (1.0, 1.0), 6.0))
     assert (row["value"], row["rival_value"], row["ratio"], row["met"]) == (0.2, 1.0, 5.0, False)
 
 
 def test_what_has_no_rival_is_not_judged() -> None:
-    row = row_of("alone", ALONE)
+    row = make_row("alone", ALONE)
     assert [row[key] for key in ("value", "rival", "rival_value", "ratio", "target", "met")] == [3.0] + [None] * 5
-    assert verdict([row]) == "0 of 0 targets met"
+    assert summarise([row]) == "0 of 0 targets met"
 
 
 def test_a_target_just_reached_is_met() -> None:
-    assert row_of("even", Contest("Mray/s", (1.0,), 3.0, "a rival", (2.0,), 2.0))["met"] is True
+    assert make_row("even", Contest("Mray/s", (1.0,), 3.0, "a rival", (2.0,), 2.0))["met"] is True
 
 
 @pytest.mark.usefixtures("three_rows")
@@ -86,9 +88,9 @@ def test_only_some_rows_and_nothing_said(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_a_rival_that_cannot_be_compared_leaves_its_target_open() -> None:
-    row = row_of("raced", Contest("s", (0.2,), None, "a rival: not judged, 7.0 m off", (), 6.0))
+    row = make_row("raced", Contest("s", (0.2,), None, "a rival: not judged, 7.0 m off", (), 6.0))
     assert [row[key] for key in ("value", "rival_value", "ratio", "target", "met")] == [0.2, None, None, 6.0, None]
-    told = verdict([row_of("fast", FAST), row, row_of("alone", ALONE)])
+    told = summarise([make_row("fast", FAST), row, make_row("alone", ALONE)])
     assert told == "1 of 1 targets met; 1 not judged: raced"
 
 
@@ -96,7 +98,7 @@ def test_what_failed_is_a_row_and_the_rows_before_it_stay(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failed = FailedContest("s", (), target=10.0, reason="it is 3.0 m off")
-    monkeypatch.setattr(bench, "contests", lambda: {"fast": lambda: FAST, "merge": lambda: failed})
+    monkeypatch.setattr(bench, "list_contests", lambda: {"fast": lambda: FAST, "merge": lambda: failed})
     code, out, _ = run(capsys, "--out", str(tmp_path / "speed.json"))
     assert code == 0
     assert out.splitlines()[-2:] == [
@@ -133,7 +135,7 @@ def test_where_the_table_cannot_go_is_told_before_anything_is_measured(
     def never() -> Contest:
         raise AssertionError("measured")
 
-    monkeypatch.setattr(bench, "contests", lambda: {"never": never})
+    monkeypatch.setattr(bench, "list_contests", lambda: {"never": never})
     code, _, err = run(capsys, "--out", str(tmp_path))
     assert (code, err) == (2, f"error: {tmp_path}: is a folder: name a file for the table\n")
     (tmp_path / "file").touch()
@@ -153,7 +155,7 @@ def test_a_table_that_cannot_be_written_leaves_no_half_file(tmp_path: Path) -> N
 
 def test_a_real_row_of_a_small_world() -> None:
     told: list[Any] = []
-    rows = chosen(contests(BenchSite("smoke/one_box", 0, n_props=3, repeats=2)), ["casting-bare"])
+    rows = choose(list_contests(BenchSite("smoke/one_box", 0, n_props=3, repeats=2)), ["casting-bare"])
     table = measure(rows, lambda *args: told.append(args))
     (row,) = table["rows"]
     assert told == [("casting-bare", 0, 1)]

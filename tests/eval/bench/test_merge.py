@@ -13,7 +13,7 @@ from cdpipe.core.geometry import yaw_pose
 from cdpipe.merge.global_registration import is_kiss_matcher_installed
 from cdpipe.model.types import MergedMaps
 from eval.bench import merge as merge_bench
-from eval.bench.bench import contests, descriptor_contests, measure, row_of, verdict
+from eval.bench.bench import descriptor_contests, list_contests, make_row, measure, summarise
 from eval.bench.merge import Goals, MergeSite, merge_contests, paper_sites
 from sim.studies.bench import BenchSite
 
@@ -38,7 +38,7 @@ def told(monkeypatch: pytest.MonkeyPatch, before_T_after: np.ndarray, reason: st
 
 
 def test_rows_of_both_paper_sites_stand_in_the_table() -> None:
-    names = list(contests())
+    names = list(list_contests())
     for size in ("60k", "1400k"):
         assert [name for name in names if size in name and "merge" in name] == [
             name.replace("tiny", size) for name in ROWS
@@ -49,7 +49,7 @@ def test_rows_of_both_paper_sites_stand_in_the_table() -> None:
 
 @needs_kiss_matcher
 def test_real_rows_of_a_small_world(site: MergeSite) -> None:
-    every = contests(BenchSite("smoke/one_box"), [site])
+    every = list_contests(BenchSite("smoke/one_box"), [site])
     rows = {row["name"]: row for row in measure({name: every[name] for name in ROWS})["rows"]}
     assert list(rows) == ROWS
     assert {row["unit"] for row in rows.values()} == {"s"}
@@ -78,7 +78,7 @@ def test_all_in_is_descriptors_index_and_merge(site: MergeSite) -> None:
     described = [replace(session, descriptor_s=(1.0, 3.0)) for session in site.sessions]
     fixed = replace(site)  # the same pair, none of its times
     fixed.__dict__.update(sessions=tuple(described), raced=([PARTS, PARTS], [9.0, 9.0]), rival=("told", True))
-    row = row_of("all-in", merge_contests([fixed])["merge-tiny-all-in"]())
+    row = make_row("all-in", merge_contests([fixed])["merge-tiny-all-in"]())
     # 1 + 1 + 2 + 0.5 and 3 + 3 + 2 + 0.5
     assert (row["value"], row["rival_value"], row["spread"]) == (6.5, 9.0, 2.0)
 
@@ -110,7 +110,7 @@ def test_the_time_of_a_merge_that_failed_is_no_figure(
     assert {(row["value"], row["met"]) for row in rows} == {(None, False)}
     assert [row["target"] for row in rows] == [1.0, 10.0, 1.0, 3.0, None]
     assert all(message in row["reason"] for row in rows)
-    assert verdict(rows) == f"0 of 5 targets met; missed: {', '.join(ROWS)}"
+    assert summarise(rows) == f"0 of 5 targets met; missed: {', '.join(ROWS)}"
 
 
 def test_turns_are_taken_and_the_first_does_not_count(site: MergeSite, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,7 +140,7 @@ def test_a_rival_that_is_wrong_or_missing_is_told(site: MergeSite, monkeypatch: 
     assert not is_comparable
     # a thousand times slower, and wrong: no target is met by that
     wrong.__dict__["raced"] = ([PARTS, PARTS], [500.0, 500.0])
-    row = row_of("raced", merge_contests([wrong])["merge-tiny-raced"]())
+    row = make_row("raced", merge_contests([wrong])["merge-tiny-raced"]())
     assert (row["rival"], row["ratio"], row["target"], row["met"]) == (name, None, 10.0, None)
     monkeypatch.setattr(merge_bench, "kiss_and_gicp", lambda *clouds: None)
     assert nothing.rival == ("KISS-Matcher at 0.5 m and GICP: not judged, it found nothing", False)
@@ -149,6 +149,6 @@ def test_a_rival_that_is_wrong_or_missing_is_told(site: MergeSite, monkeypatch: 
     monkeypatch.setattr(merge_bench, "is_kiss_matcher_installed", lambda: False)
     told(monkeypatch, np.eye(4))
     monkeypatch.setattr(MergeSite, "missed_m", lambda self, pose: 0.0)
-    row = row_of("raced", merge_contests([missing])["merge-tiny-raced"]())
+    row = make_row("raced", merge_contests([missing])["merge-tiny-raced"]())
     assert row["rival"] == "KISS-Matcher: not installed (extra `kiss`)"
     assert (row["value"], row["ratio"], row["met"], row["n"]) == (0.5, None, None, 2)

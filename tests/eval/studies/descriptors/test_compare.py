@@ -18,8 +18,8 @@ from eval.core.progress import Silent
 from eval.running.stages import kept_bytes
 from eval.scoring.region_metrics import keyframe_labels
 from eval.studies.descriptors import compare as command
-from eval.studies.descriptors.compare import places_table, spheres_table
-from eval.studies.descriptors.rows import describe_keyframes, pair_rows, place_scores, scan_row, sphere_rows
+from eval.studies.descriptors.compare import tabulate_places, tabulate_spheres
+from eval.studies.descriptors.rows import describe_keyframes, measure_pair, measure_scans, measure_spheres, score_places
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import SESSIONS, load_ground_truth
 
@@ -34,7 +34,7 @@ def mapped_pair(pair: Path) -> list[MappedSession]:
 
 
 def test_every_descriptor_has_its_row_and_its_price(tiny_pair: Path) -> None:
-    rows = pair_rows(tiny_pair)
+    rows = measure_pair(tiny_pair)
     # a pose of 7 numbers; q and w of each; 64 numbers of four bytes or of one
     assert [(row["descriptor"], row["precision"], row["bytes_per_keyframe"]) for row in rows] == [
         ("3deg", "float32", 28 + 4 * (64 + 64)),
@@ -63,13 +63,13 @@ def test_places_are_those_of_describe_scans(tiny_pair: Path) -> None:
         session.world_T_sensor[mapped.map.keyframe_scans]
         for session, mapped in ((truth.before, before), (truth.after, after))
     ]
-    expected = place_scores(before.descriptors, after.descriptors, *poses)
+    expected = score_places(before.descriptors, after.descriptors, *poses)
     described = [
         describe_keyframes(pipeline_input(tiny_pair, name), mapped.map, ("3deg",))["3deg"]
         for name, mapped in zip(SESSIONS, (before, after), strict=True)
     ]
     assert [len(each.seconds) for each in described] == [len(before.map.keyframe_scans), len(after.map.keyframe_scans)]
-    row = scan_row("3deg", *described, truth)
+    row = measure_scans("3deg", *described, truth)
     assert {name: row[name] for name in expected} == pytest.approx(
         expected, abs=1e-4
     )  # one scan at a time rounds otherwise
@@ -81,7 +81,7 @@ def test_the_auroc_of_spheres_against_every_pair_of_keyframes(tiny_pair: Path, t
     truth = replace(truth, pair=replace(truth.pair, score_radius_m=1.6))
     merged = MergedMaps(before.map, after.map, tiny_merge, {}, is_accepted=True)
     config = load_config("tunnelcd", ["query.radius_m=1.6"])
-    rows = sphere_rows(merged, before.descriptors, after.descriptors, truth, config)
+    rows = measure_spheres(merged, before.descriptors, after.descriptors, truth, config)
     places = truth.before.world_T_sensor[before.map.keyframe_scans, :3, 3]
     labels = keyframe_labels(places, truth.centroids_world, truth.is_observable, 1.6)
     assert (labels == 1).any()
@@ -95,7 +95,7 @@ def test_the_auroc_of_spheres_against_every_pair_of_keyframes(tiny_pair: Path, t
         against = scores[labels == 1][:, None] - scores[labels == 0][None]
         assert row["region_auroc"] == pytest.approx(np.mean(np.where(against == 0, 0.5, against > 0)))
         assert (row["n_positive"], row["n_negative"]) == ((labels == 1).sum(), (labels == 0).sum())
-    refused = sphere_rows(replace(merged, is_accepted=False), before.descriptors, after.descriptors, truth, config)
+    refused = measure_spheres(replace(merged, is_accepted=False), before.descriptors, after.descriptors, truth, config)
     assert [row["status"] for row in refused] == ["merge_refused"] * 2
     assert np.isnan([row["region_auroc"] for row in refused]).all()
 
@@ -123,7 +123,7 @@ def test_places_by_hand() -> None:
             *scan_rows("cave", [0.1], [9]),
         ]
     )
-    table = places_table(rows).set_index("group")
+    table = tabulate_places(rows).set_index("group")
     # each pair counts once; cave is out of distribution, alone, and no group
     assert table.index.tolist() == ["narrow", "wide", "cave", "all in distribution"]
     every = table.loc["all in distribution"]
@@ -138,7 +138,7 @@ def test_spheres_by_hand() -> None:
     rows = [sphere_row("wide", 0, "float32", 0.9, 284), sphere_row("wide", 0, "int8", 0.8, 92)]
     rows += [sphere_row("wide", 1, "float32", 0.7, 284), sphere_row("wide", 1, "int8", 0.72, 92)]
     rows += [sphere_row("wide", 2, "float32", np.nan, 284), sphere_row("wide", 2, "int8", np.nan, 92)]
-    table = spheres_table(pd.DataFrame(rows)).set_index("precision")
+    table = tabulate_spheres(pd.DataFrame(rows)).set_index("precision")
     assert table["region_auroc"].tolist() == pytest.approx([0.8, 0.76])
     # losses 0.1 and -0.02
     assert table["auroc_loss"].tolist() == pytest.approx([0.0, 0.04])
@@ -159,7 +159,7 @@ def fast(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         made.append(pair.name)
 
     monkeypatch.setattr(command, "simulate_pair", simulated)
-    monkeypatch.setattr(command, "pair_rows", lambda pair: [{"descriptor": "solid", "of": pair.name}])
+    monkeypatch.setattr(command, "measure_pair", lambda pair: [{"descriptor": "solid", "of": pair.name}])
     return made
 
 

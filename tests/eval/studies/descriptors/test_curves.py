@@ -15,7 +15,7 @@ from cdpipe.training.data import TunnelShard
 from eval.core.progress import Silent
 from eval.studies.descriptors import curves as descriptor_curves
 from eval.studies.descriptors.curve_plots import curves_chart, varying
-from eval.studies.descriptors.curves import BITS, Point, main, points, share_of
+from eval.studies.descriptors.curves import BITS, Point, main, points, select_share
 from eval.training.dataset import Recipe
 from eval.training.dataset_run import Where, make_dataset
 
@@ -34,7 +34,7 @@ def _tunnels(**n_of: int) -> list[TunnelShard]:
 
 def test_a_share_is_of_each_family_and_holds_the_smaller_ones() -> None:
     tunnels = _tunnels(narrow=16, wide=20, tight=3)
-    shares = [share_of(tunnels, share, seed=1) for share in (0.125, 0.25, 0.5, 1.0)]
+    shares = [select_share(tunnels, share, seed=1) for share in (0.125, 0.25, 0.5, 1.0)]
     counted = [
         [sum(tunnel.family == family for tunnel in own) for family in ("narrow", "wide", "tight")] for own in shares
     ]
@@ -42,7 +42,7 @@ def test_a_share_is_of_each_family_and_holds_the_smaller_ones() -> None:
     assert counted == [[2, 2, 1], [4, 5, 1], [8, 10, 2], [16, 20, 3]]
     names = [{(tunnel.family, tunnel.seed) for tunnel in own} for own in shares]
     assert all(small < large for small, large in pairwise(names))
-    assert shares[3] == tunnels and share_of(tunnels, 0.25, seed=2) != shares[1]
+    assert shares[3] == tunnels and select_share(tunnels, 0.25, seed=2) != shares[1]
 
 
 def test_every_network_is_trained_once_and_differs_from_the_base_in_one_thing_or_in_the_head() -> None:

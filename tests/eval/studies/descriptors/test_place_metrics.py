@@ -3,7 +3,7 @@ import pytest
 
 from cdpipe.core.geometry import Float64Array, yaw_pose
 from cdpipe.model.types import DescriptorSet
-from eval.studies.descriptors.rows import place_outcomes, place_scores
+from eval.studies.descriptors.rows import find_places, score_places
 
 SIZE = 64
 BIN_RAD = 2 * np.pi / SIZE
@@ -34,10 +34,10 @@ def test_scores_by_hand() -> None:
     headings = [0.1, 0.7, -1.0, 2.0]
     before = poses([0, 10, 20, 30], headings)
     sets = described(UNITS, headings), described([UNITS[3], UNITS[0], UNITS[2], UNITS[1]], [-1.7, 0.5, 3.0 - np.pi, 0])
-    outcomes = place_outcomes(*sets, before, after)
+    outcomes = find_places(*sets, before, after)
     np.testing.assert_allclose(outcomes.found_m, [17.1, 1.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(outcomes.yaw_error_deg, [np.rad2deg(0.3), 0.0, 180.0], atol=0.2)
-    scores = place_scores(*sets, before, after)
+    scores = score_places(*sets, before, after)
     assert scores["place_recall_at_1"] == pytest.approx(2 / 3)
     assert scores["yaw_error_deg"] == pytest.approx(np.rad2deg(0.3), abs=0.2)
     assert (scores["yaw_flip_share"], scores["n_places"], scores["n_yaws"]) == (pytest.approx(1 / 3), 3.0, 3.0)
@@ -46,25 +46,25 @@ def test_scores_by_hand() -> None:
 def test_a_found_place_within_three_metres_counts() -> None:
     before, after = poses([0, 2.9, 9], [0, 0, 0]), poses([0], [0])
     nearest_is_second = described([[1, 0], [0, 1], [1, 1]], None), described([[0, 1]], None)
-    assert place_scores(*nearest_is_second, before, after)["place_recall_at_1"] == 1.0
+    assert score_places(*nearest_is_second, before, after)["place_recall_at_1"] == 1.0
     before = poses([0, 3.1, 9], [0, 0, 0])
-    assert place_scores(*nearest_is_second, before, after)["place_recall_at_1"] == 0.0
+    assert score_places(*nearest_is_second, before, after)["place_recall_at_1"] == 0.0
 
 
 def test_without_orientation_or_without_places() -> None:
-    blind = place_scores(described(UNITS, None), described(UNITS, None), BEFORE, BEFORE)
+    blind = score_places(described(UNITS, None), described(UNITS, None), BEFORE, BEFORE)
     assert (blind["place_recall_at_1"], blind["n_yaws"]) == (1.0, 0.0)
     assert np.isnan(blind["yaw_error_deg"])
     assert np.isnan(blind["yaw_flip_share"])
-    far = place_scores(described(UNITS, None), described([UNITS[0]], None), BEFORE, poses([500], [0]))
+    far = score_places(described(UNITS, None), described([UNITS[0]], None), BEFORE, poses([500], [0]))
     assert far["n_places"] == 0.0
     assert np.isnan(far["place_recall_at_1"])
     nothing = DescriptorSet(np.zeros((0, 4), np.float32), None, np.zeros(0, np.int64), "none", "")
-    assert place_scores(nothing, nothing, np.zeros((0, 4, 4)), np.zeros((0, 4, 4)))["n_places"] == 0.0
+    assert score_places(nothing, nothing, np.zeros((0, 4, 4)), np.zeros((0, 4, 4)))["n_places"] == 0.0
     # even vectors have no peak: no yaw, and no error in it
     even = described(UNITS, None)
     even = DescriptorSet(even.q, np.zeros((4, SIZE), np.float32), even.keyframe_scans, "even", "")
-    assert place_scores(even, even, BEFORE, BEFORE)["n_yaws"] == 0.0
+    assert score_places(even, even, BEFORE, BEFORE)["n_yaws"] == 0.0
 
 
 def test_turning_the_world_changes_nothing() -> None:
@@ -72,11 +72,11 @@ def test_turning_the_world_changes_nothing() -> None:
     sets = described(UNITS, [0.0] * 4), described(UNITS, [0.2, -0.7, 1.5, 0.0])
     after = poses([0, 10, 20, 30], headings)
     turn = yaw_pose(2.2, (5.0, -3.0, 1.0))
-    here, there = place_outcomes(*sets, BEFORE, after), place_outcomes(*sets, turn @ BEFORE, turn @ after)
+    here, there = find_places(*sets, BEFORE, after), find_places(*sets, turn @ BEFORE, turn @ after)
     np.testing.assert_allclose(here.yaw_error_deg, there.yaw_error_deg, atol=1e-6)
     np.testing.assert_allclose(here.found_m, there.found_m, atol=1e-9)
 
 
 def test_descriptors_of_other_keyframes_are_refused() -> None:
     with pytest.raises(ValueError, match="4 and 3 poses"):
-        place_outcomes(described(UNITS, None), described(UNITS, None), BEFORE, BEFORE[:3])
+        find_places(described(UNITS, None), described(UNITS, None), BEFORE, BEFORE[:3])
