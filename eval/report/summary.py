@@ -101,7 +101,7 @@ def _headlines(data: RunData) -> Table:
     stored = stored_table(data, "regions_table")
     if len(stored):
         names = ["domain", "variant"]
-        stored = stored[[*names, POOLED, f"{POOLED}_low", f"{POOLED}_high"]]
+        stored = stored.reindex(columns=[*names, POOLED, f"{POOLED}_low", f"{POOLED}_high"])
         table = table.drop(columns=stored.columns.difference(names)).merge(stored, on=names, how="left")
     shown = [column for column in HEADLINES if table[column.key].notna().any()]
     oracle = table["variant"].map(is_told_the_truth)
