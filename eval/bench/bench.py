@@ -24,7 +24,7 @@ from cdpipe.model.config import load_config
 from cdpipe.query.query import find_regions
 from eval.bench.extract import ExtractSite, extract_contests, extract_sites
 from eval.bench.merge import FailedContest, MergeSite, against_limit, merge_contests, paper_sites
-from eval.core.output import make_writable, unwritable
+from eval.core.output import make_writable, unwritable, whole_file
 from eval.core.provenance import machine
 from sim.studies.bench import BenchSite, sensor_contests
 from sim.studies.timing import Contest, timed
@@ -148,12 +148,10 @@ def write_table(table: Mapping[str, Any], path: Path) -> None:
     Raises:
         InputError: It cannot be written there.
     """
-    partial = path.with_name(f".{path.name}.partial")
     try:
-        partial.write_text(json.dumps(table, indent=1) + "\n")
-        partial.replace(path)
+        with whole_file(path) as partial:
+            partial.write_text(json.dumps(table, indent=1) + "\n")
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise unwritable(path, error) from error
 
 

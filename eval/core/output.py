@@ -1,4 +1,4 @@
-"""Output folders that are complete or absent."""
+"""Output files and folders that are complete or absent."""
 
 from __future__ import annotations
 
@@ -43,6 +43,18 @@ def new_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
         _remove_empty(made)
         raise
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yield a hidden path that becomes `path` when the block succeeds, and is removed when it fails."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 @contextmanager

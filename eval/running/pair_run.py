@@ -23,6 +23,7 @@ from cdpipe.merge.global_registration import is_kiss_matcher_installed
 from cdpipe.model.config import MapConfig
 from cdpipe.pipeline import Merge, OnStage, Propose
 from eval.core.domains import domain_of
+from eval.core.output import whole_file
 from eval.core.progress import RunProgress
 from eval.core.provenance import digest, git_commit, now
 from eval.oracles.merge import merged_by_truth
@@ -260,18 +261,9 @@ def _write_maps(path: Path, stages: PairStages) -> None:
         before, after = stages.maps(MapConfig())
     except TunnelcdError:
         return  # each cell of the pair records the same error
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.partial.npz")
-    try:
-        np.savez_compressed(
-            partial,
-            allow_pickle=False,
-            before_points=before.points.astype(np.float32),
-            after_points=after.points.astype(np.float32),
-        )
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    points = {"before_points": before.points.astype(np.float32), "after_points": after.points.astype(np.float32)}
+    with whole_file(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **points)
 
 
 def _answer(stages: PairStages, cell: Cell, truth: GroundTruth, folder: Path) -> None:

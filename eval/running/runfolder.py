@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.errors import InputError
-from eval.core.output import make_writable
+from eval.core.output import make_writable, whole_file
 from eval.core.provenance import TOOL
 from eval.core.statistics import summarise
 from eval.plans.coverage import coverage
@@ -250,9 +250,8 @@ def _provenance(run: RunFolder) -> Mapping[str, Any]:
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write JSON that appears whole or not at all; numpy scalars become plain numbers."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(document, indent=1, default=_plain)
-    _whole(path, lambda partial: partial.write_text(text))
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(document, indent=1, default=_plain))
 
 
 def remove(path: Path) -> None:
@@ -269,17 +268,8 @@ def _items(table: str, cells: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def _write_csv(path: Path, frame: pd.DataFrame) -> None:
-    _whole(path, lambda partial: frame.to_csv(partial, index=False))
-
-
-def _whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file that appears whole or not at all; where the disk is full, nothing is left of it."""
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        write(partial)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with whole_file(path) as partial:
+        frame.to_csv(partial, index=False)
 
 
 def _plain(value: Any) -> Any:

@@ -14,6 +14,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 import cdpipe
+from eval.core.output import whole_file
 from eval.core.provenance import digest
 
 MAPS = "maps"
@@ -75,14 +77,8 @@ class StageCache:
         self._hold(name, kept)
         if self._folder is None or (_is_maps(name) and _maps_bytes(self._folder) >= MAPS_BYTES):
             return
-        path = self._folder / f"{name}.npz"
-        partial = path.with_name(f".{path.name}.partial")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(OSError), whole_file(self._folder / f"{name}.npz") as partial:
             _write(partial, kept)
-            partial.replace(path)
-        except OSError:
-            partial.unlink(missing_ok=True)
 
     def _hold(self, name: str, kept: Kept) -> None:
         if not _is_maps(name):

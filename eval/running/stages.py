@@ -37,7 +37,7 @@ from cdpipe.pipeline import (
     map_sources,
 )
 from eval.running.stage_cache import Kept, StageCache
-from eval.running.stage_results import STAGES, maps_arrays, maps_from, maps_name
+from eval.running.stage_results import name_result, pack, unpack
 
 REPEAT_BELOW_S = 1.0
 REPEATS = 3
@@ -82,20 +82,20 @@ class PairStages(Hooks):
 
     def run(self, stage: Stage, config: PipelineConfig, compute: Callable[[], Done[T]]) -> Done[T]:
         """Return the kept result of a stage, or run the stage and keep its result."""
+        name = name_result(stage, config)
         if stage == "maps":
-            maps: Any = self._find_maps(config.map, compute)
+            maps: Any = self._find_maps(name, compute)
             return Done(maps)
-        name, pack, unpack = STAGES[stage]
-        kept = self._cache.find(name(config))
+        kept = self._cache.find(name)
         if kept is None:
             done = compute() if stage in _OF_DESCRIPTORS else self.time(compute)
-            kept = Kept(pack(done.value), done.seconds, self._is_shared)
-            self._cache.keep(name(config), kept)
+            kept = Kept(pack(stage, done.value), done.seconds, self._is_shared)
+            self._cache.keep(name, kept)
         if stage in _OF_DESCRIPTORS:
             self._are_descriptors_contended |= kept.is_contended
         else:
             self.is_contended |= kept.is_contended
-        return Done(unpack(kept.arrays, self._maps), kept.seconds)
+        return Done(unpack(stage, kept.arrays, self._maps or ()), kept.seconds)
 
     def time(self, compute: Callable[[], Done[T]]) -> Done[T]:
         """Run a step, repeatedly where it is timed."""
@@ -148,17 +148,16 @@ class PairStages(Hooks):
         self.is_contended |= is_described and self._are_descriptors_contended
         return seconds if is_described else {"t_descriptor_s": 0.0}
 
-    def _find_maps(self, config: MapConfig, compute: Callable[[], Done[Any]]) -> tuple[PointMap, PointMap]:
-        name = maps_name(config)
+    def _find_maps(self, name: str, compute: Callable[[], Done[Any]]) -> tuple[PointMap, PointMap]:
         if self._maps is None or name != self._maps_name:
             # the old maps must be gone before the new ones are built: the large site fills gigabytes
             self._maps = None
             kept = self._cache.find(name)
             if kept is None:
                 self._maps = compute().value
-                self._cache.keep(name, Kept(maps_arrays(self._maps)))
+                self._cache.keep(name, Kept(pack("maps", self._maps)))
             else:
-                self._maps = maps_from(kept.arrays)
+                self._maps = unpack("maps", kept.arrays)
             self._maps_name = name
         return self._maps
 

@@ -15,6 +15,7 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.training.shard import FIELDS, SUFFIX, read_about, split_of
+from eval.core.output import whole_file
 
 COUNTS = ("n_before", "n_after", "n_covered", "n_positive", "n_negative", "n_changes", "n_observable")
 INDEX_COLUMNS = (
@@ -31,9 +32,11 @@ def write_card(out: Path) -> None:
     """
     rows = [*(_shard_row(path) for path in out.glob(f"*{SUFFIX}")), *_refused_rows(out)]
     rows.sort(key=lambda row: (row["family"], row["seed"]))
-    _replace(out / "index.csv", pd.DataFrame(rows, columns=list(INDEX_COLUMNS)).to_csv(index=False))
+    with whole_file(out / "index.csv") as partial:
+        pd.DataFrame(rows, columns=list(INDEX_COLUMNS)).to_csv(partial, index=False)
     document = json.loads((out / "dataset.json").read_text())
-    _replace(out / "README.md", card(rows, document["recipe"], document["commands"]))
+    with whole_file(out / "README.md") as partial:
+        partial.write_text(card(rows, document["recipe"], document["commands"]))
 
 
 def fields_table() -> str:
@@ -159,9 +162,3 @@ def _refused_rows(out: Path) -> list[Row]:
         row |= {name: about[name] for name in ("family", "seed", "digest", "reason")}
         rows.append(row)
     return rows
-
-
-def _replace(path: Path, text: str) -> None:
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text)
-    partial.replace(path)

@@ -18,7 +18,7 @@ from typing import Any
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.training.shard import FORMAT, FORMAT_VERSION, SUFFIX, read_about
 from eval.core.cluster import HERE, Where, connected, n_slots, require_usable
-from eval.core.output import make_writable
+from eval.core.output import make_writable, whole_file
 from eval.core.progress import RunProgress, Silent, duration
 from eval.plans.plan import parse_seeds_option
 from eval.plans.worlds import world_slug
@@ -188,12 +188,8 @@ def _keep(out: Path, tunnel: Tunnel, result: bytes | str) -> None:
         about = {"family": tunnel.family, "seed": tunnel.seed, "digest": tunnel.digest, "reason": result}
         write_json(out / tunnel.refusal, about)
         return
-    partial = out / f".{tunnel.file}.partial"
-    try:
+    with whole_file(out / tunnel.file) as partial:
         partial.write_bytes(result)
-        partial.replace(out / tunnel.file)
-    finally:
-        partial.unlink(missing_ok=True)
     (out / tunnel.refusal).unlink(missing_ok=True)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from cdpipe.core.voxel import cell_keys
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import Session, chunk_path, load_arrays, read_session
 from cdpipe.model.types import PosedScan
+from eval.core.output import whole_file
 from sim.session.truth import Int16Array, read_labels
 
 CELL_M = 0.1
@@ -242,14 +244,7 @@ def _read_cache(path: Path, fingerprint: str, session: Session) -> ScoringPoints
 
 def _write_cache(path: Path, fingerprint: str, universe: ScoringPoints) -> None:
     names = ("returns", "points_odom", "change", "instance", "nearest_m")
-    partial = path.with_name(f".{path.stem}.partial.npz")
-    try:
-        np.savez(
-            partial,
-            allow_pickle=False,
-            fingerprint=np.array(fingerprint),
-            **{name: getattr(universe, name) for name in names},
-        )
-        partial.replace(path)
-    except OSError:
-        partial.unlink(missing_ok=True)  # a read-only folder is scored without the cache, more slowly
+    arrays = {name: getattr(universe, name) for name in names}
+    # a read-only folder is scored without the cache, more slowly
+    with suppress(OSError), whole_file(path) as partial, partial.open("wb") as file:
+        np.savez(file, allow_pickle=False, fingerprint=np.array(fingerprint), **arrays)

@@ -38,7 +38,7 @@ from cdpipe.training.shard import read_shard
 from cdpipe.training.sphere_training import SphereData, SphereTask, local_scores, pool_within_reach, read_sphere_data
 from eval.core.exits import run_program
 from eval.core.figures import picture, png
-from eval.core.output import make_writable
+from eval.core.output import make_writable, whole_file
 from eval.core.ranking import auroc
 from eval.studies.descriptors.curve_plots import curves_chart
 from eval.training.training_run import data_digest
@@ -288,9 +288,8 @@ def main(
 
 def _write(table: pd.DataFrame, path: Path) -> None:
     try:
-        partial = path.with_suffix(".partial")
-        table.to_csv(partial, index=False, float_format="%.5g")
-        partial.replace(path)
+        with whole_file(path) as partial:
+            table.to_csv(partial, index=False, float_format="%.5g")
         path.with_suffix(".png").write_bytes(png(picture(curves_chart(table))))
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error

@@ -19,12 +19,14 @@ from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import PipelineConfig, load_config
 from cdpipe.model.report import ChangeRegions
 from cdpipe.model.types import DescriptorSet, KeyframeViews, MergedMaps, PointMap
+from cdpipe.pipeline import Stage
 from eval.plans.plan import load_plan
 from eval.running import stage_cache, stage_results, stages
 from eval.running.pair_run import Tools
 from eval.running.runfolder import RunFolder, start_run_folder
 from eval.running.runner import run_plan
 from eval.running.stage_cache import Kept, StageCache, open_cache
+from eval.running.stage_results import name_result, pack, unpack
 from eval.running.stages import PairStages
 from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
@@ -303,12 +305,12 @@ def test_results_come_back_as_they_went(tmp_path: Path) -> None:
         ChangeRegions(np.ones((2, 3)), 4.5, np.array([2.0, 1.0]), np.ones((2, 2), int), np.ones(2, bool), np.ones(1)),
         ChangeRegions(np.ones((0, 3)), 4.5, np.ones(0), np.ones((0, 2), int), np.ones(0, bool), np.full(2, np.nan)),
     ]
-    StageCache(tmp_path).keep("maps-0", Kept(stage_results.maps_arrays(maps), {"t_merge_s": 2.0}, True))
+    StageCache(tmp_path).keep("maps-0", Kept(pack("maps", maps), {"t_merge_s": 2.0}, True))
     given = {
-        "descriptors": stage_results.descriptors_arrays(described),
-        "spheres": stage_results.spheres_arrays(spheres),
-        **{f"merge-{i}": stage_results.merged_arrays(merged) for i, merged in enumerate(merges)},
-        **{f"regions-{i}": stage_results.regions_arrays(each) for i, each in enumerate(regions)},
+        "descriptors": pack("descriptors", described),
+        "spheres": pack("spheres", spheres),
+        **{f"merge-{i}": pack("merge", merged) for i, merged in enumerate(merges)},
+        **{f"regions-{i}": pack("regions", each) for i, each in enumerate(regions)},
     }
     for name, arrays in given.items():
         StageCache(tmp_path).keep(name, Kept(arrays))
@@ -316,13 +318,13 @@ def test_results_come_back_as_they_went(tmp_path: Path) -> None:
     found = later.find("maps-0")
     assert found is not None
     assert (found.seconds, found.is_contended) == ({"t_merge_s": 2.0}, True)
-    assert_same(stage_results.maps_from(found.arrays), maps)
+    assert_same(unpack("maps", found.arrays), maps)
     back = {name: each.arrays for name in given if (each := later.find(name)) is not None}
-    assert_same(stage_results.descriptors_from(back["descriptors"]), described)
-    assert_same(stage_results.spheres_from(back["spheres"]), spheres)
+    assert_same(unpack("descriptors", back["descriptors"]), described)
+    assert_same(unpack("spheres", back["spheres"]), spheres)
     for i in (0, 1):
-        assert_same(stage_results.merged_from(back[f"merge-{i}"], maps), replace(merges[i], seconds={}))
-        assert_same(stage_results.regions_from(back[f"regions-{i}"]), regions[i])
+        assert_same(unpack("merge", back[f"merge-{i}"], maps), replace(merges[i], seconds={}))
+        assert_same(unpack("regions", back[f"regions-{i}"]), regions[i])
 
 
 def test_no_damage_goes_unnoticed(tmp_path: Path) -> None:
@@ -373,15 +375,8 @@ def test_weights_are_part_of_what_is_read(monkeypatch: pytest.MonkeyPatch) -> No
     config = config_of("tunnelcd")
 
     def names() -> list[str]:
-        return [
-            name(config)
-            for name in (
-                stage_results.descriptors_name,
-                stage_results.spheres_name,
-                stage_results.merge_name,
-                stage_results.regions_name,
-            )
-        ]
+        stages: tuple[Stage, ...] = ("descriptors", "spheres", "merge", "regions")
+        return [name_result(stage, config) for stage in stages]
 
     usual = names()
     monkeypatch.setattr(stage_results, "sphere_digest", lambda: "other")
