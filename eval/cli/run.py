@@ -81,9 +81,9 @@ def score(
     if answer is not None:
         if predictions is not None:
             raise InputError("--predictions: goes with a run folder alone, not with one pair and its answer")
-        from eval.scoring.scoring import score_pair
+        from eval.scoring.scoring import score
 
-        row = score_pair(folder, answer).row
+        row = score(answer, folder)
         if not quiet:
             print_row(row)
         return

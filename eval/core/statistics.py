@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from cdpipe.core.geometry import Float64Array, stream
+from cdpipe.core.geometry import BoolArray, Float64Array, stream
 from eval.core.ranking import auroc, average_precision
 
 N_RESAMPLES = 2000
@@ -56,6 +56,18 @@ def summarise(
     return pd.DataFrame(rows, columns=[*columns, "n", "n_failed", "n_used", "n_used_ok"])
 
 
+def mean(values: Float64Array | BoolArray) -> float:
+    """Return the mean of the numbers that are not NaN; NaN without one."""
+    values = values[~np.isnan(values)]
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def median(values: Float64Array) -> float:
+    """Return the median of the numbers that are not NaN; NaN without one."""
+    values = values[~np.isnan(values)]
+    return float(np.median(values)) if len(values) else float("nan")
+
+
 def bootstrap_interval(
     values: Float64Array, statistic: Literal["mean", "median"] = "mean", seed: int = 0
 ) -> tuple[float, float]:
@@ -81,7 +93,7 @@ def mean_with_interval(values: Float64Array, seed: int = 0) -> tuple[float, floa
     """
     values = values[~np.isnan(values)]
     low, high = bootstrap_interval(values, seed=seed)
-    return _of_numbers(values, "mean"), low, high, len(values)
+    return mean(values), low, high, len(values)
 
 
 def wilson_interval(n_hits: int, n: int) -> tuple[float, float]:
@@ -114,10 +126,7 @@ def _summary(
 
 
 def _of_numbers(values: Float64Array, statistic: Literal["mean", "median"]) -> float:
-    values = values[~np.isnan(values)]
-    if len(values) == 0:
-        return float("nan")
-    return float(values.mean() if statistic == "mean" else np.median(values))
+    return mean(values) if statistic == "mean" else median(values)
 
 
 def _pooled(keyframes: pd.DataFrame) -> list[dict[str, Any]]:

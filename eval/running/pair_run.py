@@ -29,11 +29,11 @@ from eval.core.provenance import digest, git_commit, now
 from eval.oracles.merge import merged_by_truth
 from eval.oracles.regions import regions_by_truth
 from eval.plans.variants import Cell
-from eval.running.rescoring import cell_document, score_stored
+from eval.running.rescoring import cell_document
 from eval.running.runfolder import RunFolder, remove
 from eval.running.stage_cache import open_cache
 from eval.running.stages import PairStages
-from eval.scoring.scoring import METRICS_VERSION, CaseScore
+from eval.scoring.scoring import METRICS_VERSION, CaseScore, score_stored
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 from scenarios.library import load_scenario

@@ -22,10 +22,10 @@ from eval.core.progress import RunProgress, Silent
 from eval.plans.coverage import plan_of
 from eval.plans.plan import planned_cases
 from eval.plans.variants import slug
-from eval.running.rescoring import LAST, NO_KEY, cell_document, foreign_identity, score_stored
+from eval.running.rescoring import LAST, NO_KEY, cell_document, foreign_identity
 from eval.running.runfolder import RunFolder, remove, write_tables
 from eval.running.sides import list_versions
-from eval.scoring.scoring import METRICS_VERSION
+from eval.scoring.scoring import METRICS_VERSION, score_stored
 from eval.truth.ground_truth import load_ground_truth
 
 _FILES = ("answer.json", "answer.npz")

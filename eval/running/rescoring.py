@@ -7,26 +7,13 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from cdpipe.io.answer import read_answer
 from eval.core.progress import RunProgress, Silent
 from eval.running.runfolder import IDENTITY, ITEM_TABLES, RunFolder, write_tables
-from eval.scoring.answer_check import check_answer
-from eval.scoring.scoring import CaseScore, score_answer
-from eval.truth.ground_truth import GroundTruth, load_ground_truth
+from eval.scoring.scoring import CaseScore, score_stored
+from eval.truth.ground_truth import load_ground_truth
 
 # key and position of a cell of another program: its rows come last
 NO_KEY, LAST = "", (1_000_000, 1_000_000)
-
-
-def score_stored(truth: GroundTruth, folder: Path) -> CaseScore:
-    """Score the answer stored in a folder.
-
-    Raises:
-        InputError: It is damaged, or cannot be an answer to this pair.
-    """
-    answer = read_answer(folder)
-    check_answer(answer, truth, folder)
-    return score_answer(answer, truth)
 
 
 def cell_document(score: CaseScore, identity: Mapping[str, Any], key: str, place: Sequence[int]) -> dict[str, Any]:

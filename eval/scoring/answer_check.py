@@ -17,7 +17,7 @@ from eval.scoring.answer_rows import POINT_RADIUS_M, rows_near_points
 from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth
 from eval.truth.universe import ScoringPoints
 
-_SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns"))
+SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns"))
 _MANY = 100  # so many valid returns include the first return of some cell
 _ASIDE_M = 2.0  # largest gap between an object's points and its returns
 
@@ -53,8 +53,8 @@ def check_answer(answer: Answer, truth: GroundTruth, folder: Path) -> None:
 
 def _check_seconds(seconds: Mapping[str, float]) -> None:
     for name, value in seconds.items():
-        if name not in _SECONDS:
-            raise ValueError(f"seconds.{name} is unknown{suggest(name, _SECONDS)} (known: {', '.join(_SECONDS)})")
+        if name not in SECONDS:
+            raise ValueError(f"seconds.{name} is unknown{suggest(name, SECONDS)} (known: {', '.join(SECONDS)})")
         if not 0 <= value < np.inf:
             raise ValueError(f"seconds.{name} = {value}: expected seconds, 0 or more; leave out what was not measured")
 

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, travelled_m
+from eval.core.statistics import median
 from eval.truth.ground_truth import SessionTruth
 
 PAIR_RADIUS_M = 5.0
@@ -125,7 +126,7 @@ def merge_columns(errors: MergeErrors | None) -> dict[str, float]:
     for name, part in (("m", "metres"), ("deg", "degrees"), ("along_m", "along_m")):
         values = np.zeros(0) if errors is None else getattr(errors, part)
         values = values[~np.isnan(values)]
-        columns[f"merge_error_{name}"] = float(np.median(values)) if len(values) else float("nan")
+        columns[f"merge_error_{name}"] = median(values)
         columns[f"merge_error_{name}_p95"] = float(np.percentile(values, 95)) if len(values) else float("nan")
     columns["n_merge_pairs"] = 0 if errors is None else len(errors.metres)
     return columns

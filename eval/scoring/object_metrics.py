@@ -13,6 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.voxel import cell_keys
 from cdpipe.model.report import ChangedObject
+from eval.core.statistics import mean
 from eval.truth.ground_truth import SESSIONS, GroundTruth
 from eval.truth.universe import CELL_M
 
@@ -152,7 +153,7 @@ def object_columns(matches: ObjectMatches, right: Float64Array, truth: GroundTru
     is_partial = truth.is_observable & truth.is_partial
     n_main = int(np.count_nonzero(is_main))
     columns = {
-        f"object_iou_{name}": _mean(values[is_main])
+        f"object_iou_{name}": mean(values[is_main])
         for name, values in (("point", matches.iou_point), ("voxel", matches.iou_voxel), ("box", matches.iou_box))
     }
     f1_25, _, _ = _instance_scores(matches, is_main, 0.25)
@@ -163,12 +164,12 @@ def object_columns(matches: ObjectMatches, right: Float64Array, truth: GroundTru
         "object_f1_50": f1_50 if n_main else float("nan"),
         "object_precision_50": precision_50,
         "object_pq": quality if n_main else float("nan"),
-        "kind_accuracy": _mean(right[~np.isnan(right)]),
+        "kind_accuracy": mean(right[~np.isnan(right)]),
         "n_objects": len(matches.matched_change),
         "n_matched": int(np.count_nonzero(matches.matched_object >= 0)),
         "n_ignored_objects": matches.outcomes.count("ignored"),
         "n_partial": int(np.count_nonzero(is_partial)),
-        "object_iou_point_partial": _mean(matches.iou_point[is_partial]),
+        "object_iou_point_partial": mean(matches.iou_point[is_partial]),
     }
 
 
@@ -197,7 +198,3 @@ def _instance_scores(matches: ObjectMatches, is_main: BoolArray, min_iou: float)
         n_hit / (n_hit + n_false) if n_hit + n_false else float("nan"),
         float(matches.iou_point[is_hit].sum()) / weight if weight else float("nan"),
     )
-
-
-def _mean(values: Float64Array) -> float:
-    return float(values.mean()) if len(values) else float("nan")

@@ -10,6 +10,7 @@ import numpy as np
 
 from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.model.report import ChangedObject
+from eval.core.statistics import median
 from eval.scoring.object_metrics import ObjectMatches
 from eval.scoring.region_metrics import places_in_map
 from eval.truth.ground_truth import GroundTruth
@@ -91,8 +92,8 @@ def size_columns(errors: SizeErrors, truth: GroundTruth) -> dict[str, float]:
     """Return the columns of results.csv: medians over the matched changes that have a number; NaN without one."""
     is_pile = np.array([change.prop_kind == PILE_KIND for change in truth.pair.changes], dtype=np.bool_)
     return {
-        "displacement_error_m": _median(errors.displacement_m),
-        "pile_volume_error": _median(np.abs(errors.volume_share[is_pile])),
+        "displacement_error_m": median(errors.displacement_m),
+        "pile_volume_error": median(np.abs(errors.volume_share[is_pile])),
     }
 
 
@@ -105,8 +106,3 @@ def _middle_world(change: Change, height_m: float) -> Float64Array:
     """Return the (3,) centre of an object, whose own origin is on the floor, in any orientation."""
     pose = np.asarray(change.world_T_object, dtype=np.float64)
     return np.asarray(pose[:3, :3] @ (0.0, 0.0, height_m / 2) + pose[:3, 3])
-
-
-def _median(values: Float64Array) -> float:
-    values = values[~np.isnan(values)]
-    return float(np.median(values)) if len(values) else float("nan")

@@ -17,7 +17,8 @@ from cdpipe.extract.extract import FIGURES, hull_volume_m3
 from cdpipe.io.answer import Answer, read_answer
 from cdpipe.model.report import ChangedObject, ChangeReport
 from eval.core.domains import domain_of, is_change_in_distribution
-from eval.scoring.answer_check import check_answer
+from eval.core.statistics import mean
+from eval.scoring.answer_check import SECONDS, check_answer
 from eval.scoring.answer_rows import answer_rows
 from eval.scoring.merge_metrics import evidence_columns, merge_columns, merge_errors, overlap_true
 from eval.scoring.object_metrics import ObjectMatches, kinds_right, match_objects, object_columns, unanswered_objects
@@ -55,23 +56,22 @@ def score(answer: ChangeReport | Path | str, pair: Path | str) -> dict[str, Any]
     Raises:
         InputError: The pair has no truth, a file is damaged, or the answer cannot be an answer to this pair.
     """
-    if not isinstance(answer, ChangeReport):
-        return score_pair(Path(pair), Path(answer)).row
     truth = load_ground_truth(Path(pair))
+    if not isinstance(answer, ChangeReport):
+        return score_stored(truth, Path(answer)).row
     whole = Answer("ok", "", str(answer.config.get("method", "")), answer, answer.seconds, answer.evidence)
     check_answer(whole, truth, Path("report"))
     return score_answer(whole, truth).row
 
 
-def score_pair(pair: Path, answer_folder: Path) -> CaseScore:
-    """Score the answer stored in a folder against a simulated pair.
+def score_stored(truth: GroundTruth, folder: Path) -> CaseScore:
+    """Score the answer stored in a folder.
 
     Raises:
-        InputError: The pair has no truth, a file is damaged, or the answer cannot be an answer to this pair.
+        InputError: A file is damaged, or the answer cannot be an answer to this pair.
     """
-    truth = load_ground_truth(pair)
-    answer = read_answer(answer_folder)
-    check_answer(answer, truth, answer_folder)
+    answer = read_answer(folder)
+    check_answer(answer, truth, folder)
     return score_answer(answer, truth)
 
 
@@ -122,9 +122,6 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
             for index, (score, label) in enumerate(zip(keyframe_scores, regions.keyframe_labels, strict=True))
         ],
     )
-
-
-_NAN = float("nan")
 
 
 def change_rows(
@@ -257,11 +254,7 @@ def _times(answer: Answer, n_proposed: int) -> dict[str, float]:
 
     Withdrawn regions were compared and extracted as well, so times per region count them.
     """
-    seconds = answer.seconds
-    index, merge, refine, descriptor, cd, oe, returns = (
-        float(seconds.get(f"t_{name}_s", _NAN))
-        for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns")
-    )
+    index, merge, refine, descriptor, cd, oe, returns = (float(answer.seconds.get(name, _NAN)) for name in SECONDS)
     n_keyframes = 0 if answer.report is None else sum(len(scans) for scans in answer.report.keyframe_scans)
     return {
         "t_index_s": index,
@@ -281,7 +274,7 @@ def _times(answer: Answer, n_proposed: int) -> dict[str, float]:
 
 
 def _figure_means(report: ChangeReport | None) -> dict[str, float]:
-    return {name: _mean(figure(report, name)[report.regions.is_reported]) if report else _NAN for name in FIGURES}
+    return {name: mean(figure(report, name)[report.regions.is_reported]) if report else _NAN for name in FIGURES}
 
 
 def _sizes(answer: Answer, truth: GroundTruth, n_regions: int, after_path_m: float) -> dict[str, Any]:
@@ -299,8 +292,3 @@ def _sizes(answer: Answer, truth: GroundTruth, n_regions: int, after_path_m: flo
         # a refused pair, or one that ends at the merge, is neither silent nor an alarm
         "is_alarm": n_regions > 0 if is_unchanged and answer.report is not None and answer.until is None else _NAN,
     }
-
-
-def _mean(values: Float64Array) -> float:
-    values = values[~np.isnan(values)]
-    return float(values.mean()) if len(values) else _NAN

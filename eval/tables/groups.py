@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
-from eval.core.statistics import N_RESAMPLES
+from eval.core.statistics import N_RESAMPLES, mean, median
 from eval.tables.region_curves import RankedPairs, found_at
-from eval.tables.rows import PAIR, mean, median, numbers, texts
+from eval.tables.rows import PAIR, numbers, texts
 
 RATE_PER_100M = 0.1
 EDGES: Mapping[str, tuple[float, ...]] = {

@@ -14,11 +14,11 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
-from eval.core.statistics import mean_with_interval
+from eval.core.statistics import mean_with_interval, median
 from eval.plans.targets import Targets
 from eval.scoring.object_sizes import PILE_KIND
 from eval.tables.groups import clustered_interval, main_changes, objects_by_group, pair_numbers
-from eval.tables.rows import by_domain, median, numbers, of_cases, texts, with_domain
+from eval.tables.rows import by_domain, numbers, of_cases, texts, with_domain
 from eval.tables.targets import judged_targets
 
 FILES = ("objects_table", "objects_by_group", "objects_targets")

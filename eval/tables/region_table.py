@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from eval.core.ranking import auroc
-from eval.core.statistics import mean_with_interval, wilson_interval
+from eval.core.statistics import mean, mean_with_interval, median, wilson_interval
 from eval.plans.targets import Targets
 from eval.tables.groups import recall_by_size
 from eval.tables.region_curves import (
@@ -27,14 +27,7 @@ from eval.tables.region_curves import (
     resampled_recalls,
     roc_curve,
 )
-from eval.tables.rows import (
-    by_domain,
-    mean,
-    median,
-    numbers,
-    of_cases,
-    with_domain,
-)
+from eval.tables.rows import by_domain, numbers, of_cases, with_domain
 from eval.tables.targets import is_unchanged_pair, judged_targets
 
 FILES = ("regions_table", "regions_targets", "regions_by_size", "roc", "froc")

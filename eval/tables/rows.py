@@ -35,18 +35,6 @@ def numbers(table: pd.DataFrame, column: str) -> Float64Array:
     return pd.to_numeric(table[column], errors="coerce").to_numpy(dtype=np.float64)
 
 
-def mean(values: Float64Array) -> float:
-    """Return the mean of the finite numbers; NaN without one."""
-    values = values[np.isfinite(values)]
-    return float(values.mean()) if len(values) else float("nan")
-
-
-def median(values: Float64Array) -> float:
-    """Return the median of the numbers that are not NaN; NaN without one."""
-    values = values[~np.isnan(values)]
-    return float(np.median(values)) if len(values) else float("nan")
-
-
 def is_told_the_truth(variant: str) -> bool:
     """Tell whether a variant takes its merge or its regions from the truth."""
     return variant.startswith("oracle-")

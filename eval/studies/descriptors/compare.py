@@ -15,11 +15,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import pandas as pd
 import typer
 
-from cdpipe.core.geometry import Float64Array
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import checkpoint_digest, sphere_digest, use_threads
 from cdpipe.model.config import load_config
@@ -28,11 +26,12 @@ from eval.core.exits import run_program
 from eval.core.output import make_writable
 from eval.core.progress import RunProgress, shown_progress
 from eval.core.provenance import digest, git_commit, machine
-from eval.core.statistics import bootstrap_interval, mean_with_interval
+from eval.core.statistics import bootstrap_interval, mean_with_interval, median
 from eval.plans.plan import parse_seeds_option
 from eval.plans.worlds import world_slug
 from eval.running.runfolder import remove, write_json
 from eval.studies.descriptors.rows import METHODS, SPHERE, measure_pair
+from eval.tables.rows import numbers
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
@@ -132,7 +131,7 @@ def tabulate_places(rows: pd.DataFrame) -> pd.DataFrame:
     table = []
     for group, own in _groups(rows[rows["descriptor"] != SPHERE]):
         for (descriptor, precision), cases in own.groupby(["descriptor", "precision"], sort=False):
-            yaws_deg = _numbers(cases, "yaw_error_deg")
+            yaws_deg = numbers(cases, "yaw_error_deg")
             low, high = bootstrap_interval(yaws_deg, "median")
             table.append(
                 {
@@ -140,7 +139,7 @@ def tabulate_places(rows: pd.DataFrame) -> pd.DataFrame:
                     "descriptor": descriptor,
                     "precision": precision,
                     **_mean(cases, "place_recall_at_1"),
-                    "yaw_error_deg": float(np.nanmedian(yaws_deg)) if not np.isnan(yaws_deg).all() else float("nan"),
+                    "yaw_error_deg": median(yaws_deg),
                     "yaw_error_deg_low": low,
                     "yaw_error_deg_high": high,
                     **_mean(cases, "yaw_flip_share"),
@@ -166,7 +165,7 @@ def tabulate_spheres(rows: pd.DataFrame) -> pd.DataFrame:
         exact = own[own["precision"] == "float32"].set_index(_PAIR)["region_auroc"]
         for precision, cases in own.groupby("precision", sort=False):
             loss = exact - cases.set_index(_PAIR)["region_auroc"]
-            ratio = _numbers(cases, "map_bytes_per_keyframe") / _numbers(cases, "bytes_per_keyframe")
+            ratio = numbers(cases, "map_bytes_per_keyframe") / numbers(cases, "bytes_per_keyframe")
             table.append(
                 {
                     "group": group,
@@ -177,7 +176,7 @@ def tabulate_spheres(rows: pd.DataFrame) -> pd.DataFrame:
                     "n_pairs": len(cases),
                     "n_used": int(cases["region_auroc"].notna().sum()),
                     "n_refused": int((cases["status"] != "ok").sum()),
-                    "map_over_kept": float(np.median(ratio)),
+                    "map_over_kept": median(ratio),
                     "map_over_kept_least": float(ratio.min()),
                     **_price(cases),
                 }
@@ -196,19 +195,15 @@ def _groups(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 
 def _mean(cases: pd.DataFrame, column: str) -> dict[str, float]:
-    value, low, high, _ = mean_with_interval(_numbers(cases, column))
+    value, low, high, _ = mean_with_interval(numbers(cases, column))
     return {column: value, f"{column}_low": low, f"{column}_high": high}
 
 
 def _price(cases: pd.DataFrame) -> dict[str, Any]:
     return {
         "bytes_per_keyframe": int(cases["bytes_per_keyframe"].iloc[0]),
-        "ms_per_keyframe": float(np.median(_numbers(cases, "ms_per_keyframe"))),
+        "ms_per_keyframe": median(numbers(cases, "ms_per_keyframe")),
     }
-
-
-def _numbers(cases: pd.DataFrame, column: str) -> Float64Array:
-    return cases[column].to_numpy(dtype=np.float64)
 
 
 def main(
@@ -221,9 +216,8 @@ def main(
     quiet: Annotated[bool, typer.Option("--quiet", "-q")] = False,
 ) -> None:
     """Measure every descriptor on simulated pairs."""
-    numbers = parse_seeds_option(seeds)
     with shown_progress(quiet, "pairs") as progress:
-        rows = measure(families or _FAMILIES, numbers, out, progress, keep=keep)
+        rows = measure(families or _FAMILIES, parse_seeds_option(seeds), out, progress, keep=keep)
     tables = {"descriptors": rows, "places": tabulate_places(rows), "spheres": tabulate_spheres(rows)}
     for name, table in tables.items():
         table.to_csv(out / f"{name}.csv", index=False)

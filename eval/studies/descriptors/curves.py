@@ -40,7 +40,9 @@ from eval.core.exits import run_program
 from eval.core.figures import picture, png
 from eval.core.output import make_writable, whole_file
 from eval.core.ranking import auroc
+from eval.core.statistics import mean
 from eval.studies.descriptors.curve_plots import curves_chart
+from eval.tables.rows import records
 from eval.training.training_run import data_digest
 
 FLOAT_BITS = 32
@@ -161,20 +163,15 @@ def _of_group(log_odds: Float64Array, data: SphereData, is_found: BoolArray, is_
         auroc(log_odds[mask], is_positive[mask])
         for mask in (is_used & (data.tunnels == tunnel) for tunnel in np.unique(data.tunnels[is_used]))
     ]
-    defined = [value for value in by_tunnel if not np.isnan(value)]
     is_unchanged = is_used & ~is_positive
     return {
-        "log_likelihood": -_mean(surprise[is_used]),
-        "auroc": _mean(np.array(defined)),
-        "unchanged_above_0": _mean(log_odds[is_unchanged] >= 0),
-        "changes_found": _mean(is_found),
+        "log_likelihood": -mean(surprise[is_used]),
+        "auroc": mean(np.array(by_tunnel)),
+        "unchanged_above_0": mean(log_odds[is_unchanged] >= 0),
+        "changes_found": mean(is_found),
         "n_unchanged": int(is_unchanged.sum()),
         "n_changes": len(is_found),
     }
-
-
-def _mean(values: npt.NDArray[np.float64] | BoolArray) -> float:
-    return float(values.mean()) if len(values) else float("nan")
 
 
 def points(n_seeds: int) -> list[Point]:
@@ -251,7 +248,7 @@ def read_rows(path: Path, run: Mapping[str, Any]) -> list[dict[str, Any]]:
         raise InputError(f"{path}: damaged ({error}): remove it; networks that were trained are kept") from error
     if not is_same:
         raise InputError(f"{path}: of other data or another number of steps: name another --out")
-    return [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]
+    return records(table)
 
 
 def main(

@@ -25,6 +25,7 @@ from cdpipe.model.config import DescriptorConfig, PipelineConfig, load_config
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, PosedScan, ScanSource
 from cdpipe.query.query import find_regions
 from eval.core.ranking import auroc
+from eval.core.statistics import mean, median
 from eval.scoring.region_metrics import keyframe_labels
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import SESSIONS, GroundTruth, load_ground_truth
@@ -141,36 +142,9 @@ SAME_PLACE_M = 3.0
 FLIPPED_DEG = 90.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlaceOutcomes:
-    """What became of the places of one pair of sessions.
-
-    Attributes:
-        found_m: (P,) how far the place that was found lies from each asked after keyframe, in the world.
-        yaw_error_deg: (P,) absolute error of the yaw between each and its true neighbour; NaN where the orientation
-            vectors have no peak, or the descriptor has none.
-    """
-
-    found_m: Float64Array
-    yaw_error_deg: Float64Array
-
-    @property
-    def columns(self) -> dict[str, float]:
-        """The figures; NaN where nothing was asked."""
-        n = len(self.found_m)
-        known_deg = self.yaw_error_deg[~np.isnan(self.yaw_error_deg)]
-        return {
-            "place_recall_at_1": float(np.mean(self.found_m <= SAME_PLACE_M)) if n else float("nan"),
-            "yaw_error_deg": float(np.median(known_deg)) if len(known_deg) else float("nan"),
-            "yaw_flip_share": float(np.mean(known_deg > FLIPPED_DEG)) if len(known_deg) else float("nan"),
-            "n_places": float(n),
-            "n_yaws": float(len(known_deg)),
-        }
-
-
 def find_places(
     before: DescriptorSet, after: DescriptorSet, world_T_before: Float64Array, world_T_after: Float64Array
-) -> PlaceOutcomes:
+) -> tuple[Float64Array, Float64Array]:
     """Look every after keyframe up among the before keyframes, and compare with the truth.
 
     Args:
@@ -178,6 +152,11 @@ def find_places(
         after: Descriptors of the after session's Ka keyframes, of the same kind.
         world_T_before: (Kb, 4, 4) true poses of the before keyframes.
         world_T_after: (Ka, 4, 4) true poses of the after keyframes.
+
+    Returns:
+        Of the P after keyframes with a before keyframe within 3 m, in the world: (P,) distance in metres to the place
+        that was found; (P,) absolute error in degrees of the yaw against the nearest before keyframe, NaN where the
+        orientation vectors have no peak, or the descriptor has none.
     """
     require_poses("world_T_before", world_T_before)
     require_poses("world_T_after", world_T_after)
@@ -186,7 +165,7 @@ def find_places(
             f"{len(before.q)} and {len(after.q)} descriptors for {len(world_T_before)} and {len(world_T_after)} poses"
         )
     if len(before.q) == 0 or len(after.q) == 0:
-        return PlaceOutcomes(np.zeros(0), np.zeros(0))
+        return np.zeros(0), np.zeros(0)
     places_b, places_a = world_T_before[:, :3, 3], world_T_after[:, :3, 3]
     gaps_m, neighbours = cKDTree(places_b).query(places_a)
     j = np.flatnonzero(np.asarray(gaps_m) <= SAME_PLACE_M)
@@ -197,14 +176,25 @@ def find_places(
         true_rad = _heading_rad(world_T_after[j]) - _heading_rad(world_T_before[i])
         off_rad = relative_yaws_rad(before.w[i], after.w[j], n=1)[:, 0] - true_rad
         errors_deg = np.abs(np.rad2deg(np.angle(np.exp(1j * off_rad))))
-    return PlaceOutcomes(np.linalg.norm(places_b[found] - places_a[j], axis=1), errors_deg)
+    return np.linalg.norm(places_b[found] - places_a[j], axis=1), errors_deg
 
 
 def score_places(
     before: DescriptorSet, after: DescriptorSet, world_T_before: Float64Array, world_T_after: Float64Array
 ) -> dict[str, float]:
-    """Return recall at 1, median yaw error and share of flipped yaws of one pair; arguments as `find_places`."""
-    return find_places(before, after, world_T_before, world_T_after).columns
+    """Return recall at 1, median yaw error and share of flipped yaws of one pair, NaN where nothing was asked.
+
+    Arguments as `find_places`.
+    """
+    found_m, errors_deg = find_places(before, after, world_T_before, world_T_after)
+    known_deg = errors_deg[~np.isnan(errors_deg)]
+    return {
+        "place_recall_at_1": mean(found_m <= SAME_PLACE_M),
+        "yaw_error_deg": median(known_deg),
+        "yaw_flip_share": mean(known_deg > FLIPPED_DEG),
+        "n_places": float(len(found_m)),
+        "n_yaws": float(len(known_deg)),
+    }
 
 
 def _heading_rad(poses: Float64Array) -> Float64Array:

@@ -15,7 +15,7 @@ from cdpipe.io.answer import write_answer, write_failure
 from cdpipe.io.readers import open_session
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 from eval.core.domains import domain_of, is_change_in_distribution
-from eval.scoring.scoring import METRICS_VERSION, CaseScore, score_pair
+from eval.scoring.scoring import METRICS_VERSION, CaseScore, score_stored
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
 ONES = (
@@ -99,7 +99,7 @@ def true_report(pair: Path, merge: np.ndarray) -> ChangeReport:
 
 def scored(pair: Path, report: ChangeReport) -> CaseScore:
     write_answer(pair.parent / "answer", "test-method", report)
-    return score_pair(pair, pair.parent / "answer")
+    return score_stored(load_ground_truth(pair), pair.parent / "answer")
 
 
 def test_the_truth_as_answer_scores_exactly_one(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
@@ -272,7 +272,7 @@ def test_a_refused_case_scores_zero_and_has_the_times_of_its_merge(tiny_pair: Pa
     folder = tiny_pair.parent / "answer"
     seconds = {"t_index_s": 0.25, "t_merge_s": 0.5}
     write_failure(folder, "paper", "merge_refused", "overlap too small", {"overlap": 0.1}, {}, seconds=seconds)
-    case = score_pair(tiny_pair, folder)
+    case = score_stored(load_ground_truth(tiny_pair), folder)
     zeros = [name for name in ONES if name not in ("region_precision", "region_auroc", "region_ap")]
     assert {name: case.row[name] for name in zeros} == dict.fromkeys(zeros, 0.0)
     undefined = ("region_precision", "region_auroc", "merge_error_m", "t_total_s", "t_refine_s", "region_coverage")
@@ -298,7 +298,7 @@ def test_an_answer_that_ends_at_the_merge_is_scored_up_to_it(
     report = without_objects_and_regions(true_report(pair, tiny_merge))
     folder = pair.parent / "answer"
     write_answer(folder, "test-method", report, "merge")
-    case = score_pair(pair, folder)
+    case = score_stored(load_ground_truth(pair), folder)
     assert case.row["status"] == "ok"
     assert np.isnan([case.row[name] for name in NOT_OF_THE_MERGE]).all()
     assert case.row["merge_error_m"] == pytest.approx(0.0, abs=1e-9)
@@ -307,7 +307,7 @@ def test_an_answer_that_ends_at_the_merge_is_scored_up_to_it(
     assert (case.changes, case.regions, case.objects, case.keyframes) == ([], [], [], [])
     assert sorted(case.row) == sorted(COLUMNS)
     write_failure(folder, "paper", "merge_refused", "too smooth", {"overlap": 0.1}, {}, "merge")
-    refused = score_pair(pair, folder)
+    refused = score_stored(load_ground_truth(pair), folder)
     assert (refused.row["status"], refused.row["error"]) == ("merge_refused", "too smooth")
     assert np.isnan([refused.row[name] for name in (*NOT_OF_THE_MERGE, "merge_error_m", "t_merge_s")]).all()
     assert (refused.row["evidence_overlap"], refused.changes) == (0.1, [])
@@ -342,7 +342,7 @@ def test_evidence_is_in_the_row_whatever_came_of_the_merge(tiny_pair: Path, tiny
 def test_the_true_overlap_is_there_whatever_the_status(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
     assert scored(tiny_pair, true_report(tiny_pair, tiny_merge)).row["overlap_true"] == 1.0
     write_failure(tiny_pair.parent / "answer", "paper", "failed", "", {}, {})
-    assert score_pair(tiny_pair, tiny_pair.parent / "answer").row["overlap_true"] == 1.0
+    assert score_stored(load_ground_truth(tiny_pair), tiny_pair.parent / "answer").row["overlap_true"] == 1.0
 
 
 def test_parts_of_the_merge_that_are_not_stated_are_undefined_and_so_is_the_sum(
@@ -374,7 +374,7 @@ def test_an_unchanged_pair(write_tiny_pair: Callable[..., Path], tiny_merge: np.
     assert loud["is_alarm"] is True
     assert loud["region_precision"] == 0.0
     write_failure(pair.parent / "refused", "paper", "merge_refused", "", {}, {})
-    refused = score_pair(pair, pair.parent / "refused").row
+    refused = score_stored(load_ground_truth(pair), pair.parent / "refused").row
     assert np.isnan(refused["is_alarm"])
     assert np.isnan(refused["region_recall"])
 
@@ -428,7 +428,7 @@ def test_a_foreign_answer_of_points_is_scored_alike(tiny_pair: Path, tiny_merge:
     folder = tiny_pair.parent / "answer"
     # 1 mm off: neighbouring cells of the tiny pair are farther than 0.1 m apart
     make_foreign(folder, [item.points_map + 0.001 for item in report.objects])
-    foreign = score_pair(tiny_pair, folder).row
+    foreign = score_stored(load_ground_truth(tiny_pair), folder).row
     assert {name: foreign[name] for name in ONES} == {name: own[name] for name in ONES}
     assert foreign["n_merge_pairs"] == 14
     assert np.isnan(foreign["n_keyframes_before"])
@@ -443,12 +443,12 @@ def test_foreign_points_that_are_not_numbers_or_have_two_owners_are_refused(
     points = [item.points_map.copy() for item in report.objects]
     make_foreign(folder, [points[0], points[1], np.concatenate([points[2], points[0][:1]])])
     with pytest.raises(InputError, match="one owner at most"):
-        score_pair(tiny_pair, folder)
+        score_stored(load_ground_truth(tiny_pair), folder)
     points[1][0, 2] = np.nan
     write_answer(folder, "foreign", report)
     make_foreign(folder, points)
     with pytest.raises(InputError, match=r"objects\[1\]: object_points_odom: entry 0 "):
-        score_pair(tiny_pair, folder)
+        score_stored(load_ground_truth(tiny_pair), folder)
 
 
 def with_returns(report: ChangeReport, *returns: tuple[int, int]) -> ChangeReport:
@@ -532,4 +532,4 @@ def test_answers_that_cannot_be_are_refused_in_one_line(
 
 def test_a_pair_without_truth_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="only simulated pairs have truth"):
-        score_pair(tmp_path, tmp_path)
+        score_stored(load_ground_truth(tmp_path), tmp_path)

@@ -34,9 +34,9 @@ def test_scores_by_hand() -> None:
     headings = [0.1, 0.7, -1.0, 2.0]
     before = poses([0, 10, 20, 30], headings)
     sets = described(UNITS, headings), described([UNITS[3], UNITS[0], UNITS[2], UNITS[1]], [-1.7, 0.5, 3.0 - np.pi, 0])
-    outcomes = find_places(*sets, before, after)
-    np.testing.assert_allclose(outcomes.found_m, [17.1, 1.0, 0.0], atol=1e-9)
-    np.testing.assert_allclose(outcomes.yaw_error_deg, [np.rad2deg(0.3), 0.0, 180.0], atol=0.2)
+    found_m, yaw_error_deg = find_places(*sets, before, after)
+    np.testing.assert_allclose(found_m, [17.1, 1.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(yaw_error_deg, [np.rad2deg(0.3), 0.0, 180.0], atol=0.2)
     scores = score_places(*sets, before, after)
     assert scores["place_recall_at_1"] == pytest.approx(2 / 3)
     assert scores["yaw_error_deg"] == pytest.approx(np.rad2deg(0.3), abs=0.2)
@@ -73,8 +73,8 @@ def test_turning_the_world_changes_nothing() -> None:
     after = poses([0, 10, 20, 30], headings)
     turn = yaw_pose(2.2, (5.0, -3.0, 1.0))
     here, there = find_places(*sets, BEFORE, after), find_places(*sets, turn @ BEFORE, turn @ after)
-    np.testing.assert_allclose(here.yaw_error_deg, there.yaw_error_deg, atol=1e-6)
-    np.testing.assert_allclose(here.found_m, there.found_m, atol=1e-9)
+    np.testing.assert_allclose(here[1], there[1], atol=1e-6)
+    np.testing.assert_allclose(here[0], there[0], atol=1e-9)
 
 
 def test_descriptors_of_other_keyframes_are_refused() -> None:
