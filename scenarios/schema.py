@@ -243,7 +243,12 @@ class Prop(Settings):
         if (self.kind not in PROP_KINDS or self.kind == "mesh") != (self.mesh is not None):
             raise ValueError(f"prop {self.name!r}: kind: mesh and a file `mesh` go together")
         if (self.mesh is None) == (self.size_m is None):
-            raise ValueError(f"prop {self.name!r}: give size_m, but not to a mesh, which has its own")
+            wanted = (
+                "size_m: [length, width, height] is missing"
+                if self.mesh is None
+                else "a mesh has its own size: leave size_m out"
+            )
+            raise ValueError(f"prop {self.name!r}: {wanted}")
         if (self.change == "moved") != ((self.to is not None) != (self.shift is not None)):
             raise ValueError(f"prop {self.name!r}: change: moved goes with a place `to` or a `shift`, not both")
         if (self.change == "reshaped") != (self.loaded_share is not None):

@@ -43,7 +43,8 @@ def load_entry_point(group: str, name: str) -> Any:
     """
     entry = entry_points(group).get(name)
     if entry is None:
-        raise InputError(f"{group}: {name!r} is not registered (registered: {', '.join(entry_points(group))})")
+        known = ", ".join(entry_points(group))
+        raise InputError(f"{group}: {name!r} is not registered (registered: {known}): install the package that has it")
     try:
         return entry.load()
     except (ImportError, AttributeError) as error:

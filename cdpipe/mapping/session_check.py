@@ -51,7 +51,7 @@ def check_session(source: ScanSource, config: MapConfig, other: ScanSource | Non
     if len(poses) < 2:
         raise InputError(
             f"{source.name}: {len(poses)} scan: expected a drive, at least two scans along a path: what one scan sees "
-            "cannot be told from a place that looks alike (cdpipe.merge.merge.register aligns two single clouds)"
+            "cannot be told from a place that looks alike (cdpipe.merge.registration.register aligns two single clouds)"
         )
     points = _sampled_points(source)
     if len(points) == 0:

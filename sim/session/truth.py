@@ -106,13 +106,13 @@ def write_pair_truth(pair: Path, truth: PairTruth) -> None:
     (pair / "truth" / "changes.json").write_text(json.dumps(document, indent=1))
 
 
-def read_pair_truth(pair: Path) -> PairTruth:
+def read_pair_truth(pair: str | Path) -> PairTruth:
     """Read `PAIR/truth/changes.json`.
 
     Raises:
         InputError: The pair has no truth, or it is damaged.
     """
-    path = pair / "truth" / "changes.json"
+    path = Path(pair) / "truth" / "changes.json"
     if not path.is_file():
         raise InputError(f"{path}: missing: only simulated pairs have truth to score against")
     try:

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, stream, yaw_pose, yaw_rad
+from cdpipe.core.yamlfile import suggest
 from scenarios import load_scenario, scenario_names
 from scenarios.schema import Drift, Place, Prop, Roughness, Scenario, Section, SessionPlan, Tunnel
 from sim.placement.placing import Standing, standing_box, standing_middle
@@ -25,7 +26,7 @@ from sim.scene import Scene, World, build_world
 from sim.view.picture import render
 
 SEED = 20000
-_SIZES: dict[str, tuple[float, float, float]] = {
+SIZES: dict[str, tuple[float, float, float]] = {
     "box": (0.8, 0.6, 0.6),
     "crate": (1.2, 0.8, 0.9),
     "chair": (0.5, 0.5, 0.9),
@@ -70,17 +71,20 @@ def draw_gallery(out: Path, only: Sequence[str] = ()) -> list[Path]:
         only: Names of families and kinds; empty for all.
 
     Raises:
-        ScenarioError: A family cannot be built.
+        ScenarioError: A name is neither a family nor a kind that has a size here, or a family cannot be built.
     """
+    families = [name for name in scenario_names() if not name.startswith(("smoke/", "unchanged/"))]
+    for name in only:
+        if name not in families and name not in SIZES:
+            raise ScenarioError(f"{name}: neither a family nor a kind of prop{suggest(name, [*families, *SIZES])}")
     out.mkdir(parents=True, exist_ok=True)
     written = []
-    families = [name for name in scenario_names() if not name.startswith(("smoke/", "unchanged/"))]
     for name in families:
         if not only or name in only:
             path = out / f"family-{name.replace('/', '-')}.jpg"
             _save(path, [(family_picture(load_scenario(name, SEED), SEED), "")])
             written.append(path)
-    for kind in _SIZES:
+    for kind in SIZES:
         if not only or kind in only:
             path = out / f"prop-{kind}.jpg"
             _save(path, prop_pictures(kind))
@@ -149,7 +153,7 @@ def _stage(kind: str, case: _Case, fraction: float) -> Scenario:
         {
             "name": kind,
             "kind": kind,
-            "size_m": _SIZES[kind],
+            "size_m": SIZES[kind],
             "place": Place(**where, lateral=lateral, yaw_deg=20.0 if lateral < 0.5 else 0.0, posture=case.posture),
             "change": "none" if case.loaded_share is None else "reshaped",
             "loaded_share": case.loaded_share,

@@ -18,7 +18,10 @@ def test_every_shipped_preset_says_what_wide_drifts_need() -> None:
         narrow, wide = load_config(name), load_config(name, site="wide")
         assert (narrow.query.radius_m, wide.query.radius_m) == (4.5, 10.0)
         scored = narrow.query.n_regions is None
-        assert (wide.query.threshold != narrow.query.threshold) == scored
+        has_own = wide.query.threshold != narrow.query.threshold
+        assert has_own == scored, (
+            f"{name}: scores differ between narrow and wide drifts; calibrate a threshold for each"
+        )
         same = {"radius_m": 4.5, "threshold": narrow.query.threshold}
         assert wide.model_copy(update={"query": wide.query.model_copy(update=same)}) == narrow
 

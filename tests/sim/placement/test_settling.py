@@ -14,6 +14,7 @@ from sim.geometry.raycast import Caster
 from sim.placement.contact import interpenetration_m, surface_points
 from sim.placement.placing import Standing, bounding_rectangle, rectangles_overlap
 from sim.scene import World, build_world
+from sim.view import gallery
 
 MakeScenario = Callable[..., Scenario]
 MakeProp = Callable[..., Prop]
@@ -94,6 +95,18 @@ def test_at_rest_nothing_is_a_centimetre_deep_in_rock_or_in_another(rough_world:
     for item in rough_world.standing:
         others = [other for other in rough_world.standing if other is not item]
         assert interpenetration_m(item, rough_world.fixed, others) < 0.01, item.prop.name
+
+
+@pytest.mark.parametrize("kind", sorted(set(gallery.SIZES) - {"railing", "muck_pile"}))
+def test_every_kind_that_is_not_set_into_the_floor_comes_to_rest_on_it(
+    kind: str, level_tunnel: Tunnel, make_scenario: MakeScenario, make_prop: MakeProp
+) -> None:
+    prop = make_prop(kind, kind=kind, size_m=gallery.SIZES[kind])
+    world = build_world(make_scenario(tunnel=level_tunnel, props=(prop,)), 3)
+    (item,) = world.standing
+    assert interpenetration_m(item, world.fixed, []) < 0.01
+    assert abs(world_points(item)[:, 2].min()) < 0.01
+    assert tilt_deg(item) < 30.0  # a rock lies on one of its faces
 
 
 def test_everything_touches_the_floor_it_rests_on(rough_world: World) -> None:

@@ -18,6 +18,7 @@ from sim.materials import REFLECTIVITY
 from sim.props.parts import beam, block, revolve, surface
 from sim.props.props import shape_of
 from sim.props.shapes import Shape, hull_volume_m3, signed_volume_m3, solid_mesh, visible_part
+from sim.view import gallery
 
 SIZES = {
     "box": (0.8, 0.6, 0.5),
@@ -53,7 +54,10 @@ def visible_extent(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_every_kind_is_tested() -> None:
-    assert set(SIZES) | {"mesh"} == set(get_args(PropKind))
+    kinds = set(get_args(PropKind)) - {"mesh"}
+    assert set(SIZES) == set(MATERIALS) == set(gallery.SIZES) == kinds
+    listed = (Path(__file__).parents[3] / "scenarios" / "README.md").read_text().partition("\nKinds: ")[2]
+    assert all(kind in listed.partition(".")[0] for kind in kinds)
 
 
 @pytest.mark.parametrize("scale", [(1.0, 1.0, 1.0), (1.4, 1.2, 0.8)])
