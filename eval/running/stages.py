@@ -180,9 +180,9 @@ def time_parts(compute: Callable[[], Done[T]], clock: Callable[[], float] = time
 def kept_bytes(before: MappedSession, config: PipelineConfig) -> dict[str, float]:
     """Return the bytes of the thinned before map, and of what a method keeps of that session to find regions.
 
-    Both as float32: x, y, z of every map point; for a descriptor one vector and one pose (7 numbers) per keyframe. A
-    method that compares points, or renders the before map from new poses, keeps the map; `dufomap` also keeps the
-    returns of the scans that it casts. Random regions keep the poses alone.
+    Both as float32: x, y, z of every map point; for a descriptor one vector and one pose (7 numbers) per keyframe. Any
+    other method keeps the map; `dufomap` also keeps the returns of the scans that it casts. Random regions keep the
+    poses alone.
     """
     map_bytes = 12.0 * len(before.map.points)
     vectors = {"scan": before.descriptors.q, "sphere": before.descriptors.spheres}.get(config.query.compare)
