@@ -47,7 +47,7 @@ def list_command() -> None:
     from cdpipe.core.plugins import METHODS, METRICS, entry_points
     from cdpipe.model.config import preset_names
     from cdpipe.sensor.ouster import profile_names
-    from eval.plans.plan import plan_names
+    from eval.plans.files import plan_names
     from scenarios import prop_names, scenario_names
 
     groups = {
@@ -102,7 +102,8 @@ def check_file(name_or_path: str) -> str:
     from cdpipe.core.errors import InputError
     from cdpipe.core.yamlfile import read_yaml, suggest
     from cdpipe.model.config import PipelineConfig, load_config, preset_names
-    from eval.plans.plan import Plan, cells, load_plan, plan_names
+    from eval.plans.files import plan_names
+    from eval.plans.plan import Plan, cells, load_plan
     from scenarios import check_scenario, scenario_names
     from scenarios.schema import Scenario
 

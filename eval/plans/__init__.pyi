@@ -1,5 +1,6 @@
 from .changes import changed_plan
-from .plan import Plan, cells, load_plan, parse_seeds, plan_names
+from .files import plan_names
+from .plan import Plan, cells, load_plan, parse_seeds
 from .variants import Cell
 
 __all__ = [

@@ -140,3 +140,9 @@ class Grid(Settings):
     variant: PresetName
     scenarios: Annotated[tuple[Label, ...], NotEmpty]
     keys: Annotated[dict[str, Values], NotEmpty, AfterValidator(_valid_keys)]
+
+    @property
+    def points(self) -> list[tuple[str, ...]]:
+        """The settings of every combination."""
+        axes = [[setting_text(key, value) for value in values] for key, values in self.keys.items()]
+        return list(itertools.product(*axes))

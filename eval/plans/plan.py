@@ -29,21 +29,19 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from importlib import resources
-from importlib.resources.abc import Traversable
-from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.plugins import find_yaml
-from cdpipe.core.yamlfile import Settings, read_yaml, suggest, validate
+from cdpipe.core.yamlfile import Settings, suggest, validate
+from cdpipe.model.config import Site
+from eval.plans.files import read_plan
 from eval.plans.parts import Grid, Label, NotEmpty, Variant
 from eval.plans.targets import PlanTargets, Targets
-from eval.plans.variants import Cell, Until, methods_of, slug
-from eval.plans.worlds import OneOrMore, ScenarioItem, group_of, world_slug, worlds_of
+from eval.plans.variants import Cell, Method, Until, slug
+from eval.plans.worlds import OneOrMore, ScenarioItem, World, group_of, world_slug, worlds_of
 
 _TOO_LONG = "is too long for a folder's name: put the settings into a file of their own"
 _LONGEST_SLUG = 200  # file systems take names of 255 bytes
@@ -218,20 +216,29 @@ def load_plan(name_or_path: str) -> Plan:
     Raises:
         InputError: It is unknown or has mistakes (one line each).
     """
-    if name_or_path.endswith((".yaml", ".yml")):
-        return validate(Plan, read_yaml(Path(name_or_path)))
-    plans = _plans()
-    if name_or_path not in plans:
-        raise InputError(
-            f"plan {name_or_path!r} is unknown{suggest(name_or_path, plans)} "
-            f"(known: {', '.join(plans)}, or the path of a .yaml file)"
+    return validate(Plan, read_plan(name_or_path))
+
+
+def methods_of(plan: Plan, world: World) -> list[Method]:
+    """Return the methods that a plan runs in one of its worlds: variants first, then grid points."""
+    places = dict.fromkeys((world.name, world.label))
+    site: Site = "narrow" if places.keys().isdisjoint(plan.wide) else "wide"
+    methods = [
+        Method(
+            preset=variant.preset,
+            named=variant.set,
+            silent=tuple(setting for place in places for setting in variant.per_scenario.get(place, ())),
+            site=site,
+            oracle=variant.oracle_merge,
+            oracle_regions=variant.oracle_regions,
         )
-    return validate(Plan, read_yaml(Path(f"{name_or_path}.yaml"), plans[name_or_path].read_text()))
-
-
-def plan_names() -> list[str]:
-    """Return the names of all plans: shipped, and on the search path."""
-    return list(_plans())
+        for variant in plan.variants
+        if not variant.scenarios or world.label in variant.scenarios
+    ]
+    for grid in plan.grid:
+        if not places.keys().isdisjoint(grid.scenarios):
+            methods += [Method(grid.variant, point, site=site) for point in grid.points]
+    return methods
 
 
 def cells(plan: Plan) -> list[Cell]:
@@ -267,7 +274,3 @@ def planned_cases(plan: Plan) -> set[tuple[str, int, str]]:
         for method in methods_of(plan, world)
         for seed in plan.seeds[: world.n_seeds]
     }
-
-
-def _plans() -> dict[str, Traversable]:
-    return find_yaml("plans", resources.files("eval") / "plans")

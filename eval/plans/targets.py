@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import Document, Settings, validate
+from eval.plans.files import read_plan
 from eval.plans.variants import ORACLE_MERGE
 from eval.plans.worlds import PairKind
 
@@ -109,15 +110,18 @@ def targets_of(provenance: Mapping[str, Any]) -> Targets:
 
 
 def _of_plan(value: Any) -> Any:
-    """Take the name of a shipped plan for the targets of that plan."""
-    if not isinstance(value, str):
-        return {} if value is None else value
-    from eval.plans.plan import load_plan  # noqa: PLC0415 - a plan holds targets, and may name another plan's
-
-    try:
-        return load_plan(value).targets
-    except InputError as error:
-        raise ValueError(str(error)) from error
+    """Replace the name of a plan by the targets of that plan, which may in turn name another plan."""
+    named: set[str] = set()
+    while isinstance(value, str):
+        if value in named:
+            raise ValueError(f"the targets of {value} are those of {value}")
+        named.add(value)
+        try:
+            document = read_plan(value).value
+        except InputError as error:
+            raise ValueError(str(error)) from error
+        value = document.get("targets") if isinstance(document, dict) else None
+    return {} if value is None else value
 
 
 PlanTargets = Annotated[Targets, BeforeValidator(_of_plan)]

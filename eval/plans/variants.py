@@ -1,21 +1,17 @@
-"""Variants and grids expanded over the worlds of a plan: methods with their names, and cells."""
+"""A variant or a grid point in one world: its method with its name, and its cells."""
 
 from __future__ import annotations
 
-import itertools
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 from cdpipe.core.errors import InputError
 from cdpipe.model.config import PipelineConfig, Site, load_config
 from eval.oracles.merge import OracleMerge
-from eval.plans.worlds import World, setting_text
-
-if TYPE_CHECKING:
-    from eval.plans.plan import Plan
+from eval.plans.worlds import World
 
 ORACLE_MERGE, ORACLE_REGIONS = "oracle-merge", "oracle-regions"
 _ORACLE_PRESET = "tunnelcd"
@@ -88,28 +84,6 @@ class Method:
         )
 
 
-def methods_of(plan: Plan, world: World) -> list[Method]:
-    """Return the methods that a plan runs in one of its worlds: variants first, then grid points."""
-    places = dict.fromkeys((world.name, world.label))
-    site: Site = "narrow" if places.keys().isdisjoint(plan.wide) else "wide"
-    methods = [
-        Method(
-            preset=variant.preset,
-            named=variant.set,
-            silent=tuple(setting for place in places for setting in variant.per_scenario.get(place, ())),
-            site=site,
-            oracle=variant.oracle_merge,
-            oracle_regions=variant.oracle_regions,
-        )
-        for variant in plan.variants
-        if not variant.scenarios or world.label in variant.scenarios
-    ]
-    for grid in plan.grid:
-        if not places.keys().isdisjoint(grid.scenarios):
-            methods += [Method(grid.variant, point, site=site) for point in _points(grid.keys)]
-    return methods
-
-
 def variant_name(
     preset: str, settings: Iterable[str], oracle: OracleMerge | None = None, *, oracle_regions: bool = False
 ) -> str:
@@ -130,11 +104,6 @@ def variant_name(
 def slug(variant: str) -> str:
     """Return a variant's name as a folder name."""
     return re.sub(r"[^A-Za-z0-9._=,-]", "_", variant)
-
-
-def _points(keys: Mapping[str, Sequence[Any]]) -> list[tuple[str, ...]]:
-    axes = [[setting_text(key, value) for value in values] for key, values in keys.items()]
-    return list(itertools.product(*axes))
 
 
 def _stem(preset: str) -> str:

@@ -7,7 +7,8 @@ from cdpipe.core.errors import InputError
 from cdpipe.model.config import load_config
 from eval.plans import plan as plan_module
 from eval.plans.changes import changed_plan
-from eval.plans.plan import Plan, cells, load_plan, parse_seeds, plan_names, planned_cases
+from eval.plans.files import plan_names
+from eval.plans.plan import Plan, cells, load_plan, parse_seeds, planned_cases
 from eval.plans.variants import slug, variant_name
 from eval.plans.worlds import setting_text, world_slug
 from eval.running.runfolder import reported

@@ -7,7 +7,8 @@ import yaml
 
 from cdpipe.core.errors import InputError
 from eval.plans.changes import changed_plan
-from eval.plans.plan import load_plan, plan_names
+from eval.plans.files import plan_names
+from eval.plans.plan import load_plan
 from eval.plans.targets import Target, Targets, targets_of
 
 PLAN = {"name": "tiny", "scenarios": ["smoke/one_box"], "seeds": [1], "variants": [{"preset": "paper"}]}
@@ -30,6 +31,12 @@ def test_a_run_finds_its_targets_whether_its_plan_was_stored_with_them_or_before
     document = plan.model_dump(mode="json")
     assert targets_of({"plan": document}) == plan.targets
     assert targets_of({"plan": {key: value for key, value in document.items() if key != "targets"}}) == plan.targets
+
+
+def test_a_plan_that_takes_its_own_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "tiny.yaml"
+    with pytest.raises(InputError, match="targets"):
+        load_plan(written(tmp_path, targets=str(path)))
 
 
 def test_a_run_of_an_unknown_plan_has_none() -> None:
