@@ -47,9 +47,9 @@ def list_contests(
     sites = merge_sites or paper_sites()
     return {
         **sensor_contests(site or BenchSite()),
-        **merge_contests(sites),
-        **descriptor_contests(sites),
-        **extract_contests(spheres or extract_sites()),
+        **{name: contest for each in sites for name, contest in merge_contests(each)},
+        **{name: contest for each in sites for name, contest in descriptor_contests(each)},
+        **{name: contest for each in spheres or extract_sites() for name, contest in extract_contests(each)},
     }
 
 
@@ -159,12 +159,8 @@ def _figures(contest: Contest, seconds: Sequence[float]) -> list[float]:
     return [each if contest.work is None else contest.work / each for each in seconds]
 
 
-def descriptor_contests(sites: Sequence[MergeSite]) -> dict[str, Callable[[], Contest]]:
-    """Return the rows of descriptors and query by name, each against its limit, in the order of the table."""
-    return {name: contest for site in sites for name, contest in _rows(site)}
-
-
-def _rows(site: MergeSite) -> Iterator[tuple[str, Callable[[], Contest]]]:
+def descriptor_contests(site: MergeSite) -> Iterator[tuple[str, Callable[[], Contest]]]:
+    """Yield the rows of descriptors and query with their names, each against its limit."""
     yield f"3deg-{site.size}-per-scan", partial(_scan, site)
     yield f"sphere-{site.size}-per-keyframe", partial(_sphere, site)
     yield f"query-{site.size}-per-region", partial(_query, site)

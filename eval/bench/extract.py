@@ -196,12 +196,8 @@ def extract_sites() -> tuple[ExtractSite, ExtractSite]:
     )
 
 
-def extract_contests(sites: Sequence[ExtractSite]) -> dict[str, Callable[[], Contest]]:
-    """Return the rows of the extraction by name, in the order of the table."""
-    return {name: contest for site in sites for name, contest in _rows(site)}
-
-
-def _rows(site: ExtractSite) -> Iterator[tuple[str, Callable[[], Contest]]]:
+def extract_contests(site: ExtractSite) -> Iterator[tuple[str, Callable[[], Contest]]]:
+    """Yield the rows of the extraction with their names, in the order of the table."""
     size = site.n_points
     yield f"extract-voxel-{size}", partial(_voxel, site, ("after",))
     yield f"extract-voxel-{size}-both", partial(_voxel, site, ("after", "before"))

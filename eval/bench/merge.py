@@ -187,11 +187,6 @@ class MergeSite:
         return (f"{name}: not judged, {missed_m:.1f} m off", False) if missed_m > _WRONG_M else (name, True)
 
 
-def merge_contests(sites: Sequence[MergeSite]) -> dict[str, Callable[[], Contest]]:
-    """Return the rows of the merge by name, in the order of the table."""
-    return {name: contest for site in sites for name, contest in _rows(site)}
-
-
 def paper_sites() -> tuple[MergeSite, MergeSite]:
     """Return the sites of the table: maps of some 60 thousand and 1.3 million points."""
     return (
@@ -224,7 +219,8 @@ def against_limit(seconds: Sequence[float], limit_s: float, remark: str = "") ->
     return Contest("s", tuple(seconds), None, f"its limit, {1000 * limit_s:g} ms{remark}", (limit_s,), 1.0)
 
 
-def _rows(site: MergeSite) -> Iterator[tuple[str, Callable[[], Contest]]]:
+def merge_contests(site: MergeSite) -> Iterator[tuple[str, Callable[[], Contest]]]:
+    """Yield the rows of the merge with their names, in the order of the table."""
     goals = site.goals
     rows: dict[str, tuple[Callable[[], Contest], float | None]] = {
         "": (lambda: against_limit(_part(site, "t_merge_s"), goals.merge_s), 1.0),

@@ -43,9 +43,8 @@ def print_results(folder: Path, quiet: bool) -> None:
     is_told = (folder / "provenance.json").is_file()
     provenance = RunFolder(folder).provenance() if is_told else {}
     covered = coverage(provenance, cases)
-    is_whole = covered is None or covered.is_whole
-    targets = merge_overview(results, targets_of(provenance), is_whole=is_whole)
-    if covered is not None and not is_whole:
+    targets = merge_overview(results, targets_of(provenance), is_whole=covered.is_whole)
+    if not covered.is_whole:
         typer.echo(f"{covered.sentence}\n")
     if len(targets):
         print_table("merge: share of the pairs within the target of their kind, with its 95 % interval", targets)

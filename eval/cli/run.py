@@ -151,9 +151,9 @@ def _list_cells(plan: Plan, out: Path, *, force: bool, limit: int | None) -> Non
     from eval.running.runner import list_cells
 
     every = list_cells(plan, out, force=force, limit=limit)
-    for cell in every:
-        typer.echo(f"{cell.state:<8}  {cell.scenario} {cell.seed} {cell.variant}")
-    count = Counter(cell.state for cell in every)
+    for cell, state in every:
+        typer.echo(f"{state:<8}  {cell.scenario} {cell.seed} {cell.variant}")
+    count = Counter(state for _, state in every)
     left = f", {count['left']} left by --limit" if count["left"] else ""
     typer.echo(
         f"{out}: {len(every)} cells: {count['finished']} finished, {count['to do']} to do{left}; nothing was run"

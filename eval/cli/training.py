@@ -64,8 +64,7 @@ def train(
         raise InputError(f"--descriptor {descriptor}: expected {' or '.join(TASKS)}")
     command = shlex.join(["tunnelcd", *sys.argv[1:]])
     with shown_progress(quiet) as progress:
-        trained = train_descriptor(
-            data, out, descriptor, FitConfig(seed, steps, patience=patience), threads, command, progress
-        )
-    scores = ", ".join(f"{name} {value}" for name, value in trained.card["validation"]["trained"].items())
-    say(quiet, f"{trained.checkpoint}: best of step {trained.card['best_step']} on validation tunnels: {scores}")
+        config = FitConfig(seed, steps, patience=patience)
+        checkpoint, card = train_descriptor(data, out, descriptor, config, threads, command, progress)
+    scores = ", ".join(f"{name} {value}" for name, value in card["validation"]["trained"].items())
+    say(quiet, f"{checkpoint}: best of step {card['best_step']} on validation tunnels: {scores}")

@@ -13,7 +13,7 @@ from eval.plans.plan import Plan, planned_cases
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """Number of session pairs in the plan of a run, and of those with all of their cells."""
+    """Number of session pairs in the plan of a run, and of those with all of their cells; both 0 without a plan."""
 
     n_done: int
     n_planned: int
@@ -29,27 +29,22 @@ class Coverage:
         return f"{self.n_done} of {self.n_planned} planned pairs so far: no verdict before all are there."
 
 
-def coverage(provenance: Mapping[str, Any], cases: Iterable[tuple[str, int, str]]) -> Coverage | None:
-    """Compare the rows of a run with its latest plan.
+def coverage(provenance: Mapping[str, Any], cases: Iterable[tuple[str, int, str]]) -> Coverage:
+    """Compare the rows of a run with its latest plan; a run is whole where that is absent or not valid any more.
 
     Args:
         provenance: Content of provenance.json.
         cases: Scenario, seed and variant of each row of results.csv.
-
-    Returns:
-        None where provenance.json has no plan, or the plan is not valid any more (e.g. a preset's file is gone).
     """
     plan = plan_of(provenance)
-    if plan is None:
-        return None
-    planned = planned_cases(plan)
+    planned = set() if plan is None else planned_cases(plan)
     missing = planned - set(cases)
     pairs = {(scenario, seed) for scenario, seed, _ in planned}
     return Coverage(len(pairs - {(scenario, seed) for scenario, seed, _ in missing}), len(pairs))
 
 
 def plan_of(provenance: Mapping[str, Any]) -> Plan | None:
-    """Return the latest plan of a run; None where it is absent or not valid any more."""
+    """Return the latest plan of a run; None where it is absent or not valid any more (a preset's file is gone)."""
     document = provenance.get("plan")
     if not isinstance(document, dict):
         return None

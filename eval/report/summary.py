@@ -158,8 +158,7 @@ def _sentence(data: RunData, merges: pd.DataFrame) -> str:
     results = pd.DataFrame(list(data.results))
     covered = covered_by(data)
     n_pairs, n_methods = len(results[PAIR].drop_duplicates()), results["variant"].nunique()
-    is_whole = covered is None or covered.is_whole
-    parts = [] if covered is None or is_whole else [covered.sentence.removesuffix(".")]
+    parts = [] if covered.is_whole else [covered.sentence.removesuffix(".")]
     parts.append(f"{_counted(n_pairs, 'session pair')}, {_counted(n_methods, 'variant')}")
     bad = [row for row in data.results if text(row, "status") != "ok"]
     n_unmade = sum(is_unmade(row) for row in bad)
@@ -179,7 +178,7 @@ def _sentence(data: RunData, merges: pd.DataFrame) -> str:
         targets = stored_table(data, f"{name}_targets")
         verdicts += list(targets["is_met"]) if len(targets) else []
     verdicts = [bool(value) for value in verdicts if not pd.isna(value)]
-    if verdicts and is_whole:
+    if verdicts and covered.is_whole:
         parts.append(f"{sum(verdicts)} of {len(verdicts)} targets of the plan are met")
     if is_contended(data):
         parts.append("times were measured beside other work")

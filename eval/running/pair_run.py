@@ -269,10 +269,7 @@ def _write_maps(path: Path, stages: PairStages) -> None:
 def _answer(stages: PairStages, cell: Cell, truth: GroundTruth, folder: Path) -> None:
     settings = cell.config.model_dump(mode="json")
     try:
-        if cell.until is None:
-            report = stages.answer(cell.config, _oracle(cell, truth), _true_regions(cell, truth))
-        else:
-            report = stages.merge_answer(cell.config, _oracle(cell, truth))
+        report = stages.answer(cell.config, _oracle(cell, truth), _true_regions(cell, truth), cell.until)
     except MergeFailedError as error:
         measured = error.evidence, settings, cell.until, error.seconds
         write_failure(folder, cell.variant, "merge_refused", str(error), *measured)

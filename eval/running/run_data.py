@@ -94,8 +94,8 @@ def comparable(data: RunData) -> pd.DataFrame:
     return with_domain([row for row in data.results if (row["scenario"], row["variant"]) in wanted])
 
 
-def covered_by(data: RunData) -> Coverage | None:
-    """Return how much of its plan a run holds; None where that is not known."""
+def covered_by(data: RunData) -> Coverage:
+    """Return how much of its plan a run holds."""
     cases = ((str(row["scenario"]), int(row["seed"]), str(row["variant"])) for row in data.results)
     return coverage(data.provenance, cases)
 

@@ -233,10 +233,8 @@ def _report_tables(
     subjects, targets = reported(provenance), targets_of(provenance)
     if not subjects or "region_auroc" not in results:
         return tables
-    covered = coverage(
-        provenance, zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
-    )
-    is_whole = covered is None or covered.is_whole
+    cases = zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
+    is_whole = coverage(provenance, cases).is_whole
     if "regions" in subjects:
         tables |= region_tables(results, items, targets, is_whole=is_whole)
     if "objects" in subjects:

@@ -42,16 +42,6 @@ class RunOutcome:
     n_died: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Listed:
-    """One cell of a plan and its state: "finished", "to do", or "left" by `--limit`."""
-
-    scenario: str
-    seed: int
-    variant: str
-    state: str
-
-
 def run_plan(
     plan: Plan,
     run: RunFolder,
@@ -112,8 +102,8 @@ def run_plan(
     return RunOutcome(n_run, len(all_cells) - n_todo, n_todo - n_run, n_died)
 
 
-def list_cells(plan: Plan, path: Path, *, force: bool = False, limit: int | None = None) -> list[Listed]:
-    """Return what `run_plan` would do with each cell of a plan, in order; writes nothing.
+def list_cells(plan: Plan, path: Path, *, force: bool = False, limit: int | None = None) -> list[tuple[Cell, str]]:
+    """Return each cell of a plan and its state, "finished", "to do", or "left" by `limit`; writes nothing.
 
     Raises:
         InputError: A setting is wrong, or the folder holds something else than a run.
@@ -125,12 +115,8 @@ def list_cells(plan: Plan, path: Path, *, force: bool = False, limit: int | None
         raise InputError(f"{path}: is a file: name a folder to run in")
     all_cells = cells(plan)
     pairs = _pairs(run, plan, all_cells, force, TOOLS)
-    todo = {(each.cell.scenario, each.cell.seed, each.cell.variant) for pair in pairs for each in pair.todo}
-    chosen = {
-        (each.cell.scenario, each.cell.seed, each.cell.variant) for pair in _limited(pairs, limit) for each in pair.todo
-    }
-    names = [(cell.scenario, cell.seed, cell.variant) for cell in all_cells]
-    return [Listed(*name, "to do" if name in chosen else "left" if name in todo else "finished") for name in names]
+    todo, chosen = ({each.cell for pair in some for each in pair.todo} for some in (pairs, _limited(pairs, limit)))
+    return [(cell, "to do" if cell in chosen else "left" if cell in todo else "finished") for cell in all_cells]
 
 
 def _run_here(run: RunFolder, pairs: Sequence[Pair], made: Made, progress: RunProgress, tools: Tools) -> None:

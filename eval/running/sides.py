@@ -11,8 +11,7 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import suggest
-from eval.plans.coverage import coverage
-from eval.running.run_data import Row, RunData, flag, read_run
+from eval.running.run_data import Row, RunData, covered_by, flag, read_run
 from eval.scoring.scoring import METRICS_VERSION
 from eval.tables.rows import PAIR
 
@@ -162,9 +161,8 @@ def cautions(a: Side, b: Side) -> list[str]:
     if why := why_no_times(a, b):
         found.append(f"Times are not judged: {why}.")
     for side in {each.path: each for each in (a, b)}.values():
-        cases = ((str(row["scenario"]), int(row["seed"]), str(row["variant"])) for row in side.data.results)
-        covered = coverage(side.data.provenance, cases)
-        if covered is not None and not covered.is_whole:
+        covered = covered_by(side.data)
+        if not covered.is_whole:
             found.append(
                 f"{side.path.resolve().name} is not finished: {covered.n_done} of {covered.n_planned} planned pairs."
             )

@@ -36,6 +36,7 @@ from cdpipe.pipeline import (
     map_pair,
     map_sources,
 )
+from eval.plans.variants import Until
 from eval.running.stage_cache import Kept, StageCache
 from eval.running.stage_results import name_result, pack, unpack
 
@@ -106,43 +107,34 @@ class PairStages(Hooks):
         return map_sources(self._sources, PipelineConfig(map=config), self)
 
     def answer(
-        self, config: PipelineConfig, merge: Merge | None = None, propose: Propose | None = None
+        self,
+        config: PipelineConfig,
+        merge: Merge | None = None,
+        propose: Propose | None = None,
+        until: Until | None = None,
     ) -> ChangeReport:
-        """Run one method to its end.
+        """Run one method; until the merge gives an answer without regions and objects.
 
         Args:
             config: All settings.
             merge: What merges instead of the method.
             propose: What proposes regions instead of the method, from the scans of the keyframes of both sessions.
+            until: Last stage, None for the whole method.
 
         Raises:
             MergeFailedError: The maps could not be merged.
             TunnelcdError: The input does not allow an answer.
         """
-        mapped = self._map_pair(config)
-        report = detect_changes(*mapped.value, config, self, merge=merge, propose=propose)
-        is_described = propose is None and load_method(config.method).uses_descriptors
-        return replace(
-            report,
-            seconds={**report.seconds, **self._of_descriptors(mapped.seconds, is_described)},
-            evidence={**report.evidence, **kept_bytes(mapped.value[0], config)},
-        )
-
-    def merge_answer(self, config: PipelineConfig, merge: Merge | None = None) -> ChangeReport:
-        """Run one method up to its merge: an answer without regions and objects, and descriptors timed if it used them.
-
-        Raises:
-            MergeFailedError: The maps could not be merged.
-            TunnelcdError: The input does not allow an answer.
-        """
-        mapped = self._map_pair(config)
-        report = detect_merge(*mapped.value, config, self, merge=merge)
-        is_described = merge is None and config.merge.method != "kiss-matcher"
-        return replace(report, seconds={**report.seconds, **self._of_descriptors(mapped.seconds, is_described)})
-
-    def _map_pair(self, config: PipelineConfig) -> Done[tuple[MappedSession, MappedSession]]:
         self.is_contended, self._are_descriptors_contended = self._is_shared, False
-        return map_pair(self._sources, config, self)
+        mapped = map_pair(self._sources, config, self)
+        if until == "merge":
+            report = detect_merge(*mapped.value, config, self, merge=merge)
+            is_described = merge is None and config.merge.method != "kiss-matcher"
+        else:
+            report = detect_changes(*mapped.value, config, self, merge=merge, propose=propose)
+            report = replace(report, evidence={**report.evidence, **kept_bytes(mapped.value[0], config)})
+            is_described = propose is None and load_method(config.method).uses_descriptors
+        return replace(report, seconds={**report.seconds, **self._of_descriptors(mapped.seconds, is_described)})
 
     def _of_descriptors(self, seconds: Mapping[str, float], is_described: bool) -> Mapping[str, float]:
         self.is_contended |= is_described and self._are_descriptors_contended

@@ -6,13 +6,12 @@ import hashlib
 import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from cdpipe.core.errors import InputError
 from cdpipe.descriptors import use_threads
 from cdpipe.descriptors.network import checkpoint_bytes, digest, make_untrained_network
 from cdpipe.descriptors.sphere_network import SphereNetwork, make_untrained_sphere_network
@@ -32,17 +31,9 @@ SOURCES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Trained:
-    """Result of a training run: the checkpoint and its model card."""
-
-    checkpoint: Path
-    card: Mapping[str, Any]
-
-
 def train_descriptor(
     data: Path, out: Path, name: str, config: FitConfig, threads: int, command: str, progress: RunProgress
-) -> Trained:
+) -> tuple[Path, dict[str, Any]]:
     """Train one descriptor on the tunnels of split train; those of split validation decide when to stop.
 
     Args:
@@ -53,6 +44,9 @@ def train_descriptor(
         threads: Of torch.
         command: What to write into the card.
         progress: Told of every step.
+
+    Returns:
+        The checkpoint and the content of its model card.
 
     Raises:
         InputError: The folder lacks a split, is damaged, or `out` holds another run.
@@ -101,12 +95,9 @@ def train_descriptor(
         "seconds": round(history[-1].seconds, 1),
     }
     checkpoint = out / f"{name}.safetensors"
-    try:
-        checkpoint.write_bytes(content)
-        (out / f"{name}.json").write_text(json.dumps(card, indent=1) + "\n")
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
-    return Trained(checkpoint, card)
+    checkpoint.write_bytes(content)
+    (out / f"{name}.json").write_text(json.dumps(card, indent=1) + "\n")
+    return checkpoint, card
 
 
 def data_digest(tunnels: Sequence[TunnelShard]) -> str:
@@ -120,10 +111,7 @@ def data_digest(tunnels: Sequence[TunnelShard]) -> str:
 def write_curves(path: Path, history: Sequence[Progress]) -> None:
     """Write one row per validation: step, losses, scores, whether it was the best so far."""
     rows = [{"step": done.step, **done.losses, **done.scores, "is_best": done.is_best} for done in history]
-    try:
-        pd.DataFrame(rows).to_csv(path, index=False, lineterminator="\r\n")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+    pd.DataFrame(rows).to_csv(path, index=False, lineterminator="\r\n")
 
 
 def draw_curves(path: Path, name: str, history: Sequence[Progress]) -> None:

@@ -69,7 +69,7 @@ def draw_merge(data: RunData) -> MergePart:
     by_kind = bool((kinds(results) != "").any())
     table = merge_table(results, targets_of(data.provenance))
     is_main, covered, name = ends_at_merge(data), covered_by(data), shown_variant(data)
-    is_whole = covered is None or covered.is_whole
+    is_whole = covered.is_whole
     tables: tuple[Table, ...] = (times_table(results),) if by_kind or is_main else ()
     if by_kind:
         of_targets = kinds_table(table, is_whole=is_whole), families_table(table, name, is_whole=is_whole)

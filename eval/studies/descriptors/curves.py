@@ -212,10 +212,7 @@ def trained(
     network = make_untrained_sphere_network(point.seed, point.size)
     task = SphereTask(network, read_sphere_data(tunnels), held.data, point.seed)
     config = FitConfig(seed=point.seed, steps=steps, validate_every=steps)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made: {error.strerror}") from error
+    make_writable(folder)
     fit(task, config, folder, f"{point.name} {data}", lambda *_: None, lambda _: None)
     task.finish()
     return network
@@ -284,12 +281,9 @@ def main(
 
 
 def _write(table: pd.DataFrame, path: Path) -> None:
-    try:
-        with whole_file(path) as partial:
-            table.to_csv(partial, index=False, float_format="%.5g")
-        path.with_suffix(".png").write_bytes(png(picture(curves_chart(table))))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+    with whole_file(path) as partial:
+        table.to_csv(partial, index=False, float_format="%.5g")
+    path.with_suffix(".png").write_bytes(png(picture(curves_chart(table))))
 
 
 if __name__ == "__main__":

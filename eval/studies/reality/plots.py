@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import mode
 
 import numpy as np
 import pandas as pd
 
-from cdpipe.core.geometry import Float64Array
 from eval.core.charts import (
     BLACK,
     BLUE,
@@ -26,7 +26,7 @@ from eval.core.charts import (
 )
 from eval.core.figures import blank_figure, picture, png
 from eval.studies.reality.sensor_measures import Revolutions
-from eval.studies.reality.static_novelty import CELLS_M, REAL_SHARES, Novelty
+from eval.studies.reality.static_novelty import CELLS_M, REAL_SHARES, Case, Shares
 from eval.studies.reality.tables import first_number
 
 _PANELS = (
@@ -39,6 +39,7 @@ _PANELS = (
     ("isolated returns", "range, m", "share of returns", "linear"),
     ("mixed at edges", "jump of range, m", "share of edge pixels in between", "linear"),
 )
+_STANDING = ("standing", "default")
 _COLOURS = (BLACK, BLUE, VERMILLION, ORANGE, GREEN)
 
 
@@ -79,31 +80,32 @@ def draw_scene(real: Revolutions, recast: Revolutions, path: Path) -> None:
     path.write_bytes(png(figure))
 
 
-def draw_novelty(results: Sequence[Novelty], path: Path) -> None:
+def draw_novelty(results: Sequence[tuple[Case, Shares]], path: Path) -> None:
     """Write the share of new returns by the number of revolutions, and by effect."""
-    standing = sorted((r for r in results if r.way == "standing" and r.variant == "default"), key=_n_revolutions)
-    numbers = [each.n_revolutions for each in standing]
+    standing = {case.n_revolutions: shares for case, shares in results if (case.way, case.variant) == _STANDING}
+    numbers = sorted(standing)
     lines = []
     for index, (cell_m, colour) in enumerate(zip(CELLS_M, (BLUE, VERMILLION, GREEN), strict=True)):
-        percent = [100.0 * each.shares[index] for each in standing]
+        percent = [100.0 * standing[number][index] for number in numbers]
         lines.append(Series(numbers, percent, Look(colour, marker="circle", size=3.0), f"voxel {cell_m:g} m"))
         lines.append(Series(numbers, [100.0 * REAL_SHARES[index]] * len(numbers), Look(colour, 1.0, "dot")))
     x = Axis("revolutions in both halves", is_log=True, ticks={float(number): f"{number}" for number in numbers})
     heading = "standing, default effects; dotted: real recording"
     y = Axis("returns in new voxels [%]", log_span([np.ravel(each.y) for each in lines]), is_log=True)
     by_number = Panel(x, y, lines, heading)
-    most = [each for each in results if each.n_revolutions == _most_common(results)]
+    most_common = mode(case.n_revolutions for case, _ in results)
+    most = [(case, shares) for case, shares in results if case.n_revolutions == most_common]
     # a variant that the standing sensor was not run with keeps its place among the others
-    variants = list(dict.fromkeys(each.variant for each in sorted(most, key=_is_standing)))
+    variants = list(dict.fromkeys(case.variant for case, _ in sorted(most, key=lambda each: each[0].way == "standing")))
     places = np.arange(len(variants))
     bars = []
-    for way, colour in zip(dict.fromkeys(each.way for each in most), (BLUE, ORANGE, VERMILLION), strict=False):
-        shares = {each.variant: 100.0 * each.shares[0] for each in most if each.way == way}
-        bars.append(Series(places, [shares.get(name, np.nan) for name in variants], Look(colour), way, "bars"))
+    for way, colour in zip(dict.fromkeys(case.way for case, _ in most), (BLUE, ORANGE, VERMILLION), strict=False):
+        percents = {case.variant: 100.0 * shares[0] for case, shares in most if case.way == way}
+        bars.append(Series(places, [percents.get(name, np.nan) for name in variants], Look(colour), way, "bars"))
     ends = [-0.5, len(variants) - 0.5]
     bars.append(Series(ends, [100.0 * REAL_SHARES[0]] * 2, Look(BLACK, 1.0, "dot"), "real recording"))
     x = Axis(ticks=named_ticks([name.replace("_", "_\n").replace(" ", "\n") for name in variants]), tick_pt=5.5)
-    heading = f"{_most_common(results)} revolutions"
+    heading = f"{most_common} revolutions"
     by_effect = Panel(x, Axis("returns in new voxels of 0.1 m [%]"), bars, heading)
     path.write_bytes(png(picture(Drawing([[by_number], [by_effect]], 300))))
 
@@ -111,17 +113,3 @@ def draw_novelty(results: Sequence[Novelty], path: Path) -> None:
 def _bin_name(where: str) -> str:
     short = where.removeprefix("jump ").removesuffix(" photons").removesuffix(" m")
     return short.replace(" photons or more", "+")
-
-
-def _is_standing(novelty: Novelty) -> bool:
-    return novelty.way == "standing"
-
-
-def _n_revolutions(novelty: Novelty) -> int:
-    return novelty.n_revolutions
-
-
-def _most_common(results: Sequence[Novelty]) -> int:
-    numbers: Float64Array = np.array([each.n_revolutions for each in results], dtype=np.float64)
-    values, counts = np.unique(numbers, return_counts=True)
-    return int(values[np.argmax(counts)])

@@ -11,7 +11,7 @@ rebuilding itself adds.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -20,10 +20,9 @@ import pandas as pd
 import typer
 
 from eval.core.exits import run_program
-from eval.core.output import make_writable, unwritable
+from eval.core.output import make_writable
 from eval.studies.reality.plots import draw_measures, draw_novelty, draw_scene
 from eval.studies.reality.scenes import (
-    Rebuilt,
     as_revolutions,
     cast_at_origin,
     drive_of,
@@ -33,7 +32,7 @@ from eval.studies.reality.scenes import (
     with_effects,
 )
 from eval.studies.reality.sensor_measures import Revolutions
-from eval.studies.reality.static_novelty import Novelty, effect_variants, novelty_cases, static_novelty
+from eval.studies.reality.static_novelty import effect_variants, novelty_cases, static_novelty
 from eval.studies.reality.tables import markdown, measured, novelty_table, side_by_side, surface_rows
 from scenarios.schema import Sensor
 from sim.session.revolution import Drive, cast_revolution
@@ -47,62 +46,38 @@ _N_REPEATS = 10  # revolutions of each simulated source
 _FAR_M = 250.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Comparison:
-    """Result of the comparison.
-
-    Attributes:
-        real: The recording.
-        rebuilt: The scene made of it.
-        recast: One revolution simulated in that scene, default effects.
-        measures: Table of `eval.studies.reality.tables.COLUMNS`.
-        novelty: Every simulated figure of static novelty, in the first of `WORLDS`.
-    """
-
-    real: Revolutions
-    rebuilt: Rebuilt
-    recast: Revolutions
-    measures: pd.DataFrame
-    novelty: tuple[Novelty, ...]
-
-
-def compare(data: Path | None) -> Comparison:
+def compare(real: Revolutions, drives: Sequence[Drive]) -> tuple[Revolutions, pd.DataFrame]:
     """Measure the recording and the simulator by the same definitions.
 
     Args:
-        data: Folder of the recording.
+        real: The recording.
+        drives: Drives through `WORLDS`, with the sensor of the recording.
 
-    Raises:
-        InputError: The recording is missing or damaged, or the extra `ouster` is not installed.
+    Returns:
+        One revolution simulated in the scene rebuilt from the recording, with default effects; the table of
+        `eval.studies.reality.tables.COLUMNS`.
     """
-    real = real_revolution(find_recording(data))
-    drives = [drive_of(family, seed, real.sensor, PROFILE) for family, seed in WORLDS]
-    rebuilt = rebuild(real, drives[0].scene)
-    tables = [measured(real, REAL), surface_rows(real, rebuilt.is_surface, REAL)]
+    scene, is_surface = rebuild(real, drives[0].scene)
+
+    def cast(name: str, settings: Sensor, n_revolutions: int) -> Revolutions:
+        scans = [cast_at_origin(scene, real.sensor, settings, number) for number in range(n_revolutions)]
+        recast = as_revolutions(real.sensor, scans)
+        tables.extend([measured(recast, name), surface_rows(recast, is_surface, name)])
+        return recast
+
+    tables = [measured(real, REAL), surface_rows(real, is_surface, REAL)]
     recasts = []
     for name, number in (("", 1), (", 19 sub-rays", 19)):
         settings = Sensor.model_validate({"profile": PROFILE, "max_range_m": _FAR_M, "sub_rays": number})
-        recast = _recast(rebuilt, real, settings, _N_REPEATS)
-        recasts.append(recast)
-        source = f"{SAME_SCENE}{name}"
-        tables += [measured(recast, source), surface_rows(recast, rebuilt.is_surface, source)]
+        recasts.append(cast(f"{SAME_SCENE}{name}", settings, _N_REPEATS))
         tables += [
             measured(_driven(drive, settings), f"{family} {seed}{name}")
             for drive, (family, seed) in zip(drives, WORLDS, strict=True)
         ]
     off = effect_variants(Sensor(profile=PROFILE, max_range_m=_FAR_M))["all off"]
-    floor = _recast(rebuilt, real, off, 1)  # nothing is random: further revolutions are the same
-    tables += [
-        measured(floor, f"{SAME_SCENE}, effects off"),
-        surface_rows(floor, rebuilt.is_surface, f"{SAME_SCENE}, effects off"),
-    ]
+    cast(f"{SAME_SCENE}, effects off", off, 1)  # nothing is random: further revolutions are the same
     first = Revolutions(real.sensor, recasts[0].range_m[:1], recasts[0].signal[:1], recasts[0].reflectivity[:1])
-    return Comparison(real, rebuilt, first, pd.concat(tables, ignore_index=True), tuple(_novelty(drives[0])))
-
-
-def _recast(rebuilt: Rebuilt, real: Revolutions, settings: Sensor, n_revolutions: int) -> Revolutions:
-    scans = [cast_at_origin(rebuilt.scene, real.sensor, settings, number) for number in range(n_revolutions)]
-    return as_revolutions(real.sensor, scans)
+    return first, pd.concat(tables, ignore_index=True)
 
 
 def _driven(drive: Drive, settings: Sensor) -> Revolutions:
@@ -112,11 +87,6 @@ def _driven(drive: Drive, settings: Sensor) -> Revolutions:
     return as_revolutions(recorded.sensor, [cast_revolution(recorded, number)[1] for number in numbers])
 
 
-def _novelty(drive: Drive) -> list[Novelty]:
-    first = drive.trajectory.n_scans // 3
-    return [static_novelty(drive, case, first) for case in novelty_cases(drive.scenario.sensor)]
-
-
 def main(
     out: Annotated[Path, typer.Option(help="folder for reality.csv, reality-novelty.csv, their .md and plots")],
     data: Annotated[Path | None, typer.Option(help=f"folder of the real recording [${DATA_VARIABLE}]")] = None,
@@ -124,20 +94,21 @@ def main(
     """Print and write the comparison."""
     given = os.environ.get(DATA_VARIABLE)
     folder = data or (Path(given) if given else None)
-    find_recording(folder)
+    pcap = find_recording(folder)
     make_writable(out)
-    comparison = compare(folder)
-    novelty = novelty_table(comparison.novelty)
-    text = "\n".join(markdown(table) for table in (side_by_side(comparison.measures), novelty))
-    try:
-        comparison.measures.to_csv(out / "reality.csv", index=False, float_format="%.5g")
-        novelty.to_csv(out / "reality-novelty.csv", index=False, float_format="%.4g")
-        (out / "reality.md").write_text(text)
-        draw_measures(comparison.measures, out / "reality-measures.png")
-        draw_scene(comparison.real, comparison.recast, out / "reality-scene.png")
-        draw_novelty(comparison.novelty, out / "reality-novelty.png")
-    except OSError as error:
-        raise unwritable(out, error) from error
+    real = real_revolution(pcap)
+    drives = [drive_of(family, seed, real.sensor, PROFILE) for family, seed in WORLDS]
+    recast, measures = compare(real, drives)
+    first = drives[0].trajectory.n_scans // 3
+    shares = [(case, static_novelty(drives[0], case, first)) for case in novelty_cases(drives[0].scenario.sensor)]
+    novelty = novelty_table(shares)
+    text = "\n".join(markdown(table) for table in (side_by_side(measures), novelty))
+    measures.to_csv(out / "reality.csv", index=False, float_format="%.5g")
+    novelty.to_csv(out / "reality-novelty.csv", index=False, float_format="%.4g")
+    (out / "reality.md").write_text(text)
+    draw_measures(measures, out / "reality-measures.png")
+    draw_scene(real, recast, out / "reality-scene.png")
+    draw_novelty(shares, out / "reality-novelty.png")
     typer.echo(text, nl=False)
 
 

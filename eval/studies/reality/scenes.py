@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -113,21 +113,7 @@ _SMOOTHING = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0  # Savitzky-
 _TIP_ROW, _TIP_COLUMN = 0.15, 0.2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Rebuilt:
-    """A recorded revolution made into a surface.
-
-    Attributes:
-        scene: One patch for each pixel, as wide as the pixel.
-        is_surface: (H, W) destaggered mask of the pixels that have one: every return, and holes of one or two columns
-            between returns that agree.
-    """
-
-    scene: Scene
-    is_surface: BoolArray
-
-
-def rebuild(real: Revolutions, template: Scene) -> Rebuilt:
+def rebuild(real: Revolutions, template: Scene) -> tuple[Scene, BoolArray]:
     """Make a surface from the first revolution, with the noise of the sensor removed.
 
     Each pixel becomes a flat patch that reaches half way to its neighbours and is inclined towards those of similar
@@ -138,6 +124,10 @@ def rebuild(real: Revolutions, template: Scene) -> Rebuilt:
     Args:
         real: The recording, in the sensor frame.
         template: Any scene: only its caster, instances and reflectivities are replaced.
+
+    Returns:
+        The scene, with one patch for each pixel, as wide as the pixel; the (H, W) destaggered mask of the pixels that
+        have one: every return, and holes of one or two columns between returns that agree.
     """
     filled_m, share, is_surface = _closed(real)
     inverse = np.where(is_surface, 1.0 / np.where(is_surface, filled_m, 1.0), 0.0)
@@ -154,7 +144,7 @@ def rebuild(real: Revolutions, template: Scene) -> Rebuilt:
         instance=np.zeros(len(levels), np.int32),
         reflectivity=_LEVELS[np.minimum(levels, _N_LEVELS - 1)].astype(np.float32),
     )
-    return Rebuilt(scene, is_surface)
+    return scene, is_surface
 
 
 def _closed(real: Revolutions) -> tuple[Float64Array, Float64Array, BoolArray]:

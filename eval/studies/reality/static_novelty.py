@@ -27,6 +27,7 @@ CELLS_M = (0.1, 0.2, 0.4)
 # revolutions a half has, whether the sensor moved and where its poses come from is not known.
 REAL_SHARES = (0.061, 0.021, 0.008)
 POSE_ERROR_M, POSE_ERROR_DEG = 0.01, 0.1
+Shares = tuple[float, ...]
 Way = Literal["standing", "driving", "driving, poses off"]
 WAYS: tuple[Way, ...] = ("standing", "driving", "driving, poses off")
 N_REVOLUTIONS = 40
@@ -49,23 +50,6 @@ class Case:
     variant: str
     settings: Sensor
     n_revolutions: int
-
-
-@dataclass(frozen=True, slots=True)
-class Novelty:
-    """Shares of one way of cutting a session in halves.
-
-    Attributes:
-        way: How the sensor moved.
-        variant: Which effects were on.
-        n_revolutions: In both halves together.
-        shares: Share of novel returns for each of `CELLS_M`.
-    """
-
-    way: Way
-    variant: str
-    n_revolutions: int
-    shares: tuple[float, ...]
 
 
 def effect_variants(default: Sensor) -> dict[str, Sensor]:
@@ -94,8 +78,8 @@ def novelty_cases(default: Sensor) -> list[Case]:
     return cases
 
 
-def static_novelty(drive: Drive, case: Case, first: int) -> Novelty:
-    """Return the share of novel returns between two halves of some revolutions of a drive.
+def static_novelty(drive: Drive, case: Case, first: int) -> Shares:
+    """Return the share of novel returns between two halves of some revolutions of a drive, for each of `CELLS_M`.
 
     Args:
         drive: World and way.
@@ -108,8 +92,7 @@ def static_novelty(drive: Drive, case: Case, first: int) -> Novelty:
         halves = np.concatenate(clouds[:half]), np.concatenate(clouds[half:])
     else:
         halves = np.concatenate(clouds[::2]), np.concatenate(clouds[1::2])
-    shares = tuple(novel_shares(halves, CELLS_M).tolist())
-    return Novelty(case.way, case.variant, case.n_revolutions, shares)
+    return tuple(novel_shares(halves, CELLS_M).tolist())
 
 
 def _clouds(drive: Drive, case: Case, numbers: Sequence[int]) -> list[Float64Array]:

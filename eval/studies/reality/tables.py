@@ -18,7 +18,7 @@ from eval.studies.reality.sensor_measures import (
     photons_per_percent,
     return_share,
 )
-from eval.studies.reality.static_novelty import CELLS_M, REAL_SHARES, Novelty
+from eval.studies.reality.static_novelty import CELLS_M, REAL_SHARES, Case, Shares
 
 COLUMNS = ("measure", "where", "unit", "source", "value", "n")
 RANGE_BINS_M = (2.4, 4.0, 6.0, 9.0, 13.0, 20.0, 40.0)
@@ -45,10 +45,10 @@ def surface_rows(revolutions: Revolutions, is_surface: BoolArray, source: str) -
     return pd.DataFrame([row], columns=list(COLUMNS))
 
 
-def novelty_table(results: Sequence[Novelty]) -> pd.DataFrame:
+def novelty_table(results: Sequence[tuple[Case, Shares]]) -> pd.DataFrame:
     """Return one row per simulated session and the real one: way, variant, revolutions, percent new at each cell."""
     real = ("real recording of a static scene (stated)", "", np.nan, REAL_SHARES)
-    sources = [real, *((each.way, each.variant, each.n_revolutions, each.shares) for each in results)]
+    sources = [real, *((case.way, case.variant, case.n_revolutions, shares) for case, shares in results)]
     rows = [(*source, *(100.0 * share for share in shares)) for *source, shares in sources]
     columns = ["way", "variant", "n_revolutions", *(f"new_percent_{cell:g}m" for cell in CELLS_M)]
     return pd.DataFrame(rows, columns=columns)

@@ -29,7 +29,7 @@ def test_rows_of_both_sizes_stand_in_the_table() -> None:
 
 
 def test_real_rows_of_a_small_world(site: ExtractSite) -> None:
-    rows = {row["name"]: row for row in measure(extract_contests([site]))["rows"]}
+    rows = {row["name"]: row for row in measure(dict(extract_contests(site)))["rows"]}
     assert list(rows) == [name.format(1500) for name in NAMES]
     assert all(0 < row["value"] < 5 and (row["unit"], row["n"]) == ("s", 2) for row in rows.values())
     limits = {name: row["rival_value"] for name, row in rows.items() if row["target"] is not None}

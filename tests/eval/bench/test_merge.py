@@ -68,7 +68,7 @@ def test_real_rows_of_a_small_world(site: MergeSite) -> None:
 
 
 def test_rows_of_descriptors_and_query(site: MergeSite) -> None:
-    rows = {row["name"]: row for row in measure(descriptor_contests([site]))["rows"]}
+    rows = {row["name"]: row for row in measure(dict(descriptor_contests(site)))["rows"]}
     limits = {"3deg-tiny-per-scan": 0.1, "sphere-tiny-per-keyframe": 0.003, "query-tiny-per-region": 0.016}
     assert {name: row["rival_value"] for name, row in rows.items()} == limits
     assert all(0 < row["value"] < 1 and row["target"] == 1.0 for row in rows.values())
@@ -78,7 +78,7 @@ def test_all_in_is_descriptors_index_and_merge(site: MergeSite) -> None:
     described = [replace(session, descriptor_s=(1.0, 3.0)) for session in site.sessions]
     fixed = replace(site)  # the same pair, none of its times
     fixed.__dict__.update(sessions=tuple(described), raced=([PARTS, PARTS], [9.0, 9.0]), rival=("told", True))
-    row = make_row("all-in", merge_contests([fixed])["merge-tiny-all-in"]())
+    row = make_row("all-in", dict(merge_contests(fixed))["merge-tiny-all-in"]())
     # 1 + 1 + 2 + 0.5 and 3 + 3 + 2 + 0.5
     assert (row["value"], row["rival_value"], row["spread"]) == (6.5, 9.0, 2.0)
 
@@ -105,7 +105,7 @@ def test_the_time_of_a_merge_that_failed_is_no_figure(
     monkeypatch.setattr(merge_bench, "is_kiss_matcher_installed", lambda: False)
     failing = replace(site)
     failing.__dict__["sessions"] = site.sessions
-    rows = measure(merge_contests([failing]))["rows"]
+    rows = measure(dict(merge_contests(failing)))["rows"]
     assert [row["name"] for row in rows] == ROWS
     assert {(row["value"], row["met"]) for row in rows} == {(None, False)}
     assert [row["target"] for row in rows] == [1.0, 10.0, 1.0, 3.0, None]
@@ -140,7 +140,7 @@ def test_a_rival_that_is_wrong_or_missing_is_told(site: MergeSite, monkeypatch: 
     assert not is_comparable
     # a thousand times slower, and wrong: no target is met by that
     wrong.__dict__["raced"] = ([PARTS, PARTS], [500.0, 500.0])
-    row = make_row("raced", merge_contests([wrong])["merge-tiny-raced"]())
+    row = make_row("raced", dict(merge_contests(wrong))["merge-tiny-raced"]())
     assert (row["rival"], row["ratio"], row["target"], row["met"]) == (name, None, 10.0, None)
     monkeypatch.setattr(merge_bench, "kiss_and_gicp", lambda *clouds: None)
     assert nothing.rival == ("KISS-Matcher at 0.5 m and GICP: not judged, it found nothing", False)
@@ -149,6 +149,6 @@ def test_a_rival_that_is_wrong_or_missing_is_told(site: MergeSite, monkeypatch: 
     monkeypatch.setattr(merge_bench, "is_kiss_matcher_installed", lambda: False)
     told(monkeypatch, np.eye(4))
     monkeypatch.setattr(MergeSite, "missed_m", lambda self, pose: 0.0)
-    row = make_row("raced", merge_contests([missing])["merge-tiny-raced"]())
+    row = make_row("raced", dict(merge_contests(missing))["merge-tiny-raced"]())
     assert row["rival"] == "KISS-Matcher: not installed (extra `kiss`)"
     assert (row["value"], row["ratio"], row["met"], row["n"]) == (0.5, None, None, 2)

@@ -47,7 +47,7 @@ from eval.studies.reality.static_novelty import (
     N_REVOLUTIONS,
     STANDING_NUMBERS,
     Case,
-    Novelty,
+    Shares,
     Way,
     effect_variants,
     novelty_cases,
@@ -208,11 +208,11 @@ def test_rebuilt_scene_gives_a_recording_back_and_closes_small_holes_only(drive:
     holes[0, row, column : column + 2] = 0.0
     holes[0, row, column + 10 : column + 13] = 0.0
     recorded = with_ranges(holes)
-    rebuilt = rebuild(recorded, drive.scene)
-    again = as_revolutions(SENSOR, [cast_at_origin(rebuilt.scene, SENSOR, OFF, 0)])
-    assert rebuilt.is_surface[row, column : column + 2].all()
-    assert not rebuilt.is_surface[row, column + 10 : column + 13].any()
-    np.testing.assert_array_equal(again.is_return[0], rebuilt.is_surface)
+    scene, is_surface = rebuild(recorded, drive.scene)
+    again = as_revolutions(SENSOR, [cast_at_origin(scene, SENSOR, OFF, 0)])
+    assert is_surface[row, column : column + 2].all()
+    assert not is_surface[row, column + 10 : column + 13].any()
+    np.testing.assert_array_equal(again.is_return[0], is_surface)
     seen = recorded.is_return
     error_m = np.abs(again.range_m - range_m)[seen]
     assert np.percentile(error_m, 95) < 0.002
@@ -223,15 +223,15 @@ def test_rebuilt_scene_gives_a_recording_back_and_closes_small_holes_only(drive:
 def test_standing_sensor_without_effects_sees_nothing_new_and_noise_alone_makes_it(drive: Drive) -> None:
     variants = effect_variants(drive.scenario.sensor)
 
-    def found(variant: str, way: Way) -> Novelty:
+    def found(variant: str, way: Way) -> Shares:
         return static_novelty(drive, Case(way, variant, variants[variant], 4), 0)
 
     off, default, driving = found("all off", "standing"), found("default", "standing"), found("all off", "driving")
-    assert off.shares == (0.0, 0.0, 0.0)
-    assert default.shares[0] > default.shares[1] > default.shares[2] > 0.0
-    assert driving.shares[0] > 0.01  # another place samples other voxels
+    assert off == (0.0, 0.0, 0.0)
+    assert default[0] > default[1] > default[2] > 0.0
+    assert driving[0] > 0.01  # another place samples other voxels
     assert default == found("default", "standing")
-    assert found("all off", "driving, poses off").shares[0] > driving.shares[0]
+    assert found("all off", "driving, poses off")[0] > driving[0]
 
 
 def test_no_case_of_novelty_is_the_same_as_another() -> None:
@@ -318,7 +318,7 @@ def test_plots_are_written(tmp_path: Path) -> None:
     revolutions = with_ranges(noisy)
     draw_measures(measured(revolutions, "real"), tmp_path / "a.png")
     draw_scene(revolutions, revolutions, tmp_path / "b.png")
-    results = [Novelty("standing", "default", n, (0.05 / n, 0.02 / n, 0.01 / n)) for n in (4, 8)]
+    results = [(Case("standing", "default", Sensor(), n), (0.05 / n, 0.02 / n, 0.01 / n)) for n in (4, 8)]
     draw_novelty(results, tmp_path / "c.png")
     assert [path.read_bytes()[:4] for path in sorted(tmp_path.iterdir())] == [b"\x89PNG"] * 3
     assert novelty_table(results).iloc[0, -3:].tolist() == pytest.approx([6.1, 2.1, 0.8])
