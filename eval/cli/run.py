@@ -34,6 +34,10 @@ def run_command(
     plan: Annotated[str, typer.Argument(help="name from `list`, or a .yaml file")],
     out: RunOut,
     seeds: Annotated[str | None, typer.Option(metavar="A:B", help="replaces the plan's seeds; B excluded")] = None,
+    preset: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="replaces the plan's variants: a preset or a .yaml file; may be repeated"),
+    ] = None,
     settings: SetSettings = None,
     grid: Annotated[
         list[str] | None,
@@ -51,7 +55,7 @@ def run_command(
     from eval.plans.changes import changed_plan
     from eval.plans.plan import load_plan
 
-    chosen = changed_plan(load_plan(plan), seeds=seeds, settings=settings or (), grid=grid or ())
+    chosen = changed_plan(load_plan(plan), seeds=seeds, presets=preset or (), settings=settings or (), grid=grid or ())
     where = Where(workers, scheduler)
     require_usable(where)
     if dry_run:

@@ -1,4 +1,4 @@
-"""Changes of a plan by the options --seeds, --set and --grid."""
+"""Changes of a plan by the options --seeds, --preset, --set and --grid."""
 
 from __future__ import annotations
 
@@ -17,13 +17,19 @@ from eval.plans.worlds import group_of
 
 
 def changed_plan(
-    plan: Plan, *, seeds: str | None = None, settings: Sequence[str] = (), grid: Sequence[str] = ()
+    plan: Plan,
+    *,
+    seeds: str | None = None,
+    presets: Sequence[str] = (),
+    settings: Sequence[str] = (),
+    grid: Sequence[str] = (),
 ) -> Plan:
-    """Return the plan with the options --seeds, --set and --grid applied.
+    """Return the plan with the options --seeds, --preset, --set and --grid applied.
 
     Args:
         plan: The plan.
         seeds: "A:B", replaces the plan's seeds.
+        presets: Names or files, replace the plan's variants and its own grids.
         settings: `key=value`, written over every variant and every grid point.
         grid: `key=v1,v2`; every variant runs at every combination. The plan's own grids stay. Variants merged by the
             truth get neither settings nor grids of `merge`; variants with regions from the truth get none of `query`
@@ -37,6 +43,8 @@ def changed_plan(
     document = plan.model_dump(mode="json")
     if seeds is not None:
         document["seeds"] = parse_seeds(seeds)
+    if presets:
+        document |= {"variants": [{"preset": name, "set": [], "per_scenario": {}} for name in presets], "grid": []}
     overridden = {key_of(setting) for setting in (*settings, *itertools.chain(*axes))}
     document["variants"] = [
         {

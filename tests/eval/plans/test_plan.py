@@ -186,6 +186,14 @@ def test_command_line_replaces_seeds_and_sets_every_variant(tmp_path: Path) -> N
     }
 
 
+def test_presets_of_the_command_line_replace_the_plan_s_variants_and_grids(tmp_path: Path) -> None:
+    plan = changed_plan(read(tmp_path), presets=["c2c", "voxel-diff"], settings=["query.radius_m=6"])
+    assert {c.variant for c in cells(plan)} == {"c2c[query.radius_m=6]", "voxel-diff[query.radius_m=6]"}
+    assert len(cells(plan)) == 2 * 2 * 2
+    with pytest.raises(InputError, match=r"voxel-dif.*voxel-diff"):
+        changed_plan(plan, presets=["voxel-dif"])
+
+
 def test_every_wrong_value_of_a_grid_is_named(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"= 'x': input should be a valid number.*; extract\.voxel_m = -2: input should"
