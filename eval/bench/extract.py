@@ -97,7 +97,7 @@ class ExtractSite:
 
 @dataclass(frozen=True)
 class Region:
-    """One sphere of both maps, with the steps of the default rule."""
+    """One sphere of both maps; the steps of the default rule are its properties, computed once."""
 
     merged: MergedMaps
     centre_map: Float64Array
@@ -118,14 +118,10 @@ class Region:
         """The before sphere, indexed."""
         return Surface(self.spheres["before"].points)
 
-    def realigned(self) -> Float64Array:
-        """Align the after sphere (4, 4) with the before one."""
-        return realign(self.spheres["after"].points, self.centre_map, self.before_surface)
-
     @cached_property
     def correction(self) -> Float64Array:
-        """Result of `realigned`."""
-        return self.realigned()
+        """(4, 4) alignment of the after sphere with the before one."""
+        return realign(self.spheres["after"].points, self.centre_map, self.before_surface)
 
     @cached_property
     def after_points(self) -> Float64Array:
@@ -135,14 +131,11 @@ class Region:
     @cached_property
     def tables(self) -> tuple[PlaneTable, PlaneTable]:
         """The before and the after sphere, indexed and with a plane for each cell."""
-        return self.index()
-
-    def index(self) -> tuple[PlaneTable, PlaneTable]:
-        """Index both spheres."""
         return PlaneTable(Surface(self.spheres["before"].points)), PlaneTable(Surface(self.after_points))
 
-    def compare(self) -> tuple[tuple[Int64Array, float], tuple[Int64Array, float]]:
-        """Return the candidates of the after and of the before sphere, and how well they agree with the other one."""
+    @cached_property
+    def compared(self) -> tuple[tuple[Int64Array, float], tuple[Int64Array, float]]:
+        """The candidates of the after and of the before sphere, and how well they agree with the other one."""
         before, after = self.tables
         return find_candidates(self.after_points, before), find_candidates(self.spheres["before"].points, after)
 
@@ -161,15 +154,16 @@ class Region:
         in_map = self.spheres["after"].points[members]
         return self.crops.near("after", in_map, SITE_M), self.crops.near("before", in_map, SITE_M + RIM_M)
 
+    @cached_property
     def pools(self) -> tuple[ReturnPool, ReturnPool]:
-        """Read the returns at the site from both sessions."""
+        """The returns at the site, read from both sessions."""
         own, others = self.site
         return ReturnPool(self.merged.after, [own]), ReturnPool(self.merged.before, [others])
 
     @cached_property
     def returns(self) -> tuple[Int64Array, Int64Array]:
         """Returns of the after and of the before session at the site."""
-        (own, others), (own_pool, other_pool) = self.site, self.pools()
+        (own, others), (own_pool, other_pool) = self.site, self.pools
         return own_pool.of(own), other_pool.of(others)
 
     def look_closely(self, config: ExtractConfig) -> list[Int64Array]:
@@ -181,11 +175,6 @@ class Region:
         noise_m = max(median_m for _, median_m in self.compared)
         rays = partial(collect_rays, self.merged, "before", others, ends, self.correction)
         return find_object_cells(site, free_space_votes(site.points, _views(self.merged)), rays, noise_m, config)
-
-    @cached_property
-    def compared(self) -> tuple[tuple[Int64Array, float], tuple[Int64Array, float]]:
-        """Result of `compare`."""
-        return self.compare()
 
 
 def extract_sites() -> tuple[ExtractSite, ExtractSite]:
@@ -202,15 +191,21 @@ def extract_contests(site: ExtractSite) -> Iterator[tuple[str, Callable[[], Cont
     yield f"extract-voxel-{size}", partial(_voxel, site, ("after",))
     yield f"extract-voxel-{size}-both", partial(_voxel, site, ("after", "before"))
     steps: dict[str, tuple[Callable[[Region], object], float | None]] = {
-        "": (Region.compare, site.surface_s),
-        "-crop": (lambda region: region.crops.around(region.centre_map, region.radius_m), None),
-        "-index": (Region.index, None),
-        "-realign": (Region.realigned, _REALIGN_LIMIT_S),
-        "-returns": (Region.pools, None),
+        "": (_compute_again("compared"), site.surface_s),
+        "-crop": (_compute_again("spheres"), None),
+        "-index": (_compute_again("tables"), None),
+        "-realign": (_compute_again("correction"), _REALIGN_LIMIT_S),
+        "-returns": (_compute_again("pools"), None),
         "-site": (lambda region: region.look_closely(site.config.extract), None),
     }
     for name, (step, limit_s) in steps.items():
         yield f"extract-surface-{size}{name}", partial(_step, site, step, limit_s)
+
+
+def _compute_again(name: str) -> Callable[[Region], object]:
+    """Return the step behind a cached property."""
+    step: Callable[[Region], object] = vars(Region)[name].func
+    return step
 
 
 def _step(site: ExtractSite, step: Callable[[Region], object], limit_s: float | None) -> Contest:

@@ -36,7 +36,7 @@ def dataset(
     from eval.training.dataset_run import make_dataset
 
     recipe = Recipe(draws, error_m, error_deg, tuple(settings or ()))
-    with shown_progress(quiet) as progress:
+    with shown_progress(quiet, rate="tunnels") as progress:
         command, where = shlex.join(["tunnelcd", *sys.argv[1:]]), Where(workers, scheduler)
         outcome = make_dataset(families, seeds, recipe, out, where, limit, command, progress)
     left = f", {outcome.n_left} left by --limit" if outcome.n_left else ""

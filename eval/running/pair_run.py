@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from cdpipe.descriptors import checkpoint_digest, sphere_digest, use_threads
 from cdpipe.io.answer import write_answer, write_failure
 from cdpipe.merge.global_registration import is_kiss_matcher_installed
 from cdpipe.model.config import MapConfig
-from cdpipe.pipeline import Merge, OnStage, Propose
+from cdpipe.pipeline import OnStage
 from eval.core.domains import domain_of
 from eval.core.output import whole_file
 from eval.core.progress import RunProgress
@@ -30,7 +31,7 @@ from eval.oracles.merge import merged_by_truth
 from eval.oracles.regions import regions_by_truth
 from eval.plans.variants import Cell
 from eval.running.rescoring import cell_document
-from eval.running.runfolder import RunFolder, remove
+from eval.running.runfolder import RunFolder, remove, write_json
 from eval.running.stage_cache import open_cache
 from eval.running.stages import PairStages
 from eval.scoring.scoring import METRICS_VERSION, CaseScore, score_stored
@@ -177,7 +178,7 @@ class PairRun:
         is_contended |= self._made.is_contended
         told = {"pair_kind": pair.kind, "commit": self._made.commit, "is_contended": is_contended}
         path = self._run.cell(pair.name, pair.seed, cell.variant)
-        self._run.write_cell(path, cell_document(score, {**names, **told}, each.key, each.place))
+        write_json(path, cell_document(score, {**names, **told}, each.key, each.place))
 
 
 def is_finished(run: RunFolder, each: Todo) -> bool:
@@ -267,9 +268,12 @@ def _write_maps(path: Path, stages: PairStages) -> None:
 
 
 def _answer(stages: PairStages, cell: Cell, truth: GroundTruth, folder: Path) -> None:
-    settings = cell.config.model_dump(mode="json")
+    settings, noise, sessions = cell.config.model_dump(mode="json"), cell.oracle, (truth.before, truth.after)
+    # the stages get what oracles make of the truth, and never the truth
+    merge = None if noise is None else partial(merged_by_truth, truth=sessions, noise=noise, seed=cell.seed)
+    propose = partial(regions_by_truth, truth, config=cell.config.query) if cell.oracle_regions else None
     try:
-        report = stages.answer(cell.config, _oracle(cell, truth), _true_regions(cell, truth), cell.until)
+        report = stages.answer(cell.config, merge, propose, cell.until)
     except MergeFailedError as error:
         measured = error.evidence, settings, cell.until, error.seconds
         write_failure(folder, cell.variant, "merge_refused", str(error), *measured)
@@ -277,21 +281,6 @@ def _answer(stages: PairStages, cell: Cell, truth: GroundTruth, folder: Path) ->
         write_failure(folder, cell.variant, "failed", str(error), {}, settings, cell.until)
     else:
         write_answer(folder, cell.variant, report, cell.until)
-
-
-def _oracle(cell: Cell, truth: GroundTruth) -> Merge | None:
-    """Return the oracle's merge; the stages get its result and never the truth."""
-    noise = cell.oracle
-    if noise is None:
-        return None
-    return lambda before, after: merged_by_truth(before, after, (truth.before, truth.after), noise, cell.seed)
-
-
-def _true_regions(cell: Cell, truth: GroundTruth) -> Propose | None:
-    """Return the oracle's regions; the later stages get these and never the truth."""
-    if not cell.oracle_regions:
-        return None
-    return lambda scans: regions_by_truth(truth, scans, cell.config.query)
 
 
 def _unmade(pair: Pair, status: str, error: str) -> CaseScore:

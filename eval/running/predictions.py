@@ -23,7 +23,7 @@ from eval.plans.coverage import plan_of
 from eval.plans.plan import planned_cases
 from eval.plans.variants import slug
 from eval.running.rescoring import LAST, NO_KEY, cell_document, foreign_identity
-from eval.running.runfolder import RunFolder, remove, write_tables
+from eval.running.runfolder import RunFolder, remove, write_json, write_tables
 from eval.running.sides import list_versions
 from eval.scoring.scoring import METRICS_VERSION, score_stored
 from eval.truth.ground_truth import load_ground_truth
@@ -64,7 +64,7 @@ def add_predictions(run: RunFolder, folder: Path, name: str, progress: RunProgre
     for pair, document in documents.items():
         scenario, seed = document["row"]["scenario"], int(pair.name)
         _copy(found[pair], run.answer(scenario, seed, name))
-        run.write_cell(run.cell(scenario, seed, name), document)
+        write_json(run.cell(scenario, seed, name), document)
     progress.cells("done", len(documents), len(documents))
     write_tables(run)
     return len(documents)
@@ -143,8 +143,7 @@ def _require_free(run: RunFolder, name: str) -> None:
 
 def _require_current(run: RunFolder) -> None:
     """Refuse a run that was scored by another metrics version."""
-    cells = (run.read_cell(path) for path in sorted(run.path.glob("cells/*/*/*.json")))
-    others = list_versions(cell["row"] for cell in cells if cell is not None) - {str(METRICS_VERSION)}
+    others = list_versions(cell["row"] for cell in run.finished_cells()) - {str(METRICS_VERSION)}
     if others:
         told = " and ".join(sorted(others))
         raise InputError(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from eval.core.progress import RunProgress, Silent
-from eval.running.runfolder import IDENTITY, ITEM_TABLES, RunFolder, write_tables
+from eval.running.runfolder import IDENTITY, ITEM_TABLES, RunFolder, write_json, write_tables
 from eval.scoring.scoring import CaseScore, score_stored
 from eval.truth.ground_truth import load_ground_truth
 
@@ -62,7 +62,7 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
             progress.cells("{scenario} {seed} {variant}".format(**identity), len(documents), len(folders))
             documents[path] = cell_document(score_stored(truth, folder), identity, key, place)
     for path, document in documents.items():
-        run.write_cell(path, document)
+        write_json(path, document)
     progress.cells("done", len(documents), len(documents))
     write_tables(run)
     return len(documents)

@@ -63,7 +63,7 @@ def read_run(run: Path) -> RunData:
     absent = [name for name in REQUIRED if name not in results[0]]
     if absent:
         raise InputError(f"{path}: column {', '.join(absent)} is missing: expected a table written by `tunnelcd run`")
-    _require_cases(path, results)
+    _require_cases(path, pd.DataFrame(results))
     missing: list[str] = []
     items = {name: _optional_rows(table_file(run / f"{name}.csv"), missing) for name in ("changes", "regions")}
     provenance = _optional_json(run / "provenance.json", missing)
@@ -98,22 +98,6 @@ def covered_by(data: RunData) -> Coverage:
     """Return how much of its plan a run holds."""
     cases = ((str(row["scenario"]), int(row["seed"]), str(row["variant"])) for row in data.results)
     return coverage(data.provenance, cases)
-
-
-def _require_cases(path: Path, rows: Iterable[Row]) -> None:
-    """Refuse rows without a valid seed and repeated cases: every mean would be wrong."""
-    seen = set()
-    for line, row in enumerate(rows, start=2):
-        try:
-            seed = int(row["seed"])
-        except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"{path}:{line}: seed = {row['seed']}: expected a whole number") from error
-        if float(row["seed"]) != seed:
-            raise InputError(f"{path}:{line}: seed = {row['seed']}: expected a whole number")
-        case = (text(row, "scenario"), seed, text(row, "variant"))
-        if case in seen:
-            raise InputError(f"{path}:{line}: {case[0]}, seed {case[1]}, {case[2]} stands there twice")
-        seen.add(case)
 
 
 def number(row: Row, column: str) -> float:
@@ -286,6 +270,19 @@ def _sorted(values: set[str]) -> tuple[str, ...]:
             return 1, 0.0, value
 
     return tuple(sorted(values, key=order))
+
+
+def _require_cases(path: Path, results: pd.DataFrame) -> None:
+    """Refuse rows without a valid seed and repeated cases: every mean would be wrong."""
+    for line, seed in enumerate(results["seed"], start=2):
+        if not float(pd.to_numeric(seed, errors="coerce")).is_integer():
+            raise InputError(f"{path}:{line}: seed = {seed}: expected a whole number")
+    is_repeated = results.duplicated(["scenario", "seed", "variant"]).to_numpy()
+    if is_repeated.any():
+        index = int(np.argmax(is_repeated))
+        row = results.iloc[index]
+        case = f"{row['scenario']}, seed {int(row['seed'])}, {row['variant']}"
+        raise InputError(f"{path}:{index + 2}: {case} stands there twice")
 
 
 def _rows(path: Path) -> tuple[Row, ...]:

@@ -75,6 +75,11 @@ class RunFolder:
         """Folder of what the stages of a pair gave."""
         return self.path / "stages" / world_slug(scenario) / str(seed)
 
+    def finished_cells(self) -> list[dict[str, Any]]:
+        """Return every finished cell, by its path."""
+        cells = (self.read_cell(path) for path in sorted(self.path.glob("cells/*/*/*.json")))
+        return [cell for cell in cells if cell is not None]
+
     def answer_folders(self) -> Iterator[Path]:
         """Yield the folder of every stored answer, sorted."""
         yield from sorted(file.parent for file in self.path.glob("answers/*/*/*/answer.json"))
@@ -87,10 +92,6 @@ class RunFolder:
             return None
         whole = isinstance(document, dict) and {"key", "order", "row", *ITEM_TABLES} <= set(document)
         return document if whole else None
-
-    def write_cell(self, path: Path, document: Mapping[str, Any]) -> None:
-        """Write a finished cell; it appears whole or not at all."""
-        write_json(path, document)
 
     def provenance(self) -> dict[str, Any]:
         """Read provenance.json.
@@ -163,8 +164,7 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     Raises:
         InputError: No cell is finished.
     """
-    cells = [run.read_cell(path) for path in sorted(run.path.glob("cells/*/*/*.json"))]
-    whole = [cell for cell in cells if cell is not None]
+    whole = run.finished_cells()
     if not whole:
         raise InputError(f"{run.path}: no finished cell: run a plan first")
     whole.sort(key=lambda cell: (cell["order"][0], cell["row"]["scenario"], cell["row"]["seed"], cell["order"][1]))

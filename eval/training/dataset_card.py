@@ -30,7 +30,8 @@ def write_card(out: Path) -> None:
     Raises:
         InputError: A shard is damaged.
     """
-    rows = [*(_shard_row(path) for path in out.glob(f"*{SUFFIX}")), *_refused_rows(out)]
+    rows = [_shard_row(path) for path in out.glob(f"*{SUFFIX}")]
+    rows += [_refused_row(path) for path in out.glob("*.refused.json")]
     rows.sort(key=lambda row: (row["family"], row["seed"]))
     with whole_file(out / "index.csv") as partial:
         pd.DataFrame(rows, columns=list(INDEX_COLUMNS)).to_csv(partial, index=False)
@@ -137,28 +138,20 @@ def _shard_row(path: Path) -> Row:
     about, content = read_about(path), path.read_bytes()
     try:
         return {
-            "family": about["family"],
-            "seed": about["seed"],
+            **{name: about[name] for name in ("family", "seed", "digest", "score_radius_m")},
+            **{name: about["counts"][name] for name in COUNTS},
             "split": split_of(about["seed"]),
             "status": "ok",
             "shard": path.name,
-            **{name: about["counts"][name] for name in COUNTS},
-            "score_radius_m": about["score_radius_m"],
             "bytes": len(content),
             "sha256": hashlib.sha256(content).hexdigest(),
-            "digest": about["digest"],
             "reason": "",
         }
     except KeyError as error:
         raise InputError(f"{path}: damaged: its metadata lacks {error}: remove it and run the command again") from error
 
 
-def _refused_rows(out: Path) -> list[Row]:
-    rows = []
-    for path in out.glob("*.refused.json"):
-        about = json.loads(path.read_text())
-        row = dict.fromkeys(INDEX_COLUMNS, "")
-        row |= {"status": "refused", "split": split_of(about["seed"])}
-        row |= {name: about[name] for name in ("family", "seed", "digest", "reason")}
-        rows.append(row)
-    return rows
+def _refused_row(path: Path) -> Row:
+    about = json.loads(path.read_text())
+    told = {name: about[name] for name in ("family", "seed", "digest", "reason")}
+    return {**dict.fromkeys(INDEX_COLUMNS, ""), **told, "status": "refused", "split": split_of(about["seed"])}

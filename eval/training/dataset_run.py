@@ -19,7 +19,7 @@ from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.training.shard import FORMAT, FORMAT_VERSION, SUFFIX, read_about
 from eval.core.cluster import HERE, Where, connected, n_slots, require_usable
 from eval.core.output import make_writable, whole_file
-from eval.core.progress import RunProgress, Silent, duration
+from eval.core.progress import RunProgress, Silent
 from eval.plans.plan import parse_seeds_option
 from eval.plans.worlds import world_slug
 from eval.running.runfolder import write_json
@@ -82,7 +82,7 @@ def make_dataset(
         where: Where to compute.
         limit: Compute at most this many tunnels.
         command: For the data card.
-        progress: Receives the rate in keyframe pairs per second and the time left.
+        progress: Receives each tunnel and its number of keyframe pairs.
 
     Raises:
         InputError: A family, the seeds, the folder or the scheduler is wrong.
@@ -94,14 +94,20 @@ def make_dataset(
     _take_folder(out, recipe, command)
     missing = [tunnel for tunnel in tunnels if not _is_done(out, tunnel)]
     todo = missing[:limit]
-    pace = _Pace(progress, len(todo))
+    start, n_pairs = time.perf_counter(), []
+    if todo:
+        progress.cells("the first tunnel", 0, len(todo))
     try:
         for tunnel in todo:
             (out / tunnel.file).unlink(missing_ok=True)  # of another digest: not to be read while it is made anew
         with closing(_computed(todo, recipe, where)) as results:
-            for tunnel, result in results:
+            for n_done, (tunnel, result) in enumerate(results, start=1):
                 _keep(out, tunnel, result)
-                pace.tell(tunnel, out)
+                told = "refused"
+                if isinstance(result, bytes):
+                    n_pairs.append(int(read_about(out / tunnel.file)["counts"]["n_before"]))
+                    told = f"{n_pairs[-1]} keyframe pairs"
+                progress.cells(f"{tunnel.family} {tunnel.seed}: {told}", n_done, len(todo))
     finally:
         if is_new and [path.name for path in out.iterdir()] == ["dataset.json"]:
             # no tunnel was made, e.g. where a scheduler cannot be reached: leave nothing behind
@@ -111,8 +117,8 @@ def make_dataset(
         else:
             write_card(out)
     n_refused = sum((out / tunnel.refusal).is_file() for tunnel in tunnels)
-    n_kept = len(tunnels) - len(missing)
-    return DatasetOutcome(pace.n_made, n_kept, n_refused, len(missing) - len(todo), pace.n_pairs, pace.seconds)
+    n_kept, seconds = len(tunnels) - len(missing), time.perf_counter() - start
+    return DatasetOutcome(len(n_pairs), n_kept, n_refused, len(missing) - len(todo), sum(n_pairs), seconds)
 
 
 def _tunnels(families: Sequence[str], seeds: str, recipe: Recipe) -> list[Tunnel]:
@@ -191,36 +197,6 @@ def _keep(out: Path, tunnel: Tunnel, result: bytes | str) -> None:
     with whole_file(out / tunnel.file) as partial:
         partial.write_bytes(result)
     (out / tunnel.refusal).unlink(missing_ok=True)
-
-
-class _Pace:
-    """Reports the rate at which tunnels are made."""
-
-    def __init__(self, progress: RunProgress, n_todo: int) -> None:
-        self._progress = progress
-        self._n_todo = n_todo
-        self._start = time.perf_counter()
-        self._n_done = self.n_made = self.n_pairs = 0
-        if n_todo:
-            progress.cells("the first tunnel", 0, n_todo)
-
-    @property
-    def seconds(self) -> float:
-        """Wall-clock seconds so far."""
-        return time.perf_counter() - self._start
-
-    def tell(self, tunnel: Tunnel, out: Path) -> None:
-        """Count a finished tunnel and report the mean rate, with the time of refused tunnels included."""
-        self._n_done += 1
-        told = "refused"
-        if (out / tunnel.file).is_file():
-            n_pairs = int(read_about(out / tunnel.file)["counts"]["n_before"])
-            self.n_made += 1
-            self.n_pairs += n_pairs
-            told = f"{n_pairs} pairs"
-        left_s = self.seconds / self._n_done * (self._n_todo - self._n_done)
-        rate = f"{self.n_pairs / self.seconds:.1f} keyframe pairs/s, {duration(left_s)} left"
-        self._progress.cells(f"{tunnel.family} {tunnel.seed}: {told}; {rate}", self._n_done, self._n_todo)
 
 
 def _attempt(tunnel: Tunnel, recipe: Recipe) -> bytes | str:

@@ -80,7 +80,7 @@ def run(tmp_path: Path, tiny_pair: Path) -> RunFolder:
             "objects": [],
             "keyframes": [],
         }
-        folder.write_cell(folder.cell("tiny/pair", seed, "ours"), cell)
+        write_json(folder.cell("tiny/pair", seed, "ours"), cell)
     return folder
 
 
@@ -146,7 +146,7 @@ def test_rows_of_other_metrics_are_scored_again_first(
     cell = run.read_cell(path)
     assert cell is not None
     cell["row"]["metrics_version"] = METRICS_VERSION - 1
-    run.write_cell(path, cell)
+    write_json(path, cell)
     code, _, err = command("score", run.path, "--predictions", tmp_path / "mine", "--as", "theirs")
     assert (
         code == 2

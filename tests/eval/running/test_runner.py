@@ -24,7 +24,7 @@ from eval.plans.plan import Plan, cells, load_plan
 from eval.running import pair_run
 from eval.running.pair_run import Tools
 from eval.running.rescoring import rescore
-from eval.running.runfolder import RunFolder, open_run_folder, remove, start_run_folder, write_tables
+from eval.running.runfolder import RunFolder, open_run_folder, remove, start_run_folder, write_json, write_tables
 from eval.running.runner import RunOutcome, run_plan
 from eval.running.stages import time_parts
 from eval.truth.adapters import pipeline_input
@@ -194,7 +194,7 @@ def test_another_version_of_the_metrics_redoes_all(smoke_copy: RunFolder, runner
     for path in smoke_copy.path.glob("cells/*/*/*.json"):
         document = json.loads(path.read_text())
         document["row"]["metrics_version"] -= 1
-        smoke_copy.write_cell(path, document)
+        write_json(path, document)
     assert runner.run(smoke_copy.path, load_plan("smoke"), limit=1)[1] == RunOutcome(1, 0, 7)
     # what is stale is in no table
     assert len(table(smoke_copy)) == 1
