@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -25,11 +24,3 @@ Scheduler = Annotated[
     str | None,
     typer.Option(metavar="tcp://HOST:PORT", help="compute on this Dask cluster instead", show_default=False),
 ]
-
-
-class ShownViews(Enum):
-    """Which pairs of a run get a 3-D view (`eval.report.site.views.Views`)."""
-
-    chosen = "chosen"
-    none = "none"
-    all = "all"

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from eval.cli.options import Quiet, RunOut, Scheduler, SetSettings, ShownViews, Workers
+from eval.cli.options import Quiet, RunOut, Scheduler, SetSettings, Workers
 from eval.cli.printed_results import print_comparison, print_results
 from eval.core.printing import print_row, say
 from eval.core.progress import shown_progress
@@ -120,8 +120,9 @@ def report(
         typer.Option("--out", help="folder of a comparison; else the second run's", show_default=False),
     ] = None,
     views: Annotated[
-        ShownViews, typer.Option(help="3-D views beside the page: of the first and the worst pairs, none, or all")
-    ] = ShownViews.chosen,
+        Literal["chosen", "none", "all"],
+        typer.Option(help="3-D views beside the page: of the first and the worst pairs, none, or all"),
+    ] = "chosen",
     quiet: Quiet = False,
 ) -> None:
     """Write one offline page with tables, plots and pictures of a run; or of the differences between two runs."""
@@ -133,7 +134,7 @@ def report(
 
         if out is not None:
             raise InputError("--out: the page of a run lies in its folder: leave --out to a comparison")
-        typer.echo(f"page: {write_page(open_run_folder(Path(folder)).path, views.value)}")
+        typer.echo(f"page: {write_page(open_run_folder(Path(folder)).path, views)}")
         return
     if other is not None and against is not None:
         raise InputError(f"--against {against}: a second run is named too: write {folder}:{against} {other} instead")

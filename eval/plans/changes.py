@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import yaml
@@ -75,11 +74,6 @@ def _additions(
 
 def _refuse_mistakes(seeds: str | None, settings: Sequence[str], grid: Sequence[str]) -> None:
     """Check every option and raise all mistakes at once."""
-    checks: list[tuple[str, Callable[[], object]]] = []
-    if seeds is not None:
-        checks.append((f"--seeds {seeds}", partial(parse_seeds, seeds)))
-    checks += [(f"--set {setting}", partial(valid_setting, setting)) for setting in settings]
-    checks += [(f"--grid {text}", partial(_check_axis, text)) for text in grid]
     axes = [key_of(text) for text in grid if "=" in text]
     keys = [*axes, *{key_of(setting) for setting in settings}]
     mistakes = [
@@ -87,11 +81,17 @@ def _refuse_mistakes(seeds: str | None, settings: Sequence[str], grid: Sequence[
         for key in dict.fromkeys(axes)
         if keys.count(key) > 1
     ]
-    for option, check in checks:
-        try:
-            check()
-        except ValueError as error:
-            mistakes.append(f"{option}: {error}")
+    options: list[tuple[str, Callable[[str], object], Sequence[str]]] = [
+        ("--seeds", parse_seeds, [] if seeds is None else [seeds]),
+        ("--set", valid_setting, settings),
+        ("--grid", _check_axis, grid),
+    ]
+    for option, check, texts in options:
+        for text in texts:
+            try:
+                check(text)
+            except ValueError as error:
+                mistakes.append(f"{option} {text}: {error}")
     if mistakes:
         raise InputError("\n".join(mistakes))
 

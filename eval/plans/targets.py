@@ -79,7 +79,7 @@ class Targets(Settings):
 
     def share(self, pair_kind: str) -> float | None:
         """Return which share of the pairs of a kind must do what it asks for; None where no target is set."""
-        return next((value for kind, value in self.merge.items() if kind == pair_kind), None)
+        return {str(kind): value for kind, value in self.merge.items()}.get(pair_kind)
 
     def shown_method(self, variants: Sequence[str]) -> str:
         """Return the variant whose cases are shown: the method, else the first that is no oracle, else the first."""

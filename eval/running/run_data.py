@@ -20,7 +20,7 @@ from eval.plans.coverage import Coverage, coverage
 from eval.plans.targets import targets_of
 from eval.plans.worlds import references
 from eval.running.runfolder import RunFolder
-from eval.tables.rows import with_domain
+from eval.tables.rows import records, with_domain
 
 Row = Mapping[str, Any]
 REQUIRED = ("scenario", "seed", "variant", "status")
@@ -64,9 +64,18 @@ def read_run(run: Path) -> RunData:
     if absent:
         raise InputError(f"{path}: column {', '.join(absent)} is missing: expected a table written by `tunnelcd run`")
     _require_cases(path, pd.DataFrame(results))
-    missing: list[str] = []
-    items = {name: _optional_rows(table_file(run / f"{name}.csv"), missing) for name in ("changes", "regions")}
-    provenance = _optional_json(run / "provenance.json", missing)
+    missing = []
+    items: dict[str, tuple[Row, ...]] = {"changes": (), "regions": ()}
+    for name in items:
+        if (path := table_file(run / f"{name}.csv")).is_file():
+            items[name] = _rows(path)
+        else:
+            missing.append(f"{path.name} is not in the run folder: what it would show is left out.")
+    provenance = read_document(run / "provenance.json")
+    if not provenance:
+        missing.append(
+            "provenance.json is not in the run folder or damaged: machine, command and versions are unknown."
+        )
     return RunData(RunFolder(run), results, items["changes"], items["regions"], provenance, tuple(missing))
 
 
@@ -292,18 +301,4 @@ def _rows(path: Path) -> tuple[Row, ...]:
         return ()
     except (OSError, EOFError, lzma.LZMAError, UnicodeDecodeError, pd.errors.ParserError) as error:
         raise InputError(f"{path}: cannot be read as a table: {error}") from error
-    return tuple({str(key): value for key, value in row.items()} for row in frame.to_dict("records"))
-
-
-def _optional_rows(path: Path, missing: list[str]) -> tuple[Row, ...]:
-    if not path.is_file():
-        missing.append(f"{path.name} is not in the run folder: what it would show is left out.")
-        return ()
-    return _rows(path)
-
-
-def _optional_json(path: Path, missing: list[str]) -> Mapping[str, Any]:
-    document = read_document(path)
-    if not document:
-        missing.append(f"{path.name} is not in the run folder or damaged: machine, command and versions are unknown.")
-    return document
+    return tuple(records(frame))

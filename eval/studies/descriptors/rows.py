@@ -9,7 +9,7 @@ show.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from time import thread_time
 from typing import Any, get_args
@@ -22,7 +22,7 @@ from cdpipe.descriptors import checkpoint_digest, describe_map, describe_scan, r
 from cdpipe.mapping.mapping import build_map
 from cdpipe.merge.merge import merge_maps
 from cdpipe.model.config import DescriptorConfig, PipelineConfig, load_config
-from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, PosedScan, ScanSource
+from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, ScanSource
 from cdpipe.query.query import find_regions
 from eval.core.ranking import auroc
 from eval.core.statistics import mean, median
@@ -36,14 +36,7 @@ SPHERE = "sphere"
 METHODS: tuple[str, ...] = get_args(DescriptorConfig.model_fields["method"].annotation)
 PRECISIONS: tuple[str, ...] = get_args(DescriptorConfig.model_fields["precision"].annotation)
 Row = dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Described:
-    """The keyframes of one session by one descriptor of scans, and the seconds each took."""
-
-    descriptors: DescriptorSet
-    seconds: Float64Array
+Described = tuple[DescriptorSet, Float64Array]
 
 
 def measure_pair(pair: Path) -> list[Row]:
@@ -63,38 +56,44 @@ def measure_pair(pair: Path) -> list[Row]:
     described = {name: describe_keyframes(sources[name], maps[name], METHODS) for name in SESSIONS}
     rows = [measure_scans(method, described["before"][method], described["after"][method], truth) for method in METHODS]
     method = config.descriptor.method
-    mapped = [MappedSession(maps[name], described[name][method].descriptors) for name in SESSIONS]
+    mapped = [MappedSession(maps[name], described[name][method][0]) for name in SESSIONS]
     merged = merge_maps(mapped[0], mapped[1], config.merge)
     return rows + measure_spheres(merged, mapped[0].descriptors, mapped[1].descriptors, truth, config)
 
 
 def describe_keyframes(source: ScanSource, thin_map: PointMap, methods: Iterable[str]) -> Mapping[str, Described]:
-    """Describe every keyframe of a session by several descriptors of scans, reading each scan once."""
+    """Describe every keyframe of a session by several descriptors of scans, reading each scan once.
+
+    Returns:
+        By method, the descriptors and the seconds that each keyframe took.
+    """
     configs = {method: DescriptorConfig(method=method) for method in methods}
     parts: dict[str, list[tuple[Any, Any, float]]] = {method: [] for method in configs}
     for index in thin_map.keyframe_scans.tolist():
         scan = source.scan(index)
         for method, config in configs.items():
-            parts[method].append(_timed(scan, config))
+            start = thread_time()
+            q, w = describe_scan(scan, config)
+            parts[method].append((q, w, thread_time() - start))
     found = {}
     for method, config in configs.items():
-        q, w, seconds = zip(*parts[method], strict=True)
-        vectors = np.stack(q), np.stack(w), thin_map.keyframe_scans, method, checkpoint_digest(config)
-        found[method] = Described(DescriptorSet(*vectors), np.array(seconds))
+        qs, ws, seconds = zip(*parts[method], strict=True)
+        vectors = np.stack(qs), np.stack(ws), thin_map.keyframe_scans, method, checkpoint_digest(config)
+        found[method] = DescriptorSet(*vectors), np.array(seconds)
     return found
 
 
 def measure_scans(method: str, before: Described, after: Described, truth: GroundTruth) -> Row:
     """Return what a descriptor of scans recognises, and its price; its vectors are q and w, kept with a pose each."""
-    world_T_before = truth.before.world_T_sensor[before.descriptors.keyframe_scans]
-    world_T_after = truth.after.world_T_sensor[after.descriptors.keyframe_scans]
+    (own, own_s), (other, other_s) = before, after
+    poses = truth.before.world_T_sensor[own.keyframe_scans], truth.after.world_T_sensor[other.keyframe_scans]
     return {
         "descriptor": method,
-        "precision": before.descriptors.q.dtype.name,
+        "precision": own.q.dtype.name,
         "status": "ok",
-        "bytes_per_keyframe": POSE_BYTES + _bytes_each(before.descriptors.q) + _bytes_each(before.descriptors.w),
-        "ms_per_keyframe": 1000 * float(np.median([*before.seconds, *after.seconds])),
-        **score_places(before.descriptors, after.descriptors, world_T_before, world_T_after),
+        "bytes_per_keyframe": POSE_BYTES + _bytes_each(own.q) + _bytes_each(own.w),
+        "ms_per_keyframe": 1000 * float(np.median([*own_s, *other_s])),
+        **score_places(own, other, *poses),
     }
 
 
@@ -199,12 +198,6 @@ def score_places(
 
 def _heading_rad(poses: Float64Array) -> Float64Array:
     return np.asarray(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
-
-
-def _timed(scan: PosedScan, config: DescriptorConfig) -> tuple[Any, Any, float]:
-    start = thread_time()
-    q, w = describe_scan(scan, config)
-    return q, w, thread_time() - start
 
 
 def _bytes_each(vectors: Any) -> int:

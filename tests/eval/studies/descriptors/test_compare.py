@@ -68,7 +68,7 @@ def test_places_are_those_of_describe_scans(tiny_pair: Path) -> None:
         describe_keyframes(pipeline_input(tiny_pair, name), mapped.map, ("3deg",))["3deg"]
         for name, mapped in zip(SESSIONS, (before, after), strict=True)
     ]
-    assert [len(each.seconds) for each in described] == [len(before.map.keyframe_scans), len(after.map.keyframe_scans)]
+    assert [len(seconds) for _, seconds in described] == [len(before.map.keyframe_scans), len(after.map.keyframe_scans)]
     row = measure_scans("3deg", *described, truth)
     assert {name: row[name] for name in expected} == pytest.approx(
         expected, abs=1e-4
