@@ -19,7 +19,7 @@ from eval.core.statistics import ENOUGH_PAIRS
 from eval.report.compared_columns import COMPARED
 from eval.report.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare
 from eval.report.render import rendered, written
-from eval.report.settings.charts import Effect, effect_chart
+from eval.report.settings.charts import effect_chart
 from eval.report.settings.effects import signed
 from eval.report.tables import Cell, Picture, Table
 from eval.running.sides import Side, cautions, only_in, short_names, why_no_times
@@ -149,19 +149,14 @@ def detail_tables(table: pd.DataFrame) -> list[Table]:
 
 def picture(table: pd.DataFrame) -> Picture | None:
     """Return the differences of up to three main figures with their intervals; None where none of them differs."""
-    rows = [row for row in _records(table) if row["scope"] == "domain" and not math.isnan(row["low"])]
-    differ = {row["metric"] for row in rows if row["verdict"] != SAME}
+    names = [spaced(row["name"]) for row in _records(table)]
+    rows = table.assign(setting=names, variant=table["where"].map(domain_name))
+    rows = rows[(rows["scope"] == "domain") & rows["low"].notna()]
+    differ = set(rows["metric"][rows["verdict"] != SAME])
     drawn = [key for key in _DRAWN if key in differ][:_MAX_DRAWN]
     if not drawn:
         return None
-    panels = {
-        _COLUMNS[key].heading: [
-            Effect(spaced(row["name"]), domain_name(row["where"]), row["difference"], row["low"], row["high"])
-            for row in rows
-            if row["metric"] == key
-        ]
-        for key in drawn
-    }
+    panels = {_COLUMNS[key].heading: rows[rows["metric"] == key] for key in drawn}
     caption = "Dots are means of B \u2212 A over session pairs, lines their 95 % intervals; right of 0 B is better."
     return Picture("What moved, and how surely", picture_address(effect_chart(panels)), caption)
 

@@ -23,10 +23,10 @@ from eval.report.comparing import BETTER, WORSE, pooled_difference, verdict
 from eval.report.objects.tables import OBJECT_COLUMNS
 from eval.report.regions.regions import REGION_COLUMNS
 from eval.report.summary import is_unmade, means_by_method
-from eval.report.tables import Table, beside, best_rows, group_name, interval_of_row, used_pairs
+from eval.report.tables import Table, methods_table
 from eval.running.run_data import RunData, comparable, off_grids, stored_table
 from eval.running.sides import Side, is_contended
-from eval.tables.columns import EN_DASH, RESULT_COLUMNS, THIN_SPACE, Column, spaced
+from eval.tables.columns import EN_DASH, RESULT_COLUMNS, THIN_SPACE, Column
 from eval.tables.rows import ALL_DOMAINS, PAIR, is_told_the_truth, numbers, records, texts, with_domain
 
 _MARKS = {"bold": r"\textbf{%s}", "small": r"{\scriptsize %s}", "dagger": r"%s$^\dagger$", "": "%s"}
@@ -79,21 +79,17 @@ def _float(
     shown = [column for column in columns if table[column.key].notna().any()]
     lines: list[list[str]] = []
     untested: set[str] = set()
-    for domain, own in table.groupby("domain", sort=False):
-        rows, of_domain = records(own), cases if domain == ALL_DOMAINS else cases[cases["domain"] == domain]
-        marks = [_marks(rows, column, of_domain, data, untested) for column in shown]
-        for place, row in enumerate(rows):
-            group = group_name(str(domain), rows) if place == 0 else ""
-            values = [
-                _marked(column.shown(float(row[column.key])), of_column[place])
-                for column, of_column in zip(shown, marks, strict=True)
-            ]
-            lines.append([_escaped(group), _escaped(spaced(str(row["variant"]))), str(row["n_pairs"]), *values])
-            used = [used_pairs(of_domain, str(row["variant"]), column.key) for column in shown]
-            below = [
-                beside(interval_of_row(row, column.key, column.shown), *n).replace("\n", "; ")
-                for column, n in zip(shown, used, strict=True)
-            ]
+    domains = table.groupby("domain", sort=False)
+    for (domain, own), (group, rows) in zip(domains, methods_table(table, shown, cases).groups(), strict=True):
+        of_domain = cases if domain == ALL_DOMAINS else cases[cases["domain"] == domain]
+        marks = [
+            _marks(records(own), column, [cells[place].is_best for cells in rows], of_domain, data, untested)
+            for place, column in enumerate(shown, start=2)
+        ]
+        for place, (method, n_pairs, *values) in enumerate(rows):
+            marked = [_marked(cell.text, of_column[place]) for cell, of_column in zip(values, marks, strict=True)]
+            lines.append([_escaped("" if place else group), _escaped(method.text), n_pairs.text, *marked])
+            below = [cell.interval.replace("\n", "; ") for cell in values]
             if any(below):
                 lines.append(["", "", "", *(_marked(word, "small" if word else "") for word in below)])
     names = ", ".join(column.heading for column in shown if column.key in untested)
@@ -115,15 +111,19 @@ def _typeset(headings: Sequence[str], lines: Sequence[Sequence[str]], caption: s
 
 
 def _marks(
-    rows: Sequence[Mapping[str, Any]], column: Column, cases: pd.DataFrame, data: RunData, untested: set[str]
+    rows: Sequence[Mapping[str, Any]],
+    column: Column,
+    is_best: Sequence[bool],
+    cases: pd.DataFrame,
+    data: RunData,
+    untested: set[str],
 ) -> list[str]:
     """Return "bold", "dagger" or "" for each row; a column whose differences cannot be taken is added to `untested`."""
-    used = [used_pairs(cases, str(row["variant"]), column.key)[0] for row in rows]
-    marks = ["bold" if is_best else "" for is_best in best_rows(rows, column, used)]
-    if not any(marks):
+    marks = ["bold" if each else "" for each in is_best]
+    if not any(is_best):
         return marks
     top = (max if column.better == "high" else min)(
-        (float(row[column.key]), place) for place, row in enumerate(rows) if marks[place]
+        (float(row[column.key]), place) for place, row in enumerate(rows) if is_best[place]
     )[1]
     for place, row in enumerate(rows):
         if not marks[place] and not is_told_the_truth(str(row["variant"])) and not math.isnan(float(row[column.key])):

@@ -20,8 +20,7 @@ from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.targets import targets_of
 from eval.report.charts import Chart, plotly_script
-from eval.report.cost.charts import draw_pareto
-from eval.report.cost.pareto import pareto_table
+from eval.report.cost import draw_pareto, pareto_table
 from eval.report.latex import latex_tables, to_latex
 from eval.report.merge.merge import draw_merge
 from eval.report.merge.tables import MERGE_COLUMNS

@@ -203,7 +203,7 @@ def methods_table(
     table: pd.DataFrame,
     columns: Sequence[Column],
     cases: pd.DataFrame,
-    caption: str,
+    caption: str = "",
     *,
     counts: Mapping[str, str] | None = None,
 ) -> Table:

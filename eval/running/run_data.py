@@ -153,6 +153,12 @@ def of(rows: Iterable[Row], **wanted: Any) -> list[Row]:
     return found
 
 
+def rows_of_case(data: RunData, scenario: str, seed: int, variant: str) -> dict[str, list[Row]]:
+    """Return the rows of the tables `changes` and `regions` that are about one answer."""
+    wanted = {"scenario": scenario, "seed": seed, "variant": variant}
+    return {"changes": of(data.changes, **wanted), "regions": of(data.regions, **wanted)}
+
+
 def scenarios(data: RunData, *, unchanged: bool) -> list[str]:
     """Return the scenarios with changes, or those without, in the order of results.csv.
 

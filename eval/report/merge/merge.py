@@ -10,31 +10,15 @@ import pandas as pd
 from eval.core.figures import picture_address
 from eval.plans.targets import is_oracle, targets_of
 from eval.report.merge.cases import MAX_ROWS, Case, case_table, distinct_cases, draw_case, read_case
-from eval.report.merge.charts import MergedPairs, error_chart, time_chart
-from eval.report.merge.tables import (
-    families_table,
-    kinds_table,
-    refusals_table,
-    stated_seconds,
-    times_table,
-)
+from eval.report.merge.charts import error_chart, time_chart
+from eval.report.merge.tables import families_table, kinds_table, refusals_table, stated_seconds, times_table
 from eval.report.tables import Picture, Table
 from eval.running.run_data import RunData, covered_by, ends_at_merge, repeats, shown_variant, text
-from eval.tables.merge_table import (
-    EXACT_M,
-    RIGHT_DEG,
-    RIGHT_M,
-    RULES,
-    TIMES,
-    is_within_target,
-    kinds,
-    merge_table,
-)
+from eval.tables.merge_table import EXACT_M, RIGHT_DEG, RIGHT_M, RULES, TIMES, is_within_target, kinds, merge_table
 from eval.tables.rows import numbers
 
 N_WORST = 10
 MAX_PICTURES = 24
-_TIME_NAMES = {"t_index_s": "t_index [s]", "t_merge_s": "t_merge [s]", "t_refine_s": "t_refine [s]"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +58,6 @@ def draw_merge(data: RunData) -> MergePart:
     if by_kind:
         of_targets = kinds_table(table, is_whole=is_whole), families_table(table, name, is_whole=is_whole)
         tables = (*of_targets, refusals_table(results), *tables)
-    plots = (_error_plot(results), _time_plot(results)) if by_kind else ()
-    if by_kind:
         cases, shown = _chosen_cases(data, results, name, notes)
     else:
         cases, shown = _every_case(data, name, notes)
@@ -85,7 +67,7 @@ def draw_merge(data: RunData) -> MergePart:
     return MergePart(
         is_main,
         tuple(part for part in tables if part.rows),
-        tuple(plot for plot in plots if plot is not None),
+        tuple(_plots(results) if by_kind else ()),
         tuple(part for part in cases if part.rows),
         tuple(picture for picture in drawn if picture is not None),
         tuple(notes),
@@ -93,39 +75,26 @@ def draw_merge(data: RunData) -> MergePart:
     )
 
 
-def _error_plot(results: pd.DataFrame) -> Picture | None:
-    variants = [name for name in dict.fromkeys(str(v) for v in results["variant"]) if not is_oracle(name)]
-    words = {"ok": "accepted", "merge_refused": "refused"}
-    panels = {}
-    for name in variants:
-        own = results[results["variant"] == name]
-        outcomes = [words.get(str(status), "failed") for status in own["status"]]
-        overlaps, errors_m = numbers(own, "overlap_true"), numbers(own, "merge_error_m")
-        panels[name] = MergedPairs(list(kinds(own)), overlaps, errors_m, outcomes)
-    if not panels:
-        return None
-    return Picture(
+def _plots(results: pd.DataFrame) -> list[Picture]:
+    """Draw errors and times of every variant that does not merge by the truth."""
+    own = results[[not is_oracle(str(name)) for name in results["variant"]]]
+    if len(own) == 0:
+        return []
+    errors = Picture(
         "Merge error against the true overlap",
-        picture_address(error_chart(panels, EXACT_M, RIGHT_M)),
+        picture_address(error_chart(own)),
         f"One mark per pair: dots were accepted, crosses not. Dashed: {EXACT_M:g} m, the target of clean pairs; solid: "
         f"{RIGHT_M:g} m, above which an accepted merge is wrong. Errors below 0.1 mm stand at 0.1 mm.",
     )
-
-
-def _time_plot(results: pd.DataFrame) -> Picture | None:
-    variants = [name for name in dict.fromkeys(str(v) for v in results["variant"]) if not is_oracle(name)]
-    panels = {
-        _TIME_NAMES[column]: {name: stated_seconds(results[results["variant"] == name], column) for name in variants}
-        for column in TIMES
-    }
-    if not any((values > 0).any() for panel in panels.values() for values in panel.values()):
-        return None
-    return Picture(
+    if not any(len(stated_seconds(own, column)) for column in TIMES):
+        return [errors]
+    times = Picture(
         "Time of the merge",
-        picture_address(time_chart(panels)),
+        picture_address(time_chart(own)),
         "One dot per accepted pair (n of them; refused ones state no time), a bar at the median, logarithmic; one "
         "thread. Indexing can be done while mapping.",
     )
+    return [errors, times]
 
 
 def _chosen_cases(data: RunData, results: pd.DataFrame, name: str, notes: list[str]) -> tuple[list[Table], list[Case]]:
@@ -141,14 +110,11 @@ def _chosen_cases(data: RunData, results: pd.DataFrame, name: str, notes: list[s
     # not merged first, in the order of the table; then the worst of those that were accepted
     outside = outside[np.lexsort((-badness[outside], status[outside] == "ok"))].tolist()
     cases = {index: read_case(data, data.results[index]) for index in dict.fromkeys([*outside, *worst])}
-    tables = [
-        case_table(
-            [cases[index] for index in worst], f"The worst accepted merges of {name}, worst first", by_kind=True
-        ),
-        case_table(
-            [cases[index] for index in outside], f"Every pair of {name} that is outside its target", by_kind=True
-        ),
-    ]
+    captions = {
+        f"The worst accepted merges of {name}, worst first": worst,
+        f"Every pair of {name} that is outside its target": outside,
+    }
+    tables = [case_table([cases[at] for at in own], caption, by_kind=True) for caption, own in captions.items()]
     if not outside:
         notes.append(f"{name}: every pair is within its target.")
     return tables, list(cases.values())

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
-from eval.core.domains import domain_of
+from eval.core.charts import Axis, Drawing, Look, Panel, Series
+from eval.core.domains import domain_name
 from eval.core.figures import picture_address
 from eval.report.objects.cases import object_cases, voxel_variants
-from eval.report.objects.charts import SizeLine, SizePanel, iou_by_size_chart
 from eval.report.objects.tables import OBJECT_COLUMNS, OBJECT_COUNTS, WITHDRAWAL_COLUMNS, groups_table
+from eval.report.regions.charts import look_of
 from eval.report.tables import Picture, Table, methods_table, targets_table
 from eval.running.run_data import RunData, off_grids, shown_variant, stored_table
 from eval.running.runfolder import reported
@@ -20,6 +22,8 @@ from eval.tables.rows import ALL_DOMAINS, numbers, with_domain
 
 _CAPTION = "Objects: one row is one method on the pairs in or out of the training distribution"
 _WITHDRAWAL_CAPTION = "Regions before and after those without an object are withdrawn: one row is one method"
+_DOTS = Look("#a8a8a8", 0.0, marker="circle", size=3.0)
+_LEAST_M3, _MOST_M3 = 0.02, 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,35 +52,41 @@ def draw_objects(data: RunData) -> ObjectPart | None:
         targets_table(stored_table(data, "objects_targets")),
         *(groups_table(groups, domain, main, voxel_variants(data, main)) for domain in domains),
     ]
-    plot = _size_plot(groups, data, main)
-    plots = () if plot is None else (plot,)
+    plots = (_size_plot(groups, data, main),) if len(groups) else ()
     return ObjectPart(tuple(each for each in tables if each.rows), plots, tuple(cases), tuple(missing))
 
 
-def _size_plot(groups: pd.DataFrame, data: RunData, main: str) -> Picture | None:
+def _size_plot(groups: pd.DataFrame, data: RunData, main: str) -> Picture:
     """Draw the IoU of every object of the main variant and the means of all variants over the volume of the hull."""
-    if len(groups) == 0:
-        return None
     names = [main, *(str(name) for name in groups["variant"].unique() if name != main)]
+    domains = with_domain(data.results).drop_duplicates("scenario").set_index("scenario")["domain"]
     changes = pd.DataFrame(list(data.changes))
-    own = main_changes(changes[changes["variant"] == main])
-    families = {str(row["scenario"]): str(row.get("family", row["scenario"])) for row in data.results}
-    domain = np.array([domain_of(families.get(str(name), str(name))) for name in own["scenario"]], dtype=object)
-    panels = {}
-    for name in [each for each in dict.fromkeys(groups["domain"]) if each != ALL_DOMAINS]:
-        sizes = groups[(groups["domain"] == name) & (groups["measure"] == "hull_volume_m3")]
-        lines = {each: _line(sizes[sizes["variant"] == each]) for each in names if (sizes["variant"] == each).any()}
-        inside = own[domain == name]
-        panels[str(name)] = SizePanel(numbers(inside, "hull_volume_m3"), numbers(inside, "iou_point"), lines)
+    objects = main_changes(changes[changes["variant"] == main])
+    objects = objects.assign(domain=objects["scenario"].map(domains))
+    sizes = groups[groups["measure"] == "hull_volume_m3"]
+    panels: list[Panel] = []
+    for domain in [str(each) for each in groups["domain"].unique() if each != ALL_DOMAINS]:
+        own = objects[objects["domain"] == domain]
+        lines = _size_lines(sizes[sizes["domain"] == domain], names)
+        dots = Series(np.clip(numbers(own, "hull_volume_m3"), _LEAST_M3, _MOST_M3), numbers(own, "iou_point"), _DOTS)
+        x = Axis("hull of the object [m³]", (0.8 * _LEAST_M3, 1.25 * _MOST_M3), is_log=True)
+        y = Axis("" if panels else "point IoU", (-0.03, 1.03))
+        panels.append(Panel(x, y, [dots, *lines], f"{domain_name(domain)}, {len(own)} objects"))
     return Picture(
         "Point IoU by the size of the object",
-        picture_address(iou_by_size_chart(panels, names)),
+        picture_address(Drawing([panels], 325)),
         f"A dot for every observable object, answered by {main}, missed ones at 0; lines: means of each method in bins "
         f"of the hull's volume; bars: 95 % interval over pairs of {main}.",
     )
 
 
-def _line(sizes: pd.DataFrame) -> SizeLine:
-    low, high = (np.clip(numbers(sizes, name), *ends) for name, ends in (("low", (0.03, 10.0)), ("high", (0.1, 30.0))))
-    interval = (numbers(sizes, f"iou_point_{end}") for end in ("low", "high"))
-    return SizeLine(np.sqrt(low * high), numbers(sizes, "iou_point"), *interval)
+def _size_lines(sizes: pd.DataFrame, names: Sequence[str]) -> list[Series]:
+    """Return the line of each method through the middles of its bins; the intervals are those of the first method."""
+    lines = []
+    for name in names:
+        own = sizes[sizes["variant"] == name]
+        middles_m3 = np.sqrt(own["low"].clip(0.03, 10.0) * own["high"].clip(0.1, 30.0))
+        low, high = (own["iou_point_low"], own["iou_point_high"]) if name == names[0] else (None, None)
+        look = replace(look_of(name, names), marker="circle", size=3.0)
+        lines.append(Series(middles_m3, own["iou_point"], look, name, low=low, high=high))
+    return [line for line in lines if np.size(line.y)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,11 +12,12 @@ import pandas as pd
 from eval.core.figures import picture_address
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.worlds import group_of
-from eval.report.settings.charts import Effect, effect_chart
+from eval.report.settings.charts import effect_chart
 from eval.report.tables import Cell, Picture, Table
 from eval.running.run_data import RunData, of, over_pairs
 from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, Column, count
 from eval.tables.effects import effects
+from eval.tables.rows import records
 
 _OBSERVABLE = Column("n_observable", "observable changes", None, count, "", "")
 _KEYS = (
@@ -26,8 +27,6 @@ _KEYS = (
 COLUMNS = (_OBSERVABLE, *(column for column in RESULT_COLUMNS if column.key in _KEYS))
 _DRAWN = ("region_recall_at_k", "object_iou_point")
 _MINUS = "\u2212"
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +42,8 @@ def draw_effects(data: RunData) -> list[EffectsOn]:
     """Return table and picture for every world that others repeat with something set otherwise."""
     results = pd.DataFrame(list(data.results))
     known = [name for name in ("scenario", "seed", "variant", *(column.key for column in COLUMNS)) if name in results]
-    found: dict[str, list[Row]] = {}
-    for record in effects(results[known]).to_dict("records"):
-        row = {str(key): value for key, value in record.items()}
-        found.setdefault(row["reference"], []).append(row)
-    return [_effects_on(data, reference, rows) for reference, rows in found.items()]
+    found = effects(results[known]).groupby("reference", sort=False)
+    return [_effects_on(data, str(reference), own) for reference, own in found]
 
 
 def signed(column: Column, value: float) -> str:
@@ -66,54 +62,43 @@ def shortened(settings: Sequence[str]) -> tuple[str, list[str]]:
     return group, [", ".join(part.removeprefix(f"{group}.") for part in text.split(",")) for text in settings]
 
 
-def _effects_on(data: RunData, reference: str, rows: Sequence[Row]) -> EffectsOn:
-    columns = [column for column in COLUMNS if any(row["n"] and row["metric"] == column.key for row in rows)]
-    settings = list(dict.fromkeys(row["settings"] for row in rows))
+def _effects_on(data: RunData, reference: str, table: pd.DataFrame) -> EffectsOn:
+    columns = [column for column in COLUMNS if column.key in set(table["metric"][table["n"] > 0])]
+    settings = list(table["settings"].unique())
     group, short = shortened(settings)
-    names = dict(zip(settings, short, strict=True))
     title = f"{reference}: what each setting of its {group} does" if group else f"{reference}: what each setting does"
-    table = Table(*_lines(data, rows, columns, names), f"{title}, on average")
+    table = table.assign(setting=table["settings"].map(dict(zip(settings, short, strict=True))))
     drawn = [column for column in columns if column.key in _DRAWN]
-    return EffectsOn(reference, table, _picture(title, rows, drawn, names) if drawn else None)
+    headings = ("setting", "pairs", *(column.heading for column in columns))
+    lines = Table(headings, tuple(_lines(data, table, columns, short)), f"{title}, on average")
+    return EffectsOn(reference, lines, _picture(title, table, drawn) if drawn else None)
 
 
 def _lines(
-    data: RunData, rows: Sequence[Row], columns: Sequence[Column], names: dict[str, str]
-) -> tuple[tuple[str, ...], tuple[tuple[str, tuple[Cell, ...]], ...]]:
-    """Headings and rows of the table: for each variant the world's own means, then every setting."""
-    by_place = {(row["variant"], row["settings"], row["metric"]): row for row in rows}
-    lines: list[tuple[str, tuple[Cell, ...]]] = []
-    for variant in dict.fromkeys(row["variant"] for row in rows):
-        plain = of(data.results, scenario=rows[0]["reference"], variant=variant)
+    data: RunData, table: pd.DataFrame, columns: Sequence[Column], settings: Sequence[str]
+) -> Iterator[tuple[str, tuple[Cell, ...]]]:
+    """Yield the rows of the table: for each variant the world's own means, then every setting."""
+    for variant, own in table.groupby("variant", sort=False):
+        plain = of(data.results, scenario=table["reference"].iloc[0], variant=variant)
         means = (Cell(column.shown(over_pairs(plain, column.key))) for column in columns)
-        lines.append((variant, (Cell("as it is: mean"), Cell(str(len(plain))), *means)))
-        for settings, name in names.items():
-            found = [by_place.get((variant, settings, column.key)) for column in columns]
-            n = max((int(row["n"]) for row in found if row is not None), default=0)
-            cells = (
-                Cell(UNDEFINED) if row is None else _cell(column, row)
-                for column, row in zip(columns, found, strict=True)
-            )
-            lines.append((variant, (Cell(name), Cell(str(n)), *cells)))
-    return ("setting", "pairs", *(column.heading for column in columns)), tuple(lines)
+        yield str(variant), (Cell("as it is: mean"), Cell(str(len(plain))), *means)
+        for setting in settings:
+            by_key = {row["metric"]: row for row in records(own[own["setting"] == setting])}
+            found = [(column, by_key.get(column.key)) for column in columns]
+            n = max((row["n"] for _, row in found if row is not None), default=0)
+            cells = (Cell(UNDEFINED) if row is None else _cell(column, row) for column, row in found)
+            yield str(variant), (Cell(setting), Cell(str(n)), *cells)
 
 
-def _cell(column: Column, row: Row) -> Cell:
+def _cell(column: Column, row: Mapping[str, Any]) -> Cell:
     is_clear = row["n"] >= ENOUGH_PAIRS and (row["low"] > 0 or row["high"] < 0)
     low, high = (signed(column, row[end]) for end in ("low", "high"))
     return Cell(signed(column, row["difference"]), is_clear, "" if math.isnan(row["low"]) else f"{low} to {high}")
 
 
-def _picture(title: str, rows: Sequence[Row], columns: Sequence[Column], names: dict[str, str]) -> Picture:
-    panels = {
-        column.heading: [
-            Effect(names[row["settings"]], row["variant"], row["difference"], row["low"], row["high"])
-            for row in rows
-            if row["metric"] == column.key
-        ]
-        for column in columns
-    }
-    counts = sorted({int(row["n"]) for row in rows if row["metric"] in _DRAWN})
+def _picture(title: str, table: pd.DataFrame, columns: Sequence[Column]) -> Picture:
+    panels = {column.heading: table[table["metric"] == column.key] for column in columns}
+    counts = sorted(set(table["n"][table["metric"].isin(_DRAWN)]))
     n = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     pairs = "pair" if n == "1" else "pairs"
     caption = f"Dots are means over {n} session {pairs}, lines their 95 % intervals; right of 0 is better."

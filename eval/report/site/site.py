@@ -9,17 +9,26 @@ from pathlib import Path
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, invert, transform
 from cdpipe.io.answer import Answer, read_answer
 from cdpipe.io.session import load_arrays
-from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.report import ChangeReport
 from eval.report.maps import Points, RegionMark, State, TruthMark, distance_map, overlay_map, region_map
 from eval.report.objects.objects import object_pictures
 from eval.report.tables import Picture
-from eval.running.run_data import SHOWN_PRESETS, Row, RunData, first_seed, flag, named_variants, number, of, text
+from eval.running.run_data import (
+    SHOWN_PRESETS,
+    Row,
+    RunData,
+    first_seed,
+    flag,
+    named_variants,
+    number,
+    rows_of_case,
+    text,
+)
+from eval.scoring.region_metrics import places_in_map
 from eval.truth.aligned import alignment_of
-from eval.truth.ground_truth import GroundTruth, SessionTruth, load_ground_truth
+from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
 _STATES: dict[bool | None, State] = {True: "found", False: "missed", None: "not scored"}
 
@@ -44,20 +53,23 @@ def draw_site(data: RunData, scenario: str) -> Site:
     maps = _maps(data.folder.maps(scenario, seed), missing)
     truth = _truth(data.folder.pair(scenario, seed), missing)
     maps_drawn = [] if maps is None else _map_pictures(maps, answers, truth, missing)
-    regions = [] if maps is None else _region_pictures(data, scenario, seed, maps[0], answers, truth)
+    regions = []
+    for name in SHOWN_PRESETS:
+        report = answers[name].report if name in answers else None
+        if maps is not None and report is not None:
+            rows = rows_of_case(data, scenario, seed, name)
+            regions.append(region_picture(f"Changed regions: {name}", maps[0], report, truth, rows))
     objects = [] if truth is None else object_pictures(data, scenario, seed, answers, truth)
     return Site(scenario, seed, tuple(maps_drawn), tuple(regions), tuple(objects), tuple(missing))
 
 
 def _answers(data: RunData, scenario: str, seed: int, missing: list[str]) -> dict[str, Answer]:
-    """Readable answers with a report, the shown presets first."""
+    """Return the readable answers with a report, the shown presets first."""
     variants = named_variants(data, scenario)
     missing += [f"Preset {name} was not run on {scenario}." for name in SHOWN_PRESETS if name not in variants]
-    order = [name for name in SHOWN_PRESETS if name in variants]
-    order += [name for name in variants if name not in SHOWN_PRESETS]
     found: dict[str, Answer] = {}
     refused: dict[str, list[str]] = {}
-    for name in order:
+    for name in dict.fromkeys([*(name for name in SHOWN_PRESETS if name in variants), *variants]):
         try:
             answer = read_answer(data.folder.answer(scenario, seed, name))
         except InputError:
@@ -98,83 +110,64 @@ def _map_pictures(
     maps: tuple[Points, Points], answers: Mapping[str, Answer], truth: GroundTruth | None, missing: list[str]
 ) -> list[Picture]:
     before, after = maps
-    pictures = [
-        Picture(
-            "Both maps before alignment",
-            overlay_map(before, after),
-            f"Seen from above, each in the frame its robot started in: {len(before):,} points before, {len(after):,} "
-            "after, thinned.",
-        )
-    ]
-    chosen = next(((name, answer.report) for name, answer in answers.items() if answer.report is not None), None)
-    if chosen is None:
-        missing.append("No answer holds a merge, so the aligned maps are not shown.")
-        return pictures
-    name, report = chosen
-    alignment = _alignment(name, report, truth, missing)
-    if alignment is None:
-        return pictures
-    aligned = alignment.to_map(after.astype(np.float64))
-    pictures.append(
-        Picture(
-            "The after map, aligned by the pipeline",
-            distance_map(before, aligned),
-            f"With the merge of {name}. Colour: distance to the nearest before point, the farthest one on top; dark "
-            "where something is new, but also where the before session never looked.",
-        )
+    overlay = Picture(
+        "Both maps before alignment",
+        overlay_map(before, after),
+        f"Seen from above, each in the frame its robot started in: {len(before):,} points before, {len(after):,} "
+        "after, thinned.",
     )
-    return pictures
-
-
-def _alignment(name: str, report: ChangeReport, truth: GroundTruth | None, missing: list[str]) -> PathAlignment | None:
-    """Return what the after map was aligned with; None where that needs the session's poses and they cannot be read."""
-    if report.local_before_T_after is None:
-        return PathAlignment.rigid(report.before_T_after)
-    if truth is None:
+    name, report = next(((name, answer.report) for name, answer in answers.items()), ("", None))
+    if report is None:
+        missing.append("No answer holds a merge, so the aligned maps are not shown.")
+        return [overlay]
+    if truth is None and report.local_before_T_after is not None:
         missing.append(
             f"The poses that the merge of {name} bends along cannot be read, so the aligned maps are missing."
         )
-        return None
+        return [overlay]
     try:
-        return alignment_of(report, truth.after.odom_T_sensor)
+        # a rigid merge asks for no poses
+        alignment = alignment_of(report, np.zeros((0, 4, 4)) if truth is None else truth.after.odom_T_sensor)
     except InputError as error:
         missing.append(f"The merge of {name} does not fit the pair, so the aligned maps are missing: {error}")
-        return None
+        return [overlay]
+    aligned = Picture(
+        "The after map, aligned by the pipeline",
+        distance_map(before, alignment.to_map(after.astype(np.float64))),
+        f"With the merge of {name}. Colour: distance to the nearest before point, the farthest one on top; dark "
+        "where something is new, but also where the before session never looked.",
+    )
+    return [overlay, aligned]
 
 
-def _region_pictures(
-    data: RunData,
-    scenario: str,
-    seed: int,
-    before: Points,
-    answers: Mapping[str, Answer],
-    truth: GroundTruth | None,
-) -> list[Picture]:
-    pictures = []
-    for name in SHOWN_PRESETS:
-        report = answers[name].report if name in answers else None
-        if report is None:
-            continue
-        rows = of(data.changes, scenario=scenario, seed=seed, variant=name)
-        marks = [] if truth is None else truth_marks(truth, rows)
-        regions = region_marks(report, of(data.regions, scenario=scenario, seed=seed, variant=name))
-        caption = region_caption(regions, report.regions.radius_m, [mark.state for mark in marks])
-        pictures.append(
-            Picture(f"Changed regions: {name}", region_map(before, regions, report.regions.radius_m, marks), caption)
-        )
-    return pictures
+def region_picture(
+    title: str, before: Points, report: ChangeReport, truth: GroundTruth | None, rows: Mapping[str, Sequence[Row]]
+) -> Picture:
+    """Draw the reported regions of an answer over the before map, and where the changes truly are.
 
-
-def region_caption(regions: Sequence[RegionMark], radius_m: float, states: Sequence[State]) -> str:
-    """Return what stands below a map of regions: how many, how many of them false, and how many changes they find."""
-    n_false = sum(mark.is_false for mark in regions)
+    Args:
+        title: What stands above it.
+        before: (N, 3) points of the before map, metres.
+        report: The answer.
+        truth: The pair's truth; None where it cannot be read.
+        rows: The rows of `changes` and `regions` that the answer has in the tables of those names.
+    """
+    outcomes = {int(number(row, "region")): text(row, "outcome") for row in rows["regions"]}
+    regions = [
+        RegionMark(float(x_m), float(y_m), outcomes.get(index) == "false")
+        for index, (x_m, y_m, _) in enumerate(report.regions.centres_map)
+        if report.regions.is_reported[index]
+    ]
+    marks = [] if truth is None else truth_marks(truth, rows["changes"])
+    states = [mark.state for mark in marks]
+    radius_m, n_false = report.regions.radius_m, sum(mark.is_false for mark in regions)
     words = [f"{len(regions)} regions of {radius_m:g} m reported, {n_false} of them false."]
     if states and "not scored" not in states:
         n_observable = len(states) - states.count("unobservable")
         words.append(f"{states.count('found')} of {n_observable} observable changes found.")
     if states:
         words.append("Numbers are those of the changes below.")
-    return " ".join(words)
+    return Picture(title, region_map(before, regions, radius_m, marks), " ".join(words))
 
 
 def truth_marks(truth: GroundTruth, rows: Sequence[Row]) -> list[TruthMark]:
@@ -185,26 +178,9 @@ def truth_marks(truth: GroundTruth, rows: Sequence[Row]) -> list[TruthMark]:
         rows: Rows of changes.csv of one variant.
     """
     is_found = {int(number(row, "id")): flag(row, "is_found") for row in rows}
+    places = places_in_map(truth.centroids_world, truth.before, np.arange(len(truth.before.odom_T_sensor)))
     marks = []
-    for change, centroid, is_observable in zip(
-        truth.pair.changes, truth.centroids_world, truth.is_observable, strict=True
-    ):
-        place = world_to_odom(truth.before, centroid)
-        state: State = _STATES[is_found.get(change.id)] if is_observable else "unobservable"
-        marks.append(TruthMark(float(place[0]), float(place[1]), str(change.id), state))
+    for change, (x_m, y_m, _), is_observable in zip(truth.pair.changes, places, truth.is_observable, strict=True):
+        state = _STATES[is_found.get(change.id)] if is_observable else "unobservable"
+        marks.append(TruthMark(float(x_m), float(y_m), str(change.id), state))
     return marks
-
-
-def world_to_odom(session: SessionTruth, point_world: Float64Array) -> Float64Array:
-    """Carry a (3,) world point into a session's odom frame through its truly nearest scan."""
-    nearest = int(np.argmin(np.linalg.norm(session.world_T_sensor[:, :3, 3] - point_world, axis=1)))
-    odom_T_world = session.odom_T_sensor[nearest] @ invert(session.world_T_sensor[nearest])
-    return np.asarray(transform(odom_T_world, point_world[None])[0])
-
-
-def region_marks(report: ChangeReport, rows: Sequence[Row]) -> list[RegionMark]:
-    """Return the reported regions; `rows` of regions.csv say which of them are false."""
-    outcomes = {int(number(row, "region")): text(row, "outcome") for row in rows}
-    reported = np.flatnonzero(report.regions.is_reported)
-    centres = report.regions.centres_map
-    return [RegionMark(float(centres[i, 0]), float(centres[i, 1]), outcomes.get(int(i)) == "false") for i in reported]

@@ -13,7 +13,7 @@ from typing import Literal
 
 from cdpipe.core.errors import InputError
 from eval.report.site.case_view import view_file, write_case_view
-from eval.running.run_data import RunData, first_seed, of, scenarios
+from eval.running.run_data import RunData, first_seed, of, rows_of_case, scenarios
 
 Views = Literal["none", "chosen", "all"]
 HOW_TO_GET = "3-D views of single pairs need the extra view: pip install 'tunnelcd[view]', then write this page again."
@@ -58,12 +58,11 @@ def write_views(data: RunData, variant: str, worst: Sequence[tuple[str, int]], v
         chosen += [(str(row["scenario"]), int(row["seed"])) for row in data.results]
     links, missing = {}, []
     for scenario, seed in dict.fromkeys(chosen):
-        own = {"scenario": scenario, "seed": seed, "variant": variant}
-        if not (data.folder.pair(scenario, seed) / "truth").is_dir() or not of(data.results, **own):
+        is_run = of(data.results, scenario=scenario, seed=seed, variant=variant)
+        if not (data.folder.pair(scenario, seed) / "truth").is_dir() or not is_run:
             continue
         try:
-            rows = {"changes": of(data.changes, **own), "regions": of(data.regions, **own)}
-            write_case_view(data.folder, (scenario, seed), variant, rows)
+            write_case_view(data.folder, (scenario, seed), variant, rows_of_case(data, scenario, seed, variant))
         except (InputError, KeyError) as error:
             missing.append(f"No 3-D view: {error}.")
             continue

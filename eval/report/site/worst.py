@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from cdpipe.core.errors import InputError
 from cdpipe.io.answer import read_answer
 from cdpipe.io.session import load_arrays
-from eval.report.maps import region_map
-from eval.report.site.site import region_caption, region_marks, truth_marks
+from eval.report.site.site import region_picture
 from eval.report.tables import Picture
-from eval.running.run_data import Row, RunData, number, of, scenarios, text
+from eval.running.run_data import Row, RunData, number, of, rows_of_case, scenarios, text
 from eval.tables.columns import share
 from eval.truth.ground_truth import load_ground_truth
 
@@ -75,7 +74,6 @@ def _words(row: Row) -> str:
 def _picture(data: RunData, variant: str, row: Row) -> Picture | None:
     """Return the map with regions and changes; None where answer, maps or truth cannot be read."""
     scenario, seed = str(row["scenario"]), int(row["seed"])
-    own = {"scenario": scenario, "seed": seed, "variant": variant}
     try:
         report = read_answer(data.folder.answer(scenario, seed, variant)).report
         before = load_arrays(data.folder.maps(scenario, seed))["before_points"]
@@ -84,7 +82,5 @@ def _picture(data: RunData, variant: str, row: Row) -> Picture | None:
         return None
     if report is None or len(before) == 0:
         return None
-    marks = truth_marks(truth, of(data.changes, **own))
-    regions = region_marks(report, of(data.regions, **own))
-    caption = region_caption(regions, report.regions.radius_m, [mark.state for mark in marks])
-    return Picture(f"{scenario}, seed {seed}", region_map(before, regions, report.regions.radius_m, marks), caption)
+    rows = rows_of_case(data, scenario, seed, variant)
+    return region_picture(f"{scenario}, seed {seed}", before, report, truth, rows)

@@ -3,7 +3,7 @@ import html
 import json
 import re
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from cdpipe.model.config import load_config
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
 from cdpipe.sensor.ouster import parse_metadata
 from eval.report.page import write_page
-from eval.report.site.site import truth_marks, world_to_odom
+from eval.report.site.site import truth_marks
 from eval.running.runfolder import RunFolder
 from eval.truth.ground_truth import load_ground_truth
 from sim.session.truth import PairTruth, write_labels, write_pair_truth, write_true_poses
@@ -510,16 +510,6 @@ def test_truth_is_marked_where_it_is_on_the_before_map(run: Path) -> None:
     # the before session's odom frame is the world here, whatever the after session's is
     np.testing.assert_allclose([[m.x_m, m.y_m] for m in marks], truth.centroids_world[:, :2], atol=1e-9)
     assert np.abs(truth.centroids_world[0, :2] - (2.5, 0.0)).max() < 2.1
-
-
-def test_a_world_point_enters_a_drifting_map_through_its_nearest_scan(run: Path) -> None:
-    before = load_ground_truth(RunFolder(run).pair(SITE, 7)).before
-    # from scan 3 on, the robot believes itself 1 m farther left
-    drifted = before.odom_T_sensor.copy()
-    drifted[3:, 1, 3] += 1.0
-    session = replace(before, odom_T_sensor=drifted)
-    np.testing.assert_allclose(world_to_odom(session, np.array([1.1, 0.5, 0.2])), [1.1, 0.5, 0.2], atol=1e-12)
-    np.testing.assert_allclose(world_to_odom(session, np.array([4.2, 0.5, 0.2])), [4.2, 1.5, 0.2], atol=1e-12)
 
 
 def test_the_same_folder_gives_the_same_page(run: Path) -> None:

@@ -1,13 +1,14 @@
 """The charts of the merge: which pairs stand where."""
 
 import numpy as np
+import pandas as pd
 
 from eval.core.charts import Series
 from eval.core.figures import picture
-from eval.report.merge.charts import MergedPairs, error_chart, time_chart
+from eval.report.merge.charts import error_chart, time_chart
+from eval.tables.merge_table import EXACT_M, RIGHT_M
 
 NAN = float("nan")
-EXACT_M, RIGHT_M = 0.05, 0.5
 
 
 def points(series: Series) -> list[tuple[float, float]]:
@@ -15,13 +16,14 @@ def points(series: Series) -> list[tuple[float, float]]:
 
 
 def test_errors_stand_at_their_height_and_pairs_without_one_above_them_all() -> None:
-    pairs = MergedPairs(
-        ["clean", "clean", "drift", "drift", "drift"],
-        np.array([0.3, 0.5, 0.9, 0.4, NAN]),
-        np.array([0.01, 1e-9, NAN, NAN, 1e9]),
-        ["accepted", "accepted", "accepted", "refused", "failed"],
-    )
-    ((panel,),) = error_chart({"ours": pairs}, EXACT_M, RIGHT_M).rows
+    results = pd.DataFrame({
+        "variant": "ours",
+        "pair_kind": ["clean", "clean", "drift", "drift", "drift"],
+        "overlap_true": [0.3, 0.5, 0.9, 0.4, NAN],
+        "merge_error_m": [0.01, 1e-9, NAN, NAN, 1e9],
+        "status": ["ok", "ok", "ok", "merge_refused", "died"],
+    })  # fmt: skip
+    ((panel,),) = error_chart(results).rows
     drawn = [(each.name, each.look.marker, points(each)) for each in panel.series if each.name and len(points(each))]
     height = {name: at for at, name in (panel.y.ticks or {}).items()}
     assert drawn == [
@@ -36,26 +38,23 @@ def test_errors_stand_at_their_height_and_pairs_without_one_above_them_all() -> 
 
 
 def test_three_variants_share_a_row_and_one_axis() -> None:
-    one = MergedPairs(["clean"], np.array([0.5]), np.array([0.01]), ["accepted"])
-    rows = error_chart(dict.fromkeys("abcd", one), EXACT_M, RIGHT_M).rows
+    one = {"pair_kind": "clean", "overlap_true": 0.5, "merge_error_m": 0.01, "status": "ok"}
+    rows = error_chart(pd.DataFrame([{"variant": name, **one} for name in "abcd"])).rows
     assert [[panel.heading for panel in row] for row in rows] == [["a", "b", "c"], ["d"]]
     assert len({panel.y.span for row in rows for panel in row}) == 1
     assert [any((panel.y.ticks or {}).values()) for panel in rows[0]] == [True, False, False]
 
 
 def test_times_have_a_row_a_median_and_a_count_for_each_variant() -> None:
-    times = {"t_merge [s]": {"ours": np.array([0.05, 0.01, 0.3]), "theirs": np.array([1.0, 2.0, NAN])}}
-    ((panel,),) = time_chart(times).rows
-    assert panel.y.ticks == {0.0: "ours", 1.0: "theirs"}
+    seconds = {"ours": (0.05, 0.01, 0.3), "theirs": (1.0, 2.0, NAN)}
+    results = pd.DataFrame([{"variant": name, "t_merge_s": value} for name, own in seconds.items() for value in own])
+    ((_, panel, other),) = time_chart(results).rows
+    assert (panel.x.title, panel.y.span) == ("t_merge [s]", (1.5, -0.5))
     medians = [points(each) for each in panel.series if each.look.width > 0]
     assert [(ends[0][0], round(np.mean([y for _, y in ends]))) for ends in medians] == [(0.05, 0), (1.5, 1)]
     assert [label for each in panel.series for label in each.labels] == ["n 3", "n 2"]
     for each in panel.series:
         assert all(panel.x.span[0] <= x <= panel.x.span[1] for x, _ in points(each))
-
-
-def test_a_variant_without_times_has_an_empty_row() -> None:
-    drawing = time_chart({"t_refine [s]": {"ours": np.array([NAN]), "theirs": np.zeros(0)}})
-    ((panel,),) = drawing.rows
-    assert [label for each in panel.series for label in each.labels] == ["n 0", "n 0"]
-    assert len(picture(drawing).axes) == 1
+    # no pair states the time of the third part
+    assert [label for each in other.series for label in each.labels] == ["n 0", "n 0"]
+    assert len(picture(time_chart(results)).axes) == 3

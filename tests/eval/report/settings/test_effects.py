@@ -10,7 +10,7 @@ import pytest
 
 from eval.core.figures import picture
 from eval.report.page import write_page
-from eval.report.settings.charts import Effect, effect_chart
+from eval.report.settings.charts import effect_chart
 from eval.report.settings.effects import draw_effects, shortened
 from eval.running.run_data import first_seed, named_variants, read_run, scenarios
 
@@ -160,8 +160,8 @@ def test_settings_are_shortened_by_the_group_they_share() -> None:
 
 
 def test_a_row_for_each_setting_and_a_mark_with_its_interval_for_each_variant() -> None:
-    effects = [Effect("up", "ours", 0.2, 0.1, 0.3), Effect("down, too", "theirs", -0.2, -0.3, -0.1)]
-    effects += [Effect("up", "undefined", NAN, NAN, NAN)]
+    rows = [("up", "ours", 0.2, 0.1, 0.3), ("down, too", "theirs", -0.2, -0.3, -0.1), ("up", "undefined", *[NAN] * 3)]
+    effects = pd.DataFrame(rows, columns=["setting", "variant", "difference", "low", "high"])
     drawing = effect_chart({"recall": effects, "IoU": effects[:1]})
     first, second = drawing.rows[0]
     zero, ours, theirs, _ = first.series

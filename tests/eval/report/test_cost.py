@@ -6,8 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from eval.report.cost.charts import draw_pareto
-from eval.report.cost.pareto import COLUMNS, front, pareto_table
+from eval.report.cost import COLUMNS, draw_pareto, front, pareto_table
 from eval.running.run_data import RunData
 from eval.running.runfolder import RunFolder
 

@@ -1,1 +1,0 @@
-"""Quality against cost on the page."""
