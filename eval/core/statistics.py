@@ -10,6 +10,7 @@ import pandas as pd
 from cdpipe.core.geometry import BoolArray, Float64Array, stream
 from eval.core.ranking import auroc, average_precision
 
+Statistic = Literal["mean", "median"]
 N_RESAMPLES = 2000
 # sign test: six pairs agree by chance in 2^(1-6) = 3 % of cases, five in 6 %
 ENOUGH_PAIRS = 6
@@ -68,9 +69,12 @@ def median(values: Float64Array) -> float:
     return float(np.median(values)) if len(values) else float("nan")
 
 
-def bootstrap_interval(
-    values: Float64Array, statistic: Literal["mean", "median"] = "mean", seed: int = 0
-) -> tuple[float, float]:
+def statistic_of(column: str) -> Statistic:
+    """Return how a column is summarised over pairs: times by their median, everything else by its mean."""
+    return "median" if column.startswith("t_") else "mean"
+
+
+def bootstrap_interval(values: Float64Array, statistic: Statistic = "mean", seed: int = 0) -> tuple[float, float]:
     """Return the 95 % percentile interval of the mean or median of (N,) numbers, one for each session pair.
 
     Pairs are drawn with replacement; NaN is left out after drawing. The interval is NaN for fewer than two numbers,
@@ -112,7 +116,7 @@ def wilson_interval(n_hits: int, n: int) -> tuple[float, float]:
 def _summary(
     metric: str, values: Float64Array, is_ok: np.ndarray[Any, np.dtype[np.bool_]], seed: int
 ) -> dict[str, Any]:
-    statistic: Literal["mean", "median"] = "median" if metric.startswith("t_") else "mean"
+    statistic = statistic_of(metric)
     low, high = bootstrap_interval(values, statistic, seed)
     return {
         "statistic": statistic,
@@ -125,7 +129,7 @@ def _summary(
     }
 
 
-def _of_numbers(values: Float64Array, statistic: Literal["mean", "median"]) -> float:
+def _of_numbers(values: Float64Array, statistic: Statistic) -> float:
     return mean(values) if statistic == "mean" else median(values)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from eval.core.domains import domain_of
-from eval.tables.columns import RESULT_COLUMNS, Column, fine, share, significant
+from eval.tables.columns import RESULT_COLUMNS, Column, select, share, significant
 from eval.tables.merge_table import RULES, is_within_target, kinds
 from eval.tables.rows import numbers, texts
 
@@ -16,40 +16,29 @@ POOLED = "recall_at_0.1"
 POOLED_RATE_PER_100M = 0.1
 # kinds of pair at which a refusal can be right
 _REFUSABLE = ("smooth", "disjoint")
-_SHOWN = {column.key: column for column in RESULT_COLUMNS}
-
-
-def _kilobytes(value: float) -> str:
-    return significant(value / 1000.0)
-
-
+_P95 = replace(*select(RESULT_COLUMNS, "merge_error_m"), key="merge_error_m_p95",
+               heading="merge error, 95th percentile [m]")  # fmt: skip
 COMPARED = (
     Column("is_answered", "answered", "high", share,
-           "Share of the pairs with an answer, where refusing the merge is never right.", ""),
+           "Share of the pairs with an answer, where refusing the merge is never right."),
     Column("is_within_target", "merge within target", "high", share,
-           "Share of the pairs whose merge does what their kind asks.", ""),
-    _SHOWN["region_recall"],
-    _SHOWN["region_precision"],
-    _SHOWN["region_recall_at_k"],
+           "Share of the pairs whose merge does what their kind asks."),
+    *select(RESULT_COLUMNS, "region_recall", "region_precision", "region_recall_at_k"),
     Column(POOLED, "recall at 0.1 false / 100 m", "high", share,
            "Changes of all pairs together found at the lowest threshold with at most 0.1 false regions per 100 m, set "
            "anew in every draw of pairs.", "Undefined without regions.csv and changes.csv."),
-    _SHOWN["region_auroc"],
-    _SHOWN["false_regions_per_100m"],
+    *select(RESULT_COLUMNS, "region_auroc", "false_regions_per_100m"),
     Column("is_alarm", "alarm where nothing changed", "low", share,
            "Share of the unchanged pairs with a reported region.", "Undefined for changed and refused pairs."),
-    _SHOWN["object_iou_point"],
-    Column("object_iou_voxel", "object voxel IoU", "high", share, "The same with 0.1 m voxels, mean over 8 grids.", ""),
-    _SHOWN["object_f1_50"],
-    _SHOWN["kind_accuracy"],
-    _SHOWN["merge_error_m"],
-    _SHOWN["merge_error_deg"],
-    replace(_SHOWN["merge_error_m"], key="merge_error_m_p95", heading="merge error, 95th percentile [m]", shown=fine),
-    _SHOWN["t_total_s"],
+    *select(RESULT_COLUMNS, "object_iou_point"),
+    Column("object_iou_voxel", "object voxel IoU", "high", share, "The same with 0.1 m voxels, mean over 8 grids."),
+    *select(RESULT_COLUMNS, "object_f1_50", "kind_accuracy", "merge_error_m", "merge_error_deg"),
+    _P95,
+    *select(RESULT_COLUMNS, "t_total_s"),
     Column("t_total_with_merge_s", "time with merge [s]", "low", significant,
-           "The same and indexing, merge, refinement.", ""),
-    Column("bytes_regions_before", "kept of the before map [kB]", "low", _kilobytes,
-           "What a method keeps of the before session to find regions.", ""),
+           "The same and indexing, merge, refinement."),
+    Column("bytes_regions_before", "kept of the before map [kB]", "low", lambda size: significant(size / 1000.0),
+           "What a method keeps of the before session to find regions."),
 )  # fmt: skip
 
 

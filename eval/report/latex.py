@@ -26,7 +26,7 @@ from eval.report.summary import is_unmade, means_by_method
 from eval.report.tables import Table, methods_table
 from eval.running.run_data import RunData, comparable, off_grids, stored_table
 from eval.running.sides import Side, is_contended
-from eval.tables.columns import EN_DASH, RESULT_COLUMNS, THIN_SPACE, Column
+from eval.tables.columns import EN_DASH, RESULT_COLUMNS, THIN_SPACE, Column, select
 from eval.tables.rows import ALL_DOMAINS, PAIR, is_told_the_truth, numbers, records, texts, with_domain
 
 _MARKS = {"bold": r"\textbf{%s}", "small": r"{\scriptsize %s}", "dagger": r"%s$^\dagger$", "": "%s"}
@@ -36,7 +36,7 @@ _LATEX = {
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", EN_DASH: "--", THIN_SPACE: r"\,", "³": r"$^3$",
     "†": r"$^\dagger$",
 }  # fmt: skip
-_KEPT = next(column for column in COMPARED if column.key == "bytes_regions_before")
+(_KEPT,) = select(COMPARED, "bytes_regions_before")
 SUMMARY_COLUMNS = (*RESULT_COLUMNS, replace(_KEPT, heading="kept [kB]"))
 _SUBJECTS = {"regions_table": ("Finding the changed places", REGION_COLUMNS),
              "objects_table": ("Cutting out the objects", OBJECT_COLUMNS)}  # fmt: skip

@@ -7,15 +7,13 @@ from typing import Any
 import numpy as np
 
 from eval.core.charts import Axis, Drawing, Panel, Series, named_ticks
-from eval.core.statistics import bootstrap_interval
 from eval.report.charts import Chart
 from eval.report.regions.charts import look_of
-from eval.running.run_data import RunData, named_variants, number, of, over_pairs, scenarios, split_variant
-from eval.tables.columns import RESULT_COLUMNS
+from eval.running.run_data import RunData, interval_over_pairs, named_variants, of, over_pairs, scenarios, split_variant
+from eval.tables.columns import RESULT_COLUMNS, select
 
-_KEYS = ("region_recall_at_k", "region_auroc", "object_iou_point")
+_COLUMNS = select(RESULT_COLUMNS, "region_recall_at_k", "region_auroc", "object_iou_point")
 _MAX_METHODS = 14
-_COLUMNS = [column for key in _KEYS for column in RESULT_COLUMNS if column.key == key]
 
 
 def draw_scenarios(data: RunData) -> list[Chart]:
@@ -37,8 +35,7 @@ def draw_scenarios(data: RunData) -> list[Chart]:
         for name in methods:
             groups = [values[world, name] for world in worlds]
             means = [over_pairs(group, column.key) for group in groups]
-            ends = [bootstrap_interval(np.array([number(row, column.key) for row in group])) for group in groups]
-            low, high = np.array(ends).T
+            low, high = np.array([interval_over_pairs(group, column.key) for group in groups]).T
             hover = [f"{world}: {mean:.3f}" for world, mean in zip(worlds, means, strict=True)]
             look = look_of(name, methods)
             series.append(Series(list(ticks), means, look, name, "bars", low=low, high=high, hover=hover))

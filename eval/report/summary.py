@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
-from eval.core.statistics import bootstrap_interval
+from eval.core.statistics import bootstrap_interval, statistic_of
 from eval.report.compared_columns import COMPARED, POOLED, figures_of, is_time
 from eval.report.tables import Cell, Table, methods_table
 from eval.running.run_data import (
@@ -26,16 +26,15 @@ from eval.running.run_data import (
     text,
 )
 from eval.running.sides import is_contended
-from eval.tables.columns import Column, fine, share, spaced
+from eval.tables.columns import Column, fine, select, share, spaced
 from eval.tables.merge_table import ALL_FAMILIES, RIGHT_DEG, RIGHT_M
-from eval.tables.rows import ALL_DOMAINS, PAIR, by_domain, is_told_the_truth, numbers, records
+from eval.tables.rows import ALL_DOMAINS, PAIR, by_domain, is_told_the_truth, mean, median, numbers, records
 
-_KEYS = (
-    POOLED, "region_recall", "region_auroc", "false_regions_per_100m", "is_alarm", "object_iou_point", "object_f1_50",
-    "merge_error_m", "t_total_s", "bytes_regions_before",
-)  # fmt: skip
 _MAX_METHODS = 8
-HEADLINES = tuple(column for key in _KEYS for column in COMPARED if column.key == key)
+HEADLINES = select(
+    COMPARED, POOLED, "region_recall", "region_auroc", "false_regions_per_100m", "is_alarm", "object_iou_point",
+    "object_f1_50", "merge_error_m", "t_total_s", "bytes_regions_before",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,10 +82,8 @@ def is_unmade(row: Row) -> bool:
 
 
 def _mean(values: Float64Array, key: str) -> dict[str, float]:
-    values = values[~np.isnan(values)]
-    low, high = bootstrap_interval(values, "median" if is_time(key) else "mean")
-    value = (np.median(values) if is_time(key) else values.mean()) if len(values) else math.nan
-    return {key: float(value), f"{key}_low": low, f"{key}_high": high}
+    low, high = bootstrap_interval(values[~np.isnan(values)], statistic_of(key))
+    return {key: (median if is_time(key) else mean)(values), f"{key}_low": low, f"{key}_high": high}
 
 
 def _headlines(data: RunData) -> Table:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,14 +12,14 @@ import numpy as np
 import pandas as pd
 
 from eval.core.domains import domain_name
-from eval.core.statistics import ENOUGH_PAIRS, bootstrap_interval
+from eval.core.statistics import ENOUGH_PAIRS
 from eval.running.run_data import (
     Row,
     RunData,
     defined,
     flag,
+    interval_over_pairs,
     named_variants,
-    number,
     of,
     over_pairs,
     scenarios,
@@ -107,21 +108,14 @@ def unchanged_table(data: RunData) -> Table:
 
 def alarm_text(group: Sequence[Row]) -> str:
     """Return "alarm", "silent" or "refused" of one pair, or how many of several."""
-    counts: dict[str, int] = {}
-    for row in group:
-        refused = text(row, "status") != "ok"
-        word = "refused" if refused else "alarm" if flag(row, "is_alarm") else "silent"
-        counts[word] = counts.get(word, 0) + 1
-    return _counted(counts)
+    return _counted(
+        "refused" if text(row, "status") != "ok" else "alarm" if flag(row, "is_alarm") else "silent" for row in group
+    )
 
 
 def status_text(group: Sequence[Row]) -> str:
     """Return the status of one pair, or how many pairs have which."""
-    counts: dict[str, int] = {}
-    for row in group:
-        word = text(row, "status").replace("_", " ")
-        counts[word] = counts.get(word, 0) + 1
-    return _counted(counts)
+    return _counted(text(row, "status").replace("_", " ") for row in group)
 
 
 def best(values: Sequence[float], column: Column, n_used: Sequence[int] | None = None) -> list[bool]:
@@ -167,8 +161,7 @@ def beside(interval: str, n_used: int, n: int) -> str:
 
 def interval_text(group: Sequence[Row], column: Column) -> str:
     """Return the 95 % bootstrap interval over session pairs, "" for fewer than two defined values."""
-    values = np.array([number(row, column.key) for row in group], dtype=np.float64)
-    low, high = bootstrap_interval(values, "median" if column.key.startswith("t_") else "mean")
+    low, high = interval_over_pairs(group, column.key)
     return "" if math.isnan(low) else f"{column.shown(low)}{EN_DASH}{column.shown(high)}"
 
 
@@ -181,8 +174,9 @@ def _column_cells(groups: Sequence[Sequence[Row]], column: Column) -> list[Cell]
     ]
 
 
-def _counted(counts: dict[str, int]) -> str:
-    if sum(counts.values()) == 1:
+def _counted(words: Iterable[str]) -> str:
+    counts = Counter(words)
+    if counts.total() == 1:
         return next(iter(counts))
     return ", ".join(f"{n} {word}" for word, n in counts.items())
 

@@ -15,6 +15,7 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
+from eval.core.statistics import bootstrap_interval, statistic_of
 from eval.core.tablefile import table_file
 from eval.plans.coverage import Coverage, coverage
 from eval.plans.targets import targets_of
@@ -142,7 +143,12 @@ def over_pairs(rows: Iterable[Row], column: str) -> float:
     values = defined(rows, column)
     if len(values) == 0:
         return math.nan
-    return float(np.median(values) if column.startswith("t_") else values.mean())
+    return float(np.median(values) if statistic_of(column) == "median" else values.mean())
+
+
+def interval_over_pairs(rows: Iterable[Row], column: str) -> tuple[float, float]:
+    """Return the 95 % bootstrap interval of `over_pairs`; NaN for fewer than two defined values."""
+    return bootstrap_interval(np.array([number(row, column) for row in rows], np.float64), statistic_of(column))
 
 
 def of(rows: Iterable[Row], **wanted: Any) -> list[Row]:
@@ -222,7 +228,7 @@ def grids(data: RunData) -> list[GridOf]:
         found.setdefault((str(row["scenario"]), preset, tuple(settings)), {})[str(row["variant"])] = settings
     result = []
     for (scenario, preset, keys), variants in found.items():
-        values = {key: _sorted({settings[key] for settings in variants.values()}) for key in keys}
+        values = {key: sorted_values({settings[key] for settings in variants.values()}) for key in keys}
         varied = [key for key in keys if len(values[key]) >= 2]
         if len(varied) == 2:
             row_key, column_key = varied
@@ -277,7 +283,9 @@ def _cases(data: RunData) -> list[tuple[str, str, int]]:
     return [(str(row["scenario"]), str(row["variant"]), int(row["seed"])) for row in data.results]
 
 
-def _sorted(values: set[str]) -> tuple[str, ...]:
+def sorted_values(values: Iterable[str]) -> tuple[str, ...]:
+    """Return the values of a setting in rising order, numbers before words."""
+
     def order(value: str) -> tuple[int, float, str]:
         try:
             return 0, float(value), value

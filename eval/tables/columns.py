@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -45,12 +45,17 @@ def count(value: float) -> str:
     return f"{value:,.0f}".replace(",", THIN_SPACE) if value == round(value) else f"{value:.1f}"
 
 
+def scaled(factor: float) -> Callable[[float], str]:
+    """Return what writes three significant digits of a value times a factor, for other units than those of a table."""
+    return lambda value: significant(factor * value)
+
+
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column of results.csv.
+    """One column of a table.
 
     Attributes:
-        key: Its name there.
+        key: Its name in the file.
         heading: What stands above it on the page.
         better: Which direction wins, or None where neither does.
         shown: How a value is written.
@@ -62,81 +67,54 @@ class Column:
     heading: str
     better: Literal["high", "low"] | None
     shown: Callable[[float], str]
-    meaning: str
-    when_undefined: str
+    meaning: str = ""
+    when_undefined: str = ""
+
+
+def select(columns: Iterable[Column], *keys: str) -> tuple[Column, ...]:
+    """Return the columns of the given keys, in that order."""
+    known = {column.key: column for column in columns}
+    return tuple(known[key] for key in keys)
 
 
 _NO_CHANGE = "Undefined where the pair has no observable change."
 _NOT_OK = "Undefined where the status is not ok."
 
 RESULT_COLUMNS = (
-    Column(
-        "region_recall", "region recall", "high", share,
-        "Share of the observable changes that a reported region finds: its centre lies within the family's scoring "
-        "radius of the change's centroid.",
-        _NO_CHANGE,
-    ),
-    Column(
-        "region_precision", "region precision", "high", share,
-        "Share of true regions among the reported true and false ones; a second region on a found change counts as "
-        "neither.",
-        "Undefined where no region was reported that counts.",
-    ),
-    Column(
-        "region_recall_at_k", "recall at K", "high", share,
-        "Region recall of the K best-scored candidates, whatever the threshold says; K is the number of observable "
-        "changes.",
-        _NO_CHANGE,
-    ),
-    Column(
-        "region_auroc", "AUROC", "high", share,
-        "How well the score of each before keyframe tells those near an observable change from those far from any; "
-        "0.5 is chance.",
-        "Undefined where a pair has keyframes of one class only, or the method gives no keyframe scores.",
-    ),
-    Column(
-        "false_regions_per_100m", "false regions / 100 m", "low", share,
-        "Reported regions that find no change, per 100 m of the after drive.",
-        _NOT_OK,
-    ),
-    Column(
-        "object_iou_point", "object IoU", "high", share,
-        "Returns of the answer against returns of the truth, one per 0.1 m cell; best one-to-one match per observable "
-        "change, unmatched counts 0, mean over changes.",
-        _NO_CHANGE,
-    ),
-    Column(
-        "object_f1_50", "object F1 at 0.5", "high", share,
-        "Objects right at an IoU of at least 0.5, as the harmonic mean of their precision and recall.",
-        _NO_CHANGE,
-    ),
-    Column(
-        "kind_accuracy", "kind", "high", share,
-        "Share of the matched changes that were called added, removed, moved or reshaped rightly.",
-        "Undefined where no change was matched.",
-    ),
-    Column(
-        "merge_error_m", "merge error [m]", "low", fine,
-        "Median translation error between every after keyframe and the truly nearest before keyframe.",
-        _NOT_OK,
-    ),
-    Column(
-        "merge_error_deg", "merge error [deg]", "low", fine,
-        "The same in rotation.",
-        _NOT_OK,
-    ),
-    Column(
-        "t_total_s", "time [s]", "low", significant,
-        "Descriptors, change detection and object extraction of one pair, without the merge; one thread.",
-        _NOT_OK,
-    ),
+    Column("region_recall", "region recall", "high", share,
+           "Share of the observable changes that a reported region finds: its centre lies within the family's scoring "
+           "radius of the change's centroid.", _NO_CHANGE),
+    Column("region_precision", "region precision", "high", share,
+           "Share of true regions among the reported true and false ones; a second region on a found change counts as "
+           "neither.", "Undefined where no region was reported that counts."),
+    Column("region_recall_at_k", "recall at K", "high", share,
+           "Region recall of the K best-scored candidates, whatever the threshold says; K is the number of observable "
+           "changes.", _NO_CHANGE),
+    Column("region_auroc", "AUROC", "high", share,
+           "How well the score of each before keyframe tells those near an observable change from those far from any; "
+           "0.5 is chance.",
+           "Undefined where a pair has keyframes of one class only, or the method gives no keyframe scores."),
+    Column("false_regions_per_100m", "false regions / 100 m", "low", share,
+           "Reported regions that find no change, per 100 m of the after drive.", _NOT_OK),
+    Column("object_iou_point", "object IoU", "high", share,
+           "Returns of the answer against returns of the truth, one per 0.1 m cell; best one-to-one match per "
+           "observable change, unmatched counts 0, mean over changes.", _NO_CHANGE),
+    Column("object_f1_50", "object F1 at 0.5", "high", share,
+           "Objects right at an IoU of at least 0.5, as the harmonic mean of their precision and recall.", _NO_CHANGE),
+    Column("kind_accuracy", "kind", "high", share,
+           "Share of the matched changes that were called added, removed, moved or reshaped rightly.",
+           "Undefined where no change was matched."),
+    Column("merge_error_m", "merge error [m]", "low", fine,
+           "Median translation error between every after keyframe and the truly nearest before keyframe.", _NOT_OK),
+    Column("merge_error_deg", "merge error [deg]", "low", fine, "The same in rotation.", _NOT_OK),
+    Column("t_total_s", "time [s]", "low", significant,
+           "Descriptors, change detection and object extraction of one pair, without the merge; one thread.", _NOT_OK),
 )  # fmt: skip
 
 UNCHANGED_COLUMNS = (
     Column("n_regions", "regions", None, count, "Reported regions; each is a false alarm.", _NOT_OK),
     Column("n_objects", "objects", None, count, "Objects cut out of them.", _NOT_OK),
-    *(column for column in RESULT_COLUMNS if column.key in ("false_regions_per_100m", "merge_error_m",
-                                                            "merge_error_deg", "t_total_s")),
+    *select(RESULT_COLUMNS, "false_regions_per_100m", "merge_error_m", "merge_error_deg", "t_total_s"),
 )  # fmt: skip
 
 TIME_MEANINGS = (

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
-from eval.core.statistics import N_RESAMPLES, mean, median
+from eval.core.statistics import N_RESAMPLES, Statistic, mean, median
 from eval.tables.region_curves import RankedPairs, found_at
 from eval.tables.rows import PAIR, numbers, texts
 
@@ -22,7 +22,6 @@ EDGES: Mapping[str, tuple[float, ...]] = {
 }
 _HIT_IOU = 0.5
 _MEASURE = "hull_volume_m3"
-Statistic = Literal["mean", "median"]
 
 
 def main_changes(changes: pd.DataFrame) -> pd.DataFrame:

@@ -24,21 +24,21 @@ MERGE_COLUMNS = (
            "Wilson interval over pairs.", "No target for an oracle."),
     Column("wrong", "wrong, accepted", "low", fine,
            f"Pairs that were accepted with a median error over {RIGHT_M:g} m or {RIGHT_DEG:g} deg, or although the "
-           "sessions share no place, where the error is undefined.", ""),
+           "sessions share no place, where the error is undefined."),
     Column("merge_error_m", "error [m], [deg], along [m]", "low", fine,
            "Median over the accepted pairs of a pair's median error; below it the 95th percentile over the pairs, and "
            "of how many where not of all. Along: the part along the tunnel.", "Undefined where nothing was accepted."),
     Column("merge_error_m_p95", "p95 along path [m]", "low", fine,
-           "The same of a pair's 95th percentile over its keyframes.", ""),
+           "The same of a pair's 95th percentile over its keyframes."),
     Column("n_p95_over_half_m", "p95 over 0.5 m", "low", significant,
-           f"Accepted pairs whose 95th percentile along the path is over {RIGHT_M:g} m, median right or not.", ""),
+           f"Accepted pairs whose 95th percentile along the path is over {RIGHT_M:g} m, median right or not."),
     Column("overlap_true", "true overlap", None, fine,
-           "Share of the after drive that lies within 5 m of the before drive.", ""),
-    Column("t_index_s", "t_index", "low", significant, "Indexing both maps; can be done while mapping.", ""),
+           "Share of the after drive that lies within 5 m of the before drive."),
+    Column("t_index_s", "t_index", "low", significant, "Indexing both maps; can be done while mapping."),
     Column("t_merge_s", "t_merge", "low", significant,
            "From indexed maps and stored vectors to an accepted transform: every candidate registered coarsely, the "
-           "best judged along the path, the next only if it is refused.", ""),
-    Column("t_refine_s", "t_refine", "low", significant, "Local refinement along the path.", ""),
+           "best judged along the path, the next only if it is refused."),
+    Column("t_refine_s", "t_refine", "low", significant, "Local refinement along the path."),
 )  # fmt: skip
 
 

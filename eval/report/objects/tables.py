@@ -10,34 +10,23 @@ import pandas as pd
 
 from eval.core.domains import domain_name
 from eval.report.tables import Cell, Table, interval_of_row
-from eval.tables.columns import EN_DASH, Column, count, share, significant
+from eval.tables.columns import EN_DASH, Column, count, scaled, share
 from eval.tables.object_table import ORACLE_VARIANT
 from eval.tables.rows import records
 
-
-def _cm(metres: float) -> str:
-    return significant(100.0 * metres)
-
-
-def _percent(value: float) -> str:
-    return significant(100.0 * value)
-
-
-def _ms(seconds: float) -> str:
-    return significant(1000.0 * seconds)
-
-
+_cm = _percent = scaled(100.0)
+_ms = scaled(1000.0)
 OBJECT_COLUMNS = (
     Column("object_iou_point", "point IoU", "high", share,
            "Returns shared by answer and truth, of those in either, one per 0.1 m cell; mean over the observable "
-           "changes of a pair, missed ones 0, then over pairs. Below it the 95 % bootstrap interval over pairs.", ""),
+           "changes of a pair, missed ones 0, then over pairs. Below it the 95 % bootstrap interval over pairs."),
     Column("iou_matched_median", "of those matched", "high", share,
            "Median over the objects that were matched at all, all pairs together.",
            "Undefined where none was matched."),
-    Column("object_iou_voxel", "voxel IoU", "high", share, "The same with 0.1 m voxels, mean over 8 grids.", ""),
+    Column("object_iou_voxel", "voxel IoU", "high", share, "The same with 0.1 m voxels, mean over 8 grids."),
     Column("object_f1_25", "F1 at 0.25", "high", share, "Objects matched with at least this IoU, against missed and "
-           "false ones; mean over pairs.", ""),
-    Column("object_f1_50", "F1 at 0.5", "high", share, "", ""),
+           "false ones; mean over pairs."),
+    Column("object_f1_50", "F1 at 0.5", "high", share),
     Column("object_precision_50", "precision at 0.5", "high", share, "Matched objects among all that count.",
            "Undefined where none was answered."),
     Column("kind_accuracy", "kind right", "high", share,
@@ -50,20 +39,20 @@ OBJECT_COLUMNS = (
            "Median size of (answered - true) / true over matched muck piles.",
            "Undefined where no volume was answered."),
     Column("object_iou_point_partial", "short moves, reshaped: IoU", "high", share,
-           "Point IoU of the group `partial`, which is in no other column but kind and displacement.", ""),
+           "Point IoU of the group `partial`, which is in no other column but kind and displacement."),
 )  # fmt: skip
 OBJECT_COUNTS = {
     "iou_matched_median": "n_matched", "displacement_error_m": "n_displacements",
     "pile_volume_error": "n_piles", "object_iou_point_partial": "n_partial",
 }  # fmt: skip
 WITHDRAWAL_COLUMNS = (
-    Column("n_withdrawn", "withdrawn", None, count, "", ""),
-    Column("region_recall_proposed", "recall, proposed", "high", share, "", ""),
-    Column("region_recall", "recall, kept", "high", share, "", ""),
-    Column("false_regions_per_100m_proposed", "false / 100 m, proposed", "low", share, "", ""),
-    Column("false_regions_per_100m", "false / 100 m, kept", "low", share, "", ""),
-    Column("t_oe_per_region_s", "t_oe / region [ms]", None, _ms, "", ""),
-    Column("t_returns_per_region_s", "of that returns, kinds, shapes [ms]", None, _ms, "", ""),
+    Column("n_withdrawn", "withdrawn", None, count),
+    Column("region_recall_proposed", "recall, proposed", "high", share),
+    Column("region_recall", "recall, kept", "high", share),
+    Column("false_regions_per_100m_proposed", "false / 100 m, proposed", "low", share),
+    Column("false_regions_per_100m", "false / 100 m, kept", "low", share),
+    Column("t_oe_per_region_s", "t_oe / region [ms]", None, _ms),
+    Column("t_returns_per_region_s", "of that returns, kinds, shapes [ms]", None, _ms),
 )  # fmt: skip
 
 

@@ -13,21 +13,17 @@ from eval.report.regions.charts import draw_free_response, draw_roc, draw_sizes
 from eval.report.tables import Cell, Table, interval_of_row, methods_table, targets_table
 from eval.running.run_data import RunData, off_grids, shown_variant, stored_table
 from eval.running.runfolder import reported
-from eval.tables.columns import Column, share, significant
+from eval.tables.columns import Column, scaled, share, significant
 from eval.tables.rows import records, with_domain
 
-
-def _ms(seconds: float) -> str:
-    return significant(1000.0 * seconds)
-
-
+_ms = scaled(1000.0)
 REGION_COLUMNS = (
     Column("region_auroc", "AUROC", "high", share,
            "How well keyframe scores tell places near a change from places far from any; mean over pairs, below it the "
            "95 % bootstrap interval over pairs.",
            "Undefined for a pair without an answer, or with keyframes of one class only."),
     Column("region_auroc_pooled", "pooled", "high", share,
-           "The same over all keyframes of all pairs at once, scores as they are.", ""),
+           "The same over all keyframes of all pairs at once, scores as they are."),
     Column("region_recall_at_k", "recall at K", "high", share,
            "Share of the K observable changes of a pair that its K best candidates find, without what was withdrawn.",
            "0 without an answer."),
@@ -35,19 +31,19 @@ REGION_COLUMNS = (
            "Share of all observable changes found at the lowest threshold with at most 0.1 false regions per 100 m of "
            "after path, changed and unchanged pairs together; a threshold for each method and kind of site.",
            "0 for the changes of a pair without an answer."),
-    Column("recall_at_0.5", "at 0.5", "high", share, "The same at 0.5 false regions per 100 m.", ""),
+    Column("recall_at_0.5", "at 0.5", "high", share, "The same at 0.5 false regions per 100 m."),
     Column("recall_at_0.1_proposed", "at 0.1, proposed", "high", share,
-           "At 0.1 false regions per 100 m as if no region had been withdrawn: what the scores alone can do.", ""),
-    Column("region_recall", "recall", "high", share, "Share found at the method's own, calibrated threshold.", ""),
+           "At 0.1 false regions per 100 m as if no region had been withdrawn: what the scores alone can do."),
+    Column("region_recall", "recall", "high", share, "Share found at the method's own, calibrated threshold."),
     Column("region_precision", "precision", "high", share, "True among true and false regions.",
            "Undefined where nothing was reported."),
     Column("false_regions_per_100m", "false / 100 m", None, share,
-           "False regions at the method's own threshold, over the whole way of all pairs together.", ""),
+           "False regions at the method's own threshold, over the whole way of all pairs together."),
     Column("bytes_ratio", "map / kept", None, significant,
            "How many times smaller than the thinned before map that is which a method keeps of it to find regions; "
-           "1: the map itself.", ""),
+           "1: the map itself."),
     Column("t_descriptor_per_keyframe_s", "t_descriptor / keyframe [ms]", None, _ms,
-           "Median; can be done while mapping.", ""),
+           "Median; can be done while mapping."),
     Column("t_cd_per_region_s", "t_cd / region [ms]", None, _ms, "Median.",
            "Undefined where no region was reported."),
 )  # fmt: skip

@@ -15,16 +15,15 @@ from eval.plans.worlds import group_of
 from eval.report.settings.charts import effect_chart
 from eval.report.tables import Cell, Picture, Table
 from eval.running.run_data import RunData, of, over_pairs
-from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, Column, count
+from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, Column, count, select
 from eval.tables.effects import effects
 from eval.tables.rows import records
 
-_OBSERVABLE = Column("n_observable", "observable changes", None, count, "", "")
-_KEYS = (
-    "region_recall", "region_recall_at_k", "region_auroc", "false_regions_per_100m", "object_iou_point",
-    "merge_error_m",
+COLUMNS = (
+    Column("n_observable", "observable changes", None, count),
+    *select(RESULT_COLUMNS, "region_recall", "region_recall_at_k", "region_auroc", "false_regions_per_100m",
+            "object_iou_point", "merge_error_m"),
 )  # fmt: skip
-COLUMNS = (_OBSERVABLE, *(column for column in RESULT_COLUMNS if column.key in _KEYS))
 _DRAWN = ("region_recall_at_k", "object_iou_point")
 _MINUS = "\u2212"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from cdpipe.core.errors import InputError
 from cdpipe.model.config import load_config
 from eval.core.charts import COLOURS, Axis, Drawing, Look, Panel, Series, named_ticks
 from eval.core.domains import domain_name
-from eval.core.statistics import bootstrap_interval
 from eval.report.charts import Chart
 from eval.report.settings.grids import N_ACROSS, SHARES
 from eval.running.run_data import (
@@ -20,10 +19,11 @@ from eval.running.run_data import (
     RunData,
     defined,
     grid_points,
-    number,
+    interval_over_pairs,
     of,
     over_pairs,
     repeats,
+    sorted_values,
     split_variant,
     text,
 )
@@ -68,8 +68,7 @@ def factors(data: RunData) -> list[Factor]:
         own = _setting_of(preset, key) if preset in variants else ""
         every = {**points, own: preset} if own else points
         if len(every) >= 2:
-            order = sorted(every, key=_order)
-            result.append(Factor(preset, key, {value: every[value] for value in order}, own))
+            result.append(Factor(preset, key, {value: every[value] for value in sorted_values(every)}, own))
     return result
 
 
@@ -128,12 +127,7 @@ def _series(factor: Factor, rows: Sequence[Row], key: str, colour: str, domain: 
     """Return the line of a domain, and a star at the value that the preset itself has."""
     groups = [of(rows, variant=name) for name in factor.points.values()]
     means = np.array([over_pairs(group, key) for group in groups])
-    statistic: Literal["mean", "median"] = "median" if key.startswith("t_") else "mean"
-    ends = [
-        bootstrap_interval(np.array([number(row, key) for row in group], dtype=np.float64), statistic)
-        for group in groups
-    ]
-    low, high = np.array(ends).T
+    low, high = np.array([interval_over_pairs(group, key) for group in groups]).T
     hover = [
         f"{value}: {mean:.3g}, n {len(defined(group, key))}"
         for value, mean, group in zip(factor.points, means, groups, strict=True)
@@ -153,10 +147,3 @@ def _setting_of(preset: str, key: str) -> str:
     for part in key.split("."):
         value = value.get(part) if isinstance(value, dict) else None
     return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _order(value: str) -> tuple[int, float, str]:
-    try:
-        return 0, float(value), value
-    except ValueError:
-        return 1, 0.0, value
