@@ -43,9 +43,9 @@ class Chart:
     has_png: bool = False
 
     @property
-    def png(self) -> bytes | None:
-        """The chart as a PNG file for papers; None where there is none."""
-        return png(picture(self.drawing)) if self.has_png else None
+    def png(self) -> bytes:
+        """The chart as a PNG file for papers."""
+        return png(picture(self.drawing))
 
     @property
     def figure(self) -> dict[str, Any]:

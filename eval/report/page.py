@@ -81,66 +81,76 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
     """
     data = read_run(run)
     check_versions(Side(data), Side(data))
+    merges = merge_table(pd.DataFrame(list(data.results)), targets_of(data.provenance))
+    content = _about(data, merges)
     files: dict[str, str | bytes] = {**latex_tables(data)}
-    if len(merges := merge_table(pd.DataFrame(list(data.results)), targets_of(data.provenance))):
+    if len(merges):
         files["merge.csv"] = merges.to_csv(index=False)
-    if ends_at_merge(data):
-        files["index.html"] = rendered("page.html", _merge_content(data, merges))
-    else:
-        tables = {"results": results_table(data), "table1": time_table(data), "table2": volume_table(data)}
-        files["results.tex"] = to_latex(tables["results"])
-        for name in ("table1", "table2"):
-            files[f"{name}.csv"] = to_csv(tables[name])
-            files[f"{name}.tex"] = to_latex(tables[name])
+    if not ends_at_merge(data):
         points = pareto_table(data)
         if len(points):
             files["pareto.csv"] = points.to_csv(index=False)
-        content = _content(data, merges, tables, draw_pareto(points, is_contended=is_contended(data)), views)
-        files |= {f"{each.name}.png": each.png for each in content["charts"] if each.has_png}
-        files["index.html"] = rendered("page.html", content)
+        content |= _sections(data, draw_pareto(points, is_contended=is_contended(data)), views)
+        files["results.tex"] = to_latex(content["results"])
+        for name in ("table1", "table2"):
+            files |= {f"{name}.csv": to_csv(content[name]), f"{name}.tex": to_latex(content[name])}
+    content["missing"] = list(dict.fromkeys([*content["missing"], *content["merge"].missing]))
+    files["index.html"] = rendered("page.html", content)
+    files |= {f"{chart.name}.png": chart.png for chart in content["charts"] if chart.has_png}
     for name, file in files.items():
         written(run / name, file)
     return run / "index.html"
 
 
-def _content(
-    data: RunData, merges: pd.DataFrame, tables: Mapping[str, Table], pareto: Sequence[Chart], views: Views
-) -> dict[str, Any]:
-    regions, objects = draw_regions(data), draw_objects(data)
-    worlds = scenarios(data, unchanged=False)
+def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
+    """Return what every page shows: the run, its summary and its merges, and nothing of regions and objects."""
+    return {
+        "plan": str(data.provenance.get("plan", {}).get("name", "")),
+        "machine": machine_text(data.provenance),
+        "command": str(data.provenance.get("command") or "unknown"),
+        "finished": str(data.provenance.get("finished") or "unknown"),
+        "failures": failures(data),
+        "settings": settings(data),
+        "provenance": json.dumps(data.provenance, indent=2, ensure_ascii=False),
+        "commits": commits_text(data),
+        "summary": draw_summary(data, merges),
+        "merge": draw_merge(data),
+        "columns": MERGE_COLUMNS,
+        "views": None,
+        "charts": (),
+        "plotly": "",
+        # the other tables are not missing where a run ends at the merge
+        "missing": [line for line in data.missing if line.startswith("provenance.json")],
+    }
+
+
+def _sections(data: RunData, pareto: Sequence[Chart], views: Views) -> dict[str, Any]:
+    """Return what a page shows of regions, objects and times; `missing` lists what could not be shown of them."""
+    regions, objects, unchanged = draw_regions(data), draw_objects(data), unchanged_table(data)
+    worlds, variant = scenarios(data, unchanged=False), shown_variant(data)
     # a run about objects alone shows its best and worst in their own section, and no maps
     is_mapped = regions is not None or objects is None
     sites = [draw_site(data, scenario) for scenario in worlds] if is_mapped else []
-    variant = shown_variant(data)
     worst = worst_rows(data, variant)
     links = write_views(data, variant, [(str(row["scenario"]), int(row["seed"])) for row in worst], views)
     grids, factors, by_scenario = draw_grids(data), draw_factors(data), draw_scenarios(data)
-    unchanged = unchanged_table(data)
     n_unchanged = len({(row["scenario"], row["seed"]) for row in data.results if flag(row, "is_unchanged_pair")})
-    merge = draw_merge(data)
-    missing = [*data.missing, *(line for site in sites for line in site.missing), *merge.missing, *links.missing]
-    missing += [] if regions is None else regions.missing
-    missing += [] if objects is None else objects.missing
+    missing = [*data.missing, *(line for part in (*sites, links, regions, objects) if part for line in part.missing)]
     missing += [] if worlds else ["No scenario with changes was run."]
     if objects is None:
         missing += [] if n_unchanged else ["No unchanged pair was run, so false alarms are not measured."]
         missing += [] if grids else ["No grid of two settings was run."]
     charts = [*(regions.plots if regions is not None else ()), *pareto, *by_scenario, *grids, *factors]
     return {
-        **_about(data, missing),
-        "summary": draw_summary(data, merges),
         "regions": regions,
-        "region_columns": [] if regions is None else REGION_COLUMNS,
         "objects": objects,
-        "object_columns": [] if objects is None else OBJECT_COLUMNS,
-        "merge": merge,
-        "results": tables["results"],
+        "results": results_table(data),
         "unchanged": unchanged,
         "n_unchanged": n_unchanged,
         "effects": draw_effects(data),
         "enough_pairs": ENOUGH_PAIRS,
-        "table1": tables["table1"],
-        "table2": tables["table2"],
+        "table1": time_table(data),
+        "table2": volume_table(data),
         "grids": grids,
         "factors": factors,
         "by_scenario": by_scenario,
@@ -151,41 +161,14 @@ def _content(
         "charts": charts,
         "plotly": plotly_script() if charts else "",
         "sites": sites,
-        "columns": (*RESULT_COLUMNS, *([PQ_COLUMN] if grids else [])),
+        "columns": (
+            *(() if regions is None else REGION_COLUMNS), *(() if objects is None else OBJECT_COLUMNS),
+            *RESULT_COLUMNS, *([PQ_COLUMN] if grids else []),
+        ),
         "time_meanings": TIME_MEANINGS,
         "point_colours": POINT_COLOURS,
-    }
-
-
-def _merge_content(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
-    """Return the content of a page that shows the merge alone."""
-    merge = draw_merge(data)
-    # what a run without regions and objects does not hold is not missing
-    missing = [line for line in data.missing if line.startswith("provenance.json")]
-    return {
-        **_about(data, [*missing, *merge.missing]),
-        "summary": draw_summary(data, merges),
-        "merge": merge,
-        "columns": MERGE_COLUMNS,
-        "views": None,
-        "charts": (),
-        "plotly": "",
-    }
-
-
-def _about(data: RunData, missing: Sequence[str]) -> dict[str, Any]:
-    """Return what every page tells of its run."""
-    return {
-        "plan": str(data.provenance.get("plan", {}).get("name", "")),
-        "machine": machine_text(data.provenance),
-        "command": str(data.provenance.get("command") or "unknown"),
-        "finished": str(data.provenance.get("finished") or "unknown"),
-        "missing": list(dict.fromkeys(missing)),
-        "failures": failures(data),
-        "settings": settings(data),
-        "provenance": json.dumps(data.provenance, indent=2, ensure_ascii=False),
-        "commits": commits_text(data),
-    }
+        "missing": missing,
+    }  # fmt: skip
 
 
 def failures(data: RunData) -> list[str]:

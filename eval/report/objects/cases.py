@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Int64Array
-from cdpipe.io.answer import Answer, read_answer
-from eval.report.objects.objects import Shown, change_panels, object_title
+from cdpipe.io.answer import read_answer
+from eval.report.objects.objects import AnsweredPair, object_title
 from eval.report.tables import Picture
 from eval.running.run_data import Row, RunData, flag, number, of, split_variant, text
-from eval.scoring.answer_rows import answer_rows
 from eval.tables.columns import count, significant
-from eval.truth.ground_truth import GroundTruth, load_ground_truth
+from eval.truth.ground_truth import load_ground_truth
 
 N_WORST = 10
 VOXEL_RULE = "extract.method"
@@ -28,7 +27,7 @@ def object_cases(data: RunData, variant: str) -> tuple[list[Picture], list[str]]
     """
     chosen = chosen_cases([row for row in data.changes if row.get("variant") == variant])
     shown = [variant, *voxel_variants(data, variant)]
-    pairs: dict[tuple[str, int], _Opened | str] = {}
+    pairs: dict[tuple[str, int], AnsweredPair | str] = {}
     pictures, missing = [], []
     for words, row in chosen:
         scenario, seed = str(row["scenario"]), int(row["seed"])
@@ -84,18 +83,7 @@ def why(data: RunData, row: Row) -> str:
     return "its region was below the threshold" if near else "no candidate region finds it"
 
 
-class _Opened:
-    """A pair with the answers that are drawn."""
-
-    def __init__(self, truth: GroundTruth, answers: dict[str, Answer]) -> None:
-        self.truth = truth
-        self.answers = answers
-        self.rows: dict[str, Sequence[Int64Array]] = {
-            name: answer_rows(answer, truth) for name, answer in answers.items()
-        }
-
-
-def _open(data: RunData, scenario: str, seed: int, shown: Sequence[str]) -> _Opened | str:
+def _open(data: RunData, scenario: str, seed: int, shown: Sequence[str]) -> AnsweredPair | str:
     """Open a pair, or say why it cannot be drawn."""
     try:
         truth = load_ground_truth(data.folder.pair(scenario, seed))
@@ -103,29 +91,19 @@ def _open(data: RunData, scenario: str, seed: int, shown: Sequence[str]) -> _Ope
         return f"The simulated pair {scenario}, seed {seed}, is not in the run folder: its objects are not drawn."
     answers = {}
     for name in shown:
-        try:
-            answer = read_answer(data.folder.answer(scenario, seed, name))
-        except InputError:
-            continue
-        if answer.report is not None:
-            answers[name] = answer
-    return _Opened(truth, answers)
+        with suppress(InputError):
+            answers[name] = read_answer(data.folder.answer(scenario, seed, name))
+    return AnsweredPair(data, (scenario, seed), truth, answers)
 
 
-def _picture(data: RunData, words: str, row: Row, opened: _Opened, shown: Sequence[str]) -> Picture:
-    change_id = int(number(row, "id"))
-    index = next(place for place, change in enumerate(opened.truth.pair.changes) if change.id == change_id)
-    scenario, seed = str(row["scenario"]), int(row["seed"])
-    beside = []
-    for place, name in enumerate(shown):
-        rows = of(data.changes, scenario=scenario, seed=seed, variant=name, id=change_id)
-        title = name if place == 0 else "voxel rule"
-        beside.append(Shown(title, opened.answers.get(name), opened.rows.get(name, ()), rows[0] if rows else {}))
-    change = opened.truth.pair.changes[index]
-    address = change_panels(index, opened.truth, beside)
-    reason = why(data, row)
+def _picture(data: RunData, words: str, row: Row, pair: AnsweredPair, shown: Sequence[str]) -> Picture:
+    changes = pair.truth.pair.changes
+    index = [change.id for change in changes].index(int(number(row, "id")))
+    change, reason = changes[index], why(data, row)
+    titles = {name: "voxel rule" if place else name for place, name in enumerate(shown)}
+    seen_from = f"{count(change.n_returns)} returns from {significant(number(row, 'range_m'))} m on"
     caption = (
-        f"{scenario}, seed {seed}; {significant(change.hull_volume_m3)} m³, {count(change.n_returns)} returns from "
-        f"{significant(number(row, 'range_m'))} m on"
+        f"{row['scenario']}, seed {int(row['seed'])}; {significant(change.hull_volume_m3)} m³, "
+        f"{seen_from}{'; ' if reason else ''}{reason}"
     )
-    return Picture(f"{words}: {object_title(change)}", address, f"{caption}{'; ' if reason else ''}{reason}")
+    return Picture(f"{words}: {object_title(change)}", pair.draw(index, titles), caption)

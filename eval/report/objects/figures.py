@@ -12,6 +12,8 @@ from cdpipe.core.geometry import Float64Array
 from eval.core.charts import BLACK, CONTEXT
 from eval.core.figures import blank_figure, data_address
 
+# (points (N, 3) in metres, colour) of each
+Layers = tuple[tuple[Float64Array, str], ...]
 _TURNS_RAD = np.deg2rad([25.0, -25.0, 65.0, -65.0, 90.0])
 
 
@@ -22,12 +24,12 @@ class Panel:
     Attributes:
         title: What stands above it.
         note: What stands below it.
-        layers: (points (N, 3) in metres, colour) from back to front; all panels of an object share a frame.
+        layers: From back to front; all panels of an object share a frame.
     """
 
     title: str
     note: str
-    layers: tuple[tuple[Float64Array, str], ...]
+    layers: Layers
 
 
 def object_panels(panels: Sequence[Panel], truth: Float64Array, view_from: Float64Array) -> str:
