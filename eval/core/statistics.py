@@ -100,6 +100,28 @@ def mean_with_interval(values: Float64Array, seed: int = 0) -> tuple[float, floa
     return mean(values), low, high, len(values)
 
 
+def paired_difference(a: Float64Array, b: Float64Array, seed: int = 0) -> dict[str, Any]:
+    """Return the mean difference b - a over the pairs that have a number on both sides.
+
+    Args:
+        a: (N,) numbers of one side, one for each session pair, NaN where undefined.
+        b: (N,) numbers of the other side, for the same pairs.
+        seed: Seed of the bootstrap.
+
+    Returns:
+        `n_used` pairs with both numbers, `n_only_a` and `n_only_b` with one; over those used the means `mean_a` and
+        `mean_b` and the `difference` with its 95 % interval `low` to `high`, NaN where there is none.
+    """
+    has_a, has_b = ~np.isnan(a), ~np.isnan(b)
+    used = has_a & has_b
+    difference, low, high, n_used = mean_with_interval((b - a)[used], seed)
+    return {
+        "n_used": n_used, "n_only_a": int((has_a & ~has_b).sum()), "n_only_b": int((has_b & ~has_a).sum()),
+        "mean_a": mean(a[used]), "mean_b": mean(b[used]), "difference": difference,
+        "low": low, "high": high,
+    }  # fmt: skip
+
+
 def wilson_interval(n_hits: int, n: int) -> tuple[float, float]:
     """Return the 95 % Wilson score interval of the share of `n` pairs that are hits; NaN for none.
 

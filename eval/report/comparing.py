@@ -14,11 +14,11 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.errors import InputError
-from eval.core.statistics import ENOUGH_PAIRS, mean_with_interval
+from eval.core.statistics import ENOUGH_PAIRS, paired_difference
 from eval.report.compared_columns import COMPARED, POOLED, POOLED_RATE_PER_100M, figures_of, is_time
 from eval.running.sides import Side, check_versions, matched_variants
 from eval.tables.region_curves import interval_of, ranked_pairs, recall_at, resampled_recalls
-from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR
+from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers
 
 BETTER, WORSE, NOISE = "better", "worse", "no difference beyond noise"
 SAME, TOO_FEW, NOT_JUDGED = "the same", "too few pairs", "not judged"
@@ -70,7 +70,7 @@ def compare(a: Side, b: Side, *, times_count: bool = True, seed: int = 0) -> pd.
         raise InputError(f"{a.name} and {b.name} share no session pair and variant: nothing can be paired")
     for row in rows:
         is_judged = times_count or not is_time(row["metric"])
-        row["verdict"] = _verdict(row) if is_judged else NOT_JUDGED
+        row["verdict"] = verdict(row) if is_judged else NOT_JUDGED
     rows.sort(key=_place)
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
@@ -86,47 +86,30 @@ def paired_differences(a: pd.DataFrame, b: pd.DataFrame, seed: int = 0) -> list[
     Returns:
         A row for each column that at least one pair has on both sides.
     """
-    found = []
-    for column in COMPARED:
-        if column.key not in a or column.key not in b:
-            continue
-        values_a, values_b = a[column.key].to_numpy(np.float64), b[column.key].to_numpy(np.float64)
-        has_a, has_b = ~np.isnan(values_a), ~np.isnan(values_b)
-        used = has_a & has_b
-        if not used.any():
-            continue
-        difference, low, high, n = mean_with_interval((values_b - values_a)[used], seed)
-        found.append(
-            {
-                "metric": column.key, "good": column.better, "n_used": n, "n_only_a": int((has_a & ~has_b).sum()),
-                "n_only_b": int((has_b & ~has_a).sum()), "mean_a": float(values_a[used].mean()),
-                "mean_b": float(values_b[used].mean()), "difference": difference, "low": low, "high": high,
-            }
-        )  # fmt: skip
-    return found
+    columns = [column for column in COMPARED if column.key in a and column.key in b]
+    found = [
+        {"metric": column.key, "good": column.better,
+         **paired_difference(numbers(a, column.key), numbers(b, column.key), seed)}
+        for column in columns
+    ]  # fmt: skip
+    return [row for row in found if row["n_used"]]
 
 
-def verdict(good: str, n_used: int, difference: float, interval: tuple[float, float]) -> str:
-    """Return the word for the difference of a figure whose good direction is "high" or "low".
+def verdict(row: Mapping[str, Any]) -> str:
+    """Return the word for a difference b - a.
 
     Args:
-        good: The direction in which it should move.
-        n_used: Over how many session pairs the difference is.
-        difference: B less A.
-        interval: Its 95 % interval; NaN for none.
+        row: `good`, the direction ("high" or "low") in which the figure should move; `n_used`, over how many session
+            pairs the difference is; `difference` and its 95 % interval `low` to `high`, NaN for none.
     """
-    low, high = interval
-    if difference == 0.0 and low == 0.0 and high == 0.0:
+    low, high = row["low"], row["high"]
+    if row["difference"] == low == high == 0.0:
         return SAME
-    if n_used < ENOUGH_PAIRS or math.isnan(low):
+    if row["n_used"] < ENOUGH_PAIRS or math.isnan(low):
         return TOO_FEW
     if low <= 0.0 <= high:
         return NOISE
-    return BETTER if (low > 0.0) == (good == "high") else WORSE
-
-
-def _verdict(row: Mapping[str, Any]) -> str:
-    return verdict(row["good"], row["n_used"], row["difference"], (row["low"], row["high"]))
+    return BETTER if (low > 0.0) == (row["good"] == "high") else WORSE
 
 
 def _groups(a: pd.DataFrame, b: pd.DataFrame) -> list[tuple[str, str, pd.MultiIndex]]:

@@ -16,11 +16,11 @@ import pandas as pd
 from cdpipe.core.geometry import BoolArray, Float64Array
 from eval.core.charts import BLACK, BLUE, SYMBOLS, Axis, Drawing, Look, Panel, Series, log_span
 from eval.core.domains import domain_name
-from eval.core.statistics import mean_with_interval
+from eval.core.statistics import mean, mean_with_interval, median
 from eval.report.charts import Chart
 from eval.report.regions.charts import look_of
 from eval.running.run_data import RunData, comparable, stored_table
-from eval.tables.rows import ALL_DOMAINS, DOMAINS, is_told_the_truth, mean, median, numbers, records
+from eval.tables.rows import ALL_DOMAINS, DOMAINS, is_told_the_truth, numbers, records
 
 _RECALL_AT_RATE, _RECALL_AT_K, _F1 = "recall_at_0.1", "region_recall_at_k", "object_f1_50"
 _TIME, _BYTES = "t_total_s", "bytes_regions_before"

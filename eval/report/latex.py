@@ -17,7 +17,7 @@ from typing import Any
 
 import pandas as pd
 
-from eval.core.statistics import mean_with_interval
+from eval.core.statistics import paired_difference
 from eval.report.compared_columns import COMPARED, POOLED
 from eval.report.comparing import BETTER, WORSE, pooled_difference, verdict
 from eval.report.objects.tables import OBJECT_COLUMNS
@@ -140,16 +140,12 @@ def _is_told_apart(cases: pd.DataFrame, column: Column, first: str, second: str,
     pairs = own[0].index.intersection(own[1].index)
     if column.key == POOLED:
         rows = pooled_difference((Side(data), Side(data)), (first, second), pairs)
-        if not rows:
-            return None
-        n_used, difference, interval = rows[0]["n_used"], rows[0]["difference"], (rows[0]["low"], rows[0]["high"])
     elif column.key in cases:
-        values = [numbers(frame.loc[pairs], column.key) for frame in own]
-        difference, low, high, n_used = mean_with_interval(values[1] - values[0])
-        interval = (low, high)
+        a, b = (numbers(frame.loc[pairs], column.key) for frame in own)
+        rows = [paired_difference(a, b)]
     else:
-        return None
-    return verdict("high", n_used, difference, interval) in (BETTER, WORSE)
+        rows = []
+    return verdict({"good": "high", **rows[0]}) in (BETTER, WORSE) if rows else None
 
 
 def _caption(words: str, data: RunData, results: pd.DataFrame) -> str:

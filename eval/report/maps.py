@@ -87,8 +87,7 @@ def distance_map(before: Points, after: Points) -> str:
         after: (M, 3) points in the same frame; a fixed random subset of a large map is tested.
     """
     raster = Raster.around(before, after)
-    if len(after) > _MAX_TESTED:
-        after = after[stream(0, "page", "subset").choice(len(after), _MAX_TESTED, replace=False)]
+    after = draw_subset(after, _MAX_TESTED)
     tree = cKDTree(before, compact_nodes=False, balanced_tree=False)
     distances = np.asarray(tree.query(after, distance_upper_bound=2 * FAR_M)[0])
     rows, columns, inside = raster.cells(after)
@@ -99,17 +98,9 @@ def distance_map(before: Points, after: Points) -> str:
     image = np.where((farthest < 0)[..., None], _on_white(_tinted(n_before, CONTEXT), n_before > 0), image)
     figure, axes = _map_axes(raster)
     axes.imshow(image, extent=raster.extent, origin="lower")
-    bar = figure.colorbar(
-        ScalarMappable(Normalize(0.0, FAR_M), _DISTANCE_COLOURS),
-        ax=axes,
-        extend="max",
-        location="top",
-        shrink=0.35,
-        aspect=30,
-        pad=0.02,
+    draw_colour_bar(
+        figure, axes, _DISTANCE_COLOURS, FAR_M, "distance to the before map [m]", location="top", shrink=0.35, aspect=30
     )
-    bar.set_label("distance to the before map [m]", fontsize=8)
-    bar.ax.tick_params(labelsize=7)
     return data_address(figure)
 
 
@@ -249,13 +240,33 @@ def _map_axes(raster: Raster) -> tuple[Figure, Axes]:
     width_in = float(np.clip(height_in * columns / rows, 6.5, _MAP_WIDTH_IN))
     figure = blank_figure(width_in, height_in + 0.8)
     axes = figure.add_subplot()
-    axes.set_aspect("equal")
     axes.set_xlabel("x [m]", fontsize=8)
     axes.set_ylabel("y [m]", fontsize=8)
-    axes.tick_params(labelsize=7)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    style_map_axes(axes)
     return figure, axes
+
+
+def style_map_axes(axes: Axes) -> None:
+    """Give axes that show a map from above equal scales, small ticks, and no frame at the top and the right."""
+    axes.set_aspect("equal")
+    axes.tick_params(labelsize=7)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def draw_colour_bar(
+    figure: Figure, axes: Axes | list[Axes], colours: LinearSegmentedColormap, end_m: float, label: str, **place: Any
+) -> None:
+    """Draw the scale of colours from 0 to `end_m` and more; `place` says where, as matplotlib takes it."""
+    bar = figure.colorbar(ScalarMappable(Normalize(0.0, end_m), colours), ax=axes, extend="max", pad=0.02, **place)
+    bar.set_label(label, fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+
+
+def draw_subset(points: Points, n_most: int) -> Points:
+    """Return (N, 3) points, or a fixed random subset where there are more than `n_most`."""
+    if len(points) <= n_most:
+        return points
+    return points[stream(0, "page", "subset").choice(len(points), n_most, replace=False)]
 
 
 def _legend(axes: Axes, handles: list[Any]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
-from eval.core.statistics import bootstrap_interval, statistic_of
+from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
 from eval.report.compared_columns import COMPARED, POOLED, figures_of, is_time
 from eval.report.tables import Cell, Table, methods_table
 from eval.running.run_data import (
@@ -28,7 +28,7 @@ from eval.running.run_data import (
 from eval.running.sides import is_contended
 from eval.tables.columns import Column, fine, select, share, spaced
 from eval.tables.merge_table import ALL_FAMILIES, RIGHT_DEG, RIGHT_M
-from eval.tables.rows import ALL_DOMAINS, PAIR, by_domain, is_told_the_truth, mean, median, numbers, records
+from eval.tables.rows import ALL_DOMAINS, PAIR, by_domain, is_told_the_truth, numbers, records
 
 _MAX_METHODS = 8
 HEADLINES = select(

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
-from eval.core.statistics import IDENTITY_COLUMNS, mean_with_interval
+from eval.core.statistics import IDENTITY_COLUMNS, paired_difference
 from eval.plans.worlds import references, settings_over
+from eval.tables.rows import numbers
 
 KEYS = ("scenario", "variant", "seed")
 COLUMNS = ("reference", "settings", "variant", "metric", "without", "with", "difference", "low", "high", "n")
@@ -32,20 +32,15 @@ def effects(results: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
         there is none. Times are left out: they say more about the machine. Without such worlds there is no row.
     """
     metrics = [name for name in results.columns if name not in IDENTITY_COLUMNS and not name.startswith("t_")]
-    numbers = results[metrics].apply(pd.to_numeric, errors="coerce").set_index(results["seed"])
-    cases = dict(list(numbers.groupby([results["scenario"].to_numpy(), results["variant"].to_numpy()])))
+    figures = results[metrics].apply(pd.to_numeric, errors="coerce").set_index(results["seed"])
+    cases = dict(list(figures.groupby([results["scenario"].to_numpy(), results["variant"].to_numpy()])))
     rows: list[dict[str, Any]] = []
     for (world, variant), reference in references(zip(*(results[name] for name in KEYS), strict=True)).items():
         changed, plain = cases[world, variant].align(cases[reference, variant], join="inner", axis=0)
         names = {"reference": reference, "settings": settings_over(world, reference), "variant": variant}
-        rows += [{**names, "metric": metric, **_effect(plain, changed, metric, seed)} for metric in metrics]
-    return pd.DataFrame(rows, columns=list(COLUMNS))
-
-
-def _effect(plain: pd.DataFrame, changed: pd.DataFrame, metric: str, seed: int) -> dict[str, Any]:
-    without, with_ = (frame[metric].to_numpy(dtype=np.float64) for frame in (plain, changed))
-    is_used = ~np.isnan(without) & ~np.isnan(with_)
-    difference, low, high, n = mean_with_interval((with_ - without)[is_used], seed)
-    means = (float(values[is_used].mean()) if n else float("nan") for values in (without, with_))
-    found = dict(zip(("without", "with"), means, strict=True))
-    return {**found, "difference": difference, "low": low, "high": high, "n": n}
+        rows += [
+            {**names, "metric": metric, **paired_difference(numbers(plain, metric), numbers(changed, metric), seed)}
+            for metric in metrics
+        ]
+    columns = {"mean_a": "without", "mean_b": "with", "n_used": "n"}
+    return pd.DataFrame(rows).rename(columns=columns).reindex(columns=list(COLUMNS))

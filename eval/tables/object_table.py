@@ -14,11 +14,11 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
-from eval.core.statistics import mean_with_interval, median
+from eval.core.statistics import median
 from eval.plans.targets import Targets
 from eval.scoring.object_sizes import PILE_KIND
 from eval.tables.groups import clustered_interval, main_changes, objects_by_group, pair_numbers
-from eval.tables.rows import by_domain, numbers, of_cases, texts, with_domain
+from eval.tables.rows import by_domain, means_with_intervals, numbers, of_cases, texts, with_domain
 from eval.tables.targets import judged_targets
 
 FILES = ("objects_table", "objects_by_group", "objects_targets")
@@ -104,9 +104,7 @@ def _counts(own: pd.DataFrame, changes: pd.DataFrame) -> dict[str, Any]:
 
 def _means(own: pd.DataFrame) -> dict[str, float]:
     """Return means over pairs with their intervals, false regions over the whole way, and the median time."""
-    found: dict[str, float] = {}
-    for name in _MEANS:
-        found[name], found[f"{name}_low"], found[f"{name}_high"], _ = mean_with_interval(numbers(own, name))
+    found = means_with_intervals(own, _MEANS)
     path_m = numbers(own, "after_path_m")
     for name in _RATES:
         rate = numbers(own, name)

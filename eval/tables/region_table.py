@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from eval.core.ranking import auroc
-from eval.core.statistics import mean, mean_with_interval, median, wilson_interval
+from eval.core.statistics import mean, median, wilson_interval
 from eval.plans.targets import Targets
 from eval.tables.groups import recall_by_size
 from eval.tables.region_curves import (
@@ -27,7 +27,7 @@ from eval.tables.region_curves import (
     resampled_recalls,
     roc_curve,
 )
-from eval.tables.rows import by_domain, numbers, of_cases, with_domain
+from eval.tables.rows import by_domain, means_with_intervals, numbers, of_cases, with_domain
 from eval.tables.targets import is_unchanged_pair, judged_targets
 
 FILES = ("regions_table", "regions_targets", "regions_by_size", "roc", "froc")
@@ -111,10 +111,6 @@ def _counts(own: pd.DataFrame) -> dict[str, Any]:
     unchanged_m = numbers(unchanged, "after_path_m")[~np.isnan(alarms)].sum()
     n_false_unchanged = np.nansum(numbers(unchanged, "n_false_regions")[~np.isnan(alarms)])
     map_bytes, kept_bytes = numbers(answered, "bytes_map_before"), numbers(answered, "bytes_regions_before")
-    means: dict[str, Any] = {}
-    for name in _MEANS:
-        value, low, high, _ = mean_with_interval(numbers(own, name))
-        means |= {name: value, f"{name}_low": low, f"{name}_high": high}
     return {
         "n_pairs": len(own),
         "n_refused": int((own["status"] == "merge_refused").sum()),
@@ -123,7 +119,7 @@ def _counts(own: pd.DataFrame) -> dict[str, Any]:
         "n_changed": int(np.count_nonzero(numbers(own, "n_observable") > 0)),
         "n_observable": int(np.nansum(numbers(own, "n_observable"))),
         "n_found": int(np.nansum(numbers(own, "n_found_changes"))),
-        **means,
+        **means_with_intervals(own, _MEANS),
         "km": path_m / 1000.0,
         "false_regions_per_100m": 100.0 * n_false / path_m if path_m > 0 else math.nan,
         "n_unchanged": n_unchanged,

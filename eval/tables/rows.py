@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
 from eval.core.domains import domain_of
+from eval.core.statistics import mean_with_interval
 
 PAIR = ["scenario", "seed"]
 ALL_DOMAINS = "all"
@@ -33,6 +34,14 @@ def numbers(table: pd.DataFrame, column: str) -> Float64Array:
     if column not in table:
         return np.full(len(table), np.nan)
     return pd.to_numeric(table[column], errors="coerce").to_numpy(dtype=np.float64)
+
+
+def means_with_intervals(table: pd.DataFrame, columns: Iterable[str]) -> dict[str, float]:
+    """Return the mean of each column over session pairs, and its 95 % interval under `..._low` and `..._high`."""
+    found: dict[str, float] = {}
+    for name in columns:
+        found[name], found[f"{name}_low"], found[f"{name}_high"], _ = mean_with_interval(numbers(table, name))
+    return found
 
 
 def is_told_the_truth(variant: str) -> bool:

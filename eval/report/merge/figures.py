@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.patches import Rectangle
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Float64Array, stream
+from cdpipe.core.geometry import Float64Array
 from eval.core.charts import BLACK, VERMILLION
 from eval.core.figures import blank_figure, data_address
-from eval.report.maps import Points, Raster, bulk_mask
+from eval.report.maps import Points, Raster, bulk_mask, draw_colour_bar, draw_subset, style_map_axes
 
 FULL_M = 0.3
 STRETCH_M = 16.0
@@ -20,7 +21,7 @@ _UNSEEN_M = 1.0
 _MAX_DRAWN = 120_000
 _NEIGHBOURS = 6
 _SQUARE_M = 8.0
-_MARGIN_M = 0.5
+_MARGINS_M = (-0.5, 0.5, -0.5, 0.5)
 _WIDTH_IN = 9.0
 _COLOURS = LinearSegmentedColormap.from_list(
     "gap", [(0.0, "#dfe7ee"), (0.2, "#a9c6dc"), (0.4, "#f3d9a4"), (0.65, VERMILLION), (1.0, "#6d0f00")]
@@ -81,10 +82,12 @@ def alignment_picture(before: Points, aligned: Points) -> str:
         aligned: (M, 3) points of the after map in the map frame; a fixed random subset of a large map is drawn.
     """
     raster = Raster.around(before, aligned)
-    aligned = _subset(aligned[bulk_mask(aligned[:, :2])])
+    aligned = draw_subset(aligned[bulk_mask(aligned[:, :2])], _MAX_DRAWN)
     distances_m = surface_distances(before, aligned)
-    before = _subset(before[bulk_mask(before[:, :2])])
+    before = draw_subset(before[bulk_mask(before[:, :2])], _MAX_DRAWN)
     worst = worst_stretch(aligned, distances_m)
+    farthest_on_top = np.argsort(distances_m)
+    aligned, distances_m = aligned[farthest_on_top], distances_m[farthest_on_top]
     left, right, bottom, top = raster.extent if worst is None else _around_both(raster.extent, _around(worst))
     aspect = (right - left) / (top - bottom)
     height_in = float(np.clip((_WIDTH_IN - 0.9) / (aspect + 1.0), 2.4, 4.4))
@@ -101,19 +104,11 @@ def alignment_picture(before: Points, aligned: Points) -> str:
         zoom.set_title(f"where it fits worst ({STRETCH_M:g} m)", fontsize=8)
         square = Rectangle(window[::2], STRETCH_M, STRETCH_M, fill=False, edgecolor=BLACK, linewidth=1.0)
         whole.add_patch(square)
-    bar = figure.colorbar(
-        ScalarMappable(Normalize(0.0, FULL_M), _COLOURS), ax=[whole, zoom], extend="max", location="bottom",
-        shrink=0.4, aspect=40, pad=0.02,
+    draw_colour_bar(
+        figure, [whole, zoom], _COLOURS, FULL_M, "distance to the surface of the before map [m]", location="bottom",
+        shrink=0.4, aspect=40,
     )  # fmt: skip
-    bar.set_label("distance to the surface of the before map [m]", fontsize=8)
-    bar.ax.tick_params(labelsize=7)
     return data_address(figure)
-
-
-def _subset(points: Points) -> Points:
-    if len(points) <= _MAX_DRAWN:
-        return points
-    return points[stream(0, "page", "subset").choice(len(points), _MAX_DRAWN, replace=False)]
 
 
 def _around(centre: tuple[float, float]) -> tuple[float, float, float, float]:
@@ -126,33 +121,17 @@ def _around_both(
     extent: tuple[float, float, float, float], square: tuple[float, float, float, float]
 ) -> tuple[float, float, float, float]:
     """Left, right, bottom, top of the smallest window that shows the whole of both, the square's outline too."""
-    return (
-        min(extent[0], square[0] - _MARGIN_M),
-        max(extent[1], square[1] + _MARGIN_M),
-        min(extent[2], square[2] - _MARGIN_M),
-        max(extent[3], square[3] + _MARGIN_M),
-    )
+    left, right, bottom, top = (end + margin for end, margin in zip(square, _MARGINS_M, strict=True))
+    return min(extent[0], left), max(extent[1], right), min(extent[2], bottom), max(extent[3], top)
 
 
 def _points_from_above(
     axes: Axes, before: Points, after: Points, distances_m: Float64Array, window: tuple[float, float, float, float]
 ) -> None:
-    """Draw the before map pale and the after map over it, the farthest points on top."""
+    """Draw the before map pale and the after map over it, in the order in which its points come."""
     left, right, bottom, top = window
-    span = max(right - left, top - bottom)
-    size = float(np.clip(75.0 / span, 0.25, 6.0))
-    for points, colours in ((before, None), (after, distances_m)):
-        inside = (points[:, 0] >= left) & (points[:, 0] <= right) & (points[:, 1] >= bottom) & (points[:, 1] <= top)
-        own = points[inside]
-        if colours is None:
-            axes.scatter(own[:, 0], own[:, 1], s=size, color=_UNSEEN, linewidths=0)
-        else:
-            order = np.argsort(colours[inside])
-            axes.scatter(
-                own[order, 0], own[order, 1], s=size, c=colours[inside][order], cmap=_COLOURS, vmin=0.0, vmax=FULL_M,
-                linewidths=0,
-            )  # fmt: skip
-    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
-    axes.tick_params(labelsize=7)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    look: dict[str, Any] = {"s": float(np.clip(75.0 / max(right - left, top - bottom), 0.25, 6.0)), "linewidths": 0}
+    axes.scatter(before[:, 0], before[:, 1], color=_UNSEEN, **look)
+    axes.scatter(after[:, 0], after[:, 1], c=distances_m, cmap=_COLOURS, vmin=0.0, vmax=FULL_M, **look)
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+    style_map_axes(axes)

@@ -99,11 +99,15 @@ def test_every_column_has_a_direction_and_the_verdict_respects_it() -> None:
     costs = {"t_total_s", "t_total_with_merge_s", "bytes_regions_before"}
     errors = {"merge_error_m", "merge_error_deg", "merge_error_m_p95"}
     assert low == {"false_regions_per_100m", "is_alarm"} | costs | errors
-    assert verdict("high", 6, 0.2, (0.1, 0.3)) == verdict("low", 6, -0.2, (-0.3, -0.1)) == BETTER
-    assert verdict("low", 6, 0.2, (0.1, 0.3)) == verdict("high", 6, -0.2, (-0.3, -0.1)) == WORSE
-    assert verdict("high", 60, 0.2, (0.0, 0.3)) == verdict("low", 60, 0.0, (-0.1, 0.3)) == NOISE
-    assert verdict("high", 5, 0.2, (0.1, 0.3)) == verdict("high", 1, 0.2, (NAN, NAN)) == TOO_FEW
-    assert verdict("high", 6, 0.0, (0.0, 0.0)) == SAME
+    assert word("high", 6, 0.2, 0.1, 0.3) == word("low", 6, -0.2, -0.3, -0.1) == BETTER
+    assert word("low", 6, 0.2, 0.1, 0.3) == word("high", 6, -0.2, -0.3, -0.1) == WORSE
+    assert word("high", 60, 0.2, 0.0, 0.3) == word("low", 60, 0.0, -0.1, 0.3) == NOISE
+    assert word("high", 5, 0.2, 0.1, 0.3) == word("high", 1, 0.2, NAN, NAN) == TOO_FEW
+    assert word("high", 6, 0.0, 0.0, 0.0) == SAME
+
+
+def word(good: str, n_used: int, difference: float, low: float, high: float) -> str:
+    return verdict({"good": good, "n_used": n_used, "difference": difference, "low": low, "high": high})
 
 
 def test_noise_is_called_moved_about_once_in_twenty_times() -> None:
@@ -119,7 +123,7 @@ def test_noise_is_called_moved_about_once_in_twenty_times() -> None:
 
 def _recall_verdict(a: pd.DataFrame, b: pd.DataFrame) -> str:
     found = {each["metric"]: each for each in paired_differences(a, b)}["region_recall"]
-    return verdict("high", found["n_used"], found["difference"], (found["low"], found["high"]))
+    return verdict(found)
 
 
 def test_domains_scenarios_and_all_pairs_have_rows(write: Write) -> None:
