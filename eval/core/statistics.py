@@ -86,7 +86,15 @@ def bootstrap_interval(values: Float64Array, statistic: Statistic = "mean", seed
     samples = values[draws]
     samples = samples[~np.isnan(samples).all(axis=1)]
     results = np.nanmean(samples, axis=1) if statistic == "mean" else np.nanmedian(samples, axis=1)
-    low, high = np.percentile(results, (2.5, 97.5))
+    return interval_of(results)
+
+
+def interval_of(samples: Float64Array) -> tuple[float, float]:
+    """Return the 95 % percentile interval of bootstrap samples, NaN among them left out; NaN without a sample."""
+    samples = samples[~np.isnan(samples)]
+    if len(samples) == 0:
+        return float("nan"), float("nan")
+    low, high = np.percentile(samples, (2.5, 97.5))
     return float(low), float(high)
 
 

@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.errors import InputError
-from eval.core.statistics import ENOUGH_PAIRS, paired_difference
+from eval.core.statistics import ENOUGH_PAIRS, interval_of, paired_difference
 from eval.report.compared_columns import COMPARED, POOLED, POOLED_RATE_PER_100M, figures_of, is_time
 from eval.running.sides import Side, check_versions, matched_variants
-from eval.tables.region_curves import interval_of, ranked_pairs, recall_at, resampled_recalls
+from eval.tables.region_curves import ranked_pairs, recall_at, resampled_recalls
 from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers
 
 BETTER, WORSE, NOISE = "better", "worse", "no difference beyond noise"

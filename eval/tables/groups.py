@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
-from eval.core.statistics import N_RESAMPLES, Statistic, mean, median
+from eval.core.statistics import N_RESAMPLES, Statistic, interval_of, mean, median
 from eval.tables.region_curves import RankedPairs, found_at
 from eval.tables.rows import PAIR, numbers, texts
 
@@ -92,24 +92,17 @@ def recall_by_size(ranked: RankedPairs, changes: pd.DataFrame) -> list[dict[str,
         "recall_at_rate": found_at(ranked, RATE_PER_100M),
     }
     rows: list[dict[str, Any]] = []
-    for measure, edges in EDGES.items():
-        if measure not in own:
-            continue
-        values = numbers(own, measure)
-        for low, high in pairwise(edges):
-            inside = (values >= low) & (values < high)
-            if not inside.any():
-                continue
-            interval = clustered_interval(
-                found["recall_at_rate"][inside].astype(np.float64), ranked.change_pair[inside]
-            )
+    for measure in EDGES:
+        for low, high, inside in _bins(own, measure):
+            of_pair = ranked.change_pair[inside]
+            interval = clustered_interval(found["recall_at_rate"][inside].astype(np.float64), of_pair)
             rows.append(
                 {
                     "measure": measure,
                     "low": low,
                     "high": high,
                     "n_changes": int(inside.sum()),
-                    "n_pairs": len(np.unique(ranked.change_pair[inside])),
+                    "n_pairs": len(np.unique(of_pair)),
                     **{name: float(is_hit[inside].mean()) for name, is_hit in found.items()},
                     "interval_low": interval[0],
                     "interval_high": interval[1],
@@ -156,8 +149,7 @@ def clustered_interval(values: Float64Array, pair: Int64Array, statistic: Statis
         order = np.argsort(values, kind="stable")
         times_drawn = np.stack([np.bincount(draw, minlength=n_pairs) for draw in draws])
         samples = _repeated_medians(values[order], times_drawn[:, place[order]])
-    low, high = np.percentile(samples, (2.5, 97.5))
-    return float(low), float(high)
+    return interval_of(samples)
 
 
 def _repeated_medians(rising: Float64Array, times: Int64Array) -> Float64Array:
@@ -173,8 +165,14 @@ def _groups(changes: pd.DataFrame) -> Iterator[tuple[dict[str, Any], BoolArray]]
     kinds = texts(changes, "prop_kind")
     for kind in sorted(set(kinds)):
         yield {"measure": "prop_kind", "value": kind, "low": np.nan, "high": np.nan}, np.asarray(kinds == kind)
-    volumes_m3 = numbers(changes, _MEASURE)
-    for low, high in pairwise(EDGES[_MEASURE]):
-        inside = (volumes_m3 >= low) & (volumes_m3 < high)
+    for low, high, inside in _bins(changes, _MEASURE):
+        yield {"measure": _MEASURE, "value": "", "low": low, "high": high}, inside
+
+
+def _bins(changes: pd.DataFrame, measure: str) -> Iterator[tuple[float, float, BoolArray]]:
+    """Yield the ends of each bin of a measure that holds a change (low included), and (N,) which it holds."""
+    values = numbers(changes, measure)
+    for low, high in pairwise(EDGES[measure]):
+        inside = (values >= low) & (values < high)
         if inside.any():
-            yield {"measure": _MEASURE, "value": "", "low": low, "high": high}, inside
+            yield low, high, inside

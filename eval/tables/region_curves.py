@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
+from eval.core.ranking import comparable, last_of_ties
 from eval.core.statistics import N_RESAMPLES
 from eval.tables.rows import PAIR
 
@@ -165,15 +166,6 @@ def resampled_recalls(ranked: RankedPairs, rate_per_100m: float, seed: int = 0) 
     return np.concatenate([_recalls(ranked, rate_per_100m, weights[first : first + _BATCH]) for first in batches])
 
 
-def interval_of(samples: Float64Array) -> tuple[float, float]:
-    """Return the 95 % percentile interval of bootstrap samples, NaN among them left out."""
-    samples = samples[~np.isnan(samples)]
-    if len(samples) == 0:
-        return float("nan"), float("nan")
-    low, high = np.percentile(samples, (2.5, 97.5))
-    return float(low), float(high)
-
-
 def found_at(ranked: RankedPairs, rate_per_100m: float) -> BoolArray:
     """Return (C,) which changes are found at the thresholds of `recall_at`."""
     ones = np.ones((1, len(ranked.pairs)))
@@ -201,9 +193,9 @@ def roc_curve(scores: Float64Array, is_positive: BoolArray) -> tuple[Float64Arra
     n_negative = len(is_positive) - n_positive
     if n_positive == 0 or n_negative == 0:
         return np.zeros(0), np.zeros(0)
-    comparable = np.where(np.isnan(scores), -np.inf, scores)
-    order = np.argsort(-comparable, kind="stable")
-    last = _last_of_ties(comparable[order])
+    falling = comparable(scores)
+    order = np.argsort(-falling, kind="stable")
+    last = last_of_ties(falling[order])
     true = np.concatenate([[0], np.cumsum(is_positive[order])[last]]) / n_positive
     false = np.concatenate([[0], np.cumsum(~is_positive[order])[last]]) / n_negative
     # a point on the straight line between its neighbours tells nothing
@@ -237,16 +229,9 @@ def _cumulated(
     """
     own = np.flatnonzero(ranked.site[ranked.pair] == site)
     own = own[np.argsort(-ranked.score[own], kind="stable")]
-    last = _last_of_ties(ranked.score[own])
+    last = last_of_ties(ranked.score[own])
     drawn = weights[:, ranked.pair[own]]
     n_false = np.cumsum(drawn * ranked.is_false[own], axis=1)[:, last]
     n_found = np.cumsum(drawn * ranked.n_new[own], axis=1)[:, last]
     path_m = weights @ np.where(ranked.site == site, ranked.path_m, 0.0)
     return n_false, n_found, path_m, ranked.score[own][last]
-
-
-def _last_of_ties(falling: Float64Array) -> Int64Array:
-    """Return the places behind which a threshold can lie: the last of each run of equal (N,) scores."""
-    if len(falling) == 0:
-        return np.zeros(0, dtype=np.int64)
-    return np.append(np.flatnonzero(falling[1:] != falling[:-1]), len(falling) - 1)

@@ -14,14 +14,13 @@ import numpy as np
 import pandas as pd
 
 from eval.core.ranking import auroc
-from eval.core.statistics import mean, median, wilson_interval
+from eval.core.statistics import interval_of, mean, median, wilson_interval
 from eval.plans.targets import Targets
 from eval.tables.groups import recall_by_size
 from eval.tables.region_curves import (
     RATES_PER_100M,
     RankedPairs,
     free_response,
-    interval_of,
     ranked_pairs,
     recall_at,
     resampled_recalls,

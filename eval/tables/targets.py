@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from eval.core.statistics import mean_with_interval, median
+from eval.core.statistics import interval_of, mean_with_interval, median
 from eval.plans.targets import RATE_COLUMN, Target
-from eval.tables.region_curves import RankedPairs, interval_of, recall_at, resampled_recalls
+from eval.tables.region_curves import RankedPairs, recall_at, resampled_recalls
 from eval.tables.rows import numbers, records, texts
 
 COLUMNS = ("target", "domain", "variant", "value", "low", "high", "asked", "n", "is_met")

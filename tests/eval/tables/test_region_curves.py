@@ -7,12 +7,12 @@ import pandas as pd
 import pytest
 
 from eval.core.ranking import auroc
+from eval.core.statistics import interval_of
 from eval.tables.groups import clustered_interval, recall_by_size
 from eval.tables.region_curves import (
     RankedPairs,
     found_at,
     free_response,
-    interval_of,
     parsed_ids,
     ranked_pairs,
     recall_at,
