@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from eval.core.domains import domain_of
+from cdpipe.core.geometry import Float64Array
 from eval.tables.columns import RESULT_COLUMNS, Column, select, share, significant
 from eval.tables.merge_table import RULES, is_within_target, kinds
-from eval.tables.rows import numbers, texts
+from eval.tables.rows import numbers, with_domain
 
 POOLED = "recall_at_0.1"
 POOLED_RATE_PER_100M = 0.1
@@ -54,12 +54,11 @@ def figures_of(results: pd.DataFrame) -> pd.DataFrame:
     kind = kinds(results)
     answered = np.where(np.isin(kind, _REFUSABLE), np.nan, (results["status"] == "ok").to_numpy(dtype=np.float64))
     within = np.where(np.isin(kind, list(RULES)), is_within_target(results).astype(np.float64), np.nan)
-    family = texts(results, "family" if "family" in results else "scenario")
     columns = {
         "scenario": results["scenario"].astype(str).to_numpy(),
         "seed": results["seed"].to_numpy().astype(np.int64),
         "variant": results["variant"].astype(str).to_numpy(),
-        "domain": [domain_of(name) for name in family],
+        "domain": with_domain(results)["domain"].to_numpy(),
         "is_answered": answered,
         "is_within_target": within,
     }
@@ -72,10 +71,7 @@ def is_time(key: str) -> bool:
     return key.startswith("t_")
 
 
-def _as_numbers(results: pd.DataFrame, key: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _as_numbers(results: pd.DataFrame, key: str) -> Float64Array:
     """Return a column as numbers; truth values that a table held beside empty cells are read back as texts."""
-    if results[key].dtype == bool:
-        return results[key].to_numpy(dtype=np.float64)
     words = {"true": 1.0, "false": 0.0}
-    mapped = results[key].map(lambda value: words.get(str(value).lower(), value))
-    return numbers(results.assign(**{key: mapped}), key)
+    return numbers(results.assign(**{key: results[key].map(lambda value: words.get(str(value).lower(), value))}), key)

@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.errors import InputError
-from eval.core.statistics import ENOUGH_PAIRS, interval_of, paired_difference
+from eval.core.statistics import ENOUGH_PAIRS, paired_difference
 from eval.report.compared_columns import COMPARED, POOLED, POOLED_RATE_PER_100M, figures_of, is_time
 from eval.running.sides import Side, check_versions, matched_variants
-from eval.tables.region_curves import ranked_pairs, recall_at, resampled_recalls
+from eval.tables.region_curves import ranked_pairs, recall_at, recall_difference
 from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers
 
 BETTER, WORSE, NOISE = "better", "worse", "no difference beyond noise"
@@ -152,12 +152,11 @@ def pooled_difference(
     if n_used == 0 or first.pairs != second.pairs:
         return []
     recalls = [recall_at(each, POOLED_RATE_PER_100M) for each in ranked]
-    drawn = [resampled_recalls(each, POOLED_RATE_PER_100M, seed) for each in ranked]
-    low, high = interval_of(drawn[1] - drawn[0]) if n_used > 1 else (math.nan, math.nan)
+    difference, low, high = recall_difference(first, second, POOLED_RATE_PER_100M, seed)
     return [
         {
             "metric": POOLED, "good": "high", "n_used": n_used, "n_only_a": 0, "n_only_b": 0, "mean_a": recalls[0],
-            "mean_b": recalls[1], "difference": recalls[1] - recalls[0], "low": low, "high": high,
+            "mean_b": recalls[1], "difference": difference, "low": low, "high": high,
         }
     ]  # fmt: skip
 

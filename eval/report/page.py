@@ -115,6 +115,7 @@ def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
         "commits": commits_text(data),
         "summary": draw_summary(data, merges),
         "merge": draw_merge(data),
+        "ends_at_merge": ends_at_merge(data),
         "columns": MERGE_COLUMNS,
         "views": None,
         "charts": (),

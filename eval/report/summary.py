@@ -13,7 +13,7 @@ import pandas as pd
 from cdpipe.core.geometry import Float64Array
 from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
 from eval.report.compared_columns import COMPARED, POOLED, figures_of, is_time
-from eval.report.tables import Cell, Table, methods_table
+from eval.report.tables import Cell, Table, methods_table, written_interval
 from eval.running.run_data import (
     Row,
     RunData,
@@ -101,25 +101,17 @@ def _headlines(data: RunData) -> Table:
         stored = stored.reindex(columns=[*names, POOLED, f"{POOLED}_low", f"{POOLED}_high"])
         table = table.drop(columns=stored.columns.difference(names)).merge(stored, on=names, how="left")
     shown = [column for column in HEADLINES if table[column.key].notna().any()]
-    oracle = table["variant"].map(is_told_the_truth)
-    ranks = {f"rank{place}": _rank(table, column) for place, column in enumerate(shown) if column.better == "high"}
-    ranked = table.assign(oracle=oracle, **ranks).sort_values(["oracle", *ranks], kind="stable")
-    first = pd.concat([_first(own, shown_variant(data)) for _, own in ranked.groupby("domain") if len(own)])
+    # higher is better, as written; what is undefined comes last
+    ranks = {column.key: -table[column.key].round(2).fillna(-math.inf) for column in shown if column.better == "high"}
+    order = pd.DataFrame({"domain": table["domain"], "oracle": table["variant"].map(is_told_the_truth), **ranks})
+    ranked = table.loc[order.sort_values(["domain", "oracle", *ranks], kind="stable").index]
+    is_first = ranked.groupby("domain").cumcount() < _MAX_METHODS
+    first = ranked[is_first | (ranked["variant"] == shown_variant(data))]
     caption = (
         f"Headline figures: one row is one method, best first, at most {_MAX_METHODS} for each domain; means over "
         "session pairs (times: median)"
     )
     return methods_table(first, shown, figures, caption)
-
-
-def _first(ranked: pd.DataFrame, main: str) -> pd.DataFrame:
-    """Return the first rows of a domain, and that of the method that the plan is about."""
-    is_shown = np.arange(len(ranked)) < _MAX_METHODS
-    return ranked[is_shown | (ranked["variant"] == main).to_numpy()]
-
-
-def _rank(table: pd.DataFrame, column: Column) -> pd.Series[float]:
-    return -table[column.key].round(2).fillna(-math.inf)
 
 
 def _merge_headlines(merges: pd.DataFrame) -> Table:
@@ -147,7 +139,7 @@ def _merge_headlines(merges: pd.DataFrame) -> Table:
 
 def _share_cell(row: Mapping[str, Any]) -> Cell:
     value, low, high = (float(row.get(name, math.nan)) for name in ("share_within_target", "low", "high"))
-    return Cell(share(value), interval="" if math.isnan(low) else f"{share(low)}\u2013{share(high)}")
+    return Cell(share(value), interval=written_interval(low, high, share))
 
 
 def _sentence(data: RunData, merges: pd.DataFrame) -> str:

@@ -13,6 +13,7 @@ import pandas as pd
 
 from eval.core.domains import domain_name
 from eval.core.statistics import ENOUGH_PAIRS
+from eval.report.charts import Chart
 from eval.running.run_data import (
     Row,
     RunData,
@@ -70,6 +71,11 @@ class Table:
         return list(found.items())
 
 
+def with_rows(tables: Iterable[Table]) -> tuple[Table, ...]:
+    """Return the tables that are not empty."""
+    return tuple(table for table in tables if table.rows)
+
+
 @dataclass(frozen=True, slots=True)
 class Picture:
     """A picture with its title and caption; `address` holds it."""
@@ -77,6 +83,27 @@ class Picture:
     title: str
     address: str
     caption: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Section:
+    """What the page shows of one subject.
+
+    Attributes:
+        tables: Over all pairs.
+        plots: Over all pairs.
+        cases: Tables of single cases.
+        pictures: Of single cases.
+        notes: What was left out for space.
+        missing: What could not be shown.
+    """
+
+    tables: tuple[Table, ...] = ()
+    plots: tuple[Picture | Chart, ...] = ()
+    cases: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    notes: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
 
 
 def results_table(data: RunData) -> Table:
@@ -161,8 +188,7 @@ def beside(interval: str, n_used: int, n: int) -> str:
 
 def interval_text(group: Sequence[Row], column: Column) -> str:
     """Return the 95 % bootstrap interval over session pairs, "" for fewer than two defined values."""
-    low, high = interval_over_pairs(group, column.key)
-    return "" if math.isnan(low) else f"{column.shown(low)}{EN_DASH}{column.shown(high)}"
+    return written_interval(*interval_over_pairs(group, column.key), column.shown)
 
 
 def _column_cells(groups: Sequence[Sequence[Row]], column: Column) -> list[Cell]:
@@ -241,6 +267,11 @@ def best_rows(rows: Sequence[Mapping[str, Any]], column: Column, n_used: Sequenc
 def interval_of_row(row: Mapping[str, Any], key: str, shown: Callable[[float], str]) -> str:
     """Return the interval of a column of a row, "" where it has none."""
     low, high = (float(row.get(f"{key}_{end}", math.nan)) for end in ("low", "high"))
+    return written_interval(low, high, shown)
+
+
+def written_interval(low: float, high: float, shown: Callable[[float], str]) -> str:
+    """Return an interval as text, "" for NaN."""
     return "" if math.isnan(low) else f"{shown(low)}{EN_DASH}{shown(high)}"
 
 

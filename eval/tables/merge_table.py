@@ -6,6 +6,7 @@ within a target only where the target says that refusing is right.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -96,21 +97,16 @@ def merge_table(results: pd.DataFrame, targets: Targets) -> pd.DataFrame:
         are left out.
     """
     kind = kinds(results)
-    cases = results.assign(
-        pair_kind=kind,
-        family=results["family"] if "family" in results else results["scenario"],
-    )
-    cases = cases[kind != ""]
+    family = results["family" if "family" in results else "scenario"]
+    cases = results.assign(pair_kind=kind, family=family)[kind != ""]
     rows: list[dict[str, Any]] = []
     for keys in (["pair_kind", "variant"], ["pair_kind", "family", "variant"]):
         for values, group in cases.groupby(keys, sort=False):
             names = {"family": ALL_FAMILIES, **dict(zip(keys, values, strict=True))}
             rows.append({**{key: names[key] for key in ("pair_kind", "family", "variant")}, **_counts(group, targets)})
-    return (
-        pd.DataFrame(rows).sort_values("pair_kind", key=_kind_order, kind="stable", ignore_index=True)
-        if rows
-        else (pd.DataFrame(columns=["pair_kind", "family", "variant", "n_pairs"]))
-    )
+    if not rows:
+        return pd.DataFrame(columns=["pair_kind", "family", "variant", "n_pairs"])
+    return pd.DataFrame(rows).sort_values("pair_kind", key=_kind_order, kind="stable", ignore_index=True)
 
 
 def merge_overview(results: pd.DataFrame, targets: Targets, *, is_whole: bool = True) -> pd.DataFrame:
@@ -160,18 +156,21 @@ def _counts(group: pd.DataFrame, targets: Targets) -> dict[str, Any]:
         "n_p95_over_half_m": int((accepted & (numbers(group, "merge_error_m_p95") > RIGHT_M)).sum()),
         "is_met": None if asked is None else bool(share >= asked and n_wrong == 0),
         "n_named_degeneracy": int((names_degeneracy(group) & np.asarray(status == "merge_refused")).sum()),
-        **{name: value for column in ERRORS for name, value in _spread(column, group[accepted]).items()},
-        **{name: value for column in TIMES for name, value in _spread(column, group).items()},
+        **_spread(group[accepted], ERRORS),
+        **_spread(group, TIMES),
     }
 
 
-def _spread(column: str, group: pd.DataFrame) -> dict[str, float]:
-    values = numbers(group, column)
-    values = values[~np.isnan(values)]
-    median, p95 = np.percentile(values, (50, 95)) if len(values) else (np.nan, np.nan)
-    return {f"median_{column}": float(median), f"p95_{column}": float(p95), f"n_{column}": len(values)}
+def _spread(group: pd.DataFrame, columns: Sequence[str]) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for column in columns:
+        values = numbers(group, column)
+        values = values[~np.isnan(values)]
+        median, p95 = np.percentile(values, (50, 95)) if len(values) else (np.nan, np.nan)
+        found |= {f"median_{column}": float(median), f"p95_{column}": float(p95), f"n_{column}": len(values)}
+    return found
 
 
 def _kind_order(column: pd.Series[str]) -> pd.Series[int]:
-    order = {name: place for place, name in enumerate(RULES)}
-    return column.map(lambda name: order.get(name, len(order)))
+    order = list(RULES)
+    return column.map(lambda name: order.index(name) if name in order else len(order))

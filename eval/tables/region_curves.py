@@ -18,7 +18,7 @@ import pandas as pd
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from eval.core.ranking import comparable, last_of_ties
-from eval.core.statistics import N_RESAMPLES
+from eval.core.statistics import N_RESAMPLES, interval_of
 from eval.tables.rows import PAIR
 
 RATES_PER_100M = (0.1, 0.5)
@@ -164,6 +164,20 @@ def resampled_recalls(ranked: RankedPairs, rate_per_100m: float, seed: int = 0) 
         np.add.at(weights, (np.arange(N_RESAMPLES)[:, None], draws), 1.0)
     batches = range(0, N_RESAMPLES, _BATCH)
     return np.concatenate([_recalls(ranked, rate_per_100m, weights[first : first + _BATCH]) for first in batches])
+
+
+def recall_difference(
+    a: RankedPairs, b: RankedPairs, rate_per_100m: float, seed: int = 0
+) -> tuple[float, float, float]:
+    """Return `recall_at` of b less that of a, and the low and high end of its 95 % interval, draw by draw.
+
+    The interval is NaN for different pairs, and for fewer than two pairs with an observable change.
+    """
+    difference = recall_at(b, rate_per_100m) - recall_at(a, rate_per_100m)
+    if a.pairs != b.pairs or np.count_nonzero(a.n_observable) < 2:
+        return difference, float("nan"), float("nan")
+    drawn = [resampled_recalls(each, rate_per_100m, seed) for each in (a, b)]
+    return difference, *interval_of(drawn[1] - drawn[0])
 
 
 def found_at(ranked: RankedPairs, rate_per_100m: float) -> BoolArray:

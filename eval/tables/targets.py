@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from eval.core.statistics import interval_of, mean_with_interval, median
+from eval.core.statistics import mean_with_interval, median
 from eval.plans.targets import RATE_COLUMN, Target
-from eval.tables.region_curves import RankedPairs, recall_at, resampled_recalls
+from eval.tables.region_curves import RankedPairs, recall_difference
 from eval.tables.rows import numbers, records, texts
 
 COLUMNS = ("target", "domain", "variant", "value", "low", "high", "asked", "n", "is_met")
@@ -86,10 +86,7 @@ def _against(target: Target, variant: str, ranked: Mapping[tuple[str, str], Rank
     if ours is None or theirs is None:
         return None
     rate = float(target.column.removeprefix(RATE_COLUMN))
-    difference = recall_at(ours, rate) - recall_at(theirs, rate)
-    low = high = math.nan
-    if ours.pairs == theirs.pairs and np.count_nonzero(ours.n_observable) > 1:
-        low, high = interval_of(resampled_recalls(ours, rate) - resampled_recalls(theirs, rate))
+    difference, low, high = recall_difference(theirs, ours, rate)
     return {"domain": target.domain, "value": difference, "low": low, "high": high, "n": len(ours.pairs)}
 
 

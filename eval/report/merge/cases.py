@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -181,10 +182,7 @@ def _gate_cell(case: Case, name: str) -> Cell:
 
 
 def _presets(variants: Sequence[str]) -> str:
-    counts: dict[str, int] = {}
-    for name in variants:
-        stem = split_variant(name)[0]
-        counts[stem] = counts.get(stem, 0) + 1
+    counts = Counter(split_variant(name)[0] for name in variants)
     return ", ".join(name if n == 1 else f"{name} ({n} settings)" for name, n in counts.items())
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pandas as pd
 
@@ -12,7 +10,7 @@ from eval.plans.targets import is_oracle, targets_of
 from eval.report.merge.cases import MAX_ROWS, Case, case_table, distinct_cases, draw_case, read_case
 from eval.report.merge.charts import error_chart, time_chart
 from eval.report.merge.tables import families_table, kinds_table, refusals_table, stated_seconds, times_table
-from eval.report.tables import Picture, Table
+from eval.report.tables import Picture, Section, Table, with_rows
 from eval.running.run_data import RunData, covered_by, ends_at_merge, repeats, shown_variant, text
 from eval.tables.merge_table import EXACT_M, RIGHT_DEG, RIGHT_M, RULES, TIMES, is_within_target, kinds, merge_table
 from eval.tables.rows import numbers
@@ -21,58 +19,30 @@ N_WORST = 10
 MAX_PICTURES = 24
 
 
-@dataclass(frozen=True, slots=True)
-class MergePart:
-    """What the page shows of the merge.
+def draw_merge(data: RunData) -> Section:
+    """Return tables and pictures of the merges of a run.
 
-    Attributes:
-        is_main: Whether the run ended at the merge, so that this is all there is.
-        tables: Of the targets: over all families, by family; of the reasons for refusals; of the times.
-        plots: Errors against overlap, times.
-        cases: What was measured of single merges: the worst accepted ones and all outside their target, or all of an
-            ordinary run.
-        pictures: Aligned maps of those.
-        notes: What was left out for space.
-        missing: What could not be drawn.
+    Where pairs have a kind, the cases are the worst accepted merges and all that miss their target; elsewhere all.
     """
-
-    is_main: bool
-    tables: tuple[Table, ...]
-    plots: tuple[Picture, ...]
-    cases: tuple[Table, ...]
-    pictures: tuple[Picture, ...]
-    notes: tuple[str, ...]
-    missing: tuple[str, ...]
-
-
-def draw_merge(data: RunData) -> MergePart:
-    """Return tables and pictures of the merges of a run."""
     results = pd.DataFrame(list(data.results))
     missing: list[str] = []
     notes: list[str] = []
-    by_kind = bool((kinds(results) != "").any())
-    table = merge_table(results, targets_of(data.provenance))
-    is_main, covered, name = ends_at_merge(data), covered_by(data), shown_variant(data)
-    is_whole = covered.is_whole
-    tables: tuple[Table, ...] = (times_table(results),) if by_kind or is_main else ()
+    by_kind, name = bool((kinds(results) != "").any()), shown_variant(data)
+    tables = [times_table(results)] if by_kind or ends_at_merge(data) else []
     if by_kind:
+        table, is_whole = merge_table(results, targets_of(data.provenance)), covered_by(data).is_whole
         of_targets = kinds_table(table, is_whole=is_whole), families_table(table, name, is_whole=is_whole)
-        tables = (*of_targets, refusals_table(results), *tables)
+        tables = [*of_targets, refusals_table(results), *tables]
         cases, shown = _chosen_cases(data, results, name, notes)
     else:
         cases, shown = _every_case(data, name, notes)
     drawn = [draw_case(data, case, missing) for case in shown[:MAX_PICTURES]]
     if len(shown) > MAX_PICTURES:
         notes.append(f"The aligned maps of {len(shown) - MAX_PICTURES} further cases are left out of this page.")
-    return MergePart(
-        is_main,
-        tuple(part for part in tables if part.rows),
-        tuple(_plots(results) if by_kind else ()),
-        tuple(part for part in cases if part.rows),
-        tuple(picture for picture in drawn if picture is not None),
-        tuple(notes),
-        tuple(missing),
-    )
+    return Section(
+        with_rows(tables), tuple(_plots(results) if by_kind else ()), with_rows(cases),
+        tuple(picture for picture in drawn if picture is not None), tuple(notes), tuple(missing),
+    )  # fmt: skip
 
 
 def _plots(results: pd.DataFrame) -> list[Picture]:

@@ -53,26 +53,26 @@ def kinds_table(table: pd.DataFrame, *, is_whole: bool = True) -> Table:
 
     Nothing is said to be met or not where the table does not hold the whole of what was planned.
     """
-    rows = [
-        (_kind_text(str(row["pair_kind"])), (Cell(str(row["variant"])), *_target_cells(row, is_whole=is_whole)))
-        for row in records(table[table["family"] == ALL_FAMILIES] if len(table) else table)
-    ]
-    headings = ("variant", *_TARGET_HEADINGS)
-    return Table(headings, tuple(rows), "Kinds of pair: one row is one method; the group says what the kind asks for")
+    own = table[table["family"] == ALL_FAMILIES]
+    caption = "Kinds of pair: one row is one method; the group says what the kind asks for"
+    groups = {kind: f"{kind}: {RULES[kind]}" if kind in RULES else kind for kind in own["pair_kind"].unique()}
+    return _targets_table(own.replace({"pair_kind": groups}), "variant", caption, is_whole=is_whole)
 
 
 def families_table(table: pd.DataFrame, name: str, *, is_whole: bool = True) -> Table:
     """Return the same for one variant, family by family."""
-    if len(table) == 0:
-        return Table((), ())
     own = table[(table["family"] != ALL_FAMILIES) & (table["variant"] == name)]
+    caption = f"The same by family: {name}; all variants are in merge.csv"
+    return _targets_table(own, "family", caption, is_whole=is_whole)
+
+
+def _targets_table(table: pd.DataFrame, first: str, caption: str, *, is_whole: bool) -> Table:
+    """Return the rows of the merge table by their `pair_kind`; `first` is the column that names them."""
     rows = [
-        (str(row["pair_kind"]), (Cell(str(row["family"])), *_target_cells(row, is_whole=is_whole)))
-        for row in records(own)
+        (str(row["pair_kind"]), (Cell(str(row[first])), *_target_cells(row, is_whole=is_whole)))
+        for row in records(table)
     ]
-    return Table(
-        ("family", *_TARGET_HEADINGS), tuple(rows), f"The same by family: {name}; all variants are in merge.csv"
-    )
+    return Table((first, *_TARGET_HEADINGS), tuple(rows), caption)
 
 
 def refusals_table(results: pd.DataFrame) -> Table:
@@ -114,10 +114,6 @@ def stated_seconds(results: pd.DataFrame, column: str) -> Float64Array:
     return values[values >= _NOTHING_S]
 
 
-def _kind_text(kind: str) -> str:
-    return f"{kind}: {RULES[kind]}" if kind in RULES else kind
-
-
 def _target_cells(row: dict[str, Any], *, is_whole: bool) -> tuple[Cell, ...]:
     has_target = is_whole and not math.isnan(float(row["target_share"]))
     low, high = _percent(row["low"]).removesuffix(" %"), _percent(row["high"])
@@ -128,8 +124,7 @@ def _target_cells(row: dict[str, Any], *, is_whole: bool) -> tuple[Cell, ...]:
         Cell(_percent(row["share_within_target"]), interval=f"{low}{EN_DASH}{high}"),
         Cell(str(n_wrong), n_wrong > 0),
         *(Cell(str(row[name])) for name in ("n_pairs", "n_accepted", "n_refused", "n_failed")),
-        *(_error_cell(row, name) for name in ("merge_error_m", "merge_error_deg", "merge_error_along_m")),
-        _error_cell(row, "merge_error_m_p95"),
+        *(_error_cell(row, f"merge_error_{name}") for name in ("m", "deg", "along_m", "m_p95")),
         Cell(str(row["n_p95_over_half_m"])),
     )
 

@@ -59,15 +59,10 @@ def object_panels(panels: Sequence[Panel], truth: Float64Array, view_from: Float
             near = ((shown > low) & (shown < high)).all(axis=1)
             size = 1.5 if colour == CONTEXT else 5.0
             axes.scatter(shown[near, 0], shown[near, 1], s=size, c=colour, linewidths=0)
-        axes.set_xlim(low[0], high[0])
-        axes.set_ylim(low[1], high[1])
-        axes.set_aspect("equal")
-        axes.set_xticks([])
-        axes.set_yticks([])
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
         axes.set_title(panel.title, fontsize=11, pad=4)
         axes.set_xlabel(panel.note.replace(", ", "\n", 1), fontsize=9, labelpad=4)
-        for spine in axes.spines.values():
-            spine.set_color("#bbbbbb")
+        axes.spines[:].set_color("#bbbbbb")
     _scale_bar(figure.axes[0], low, high)
     return data_address(figure)
 

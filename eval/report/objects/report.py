@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,7 @@ from eval.core.figures import picture_address
 from eval.report.objects.cases import object_cases, voxel_variants
 from eval.report.objects.tables import OBJECT_COLUMNS, OBJECT_COUNTS, WITHDRAWAL_COLUMNS, groups_table
 from eval.report.regions.charts import look_of
-from eval.report.tables import Picture, Table, methods_table, targets_table
+from eval.report.tables import Picture, Section, methods_table, targets_table, with_rows
 from eval.running.run_data import RunData, off_grids, shown_variant, stored_table
 from eval.running.runfolder import reported
 from eval.tables.groups import main_changes
@@ -26,25 +26,15 @@ _DOTS = Look("#a8a8a8", 0.0, marker="circle", size=3.0)
 _LEAST_M3, _MOST_M3 = 0.02, 60.0
 
 
-@dataclass(frozen=True, slots=True)
-class ObjectPart:
-    """What the page shows of the objects of a run: tables, plots, single objects, and what is not there."""
-
-    tables: tuple[Table, ...]
-    plots: tuple[Picture, ...]
-    cases: tuple[Picture, ...]
-    missing: tuple[str, ...]
-
-
-def draw_objects(data: RunData) -> ObjectPart | None:
+def draw_objects(data: RunData) -> Section | None:
     """Return tables, plot and pictures of the objects; None where the plan of the run does not ask for them."""
     if "objects" not in reported(data.provenance):
         return None
     table, groups = (off_grids(stored_table(data, name), data) for name in ("objects_table", "objects_by_group"))
     if len(table) == 0:
-        return ObjectPart((), (), (), ("objects_table.csv is not in the run folder: `tunnelcd score` makes it.",))
+        return Section(missing=("objects_table.csv is not in the run folder: `tunnelcd score` makes it.",))
     main, rows = shown_variant(data), with_domain(data.results)
-    cases, missing = object_cases(data, main)
+    pictures, missing = object_cases(data, main)
     domains = [str(name) for name in table["domain"].unique() if name != ALL_DOMAINS]
     tables = [
         methods_table(table, OBJECT_COLUMNS, rows, _CAPTION, counts=OBJECT_COUNTS),
@@ -53,7 +43,7 @@ def draw_objects(data: RunData) -> ObjectPart | None:
         *(groups_table(groups, domain, main, voxel_variants(data, main)) for domain in domains),
     ]
     plots = (_size_plot(groups, data, main),) if len(groups) else ()
-    return ObjectPart(tuple(each for each in tables if each.rows), plots, tuple(cases), tuple(missing))
+    return Section(with_rows(tables), plots, pictures=tuple(pictures), missing=tuple(missing))
 
 
 def _size_plot(groups: pd.DataFrame, data: RunData, main: str) -> Picture:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import pandas as pd
 
 from eval.core.domains import domain_name
 from eval.plans.targets import targets_of
-from eval.report.charts import Chart
 from eval.report.regions.charts import draw_free_response, draw_roc, draw_sizes
-from eval.report.tables import Cell, Table, interval_of_row, methods_table, targets_table
+from eval.report.tables import Cell, Section, Table, interval_of_row, methods_table, targets_table, with_rows
 from eval.running.run_data import RunData, off_grids, shown_variant, stored_table
 from eval.running.runfolder import reported
 from eval.tables.columns import Column, scaled, share, significant
@@ -51,23 +48,14 @@ _CURVES = ("roc", "froc", "regions_by_size")
 _CAPTION = "Regions: one row is one method on the pairs in or out of the training distribution"
 
 
-@dataclass(frozen=True, slots=True)
-class RegionPart:
-    """What the page shows of the regions of a run: tables, charts, and what is not there."""
-
-    tables: tuple[Table, ...]
-    plots: tuple[Chart, ...]
-    missing: tuple[str, ...]
-
-
-def draw_regions(data: RunData) -> RegionPart | None:
+def draw_regions(data: RunData) -> Section | None:
     """Return tables and plots of the regions; None where the plan of the run does not ask for them."""
     if "regions" not in reported(data.provenance):
         return None
     found = {name: off_grids(stored_table(data, name), data) for name in ("regions_table", *_CURVES)}
     table, main = found["regions_table"], shown_variant(data)
     if len(table) == 0:
-        return RegionPart((), (), ("regions_table.csv is not in the run folder: `tunnelcd score` makes it.",))
+        return Section(missing=("regions_table.csv is not in the run folder: `tunnelcd score` makes it.",))
     methods = methods_table(table, REGION_COLUMNS, with_domain(data.results), _CAPTION)
     tables = (methods, silence_table(table), targets_table(stored_table(data, "regions_targets")))
     first = [main, *(target.less for target in targets_of(data.provenance).regions if target.less)]
@@ -75,9 +63,7 @@ def draw_regions(data: RunData) -> RegionPart | None:
         draw_roc(found["roc"], table, main), draw_free_response(found["froc"], table),
         draw_sizes(found["regions_by_size"], table, first),
     )  # fmt: skip
-    return RegionPart(
-        tuple(each for each in tables if each.rows), tuple(each for each in plots if each is not None), ()
-    )
+    return Section(with_rows(tables), tuple(each for each in plots if each is not None))
 
 
 def silence_table(table: pd.DataFrame) -> Table:

@@ -14,14 +14,9 @@ from eval.running.run_data import GridOf, RunData, grids, of, over_pairs
 from eval.tables.columns import RESULT_COLUMNS, Column, share
 
 _GRID_KEYS = (
-    "region_recall",
-    "region_auroc",
-    "object_iou_point",
-    "object_f1_50",
-    "object_pq",
-    "false_regions_per_100m",
+    "region_recall", "region_auroc", "object_iou_point", "object_f1_50", "object_pq", "false_regions_per_100m",
     "t_total_s",
-)
+)  # fmt: skip
 SHARES = ("region_recall", "region_recall_at_k", "region_auroc", "object_iou_point", "object_f1_50", "object_pq")
 # by which settings are chosen: it asks for objects that are whole and for none that are false
 PQ_COLUMN = Column(
