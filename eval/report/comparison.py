@@ -103,11 +103,10 @@ def sentences(found: Comparison) -> list[str]:
     rows = _widest(found.table)
     counts = Counter(row["verdict"] for row in rows)
     told = ", ".join(f"{counts[word]} {word}" for word in (BETTER, WORSE, NOISE, SAME, TOO_FEW) if counts[word])
-    only = [
-        f"Only in {letter}: {'; '.join(lines[:_MAX_LINES])}{f'; and {n_more} more' if n_more > 0 else ''}."
-        for letter, lines in zip("AB", found.only, strict=True)
-        if lines and (n_more := len(lines) - _MAX_LINES) is not None
-    ]
+    only = []
+    for letter, lines in zip("AB", found.only, strict=True):
+        more = [f"and {len(lines) - _MAX_LINES} more"] if len(lines) > _MAX_LINES else []
+        only += [f"Only in {letter}: {'; '.join([*lines[:_MAX_LINES], *more])}."] if lines else []
     return [f"{found.names[1]} (B) against {found.names[0]} (A), {len(rows)} figures: {told}.", *found.cautions, *only]
 
 
@@ -121,7 +120,7 @@ def matrix_table(table: pd.DataFrame) -> Table:
         for name in dict.fromkeys(row["name"] for row in here):
             own = {row["metric"]: row for row in here if row["name"] == name}
             n_pairs = max(int(row["n_pairs"]) for row in own.values())
-            cells = (_difference(_COLUMNS[key], own[key]) if key in own else Cell("") for key in present)
+            cells = (_difference(own[key]) if key in own else Cell("") for key in present)
             lines.append((domain_name(str(where)), (Cell(spaced(name)), Cell(str(n_pairs)), *cells)))
     headings = ("method", "pairs", *(_COLUMNS[key].heading for key in present))
     return Table(headings, tuple(lines), "Mean difference B \u2212 A over session pairs, with its 95 % interval")
@@ -178,10 +177,9 @@ def _content(found: Comparison) -> dict[str, Any]:
     }
 
 
-def _difference(column: Column, row: Mapping[str, Any]) -> Cell:
-    is_moved = row["verdict"] in COLOURS
-    interval = _interval(column, row)
-    return Cell(_signed(column, row["difference"]), is_moved, interval, COLOURS.get(row["verdict"], ""))
+def _difference(row: Mapping[str, Any]) -> Cell:
+    column, colour = _COLUMNS[row["metric"]], COLOURS.get(row["verdict"], "")
+    return Cell(_signed(column, row["difference"]), bool(colour), _interval(column, row), colour)
 
 
 def _interval(column: Column, row: Mapping[str, Any]) -> str:

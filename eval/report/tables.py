@@ -186,18 +186,14 @@ def beside(interval: str, n_used: int, n: int) -> str:
     return "\n".join(filter(None, (interval, f"{n_used} of {n} pairs" if 0 < n_used < n else "")))
 
 
-def interval_text(group: Sequence[Row], column: Column) -> str:
-    """Return the 95 % bootstrap interval over session pairs, "" for fewer than two defined values."""
-    return written_interval(*interval_over_pairs(group, column.key), column.shown)
-
-
 def _column_cells(groups: Sequence[Sequence[Row]], column: Column) -> list[Cell]:
     values = [over_pairs(group, column.key) for group in groups]
     counts = [len(defined(group, column.key)) for group in groups]
-    return [
-        Cell(column.shown(value), is_best, beside(interval_text(group, column), n, len(group)))
-        for group, value, n, is_best in zip(groups, values, counts, best(values, column, counts), strict=True)
-    ]
+    cells = []
+    for group, value, n, is_best in zip(groups, values, counts, best(values, column, counts), strict=True):
+        interval = written_interval(*interval_over_pairs(group, column.key), column.shown)
+        cells.append(Cell(column.shown(value), is_best, beside(interval, n, len(group))))
+    return cells
 
 
 def _counted(words: Iterable[str]) -> str:
@@ -207,16 +203,11 @@ def _counted(words: Iterable[str]) -> str:
     return ", ".join(f"{n} {word}" for word, n in counts.items())
 
 
-def to_frame(table: Table) -> pd.DataFrame:
-    """Return the texts of a table as they are on the page, the group as the first column, `scenario`."""
-    rows = [(group, *(cell.text for cell in cells)) for group, cells in table.rows]
-    return pd.DataFrame(rows, columns=["scenario", *table.headings])
-
-
 def to_csv(table: Table) -> str:
     """Return a table as CSV, the group as its first column; "–" is left empty, numbers hold no thin spaces."""
-    frame = to_frame(table).map(lambda word: "" if word == UNDEFINED else word.replace(THIN_SPACE, ""))
-    return str(frame.to_csv(index=False))
+    rows = [(group, *(cell.text for cell in cells)) for group, cells in table.rows]
+    frame = pd.DataFrame(rows, columns=["scenario", *table.headings])
+    return str(frame.map(lambda word: "" if word == UNDEFINED else word.replace(THIN_SPACE, "")).to_csv(index=False))
 
 
 def methods_table(
