@@ -1,7 +1,6 @@
-"""Charts of the page that can be hovered, zoomed and filtered: drawings as plotly figures, drawn inside the file.
+"""Interactive charts of the page: drawings of `eval.core.charts` as plotly figures.
 
-The page holds plotly.js once and fetches nothing. The same drawing as a PNG file for papers is made by
-`eval.core.charts.picture`.
+The page holds plotly.js once and fetches nothing. `eval.core.figures.picture` draws the same chart as a PNG file.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What moved between two runs, or between two methods of one, and whether it is more than noise.
+"""Differences between two runs, or between two methods of one run, with intervals and verdicts.
 
-Every figure is paired: the difference B - A is taken pair by pair, over the session pairs that both sides have, and its
-interval is a bootstrap over those pairs. A verdict needs an interval that leaves out 0 and six pairs or more.
+A difference B - A is the mean over the session pairs that both sides have. Its interval is a bootstrap over these
+pairs. A verdict needs at least six pairs and an interval that excludes 0.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ _NEEDED = (
 
 
 def compare(a: Side, b: Side, *, times_count: bool = True, seed: int = 0) -> pd.DataFrame:
-    """Compare every variant that both sides have, or the one of a side with those of the other, pair by pair.
+    """Compare two sides pair by pair: every variant that both have, or the only variant of a side with all others.
 
     Args:
-        a: What is compared with.
-        b: What is judged.
+        a: The reference.
+        b: The side that the verdicts are about.
         times_count: Whether times may be judged: both runs are of one machine that did nothing else.
         seed: Seed of the bootstrap.
 
@@ -169,6 +169,6 @@ def _items(rows: Sequence[Mapping[str, Any]], variant: str, pairs: pd.Index[Any]
 
 
 def _place(row: Mapping[str, Any]) -> tuple[bool, int, str]:
-    """Return where a row stands: domains first, then scenarios by name; variants and figures keep their order."""
+    """Return the sort key of a row: domains first, then scenarios by name."""
     is_scenario = row["scope"] == "scenario"
     return is_scenario, 0 if is_scenario else DOMAINS.index(row["where"]), row["where"]

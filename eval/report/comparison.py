@@ -1,4 +1,4 @@
-"""A comparison of two runs, or of the methods of one, as one offline page, with comparison.csv beside it."""
+"""The comparison of two runs, or of the methods of one run, as one offline page and comparison.csv."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from eval.core.output import make_writable
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.report.compared_columns import COMPARED
 from eval.report.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare
-from eval.report.render import rendered, written
+from eval.report.render import render_page, write_file
 from eval.report.settings.charts import effect_chart
 from eval.report.settings.effects import signed
 from eval.report.tables import Cell, Picture, Table
@@ -41,13 +41,13 @@ _MAX_LINES = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Two sides held against each other.
+    """Two sides and their differences.
 
     Attributes:
         names: What A and B are called.
         table: As `eval.report.comparing.compare` returns it.
-        only: What is in A only, and in B only, a line each.
-        cautions: What stands against the comparison, a sentence each.
+        only: The variants, scenarios and pairs of A only, and of B only, one line each.
+        cautions: The reasons against the comparison, one sentence each.
     """
 
     names: tuple[str, str]
@@ -56,8 +56,8 @@ class Comparison:
     cautions: tuple[str, ...]
 
 
-def compared(a: Side, b: Side) -> Comparison:
-    """Hold two sides against each other.
+def compare_sides(a: Side, b: Side) -> Comparison:
+    """Compare two sides.
 
     Raises:
         InputError: They share no session pair, or their metrics versions differ.
@@ -77,8 +77,8 @@ def write_comparison(found: Comparison, folder: Path) -> Path:
         InputError: The folder cannot be written.
     """
     make_writable(folder)
-    written(folder / "comparison.csv", found.table.to_csv(index=False))
-    written(folder / "comparison.html", rendered("comparison.html", _content(found)))
+    write_file(folder / "comparison.csv", found.table.to_csv(index=False))
+    write_file(folder / "comparison.html", render_page("comparison.html", _content(found)))
     return folder / "comparison.html"
 
 
@@ -99,7 +99,7 @@ def overview(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def sentences(found: Comparison) -> list[str]:
-    """Return how many figures moved, then what stands against the comparison and what is on one side only."""
+    """Return the counts of the verdicts, then the cautions, then what only one side has."""
     rows = _widest(found.table)
     counts = Counter(row["verdict"] for row in rows)
     told = ", ".join(f"{counts[word]} {word}" for word in (BETTER, WORSE, NOISE, SAME, TOO_FEW) if counts[word])
@@ -204,7 +204,7 @@ def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _signed(column: Column, value: float) -> str:
-    """Write a difference with its sign, with more digits than its column has where these would hide it."""
+    """Write a difference with its sign, and with more digits where the digits of its column would show 0."""
     written = signed(column, value)
     if value == 0.0 or math.isnan(value) or any(digit in written for digit in "123456789"):
         return written

@@ -1,8 +1,8 @@
-"""Quality against what it costs: which methods no other beats in both, as a table and as charts.
+"""Quality against cost: the Pareto front of the methods, as a table and as charts.
 
-Cost is the median time of a pair, or the mean of the bytes kept of the before session. A method is on the front where
-no other is as cheap and as good, and cheaper or better. Only methods that ran the same number of pairs and find
-anything compete, and none that is told the truth does.
+Cost is the median time of a pair, or the mean of the bytes kept of the before session. A method is on the front if no
+other method is at least as good and as cheap, and better in one of the two. A method competes if it is not told the
+truth, finds something, and ran as many pairs as any other.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """The tables of a run as LaTeX, typeset by pandas in the style of booktabs.
 
-Bold is the best value of its group as written, equal ones too. A dagger marks a value that cannot be told from the
-best: the paired difference over the session pairs of both is not beyond noise, or fewer than six pairs have it. So what
-stands neither bold nor marked is worse than the best beyond noise, in every column but those that the caption names as
-not tested. Methods that are told the truth take no part.
+Bold: the best value of its group, compared as written. Dagger: not distinguishable from the best, because the paired
+difference is within noise or fewer than six pairs have both values. A value with neither mark is worse than the best
+beyond noise; the caption names the columns that are not tested. Methods that are told the truth get no mark.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ _SUBJECTS = {"regions_table": ("Finding the changed places", REGION_COLUMNS),
 def latex_tables(data: RunData) -> dict[str, str]:
     """Return summary.tex, and regions_table.tex and objects_table.tex where the tables of that name are in the run.
 
-    Points of grids are left to the tables' own files and to the charts of the page.
+    Points of grids are left out: their CSV files and the charts of the page hold them.
 
     Returns:
         LaTeX sources by file name; each needs nothing but the package booktabs.
@@ -149,7 +148,7 @@ def _is_told_apart(cases: pd.DataFrame, column: Column, first: str, second: str,
 
 
 def _caption(words: str, data: RunData, results: pd.DataFrame) -> str:
-    """Return what a table shows, over how much, and how its marks are meant."""
+    """Return the caption: the subject of a table, its number of pairs, and the meaning of its marks."""
     n_pairs, n_failed = len(results[PAIR].drop_duplicates()), int((texts(results, "status") != "ok").sum())
     plan = data.provenance.get("plan")
     name = str(plan.get("name") or "") if isinstance(plan, Mapping) else ""

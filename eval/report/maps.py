@@ -1,6 +1,6 @@
-"""The maps of the page as PNG data addresses: both maps, their distances, and regions over them.
+"""Maps seen from above as PNG data addresses: both maps, the distances between them, and regions.
 
-A map is a raster of points per cell, so that a million points cost no more than a thousand.
+Points are counted in the cells of a raster, so the size of a picture does not grow with the number of points.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Points = npt.NDArray[Any]
 
 @dataclass(frozen=True, slots=True)
 class TruthMark:
-    """Where a change truly is on the map: x, y in metres, its label, and what became of it."""
+    """The true place of a change on the map: x, y in metres, its label and its outcome."""
 
     x_m: float
     y_m: float
@@ -173,7 +173,7 @@ class Raster:
 
     @classmethod
     def around(cls, *clouds: Points) -> Raster:
-        """Return cells over all points of some (N, 3) clouds but strays."""
+        """Return cells that cover all points of some (N, 3) clouds except stray ones."""
         plans = [cloud[bulk_mask(cloud[:, :2]), :2] for cloud in clouds if len(cloud)]
         if not plans:
             raise ValueError("a map to draw must hold points")
@@ -211,9 +211,9 @@ class Raster:
 
 
 def bulk_mask(plan: Points) -> npt.NDArray[np.bool_]:
-    """Mark points (N, 2) with others in their square: false returns far off must not shrink the picture.
+    """Return (N,) which of (N, 2) points share their square with others, so that strays do not shrink the picture.
 
-    All of them where every point stands alone.
+    All points are marked where every point is alone.
     """
     squares = np.floor(plan / _SQUARE_M).astype(np.int64)
     # one number for each square: rows of two are sorted twenty times slower

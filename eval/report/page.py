@@ -1,8 +1,8 @@
-"""One offline page about a run, with tables and pictures like the paper's, and its tables as CSV and LaTeX beside it.
+"""One offline page about a run, with its tables as CSV and LaTeX files beside it.
 
-The page reads a run folder and runs nothing. Everything it shows is inside the file: no script, font or picture is
-fetched, and what draws its charts stands in it once. Only 3-D views are files of their own. What a folder lacks is
-named on the page; only a folder without results.csv is refused.
+The page reads a run folder and runs nothing. The file holds every script, font and picture that it shows, and fetches
+nothing; only 3-D views are files of their own. The page names what the folder lacks. A folder without results.csv is
+refused.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from eval.report.objects.report import draw_objects
 from eval.report.objects.tables import OBJECT_COLUMNS
 from eval.report.paper import time_table, volume_table
 from eval.report.regions.regions import REGION_COLUMNS, draw_regions
-from eval.report.render import rendered, written
+from eval.report.render import render_page, write_file
 from eval.report.scenarios import draw_scenarios
 from eval.report.settings.effects import draw_effects
 from eval.report.settings.factors import draw_factors
@@ -64,9 +64,9 @@ POINT_COLOURS = (
 def write_page(run: Path, views: Views = "chosen") -> Path:
     """Write `index.html` and the tables table1, table2 (.csv, .tex), results.tex and summary.tex into a run folder.
 
-    Also regions_table.tex and objects_table.tex where there are the tables, and pareto.csv with its pictures where
-    methods can be compared by their cost. Of a run whose plan ends at the merge the page shows the merge alone. Where
-    pairs have a kind, merge.csv is written.
+    Further files: regions_table.tex and objects_table.tex where the tables exist, pareto.csv and its pictures where
+    methods can be compared by cost, and merge.csv where pairs have a kind. The page of a run that ends at the merge
+    shows the merge alone.
 
     Args:
         run: The folder; results.csv must be there, anything else may be missing.
@@ -95,10 +95,10 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
         for name in ("table1", "table2"):
             files |= {f"{name}.csv": to_csv(content[name]), f"{name}.tex": to_latex(content[name])}
     content["missing"] = list(dict.fromkeys([*content["missing"], *content["merge"].missing]))
-    files["index.html"] = rendered("page.html", content)
+    files["index.html"] = render_page("page.html", content)
     files |= {f"{chart.name}.png": chart.png for chart in content["charts"] if chart.has_png}
     for name, file in files.items():
-        written(run / name, file)
+        write_file(run / name, file)
     return run / "index.html"
 
 
@@ -106,13 +106,13 @@ def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
     """Return what every page shows: the run, its summary and its merges, and nothing of regions and objects."""
     return {
         "plan": str(data.provenance.get("plan", {}).get("name", "")),
-        "machine": machine_text(data.provenance),
+        "machine": describe_machine(data.provenance),
         "command": str(data.provenance.get("command") or "unknown"),
         "finished": str(data.provenance.get("finished") or "unknown"),
-        "failures": failures(data),
-        "settings": settings(data),
+        "failures": list_failures(data),
+        "settings": tabulate_settings(data),
         "provenance": json.dumps(data.provenance, indent=2, ensure_ascii=False),
-        "commits": commits_text(data),
+        "commits": describe_commits(data),
         "summary": draw_summary(data, merges),
         "merge": draw_merge(data),
         "ends_at_merge": ends_at_merge(data),
@@ -172,7 +172,7 @@ def _sections(data: RunData, pareto: Sequence[Chart], views: Views) -> dict[str,
     }  # fmt: skip
 
 
-def failures(data: RunData) -> list[str]:
+def list_failures(data: RunData) -> list[str]:
     """Return one line for every pair and reason without an answer, naming the variants it met."""
     found: dict[tuple[str, int, str], list[str]] = {}
     for row in data.results:
@@ -186,7 +186,7 @@ def failures(data: RunData) -> list[str]:
     ]
 
 
-def machine_text(provenance: Mapping[str, Any]) -> str:
+def describe_machine(provenance: Mapping[str, Any]) -> str:
     """Return the machine in a few words: processor, cores, memory, threads."""
     machine = provenance.get("machine")
     if not isinstance(machine, Mapping):
@@ -203,7 +203,7 @@ def machine_text(provenance: Mapping[str, Any]) -> str:
     return ", ".join(part for part in parts if part)
 
 
-def commits_text(data: RunData) -> str:
+def describe_commits(data: RunData) -> str:
     """Return which commits made how many of the answers, "" where all are of one; cells are kept when code changes."""
     counts = Counter(text(row, "commit") or "unknown" for row in data.results)
     if len(counts) < 2:
@@ -212,7 +212,7 @@ def commits_text(data: RunData) -> str:
     return f"The answers were made by more than one commit: {named}. A + marks a tree that differed from its commit."
 
 
-def settings(data: RunData) -> Table:
+def tabulate_settings(data: RunData) -> Table:
     """Return the effective settings of every named variant, from its answers, sites that differ side by side."""
     found: dict[str, list[dict[str, str]]] = {}
     for scenario in [*scenarios(data, unchanged=False), *scenarios(data, unchanged=True)]:

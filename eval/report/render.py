@@ -10,12 +10,13 @@ from typing import Any
 import jinja2
 
 from cdpipe.core.errors import InputError
+from eval.core.output import whole_file
 
 _FILES = ("page.html", "comparison.html", "parts.html", "page.css", "charts.js")
 
 
-def rendered(template: str, content: Mapping[str, Any]) -> str:
-    """Return a page of its template's name; a name that the content lacks is an error."""
+def render_page(template: str, content: Mapping[str, Any]) -> str:
+    """Return a page made from a template; a name that the content lacks is an error."""
     folder = resources.files("eval") / "report" / "templates"
     environment = jinja2.Environment(
         loader=jinja2.DictLoader({name: (folder / name).read_text(encoding="utf-8") for name in _FILES}),
@@ -27,15 +28,14 @@ def rendered(template: str, content: Mapping[str, Any]) -> str:
     return environment.get_template(template).render(content)
 
 
-def written(path: Path, content: str | bytes) -> None:
+def write_file(path: Path, content: str | bytes) -> None:
     """Write a file.
 
     Raises:
         InputError: It cannot be written.
     """
-    partial = path.with_name(f".{path.name}.partial")
     try:
-        partial.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
-        partial.replace(path)
+        with whole_file(path) as partial:
+            partial.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error

@@ -1,4 +1,4 @@
-"""Single merges on the page: what each measured against its gates, what came of it and why, and the maps it aligned."""
+"""Single merges on the page: their evidence and gates, their outcome and its reason, and the aligned maps."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def read_case(data: RunData, row: Row, variants: tuple[str, ...] = ()) -> Case:
 
 
 def distinct_cases(data: RunData, rows: Sequence[Row], preferred: str) -> list[Case]:
-    """Return each merge once: variants that differ only in later stages share one, and `preferred` speaks for them."""
+    """Return each merge once; variants that differ only in later stages share one, under `preferred` where it can."""
     found: dict[tuple[Any, ...], list[Case]] = {}
     for row in rows:
         case = read_case(data, row)
@@ -98,7 +98,7 @@ def case_table(cases: Sequence[Case], caption: str, *, by_kind: bool) -> Table:
 
 
 def outcome_text(case: Case) -> str:
-    """Say in words what came of a merge, and why."""
+    """Return the outcome of a merge and its reason."""
     status, error = text(case.row, "status"), text(case.row, "error")
     if status != "ok":
         return f"{status.removeprefix('merge_')}: {error}" if error else status.removeprefix("merge_")
@@ -113,7 +113,7 @@ def outcome_text(case: Case) -> str:
 
 
 def draw_case(data: RunData, case: Case, missing: list[str]) -> Picture | None:
-    """Draw the aligned maps of a merge coloured by distance; a refused one as the maps truly lie, if they ever meet."""
+    """Draw the aligned maps of a merge coloured by distance; of a refused merge the true alignment, if any."""
     scenario, seed, variant = str(case.row["scenario"]), int(case.row["seed"]), str(case.row["variant"])
     name = f"{scenario}, seed {seed}"
     try:
@@ -137,7 +137,7 @@ def draw_case(data: RunData, case: Case, missing: list[str]) -> Picture | None:
 
 
 def true_alignment(pair: Path) -> PathAlignment | None:
-    """Return how the maps of a pair truly lie, place by place; None where the sessions never come within 5 m."""
+    """Return the true alignment of a pair along the path; None where the sessions never come within 5 m."""
     before, after = (read_session(pair / name).odom_T_sensor for name in ("before", "after"))
     world_T_before, world_T_after = (read_true_poses(pair / name) for name in ("before", "after"))
     along = travelled_m(after)

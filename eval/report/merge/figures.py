@@ -30,10 +30,10 @@ _UNSEEN = "#ececec"
 
 
 def surface_distances(before: Points, points: Points) -> Float64Array:
-    """Return how far (N, 3) points lie from the surface that (M, 3) points of the before map were taken from.
+    """Return the distance of (N, 3) points to the surface that (M, 3) points of the before map sample, metres.
 
-    That is the distance to the plane through the six nearest points: two maps thinned to 0.2 m are 7 cm from each
-    other's nearest point even where they fit exactly. Farther than 0.3 m from every point it is that distance.
+    It is the distance to the plane through the six nearest points, because two maps thinned to 0.2 m are 7 cm from each
+    other's nearest point even where they fit exactly. Beyond 0.3 m it is the distance to the nearest point.
     """
     nearest_m, index = (
         np.asarray(found)
@@ -55,8 +55,8 @@ def surface_distances(before: Points, points: Points) -> Float64Array:
 def worst_stretch(points: Points, distances_m: Float64Array) -> tuple[float, float] | None:
     """Return the middle (x, y) of the place that both sessions saw and that fits worst.
 
-    Places are squares of 8 m. One is judged by the median distance of its points, if it holds at least half as many as
-    squares usually do and the before map has something within 1 m of most; None where no square does.
+    Places are squares of 8 m. The worst has the greatest median distance of its points. A square counts if it holds at
+    least half the median number of points and most of them have a before point within 1 m. None where no square counts.
     """
     _, square, counts = np.unique(
         np.floor(points[:, :2] / _SQUARE_M).astype(np.int64), axis=0, return_inverse=True, return_counts=True

@@ -1,4 +1,4 @@
-"""The merge on the page: the table of a plan's targets and its plots, or the evidence of every merge, and the maps."""
+"""The merges on the page: targets and charts of a plan with kinds of pairs, evidence of single merges, and maps."""
 
 from __future__ import annotations
 
@@ -93,8 +93,8 @@ def _chosen_cases(data: RunData, results: pd.DataFrame, name: str, notes: list[s
 def _every_case(data: RunData, name: str, notes: list[str]) -> tuple[list[Table], list[Case]]:
     """Return every distinct merge of an ordinary run and, of each scenario, one whose maps are shown.
 
-    Worlds that only repeat another one are left out, and merges of which nothing is told. Where there are too many for
-    a table, those that were not accepted come first.
+    Repeated worlds and accepted merges without evidence are left out. Where there are too many for a table, merges that
+    were not accepted come first.
     """
     held = repeats(data)
     rows = [row for row in data.results if (row["scenario"], row["variant"]) not in held]

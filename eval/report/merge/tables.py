@@ -51,7 +51,7 @@ _TARGET_HEADINGS = (
 def kinds_table(table: pd.DataFrame, *, is_whole: bool = True) -> Table:
     """Return a row for every kind of pair and variant: counts, share within the target, errors, met or not.
 
-    Nothing is said to be met or not where the table does not hold the whole of what was planned.
+    There is no verdict where the run does not hold all planned pairs.
     """
     own = table[table["family"] == ALL_FAMILIES]
     caption = "Kinds of pair: one row is one method; the group says what the kind asks for"

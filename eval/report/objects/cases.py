@@ -44,7 +44,7 @@ def object_cases(data: RunData, variant: str) -> tuple[list[Picture], list[str]]
 def chosen_cases(rows: Sequence[Row]) -> list[tuple[str, Row]]:
     """Return the best, the median and the ten worst observable changes of the main group, none twice.
 
-    Missed ones have an IoU of 0. Of equal ones the larger comes first among the worst, and among the best.
+    Missed changes have an IoU of 0. Of changes with equal IoU the larger one comes first.
     """
     main = [row for row in rows if text(row, "group") == "full" and not math.isnan(number(row, "iou_point"))]
     ranked = sorted(main, key=lambda row: (number(row, "iou_point"), -number(row, "n_truth_cells")))
@@ -59,7 +59,7 @@ def chosen_cases(rows: Sequence[Row]) -> list[tuple[str, Row]]:
 
 
 def voxel_variants(data: RunData, variant: str) -> list[str]:
-    """Return the variant with the paper's rule in a variant's place, if there is one."""
+    """Return the variant that differs from a variant by the paper's extraction rule, if it was run."""
     names = dict.fromkeys(str(row["variant"]) for row in data.results)
     split = ((name, *split_variant(name)) for name in names)
     return [name for name, stem, settings in split if stem == variant and settings.get(VOXEL_RULE) == "voxel"][:1]

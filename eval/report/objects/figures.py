@@ -70,8 +70,8 @@ def object_panels(panels: Sequence[Panel], truth: Float64Array, view_from: Float
 def oblique_view(truth: Float64Array, view_from: Float64Array) -> Callable[[Float64Array], Float64Array]:
     """Return a function from (N, 3) points to (N, 2) picture coordinates, metres: orthographic, 25 deg from above.
 
-    The eye stands on the side of `view_from`, turned about the object by the first of some angles that shows at least
-    60 % of the greatest width that any angle shows: no railing is seen from its end.
+    The view is from the side of `view_from`. It turns about the object by the first of a few angles that shows at least
+    60 % of the greatest width that any of them shows, so that no railing is seen from its end.
     """
     centre = truth.mean(axis=0)
     offset = view_from[:2] - centre[:2]

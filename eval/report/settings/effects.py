@@ -54,7 +54,7 @@ def signed(column: Column, value: float) -> str:
     return f"{sign}{written}"
 
 
-def shortened(settings: Sequence[str]) -> tuple[str, list[str]]:
+def shorten(settings: Sequence[str]) -> tuple[str, list[str]]:
     """Return the group that all settings belong to, "" if there is none, and the settings without it."""
     groups = {group_of(part) for text in settings for part in text.split(",")}
     group = groups.pop() if len(groups) == 1 else ""
@@ -64,7 +64,7 @@ def shortened(settings: Sequence[str]) -> tuple[str, list[str]]:
 def _effects_on(data: RunData, reference: str, table: pd.DataFrame) -> EffectsOn:
     columns = [column for column in COLUMNS if column.key in set(table["metric"][table["n"] > 0])]
     settings = list(table["settings"].unique())
-    group, short = shortened(settings)
+    group, short = shorten(settings)
     title = f"{reference}: what each setting of its {group} does" if group else f"{reference}: what each setting does"
     table = table.assign(setting=table["settings"].map(dict(zip(settings, short, strict=True))))
     drawn = [column for column in columns if column.key in _DRAWN]

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from eval.report.comparing import BETTER, COLUMNS
-from eval.report.comparison import COLOURS, compared, detail_tables, matrix_table, overview, sentences
+from eval.report.comparison import COLOURS, compare_sides, detail_tables, matrix_table, overview, sentences
 from eval.running.sides import Side, read_side
 from eval.scoring.scoring import METRICS_VERSION
 
@@ -44,7 +44,7 @@ def sides(*paths: Path | str) -> list[Side]:
 
 
 def test_the_first_sentence_counts_and_the_last_names_what_is_not_paired(runs: tuple[Path, Path]) -> None:
-    told = sentences(compared(*sides(*runs)))
+    told = sentences(compare_sides(*sides(*runs)))
     # answered, recall, recall at K, merge error of two methods: two recalls are better, two errors worse
     for words in ("8 figures", "2 better", "2 worse", "4 the same"):
         assert words in told[0]
@@ -52,7 +52,7 @@ def test_the_first_sentence_counts_and_the_last_names_what_is_not_paired(runs: t
 
 
 def test_the_tables_say_the_same_as_the_file(runs: tuple[Path, Path]) -> None:
-    found = compared(*sides(*runs))
+    found = compare_sides(*sides(*runs))
     matrix = matrix_table(found.table)
     assert [group for group, _ in matrix.groups()] == ["in distribution", "out of distribution", "all pairs"]
     place = matrix.headings.index("region recall")
@@ -68,10 +68,10 @@ def test_the_tables_say_the_same_as_the_file(runs: tuple[Path, Path]) -> None:
 
 
 def test_against_names_the_method_once(runs: tuple[Path, Path]) -> None:
-    found = compared(*sides(f"{runs[0]}:c2c", runs[0]))
+    found = compare_sides(*sides(f"{runs[0]}:c2c", runs[0]))
     assert found.names == ("old:c2c", "old")
     assert set(overview(found.table)["variant"]) == {"tunnelcd", "solid<b>"}
-    turned = compared(*sides(runs[0], f"{runs[0]}:c2c"))
+    turned = compare_sides(*sides(runs[0], f"{runs[0]}:c2c"))
     assert set(overview(turned.table)["variant"]) == {"against tunnelcd", "against solid<b>"}
     np.testing.assert_allclose(np.sort(turned.table["difference"]), np.sort(-found.table["difference"]))
 

@@ -11,7 +11,7 @@ import pytest
 from eval.core.figures import picture
 from eval.report.page import write_page
 from eval.report.settings.charts import effect_chart
-from eval.report.settings.effects import draw_effects, shortened
+from eval.report.settings.effects import draw_effects, shorten
 from eval.running.run_data import first_seed, named_variants, read_run, scenarios
 
 NAN = float("nan")
@@ -155,8 +155,8 @@ def test_a_label_is_text_and_never_markup(run: Path) -> None:
 
 
 def test_settings_are_shortened_by_the_group_they_share() -> None:
-    assert shortened(["sensor.a=1", "sensor.b=2,sensor.c=3"]) == ("sensor", ["a=1", "b=2, c=3"])
-    assert shortened(["sensor.a=1", "platform.b=2"]) == ("", ["sensor.a=1", "platform.b=2"])
+    assert shorten(["sensor.a=1", "sensor.b=2,sensor.c=3"]) == ("sensor", ["a=1", "b=2, c=3"])
+    assert shorten(["sensor.a=1", "platform.b=2"]) == ("", ["sensor.a=1", "platform.b=2"])
 
 
 def test_a_row_for_each_setting_and_a_mark_with_its_interval_for_each_variant() -> None:
