@@ -47,11 +47,6 @@ class Chart:
         return png(picture(self.drawing))
 
     @property
-    def figure(self) -> dict[str, Any]:
-        """The chart as plotly.js takes it."""
-        return plotly_figure(self.drawing)
-
-    @property
     def height_px(self) -> int:
         """Height on the page, pixels."""
         return _height_px(self.drawing)
@@ -59,7 +54,9 @@ class Chart:
     @property
     def json(self) -> str:
         """The figure as JSON that may stand inside a script element: it cannot end that element."""
-        return json.dumps(_plain(self.figure), separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
+        return json.dumps(_plain(plotly_figure(self.drawing)), separators=(",", ":"), allow_nan=False).replace(
+            "</", "<\\/"
+        )
 
 
 def plotly_script() -> str:

@@ -19,8 +19,7 @@ from eval.core.statistics import ENOUGH_PAIRS
 from eval.report.compared_columns import COMPARED
 from eval.report.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare
 from eval.report.render import render_page, write_file
-from eval.report.settings.charts import effect_chart
-from eval.report.settings.effects import signed
+from eval.report.settings.effects import effect_chart, signed
 from eval.report.tables import Cell, Picture, Table
 from eval.running.sides import Side, cautions, only_in, short_names, why_no_times
 from eval.tables.columns import Column, spaced

@@ -150,8 +150,7 @@ def _is_told_apart(cases: pd.DataFrame, column: Column, first: str, second: str,
 def _caption(words: str, data: RunData, results: pd.DataFrame) -> str:
     """Return the caption: the subject of a table, its number of pairs, and the meaning of its marks."""
     n_pairs, n_failed = len(results[PAIR].drop_duplicates()), int((texts(results, "status") != "ok").sum())
-    plan = data.provenance.get("plan")
-    name = str(plan.get("name") or "") if isinstance(plan, Mapping) else ""
+    name = data.provenance.get("plan", {}).get("name", "")
     told = f"{words}{f', plan {name}' if name else ''}: {n_pairs} session pairs, {results['variant'].nunique()} methods"
     n_unmade = sum(is_unmade(row) for row in records(results))
     failed = f"{n_failed - n_unmade} of {len(results)} cases without an answer, which miss all their changes"

@@ -7,12 +7,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
+from eval.core.charts import BLACK, COLOURS, SYMBOLS, Axis, Drawing, Look, Panel, Series
 from eval.core.figures import picture_address
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.worlds import group_of
-from eval.report.settings.charts import effect_chart
 from eval.report.tables import Cell, Picture, Table
 from eval.running.run_data import RunData, of, over_pairs
 from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, Column, count, select
@@ -26,6 +27,8 @@ COLUMNS = (
 )  # fmt: skip
 _DRAWN = ("region_recall_at_k", "object_iou_point")
 _MINUS = "\u2212"
+_ROW_PX, _LINES_PER_ROW, _MARGIN_PX = 30, 0.45, 50
+_ZERO = Look(BLACK, 0.8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +62,35 @@ def shorten(settings: Sequence[str]) -> tuple[str, list[str]]:
     groups = {group_of(part) for text in settings for part in text.split(",")}
     group = groups.pop() if len(groups) == 1 else ""
     return group, [", ".join(part.removeprefix(f"{group}.") for part in text.split(",")) for text in settings]
+
+
+def effect_chart(panels: Mapping[str, pd.DataFrame]) -> Drawing:
+    """Draw one panel for each figure: settings from top to bottom, a dot and a line for each variant.
+
+    Args:
+        panels: By the name of the figure, a row for each effect on it: `setting`, `variant`, `difference` and its
+            interval `low` to `high`, NaN where undefined; settings and variants in the order in which they come.
+    """
+    every = pd.concat(panels.values())
+    settings, variants = (list(every[name].unique()) for name in ("setting", "variant"))
+    names = [setting.replace(", ", ",\n") for setting in settings]
+    # a row is as high as its name needs
+    heights = np.maximum(1.0, _LINES_PER_ROW * np.array([1 + name.count("\n") for name in names]))
+    middles = dict(zip(settings, (np.cumsum(heights) - heights / 2).tolist(), strict=True))
+    bottom = float(heights.sum())
+    step = 0.6 / max(len(variants), 2)
+    row: list[Panel] = []
+    for figure, table in panels.items():
+        series = [Series([0.0, 0.0], [0.0, bottom], _ZERO)]
+        for order, variant in enumerate(variants):
+            own = table[table["variant"] == variant]
+            places = own["setting"].map(middles) + (order - (len(variants) - 1) / 2) * step
+            look = Look(COLOURS[(order + 1) % len(COLOURS)], 0.0, marker=SYMBOLS[order % len(SYMBOLS)], size=4.5)
+            ends = {"low": own["low"], "high": own["high"]}
+            series.append(Series(own["difference"], places.tolist(), look, variant, is_across=True, **ends))
+        ticks = {place: "" if row else text for place, text in zip(middles.values(), names, strict=True)}
+        row.append(Panel(Axis(f"difference of {figure}"), Axis(span=(bottom, 0.0), ticks=ticks), series))
+    return Drawing([row], round(_MARGIN_PX + _ROW_PX * bottom))
 
 
 def _effects_on(data: RunData, reference: str, table: pd.DataFrame) -> EffectsOn:

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from eval.report.charts import plotly_figure
 from eval.report.cost import COLUMNS, draw_pareto, front, pareto_table
 from eval.running.run_data import RunData
 from eval.running.runfolder import RunFolder
@@ -97,8 +98,8 @@ def test_the_picture_names_the_front(tmp_path: Path) -> None:
     methods = {"tunnelcd": (0.9, 3.0, 5.0), "voxel-diff": (0.3, 1.0, 9.0), "c2c": (0.2, 2.0, 9.0)}
     (chart,) = draw_pareto(pareto_table(run(tmp_path, methods)))
     assert chart.name == "pareto_objects"
-    assert chart.png is not None and chart.png.startswith(b"\x89PNG")
-    labels = [text for trace in chart.figure["data"] for text in trace.get("text", ()) if text]
+    assert chart.png.startswith(b"\x89PNG")
+    labels = [text for trace in plotly_figure(chart.drawing)["data"] for text in trace.get("text", ()) if text]
     assert labels == ["<b>tunnelcd</b>", "<b>voxel-diff</b>", "<b>tunnelcd</b>"]
     front_text = chart.caption.partition("On the front: ")[2]
     assert "time of a pair, in distribution: tunnelcd, voxel-diff;" in front_text

@@ -10,8 +10,7 @@ import pytest
 
 from eval.core.figures import picture
 from eval.report.page import write_page
-from eval.report.settings.charts import effect_chart
-from eval.report.settings.effects import draw_effects, shorten
+from eval.report.settings.effects import draw_effects, effect_chart, shorten
 from eval.running.run_data import first_seed, named_variants, read_run, scenarios
 
 NAN = float("nan")
