@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.voxel import cell_keys
-from cdpipe.model.config import ClusterConfig, ExtractConfig, OutlierConfig
+from cdpipe.model.config import ClusterConfig, ExtractConfig, OutlierConfig, PipelineConfig
 
 _MAX_DENSE_CELLS = 1 << 22
 
@@ -97,6 +97,19 @@ def label_clusters(points: Float64Array, config: ClusterConfig) -> Int64Array:
     big = order[sizes[order] >= config.min_points]
     labels[big] = np.arange(len(big))
     return labels[groups]
+
+
+def cluster_inliers(points: Float64Array, new: Int64Array, config: PipelineConfig) -> list[Int64Array]:
+    """Return the indices into (N, 3) points of each cluster of the new ones, without outliers, largest cluster first.
+
+    Args:
+        points: (N, 3) points, metres.
+        new: (M,) indices of the new points.
+        config: `outlier` and `cluster` are used.
+    """
+    new = new[inlier_mask(points[new], config.outlier)]
+    labels = label_clusters(points[new], config.cluster)
+    return [new[labels == label] for label in range(labels.max(initial=-1) + 1)]
 
 
 def label_groups(points: Float64Array, link_m: float) -> tuple[Int64Array, Int64Array]:

@@ -145,6 +145,10 @@ class PointMap:
         cells = np.floor(self.points[self.return_points[returns]] / self.voxel_m)
         return (cells + (self.return_offsets[returns] + 0.5) / PLACES) * self.voxel_m
 
+    def scans_of(self, returns: Int64Array) -> Int64Array:
+        """Return the (N,) scan of each of (N,) returns."""
+        return np.searchsorted(self.scan_offsets, returns, side="right") - 1
+
     @property
     def odom_T_keyframe(self) -> Float64Array:
         """(K, 4, 4) pose of each keyframe."""
@@ -232,3 +236,20 @@ class MergedMaps:
     def alignment(self) -> PathAlignment:
         """What every later stage aligns with."""
         return PathAlignment.rigid(self.before_T_after) if self.local is None else self.local
+
+    def map_of(self, session: SessionName) -> PointMap:
+        """Return the map of a session, in its own odom frame."""
+        return self.before if session == "before" else self.after
+
+    def to_map(self, session: SessionName, points_odom: Float64Array) -> Float64Array:
+        """Return (N, 3) points of a session's odom frame in the map frame, metres."""
+        return points_odom if session == "before" else self.alignment.to_map(points_odom)
+
+    def to_odom(self, session: SessionName, points_map: Float64Array) -> Float64Array:
+        """Return (N, 3) points of the map frame in a session's odom frame, metres."""
+        return points_map if session == "before" else self.alignment.to_odom(points_map)
+
+    def keyframe_positions(self, before: DescriptorSet, after: DescriptorSet) -> tuple[Float64Array, Float64Array]:
+        """Return the (Kb, 3) before and (Ka, 3) after positions of the described keyframes, map frame, metres."""
+        after_positions = self.after.odom_T_sensor[after.keyframe_scans, :3, 3]
+        return self.before.odom_T_sensor[before.keyframe_scans, :3, 3], self.alignment.to_map(after_positions)

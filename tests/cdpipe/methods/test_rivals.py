@@ -11,7 +11,7 @@ from cdpipe.methods.c2c import c2c
 from cdpipe.methods.random_regions import RandomRegions
 from cdpipe.methods.registry import load_method
 from cdpipe.methods.voxel_diff import voxel_diff
-from cdpipe.methods.whole_map import PlacedMaps, whole_map
+from cdpipe.methods.whole_map import PlacedMaps, WholeMap
 from cdpipe.model.config import PipelineConfig, load_config, preset_names
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap, SessionName
@@ -225,8 +225,8 @@ def test_random_regions_stay_where_the_after_session_came() -> None:
 
 def test_every_preset_has_its_method() -> None:
     assert {load_config(name).method for name in preset_names()} <= entry_points(METHODS).keys()
-    assert load_method("voxel-diff").detect is voxel_diff
-    assert load_method("c2c").detect is c2c
+    assert load_method("voxel-diff").detect == voxel_diff.detect
+    assert load_method("c2c").detect == c2c.detect
 
 
 def test_figures_are_of_the_after_map() -> None:
@@ -255,10 +255,11 @@ def test_a_mask_of_ones_own_makes_a_method() -> None:
     # beside the walls the nearest point of the other map may be any of a column: only what stands in the middle counts
     config = load_config("voxel-diff", ["query.threshold=0", "outlier.sigmas=10", "cluster.min_points=33"])
 
+    @WholeMap
     def in_the_middle(maps: PlacedMaps, session: SessionName, other: SessionName, config: PipelineConfig) -> BoolArray:
         return higher_mask(maps, session, other, config) & (np.abs(maps.points[session][:, 1]) < 1.5)
 
-    report = whole_map(merged, descriptors(merged.before), descriptors(merged.after), config, in_the_middle)
+    report = in_the_middle.detect(merged, descriptors(merged.before), descriptors(merged.after), config)
     assert report.regions.scores.tolist() == [64.0]
     (item,) = report.objects
     assert (item.session, item.kind) == ("after", "added")
