@@ -33,6 +33,13 @@ def require_shape(name: str, array: npt.NDArray[Any], shape: tuple[int | None, .
     raise ValueError(f"{name} must be ({wanted}), got {array.shape}")
 
 
+def require_shapes(owner: object, **shapes: tuple[int | None, ...]) -> None:
+    """Raise `ValueError` unless each named attribute of `owner` has its shape (`require_shape`) or is None."""
+    for name, shape in shapes.items():
+        if getattr(owner, name) is not None:
+            require_shape(name, getattr(owner, name), shape)
+
+
 def require_poses(name: str, poses: npt.NDArray[Any]) -> None:
     """Raise `ValueError` unless `poses` is (N, 4, 4), finite and rigid to 1e-6."""
     require_shape(name, poses, (None, 4, 4))

@@ -36,6 +36,7 @@ from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.io.answer_parts import (
     FORMAT,
     FORMAT_VERSION,
+    OFFSETS,
     AnswerPart,
     ShapePart,
     Until,
@@ -44,6 +45,9 @@ from cdpipe.io.answer_parts import (
 )
 from cdpipe.io.session import load_arrays
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
+
+# Fields of an object that answer.json holds as they are.
+_OBJECT_FIELDS = ("session", "kind", "region", "score", "partner")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,29 +161,26 @@ def read_answer(folder: Path) -> Answer:
 def _report(
     document: AnswerPart, arrays: Mapping[str, npt.NDArray[Any]]
 ) -> tuple[ChangeReport, tuple[Float64Array, ...] | None]:
-    n = len(document.objects)
-    points_map: list[Any] = [np.zeros((0, 3))] * n
-    if "object_points_map" in arrays:
-        points_map = _split(arrays["object_points_map"], arrays["object_point_offsets"])
+
+    def split(name: str, empty: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
+        if name not in arrays:
+            return [empty] * len(document.objects)
+        return [arrays[name][start:end] for start, end in pairwise(arrays[OFFSETS[name]])]
+
+    no_points = np.zeros((0, 3))
     points_odom = None
-    returns: list[Any] = [np.zeros((0, 2), dtype=np.int32)] * n
-    if "object_returns" in arrays:
-        returns = _split(arrays["object_returns"], arrays["object_return_offsets"])
-    elif "object_points_odom" in arrays:
-        points_odom = tuple(_split(arrays["object_points_odom"], arrays["object_point_odom_offsets"]))
+    if "object_points_odom" in arrays and "object_returns" not in arrays:
+        points_odom = tuple(split("object_points_odom", no_points))
+    returns, points_map = split("object_returns", np.zeros((0, 2), np.int32)), split("object_points_map", no_points)
     objects = tuple(
         ChangedObject(
-            session=part.session,
-            kind=part.kind,
-            region=part.region,
-            returns=found,
+            **{name: getattr(part, name) for name in _OBJECT_FIELDS},
+            returns=of_object,
             points_map=points,
-            score=part.score,
-            partner=part.partner,
             shape=None if part.shape is None else _shape(part.shape),
             displacement_map=None if part.displacement_map is None else _numbers(part.displacement_map),
         )
-        for part, found, points in zip(document.objects, returns, points_map, strict=True)
+        for part, of_object, points in zip(document.objects, returns, points_map, strict=True)
     )
     scores = arrays["region_scores"]
     regions = ChangeRegions(
@@ -208,19 +209,10 @@ def _report(
 
 
 def _object_document(item: ChangedObject) -> dict[str, Any]:
-    document: dict[str, Any] = {
-        "session": item.session,
-        "kind": item.kind,
-        "region": item.region,
-        "score": item.score,
-        "partner": item.partner,
-    }
+    document: dict[str, Any] = {name: getattr(item, name) for name in _OBJECT_FIELDS}
     if item.shape is not None:
-        document["shape"] = {
-            "map_T_box": item.shape.map_T_box.tolist(),
-            "box_m": item.shape.box_m.tolist(),
-            "volume_m3": item.shape.volume_m3,
-        }
+        map_T_box, box_m = item.shape.map_T_box.tolist(), item.shape.box_m.tolist()
+        document["shape"] = {"map_T_box": map_T_box, "box_m": box_m, "volume_m3": item.shape.volume_m3}
     if item.displacement_map is not None:
         document["displacement_map"] = item.displacement_map.tolist()
     return document
@@ -247,7 +239,3 @@ def _stack(arrays: Sequence[npt.NDArray[Any]], empty: tuple[int, int], dtype: ty
 
 def _offsets(arrays: Sequence[npt.NDArray[Any]]) -> Int64Array:
     return np.concatenate([[0], np.cumsum([len(array) for array in arrays])]).astype(np.int64)
-
-
-def _split(values: npt.NDArray[Any], offsets: Int64Array) -> list[npt.NDArray[Any]]:
-    return [values[a:b] for a, b in pairwise(offsets)]

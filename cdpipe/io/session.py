@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, require_poses, require_shape
+from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, require_poses, require_shape, require_shapes
 from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
 
 FORMAT = "tunnelcd-session"
@@ -53,11 +53,8 @@ class ScanChunk:
 
     def __post_init__(self) -> None:
         require_shape("range_mm", self.range_mm, (None, None, None))
-        scans, _, width = self.range_mm.shape
-        require_shape("reflectivity", self.reflectivity, self.range_mm.shape)
-        require_shape("signal", self.signal, self.range_mm.shape)
-        require_shape("column_stamps_ns", self.column_stamps_ns, (scans, width))
-        require_shape("column_poses", self.column_poses, (scans, width, 7))
+        shape = s, _, width = self.range_mm.shape
+        require_shapes(self, reflectivity=shape, signal=shape, column_stamps_ns=(s, width), column_poses=(s, width, 7))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

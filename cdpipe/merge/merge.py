@@ -184,11 +184,11 @@ def _start_by_kiss_matcher(maps: tuple[IndexedMap, IndexedMap], config: MergeCon
     Odometry observes gravity, so a pose that tilts the after map is rejected.
     """
     before, after = maps
-    found = register_globally(before.map.points, after.map.points, config.kiss_voxel_m)
-    if found is None or found.before_T_after[2, 2] < _UPRIGHT:
+    pose = register_globally(before.map.points, after.map.points, config.kiss_voxel_m)
+    if pose is None or pose[2, 2] < _UPRIGHT:
         return []
-    distances_m, _ = before.path.query(transform(found.before_T_after, after.positions))
-    return [_Start(int(np.argmin(distances_m)), found.before_T_after, {"is_fallback": 1.0})]
+    distances_m, _ = before.path.query(transform(pose, after.positions))
+    return [_Start(int(np.argmin(distances_m)), pose, {"is_fallback": 1.0})]
 
 
 def _choose_hypothesis(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, Int64Array, require_poses, require_shape, yaw_rad
+from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, Int64Array, require_poses, require_shapes, yaw_rad
 from cdpipe.model.types import Kind, SessionName, UInt8Array
 
 if TYPE_CHECKING:
@@ -49,19 +49,13 @@ class ChangeRegions:
 
     def __post_init__(self) -> None:
         n = len(self.scores)
-        if self.is_withdrawn is not None:
-            require_shape("is_withdrawn", self.is_withdrawn, (n,))
-            if (self.is_withdrawn & self.is_reported).any():
-                raise ValueError("is_withdrawn and is_reported: a region is one or the other")
-        if self.direction is not None:
-            require_shape("direction", self.direction, (n,))
-            if self.direction.dtype != np.uint8 or (self.direction > 1).any():
-                raise ValueError("direction must be uint8: 0 for a before keyframe that was looked up, 1 for an after")
-        require_shape("centres_map", self.centres_map, (n, 3))
-        require_shape("pairs", self.pairs, (n, 2))
-        require_shape("is_reported", self.is_reported, (n,))
+        require_shapes(self, centres_map=(n, 3), pairs=(n, 2), is_reported=(n,), is_withdrawn=(n,), direction=(n,))
         if self.is_reported.dtype != np.bool_:
             raise ValueError(f"is_reported must be a boolean mask, got {self.is_reported.dtype}")
+        if self.is_withdrawn is not None and (self.is_withdrawn & self.is_reported).any():
+            raise ValueError("is_withdrawn and is_reported: a region is one or the other")
+        if self.direction is not None and (self.direction.dtype != np.uint8 or (self.direction > 1).any()):
+            raise ValueError("direction must be uint8: 0 for a before keyframe that was looked up, 1 for an after")
         if (np.diff(self.scores) > 0).any():
             raise ValueError("scores must fall: best candidate first")
 
@@ -82,7 +76,7 @@ class ObjectShape:
 
     def __post_init__(self) -> None:
         require_poses("map_T_box", self.map_T_box[None])
-        require_shape("box_m", self.box_m, (3,))
+        require_shapes(self, box_m=(3,))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,10 +107,7 @@ class ChangedObject:
     displacement_map: Float64Array | None = None
 
     def __post_init__(self) -> None:
-        require_shape("returns", self.returns, (None, 2))
-        require_shape("points_map", self.points_map, (None, 3))
-        if self.displacement_map is not None:
-            require_shape("displacement_map", self.displacement_map, (3,))
+        require_shapes(self, returns=(None, 2), points_map=(None, 3), displacement_map=(3,))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

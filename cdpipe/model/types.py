@@ -16,7 +16,7 @@ from cdpipe.core.geometry import (
     Int32Array,
     Int64Array,
     require_poses,
-    require_shape,
+    require_shapes,
 )
 from cdpipe.model.alignment import PathAlignment
 
@@ -47,10 +47,8 @@ class PosedScan:
     pixels: Int32Array
 
     def __post_init__(self) -> None:
-        require_shape("points_sensor", self.points_sensor, (None, 3))
-        require_shape("odom_T_sensor", self.odom_T_sensor, (4, 4))
-        require_shape("stamps_ns", self.stamps_ns, (len(self.points_sensor),))
-        require_shape("pixels", self.pixels, (len(self.points_sensor),))
+        n = len(self.points_sensor)
+        require_shapes(self, points_sensor=(None, 3), odom_T_sensor=(4, 4), stamps_ns=(n,), pixels=(n,))
 
 
 class ScanSource(Protocol):
@@ -85,7 +83,7 @@ class KeyframeViews:
     sensor_T_odom: Float64Array
 
     def __post_init__(self) -> None:
-        require_shape("ranges_m", self.ranges_m, (len(self.sensor_T_odom), None, None))
+        require_shapes(self, ranges_m=(len(self.sensor_T_odom), None, None))
         require_poses("sensor_T_odom", self.sensor_T_odom)
 
 
@@ -123,16 +121,11 @@ class PointMap:
     views: KeyframeViews | None = None
 
     def __post_init__(self) -> None:
-        require_shape("points", self.points, (None, 3))
-        if self.seen_from is not None:
-            require_shape("seen_from", self.seen_from, self.points.shape)
-        if self.return_offsets is not None:
-            require_shape("return_offsets", self.return_offsets, (len(self.return_points), 3))
-        require_shape("nearest_m", self.nearest_m, (len(self.points),))
+        n, m = len(self.points), len(self.return_points)
+        require_shapes(self, points=(None, 3), seen_from=(n, 3), nearest_m=(n,), keyframe_scans=(None,))
+        require_shapes(self, return_points=(m,), return_pixels=(m,), return_offsets=(m, 3))
+        require_shapes(self, scan_offsets=(len(self.odom_T_sensor) + 1,))
         require_poses("odom_T_sensor", self.odom_T_sensor)
-        require_shape("keyframe_scans", self.keyframe_scans, (None,))
-        require_shape("return_pixels", self.return_pixels, self.return_points.shape)
-        require_shape("scan_offsets", self.scan_offsets, (len(self.odom_T_sensor) + 1,))
 
     def positions_of(self, returns: Int64Array) -> Float64Array:
         """Return the (N, 3) places of (N,) returns, the session's odom frame, metres, to 1/PLACES of a cell.
@@ -176,12 +169,8 @@ class DescriptorSet:
     spheres: Spheres | None = None
 
     def __post_init__(self) -> None:
-        require_shape("q", self.q, (None, None))
-        if self.spheres is not None:
-            require_shape("spheres", self.spheres, (len(self.q), None))
-        if self.w is not None:
-            require_shape("w", self.w, (len(self.q), None))
-        require_shape("keyframe_scans", self.keyframe_scans, (len(self.q),))
+        n = len(self.q)
+        require_shapes(self, q=(n, None), spheres=(n, None), w=(n, None), keyframe_scans=(n,))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

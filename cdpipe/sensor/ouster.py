@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, require_shape, transform
+from cdpipe.core.geometry import Float64Array, require_shapes, transform
 from cdpipe.sensor.ouster_metadata import parse_fields, read_document, require_mode
 
 
@@ -48,9 +48,8 @@ class SensorMetadata:
     pixel_shift: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        require_shape("altitude_deg", self.altitude_deg, (None,))
-        require_shape("azimuth_deg", self.azimuth_deg, self.altitude_deg.shape)
-        require_shape("sensor_T_lidar", self.sensor_T_lidar, (4, 4))
+        n = len(self.altitude_deg)
+        require_shapes(self, altitude_deg=(n,), azimuth_deg=(n,), sensor_T_lidar=(4, 4))
 
     @property
     def height(self) -> int:

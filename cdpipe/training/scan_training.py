@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, require_shape, stream
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, require_shapes, stream
 from cdpipe.descriptors.network import DIMENSIONS, PlaceNetwork, yaw_correlation
 from cdpipe.descriptors.range_image import COLUMNS
 
@@ -50,9 +50,7 @@ class PlaceData:
 
     def __post_init__(self) -> None:
         n = len(self.images_m)
-        require_shape("positions", self.positions, (n, 3))
-        for name in ("headings_rad", "tunnels", "sessions"):
-            require_shape(name, getattr(self, name), (n,))
+        require_shapes(self, positions=(n, 3), headings_rad=(n,), tunnels=(n,), sessions=(n,))
 
 
 TUNNELS_PER_BATCH = 8

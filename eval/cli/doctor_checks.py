@@ -91,7 +91,7 @@ def coarse_merge() -> str:
     found = register_globally(transform(before_T_after, _room(0)), _room(1), 0.4)
     if found is None:
         raise RuntimeError("two samples of one room were not matched")
-    off_m = float(np.linalg.norm(found.before_T_after[:3, 3] - before_T_after[:3, 3]))
+    off_m = float(np.linalg.norm(found[:3, 3] - before_T_after[:3, 3]))
     _require(off_m < 0.5, f"two samples of one room were matched {off_m:.2f} m off")
     return f"matches two samples of a room within {100 * off_m:.0f} cm"
 
