@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from cdpipe.core.geometry import Float64Array
 from cdpipe.extract.crops import DIRECTIONS, SESSIONS, Crops
 from cdpipe.extract.objects import PointGroup, assemble_objects
-from cdpipe.extract.point_comparison import cluster_inliers, far_points_mask, new_points_mask
+from cdpipe.extract.point_comparison import cluster_inliers, is_within, new_points_mask
 from cdpipe.extract.surface_rule import cut_by_surface
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
@@ -150,16 +150,18 @@ def _cut_by_points(merged: MergedMaps, regions: ChangeRegions, config: PipelineC
     As in the paper, each region is cut separately, so an object across two regions becomes two objects.
     """
     is_voxel, extract = config.extract.method == "voxel", config.extract
-    is_new = new_points_mask if is_voxel else far_points_mask
     # a voxel that intersects the sphere extends at most its diagonal beyond it
-    crops = Crops(merged, np.sqrt(3.0) * extract.voxel_m if is_voxel else extract.distance_m)
+    reach_m = np.sqrt(3.0) * extract.voxel_m if is_voxel else extract.distance_m
+    crops = Crops(merged, reach_m)
     is_taken = {name: np.zeros(len(merged.map_of(name).points), np.bool_) for name in SESSIONS}
     groups: list[PointGroup] = []
     for region in np.flatnonzero(regions.is_reported).tolist():
         spheres = crops.around(regions.centres_map[region], regions.radius_m)
         for session, other in DIRECTIONS:
             indices, points = spheres[session].inside
-            new = np.flatnonzero(is_new(points, spheres[other].points, extract) & ~is_taken[session][indices])
+            others = spheres[other].points
+            is_old = ~new_points_mask(points, others, extract) if is_voxel else is_within(points, others, reach_m)
+            new = np.flatnonzero(~is_old & ~is_taken[session][indices])
             for members in cluster_inliers(points, new, config):
                 groups.append(PointGroup(session, indices[members], points[members], region))
                 is_taken[session][indices[members]] = True

@@ -13,8 +13,8 @@ from cdpipe.core.voxel import cell_means
 from cdpipe.extract.crops import SESSIONS, Crops
 from cdpipe.extract.moves import find_moves
 from cdpipe.extract.remains import is_heap, is_part_of_remainder
-from cdpipe.extract.shape import ground_heights, measure_shape, upright_box
-from cdpipe.model.report import ChangedObject
+from cdpipe.extract.shape import column_volume_m3, ground_heights, upright_box
+from cdpipe.model.report import ChangedObject, ObjectShape
 from cdpipe.model.types import MergedMaps, PointMap, SessionName
 
 _BLOCK_RETURNS = 1 << 22
@@ -89,6 +89,7 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
         may_be_part = group.session == "before" and group.returns is not None
         is_part[number] = may_be_part and is_part_of_remainder(taken, around["before"], other)
         column_m = voxel_m if point_map.return_offsets is None else voxel_m / 2
+        volume_m3 = column_volume_m3(points[number], other, column_m, voxel_m)
         objects.append(
             ChangedObject(
                 session=group.session,
@@ -97,7 +98,7 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
                 returns=returns[number],
                 points_map=group.points_map,
                 score=float(len(group.indices)),
-                shape=measure_shape(points[number], other, column_m, voxel_m),
+                shape=ObjectShape(*upright_box(points[number]), volume_m3),
             )
         )
     return _link_moves(objects, points, is_part, surroundings)

@@ -49,17 +49,6 @@ def is_within(points: Float64Array, others: Float64Array, distance_m: float) -> 
     return np.asarray(gaps_m) <= distance_m
 
 
-def far_points_mask(points: Float64Array, reference_points: Float64Array, config: ExtractConfig) -> BoolArray:
-    """Mark the points farther than `distance_m` from every point of the reference.
-
-    Args:
-        points: (N, 3) points, metres.
-        reference_points: (M, 3) points of the other session, same frame.
-        config: The distance.
-    """
-    return ~is_within(points, reference_points, config.distance_m)
-
-
 def inlier_mask(points: Float64Array, config: OutlierConfig) -> BoolArray:
     """Mark the inliers of the paper's statistical outlier removal (section IV).
 

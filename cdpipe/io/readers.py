@@ -205,5 +205,5 @@ def _open_ply_scans(folder: Path) -> PlyScans:
             f"{trajectories[0]}: {len(rows)} poses for {len(files)} *.ply scans: one line for each scan is "
             "needed, in the order of the file names"
         )
-    poses = [make_pose(Rotation.from_quat(row[4:]).as_matrix(), row[1:4]) for row in rows]
-    return PlyScans(folder, files, np.array(poses).reshape(-1, 4, 4), stamps_from_first_ns(rows))
+    poses = make_pose(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4])
+    return PlyScans(folder, files, poses, stamps_from_first_ns(rows))

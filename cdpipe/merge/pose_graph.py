@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array, make_pose
 
 # Prior on an unconstrained anchor; it keeps the system regular.
 _WEAKEST = 1e-6
@@ -165,10 +165,7 @@ def _solve(system: _System, corner: float, slope: float) -> tuple[Float64Array, 
 
 def _make_poses(rotations: Float64Array, translations: Float64Array, positions: Float64Array) -> Float64Array:
     """Return the (N, 4, 4) transforms with the given rotations that map positions to translations."""
-    result = np.repeat(np.eye(4)[None], len(positions), axis=0)
-    result[:, :3, :3] = rotations
-    result[:, :3, 3] = translations - np.einsum("aij,aj->ai", rotations, positions)
-    return result
+    return make_pose(rotations, translations - np.einsum("aij,aj->ai", rotations, positions))
 
 
 def _apply(dst_T_src: Float64Array, points: Float64Array) -> Float64Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cdpipe.core.geometry import BoolArray
-from cdpipe.extract.point_comparison import far_points_mask
+from cdpipe.extract.point_comparison import is_within
 from cdpipe.methods.whole_map import PlacedMaps, WholeMap
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.types import SessionName
@@ -15,4 +15,4 @@ def c2c(maps: PlacedMaps, session: SessionName, other: SessionName, config: Pipe
 
     CloudCompare and others measure this distance to the nearest point.
     """
-    return far_points_mask(maps.points[session], maps.points[other], config.extract)
+    return ~is_within(maps.points[session], maps.points[other], config.extract.distance_m)

@@ -48,7 +48,7 @@ class Task(Protocol):
 
     @property
     def network(self) -> nn.Module:
-        """The network; `fit` changes its weights."""
+        """The network; `fit` trains it."""
 
     def losses(self, step: int) -> dict[str, Tensor]:
         """Return the terms of a step's loss by name; their sum is minimised."""

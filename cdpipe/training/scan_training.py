@@ -58,14 +58,14 @@ ANCHORS_PER_TUNNEL = 8
 
 
 class PlaceTask:
-    """Trains a place network on some tunnels and scores it on others.
+    """Trains a place network, `network`, on some tunnels and scores it on others.
 
     Raises:
         InputError: No place of the training tunnels was visited by both sessions.
     """
 
     def __init__(self, network: PlaceNetwork, training: PlaceData, validation: PlaceData, seed: int) -> None:
-        self._network, self._data, self._validation, self._seed = network, training, validation, seed
+        self.network, self._data, self._validation, self._seed = network, training, validation, seed
         self._partners = _partners(training)
         paired = np.array([len(partners) > 0 for partners in self._partners])
         by_tunnel = [np.flatnonzero(paired & (training.tunnels == tunnel)) for tunnel in np.unique(training.tunnels)]
@@ -75,11 +75,6 @@ class PlaceTask:
                 f"training tunnels: no keyframe within {SAME_PLACE_M:g} m of one of the other session; make tunnels "
                 "that both sessions drive through"
             )
-
-    @property
-    def network(self) -> PlaceNetwork:
-        """The network."""
-        return self._network
 
     def losses(self, step: int) -> dict[str, Tensor]:
         """Return the classification losses of q and w."""
@@ -91,7 +86,7 @@ class PlaceTask:
         # a mirrored tunnel counts as another tunnel, so all its keyframes are mirrored together
         tunnels, index = np.unique(self._data.tunnels[chosen], return_inverse=True)
         images, headings = _mirror(images, headings, (draw.random(len(tunnels)) < 0.5)[index])
-        q, w = self._network(images)
+        q, w = self.network(images)
         place_loss = _place_loss(q, _is_other_place(self._data, anchors, chosen))
         return {"place": place_loss, "yaw": _YAW_WEIGHT * _yaw_loss(w, headings)}
 
@@ -104,7 +99,7 @@ class PlaceTask:
 
     def scores(self) -> dict[str, float]:
         """Return the scores of `evaluate` on the validation tunnels."""
-        return evaluate(self._network, self._validation)
+        return evaluate(self.network, self._validation)
 
     def finish(self) -> dict[str, float]:
         """Return no figures: nothing is calibrated."""
