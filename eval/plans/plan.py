@@ -41,7 +41,7 @@ from eval.plans.files import read_plan
 from eval.plans.parts import Grid, Label, NotEmpty, Variant
 from eval.plans.targets import PlanTargets, Targets
 from eval.plans.variants import Cell, Method, Until, slug
-from eval.plans.worlds import OneOrMore, ScenarioItem, World, group_of, world_slug, worlds_of
+from eval.plans.worlds import OneOrMore, ScenarioItem, World, get_group, list_worlds, world_slug
 
 _TOO_LONG = "is too long for a folder's name: put the settings into a file of their own"
 _LONGEST_SLUG = 200  # file systems take names of 255 bytes
@@ -66,16 +66,16 @@ def refuse(mistakes: Iterable[Mistake]) -> None:
         raise ValidationError.from_exception_data("Plan", found)
 
 
-def misfits(plan: Plan) -> list[Mistake]:
+def find_misfits(plan: Plan) -> list[Mistake]:
     """Return every mistake in the relations between the parts of a plan."""
-    return [*_past_the_end(plan), *_unknown_worlds(plan), *_repeated_variants(plan)]
+    return [*_find_settings_past_the_end(plan), *_find_unknown_worlds(plan), *_find_repeated_variants(plan)]
 
 
-def repeated_worlds(items: Iterable[ScenarioItem]) -> Iterator[Mistake]:
+def find_repeated_worlds(items: Iterable[ScenarioItem]) -> Iterator[Mistake]:
     """Yield the worlds that are listed twice or whose label is too long for a folder's name."""
     known: set[object] = set()
     for place, item in enumerate(items):
-        for index, world in enumerate(worlds_of([item])):
+        for index, world in enumerate(list_worlds([item])):
             folder = world_slug(world.label)
             names = {folder, (world.name, world.settings)}
             rule = _TOO_LONG if len(folder) > _LONGEST_SLUG else "is listed twice" if known & names else ""
@@ -85,7 +85,7 @@ def repeated_worlds(items: Iterable[ScenarioItem]) -> Iterator[Mistake]:
             known |= names
 
 
-def _past_the_end(plan: Plan) -> Iterator[Mistake]:
+def _find_settings_past_the_end(plan: Plan) -> Iterator[Mistake]:
     if plan.until != "merge":
         return
     told = " and ".join(plan.report)
@@ -97,18 +97,18 @@ def _past_the_end(plan: Plan) -> Iterator[Mistake]:
         yield Mistake(("wide",), ", ".join(plan.wide), rule.format("wide"))
     for place, variant in enumerate(plan.variants):
         for setting in variant.every_setting:
-            if group_of(setting) in _AFTER_MERGE:
+            if get_group(setting) in _AFTER_MERGE:
                 yield Mistake(("variants", place), variant.preset, rule.format(f"{setting} of {variant.preset}"))
         if variant.oracle_regions:
             yield Mistake(("variants", place, "oracle_regions"), "true", rule.format("oracle_regions"))
     for place, grid in enumerate(plan.grid):
         for key in grid.keys:
-            if group_of(key) in _AFTER_MERGE:
+            if get_group(key) in _AFTER_MERGE:
                 yield Mistake(("grid", place, "keys", key), key, rule.format(f"{key} of the grid of {grid.variant}"))
 
 
-def _unknown_worlds(plan: Plan) -> Iterator[Mistake]:
-    worlds = worlds_of(plan.scenarios)
+def _find_unknown_worlds(plan: Plan) -> Iterator[Mistake]:
+    worlds = list_worlds(plan.scenarios)
     labels = [world.label for world in worlds]
     for place, variant in enumerate(plan.variants):
         for index, name in enumerate(variant.scenarios):
@@ -134,10 +134,10 @@ def _unknown_worlds(plan: Plan) -> Iterator[Mistake]:
             yield Mistake(where, name, f"{who} names {name!r}, which is not in scenarios{suggest(name, known)}")
 
 
-def _repeated_variants(plan: Plan) -> Iterator[Mistake]:
+def _find_repeated_variants(plan: Plan) -> Iterator[Mistake]:
     told = set()
-    for world in worlds_of(plan.scenarios):
-        folders = Counter(slug(method.variant) for method in methods_of(plan, world))
+    for world in list_worlds(plan.scenarios):
+        folders = Counter(slug(method.variant) for method in list_methods(plan, world))
         for folder, n in folders.items():
             if folder not in told and (n > 1 or len(folder) > _LONGEST_SLUG):
                 told.add(folder)
@@ -180,12 +180,12 @@ def parse_seeds_option(text: str) -> tuple[int, ...]:
         raise InputError(f"--seeds {text}: {error}") from error
 
 
-def _subjects(value: Any) -> Any:
+def _list_subjects(value: Any) -> Any:
     return [value] if isinstance(value, str) else () if value is None else value
 
 
 class Plan(Settings):
-    """A plan; `cells` expands it."""
+    """A plan; `expand_cells` expands it."""
 
     name: Annotated[str, Field(min_length=1)]
     description: str = ""
@@ -193,7 +193,7 @@ class Plan(Settings):
     wide: Annotated[tuple[Label, ...], OneOrMore] = ()
     seeds: Annotated[tuple[int, ...], BeforeValidator(parse_seeds)]
     until: Until | None = None
-    report: Annotated[tuple[Literal["regions", "objects"], ...], BeforeValidator(_subjects)] = ()
+    report: Annotated[tuple[Literal["regions", "objects"], ...], BeforeValidator(_list_subjects)] = ()
     targets: PlanTargets = Targets()
     variants: Annotated[tuple[Variant, ...], NotEmpty]
     grid: tuple[Grid, ...] = ()
@@ -201,12 +201,12 @@ class Plan(Settings):
     @field_validator("scenarios")
     @classmethod
     def _worlds_differ(cls, items: tuple[ScenarioItem, ...]) -> tuple[ScenarioItem, ...]:
-        refuse(repeated_worlds(items))
+        refuse(find_repeated_worlds(items))
         return items
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Plan:
-        refuse(misfits(self))
+        refuse(find_misfits(self))
         return self
 
 
@@ -219,7 +219,7 @@ def load_plan(name_or_path: str) -> Plan:
     return validate(Plan, read_plan(name_or_path))
 
 
-def methods_of(plan: Plan, world: World) -> list[Method]:
+def list_methods(plan: Plan, world: World) -> list[Method]:
     """Return the methods that a plan runs in one of its worlds: variants first, then grid points."""
     places = dict.fromkeys((world.name, world.label))
     site: Site = "narrow" if places.keys().isdisjoint(plan.wide) else "wide"
@@ -241,7 +241,7 @@ def methods_of(plan: Plan, world: World) -> list[Method]:
     return methods
 
 
-def cells(plan: Plan) -> list[Cell]:
+def expand_cells(plan: Plan) -> list[Cell]:
     """Return all cells: by scenario, then seed, then variant, grids last.
 
     Raises:
@@ -249,9 +249,9 @@ def cells(plan: Plan) -> list[Cell]:
     """
     found: list[Cell] = []
     mistakes: list[str] = []
-    for world in worlds_of(plan.scenarios):
+    for world in list_worlds(plan.scenarios):
         methods = []
-        for method in methods_of(plan, world):
+        for method in list_methods(plan, world):
             try:
                 methods.append((method, method.config()))
             except InputError as error:
@@ -266,11 +266,11 @@ def cells(plan: Plan) -> list[Cell]:
     return found
 
 
-def planned_cases(plan: Plan) -> set[tuple[str, int, str]]:
+def list_planned_cases(plan: Plan) -> set[tuple[str, int, str]]:
     """Return (scenario, seed, variant) of all cells."""
     return {
         (world.label, seed, method.variant)
-        for world in worlds_of(plan.scenarios)
-        for method in methods_of(plan, world)
+        for world in list_worlds(plan.scenarios)
+        for method in list_methods(plan, world)
         for seed in plan.seeds[: world.n_seeds]
     }

@@ -18,7 +18,7 @@ import pandas as pd
 from cdpipe.model.config import settings_table
 from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.core.statistics import ENOUGH_PAIRS
-from eval.plans.targets import targets_of
+from eval.plans.targets import read_targets
 from eval.report.charts import Chart, plotly_script
 from eval.report.cost.charts import draw_pareto
 from eval.report.cost.pareto import pareto_table
@@ -83,7 +83,7 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
     data = read_run(run)
     check_versions(Side(data), Side(data))
     files: dict[str, str | bytes] = {**latex_tables(data)}
-    if len(merges := merge_table(pd.DataFrame(list(data.results)), targets_of(data.provenance))):
+    if len(merges := merge_table(pd.DataFrame(list(data.results)), read_targets(data.provenance))):
         files["merge.csv"] = merges.to_csv(index=False)
     if ends_at_merge(data):
         files["index.html"] = rendered("page.html", _merge_content(data, merges))

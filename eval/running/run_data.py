@@ -16,9 +16,9 @@ import pandas as pd
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 from eval.core.tablefile import table_file
-from eval.plans.coverage import Coverage, coverage
-from eval.plans.targets import targets_of
-from eval.plans.worlds import references
+from eval.plans.coverage import Coverage, measure_coverage
+from eval.plans.targets import read_targets
+from eval.plans.worlds import find_references
 from eval.running.runfolder import RunFolder
 from eval.tables.rows import records, with_domain
 
@@ -93,7 +93,7 @@ def ends_at_merge(data: RunData) -> bool:
 
 def shown_variant(data: RunData) -> str:
     """Return the variant whose cases a page shows: the one that the plan is about, or the first that was run."""
-    return targets_of(data.provenance).shown_method([str(row["variant"]) for row in data.results])
+    return read_targets(data.provenance).shown_method([str(row["variant"]) for row in data.results])
 
 
 def comparable(data: RunData) -> pd.DataFrame:
@@ -106,7 +106,7 @@ def comparable(data: RunData) -> pd.DataFrame:
 def covered_by(data: RunData) -> Coverage:
     """Return how much of its plan a run holds."""
     cases = ((str(row["scenario"]), int(row["seed"]), str(row["variant"])) for row in data.results)
-    return coverage(data.provenance, cases)
+    return measure_coverage(data.provenance, cases)
 
 
 def number(row: Row, column: str) -> float:
@@ -165,7 +165,7 @@ def scenarios(data: RunData, *, unchanged: bool) -> list[str]:
 
 def repeats(data: RunData) -> dict[tuple[str, str], str]:
     """Return the reference world of each (world, variant) that has one (`eval.plans.worlds`)."""
-    return references(_cases(data))
+    return find_references(_cases(data))
 
 
 def is_unchanged(data: RunData, scenario: str) -> bool:

@@ -32,8 +32,8 @@ from cdpipe.core.errors import InputError
 from eval.core.output import make_writable, whole_file
 from eval.core.provenance import TOOL
 from eval.core.statistics import summarise
-from eval.plans.coverage import coverage
-from eval.plans.targets import targets_of
+from eval.plans.coverage import measure_coverage
+from eval.plans.targets import read_targets
 from eval.plans.variants import slug
 from eval.plans.worlds import world_slug
 from eval.tables.effects import effects
@@ -177,7 +177,7 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     _write_csv(run.path / "summary.csv", summarise(results, keyframes=items["keyframes"]))
     tables = {
         "effects": effects(results),
-        "merge": merge_table(results, targets_of(_provenance(run))),
+        "merge": merge_table(results, read_targets(_provenance(run))),
         **_report_tables(run, results, items),
     }
     for name, found in tables.items():
@@ -230,11 +230,11 @@ def _report_tables(
     """Return the tables that the plan asks for, and empty ones for those that it does not."""
     tables = {name: pd.DataFrame() for name in (*REGION_FILES, *OBJECT_FILES)}
     provenance = _provenance(run)
-    subjects, targets = reported(provenance), targets_of(provenance)
+    subjects, targets = reported(provenance), read_targets(provenance)
     if not subjects or "region_auroc" not in results:
         return tables
     cases = zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
-    is_whole = coverage(provenance, cases).is_whole
+    is_whole = measure_coverage(provenance, cases).is_whole
     if "regions" in subjects:
         tables |= region_tables(results, items, targets, is_whole=is_whole)
     if "objects" in subjects:

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from eval.core.figures import picture_address
-from eval.plans.targets import is_oracle, targets_of
+from eval.plans.targets import is_oracle, read_targets
 from eval.report.merge.cases import MAX_ROWS, Case, case_table, distinct_cases, draw_case, read_case
 from eval.report.merge.charts import MergedPairs, error_chart, time_chart
 from eval.report.merge.tables import (
@@ -67,7 +67,7 @@ def draw_merge(data: RunData) -> MergePart:
     missing: list[str] = []
     notes: list[str] = []
     by_kind = bool((kinds(results) != "").any())
-    table = merge_table(results, targets_of(data.provenance))
+    table = merge_table(results, read_targets(data.provenance))
     is_main, covered, name = ends_at_merge(data), covered_by(data), shown_variant(data)
     is_whole = covered.is_whole
     tables: tuple[Table, ...] = (times_table(results),) if by_kind or is_main else ()

@@ -11,7 +11,7 @@ from cdpipe.io.answer import Answer, read_answer
 from eval.report.objects.objects import Shown, change_panels, object_title
 from eval.report.tables import Picture
 from eval.running.run_data import Row, RunData, flag, number, of, split_variant, text
-from eval.scoring.answer_rows import answer_rows
+from eval.scoring.answer_rows import find_answer_rows
 from eval.tables.columns import count, significant
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
@@ -91,7 +91,7 @@ class _Opened:
         self.truth = truth
         self.answers = answers
         self.rows: dict[str, Sequence[Int64Array]] = {
-            name: answer_rows(answer, truth) for name, answer in answers.items()
+            name: find_answer_rows(answer, truth) for name, answer in answers.items()
         }
 
 

@@ -13,7 +13,7 @@ from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.report.objects.figures import Panel, object_panels
 from eval.report.tables import Picture
 from eval.running.run_data import SHOWN_PRESETS, Row, RunData, flag, named_variants, number, of, text
-from eval.scoring.answer_rows import answer_rows
+from eval.scoring.answer_rows import find_answer_rows
 from eval.tables.columns import share
 from eval.truth.ground_truth import GroundTruth
 from eval.truth.universe import CELL_M
@@ -44,7 +44,7 @@ def object_pictures(
 ) -> list[Picture]:
     """Draw every observable change of a pair beside what the shown presets answered."""
     names = [name for name in SHOWN_PRESETS if name in named_variants(data, scenario)]
-    object_rows = {name: answer_rows(answers[name], truth) for name in names if name in answers}
+    object_rows = {name: find_answer_rows(answers[name], truth) for name in names if name in answers}
     pictures = []
     for index, change in enumerate(truth.pair.changes):
         if not truth.is_observable[index]:

@@ -11,7 +11,7 @@ import pandas as pd
 
 from eval.core.figures import picture_address
 from eval.core.statistics import ENOUGH_PAIRS
-from eval.plans.worlds import group_of
+from eval.plans.worlds import get_group
 from eval.report.settings.charts import Effect, effect_chart
 from eval.report.tables import Cell, Picture, Table
 from eval.running.run_data import RunData, of, over_pairs
@@ -61,7 +61,7 @@ def signed(column: Column, value: float) -> str:
 
 def shortened(settings: Sequence[str]) -> tuple[str, list[str]]:
     """Return the group that all settings belong to, "" if there is none, and the settings without it."""
-    groups = {group_of(part) for text in settings for part in text.split(",")}
+    groups = {get_group(part) for text in settings for part in text.split(",")}
     group = groups.pop() if len(groups) == 1 else ""
     return group, [", ".join(part.removeprefix(f"{group}.") for part in text.split(",")) for text in settings]
 
