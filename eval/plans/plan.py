@@ -29,7 +29,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -48,30 +48,18 @@ _LONGEST_SLUG = 200  # file systems take names of 255 bytes
 _AFTER_MERGE = ("query", "extract", "outlier", "cluster", "m3c2", "dufomap")
 
 
-class Mistake(NamedTuple):
-    """One mistake of a plan: the keys that lead to it, the written value, and the rule that it breaks."""
-
-    where: tuple[str | int, ...]
-    written: str
-    rule: str
+def _mistake(where: tuple[str | int, ...], written: str, rule: str) -> InitErrorDetails:
+    """Return a mistake as pydantic takes it: the keys that lead to it, the written value, the rule that it breaks."""
+    return InitErrorDetails(type=PydanticCustomError("plan", "{rule}", {"rule": rule}), loc=where, input=written)
 
 
-def refuse(mistakes: Iterable[Mistake]) -> None:
+def _refuse(mistakes: list[InitErrorDetails]) -> None:
     """Raise pydantic's error with all mistakes, if there are any."""
-    found = [
-        InitErrorDetails(type=PydanticCustomError("plan", "{rule}", {"rule": rule}), loc=where, input=written)
-        for where, written, rule in mistakes
-    ]
-    if found:
-        raise ValidationError.from_exception_data("Plan", found)
+    if mistakes:
+        raise ValidationError.from_exception_data("Plan", mistakes)
 
 
-def find_misfits(plan: Plan) -> list[Mistake]:
-    """Return every mistake in the relations between the parts of a plan."""
-    return [*_find_settings_past_the_end(plan), *_find_unknown_worlds(plan), *_find_repeated_variants(plan)]
-
-
-def find_repeated_worlds(items: Iterable[ScenarioItem]) -> Iterator[Mistake]:
+def _find_repeated_worlds(items: Iterable[ScenarioItem]) -> Iterator[InitErrorDetails]:
     """Yield the worlds that are listed twice or whose label is too long for a folder's name."""
     known: set[object] = set()
     for place, item in enumerate(items):
@@ -81,40 +69,40 @@ def find_repeated_worlds(items: Iterable[ScenarioItem]) -> Iterator[Mistake]:
             rule = _TOO_LONG if len(folder) > _LONGEST_SLUG else "is listed twice" if known & names else ""
             if rule:
                 where = (place, "each", index - 1) if index else (place,)
-                yield Mistake(where, ",".join(world.own) or world.name, f"scenario {world.label} {rule}")
+                yield _mistake(where, ",".join(world.own) or world.name, f"scenario {world.label} {rule}")
             known |= names
 
 
-def _find_settings_past_the_end(plan: Plan) -> Iterator[Mistake]:
+def _find_settings_past_the_end(plan: Plan) -> Iterator[InitErrorDetails]:
     if plan.until != "merge":
         return
     told = " and ".join(plan.report)
     if told:
         rule = f"report: {told} needs {told}, and the plan ends at the merge; leave one of them out"
-        yield Mistake(("report",), told, rule)
+        yield _mistake(("report",), told, rule)
     rule = "{} does nothing: the plan ends at the merge; leave it out, or leave out until"
     if plan.wide:
-        yield Mistake(("wide",), ", ".join(plan.wide), rule.format("wide"))
+        yield _mistake(("wide",), ", ".join(plan.wide), rule.format("wide"))
     for place, variant in enumerate(plan.variants):
         for setting in variant.every_setting:
             if get_group(setting) in _AFTER_MERGE:
-                yield Mistake(("variants", place), variant.preset, rule.format(f"{setting} of {variant.preset}"))
+                yield _mistake(("variants", place), variant.preset, rule.format(f"{setting} of {variant.preset}"))
         if variant.oracle_regions:
-            yield Mistake(("variants", place, "oracle_regions"), "true", rule.format("oracle_regions"))
+            yield _mistake(("variants", place, "oracle_regions"), "true", rule.format("oracle_regions"))
     for place, grid in enumerate(plan.grid):
         for key in grid.keys:
             if get_group(key) in _AFTER_MERGE:
-                yield Mistake(("grid", place, "keys", key), key, rule.format(f"{key} of the grid of {grid.variant}"))
+                yield _mistake(("grid", place, "keys", key), key, rule.format(f"{key} of the grid of {grid.variant}"))
 
 
-def _find_unknown_worlds(plan: Plan) -> Iterator[Mistake]:
+def _find_unknown_worlds(plan: Plan) -> Iterator[InitErrorDetails]:
     worlds = list_worlds(plan.scenarios)
     labels = [world.label for world in worlds]
     for place, variant in enumerate(plan.variants):
         for index, name in enumerate(variant.scenarios):
             if name not in labels:
                 rule = f"scenarios of {variant.preset} names {name!r}, which is no world of the plan"
-                yield Mistake(("variants", place, "scenarios", index), name, rule + suggest(name, labels))
+                yield _mistake(("variants", place, "scenarios", index), name, rule + suggest(name, labels))
     known = dict.fromkeys(name for world in worlds for name in (world.name, world.label))
     asked: list[tuple[tuple[str | int, ...], str, str]] = [
         (("wide", index), "wide", name) for index, name in enumerate(plan.wide)
@@ -131,10 +119,10 @@ def _find_unknown_worlds(plan: Plan) -> Iterator[Mistake]:
         ]
     for where, who, name in asked:
         if name not in known:
-            yield Mistake(where, name, f"{who} names {name!r}, which is not in scenarios{suggest(name, known)}")
+            yield _mistake(where, name, f"{who} names {name!r}, which is not in scenarios{suggest(name, known)}")
 
 
-def _find_repeated_variants(plan: Plan) -> Iterator[Mistake]:
+def _find_repeated_variants(plan: Plan) -> Iterator[InitErrorDetails]:
     told = set()
     for world in list_worlds(plan.scenarios):
         folders = Counter(slug(method.variant) for method in list_methods(plan, world))
@@ -142,7 +130,7 @@ def _find_repeated_variants(plan: Plan) -> Iterator[Mistake]:
             if folder not in told and (n > 1 or len(folder) > _LONGEST_SLUG):
                 told.add(folder)
                 rule = f"stands twice in the plan for {world.label}" if n > 1 else _TOO_LONG
-                yield Mistake(("variants",), folder, f"variant {folder} {rule}")
+                yield _mistake(("variants",), folder, f"variant {folder} {rule}")
 
 
 def parse_seeds(value: Any) -> tuple[int, ...]:
@@ -201,12 +189,12 @@ class Plan(Settings):
     @field_validator("scenarios")
     @classmethod
     def _worlds_differ(cls, items: tuple[ScenarioItem, ...]) -> tuple[ScenarioItem, ...]:
-        refuse(find_repeated_worlds(items))
+        _refuse(list(_find_repeated_worlds(items)))
         return items
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Plan:
-        refuse(find_misfits(self))
+        _refuse([*_find_settings_past_the_end(self), *_find_unknown_worlds(self), *_find_repeated_variants(self)])
         return self
 
 

@@ -46,12 +46,12 @@ from eval.running.run_data import (
     flag,
     named_variants,
     of,
-    read_document,
     read_run,
     scenarios,
     shown_variant,
     text,
 )
+from eval.running.runfolder import read_json
 from eval.running.sides import Side, check_versions, is_contended
 from eval.tables.columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
 from eval.tables.merge_table import merge_table
@@ -236,7 +236,7 @@ def settings(data: RunData) -> Table:
         seed = first_seed(data, scenario)
         for name in named_variants(data, scenario):
             if of(data.results, scenario=scenario, seed=seed, variant=name):
-                document = read_document(data.folder.answer(scenario, seed, name) / "answer.json")
+                document = read_json(data.folder.answer(scenario, seed, name) / "answer.json")
                 found.setdefault(name, []).append(_flat(document.get("config") or {}))
     keys = [key for key, _, _ in settings_table()]
     keys += sorted({key for configs in found.values() for config in configs for key in config} - set(keys))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import lzma
 import math
 from collections.abc import Iterable, Mapping
@@ -19,7 +18,7 @@ from eval.core.tablefile import table_file
 from eval.plans.coverage import Coverage, measure_coverage
 from eval.plans.targets import read_targets
 from eval.plans.worlds import find_references
-from eval.running.runfolder import RunFolder
+from eval.running.runfolder import RunFolder, read_json
 from eval.tables.rows import records, with_domain
 
 Row = Mapping[str, Any]
@@ -71,7 +70,7 @@ def read_run(run: Path) -> RunData:
             items[name] = _rows(path)
         else:
             missing.append(f"{path.name} is not in the run folder: what it would show is left out.")
-    provenance = read_document(run / "provenance.json")
+    provenance = read_json(run / "provenance.json")
     if not provenance:
         missing.append(
             "provenance.json is not in the run folder or damaged: machine, command and versions are unknown."
@@ -256,15 +255,6 @@ def split_variant(variant: str) -> tuple[str, dict[str, str]]:
         key, _, value = part.partition("=")
         settings[key.strip()] = value.strip()
     return preset, settings
-
-
-def read_document(path: Path) -> dict[str, Any]:
-    """Read a JSON object; {} where it is missing or damaged."""
-    try:
-        document = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return {}
-    return document if isinstance(document, dict) else {}
 
 
 def _cases(data: RunData) -> list[tuple[str, str, int]]:

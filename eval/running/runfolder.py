@@ -86,12 +86,8 @@ class RunFolder:
 
     def read_cell(self, path: Path) -> dict[str, Any] | None:
         """Read a finished cell; None where there is none, or what is there was cut short."""
-        try:
-            document = json.loads(path.read_text())
-        except (FileNotFoundError, json.JSONDecodeError):
-            return None
-        whole = isinstance(document, dict) and {"key", "order", "row", *ITEM_TABLES} <= set(document)
-        return document if whole else None
+        document = read_json(path)
+        return document if {"key", "order", "row", *ITEM_TABLES} <= set(document) else None
 
     def provenance(self) -> dict[str, Any]:
         """Read provenance.json.
@@ -244,6 +240,15 @@ def _report_tables(
 
 def _provenance(run: RunFolder) -> Mapping[str, Any]:
     return run.provenance() if (run.path / "provenance.json").is_file() else {}
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object; {} where it is missing or damaged."""
+    try:
+        document = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return document if isinstance(document, dict) else {}
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

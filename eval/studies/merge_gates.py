@@ -30,7 +30,7 @@ from eval.core.figures import picture, png
 from eval.core.output import make_writable
 from eval.plans.coverage import read_stored_plan
 from eval.plans.plan import expand_cells
-from eval.running.run_data import read_document
+from eval.running.runfolder import read_json
 from eval.studies.calibrate import read_table
 from eval.tables.merge_table import RULES, is_accepted, is_right, kinds
 from eval.tables.rows import numbers, texts
@@ -211,7 +211,7 @@ def main(
     """Print, write and draw which merges of a validation run each gate accepts and refuses."""
     path = run / "results.csv"
     results = read_table(path, "merge-gates")
-    require_ungated(results, choose_variant(results, variant), read_document(run / "provenance.json"))
+    require_ungated(results, choose_variant(results, variant), read_json(run / "provenance.json"))
     cases, thresholds = tabulate_merges(results, variant), read_committed_thresholds()
     if len(cases) == 0:
         raise InputError(f"{path}: no merge was accepted: the plan's variant must set merge.accept_all=true")

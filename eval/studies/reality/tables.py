@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import BoolArray, Float64Array
+from eval.core.statistics import mean
 from eval.studies.reality.sensor_measures import (
     Revolutions,
     estimate_photons,
@@ -112,21 +113,21 @@ def _measure_signal(revolutions: Revolutions) -> Iterator[Row]:
 
 def _measure_detection(revolutions: Revolutions) -> Iterator[Row]:
     for label, inside in _split_into_bins(np.nan_to_num(estimate_photons(revolutions)), DETECTION_BINS, "photons"):
-        share = float(revolutions.is_return[inside].mean()) if inside.any() else np.nan
+        share = mean(revolutions.is_return[inside])
         yield from _make_row("returns by photons of the neighbours", label, "share", share, inside)
 
 
 def _measure_outliers(revolutions: Revolutions) -> Iterator[Row]:
     is_return, alone = revolutions.is_return, find_isolated(revolutions)
-    yield from _make_row("isolated returns", "all", "share", _share(alone, is_return), is_return)
+    yield from _make_row("isolated returns", "all", "share", mean(alone[is_return]), is_return)
     for label, inside in _split_into_bins(revolutions.range_m, RANGE_BINS_M, "m"):
-        yield from _make_row("isolated returns", label, "share", _share(alone, inside), inside)
+        yield from _make_row("isolated returns", label, "share", mean(alone[inside]), inside)
     jump_m, is_mixed, is_missing = find_edges(revolutions)
     is_edge = np.isfinite(jump_m)
-    yield from _make_row("missing at edges", "all", "share", _share(is_missing, is_edge), is_edge)
+    yield from _make_row("missing at edges", "all", "share", mean(is_missing[is_edge]), is_edge)
     for label, inside in _split_into_bins(np.nan_to_num(jump_m), JUMP_BINS_M, "m"):
         where = inside & is_return
-        yield from _make_row("mixed at edges", f"jump {label}", "share", _share(is_mixed, where), where)
+        yield from _make_row("mixed at edges", f"jump {label}", "share", mean(is_mixed[where]), where)
 
 
 def _split_into_bins(values: Float64Array, limits: Sequence[float], unit: str) -> Iterator[tuple[str, BoolArray]]:
@@ -139,11 +140,6 @@ def _make_row(measure: str, where: str, unit: str, value: float, counted: BoolAr
     n = int(np.count_nonzero(counted))
     if n >= _LEAST:
         yield measure, where, unit, value, n
-
-
-def _share(part: BoolArray, whole: BoolArray) -> float:
-    n_whole = int(np.count_nonzero(whole))
-    return int(np.count_nonzero(part & whole)) / n_whole if n_whole else float("nan")
 
 
 def _format_cell(value: object) -> str:

@@ -299,7 +299,7 @@ def test_a_world_that_cannot_be_made_is_a_row_and_the_others_go_on(tmp_path: Pat
 
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, runner: Runner) -> None:
     class Impatient:
-        def expand_cells(self, label: str, done: int, total: int) -> None:
+        def cells(self, label: str, done: int, total: int) -> None:
             if done == 2:
                 raise KeyboardInterrupt
 
@@ -497,7 +497,7 @@ def test_scoring_again_names_worlds_as_running_does(tmp_path: Path, runner: Runn
     labels: list[str] = []
 
     class Heard(Silent):
-        def expand_cells(self, label: str, done: int, total: int) -> None:
+        def cells(self, label: str, done: int, total: int) -> None:
             labels.append(label)
 
     run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
