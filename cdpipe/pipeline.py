@@ -227,11 +227,34 @@ def detect_changes(
     """
     hooks = hooks or Hooks()
     merged = merge_mapped(before, after, config, hooks, merge)
-    report = compare_maps(merged, before.descriptors, after.descriptors, config, hooks, merge, propose)
+    method = load_method(config.method)
+    described = before.descriptors, after.descriptors
+    regions: Done[ChangeRegions] | None = None
+
+    def query() -> Done[ChangeRegions]:
+        assert method.propose is not None
+        hooks.on_stage("query", 0, 1)
+        start = time.perf_counter()
+        proposed = method.propose(merged, *described, config)
+        return Done(proposed, {"t_cd_s": time.perf_counter() - start})
+
+    def answer() -> Done[ChangeReport]:
+        if regions is not None:
+            report = extract_changes(merged, regions.value, described, regions.seconds["t_cd_s"], config)
+        else:
+            assert method.detect is not None  # a method has `propose` or `detect`
+            report = method.detect(merged, *described, config)
+        return Done(report, report.seconds)
+
+    if propose is not None:
+        regions = Done(propose((described[0].keyframe_scans, described[1].keyframe_scans)), {"t_cd_s": 0.0})
+    elif method.propose is not None:
+        regions = hooks.run("regions", config, query) if merge is None else hooks.time(query)
+    done = hooks.time(answer)
     return replace(
-        report,
-        seconds={**report.seconds, **merged.seconds},
-        evidence={**report.evidence, **_sizes(merged)},
+        done.value,
+        seconds={**done.seconds, **merged.seconds},
+        evidence={**done.value.evidence, **_sizes(merged)},
     )
 
 
@@ -278,44 +301,6 @@ def merge_mapped(
         merged.evidence,
         {name: merged.seconds[name] for name in ("t_index_s", "t_merge_s") if name in merged.seconds},
     )
-
-
-def compare_maps(
-    merged: MergedMaps,
-    before: DescriptorSet,
-    after: DescriptorSet,
-    config: PipelineConfig,
-    hooks: Hooks | None = None,
-    merge: Merge | None = None,
-    propose: Propose | None = None,
-) -> ChangeReport:
-    """Compare two merged maps by `config.method`; arguments as in `detect_changes`."""
-    hooks = hooks or Hooks()
-    method = load_method(config.method)
-    described = before, after
-    regions: Done[ChangeRegions] | None = None
-
-    def query() -> Done[ChangeRegions]:
-        assert method.propose is not None
-        hooks.on_stage("query", 0, 1)
-        start = time.perf_counter()
-        proposed = method.propose(merged, before, after, config)
-        return Done(proposed, {"t_cd_s": time.perf_counter() - start})
-
-    def answer() -> Done[ChangeReport]:
-        if regions is not None:
-            report = extract_changes(merged, regions.value, described, regions.seconds["t_cd_s"], config)
-        else:
-            assert method.detect is not None  # a method has `propose` or `detect`
-            report = method.detect(merged, before, after, config)
-        return Done(report, report.seconds)
-
-    if propose is not None:
-        regions = Done(propose((before.keyframe_scans, after.keyframe_scans)), {"t_cd_s": 0.0})
-    elif method.propose is not None:
-        regions = hooks.run("regions", config, query) if merge is None else hooks.time(query)
-    done = hooks.time(answer)
-    return replace(done.value, seconds=done.seconds)
 
 
 def _open(session: Path | str | ScanSource, config: PipelineConfig) -> tuple[ScanSource, DescriptorSet | None]:

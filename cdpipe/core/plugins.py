@@ -85,9 +85,9 @@ def find_yaml(kind: str, *shipped: Traversable, group: str | None = None) -> dic
     """Return the YAML files of a kind by name (without `.yaml`), sorted: shipped, of plugins, on `TUNNELCD_PATH`.
 
     Args:
-        kind: Folder looked for on the search path, e.g. `presets`.
-        shipped: Our own folders.
-        group: Entry-point group in which each value names a package that holds such files.
+        kind: Name of the folder on the search path, e.g. `presets`.
+        shipped: Folders of this package.
+        group: Entry-point group; each entry names a package that contains such files.
 
     Raises:
         InputError: Two files claim one name, or a plugin's package cannot be found.

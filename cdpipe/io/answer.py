@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.core.geometry import Float64Array
 from cdpipe.io.answer_parts import (
     FORMAT,
     FORMAT_VERSION,
@@ -87,10 +87,8 @@ def write_answer(folder: Path, method: str, report: ChangeReport, until: Until |
         "keyframe_scores": regions.keyframe_scores,
         "before_keyframe_scans": report.keyframe_scans[0],
         "after_keyframe_scans": report.keyframe_scans[1],
-        "object_returns": _stack([item.returns for item in objects], (0, 2), np.int32),
-        "object_return_offsets": _offsets([item.returns for item in objects]),
-        "object_points_map": _stack([item.points_map for item in objects], (0, 3), np.float64),
-        "object_point_offsets": _offsets([item.points_map for item in objects]),
+        **_join("object_returns", np.zeros((0, 2), np.int32), [item.returns for item in objects]),
+        **_join("object_points_map", np.zeros((0, 3)), [item.points_map for item in objects]),
         **{f"figure_{name}": values for name, values in report.figures.items()},
     }
     optional = {
@@ -271,9 +269,6 @@ def _write_json(folder: Path, document: Mapping[str, Any], until: Until | None) 
     partial.replace(folder / "answer.json")
 
 
-def _stack(arrays: Sequence[npt.NDArray[Any]], empty: tuple[int, int], dtype: type) -> npt.NDArray[Any]:
-    return np.concatenate(arrays) if arrays else np.zeros(empty, dtype=dtype)
-
-
-def _offsets(arrays: Sequence[npt.NDArray[Any]]) -> Int64Array:
-    return np.concatenate([[0], np.cumsum([len(array) for array in arrays])]).astype(np.int64)
+def _join(name: str, empty: npt.NDArray[Any], parts: Sequence[npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    """Return the rows of all objects as one array, and the offsets of each object, under their names in the file."""
+    return {name: np.concatenate([empty, *parts]), OFFSETS[name]: np.cumsum([0, *map(len, parts)])}

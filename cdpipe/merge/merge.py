@@ -84,24 +84,22 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     maps = (IndexedMap(before.map, config, is_target=True), IndexedMap(after.map, config, is_target=False))
     indexed = perf_counter()
     best, n_hypotheses = _find_hypothesis(before, after, maps, config)
-    reason = _TOO_FEW
     evidence: dict[str, float] = {"n_hypotheses": float(n_hypotheses)}
-    if best is not None:
-        reason = "" if config.accept_all else explain_refusal(best.evidence, config)
-        if reason and config.fallback and not is_kiss_matcher_installed():
-            reason += " (KISS-Matcher could not be asked: pip install 'tunnelcd[kiss]')"
-        evidence = {**best.evidence, **evidence}
     seconds = {"t_index_s": indexed - start, "t_merge_s": perf_counter() - indexed, "t_refine_s": 0.0}
-    before_T_after, local = np.eye(4), None
-    if best is not None:
-        before_T_after = best.before_T_after
-        if not reason and config.refine == "local":
-            refining = perf_counter()
-            local, measured = refine(*maps, best.walk, config)
-            evidence |= measured
-            if local is not None:
-                before_T_after = fit_rigid(local.anchors_odom, local.before_T_after)
-            seconds["t_refine_s"] = perf_counter() - refining
+    if best is None:
+        return MergedMaps(before.map, after.map, np.eye(4), evidence, False, _TOO_FEW, seconds=seconds)
+    evidence = {**best.evidence, **evidence}
+    reason = "" if config.accept_all else explain_refusal(evidence, config)
+    if reason and config.fallback and not is_kiss_matcher_installed():
+        reason += " (KISS-Matcher could not be asked: pip install 'tunnelcd[kiss]')"
+    before_T_after, local = best.before_T_after, None
+    if not reason and config.refine == "local":
+        refining = perf_counter()
+        local, measured = refine(*maps, best.walk, config)
+        evidence |= measured
+        if local is not None:
+            before_T_after = fit_rigid(local.anchors_odom, local.before_T_after)
+        seconds["t_refine_s"] = perf_counter() - refining
     return MergedMaps(before.map, after.map, before_T_after, evidence, not reason, reason, local, seconds)
 
 

@@ -50,7 +50,7 @@ class PoseGraph:
         after = np.minimum(after, len(anchors_m) - 1)
         length_m = np.maximum(anchors_m[after] - anchors_m[before], 1e-9)
         share = np.clip((places_m - anchors_m[before]) / length_m, 0.0, 1.0)
-        moved = (1 - share[:, None]) * self._moved(before, places) + share[:, None] * self._moved(after, places)
+        moved = (1 - share[:, None]) * self._predict(before, places) + share[:, None] * self._predict(after, places)
         rotations = self.before_T_after[before, :3, :3]
         turn = np.swapaxes(rotations, 1, 2) @ self.before_T_after[after, :3, :3]
         rotations = (
@@ -58,7 +58,7 @@ class PoseGraph:
         )
         return _make_poses(rotations, moved, places)
 
-    def _moved(self, anchors: np.ndarray, places: Float64Array) -> Float64Array:
+    def _predict(self, anchors: np.ndarray, places: Float64Array) -> Float64Array:
         """Return the (K, 3) map position of each place as predicted from one anchor, given by index."""
         apart = places - self.positions[anchors]
         stretched = self.positions[anchors] + (1 + self.stretch) * apart

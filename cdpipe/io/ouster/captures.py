@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.io.ouster.integrity import require_whole_osf, require_whole_pcap
+from cdpipe.io.ouster.integrity import check_osf_integrity, check_pcap_integrity
 from cdpipe.io.readers import RECORDING_SUFFIXES
 from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
 from cdpipe.sensor.ouster_metadata import read_document, require_mode
@@ -150,12 +150,12 @@ def open_recording(path: Path, metadata: Path | None = None) -> Recording:
     if suffix == ".osf":
         if metadata is not None:
             raise InputError(f"{path}: an OSF carries its sensor's metadata: leave --metadata out")
-        require_whole_osf(path)
+        check_osf_integrity(path)
         info = _only_sensor(path)
         sensor = parse_metadata(json.loads(info.to_json_string()), str(path))
         require_mode(sensor.mode, str(path))
         return Recording(path, sensor, info, None)
-    require_whole_pcap(path)
+    check_pcap_integrity(path)
     beside = path.with_suffix(".json")
     if metadata is None and not beside.exists():
         raise InputError(f"{path}: {beside.name} is not beside it: give the sensor's metadata .json with --metadata")

@@ -14,7 +14,7 @@ from cdpipe.methods.whole_map import PlacedMaps
 from cdpipe.model.config import load_config
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, SessionName
-from cdpipe.pipeline import compare_maps
+from cdpipe.pipeline import detect_changes
 from eval.running.stages import kept_bytes
 from tests.cdpipe.rooms import Box, RoomScans
 
@@ -60,7 +60,8 @@ def merged(before: PointMap, after: PointMap, before_T_after: Float64Array) -> M
 
 def answer(method: str, maps: MergedMaps, settings: Sequence[str] = ()) -> ChangeReport:
     config = load_config(method, [*SETTINGS, *settings])
-    return compare_maps(maps, descriptors(maps.before), descriptors(maps.after), config)
+    mapped = [MappedSession(each, descriptors(each)) for each in (maps.before, maps.after)]
+    return detect_changes(*mapped, config, merge=lambda before, after: maps)
 
 
 def returns_of(report: ChangeReport) -> set[tuple[int, int]]:

@@ -14,8 +14,8 @@ from cdpipe.methods.voxel_diff import voxel_diff
 from cdpipe.methods.whole_map import PlacedMaps, WholeMap
 from cdpipe.model.config import PipelineConfig, load_config, preset_names
 from cdpipe.model.report import ChangeReport
-from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap, SessionName
-from cdpipe.pipeline import compare_maps
+from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, SessionName
+from cdpipe.pipeline import detect_changes
 
 LENGTH_M = 40.0
 SPACING_M = 0.2
@@ -66,7 +66,8 @@ def descriptors(point_map: PointMap) -> DescriptorSet:
 
 
 def answer(merged: MergedMaps, config: PipelineConfig) -> ChangeReport:
-    return compare_maps(merged, descriptors(merged.before), descriptors(merged.after), config)
+    mapped = [MappedSession(each, descriptors(each)) for each in (merged.before, merged.after)]
+    return detect_changes(*mapped, config, merge=lambda before, after: merged)
 
 
 def test_one_added_crate_by_hand() -> None:
@@ -183,10 +184,9 @@ def test_moving_the_after_session_changes_nothing() -> None:
 
 def test_random_regions_are_keyframes_and_repeat_with_their_seed() -> None:
     merged = pair([], [crate(20.0)])
-    sets = descriptors(merged.before), descriptors(merged.after)
 
     def drawn(seed: int) -> ChangeReport:
-        return compare_maps(merged, *sets, load_config("random-regions", [f"seed={seed}"]))
+        return answer(merged, load_config("random-regions", [f"seed={seed}"]))
 
     first = drawn(0)
     assert int(first.regions.is_reported.sum()) == 3
