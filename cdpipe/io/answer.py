@@ -33,6 +33,7 @@ import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
+from cdpipe.core.yamlfile import read_json
 from cdpipe.io.answer_parts import (
     FORMAT,
     FORMAT_VERSION,
@@ -158,12 +159,7 @@ def read_answer(folder: Path) -> Answer:
         InputError: It is missing, damaged or inconsistent; the text names the file and the field.
     """
     path = folder / "answer.json"
-    if not path.is_file():
-        raise InputError(f"{path}: missing: expected an answer written by `tunnelcd detect` or by another method")
-    try:
-        value = json.loads(path.read_text())
-    except ValueError as error:
-        raise InputError(f"{path}: damaged, not JSON: {error}") from error
+    value = read_json(path, "expected an answer written by `tunnelcd detect` or by another method")
     document = check_document(path, value)
     if not isinstance(document, AnswerPart):
         status, method, seconds, until = document.status, document.method, document.seconds, document.until

@@ -20,7 +20,8 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, require_shapes, transform
-from cdpipe.sensor.ouster_metadata import parse_fields, read_document, require_mode
+from cdpipe.core.yamlfile import read_json
+from cdpipe.sensor.ouster_metadata import METADATA_FILE, parse_fields, require_mode
 
 
 @dataclass(frozen=True, slots=False, eq=False)
@@ -142,7 +143,7 @@ def load_profile(name_or_path: str, mode: str | None = None) -> SensorMetadata:
         InputError: The profile is unknown, the file is no complete Ouster metadata, or the mode is not in `MODES`.
     """
     if name_or_path.endswith(".json"):
-        document = read_document(Path(name_or_path))
+        document = read_json(Path(name_or_path), METADATA_FILE)
     elif name_or_path in profile_names():
         document = json.loads((_profiles() / f"{name_or_path}.json").read_text())
     else:
