@@ -70,11 +70,13 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
     points: dict[int, Float64Array] = {}
     for session in SESSIONS:
         members = [number for number, group in enumerate(groups) if group.session == session]
-        pool = ReturnPool(merged.map_of(session), [groups[n].indices for n in members if groups[n].returns is None])
+        point_map = merged.map_of(session)
+        pool = ReturnPool(point_map, [groups[n].indices for n in members if groups[n].returns is None])
         for number in members:
             own = groups[number].returns
             indices = np.sort(pool.of(groups[number].indices) if own is None else own)
-            returns[number] = _scan_and_pixel(merged.map_of(session), indices)
+            scans_and_pixels = np.column_stack([point_map.scans_of(indices), point_map.return_pixels[indices]])
+            returns[number] = scans_and_pixels.astype(np.int32)
             points[number] = _measured_points(merged, groups[number], indices)
     surroundings = _Surroundings(merged)
     objects = []
@@ -149,11 +151,6 @@ class ReturnPool:
         ends = np.searchsorted(self._owners, indices, side="right")
         parts = [self._returns[start:end] for start, end in zip(starts.tolist(), ends.tolist(), strict=True)]
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
-
-
-def _scan_and_pixel(point_map: PointMap, returns: Int64Array) -> Int32Array:
-    """Return the (M, 2) scan and pixel of (M,) returns."""
-    return np.column_stack([point_map.scans_of(returns), point_map.return_pixels[returns]]).astype(np.int32)
 
 
 def _measured_points(merged: MergedMaps, group: PointGroup, returns: Int64Array) -> Float64Array:

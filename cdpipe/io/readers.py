@@ -16,7 +16,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int64Array, make_pose
 from cdpipe.io.ply import read_ply_points
 from cdpipe.io.session import ScanChunk, Session, chunk_path, is_session, read_session
-from cdpipe.io.tum import TUM_LINE, read_tum, require_unit_poses, stamps_from_first_ns
+from cdpipe.io.tum import TUM_LINE, read_tum, require_unit_poses
 from cdpipe.mapping.deskew import deskew
 from cdpipe.model.types import PosedScan, ScanSource
 
@@ -206,4 +206,5 @@ def _open_ply_scans(folder: Path) -> PlyScans:
             "needed, in the order of the file names"
         )
     poses = make_pose(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4])
-    return PlyScans(folder, files, poses, stamps_from_first_ns(rows))
+    stamps_ns = np.round((rows[:, 0] - rows[0, 0]) * 1e9).astype(np.int64)
+    return PlyScans(folder, files, poses, stamps_ns)

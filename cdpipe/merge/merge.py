@@ -15,7 +15,7 @@ from time import perf_counter
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, transform
+from cdpipe.core.geometry import Float64Array, Int64Array, transform
 from cdpipe.merge.candidates import Candidate, find_candidates, find_closest_pair
 from cdpipe.merge.evidence import SurfaceFit, explain_refusal, measure_fit, sample_evenly
 from cdpipe.merge.global_registration import is_kiss_matcher_installed, register_globally
@@ -256,7 +256,8 @@ def _judge(start: _Start, maps: tuple[IndexedMap, IndexedMap], config: MergeConf
 
     everywhere = np.arange(len(after.positions))
     walked, fits = along(choose_evenly(everywhere, _CHECKS, start.keyframe))
-    shared = everywhere[_is_shared_keyframe(walked, before, after)]
+    alignment = PathAlignment(after.positions[walked.keyframes], walked.before_T_after)
+    shared = everywhere[is_shared(before, alignment.to_map(after.positions))]
     if len(fits) < _CHECKS // 2 < len(shared):
         walked, fits = along(choose_evenly(shared, _CHECKS, start.keyframe))
     evidence = {
@@ -285,12 +286,6 @@ def _register_start(
     if config.method != "frame" and len(points) >= MIN_SPHERE_POINTS:
         pose = align_by_gicp(points, centre, before.target, pose, config.vgicp_correspondence_m, config.voxel_m)
     return pose, measure_fit(before, after, pose, sample_evenly(points), centre, _CHECK_RADIUS_M)
-
-
-def _is_shared_keyframe(walked: Walk, before: IndexedMap, after: IndexedMap) -> BoolArray:
-    """Return the (K,) mask of the after keyframes within 5 m of the before path."""
-    alignment = PathAlignment(after.positions[walked.keyframes], walked.before_T_after)
-    return is_shared(before, alignment.to_map(after.positions))
 
 
 def _hessian_ratio(walked: Walk) -> float:

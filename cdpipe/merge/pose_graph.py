@@ -133,7 +133,7 @@ def _add_odometry(system: _System, state: _State, steps: Float64Array) -> tuple[
     weights = np.repeat([1 / _DRIFT_RAD**2, 1 / _DRIFT_M**2], 3) / length_m[:, None]
     # derivatives: identity for the second anchor, minus the step for the stretch
     here = np.repeat(-np.eye(6)[None], n, axis=0)
-    here[:, 3:, :3] = _cross_matrices(steps)
+    here[:, 3:, :3] = -np.cross(steps[:, None, :], np.eye(3)[None])  # the matrices [step]x of the cross product
     per_stretch = np.hstack([np.zeros((n, 3)), -steps])
     weighted = np.swapaxes(here, 1, 2) * weights[:, None]
     system.blocks[:-1] += weighted @ here
@@ -170,8 +170,3 @@ def _make_poses(rotations: Float64Array, translations: Float64Array, positions: 
 
 def _apply(dst_T_src: Float64Array, points: Float64Array) -> Float64Array:
     return np.asarray(np.einsum("aij,aj->ai", dst_T_src[:, :3, :3], points) + dst_T_src[:, :3, 3])
-
-
-def _cross_matrices(vectors: Float64Array) -> Float64Array:
-    """Return the (N, 3, 3) matrices [v]x of (N, 3) vectors: [v]x @ turn = v x turn."""
-    return -np.cross(vectors[:, None, :], np.eye(3)[None])

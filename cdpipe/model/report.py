@@ -153,11 +153,13 @@ class ChangeReport:
 
         if table not in ("objects", "regions"):
             raise ValueError(f"table must be 'objects' or 'regions', got {table!r}")
-        if table == "regions":
-            return pd.DataFrame(_region_columns(self))
-        return pd.DataFrame(
-            [_object_row(index, item) for index, item in enumerate(self.objects)], columns=_OBJECT_COLUMNS
-        )
+        if table == "objects":
+            rows = [_object_row(index, item) for index, item in enumerate(self.objects)]
+            return pd.DataFrame(rows, columns=_OBJECT_COLUMNS)
+        shown = np.flatnonzero(self.regions.is_proposed)
+        columns = {"score": self.regions.scores, "is_withdrawn": ~self.regions.is_reported}
+        columns |= {f"{axis}_m": self.regions.centres_map[:, k] for k, axis in enumerate(_AXES)} | dict(self.figures)
+        return pd.DataFrame({"region": shown, **{name: values[shown] for name, values in columns.items()}})
 
 
 _AXES = "xyz"
@@ -169,18 +171,6 @@ _OBJECT_COLUMNS = [
     *("box_length_m", "box_width_m", "box_height_m", "box_yaw_deg", "volume_m3"),
     *(f"displacement_{axis}_m" for axis in _AXES),
 ]
-
-
-def _region_columns(report: ChangeReport) -> dict[str, object]:
-    regions = report.regions
-    shown = np.flatnonzero(regions.is_proposed)
-    return {
-        "region": shown,
-        "score": regions.scores[shown],
-        "is_withdrawn": ~regions.is_reported[shown],
-        **{f"{axis}_m": regions.centres_map[shown, k] for k, axis in enumerate(_AXES)},
-        **{name: values[shown] for name, values in report.figures.items()},
-    }
 
 
 def _object_row(index: int, item: ChangedObject) -> tuple[object, ...]:

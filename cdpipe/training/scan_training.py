@@ -87,7 +87,10 @@ class PlaceTask:
         tunnels, index = np.unique(self._data.tunnels[chosen], return_inverse=True)
         images, headings = _mirror(images, headings, (draw.random(len(tunnels)) < 0.5)[index])
         q, w = self.network(images)
-        place_loss = _place_loss(q, _is_other_place(self._data, anchors, chosen))
+        positions, tunnel_of = self._data.positions, self._data.tunnels
+        apart_m = np.linalg.norm(positions[anchors, None] - positions[None, chosen], axis=2)
+        is_other = (tunnel_of[anchors, None] != tunnel_of[None, chosen]) | (apart_m > OTHER_PLACE_M)
+        place_loss = _place_loss(q, torch.from_numpy(is_other))
         return {"place": place_loss, "yaw": _YAW_WEIGHT * _yaw_loss(w, headings)}
 
     def _anchors(self, draw: np.random.Generator) -> Int64Array:
@@ -166,12 +169,6 @@ def _mirror(images: Tensor, headings_rad: Float64Array, is_mirrored: BoolArray) 
     """Mirror the marked images; a mirrored heading changes its sign."""
     flips = torch.from_numpy(is_mirrored)[:, None, None]
     return torch.where(flips, images.flip(2), images), np.where(is_mirrored, -headings_rad, headings_rad)
-
-
-def _is_other_place(data: PlaceData, anchors: Int64Array, chosen: Int64Array) -> Tensor:
-    apart = np.linalg.norm(data.positions[anchors, None] - data.positions[None, chosen], axis=2)
-    other_tunnel = data.tunnels[anchors, None] != data.tunnels[None, chosen]
-    return torch.from_numpy(other_tunnel | (apart > OTHER_PLACE_M))
 
 
 def _place_loss(q: Tensor, is_negative: Tensor) -> Tensor:
