@@ -1,7 +1,6 @@
 from .core.errors import InputError, MergeFailedError, TunnelcdError
-from .io.answer import read_answer, write_answer
+from .io.answer import read_answer, save_report, write_answer
 from .io.readers import open_session as open_session
-from .io.report import save_report
 from .methods.registry import load_method
 from .model.config import PipelineConfig, load_config, preset_names
 from .model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape

@@ -1,8 +1,8 @@
-"""The pipeline: map, describe, merge, query, extract. The one place that puts the stages in order.
+"""The pipeline: map, describe, merge, query, extract. This module alone defines the order of the stages.
 
-`detect` takes two sessions, `detect_changes` two mapped ones. `Hooks` stand around every stage: the command line tells
-progress with them, a benchmark keeps and times what the stages give. `PipelineConfig.method` names what compares the
-merged maps, whoever calls.
+`detect` takes two sessions, `detect_changes` two mapped sessions. `Hooks` are called around every stage: the command
+line reports progress with them, a benchmark caches and times results. `PipelineConfig.method` names the method that
+compares the merged maps.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
@@ -26,7 +25,6 @@ from cdpipe.io.readers import open_session
 from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.session_check import check_session, unit_hint
 from cdpipe.merge.merge import merge_maps
-from cdpipe.methods import registry
 from cdpipe.methods.registry import load_method
 from cdpipe.model.config import PipelineConfig, Site, load_config
 from cdpipe.model.report import ChangeRegions, ChangeReport
@@ -41,28 +39,28 @@ Propose = Callable[[tuple[Int64Array, Int64Array]], ChangeRegions]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Done(Generic[T]):
-    """What a stage gave, and the wall-clock seconds of its parts by name."""
+    """The result of a stage, and the wall-clock seconds of its parts by name."""
 
     value: T
     seconds: Mapping[str, float] = field(default_factory=dict)
 
 
 class Hooks:
-    """What stands around the stages. As it is, each stage runs once; override `run` to keep results, `time` to repeat.
+    """Hooks around the stages. Here each stage runs once; override `run` to cache results, `time` to repeat a step.
 
     Args:
-        on_stage: Told the name of a stage before it runs, what of it is done, and how much there is.
+        on_stage: Called before a stage with its name, the work done and the total work.
     """
 
     def __init__(self, on_stage: OnStage = lambda name, done, total: None) -> None:
         self.on_stage = on_stage
 
     def run(self, stage: Stage, config: PipelineConfig, compute: Callable[[], Done[T]]) -> Done[T]:
-        """Return what a stage gives; it depends on the sessions and on the settings alone."""
+        """Return the result of a stage that depends only on the sessions and the settings."""
         return compute()
 
     def time(self, compute: Callable[[], Done[T]]) -> Done[T]:
-        """Return what a step gives that depends on more than that, or is not worth keeping."""
+        """Return the result of a step that is not cached."""
         return compute()
 
 
@@ -76,38 +74,32 @@ def detect(
 ) -> ChangeReport:
     """Find what changed between two recorded sessions.
 
-    Descriptors that are stored beside a session (`tunnelcd describe`) are used where they are of the same weights and
-    keyframes; `t_descriptor_s` then does not contain them.
+    Descriptors that `tunnelcd describe` stored beside a session are used if they have the same weights and keyframes;
+    `t_descriptor_s` then does not include them.
 
     Args:
-        before: The earlier session: its folder, or opened by `open_session`.
-        after: The later one.
+        before: The earlier session: its folder, or the session as opened by `open_session`.
+        after: The later session.
         preset: Name of a preset, or the path of a .yaml file.
-        settings: Written over the preset, e.g. `{"query.radius_m": 6}`.
-        site: Which section of the preset holds: that for narrow or that for wide drifts.
-        hooks: What stands around the stages.
+        settings: Settings that replace those of the preset, e.g. `{"query.radius_m": 6}`.
+        site: Section of the preset that applies: for narrow or for wide drifts.
+        hooks: Called around the stages.
 
     Raises:
-        MergeFailedError: The sessions could not be put into one frame; it carries what was measured.
+        MergeFailedError: The sessions could not be aligned with enough evidence; it contains the evidence.
         InputError: A session or a setting cannot be used, or the method's extra is not installed.
     """
     config = load_config(preset, settings, site)
-    load_method(config.method)  # a missing extra is told before anything is mapped
+    load_method(config.method)  # report a missing extra before the mapping
     use_threads(THREADS)
-    sources = [open_session(Path(each)) if isinstance(each, Path | str) else each for each in (before, after)]
-    stored = [
-        load_descriptors(Path(each), config.descriptor, source.odom_T_sensor, config.map)
-        if isinstance(each, Path | str)
-        else None
-        for each, source in zip((before, after), sources, strict=True)
-    ]
     hooks = hooks or Hooks()
+    (before, stored_before), (after, stored_after) = (_open(each, config) for each in (before, after))
+    sources, stored = (before, after), (stored_before, stored_after)
     mapped = map_pair(sources, config, hooks, stored)
     try:
         report = detect_changes(*mapped.value, config, hooks)
     except MergeFailedError as error:
-        names = f"{sources[0].name} and {sources[1].name}"
-        raise MergeFailedError(f"{names}: {error}", error.evidence, error.seconds) from error
+        raise MergeFailedError(f"{before.name} and {after.name}: {error}", error.evidence, error.seconds) from error
     return replace(report, seconds={**report.seconds, **mapped.seconds})
 
 
@@ -134,10 +126,10 @@ def describe(
 
 
 def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
-    """Do what a robot does while it drives: thin its map and describe its keyframes.
+    """Build the thinned map of a session and describe its keyframes, as a robot does while it drives.
 
     Raises:
-        InputError: The session or one of its scans cannot be used; the text names it and says how to mend it.
+        InputError: The session or one of its scans cannot be used; the message names it and a remedy.
     """
     check_session(source, config.map)
     thin_map = build_map(source, config.map)
@@ -158,11 +150,11 @@ def map_pair(
     Args:
         sources: The before and the after session.
         config: All settings.
-        hooks: What stands around the stages.
-        stored: Descriptors of each session, used where they are of the keyframes of its map.
+        hooks: Called around the stages.
+        stored: Stored descriptors of each session, used if they have the keyframes of its map.
 
     Returns:
-        Both, and `t_descriptor_s` of all descriptors that were computed.
+        Both mapped sessions, and `t_descriptor_s` of all descriptors that were computed.
 
     Raises:
         InputError: A session or one of its scans cannot be used.
@@ -172,10 +164,20 @@ def map_pair(
         each if each is not None and np.array_equal(each.keyframe_scans, thin_map.keyframe_scans) else None
         for each, thin_map in zip(stored, maps, strict=True)
     ]
-    scans = hooks.run("descriptors", config, lambda: _describe_scans(sources, maps, kept, config, hooks))
+
+    def keyframes(session: int, chosen: slice) -> DescriptorSet:
+        return describe_scans(sources[session], maps[session].keyframe_scans[chosen], config.descriptor)
+
+    def surroundings(session: int, chosen: slice) -> Spheres:
+        return describe_map(maps[session], maps[session].odom_T_keyframe[chosen], config.descriptor)
+
+    scans = hooks.run("descriptors", config, lambda: _describe_both("describe keyframes", keyframes, kept, hooks))
     (before, after), seconds = scans.value, dict(scans.seconds)
     if config.query.compare == "sphere":
-        spheres = hooks.run("spheres", config, lambda: _describe_spheres(maps, kept, config, hooks))
+        known: list[Spheres | None] = [None if each is None else each.spheres for each in kept]
+        spheres: Done[tuple[Spheres, Spheres]] = hooks.run(
+            "spheres", config, lambda: _describe_both("describe spheres", surroundings, known, hooks)
+        )
         before, after = (replace(a, spheres=b) for a, b in zip((before, after), spheres.value, strict=True))
         seconds["t_descriptor_s"] += spheres.seconds["t_descriptor_s"]
     return Done((MappedSession(maps[0], before), MappedSession(maps[1], after)), seconds)
@@ -189,7 +191,7 @@ def map_sources(sources: Sequence[ScanSource], config: PipelineConfig, hooks: Ho
     """
 
     def compute() -> Done[tuple[PointMap, PointMap]]:
-        # both before either is mapped, which may take minutes
+        # check both sessions first: mapping may take minutes
         for source, other in (sources, sources[::-1]):
             check_session(source, config.map, other)
         maps = []
@@ -214,22 +216,45 @@ def detect_changes(
 
     Args:
         before: The earlier session.
-        after: The later one.
-        config: All settings; `method` names what compares the merged maps.
-        hooks: What stands around the stages.
-        merge: What merges instead of the method's merge.
-        propose: What proposes regions instead of the method, from the scans of the keyframes of both sessions.
+        after: The later session.
+        config: All settings; `method` names the method that compares the merged maps.
+        hooks: Called around the stages.
+        merge: Replaces the merge.
+        propose: Replaces the method: returns regions from the keyframe scans of both sessions.
 
     Raises:
-        MergeFailedError: The sessions could not be aligned with enough evidence; it carries what was measured.
+        MergeFailedError: The sessions could not be aligned with enough evidence; it contains the evidence.
     """
     hooks = hooks or Hooks()
     merged = merge_mapped(before, after, config, hooks, merge)
-    report = compare_maps(merged, before.descriptors, after.descriptors, config, hooks, merge, propose)
+    method = load_method(config.method)
+    described = before.descriptors, after.descriptors
+    regions: Done[ChangeRegions] | None = None
+
+    def query() -> Done[ChangeRegions]:
+        assert method.propose is not None
+        hooks.on_stage("query", 0, 1)
+        start = time.perf_counter()
+        proposed = method.propose(merged, *described, config)
+        return Done(proposed, {"t_cd_s": time.perf_counter() - start})
+
+    def answer() -> Done[ChangeReport]:
+        if regions is not None:
+            report = extract_changes(merged, regions.value, described, regions.seconds["t_cd_s"], config)
+        else:
+            assert method.detect is not None  # a method has `propose` or `detect`
+            report = method.detect(merged, *described, config)
+        return Done(report, report.seconds)
+
+    if propose is not None:
+        regions = Done(propose((described[0].keyframe_scans, described[1].keyframe_scans)), {"t_cd_s": 0.0})
+    elif method.propose is not None:
+        regions = hooks.run("regions", config, query) if merge is None else hooks.time(query)
+    done = hooks.time(answer)
     return replace(
-        report,
-        seconds={**report.seconds, **merged.seconds},
-        evidence={**report.evidence, **_sizes(merged)},
+        done.value,
+        seconds={**done.seconds, **merged.seconds},
+        evidence={**done.value.evidence, **_sizes(merged)},
     )
 
 
@@ -262,11 +287,11 @@ def merge_mapped(
 
     def compute() -> Done[MergedMaps]:
         hooks.on_stage("merge", 0, 1)
-        merged = (merge or _merge_by(config))(before, after)
+        merged = merge(before, after) if merge else merge_maps(before, after, config.merge)
         return Done(merged, merged.seconds)
 
     done = hooks.run("merge", config, compute) if merge is None else compute()
-    # what is found again is of equal maps, and may hold none itself
+    # a cached result belongs to equal maps, and may not contain them
     merged = replace(done.value, before=before.map, after=after.map, seconds=done.seconds)
     if merged.is_accepted:
         return merged
@@ -278,87 +303,23 @@ def merge_mapped(
     )
 
 
-def compare_maps(
-    merged: MergedMaps,
-    before: DescriptorSet,
-    after: DescriptorSet,
-    config: PipelineConfig,
-    hooks: Hooks | None = None,
-    merge: Merge | None = None,
-    propose: Propose | None = None,
-) -> ChangeReport:
-    """Compare two merged maps by `config.method`; arguments as in `detect_changes`."""
-    hooks = hooks or Hooks()
-    method = load_method(config.method)
-    described = before, after
-    if propose is not None:
-        regions = Done(propose((before.keyframe_scans, after.keyframe_scans)), {"t_cd_s": 0.0})
-    elif method.propose is not None:
-        query = partial(_query, method.propose, merged, described, config, hooks)
-        regions = hooks.run("regions", config, query) if merge is None else hooks.time(query)
-    else:
-        assert method.detect is not None  # a method has one of both
-        return _timed_report(hooks, partial(method.detect, merged, before, after, config))
-    t_cd_s = regions.seconds["t_cd_s"]
-    return _timed_report(hooks, lambda: extract_changes(merged, regions.value, described, t_cd_s, config))
+def _open(session: Path | str | ScanSource, config: PipelineConfig) -> tuple[ScanSource, DescriptorSet | None]:
+    """Return an opened session, and the descriptors stored in its folder."""
+    if not isinstance(session, Path | str):
+        return session, None
+    source = open_session(Path(session))
+    return source, load_descriptors(Path(session), config.descriptor, source.odom_T_sensor, config.map)
 
 
-def _query(
-    propose: registry.Propose,
-    merged: MergedMaps,
-    described: tuple[DescriptorSet, DescriptorSet],
-    config: PipelineConfig,
-    hooks: Hooks,
-) -> Done[ChangeRegions]:
-    hooks.on_stage("query", 0, 1)
+def _describe_both(
+    name: str, describe: Callable[[int, slice], T], stored: Sequence[T | None], hooks: Hooks
+) -> Done[tuple[T, T]]:
+    """Describe the sessions, numbered 0 and 1, that have no stored descriptors; `describe` gets some keyframes."""
+    hooks.on_stage(name, 0, 1)
+    if any(each is None for each in stored):
+        describe(0, slice(1))  # loads the network
     start = time.perf_counter()
-    regions = propose(merged, *described, config)
-    return Done(regions, {"t_cd_s": time.perf_counter() - start})
-
-
-def _timed_report(hooks: Hooks, answer: Callable[[], ChangeReport]) -> ChangeReport:
-    def compute() -> Done[ChangeReport]:
-        report = answer()
-        return Done(report, report.seconds)
-
-    done = hooks.time(compute)
-    return replace(done.value, seconds=done.seconds)
-
-
-def _merge_by(config: PipelineConfig) -> Merge:
-    return lambda before, after: merge_maps(before, after, config.merge)
-
-
-def _describe_scans(
-    sources: Sequence[ScanSource],
-    maps: Sequence[PointMap],
-    stored: Sequence[DescriptorSet | None],
-    config: PipelineConfig,
-    hooks: Hooks,
-) -> Done[tuple[DescriptorSet, DescriptorSet]]:
-    hooks.on_stage("describe keyframes", 0, 1)
-    if None in stored:
-        describe_scans(sources[0], maps[0].keyframe_scans[:1], config.descriptor)  # loads the network
-    start = time.perf_counter()
-    before, after = (
-        kept or describe_scans(source, thin_map.keyframe_scans, config.descriptor)
-        for source, thin_map, kept in zip(sources, maps, stored, strict=True)
-    )
-    return Done((before, after), {"t_descriptor_s": time.perf_counter() - start})
-
-
-def _describe_spheres(
-    maps: Sequence[PointMap], stored: Sequence[DescriptorSet | None], config: PipelineConfig, hooks: Hooks
-) -> Done[tuple[Spheres, Spheres]]:
-    hooks.on_stage("describe spheres", 0, 1)
-    describe_map(maps[0], maps[0].odom_T_keyframe[:1], config.descriptor)  # loads the network
-    start = time.perf_counter()
-    before, after = (
-        describe_map(thin_map, thin_map.odom_T_keyframe, config.descriptor)
-        if kept is None or kept.spheres is None
-        else kept.spheres
-        for thin_map, kept in zip(maps, stored, strict=True)
-    )
+    before, after = (describe(k, slice(None)) if each is None else each for k, each in enumerate(stored))
     return Done((before, after), {"t_descriptor_s": time.perf_counter() - start})
 
 

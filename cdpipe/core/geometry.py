@@ -33,6 +33,13 @@ def require_shape(name: str, array: npt.NDArray[Any], shape: tuple[int | None, .
     raise ValueError(f"{name} must be ({wanted}), got {array.shape}")
 
 
+def require_shapes(owner: object, **shapes: tuple[int | None, ...]) -> None:
+    """Raise `ValueError` unless each named attribute of `owner` has its shape (`require_shape`) or is None."""
+    for name, shape in shapes.items():
+        if getattr(owner, name) is not None:
+            require_shape(name, getattr(owner, name), shape)
+
+
 def require_poses(name: str, poses: npt.NDArray[Any]) -> None:
     """Raise `ValueError` unless `poses` is (N, 4, 4), finite and rigid to 1e-6."""
     require_shape(name, poses, (None, 4, 4))
@@ -47,12 +54,13 @@ def require_poses(name: str, poses: npt.NDArray[Any]) -> None:
 
 
 def make_pose(rotation: npt.ArrayLike | None = None, translation: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Float64Array:
-    """Return a (4, 4) pose from a (3, 3) rotation (identity by default) and a translation in metres."""
-    pose = np.eye(4)
-    if rotation is not None:
-        pose[:3, :3] = rotation
-    pose[:3, 3] = translation
-    return pose
+    """Return (..., 4, 4) poses from (..., 3, 3) rotations (identity by default) and (..., 3) translations in metres."""
+    translation = np.asarray(translation, dtype=np.float64)
+    poses = np.zeros((*translation.shape[:-1], 4, 4))
+    poses[..., :3, :3] = np.eye(3) if rotation is None else rotation
+    poses[..., :3, 3] = translation
+    poses[..., 3, 3] = 1.0
+    return poses
 
 
 def yaw_pose(yaw_rad: float, translation: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Float64Array:
@@ -62,12 +70,8 @@ def yaw_pose(yaw_rad: float, translation: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Fl
 
 def invert(poses: Float64Array) -> Float64Array:
     """Return the inverse of one (4, 4) pose or of a stack (..., 4, 4)."""
-    inverse = np.zeros_like(poses)
     rotations = np.swapaxes(poses[..., :3, :3], -1, -2)
-    inverse[..., :3, :3] = rotations
-    inverse[..., :3, 3] = -(rotations @ poses[..., :3, 3:])[..., 0]
-    inverse[..., 3, 3] = 1.0
-    return inverse
+    return make_pose(rotations, -(rotations @ poses[..., :3, 3:])[..., 0])
 
 
 def transform(dst_T_src: Float64Array, points: Float64Array) -> Float64Array:

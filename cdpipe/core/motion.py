@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array, make_pose
 
 # Below this angle Slerp equals linear interpolation of the quaternions to the last bit.
 _STRAIGHT_RAD = 1e-6
@@ -32,11 +32,7 @@ class Motion:
     def poses(self, time_s: Float64Array) -> Float64Array:
         """Return the poses (..., 4, 4) at times (...)."""
         points, quaternions = self.sample(time_s)
-        poses = np.zeros((*time_s.shape, 4, 4))
-        poses[..., :3, :3] = rotation_matrices(quaternions)
-        poses[..., :3, 3] = points
-        poses[..., 3, 3] = 1.0
-        return poses
+        return make_pose(rotation_matrices(quaternions), points)
 
     def sample(self, time_s: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return the positions (..., 3) and unit quaternions (..., 4) at times (...)."""

@@ -1,4 +1,4 @@
-"""What others add without a change of ours: entry points of installed packages, and folders on `TUNNELCD_PATH`."""
+"""What an installation adds: optional packages, entry points of plugins, and folders on `TUNNELCD_PATH`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 from functools import cache
 from importlib import metadata, resources
 from importlib.resources.abc import Traversable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,19 @@ METHODS = "tunnelcd.methods"
 METRICS = "tunnelcd.metrics"
 PRESETS = "tunnelcd.presets"
 SEARCH_PATH = "TUNNELCD_PATH"
+# Optional dependency of pyproject.toml -> the module that it installs.
+_EXTRAS = {"m3c2": "py4dgeo", "dufomap": "dufomap", "kiss": "kiss_matcher", "odometry": "kiss_icp"}
+
+
+def has_extra(name: str) -> bool:
+    """Return whether an extra is installed; True for a name that is no extra."""
+    return name not in _EXTRAS or find_spec(_EXTRAS[name]) is not None
+
+
+def require_extra(name: str, asked_by: str) -> None:
+    """Raise `InputError` unless the extra is installed; `asked_by` names the setting or method that needs it."""
+    if not has_extra(name):
+        raise InputError(f"{asked_by} needs a package more: pip install 'tunnelcd[{name}]'")
 
 
 @cache
@@ -71,9 +85,9 @@ def find_yaml(kind: str, *shipped: Traversable, group: str | None = None) -> dic
     """Return the YAML files of a kind by name (without `.yaml`), sorted: shipped, of plugins, on `TUNNELCD_PATH`.
 
     Args:
-        kind: Folder looked for on the search path, e.g. `presets`.
-        shipped: Our own folders.
-        group: Entry-point group in which each value names a package that holds such files.
+        kind: Name of the folder on the search path, e.g. `presets`.
+        shipped: Folders of this package.
+        group: Entry-point group; each entry names a package that contains such files.
 
     Raises:
         InputError: Two files claim one name, or a plugin's package cannot be found.

@@ -1,4 +1,4 @@
-"""How many threads numeric libraries may use: one, so that the same input gives the same bytes and honest times."""
+"""Number of threads of numeric libraries: one, so that the same input gives the same bytes and comparable times."""
 
 from __future__ import annotations
 

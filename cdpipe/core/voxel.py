@@ -1,10 +1,10 @@
-"""Voxel grid: integer keys of cells, means per cell, and the distinct cells of a stream of points."""
+"""Grids: integer keys of voxels, means per voxel, the distinct voxels of a stream of points, and images of ranges."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
 
 _BITS = 21
 _HALF = 1 << (_BITS - 1)
@@ -60,6 +60,22 @@ def cell_means(points: Float64Array, cell_m: float) -> tuple[Float64Array, Int64
     counts = np.bincount(cells)
     means = np.column_stack([np.bincount(cells, points[:, axis]) / counts for axis in range(3)])
     return means, cells.astype(np.int64)
+
+
+def nearest_image(pixels: Int64Array, values_m: Float64Array, shape: tuple[int, int]) -> Float32Array:
+    """Return the float32 image of a shape with the smallest value of each pixel, 0 in a pixel without one.
+
+    Args:
+        pixels: (N,) pixel of each value, row * columns + column; negative ones are outside the image.
+        values_m: (N,) ranges or distances, metres.
+        shape: Rows and columns.
+    """
+    is_inside = pixels >= 0
+    image = np.full(shape[0] * shape[1], np.inf, dtype=np.float32)
+    # `minimum.at` is much faster without a type conversion
+    np.minimum.at(image, pixels[is_inside], values_m[is_inside].astype(np.float32))
+    image[np.isinf(image)] = 0.0
+    return image.reshape(shape)
 
 
 class UniqueCells:

@@ -1,4 +1,4 @@
-"""YAML files checked against pydantic models; all mistakes of a file are reported at once, each with its line."""
+"""YAML and JSON files checked against pydantic models; all mistakes of a file are reported at once."""
 
 from __future__ import annotations
 
@@ -82,6 +82,25 @@ def _parse(path: str, text: str) -> Document:
     if mistakes:
         raise InputError("\n".join(mistakes))
     return Document(path, value, {key: f"{path}:{line}" for key, line in lines.items()})
+
+
+def read_json(path: Path, expected: str) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        InputError: The file is missing, cannot be read, or holds no JSON object; the message ends with `expected`.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: missing: {expected}") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}): {expected}") from error
+    except (ValueError, RecursionError) as error:  # not text, not JSON, numbers too long or nesting too deep
+        raise InputError(f"{path}: damaged, not JSON ({error}): {expected}") from error
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: damaged, holds a JSON {type(document).__name__}: {expected}")
+    return document
 
 
 def validate(model: type[ModelT], document: Document) -> ModelT:

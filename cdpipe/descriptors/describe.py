@@ -133,7 +133,10 @@ def _describe(clouds_sensor: Iterable[Float64Array], method: str) -> tuple[Float
     if method in HANDMADE:
         vectors = [HANDMADE[method](points) for points in clouds_sensor]
         return np.stack([q for q, _ in vectors]), np.stack([w for _, w in vectors])
-    return _apply(_network(method)[0], np.stack([range_image(points) for points in clouds_sensor]))
+    images = torch.from_numpy(np.stack([range_image(points) for points in clouds_sensor]))
+    with torch.inference_mode():
+        q, w = _network(method)[0](images)
+    return q.numpy().astype(np.float32), w.numpy().astype(np.float32)
 
 
 @cache
@@ -142,9 +145,3 @@ def _network(method: str) -> tuple[PlaceNetwork, str]:
         network = make_untrained_network()
         return network, digest(checkpoint_bytes(network))
     return load_trained_network()
-
-
-def _apply(network: PlaceNetwork, images: Float32Array) -> tuple[Float32Array, Float32Array]:
-    with torch.inference_mode():
-        q, w = network(torch.from_numpy(images))
-    return q.numpy().astype(np.float32), w.numpy().astype(np.float32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cdpipe.core.geometry import Float32Array, Float64Array
+from cdpipe.core.voxel import nearest_image
 
 ROWS = 32
 COLUMNS = 256
@@ -28,9 +29,5 @@ def range_image(points_sensor: Float64Array) -> Float32Array:
     rows = np.floor((ELEVATION_RAD - elevation) / (2 * ELEVATION_RAD) * ROWS).astype(np.int64)
     turn = np.arctan2(y, x) / (2 * np.pi)
     columns = np.floor(turn * COLUMNS).astype(np.int64) % COLUMNS
-    inside = (rows >= 0) & (rows < ROWS) & is_return
-    # `minimum.at` is much faster without a type conversion
-    image = np.full(ROWS * COLUMNS, np.inf, dtype=np.float32)
-    np.minimum.at(image, (rows * COLUMNS + columns)[inside], ranges[inside].astype(np.float32))
-    image[np.isinf(image)] = 0.0
-    return image.reshape(ROWS, COLUMNS)
+    is_inside = (rows >= 0) & (rows < ROWS) & is_return
+    return nearest_image(np.where(is_inside, rows * COLUMNS + columns, -1), ranges, (ROWS, COLUMNS))

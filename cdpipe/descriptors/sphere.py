@@ -84,7 +84,7 @@ def change_log_odds(merged: MergedMaps, before: DescriptorSet, is_covered: BoolA
     logits = change_logits(merged, before, is_covered)[is_covered]
     positions = merged.before.odom_T_sensor[before.keyframe_scans[is_covered], :3, 3]
     most_changed = torch.from_numpy(average_neighbours(logits, positions).max(axis=1))
-    log_odds[is_covered] = _network()[0].calibrated(most_changed).numpy()
+    log_odds[is_covered] = _network()[0].calibrate(most_changed).numpy()
     return log_odds
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, invert, transform
 from cdpipe.core.grid_index import GridIndex
+from cdpipe.core.voxel import nearest_image
 
 ROWS = 16
 COLUMNS = 96
@@ -40,12 +41,8 @@ def sphere_image(points_anchor: Float64Array) -> Float32Array:
     """
     pixel = pixels(points_anchor)
     is_inside = pixel >= 0
-    distances_m = np.hypot(points_anchor[is_inside, 1], points_anchor[is_inside, 2]).astype(np.float32)
-    # `minimum.at` is much faster without a type conversion
-    image = np.full(ROWS * COLUMNS, np.inf, dtype=np.float32)
-    np.minimum.at(image, pixel[is_inside], distances_m)
-    image[np.isinf(image)] = 0.0
-    return image.reshape(ROWS, COLUMNS)
+    distances_m = np.hypot(points_anchor[is_inside, 1], points_anchor[is_inside, 2])
+    return nearest_image(pixel[is_inside], distances_m, (ROWS, COLUMNS))
 
 
 def render(index: GridIndex, map_T_anchor: Float64Array) -> Float32Array:

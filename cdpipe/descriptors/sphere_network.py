@@ -92,7 +92,7 @@ class SphereNetwork(nn.Module):
         logits: Tensor = self.logit(hidden)[:, 0] + _FIRST_LOGIT
         return logits
 
-    def calibrated(self, logits: Tensor) -> Tensor:
+    def calibrate(self, logits: Tensor) -> Tensor:
         """Return the calibrated log-odds of a place from the log-odds of its most changed sector."""
         log_odds: Tensor = self.calibration[0] * logits.double() + self.calibration[1]
         return log_odds

@@ -7,17 +7,17 @@ distance to the surface together with free space (`surface`, `cdpipe.extract.sur
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.extract.crops import DIRECTIONS, Crops
+from cdpipe.core.geometry import Float64Array
+from cdpipe.extract.crops import DIRECTIONS, SESSIONS, Crops
 from cdpipe.extract.objects import PointGroup, assemble_objects
-from cdpipe.extract.point_comparison import far_points_mask, inlier_mask, label_clusters, new_points_mask
+from cdpipe.extract.point_comparison import cluster_inliers, is_within, new_points_mask
 from cdpipe.extract.surface_rule import cut_by_surface
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
@@ -54,18 +54,24 @@ def withdraw_empty_regions(
 
 
 def measure_regions(
-    merged: MergedMaps, regions: ChangeRegions, groups: Sequence[PointGroup]
+    regions: ChangeRegions,
+    groups: Sequence[PointGroup],
+    after_within: Callable[[Float64Array, float], Float64Array],
 ) -> dict[str, Float64Array]:
     """Return the figures of the paper's Table II, all of the after map: (R,) by name, NaN if not reported.
 
     `v_sphere_m3` is the volume of the convex hull of the map points in the sphere, `v_oe_m3` the sum of the hull
     volumes of the region's objects, `s_points` and `oe_points` the numbers of points. An object counts as a whole, in
     the best region that it lies in.
+
+    Args:
+        regions: Candidates; the reported ones are measured.
+        groups: Points of all objects.
+        after_within: Returns the (N, 3) after map points within a radius of a centre (3,), map frame, metres.
     """
-    crops = Crops(merged, margin_m=0.0)
     figures = {name: np.full(len(regions.scores), np.nan) for name in FIGURES}
     for region in np.flatnonzero(regions.is_reported).tolist():
-        points = crops.around(regions.centres_map[region], regions.radius_m)["after"].points
+        points = after_within(regions.centres_map[region], regions.radius_m)
         added = [group for group in groups if group.session == "after" and group.region == region]
         figures["v_sphere_m3"][region] = hull_volume_m3(points)
         figures["v_oe_m3"][region] = sum(hull_volume_m3(group.points_map) for group in added)
@@ -81,13 +87,13 @@ def extract_changes(
     t_cd_s: float,
     config: PipelineConfig,
 ) -> ChangeReport:
-    """Cut the objects out of some regions, wherever these are from, and take back the regions that hold none.
+    """Extract the objects of the reported regions, and withdraw the regions without an object.
 
     Args:
         merged: Both maps.
-        regions: Candidates; the reported ones are looked at.
+        regions: Candidates, of any method.
         described: Descriptors of the before and of the after session; only the scans of their keyframes are used.
-        t_cd_s: How long it took to find the regions.
+        t_cd_s: Seconds that it took to find the regions.
         config: All settings.
     """
     start = perf_counter()
@@ -97,7 +103,9 @@ def extract_changes(
     objects = assemble_objects(merged, groups)
     end = perf_counter()
     seconds = {"t_cd_s": t_cd_s, "t_oe_s": end - start, "t_returns_s": end - grouped}
-    return make_report(merged, described, regions, objects, measure_regions(merged, regions, groups), seconds, config)
+    crops = Crops(merged, margin_m=0.0)
+    figures = measure_regions(regions, groups, lambda centre, radius_m: crops.crop("after", centre, radius_m)[1])
+    return make_report(merged, described, regions, objects, figures, seconds, config)
 
 
 def make_report(
@@ -109,7 +117,10 @@ def make_report(
     seconds: Mapping[str, float],
     config: PipelineConfig,
 ) -> ChangeReport:
-    """Return the report on two merged maps; `described` says which scans of each session are keyframes."""
+    """Return the report on two merged maps; `described` gives the keyframe scans of both sessions."""
+    local = None
+    if merged.local is not None:
+        local = merged.local.at(merged.after.odom_T_sensor[described[1].keyframe_scans, :3, 3])
     return ChangeReport(
         before_T_after=merged.before_T_after,
         evidence=merged.evidence,
@@ -119,15 +130,8 @@ def make_report(
         figures=figures,
         keyframe_scans=(described[0].keyframe_scans, described[1].keyframe_scans),
         config=config.model_dump(),
-        local_before_T_after=local_alignment(merged, described[1]),
+        local_before_T_after=local,
     )
-
-
-def local_alignment(merged: MergedMaps, after: DescriptorSet) -> Float64Array | None:
-    """Return the (Ka, 4, 4) alignment at each after keyframe, for a report; None where it is rigid."""
-    if merged.local is None:
-        return None
-    return merged.local.at(merged.after.odom_T_sensor[after.keyframe_scans, :3, 3])
 
 
 def hull_volume_m3(points: Float64Array) -> float:
@@ -145,30 +149,20 @@ def _cut_by_points(merged: MergedMaps, regions: ChangeRegions, config: PipelineC
 
     As in the paper, each region is cut separately, so an object across two regions becomes two objects.
     """
-    extract = config.extract
+    is_voxel, extract = config.extract.method == "voxel", config.extract
     # a voxel that intersects the sphere extends at most its diagonal beyond it
-    crops = Crops(merged, np.sqrt(3.0) * extract.voxel_m if extract.method == "voxel" else extract.distance_m)
-    is_taken = {
-        "before": np.zeros(len(merged.before.points), np.bool_),
-        "after": np.zeros(len(merged.after.points), np.bool_),
-    }
+    reach_m = np.sqrt(3.0) * extract.voxel_m if is_voxel else extract.distance_m
+    crops = Crops(merged, reach_m)
+    is_taken = {name: np.zeros(len(merged.map_of(name).points), np.bool_) for name in SESSIONS}
     groups: list[PointGroup] = []
     for region in np.flatnonzero(regions.is_reported).tolist():
         spheres = crops.around(regions.centres_map[region], regions.radius_m)
         for session, other in DIRECTIONS:
             indices, points = spheres[session].inside
-            for members in _cluster_new_points(points, spheres[other].points, is_taken[session][indices], config):
+            others = spheres[other].points
+            is_old = ~new_points_mask(points, others, extract) if is_voxel else is_within(points, others, reach_m)
+            new = np.flatnonzero(~is_old & ~is_taken[session][indices])
+            for members in cluster_inliers(points, new, config):
                 groups.append(PointGroup(session, indices[members], points[members], region))
                 is_taken[session][indices[members]] = True
     return groups
-
-
-def _cluster_new_points(
-    points: Float64Array, reference: Float64Array, is_taken: BoolArray, config: PipelineConfig
-) -> list[Int64Array]:
-    """Return the indices into `points` of each object."""
-    is_new = new_points_mask if config.extract.method == "voxel" else far_points_mask
-    new = np.flatnonzero(is_new(points, reference, config.extract) & ~is_taken)
-    new = new[inlier_mask(points[new], config.outlier)]
-    labels = label_clusters(points[new], config.cluster)
-    return [new[labels == label] for label in range(labels.max(initial=-1) + 1)]

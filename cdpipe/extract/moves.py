@@ -136,16 +136,14 @@ def _tree(points: Float64Array) -> cKDTree:
 def _neighbours(start: _Cloud, come: Sequence[_Cloud]) -> list[int]:
     """Return the indices of the neighbouring objects, nearest first, at most `_MOST_TRIED`."""
     tree = cKDTree(start.few[:, :2])
-    gaps_m = [float(np.min(tree.query(end.few[:, :2])[0])) for end in come]
-    order = sorted(range(len(come)), key=lambda a: gaps_m[a])
-    return [a for a in order if gaps_m[a] < _BESIDE_M][:_MOST_TRIED]
+    gaps_m = np.array([np.min(tree.query(end.few[:, :2])[0]) for end in come])
+    return [a for a in np.argsort(gaps_m, kind="stable").tolist() if gaps_m[a] < _BESIDE_M][:_MOST_TRIED]
 
 
 def _similar(start: _Cloud, come: Sequence[_Cloud]) -> list[int]:
     """Return the indices of the objects of similar extents, most similar first, at most `_MOST_TRIED`."""
-    misfits = [float(np.abs(start.log_extents - end.log_extents).max()) for end in come]
-    order = sorted(range(len(come)), key=lambda a: misfits[a])
-    return [a for a in order if misfits[a] <= np.log(_FAR_FACTOR)][:_MOST_TRIED]
+    misfits = np.array([np.abs(start.log_extents - end.log_extents).max() for end in come])
+    return [a for a in np.argsort(misfits, kind="stable").tolist() if misfits[a] <= np.log(_FAR_FACTOR)][:_MOST_TRIED]
 
 
 def _match_pair(start: _Cloud, end: _Cloud, least_share: float) -> tuple[float, Float64Array] | None:

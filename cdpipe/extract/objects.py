@@ -9,12 +9,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array, invert, require_shape, transform
-from cdpipe.core.grid_index import GridIndex
 from cdpipe.core.voxel import cell_means
+from cdpipe.extract.crops import SESSIONS, Crops
 from cdpipe.extract.moves import find_moves
 from cdpipe.extract.remains import is_heap, is_part_of_remainder
-from cdpipe.extract.shape import ground_heights, measure_shape, upright_box
-from cdpipe.model.report import ChangedObject
+from cdpipe.extract.shape import column_volume_m3, ground_heights, upright_box
+from cdpipe.model.report import ChangedObject, ObjectShape
 from cdpipe.model.types import MergedMaps, PointMap, SessionName
 
 _BLOCK_RETURNS = 1 << 22
@@ -23,14 +23,12 @@ _BLOCK_RETURNS = 1 << 22
 _FINE_SHARE = 4
 _RETURNS_PER_CELL = 3
 _LEAST_FULL_CELLS = 0.2
-# Margin of an object's surroundings, margin for an alignment that varies, and distance that still is the object.
+# Margin of an object's surroundings, and distance that still is the object.
 _AROUND_M = 1.0
-_BEND_M = 0.5
 _ON_OBJECT_M = 0.1
 # Column width of the ground, and height above it that is not ground.
 _GROUND_M = 0.4
 _ABOVE_GROUND_M = 0.06
-_SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,16 +66,17 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
     """
     if not groups:
         return ()
-    maps = {"before": merged.before, "after": merged.after}
     returns: dict[int, Int32Array] = {}
     points: dict[int, Float64Array] = {}
-    for session in _SESSIONS:
+    for session in SESSIONS:
         members = [number for number, group in enumerate(groups) if group.session == session]
-        pool = ReturnPool(maps[session], [groups[n].indices for n in members if groups[n].returns is None])
+        point_map = merged.map_of(session)
+        pool = ReturnPool(point_map, [groups[n].indices for n in members if groups[n].returns is None])
         for number in members:
             own = groups[number].returns
             indices = np.sort(pool.of(groups[number].indices) if own is None else own)
-            returns[number] = _scan_and_pixel(maps[session], indices)
+            scans_and_pixels = np.column_stack([point_map.scans_of(indices), point_map.return_pixels[indices]])
+            returns[number] = scans_and_pixels.astype(np.int32)
             points[number] = _measured_points(merged, groups[number], indices)
     surroundings = _Surroundings(merged)
     objects = []
@@ -85,12 +84,14 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
     for number, group in enumerate(groups):
         around = surroundings.of(group)
         other = around["after" if group.session == "before" else "before"]
-        voxel_m = maps[group.session].voxel_m
+        point_map = merged.map_of(group.session)
+        voxel_m = point_map.voxel_m
         taken, _ = cell_means(group.points_map, voxel_m)  # the density of its surroundings
         # groups of whole map points leave the foot of an object behind, which would look like a remainder
         may_be_part = group.session == "before" and group.returns is not None
         is_part[number] = may_be_part and is_part_of_remainder(taken, around["before"], other)
-        column_m = voxel_m if maps[group.session].return_offsets is None else voxel_m / 2
+        column_m = voxel_m if point_map.return_offsets is None else voxel_m / 2
+        volume_m3 = column_volume_m3(points[number], other, column_m, voxel_m)
         objects.append(
             ChangedObject(
                 session=group.session,
@@ -99,7 +100,7 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
                 returns=returns[number],
                 points_map=group.points_map,
                 score=float(len(group.indices)),
-                shape=measure_shape(points[number], other, column_m, voxel_m),
+                shape=ObjectShape(*upright_box(points[number]), volume_m3),
             )
         )
     return _link_moves(objects, points, is_part, surroundings)
@@ -152,19 +153,12 @@ class ReturnPool:
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
 
-def _scan_and_pixel(point_map: PointMap, returns: Int64Array) -> Int32Array:
-    """Return the (M, 2) scan and pixel of (M,) returns."""
-    scans = np.searchsorted(point_map.scan_offsets, returns, side="right") - 1
-    return np.column_stack([scans, point_map.return_pixels[returns]]).astype(np.int32)
-
-
 def _measured_points(merged: MergedMaps, group: PointGroup, returns: Int64Array) -> Float64Array:
     """Return the (P, 3) points that measure a group, map frame: means of returns if the map stores their positions."""
-    point_map = merged.before if group.session == "before" else merged.after
+    point_map = merged.map_of(group.session)
     if point_map.return_offsets is None or len(returns) == 0:
         return group.points_map
-    means = _fine_points(point_map, returns)
-    return means if group.session == "before" else merged.alignment.to_map(means)
+    return merged.to_map(group.session, _fine_points(point_map, returns))
 
 
 def _fine_points(point_map: PointMap, returns: Int64Array) -> Float64Array:
@@ -181,7 +175,7 @@ class _Surroundings:
 
     def __init__(self, merged: MergedMaps) -> None:
         self._merged = merged
-        self._before, self._after = GridIndex(merged.before.points), GridIndex(merged.after.points)
+        self._crops = Crops(merged, margin_m=0.0)
 
     def of(self, group: PointGroup) -> dict[SessionName, Float64Array]:
         """Return the (N, 3) points of each session within `_AROUND_M` of a group's box, without the group's own.
@@ -209,31 +203,24 @@ class _Surroundings:
             map_T_box, box_m = upright_box(place)
             found = self._within(map_T_box[:3, 3], float(np.linalg.norm(box_m)) / 2 + _AROUND_M)
             ground = np.concatenate([around for _, around in found.values()])
-            for session in _SESSIONS:
+            for session in SESSIONS:
                 indices, around = found[session]
                 is_inside = (np.abs(transform(invert(map_T_box), around)) <= box_m / 2 + _ON_OBJECT_M).all(axis=1)
                 indices, around = indices[is_inside], around[is_inside]
                 is_high = around[:, 2] > ground_heights(ground, around, _GROUND_M) + _ABOVE_GROUND_M
                 chosen[session].append(indices[is_high])
-        return list(zip(self._finely("before", chosen["before"]), self._finely("after", chosen["after"]), strict=True))
+        return list(zip(*(self._finely(session, chosen[session]) for session in SESSIONS), strict=True))
 
     def _within(self, centre_map: Float64Array, radius_m: float) -> dict[SessionName, tuple[Int64Array, Float64Array]]:
-        """Return the map points of each session in a sphere, and their (N, 3) positions, map frame."""
-        before = self._before.crop(centre_map, radius_m)
-        alignment = self._merged.alignment
-        bend_m = 0.0 if alignment.is_rigid else _BEND_M
-        after = self._after.crop(alignment.to_odom(centre_map[None])[0], radius_m + bend_m)
-        return {
-            "before": (before, self._merged.before.points[before]),
-            "after": (after, alignment.to_map(self._merged.after.points[after])),
-        }
+        """Return the map points of each session in a sphere and somewhat beyond, and their (N, 3) map positions."""
+        return {session: self._crops.crop_roughly(session, centre_map, radius_m) for session in SESSIONS}
 
     def _finely(self, session: SessionName, chosen: Sequence[Int64Array]) -> list[Float64Array]:
         """Return the (P, 3) points of sets of map points, map frame: means of returns if the map stores them."""
-        point_map = self._merged.before if session == "before" else self._merged.after
+        point_map = self._merged.map_of(session)
         if point_map.return_offsets is None:
             points = [point_map.points[indices] for indices in chosen]
         else:
             pool = ReturnPool(point_map, chosen)
             points = [_fine_points(point_map, np.sort(pool.of(indices))) for indices in chosen]
-        return [self._merged.alignment.to_map(odom) if session == "after" else odom for odom in points]
+        return [self._merged.to_map(session, odom) for odom in points]

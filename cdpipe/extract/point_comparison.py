@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.voxel import cell_keys
-from cdpipe.model.config import ClusterConfig, ExtractConfig, OutlierConfig
+from cdpipe.model.config import ClusterConfig, ExtractConfig, OutlierConfig, PipelineConfig
 
 _MAX_DENSE_CELLS = 1 << 22
 
@@ -47,17 +47,6 @@ def is_within(points: Float64Array, others: Float64Array, distance_m: float) -> 
     # the bound of the search excludes the border, so it is slightly larger
     gaps_m, _ = cKDTree(others).query(points, distance_upper_bound=distance_m * (1 + 1e-6))
     return np.asarray(gaps_m) <= distance_m
-
-
-def far_points_mask(points: Float64Array, reference_points: Float64Array, config: ExtractConfig) -> BoolArray:
-    """Mark the points farther than `distance_m` from every point of the reference.
-
-    Args:
-        points: (N, 3) points, metres.
-        reference_points: (M, 3) points of the other session, same frame.
-        config: The distance.
-    """
-    return ~is_within(points, reference_points, config.distance_m)
 
 
 def inlier_mask(points: Float64Array, config: OutlierConfig) -> BoolArray:
@@ -97,6 +86,19 @@ def label_clusters(points: Float64Array, config: ClusterConfig) -> Int64Array:
     big = order[sizes[order] >= config.min_points]
     labels[big] = np.arange(len(big))
     return labels[groups]
+
+
+def cluster_inliers(points: Float64Array, new: Int64Array, config: PipelineConfig) -> list[Int64Array]:
+    """Return the indices into (N, 3) points of each cluster of the new ones, without outliers, largest cluster first.
+
+    Args:
+        points: (N, 3) points, metres.
+        new: (M,) indices of the new points.
+        config: `outlier` and `cluster` are used.
+    """
+    new = new[inlier_mask(points[new], config.outlier)]
+    labels = label_clusters(points[new], config.cluster)
+    return [new[labels == label] for label in range(labels.max(initial=-1) + 1)]
 
 
 def label_groups(points: Float64Array, link_m: float) -> tuple[Int64Array, Int64Array]:

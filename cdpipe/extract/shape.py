@@ -12,26 +12,9 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from cdpipe.core.geometry import Float64Array, yaw_pose
 from cdpipe.core.voxel import cell_keys
-from cdpipe.model.report import ObjectShape
 
 # The ground at a place is the median over this many nearest columns, robust against a false return below the floor.
 _GROUND_COLUMNS = 5
-
-
-def measure_shape(
-    points_map: Float64Array, other_map: Float64Array, column_m: float = 0.1, ground_m: float = 0.2
-) -> ObjectShape:
-    """Measure an object.
-
-    Args:
-        points_map: (P, 3) its points, map frame, metres; P is at least 1.
-        other_map: (Q, 3) points of the other session below and around it; if empty, the floor is level at the
-            object's lowest point.
-        column_m: Column width of the object, at least its point spacing, metres.
-        ground_m: Column width of the ground, metres.
-    """
-    map_T_box, box_m = upright_box(points_map)
-    return ObjectShape(map_T_box, box_m, column_volume_m3(points_map, other_map, column_m, ground_m))
 
 
 def upright_box(points: Float64Array) -> tuple[Float64Array, Float64Array]:
@@ -62,7 +45,15 @@ def upright_box(points: Float64Array) -> tuple[Float64Array, Float64Array]:
 def column_volume_m3(
     points_map: Float64Array, other_map: Float64Array, column_m: float = 0.1, ground_m: float = 0.2
 ) -> float:
-    """Return the volume between an object and the ground, 0 without a footprint; arguments as of `measure_shape`."""
+    """Return the volume between an object and the ground; 0 without a footprint.
+
+    Args:
+        points_map: (P, 3) points of the object, map frame, metres; P is at least 1.
+        other_map: (Q, 3) points of the other session below and around it; if empty, the floor is level at the
+            object's lowest point.
+        column_m: Column width of the object, at least its point spacing, metres.
+        ground_m: Column width of the ground, metres.
+    """
     columns = _columns(points_map, column_m)
     heights = np.maximum(columns[:, 2] - ground_heights(other_map, columns, ground_m), 0.0)
     try:

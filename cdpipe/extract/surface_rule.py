@@ -13,7 +13,7 @@ import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform, travelled_m
 from cdpipe.core.voxel import cell_means
-from cdpipe.extract.crops import DIRECTIONS, Crops, Sphere
+from cdpipe.extract.crops import DIRECTIONS, SESSIONS, Crops, Sphere
 from cdpipe.extract.objects import PointGroup, ReturnPool
 from cdpipe.extract.point_comparison import label_groups
 from cdpipe.extract.surface import (
@@ -88,8 +88,7 @@ def cut_by_surface(merged: MergedMaps, regions: ChangeRegions, config: ExtractCo
             continue
         agreements[region], of_region = _compare_region(merged, spheres, regions.centres_map[region], region, config)
         found += of_region
-    sites = _find_sites(crops, found, agreements)
-    return _cut_sites(merged, sites, config)
+    return _cut_sites(merged, _find_sites(merged, crops, found, agreements), config)
 
 
 def _compare_region(
@@ -143,7 +142,9 @@ class _Site:
     agreement: _Agreement
 
 
-def _find_sites(crops: Crops, found: Iterable[_Candidates], agreements: dict[int, _Agreement]) -> list[_Site]:
+def _find_sites(
+    merged: MergedMaps, crops: Crops, found: Iterable[_Candidates], agreements: dict[int, _Agreement]
+) -> list[_Site]:
     """Group the candidates of all regions into sites, per session; return them by region, best first."""
     sites = []
     for session, other in DIRECTIONS:
@@ -156,7 +157,7 @@ def _find_sites(crops: Crops, found: Iterable[_Candidates], agreements: dict[int
         order = np.lexsort((region, ~is_telling, indices))  # a point takes its best region in which it is telling
         first = order[np.unique(indices[order], return_index=True)[1]]
         indices, is_telling, region = indices[first], is_telling[first], region[first]
-        points = crops.points_map(session, indices)
+        points = merged.to_map(session, merged.map_of(session).points.take(indices, axis=0))
         labels, sizes = label_groups(points, 2 * SITE_M)  # closer sites would share returns
         for label in np.flatnonzero(np.bincount(labels, is_telling, len(sizes)) >= _MIN_TELLING):
             members = labels == label
@@ -168,24 +169,18 @@ def _find_sites(crops: Crops, found: Iterable[_Candidates], agreements: dict[int
 
 
 def _cut_sites(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) -> list[PointGroup]:
-    maps = {"before": merged.before, "after": merged.after}
     pools = {
-        name: ReturnPool(
-            maps[name],
-            [site.own if site.session == name else site.others for site in sites],
-        )
-        for name in maps
+        name: ReturnPool(merged.map_of(name), [site.own if site.session == name else site.others for site in sites])
+        for name in SESSIONS
     }
     result = []
     for site in sites:
         other: SessionName = "before" if site.session == "after" else "after"
+        own_map = merged.map_of(site.session)
         correction = site.agreement.correction
         returns = {site.session: pools[site.session].of(site.own), other: pools[other].of(site.others)}
         after_map = merged.alignment.to_map(merged.after.positions_of(returns["after"]))
-        points = {
-            "before": merged.before.positions_of(returns["before"]),
-            "after": transform(correction, after_map),
-        }
+        points = {"before": merged.before.positions_of(returns["before"]), "after": transform(correction, after_map)}
         compared = compare_site(points[site.session], points[other])
         n_views = _free_space_votes(compared.points, merged, other, correction)
         rays = partial(collect_rays, merged, other, returns[other], points[other], correction)
@@ -194,11 +189,11 @@ def _cut_sites(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) ->
             is_member[cells] = True
             of_object = is_member[compared.cell_of_return]
             chosen = returns[site.session][of_object]
-            if _is_out_of_place(maps[site.session], chosen):
+            if _is_out_of_place(own_map, chosen):
                 continue
             # the answer uses the merge's map frame, without the correction
             in_map = (points["before"] if site.session == "before" else after_map)[of_object]
-            indices = np.unique(maps[site.session].return_points[chosen]).astype(np.int64)
+            indices = np.unique(own_map.return_points[chosen]).astype(np.int64)
             thinned, _ = cell_means(in_map, SURFACE_CELL_M)
             result.append(PointGroup(site.session, indices, thinned, site.region, chosen))
     return result
@@ -219,7 +214,7 @@ def _is_out_of_place(point_map: PointMap, returns: Int64Array) -> bool:
     n_through, n_hit = count_through_and_hit(places, point_map.views)
     if n_through.sum() > _DOUBLED * n_hit.sum():
         return True
-    scans = np.searchsorted(point_map.scan_offsets, returns, side="right") - 1
+    scans = point_map.scans_of(returns)
     ranges_m = np.linalg.norm(points - point_map.odom_T_sensor[scans, :3, 3], axis=1)
     # weighted by path length, because the scans of a robot at rest are redundant
     way_m = np.diff(travelled_m(point_map.odom_T_sensor), prepend=0.0)[scans]
@@ -257,7 +252,7 @@ def _free_space_votes(
 
     A map without range images gives a number above every threshold.
     """
-    views = (merged.before if other == "before" else merged.after).views
+    views = merged.map_of(other).views
     if views is None:
         return np.full(len(points_map), _UNKNOWN_VIEWS)
     if other == "after":
@@ -269,8 +264,8 @@ def collect_rays(
     merged: MergedMaps, session: SessionName, returns: Int64Array, ends: Float64Array, correction: Float64Array
 ) -> Rays:
     """Return the rays of M returns: end points (M, 3) as given, sensor positions (M, 3), and scans (M,)."""
-    point_map = merged.before if session == "before" else merged.after
-    scans = np.searchsorted(point_map.scan_offsets, returns, side="right") - 1
+    point_map = merged.map_of(session)
+    scans = point_map.scans_of(returns)
     seen, scan_of_return = np.unique(scans, return_inverse=True)
     origins = point_map.odom_T_sensor[seen, :3, 3]
     if session == "after":

@@ -32,10 +32,12 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.core.geometry import Float64Array
+from cdpipe.core.yamlfile import read_json
 from cdpipe.io.answer_parts import (
     FORMAT,
     FORMAT_VERSION,
+    OFFSETS,
     AnswerPart,
     ShapePart,
     Until,
@@ -44,6 +46,9 @@ from cdpipe.io.answer_parts import (
 )
 from cdpipe.io.session import load_arrays
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
+
+# Fields of an object that answer.json holds as they are.
+_OBJECT_FIELDS = ("session", "kind", "region", "score", "partner")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,10 +88,8 @@ def write_answer(folder: Path, method: str, report: ChangeReport, until: Until |
         "keyframe_scores": regions.keyframe_scores,
         "before_keyframe_scans": report.keyframe_scans[0],
         "after_keyframe_scans": report.keyframe_scans[1],
-        "object_returns": _stack([item.returns for item in objects], (0, 2), np.int32),
-        "object_return_offsets": _offsets([item.returns for item in objects]),
-        "object_points_map": _stack([item.points_map for item in objects], (0, 3), np.float64),
-        "object_point_offsets": _offsets([item.points_map for item in objects]),
+        **_join("object_returns", np.zeros((0, 2), np.int32), [item.returns for item in objects]),
+        **_join("object_points_map", np.zeros((0, 3)), [item.points_map for item in objects]),
         **{f"figure_{name}": values for name, values in report.figures.items()},
     }
     optional = {
@@ -108,6 +111,27 @@ def write_answer(folder: Path, method: str, report: ChangeReport, until: Until |
         "objects": [_object_document(item) for item in objects],
     }
     _write_json(folder, document, until)
+
+
+def save_report(report: ChangeReport, folder: Path | str, method: str = "tunnelcd") -> None:
+    """Write answer.json and answer.npz, regions.csv, objects.csv and objects.ply.
+
+    Args:
+        report: What `detect` returned.
+        folder: Where; it may exist, and its files of these names are replaced.
+        method: What the answer calls its method.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    folder = Path(folder)
+    try:
+        write_answer(folder, method, report)
+        report.to_pandas("regions").to_csv(folder / "regions.csv", index=False)
+        report.to_pandas("objects").to_csv(folder / "objects.csv", index=False)
+        _write_ply(folder / "objects.ply", report)
+    except OSError as error:
+        raise InputError(f"{error.filename or folder}: cannot be written: {error.strerror}") from error
 
 
 def write_failure(
@@ -135,12 +159,7 @@ def read_answer(folder: Path) -> Answer:
         InputError: It is missing, damaged or inconsistent; the text names the file and the field.
     """
     path = folder / "answer.json"
-    if not path.is_file():
-        raise InputError(f"{path}: missing: expected an answer written by `tunnelcd detect` or by another method")
-    try:
-        value = json.loads(path.read_text())
-    except ValueError as error:
-        raise InputError(f"{path}: damaged, not JSON: {error}") from error
+    value = read_json(path, "expected an answer written by `tunnelcd detect` or by another method")
     document = check_document(path, value)
     if not isinstance(document, AnswerPart):
         status, method, seconds, until = document.status, document.method, document.seconds, document.until
@@ -157,29 +176,26 @@ def read_answer(folder: Path) -> Answer:
 def _report(
     document: AnswerPart, arrays: Mapping[str, npt.NDArray[Any]]
 ) -> tuple[ChangeReport, tuple[Float64Array, ...] | None]:
-    n = len(document.objects)
-    points_map: list[Any] = [np.zeros((0, 3))] * n
-    if "object_points_map" in arrays:
-        points_map = _split(arrays["object_points_map"], arrays["object_point_offsets"])
+
+    def split(name: str, empty: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
+        if name not in arrays:
+            return [empty] * len(document.objects)
+        return [arrays[name][start:end] for start, end in pairwise(arrays[OFFSETS[name]])]
+
+    no_points = np.zeros((0, 3))
     points_odom = None
-    returns: list[Any] = [np.zeros((0, 2), dtype=np.int32)] * n
-    if "object_returns" in arrays:
-        returns = _split(arrays["object_returns"], arrays["object_return_offsets"])
-    elif "object_points_odom" in arrays:
-        points_odom = tuple(_split(arrays["object_points_odom"], arrays["object_point_odom_offsets"]))
+    if "object_points_odom" in arrays and "object_returns" not in arrays:
+        points_odom = tuple(split("object_points_odom", no_points))
+    returns, points_map = split("object_returns", np.zeros((0, 2), np.int32)), split("object_points_map", no_points)
     objects = tuple(
         ChangedObject(
-            session=part.session,
-            kind=part.kind,
-            region=part.region,
-            returns=found,
+            **{name: getattr(part, name) for name in _OBJECT_FIELDS},
+            returns=of_object,
             points_map=points,
-            score=part.score,
-            partner=part.partner,
             shape=None if part.shape is None else _shape(part.shape),
             displacement_map=None if part.displacement_map is None else _numbers(part.displacement_map),
         )
-        for part, found, points in zip(document.objects, returns, points_map, strict=True)
+        for part, of_object, points in zip(document.objects, returns, points_map, strict=True)
     )
     scores = arrays["region_scores"]
     regions = ChangeRegions(
@@ -208,19 +224,10 @@ def _report(
 
 
 def _object_document(item: ChangedObject) -> dict[str, Any]:
-    document: dict[str, Any] = {
-        "session": item.session,
-        "kind": item.kind,
-        "region": item.region,
-        "score": item.score,
-        "partner": item.partner,
-    }
+    document: dict[str, Any] = {name: getattr(item, name) for name in _OBJECT_FIELDS}
     if item.shape is not None:
-        document["shape"] = {
-            "map_T_box": item.shape.map_T_box.tolist(),
-            "box_m": item.shape.box_m.tolist(),
-            "volume_m3": item.shape.volume_m3,
-        }
+        map_T_box, box_m = item.shape.map_T_box.tolist(), item.shape.box_m.tolist()
+        document["shape"] = {"map_T_box": map_T_box, "box_m": box_m, "volume_m3": item.shape.volume_m3}
     if item.displacement_map is not None:
         document["displacement_map"] = item.displacement_map.tolist()
     return document
@@ -234,6 +241,23 @@ def _numbers(values: Sequence[Any]) -> Float64Array:
     return np.asarray(values, dtype=np.float64)
 
 
+def _write_ply(path: Path, report: ChangeReport) -> None:
+    """Write the points of all objects, map frame, each with the index of its object."""
+    vertex = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("object", "<i4")])
+    parts = []
+    for index, item in enumerate(report.objects):
+        part = np.empty(len(item.points_map), dtype=vertex)
+        part["x"], part["y"], part["z"] = item.points_map.T
+        part["object"] = index
+        parts.append(part)
+    vertices = np.concatenate(parts) if parts else np.empty(0, dtype=vertex)
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
+        "property float x\nproperty float y\nproperty float z\nproperty int object\nend_header\n"
+    )
+    path.write_bytes(header.encode() + vertices.tobytes())
+
+
 def _write_json(folder: Path, document: Mapping[str, Any], until: Until | None) -> None:
     partial = folder / ".answer.json.partial"
     head = {"format": FORMAT, "format_version": FORMAT_VERSION, **({} if until is None else {"until": until})}
@@ -241,13 +265,6 @@ def _write_json(folder: Path, document: Mapping[str, Any], until: Until | None) 
     partial.replace(folder / "answer.json")
 
 
-def _stack(arrays: Sequence[npt.NDArray[Any]], empty: tuple[int, int], dtype: type) -> npt.NDArray[Any]:
-    return np.concatenate(arrays) if arrays else np.zeros(empty, dtype=dtype)
-
-
-def _offsets(arrays: Sequence[npt.NDArray[Any]]) -> Int64Array:
-    return np.concatenate([[0], np.cumsum([len(array) for array in arrays])]).astype(np.int64)
-
-
-def _split(values: npt.NDArray[Any], offsets: Int64Array) -> list[npt.NDArray[Any]]:
-    return [values[a:b] for a, b in pairwise(offsets)]
+def _join(name: str, empty: npt.NDArray[Any], parts: Sequence[npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    """Return the rows of all objects as one array, and the offsets of each object, under their names in the file."""
+    return {name: np.concatenate([empty, *parts]), OFFSETS[name]: np.cumsum([0, *map(len, parts)])}

@@ -85,7 +85,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "object_points_odom": ("P", 3), "object_point_odom_offsets": ("O + 1",), "local_before_T_after": ("Ka", 4, 4),
 }  # fmt: skip
 _REQUIRED = ("region_centres_map", "region_scores")
-_OFFSETS = {
+OFFSETS = {
     "object_returns": "object_return_offsets",
     "object_points_map": "object_point_offsets",
     "object_points_odom": "object_point_odom_offsets",
@@ -122,7 +122,7 @@ def check_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects: 
             mistakes.append(f"array {name}: expected {wanted}, got {array.dtype}")
         elif array.ndim != len(shape) or array.shape[1:] != shape[1:]:
             mistakes.append(f"array {name} must be {_format_shape(shape)}, got {array.shape}")
-    needed = [*_REQUIRED, *(_OFFSETS[name] for name in _OFFSETS if name in arrays)]
+    needed = [*_REQUIRED, *(OFFSETS[name] for name in OFFSETS if name in arrays)]
     mistakes += [
         f"array {name} is missing: expected {_format_shape(_SHAPES[name])}" for name in needed if name not in arrays
     ]
@@ -132,7 +132,7 @@ def check_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects: 
             "or their object_returns, (M, 2)"
         )
     if not mistakes:
-        for name, offsets in _OFFSETS.items():
+        for name, offsets in OFFSETS.items():
             if name in arrays:
                 mistakes += _offset_mistakes(offsets, arrays[offsets], name, len(arrays[name]), n_objects)
     if mistakes:

@@ -16,7 +16,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int64Array, make_pose
 from cdpipe.io.ply import read_ply_points
 from cdpipe.io.session import ScanChunk, Session, chunk_path, is_session, read_session
-from cdpipe.io.tum import TUM_LINE, read_tum, require_unit_poses, stamps_from_first_ns
+from cdpipe.io.tum import TUM_LINE, read_tum, require_unit_poses
 from cdpipe.mapping.deskew import deskew
 from cdpipe.model.types import PosedScan, ScanSource
 
@@ -50,22 +50,19 @@ def open_session(path: Path) -> ScanSource:
 
 
 class RecordedScans:
-    """The scans of a session folder, deskewed by its own odometry; the chunk read last is cached."""
+    """The scans of a session folder, deskewed by its own odometry; the chunk read last is cached.
+
+    Attributes:
+        name: The session's folder.
+        odom_T_sensor: (S, 4, 4) pose of each revolution.
+    """
 
     def __init__(self, session: Session) -> None:
+        self.name = str(session.path)
+        self.odom_T_sensor = session.odom_T_sensor
         self._session = session
         self._chunk_index = -1
         self._chunk: ScanChunk | None = None
-
-    @property
-    def name(self) -> str:
-        """The session's folder."""
-        return str(self._session.path)
-
-    @property
-    def odom_T_sensor(self) -> Float64Array:
-        """(S, 4, 4) pose of each revolution."""
-        return self._session.odom_T_sensor
 
     def scan(self, index: int) -> PosedScan:
         """Read and deskew one revolution.
@@ -111,23 +108,18 @@ class RecordedScans:
 
 
 class PlyScans:
-    """Scans in PLY files, each with one pose."""
+    """Scans in PLY files, each with one pose.
+
+    Attributes:
+        name: The folder.
+        odom_T_sensor: (S, 4, 4) pose of each scan.
+    """
 
     def __init__(self, folder: Path, files: list[Path], odom_T_sensor: Float64Array, stamps_ns: Int64Array) -> None:
-        self._folder = folder
+        self.name = str(folder)
+        self.odom_T_sensor = odom_T_sensor
         self._files = files
-        self._odom_T_sensor = odom_T_sensor
         self._stamps_ns = stamps_ns
-
-    @property
-    def name(self) -> str:
-        """The folder."""
-        return str(self._folder)
-
-    @property
-    def odom_T_sensor(self) -> Float64Array:
-        """(S, 4, 4) pose of each scan."""
-        return self._odom_T_sensor
 
     def scan(self, index: int) -> PosedScan:
         """Read one file.
@@ -148,7 +140,7 @@ class PlyScans:
         return PosedScan(
             index=index,
             points_sensor=points,
-            odom_T_sensor=self._odom_T_sensor[index],
+            odom_T_sensor=self.odom_T_sensor[index],
             stamps_ns=np.full(len(points), self._stamps_ns[index]),
             pixels=np.arange(len(points), dtype=np.int32),
         )
@@ -163,7 +155,7 @@ class PlyScans:
         for index, file in enumerate(self._files):
             scan = self.scan(index)
             stamp_ns = int(self._stamps_ns[index])
-            repeats.require_new(str(file), file.name, scan.points_sensor, self._odom_T_sensor[index], stamp_ns)
+            repeats.require_new(str(file), file.name, scan.points_sensor, self.odom_T_sensor[index], stamp_ns)
             yield scan
 
 
@@ -213,5 +205,6 @@ def _open_ply_scans(folder: Path) -> PlyScans:
             f"{trajectories[0]}: {len(rows)} poses for {len(files)} *.ply scans: one line for each scan is "
             "needed, in the order of the file names"
         )
-    poses = [make_pose(Rotation.from_quat(row[4:]).as_matrix(), row[1:4]) for row in rows]
-    return PlyScans(folder, files, np.array(poses).reshape(-1, 4, 4), stamps_from_first_ns(rows))
+    poses = make_pose(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4])
+    stamps_ns = np.round((rows[:, 0] - rows[0, 0]) * 1e9).astype(np.int64)
+    return PlyScans(folder, files, poses, stamps_ns)

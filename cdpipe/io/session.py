@@ -20,13 +20,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ConfigDict, Field
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, require_poses, require_shape
+from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, require_poses, require_shape, require_shapes
+from cdpipe.core.yamlfile import Document, Settings, read_json, validate
 from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
 
 FORMAT = "tunnelcd-session"
@@ -53,11 +55,8 @@ class ScanChunk:
 
     def __post_init__(self) -> None:
         require_shape("range_mm", self.range_mm, (None, None, None))
-        scans, _, width = self.range_mm.shape
-        require_shape("reflectivity", self.reflectivity, self.range_mm.shape)
-        require_shape("signal", self.signal, self.range_mm.shape)
-        require_shape("column_stamps_ns", self.column_stamps_ns, (scans, width))
-        require_shape("column_poses", self.column_poses, (scans, width, 7))
+        shape = s, _, width = self.range_mm.shape
+        require_shapes(self, reflectivity=shape, signal=shape, column_stamps_ns=(s, width), column_poses=(s, width, 7))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,6 +185,27 @@ class SessionWriter:
             raise InputError(f"{self._path}: cannot write there: {error.strerror}") from error
 
 
+class _Provenance(Settings):
+    """The field of the provenance that readers use; its value fits int64 stamps."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    sensor_clock_start_ns: Annotated[int, Field(ge=0, lt=2**62)] = 0
+
+
+class _Header(Settings):
+    """The fields of session.json that readers use."""
+
+    model_config = ConfigDict(extra="ignore", strict=True)
+
+    format: Literal["tunnelcd-session"]
+    format_version: Literal[2]
+    n_scans: int
+    chunk_scans: Annotated[int, Field(ge=1)]
+    sensor: dict[str, Any]
+    provenance: _Provenance
+
+
 def is_session(path: Path) -> bool:
     """Return whether a folder holds a session.json."""
     return (path / "session.json").is_file()
@@ -201,26 +221,10 @@ def read_session(path: Path) -> Session:
         raise InputError(f"{path}: no such session folder")
     if not is_session(path):
         raise InputError(f"{path}: no session.json in it: expected a session written by `tunnelcd simulate`")
-    try:
-        document = json.loads((path / "session.json").read_text())
-        if (document["format"], document["format_version"]) != (FORMAT, FORMAT_VERSION):
-            raise InputError(
-                f"{path / 'session.json'}: format {document['format']} {document['format_version']}: "
-                f"this version reads {FORMAT} {FORMAT_VERSION}"
-            )
-        n_scans, chunk_scans = int(document["n_scans"]), int(document["chunk_scans"])
-        sensor_document, provenance = document["sensor"], document["provenance"]
-        if chunk_scans < 1:
-            raise ValueError(f"chunk_scans = {chunk_scans}")
-        _check_provenance(provenance)
-    except OSError as error:
-        raise InputError(f"{path / 'session.json'}: cannot be read: {error.strerror}") from error
-    except KeyError as error:
-        said = f"{path / 'session.json'}: damaged: no {error} in it"
-        raise InputError(f"{said}: expected a session written by `tunnelcd simulate`, copy it again") from error
-    # ValueError: not JSON, not text, or not a number
-    except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise InputError(f"{path / 'session.json'}: damaged: {error}") from error
+    source = path / "session.json"
+    document = read_json(source, "expected a session written by `tunnelcd simulate`, copy it again")
+    header = validate(_Header, Document(str(source), document))
+    n_scans = header.n_scans
     poses = load_arrays(path / "odometry.npz").get("odom_T_sensor")
     if poses is None or len(poses) != n_scans:
         raise InputError(
@@ -233,17 +237,8 @@ def read_session(path: Path) -> Session:
         require_poses("odom_T_sensor", poses)
     except ValueError as error:
         raise InputError(f"{path / 'odometry.npz'}: {error}: mend the pose, or leave the scan out") from error
-    sensor = parse_metadata(sensor_document, str(path / "session.json"))
-    return Session(path, sensor, poses, chunk_scans, provenance)
-
-
-def _check_provenance(provenance: Any) -> None:
-    """Raise `ValueError` unless provenance is a JSON object and its clock start, if given, fits int64 stamps."""
-    if not isinstance(provenance, dict):
-        raise ValueError(f"provenance = {provenance!r:.40}, expected a JSON object")
-    start_ns = provenance.get("sensor_clock_start_ns", 0)
-    if type(start_ns) is not int or not 0 <= start_ns < 2**62:
-        raise ValueError(f"provenance.sensor_clock_start_ns = {start_ns!r:.40}, expected nanoseconds, 0 to 2^62")
+    sensor = parse_metadata(header.sensor, str(source))
+    return Session(path, sensor, poses, header.chunk_scans, document["provenance"])
 
 
 def chunk_path(folder: Path, index: int) -> Path:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.core.geometry import Float64Array
 from cdpipe.core.motion import Motion, make_motion
 
 TUM_LINE = "stamp tx ty tz qx qy qz qw"
@@ -91,11 +91,6 @@ def motion_along(path: Path, first_ns: int, last_ns: int, slack_s: float) -> Mot
             f"at most {_LONGEST_GAP_S:g} s can be bridged"
         )
     return motion_through(rows, first_ns / 1e9)
-
-
-def stamps_from_first_ns(rows: Float64Array) -> Int64Array:
-    """Return the stamps (N,) of TUM rows since the first, nanoseconds."""
-    return np.round((rows[:, 0] - rows[:1, 0]) * 1e9).astype(np.int64)
 
 
 def require_unit_poses(poses: Float64Array, where: Callable[[int], str]) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.voxel import cell_keys, nearest_image
 from cdpipe.model.types import Float16Array, KeyframeViews
 
 ROWS = 64
@@ -34,12 +34,7 @@ def render_view(points_sensor: Float64Array) -> Float16Array:
     Args:
         points_sensor: (N, 3) returns of a scan, sensor frame, metres.
     """
-    pixel, ranges_m = _pixels(points_sensor)
-    is_kept = pixel >= 0
-    image = np.full(ROWS * COLUMNS, np.inf, dtype=np.float32)
-    np.minimum.at(image, pixel[is_kept], ranges_m[is_kept].astype(np.float32))
-    image[np.isinf(image)] = 0.0
-    return image.reshape(ROWS, COLUMNS).astype(np.float16)
+    return nearest_image(*_pixels(points_sensor), (ROWS, COLUMNS)).astype(np.float16)
 
 
 def free_space_votes(points_odom: Float64Array, views: KeyframeViews) -> Int64Array:

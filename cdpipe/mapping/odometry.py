@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterable
 from typing import Any
 
@@ -25,12 +24,6 @@ _FIRST_THRESHOLD_M = 2.0
 _LEAST_MOTION_M = 0.1
 _MAX_ITERATIONS = 500
 _CONVERGED = 1e-4
-
-
-def require_kiss_icp(asked_by: str) -> None:
-    """Raise `InputError` unless KISS-ICP is installed; `asked_by` names the setting that needs it."""
-    if importlib.util.find_spec("kiss_icp") is None:
-        raise InputError(f"{asked_by} needs a package more: pip install 'tunnelcd[odometry]'")
 
 
 def estimate_motion(

@@ -11,12 +11,10 @@ level (z up).
 from __future__ import annotations
 
 import ctypes
-import importlib.util
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -25,8 +23,8 @@ import numpy.typing as npt
 import small_gicp
 from scipy.spatial import cKDTree
 
-from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, make_pose, require_shape
+from cdpipe.core.plugins import has_extra, require_extra
 from cdpipe.core.voxel import max_coordinate_m
 
 # Far compared with any mine; the rounding of the library's float32 is 0.03 mm there.
@@ -41,33 +39,12 @@ _N_PROBED = 1000
 _MIN_INLIERS = 3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CoarsePose:
-    """The unverified result of KISS-Matcher.
-
-    Attributes:
-        before_T_after: (4, 4) pose of the after cloud in the before cloud's frame.
-        n_inliers: Correspondences that agree with the pose.
-        n_correspondences: Feature correspondences before outlier rejection.
-    """
-
-    before_T_after: Float64Array
-    n_inliers: int
-    n_correspondences: int
-
-
 def is_kiss_matcher_installed() -> bool:
     """Return whether the extra `kiss` is installed."""
-    return importlib.util.find_spec("kiss_matcher") is not None
+    return has_extra("kiss")
 
 
-def require_kiss_matcher(asked_by: str) -> None:
-    """Raise `InputError` unless KISS-Matcher is installed; `asked_by` names the setting that needs it."""
-    if not is_kiss_matcher_installed():
-        raise InputError(f"{asked_by} needs a package more: pip install 'tunnelcd[kiss]'")
-
-
-def register_globally(before_points: Float64Array, after_points: Float64Array, voxel_m: float) -> CoarsePose | None:
+def register_globally(before_points: Float64Array, after_points: Float64Array, voxel_m: float) -> Float64Array | None:
     """Register two level clouds without an initial guess; deterministic.
 
     Args:
@@ -76,13 +53,14 @@ def register_globally(before_points: Float64Array, after_points: Float64Array, v
         voxel_m: Voxel size of both clouds; normals use a radius of 3 voxels, features of 5.
 
     Returns:
-        None if fewer than three correspondences agree, or if a cloud is too sparse for normals at this voxel size.
+        (4, 4) pose of the after cloud in the before cloud's frame, not verified. None if fewer than three
+        correspondences agree, or if a cloud is too sparse for normals at this voxel size.
 
     Raises:
         InputError: The extra `kiss` is not installed.
         ValueError: A point is not finite, or a cloud is too wide for the voxel.
     """
-    require_kiss_matcher("finding a merge by KISS-Matcher")
+    require_extra("kiss", "finding a merge by KISS-Matcher")
     clouds, centres = [], []
     for name, points in (("before_points", before_points), ("after_points", after_points)):
         cloud, centre = _prepare(name, points, voxel_m)
@@ -95,13 +73,10 @@ def register_globally(before_points: Float64Array, after_points: Float64Array, v
     before_seen, after_seen = ((cloud - _VIEWPOINT_M).astype(np.float32) for cloud in clouds)
     with _one_openmp_thread():
         found = matcher.estimate(after_seen, before_seen)
-    n_inliers = matcher.get_num_final_inliers()
     pose = make_pose(np.asarray(found.rotation), np.asarray(found.translation))
-    if not found.valid or n_inliers < _MIN_INLIERS or not np.isfinite(pose).all():
+    if not found.valid or matcher.get_num_final_inliers() < _MIN_INLIERS or not np.isfinite(pose).all():
         return None
-    before_T_seen, seen_T_after = make_pose(translation=centres[0]), make_pose(translation=-centres[1])
-    n_correspondences = len(matcher.get_initial_correspondences())
-    return CoarsePose(before_T_seen @ pose @ seen_T_after, n_inliers, n_correspondences)
+    return np.asarray(make_pose(translation=centres[0]) @ pose @ make_pose(translation=-centres[1]))
 
 
 def _prepare(name: str, points: Float64Array, voxel_m: float) -> tuple[Float64Array, Float64Array]:

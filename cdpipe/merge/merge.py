@@ -15,7 +15,7 @@ from time import perf_counter
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, transform
+from cdpipe.core.geometry import Float64Array, Int64Array, transform
 from cdpipe.merge.candidates import Candidate, find_candidates, find_closest_pair
 from cdpipe.merge.evidence import SurfaceFit, explain_refusal, measure_fit, sample_evenly
 from cdpipe.merge.global_registration import is_kiss_matcher_installed, register_globally
@@ -84,24 +84,22 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     maps = (IndexedMap(before.map, config, is_target=True), IndexedMap(after.map, config, is_target=False))
     indexed = perf_counter()
     best, n_hypotheses = _find_hypothesis(before, after, maps, config)
-    reason = _TOO_FEW
     evidence: dict[str, float] = {"n_hypotheses": float(n_hypotheses)}
-    if best is not None:
-        reason = "" if config.accept_all else explain_refusal(best.evidence, config)
-        if reason and config.fallback and not is_kiss_matcher_installed():
-            reason += " (KISS-Matcher could not be asked: pip install 'tunnelcd[kiss]')"
-        evidence = {**best.evidence, **evidence}
     seconds = {"t_index_s": indexed - start, "t_merge_s": perf_counter() - indexed, "t_refine_s": 0.0}
-    before_T_after, local = np.eye(4), None
-    if best is not None:
-        before_T_after = best.before_T_after
-        if not reason and config.refine == "local":
-            refining = perf_counter()
-            local, measured = refine(*maps, best.walk, config)
-            evidence |= measured
-            if local is not None:
-                before_T_after = fit_rigid(local.anchors_odom, local.before_T_after)
-            seconds["t_refine_s"] = perf_counter() - refining
+    if best is None:
+        return MergedMaps(before.map, after.map, np.eye(4), evidence, False, _TOO_FEW, seconds=seconds)
+    evidence = {**best.evidence, **evidence}
+    reason = "" if config.accept_all else explain_refusal(evidence, config)
+    if reason and config.fallback and not is_kiss_matcher_installed():
+        reason += " (KISS-Matcher could not be asked: pip install 'tunnelcd[kiss]')"
+    before_T_after, local = best.before_T_after, None
+    if not reason and config.refine == "local":
+        refining = perf_counter()
+        local, measured = refine(*maps, best.walk, config)
+        evidence |= measured
+        if local is not None:
+            before_T_after = fit_rigid(local.anchors_odom, local.before_T_after)
+        seconds["t_refine_s"] = perf_counter() - refining
     return MergedMaps(before.map, after.map, before_T_after, evidence, not reason, reason, local, seconds)
 
 
@@ -184,11 +182,11 @@ def _start_by_kiss_matcher(maps: tuple[IndexedMap, IndexedMap], config: MergeCon
     Odometry observes gravity, so a pose that tilts the after map is rejected.
     """
     before, after = maps
-    found = register_globally(before.map.points, after.map.points, config.kiss_voxel_m)
-    if found is None or found.before_T_after[2, 2] < _UPRIGHT:
+    pose = register_globally(before.map.points, after.map.points, config.kiss_voxel_m)
+    if pose is None or pose[2, 2] < _UPRIGHT:
         return []
-    distances_m, _ = before.path.query(transform(found.before_T_after, after.positions))
-    return [_Start(int(np.argmin(distances_m)), found.before_T_after, {"is_fallback": 1.0})]
+    distances_m, _ = before.path.query(transform(pose, after.positions))
+    return [_Start(int(np.argmin(distances_m)), pose, {"is_fallback": 1.0})]
 
 
 def _choose_hypothesis(
@@ -258,7 +256,8 @@ def _judge(start: _Start, maps: tuple[IndexedMap, IndexedMap], config: MergeConf
 
     everywhere = np.arange(len(after.positions))
     walked, fits = along(choose_evenly(everywhere, _CHECKS, start.keyframe))
-    shared = everywhere[_is_shared_keyframe(walked, before, after)]
+    alignment = PathAlignment(after.positions[walked.keyframes], walked.before_T_after)
+    shared = everywhere[is_shared(before, alignment.to_map(after.positions))]
     if len(fits) < _CHECKS // 2 < len(shared):
         walked, fits = along(choose_evenly(shared, _CHECKS, start.keyframe))
     evidence = {
@@ -287,12 +286,6 @@ def _register_start(
     if config.method != "frame" and len(points) >= MIN_SPHERE_POINTS:
         pose = align_by_gicp(points, centre, before.target, pose, config.vgicp_correspondence_m, config.voxel_m)
     return pose, measure_fit(before, after, pose, sample_evenly(points), centre, _CHECK_RADIUS_M)
-
-
-def _is_shared_keyframe(walked: Walk, before: IndexedMap, after: IndexedMap) -> BoolArray:
-    """Return the (K,) mask of the after keyframes within 5 m of the before path."""
-    alignment = PathAlignment(after.positions[walked.keyframes], walked.before_T_after)
-    return is_shared(before, alignment.to_map(after.positions))
 
 
 def _hessian_ratio(walked: Walk) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array, make_pose
 
 # Prior on an unconstrained anchor; it keeps the system regular.
 _WEAKEST = 1e-6
@@ -50,7 +50,7 @@ class PoseGraph:
         after = np.minimum(after, len(anchors_m) - 1)
         length_m = np.maximum(anchors_m[after] - anchors_m[before], 1e-9)
         share = np.clip((places_m - anchors_m[before]) / length_m, 0.0, 1.0)
-        moved = (1 - share[:, None]) * self._moved(before, places) + share[:, None] * self._moved(after, places)
+        moved = (1 - share[:, None]) * self._predict(before, places) + share[:, None] * self._predict(after, places)
         rotations = self.before_T_after[before, :3, :3]
         turn = np.swapaxes(rotations, 1, 2) @ self.before_T_after[after, :3, :3]
         rotations = (
@@ -58,7 +58,7 @@ class PoseGraph:
         )
         return _make_poses(rotations, moved, places)
 
-    def _moved(self, anchors: np.ndarray, places: Float64Array) -> Float64Array:
+    def _predict(self, anchors: np.ndarray, places: Float64Array) -> Float64Array:
         """Return the (K, 3) map position of each place as predicted from one anchor, given by index."""
         apart = places - self.positions[anchors]
         stretched = self.positions[anchors] + (1 + self.stretch) * apart
@@ -133,7 +133,7 @@ def _add_odometry(system: _System, state: _State, steps: Float64Array) -> tuple[
     weights = np.repeat([1 / _DRIFT_RAD**2, 1 / _DRIFT_M**2], 3) / length_m[:, None]
     # derivatives: identity for the second anchor, minus the step for the stretch
     here = np.repeat(-np.eye(6)[None], n, axis=0)
-    here[:, 3:, :3] = _cross_matrices(steps)
+    here[:, 3:, :3] = -np.cross(steps[:, None, :], np.eye(3)[None])  # the matrices [step]x of the cross product
     per_stretch = np.hstack([np.zeros((n, 3)), -steps])
     weighted = np.swapaxes(here, 1, 2) * weights[:, None]
     system.blocks[:-1] += weighted @ here
@@ -165,16 +165,8 @@ def _solve(system: _System, corner: float, slope: float) -> tuple[Float64Array, 
 
 def _make_poses(rotations: Float64Array, translations: Float64Array, positions: Float64Array) -> Float64Array:
     """Return the (N, 4, 4) transforms with the given rotations that map positions to translations."""
-    result = np.repeat(np.eye(4)[None], len(positions), axis=0)
-    result[:, :3, :3] = rotations
-    result[:, :3, 3] = translations - np.einsum("aij,aj->ai", rotations, positions)
-    return result
+    return make_pose(rotations, translations - np.einsum("aij,aj->ai", rotations, positions))
 
 
 def _apply(dst_T_src: Float64Array, points: Float64Array) -> Float64Array:
     return np.asarray(np.einsum("aij,aj->ai", dst_T_src[:, :3, :3], points) + dst_T_src[:, :3, 3])
-
-
-def _cross_matrices(vectors: Float64Array) -> Float64Array:
-    """Return the (N, 3, 3) matrices [v]x of (N, 3) vectors: [v]x @ turn = v x turn."""
-    return -np.cross(vectors[:, None, :], np.eye(3)[None])

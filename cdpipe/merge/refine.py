@@ -82,9 +82,9 @@ def refine(
     information = _discount_normal_noise(walked.information) * np.where(is_good, 1 / _POINT_M**2, 0.0)[:, None, None]
     positions = after.positions[walked.keyframes]
     per_stretch = _per_stretch(before, after, walked, is_good, radius_m)
-    chain = solve_pose_graph(positions, walked.before_T_after, information, per_stretch)
-    every = chain.at(path_m[walked.keyframes], path_m, after.positions)
-    alignment = PathAlignment(after.positions, every)
+    graph = solve_pose_graph(positions, walked.before_T_after, information, per_stretch)
+    local = graph.at(path_m[walked.keyframes], path_m, after.positions)
+    alignment = PathAlignment(after.positions, local)
     moved_m = np.linalg.norm(alignment.to_map(positions) - coarse.to_map(positions), axis=1)
     return alignment, {
         **evidence,

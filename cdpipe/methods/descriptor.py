@@ -1,4 +1,4 @@
-"""Regions by descriptors, as in the paper and as `tunnelcd` does it; `query.compare` says which descriptors."""
+"""Regions by descriptors, as in the paper and in `tunnelcd`; `query.compare` names the descriptors."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from cdpipe.query.query import find_regions
 
 
 class DescriptorQuery:
-    """The inverted query of the paper (section III), or its comparison of spheres; a registered method."""
+    """A registered method: the inverted query of the paper (section III), or the comparison of spheres."""
 
     uses_descriptors = True
 
     def propose(
         self, merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig
     ) -> ChangeRegions:
-        """Return the places that changed, ranked, by the descriptors of the keyframes."""
+        """Return the candidate regions, ranked by the descriptors of the keyframes."""
         return find_regions(merged, before, after, config.query)

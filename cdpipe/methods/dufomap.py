@@ -1,8 +1,8 @@
 """DUFOMap (Duberg, Zhang, Jia, Jensfelt 2024), extra `dufomap`: what stands where the other session's rays saw a void.
 
-DUFOMap cleans a map of what moved: it casts the rays of each scan, marks the voxels in which, localisation errors
-considered, nothing can have been (void), and drops all points that lie in a voxel that was void at any time. For two
-sessions the scans of one are integrated and the map points of the other are asked about, in both directions.
+DUFOMap removes moving objects from a map. It casts the rays of each scan, marks the voxels that must have been empty
+(void) despite localisation errors, and drops every point in a voxel that was void at any time. For two sessions, the
+scans of one mark the void voxels and the map points of the other are looked up in them, in both directions.
 """
 
 # ruff: noqa: PLC0415 - dufomap is an extra, and everybody else must be able to import this
@@ -16,65 +16,49 @@ import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array
 from cdpipe.core.threads import THREADS
-from cdpipe.methods.registry import require_extra
-from cdpipe.methods.whole_map import PlacedMaps, whole_map
-from cdpipe.model.config import DufomapConfig, PipelineConfig
-from cdpipe.model.report import ChangeReport
-from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap, SessionName
+from cdpipe.methods.whole_map import PlacedMaps, WholeMap
+from cdpipe.model.config import PipelineConfig
+from cdpipe.model.types import SessionName
 
-# d_p, as its authors have it: a voxel is void if its neighbours were seen too. Without, half of a tunnel is new.
+# d_p, the authors' value: a voxel is void only if its neighbours were seen too. With 0, half of a tunnel is new.
 _UNKNOWN_VOXELS = 1
 
 
-def dufomap(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig) -> ChangeReport:
-    """Compare the maps by `whole_map`: new is what stands where the other session saw a void (`void_mask`).
+@WholeMap
+def dufomap(maps: PlacedMaps, session: SessionName, other: SessionName, config: PipelineConfig) -> BoolArray:
+    """Mark the map points of `session` in a voxel that `other` saw to be void.
 
-    Raises:
-        InputError: The extra `dufomap` is not installed.
-    """
-    require_extra("dufomap")
-    return whole_map(merged, before, after, config, void_mask)
-
-
-def void_mask(maps: PlacedMaps, session: SessionName, other: SessionName, config: PipelineConfig) -> BoolArray:
-    """Mark the map points of `session` that lie in a voxel which `other` saw to be void.
-
-    Rays are cast in the other session's own odom frame, so that its returns need not be moved; the points are.
+    Rays are cast in the other session's own odom frame; the points are transformed into it.
 
     Args:
         maps: Both maps, and the returns of every scan.
-        session: Whose points are asked about.
-        other: Whose rays are cast.
-        config: `dufomap` and `query.radius_m` are used; points farther than that from the other path, which nobody will
-            ask for, are not looked up.
+        session: The session whose points are marked.
+        other: The session whose rays are cast.
+        config: `dufomap` and `query.radius_m` are used. Points farther than that from the other path are not compared,
+            so they are not looked up.
 
     Returns:
         (N,) mask of the points of `session`.
     """
     points = maps.points[session]
-    asked = np.flatnonzero(maps.is_comparable(points, other, config.query.radius_m))
-    cast_from, asked_odom = maps.merged.before, points[asked]
-    if other == "after":
-        cast_from, asked_odom = maps.merged.after, maps.merged.alignment.to_odom(points[asked])
+    compared = np.flatnonzero(maps.is_comparable(points, other, config.query.radius_m))
+    point_map, points_odom = maps.merged.map_of(other), maps.merged.to_odom(other, points[compared])
+    settings = config.dufomap
+    void_map = load_dufomap().dufomap(settings.voxel_m, settings.hit_inflation_m, _UNKNOWN_VOXELS, THREADS)
+    for scan in range(0, len(point_map.odom_T_sensor), settings.every_scan):
+        returns = np.arange(*point_map.scan_offsets[scan : scan + 2])
+        void_map.run(point_map.positions_of(returns), _origin_pose(point_map.odom_T_sensor[scan, :3, 3]), False)
     is_void = np.zeros(len(points), dtype=np.bool_)
-    is_void[asked] = _in_void(cast_from, asked_odom, config.dufomap)
+    is_void[compared] = void_map.segment(points_odom, _origin_pose(np.zeros(3)), False)
     return is_void
 
 
-def _in_void(cast_from: PointMap, points_odom: Float64Array, config: DufomapConfig) -> BoolArray:
-    void_map = loaded_dufomap().dufomap(config.voxel_m, config.hit_inflation_m, _UNKNOWN_VOXELS, THREADS)
-    for scan in range(0, len(cast_from.odom_T_sensor), config.every_scan):
-        returns = np.arange(*cast_from.scan_offsets[scan : scan + 2])
-        void_map.run(cast_from.positions_of(returns), _origin_pose(cast_from.odom_T_sensor[scan, :3, 3]), False)
-    return np.asarray(void_map.segment(points_odom, _origin_pose(np.zeros(3)), False), dtype=np.bool_)
-
-
 def _origin_pose(origin_odom: Float64Array) -> list[float]:
-    """Return the sensor's position as the package takes it, unturned: the points are in the odom frame already."""
+    """Return a position and the identity quaternion, as the package takes a pose; points are in the odom frame."""
     return [*origin_odom.tolist(), 1.0, 0.0, 0.0, 0.0]
 
 
-def loaded_dufomap() -> Any:
+def load_dufomap() -> Any:
     """Return the module dufomap, silent."""
     # its C++ part would write its settings to standard error each time; read when it is loaded
     os.environ.setdefault("GLOG_minloglevel", "2")

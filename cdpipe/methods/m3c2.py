@@ -1,9 +1,9 @@
 """M3C2 (Lague, Brodu, Leroux 2013) by py4dgeo, extra `m3c2`: how far a surface moved along its own normal.
 
-At each map point of one session the normal is that of the plane through its own map around it; the distance is that
-between the mean places of both maps within a cylinder along that normal. It counts where it is larger than its own 95 %
-level of detection and than `extract.distance_m`, and where the other map's surface lies behind, seen from the session's
-own path: a crate stands in front of the floor, and the floor under it is hidden, not gone.
+The normal at a map point is that of the plane through its own map around it. The distance is that between the mean
+points of both maps within a cylinder along the normal. A point is new if the distance is larger than its 95 % level of
+detection and than `extract.distance_m`, and if the other map's surface lies behind the point, seen from the session's
+own path: a crate stands in front of the floor, and the floor under it is hidden, not removed.
 """
 
 # ruff: noqa: PLC0415 - py4dgeo is an extra, and everybody else must be able to import this
@@ -18,39 +18,29 @@ import numpy as np
 
 from cdpipe.core.geometry import BoolArray
 from cdpipe.core.threads import THREADS
-from cdpipe.methods.registry import require_extra
-from cdpipe.methods.whole_map import PlacedMaps, nearest_of, whole_map
+from cdpipe.methods.whole_map import PlacedMaps, WholeMap
 from cdpipe.model.config import PipelineConfig
-from cdpipe.model.report import ChangeReport
-from cdpipe.model.types import DescriptorSet, MergedMaps, SessionName
+from cdpipe.model.types import SessionName
+from cdpipe.query.query import query_nearest
 
 
-def m3c2(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig) -> ChangeReport:
-    """Compare the maps by `whole_map`: new is what moved along its normal (`m3c2_mask`).
-
-    Raises:
-        InputError: The extra `m3c2` is not installed.
-    """
-    require_extra("m3c2")
-    return whole_map(merged, before, after, config, m3c2_mask)
-
-
-def m3c2_mask(maps: PlacedMaps, session: SessionName, other: SessionName, config: PipelineConfig) -> BoolArray:
+@WholeMap
+def m3c2(maps: PlacedMaps, session: SessionName, other: SessionName, config: PipelineConfig) -> BoolArray:
     """Mark the map points of `session` that stand in front of the surface of `other`.
 
-    Where the cylinder holds nothing of the other map there is no distance, and the point is not new.
+    A point is not new if its cylinder holds no point of the other map, because there is no distance.
 
     Args:
         maps: Both maps.
-        session: Whose points are asked about.
-        other: What they are compared to.
-        config: `m3c2`, `extract.distance_m` and `query.radius_m` are used; points farther than that from the other
-            path, which nobody will ask for, are not measured.
+        session: The session whose points are marked.
+        other: The session they are compared to.
+        config: `m3c2`, `extract.distance_m` and `query.radius_m` are used. Points farther than that from the other path
+            are not compared, so they are not measured.
 
     Returns:
         (N,) mask of the points of `session`.
     """
-    py4dgeo = loaded_py4dgeo()
+    py4dgeo = load_py4dgeo()
     points = maps.points[session]
     core = np.flatnonzero(maps.is_comparable(points, other, config.query.radius_m))
     is_new = np.zeros(len(points), dtype=np.bool_)
@@ -64,7 +54,7 @@ def m3c2_mask(maps: PlacedMaps, session: SessionName, other: SessionName, config
         max_distance=config.m3c2.depth_m,
     )
     distances_m, uncertainties = algorithm.run()
-    seen_from = maps.path[session][nearest_of(points[core], maps.path[session])[1]]
+    seen_from = maps.path[session][query_nearest(points[core], maps.path[session])[1]]
     is_towards_path = np.einsum("ij,ij->i", algorithm.directions(), seen_from - points[core]) > 0
     behind_m = np.where(is_towards_path, -distances_m, distances_m)
     # NaN where there is no distance, and where the points are too few to tell its error
@@ -73,7 +63,7 @@ def m3c2_mask(maps: PlacedMaps, session: SessionName, other: SessionName, config
     return is_new
 
 
-def loaded_py4dgeo() -> Any:
+def load_py4dgeo() -> Any:
     """Return the module py4dgeo, silent and held to one thread."""
     import py4dgeo
 

@@ -75,7 +75,7 @@ class PathAlignment:
 
     def to_map(self, points_odom: Float64Array) -> Float64Array:
         """Return (N, 3) points of the after odom frame in the map frame."""
-        return _moved(points_odom, self.anchors_odom, self.before_T_after)
+        return _move(points_odom, self.anchors_odom, self.before_T_after)
 
     def to_odom(self, points_map: Float64Array) -> Float64Array:
         """Return (N, 3) points of the map frame in the after odom frame.
@@ -83,21 +83,21 @@ class PathAlignment:
         The inverse of `to_map` up to millimetres, the bend of the blend between two anchors.
         """
         rotated = np.einsum("aij,aj->ai", self.before_T_after[:, :3, :3], self.anchors_odom)
-        return _moved(points_map, rotated + self.before_T_after[:, :3, 3], invert(self.before_T_after))
+        return _move(points_map, rotated + self.before_T_after[:, :3, 3], invert(self.before_T_after))
 
 
-def _moved(points: Float64Array, anchors: Float64Array, dst_T_src: Float64Array) -> Float64Array:
+def _move(points: Float64Array, anchors: Float64Array, dst_T_src: Float64Array) -> Float64Array:
     """Move points by interpolating the blend between the corners of their cells; exactly where that is no slower."""
     require_shape("points", points, (None, 3))
     if len(anchors) == 1:
         return transform(dst_T_src[0], points)
     cells, first, cell_of = np.unique(cell_keys(points, _CELL_M), return_index=True, return_inverse=True)
     if len(points) <= _MIN_POINTS_PER_CELL * len(cells):
-        return _blended(points, anchors, dst_T_src)
+        return _blend(points, anchors, dst_T_src)
     low = np.floor(points[first] / _CELL_M)
     around = (low[:, None] + _CORNERS).reshape(-1, 3) * _CELL_M
     _, first, corner_of = np.unique(cell_keys(around, _CELL_M), return_index=True, return_inverse=True)
-    corners = _blended(around[first], anchors, dst_T_src)
+    corners = _blend(around[first], anchors, dst_T_src)
     corners_of_cell = corners[corner_of].reshape(len(cells), 3 * len(_CORNERS))
     return np.concatenate(
         [
@@ -116,7 +116,7 @@ def _between_corners(points: Float64Array, low: Float64Array, corners: Float64Ar
     return np.asarray(np.einsum("nk,nkj->nj", weights.reshape(-1, 8), corners.reshape(-1, 8, 3)))
 
 
-def _blended(points: Float64Array, anchors: Float64Array, dst_T_src: Float64Array) -> Float64Array:
+def _blend(points: Float64Array, anchors: Float64Array, dst_T_src: Float64Array) -> Float64Array:
     moved = np.zeros_like(points)
     nearest, weights = _weights(anchors, points)
     for k in range(nearest.shape[1]):

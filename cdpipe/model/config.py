@@ -1,4 +1,4 @@
-"""Every setting of the pipeline: one pydantic model, one dotted key each; a preset is a named set of them."""
+"""All settings of the pipeline in one pydantic model, each with a dotted key; a preset is a named set of settings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from cdpipe.core.yamlfile import (
 )
 
 Positive = Annotated[float, Field(gt=0)]
-# Smaller ones are noise, and could not be numbered a kilometre from the origin.
+# Smaller cells hold only noise, and `cell_keys` could not number them a kilometre from the origin.
 Cell = Annotated[float, Field(ge=0.01)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
@@ -33,7 +33,7 @@ Site = Literal["narrow", "wide"]
 
 
 class MapConfig(Settings):
-    """How scans become a thinned map and keyframes."""
+    """From scans to a thinned map and keyframes."""
 
     voxel_m: Cell = Field(0.2, description="cell of the thinned map")
     max_range_m: Positive = Field(60.0, description="returns beyond are not mapped")
@@ -41,7 +41,7 @@ class MapConfig(Settings):
 
 
 class DescriptorConfig(Settings):
-    """Which descriptor every keyframe gets while mapping."""
+    """The descriptor of every keyframe, computed while mapping."""
 
     method: Literal["3deg", "untrained", "scan-context", "solid"] = Field(
         "3deg", description="trained weights, the same network untrained, or one made by hand"
@@ -50,7 +50,7 @@ class DescriptorConfig(Settings):
 
 
 class MergeConfig(Settings):
-    """Both maps into one frame: candidate pairs of places, registration of spheres, acceptance, local refinement."""
+    """Alignment of both maps: candidate pairs of places, registration of spheres, acceptance, local refinement."""
 
     method: Literal["voting", "frame", "kiss-matcher"] = Field(
         "voting", description="candidates that agree; FRAME's closest pair; or KISS-Matcher on the whole maps"
@@ -94,7 +94,7 @@ class QueryConfig(Settings):
 
 
 class ExtractConfig(Settings):
-    """Cutting objects out of a region: the paper's point-to-voxel comparison, distances, or surfaces."""
+    """Object extraction: the paper's point-to-voxel comparison, distances, or surfaces."""
 
     method: Literal["surface", "voxel", "nearest"] = Field(
         "surface", description="distance from the other session's surface; the paper's voxels; or the nearest point's"
@@ -127,7 +127,7 @@ class OutlierConfig(Settings):
 
 
 class ClusterConfig(Settings):
-    """New points into objects."""
+    """From new points to objects."""
 
     radius_m: Positive = Field(0.5, description="points nearer than this are one object")
     min_points: Count = Field(16, description="smaller clusters are dropped")
@@ -142,7 +142,7 @@ class M3C2Config(Settings):
 
 
 class DufomapConfig(Settings):
-    """Voids that rays passed through (DUFOMap)."""
+    """Voxels that rays passed through (DUFOMap)."""
 
     voxel_m: Cell = Field(0.1, description="`dufomap`: voxel of the void map")
     hit_inflation_m: NonNegative = Field(0.2, description="`dufomap`: no void this near in front of a return (d_s)")
@@ -194,17 +194,18 @@ def preset_names() -> list[str]:
 def load_config(
     preset: str = "tunnelcd", settings: Iterable[str] | Mapping[str, Any] = (), site: Site = "narrow"
 ) -> PipelineConfig:
-    """Read a preset (a name or the path of a .yaml file) and write settings over it.
+    """Read a preset and apply settings to it.
 
     Args:
-        preset: What stands in it is for narrow drifts, and under `wide` what is otherwise in wide ones: the radius, and
-            with it the threshold.
-        settings: Written over either: `["query.radius_m=6"]`, `{"query.radius_m": 6}` or `{"query": {"radius_m": 6}}`.
-        site: Which of them.
+        preset: Name of a preset, or the path of a .yaml file. Its settings are for narrow drifts; the section `wide`
+            has those that differ in wide drifts: the radius, and with it the threshold.
+        settings: Replace those of the preset: `["query.radius_m=6"]`, `{"query.radius_m": 6}` or
+            `{"query": {"radius_m": 6}}`.
+        site: Narrow or wide drifts.
 
     Raises:
-        InputError: The preset is unknown or not made for such a site, or keys or values are wrong; all mistakes of
-            both kinds of site at once.
+        InputError: The preset is unknown or has no settings for the site, or keys or values are wrong. All mistakes for
+            both sites are reported at once.
     """
     settings = setting_lines(settings)
     narrow, wide = split_section(_preset_document(preset), "wide")

@@ -1,4 +1,4 @@
-"""The answer of a method: regions, objects, and all that was measured on the way."""
+"""The answer of a method: regions, objects, times and measurements."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, Int64Array, require_poses, require_shape, yaw_rad
+from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, Int64Array, require_poses, require_shapes, yaw_rad
 from cdpipe.model.types import Kind, SessionName, UInt8Array
 
 if TYPE_CHECKING:
@@ -21,16 +21,15 @@ class ChangeRegions:
 
     Attributes:
         centres_map: (R, 3) sphere centres, map frame, metres.
-        radius_m: Radius of all of them.
-        scores: (R,) change score, falling; larger means changed more surely.
+        radius_m: Radius of all spheres.
+        scores: (R,) change score, falling; a larger score means a surer change.
         pairs: (R, 2) int64 before and after keyframe of each.
-        is_reported: (R,) whether it stands in the answer: the threshold (or the fixed number) let it through, and it
-            was not withdrawn.
-        keyframe_scores: (K,) score of every before keyframe, NaN where the after session never came near.
-        is_withdrawn: (R,) whether it was let through and then nothing could be cut out of it; None where no region was.
-        direction: (R,) uint8, whose keyframe was looked up in the other session: 0 the before session's, 1 the after
-            session's (`pairs` has both, and the centre is where the one that was looked up stands); None for methods
-            that look up no keyframes.
+        is_reported: (R,) whether the region is in the answer: it passed the threshold (or the fixed number of regions)
+            and was not withdrawn.
+        keyframe_scores: (K,) score of every before keyframe, NaN if the after session never came near.
+        is_withdrawn: (R,) whether the region passed the threshold but contains no object; None if none was withdrawn.
+        direction: (R,) uint8 session whose keyframe was queried in the other session: 0 before, 1 after. The centre is
+            the position of that keyframe. None for methods that query no keyframes.
     """
 
     centres_map: Float64Array
@@ -44,36 +43,30 @@ class ChangeRegions:
 
     @property
     def is_proposed(self) -> BoolArray:
-        """(R,) whether the threshold (or the fixed number) let it through, whatever was cut out of it later."""
+        """(R,) whether the region passed the threshold (or the fixed number), withdrawn or not."""
         return self.is_reported if self.is_withdrawn is None else self.is_reported | self.is_withdrawn
 
     def __post_init__(self) -> None:
         n = len(self.scores)
-        if self.is_withdrawn is not None:
-            require_shape("is_withdrawn", self.is_withdrawn, (n,))
-            if (self.is_withdrawn & self.is_reported).any():
-                raise ValueError("is_withdrawn and is_reported: a region is one or the other")
-        if self.direction is not None:
-            require_shape("direction", self.direction, (n,))
-            if self.direction.dtype != np.uint8 or (self.direction > 1).any():
-                raise ValueError("direction must be uint8: 0 for a before keyframe that was looked up, 1 for an after")
-        require_shape("centres_map", self.centres_map, (n, 3))
-        require_shape("pairs", self.pairs, (n, 2))
-        require_shape("is_reported", self.is_reported, (n,))
+        require_shapes(self, centres_map=(n, 3), pairs=(n, 2), is_reported=(n,), is_withdrawn=(n,), direction=(n,))
         if self.is_reported.dtype != np.bool_:
             raise ValueError(f"is_reported must be a boolean mask, got {self.is_reported.dtype}")
+        if self.is_withdrawn is not None and (self.is_withdrawn & self.is_reported).any():
+            raise ValueError("is_withdrawn and is_reported: a region is one or the other")
+        if self.direction is not None and (self.direction.dtype != np.uint8 or (self.direction > 1).any()):
+            raise ValueError("direction must be uint8: 0 for a queried before keyframe, 1 for an after keyframe")
         if (np.diff(self.scores) > 0).any():
             raise ValueError("scores must fall: best candidate first")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectShape:
-    """How large an object is and how it stands, map frame.
+    """Size and pose of an object, map frame.
 
     Attributes:
-        map_T_box: (4, 4) pose of the oriented box around it: its centre, and its edges as axes; one axis is vertical.
+        map_T_box: (4, 4) pose of its oriented box: the centre, and the edges as axes; one axis is vertical.
         box_m: (3,) edges of that box, metres; the vertical one last.
-        volume_m3: What it takes up above the surface it stands on, as far as it was seen.
+        volume_m3: Volume of its observed part above the surface it stands on.
     """
 
     map_T_box: Float64Array
@@ -82,7 +75,7 @@ class ObjectShape:
 
     def __post_init__(self) -> None:
         require_poses("map_T_box", self.map_T_box[None])
-        require_shape("box_m", self.box_m, (3,))
+        require_shapes(self, box_m=(3,))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,16 +83,16 @@ class ChangedObject:
     """One object that is in one session and not in the other.
 
     Attributes:
-        session: The session whose returns it is made of.
-        kind: What happened to it.
-        region: Index of the region it was found in, -1 for methods without regions.
+        session: The session that holds its returns.
+        kind: Added, removed, moved or reshaped.
+        region: Index of its region, -1 for methods without regions.
         returns: (M, 2) int32 (scan, pixel) of its returns.
         points_map: (P, 3) its thinned points, map frame, metres.
-        score: Larger means surer.
-        partner: Index of the other half of a moved object in the report, or -1.
-        shape: Boxes and volume; None in a foreign answer that does not tell.
-        displacement_map: (3,) from where a moved object stood to where it stands, map frame, metres; the same in both
-            halves, None for what was not moved.
+        score: A larger score means a surer change.
+        partner: Index in the report of the other half of a moved object, or -1.
+        shape: Box and volume; None if a foreign answer does not contain them.
+        displacement_map: (3,) displacement of a moved object from before to after, map frame, metres; the same in both
+            halves, None if not moved.
     """
 
     session: SessionName
@@ -113,10 +106,7 @@ class ChangedObject:
     displacement_map: Float64Array | None = None
 
     def __post_init__(self) -> None:
-        require_shape("returns", self.returns, (None, 2))
-        require_shape("points_map", self.points_map, (None, 3))
-        if self.displacement_map is not None:
-            require_shape("displacement_map", self.displacement_map, (3,))
+        require_shapes(self, returns=(None, 2), points_map=(None, 3), displacement_map=(3,))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,12 +117,12 @@ class ChangeReport:
         before_T_after: (4, 4) the merge that was used.
         evidence: What the merge measured.
         regions: All candidates.
-        objects: What was cut out of the reported regions.
+        objects: Objects extracted from the reported regions.
         seconds: Wall-clock seconds per stage (`t_merge_s`, `t_cd_s`, `t_oe_s`, `t_descriptor_s`).
-        figures: (R,) value of each row of the paper's Table II per region, by column name; NaN where not reported.
-        keyframe_scans: Scans of the before and of the after keyframes that `regions.pairs` index.
+        figures: (R,) value of each row of the paper's Table II per region, by column name; NaN if not reported.
+        keyframe_scans: Scans of the before and of the after keyframes that `regions.pairs` indexes.
         config: The effective settings.
-        local_before_T_after: (Ka, 4, 4) the merge as refined at each after keyframe; None where `before_T_after` holds
+        local_before_T_after: (Ka, 4, 4) refined alignment at each after keyframe; None if `before_T_after` holds
             everywhere.
     """
 
@@ -149,12 +139,12 @@ class ChangeReport:
     def to_pandas(self, table: Literal["objects", "regions"] = "objects") -> pd.DataFrame:
         """Return the objects or the reported regions as a table; positions in the map frame, metres.
 
-        `objects`: one row per object: what happened to it, centroid and corners of its points, centre, level edges (the
-        longer one is the length), height and yaw of its upright box, volume, and how far a moved one went. What is not
-        known is empty.
+        `objects`: one row per object: kind, centroid and corners of its points, centre, horizontal edges (the longer
+        one is the length), height and yaw of its upright box, volume, and displacement if moved. Unknown values are
+        empty.
 
-        `regions`: one row per region that the threshold let through, best first. A withdrawn region does not stand in
-        the answer: nothing could be cut out of it.
+        `regions`: one row per region that passed the threshold, best first. A withdrawn region contains no object and
+        is not in the answer.
 
         Raises:
             ValueError: There is no such table.
@@ -163,11 +153,13 @@ class ChangeReport:
 
         if table not in ("objects", "regions"):
             raise ValueError(f"table must be 'objects' or 'regions', got {table!r}")
-        if table == "regions":
-            return pd.DataFrame(_region_columns(self))
-        return pd.DataFrame(
-            [_object_row(index, item) for index, item in enumerate(self.objects)], columns=_OBJECT_COLUMNS
-        )
+        if table == "objects":
+            rows = [_object_row(index, item) for index, item in enumerate(self.objects)]
+            return pd.DataFrame(rows, columns=_OBJECT_COLUMNS)
+        shown = np.flatnonzero(self.regions.is_proposed)
+        columns = {"score": self.regions.scores, "is_withdrawn": ~self.regions.is_reported}
+        columns |= {f"{axis}_m": self.regions.centres_map[:, k] for k, axis in enumerate(_AXES)} | dict(self.figures)
+        return pd.DataFrame({"region": shown, **{name: values[shown] for name, values in columns.items()}})
 
 
 _AXES = "xyz"
@@ -181,18 +173,6 @@ _OBJECT_COLUMNS = [
 ]
 
 
-def _region_columns(report: ChangeReport) -> dict[str, object]:
-    regions = report.regions
-    shown = np.flatnonzero(regions.is_proposed)
-    return {
-        "region": shown,
-        "score": regions.scores[shown],
-        "is_withdrawn": ~regions.is_reported[shown],
-        **{f"{axis}_m": regions.centres_map[shown, k] for k, axis in enumerate(_AXES)},
-        **{name: values[shown] for name, values in report.figures.items()},
-    }
-
-
 def _object_row(index: int, item: ChangedObject) -> tuple[object, ...]:
     points = item.points_map if len(item.points_map) else np.full((1, 3), np.nan)
     identity = index, item.session, item.kind, item.partner, item.region, item.score
@@ -203,7 +183,7 @@ def _object_row(index: int, item: ChangedObject) -> tuple[object, ...]:
 
 
 def _box_row(shape: ObjectShape | None) -> tuple[float, ...]:
-    """Return centre (3,), edges (3,), yaw in degrees and volume, NaN where nothing is known."""
+    """Return centre (3,), edges (3,), yaw in degrees and volume; NaN without a shape."""
     if shape is None:
         return (np.nan,) * 8
     yaw_deg = float(np.rad2deg(yaw_rad(shape.map_T_box)))

@@ -1,4 +1,4 @@
-"""What passes between the stages. Every class is frozen and rejects arrays of the wrong shape."""
+"""Types that the stages exchange. Every class is frozen and rejects arrays of the wrong shape."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from cdpipe.core.geometry import (
     Int32Array,
     Int64Array,
     require_poses,
-    require_shape,
+    require_shapes,
 )
 from cdpipe.model.alignment import PathAlignment
 
 Kind = Literal["added", "removed", "moved", "reshaped"]
 SessionName = Literal["before", "after"]
-PLACES = 256  # along each edge of a map's cell, at which a return can be kept
+PLACES = 256  # positions along the edge of a map cell to which a return is rounded
 Spheres = Float32Array | Int8Array
 UInt8Array = npt.NDArray[np.uint8]
 Float16Array = npt.NDArray[np.float16]
@@ -30,14 +30,14 @@ Float16Array = npt.NDArray[np.float16]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedScan:
-    """One LiDAR revolution with the pose the robot believed it had.
+    """One LiDAR revolution with its odometry pose.
 
     Attributes:
         index: Position of the scan in its session.
         points_sensor: (N, 3) float64 returns, metres, deskewed into the sensor frame at the revolution's pose.
         odom_T_sensor: (4, 4) float64 pose that maps sensor points into the session's odom frame.
         stamps_ns: (N,) int64 time of each return since the start of the session.
-        pixels: (N,) int32 where each return came from: row * W + column, or the row of the file it was read from.
+        pixels: (N,) int32 origin of each return: row * W + column, or the row of its file.
     """
 
     index: int
@@ -47,14 +47,12 @@ class PosedScan:
     pixels: Int32Array
 
     def __post_init__(self) -> None:
-        require_shape("points_sensor", self.points_sensor, (None, 3))
-        require_shape("odom_T_sensor", self.odom_T_sensor, (4, 4))
-        require_shape("stamps_ns", self.stamps_ns, (len(self.points_sensor),))
-        require_shape("pixels", self.pixels, (len(self.points_sensor),))
+        n = len(self.points_sensor)
+        require_shapes(self, points_sensor=(None, 3), odom_T_sensor=(4, 4), stamps_ns=(n,), pixels=(n,))
 
 
 class ScanSource(Protocol):
-    """A session as the pipeline sees it, whatever it was recorded with."""
+    """A session as the pipeline reads it, of any sensor and format."""
 
     @property
     def name(self) -> str:
@@ -73,7 +71,7 @@ class ScanSource(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeViews:
-    """Range image of each keyframe: space in front of the measured ranges was seen to be free.
+    """Range image of each keyframe: the space in front of the measured ranges is free.
 
     Attributes:
         ranges_m: (K, ROWS, COLUMNS) float16 range of the nearest return of each pixel (`cdpipe.mapping.free_space`), 0
@@ -85,18 +83,18 @@ class KeyframeViews:
     sensor_T_odom: Float64Array
 
     def __post_init__(self) -> None:
-        require_shape("ranges_m", self.ranges_m, (len(self.sensor_T_odom), None, None))
+        require_shapes(self, ranges_m=(len(self.sensor_T_odom), None, None))
         require_poses("sensor_T_odom", self.sensor_T_odom)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointMap:
-    """A thinned map and, for each of its points, the returns it stands for.
+    """A thinned map and, for each of its points, the returns that it represents.
 
     Attributes:
         points: (N, 3) float64 mean of the returns of each occupied cell, weighted by the inverse square of the ranges;
             session odom frame, metres.
-        nearest_m: (N,) float32 shortest range of the returns of each.
+        nearest_m: (N,) float32 shortest range of the returns of each point.
         voxel_m: Cell size of the thinning.
         odom_T_sensor: (S, 4, 4) pose of every scan.
         keyframe_scans: (K,) int64 index of the scan of each keyframe.
@@ -104,10 +102,10 @@ class PointMap:
         return_pixels: (M,) int32 pixel of each return within its scan.
         scan_offsets: (S + 1,) int64; the returns of scan s are scan_offsets[s]:scan_offsets[s + 1].
         seen_from: (N, 3) float32 mean position of the sensor when each point was seen, weighted like the point; None
-            where it is not known.
-        return_offsets: (M, 3) uint8 place of each return in its cell, in 1/PLACES of `voxel_m` from the cell's lower
-            corner; None where that was not kept.
-        views: Range images of the keyframes; None where they were not kept.
+            if unknown.
+        return_offsets: (M, 3) uint8 position of each return in its cell, in 1/PLACES of `voxel_m` from the cell's lower
+            corner; None if not stored.
+        views: Range images of the keyframes; None if not stored.
     """
 
     points: Float64Array
@@ -123,27 +121,26 @@ class PointMap:
     views: KeyframeViews | None = None
 
     def __post_init__(self) -> None:
-        require_shape("points", self.points, (None, 3))
-        if self.seen_from is not None:
-            require_shape("seen_from", self.seen_from, self.points.shape)
-        if self.return_offsets is not None:
-            require_shape("return_offsets", self.return_offsets, (len(self.return_points), 3))
-        require_shape("nearest_m", self.nearest_m, (len(self.points),))
+        n, m = len(self.points), len(self.return_points)
+        require_shapes(self, points=(None, 3), seen_from=(n, 3), nearest_m=(n,), keyframe_scans=(None,))
+        require_shapes(self, return_points=(m,), return_pixels=(m,), return_offsets=(m, 3))
+        require_shapes(self, scan_offsets=(len(self.odom_T_sensor) + 1,))
         require_poses("odom_T_sensor", self.odom_T_sensor)
-        require_shape("keyframe_scans", self.keyframe_scans, (None,))
-        require_shape("return_pixels", self.return_pixels, self.return_points.shape)
-        require_shape("scan_offsets", self.scan_offsets, (len(self.odom_T_sensor) + 1,))
 
     def positions_of(self, returns: Int64Array) -> Float64Array:
-        """Return the (N, 3) places of (N,) returns, the session's odom frame, metres, to 1/PLACES of a cell.
+        """Return the (N, 3) positions of (N,) returns, the session's odom frame, metres, to 1/PLACES of a cell.
 
         Raises:
-            ValueError: The map did not keep them.
+            ValueError: The map does not store them.
         """
         if self.return_offsets is None:
-            raise ValueError("return_offsets is None: this map does not know where its returns are")
+            raise ValueError("return_offsets is None: this map does not store the positions of its returns")
         cells = np.floor(self.points[self.return_points[returns]] / self.voxel_m)
         return (cells + (self.return_offsets[returns] + 0.5) / PLACES) * self.voxel_m
+
+    def scans_of(self, returns: Int64Array) -> Int64Array:
+        """Return the (N,) scan of each of (N,) returns."""
+        return np.searchsorted(self.scan_offsets, returns, side="right") - 1
 
     @property
     def odom_T_keyframe(self) -> Float64Array:
@@ -157,10 +154,10 @@ class DescriptorSet:
 
     Attributes:
         q: (K, D) float32 place vectors, unit length, unchanged by a turn of the sensor.
-        w: (K, D) float32 orientation vectors, or None for descriptors that have none.
+        w: (K, D) float32 orientation vectors, or None for descriptors without them.
         keyframe_scans: (K,) int64 scan of each keyframe.
-        name: Which descriptor.
-        checkpoint: Digest of the weights, or "" where there are none.
+        name: Name of the descriptor.
+        checkpoint: Digest of the weights, or "" without weights.
         spheres: (K, E) float32 or int8 descriptor of the map around each keyframe (`describe_map`), or None.
     """
 
@@ -172,17 +169,13 @@ class DescriptorSet:
     spheres: Spheres | None = None
 
     def __post_init__(self) -> None:
-        require_shape("q", self.q, (None, None))
-        if self.spheres is not None:
-            require_shape("spheres", self.spheres, (len(self.q), None))
-        if self.w is not None:
-            require_shape("w", self.w, (len(self.q), None))
-        require_shape("keyframe_scans", self.keyframe_scans, (len(self.q),))
+        n = len(self.q)
+        require_shapes(self, q=(n, None), spheres=(n, None), w=(n, None), keyframe_scans=(n,))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedSession:
-    """What a robot brings home: its thinned map, and descriptors of all of its keyframes or of none."""
+    """A mapped session: its thinned map, and descriptors of all of its keyframes or of none."""
 
     map: PointMap
     descriptors: DescriptorSet
@@ -200,19 +193,18 @@ class MappedSession:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MergedMaps:
-    """Both maps in the before session's odom frame, from here on called `map`.
+    """Both maps and their alignment; the before session's odom frame is the map frame.
 
-    Two odometries drift apart, so no single transform fits everywhere: `alignment` says where the after session's odom
-    frame lies around each place of its path.
+    Two odometries drift apart, so no single transform fits everywhere: `alignment` varies along the after path.
 
     Attributes:
-        before: The before map; its odom frame is the map frame.
+        before: The before map.
         after: The after map, still in its own odom frame.
-        before_T_after: (4, 4) pose of the after session's odom frame in the map frame, one for the whole map.
-        evidence: What was measured about the alignment, by name.
+        before_T_after: (4, 4) pose of the after session's odom frame in the map frame, one for the full map.
+        evidence: Measurements of the alignment, by name.
         is_accepted: Whether the evidence suffices.
-        reason: Why not, or "".
-        local: The same place by place, as refined; None where nothing was.
+        reason: Reason of a refusal, or "".
+        local: The local alignment along the path; None if it was not refined.
         seconds: Wall-clock seconds of `t_index_s`, `t_merge_s` and `t_refine_s`.
     """
 
@@ -230,5 +222,22 @@ class MergedMaps:
 
     @property
     def alignment(self) -> PathAlignment:
-        """What every later stage aligns with."""
+        """The alignment that all later stages use."""
         return PathAlignment.rigid(self.before_T_after) if self.local is None else self.local
+
+    def map_of(self, session: SessionName) -> PointMap:
+        """Return the map of a session, in its own odom frame."""
+        return self.before if session == "before" else self.after
+
+    def to_map(self, session: SessionName, points_odom: Float64Array) -> Float64Array:
+        """Return (N, 3) points of a session's odom frame in the map frame, metres."""
+        return points_odom if session == "before" else self.alignment.to_map(points_odom)
+
+    def to_odom(self, session: SessionName, points_map: Float64Array) -> Float64Array:
+        """Return (N, 3) points of the map frame in a session's odom frame, metres."""
+        return points_map if session == "before" else self.alignment.to_odom(points_map)
+
+    def keyframe_positions(self, before: DescriptorSet, after: DescriptorSet) -> tuple[Float64Array, Float64Array]:
+        """Return the (Kb, 3) before and (Ka, 3) after positions of the described keyframes, map frame, metres."""
+        after_positions = self.after.odom_T_sensor[after.keyframe_scans, :3, 3]
+        return self.before.odom_T_sensor[before.keyframe_scans, :3, 3], self.alignment.to_map(after_positions)

@@ -36,8 +36,7 @@ def sphere_difference(
     Returns:
         (Kb,) shares in [0, 1]; NaN for a keyframe without an after keyframe within `max_pair_m` or without points.
     """
-    before_path = merged.before.odom_T_sensor[before.keyframe_scans, :3, 3]
-    after_path = merged.alignment.to_map(merged.after.odom_T_sensor[after.keyframe_scans, :3, 3])
+    before_path, after_path = merged.keyframe_positions(before, after)
     seen_before = merged.before.points[is_within(merged.before.points, after_path, config.radius_m)]
     after_points = merged.alignment.to_map(merged.after.points)
     # after points far from every before keyframe are in no sphere, so they need no distance

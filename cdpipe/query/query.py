@@ -46,10 +46,9 @@ class _Places:
     """Map positions of all keyframes, and the spatially nearest keyframe of the other session."""
 
     def __init__(self, merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> None:
-        self.before = merged.before.odom_T_sensor[before.keyframe_scans, :3, 3]
-        self.after = merged.alignment.to_map(merged.after.odom_T_sensor[after.keyframe_scans, :3, 3])
-        gap_b, self.near_a = _nearest(self.before, self.after)
-        gap_a, self.near_b = _nearest(self.after, self.before)
+        self.before, self.after = merged.keyframe_positions(before, after)
+        gap_b, self.near_a = query_nearest(self.before, self.after)
+        gap_a, self.near_b = query_nearest(self.after, self.before)
         self.is_covered_b, self.is_covered_a = gap_b <= config.max_pair_m, gap_a <= config.max_pair_m
 
     @property
@@ -67,8 +66,8 @@ def _score_by_scans(places: _Places, before: DescriptorSet, after: DescriptorSet
     """
     is_covered_b, is_covered_a = places.is_covered_b, places.is_covered_a
     if config.reading == "nearest":
-        score_b, partner_of_b = _nearest(before.q, after.q)
-        score_a, partner_of_a = _nearest(after.q, before.q)
+        score_b, partner_of_b = query_nearest(before.q, after.q)
+        score_a, partner_of_a = query_nearest(after.q, before.q)
         is_candidate_b, is_candidate_a = np.isfinite(score_b), np.isfinite(score_a)
     else:
         partner_of_b, partner_of_a = places.near_a, places.near_b
@@ -153,7 +152,7 @@ def _suppress_neighbours(centres: Float64Array, distance_m: float) -> BoolArray:
     return is_kept
 
 
-def _nearest(points: npt.NDArray[Any], others: npt.NDArray[Any]) -> tuple[Float64Array, Int64Array]:
+def query_nearest(points: npt.NDArray[Any], others: npt.NDArray[Any]) -> tuple[Float64Array, Int64Array]:
     """Return distance and index of the nearest of `others` for each point; infinity and 0 if there are none."""
     if len(others) == 0 or len(points) == 0:
         return np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64)

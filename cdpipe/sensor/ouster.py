@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, require_shape, transform
-from cdpipe.sensor.ouster_metadata import parse_fields, read_document, require_mode
+from cdpipe.core.geometry import Float64Array, require_shapes, transform
+from cdpipe.core.yamlfile import read_json
+from cdpipe.sensor.ouster_metadata import METADATA_FILE, parse_fields, require_mode
 
 
 @dataclass(frozen=True, slots=False, eq=False)
@@ -48,9 +49,8 @@ class SensorMetadata:
     pixel_shift: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        require_shape("altitude_deg", self.altitude_deg, (None,))
-        require_shape("azimuth_deg", self.azimuth_deg, self.altitude_deg.shape)
-        require_shape("sensor_T_lidar", self.sensor_T_lidar, (4, 4))
+        n = len(self.altitude_deg)
+        require_shapes(self, altitude_deg=(n,), azimuth_deg=(n,), sensor_T_lidar=(4, 4))
 
     @property
     def height(self) -> int:
@@ -143,7 +143,7 @@ def load_profile(name_or_path: str, mode: str | None = None) -> SensorMetadata:
         InputError: The profile is unknown, the file is no complete Ouster metadata, or the mode is not in `MODES`.
     """
     if name_or_path.endswith(".json"):
-        document = read_document(Path(name_or_path))
+        document = read_json(Path(name_or_path), METADATA_FILE)
     elif name_or_path in profile_names():
         document = json.loads((_profiles() / f"{name_or_path}.json").read_text())
     else:

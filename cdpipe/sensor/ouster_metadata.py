@@ -6,10 +6,8 @@ firmware and of the vendor's SDK.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +15,7 @@ import numpy as np
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 
+METADATA_FILE = "expected the metadata .json of an Ouster sensor"
 MODES = ("512x10", "512x20", "1024x10", "1024x20", "2048x10")
 
 _SECTIONS = ("sensor_info", "config_params", "beam_intrinsics", "lidar_intrinsics", "imu_intrinsics")
@@ -26,26 +25,6 @@ _OTHER_BEAM_ORIGIN_MM = 12.163
 _FARTHEST_BEAM_ORIGIN_MM = 100.0
 _LIDAR_TO_SENSOR_MM = (-1.0, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 36.18, 0, 0, 0, 1)
 _BEAMS_OF_PRODUCT = re.compile(r"^OS-[0-9A-Za-z]+-(\d+)")
-
-
-def read_document(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        InputError: The file is missing, cannot be read, or holds no JSON object.
-    """
-    expected = "expected the metadata .json of an Ouster sensor"
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such sensor metadata file") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}): {expected}") from error
-    except (ValueError, RecursionError) as error:  # not text, not JSON, numbers too long or nesting too deep
-        raise InputError(f"{path}: not JSON ({error}): {expected}") from error
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: holds a JSON {type(document).__name__}: {expected}")
-    return document
 
 
 def parse_fields(document: Mapping[str, Any], source: str, mode: str | None = None) -> dict[str, Any]:

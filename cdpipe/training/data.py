@@ -116,7 +116,10 @@ class ChangePairs(torch.utils.data.Dataset[dict[str, Any]]):
         tunnel = self._tunnels[place]
         before_it = int(self._ends[place - 1]) if place else 0
         nth_draw, anchor = divmod(index - before_it, tunnel.n_before)
-        draw, arrays = self._draws[nth_draw], self._arrays(place)
+        draw = self._draws[nth_draw]
+        if self._held[0] != place:
+            self._held = place, read_shard(tunnel.path, _PER_PAIR)[0]
+        arrays = self._held[1]
         return {
             "before_image": torch.from_numpy(arrays["before_images"][anchor]),
             "after_image": torch.from_numpy(arrays["after_images"][draw, anchor]),
@@ -129,11 +132,6 @@ class ChangePairs(torch.utils.data.Dataset[dict[str, Any]]):
             "draw": draw,
             "anchor": anchor,
         }
-
-    def _arrays(self, place: int) -> dict[str, Any]:
-        if self._held[0] != place:
-            self._held = place, read_shard(self._tunnels[place].path, _PER_PAIR)[0]
-        return self._held[1]
 
 
 def stacked(tunnels: Sequence[TunnelShard], names: Sequence[str]) -> dict[str, Tensor]:

@@ -48,7 +48,7 @@ class Task(Protocol):
 
     @property
     def network(self) -> nn.Module:
-        """The network; `fit` changes its weights."""
+        """The network; `fit` trains it."""
 
     def losses(self, step: int) -> dict[str, Tensor]:
         """Return the terms of a step's loss by name; their sum is minimised."""
@@ -121,7 +121,7 @@ def fit(
     sums: dict[str, float] = {}
     began = perf_counter() - (history[-1].seconds if history else 0.0)
     for step in range(history[-1].step if history else 0, config.steps):
-        if _is_stopped(history, config.patience):
+        if len(history) > config.patience and not any(done.is_best for done in history[-config.patience :]):
             break
         for group in optimiser.param_groups:
             group["lr"] = learning_rate(step, config)
@@ -151,10 +151,6 @@ def fit(
     network.load_state_dict(best)
     network.eval()
     return history
-
-
-def _is_stopped(history: list[Progress], patience: int) -> bool:
-    return len(history) > patience and not any(done.is_best for done in history[-patience:])
 
 
 def _save(

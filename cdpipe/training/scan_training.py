@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, require_shape, stream
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, require_shapes, stream
 from cdpipe.descriptors.network import DIMENSIONS, PlaceNetwork, yaw_correlation
 from cdpipe.descriptors.range_image import COLUMNS
 
@@ -50,9 +50,7 @@ class PlaceData:
 
     def __post_init__(self) -> None:
         n = len(self.images_m)
-        require_shape("positions", self.positions, (n, 3))
-        for name in ("headings_rad", "tunnels", "sessions"):
-            require_shape(name, getattr(self, name), (n,))
+        require_shapes(self, positions=(n, 3), headings_rad=(n,), tunnels=(n,), sessions=(n,))
 
 
 TUNNELS_PER_BATCH = 8
@@ -60,14 +58,14 @@ ANCHORS_PER_TUNNEL = 8
 
 
 class PlaceTask:
-    """Trains a place network on some tunnels and scores it on others.
+    """Trains a place network, `network`, on some tunnels and scores it on others.
 
     Raises:
         InputError: No place of the training tunnels was visited by both sessions.
     """
 
     def __init__(self, network: PlaceNetwork, training: PlaceData, validation: PlaceData, seed: int) -> None:
-        self._network, self._data, self._validation, self._seed = network, training, validation, seed
+        self.network, self._data, self._validation, self._seed = network, training, validation, seed
         self._partners = _partners(training)
         paired = np.array([len(partners) > 0 for partners in self._partners])
         by_tunnel = [np.flatnonzero(paired & (training.tunnels == tunnel)) for tunnel in np.unique(training.tunnels)]
@@ -77,11 +75,6 @@ class PlaceTask:
                 f"training tunnels: no keyframe within {SAME_PLACE_M:g} m of one of the other session; make tunnels "
                 "that both sessions drive through"
             )
-
-    @property
-    def network(self) -> PlaceNetwork:
-        """The network."""
-        return self._network
 
     def losses(self, step: int) -> dict[str, Tensor]:
         """Return the classification losses of q and w."""
@@ -93,8 +86,11 @@ class PlaceTask:
         # a mirrored tunnel counts as another tunnel, so all its keyframes are mirrored together
         tunnels, index = np.unique(self._data.tunnels[chosen], return_inverse=True)
         images, headings = _mirror(images, headings, (draw.random(len(tunnels)) < 0.5)[index])
-        q, w = self._network(images)
-        place_loss = _place_loss(q, _is_other_place(self._data, anchors, chosen))
+        q, w = self.network(images)
+        positions, tunnel_of = self._data.positions, self._data.tunnels
+        apart_m = np.linalg.norm(positions[anchors, None] - positions[None, chosen], axis=2)
+        is_other = (tunnel_of[anchors, None] != tunnel_of[None, chosen]) | (apart_m > OTHER_PLACE_M)
+        place_loss = _place_loss(q, torch.from_numpy(is_other))
         return {"place": place_loss, "yaw": _YAW_WEIGHT * _yaw_loss(w, headings)}
 
     def _anchors(self, draw: np.random.Generator) -> Int64Array:
@@ -106,7 +102,7 @@ class PlaceTask:
 
     def scores(self) -> dict[str, float]:
         """Return the scores of `evaluate` on the validation tunnels."""
-        return evaluate(self._network, self._validation)
+        return evaluate(self.network, self._validation)
 
     def finish(self) -> dict[str, float]:
         """Return no figures: nothing is calibrated."""
@@ -173,12 +169,6 @@ def _mirror(images: Tensor, headings_rad: Float64Array, is_mirrored: BoolArray) 
     """Mirror the marked images; a mirrored heading changes its sign."""
     flips = torch.from_numpy(is_mirrored)[:, None, None]
     return torch.where(flips, images.flip(2), images), np.where(is_mirrored, -headings_rad, headings_rad)
-
-
-def _is_other_place(data: PlaceData, anchors: Int64Array, chosen: Int64Array) -> Tensor:
-    apart = np.linalg.norm(data.positions[anchors, None] - data.positions[None, chosen], axis=2)
-    other_tunnel = data.tunnels[anchors, None] != data.tunnels[None, chosen]
-    return torch.from_numpy(other_tunnel | (apart > OTHER_PLACE_M))
 
 
 def _place_loss(q: Tensor, is_negative: Tensor) -> Tensor:

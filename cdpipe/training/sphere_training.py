@@ -97,19 +97,12 @@ def read_sphere_data(tunnels: Sequence[TunnelShard]) -> SphereData:
         parts["labels"].append(arrays["labels"][covered])
         parts["tunnels"].append(np.full(covered.sum(), place))
         parts["score_radius_m"].append(np.full(covered.sum(), about["score_radius_m"]))
-    joined = {name: np.concatenate(arrays) for name, arrays in parts.items()}
+    joined: dict[str, Any] = {name: np.concatenate(arrays) for name, arrays in parts.items()}
     if len(joined["labels"]) == 0:
         raise InputError("no keyframe of these tunnels was seen by both sessions: make a larger dataset")
-    return SphereData(
-        before_m=torch.from_numpy(joined["before_m"]),
-        after_m=torch.from_numpy(joined["after_m"]),
-        before_marks=torch.from_numpy(joined["before_marks"]),
-        after_marks=torch.from_numpy(joined["after_marks"]),
-        positions=joined["positions"],
-        labels=joined["labels"].astype(np.int64),
-        tunnels=joined["tunnels"],
-        score_radius_m=joined["score_radius_m"],
-    )
+    joined["labels"] = joined["labels"].astype(np.int64)
+    images = ("before_m", "after_m", "before_marks", "after_marks")
+    return SphereData(**joined | {name: torch.from_numpy(joined[name]) for name in images})
 
 
 def sector_targets(before_marks: Tensor, after_marks: Tensor) -> Tensor:
@@ -125,10 +118,10 @@ def sector_targets(before_marks: Tensor, after_marks: Tensor) -> Tensor:
 
 
 class SphereTask:
-    """Trains a sphere network on some tunnels and scores it on others."""
+    """Trains a sphere network, `network`, on some tunnels and scores it on others."""
 
     def __init__(self, network: SphereNetwork, training: SphereData, validation: SphereData, seed: int) -> None:
-        self._network, self._data, self._validation, self._seed = network, training, validation, seed
+        self.network, self._data, self._validation, self._seed = network, training, validation, seed
         targets = sector_targets(training.before_marks, training.after_marks[:, 0])
         self._changed = torch.nonzero((targets == 1).any(dim=1))[:, 0].numpy()
         self._unchanged = torch.nonzero((targets == 0).all(dim=1))[:, 0].numpy()
@@ -137,15 +130,10 @@ class SphereTask:
         if not len(self._donors) or not len(self._unchanged):
             raise InputError("training needs keyframes with an object added and keyframes without: make more tunnels")
 
-    @property
-    def network(self) -> SphereNetwork:
-        """The network."""
-        return self._network
-
     def losses(self, step: int) -> dict[str, Tensor]:
         """Return the classification loss of the sectors and that of the keyframes."""
         before, after, targets = self.batch(step)
-        logits = self._network(before, after)
+        logits = self.network(before, after)
         is_known = targets >= 0
         weight = torch.tensor(_POSITIVE_WEIGHT)
         each = functional.binary_cross_entropy_with_logits(
@@ -183,7 +171,7 @@ class SphereTask:
         The log-likelihood selects the weights, because the AUROC saturates at 1.
         """
         data = self._validation
-        pooled = pooled_scores(self._network, data, draw=min(1, data.n_draws - 1))
+        pooled = pooled_scores(self.network, data, draw=min(1, data.n_draws - 1))
         by_tunnel = [
             _auroc(pooled[mask], data.labels[mask])
             for mask in (data.tunnels == tunnel for tunnel in np.unique(data.tunnels))
@@ -199,10 +187,10 @@ class SphereTask:
         """Calibrate the log-odds on the validation tunnels (Platt); return slope, offset and Brier score."""
         data = self._validation
         used = data.labels >= 0
-        pooled = pooled_scores(self._network, data, draw=min(1, data.n_draws - 1))[used]
+        pooled = pooled_scores(self.network, data, draw=min(1, data.n_draws - 1))[used]
         slope, offset, _ = fit_platt(pooled, data.labels[used] == 1)
-        self._network.calibration.copy_(torch.tensor([slope, offset], dtype=torch.float64))
-        found = torch.sigmoid(self._network.calibrated(torch.from_numpy(pooled))).numpy()
+        self.network.calibration.copy_(torch.tensor([slope, offset], dtype=torch.float64))
+        found = torch.sigmoid(self.network.calibrate(torch.from_numpy(pooled))).numpy()
         return {"slope": slope, "offset": offset, "brier": float(np.mean((found - data.labels[used]) ** 2))}
 
 

@@ -204,14 +204,14 @@ def kiss_and_gicp(before_points: Float64Array, after_points: Float64Array, voxel
     centre = before_points.mean(axis=0)
     fine = small_gicp.align(
         before_points - centre,
-        transform(found.before_T_after, after_points) - centre,
+        transform(found, after_points) - centre,
         registration_type="GICP",
         downsampling_resolution=_GICP_CELL_M,
         max_correspondence_distance=max(_GICP_REACH_M, 2 * voxel_m),
         num_threads=1,
     )
     pose = make_pose(translation=centre) @ fine.T_target_source @ make_pose(translation=-centre)
-    return np.asarray(pose @ found.before_T_after)
+    return np.asarray(pose @ found)
 
 
 def against_limit(seconds: Sequence[float], limit_s: float, remark: str = "") -> Contest:

@@ -91,7 +91,7 @@ def coarse_merge() -> str:
     found = register_globally(transform(before_T_after, _room(0)), _room(1), 0.4)
     if found is None:
         raise RuntimeError("two samples of one room were not matched")
-    off_m = float(np.linalg.norm(found.before_T_after[:3, 3] - before_T_after[:3, 3]))
+    off_m = float(np.linalg.norm(found[:3, 3] - before_T_after[:3, 3]))
     _require(off_m < 0.5, f"two samples of one room were matched {off_m:.2f} m off")
     return f"matches two samples of a room within {100 * off_m:.0f} cm"
 
@@ -116,9 +116,9 @@ def surface_distance() -> str:
     import numpy as np
 
     from cdpipe.core.geometry import stream
-    from cdpipe.methods.m3c2 import loaded_py4dgeo
+    from cdpipe.methods.m3c2 import load_py4dgeo
 
-    py4dgeo, rng = loaded_py4dgeo(), stream(0, "doctor", "floor")
+    py4dgeo, rng = load_py4dgeo(), stream(0, "doctor", "floor")
     # of an exact plane its error cannot be told, and there is no distance
     floor = np.column_stack([rng.uniform(-1.0, 1.0, (2000, 2)), rng.normal(0.0, 0.001, 2000)])
     algorithm = py4dgeo.M3C2(
@@ -137,13 +137,13 @@ def void() -> str:
     """Ask what lies in the air that rays to a wall passed through (dufomap)."""
     import numpy as np
 
-    from cdpipe.methods.dufomap import loaded_dufomap
+    from cdpipe.methods.dufomap import load_dufomap
 
     across = np.arange(-2.0, 2.0, 0.02)
     y, z = (grid.ravel() for grid in np.meshgrid(across, across))
     wall = np.column_stack([np.full(len(y), 4.0), y, z])
     pose = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
-    voids = loaded_dufomap().dufomap(0.1, 0.2, 1, 1)
+    voids = load_dufomap().dufomap(0.1, 0.2, 1, 1)
     voids.run(wall, pose, False)
     in_air, on_wall = voids.segment(np.array([[2.0, 0.0, 0.0], [4.0, 0.0, 0.0]]), pose, False)
     _require(bool(in_air) and not on_wall, "what rays passed through and what they hit was not told apart")

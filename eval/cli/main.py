@@ -13,6 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from cdpipe.core.threads import fix_threads
+from eval.cli import converting
 from eval.cli import pair as commands_pair
 from eval.cli import run as commands_run
 from eval.cli import tools as commands_tools
@@ -50,7 +51,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "view": commands_world.view,
     "describe": commands_pair.describe,
     "detect": commands_pair.detect,
-    "convert": commands_world.convert,
+    "convert": converting.convert,
     "score": commands_run.score,
     "run": commands_run.run_command,
     "report": commands_run.report,

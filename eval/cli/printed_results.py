@@ -26,8 +26,8 @@ def print_results(folder: Path, quiet: bool) -> None:
         return
     import pandas as pd
 
-    from eval.plans.coverage import coverage
-    from eval.plans.targets import targets_of
+    from eval.plans.coverage import measure_coverage
+    from eval.plans.targets import read_targets
     from eval.running.predictions import list_incomplete_variants
     from eval.running.runfolder import RunFolder
     from eval.tables.merge_table import merge_overview
@@ -42,8 +42,8 @@ def print_results(folder: Path, quiet: bool) -> None:
     cases = zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
     is_told = (folder / "provenance.json").is_file()
     provenance = RunFolder(folder).provenance() if is_told else {}
-    covered = coverage(provenance, cases)
-    targets = merge_overview(results, targets_of(provenance), is_whole=covered.is_whole)
+    covered = measure_coverage(provenance, cases)
+    targets = merge_overview(results, read_targets(provenance), is_whole=covered.is_whole)
     if not covered.is_whole:
         typer.echo(f"{covered.sentence}\n")
     if len(targets):

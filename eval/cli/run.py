@@ -52,10 +52,10 @@ def run_command(
 ) -> None:
     """Run a plan: scenarios x seeds x variants. Finished cells are kept."""
     from eval.core.cluster import Where, require_reachable, require_usable
-    from eval.plans.changes import changed_plan
+    from eval.plans.changes import change_plan
     from eval.plans.plan import load_plan
 
-    chosen = changed_plan(load_plan(plan), seeds=seeds, presets=preset or (), settings=settings or (), grid=grid or ())
+    chosen = change_plan(load_plan(plan), seeds=seeds, presets=preset or (), settings=settings or (), grid=grid or ())
     where = Where(workers, scheduler)
     require_usable(where)
     if dry_run:
@@ -166,11 +166,11 @@ def _list_cells(plan: Plan, out: Path, *, force: bool, limit: int | None) -> Non
 
 
 def _run(plan: Plan, out: Path, where: Where, *, force: bool, limit: int | None, quiet: bool) -> None:
-    from eval.plans.plan import cells
+    from eval.plans.plan import expand_cells
     from eval.running.runfolder import removed_if_empty, start_run_folder
     from eval.running.runner import run_plan
 
-    cells(plan)  # raises where settings contradict each other, before a folder is made
+    expand_cells(plan)  # raises where settings contradict each other, before a folder is made
     command = ["tunnelcd", *sys.argv[1:]]
     with removed_if_empty(out), shown_progress(quiet, rate="cells") as progress:
         run = start_run_folder(out)

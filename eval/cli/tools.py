@@ -103,7 +103,7 @@ def check_file(name_or_path: str) -> str:
     from cdpipe.core.yamlfile import read_yaml, suggest
     from cdpipe.model.config import PipelineConfig, load_config, preset_names
     from eval.plans.files import plan_names
-    from eval.plans.plan import Plan, cells, load_plan
+    from eval.plans.plan import Plan, expand_cells, load_plan
     from scenarios import check_scenario, scenario_names
     from scenarios.schema import Scenario
 
@@ -124,7 +124,7 @@ def check_file(name_or_path: str) -> str:
         own = set(content) if isinstance(content, dict) else set()
         kind = max(keys, key=lambda name: len(own & keys[name]))
     if kind == "plan":
-        return f"a plan of {len(cells(load_plan(name_or_path)))} cells"
+        return f"a plan of {len(expand_cells(load_plan(name_or_path)))} cells"
     if kind == "scenario":
         check_scenario(name_or_path)
     else:

@@ -58,10 +58,10 @@ def train(
     """Train a descriptor: checkpoint (safetensors), model card, curves. The same command resumes an interrupted run."""
     from cdpipe.core.errors import InputError
     from cdpipe.training.fit import FitConfig
-    from eval.training.training_run import TASKS, train_descriptor
+    from eval.training.training_run import SOURCES, train_descriptor
 
-    if descriptor not in TASKS:
-        raise InputError(f"--descriptor {descriptor}: expected {' or '.join(TASKS)}")
+    if descriptor not in SOURCES:
+        raise InputError(f"--descriptor {descriptor}: expected {' or '.join(SOURCES)}")
     command = shlex.join(["tunnelcd", *sys.argv[1:]])
     with shown_progress(quiet) as progress:
         config = FitConfig(seed, steps, patience=patience)

@@ -140,38 +140,3 @@ def load_view(what: str, seed: int | None = None, settings: Sequence[str] = ()) 
         hint = suggest(what, names) or "; `tunnelcd list` names the scenarios"
         raise InputError(f"{what}: neither a folder nor a scenario{hint}")
     return view_scenario(load_scenario(what, seed or 0, settings), seed or 0)
-
-
-def convert(
-    source: Annotated[Path, typer.Argument(metavar="SRC", help="session folder; or a recording, .osf or .pcap")],
-    out: Annotated[Path, typer.Argument(metavar="DST", help="new .osf file; or new session folder")],
-    metadata: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.json", help="sensor of a .pcap; else the .json beside it", show_default=False),
-    ] = None,
-    trajectory: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.tum", help="poses of the sensor, stamped by its clock", show_default=False),
-    ] = None,
-    odometry: Annotated[
-        str | None, typer.Option(metavar="kiss-icp", help="estimate the poses", show_default=False)
-    ] = None,
-    without_truth: Annotated[
-        bool, typer.Option("--without-truth", help="leave LABEL and INSTANCE out of the .osf")
-    ] = False,
-    quiet: Quiet = False,
-) -> None:
-    """Convert a session to OSF for the vendor's SDK, or an OSF or PCAP recording of an Ouster to a session."""
-    from eval.cli import converting
-
-    with shown_progress(quiet) as progress:
-        told = converting.convert(
-            source,
-            out,
-            progress,
-            metadata=metadata,
-            trajectory=trajectory,
-            odometry=odometry,
-            without_truth=without_truth,
-        )
-    say(quiet, told)

@@ -12,7 +12,7 @@ from cdpipe.core.geometry import Int64Array
 from cdpipe.model.config import QueryConfig
 from cdpipe.model.report import ChangeRegions
 from cdpipe.query.query import rank_regions
-from eval.scoring.region_metrics import places_in_map
+from eval.scoring.region_metrics import transform_to_map
 from eval.truth.ground_truth import GroundTruth
 
 
@@ -42,7 +42,7 @@ def regions_by_truth(
         for session, scans in zip((truth.before, truth.after), keyframe_scans, strict=True)
     ]
     return rank_regions(
-        centres_map=places_in_map(places_world, truth.before, keyframe_scans[0]),
+        centres_map=transform_to_map(places_world, truth.before, keyframe_scans[0]),
         scores=np.ones(len(chosen)),
         pairs=np.column_stack(nearest),
         keyframe_scores=np.zeros(0),

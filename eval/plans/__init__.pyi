@@ -1,13 +1,13 @@
-from .changes import changed_plan
+from .changes import change_plan
 from .files import plan_names
-from .plan import Plan, cells, load_plan, parse_seeds
+from .plan import Plan, expand_cells, load_plan, parse_seeds
 from .variants import Cell
 
 __all__ = [
     "Cell",
     "Plan",
-    "cells",
-    "changed_plan",
+    "change_plan",
+    "expand_cells",
     "load_plan",
     "parse_seeds",
     "plan_names",

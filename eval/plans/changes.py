@@ -10,12 +10,12 @@ import yaml
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import Document, validate
-from eval.plans.parts import acts_on_true_regions, key_of, valid_setting, valid_settings
+from eval.plans.parts import get_key, has_effect_on_true_regions, require_valid_setting, require_valid_settings
 from eval.plans.plan import Plan, parse_seeds
-from eval.plans.worlds import group_of
+from eval.plans.worlds import get_group
 
 
-def changed_plan(
+def change_plan(
     plan: Plan,
     *,
     seeds: str | None = None,
@@ -38,44 +38,44 @@ def changed_plan(
         InputError: An option is malformed, or its key or value is wrong.
     """
     _refuse_mistakes(seeds, settings, grid)
-    axes = [_grid_axis(text) for text in grid]
+    axes = [_read_axis(text) for text in grid]
     document = plan.model_dump(mode="json")
     if seeds is not None:
         document["seeds"] = parse_seeds(seeds)
     if presets:
         document |= {"variants": [{"preset": name, "set": [], "per_scenario": {}} for name in presets], "grid": []}
-    overridden = {key_of(setting) for setting in (*settings, *itertools.chain(*axes))}
+    overridden = {get_key(setting) for setting in (*settings, *itertools.chain(*axes))}
     document["variants"] = [
         {
             **variant,
-            "set": [*_without(variant["set"], overridden), *added],
-            "per_scenario": {name: _without(own, overridden) for name, own in variant["per_scenario"].items()},
+            "set": [*_drop_settings(variant["set"], overridden), *added],
+            "per_scenario": {name: _drop_settings(own, overridden) for name, own in variant["per_scenario"].items()},
         }
         for variant in document["variants"]
-        for added in _additions(variant, axes, settings)
+        for added in _list_additions(variant, axes, settings)
     ]
     for each in document["grid"]:
-        each["keys"].update({key_of(setting): [yaml.safe_load(setting.partition("=")[2])] for setting in settings})
+        each["keys"].update({get_key(setting): [yaml.safe_load(setting.partition("=")[2])] for setting in settings})
     return validate(Plan, Document(f"plan {plan.name} with the settings of the command line", document))
 
 
-def _additions(
+def _list_additions(
     variant: Mapping[str, Any], axes: Sequence[Sequence[str]], settings: Sequence[str]
 ) -> list[tuple[str, ...]]:
     """Return the settings that the options add to a variant, one tuple for each copy of it."""
     if "oracle_merge" in variant:
-        axes = [axis for axis in axes if group_of(axis[0]) != "merge"]
-        settings = [setting for setting in settings if group_of(setting) != "merge"]
+        axes = [axis for axis in axes if get_group(axis[0]) != "merge"]
+        settings = [setting for setting in settings if get_group(setting) != "merge"]
     if variant.get("oracle_regions"):
-        axes = [axis for axis in axes if acts_on_true_regions(axis[0])]
-        settings = [setting for setting in settings if acts_on_true_regions(setting)]
+        axes = [axis for axis in axes if has_effect_on_true_regions(axis[0])]
+        settings = [setting for setting in settings if has_effect_on_true_regions(setting)]
     return [(*point, *settings) for point in itertools.product(*axes)]
 
 
 def _refuse_mistakes(seeds: str | None, settings: Sequence[str], grid: Sequence[str]) -> None:
     """Check every option and raise all mistakes at once."""
-    axes = [key_of(text) for text in grid if "=" in text]
-    keys = [*axes, *{key_of(setting) for setting in settings}]
+    axes = [get_key(text) for text in grid if "=" in text]
+    keys = [*axes, *{get_key(setting) for setting in settings}]
     mistakes = [
         f"--grid {key}: set twice, by another --grid or by --set: leave one of them out"
         for key in dict.fromkeys(axes)
@@ -83,7 +83,7 @@ def _refuse_mistakes(seeds: str | None, settings: Sequence[str], grid: Sequence[
     ]
     options: list[tuple[str, Callable[[str], object], Sequence[str]]] = [
         ("--seeds", parse_seeds, [] if seeds is None else [seeds]),
-        ("--set", valid_setting, settings),
+        ("--set", require_valid_setting, settings),
         ("--grid", _check_axis, grid),
     ]
     for option, check, texts in options:
@@ -100,13 +100,13 @@ def _check_axis(text: str) -> None:
     key, equals, values = text.partition("=")
     if not equals or not key or not all(values.split(",")):
         raise ValueError("expected key=v1,v2, e.g. extract.voxel_m=0.2,0.4")
-    valid_settings(_grid_axis(text))
+    require_valid_settings(_read_axis(text))
 
 
-def _grid_axis(text: str) -> list[str]:
+def _read_axis(text: str) -> list[str]:
     key, _, values = text.partition("=")
     return [f"{key}={value}" for value in values.split(",")]
 
 
-def _without(settings: Iterable[str], keys: set[str]) -> list[str]:
-    return [setting for setting in settings if key_of(setting) not in keys]
+def _drop_settings(settings: Iterable[str], keys: set[str]) -> list[str]:
+    return [setting for setting in settings if get_key(setting) not in keys]

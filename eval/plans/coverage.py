@@ -8,7 +8,7 @@ from typing import Any
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import Document, validate
-from eval.plans.plan import Plan, planned_cases
+from eval.plans.plan import Plan, list_planned_cases
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,21 +29,21 @@ class Coverage:
         return f"{self.n_done} of {self.n_planned} planned pairs so far: no verdict before all are there."
 
 
-def coverage(provenance: Mapping[str, Any], cases: Iterable[tuple[str, int, str]]) -> Coverage:
+def measure_coverage(provenance: Mapping[str, Any], cases: Iterable[tuple[str, int, str]]) -> Coverage:
     """Compare the rows of a run with its latest plan; a run is whole where that is absent or not valid any more.
 
     Args:
         provenance: Content of provenance.json.
         cases: Scenario, seed and variant of each row of results.csv.
     """
-    plan = plan_of(provenance)
-    planned = set() if plan is None else planned_cases(plan)
+    plan = read_stored_plan(provenance)
+    planned = set() if plan is None else list_planned_cases(plan)
     missing = planned - set(cases)
     pairs = {(scenario, seed) for scenario, seed, _ in planned}
     return Coverage(len(pairs - {(scenario, seed) for scenario, seed, _ in missing}), len(pairs))
 
 
-def plan_of(provenance: Mapping[str, Any]) -> Plan | None:
+def read_stored_plan(provenance: Mapping[str, Any]) -> Plan | None:
     """Return the latest plan of a run; None where it is absent or not valid any more (a preset's file is gone)."""
     document = provenance.get("plan")
     if not isinstance(document, dict):

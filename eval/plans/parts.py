@@ -18,39 +18,39 @@ from pydantic import (
 from cdpipe.core.yamlfile import Document, Settings, apply_settings, suggest, validate
 from cdpipe.model.config import PipelineConfig, load_config, preset_names
 from eval.oracles.merge import OracleMerge
-from eval.plans.worlds import OneOrMore, group_of, known_label, setting_text, told_as_values
+from eval.plans.worlds import OneOrMore, format_setting, get_group, raise_as_value_error, require_known_label
 from scenarios.schema import Scenario
 
 # settings of the query that regions from the truth still use
 _OF_TRUE_REGIONS = ("query.radius_m", "query.suppression")
 
 
-def acts_on_true_regions(setting: str) -> bool:
+def has_effect_on_true_regions(setting: str) -> bool:
     """Return whether a setting has an effect on a variant with regions from the truth."""
-    return group_of(setting) != "query" or key_of(setting) in _OF_TRUE_REGIONS
+    return get_group(setting) != "query" or get_key(setting) in _OF_TRUE_REGIONS
 
 
-def key_of(setting: str) -> str:
+def get_key(setting: str) -> str:
     """Return the key of a `key=value`."""
     return setting.partition("=")[0]
 
 
-def valid_setting(setting: str) -> str:
+def require_valid_setting(setting: str) -> str:
     """Return a `key=value` setting of the method if its key exists and accepts the value.
 
     Raises:
         ValueError: There is no such key, the value is wrong, or the key belongs to the world.
     """
-    if group_of(setting) in Scenario.model_fields:
+    if get_group(setting) in Scenario.model_fields:
         raise ValueError(
             "belongs to the world, not to the method: set it in the plan, under scenarios, "
             f'e.g. {{name: narrow, set: ["{setting}"]}}'
         )
-    told_as_values(lambda: validate(PipelineConfig, apply_settings(Document("", {}), [setting])))
+    raise_as_value_error(lambda: validate(PipelineConfig, apply_settings(Document("", {}), [setting])))
     return setting
 
 
-def valid_settings(settings: Iterable[str]) -> None:
+def require_valid_settings(settings: Iterable[str]) -> None:
     """Check `key=value` settings of the method.
 
     Raises:
@@ -59,45 +59,45 @@ def valid_settings(settings: Iterable[str]) -> None:
     mistakes = []
     for setting in settings:
         try:
-            valid_setting(setting)
+            require_valid_setting(setting)
         except ValueError as error:
             mistakes.append(str(error))
     if mistakes:
         raise ValueError("; ".join(dict.fromkeys(mistakes)))
 
 
-def _known_preset(name: str) -> str:
+def _require_known_preset(name: str) -> str:
     if name.endswith((".yaml", ".yml")):
-        told_as_values(lambda: load_config(name))
+        raise_as_value_error(lambda: load_config(name))
     elif name not in preset_names():
         raise ValueError(f"unknown preset{suggest(name, preset_names())} (known: {', '.join(preset_names())})")
     return name
 
 
-def _valid_keys(keys: dict[str, tuple[Any, ...]]) -> dict[str, tuple[Any, ...]]:
-    valid_settings(setting_text(key, value) for key, values in keys.items() for value in values)
+def _require_valid_keys(keys: dict[str, tuple[Any, ...]]) -> dict[str, tuple[Any, ...]]:
+    require_valid_settings(format_setting(key, value) for key, values in keys.items() for value in values)
     return keys
 
 
-def _not_empty(value: Any) -> Any:
+def _require_some(value: Any) -> Any:
     # pydantic's min_length counts only valid items and would report their mistakes twice
     if isinstance(value, list | dict | tuple) and not value:
         raise ValueError("at least one is needed")
     return value
 
 
-def _with_braces(value: Any) -> Any:
+def _require_braces(value: Any) -> Any:
     # a bare `oracle_merge:` would silently be no oracle
     if not isinstance(value, dict | OracleMerge):
         raise ValueError("expected {noise_m: ..., noise_deg: ...}; {} is without noise")
     return value
 
 
-Label = Annotated[str, AfterValidator(known_label)]
-PresetName = Annotated[str, AfterValidator(_known_preset)]
-Setting = Annotated[str, AfterValidator(valid_setting)]
+Label = Annotated[str, AfterValidator(require_known_label)]
+PresetName = Annotated[str, AfterValidator(_require_known_preset)]
+Setting = Annotated[str, AfterValidator(require_valid_setting)]
 MethodSettings = Annotated[tuple[Setting, ...], OneOrMore]
-NotEmpty = BeforeValidator(_not_empty)
+NotEmpty = BeforeValidator(_require_some)
 Values = Annotated[tuple[Any, ...], NotEmpty]
 
 
@@ -108,15 +108,15 @@ class Variant(Settings):
     set: MethodSettings = ()
     per_scenario: dict[Label, MethodSettings] = Field(default_factory=dict)
     scenarios: Annotated[tuple[Label, ...], OneOrMore] = ()
-    oracle_merge: Annotated[OracleMerge | None, BeforeValidator(_with_braces)] = None
+    oracle_merge: Annotated[OracleMerge | None, BeforeValidator(_require_braces)] = None
     oracle_regions: bool = False
 
     @model_validator(mode="after")
     def _settings_act(self) -> Variant:
         for setting in self.every_setting:
-            if self.oracle_merge is not None and group_of(setting) == "merge":
+            if self.oracle_merge is not None and get_group(setting) == "merge":
                 raise ValueError(f"{setting} does nothing: this variant is merged by the truth; leave it out")
-            if self.oracle_regions and not acts_on_true_regions(setting):
+            if self.oracle_regions and not has_effect_on_true_regions(setting):
                 raise ValueError(f"{setting} does nothing: this variant's regions are the truth's; leave it out")
         return self
 
@@ -139,10 +139,10 @@ class Grid(Settings):
 
     variant: PresetName
     scenarios: Annotated[tuple[Label, ...], NotEmpty]
-    keys: Annotated[dict[str, Values], NotEmpty, AfterValidator(_valid_keys)]
+    keys: Annotated[dict[str, Values], NotEmpty, AfterValidator(_require_valid_keys)]
 
     @property
     def points(self) -> list[tuple[str, ...]]:
         """The settings of every combination."""
-        axes = [[setting_text(key, value) for value in values] for key, values in self.keys.items()]
+        axes = [[format_setting(key, value) for value in values] for key, values in self.keys.items()]
         return list(itertools.product(*axes))

@@ -29,7 +29,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -41,80 +41,68 @@ from eval.plans.files import read_plan
 from eval.plans.parts import Grid, Label, NotEmpty, Variant
 from eval.plans.targets import PlanTargets, Targets
 from eval.plans.variants import Cell, Method, Until, slug
-from eval.plans.worlds import OneOrMore, ScenarioItem, World, group_of, world_slug, worlds_of
+from eval.plans.worlds import OneOrMore, ScenarioItem, World, get_group, list_worlds, world_slug
 
 _TOO_LONG = "is too long for a folder's name: put the settings into a file of their own"
 _LONGEST_SLUG = 200  # file systems take names of 255 bytes
 _AFTER_MERGE = ("query", "extract", "outlier", "cluster", "m3c2", "dufomap")
 
 
-class Mistake(NamedTuple):
-    """One mistake of a plan: the keys that lead to it, the written value, and the rule that it breaks."""
-
-    where: tuple[str | int, ...]
-    written: str
-    rule: str
+def _mistake(where: tuple[str | int, ...], written: str, rule: str) -> InitErrorDetails:
+    """Return a mistake as pydantic takes it: the keys that lead to it, the written value, the rule that it breaks."""
+    return InitErrorDetails(type=PydanticCustomError("plan", "{rule}", {"rule": rule}), loc=where, input=written)
 
 
-def refuse(mistakes: Iterable[Mistake]) -> None:
+def _refuse(mistakes: list[InitErrorDetails]) -> None:
     """Raise pydantic's error with all mistakes, if there are any."""
-    found = [
-        InitErrorDetails(type=PydanticCustomError("plan", "{rule}", {"rule": rule}), loc=where, input=written)
-        for where, written, rule in mistakes
-    ]
-    if found:
-        raise ValidationError.from_exception_data("Plan", found)
+    if mistakes:
+        raise ValidationError.from_exception_data("Plan", mistakes)
 
 
-def misfits(plan: Plan) -> list[Mistake]:
-    """Return every mistake in the relations between the parts of a plan."""
-    return [*_past_the_end(plan), *_unknown_worlds(plan), *_repeated_variants(plan)]
-
-
-def repeated_worlds(items: Iterable[ScenarioItem]) -> Iterator[Mistake]:
+def _find_repeated_worlds(items: Iterable[ScenarioItem]) -> Iterator[InitErrorDetails]:
     """Yield the worlds that are listed twice or whose label is too long for a folder's name."""
     known: set[object] = set()
     for place, item in enumerate(items):
-        for index, world in enumerate(worlds_of([item])):
+        for index, world in enumerate(list_worlds([item])):
             folder = world_slug(world.label)
             names = {folder, (world.name, world.settings)}
             rule = _TOO_LONG if len(folder) > _LONGEST_SLUG else "is listed twice" if known & names else ""
             if rule:
                 where = (place, "each", index - 1) if index else (place,)
-                yield Mistake(where, ",".join(world.own) or world.name, f"scenario {world.label} {rule}")
+                yield _mistake(where, ",".join(world.own) or world.name, f"scenario {world.label} {rule}")
             known |= names
 
 
-def _past_the_end(plan: Plan) -> Iterator[Mistake]:
+def _find_settings_past_the_end(plan: Plan) -> Iterator[InitErrorDetails]:
     if plan.until != "merge":
         return
     told = " and ".join(plan.report)
     if told:
         rule = f"report: {told} needs {told}, and the plan ends at the merge; leave one of them out"
-        yield Mistake(("report",), told, rule)
+        yield _mistake(("report",), told, rule)
     rule = "{} does nothing: the plan ends at the merge; leave it out, or leave out until"
     if plan.wide:
-        yield Mistake(("wide",), ", ".join(plan.wide), rule.format("wide"))
+        yield _mistake(("wide",), ", ".join(plan.wide), rule.format("wide"))
     for place, variant in enumerate(plan.variants):
         for setting in variant.every_setting:
-            if group_of(setting) in _AFTER_MERGE:
-                yield Mistake(("variants", place), variant.preset, rule.format(f"{setting} of {variant.preset}"))
+            if get_group(setting) in _AFTER_MERGE:
+                yield _mistake(("variants", place), variant.preset, rule.format(f"{setting} of {variant.preset}"))
         if variant.oracle_regions:
-            yield Mistake(("variants", place, "oracle_regions"), "true", rule.format("oracle_regions"))
+            yield _mistake(("variants", place, "oracle_regions"), "true", rule.format("oracle_regions"))
     for place, grid in enumerate(plan.grid):
         for key in grid.keys:
-            if group_of(key) in _AFTER_MERGE:
-                yield Mistake(("grid", place, "keys", key), key, rule.format(f"{key} of the grid of {grid.variant}"))
+            if get_group(key) in _AFTER_MERGE:
+                yield _mistake(("grid", place, "keys", key), key, rule.format(f"{key} of the grid of {grid.variant}"))
 
 
-def _unknown_worlds(plan: Plan) -> Iterator[Mistake]:
-    worlds = worlds_of(plan.scenarios)
+def _find_unknown_worlds(plan: Plan) -> Iterator[InitErrorDetails]:
+    worlds = list_worlds(plan.scenarios)
     labels = [world.label for world in worlds]
     for place, variant in enumerate(plan.variants):
         for index, name in enumerate(variant.scenarios):
             if name not in labels:
                 rule = f"scenarios of {variant.preset} names {name!r}, which is no world of the plan"
-                yield Mistake(("variants", place, "scenarios", index), name, rule + suggest(name, labels))
+                yield _mistake(("variants", place, "scenarios", index), name, rule + suggest(name, labels))
     known = dict.fromkeys(name for world in worlds for name in (world.name, world.label))
     asked: list[tuple[tuple[str | int, ...], str, str]] = [
         (("wide", index), "wide", name) for index, name in enumerate(plan.wide)
@@ -131,18 +119,18 @@ def _unknown_worlds(plan: Plan) -> Iterator[Mistake]:
         ]
     for where, who, name in asked:
         if name not in known:
-            yield Mistake(where, name, f"{who} names {name!r}, which is not in scenarios{suggest(name, known)}")
+            yield _mistake(where, name, f"{who} names {name!r}, which is not in scenarios{suggest(name, known)}")
 
 
-def _repeated_variants(plan: Plan) -> Iterator[Mistake]:
+def _find_repeated_variants(plan: Plan) -> Iterator[InitErrorDetails]:
     told = set()
-    for world in worlds_of(plan.scenarios):
-        folders = Counter(slug(method.variant) for method in methods_of(plan, world))
+    for world in list_worlds(plan.scenarios):
+        folders = Counter(slug(method.variant) for method in list_methods(plan, world))
         for folder, n in folders.items():
             if folder not in told and (n > 1 or len(folder) > _LONGEST_SLUG):
                 told.add(folder)
                 rule = f"stands twice in the plan for {world.label}" if n > 1 else _TOO_LONG
-                yield Mistake(("variants",), folder, f"variant {folder} {rule}")
+                yield _mistake(("variants",), folder, f"variant {folder} {rule}")
 
 
 def parse_seeds(value: Any) -> tuple[int, ...]:
@@ -180,12 +168,12 @@ def parse_seeds_option(text: str) -> tuple[int, ...]:
         raise InputError(f"--seeds {text}: {error}") from error
 
 
-def _subjects(value: Any) -> Any:
+def _list_subjects(value: Any) -> Any:
     return [value] if isinstance(value, str) else () if value is None else value
 
 
 class Plan(Settings):
-    """A plan; `cells` expands it."""
+    """A plan; `expand_cells` expands it."""
 
     name: Annotated[str, Field(min_length=1)]
     description: str = ""
@@ -193,7 +181,7 @@ class Plan(Settings):
     wide: Annotated[tuple[Label, ...], OneOrMore] = ()
     seeds: Annotated[tuple[int, ...], BeforeValidator(parse_seeds)]
     until: Until | None = None
-    report: Annotated[tuple[Literal["regions", "objects"], ...], BeforeValidator(_subjects)] = ()
+    report: Annotated[tuple[Literal["regions", "objects"], ...], BeforeValidator(_list_subjects)] = ()
     targets: PlanTargets = Targets()
     variants: Annotated[tuple[Variant, ...], NotEmpty]
     grid: tuple[Grid, ...] = ()
@@ -201,12 +189,12 @@ class Plan(Settings):
     @field_validator("scenarios")
     @classmethod
     def _worlds_differ(cls, items: tuple[ScenarioItem, ...]) -> tuple[ScenarioItem, ...]:
-        refuse(repeated_worlds(items))
+        _refuse(list(_find_repeated_worlds(items)))
         return items
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Plan:
-        refuse(misfits(self))
+        _refuse([*_find_settings_past_the_end(self), *_find_unknown_worlds(self), *_find_repeated_variants(self)])
         return self
 
 
@@ -219,7 +207,7 @@ def load_plan(name_or_path: str) -> Plan:
     return validate(Plan, read_plan(name_or_path))
 
 
-def methods_of(plan: Plan, world: World) -> list[Method]:
+def list_methods(plan: Plan, world: World) -> list[Method]:
     """Return the methods that a plan runs in one of its worlds: variants first, then grid points."""
     places = dict.fromkeys((world.name, world.label))
     site: Site = "narrow" if places.keys().isdisjoint(plan.wide) else "wide"
@@ -241,7 +229,7 @@ def methods_of(plan: Plan, world: World) -> list[Method]:
     return methods
 
 
-def cells(plan: Plan) -> list[Cell]:
+def expand_cells(plan: Plan) -> list[Cell]:
     """Return all cells: by scenario, then seed, then variant, grids last.
 
     Raises:
@@ -249,9 +237,9 @@ def cells(plan: Plan) -> list[Cell]:
     """
     found: list[Cell] = []
     mistakes: list[str] = []
-    for world in worlds_of(plan.scenarios):
+    for world in list_worlds(plan.scenarios):
         methods = []
-        for method in methods_of(plan, world):
+        for method in list_methods(plan, world):
             try:
                 methods.append((method, method.config()))
             except InputError as error:
@@ -266,11 +254,11 @@ def cells(plan: Plan) -> list[Cell]:
     return found
 
 
-def planned_cases(plan: Plan) -> set[tuple[str, int, str]]:
+def list_planned_cases(plan: Plan) -> set[tuple[str, int, str]]:
     """Return (scenario, seed, variant) of all cells."""
     return {
         (world.label, seed, method.variant)
-        for world in worlds_of(plan.scenarios)
-        for method in methods_of(plan, world)
+        for world in list_worlds(plan.scenarios)
+        for method in list_methods(plan, world)
         for seed in plan.seeds[: world.n_seeds]
     }

@@ -93,7 +93,7 @@ def is_oracle(variant: str) -> bool:
     return ORACLE_MERGE in variant.partition("[")[0].split("+")
 
 
-def targets_of(provenance: Mapping[str, Any]) -> Targets:
+def read_targets(provenance: Mapping[str, Any]) -> Targets:
     """Return the targets of the plan that a run was last run with.
 
     A run from before plans held targets has those of the shipped plan of the same name; none where there is no such
@@ -109,7 +109,7 @@ def targets_of(provenance: Mapping[str, Any]) -> Targets:
         return Targets()
 
 
-def _of_plan(value: Any) -> Any:
+def _take_from_plan(value: Any) -> Any:
     """Replace the name of a plan by the targets of that plan, which may in turn name another plan."""
     named: set[str] = set()
     while isinstance(value, str):
@@ -124,7 +124,7 @@ def _of_plan(value: Any) -> Any:
     return {} if value is None else value
 
 
-PlanTargets = Annotated[Targets, BeforeValidator(_of_plan)]
+PlanTargets = Annotated[Targets, BeforeValidator(_take_from_plan)]
 
 
 class _Section(Settings):

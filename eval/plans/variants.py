@@ -57,7 +57,7 @@ class Method:
     @property
     def variant(self) -> str:
         """Its name in tables."""
-        return variant_name(self.preset, self.named, self.oracle, oracle_regions=self.oracle_regions)
+        return name_variant(self.preset, self.named, self.oracle, oracle_regions=self.oracle_regions)
 
     def config(self) -> PipelineConfig:
         """Return its effective settings.
@@ -75,7 +75,7 @@ class Method:
         return Cell(
             scenario=world.label,
             seed=seed,
-            preset=_stem(self.preset),
+            preset=_strip_suffix(self.preset),
             variant=self.variant,
             config=config,
             oracle=self.oracle,
@@ -84,7 +84,7 @@ class Method:
         )
 
 
-def variant_name(
+def name_variant(
     preset: str, settings: Iterable[str], oracle: OracleMerge | None = None, *, oracle_regions: bool = False
 ) -> str:
     """Return the preset's name, followed by its settings in brackets where there are any.
@@ -92,7 +92,7 @@ def variant_name(
     With a merge or regions from the truth the name is `oracle-merge`, `oracle-regions` or both joined by a plus. The
     brackets then begin with the preset (except `tunnelcd`) and the noise of the merge.
     """
-    stem = _stem(preset)
+    stem = _strip_suffix(preset)
     if oracle is not None or oracle_regions:
         of_preset = [] if stem == _ORACLE_PRESET else [f"preset={stem}"]
         settings = (*of_preset, *(() if oracle is None else oracle.settings), *settings)
@@ -106,5 +106,5 @@ def slug(variant: str) -> str:
     return re.sub(r"[^A-Za-z0-9._=,-]", "_", variant)
 
 
-def _stem(preset: str) -> str:
+def _strip_suffix(preset: str) -> str:
     return Path(preset).stem if preset.endswith((".yaml", ".yml")) else preset

@@ -41,7 +41,7 @@ from cdpipe.model.config import PipelineConfig
 from scenarios import check_scenario, scenario_names
 
 
-def known_scenario(name: str) -> str:
+def require_known_scenario(name: str) -> str:
     """Return the name of a scenario, or the path of a scenario's file, after checking it.
 
     Raises:
@@ -49,56 +49,56 @@ def known_scenario(name: str) -> str:
     """
     names = scenario_names()
     if name.endswith((".yaml", ".yml")):
-        told_as_values(lambda: check_scenario(name))
+        raise_as_value_error(lambda: check_scenario(name))
     elif name not in names:
         raise ValueError(f"unknown scenario{suggest(name, names) or ': `tunnelcd list` shows all'}")
     return name
 
 
-def told_as_values(check: Callable[[], object]) -> None:
+def raise_as_value_error(check: Callable[[], object]) -> None:
     """Run a check that raises InputError inside pydantic, which collects only ValueErrors."""
     try:
         check()
     except InputError as error:
-        raise ValueError("; ".join(_without_option(str(error)))) from error
+        raise ValueError("; ".join(_strip_option(str(error)))) from error
 
 
-def setting_text(key: str, value: Any) -> str:
+def format_setting(key: str, value: Any) -> str:
     """Return `key=value` as --set takes it."""
     text = yaml.safe_dump(value, default_flow_style=True, width=10_000)
     return f"{key}={text.removesuffix('...' + chr(10)).strip()}"
 
 
-def group_of(setting: str) -> str:
+def get_group(setting: str) -> str:
     """Return the first part of a setting's key."""
     return setting.partition("=")[0].partition(".")[0]
 
 
-def _as_list(value: Any) -> Any:
+def _make_list(value: Any) -> Any:
     return [value] if isinstance(value, str) else value
 
 
-def _one_spelling(setting: str) -> str:
+def _normalise_setting(setting: str) -> str:
     """Normalise the value as YAML reads it: `off` and `false ` give the same world as `false`."""
     key, equals, text = setting.partition("=")
     try:
-        return setting_text(key, yaml.safe_load(text)) if equals else setting
+        return format_setting(key, yaml.safe_load(text)) if equals else setting
     except yaml.YAMLError:
         return setting
 
 
-def _fit_on_top(settings: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+def _require_fit_on_top(settings: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
     if not settings:
         raise ValueError("an empty list sets nothing: leave it out")
     if "name" in info.data:
-        _check_draws(info.data["name"], (*info.data.get("set", ()), *settings))
+        _require_draws(info.data["name"], (*info.data.get("set", ()), *settings))
     return settings
 
 
 PairKind = Literal["clean", "drift", "smooth", "disjoint"]
-ScenarioName = Annotated[str, AfterValidator(known_scenario)]
-OneOrMore = BeforeValidator(_as_list)
-WorldSettings = Annotated[tuple[Annotated[str, AfterValidator(_one_spelling)], ...], OneOrMore]
+ScenarioName = Annotated[str, AfterValidator(require_known_scenario)]
+OneOrMore = BeforeValidator(_make_list)
+WorldSettings = Annotated[tuple[Annotated[str, AfterValidator(_normalise_setting)], ...], OneOrMore]
 
 
 class ScenarioItem(Settings):
@@ -106,7 +106,7 @@ class ScenarioItem(Settings):
 
     name: ScenarioName
     set: WorldSettings = ()
-    each: Annotated[tuple[Annotated[WorldSettings, AfterValidator(_fit_on_top)], ...], OneOrMore] = ()
+    each: Annotated[tuple[Annotated[WorldSettings, AfterValidator(_require_fit_on_top)], ...], OneOrMore] = ()
     pair_kind: PairKind | None = None
     n_seeds: Annotated[int, Field(ge=1)] | None = None
 
@@ -123,7 +123,7 @@ class ScenarioItem(Settings):
     @classmethod
     def _set_fits(cls, settings: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
         if settings and "name" in info.data:
-            _check_draws(info.data["name"], settings)
+            _require_draws(info.data["name"], settings)
         return settings
 
     @model_serializer(mode="wrap")
@@ -161,7 +161,7 @@ class World:
         return self.name + "".join(f"[{','.join(part)}]" for part in (self.common, self.own) if part)
 
 
-def worlds_of(items: Iterable[ScenarioItem]) -> list[World]:
+def list_worlds(items: Iterable[ScenarioItem]) -> list[World]:
     """Return the worlds that the items of a plan define, in order."""
     return [
         World(item.name, item.set, own, item.pair_kind or "", item.n_seeds)
@@ -170,14 +170,14 @@ def worlds_of(items: Iterable[ScenarioItem]) -> list[World]:
     ]
 
 
-def known_label(label: str) -> str:
+def require_known_label(label: str) -> str:
     """Return a scenario's name, or the label of one with settings, after checking that the scenario exists.
 
     Raises:
         ValueError: There is none.
     """
     name, bracket, _ = label.partition("[")
-    known_scenario(name if bracket and label.endswith("]") else label)
+    require_known_scenario(name if bracket and label.endswith("]") else label)
     return label
 
 
@@ -186,7 +186,7 @@ def world_slug(label: str) -> str:
     return re.sub(r"[^A-Za-z0-9._=,-]", "_", label.replace("/", "__"))
 
 
-def references(cases: Iterable[tuple[str, str, int]]) -> dict[tuple[str, str], str]:
+def find_references(cases: Iterable[tuple[str, str, int]]) -> dict[tuple[str, str], str]:
     """Return the reference of each world, for each variant that ran in both.
 
     The reference is the world whose label lacks the fewest brackets at the end: `narrow[a=1]` for `narrow[a=1][b=2]`,
@@ -203,35 +203,35 @@ def references(cases: Iterable[tuple[str, str, int]]) -> dict[tuple[str, str], s
         seeds.setdefault((world, variant), set()).add(seed)
     found: dict[tuple[str, str], str] = {}
     for (world, variant), own in seeds.items():
-        shared = (other for other in _barer(world) if not own.isdisjoint(seeds.get((other, variant), ())))
+        shared = (other for other in _shorten(world) if not own.isdisjoint(seeds.get((other, variant), ())))
         if (nearest := next(shared, None)) is not None:
             found[world, variant] = nearest
     return found
 
 
-def settings_over(world: str, reference: str) -> str:
+def list_settings_over(world: str, reference: str) -> str:
     """Return the settings of a world beyond its reference: "a=1,b=2" for `narrow[a=1][b=2]` over `narrow`."""
     return world[len(reference) + 1 : -1].replace("][", ",")
 
 
-def _barer(label: str) -> Iterator[str]:
+def _shorten(label: str) -> Iterator[str]:
     """Yield the part of a label before each bracket, longest first; not every part is a world."""
     if label.endswith("]"):
         yield from (label[:place] for place in range(len(label) - 1, 0, -1) if label[place] == "[")
 
 
-def _check_draws(name: str, settings: tuple[str, ...]) -> None:
+def _require_draws(name: str, settings: tuple[str, ...]) -> None:
     """Raise ValueError for settings that do not fit a scenario, for any seed."""
-    of_method = [setting for setting in settings if group_of(setting) in PipelineConfig.model_fields]
+    of_method = [setting for setting in settings if get_group(setting) in PipelineConfig.model_fields]
     lines = [f"{setting} belongs to the method, not to the world: set it under variants" for setting in of_method]
     try:
         check_scenario(name, [setting for setting in settings if setting not in of_method])
     except InputError as error:
-        lines += _without_option(str(error))
+        lines += _strip_option(str(error))
     if lines:
         raise ValueError("; ".join(dict.fromkeys(lines)))
 
 
-def _without_option(told: str) -> list[str]:
+def _strip_option(told: str) -> list[str]:
     """Return the lines of an error without a leading `--set`, which is wrong for a plan's file."""
     return [re.sub(r"^(--set)?:? ", "", line) for line in told.splitlines()]

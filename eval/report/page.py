@@ -18,7 +18,7 @@ import pandas as pd
 from cdpipe.model.config import settings_table
 from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.core.statistics import ENOUGH_PAIRS
-from eval.plans.targets import targets_of
+from eval.plans.targets import read_targets
 from eval.report.charts import Chart, plotly_script
 from eval.report.cost import draw_pareto, pareto_table
 from eval.report.latex import latex_tables, to_latex
@@ -45,12 +45,12 @@ from eval.running.run_data import (
     flag,
     named_variants,
     of,
-    read_document,
     read_run,
     scenarios,
     shown_variant,
     text,
 )
+from eval.running.runfolder import read_json
 from eval.running.sides import Side, check_versions, is_contended
 from eval.tables.columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
 from eval.tables.merge_table import merge_table
@@ -81,7 +81,7 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
     """
     data = read_run(run)
     check_versions(Side(data), Side(data))
-    merges = merge_table(pd.DataFrame(list(data.results)), targets_of(data.provenance))
+    merges = merge_table(pd.DataFrame(list(data.results)), read_targets(data.provenance))
     content = _about(data, merges)
     files: dict[str, str | bytes] = {**latex_tables(data)}
     if len(merges):
@@ -219,7 +219,7 @@ def tabulate_settings(data: RunData) -> Table:
         seed = first_seed(data, scenario)
         for name in named_variants(data, scenario):
             if of(data.results, scenario=scenario, seed=seed, variant=name):
-                document = read_document(data.folder.answer(scenario, seed, name) / "answer.json")
+                document = read_json(data.folder.answer(scenario, seed, name) / "answer.json")
                 found.setdefault(name, []).append(_flat(document.get("config") or {}))
     keys = [key for key, _, _ in settings_table()]
     keys += sorted({key for configs in found.values() for config in configs for key in config} - set(keys))

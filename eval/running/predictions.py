@@ -19,8 +19,8 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import suggest
 from cdpipe.model.config import preset_names
 from eval.core.progress import RunProgress, Silent
-from eval.plans.coverage import plan_of
-from eval.plans.plan import planned_cases
+from eval.plans.coverage import read_stored_plan
+from eval.plans.plan import list_planned_cases
 from eval.plans.variants import slug
 from eval.running.rescoring import LAST, NO_KEY, cell_document, foreign_identity
 from eval.running.runfolder import RunFolder, remove, write_json, write_tables
@@ -72,10 +72,10 @@ def add_predictions(run: RunFolder, folder: Path, name: str, progress: RunProgre
 
 def list_incomplete_variants(provenance: Mapping[str, Any], results: pd.DataFrame) -> list[str]:
     """Return one line for each variant outside the plan that lacks pairs of the run, naming the pairs."""
-    plan = plan_of(provenance)
+    plan = read_stored_plan(provenance)
     if plan is None:
         return []
-    planned = {variant for _, _, variant in planned_cases(plan)}
+    planned = {variant for _, _, variant in list_planned_cases(plan)}
     cases = [results["scenario"], results["seed"].astype(int)]
     every = dict.fromkeys(zip(*cases, strict=True))
     lines = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import lzma
 import math
 from collections.abc import Iterable, Mapping
@@ -17,10 +16,10 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 from eval.core.statistics import bootstrap_interval, statistic_of
 from eval.core.tablefile import table_file
-from eval.plans.coverage import Coverage, coverage
-from eval.plans.targets import targets_of
-from eval.plans.worlds import references
-from eval.running.runfolder import RunFolder
+from eval.plans.coverage import Coverage, measure_coverage
+from eval.plans.targets import read_targets
+from eval.plans.worlds import find_references
+from eval.running.runfolder import RunFolder, read_json
 from eval.tables.rows import records, with_domain
 
 Row = Mapping[str, Any]
@@ -72,7 +71,7 @@ def read_run(run: Path) -> RunData:
             items[name] = _rows(path)
         else:
             missing.append(f"{path.name} is not in the run folder: what it would show is left out.")
-    provenance = read_document(run / "provenance.json")
+    provenance = read_json(run / "provenance.json")
     if not provenance:
         missing.append(
             "provenance.json is not in the run folder or damaged: machine, command and versions are unknown."
@@ -94,7 +93,7 @@ def ends_at_merge(data: RunData) -> bool:
 
 def shown_variant(data: RunData) -> str:
     """Return the variant whose cases a page shows: the one that the plan is about, or the first that was run."""
-    return targets_of(data.provenance).shown_method([str(row["variant"]) for row in data.results])
+    return read_targets(data.provenance).shown_method([str(row["variant"]) for row in data.results])
 
 
 def comparable(data: RunData) -> pd.DataFrame:
@@ -107,7 +106,7 @@ def comparable(data: RunData) -> pd.DataFrame:
 def covered_by(data: RunData) -> Coverage:
     """Return how much of its plan a run holds."""
     cases = ((str(row["scenario"]), int(row["seed"]), str(row["variant"])) for row in data.results)
-    return coverage(data.provenance, cases)
+    return measure_coverage(data.provenance, cases)
 
 
 def number(row: Row, column: str) -> float:
@@ -177,7 +176,7 @@ def scenarios(data: RunData, *, unchanged: bool) -> list[str]:
 
 def repeats(data: RunData) -> dict[tuple[str, str], str]:
     """Return the reference world of each (world, variant) that has one (`eval.plans.worlds`)."""
-    return references(_cases(data))
+    return find_references(_cases(data))
 
 
 def is_unchanged(data: RunData, scenario: str) -> bool:
@@ -268,15 +267,6 @@ def split_variant(variant: str) -> tuple[str, dict[str, str]]:
         key, _, value = part.partition("=")
         settings[key.strip()] = value.strip()
     return preset, settings
-
-
-def read_document(path: Path) -> dict[str, Any]:
-    """Read a JSON object; {} where it is missing or damaged."""
-    try:
-        document = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return {}
-    return document if isinstance(document, dict) else {}
 
 
 def _cases(data: RunData) -> list[tuple[str, str, int]]:

@@ -32,8 +32,8 @@ from cdpipe.core.errors import InputError
 from eval.core.output import make_writable, whole_file
 from eval.core.provenance import TOOL
 from eval.core.statistics import summarise
-from eval.plans.coverage import coverage
-from eval.plans.targets import targets_of
+from eval.plans.coverage import measure_coverage
+from eval.plans.targets import read_targets
 from eval.plans.variants import slug
 from eval.plans.worlds import world_slug
 from eval.tables.effects import effects
@@ -86,12 +86,8 @@ class RunFolder:
 
     def read_cell(self, path: Path) -> dict[str, Any] | None:
         """Read a finished cell; None where there is none, or what is there was cut short."""
-        try:
-            document = json.loads(path.read_text())
-        except (FileNotFoundError, json.JSONDecodeError):
-            return None
-        whole = isinstance(document, dict) and {"key", "order", "row", *ITEM_TABLES} <= set(document)
-        return document if whole else None
+        document = read_json(path)
+        return document if {"key", "order", "row", *ITEM_TABLES} <= set(document) else None
 
     def provenance(self) -> dict[str, Any]:
         """Read provenance.json.
@@ -177,7 +173,7 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     _write_csv(run.path / "summary.csv", summarise(results, keyframes=items["keyframes"]))
     tables = {
         "effects": effects(results),
-        "merge": merge_table(results, targets_of(_provenance(run))),
+        "merge": merge_table(results, read_targets(_provenance(run))),
         **_report_tables(run, results, items),
     }
     for name, found in tables.items():
@@ -230,11 +226,11 @@ def _report_tables(
     """Return the tables that the plan asks for, and empty ones for those that it does not."""
     tables = {name: pd.DataFrame() for name in (*REGION_FILES, *OBJECT_FILES)}
     provenance = _provenance(run)
-    subjects, targets = reported(provenance), targets_of(provenance)
+    subjects, targets = reported(provenance), read_targets(provenance)
     if not subjects or "region_auroc" not in results:
         return tables
     cases = zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
-    is_whole = coverage(provenance, cases).is_whole
+    is_whole = measure_coverage(provenance, cases).is_whole
     if "regions" in subjects:
         tables |= region_tables(results, items, targets, is_whole=is_whole)
     if "objects" in subjects:
@@ -244,6 +240,15 @@ def _report_tables(
 
 def _provenance(run: RunFolder) -> Mapping[str, Any]:
     return run.provenance() if (run.path / "provenance.json").is_file() else {}
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object; {} where it is missing or damaged."""
+    try:
+        document = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return document if isinstance(document, dict) else {}
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

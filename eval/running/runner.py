@@ -22,9 +22,9 @@ from cdpipe.model.config import DescriptorConfig
 from eval.core.cluster import HERE, Where, connected, require_usable
 from eval.core.progress import RunProgress, Silent
 from eval.core.provenance import describe_run, digest
-from eval.plans.plan import Plan, cells
+from eval.plans.plan import Plan, expand_cells
 from eval.plans.variants import Cell
-from eval.plans.worlds import worlds_of
+from eval.plans.worlds import list_worlds
 from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Todo, Tools, cell_key, is_finished, pair_lock
 from eval.running.run_workers import remove_traces, run_on_workers
 from eval.running.runfolder import RunFolder, current_results, remove, write_tables
@@ -71,7 +71,7 @@ def run_plan(
     """
     progress, tools = progress or Silent(), tools or TOOLS
     require_usable(where)
-    all_cells = cells(plan)
+    all_cells = expand_cells(plan)
     provenance = _provenance(plan, all_cells, command, tools)
     pairs = _pairs(run, plan, all_cells, force, tools)
     n_todo = sum(len(pair.todo) for pair in pairs)
@@ -113,7 +113,7 @@ def list_cells(plan: Plan, path: Path, *, force: bool = False, limit: int | None
         run.provenance()
     elif path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file: name a folder to run in")
-    all_cells = cells(plan)
+    all_cells = expand_cells(plan)
     pairs = _pairs(run, plan, all_cells, force, TOOLS)
     todo, chosen = ({each.cell for pair in some for each in pair.todo} for some in (pairs, _limited(pairs, limit)))
     return [(cell, "to do" if cell in chosen else "left" if cell in todo else "finished") for cell in all_cells]
@@ -134,7 +134,7 @@ def _run_here(run: RunFolder, pairs: Sequence[Pair], made: Made, progress: RunPr
 
 def _pairs(run: RunFolder, plan: Plan, all_cells: Sequence[Cell], force: bool, tools: Tools) -> list[Pair]:
     variants = list(dict.fromkeys(cell.variant for cell in all_cells))
-    places = {world.label: (place, world) for place, world in enumerate(worlds_of(plan.scenarios))}
+    places = {world.label: (place, world) for place, world in enumerate(list_worlds(plan.scenarios))}
     pairs = []
     for (label, seed), group in groupby(all_cells, key=lambda cell: (cell.scenario, cell.seed)):
         place, world = places[label]

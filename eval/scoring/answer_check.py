@@ -13,7 +13,7 @@ from cdpipe.core.yamlfile import suggest
 from cdpipe.io.answer import Answer
 from cdpipe.model.report import ChangedObject, ChangeRegions
 from cdpipe.model.types import SessionName
-from eval.scoring.answer_rows import POINT_RADIUS_M, rows_near_points
+from eval.scoring.answer_rows import POINT_RADIUS_M, find_rows_near_points
 from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth
 from eval.truth.universe import ScoringPoints
 
@@ -189,7 +189,7 @@ def _check_points(
             all_points.append(distinct)
     if sum(map(len, all_points)) == 0:
         return
-    if not any(len(rows) for rows in rows_near_points(universe, all_points)):
+    if not any(len(rows) for rows in find_rows_near_points(universe, all_points)):
         raise ValueError(
             f"object_points_odom of the {session} session: none of its {sum(map(len, all_points))} points is within "
             f"{POINT_RADIUS_M:g} m of a return of that session: give them in its own odom frame, not in the map's"

@@ -13,7 +13,7 @@ from eval.truth.universe import ScoringPoints
 POINT_RADIUS_M = 0.1
 
 
-def answer_rows(answer: Answer, truth: GroundTruth) -> tuple[Int64Array, ...]:
+def find_answer_rows(answer: Answer, truth: GroundTruth) -> tuple[Int64Array, ...]:
     """Return, for each object of an answer, its rows of its session's scoring points.
 
     An answer with returns holds the rows among them. An answer with points (of another program) holds the rows within
@@ -28,13 +28,13 @@ def answer_rows(answer: Answer, truth: GroundTruth) -> tuple[Int64Array, ...]:
     for session in SESSIONS:
         of_session = [index for index, item in enumerate(objects) if item.session == session]
         points = [answer.points_odom[index] for index in of_session]
-        near = rows_near_points(truth.sessions[session].universe, points)
+        near = find_rows_near_points(truth.sessions[session].universe, points)
         for index, found in zip(of_session, near, strict=True):
             rows[index] = found
     return tuple(rows)
 
 
-def rows_near_points(
+def find_rows_near_points(
     universe: ScoringPoints, objects_odom: list[Float64Array], radius_m: float = POINT_RADIUS_M
 ) -> list[Int64Array]:
     """Return, for each object, the rows whose nearest predicted point is its own and within a radius.

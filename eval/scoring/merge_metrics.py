@@ -41,7 +41,7 @@ class MergeErrors:
     along_m: Float64Array
 
 
-def merge_errors(
+def compute_merge_errors(
     before: SessionTruth,
     after: SessionTruth,
     before_T_after: Float64Array,
@@ -70,7 +70,7 @@ def merge_errors(
     estimated_i_T_j = invert(before.odom_T_sensor[scans_i]) @ before_T_after @ after.odom_T_sensor[scans_j]
     errors = invert(true_i_T_j) @ estimated_i_T_j
     # rotate the tunnel axis into the frame of keyframe j, that of E's translation
-    axes_world = travel_directions(after.world_T_sensor)[scans_j]
+    axes_world = find_travel_directions(after.world_T_sensor)[scans_j]
     axes_j = np.einsum("pji,pj->pi", world_T_j[:, :3, :3], axes_world)
     return MergeErrors(
         metres=np.linalg.norm(errors[:, :3, 3], axis=1),
@@ -79,7 +79,7 @@ def merge_errors(
     )
 
 
-def overlap_true(before_world_T_sensor: Float64Array, after_world_T_sensor: Float64Array) -> float:
+def measure_overlap(before_world_T_sensor: Float64Array, after_world_T_sensor: Float64Array) -> float:
     """Return the share of the after trajectory's length that lies within 5 m of the before trajectory.
 
     Both are the true poses, (S, 4, 4) in the world, joined by straight lines. NaN where the after session never moved.
@@ -100,13 +100,13 @@ def _along(poses: Float64Array) -> Float64Array:
     return np.stack([np.interp(middles, along, poses[:, axis, 3]) for axis in range(3)], axis=1)
 
 
-def evidence_columns(evidence: Mapping[str, float]) -> dict[str, float]:
+def list_evidence(evidence: Mapping[str, float]) -> dict[str, float]:
     """Return the merge's evidence, accepted or refused; NaN where a figure is missing or not finite."""
     values = {name: float(evidence.get(name, np.nan)) for name in EVIDENCE}
     return {f"evidence_{name}": value if np.isfinite(value) else float("nan") for name, value in values.items()}
 
 
-def travel_directions(poses: Float64Array) -> Float64Array:
+def find_travel_directions(poses: Float64Array) -> Float64Array:
     """Return the (S, 3) unit direction of travel at each of (S, 4, 4) poses: the chord over 1 m of path around it.
 
     NaN where the path has no length.
@@ -120,7 +120,7 @@ def travel_directions(poses: Float64Array) -> Float64Array:
     return np.asarray(np.divide(chords, lengths, out=np.full_like(chords, np.nan), where=lengths > 0))
 
 
-def merge_columns(errors: MergeErrors | None) -> dict[str, float]:
+def summarise_merge_errors(errors: MergeErrors | None) -> dict[str, float]:
     """Return the columns of results.csv: median and 95th percentile of each error; NaN without pairs or answer."""
     columns: dict[str, float] = {}
     for name, part in (("m", "metres"), ("deg", "degrees"), ("along_m", "along_m")):

@@ -51,13 +51,13 @@ class ObjectMatches:
         )
 
 
-def best_matching(iou: Float64Array) -> list[tuple[int, int]]:
+def match_best(iou: Float64Array) -> list[tuple[int, int]]:
     """Return the one-to-one pairs (row, column) of an (A, B) matrix with the largest sum; zeros make no pair."""
     rows, columns = linear_sum_assignment(iou, maximize=True)
     return [(int(row), int(column)) for row, column in zip(rows, columns, strict=True) if iou[row, column] > 0]
 
 
-def voxel_iou(points_a: Float64Array, points_b: Float64Array, voxel_m: float = CELL_M) -> float:
+def compute_voxel_iou(points_a: Float64Array, points_b: Float64Array, voxel_m: float = CELL_M) -> float:
     """Return the IoU of the voxels that two sets of points fill, mean over 8 grids half a voxel apart.
 
     A single grid would favour answers whose edges lie on cell walls. NaN for two empty sets.
@@ -73,7 +73,7 @@ def voxel_iou(points_a: Float64Array, points_b: Float64Array, voxel_m: float = C
     return float(np.mean(values))
 
 
-def box_iou(points_a: Float64Array, points_b: Float64Array, cell_m: float = CELL_M) -> float:
+def compute_box_iou(points_a: Float64Array, points_b: Float64Array, cell_m: float = CELL_M) -> float:
     """Return the IoU of the axis-aligned boxes around two sets of points; 0 if either is empty.
 
     Each point stands for a cell: boxes reach half a cell beyond their points, so that a flat object has a volume.
@@ -110,21 +110,21 @@ def match_objects(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], 
     for session in SESSIONS:
         of_session = np.array([change.session == session for change in changes], dtype=np.bool_)
         candidates = np.flatnonzero(truth.is_observable & of_session)
-        for index, column in best_matching(iou[candidates]):
+        for index, column in match_best(iou[candidates]):
             row = candidates[index]
             matched_object[row], matched_change[column] = column, row
             points = truth.sessions[session].universe.points_odom
             true, answered = (points[of].astype(np.float64) for of in (truth.change_rows[row], rows[column]))
             ious["point"][row] = iou[row, column]
-            ious["voxel"][row] = voxel_iou(true, answered)
-            ious["box"][row] = box_iou(true, answered)
+            ious["voxel"][row] = compute_voxel_iou(true, answered)
+            ious["box"][row] = compute_box_iou(true, answered)
     is_main = truth.is_observable & ~truth.is_partial
     n_rows = np.array([len(of_object) for of_object in rows], dtype=np.int64)
     is_excused = 2 * n_shared[~is_main].sum(axis=0) > n_rows
     return ObjectMatches(matched_object, matched_change, ious["point"], ious["voxel"], ious["box"], is_excused)
 
 
-def kinds_right(objects: Sequence[ChangedObject], matches: ObjectMatches, truth: GroundTruth) -> Float64Array:
+def judge_kinds(objects: Sequence[ChangedObject], matches: ObjectMatches, truth: GroundTruth) -> Float64Array:
     """Return (C,) whether each matched change has the right kind: 1, 0, or NaN where nothing matched.
 
     A moved change is right if its object has the kind moved and is linked with the object matched to the change's other
@@ -147,7 +147,7 @@ def kinds_right(objects: Sequence[ChangedObject], matches: ObjectMatches, truth:
     return right
 
 
-def object_columns(matches: ObjectMatches, right: Float64Array, truth: GroundTruth) -> dict[str, float]:
+def summarise_objects(matches: ObjectMatches, right: Float64Array, truth: GroundTruth) -> dict[str, float]:
     """Return the object columns of results.csv; averages are over the observable changes of the main group."""
     is_main = truth.is_observable & ~truth.is_partial
     is_partial = truth.is_observable & truth.is_partial
@@ -156,8 +156,8 @@ def object_columns(matches: ObjectMatches, right: Float64Array, truth: GroundTru
         f"object_iou_{name}": mean(values[is_main])
         for name, values in (("point", matches.iou_point), ("voxel", matches.iou_voxel), ("box", matches.iou_box))
     }
-    f1_25, _, _ = _instance_scores(matches, is_main, 0.25)
-    f1_50, precision_50, quality = _instance_scores(matches, is_main, 0.5)
+    f1_25, _, _ = _score_instances(matches, is_main, 0.25)
+    f1_50, precision_50, quality = _score_instances(matches, is_main, 0.5)
     return {
         **columns,
         "object_f1_25": f1_25 if n_main else float("nan"),
@@ -173,10 +173,10 @@ def object_columns(matches: ObjectMatches, right: Float64Array, truth: GroundTru
     }
 
 
-def unanswered_objects(truth: GroundTruth) -> tuple[ObjectMatches, dict[str, float]]:
+def score_unanswered_objects(truth: GroundTruth) -> tuple[ObjectMatches, dict[str, float]]:
     """Return the scores of a case without an answer: 0 in every object column where observable changes exist."""
     matches = match_objects((), (), truth)
-    columns = object_columns(matches, np.full(len(truth.pair.changes), np.nan), truth)
+    columns = summarise_objects(matches, np.full(len(truth.pair.changes), np.nan), truth)
     if (truth.is_observable & ~truth.is_partial).any():
         columns["object_precision_50"] = 0.0
     if truth.n_observable:
@@ -184,7 +184,7 @@ def unanswered_objects(truth: GroundTruth) -> tuple[ObjectMatches, dict[str, flo
     return matches, columns
 
 
-def _instance_scores(matches: ObjectMatches, is_main: BoolArray, min_iou: float) -> tuple[float, float, float]:
+def _score_instances(matches: ObjectMatches, is_main: BoolArray, min_iou: float) -> tuple[float, float, float]:
     """Return F1, precision and panoptic quality at an IoU; NaN without changes and without objects."""
     is_hit = is_main & (matches.iou_point >= min_iou)
     n_hit = int(np.count_nonzero(is_hit))

@@ -12,7 +12,7 @@ from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.model.report import ChangedObject
 from eval.core.statistics import median
 from eval.scoring.object_metrics import ObjectMatches
-from eval.scoring.region_metrics import places_in_map
+from eval.scoring.region_metrics import transform_to_map
 from eval.truth.ground_truth import GroundTruth
 from sim.session.truth import Change
 
@@ -32,7 +32,7 @@ class SizeErrors:
     volume_share: Float64Array
 
 
-def size_errors(
+def compute_size_errors(
     objects: Sequence[ChangedObject], matches: ObjectMatches, truth: GroundTruth, keyframe_scans: Int64Array
 ) -> SizeErrors:
     """Compare the displacement and the volume of each matched object with its change's.
@@ -45,18 +45,18 @@ def size_errors(
     """
     changes = truth.pair.changes
     errors = SizeErrors(*(np.full(len(changes), np.nan) for _ in range(2)))
-    moves = true_displacements_map(truth, keyframe_scans)
+    moves = find_true_displacements_map(truth, keyframe_scans)
     for index in np.flatnonzero(matches.matched_object >= 0):
         item = objects[matches.matched_object[index]]
         if item.displacement_map is not None:
             errors.displacement_m[index] = np.linalg.norm(item.displacement_map - moves[index])
-        volume_m3 = true_volume_m3(changes[index])
+        volume_m3 = find_true_volume_m3(changes[index])
         if item.shape is not None and volume_m3 > 0:
             errors.volume_share[index] = (item.shape.volume_m3 - volume_m3) / volume_m3
     return errors
 
 
-def true_displacements_map(truth: GroundTruth, keyframe_scans: Int64Array) -> Float64Array:
+def find_true_displacements_map(truth: GroundTruth, keyframe_scans: Int64Array) -> Float64Array:
     """Return the (C, 3) displacement of each moved object, map frame, metres; NaN for objects that did not move.
 
     A displacement joins the centres of the object's bounding box before and after the move. Each centre is transformed
@@ -66,9 +66,9 @@ def true_displacements_map(truth: GroundTruth, keyframe_scans: Int64Array) -> Fl
     changes = truth.pair.changes
     if not changes:
         return np.zeros((0, 3))
-    heights_m = _heights_m(truth.pair.scenario)
-    middles_world = np.array([_middle_world(change, heights_m.get(change.name, 0.0)) for change in changes])
-    places = places_in_map(middles_world, truth.before, keyframe_scans)
+    heights_m = _list_heights_m(truth.pair.scenario)
+    middles_world = np.array([_find_middle_world(change, heights_m.get(change.name, 0.0)) for change in changes])
+    places = transform_to_map(middles_world, truth.before, keyframe_scans)
     at = {change.id: index for index, change in enumerate(changes)}
     moves = np.full((len(changes), 3), np.nan)
     for index, change in enumerate(changes):
@@ -78,7 +78,7 @@ def true_displacements_map(truth: GroundTruth, keyframe_scans: Int64Array) -> Fl
     return moves
 
 
-def true_volume_m3(change: Change) -> float:
+def find_true_volume_m3(change: Change) -> float:
     """Return the volume of a change: of its closed surface or, for props of several parts, of its convex hull.
 
     For a reshaped prop it is the removed volume. NaN for a short move, where only a part of the object is its truth.
@@ -88,7 +88,7 @@ def true_volume_m3(change: Change) -> float:
     return change.hull_volume_m3 if change.mesh_volume_m3 is None else change.mesh_volume_m3
 
 
-def size_columns(errors: SizeErrors, truth: GroundTruth) -> dict[str, float]:
+def summarise_size_errors(errors: SizeErrors, truth: GroundTruth) -> dict[str, float]:
     """Return the columns of results.csv: medians over the matched changes that have a number; NaN without one."""
     is_pile = np.array([change.prop_kind == PILE_KIND for change in truth.pair.changes], dtype=np.bool_)
     return {
@@ -97,12 +97,12 @@ def size_columns(errors: SizeErrors, truth: GroundTruth) -> dict[str, float]:
     }
 
 
-def _heights_m(scenario: Mapping[str, Any]) -> dict[str, float]:
+def _list_heights_m(scenario: Mapping[str, Any]) -> dict[str, float]:
     """Return the height of every prop whose scenario states its size."""
     return {prop["name"]: float(prop["size_m"][2]) for prop in scenario.get("props", ()) if prop.get("size_m")}
 
 
-def _middle_world(change: Change, height_m: float) -> Float64Array:
+def _find_middle_world(change: Change, height_m: float) -> Float64Array:
     """Return the (3,) centre of an object, whose own origin is on the floor, in any orientation."""
     pose = np.asarray(change.world_T_object, dtype=np.float64)
     return np.asarray(pose[:3, :3] @ (0.0, 0.0, height_m / 2) + pose[:3, 3])

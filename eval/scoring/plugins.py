@@ -14,7 +14,7 @@ Metric = Callable[[GroundTruth, Answer], Mapping[str, float]]
 """`metric(truth, answer)`: columns by name; NaN where undefined. `answer.report` is None where a method gave none."""
 
 
-def plugin_columns(truth: GroundTruth, answer: Answer, taken: Mapping[str, object]) -> dict[str, float]:
+def compute_plugin_columns(truth: GroundTruth, answer: Answer, taken: Mapping[str, object]) -> dict[str, float]:
     """Return the columns of every registered metric.
 
     Args:

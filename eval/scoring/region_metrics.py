@@ -37,12 +37,12 @@ class RegionMatches:
         return self.outcomes.count(outcome)
 
 
-def keyframes_or_all(keyframe_scans: Int64Array, n_scans: int) -> Int64Array:
+def choose_judged_scans(keyframe_scans: Int64Array, n_scans: int) -> Int64Array:
     """Return the scans an answer names as keyframes; an answer that names none is judged on every scan."""
     return keyframe_scans if len(keyframe_scans) else np.arange(n_scans)
 
 
-def centres_in_world(centres_map: Float64Array, before: SessionTruth, keyframe_scans: Int64Array) -> Float64Array:
+def transform_to_world(centres_map: Float64Array, before: SessionTruth, keyframe_scans: Int64Array) -> Float64Array:
     """Transform (R, 3) centres from the map frame into the world, each by the true pose of the nearest keyframe.
 
     The map frame is the before session's odom frame, which drifts against the world, so one transform is not enough.
@@ -54,7 +54,7 @@ def centres_in_world(centres_map: Float64Array, before: SessionTruth, keyframe_s
     return before.to_world(centres_map, keyframe_scans[nearest])
 
 
-def places_in_map(places_world: Float64Array, before: SessionTruth, keyframe_scans: Int64Array) -> Float64Array:
+def transform_to_map(places_world: Float64Array, before: SessionTruth, keyframe_scans: Int64Array) -> Float64Array:
     """Transform (N, 3) true places into the map frame, each by the true pose of the keyframe truly nearest to it."""
     if len(places_world) == 0:
         return np.zeros((0, 3))
@@ -105,7 +105,7 @@ def match_regions(
     return RegionMatches(tuple(outcomes), found, best_region)
 
 
-def recall_at_k(found: Sequence[tuple[int, ...]], is_observable: BoolArray) -> float:
+def compute_recall_at_k(found: Sequence[tuple[int, ...]], is_observable: BoolArray) -> float:
     """Return the share of the K observable changes that the first K of `found` find, best first; NaN for K = 0."""
     k = int(np.count_nonzero(is_observable))
     if k == 0:
@@ -113,7 +113,7 @@ def recall_at_k(found: Sequence[tuple[int, ...]], is_observable: BoolArray) -> f
     return len({change for changes in found[:k] for change in changes if is_observable[change]}) / k
 
 
-def covered_share(
+def measure_covered_share(
     positions_world: Float64Array, travelled_m: Float64Array, centres_world: Float64Array, radius_m: float
 ) -> float:
     """Return the share of a path's length inside spheres; the middle of a step between scans decides for the step.
@@ -136,7 +136,7 @@ def covered_share(
     return float(steps_m[distances <= radius_m].sum() / steps_m.sum())
 
 
-def keyframe_labels(
+def label_keyframes(
     positions_world: Float64Array, centroids_world: Float64Array, is_observable: BoolArray, score_radius_m: float
 ) -> Int64Array:
     """Label (K, 3) keyframes: 1 near an observable change, 0 farther than 1.5 radii from all, -1 left out."""
@@ -170,8 +170,8 @@ def score_regions(report: ChangeReport, truth: GroundTruth, after_travelled_m: F
         after_travelled_m: (S,) path length of the after session up to each scan.
     """
     regions, radius_m = report.regions, truth.pair.score_radius_m
-    keyframes = keyframes_or_all(report.keyframe_scans[0], len(truth.before.odom_T_sensor))
-    centres = centres_in_world(regions.centres_map, truth.before, keyframes)
+    keyframes = choose_judged_scans(report.keyframe_scans[0], len(truth.before.odom_T_sensor))
+    centres = transform_to_world(regions.centres_map, truth.before, keyframes)
     matches = match_regions(centres, regions.is_reported, truth.centroids_world, truth.is_observable, radius_m)
     path_m = float(after_travelled_m[-1])
     is_withdrawn = regions.is_proposed & ~regions.is_reported
@@ -180,16 +180,16 @@ def score_regions(report: ChangeReport, truth: GroundTruth, after_travelled_m: F
 
     scores = regions.keyframe_scores
     positions = truth.before.world_T_sensor[keyframes[: len(scores)], :3, 3]
-    labels = keyframe_labels(positions, truth.centroids_world, truth.is_observable, radius_m)
+    labels = label_keyframes(positions, truth.centroids_world, truth.is_observable, radius_m)
     used = labels >= 0
     columns = {
-        **_rates(matches, truth, path_m),
-        **{f"{name}_proposed": value for name, value in _rates(proposed, truth, path_m).items()},
-        "region_recall_at_k": recall_at_k(kept, truth.is_observable),
-        "region_recall_at_k_proposed": recall_at_k(matches.found, truth.is_observable),
+        **_compute_rates(matches, truth, path_m),
+        **{f"{name}_proposed": value for name, value in _compute_rates(proposed, truth, path_m).items()},
+        "region_recall_at_k": compute_recall_at_k(kept, truth.is_observable),
+        "region_recall_at_k_proposed": compute_recall_at_k(matches.found, truth.is_observable),
         "region_auroc": auroc(scores[used], labels[used] == 1),
         "region_ap": average_precision(scores[used], labels[used] == 1),
-        "region_coverage": covered_share(
+        "region_coverage": measure_covered_share(
             truth.after.world_T_sensor[:, :3, 3], after_travelled_m, centres[regions.is_reported], regions.radius_m
         ),
         "n_regions": int(np.count_nonzero(regions.is_reported)),
@@ -198,26 +198,26 @@ def score_regions(report: ChangeReport, truth: GroundTruth, after_travelled_m: F
         "n_false_regions": matches.count("false"),
         "n_duplicate_regions": matches.count("duplicate"),
         "n_ignored_regions": matches.count("ignored"),
-        "n_found_changes": _n_found(matches, truth),
+        "n_found_changes": _count_found(matches, truth),
     }
     return RegionScores(columns, matches, labels)
 
 
-def _rates(matches: RegionMatches, truth: GroundTruth, path_m: float) -> dict[str, float]:
+def _compute_rates(matches: RegionMatches, truth: GroundTruth, path_m: float) -> dict[str, float]:
     """Return recall, precision and false alarms of the matched regions."""
     n_true, n_false = matches.count("true"), matches.count("false")
     return {
-        "region_recall": _n_found(matches, truth) / truth.n_observable if truth.n_observable else float("nan"),
+        "region_recall": _count_found(matches, truth) / truth.n_observable if truth.n_observable else float("nan"),
         "region_precision": n_true / (n_true + n_false) if n_true + n_false else float("nan"),
         "false_regions_per_100m": 100.0 * n_false / path_m if path_m > 0 else float("nan"),
     }
 
 
-def _n_found(matches: RegionMatches, truth: GroundTruth) -> int:
+def _count_found(matches: RegionMatches, truth: GroundTruth) -> int:
     return int(np.count_nonzero(truth.is_observable & (matches.best_region >= 0)))
 
 
-def unanswered_regions(n_changes: int, n_observable: int) -> RegionScores:
+def score_unanswered_regions(n_changes: int, n_observable: int) -> RegionScores:
     """Return the scores of a case without an answer: recall 0; rates over reported regions are NaN."""
     nan = float("nan")
     recall = 0.0 if n_observable else nan

@@ -19,12 +19,18 @@ from cdpipe.model.report import ChangedObject, ChangeReport
 from eval.core.domains import domain_of, is_change_in_distribution
 from eval.core.statistics import mean
 from eval.scoring.answer_check import SECONDS, check_answer
-from eval.scoring.answer_rows import answer_rows
-from eval.scoring.merge_metrics import evidence_columns, merge_columns, merge_errors, overlap_true
-from eval.scoring.object_metrics import ObjectMatches, kinds_right, match_objects, object_columns, unanswered_objects
-from eval.scoring.object_sizes import SizeErrors, size_columns, size_errors
-from eval.scoring.plugins import plugin_columns
-from eval.scoring.region_metrics import RegionScores, keyframes_or_all, score_regions, unanswered_regions
+from eval.scoring.answer_rows import find_answer_rows
+from eval.scoring.merge_metrics import compute_merge_errors, list_evidence, measure_overlap, summarise_merge_errors
+from eval.scoring.object_metrics import (
+    ObjectMatches,
+    judge_kinds,
+    match_objects,
+    score_unanswered_objects,
+    summarise_objects,
+)
+from eval.scoring.object_sizes import SizeErrors, compute_size_errors, summarise_size_errors
+from eval.scoring.plugins import compute_plugin_columns
+from eval.scoring.region_metrics import RegionScores, choose_judged_scans, score_regions, score_unanswered_regions
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
 METRICS_VERSION = 4
@@ -84,38 +90,38 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
     after_travelled_m = travelled_m(truth.after.odom_T_sensor)
     report = answer.report
     if report is None or answer.until == "merge":
-        regions = unanswered_regions(len(truth.pair.changes), truth.n_observable)
-        objects, object_scores = unanswered_objects(truth)
+        regions = score_unanswered_regions(len(truth.pair.changes), truth.n_observable)
+        objects, object_scores = score_unanswered_objects(truth)
         right = np.full(len(truth.pair.changes), np.nan)
         sizes = SizeErrors(right, right)
         items: list[dict[str, Any]] = []
     else:
         regions = score_regions(report, truth, after_travelled_m)
-        rows = answer_rows(answer, truth)
+        rows = find_answer_rows(answer, truth)
         objects = match_objects(report.objects, rows, truth)
-        right = kinds_right(report.objects, objects, truth)
-        object_scores = object_columns(objects, right, truth)
-        before_scans = keyframes_or_all(report.keyframe_scans[0], len(truth.before.odom_T_sensor))
-        sizes = size_errors(report.objects, objects, truth, before_scans)
-        items = object_rows(report.objects, objects, [len(of_object) for of_object in rows], truth)
+        right = judge_kinds(report.objects, objects, truth)
+        object_scores = summarise_objects(objects, right, truth)
+        before_scans = choose_judged_scans(report.keyframe_scans[0], len(truth.before.odom_T_sensor))
+        sizes = compute_size_errors(report.objects, objects, truth, before_scans)
+        items = make_object_rows(report.objects, objects, [len(of_object) for of_object in rows], truth)
     n_regions = int(regions.columns["n_regions"])
-    found: dict[str, float] = {**regions.columns, **object_scores, **size_columns(sizes, truth)}
+    found: dict[str, float] = {**regions.columns, **object_scores, **summarise_size_errors(sizes, truth)}
     row = {
-        **_identity(answer, truth),
+        **_make_identity(answer, truth),
         **(found if answer.until is None else dict.fromkeys(found, _NAN)),
-        **_merge(answer, truth),
-        **_times(answer, n_regions + int(regions.columns["n_withdrawn"])),
-        **_figure_means(report),
-        **_sizes(answer, truth, n_regions, float(after_travelled_m[-1])),
+        **_score_merge(answer, truth),
+        **_list_times(answer, n_regions + int(regions.columns["n_withdrawn"])),
+        **_average_figures(report),
+        **_list_sizes(answer, truth, n_regions, float(after_travelled_m[-1])),
     }
-    row |= plugin_columns(truth, answer, row)
+    row |= compute_plugin_columns(truth, answer, row)
     if answer.until == "merge":
         return CaseScore(row=row, changes=[], regions=[], objects=[])
     keyframe_scores = np.zeros(0) if report is None else report.regions.keyframe_scores
     return CaseScore(
         row=row,
-        changes=change_rows(regions, (objects, sizes), right, truth, report),
-        regions=region_rows(report, regions, truth),
+        changes=make_change_rows(regions, (objects, sizes), right, truth, report),
+        regions=make_region_rows(report, regions, truth),
         objects=items,
         keyframes=[
             {"keyframe": index, "score": float(score), "label": int(label)}
@@ -124,7 +130,7 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
     )
 
 
-def change_rows(
+def make_change_rows(
     regions: RegionScores,
     scored: tuple[ObjectMatches, SizeErrors],
     right: Float64Array,
@@ -157,13 +163,13 @@ def change_rows(
     return rows
 
 
-def region_rows(report: ChangeReport | None, scored: RegionScores, truth: GroundTruth) -> list[dict[str, Any]]:
+def make_region_rows(report: ChangeReport | None, scored: RegionScores, truth: GroundTruth) -> list[dict[str, Any]]:
     """Return a row of regions.csv for every candidate, best first."""
     if report is None:
         return []
     regions = report.regions
     is_withdrawn = regions.is_proposed & ~regions.is_reported
-    figures = {name: figure(report, name) for name in FIGURES}
+    figures = {name: read_figure(report, name) for name in FIGURES}
     return [
         {
             "region": index,
@@ -179,7 +185,7 @@ def region_rows(report: ChangeReport | None, scored: RegionScores, truth: Ground
     ]
 
 
-def object_rows(
+def make_object_rows(
     objects: tuple[ChangedObject, ...], matches: ObjectMatches, n_cells: list[int], truth: GroundTruth
 ) -> list[dict[str, Any]]:
     """Return a row of objects.csv for every answered object."""
@@ -210,12 +216,12 @@ def object_rows(
     return rows
 
 
-def figure(report: ChangeReport, name: str) -> Float64Array:
+def read_figure(report: ChangeReport, name: str) -> Float64Array:
     """Return (R,) a figure of each region, NaN where the answer does not state it."""
     return np.asarray(report.figures.get(name, np.full(len(report.regions.scores), np.nan)), dtype=np.float64)
 
 
-def _identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
+def _make_identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
     return {
         "scenario": truth.pair.family,
         "family": truth.pair.family,
@@ -233,21 +239,21 @@ def _identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
     }
 
 
-def _merge(answer: Answer, truth: GroundTruth) -> dict[str, float]:
+def _score_merge(answer: Answer, truth: GroundTruth) -> dict[str, float]:
     report, errors = answer.report, None
     if report is not None:
         before_scans, after_scans = (
-            keyframes_or_all(scans, len(session.odom_T_sensor))
+            choose_judged_scans(scans, len(session.odom_T_sensor))
             for scans, session in zip(report.keyframe_scans, (truth.before, truth.after), strict=True)
         )
         local = report.local_before_T_after
         merge = report.before_T_after if local is None else local
-        errors = merge_errors(truth.before, truth.after, merge, (before_scans, after_scans))
-    overlap = overlap_true(truth.before.world_T_sensor, truth.after.world_T_sensor)
-    return {**merge_columns(errors), "overlap_true": overlap, **evidence_columns(answer.evidence)}
+        errors = compute_merge_errors(truth.before, truth.after, merge, (before_scans, after_scans))
+    overlap = measure_overlap(truth.before.world_T_sensor, truth.after.world_T_sensor)
+    return {**summarise_merge_errors(errors), "overlap_true": overlap, **list_evidence(answer.evidence)}
 
 
-def _times(answer: Answer, n_proposed: int) -> dict[str, float]:
+def _list_times(answer: Answer, n_proposed: int) -> dict[str, float]:
     """Return the time columns; a time that the answer does not state is NaN, and so are its sums.
 
     Withdrawn regions were compared and extracted as well, so times per region count them.
@@ -271,11 +277,11 @@ def _times(answer: Answer, n_proposed: int) -> dict[str, float]:
     }
 
 
-def _figure_means(report: ChangeReport | None) -> dict[str, float]:
-    return {name: mean(figure(report, name)[report.regions.is_reported]) if report else _NAN for name in FIGURES}
+def _average_figures(report: ChangeReport | None) -> dict[str, float]:
+    return {name: mean(read_figure(report, name)[report.regions.is_reported]) if report else _NAN for name in FIGURES}
 
 
-def _sizes(answer: Answer, truth: GroundTruth, n_regions: int, after_path_m: float) -> dict[str, Any]:
+def _list_sizes(answer: Answer, truth: GroundTruth, n_regions: int, after_path_m: float) -> dict[str, Any]:
     keyframes = (None, None) if answer.report is None else answer.report.keyframe_scans
     is_unchanged = len(truth.pair.changes) == 0
     return {

@@ -23,7 +23,9 @@ ALARM_SHARE = 0.05
 FALSE_PER_100M = 0.1
 
 
-def alarm_threshold(best_scores: Float64Array, alarm_share: float = ALARM_SHARE, lowest: float | None = None) -> float:
+def find_alarm_threshold(
+    best_scores: Float64Array, alarm_share: float = ALARM_SHARE, lowest: float | None = None
+) -> float:
     """Return the smallest threshold (four digits, rounded up) that at most `alarm_share` of the pairs reach.
 
     Args:
@@ -33,10 +35,10 @@ def alarm_threshold(best_scores: Float64Array, alarm_share: float = ALARM_SHARE,
     """
     if len(best_scores) == 0 or np.isnan(best_scores).any():
         raise ValueError("best_scores must hold a number for each of at least one pair")
-    return _just_above(best_scores, int(alarm_share * len(best_scores)), lowest)
+    return _round_above(best_scores, int(alarm_share * len(best_scores)), lowest)
 
 
-def rate_threshold(
+def find_rate_threshold(
     scores: Float64Array, path_m: float, false_per_100m: float = FALSE_PER_100M, lowest: float | None = None
 ) -> float:
     """Return the smallest threshold (four digits, rounded up) that at most so many false regions per 100 m reach.
@@ -45,12 +47,12 @@ def rate_threshold(
         scores: (R,) score of every candidate of all unchanged pairs.
         path_m: Summed path length of their after sessions, metres.
         false_per_100m: Largest allowed rate.
-        lowest: As in `alarm_threshold`.
+        lowest: As in `find_alarm_threshold`.
     """
-    return _just_above(scores, int(false_per_100m * path_m / 100.0 + 1e-9), lowest)
+    return _round_above(scores, int(false_per_100m * path_m / 100.0 + 1e-9), lowest)
 
 
-def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
+def find_thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
     """Return one row per variant and kind of site, with its thresholds at either rate.
 
     A threshold belongs to a kind of site, as the radius does: the same change scores differently in narrow and wide
@@ -74,7 +76,7 @@ def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
         if len(ok) == 0:
             raise InputError(f"{variant}, {radius_m:g} m: no pair has an answer: a threshold needs at least one")
         stands = (regions["variant"] == variant) & ~regions["is_withdrawn"].astype(bool)
-        lowest = _let_through(regions[regions["variant"] == variant].merge(cases[["scenario", "seed"]]))
+        lowest = _find_lowest_examined(regions[regions["variant"] == variant].merge(cases[["scenario", "seed"]]))
         if lowest is not None:
             stands &= regions["score"] >= lowest
         of_case = regions[stands].groupby(["scenario", "seed"])["score"]
@@ -82,8 +84,8 @@ def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
         candidates = [found.get(case, np.zeros(0)) for case in zip(ok["scenario"], ok["seed"], strict=True)]
         best = np.array([scores.max(initial=-np.inf) for scores in candidates])
         every, path_m = np.concatenate(candidates), float(ok["after_path_m"].sum())
-        threshold = alarm_threshold(best, lowest=lowest)
-        at_rate = rate_threshold(every, path_m, lowest=lowest)
+        threshold = find_alarm_threshold(best, lowest=lowest)
+        at_rate = find_rate_threshold(every, path_m, lowest=lowest)
         rows.append(
             {
                 "variant": variant,
@@ -100,7 +102,7 @@ def thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def as_settings(table: pd.DataFrame) -> str:
+def format_settings(table: pd.DataFrame) -> str:
     """Return the thresholds in the YAML form of presets: by rate and variant, for narrow sites and under `wide`."""
     lines = []
     rates = (
@@ -121,9 +123,9 @@ def as_settings(table: pd.DataFrame) -> str:
 
 def main(run: Annotated[Path, typer.Argument(help="folder of `tunnelcd run calibrate`")]) -> None:
     """Print and write the thresholds of a calibration run."""
-    table = thresholds(read_table(run / "results.csv", "calibrate"), read_table(run / "regions.csv", "calibrate"))
+    table = find_thresholds(read_table(run / "results.csv", "calibrate"), read_table(run / "regions.csv", "calibrate"))
     table.to_csv(run / "thresholds.csv", index=False)
-    settings = as_settings(table)
+    settings = format_settings(table)
     (run / "thresholds.yaml").write_text(settings)
     typer.echo(f"{table.to_string(index=False)}\n\n{settings}")
 
@@ -141,7 +143,7 @@ def read_table(path: Path, plan: str) -> pd.DataFrame:
         raise InputError(f"{path}: {reason}: name a folder that `tunnelcd run {plan}` made") from error
 
 
-def _let_through(regions: pd.DataFrame) -> float | None:
+def _find_lowest_examined(regions: pd.DataFrame) -> float | None:
     """Return the lowest score that was examined; None for a method that withdraws nothing."""
     is_withdrawn = regions["is_withdrawn"].astype(bool)
     if not is_withdrawn.any():
@@ -149,7 +151,7 @@ def _let_through(regions: pd.DataFrame) -> float | None:
     return float(regions.loc[is_withdrawn | regions["is_reported"].astype(bool), "score"].min())
 
 
-def _just_above(scores: Float64Array, allowed: int, lowest: float | None) -> float:
+def _round_above(scores: Float64Array, allowed: int, lowest: float | None) -> float:
     """Return the smallest number of four digits, `lowest` (0 if None) or more, that at most `allowed` scores reach."""
     silent_best = -np.inf if allowed >= len(scores) else np.sort(scores)[::-1][allowed]
     if lowest is not None:

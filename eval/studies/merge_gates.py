@@ -28,9 +28,9 @@ from eval.core.charts import BLACK, BLUE, VERMILLION, Axis, Drawing, Look, Panel
 from eval.core.exits import run_program
 from eval.core.figures import picture, png
 from eval.core.output import make_writable
-from eval.plans.coverage import plan_of
-from eval.plans.plan import cells
-from eval.running.run_data import read_document
+from eval.plans.coverage import read_stored_plan
+from eval.plans.plan import expand_cells
+from eval.running.runfolder import read_json
 from eval.studies.calibrate import read_table
 from eval.tables.merge_table import RULES, is_accepted, is_right, kinds
 from eval.tables.rows import numbers, texts
@@ -44,7 +44,7 @@ _MARKS = (
 )
 
 
-def committed_thresholds() -> dict[str, float]:
+def read_committed_thresholds() -> dict[str, float]:
     """Return the threshold of every gate in the preset `tunnelcd`."""
     merge = load_config("tunnelcd").merge
     return {name: float(getattr(merge, setting)) for name, setting in GATES}
@@ -68,8 +68,8 @@ def require_ungated(results: pd.DataFrame, variant: str, provenance: Mapping[str
             raise InputError(
                 f"{row['scenario']}, seed {row['seed']}: refused by {named[0]}: run the plan with merge.accept_all=true"
             )
-    plan = plan_of(provenance)
-    found = [] if plan is None else [cell.config for cell in cells(plan) if cell.variant == variant]
+    plan = read_stored_plan(provenance)
+    found = [] if plan is None else [cell.config for cell in expand_cells(plan) if cell.variant == variant]
     if not found or not all(config.merge.accept_all for config in found):
         raise InputError(
             f"provenance.json: variant {variant} is not told to have merge.accept_all=true: "
@@ -77,7 +77,7 @@ def require_ungated(results: pd.DataFrame, variant: str, provenance: Mapping[str
         )
 
 
-def measured(results: pd.DataFrame, variant: str) -> pd.DataFrame:
+def tabulate_merges(results: pd.DataFrame, variant: str) -> pd.DataFrame:
     """Return the accepted merges of a variant with their evidence: `right`, `kind`, and a column for each gate.
 
     Args:
@@ -87,7 +87,7 @@ def measured(results: pd.DataFrame, variant: str) -> pd.DataFrame:
     Raises:
         InputError: There is no such variant, or the table lacks the evidence.
     """
-    variant = chosen_variant(results, variant)
+    variant = choose_variant(results, variant)
     absent = [f"evidence_{name}" for name, _ in GATES if f"evidence_{name}" not in results]
     if absent:
         raise InputError(f"results.csv: column {', '.join(absent)} is missing: `tunnelcd score` the run again")
@@ -104,7 +104,7 @@ def measured(results: pd.DataFrame, variant: str) -> pd.DataFrame:
     )
 
 
-def chosen_variant(results: pd.DataFrame, variant: str) -> str:
+def choose_variant(results: pd.DataFrame, variant: str) -> str:
     """Return the named variant, or the only one where none is named.
 
     Raises:
@@ -118,11 +118,11 @@ def chosen_variant(results: pd.DataFrame, variant: str) -> str:
     return variant
 
 
-def gate_table(cases: pd.DataFrame, thresholds: Mapping[str, float]) -> pd.DataFrame:
+def tabulate_gates(cases: pd.DataFrame, thresholds: Mapping[str, float]) -> pd.DataFrame:
     """Return one row for every gate and one for all of them together.
 
     Args:
-        cases: As `measured` returns them.
+        cases: As `tabulate_merges` returns them.
         thresholds: Threshold of each gate.
 
     Returns:
@@ -138,31 +138,31 @@ def gate_table(cases: pd.DataFrame, thresholds: Mapping[str, float]) -> pd.DataF
     for name, setting in GATES:
         by_others = np.logical_or.reduce([mask for other, mask in refused.items() if other != name])
         values = cases[name].to_numpy(dtype=np.float64)
-        suggested, is_separable = suggest(values[right], values[~right], logarithmic=name in LOGARITHMIC)
+        suggested, is_separable = suggest_threshold(values[right], values[~right], logarithmic=name in LOGARITHMIC)
         rows.append(
             {
                 "gate": name,
                 "setting": f"merge.{setting}",
                 "threshold": thresholds[name],
-                **_counts(right, refused[name], refused[name] & ~by_others),
-                "worst_right": _end(values[right], np.min),
-                "best_wrong": _end(values[~right], np.max),
+                **_count_refused(right, refused[name], refused[name] & ~by_others),
+                "worst_right": _find_extreme(values[right], np.min),
+                "best_wrong": _find_extreme(values[~right], np.max),
                 "is_separable": is_separable,
                 "suggested": suggested,
             }
         )
     every = np.logical_or.reduce(list(refused.values()))
     nothing = np.zeros_like(every)
-    return pd.DataFrame([*rows, {"gate": "all", "setting": "", **_counts(right, every, nothing)}])
+    return pd.DataFrame([*rows, {"gate": "all", "setting": "", **_count_refused(right, every, nothing)}])
 
 
-def let_through(cases: pd.DataFrame, thresholds: Mapping[str, float]) -> BoolArray:
+def pass_gates(cases: pd.DataFrame, thresholds: Mapping[str, float]) -> BoolArray:
     """Return the (N,) mask of the merges that reach every gate."""
     passed = [cases[name].to_numpy(dtype=np.float64) >= thresholds[name] for name, _ in GATES]
     return np.asarray(np.logical_and.reduce(passed), dtype=np.bool_)
 
 
-def suggest(right: Float64Array, wrong: Float64Array, *, logarithmic: bool) -> tuple[float, bool]:
+def suggest_threshold(right: Float64Array, wrong: Float64Array, *, logarithmic: bool) -> tuple[float, bool]:
     """Return a threshold, and whether it separates all right values from all wrong ones.
 
     The threshold is rounded down to three digits; it is NaN without a right value.
@@ -173,12 +173,12 @@ def suggest(right: Float64Array, wrong: Float64Array, *, logarithmic: bool) -> t
     if len(wrong) and wrong.max() < right.min():
         low, high = float(wrong.max()), float(right.min())
         middle = float(np.sqrt(low * high)) if logarithmic and low > 0 else (low + high) / 2
-        rounded = _rounded_down(middle)
+        rounded = _round_down(middle)
         return (rounded if rounded > low else middle), True
-    return _rounded_down(float(np.sort(right)[int((1.0 - KEPT_SHARE) * len(right))])), False
+    return _round_down(float(np.sort(right)[int((1.0 - KEPT_SHARE) * len(right))])), False
 
 
-def gates_chart(cases: pd.DataFrame, table: pd.DataFrame) -> Drawing:
+def draw_gates(cases: pd.DataFrame, table: pd.DataFrame) -> Drawing:
     """Draw a panel for each gate: every merge by kind of pair, right and wrong, and the thresholds."""
     by_gate = {str(row["gate"]): row for row in table.to_dict("records")}
     kinds_shown = [kind for kind in (*RULES, "") if (cases["kind"] == kind).any()]
@@ -191,7 +191,9 @@ def gates_chart(cases: pd.DataFrame, table: pd.DataFrame) -> Drawing:
         if not np.isnan(suggested):
             lines.append(Series([suggested, suggested], y_span, Look(BLACK, 1.0, "dash"), "suggested"))
         marks = [
-            series for row, kind in enumerate(kinds_shown) for series in _marks(cases[cases["kind"] == kind], name, row)
+            series
+            for row, kind in enumerate(kinds_shown)
+            for series in _draw_marks(cases[cases["kind"] == kind], name, row)
         ]
         drawn = np.concatenate([np.ravel(each.x) for each in (*lines, *marks)])
         span = log_span(drawn) if name in LOGARITHMIC else None
@@ -209,25 +211,25 @@ def main(
     """Print, write and draw which merges of a validation run each gate accepts and refuses."""
     path = run / "results.csv"
     results = read_table(path, "merge-gates")
-    require_ungated(results, chosen_variant(results, variant), read_document(run / "provenance.json"))
-    cases, thresholds = measured(results, variant), committed_thresholds()
+    require_ungated(results, choose_variant(results, variant), read_json(run / "provenance.json"))
+    cases, thresholds = tabulate_merges(results, variant), read_committed_thresholds()
     if len(cases) == 0:
         raise InputError(f"{path}: no merge was accepted: the plan's variant must set merge.accept_all=true")
     make_writable(out)
-    table = gate_table(cases, thresholds)
+    table = tabulate_gates(cases, thresholds)
     table.to_csv(out / "gates.csv", index=False)
-    (out / "gates.png").write_bytes(png(picture(gates_chart(cases, table))))
+    (out / "gates.png").write_bytes(png(picture(draw_gates(cases, table))))
     typer.echo(table.to_string(index=False, na_rep="-"))
     n_other = len(results) - len(cases)
     typer.echo(f"\n{len(cases)} merges; {n_other} further rows of results.csv were not merged or are of other variants")
-    passed, right = let_through(cases, thresholds), cases["right"].to_numpy(dtype=np.bool_)
+    passed, right = pass_gates(cases, thresholds), cases["right"].to_numpy(dtype=np.bool_)
     for title, mask in (("wrong, but let through", passed & ~right), ("right, but refused", right & ~passed)):
         typer.echo(f"\n{title}: {int(mask.sum())}")
         if mask.any():
             typer.echo(cases[mask].drop(columns="right").to_string(index=False, na_rep="-"))
 
 
-def _counts(right: BoolArray, refused: BoolArray, alone: BoolArray) -> dict[str, int]:
+def _count_refused(right: BoolArray, refused: BoolArray, alone: BoolArray) -> dict[str, int]:
     return {
         "n_right": int(right.sum()),
         "n_wrong": int((~right).sum()),
@@ -239,12 +241,12 @@ def _counts(right: BoolArray, refused: BoolArray, alone: BoolArray) -> dict[str,
     }
 
 
-def _end(values: Float64Array, which: Any) -> float:
+def _find_extreme(values: Float64Array, which: Any) -> float:
     values = values[~np.isnan(values)]
     return float(which(values)) if len(values) else float("nan")
 
 
-def _rounded_down(value: float) -> float:
+def _round_down(value: float) -> float:
     if value <= 0:
         return value
     digits = 2 - int(np.floor(np.log10(value)))
@@ -252,7 +254,7 @@ def _rounded_down(value: float) -> float:
     return float(np.floor(value * 10.0**digits + 1e-9) / 10.0**digits)
 
 
-def _marks(cases: pd.DataFrame, name: str, row: int) -> list[Series]:
+def _draw_marks(cases: pd.DataFrame, name: str, row: int) -> list[Series]:
     """Return the right and the wrong merges of one kind of pair; evidence that is missing is drawn at 0."""
     found = []
     for is_right_merge, look, word, offset in _MARKS:

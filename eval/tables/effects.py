@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from eval.core.statistics import IDENTITY_COLUMNS, paired_difference
-from eval.plans.worlds import references, settings_over
+from eval.plans.worlds import find_references, list_settings_over
 from eval.tables.rows import numbers
 
 KEYS = ("scenario", "variant", "seed")
@@ -35,9 +35,9 @@ def effects(results: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
     figures = results[metrics].apply(pd.to_numeric, errors="coerce").set_index(results["seed"])
     cases = dict(list(figures.groupby([results["scenario"].to_numpy(), results["variant"].to_numpy()])))
     rows: list[dict[str, Any]] = []
-    for (world, variant), reference in references(zip(*(results[name] for name in KEYS), strict=True)).items():
+    for (world, variant), reference in find_references(zip(*(results[name] for name in KEYS), strict=True)).items():
         changed, plain = cases[world, variant].align(cases[reference, variant], join="inner", axis=0)
-        names = {"reference": reference, "settings": settings_over(world, reference), "variant": variant}
+        names = {"reference": reference, "settings": list_settings_over(world, reference), "variant": variant}
         rows += [
             {**names, "metric": metric, **paired_difference(numbers(plain, metric), numbers(changed, metric), seed)}
             for metric in metrics

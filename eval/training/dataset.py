@@ -29,7 +29,7 @@ from cdpipe.training.shard import CHANGE_KINDS, FORMAT_VERSION, encode_shard, sp
 from eval.core.provenance import digest
 from eval.oracles.merge import OracleMerge, merged_by_truth
 from eval.scoring.merge_metrics import PAIR_RADIUS_M
-from eval.scoring.region_metrics import keyframe_labels
+from eval.scoring.region_metrics import label_keyframes
 from eval.truth.adapters import WrappedScans, held_input
 from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth, ground_truth
 from eval.truth.universe import UniverseBuilder
@@ -82,7 +82,7 @@ def shard_digest(scenario: Scenario, seed: int, recipe: Recipe) -> str:
             "files": file_digests(scenario),
             "seed": seed,
             "recipe": asdict(recipe),
-            "map": _map_config().model_dump(mode="json"),
+            "map": _load_map_config().model_dump(mode="json"),
             "image": image,
         }
     )
@@ -99,17 +99,19 @@ def make_shard(family: str, seed: int, recipe: Recipe) -> bytes:
     pair = simulate_in_memory(scenario, seed)
     if len(pair.truth.changes) > _MAX_CHANGES:
         raise ScenarioError(f"{family}: {len(pair.truth.changes)} changes, labels can tell {_MAX_CHANGES} apart")
-    before, after = (_mapped(pair.sessions[name]) for name in SESSIONS)
+    before, after = (_map_held(pair.sessions[name]) for name in SESSIONS)
     truth = ground_truth(pair.truth, {"before": before.truth, "after": after.truth})
-    merged = merged_by_truth(_bare(before), _bare(after), (before.truth, after.truth), OracleMerge(), seed)
+    merged = merged_by_truth(
+        _strip_descriptors(before), _strip_descriptors(after), (before.truth, after.truth), OracleMerge(), seed
+    )
     if not merged.is_accepted:
         raise ScenarioError(f"{family}: {merged.reason}")
     arrays = {
-        **_keyframes(before, after),
-        **_images(before, after, merged.alignment.to_map(after.map.points), truth, recipe, seed),
-        **_places(before, after, truth),
-        **_changes(before, truth),
-        **_named("draw", merge_errors(recipe, seed)),
+        **_list_keyframes(before, after),
+        **_render_images(before, after, merged.alignment.to_map(after.map.points), truth, recipe, seed),
+        **_find_places(before, after, truth),
+        **_list_changes(before, truth),
+        **_prefix_names("draw", draw_merge_errors(recipe, seed)),
     }
     about = {
         "family": family,
@@ -119,12 +121,12 @@ def make_shard(family: str, seed: int, recipe: Recipe) -> bytes:
         "recipe": asdict(recipe),
         "score_radius_m": pair.truth.score_radius_m,
         "changes": [{"name": change.name, "prop_kind": change.prop_kind} for change in pair.truth.changes],
-        "counts": _counts(arrays),
+        "counts": _count_arrays(arrays),
     }
     return encode_shard(arrays, about)
 
 
-def _map_config() -> MapConfig:
+def _load_map_config() -> MapConfig:
     return load_config("tunnelcd").map
 
 
@@ -142,9 +144,9 @@ class _WatchedScans(WrappedScans):
             yield scan
 
 
-def _mapped(held: LabelledSession) -> _Mapped:
+def _map_held(held: LabelledSession) -> _Mapped:
     """Map a session, reading it once."""
-    config, session = _map_config(), held.session
+    config, session = _load_map_config(), held.session
     chosen = set(choose_keyframes(session.odom_T_sensor, config.keyframe_spacing_m).tolist())
     universe = UniverseBuilder(str(session.path), session.sensor.height, session.sensor.width)
     ranges_m, stamps_ns = [], []
@@ -162,11 +164,11 @@ def _mapped(held: LabelledSession) -> _Mapped:
         truth,
         np.array(ranges_m, dtype=np.float16),
         np.array(stamps_ns, dtype=np.int64),
-        changes_of_points(point_map, held.change),
+        find_changes_of_points(point_map, held.change),
     )
 
 
-def changes_of_points(point_map: PointMap, change: npt.NDArray[np.int16]) -> npt.NDArray[np.uint8]:
+def find_changes_of_points(point_map: PointMap, change: npt.NDArray[np.int16]) -> npt.NDArray[np.uint8]:
     """Return the (N,) change id of each map point: that of most of its changed returns, 0 where it has none.
 
     Args:
@@ -189,13 +191,13 @@ def changes_of_points(point_map: PointMap, change: npt.NDArray[np.int16]) -> npt
     return changes
 
 
-def _bare(mapped: _Mapped) -> MappedSession:
+def _strip_descriptors(mapped: _Mapped) -> MappedSession:
     """Return a mapped session without descriptors, which a merge by the truth does not need."""
     scans = mapped.map.keyframe_scans
     return MappedSession(mapped.map, DescriptorSet(np.zeros((len(scans), 1), np.float32), None, scans, "none", ""))
 
 
-def _keyframes(before: _Mapped, after: _Mapped) -> Arrays:
+def _list_keyframes(before: _Mapped, after: _Mapped) -> Arrays:
     sessions = {"before": before, "after": after}
     per_session: dict[str, Callable[[_Mapped], npt.NDArray[Any]]] = {
         "scans": lambda mapped: mapped.map.keyframe_scans,
@@ -207,14 +209,14 @@ def _keyframes(before: _Mapped, after: _Mapped) -> Arrays:
     return {f"{name}_{key}": of(mapped) for key, of in per_session.items() for name, mapped in sessions.items()}
 
 
-def merge_errors(recipe: Recipe, seed: int) -> Arrays:
+def draw_merge_errors(recipe: Recipe, seed: int) -> Arrays:
     """Return the (D, 3) translations and rotation vectors of the draws; fewer draws are the first of more."""
     drawn = stream(seed, "dataset-merge-error").normal(size=(recipe.draws, 2, 3))
     drawn[0] = 0.0
     return {"shift_m": recipe.error_m * drawn[:, 0], "turn_rad": np.deg2rad(recipe.error_deg) * drawn[:, 1]}
 
 
-def displaced(map_T_anchor: Float64Array, shift_m: Float64Array, turn_rad: Float64Array) -> Float64Array:
+def displace_poses(map_T_anchor: Float64Array, shift_m: Float64Array, turn_rad: Float64Array) -> Float64Array:
     """Return the (K, 4, 4) poses from which a map looks as its displaced copy looks from the anchors.
 
     Args:
@@ -229,12 +231,12 @@ def displaced(map_T_anchor: Float64Array, shift_m: Float64Array, turn_rad: Float
     return poses
 
 
-def _images(
+def _render_images(
     before: _Mapped, after: _Mapped, after_map: Float64Array, truth: GroundTruth, recipe: Recipe, seed: int
 ) -> Arrays:
     anchors = before.map.odom_T_keyframe
-    draws = merge_errors(recipe, seed)
-    poses = [displaced(anchors, *error) for error in zip(draws["shift_m"], draws["turn_rad"], strict=True)]
+    draws = draw_merge_errors(recipe, seed)
+    poses = [displace_poses(anchors, *error) for error in zip(draws["shift_m"], draws["turn_rad"], strict=True)]
     after_index = GridIndex(after_map)
     before_labels = label_images(before.map.points, before.point_changes, anchors)
     after_labels = np.stack([label_images(after_map, after.point_changes, each) for each in poses])
@@ -244,8 +246,8 @@ def _images(
         "after_images": np.stack([render(after_index, each) for each in poses]),
         "before_labels": before_labels,
         "after_labels": after_labels,
-        "before_visible": _visible(before_labels, ids),
-        "after_visible": _visible(after_labels, ids),
+        "before_visible": _count_visible(before_labels, ids),
+        "after_visible": _count_visible(after_labels, ids),
     }
 
 
@@ -275,17 +277,17 @@ def label_images(
     return labels.reshape(-1, ROWS, COLUMNS)
 
 
-def _visible(labels: npt.NDArray[np.uint8], ids: Sequence[int]) -> npt.NDArray[np.int32]:
+def _count_visible(labels: npt.NDArray[np.uint8], ids: Sequence[int]) -> npt.NDArray[np.int32]:
     counts = [np.count_nonzero(labels == number, axis=(-2, -1)) for number in ids]
     return np.stack(counts, axis=-1).astype(np.int32) if counts else np.zeros((*labels.shape[:-2], 0), np.int32)
 
 
-def _places(before: _Mapped, after: _Mapped, truth: GroundTruth) -> Arrays:
+def _find_places(before: _Mapped, after: _Mapped, truth: GroundTruth) -> Arrays:
     here = before.truth.world_T_sensor[before.map.keyframe_scans]
     there = after.truth.world_T_sensor[after.map.keyframe_scans]
     distance_m, nearest = cKDTree(there[:, :3, 3]).query(here[:, :3, 3])
     turns = [yaw_rad(there[j]) - yaw_rad(here[i]) for i, j in enumerate(np.asarray(nearest))]
-    labels = keyframe_labels(here[:, :3, 3], truth.centroids_world, truth.is_observable, truth.pair.score_radius_m)
+    labels = label_keyframes(here[:, :3, 3], truth.centroids_world, truth.is_observable, truth.pair.score_radius_m)
     return {
         "labels": labels.astype(np.int8),
         "is_covered": np.asarray(distance_m <= PAIR_RADIUS_M),
@@ -295,7 +297,7 @@ def _places(before: _Mapped, after: _Mapped, truth: GroundTruth) -> Arrays:
     }
 
 
-def _changes(before: _Mapped, truth: GroundTruth) -> Arrays:
+def _list_changes(before: _Mapped, truth: GroundTruth) -> Arrays:
     changes, centroids = truth.pair.changes, truth.centroids_world
     scans = before.map.keyframe_scans
     world_T_keyframe, odom_T_keyframe = before.truth.world_T_sensor[scans], before.map.odom_T_keyframe
@@ -312,14 +314,14 @@ def _changes(before: _Mapped, truth: GroundTruth) -> Arrays:
         "centroid_world": centroids,
         "centroid_odom": np.asarray(in_odom, dtype=np.float64),
     }
-    return _named("change", table)
+    return _prefix_names("change", table)
 
 
-def _named(prefix: str, arrays: Mapping[str, npt.NDArray[Any]]) -> Arrays:
+def _prefix_names(prefix: str, arrays: Mapping[str, npt.NDArray[Any]]) -> Arrays:
     return {f"{prefix}_{name}": array for name, array in arrays.items()}
 
 
-def _counts(arrays: Arrays) -> dict[str, int]:
+def _count_arrays(arrays: Arrays) -> dict[str, int]:
     labels = arrays["labels"]
     return {
         "n_before": len(arrays["before_scans"]),

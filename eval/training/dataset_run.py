@@ -22,7 +22,7 @@ from eval.core.output import make_writable, whole_file
 from eval.core.progress import RunProgress, Silent
 from eval.plans.plan import parse_seeds_option
 from eval.plans.worlds import world_slug
-from eval.running.runfolder import write_json
+from eval.running.runfolder import read_json, write_json
 from eval.training.dataset import Recipe, make_shard, shard_digest
 from eval.training.dataset_card import write_card
 from scenarios.library import load_scenario
@@ -176,10 +176,7 @@ def _is_done(out: Path, tunnel: Tunnel) -> bool:
     """Return whether a tunnel's shard, or its refusal, has the present digest."""
     refusal = out / tunnel.refusal
     if refusal.is_file():
-        try:
-            return bool(json.loads(refusal.read_text())["digest"] == tunnel.digest != "")
-        except (json.JSONDecodeError, KeyError, TypeError):
-            return False
+        return bool(read_json(refusal).get("digest") == tunnel.digest != "")
     if not (out / tunnel.file).is_file():
         return False
     try:
@@ -209,20 +206,13 @@ def _attempt(tunnel: Tunnel, recipe: Recipe) -> bytes | str:
 
 def _computed(tunnels: Sequence[Tunnel], recipe: Recipe, where: Where) -> Generator[tuple[Tunnel, bytes | str]]:
     """Yield each tunnel with its shard, or with the reason why there is none, in order of completion."""
-    wanted = []
-    for tunnel in tunnels:
-        if tunnel.refused:
-            yield tunnel, tunnel.refused
-        else:
-            wanted.append(tunnel)
-    if not wanted:
-        return
+    yield from ((tunnel, tunnel.refused) for tunnel in tunnels if tunnel.refused)
+    wanted = [tunnel for tunnel in tunnels if not tunnel.refused]
     if where == HERE:
-        for tunnel in wanted:
-            yield tunnel, _attempt(tunnel, recipe)
-        return
-    with connected(where, len(wanted)) as client:
-        yield from _from_cluster(client, wanted, recipe)
+        yield from ((tunnel, _attempt(tunnel, recipe)) for tunnel in wanted)
+    elif wanted:
+        with connected(where, len(wanted)) as client:
+            yield from _from_cluster(client, wanted, recipe)
 
 
 def _from_cluster(client: Any, tunnels: Sequence[Tunnel], recipe: Recipe) -> Iterator[tuple[Tunnel, bytes | str]]:

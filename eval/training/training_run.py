@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ def train_descriptor(
     Args:
         data: Folder of `tunnelcd dataset` with tunnels of both splits.
         out: Folder for NAME.safetensors, NAME.json, curves.csv, curves.png and the state to resume from.
-        name: Which descriptor.
+        name: Which descriptor of `SOURCES`.
         config: Seed, steps, rates, patience.
         threads: Of torch.
         command: What to write into the card.
@@ -54,7 +54,7 @@ def train_descriptor(
     use_threads(threads)
     tunnels = open_dataset(data, "train"), open_dataset(data, "validation")
     digests = tuple(data_digest(part) for part in tunnels)
-    task = TASKS[name](*tunnels, config.seed)
+    task = _make_task(name, *tunnels, config.seed)
     make_writable(out)
     before = task.scores()
     latest: list[Progress] = []
@@ -129,20 +129,11 @@ def draw_curves(path: Path, name: str, history: Sequence[Progress]) -> None:
     path.write_bytes(png(picture(Drawing([panels], 240))))
 
 
-def _sphere_task(training: Sequence[TunnelShard], validation: Sequence[TunnelShard], seed: int) -> Task:
-    return SphereTask(
-        make_untrained_sphere_network(seed), read_sphere_data(training), read_sphere_data(validation), seed
-    )
-
-
-def _place_task(training: Sequence[TunnelShard], validation: Sequence[TunnelShard], seed: int) -> Task:
+def _make_task(name: str, training: Sequence[TunnelShard], validation: Sequence[TunnelShard], seed: int) -> Task:
+    if name == "sphere":
+        network = make_untrained_sphere_network(seed)
+        return SphereTask(network, read_sphere_data(training), read_sphere_data(validation), seed)
     return PlaceTask(make_untrained_network(seed), read_place_data(training), read_place_data(validation), seed)
-
-
-TASKS: dict[str, Callable[[Sequence[TunnelShard], Sequence[TunnelShard], int], Task]] = {
-    "sphere": _sphere_task,
-    "3deg": _place_task,
-}
 
 
 def _described(tunnels: Sequence[TunnelShard], data_digest: str) -> dict[str, Any]:

@@ -10,10 +10,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float32Array, Int32Array, Int64Array, require_shape, transform
@@ -28,6 +30,7 @@ CELL_M = 0.1
 _CACHE_VERSION = 3
 _BATCH_RETURNS = 500_000
 _PENDING_ROWS = 4_000_000
+_Rows = dict[str, npt.NDArray[Any]]  # the columns of `ScoringPoints`, and the cell of each
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,13 +159,13 @@ class UniverseBuilder:
         is_entered = np.append(True, cells[1:] != cells[:-1])[: len(cells)]
         pixels = scan.pixels[is_entered]
         self._batch.append(
-            _Rows(
-                cells=cells[is_entered],
-                returns=scan.index * self._n_pixels + pixels.astype(np.int64),
-                points_odom=points_odom[is_entered].astype(np.float32),
-                change=change.ravel()[pixels],
-                instance=instance.ravel()[pixels],
-            )
+            {
+                "cells": cells[is_entered],
+                "returns": scan.index * self._n_pixels + pixels.astype(np.int64),
+                "points_odom": points_odom[is_entered].astype(np.float32),
+                "change": change.ravel()[pixels],
+                "instance": instance.ravel()[pixels],
+            }
         )
         if _count(self._batch) < _BATCH_RETURNS:
             return
@@ -175,25 +178,9 @@ class UniverseBuilder:
     def finish(self, n_scans: int) -> ScoringPoints:
         """Return the universe of the session, which has so many scans."""
         cells = _first_per_cell([*self._folded, *self._pending, *self._batch])
-        order = np.argsort(cells.returns)
-        return ScoringPoints(
-            returns=cells.returns[order],
-            points_odom=cells.points_odom[order],
-            change=cells.change[order],
-            instance=cells.instance[order],
-            n_scans=n_scans,
-            n_pixels=self._n_pixels,
-            nearest_m=self._nearest_m,
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
-    cells: Int64Array
-    returns: Int64Array
-    points_odom: Float32Array
-    change: Int16Array
-    instance: Int16Array
+        order = np.argsort(cells["returns"])
+        columns = {name: values[order] for name, values in cells.items() if name != "cells"}
+        return ScoringPoints(**columns, n_scans=n_scans, n_pixels=self._n_pixels, nearest_m=self._nearest_m)
 
 
 def _nearer(nearest_m: Float32Array, scan: PosedScan, change: Int16Array) -> Float32Array:
@@ -208,14 +195,13 @@ def _nearer(nearest_m: Float32Array, scan: PosedScan, change: Int16Array) -> Flo
 
 
 def _count(parts: Sequence[_Rows]) -> int:
-    return sum(len(part.cells) for part in parts)
+    return sum(len(part["cells"]) for part in parts)
 
 
 def _first_per_cell(parts: Sequence[_Rows]) -> _Rows:
     """Keep the first row of each cell; `parts` are in the order of measurement."""
-    _, first = np.unique(np.concatenate([part.cells for part in parts]), return_index=True)
-    names = [item.name for item in fields(_Rows)]
-    return _Rows(**{name: np.concatenate([getattr(part, name) for part in parts])[first] for name in names})
+    _, first = np.unique(np.concatenate([part["cells"] for part in parts]), return_index=True)
+    return {name: np.concatenate([part[name] for part in parts])[first] for name in parts[0]}
 
 
 def _fingerprint(session: Session) -> str:

@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
+from cdpipe.core.plugins import require_extra
 from cdpipe.core.yamlfile import setting_lines
 from cdpipe.io.session import ScanChunk, Session, SessionWriter
-from cdpipe.mapping.odometry import require_kiss_icp
 from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
@@ -86,7 +86,7 @@ def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progres
     report = on_progress or (lambda stage, done, total: None)
     _refuse_taken(out)
     if "kiss-icp" in (scenario.before.odometry.source, scenario.after.odometry.source):
-        require_kiss_icp("odometry.source = kiss-icp")
+        require_extra("odometry", "odometry.source = kiss-icp")
     files = file_digests(scenario)
     sensor = load_profile(scenario.sensor.profile, scenario.sensor.mode)
     report("world", 0, 1)
@@ -282,7 +282,7 @@ def simulate_in_memory(scenario: Scenario, seed: int, n_threads: int = 1) -> Hel
         ScenarioError: The world contradicts itself.
     """
     if "kiss-icp" in (scenario.before.odometry.source, scenario.after.odometry.source):
-        require_kiss_icp("odometry.source = kiss-icp")
+        require_extra("odometry", "odometry.source = kiss-icp")
     files = file_digests(scenario)
     drives = plan_drives(scenario, load_profile(scenario.sensor.profile, scenario.sensor.mode), seed)
     with ThreadPoolExecutor(min(n_threads, os.cpu_count() or 1)) as pool:

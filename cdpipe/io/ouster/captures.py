@@ -20,10 +20,11 @@ import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.io.ouster.integrity import require_whole_osf, require_whole_pcap
+from cdpipe.core.yamlfile import read_json
+from cdpipe.io.ouster.integrity import check_osf_integrity, check_pcap_integrity
 from cdpipe.io.readers import RECORDING_SUFFIXES
 from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
-from cdpipe.sensor.ouster_metadata import read_document, require_mode
+from cdpipe.sensor.ouster_metadata import METADATA_FILE, require_mode
 
 # A revolution needs more than this share of its columns: a recording starts and ends inside a revolution.
 _LEAST_SHARE = 0.5
@@ -150,17 +151,17 @@ def open_recording(path: Path, metadata: Path | None = None) -> Recording:
     if suffix == ".osf":
         if metadata is not None:
             raise InputError(f"{path}: an OSF carries its sensor's metadata: leave --metadata out")
-        require_whole_osf(path)
+        check_osf_integrity(path)
         info = _only_sensor(path)
         sensor = parse_metadata(json.loads(info.to_json_string()), str(path))
         require_mode(sensor.mode, str(path))
         return Recording(path, sensor, info, None)
-    require_whole_pcap(path)
+    check_pcap_integrity(path)
     beside = path.with_suffix(".json")
     if metadata is None and not beside.exists():
         raise InputError(f"{path}: {beside.name} is not beside it: give the sensor's metadata .json with --metadata")
     metadata = metadata or beside
-    sensor = parse_metadata(read_document(metadata), str(metadata))
+    sensor = parse_metadata(read_json(metadata, METADATA_FILE), str(metadata))
     require_mode(sensor.mode, str(metadata))
     try:
         info = core.SensorInfo(metadata.read_text(encoding="utf-8"))

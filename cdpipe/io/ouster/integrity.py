@@ -28,7 +28,7 @@ _PCAPNG_MAGIC = b"\x0a\x0d\x0d\x0a"
 _PCAPNG_ORDERS = {b"\x4d\x3c\x2b\x1a": "<", b"\x1a\x2b\x3c\x4d": ">"}
 
 
-def require_whole_osf(path: Path) -> None:
+def check_osf_integrity(path: Path) -> None:
     """Check the length of an OSF file against its header, and the checksums of header and metadata.
 
     Raises:
@@ -52,7 +52,7 @@ def require_whole_osf(path: Path) -> None:
                 raise InputError(f"{path}: damaged: its {part} and the checksum of it do not agree: copy it again")
 
 
-def require_whole_pcap(path: Path) -> None:
+def check_pcap_integrity(path: Path) -> None:
     """Check that a PCAP or PCAPNG file consists of complete packets.
 
     Raises:

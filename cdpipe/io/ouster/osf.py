@@ -22,7 +22,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float32Array, Float64Array
+from cdpipe.core.geometry import make_pose
 from cdpipe.io.ouster.captures import Progress, one_line, require_sdk
 from cdpipe.io.session import ScanChunk, Session
 
@@ -120,20 +120,6 @@ def sensor_info(session: Session) -> Any:
     return info
 
 
-def _column_poses(odom_T_sensor: Float64Array, sensor_T_column: Float32Array) -> Float64Array:
-    """Return the (W, 4, 4) odom_T_column of a revolution.
-
-    Args:
-        odom_T_sensor: (4, 4) pose of the revolution.
-        sensor_T_column: (W, 7) as x, y, z, qx, qy, qz, qw.
-    """
-    stored = sensor_T_column.astype(np.float64)
-    poses = np.tile(np.eye(4), (len(stored), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(stored[:, 3:]).as_matrix()
-    poses[:, :3, 3] = stored[:, :3]
-    return odom_T_sensor @ poses
-
-
 def _check_fields(session: Session, chunk: ScanChunk, fields: Fields) -> None:
     for name, values in fields.items():
         if values.shape != chunk.range_mm.shape:
@@ -156,5 +142,7 @@ def _frame(core: Any, info: Any, session: Session, chunk: ScanChunk, fields: Fie
     frame.packet_timestamp[:] = frame.timestamp[:: info.format.columns_per_packet]
     frame.measurement_id[:] = np.arange(frame.w)
     frame.status[:] = 1
-    frame.body_to_world[:] = _column_poses(session.odom_T_sensor[number], chunk.column_poses[row])
+    sensor_T_column = chunk.column_poses[row].astype(np.float64)
+    rotations = Rotation.from_quat(sensor_T_column[:, 3:]).as_matrix()
+    frame.body_to_world[:] = session.odom_T_sensor[number] @ make_pose(rotations, sensor_T_column[:, :3])
     return frame

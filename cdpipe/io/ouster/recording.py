@@ -23,10 +23,11 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, make_pose, require_poses
 from cdpipe.core.motion import Motion, make_motion
+from cdpipe.core.plugins import require_extra
 from cdpipe.io.ouster.captures import Progress, Recording, Revolution, open_recording
 from cdpipe.io.session import ScanChunk, SessionWriter
 from cdpipe.io.tum import motion_along
-from cdpipe.mapping.odometry import estimate_motion, require_kiss_icp
+from cdpipe.mapping.odometry import estimate_motion
 
 CHUNK_SCANS = 64
 KISS_ICP = "kiss-icp"
@@ -88,7 +89,7 @@ def import_recording(
     if odometry is not None and trajectory is not None:
         raise InputError("--trajectory and --odometry both give the poses: leave one out")
     if odometry is not None:
-        require_kiss_icp(f"--odometry {odometry}")
+        require_extra("odometry", f"--odometry {odometry}")
     report = on_progress or (lambda stage, done, total: None)
     recording = open_recording(source, metadata)
     times = _read_times(recording, report)

@@ -20,7 +20,8 @@ from cdpipe.merge.evidence import GATES
 from cdpipe.model.alignment import PathAlignment
 from eval.report.merge.figures import FULL_M, alignment_picture
 from eval.report.tables import Cell, Picture, Table
-from eval.running.run_data import Row, RunData, number, read_document, split_variant, text
+from eval.running.run_data import Row, RunData, number, split_variant, text
+from eval.running.runfolder import read_json
 from eval.scoring.merge_metrics import PAIR_RADIUS_M
 from eval.tables.columns import fine, share, significant
 from eval.truth.aligned import alignment_of
@@ -59,7 +60,7 @@ class Case:
 def read_case(data: RunData, row: Row, variants: tuple[str, ...] = ()) -> Case:
     """Put a row of results.csv and its answer together."""
     scenario, seed, variant = str(row["scenario"]), int(row["seed"]), str(row["variant"])
-    document = read_document(data.folder.answer(scenario, seed, variant) / "answer.json")
+    document = read_json(data.folder.answer(scenario, seed, variant) / "answer.json")
     stored = document.get("evidence")
     told = dict(stored) if isinstance(stored, Mapping) else {}
     told |= {name.removeprefix("evidence_"): row[name] for name in row if name.startswith("evidence_")}

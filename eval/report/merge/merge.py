@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from eval.core.figures import picture_address
-from eval.plans.targets import is_oracle, targets_of
+from eval.plans.targets import is_oracle, read_targets
 from eval.report.merge.cases import MAX_ROWS, Case, case_table, distinct_cases, draw_case, read_case
 from eval.report.merge.charts import error_chart, time_chart
 from eval.report.merge.tables import families_table, kinds_table, refusals_table, stated_seconds, times_table
@@ -30,7 +30,7 @@ def draw_merge(data: RunData) -> Section:
     by_kind, name = bool((kinds(results) != "").any()), shown_variant(data)
     tables = [times_table(results)] if by_kind or ends_at_merge(data) else []
     if by_kind:
-        table, is_whole = merge_table(results, targets_of(data.provenance)), covered_by(data).is_whole
+        table, is_whole = merge_table(results, read_targets(data.provenance)), covered_by(data).is_whole
         of_targets = kinds_table(table, is_whole=is_whole), families_table(table, name, is_whole=is_whole)
         tables = [*of_targets, refusals_table(results), *tables]
         cases, shown = _chosen_cases(data, results, name, notes)

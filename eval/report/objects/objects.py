@@ -12,7 +12,7 @@ from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.report.objects.figures import Layers, Panel, object_panels
 from eval.report.tables import Picture
 from eval.running.run_data import SHOWN_PRESETS, RunData, flag, named_variants, number, of, text
-from eval.scoring.answer_rows import answer_rows
+from eval.scoring.answer_rows import find_answer_rows
 from eval.tables.columns import share
 from eval.truth.ground_truth import GroundTruth
 from eval.truth.universe import CELL_M
@@ -52,7 +52,7 @@ class AnsweredPair:
         self._rows = of(data.changes, scenario=case[0], seed=case[1])
         reports = {name: answer.report for name, answer in answers.items()}
         self._objects = {name: report.objects for name, report in reports.items() if report is not None}
-        self._object_rows = {name: answer_rows(answers[name], truth) for name in self._objects}
+        self._object_rows = {name: find_answer_rows(answers[name], truth) for name in self._objects}
 
     def draw(self, index: int, titles: Mapping[str, str]) -> str:
         """Draw one change: its truth, and beside it what each variant answered.

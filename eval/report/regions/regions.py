@@ -5,7 +5,7 @@ from __future__ import annotations
 import pandas as pd
 
 from eval.core.domains import domain_name
-from eval.plans.targets import targets_of
+from eval.plans.targets import read_targets
 from eval.report.regions.charts import draw_free_response, draw_roc, draw_sizes
 from eval.report.tables import Cell, Section, Table, interval_of_row, methods_table, targets_table, with_rows
 from eval.running.run_data import RunData, off_grids, shown_variant, stored_table
@@ -58,7 +58,7 @@ def draw_regions(data: RunData) -> Section | None:
         return Section(missing=("regions_table.csv is not in the run folder: `tunnelcd score` makes it.",))
     methods = methods_table(table, REGION_COLUMNS, with_domain(data.results), _CAPTION)
     tables = (methods, silence_table(table), targets_table(stored_table(data, "regions_targets")))
-    first = [main, *(target.less for target in targets_of(data.provenance).regions if target.less)]
+    first = [main, *(target.less for target in read_targets(data.provenance).regions if target.less)]
     plots = (
         draw_roc(found["roc"], table, main), draw_free_response(found["froc"], table),
         draw_sizes(found["regions_by_size"], table, first),

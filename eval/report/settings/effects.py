@@ -13,7 +13,7 @@ import pandas as pd
 from eval.core.charts import BLACK, COLOURS, SYMBOLS, Axis, Drawing, Look, Panel, Series
 from eval.core.figures import picture_address
 from eval.core.statistics import ENOUGH_PAIRS
-from eval.plans.worlds import group_of
+from eval.plans.worlds import get_group
 from eval.report.tables import Cell, Picture, Table
 from eval.running.run_data import RunData, of, over_pairs
 from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, Column, count, select
@@ -59,7 +59,7 @@ def signed(column: Column, value: float) -> str:
 
 def shorten(settings: Sequence[str]) -> tuple[str, list[str]]:
     """Return the group that all settings belong to, "" if there is none, and the settings without it."""
-    groups = {group_of(part) for text in settings for part in text.split(",")}
+    groups = {get_group(part) for text in settings for part in text.split(",")}
     group = groups.pop() if len(groups) == 1 else ""
     return group, [", ".join(part.removeprefix(f"{group}.") for part in text.split(",")) for text in settings]
 

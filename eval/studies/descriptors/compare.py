@@ -8,7 +8,6 @@ DIR/places.csv and DIR/spheres.csv, means over session pairs with 95 % intervals
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
@@ -29,7 +28,7 @@ from eval.core.provenance import digest, git_commit, machine
 from eval.core.statistics import bootstrap_interval, mean_with_interval, median
 from eval.plans.plan import parse_seeds_option
 from eval.plans.worlds import world_slug
-from eval.running.runfolder import remove, write_json
+from eval.running.runfolder import read_json, remove, write_json
 from eval.studies.descriptors.rows import METHODS, SPHERE, measure_pair
 from eval.tables.rows import numbers
 from scenarios.library import load_scenario
@@ -66,12 +65,13 @@ def measure(
         progress.cells(f"{family} {seed}", done, len(todo))
         path = out / "rows" / f"{world_slug(family)}-{seed}.json"
         key = _key(scenario, seed)
-        stored = _stored(path, key)
-        if stored is None:
+        document = read_json(path)
+        if document.get("key") != key or "rows" not in document:
             measured = _simulated(scenario, seed, out / "pairs" / path.stem, progress, keep=keep)
-            stored = [{"family": family, "seed": seed, **row} for row in measured]
-            write_json(path, {"key": key, "commit": git_commit(), "machine": machine(), "rows": stored})
-        rows += stored
+            own = [{"family": family, "seed": seed, **row} for row in measured]
+            document = {"key": key, "commit": git_commit(), "machine": machine(), "rows": own}
+            write_json(path, document)
+        rows += document["rows"]
     progress.cells("done", len(todo), len(todo))
     return pd.DataFrame(rows)
 
@@ -107,14 +107,6 @@ def _key(scenario: Scenario, seed: int) -> str:
             "sphere": sphere_digest(),
         }
     )
-
-
-def _stored(path: Path, key: str) -> list[dict[str, object]] | None:
-    try:
-        document = json.loads(path.read_text())
-        return list(document["rows"]) if document["key"] == key else None
-    except (FileNotFoundError, json.JSONDecodeError, KeyError, TypeError):
-        return None  # absent or damaged: measured again
 
 
 _PAIR = ["family", "seed"]

@@ -135,7 +135,7 @@ def measures(network: SphereNetwork, held: HeldOut, bits: int = FLOAT_BITS) -> d
         and `changes_found`, shares; `n_unchanged` and `n_changes`, which they are shares of.
     """
     data = held.data
-    local = network.calibrated(torch.from_numpy(local_scores(network, data, DRAW, partial(rounded, bits=bits)))).numpy()
+    local = network.calibrate(torch.from_numpy(local_scores(network, data, DRAW, partial(rounded, bits=bits)))).numpy()
     log_odds = pool_within_reach(local, data)
     is_found = _found(local, held)
     found = _of_group(log_odds, data, is_found, np.ones(len(log_odds), np.bool_))

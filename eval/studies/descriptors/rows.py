@@ -26,7 +26,7 @@ from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMa
 from cdpipe.query.query import find_regions
 from eval.core.ranking import auroc
 from eval.core.statistics import mean, median
-from eval.scoring.region_metrics import keyframe_labels
+from eval.scoring.region_metrics import label_keyframes
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import SESSIONS, GroundTruth, load_ground_truth
 
@@ -111,7 +111,7 @@ def measure_spheres(
     """
     poses = merged.before.odom_T_keyframe
     world = truth.before.world_T_sensor[before.keyframe_scans, :3, 3]
-    labels = keyframe_labels(world, truth.centroids_world, truth.is_observable, truth.pair.score_radius_m)
+    labels = label_keyframes(world, truth.centroids_world, truth.is_observable, truth.pair.score_radius_m)
     used = labels >= 0
     describe_map(merged.before, poses[:1], config.descriptor)  # loads the network
     rows = []

@@ -27,7 +27,7 @@ from eval.core.charts import (
 from eval.core.figures import blank_figure, picture, png
 from eval.studies.reality.sensor_measures import Revolutions
 from eval.studies.reality.static_novelty import CELLS_M, REAL_SHARES, Case, Shares
-from eval.studies.reality.tables import first_number
+from eval.studies.reality.tables import find_first_number
 
 _PANELS = (
     ("returns by beam", "beam, top to bottom", "share of pixels that return", "linear"),
@@ -50,14 +50,14 @@ def draw_measures(table: pd.DataFrame, path: Path) -> None:
     panels = []
     for measure, across, up, scale in _PANELS:
         rows = table[(table["measure"] == measure) & (table["where"] != "all")]
-        bins = sorted(dict.fromkeys(rows["where"]), key=first_number)
+        bins = sorted(dict.fromkeys(rows["where"]), key=find_first_number)
         series = []
         for source in sources:
             values = rows[rows["source"] == source].set_index("where")["value"].reindex(bins)
             dash: Dash = "dash" if "sub-rays" in source else "dot" if "off" in source else "solid"
             look = Look(_COLOURS[names.index(source.split(",")[0])], dash=dash, marker="circle", size=3.0)
             series.append(Series(np.arange(len(bins)), values, look, source))
-        ticks = dict(list(named_ticks([_bin_name(each) for each in bins]).items())[:: max(1, len(bins) // 11)])
+        ticks = dict(list(named_ticks([_shorten_bin(each) for each in bins]).items())[:: max(1, len(bins) // 11)])
         highest = rows["value"].max()
         span = log_span(rows["value"]) if scale == "log" else (0.0, 1.05 * highest) if highest > 0 else None
         panels.append(Panel(Axis(across, ticks=ticks, tick_pt=5.5), Axis(up, span, is_log=scale == "log"), series))
@@ -110,6 +110,6 @@ def draw_novelty(results: Sequence[tuple[Case, Shares]], path: Path) -> None:
     path.write_bytes(png(picture(Drawing([[by_number], [by_effect]], 300))))
 
 
-def _bin_name(where: str) -> str:
+def _shorten_bin(where: str) -> str:
     short = where.removeprefix("jump ").removesuffix(" photons").removesuffix(" m")
     return short.replace(" photons or more", "+")

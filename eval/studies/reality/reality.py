@@ -23,17 +23,23 @@ from eval.core.exits import run_program
 from eval.core.output import make_writable
 from eval.studies.reality.plots import draw_measures, draw_novelty, draw_scene
 from eval.studies.reality.scenes import (
-    as_revolutions,
     cast_at_origin,
-    drive_of,
+    change_effects,
     find_recording,
-    real_revolution,
+    gather_revolutions,
+    plan_drive,
+    read_real_revolution,
     rebuild,
-    with_effects,
 )
 from eval.studies.reality.sensor_measures import Revolutions
-from eval.studies.reality.static_novelty import effect_variants, novelty_cases, static_novelty
-from eval.studies.reality.tables import markdown, measured, novelty_table, side_by_side, surface_rows
+from eval.studies.reality.static_novelty import list_effect_variants, list_novelty_cases, measure_static_novelty
+from eval.studies.reality.tables import (
+    arrange_by_source,
+    format_markdown,
+    tabulate_measures,
+    tabulate_novelty,
+    tabulate_surface,
+)
 from scenarios.schema import Sensor
 from sim.session.revolution import Drive, cast_revolution
 
@@ -61,30 +67,30 @@ def compare(real: Revolutions, drives: Sequence[Drive]) -> tuple[Revolutions, pd
 
     def cast(name: str, settings: Sensor, n_revolutions: int) -> Revolutions:
         scans = [cast_at_origin(scene, real.sensor, settings, number) for number in range(n_revolutions)]
-        recast = as_revolutions(real.sensor, scans)
-        tables.extend([measured(recast, name), surface_rows(recast, is_surface, name)])
+        recast = gather_revolutions(real.sensor, scans)
+        tables.extend([tabulate_measures(recast, name), tabulate_surface(recast, is_surface, name)])
         return recast
 
-    tables = [measured(real, REAL), surface_rows(real, is_surface, REAL)]
+    tables = [tabulate_measures(real, REAL), tabulate_surface(real, is_surface, REAL)]
     recasts = []
     for name, number in (("", 1), (", 19 sub-rays", 19)):
         settings = Sensor.model_validate({"profile": PROFILE, "max_range_m": _FAR_M, "sub_rays": number})
         recasts.append(cast(f"{SAME_SCENE}{name}", settings, _N_REPEATS))
         tables += [
-            measured(_driven(drive, settings), f"{family} {seed}{name}")
+            tabulate_measures(_cast_along(drive, settings), f"{family} {seed}{name}")
             for drive, (family, seed) in zip(drives, WORLDS, strict=True)
         ]
-    off = effect_variants(Sensor(profile=PROFILE, max_range_m=_FAR_M))["all off"]
+    off = list_effect_variants(Sensor(profile=PROFILE, max_range_m=_FAR_M))["all off"]
     cast(f"{SAME_SCENE}, effects off", off, 1)  # nothing is random: further revolutions are the same
     first = Revolutions(real.sensor, recasts[0].range_m[:1], recasts[0].signal[:1], recasts[0].reflectivity[:1])
     return first, pd.concat(tables, ignore_index=True)
 
 
-def _driven(drive: Drive, settings: Sensor) -> Revolutions:
+def _cast_along(drive: Drive, settings: Sensor) -> Revolutions:
     """Return revolutions spread evenly over a drive."""
-    recorded = with_effects(drive, settings)
+    recorded = change_effects(drive, settings)
     numbers = np.linspace(0, recorded.trajectory.n_scans - 1, _N_REPEATS).astype(int).tolist()
-    return as_revolutions(recorded.sensor, [cast_revolution(recorded, number)[1] for number in numbers])
+    return gather_revolutions(recorded.sensor, [cast_revolution(recorded, number)[1] for number in numbers])
 
 
 def main(
@@ -96,13 +102,15 @@ def main(
     folder = data or (Path(given) if given else None)
     pcap = find_recording(folder)
     make_writable(out)
-    real = real_revolution(pcap)
-    drives = [drive_of(family, seed, real.sensor, PROFILE) for family, seed in WORLDS]
+    real = read_real_revolution(pcap)
+    drives = [plan_drive(family, seed, real.sensor, PROFILE) for family, seed in WORLDS]
     recast, measures = compare(real, drives)
     first = drives[0].trajectory.n_scans // 3
-    shares = [(case, static_novelty(drives[0], case, first)) for case in novelty_cases(drives[0].scenario.sensor)]
-    novelty = novelty_table(shares)
-    text = "\n".join(markdown(table) for table in (side_by_side(measures), novelty))
+    shares = [
+        (case, measure_static_novelty(drives[0], case, first)) for case in list_novelty_cases(drives[0].scenario.sensor)
+    ]
+    novelty = tabulate_novelty(shares)
+    text = "\n".join(format_markdown(table) for table in (arrange_by_source(measures), novelty))
     measures.to_csv(out / "reality.csv", index=False, float_format="%.5g")
     novelty.to_csv(out / "reality-novelty.csv", index=False, float_format="%.4g")
     (out / "reality.md").write_text(text)

@@ -12,7 +12,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, transform
 from cdpipe.io.ouster.captures import open_recording
 from cdpipe.sensor.ouster import SensorMetadata
-from eval.studies.reality.sensor_measures import Revolutions, destaggered
+from eval.studies.reality.sensor_measures import Revolutions, destagger
 from scenarios.library import load_scenario
 from scenarios.schema import Sensor
 from sim.drive.trajectory import record
@@ -43,7 +43,7 @@ def find_recording(folder: Path | None) -> Path:
     raise InputError(f"{folder}: no real recording in it: expected {wanted}, there or in its folder ouster")
 
 
-def real_revolution(pcap: Path) -> Revolutions:
+def read_real_revolution(pcap: Path) -> Revolutions:
     """Read the first revolution of a capture, destaggered.
 
     Raises:
@@ -51,11 +51,11 @@ def real_revolution(pcap: Path) -> Revolutions:
     """
     recording = open_recording(pcap)
     first = next(recording.revolutions())
-    images = [destaggered(recording.sensor, each)[None] for each in (first.range_mm, first.signal, first.reflectivity)]
+    images = [destagger(recording.sensor, each)[None] for each in (first.range_mm, first.signal, first.reflectivity)]
     return Revolutions(recording.sensor, images[0] / 1000.0, images[1], images[2])
 
 
-def drive_of(family: str, seed: int, sensor: SensorMetadata, profile: str) -> Drive:
+def plan_drive(family: str, seed: int, sensor: SensorMetadata, profile: str) -> Drive:
     """Build the world of a family's seed and plan its before session with a sensor.
 
     Raises:
@@ -65,14 +65,14 @@ def drive_of(family: str, seed: int, sensor: SensorMetadata, profile: str) -> Dr
     return plan_drives(load_scenario(family, seed, settings), sensor, seed)[0]
 
 
-def with_effects(drive: Drive, settings: Sensor) -> Drive:
+def change_effects(drive: Drive, settings: Sensor) -> Drive:
     """Return the same drive recorded with other effects: where the scan does not roll, its columns have one pose."""
     scenario = drive.scenario.model_copy(update={"sensor": settings})
     trajectory = record(drive.trajectory.true, scenario, drive.sensor, drive.seed, drive.name)
     return replace(drive, scenario=scenario, trajectory=trajectory)
 
 
-def standing(drive: Drive, number: int, n_revolutions: int) -> Drive:
+def stop_drive(drive: Drive, number: int, n_revolutions: int) -> Drive:
     """Return revolutions all recorded where a drive recorded the middle column of one, the sensor standing still."""
     still = replace(
         drive.trajectory,
@@ -88,16 +88,16 @@ def cast_at_origin(scene: Scene, sensor: SensorMetadata, settings: Sensor, numbe
     return scan(scene, sensor, settings, revolution_rays(sensor, poses), 0, "before", number)
 
 
-def as_revolutions(sensor: SensorMetadata, scans: Sequence[Scan]) -> Revolutions:
+def gather_revolutions(sensor: SensorMetadata, scans: Sequence[Scan]) -> Revolutions:
     """Return simulated revolutions, destaggered."""
     ranges_mm, signal, reflectivity = (
-        destaggered(sensor, np.stack([getattr(each, name) for each in scans]))
+        destagger(sensor, np.stack([getattr(each, name) for each in scans]))
         for name in ("range_mm", "signal", "reflectivity")
     )
     return Revolutions(sensor, ranges_mm / 1000.0, signal, reflectivity)
 
 
-def world_points(sensor: SensorMetadata, result: Scan, poses: Float64Array) -> Float64Array:
+def find_world_points(sensor: SensorMetadata, result: Scan, poses: Float64Array) -> Float64Array:
     """Return the reported points (N, 3) of a revolution, world frame, each column at its true pose."""
     points = sensor.project(result.range_mm / 1000.0).swapaxes(0, 1)
     turned = points @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
@@ -129,15 +129,15 @@ def rebuild(real: Revolutions, template: Scene) -> tuple[Scene, BoolArray]:
         The scene, with one patch for each pixel, as wide as the pixel; the (H, W) destaggered mask of the pixels that
         have one: every return, and holes of one or two columns between returns that agree.
     """
-    filled_m, share, is_surface = _closed(real)
+    filled_m, share, is_surface = _close_holes(real)
     inverse = np.where(is_surface, 1.0 / np.where(is_surface, filled_m, 1.0), 0.0)
-    vertices = _vertices(real.sensor, inverse)
-    cosine = _patch_cosine(vertices)
+    vertices = _make_vertices(real.sensor, inverse)
+    cosine = _compute_patch_cosine(vertices)
     reflectivity = np.clip(share / np.maximum(cosine, 0.05), _LEVELS[0], _LEVELS[-1])
     level = np.searchsorted(_LEVELS, reflectivity[is_surface] * (_LEVELS[0] / _LEVELS[1]) ** 0.5)
     patches = vertices[is_surface]
     levels = np.unique(level)
-    caster = Caster(_patch_mesh(patches[level == each]) for each in levels)
+    caster = Caster(_make_patch_mesh(patches[level == each]) for each in levels)
     scene = replace(
         template,
         caster=caster,
@@ -147,7 +147,7 @@ def rebuild(real: Revolutions, template: Scene) -> tuple[Scene, BoolArray]:
     return scene, is_surface
 
 
-def _closed(real: Revolutions) -> tuple[Float64Array, Float64Array, BoolArray]:
+def _close_holes(real: Revolutions) -> tuple[Float64Array, Float64Array, BoolArray]:
     """Return ranges, apparent reflectivities and mask (H, W), with small holes closed and noise removed."""
     range_m, counts = real.range_m[0].copy(), np.maximum(real.reflectivity[0], 0.5)
     share = np.where(counts > 100, 2.0 ** ((counts - 100.0) / COUNTS_PER_DOUBLING), counts / 100.0)
@@ -171,7 +171,7 @@ def _closed(real: Revolutions) -> tuple[Float64Array, Float64Array, BoolArray]:
     return range_m, share, is_surface
 
 
-def _slopes(inverse: Float64Array, axis: int, ratio: float) -> Float64Array:
+def _compute_slopes(inverse: Float64Array, axis: int, ratio: float) -> Float64Array:
     """Return how much a patch's inverse range (H, W) grows over half a step down (axis 0) or on (axis 1).
 
     The mean of the slopes to the two neighbours, as far as they are the same surface. Inverse range is linear in the
@@ -187,7 +187,7 @@ def _slopes(inverse: Float64Array, axis: int, ratio: float) -> Float64Array:
     return np.asarray(total / (2.0 * np.maximum(has_back + 0.0 + has_ahead, 1.0)))
 
 
-def _vertices(sensor: SensorMetadata, inverse: Float64Array) -> Float64Array:
+def _make_vertices(sensor: SensorMetadata, inverse: Float64Array) -> Float64Array:
     """Return the tip and the four corners of each patch's triangles (H, W, 5, 3), sensor frame, metres."""
     altitude = np.deg2rad(sensor.altitude_deg)
     padded = np.concatenate([[2 * altitude[0] - altitude[1]], altitude, [2 * altitude[-1] - altitude[-2]]])
@@ -195,17 +195,17 @@ def _vertices(sensor: SensorMetadata, inverse: Float64Array) -> Float64Array:
     above, below = halves[:-1] - altitude[:, None], halves[1:] - altitude[:, None]
     shift = np.asarray(sensor.pixel_shift)[:, None]
     measurement = (np.arange(sensor.width, dtype=np.float64)[None, :] - shift) % sensor.width
-    per_row, per_column = _slopes(inverse, 0, _ROW_RATIO), _slopes(inverse, 1, _COLUMN_RATIO)
+    per_row, per_column = _compute_slopes(inverse, 0, _ROW_RATIO), _compute_slopes(inverse, 1, _COLUMN_RATIO)
     rise = 2.0 * per_row / (below - above)  # per radian, both halves of a patch alike
     places = [(_TIP_ROW * below, _TIP_COLUMN), *((edge, side) for edge in (above, below) for side in (-1.0, 1.0))]
     ends = []
     for turn, side in places:
         at = np.maximum(inverse + turn * rise + side * per_column, inverse / 2.0)
-        ends.append(_ray_ends(sensor, measurement + 0.5 * side, altitude[:, None] + turn, at))
+        ends.append(_find_ray_ends(sensor, measurement + 0.5 * side, altitude[:, None] + turn, at))
     return np.stack(ends, axis=2)
 
 
-def _ray_ends(
+def _find_ray_ends(
     sensor: SensorMetadata, measurement: Float64Array, altitude: Float64Array, inverse: Float64Array
 ) -> Float64Array:
     """Return the points (H, W, 3) at some inverse ranges along beams of any altitude at any part of a column."""
@@ -224,7 +224,7 @@ def _ray_ends(
     return transform(sensor.sensor_T_lidar, in_lidar)
 
 
-def _patch_cosine(vertices: Float64Array) -> Float64Array:
+def _compute_patch_cosine(vertices: Float64Array) -> Float64Array:
     """Return the cosine of incidence (H, W) on each patch, from its diagonals."""
     normal = np.cross(vertices[:, :, 4] - vertices[:, :, 1], vertices[:, :, 3] - vertices[:, :, 2])
     tip = vertices[:, :, 0]
@@ -232,7 +232,7 @@ def _patch_cosine(vertices: Float64Array) -> Float64Array:
     return np.asarray(np.abs((normal * tip).sum(axis=-1)) / np.maximum(size, 1e-12))
 
 
-def _patch_mesh(patches: Float64Array) -> Mesh:
+def _make_patch_mesh(patches: Float64Array) -> Mesh:
     """Return the patches (N, 5, 3) as one mesh of four triangles each, round the tip."""
     fan = np.array([[0, 1, 2], [0, 2, 4], [0, 4, 3], [0, 3, 1]])
     faces = (5 * np.arange(len(patches))[:, None, None] + fan).reshape(-1, 3)

@@ -68,7 +68,7 @@ class Revolutions:
     @cached_property
     def incidence_cosine(self) -> Float64Array:
         """(N, H, W) cosine between beam and surface, from a plane through 3 beams x 7 columns; NaN where none fits."""
-        return np.stack([_incidence_cosine(self.sensor, range_m) for range_m in self.range_m])
+        return np.stack([_compute_incidence_cosine(self.sensor, range_m) for range_m in self.range_m])
 
     @property
     def is_facing(self) -> BoolArray:
@@ -76,28 +76,28 @@ class Revolutions:
         return np.nan_to_num(self.incidence_cosine) > _FACING
 
 
-def destaggered(sensor: SensorMetadata, image: npt.NDArray[np.generic]) -> Float64Array:
+def destagger(sensor: SensorMetadata, image: npt.NDArray[np.generic]) -> Float64Array:
     """Return a staggered image (..., H, W) with each row shifted so that columns are azimuths."""
     rows = [np.roll(image[..., row, :], shift, -1) for row, shift in enumerate(sensor.pixel_shift)]
     return np.stack(rows, axis=-2).astype(np.float64)
 
 
-def staggered(sensor: SensorMetadata, image: Float64Array) -> Float64Array:
-    """Undo `destaggered`."""
+def stagger(sensor: SensorMetadata, image: Float64Array) -> Float64Array:
+    """Undo `destagger`."""
     return np.stack([np.roll(image[..., row, :], -shift, -1) for row, shift in enumerate(sensor.pixel_shift)], axis=-2)
 
 
-def spread(values: npt.NDArray[np.floating]) -> float:
+def measure_spread(values: npt.NDArray[np.floating]) -> float:
     """Return the robust standard deviation of some values; NaN for none."""
     return float(_NORMAL * np.median(np.abs(values - np.median(values)))) if len(values) else float("nan")
 
 
-def return_share(revolutions: Revolutions) -> Float64Array:
+def measure_return_share(revolutions: Revolutions) -> Float64Array:
     """Return the share (H,) of each beam's pixels that returned."""
     return np.asarray(revolutions.is_return.mean(axis=(0, 2)))
 
 
-def noise_sigma_m(revolutions: Revolutions, where: BoolArray) -> float:
+def measure_noise_sigma_m(revolutions: Revolutions, where: BoolArray) -> float:
     """Return the standard deviation of the range noise over some pixels (N, H, W), metres.
 
     Second differences along a beam, r(-1) - 2 r(0) + r(+1), have six times the variance of independent noise; a
@@ -105,17 +105,17 @@ def noise_sigma_m(revolutions: Revolutions, where: BoolArray) -> float:
     """
     range_m = revolutions.range_m
     second_m = np.roll(range_m, 1, -1) - 2.0 * range_m + np.roll(range_m, -1, -1)
-    return spread(second_m[where]) / math.sqrt(6.0)
+    return measure_spread(second_m[where]) / math.sqrt(6.0)
 
 
-def photons_per_percent(revolutions: Revolutions, where: BoolArray) -> Float64Array:
+def measure_photons_per_percent(revolutions: Revolutions, where: BoolArray) -> Float64Array:
     """Return signal x range^2 / reflectivity (n,) of the returns of 10 to 99 % among some pixels, photons m^2."""
     is_diffuse = where & revolutions.is_return & (revolutions.reflectivity >= 10) & (revolutions.reflectivity < 100)
     signal, range_m = revolutions.signal[is_diffuse], revolutions.range_m[is_diffuse]
     return np.asarray(signal * range_m**2 / revolutions.reflectivity[is_diffuse])
 
 
-def expected_photons(revolutions: Revolutions) -> Float64Array:
+def estimate_photons(revolutions: Revolutions) -> Float64Array:
     """Return the signal (N, H, W) that a pixel's two neighbours along the beam let expect, their geometric mean.
 
     NaN unless both returned from one surface. Whether the pixel itself returned has no say.
@@ -127,7 +127,7 @@ def expected_photons(revolutions: Revolutions) -> Float64Array:
     return np.where(is_one, np.sqrt(np.maximum(left, 1.0) * np.maximum(right, 1.0)), np.nan)
 
 
-def isolated(revolutions: Revolutions) -> BoolArray:
+def find_isolated(revolutions: Revolutions) -> BoolArray:
     """Mark the returns (N, H, W) that differ by more than 1 m from all eight neighbours, missing ones included."""
     range_m = revolutions.range_m
     padded = np.pad(range_m, ((0, 0), (1, 1), (0, 0)))
@@ -141,7 +141,7 @@ def isolated(revolutions: Revolutions) -> BoolArray:
     return alone
 
 
-def edges(revolutions: Revolutions) -> tuple[Float64Array, BoolArray, BoolArray]:
+def find_edges(revolutions: Revolutions) -> tuple[Float64Array, BoolArray, BoolArray]:
     """Find the pixels that lie at a jump of range along a beam: two columns agree before it, and two behind it.
 
     Returns:
@@ -158,27 +158,30 @@ def edges(revolutions: Revolutions) -> tuple[Float64Array, BoolArray, BoolArray]
     return jump_m, is_edge & is_between, is_edge & (range_m == 0)
 
 
-def novel_share(points: Float64Array, others: Float64Array, cell_m: float) -> float:
+def measure_novel_share(points: Float64Array, others: Float64Array, cell_m: float) -> float:
     """Return the share of some points (N, 3) that lie in cells which none of the other points (M, 3) occupies."""
     keys: Int64Array = cell_keys(points, cell_m)
     return float(np.isin(keys, cell_keys(others, cell_m), invert=True).mean())
 
 
-def novel_shares(halves: Sequence[Float64Array], cells_m: Sequence[float]) -> Float64Array:
+def measure_novel_shares(halves: Sequence[Float64Array], cells_m: Sequence[float]) -> Float64Array:
     """Return for each size of cell the share of novel points, the mean of first half against second and back."""
     first, second = halves
     return np.array(
-        [(novel_share(first, second, cell_m) + novel_share(second, first, cell_m)) / 2.0 for cell_m in cells_m]
+        [
+            (measure_novel_share(first, second, cell_m) + measure_novel_share(second, first, cell_m)) / 2.0
+            for cell_m in cells_m
+        ]
     )
 
 
-def _incidence_cosine(sensor: SensorMetadata, range_m: Float64Array) -> Float64Array:
+def _compute_incidence_cosine(sensor: SensorMetadata, range_m: Float64Array) -> Float64Array:
     """Return the cosines (H, W) of one revolution."""
-    points = sensor.project(staggered(sensor, range_m))
-    axes = [destaggered(sensor, points[..., axis]) for axis in range(3)]
-    beams = np.stack([destaggered(sensor, sensor.directions[..., axis]) for axis in range(3)], axis=-1)
-    window = np.stack([_windows(axis) for axis in axes], axis=-1)
-    reach = _windows(range_m)
+    points = sensor.project(stagger(sensor, range_m))
+    axes = [destagger(sensor, points[..., axis]) for axis in range(3)]
+    beams = np.stack([destagger(sensor, sensor.directions[..., axis]) for axis in range(3)], axis=-1)
+    window = np.stack([_gather_windows(axis) for axis in axes], axis=-1)
+    reach = _gather_windows(range_m)
     middle = reach[..., 2 * _REACH + 1 : 4 * _REACH + 2]
     is_whole = (reach > 0).all(axis=-1) & (np.ptp(middle, axis=-1) < 0.05 * range_m)
     window = window[is_whole]
@@ -191,7 +194,7 @@ def _incidence_cosine(sensor: SensorMetadata, range_m: Float64Array) -> Float64A
     return found
 
 
-def _windows(image: Float64Array) -> Float64Array:
+def _gather_windows(image: Float64Array) -> Float64Array:
     """Return each pixel's 3 beams x 7 columns (H, W, 21), beam by beam; 0 beyond the first and last beam."""
     padded = np.pad(image, ((1, 1), (0, 0)))
     height = len(image)

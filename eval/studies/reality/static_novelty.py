@@ -17,8 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream
-from eval.studies.reality.scenes import standing, with_effects, world_points
-from eval.studies.reality.sensor_measures import novel_shares
+from eval.studies.reality.scenes import change_effects, find_world_points, stop_drive
+from eval.studies.reality.sensor_measures import measure_novel_shares
 from scenarios.schema import Sensor
 from sim.session.revolution import Drive, cast_revolution
 
@@ -52,7 +52,7 @@ class Case:
     n_revolutions: int
 
 
-def effect_variants(default: Sensor) -> dict[str, Sensor]:
+def list_effect_variants(default: Sensor) -> dict[str, Sensor]:
     """Return the settings to be told apart: default, each effect off, both divergences, coarse steps, nothing."""
     switches = ("rolling_scan", "range_noise", "dropouts", "false_positives")
     variants = {"default": default}
@@ -63,7 +63,7 @@ def effect_variants(default: Sensor) -> dict[str, Sensor]:
     return variants
 
 
-def novelty_cases(default: Sensor) -> list[Case]:
+def list_novelty_cases(default: Sensor) -> list[Case]:
     """Return every case once: standing with default effects, by number of revolutions, then each way and variant.
 
     How a scan rolls is no matter to a sensor that stands, so that there is no such case.
@@ -72,13 +72,13 @@ def novelty_cases(default: Sensor) -> list[Case]:
     cases += [
         Case(way, variant, settings, N_REVOLUTIONS)
         for way in WAYS
-        for variant, settings in effect_variants(default).items()
+        for variant, settings in list_effect_variants(default).items()
         if way != "standing" or variant not in ("default", "rolling_scan off")
     ]
     return cases
 
 
-def static_novelty(drive: Drive, case: Case, first: int) -> Shares:
+def measure_static_novelty(drive: Drive, case: Case, first: int) -> Shares:
     """Return the share of novel returns between two halves of some revolutions of a drive, for each of `CELLS_M`.
 
     Args:
@@ -86,33 +86,33 @@ def static_novelty(drive: Drive, case: Case, first: int) -> Shares:
         case: Effects, number of revolutions, and whether all are taken from the first one's place.
         first: Number of the first revolution of the drive.
     """
-    clouds = _clouds(drive, case, range(first, first + case.n_revolutions))
+    clouds = _cast_clouds(drive, case, range(first, first + case.n_revolutions))
     half = len(clouds) // 2
     if case.way == "standing":
         halves = np.concatenate(clouds[:half]), np.concatenate(clouds[half:])
     else:
         halves = np.concatenate(clouds[::2]), np.concatenate(clouds[1::2])
-    return tuple(novel_shares(halves, CELLS_M).tolist())
+    return tuple(measure_novel_shares(halves, CELLS_M).tolist())
 
 
-def _clouds(drive: Drive, case: Case, numbers: Sequence[int]) -> list[Float64Array]:
+def _cast_clouds(drive: Drive, case: Case, numbers: Sequence[int]) -> list[Float64Array]:
     """Return the points (N, 3) of each revolution, world frame."""
-    recorded = with_effects(drive, case.settings)
+    recorded = change_effects(drive, case.settings)
     if case.way == "standing":
-        recorded, numbers = standing(recorded, numbers[0], len(numbers)), range(len(numbers))
+        recorded, numbers = stop_drive(recorded, numbers[0], len(numbers)), range(len(numbers))
 
     def cloud(number: int) -> Float64Array:
         _, result = cast_revolution(recorded, number)
         poses = recorded.trajectory.world_T_column(slice(number, number + 1))[0]
-        error = _pose_error(number) if case.way == "driving, poses off" else np.eye(4)
+        error = _draw_pose_error(number) if case.way == "driving, poses off" else np.eye(4)
         middle = poses[len(poses) // 2]
-        return world_points(recorded.sensor, result, middle @ error @ invert(middle) @ poses)
+        return find_world_points(recorded.sensor, result, middle @ error @ invert(middle) @ poses)
 
     with ThreadPoolExecutor(_THREADS) as pool:
         return list(pool.map(cloud, numbers))
 
 
-def _pose_error(number: int) -> Float64Array:
+def _draw_pose_error(number: int) -> Float64Array:
     """Return a small error (4, 4) of a revolution's pose in its own frame."""
     draw = stream(0, "pose-error", str(number)).standard_normal(6)
     turn = Rotation.from_rotvec(np.deg2rad(POSE_ERROR_DEG) * draw[:3]).as_matrix()

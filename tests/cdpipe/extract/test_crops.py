@@ -61,5 +61,5 @@ def test_what_is_near_to_some_points_equals_brute_force(strain: float) -> None:
         found = crops.near(name, some, 0.5)
         assert 50 < len(found) < len(cloud) / 4
         assert set(found.tolist()) == set(np.flatnonzero(gaps_m < 0.5).tolist())
-        np.testing.assert_allclose(crops.points_map(name, found), cloud[found], atol=2e-3)
+        np.testing.assert_allclose(pair.to_map(name, pair.map_of(name).points[found]), cloud[found], atol=2e-3)
         assert len(crops.near(name, some[:1] + 50.0, 0.5)) == 0

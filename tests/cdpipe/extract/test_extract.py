@@ -7,6 +7,7 @@ import pytest
 
 import cdpipe.extract.objects
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
+from cdpipe.extract.crops import Crops
 from cdpipe.extract.extract import cut_objects, hull_volume_m3, measure_regions, withdraw_empty_regions
 from cdpipe.extract.objects import PointGroup, assemble_objects
 from cdpipe.model.alignment import PathAlignment
@@ -27,7 +28,9 @@ def extract_objects(
     pair: MergedMaps, candidates: ChangeRegions, config: PipelineConfig
 ) -> tuple[tuple[ChangedObject, ...], dict[str, np.ndarray]]:
     groups = cut_objects(pair, candidates, config)
-    return assemble_objects(pair, groups), measure_regions(pair, candidates, groups)
+    return assemble_objects(pair, groups), measure_regions(
+        candidates, groups, lambda centre, radius_m: Crops(pair, 0.0).crop("after", centre, radius_m)[1]
+    )
 
 
 def lattice(low: tuple[float, ...], high: tuple[float, ...]) -> Float64Array:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cdpipe.extract.point_comparison
-from cdpipe.extract.point_comparison import far_points_mask, inlier_mask, is_within, label_clusters, new_points_mask
+from cdpipe.extract.point_comparison import inlier_mask, is_within, label_clusters, new_points_mask
 from cdpipe.model.config import ClusterConfig, ExtractConfig, OutlierConfig
 
 
@@ -36,22 +36,17 @@ def test_nothing_is_new_beside_itself_and_all_is_beside_nothing() -> None:
     assert new_points_mask(np.zeros((0, 3)), points, ExtractConfig()).shape == (0,)
 
 
-def test_far_points_equal_brute_force_and_the_border_is_near() -> None:
+def test_points_within_a_distance_equal_brute_force_and_include_the_border() -> None:
     rng = np.random.default_rng(3)
     points, reference = rng.uniform(-2, 2, (500, 3)), rng.uniform(-2, 2, (400, 3))
     gaps_m = np.linalg.norm(points[:, None] - reference, axis=2).min(axis=1)
-    found = far_points_mask(points, reference, ExtractConfig(distance_m=0.3))
+    found = is_within(points, reference, 0.3)
     assert 0 < found.sum() < len(points)
-    np.testing.assert_array_equal(found, gaps_m > 0.3)
-    np.testing.assert_array_equal(is_within(points, reference, 0.3), gaps_m <= 0.3)
+    np.testing.assert_array_equal(found, gaps_m <= 0.3)
     line = np.array([[1.0, 0, 0], [1.5, 0, 0], [1.6, 0, 0]])
-    assert far_points_mask(line, np.array([[0.5, 0, 0]]), ExtractConfig(distance_m=1.0)).tolist() == [
-        False,
-        False,
-        True,
-    ]
-    assert far_points_mask(line, np.zeros((0, 3)), ExtractConfig()).all()
-    assert far_points_mask(line[:0], line, ExtractConfig()).shape == (0,)
+    assert is_within(line, np.array([[0.5, 0, 0]]), 1.0).tolist() == [True, True, False]
+    assert not is_within(line, np.zeros((0, 3)), 0.3).any()
+    assert is_within(line[:0], line, 0.3).shape == (0,)
 
 
 def test_inliers_equal_brute_force() -> None:

@@ -3,7 +3,8 @@ import pytest
 
 from cdpipe.core.geometry import Float64Array, invert, stream, transform, yaw_pose, yaw_rad
 from cdpipe.core.voxel import cell_means
-from cdpipe.extract.shape import column_volume_m3, ground_heights, measure_shape, upright_box
+from cdpipe.extract.shape import column_volume_m3, ground_heights, upright_box
+from cdpipe.model.report import ObjectShape
 
 NOTHING = np.zeros((0, 3))
 
@@ -13,6 +14,10 @@ def sheet(half_m: float, height: float = 0.0, step_m: float = 0.05) -> Float64Ar
     axis = np.arange(-half_m + step_m / 2, half_m, step_m)
     x, y = np.meshgrid(axis, axis)
     return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height)])
+
+
+def measure(points: Float64Array, ground: Float64Array) -> ObjectShape:
+    return ObjectShape(*upright_box(points), column_volume_m3(points, ground))
 
 
 def cone(radius_m: float, height_m: float) -> Float64Array:
@@ -105,10 +110,10 @@ def test_a_box_fills_its_footprint_whether_its_top_was_seen_or_not(with_top: boo
 def test_turning_the_map_turns_the_box_and_leaves_the_volume() -> None:
     rubble = cone(1.2, 0.7) * (1.4, 0.8, 1.0)
     floor = sheet(3.0)
-    shape = measure_shape(rubble, floor)
+    shape = measure(rubble, floor)
     for yaw, shift in ((0.4, (3.0, 1.0, 0.3)), (2.3, (-40.0, 7.0, -2.0))):
         turn = yaw_pose(yaw, shift)
-        turned = measure_shape(transform(turn, rubble), transform(turn, floor))
+        turned = measure(transform(turn, rubble), transform(turn, floor))
         assert turned.volume_m3 == pytest.approx(shape.volume_m3, rel=0.01)
         np.testing.assert_allclose(turned.box_m, shape.box_m, rtol=1e-3)
         np.testing.assert_allclose(turned.map_T_box[:3, 3], (turn @ shape.map_T_box)[:3, 3], atol=2e-3)
@@ -117,11 +122,11 @@ def test_turning_the_map_turns_the_box_and_leaves_the_volume() -> None:
 def test_boxes_of_next_to_nothing() -> None:
     one = np.array([[1.0, 2.0, 3.0]])
     for points in (one, np.repeat(one, 3, axis=0)):
-        shape = measure_shape(points, sheet(3.0))
+        shape = measure(points, sheet(3.0))
         np.testing.assert_allclose(shape.map_T_box[:3, 3], [1, 2, 3])
         assert (shape.box_m.tolist(), shape.volume_m3) == ([0, 0, 0], 0.0)
     line = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 1.0], [1.5, 2.0, 0.2]])
-    shape = measure_shape(line, NOTHING)
+    shape = measure(line, NOTHING)
     np.testing.assert_allclose(shape.box_m, [5.0, 0.0, 1.0], atol=1e-9)
     np.testing.assert_allclose(shape.map_T_box[:3, 0], [0.6, 0.8, 0.0], atol=1e-9)
     assert shape.volume_m3 == 0.0

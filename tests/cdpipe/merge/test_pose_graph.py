@@ -5,12 +5,12 @@ import pytest
 
 from cdpipe.core.geometry import Float64Array, make_pose, yaw_pose
 from cdpipe.merge.pose_graph import PoseGraph
-from cdpipe.merge.pose_graph import solve_pose_graph as chained
+from cdpipe.merge.pose_graph import solve_pose_graph as solve
 
 
 def solve_pose_graph(positions: Float64Array, measured: Float64Array, information: Float64Array) -> Float64Array:
     """What registrations that no stretch misleads come to."""
-    return chained(positions, measured, information, np.zeros((len(positions), 6))).before_T_after
+    return solve(positions, measured, information, np.zeros((len(positions), 6))).before_T_after
 
 
 def line(n: int) -> Float64Array:
@@ -95,19 +95,19 @@ def test_a_stretch_is_found_and_what_it_misled_is_put_right(stretch: float) -> N
     measured[:, 0, 3] = stretch * (positions[:, 0] + 5.0)
     information = known(30)
     information[np.arange(30) % 4 != 0, 3] = 0.0
-    chain = chained(positions, measured, information, misled)
-    assert chain.stretch == pytest.approx(stretch, rel=0.02)
+    graph = solve(positions, measured, information, misled)
+    assert graph.stretch == pytest.approx(stretch, rel=0.02)
     np.testing.assert_allclose(
-        positions_map(chain.before_T_after, positions)[:, 0], (1 + stretch) * positions[:, 0], atol=2e-3
+        positions_map(graph.before_T_after, positions)[:, 0], (1 + stretch) * positions[:, 0], atol=2e-3
     )
 
 
 def test_between_anchors_and_beyond_them_the_stretch_goes_on() -> None:
-    chain = PoseGraph(np.array([[0.0, 0, 0], [10.0, 0, 0]]), stack(np.eye(4), 2), 0.01)
-    chain.before_T_after[1, 0, 3] = 0.1
+    graph = PoseGraph(np.array([[0.0, 0, 0], [10.0, 0, 0]]), stack(np.eye(4), 2), 0.01)
+    graph.before_T_after[1, 0, 3] = 0.1
     along = np.array([-3.0, 0.0, 2.0, 10.0, 14.0])
     places = np.column_stack([along, np.ones(5), np.zeros(5)])
-    found = chain.at(np.array([0.0, 10.0]), along, places)
+    found = graph.at(np.array([0.0, 10.0]), along, places)
     expected = places + 0.01 * places * np.array([1, 0, 0])
     # a place beside the path is a metre from it in both frames, but for the stretch
     np.testing.assert_allclose(positions_map(found, places), expected, atol=0.011)
@@ -115,12 +115,12 @@ def test_between_anchors_and_beyond_them_the_stretch_goes_on() -> None:
 
 
 def test_turns_are_shared_between_two_anchors() -> None:
-    chain = PoseGraph(np.array([[0.0, 0, 0], [10.0, 0, 0]]), np.array([np.eye(4), yaw_pose(0.1)]), 0.0)
-    (found,) = chain.at(np.array([0.0, 10.0]), np.array([2.5]), np.array([[2.5, 0, 0]]))
+    graph = PoseGraph(np.array([[0.0, 0, 0], [10.0, 0, 0]]), np.array([np.eye(4), yaw_pose(0.1)]), 0.0)
+    (found,) = graph.at(np.array([0.0, 10.0]), np.array([2.5]), np.array([[2.5, 0, 0]]))
     np.testing.assert_allclose(found[:3, :3], yaw_pose(0.025)[:3, :3], atol=1e-12)
 
 
 def test_one_anchor_speaks_for_all_places() -> None:
-    chain = PoseGraph(np.array([[1.0, 2, 3]]), yaw_pose(0.3, (1.0, 2.0, 3.0))[None], 0.0)
-    found = chain.at(np.zeros(1), np.array([0.0, 5.0]), np.array([[1.0, 2, 3], [6.0, 2, 3]]))
+    graph = PoseGraph(np.array([[1.0, 2, 3]]), yaw_pose(0.3, (1.0, 2.0, 3.0))[None], 0.0)
+    found = graph.at(np.zeros(1), np.array([0.0, 5.0]), np.array([[1.0, 2, 3], [6.0, 2, 3]]))
     np.testing.assert_allclose(found, stack(yaw_pose(0.3, (1.0, 2.0, 3.0)), 2), atol=1e-12)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import Float64Array, stream, transform, yaw_pose
-from cdpipe.methods.dufomap import void_mask
-from cdpipe.methods.m3c2 import m3c2_mask
+from cdpipe.methods.dufomap import dufomap
+from cdpipe.methods.m3c2 import m3c2
 from cdpipe.methods.whole_map import PlacedMaps
 from cdpipe.model.config import load_config
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, SessionName
-from cdpipe.pipeline import compare_maps
+from cdpipe.pipeline import detect_changes
 from eval.running.stages import kept_bytes
 from tests.cdpipe.rooms import Box, RoomScans
 
@@ -60,7 +60,8 @@ def merged(before: PointMap, after: PointMap, before_T_after: Float64Array) -> M
 
 def answer(method: str, maps: MergedMaps, settings: Sequence[str] = ()) -> ChangeReport:
     config = load_config(method, [*SETTINGS, *settings])
-    return compare_maps(maps, descriptors(maps.before), descriptors(maps.after), config)
+    mapped = [MappedSession(each, descriptors(each)) for each in (maps.before, maps.after)]
+    return detect_changes(*mapped, config, merge=lambda before, after: maps)
 
 
 def returns_of(report: ChangeReport) -> set[tuple[int, int]]:
@@ -132,7 +133,7 @@ def test_m3c2_of_a_plane_that_rose_by_hand(empty: PointMap) -> None:
         )
         maps = placed(before, after, path, merged(empty, empty, np.eye(4)))
         other: SessionName = "before" if session == "after" else "after"
-        return float(m3c2_mask(maps, session, other, load_config("m3c2", [*settings, *more])).mean())
+        return float(m3c2.new_mask(maps, session, other, load_config("m3c2", [*settings, *more])).mean())
 
     for moved_by in (np.eye(4), turn):
         assert share("after", 0.29, 2.0, moved_by) == 0.0
@@ -155,9 +156,9 @@ def test_m3c2_of_clouds_turned_together_is_the_same(empty: PointMap, crated: Poi
     maps = merged(empty, crated, np.linalg.inv(ODOM_T_ROOM))
     before, after = empty.points, transform(maps.before_T_after, crated.points)
     path = empty.odom_T_sensor[:, :3, 3]
-    first = m3c2_mask(placed(before, after, path, maps), "after", "before", config)
+    first = m3c2.new_mask(placed(before, after, path, maps), "after", "before", config)
     turned = placed(transform(turn, before), transform(turn, after), transform(turn, path), maps)
-    second = m3c2_mask(turned, "after", "before", config)
+    second = m3c2.new_mask(turned, "after", "before", config)
     assert first.sum() > 50
     # a point on the rim of a cylinder may be in or out
     assert np.count_nonzero(first != second) <= 0.001 * len(first)
@@ -181,7 +182,7 @@ def test_dufomap_by_hand(empty: PointMap) -> None:
 
     def is_void(session: SessionName, other: SessionName, *settings: str) -> list[bool]:
         given = ("query.radius_m=9", "dufomap.voxel_m=0.1", "dufomap.hit_inflation_m=0.2", *settings)
-        return void_mask(maps, session, other, load_config("dufomap", given)).tolist()
+        return dufomap.new_mask(maps, session, other, load_config("dufomap", given)).tolist()
 
     for session, other in directions:
         assert is_void(session, other) == [True, True, True, False, False, False]

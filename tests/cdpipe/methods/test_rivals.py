@@ -11,11 +11,11 @@ from cdpipe.methods.c2c import c2c
 from cdpipe.methods.random_regions import RandomRegions
 from cdpipe.methods.registry import load_method
 from cdpipe.methods.voxel_diff import voxel_diff
-from cdpipe.methods.whole_map import PlacedMaps, whole_map
+from cdpipe.methods.whole_map import PlacedMaps, WholeMap
 from cdpipe.model.config import PipelineConfig, load_config, preset_names
 from cdpipe.model.report import ChangeReport
-from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap, SessionName
-from cdpipe.pipeline import compare_maps
+from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, SessionName
+from cdpipe.pipeline import detect_changes
 
 LENGTH_M = 40.0
 SPACING_M = 0.2
@@ -66,7 +66,8 @@ def descriptors(point_map: PointMap) -> DescriptorSet:
 
 
 def answer(merged: MergedMaps, config: PipelineConfig) -> ChangeReport:
-    return compare_maps(merged, descriptors(merged.before), descriptors(merged.after), config)
+    mapped = [MappedSession(each, descriptors(each)) for each in (merged.before, merged.after)]
+    return detect_changes(*mapped, config, merge=lambda before, after: merged)
 
 
 def test_one_added_crate_by_hand() -> None:
@@ -183,10 +184,9 @@ def test_moving_the_after_session_changes_nothing() -> None:
 
 def test_random_regions_are_keyframes_and_repeat_with_their_seed() -> None:
     merged = pair([], [crate(20.0)])
-    sets = descriptors(merged.before), descriptors(merged.after)
 
     def drawn(seed: int) -> ChangeReport:
-        return compare_maps(merged, *sets, load_config("random-regions", [f"seed={seed}"]))
+        return answer(merged, load_config("random-regions", [f"seed={seed}"]))
 
     first = drawn(0)
     assert int(first.regions.is_reported.sum()) == 3
@@ -225,8 +225,8 @@ def test_random_regions_stay_where_the_after_session_came() -> None:
 
 def test_every_preset_has_its_method() -> None:
     assert {load_config(name).method for name in preset_names()} <= entry_points(METHODS).keys()
-    assert load_method("voxel-diff").detect is voxel_diff
-    assert load_method("c2c").detect is c2c
+    assert load_method("voxel-diff").detect == voxel_diff.detect
+    assert load_method("c2c").detect == c2c.detect
 
 
 def test_figures_are_of_the_after_map() -> None:
@@ -255,10 +255,11 @@ def test_a_mask_of_ones_own_makes_a_method() -> None:
     # beside the walls the nearest point of the other map may be any of a column: only what stands in the middle counts
     config = load_config("voxel-diff", ["query.threshold=0", "outlier.sigmas=10", "cluster.min_points=33"])
 
+    @WholeMap
     def in_the_middle(maps: PlacedMaps, session: SessionName, other: SessionName, config: PipelineConfig) -> BoolArray:
         return higher_mask(maps, session, other, config) & (np.abs(maps.points[session][:, 1]) < 1.5)
 
-    report = whole_map(merged, descriptors(merged.before), descriptors(merged.after), config, in_the_middle)
+    report = in_the_middle.detect(merged, descriptors(merged.before), descriptors(merged.after), config)
     assert report.regions.scores.tolist() == [64.0]
     (item,) = report.objects
     assert (item.session, item.kind) == ("after", "added")

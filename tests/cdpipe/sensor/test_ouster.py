@@ -189,7 +189,7 @@ def test_files_that_are_no_ouster_metadata(tmp_path: Path, text: bytes, message:
 
 
 def test_missing_file_and_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such sensor metadata file"):
+    with pytest.raises(InputError, match=r"none\.json: missing: expected the metadata"):
         load_profile(str(tmp_path / "none.json"))
     (tmp_path / "folder.json").mkdir()
     with pytest.raises(InputError, match="directory"):

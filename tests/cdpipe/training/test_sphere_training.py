@@ -160,7 +160,7 @@ def test_the_calibration_goes_with_the_weights() -> None:
     kept = make_untrained_sphere_network()
     kept.load_state_dict(task.network.state_dict())
     expected = said["slope"] * -2.0 + said["offset"]
-    assert float(kept.calibrated(torch.tensor(-2.0))) == pytest.approx(expected)
+    assert float(kept.calibrate(torch.tensor(-2.0))) == pytest.approx(expected)
 
 
 def test_classes_that_are_wholly_apart_get_a_curve() -> None:

@@ -451,7 +451,7 @@ def test_a_plan_whose_cells_are_refused_leaves_no_folder(
     def refused(_: Plan) -> None:
         raise InputError("settings that contradict each other")
 
-    monkeypatch.setattr(plans, "cells", refused)
+    monkeypatch.setattr(plans, "expand_cells", refused)
     assert_refused(command("run", "smoke", "--out", tmp_path / "out"), "contradict")
     assert tree(tmp_path) == set()
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cdpipe.io.readers import open_session
-from cdpipe.io.session import Session, read_session
+from cdpipe.io.session import Session, SessionWriter, read_session
 from eval.cli import converting
 from eval.cli.main import main
 from sim.session.truth import read_labels
@@ -145,16 +145,8 @@ def test_an_interrupt_leaves_nothing(
         source, target = pair / "before", tmp_path / "new" / "a.osf"
     else:
         source, target = tmp_path.parent / "whole.osf", tmp_path / "new" / "a"
-        converting.convert(pair / "before", source, _Silent())
-        monkeypatch.setattr(converting.import_recording.__globals__["SessionWriter"], "add", interrupted)
+        converting.convert(pair / "before", source, quiet=True)
+        monkeypatch.setattr(SessionWriter, "add", interrupted)
     assert command("convert", source, target, "--quiet") == (130, "", "interrupted; nothing was written\n")
     source.with_name("whole.osf").unlink(missing_ok=True)
     assert list(tmp_path.iterdir()) == []
-
-
-class _Silent:
-    def cells(self, label: str, done: int, total: int) -> None:
-        pass
-
-    def stage(self, name: str, done: int, total: int) -> None:
-        pass

@@ -6,7 +6,6 @@ import pytest
 from cdpipe import pipeline
 from cdpipe.core.errors import InputError
 from cdpipe.core.plugins import METHODS, entry_points
-from cdpipe.methods import registry
 from cdpipe.methods.registry import load_method
 
 Command = Callable[..., tuple[int, str, str]]
@@ -17,7 +16,7 @@ PACKAGES = {"m3c2": "py4dgeo", "dufomap": "dufomap"}
 def test_a_missing_extra_is_named_before_anything_is_mapped(
     method: str, tiny_pair: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(registry.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("cdpipe.core.plugins.find_spec", lambda name: None)
     monkeypatch.delattr(pipeline, "build_map")
     folders = (tiny_pair / "before", tiny_pair / "after", "--preset", method, "--out", tmp_path / "out")
     code, out, err = command("detect", *folders)

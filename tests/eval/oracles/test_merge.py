@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.geometry import invert, make_pose, stream, travelled_m, yaw_pose
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap
 from eval.oracles.merge import OracleMerge, merged_by_truth
-from eval.scoring.merge_metrics import MergeErrors, merge_errors
+from eval.scoring.merge_metrics import MergeErrors, compute_merge_errors
 from eval.truth.ground_truth import SessionTruth
 from eval.truth.universe import ScoringPoints
 
@@ -54,7 +54,7 @@ def oracle(truth: tuple[SessionTruth, SessionTruth], noise: OracleMerge, seed: i
 
 def errors_of(truth: tuple[SessionTruth, SessionTruth], merged: MergedMaps) -> MergeErrors:
     assert merged.local is not None
-    return merge_errors(*truth, merged.local.before_T_after, KEYFRAMES)
+    return compute_merge_errors(*truth, merged.local.before_T_after, KEYFRAMES)
 
 
 def pair(drift_deg_per_m: float = 0.0, start_m: float = 4.0, *, backwards: bool = False) -> tuple[SessionTruth, ...]:
@@ -129,7 +129,7 @@ def test_of_two_keyframes_at_one_place_each_keeps_its_own() -> None:
     before, after = mapped(truth[0], np.arange(N)), mapped(truth[1], np.arange(N))
     merged = merged_by_truth(before, after, truth, OracleMerge(), 1)
     assert merged.local is not None
-    errors = merge_errors(*truth, merged.local.before_T_after, (np.arange(N), np.arange(N)))
+    errors = compute_merge_errors(*truth, merged.local.before_T_after, (np.arange(N), np.arange(N)))
     np.testing.assert_allclose(errors.metres, 0.0, atol=1e-9)
 
 

@@ -9,10 +9,10 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import make_pose, yaw_pose
 from cdpipe.model.config import QueryConfig
 from eval.oracles.regions import regions_by_truth
-from eval.plans.changes import changed_plan
-from eval.plans.plan import Plan, cells, load_plan
-from eval.plans.variants import slug, variant_name
-from eval.scoring.region_metrics import centres_in_world, match_regions
+from eval.plans.changes import change_plan
+from eval.plans.plan import Plan, expand_cells, load_plan
+from eval.plans.variants import name_variant, slug
+from eval.scoring.region_metrics import match_regions, transform_to_world
 from eval.tables.merge_table import is_oracle
 from eval.truth.ground_truth import GroundTruth, SessionTruth
 from eval.truth.universe import ScoringPoints
@@ -47,7 +47,7 @@ def test_every_change_gets_a_region_that_finds_it_however_the_map_drifts() -> No
     truth = truth_of([(3.2, 1.0), (17.9, -1.5), (33.0, 0.5)], [5, 9, 7], [True, True, True])
     regions = regions_by_truth(truth, SCANS, QueryConfig(radius_m=4.5))
     # the largest first; the places are exact, for the keyframe that carries them there carries them back
-    back = centres_in_world(regions.centres_map, truth.before, SCANS[0])
+    back = transform_to_world(regions.centres_map, truth.before, SCANS[0])
     np.testing.assert_allclose(back, truth.centroids_world[[1, 2, 0]], atol=1e-9)
     assert regions.is_reported.all()
     matches = match_regions(back, regions.is_reported, truth.centroids_world, truth.is_observable, 0.01)
@@ -63,7 +63,7 @@ def test_every_change_gets_a_region_that_finds_it_however_the_map_drifts() -> No
 def test_what_nobody_could_see_gets_no_region_and_a_near_neighbour_of_a_larger_one_none_of_its_own() -> None:
     truth = truth_of([(5.0, 0.0), (8.0, 0.0), (20.0, 0.0), (30.0, 0.0)], [5, 9, 7, 3], [True, True, False, True])
     regions = regions_by_truth(truth, SCANS, QueryConfig(radius_m=4.5))
-    back = centres_in_world(regions.centres_map, truth.before, SCANS[0])
+    back = transform_to_world(regions.centres_map, truth.before, SCANS[0])
     np.testing.assert_allclose(back[:, 0], [8.0, 30.0], atol=1e-9)
     closer = regions_by_truth(truth, SCANS, QueryConfig(radius_m=4.5, suppression=0.5))
     assert len(closer.scores) == 3
@@ -100,7 +100,7 @@ def plan_of(folder: Path, text: str = PLAN) -> Plan:
 
 
 def test_oracles_are_named_after_what_they_know(tmp_path: Path) -> None:
-    found = cells(plan_of(tmp_path))
+    found = expand_cells(plan_of(tmp_path))
     assert [cell.variant for cell in found] == [
         "oracle-regions",
         "oracle-merge+oracle-regions",
@@ -110,14 +110,14 @@ def test_oracles_are_named_after_what_they_know(tmp_path: Path) -> None:
     assert [cell.oracle_regions for cell in found] == [True, True, True, False]
     assert [is_oracle(cell.variant) for cell in found] == [False, True, True, False]
     assert slug("oracle-merge+oracle-regions") == "oracle-merge_oracle-regions"
-    assert variant_name("tunnelcd", ["a.b=1"], oracle_regions=True) == "oracle-regions[a.b=1]"
+    assert name_variant("tunnelcd", ["a.b=1"], oracle_regions=True) == "oracle-regions[a.b=1]"
 
 
 def test_a_plan_is_written_as_it_was_read(tmp_path: Path) -> None:
     plan = plan_of(tmp_path)
     written = plan.model_dump(mode="json")["variants"]
     assert [variant.get("oracle_regions") for variant in written] == [True, True, True, None]
-    assert cells(changed_plan(plan, seeds="10000:10001"))[1].oracle_regions
+    assert expand_cells(change_plan(plan, seeds="10000:10001"))[1].oracle_regions
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_settings_that_nothing_reads_are_refused(tmp_path: Path, variant: str, r
 def test_a_method_without_regions_of_its_own_takes_none_from_the_truth(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, PLAN.replace("tunnelcd, oracle_regions", "c2c, oracle_regions"))
     with pytest.raises(InputError, match=r"oracle_regions .*c2c"):
-        cells(plan)
+        expand_cells(plan)
 
 
 def test_an_end_at_the_merge_has_no_regions_to_be_told(tmp_path: Path) -> None:
@@ -148,8 +148,8 @@ def test_an_end_at_the_merge_has_no_regions_to_be_told(tmp_path: Path) -> None:
 
 
 def test_settings_of_the_query_pass_by_but_for_radius_and_suppression(tmp_path: Path) -> None:
-    changed = cells(changed_plan(plan_of(tmp_path), settings=["query.threshold=7", "query.radius_m=8"]))
+    changed = expand_cells(change_plan(plan_of(tmp_path), settings=["query.threshold=7", "query.radius_m=8"]))
     assert [cell.config.query.radius_m for cell in changed] == [8.0] * 4
     assert [cell.config.query.threshold == 7 for cell in changed] == [False, False, False, True]
-    gridded = cells(changed_plan(plan_of(tmp_path), grid=["query.threshold=7,8"]))
+    gridded = expand_cells(change_plan(plan_of(tmp_path), grid=["query.threshold=7,8"]))
     assert len(gridded) == 3 + 2

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections import Counter
 
 from cdpipe.model.config import preset_names
-from eval.plans.plan import cells, load_plan
-from eval.plans.worlds import references, settings_over
+from eval.plans.plan import expand_cells, load_plan
+from eval.plans.worlds import find_references, list_settings_over
 from scenarios import load_scenario
 
 BASE = "stress/narrow"
 
 
 def test_main_runs_every_preset_and_the_bounds_on_the_pairs_of_regions() -> None:
-    found = cells(load_plan("main"))
+    found = expand_cells(load_plan("main"))
     variants = {cell.variant for cell in found}
     assert variants == {*preset_names(), "oracle-merge", "oracle-merge+oracle-regions"} - {"frame"}
     pairs = Counter((cell.scenario, cell.seed) for cell in found if cell.variant == "paper")
-    assert {scenario for scenario, _ in pairs} <= {cell.scenario for cell in cells(load_plan("regions"))}
+    assert {scenario for scenario, _ in pairs} <= {cell.scenario for cell in expand_cells(load_plan("regions"))}
     assert len(set(Counter(scenario for scenario, _ in pairs).values())) == 1  # each family counts alike
     assert {scenario.split("/")[1] for scenario, _ in pairs} >= {"narrow", "wide", "network", "cave", "site1"}
     assert all(20000 <= cell.seed < 30000 for cell in found)
@@ -26,7 +26,8 @@ def test_main_runs_every_preset_and_the_bounds_on_the_pairs_of_regions() -> None
 
 def test_main_judges_at_the_radius_and_threshold_of_regions() -> None:
     ours, theirs = (
-        {(cell.scenario, cell.variant): cell.config for cell in cells(load_plan(name))} for name in ("main", "regions")
+        {(cell.scenario, cell.variant): cell.config for cell in expand_cells(load_plan(name))}
+        for name in ("main", "regions")
     )
     shared = ours.keys() & theirs.keys()
     assert {variant for _, variant in shared} >= {"tunnelcd", "paper", "voxel-diff", "random-regions"}
@@ -39,14 +40,14 @@ def test_main_judges_at_the_radius_and_threshold_of_regions() -> None:
 
 def test_every_stress_is_held_against_the_same_pair_without_it() -> None:
     plan = load_plan("stress")
-    found = cells(plan)
-    held = references((cell.scenario, cell.variant, cell.seed) for cell in found)
+    found = expand_cells(plan)
+    held = find_references((cell.scenario, cell.variant, cell.seed) for cell in found)
     worlds = {cell.scenario for cell in found}
     methods = {cell.variant for cell in found if cell.oracle is None}
     assert held == {(world, variant): BASE for world in worlds - {BASE} for variant in methods}
     compared = {(cell.scenario, cell.variant.partition("[")[0]) for cell in found if cell.scenario != BASE}
     assert compared >= {(world, method) for world in worlds - {BASE} for method in ("tunnelcd", "paper-paired")}
-    stresses = {settings_over(world, BASE).split("=")[0] for world in worlds - {BASE}}
+    stresses = {list_settings_over(world, BASE).split("=")[0] for world in worlds - {BASE}}
     assert stresses == {"before.odometry.translation_percent", "sensor.mode", "after.route", "before.lateral"}
     merged = {(cell.preset, cell.oracle.noise_m) for cell in found if cell.oracle is not None}
     of_ours, of_paper = ({noise_m for name, noise_m in merged if name == each} for each in ("tunnelcd", "paper-paired"))

@@ -9,10 +9,10 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from eval.core.statistics import ENOUGH_PAIRS
-from eval.plans.changes import changed_plan
-from eval.plans.plan import cells, load_plan
+from eval.plans.changes import change_plan
+from eval.plans.plan import expand_cells, load_plan
 from eval.plans.variants import Cell
-from eval.plans.worlds import worlds_of
+from eval.plans.worlds import list_worlds
 
 VALIDATION, TEST = range(10000, 20000), range(20000, 30000)
 HELD_OUT = ("cave", "site1", "site2")
@@ -20,8 +20,8 @@ HELD_OUT = ("cave", "site1", "site2")
 
 def pairs_by_kind(name: str) -> Counter[str]:
     plan = load_plan(name)
-    kinds = {world.label: world.pair_kind for world in worlds_of(plan.scenarios)}
-    return Counter(kinds[label] for label, _ in {(cell.scenario, cell.seed) for cell in cells(plan)})
+    kinds = {world.label: world.pair_kind for world in list_worlds(plan.scenarios)}
+    return Counter(kinds[label] for label, _ in {(cell.scenario, cell.seed) for cell in expand_cells(plan)})
 
 
 def variants(found: list[Cell]) -> list[str]:
@@ -29,7 +29,7 @@ def variants(found: list[Cell]) -> list[str]:
 
 
 def test_merge_has_two_hundred_test_pairs_of_four_kinds_and_four_methods() -> None:
-    found = cells(load_plan("merge"))
+    found = expand_cells(load_plan("merge"))
     counts = pairs_by_kind("merge")
     assert set(counts) == {"clean", "drift", "smooth", "disjoint"}
     assert counts.total() >= 200
@@ -38,25 +38,25 @@ def test_merge_has_two_hundred_test_pairs_of_four_kinds_and_four_methods() -> No
     assert variants(found) == ["tunnelcd", "frame", "kiss-matcher", "oracle-merge"]
     assert {cell.until for cell in found} == {"merge"}
     assert {cell.seed for cell in found} <= set(TEST)
-    clean = {world.name for world in worlds_of(load_plan("merge").scenarios) if world.pair_kind == "clean"}
+    clean = {world.name for world in list_worlds(load_plan("merge").scenarios) if world.pair_kind == "clean"}
     assert clean == {f"merge/{name}" for name in ("narrow", "wide", "network", *HELD_OUT)}
 
 
 def test_thresholds_are_chosen_on_validation_pairs_of_the_same_kinds() -> None:
-    found = cells(load_plan("merge-gates"))
+    found = expand_cells(load_plan("merge-gates"))
     counts = pairs_by_kind("merge-gates")
     assert set(counts) == set(pairs_by_kind("merge"))
     assert 60 <= counts.total() <= 100
     assert {cell.seed for cell in found} <= set(VALIDATION)
     assert not any(name in cell.scenario for cell in found for name in HELD_OUT)
     assert variants(found) == ["tunnelcd[merge.accept_all=true]"]
-    of_merge = {world.name: world.pair_kind for world in worlds_of(load_plan("merge").scenarios)}
-    for world in worlds_of(load_plan("merge-gates").scenarios):
+    of_merge = {world.name: world.pair_kind for world in list_worlds(load_plan("merge").scenarios)}
+    for world in list_worlds(load_plan("merge-gates").scenarios):
         assert of_merge[world.name] == world.pair_kind
 
 
 def test_noise_has_each_error_alone_for_both_methods() -> None:
-    found = cells(load_plan("merge-noise"))
+    found = expand_cells(load_plan("merge-noise"))
     noises = {(cell.preset, cell.oracle and (cell.oracle.noise_m, cell.oracle.noise_deg)) for cell in found}
     ours, theirs = ({noise for name, noise in noises if name == each} for each in ("tunnelcd", "voxel-diff"))
     assert ours == theirs >= {None, (0, 0)}
@@ -83,14 +83,14 @@ def test_an_item_may_have_the_first_of_the_seeds_only(tmp_path: Path) -> None:
     plan = load_plan(str(tmp_path / "plan.yaml"))
     noiseless = "smoke/one_box[sensor.range_noise=false]"
     expected = [("smoke/one_box", 7), ("smoke/one_box", 5), (noiseless, 7), (noiseless, 5)]
-    assert [(cell.scenario, cell.seed) for cell in cells(plan)] == [
+    assert [(cell.scenario, cell.seed) for cell in expand_cells(plan)] == [
         *expected, ("smoke/unchanged", 7), ("smoke/unchanged", 5), ("smoke/unchanged", 6),
     ]  # fmt: skip
-    assert changed_plan(plan) == plan
+    assert change_plan(plan) == plan
     # of the seeds of the command line too, and of one there is no more than one
-    counts = Counter(cell.scenario for cell in cells(changed_plan(plan, seeds="10:14")))
+    counts = Counter(cell.scenario for cell in expand_cells(change_plan(plan, seeds="10:14")))
     assert counts == {"smoke/one_box": 2, noiseless: 2, "smoke/unchanged": 4}
-    assert len(cells(changed_plan(plan, seeds="10"))) == 3
+    assert len(expand_cells(change_plan(plan, seeds="10"))) == 3
 
 
 @pytest.mark.parametrize("number", ["0", "-1", "1.5", "many"])

@@ -6,11 +6,11 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.model.config import load_config
 from eval.plans import plan as plan_module
-from eval.plans.changes import changed_plan
+from eval.plans.changes import change_plan
 from eval.plans.files import plan_names
-from eval.plans.plan import Plan, cells, load_plan, parse_seeds, planned_cases
-from eval.plans.variants import slug, variant_name
-from eval.plans.worlds import setting_text, world_slug
+from eval.plans.plan import Plan, expand_cells, list_planned_cases, load_plan, parse_seeds
+from eval.plans.variants import name_variant, slug
+from eval.plans.worlds import format_setting, world_slug
 from eval.running.runfolder import reported
 
 PLAN = """\
@@ -46,7 +46,7 @@ def mistakes(folder: Path, text: str) -> list[str]:
 
 
 def test_cells_by_hand(tmp_path: Path) -> None:
-    found = [(c.scenario, c.seed, c.preset, c.variant) for c in cells(read(tmp_path))]
+    found = [(c.scenario, c.seed, c.preset, c.variant) for c in expand_cells(read(tmp_path))]
     grid = [
         "tunnelcd[extract.voxel_m=0.2,query.radius_m=3]",
         "tunnelcd[extract.voxel_m=0.2,query.radius_m=4.5]",
@@ -63,7 +63,7 @@ def test_cells_by_hand(tmp_path: Path) -> None:
 
 
 def test_settings_of_a_site_change_the_configuration_and_not_the_name(tmp_path: Path) -> None:
-    paper = {c.scenario: c for c in cells(read(tmp_path)) if c.preset == "paper"}
+    paper = {c.scenario: c for c in expand_cells(read(tmp_path)) if c.preset == "paper"}
     assert {c.variant for c in paper.values()} == {"paper"}
     assert paper["smoke/one_box"].config.query.radius_m == 4.5
     assert paper["smoke/unchanged"].config.query.radius_m == 10
@@ -72,7 +72,7 @@ def test_settings_of_a_site_change_the_configuration_and_not_the_name(tmp_path: 
 def test_wide_worlds_get_what_the_presets_say_of_them(tmp_path: Path) -> None:
     text = PLAN.replace('seeds: "7:9"', 'seeds: "7:9"\nwide: smoke/unchanged')
     text = text.replace("query.radius_m=10", "query.threshold=2").replace("[smoke/one_box]", "[smoke/unchanged]")
-    found = {(c.scenario, c.variant): c.config.query for c in cells(read(tmp_path, text))}
+    found = {(c.scenario, c.variant): c.config.query for c in expand_cells(read(tmp_path, text))}
     wide = load_config("tunnelcd", site="wide").query
     assert found["smoke/unchanged", "tunnelcd[extract.voxel_m=0.4]"] == wide
     assert found["smoke/one_box", "tunnelcd[extract.voxel_m=0.4]"] == load_config("tunnelcd").query
@@ -96,11 +96,13 @@ def test_a_preset_that_says_nothing_of_wide_worlds_is_told(tmp_path: Path) -> No
     (tmp_path / "mine.yaml").write_text("query: {radius_m: 3}\n")
     text = f"{{name: m, scenarios: [wide], wide: [wide], seeds: [7], variants: [{{preset: {tmp_path}/mine.yaml}}]}}"
     with pytest.raises(InputError, match=r"mine\.yaml: wide: missing"):
-        cells(read(tmp_path, text))
+        expand_cells(read(tmp_path, text))
 
 
 def test_grid_points_get_their_values(tmp_path: Path) -> None:
-    config = {c.variant: c.config for c in cells(read(tmp_path))}["tunnelcd[extract.voxel_m=0.3,query.radius_m=3]"]
+    config = {c.variant: c.config for c in expand_cells(read(tmp_path))}[
+        "tunnelcd[extract.voxel_m=0.3,query.radius_m=3]"
+    ]
     assert (config.extract.voxel_m, config.query.radius_m, config.query.compare) == (0.3, 3.0, "sphere")
 
 
@@ -165,18 +167,18 @@ def test_what_is_no_seeds(value: object) -> None:
 
 
 def test_names_and_slugs() -> None:
-    assert variant_name("paper", ()) == "paper"
-    assert variant_name("tunnelcd", ("a.b=0.3", "c=4")) == "tunnelcd[a.b=0.3,c=4]"
+    assert name_variant("paper", ()) == "paper"
+    assert name_variant("tunnelcd", ("a.b=0.3", "c=4")) == "tunnelcd[a.b=0.3,c=4]"
     assert slug("tunnelcd[a.b=0.3,c=4]") == "tunnelcd_a.b=0.3,c=4_"
-    assert variant_name("my/own.yaml", ()) == "own"
+    assert name_variant("my/own.yaml", ()) == "own"
     assert world_slug("paper/site1") == "paper__site1"
-    assert setting_text("query.n_regions", None) == "query.n_regions=null"
-    assert setting_text("a.b", 4.5) == "a.b=4.5"
+    assert format_setting("query.n_regions", None) == "query.n_regions=null"
+    assert format_setting("a.b", 4.5) == "a.b=4.5"
 
 
 def test_command_line_replaces_seeds_and_sets_every_variant(tmp_path: Path) -> None:
-    plan = changed_plan(read(tmp_path), seeds="1:2", settings=["query.radius_m=6", "extract.voxel_m=0.5"])
-    found = cells(plan)
+    plan = change_plan(read(tmp_path), seeds="1:2", settings=["query.radius_m=6", "extract.voxel_m=0.5"])
+    found = expand_cells(plan)
     assert {c.seed for c in found} == {1}
     # the command line wins over the plan's own set, over what it sets for a site, and over its grid
     assert {(c.config.query.radius_m, c.config.extract.voxel_m) for c in found} == {(6.0, 0.5)}
@@ -187,18 +189,18 @@ def test_command_line_replaces_seeds_and_sets_every_variant(tmp_path: Path) -> N
 
 
 def test_presets_of_the_command_line_replace_the_plan_s_variants_and_grids(tmp_path: Path) -> None:
-    plan = changed_plan(read(tmp_path), presets=["c2c", "voxel-diff"], settings=["query.radius_m=6"])
-    assert {c.variant for c in cells(plan)} == {"c2c[query.radius_m=6]", "voxel-diff[query.radius_m=6]"}
-    assert len(cells(plan)) == 2 * 2 * 2
+    plan = change_plan(read(tmp_path), presets=["c2c", "voxel-diff"], settings=["query.radius_m=6"])
+    assert {c.variant for c in expand_cells(plan)} == {"c2c[query.radius_m=6]", "voxel-diff[query.radius_m=6]"}
+    assert len(expand_cells(plan)) == 2 * 2 * 2
     with pytest.raises(InputError, match=r"voxel-dif.*voxel-diff"):
-        changed_plan(plan, presets=["voxel-dif"])
+        change_plan(plan, presets=["voxel-dif"])
 
 
 def test_every_wrong_value_of_a_grid_is_named(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"= 'x': input should be a valid number.*; extract\.voxel_m = -2: input should"
     ):
-        changed_plan(read(tmp_path), grid=["extract.voxel_m=0.3,x,-2"])
+        change_plan(read(tmp_path), grid=["extract.voxel_m=0.3,x,-2"])
 
 
 @pytest.mark.parametrize(
@@ -209,13 +211,13 @@ def test_a_grid_that_something_else_writes_over_is_refused(
     tmp_path: Path, settings: list[str], grid: list[str]
 ) -> None:
     with pytest.raises(InputError, match=r"--grid extract\.voxel_m: set twice"):
-        changed_plan(read(tmp_path), settings=settings, grid=grid)
+        change_plan(read(tmp_path), settings=settings, grid=grid)
 
 
 def test_command_line_grid_is_a_product_over_the_variants(tmp_path: Path) -> None:
     text = PLAN.partition("grid:")[0]
-    plan = changed_plan(read(tmp_path, text), grid=["extract.voxel_m=0.1,0.2", "query.radius_m=3,5"])
-    variants = [c.variant for c in cells(plan) if (c.scenario, c.seed) == ("smoke/one_box", 7)]
+    plan = change_plan(read(tmp_path, text), grid=["extract.voxel_m=0.1,0.2", "query.radius_m=3,5"])
+    variants = [c.variant for c in expand_cells(plan) if (c.scenario, c.seed) == ("smoke/one_box", 7)]
     assert variants == [
         f"{preset}[extract.voxel_m={voxel},query.radius_m={radius}]"
         for preset in ("paper", "tunnelcd")
@@ -236,22 +238,22 @@ def test_command_line_grid_is_a_product_over_the_variants(tmp_path: Path) -> Non
 )
 def test_mistakes_of_the_command_line(tmp_path: Path, kwargs: dict[str, object], words: str) -> None:
     with pytest.raises(InputError, match="--") as caught:
-        changed_plan(read(tmp_path), **kwargs)  # type: ignore[arg-type]
+        change_plan(read(tmp_path), **kwargs)  # type: ignore[arg-type]
     assert words in str(caught.value)
 
 
 def test_unchanged_plan_stays_equal(tmp_path: Path) -> None:
     plan = read(tmp_path)
-    assert changed_plan(plan) == plan
+    assert change_plan(plan) == plan
 
 
 @pytest.mark.parametrize("name", plan_names())
 def test_shipped_plans_are_valid(name: str) -> None:
-    assert cells(load_plan(name))
+    assert expand_cells(load_plan(name))
 
 
 def test_paper_plan_holds_what_the_page_shows() -> None:
-    found = cells(load_plan("paper"))
+    found = expand_cells(load_plan("paper"))
     presets = ["paper", "paper-topn", "paper-paired", "voxel-diff", "untrained", "random-regions", "tunnelcd"]
     for scenario in ("paper/site1", "paper/site2", "unchanged/site1"):
         plain = [c for c in found if c.scenario == scenario and "[" not in c.variant]
@@ -273,8 +275,8 @@ def test_the_example_of_the_documentation_is_a_plan(tmp_path: Path) -> None:
     assert set(Plan.model_fields) == plan.model_fields_set
     assert plan.seeds == (20000, 20001)
     # of each seed: one variant on both sites and on two more worlds of one, another and four grid points on the other
-    assert len(cells(plan)) == 2 * ((2 + 2) + 1 + 4)
-    assert {cell.variant for cell in cells(plan) if cell.preset == "paper"} == {"paper[extract.voxel_m=0.4]"}
+    assert len(expand_cells(plan)) == 2 * ((2 + 2) + 1 + 4)
+    assert {cell.variant for cell in expand_cells(plan) if cell.preset == "paper"} == {"paper[extract.voxel_m=0.4]"}
 
 
 ORACLES = """\
@@ -292,7 +294,7 @@ variants:
 
 
 def test_oracles_are_variants_of_their_own(tmp_path: Path) -> None:
-    found = cells(read(tmp_path, ORACLES))
+    found = expand_cells(read(tmp_path, ORACLES))
     assert [(c.preset, c.variant) for c in found] == [
         ("tunnelcd", "tunnelcd"),
         ("tunnelcd", "oracle-merge"),
@@ -308,14 +310,14 @@ def test_oracles_are_variants_of_their_own(tmp_path: Path) -> None:
 
 
 def test_a_plan_may_end_at_the_merge(tmp_path: Path) -> None:
-    assert {c.until for c in cells(read(tmp_path, ORACLES))} == {"merge"}
-    assert {c.until for c in cells(read(tmp_path))} == {None}
+    assert {c.until for c in expand_cells(read(tmp_path, ORACLES))} == {"merge"}
+    assert {c.until for c in expand_cells(read(tmp_path))} == {None}
 
 
 def test_the_command_line_keeps_oracles_and_the_end(tmp_path: Path) -> None:
     plan = read(tmp_path, ORACLES)
-    assert changed_plan(plan) == plan
-    found = cells(changed_plan(plan, settings=["map.keyframe_spacing_m=2"], grid=["map.voxel_m=0.1,0.4"]))
+    assert change_plan(plan) == plan
+    found = expand_cells(change_plan(plan, settings=["map.keyframe_spacing_m=2"], grid=["map.voxel_m=0.1,0.4"]))
     assert len(found) == 10
     assert {c.until for c in found} == {"merge"}
     assert "oracle-merge[noise_m=0.1,noise_deg=0.2,map.voxel_m=0.4,map.keyframe_spacing_m=2]" in {
@@ -371,14 +373,14 @@ def test_settings_that_nothing_reads(tmp_path: Path, old: str, new: str, words: 
 
 def test_the_same_settings_are_welcome_where_they_are_read(tmp_path: Path) -> None:
     text = ORACLES.replace("until: merge\n", "").replace("map.voxel_m=0.3", "query.radius_m=3")
-    assert cells(read(tmp_path, text))[3].config.query.radius_m == 3
+    assert expand_cells(read(tmp_path, text))[3].config.query.radius_m == 3
     with pytest.raises(InputError, match=r"query.radius_m=3 of tunnelcd does nothing"):
-        changed_plan(read(tmp_path, ORACLES), settings=["query.radius_m=3"])
+        change_plan(read(tmp_path, ORACLES), settings=["query.radius_m=3"])
 
 
 def test_settings_of_the_merge_on_the_command_line_pass_by_the_oracles(tmp_path: Path) -> None:
-    plan = changed_plan(read(tmp_path, ORACLES), settings=["merge.refine=none"], grid=["merge.inlier_m=0.1,0.2"])
-    assert [c.variant for c in cells(plan)] == [
+    plan = change_plan(read(tmp_path, ORACLES), settings=["merge.refine=none"], grid=["merge.inlier_m=0.1,0.2"])
+    assert [c.variant for c in expand_cells(plan)] == [
         "tunnelcd[merge.inlier_m=0.1,merge.refine=none]",
         "tunnelcd[merge.inlier_m=0.2,merge.refine=none]",
         "oracle-merge",
@@ -386,17 +388,17 @@ def test_settings_of_the_merge_on_the_command_line_pass_by_the_oracles(tmp_path:
         "oracle-merge[noise_m=0.05,noise_deg=0,map.voxel_m=0.3]",
         "oracle-merge[preset=paper]",
     ]
-    assert planned_cases(plan) == {(c.scenario, c.seed, c.variant) for c in cells(plan)}
+    assert list_planned_cases(plan) == {(c.scenario, c.seed, c.variant) for c in expand_cells(plan)}
 
 
 def test_a_variant_may_be_for_some_scenarios_alone(tmp_path: Path) -> None:
     text = PLAN.replace("  - preset: tunnelcd\n", "  - preset: tunnelcd\n    scenarios: smoke/unchanged\n")
     plan = read(tmp_path, text)
-    found = {(cell.scenario, cell.variant) for cell in cells(plan)}
+    found = {(cell.scenario, cell.variant) for cell in expand_cells(plan)}
     assert ("smoke/unchanged", "tunnelcd[extract.voxel_m=0.4]") in found
     assert ("smoke/one_box", "tunnelcd[extract.voxel_m=0.4]") not in found
-    assert {(scenario, variant) for scenario, _, variant in planned_cases(plan)} == found
-    assert cells(changed_plan(plan)) != [] and changed_plan(plan) == plan
+    assert {(scenario, variant) for scenario, _, variant in list_planned_cases(plan)} == found
+    assert expand_cells(change_plan(plan)) != [] and change_plan(plan) == plan
     assert mistakes(
         tmp_path, text.replace("scenarios: smoke/unchanged", "scenarios: [smoke/unchanged, paper/site1]")
     ) == [
@@ -425,7 +427,7 @@ def test_a_report_may_be_about_both(tmp_path: Path) -> None:
 
 def test_every_option_of_the_command_line_is_checked_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
-        changed_plan(
+        change_plan(
             read(tmp_path), seeds="a", settings=["query.radus_m=3", "x"], grid=["extract.voxel=1", "extract.voxel_m"]
         )
     lines = str(caught.value).splitlines()

@@ -11,7 +11,7 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import Document, validate
 from eval.core.domains import domain_of
-from eval.plans.plan import Plan, cells, load_plan
+from eval.plans.plan import Plan, expand_cells, load_plan
 from scenarios import load_scenario
 from scenarios.schema import Scenario
 
@@ -24,7 +24,7 @@ WIDE = ("regions/wide", "regions/site2", "null/wide")
 
 
 def pairs(name: str) -> set[tuple[str, int]]:
-    return {(cell.scenario, cell.seed) for cell in cells(load_plan(name))}
+    return {(cell.scenario, cell.seed) for cell in expand_cells(load_plan(name))}
 
 
 def way_m(scenario: Scenario) -> float:
@@ -66,7 +66,7 @@ def test_thresholds_are_set_on_twenty_validation_pairs_of_each_trained_family() 
     [("regions", TEST, {"random-regions"}), ("null", TEST, set()), ("calibrate", VALIDATION, set())],
 )
 def test_every_method_runs_on_the_seeds_that_are_its(name: str, seeds: range, others: set[str]) -> None:
-    found = cells(load_plan(name))
+    found = expand_cells(load_plan(name))
     assert {cell.seed for cell in found} <= set(seeds)
     assert {cell.variant for cell in found} == {*METHODS, *others}
     for cell in found:
@@ -75,7 +75,7 @@ def test_every_method_runs_on_the_seeds_that_are_its(name: str, seeds: range, ot
 
 def test_the_two_plans_of_test_pairs_judge_at_the_same_thresholds() -> None:
     found = {
-        name: {(c.variant, c.scenario.partition("/")[2]): c.config.query for c in cells(load_plan(name))}
+        name: {(c.variant, c.scenario.partition("/")[2]): c.config.query for c in expand_cells(load_plan(name))}
         for name in ("regions", "null")
     }
     shared = found["regions"].keys() & found["null"].keys()

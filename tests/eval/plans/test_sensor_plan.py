@@ -13,17 +13,17 @@ from pydantic.fields import FieldInfo
 from cdpipe.model.config import load_config
 from cdpipe.sensor.ouster import load_profile, profile_names
 from eval.core.statistics import ENOUGH_PAIRS
-from eval.plans.plan import cells, load_plan
-from eval.plans.worlds import references, settings_over, worlds_of
+from eval.plans.plan import expand_cells, load_plan
+from eval.plans.worlds import find_references, list_settings_over, list_worlds
 from scenarios.library import load_scenario
 from scenarios.schema import Sensor
 from sim.session.simulate import simulate_pair
 from sim.session.truth import PairTruth, read_labels, read_pair_truth, read_true_poses
 
 PLAN = load_plan("sensor")
-WORLDS = worlds_of(PLAN.scenarios)
+WORLDS = list_worlds(PLAN.scenarios)
 REFERENCE = WORLDS[0]
-OVER = {settings_over(world.label, REFERENCE.label) for world in WORLDS[1:]}
+OVER = {list_settings_over(world.label, REFERENCE.label) for world in WORLDS[1:]}
 SMALL = ("sensor.mode=512x10", "platform.scan_spacing_m=2.0", "after.end_m=9")
 
 
@@ -45,7 +45,7 @@ def test_every_effect_of_the_sensor_has_a_row_of_its_own() -> None:
 
 
 def test_all_rows_are_held_against_the_first_and_differ_from_it_in_the_sensor_only() -> None:
-    held = references((world.label, "v", 0) for world in WORLDS)
+    held = find_references((world.label, "v", 0) for world in WORLDS)
     assert held == {(world.label, "v"): REFERENCE.label for world in WORLDS[1:]}
     for seed in PLAN.seeds[:2]:
         plain = load_scenario(REFERENCE.name, seed, REFERENCE.settings)
@@ -60,7 +60,7 @@ def test_there_are_pairs_enough_to_set_a_difference_in_bold() -> None:
 
 
 def test_no_threshold_hides_an_effect() -> None:
-    found = cells(PLAN)
+    found = expand_cells(PLAN)
     as_in_tune = {value for grid in load_plan("tune").grid for value in grid.keys["query.n_regions"]}
     assert len({cell.scenario for cell in found}) == len(WORLDS)
     for cell in found:

@@ -6,10 +6,10 @@ import pytest
 import yaml
 
 from cdpipe.core.errors import InputError
-from eval.plans.changes import changed_plan
+from eval.plans.changes import change_plan
 from eval.plans.files import plan_names
 from eval.plans.plan import load_plan
-from eval.plans.targets import Target, Targets, targets_of
+from eval.plans.targets import Target, Targets, read_targets
 
 PLAN = {"name": "tiny", "scenarios": ["smoke/one_box"], "seeds": [1], "variants": [{"preset": "paper"}]}
 
@@ -27,10 +27,10 @@ def test_a_plan_takes_those_of_another_by_its_name(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", plan_names())
 def test_a_run_finds_its_targets_whether_its_plan_was_stored_with_them_or_before_there_were_any(name: str) -> None:
-    plan = changed_plan(load_plan(name), seeds="1:3")
+    plan = change_plan(load_plan(name), seeds="1:3")
     document = plan.model_dump(mode="json")
-    assert targets_of({"plan": document}) == plan.targets
-    assert targets_of({"plan": {key: value for key, value in document.items() if key != "targets"}}) == plan.targets
+    assert read_targets({"plan": document}) == plan.targets
+    assert read_targets({"plan": {key: value for key, value in document.items() if key != "targets"}}) == plan.targets
 
 
 def test_a_plan_that_takes_its_own_is_refused(tmp_path: Path) -> None:
@@ -40,7 +40,7 @@ def test_a_plan_that_takes_its_own_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_run_of_an_unknown_plan_has_none() -> None:
-    assert targets_of({"plan": {"name": "of my own"}}) == targets_of({}) == Targets()
+    assert read_targets({"plan": {"name": "of my own"}}) == read_targets({}) == Targets()
 
 
 @pytest.mark.parametrize(

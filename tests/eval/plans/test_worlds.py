@@ -6,9 +6,9 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from eval.plans import worlds
-from eval.plans.changes import changed_plan
-from eval.plans.plan import Plan, cells, load_plan
-from eval.plans.worlds import World, references, settings_over, world_slug, worlds_of
+from eval.plans.changes import change_plan
+from eval.plans.plan import Plan, expand_cells, load_plan
+from eval.plans.worlds import World, find_references, list_settings_over, list_worlds, world_slug
 
 PLAN = """\
 name: worlds
@@ -56,7 +56,7 @@ def replaced(old: str, new: str) -> str:
 
 def test_worlds_by_hand(tmp_path: Path) -> None:
     spacing, noise = "platform.scan_spacing_m=1", "sensor.range_noise=false"
-    found = worlds_of(read(tmp_path).scenarios)
+    found = list_worlds(read(tmp_path).scenarios)
     assert found == [
         World("smoke/unchanged"),
         World("smoke/one_box", (spacing,)),
@@ -68,7 +68,7 @@ def test_worlds_by_hand(tmp_path: Path) -> None:
 
 
 def test_a_plain_name_means_every_world_of_the_scenario_and_a_label_one(tmp_path: Path) -> None:
-    found = cells(read(tmp_path))
+    found = expand_cells(read(tmp_path))
     assert [(c.scenario, c.variant) for c in found] == [
         ("smoke/unchanged", "paper"),
         (PLAIN, "paper"),
@@ -100,9 +100,9 @@ def test_a_plan_is_dumped_as_it_is_written_and_read_back_the_same(tmp_path: Path
             "each": [["sensor.range_noise=false"], ["sensor.mode=512x10", "sensor.sub_rays=7"]],
         },
     ]
-    assert changed_plan(plan) == plan
-    again = changed_plan(plan, seeds="3:5", settings=["extract.voxel_m=0.1"])
-    assert worlds_of(again.scenarios) == worlds_of(plan.scenarios)
+    assert change_plan(plan) == plan
+    again = change_plan(plan, seeds="3:5", settings=["extract.voxel_m=0.1"])
+    assert list_worlds(again.scenarios) == list_worlds(plan.scenarios)
 
 
 def test_the_kind_of_a_pair_is_of_all_worlds_of_its_item_and_in_no_name(tmp_path: Path) -> None:
@@ -110,13 +110,13 @@ def test_the_kind_of_a_pair_is_of_all_worlds_of_its_item_and_in_no_name(tmp_path
         "    set: [platform.scan_spacing_m=1]\n", "    set: [platform.scan_spacing_m=1]\n    pair_kind: drift\n"
     )
     plan = read(tmp_path, text)
-    found = worlds_of(plan.scenarios)
+    found = list_worlds(plan.scenarios)
     assert [world.pair_kind for world in found] == ["", "drift", "drift", "drift"]
-    assert [world.label for world in found] == [world.label for world in worlds_of(read(tmp_path).scenarios)]
-    assert worlds_of(changed_plan(plan, seeds="1").scenarios) == found
+    assert [world.label for world in found] == [world.label for world in list_worlds(read(tmp_path).scenarios)]
+    assert list_worlds(change_plan(plan, seeds="1").scenarios) == found
     named = read(tmp_path, replaced("  - smoke/unchanged\n", "  - {name: smoke/unchanged, pair_kind: disjoint}\n"))
     assert named.model_dump(mode="json")["scenarios"][0] == {"name": "smoke/unchanged", "pair_kind": "disjoint"}
-    assert changed_plan(named) == named
+    assert change_plan(named) == named
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ variants: [{preset: paper, set: query.n_regions=3, per_scenario: {smoke/one_box:
 """
     plan = read(tmp_path, text)
     mode, noise = "sensor.mode=512x10", "sensor.range_noise=false"
-    assert worlds_of(plan.scenarios) == [World("smoke/one_box", (mode,)), World("smoke/one_box", (mode,), (noise,))]
+    assert list_worlds(plan.scenarios) == [World("smoke/one_box", (mode,)), World("smoke/one_box", (mode,), (noise,))]
     assert plan.variants[0].set == ("query.n_regions=3",)
     assert plan.variants[0].per_scenario == {"smoke/one_box": ("query.radius_m=5",)}
 
@@ -241,7 +241,7 @@ def test_worlds_that_do_not_fit(tmp_path: Path, old: str, new: str, words: str) 
 @pytest.mark.parametrize(("option", "name"), [("settings", "--set"), ("grid", "--grid")])
 def test_a_setting_of_the_world_on_the_command_line_is_shown_its_place(tmp_path: Path, option: str, name: str) -> None:
     with pytest.raises(InputError) as caught:
-        changed_plan(read(tmp_path), **{option: ["sensor.range_noise=false"]})
+        change_plan(read(tmp_path), **{option: ["sensor.range_noise=false"]})
     words = (
         f"{name} sensor.range_noise=false: belongs to the world, not to the method: set it in the plan, under scenarios"
     )
@@ -254,14 +254,14 @@ def test_folder_names() -> None:
 
 
 def test_settings_over_by_hand() -> None:
-    assert settings_over("narrow[a=1,b=2]", "narrow") == "a=1,b=2"
-    assert settings_over("narrow[a=1][b=2,c=3]", "narrow[a=1]") == "b=2,c=3"
-    assert settings_over("narrow[a=1][b=2]", "narrow") == "a=1,b=2"
-    assert settings_over("narrow[a=[[1, 2], [3]]][b=2]", "narrow[a=[[1, 2], [3]]]") == "b=2"
+    assert list_settings_over("narrow[a=1,b=2]", "narrow") == "a=1,b=2"
+    assert list_settings_over("narrow[a=1][b=2,c=3]", "narrow[a=1]") == "b=2,c=3"
+    assert list_settings_over("narrow[a=1][b=2]", "narrow") == "a=1,b=2"
+    assert list_settings_over("narrow[a=[[1, 2], [3]]][b=2]", "narrow[a=[[1, 2], [3]]]") == "b=2"
 
 
 def held(*worlds: str) -> dict[str, str]:
-    return {world: other for (world, _), other in references((world, "v", 7) for world in worlds).items()}
+    return {world: other for (world, _), other in find_references((world, "v", 7) for world in worlds).items()}
 
 
 def test_a_world_is_held_against_what_its_item_sets_in_all_of_its_worlds() -> None:
@@ -286,13 +286,13 @@ def test_worlds_are_held_against_each_other_only_where_seed_and_variant_are_the_
         ("n[a=1][b=2]", "theirs", 7),
         ("n[a=1][b=2]", "foreign", 7),
     ]
-    assert references(cases) == {("n[a=1][b=2]", "ours"): "n[a=1]", ("n[a=1][b=2]", "theirs"): "n"}
+    assert find_references(cases) == {("n[a=1][b=2]", "ours"): "n[a=1]", ("n[a=1][b=2]", "theirs"): "n"}
 
 
 def test_the_example_of_the_documentation_is_as_it_says(tmp_path: Path) -> None:
     documentation = worlds.__doc__ or ""
     example = documentation.partition("\n\n")[2].partition("\n\nThese are")[0]
     plan = read(tmp_path, f"name: x\nseeds: [0]\nvariants: [{{preset: paper}}]\n{example}\n")
-    labels = [world.label for world in worlds_of(plan.scenarios)]
+    labels = [world.label for world in list_worlds(plan.scenarios)]
     assert len(labels) == 4
     assert all(label in documentation for label in labels[:3])

@@ -26,7 +26,7 @@ from eval.core import cluster, progress
 from eval.core.cluster import Where
 from eval.core.isolation import run_isolated
 from eval.core.progress import Lines
-from eval.plans.plan import Plan, cells, load_plan
+from eval.plans.plan import Plan, expand_cells, load_plan
 from eval.plans.variants import slug
 from eval.running import pair_run, runner
 from eval.running.pair_run import Made, Tools
@@ -411,7 +411,7 @@ def task_of(folder: Path, plan: Plan, **changes: Any) -> Task:
     """Make the task of the first pair of a plan, in a folder whose token it knows."""
     folder.mkdir(exist_ok=True)
     (folder / ".workers").write_text("token")
-    pair = runner._pairs(RunFolder(folder), plan, cells(plan), False, Tools())[0]
+    pair = runner._pairs(RunFolder(folder), plan, expand_cells(plan), False, Tools())[0]
     return replace(Task(folder, "token", pair, Made("commit", is_contended=True)), **changes)
 
 

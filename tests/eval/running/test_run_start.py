@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from cdpipe.core.errors import InputError
-from cdpipe.methods import registry
 from eval.cli.tools import check_file
 from eval.core import cluster
 from eval.core.cluster import Where, require_reachable
@@ -38,7 +37,7 @@ def forbidden(*_: object, **__: object) -> None:
 def test_missing_extras_are_named_all_at_once_before_anything_is_made(
     tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(registry.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("cdpipe.core.plugins.find_spec", lambda name: None)
     monkeypatch.setattr(runner, "TOOLS", Tools(simulate=forbidden))
     plan_of(tmp_path, "{preset: voxel-diff}, {preset: m3c2}, {preset: dufomap}, {preset: m3c2, set: [map.voxel_m=0.3]}")
     code, out, err = command("run", tmp_path / "plan.yaml", "--out", tmp_path / "run")

@@ -20,7 +20,7 @@ from cdpipe.model.config import MapConfig
 from cdpipe.pipeline import Done
 from cdpipe.sensor.ouster import load_profile
 from eval.core.progress import Silent
-from eval.plans.plan import Plan, cells, load_plan
+from eval.plans.plan import Plan, expand_cells, load_plan
 from eval.running import pair_run
 from eval.running.pair_run import Tools
 from eval.running.rescoring import rescore
@@ -450,11 +450,11 @@ def test_every_row_names_the_code_that_made_its_answer(tmp_path: Path, runner: R
 
 def test_scoring_again_changes_nothing_before_all_is_scored(smoke_copy: RunFolder) -> None:
     (smoke_copy.answer(UNCHANGED, 20000, "paper") / "answer.json").write_text("{")
-    cells = {path: path.stat().st_mtime_ns for path in smoke_copy.path.glob("cells/*/*/*.json")}
+    files = {path: path.stat().st_mtime_ns for path in smoke_copy.path.glob("cells/*/*/*.json")}
     with pytest.raises(InputError, match=r"answer\.json"):
         rescore(smoke_copy)
-    assert len(cells) == 8
-    assert cells == {path: path.stat().st_mtime_ns for path in cells}
+    assert len(files) == 8
+    assert files == {path: path.stat().st_mtime_ns for path in files}
 
 
 WORLDS = f"{ONE_BOX}, {{name: {ONE_BOX}, set: [sensor.range_noise=false], each: [sensor.sub_rays=7]}}"
@@ -729,7 +729,7 @@ def test_a_world_that_cannot_be_made_keeps_its_kind(tmp_path: Path, runner: Runn
 def test_cells_made_without_kiss_matcher_are_made_again_once_it_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     def keys(*, is_installed: bool) -> dict[str, str]:
         monkeypatch.setattr(pair_run, "is_kiss_matcher_installed", lambda: is_installed)
-        found = cells(load_plan("merge"))[:4]
+        found = expand_cells(load_plan("merge"))[:4]
         return {cell.variant: pair_run.cell_key(cell, "clean", None, {}) for cell in found}
 
     there, missing = keys(is_installed=True), keys(is_installed=False)

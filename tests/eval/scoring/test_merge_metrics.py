@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import invert, make_pose, stream, yaw_pose
-from eval.scoring.merge_metrics import evidence_columns, merge_columns, merge_errors, overlap_true, travel_directions
+from eval.scoring.merge_metrics import (
+    compute_merge_errors,
+    find_travel_directions,
+    list_evidence,
+    measure_overlap,
+    summarise_merge_errors,
+)
 from eval.truth.ground_truth import SessionTruth
 from eval.truth.universe import ScoringPoints
 
@@ -32,7 +38,9 @@ ALL = (np.arange(20), np.arange(20))
 
 
 def test_the_true_merge_without_drift_has_no_error() -> None:
-    errors = merge_errors(session(drive(20), BEFORE_T_WORLD), session(drive(20), AFTER_T_WORLD), TRUE_MERGE, ALL)
+    errors = compute_merge_errors(
+        session(drive(20), BEFORE_T_WORLD), session(drive(20), AFTER_T_WORLD), TRUE_MERGE, ALL
+    )
     assert len(errors.metres) == 20
     np.testing.assert_allclose(errors.metres, 0.0, atol=1e-9)
     np.testing.assert_allclose(errors.degrees, 0.0, atol=1e-6)
@@ -44,7 +52,7 @@ def test_a_shift_by_hand(heading_rad: float) -> None:
     # 0.3 m along the drive (world x) and 0.4 m across: 0.5 m in all, whatever way the sensor looks
     slip = BEFORE_T_WORLD @ make_pose(translation=(0.3, 0.4, 0.0)) @ invert(BEFORE_T_WORLD)
     after = session(drive(20, yaw_rad=heading_rad), AFTER_T_WORLD)
-    errors = merge_errors(session(drive(20), BEFORE_T_WORLD), after, slip @ TRUE_MERGE, ALL)
+    errors = compute_merge_errors(session(drive(20), BEFORE_T_WORLD), after, slip @ TRUE_MERGE, ALL)
     np.testing.assert_allclose(errors.metres, 0.5, atol=1e-9)
     np.testing.assert_allclose(errors.along_m, 0.3, atol=1e-9)
 
@@ -53,7 +61,7 @@ def test_a_turn_by_hand() -> None:
     # a turn by 2 degrees about the world's origin shifts a keyframe at x by 2 x sin(1 deg)
     slip = BEFORE_T_WORLD @ yaw_pose(np.deg2rad(2.0)) @ invert(BEFORE_T_WORLD)
     before, after = session(drive(20), BEFORE_T_WORLD), session(drive(20), AFTER_T_WORLD)
-    errors = merge_errors(before, after, slip @ TRUE_MERGE, ALL)
+    errors = compute_merge_errors(before, after, slip @ TRUE_MERGE, ALL)
     np.testing.assert_allclose(errors.degrees, 2.0, atol=1e-6)
     np.testing.assert_allclose(errors.metres, 2 * 0.5 * np.arange(20) * np.sin(np.deg2rad(1.0)), atol=1e-9)
 
@@ -61,9 +69,9 @@ def test_a_turn_by_hand() -> None:
 def test_only_keyframes_with_a_true_neighbour_within_five_metres_count() -> None:
     # after keyframes at 9.5, 10, ... 19: the last before keyframe stands at 9.5
     before, after = session(drive(20), BEFORE_T_WORLD), session(drive(20, start_x_m=9.5), AFTER_T_WORLD)
-    assert len(merge_errors(before, after, TRUE_MERGE, ALL).metres) == 11
+    assert len(compute_merge_errors(before, after, TRUE_MERGE, ALL).metres) == 11
     far = session(drive(20, start_x_m=100.0), AFTER_T_WORLD)
-    columns = merge_columns(merge_errors(before, far, TRUE_MERGE, ALL))
+    columns = summarise_merge_errors(compute_merge_errors(before, far, TRUE_MERGE, ALL))
     assert columns["n_merge_pairs"] == 0
     assert np.isnan(columns["merge_error_m"])
 
@@ -74,9 +82,9 @@ def test_drift_of_either_session_counts_as_misalignment() -> None:
     stretched = after.copy()
     stretched[:, 0, 3] *= 1.01
     truth = SessionTruth(AFTER_T_WORLD @ stretched, after, session(after, AFTER_T_WORLD).universe)
-    errors = merge_errors(session(drive(20), BEFORE_T_WORLD), truth, TRUE_MERGE, ALL)
+    errors = compute_merge_errors(session(drive(20), BEFORE_T_WORLD), truth, TRUE_MERGE, ALL)
     np.testing.assert_allclose(errors.along_m, 0.005 * np.arange(20), atol=1e-9)
-    columns = merge_columns(errors)
+    columns = summarise_merge_errors(errors)
     assert columns["merge_error_along_m"] == pytest.approx(0.005 * 9.5)
     assert columns["merge_error_along_m_p95"] == pytest.approx(0.005 * 0.95 * 19)
 
@@ -92,10 +100,10 @@ def test_a_local_merge_is_taken_at_each_after_keyframe() -> None:
     before = session(drive(20), BEFORE_T_WORLD)
     # the first two stand farther than 5 m from every before keyframe, and every third is a keyframe
     chosen = np.arange(0, 20, 3)
-    errors = merge_errors(before, truth, local[chosen], (np.arange(20), chosen))
+    errors = compute_merge_errors(before, truth, local[chosen], (np.arange(20), chosen))
     assert len(errors.metres) == 6
     np.testing.assert_allclose(errors.metres, 0.0, atol=1e-9)
-    drifted = merge_errors(before, truth, TRUE_MERGE, (np.arange(20), chosen))
+    drifted = compute_merge_errors(before, truth, TRUE_MERGE, (np.arange(20), chosen))
     np.testing.assert_allclose(drifted.along_m, 0.005 * chosen[1:], atol=1e-9)
 
 
@@ -119,20 +127,20 @@ def line(start: tuple[float, float], end: tuple[float, float], n: int) -> np.nda
 )
 @pytest.mark.parametrize("n_before", [2, 33])
 def test_true_overlap_by_hand(after: np.ndarray, share: float, n_before: int) -> None:
-    assert overlap_true(line((0, 0), (20, 0), n_before), after) == pytest.approx(share, abs=0.1 / 24)
+    assert measure_overlap(line((0, 0), (20, 0), n_before), after) == pytest.approx(share, abs=0.1 / 24)
 
 
 def test_true_overlap_is_by_length_and_not_by_scans() -> None:
     # it waits for long where the before session was, and then leaves
     after = np.concatenate([line((20, 0), (20, 0), 500), line((20, 0), (20, 50), 3)])
-    assert overlap_true(line((0, 0), (20, 0), 9), after) == pytest.approx(5 / 50, abs=1e-9)
-    assert np.isnan(overlap_true(line((0, 0), (20, 0), 9), line((3, 0), (3, 0), 4)))
+    assert measure_overlap(line((0, 0), (20, 0), 9), after) == pytest.approx(5 / 50, abs=1e-9)
+    assert np.isnan(measure_overlap(line((0, 0), (20, 0), 9), line((3, 0), (3, 0), 4)))
     # a before session that never moved is still somewhere
-    assert overlap_true(line((0, 0), (0, 0), 4), line((-10, 0), (10, 0), 5)) == pytest.approx(0.5, abs=0.01)
+    assert measure_overlap(line((0, 0), (0, 0), 4), line((-10, 0), (10, 0), 5)) == pytest.approx(0.5, abs=0.01)
 
 
 def test_evidence_columns_by_hand() -> None:
-    columns = evidence_columns({"overlap": 1, "hessian_ratio": 0.25, "residual_m": np.inf, "unknown": 7.0})
+    columns = list_evidence({"overlap": 1, "hessian_ratio": 0.25, "residual_m": np.inf, "unknown": 7.0})
     assert (columns["evidence_overlap"], columns["evidence_hessian_ratio"]) == (1.0, 0.25)
     assert sum(map(np.isnan, columns.values())) == len(columns) - 2
     assert "evidence_unknown" not in columns
@@ -146,7 +154,7 @@ def test_errors_equal_the_definition_written_out() -> None:
     odom_j = np.stack([yaw_pose(draw.uniform(-3, 3), draw.uniform(0, 8, 3)) for _ in range(7)])
     guess = yaw_pose(0.7, (1.0, 2.0, 3.0))
     universe = session(world_i, np.eye(4)).universe
-    errors = merge_errors(
+    errors = compute_merge_errors(
         SessionTruth(odom_i, world_i, universe),
         SessionTruth(odom_j, world_j, universe),
         guess,
@@ -167,7 +175,7 @@ def test_errors_equal_the_definition_written_out() -> None:
 
 def test_direction_of_travel_follows_the_path_and_not_the_sensor() -> None:
     poses = np.concatenate([drive(5, yaw_rad=1.0), np.stack([yaw_pose(0, (2.0, 0.5 * i, 0.0)) for i in range(1, 5)])])
-    directions = travel_directions(poses)
+    directions = find_travel_directions(poses)
     np.testing.assert_allclose(directions[:4], [(1, 0, 0)] * 4, atol=1e-12)
     np.testing.assert_allclose(directions[4], np.array([1, 1, 0]) / np.sqrt(2), atol=1e-12)
     np.testing.assert_allclose(directions[5:], [(0, 1, 0)] * 4, atol=1e-12)
@@ -175,8 +183,10 @@ def test_direction_of_travel_follows_the_path_and_not_the_sensor() -> None:
 
 def test_a_robot_that_never_moved_has_no_direction() -> None:
     still = np.stack([np.eye(4)] * 3)
-    assert np.isnan(travel_directions(still)).all()
-    columns = merge_columns(merge_errors(*[session(still, np.eye(4))] * 2, np.eye(4), (np.arange(3), np.arange(3))))
+    assert np.isnan(find_travel_directions(still)).all()
+    columns = summarise_merge_errors(
+        compute_merge_errors(*[session(still, np.eye(4))] * 2, np.eye(4), (np.arange(3), np.arange(3)))
+    )
     assert np.isnan(columns["merge_error_along_m"])
     assert columns["merge_error_m"] == 0.0
-    assert np.isnan(merge_columns(None)["merge_error_m"])
+    assert np.isnan(summarise_merge_errors(None)["merge_error_m"])

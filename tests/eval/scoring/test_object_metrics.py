@@ -7,15 +7,15 @@ import pytest
 
 from cdpipe.core.geometry import stream
 from cdpipe.model.report import ChangedObject
-from eval.scoring.answer_rows import rows_near_points
+from eval.scoring.answer_rows import find_rows_near_points
 from eval.scoring.object_metrics import (
-    best_matching,
-    box_iou,
-    kinds_right,
+    compute_box_iou,
+    compute_voxel_iou,
+    judge_kinds,
+    match_best,
     match_objects,
-    object_columns,
-    unanswered_objects,
-    voxel_iou,
+    score_unanswered_objects,
+    summarise_objects,
 )
 from eval.truth.ground_truth import GroundTruth, SessionTruth
 from eval.truth.universe import ScoringPoints
@@ -65,7 +65,7 @@ def columns_of(
     truth: GroundTruth, objects: list[ChangedObject], rows: list[np.ndarray]
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     matches = match_objects(objects, rows, truth)
-    return object_columns(matches, kinds_right(objects, matches, truth), truth), matches.outcomes
+    return summarise_objects(matches, judge_kinds(objects, matches, truth), truth), matches.outcomes
 
 
 TWO_THINGS = [0] * 5 + [1] * 10 + [0] * 5 + [2] * 10 + [0] * 10
@@ -111,7 +111,7 @@ def test_an_empty_answer_scores_zero() -> None:
 
 def test_a_case_without_an_answer_scores_zero_in_every_object_column() -> None:
     truth = ground_truth([change(1), change(2, group="partial")], after=TWO_THINGS)
-    _, columns = unanswered_objects(truth)
+    _, columns = score_unanswered_objects(truth)
     assert {name: value for name, value in columns.items() if not name.startswith("n_")} == {
         "object_iou_point": 0.0,
         "object_iou_voxel": 0.0,
@@ -123,7 +123,7 @@ def test_a_case_without_an_answer_scores_zero_in_every_object_column() -> None:
         "kind_accuracy": 0.0,
         "object_iou_point_partial": 0.0,
     }
-    _, unchanged = unanswered_objects(ground_truth([]))
+    _, unchanged = score_unanswered_objects(ground_truth([]))
     assert all(np.isnan(value) for name, value in unchanged.items() if not name.startswith("n_"))
 
 
@@ -221,21 +221,21 @@ def test_a_move_is_right_with_its_kind_and_its_partner(
     truth = moved_pair()
     objects = [thing("before", kinds[0], partners[0]), thing("after", kinds[1], partners[1])]
     matches = match_objects(objects, [span(0, 10), span(20, 30)], truth)
-    assert kinds_right(objects, matches, truth).tolist() == expected
+    assert judge_kinds(objects, matches, truth).tolist() == expected
 
 
 def test_a_move_linked_with_the_wrong_object_is_wrong() -> None:
     truth = moved_pair()
     objects = [thing("before", "moved", 2), thing("after", "moved", 0), thing("after", "moved", 0)]
     matches = match_objects(objects, [span(0, 10), span(20, 30), span(35, 38)], truth)
-    assert kinds_right(objects, matches, truth).tolist() == [0.0, 1.0]
+    assert judge_kinds(objects, matches, truth).tolist() == [0.0, 1.0]
 
 
 @pytest.mark.parametrize(("kind", "expected"), [("added", 1.0), ("moved", 1.0), ("removed", 0.0), ("reshaped", 0.0)])
 def test_half_a_move_may_be_called_what_it_looks_like(kind: str, expected: float) -> None:
     truth = moved_pair(is_observable=False)
     matches = match_objects([thing("after", kind)], [span(20, 30)], truth)
-    right = kinds_right([thing("after", kind)], matches, truth)
+    right = judge_kinds([thing("after", kind)], matches, truth)
     assert np.isnan(right[0])
     assert right[1] == expected
 
@@ -246,12 +246,12 @@ def corner_points(first: int, end: int) -> np.ndarray:
 
 def test_voxel_iou_by_hand() -> None:
     # cells 0..3 against 2..5: two shared, six in total, however the grid is shifted
-    assert voxel_iou(corner_points(0, 4), corner_points(2, 6), 1.0) == pytest.approx(2 / 6)
+    assert compute_voxel_iou(corner_points(0, 4), corner_points(2, 6), 1.0) == pytest.approx(2 / 6)
     # 0.2 m apart along x: one voxel on a grid at 0, two on a grid shifted by half a voxel
     a, b = np.array([[0.4, 0.25, 0.25]]), np.array([[0.6, 0.25, 0.25]])
-    assert voxel_iou(a, b, 1.0) == 0.5
-    assert voxel_iou(a, np.zeros((0, 3)), 1.0) == 0.0
-    assert np.isnan(voxel_iou(np.zeros((0, 3)), np.zeros((0, 3)), 1.0))
+    assert compute_voxel_iou(a, b, 1.0) == 0.5
+    assert compute_voxel_iou(a, np.zeros((0, 3)), 1.0) == 0.0
+    assert np.isnan(compute_voxel_iou(np.zeros((0, 3)), np.zeros((0, 3)), 1.0))
 
 
 def test_voxel_iou_equals_sets_of_tuples() -> None:
@@ -261,18 +261,18 @@ def test_voxel_iou_equals_sets_of_tuples() -> None:
     for phase in itertools.product((0.0, 0.2), repeat=3):
         cells_a, cells_b = ({tuple(cell) for cell in np.floor((p + phase) / 0.4)} for p in (a, b))
         values.append(len(cells_a & cells_b) / len(cells_a | cells_b))
-    assert voxel_iou(a, b, 0.4) == pytest.approx(np.mean(values), abs=1e-12)
+    assert compute_voxel_iou(a, b, 0.4) == pytest.approx(np.mean(values), abs=1e-12)
 
 
 def test_box_iou_by_hand() -> None:
     # with half a cell around them, corners 0 and 1.9 make a cube of 2 m; shifted by 1 m along each axis: 1 of 8 + 8 - 1
     cube = np.array([[0.0, 0.0, 0.0], [1.9, 1.9, 1.9]])
-    assert box_iou(cube, cube + 1.0) == pytest.approx(1 / 15)
-    assert box_iou(cube, cube) == 1.0
-    assert box_iou(cube, cube + 5.0) == 0.0
-    assert box_iou(cube, np.zeros((0, 3))) == 0.0
+    assert compute_box_iou(cube, cube + 1.0) == pytest.approx(1 / 15)
+    assert compute_box_iou(cube, cube) == 1.0
+    assert compute_box_iou(cube, cube + 5.0) == 0.0
+    assert compute_box_iou(cube, np.zeros((0, 3))) == 0.0
     flat = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
-    assert box_iou(flat, flat) == 1.0
+    assert compute_box_iou(flat, flat) == 1.0
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -281,7 +281,7 @@ def test_matching_equals_trying_every_assignment(seed: int) -> None:
     iou = draw.random((4, 5)) * (draw.random((4, 5)) < 0.6)
     assignments = itertools.permutations(range(5), 4)
     best = max(sum(iou[row, column] for row, column in enumerate(columns)) for columns in assignments)
-    pairs = best_matching(iou)
+    pairs = match_best(iou)
     assert sum(iou[pair] for pair in pairs) == pytest.approx(best)
     assert all(iou[pair] > 0 for pair in pairs)
     assert len({row for row, _ in pairs}) == len({column for _, column in pairs}) == len(pairs)
@@ -305,13 +305,13 @@ def test_rows_near_points_by_hand() -> None:
     universe = line_universe([0] * 6)  # cells at x = 0.05, 0.15, ... 0.55
     points = universe.points_odom.astype(np.float64)
     # exactly on cell 1: its neighbours are 0.1 m away and within reach up to rounding, the next are not
-    near = rows_near_points(universe, [points[1:2]], radius_m=0.1001)
+    near = find_rows_near_points(universe, [points[1:2]], radius_m=0.1001)
     assert near[0].tolist() == [0, 1, 2]
     # two objects compete for cells 2 and 3: each keeps the nearer one
-    near = rows_near_points(universe, [points[1:2] + np.array([0.04, 0, 0]), points[4:5]], radius_m=0.19)
+    near = find_rows_near_points(universe, [points[1:2] + np.array([0.04, 0, 0]), points[4:5]], radius_m=0.19)
     assert [rows.tolist() for rows in near] == [[0, 1, 2], [3, 4, 5]]
-    assert [len(rows) for rows in rows_near_points(universe, [np.zeros((0, 3)), points[:1] + 50.0])] == [0, 0]
-    assert rows_near_points(universe, []) == []
+    assert [len(rows) for rows in find_rows_near_points(universe, [np.zeros((0, 3)), points[:1] + 50.0])] == [0, 0]
+    assert find_rows_near_points(universe, []) == []
 
 
 def test_rows_near_points_equal_brute_force() -> None:
@@ -323,7 +323,7 @@ def test_rows_near_points_equal_brute_force() -> None:
     every, owners = np.concatenate(objects), np.repeat([0, 1, 2], [20, 30, 5])
     distances = np.linalg.norm(points[:, None].astype(np.float64) - every[None], axis=2)
     owner = np.where(distances.min(axis=1) <= 0.1, owners[distances.argmin(axis=1)], -1)
-    for index, rows in enumerate(rows_near_points(universe, objects)):
+    for index, rows in enumerate(find_rows_near_points(universe, objects)):
         assert rows.tolist() == np.flatnonzero(owner == index).tolist()
 
 

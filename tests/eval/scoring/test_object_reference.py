@@ -11,7 +11,7 @@ import pytest
 
 from cdpipe.core.geometry import stream
 from cdpipe.model.report import ChangedObject
-from eval.scoring.object_metrics import kinds_right, match_objects, object_columns
+from eval.scoring.object_metrics import judge_kinds, match_objects, summarise_objects
 from eval.truth.ground_truth import GroundTruth, SessionTruth
 from eval.truth.universe import ScoringPoints
 from sim.session.truth import Change, PairTruth
@@ -203,7 +203,7 @@ def test_every_object_metric_equals_its_slow_twin(seed: int) -> None:
         pytest.fail(f"seed {seed} has two matchings that are equally good")
     matches = match_objects(case.objects, case.rows, case.truth)
     assert {c: int(o) for c, o in enumerate(matches.matched_object) if o >= 0} == matching
-    columns = object_columns(matches, kinds_right(case.objects, matches, case.truth), case.truth)
+    columns = summarise_objects(matches, judge_kinds(case.objects, matches, case.truth), case.truth)
     expected = slow_columns(case, matching)
     assert {name: columns[name] for name in expected} == pytest.approx(expected, nan_ok=True, abs=1e-9)
 

@@ -10,7 +10,12 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.geometry import make_pose, stream, yaw_pose
 from cdpipe.model.report import ChangedObject, ObjectShape
 from eval.scoring.object_metrics import match_objects
-from eval.scoring.object_sizes import size_columns, size_errors, true_displacements_map, true_volume_m3
+from eval.scoring.object_sizes import (
+    compute_size_errors,
+    find_true_displacements_map,
+    find_true_volume_m3,
+    summarise_size_errors,
+)
 from eval.truth.ground_truth import GroundTruth, SessionTruth
 from eval.truth.universe import ScoringPoints
 from sim.session.truth import Change, PairTruth
@@ -70,7 +75,7 @@ def thing(session: str, *, moved_by: tuple[float, ...] | None = None, volume_m3:
 
 def errors_of(truth: GroundTruth, objects: list[ChangedObject], places: list[int]) -> tuple[np.ndarray, np.ndarray]:
     rows = [np.arange(WIDTH * place, WIDTH * (place + 1)) for place in places]
-    errors = size_errors(objects, match_objects(objects, rows, truth), truth, KEYFRAMES)
+    errors = compute_size_errors(objects, match_objects(objects, rows, truth), truth, KEYFRAMES)
     return errors.displacement_m, errors.volume_share
 
 
@@ -86,10 +91,10 @@ def test_what_is_not_matched_or_never_moved_has_no_displacement() -> None:
     truth = truth_of(
         [change_at(1, "after", "added", np.eye(4)), change_at(2, "after", "moved", np.eye(4), partner=None)]
     )
-    assert np.isnan(true_displacements_map(truth, KEYFRAMES)).all()
+    assert np.isnan(find_true_displacements_map(truth, KEYFRAMES)).all()
     displacement_m, _ = errors_of(truth, [thing("after", moved_by=(1.0, 0.0, 0.0))], [0])
     assert np.isnan(displacement_m).all()
-    assert true_displacements_map(truth_of([]), KEYFRAMES).shape == (0, 3)
+    assert find_true_displacements_map(truth_of([]), KEYFRAMES).shape == (0, 3)
 
 
 @pytest.mark.parametrize("height_m", [0.0, 1.0])
@@ -99,25 +104,25 @@ def test_it_is_the_middle_that_moves_when_a_thing_falls_over(height_m: float) ->
     props = {"props": [{"name": "thing", "size_m": [0.5, 0.5, height_m]}, {"name": "mesh", "size_m": None}]}
     truth = truth_of(moved(make_pose(translation=(2.0, 0.0, 0.0)), lying), **(props if height_m else {}))
     expected = (2.0 + height_m / 2, 0.0, -height_m / 2)
-    np.testing.assert_allclose(true_displacements_map(truth, KEYFRAMES), [expected, expected], atol=1e-12)
+    np.testing.assert_allclose(find_true_displacements_map(truth, KEYFRAMES), [expected, expected], atol=1e-12)
 
 
 def test_both_halves_say_the_same_and_a_turned_map_turns_it() -> None:
     changes = moved(make_pose(translation=(4.0, 1.0, 0.0)), make_pose(translation=(7.0, 1.0, 0.0)))
     truth = truth_of(changes, yaw_pose(np.pi / 2, (50.0, -3.0, 1.0)))
-    np.testing.assert_allclose(true_displacements_map(truth, KEYFRAMES), [[0, 3, 0], [0, 3, 0]], atol=1e-12)
+    np.testing.assert_allclose(find_true_displacements_map(truth, KEYFRAMES), [[0, 3, 0], [0, 3, 0]], atol=1e-12)
 
 
 def test_drift_between_the_two_places_belongs_to_the_map() -> None:
     # odometry believes 1 % more than it drove: the map puts the far place 0.1 m too far, where the answer sees it too
     stretched = np.stack([make_pose(translation=(0.02 * index, 0.0, 0.0)) for index in range(N_SCANS)])
     truth = truth_of(moved(make_pose(translation=(0.5, 0, 0)), make_pose(translation=(10.5, 0, 0))), stretched)
-    np.testing.assert_allclose(true_displacements_map(truth, KEYFRAMES)[0], [10.1, 0.0, 0.0])
+    np.testing.assert_allclose(find_true_displacements_map(truth, KEYFRAMES)[0], [10.1, 0.0, 0.0])
     displacement_m, _ = errors_of(truth, [thing("before", moved_by=(10.1, 0, 0))], [0])
     assert displacement_m[0] == pytest.approx(0.0, abs=1e-12)
     # of places between two keyframes, at x = 0, 10 and 20, the nearer one counts
     near = truth_of(moved(make_pose(translation=(4.9, 0, 0)), make_pose(translation=(5.1, 0, 0))), stretched)
-    np.testing.assert_allclose(true_displacements_map(near, KEYFRAMES)[0], [0.3, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(find_true_displacements_map(near, KEYFRAMES)[0], [0.3, 0.0, 0.0], atol=1e-12)
 
 
 def test_volumes_by_hand() -> None:
@@ -135,9 +140,9 @@ def test_volumes_by_hand() -> None:
 
 def test_a_short_move_has_no_volume_and_a_reshaped_pile_that_of_what_is_gone() -> None:
     place = np.eye(4)
-    assert np.isnan(true_volume_m3(change_at(1, "after", "moved", place, group="partial")))
-    assert true_volume_m3(change_at(1, "before", "reshaped", place, group="partial", mesh_volume_m3=0.7)) == 0.7
-    assert true_volume_m3(change_at(1, "after", "moved", place)) == 2.0
+    assert np.isnan(find_true_volume_m3(change_at(1, "after", "moved", place, group="partial")))
+    assert find_true_volume_m3(change_at(1, "before", "reshaped", place, group="partial", mesh_volume_m3=0.7)) == 0.7
+    assert find_true_volume_m3(change_at(1, "after", "moved", place)) == 2.0
 
 
 def test_columns_are_medians_of_what_is_there() -> None:
@@ -149,10 +154,10 @@ def test_columns_are_medians_of_what_is_there() -> None:
     truth = truth_of(changes)
     objects = [thing("after", volume_m3=volume) for volume in (2.2, 1.4, 20.0)]
     matches = match_objects(objects, [np.arange(WIDTH * i, WIDTH * (i + 1)) for i in range(3)], truth)
-    columns = size_columns(size_errors(objects, matches, truth, KEYFRAMES), truth)
+    columns = summarise_size_errors(compute_size_errors(objects, matches, truth, KEYFRAMES), truth)
     # piles alone: +10 % and -30 %
     assert columns == pytest.approx({"displacement_error_m": NAN, "pile_volume_error": 0.2}, nan_ok=True)
-    none = size_columns(size_errors([], match_objects([], [], truth), truth, KEYFRAMES), truth)
+    none = summarise_size_errors(compute_size_errors([], match_objects([], [], truth), truth, KEYFRAMES), truth)
     assert np.isnan(list(none.values())).all()
 
 
@@ -200,7 +205,7 @@ def test_errors_of_displacement_and_volume_equal_their_slow_twins(seed: int) -> 
                 places.append(place)
     rows = [np.arange(WIDTH * place, WIDTH * (place + 1)) for place in places]
     matches = match_objects(objects, rows, truth)
-    errors = size_errors(objects, matches, truth, KEYFRAMES)
+    errors = compute_size_errors(objects, matches, truth, KEYFRAMES)
 
     of_moves, of_piles = [], []
     for index, each in enumerate(changes):
@@ -225,4 +230,4 @@ def test_errors_of_displacement_and_volume_equal_their_slow_twins(seed: int) -> 
         "displacement_error_m": statistics.median(of_moves) if of_moves else NAN,
         "pile_volume_error": statistics.median(of_piles) if of_piles else NAN,
     }
-    assert size_columns(errors, truth) == pytest.approx(expected, nan_ok=True, abs=1e-9)
+    assert summarise_size_errors(errors, truth) == pytest.approx(expected, nan_ok=True, abs=1e-9)

@@ -5,13 +5,13 @@ import pytest
 
 from cdpipe.core.geometry import invert, stream, transform, yaw_pose
 from eval.scoring.region_metrics import (
-    centres_in_world,
-    covered_share,
-    keyframe_labels,
+    compute_recall_at_k,
+    label_keyframes,
     match_regions,
-    places_in_map,
-    recall_at_k,
-    unanswered_regions,
+    measure_covered_share,
+    score_unanswered_regions,
+    transform_to_map,
+    transform_to_world,
 )
 from eval.truth.ground_truth import SessionTruth
 from eval.truth.universe import ScoringPoints
@@ -90,32 +90,32 @@ def test_outcomes_equal_the_loops(seed: int) -> None:
 def test_recall_at_k_looks_at_as_many_candidates_as_there_are_changes() -> None:
     is_observable = np.array([True, True, False])
     # K = 2: the third candidate comes too late, and finding the unobservable change earns nothing
-    assert recall_at_k([(0, 2), (0,), (1,)], is_observable) == 0.5
-    assert recall_at_k([(0,), (1,)], is_observable) == 1.0
-    assert recall_at_k([], is_observable) == 0.0
-    assert np.isnan(recall_at_k([(0,)], np.array([False])))
+    assert compute_recall_at_k([(0, 2), (0,), (1,)], is_observable) == 0.5
+    assert compute_recall_at_k([(0,), (1,)], is_observable) == 1.0
+    assert compute_recall_at_k([], is_observable) == 0.0
+    assert np.isnan(compute_recall_at_k([(0,)], np.array([False])))
 
 
 def test_coverage_by_hand() -> None:
     # 40 steps of a quarter metre along x; a sphere of 1 m at x = 2 holds the 8 steps between 1 and 3
     x = np.arange(41) * 0.25
     positions = on_line(*x)
-    assert covered_share(positions, x, on_line(2.0), 1.0) == 8 / 40
+    assert measure_covered_share(positions, x, on_line(2.0), 1.0) == 8 / 40
     # overlapping spheres count once
-    assert covered_share(positions, x, on_line(2.0, 2.0), 1.0) == 8 / 40
-    assert covered_share(positions, x, on_line(5.0), 100.0) == 1.0
-    assert covered_share(positions, x, on_line(), 1.0) == 0.0
-    assert np.isnan(covered_share(on_line(0.0), np.zeros(1), on_line(0.0), 1.0))
+    assert measure_covered_share(positions, x, on_line(2.0, 2.0), 1.0) == 8 / 40
+    assert measure_covered_share(positions, x, on_line(5.0), 100.0) == 1.0
+    assert measure_covered_share(positions, x, on_line(), 1.0) == 0.0
+    assert np.isnan(measure_covered_share(on_line(0.0), np.zeros(1), on_line(0.0), 1.0))
 
 
 def test_keyframe_labels_by_hand() -> None:
     # radius 4: observable change at 0, unobservable one at 40; negatives are more than 6 m from both
-    labels = keyframe_labels(on_line(0, 4, 5, 6, 6.1, 33.9, 34, 40), on_line(0, 40), np.array([True, False]), 4.0)
+    labels = label_keyframes(on_line(0, 4, 5, 6, 6.1, 33.9, 34, 40), on_line(0, 40), np.array([True, False]), 4.0)
     assert labels.tolist() == [1, 1, -1, -1, 0, 0, -1, -1]
 
 
 def test_without_changes_every_keyframe_is_a_negative() -> None:
-    assert keyframe_labels(on_line(0, 1), on_line(), np.zeros(0, dtype=np.bool_), 4.0).tolist() == [0, 0]
+    assert label_keyframes(on_line(0, 1), on_line(), np.zeros(0, dtype=np.bool_), 4.0).tolist() == [0, 0]
 
 
 def test_centres_go_into_the_world_through_the_nearest_keyframe() -> None:
@@ -123,7 +123,7 @@ def test_centres_go_into_the_world_through_the_nearest_keyframe() -> None:
     world_T_sensor = np.stack([yaw_pose(0.0), yaw_pose(np.pi / 2, (10.0, 1.0, 0.0))])
     odom_T_sensor = np.stack([yaw_pose(0.0), yaw_pose(0.0, (10.0, 0.0, 0.0))])
     before = SessionTruth(odom_T_sensor, world_T_sensor, EMPTY)
-    centres = centres_in_world(on_line(1.0, 9.0), before, np.array([0, 1]))
+    centres = transform_to_world(on_line(1.0, 9.0), before, np.array([0, 1]))
     # the second centre lies 1 m behind keyframe 1, which truly looks along +y from (10, 1)
     np.testing.assert_allclose(centres, [(1.0, 0.0, 0.0), (10.0, 0.0, 0.0)], atol=1e-12)
 
@@ -135,7 +135,7 @@ def test_moving_the_odom_frame_changes_no_place_in_the_world() -> None:
     centres_world = draw.uniform(0, 20, (9, 3))
     centres_odom = transform(invert(moved), centres_world)
     before = SessionTruth(invert(moved) @ world_T_sensor, world_T_sensor, EMPTY)
-    np.testing.assert_allclose(centres_in_world(centres_odom, before, np.arange(6)), centres_world, atol=1e-12)
+    np.testing.assert_allclose(transform_to_world(centres_odom, before, np.arange(6)), centres_world, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -148,17 +148,17 @@ def test_places_go_into_the_map_and_back(seed: int) -> None:
     keyframes = np.arange(0, len(along), 2)
     # within 2 m of a keyframe, so that the nearest one is the same in either frame
     places = world_T_sensor[draw.choice(keyframes, 20), :3, 3] + draw.uniform(-1.1, 1.1, (20, 3))
-    found = places_in_map(places, before, keyframes)
+    found = transform_to_map(places, before, keyframes)
     nearest = keyframes[np.linalg.norm(places[:, None] - world_T_sensor[keyframes, :3, 3], axis=2).argmin(axis=1)]
     expected = [transform(bends[k], place[None])[0] for k, place in zip(nearest, places, strict=True)]
     np.testing.assert_allclose(found, expected, atol=1e-9)
-    np.testing.assert_allclose(centres_in_world(found, before, keyframes), places, atol=1e-9)
-    assert places_in_map(np.zeros((0, 3)), before, keyframes).shape == (0, 3)
+    np.testing.assert_allclose(transform_to_world(found, before, keyframes), places, atol=1e-9)
+    assert transform_to_map(np.zeros((0, 3)), before, keyframes).shape == (0, 3)
 
 
 def test_a_case_without_an_answer_recalls_nothing_where_there_was_something() -> None:
-    columns = unanswered_regions(3, 2).columns
+    columns = score_unanswered_regions(3, 2).columns
     assert (columns["region_recall"], columns["region_recall_at_k"], columns["n_regions"]) == (0.0, 0.0, 0)
     assert (columns["region_recall_proposed"], columns["n_withdrawn"]) == (0.0, 0)
     assert np.isnan([columns["region_precision"], columns["false_regions_per_100m_proposed"]]).all()
-    assert np.isnan(unanswered_regions(1, 0).columns["region_recall"])
+    assert np.isnan(score_unanswered_regions(1, 0).columns["region_recall"])

@@ -7,38 +7,38 @@ import yaml
 
 from cdpipe.core.errors import InputError
 from cdpipe.model.config import load_config
-from eval.studies.calibrate import alarm_threshold, as_settings, rate_threshold, thresholds
+from eval.studies.calibrate import find_alarm_threshold, find_rate_threshold, find_thresholds, format_settings
 
 
 def test_five_per_cent_of_forty_pairs_alarm() -> None:
     # 40 pairs may give two alarms: the threshold lies just above the third best score, 0.38
     scores = np.arange(1, 41) / 100
-    threshold = alarm_threshold(scores)
+    threshold = find_alarm_threshold(scores)
     assert threshold == pytest.approx(0.3801)
     assert (scores >= threshold).sum() == 2
 
 
 def test_nineteen_pairs_allow_no_alarm() -> None:
     scores = np.linspace(100, 1234.56, 19)
-    assert alarm_threshold(scores) == 1235.0
-    assert alarm_threshold(np.array([1235.0])) == 1236.0
+    assert find_alarm_threshold(scores) == 1235.0
+    assert find_alarm_threshold(np.array([1235.0])) == 1236.0
 
 
 def test_pairs_without_candidates_count_as_silent() -> None:
-    assert alarm_threshold(np.full(5, -np.inf)) == 0.0
+    assert find_alarm_threshold(np.full(5, -np.inf)) == 0.0
     with pytest.raises(ValueError, match="at least one pair"):
-        alarm_threshold(np.zeros(0))
+        find_alarm_threshold(np.zeros(0))
 
 
 def test_half_a_kilometre_allows_five_tenths_of_a_false_region_and_so_none() -> None:
     scores = np.array([9.0, 7.0, 7.0, 5.0])
     # 0.1 per 100 m: 500 m allow none, 1000 m one, 3000 m three, 4000 m all four
-    assert rate_threshold(scores, 500.0) == pytest.approx(9.001)
-    assert rate_threshold(scores, 1000.0) == pytest.approx(7.001)
-    assert rate_threshold(scores, 2999.0) == pytest.approx(7.001)  # two share a score: both or none
-    assert rate_threshold(scores, 3000.0) == pytest.approx(5.001)
-    assert rate_threshold(scores, 4000.0) == 0.0
-    assert rate_threshold(np.zeros(0), 0.0) == 0.0
+    assert find_rate_threshold(scores, 500.0) == pytest.approx(9.001)
+    assert find_rate_threshold(scores, 1000.0) == pytest.approx(7.001)
+    assert find_rate_threshold(scores, 2999.0) == pytest.approx(7.001)  # two share a score: both or none
+    assert find_rate_threshold(scores, 3000.0) == pytest.approx(5.001)
+    assert find_rate_threshold(scores, 4000.0) == 0.0
+    assert find_rate_threshold(np.zeros(0), 0.0) == 0.0
 
 
 def _results(n_changes: int = 0) -> pd.DataFrame:
@@ -60,7 +60,7 @@ def _regions() -> pd.DataFrame:
 def test_a_table_by_hand() -> None:
     # narrow: 8 pairs, 2 refused; of the six answered none may alarm (5 % of 6), the best score is 6.
     # Their 6 km allow six false regions, and there are but four. Wide: 3 km allow three, there is one.
-    table = thresholds(_results(), _regions())
+    table = find_thresholds(_results(), _regions())
     narrow, wide = table.to_dict("records")
     assert (narrow["score_radius_m"], narrow["n_pairs"], narrow["n_alarms"], narrow["n_unanswered"]) == (4.5, 6, 0, 2)
     assert narrow["threshold"] == pytest.approx(6.001)
@@ -71,7 +71,7 @@ def test_a_table_by_hand() -> None:
 def test_what_was_withdrawn_cannot_alarm() -> None:
     regions = _regions()
     regions.loc[regions["score"] == 6.0, ["is_reported", "is_withdrawn"]] = False, True
-    narrow, wide = thresholds(_results(), regions).to_dict("records")
+    narrow, wide = find_thresholds(_results(), regions).to_dict("records")
     assert narrow["threshold"] == pytest.approx(5.001)
     assert wide["threshold"] == pytest.approx(200.1)
 
@@ -82,16 +82,16 @@ def test_no_threshold_is_below_what_was_looked_at() -> None:
     is_narrow = regions["scenario"] != "null/c"
     regions.loc[is_narrow, "is_withdrawn"] = regions.loc[is_narrow, "is_reported"]
     regions.loc[is_narrow, "is_reported"] = False
-    narrow, wide = thresholds(_results(), regions).to_dict("records")
+    narrow, wide = find_thresholds(_results(), regions).to_dict("records")
     assert (narrow["threshold"], narrow["threshold_at_rate"], narrow["n_alarms"]) == (4.0, 4.0, 0)
     assert wide["threshold"] == pytest.approx(200.1)
-    assert alarm_threshold(np.full(5, -np.inf), lowest=-6.905) == -6.905
-    assert alarm_threshold(np.array([-7.0, -2.5]), lowest=-6.905) == pytest.approx(-2.499)
-    assert alarm_threshold(np.full(40, -8.0), lowest=-6.905) == -6.905
+    assert find_alarm_threshold(np.full(5, -np.inf), lowest=-6.905) == -6.905
+    assert find_alarm_threshold(np.array([-7.0, -2.5]), lowest=-6.905) == pytest.approx(-2.499)
+    assert find_alarm_threshold(np.full(40, -8.0), lowest=-6.905) == -6.905
 
 
 def test_the_settings_are_lines_of_a_preset(tmp_path: Path) -> None:
-    document = yaml.safe_load(as_settings(thresholds(_results(), _regions())))
+    document = yaml.safe_load(format_settings(find_thresholds(_results(), _regions())))
     assert set(document) == {"threshold", "threshold_at_rate"}
     found = document["threshold"]["m"]
     assert found["preset"] == {"query": {"threshold": 6.001}}
@@ -103,9 +103,9 @@ def test_the_settings_are_lines_of_a_preset(tmp_path: Path) -> None:
 
 def test_changed_pairs_are_refused() -> None:
     with pytest.raises(InputError, match="null/a, null/b, null/c: "):
-        thresholds(_results(n_changes=1), pd.DataFrame(columns=["scenario", "seed", "variant", "score"]))
+        find_thresholds(_results(n_changes=1), pd.DataFrame(columns=["scenario", "seed", "variant", "score"]))
 
 
 def test_a_kind_of_site_without_an_answer_gives_no_threshold() -> None:
     with pytest.raises(InputError, match="m, 10 m: "):
-        thresholds(_results().assign(status=["ok"] * 8 + ["failed"] * 4), _regions())
+        find_thresholds(_results().assign(status=["ok"] * 8 + ["failed"] * 4), _regions())

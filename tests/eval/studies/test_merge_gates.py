@@ -13,14 +13,14 @@ from cdpipe.core.errors import InputError
 from cdpipe.merge.evidence import GATES
 from eval.core.figures import picture
 from eval.studies.merge_gates import (
-    committed_thresholds,
-    gate_table,
-    gates_chart,
-    let_through,
+    draw_gates,
     main,
-    measured,
+    pass_gates,
+    read_committed_thresholds,
     require_ungated,
-    suggest,
+    suggest_threshold,
+    tabulate_gates,
+    tabulate_merges,
 )
 
 NAN = float("nan")
@@ -65,9 +65,9 @@ def table_of(cases: tuple[tuple[str, float, dict[str, float]], ...] = CASES) -> 
 
 
 def test_counts_by_hand() -> None:
-    cases = measured(table_of(), "")
+    cases = tabulate_merges(table_of(), "")
     assert cases["right"].tolist() == [True, True, True, False, False, False, False]
-    table = gate_table(cases, ASKED).set_index("gate")
+    table = tabulate_gates(cases, ASKED).set_index("gate")
     assert set(table["n_right"]) == {3}
     assert set(table["n_wrong"]) == {4}
     names = [name for name, _ in GATES]
@@ -77,7 +77,7 @@ def test_counts_by_hand() -> None:
     assert table.loc[names, "n_wrong_refused_alone"].to_dict() == dict(zip(names, (0, 0, 2, 0, 0), strict=True))
     assert table.loc["all", ["n_right_refused", "n_wrong_refused", "n_wrong_let_through"]].tolist() == [2, 3, 1]
     assert table.loc["overlap", ["worst_right", "best_wrong"]].tolist() == [0.1, 0.5]
-    assert let_through(cases, ASKED).tolist() == [True, *[False] * 5, True]
+    assert pass_gates(cases, ASKED).tolist() == [True, *[False] * 5, True]
 
 
 def test_gates_judge_together_as_the_sum_of_single_merges() -> None:
@@ -90,10 +90,10 @@ def test_gates_judge_together_as_the_sum_of_single_merges() -> None:
         )
         for _ in range(60)
     )
-    cases = measured(table_of(rows), "all")
+    cases = tabulate_merges(table_of(rows), "all")
     passed = [all(row[name] >= ASKED[name] for name in ASKED) for row in cases.to_dict("records")]
-    assert let_through(cases, ASKED).tolist() == passed
-    every = gate_table(cases, ASKED).set_index("gate").loc["all"]
+    assert pass_gates(cases, ASKED).tolist() == passed
+    every = tabulate_gates(cases, ASKED).set_index("gate").loc["all"]
     assert every["n_wrong_let_through"] == sum(p and not r for p, r in zip(passed, cases["right"], strict=True))
 
 
@@ -112,23 +112,23 @@ def test_gates_judge_together_as_the_sum_of_single_merges() -> None:
 def test_suggested_threshold(
     right: list[float], wrong: list[float], logarithmic: bool, expected: tuple[float, bool]
 ) -> None:
-    value, is_separable = suggest(np.array(right), np.array(wrong), logarithmic=logarithmic)
+    value, is_separable = suggest_threshold(np.array(right), np.array(wrong), logarithmic=logarithmic)
     assert value == pytest.approx(expected[0], abs=1e-12)
     assert is_separable == expected[1]
 
 
 def test_suggestion_keeps_at_least_199_of_200() -> None:
     right = np.arange(1, 1001) / 1000
-    value, is_separable = suggest(right, np.array([0.5]), logarithmic=False)
+    value, is_separable = suggest_threshold(right, np.array([0.5]), logarithmic=False)
     assert not is_separable
     assert value == 0.006
     assert (right >= value).mean() == 0.995
-    assert np.isnan(suggest(np.zeros(0), right, logarithmic=False)[0])
+    assert np.isnan(suggest_threshold(np.zeros(0), right, logarithmic=False)[0])
 
 
 def test_committed_thresholds_are_the_presets() -> None:
-    assert set(committed_thresholds()) == {name for name, _ in GATES}
-    thresholds = committed_thresholds()
+    assert set(read_committed_thresholds()) == {name for name, _ in GATES}
+    thresholds = read_committed_thresholds()
     assert all(0 < value < 1 for name, value in thresholds.items() if name != "distinctness")
     assert thresholds["distinctness"] > 1
 
@@ -138,19 +138,19 @@ def test_only_accepted_merges_of_the_named_variant_count() -> None:
     results.loc[0, "status"] = "failed"
     results = pd.concat([results, results.assign(variant="other")])
     with pytest.raises(InputError, match="all, other"):
-        measured(results, "")
-    assert len(measured(results, "all")) == len(CASES) - 1
+        tabulate_merges(results, "")
+    assert len(tabulate_merges(results, "all")) == len(CASES) - 1
 
 
 def test_results_without_evidence_are_refused_in_one_line() -> None:
     with pytest.raises(InputError, match="evidence_agreement") as caught:
-        measured(table_of().drop(columns="evidence_agreement"), "")
+        tabulate_merges(table_of().drop(columns="evidence_agreement"), "")
     assert "\n" not in str(caught.value)
 
 
 def test_every_merge_is_drawn_on_the_row_of_its_kind_beside_the_gate() -> None:
-    cases = measured(table_of(), "")
-    drawing = gates_chart(cases, gate_table(cases, ASKED))
+    cases = tabulate_merges(table_of(), "")
+    drawing = draw_gates(cases, tabulate_gates(cases, ASKED))
     panels = [panel for row in drawing.rows for panel in row]
     assert len(panels) == len(GATES)
     for panel, (name, _) in zip(panels, GATES, strict=True):
@@ -165,8 +165,8 @@ def test_every_merge_is_drawn_on_the_row_of_its_kind_beside_the_gate() -> None:
 
 def test_one_kind_of_outcome_alone_can_be_drawn() -> None:
     for chosen in (CASES[:2], CASES[3:4], (("", 0.1, {}),)):
-        cases = measured(table_of(chosen), "")
-        assert len(picture(gates_chart(cases, gate_table(cases, ASKED))).axes) >= len(GATES)
+        cases = tabulate_merges(table_of(chosen), "")
+        assert len(picture(draw_gates(cases, tabulate_gates(cases, ASKED))).axes) >= len(GATES)
 
 
 def test_the_command_writes_table_and_plot_and_names_what_slips_through(
@@ -179,7 +179,7 @@ def test_the_command_writes_table_and_plot_and_names_what_slips_through(
     written = pd.read_csv(tmp_path / "out" / "gates.csv")
     assert written["gate"].tolist() == [*(name for name, _ in GATES), "all"]
     assert (tmp_path / "out" / "gates.png").read_bytes().startswith(b"\x89PNG")
-    passed = let_through(measured(table_of(), ""), committed_thresholds())
+    passed = pass_gates(tabulate_merges(table_of(), ""), read_committed_thresholds())
     assert f"wrong, but let through: {int(passed[3:].sum())}" in told
     with pytest.raises(InputError, match=r"results\.csv"):
         main(tmp_path / "nowhere", tmp_path / "out", "")

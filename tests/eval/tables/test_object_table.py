@@ -10,7 +10,7 @@ import yaml
 
 from cdpipe.core.geometry import stream
 from eval.core.statistics import N_RESAMPLES, mean_with_interval
-from eval.plans.plan import cells, load_plan
+from eval.plans.plan import expand_cells, load_plan
 from eval.plans.targets import Target, Targets
 from eval.tables.groups import clustered_interval, group_overview, main_changes, objects_by_group
 from eval.tables.object_table import FILES, ORACLE_VARIANT, object_overview, object_tables
@@ -193,8 +193,8 @@ def test_clustered_intervals_equal_plain_resampling(statistic: str) -> None:
 
 
 def test_the_plan_of_objects_shares_no_pair_with_that_of_regions_and_varies_the_rule_alone() -> None:
-    found = cells(load_plan("objects"))
-    assert not {cell.seed for cell in found} & {cell.seed for cell in cells(load_plan("regions"))}
+    found = expand_cells(load_plan("objects"))
+    assert not {cell.seed for cell in found} & {cell.seed for cell in expand_cells(load_plan("regions"))}
     assert {cell.seed for cell in found} <= set(TEST)
     of_site = {cell.variant: cell for cell in found if cell.scenario == "regions/site2"}
     ours, voxel = of_site["tunnelcd"], of_site["tunnelcd[extract.method=voxel,extract.voxel_m=0.65]"]

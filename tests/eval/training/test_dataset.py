@@ -29,7 +29,7 @@ from eval.core.cluster import Where
 from eval.oracles.merge import OracleMerge, merged_by_truth
 from eval.scoring.merge_metrics import PAIR_RADIUS_M
 from eval.training import dataset_run
-from eval.training.dataset import Recipe, displaced, make_shard, merge_errors
+from eval.training.dataset import Recipe, displace_poses, draw_merge_errors, make_shard
 from eval.training.dataset_card import digest_of, fields_table
 from eval.training.dataset_run import make_dataset
 from eval.truth.adapters import pipeline_input
@@ -124,7 +124,7 @@ def test_a_draw_is_off_by_its_own_error(shard: Shard, from_files: FromFiles) -> 
     shift, turn = arrays["draw_shift_m"], arrays["draw_turn_rad"]
     assert (shift[0] == 0).all() and (turn[0] == 0).all() and (shift[1] != 0).all() and (turn[1] != 0).all()
     anchors, cloud = maps[0].odom_T_keyframe, after_in_map(maps, truth)
-    poses = displaced(anchors, shift[1], turn[1])
+    poses = displace_poses(anchors, shift[1], turn[1])
     for anchor in range(0, len(anchors), 5):
         here = anchors[anchor, :3, 3]
         cross = np.array([[0, -turn[1, 2], turn[1, 1]], [turn[1, 2], 0, -turn[1, 0]], [-turn[1, 1], turn[1, 0], 0]])
@@ -141,10 +141,10 @@ def test_a_draw_is_off_by_its_own_error(shard: Shard, from_files: FromFiles) -> 
 
 
 def test_draws_have_the_spread_they_are_asked_for() -> None:
-    drawn = merge_errors(Recipe(draws=4001, error_m=0.05, error_deg=0.5), 0)
+    drawn = draw_merge_errors(Recipe(draws=4001, error_m=0.05, error_deg=0.5), 0)
     assert drawn["shift_m"][1:].std() == pytest.approx(0.05, rel=0.03)
     assert np.rad2deg(drawn["turn_rad"][1:]).std() == pytest.approx(0.5, rel=0.03)
-    np.testing.assert_array_equal(drawn["shift_m"][:7], merge_errors(Recipe(draws=7, error_m=0.05), 0)["shift_m"])
+    np.testing.assert_array_equal(drawn["shift_m"][:7], draw_merge_errors(Recipe(draws=7, error_m=0.05), 0)["shift_m"])
 
 
 def test_pixel_labels_are_where_changed_returns_are(shard: Shard, from_files: FromFiles) -> None:

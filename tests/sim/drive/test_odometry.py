@@ -143,7 +143,7 @@ def test_a_pose_that_is_not_finite_is_an_error(sensor: SensorMetadata, monkeypat
 def test_without_the_package_nothing_is_simulated(
     scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(odometry.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("cdpipe.core.plugins.find_spec", lambda name: None)
     told: list[str] = []
     with pytest.raises(InputError, match=r"pip install 'tunnelcd\[odometry\]'"):
         simulate_pair(scenario, 5, tmp_path / "pair", lambda stage, done, total: told.append(stage))

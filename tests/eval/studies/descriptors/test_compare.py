@@ -16,7 +16,7 @@ from cdpipe.model.types import MappedSession, MergedMaps
 from cdpipe.query.query import find_regions
 from eval.core.progress import Silent
 from eval.running.stages import kept_bytes
-from eval.scoring.region_metrics import keyframe_labels
+from eval.scoring.region_metrics import label_keyframes
 from eval.studies.descriptors import compare as command
 from eval.studies.descriptors.compare import tabulate_places, tabulate_spheres
 from eval.studies.descriptors.rows import describe_keyframes, measure_pair, measure_scans, measure_spheres, score_places
@@ -83,7 +83,7 @@ def test_the_auroc_of_spheres_against_every_pair_of_keyframes(tiny_pair: Path, t
     config = load_config("tunnelcd", ["query.radius_m=1.6"])
     rows = measure_spheres(merged, before.descriptors, after.descriptors, truth, config)
     places = truth.before.world_T_sensor[before.map.keyframe_scans, :3, 3]
-    labels = keyframe_labels(places, truth.centroids_world, truth.is_observable, 1.6)
+    labels = label_keyframes(places, truth.centroids_world, truth.is_observable, 1.6)
     assert (labels == 1).any()
     assert (labels == 0).any()
     for row in rows:

@@ -19,29 +19,29 @@ from eval.studies.reality import scenes as reality_scenes
 from eval.studies.reality.plots import draw_measures, draw_novelty, draw_scene
 from eval.studies.reality.reality import DATA_VARIABLE, main
 from eval.studies.reality.scenes import (
-    as_revolutions,
     cast_at_origin,
-    drive_of,
+    change_effects,
     find_recording,
-    real_revolution,
+    find_world_points,
+    gather_revolutions,
+    plan_drive,
+    read_real_revolution,
     rebuild,
-    standing,
-    with_effects,
-    world_points,
+    stop_drive,
 )
 from eval.studies.reality.sensor_measures import (
     Revolutions,
-    destaggered,
-    edges,
-    expected_photons,
-    isolated,
-    noise_sigma_m,
-    novel_share,
-    novel_shares,
-    photons_per_percent,
-    return_share,
-    spread,
-    staggered,
+    destagger,
+    estimate_photons,
+    find_edges,
+    find_isolated,
+    measure_noise_sigma_m,
+    measure_novel_share,
+    measure_novel_shares,
+    measure_photons_per_percent,
+    measure_return_share,
+    measure_spread,
+    stagger,
 )
 from eval.studies.reality.static_novelty import (
     N_REVOLUTIONS,
@@ -49,11 +49,11 @@ from eval.studies.reality.static_novelty import (
     Case,
     Shares,
     Way,
-    effect_variants,
-    novelty_cases,
-    static_novelty,
+    list_effect_variants,
+    list_novelty_cases,
+    measure_static_novelty,
 )
-from eval.studies.reality.tables import COLUMNS, markdown, measured, novelty_table, side_by_side
+from eval.studies.reality.tables import COLUMNS, arrange_by_source, format_markdown, tabulate_measures, tabulate_novelty
 from scenarios.library import load_scenario
 from scenarios.schema import Sensor
 from sim.session.revolution import Drive, cast_revolution
@@ -66,7 +66,7 @@ OFF = Sensor(range_noise=False, dropouts=False, false_positives=False, rolling_s
 
 @pytest.fixture(scope="module")
 def drive() -> Drive:
-    return drive_of("smoke/one_box", 0, SENSOR, "os1-32-g")
+    return plan_drive("smoke/one_box", 0, SENSOR, "os1-32-g")
 
 
 def with_ranges(range_m: np.ndarray, signal: float = 100.0, reflectivity: float = 20.0) -> Revolutions:
@@ -79,13 +79,13 @@ def wall_ranges(normal: np.ndarray, distance_m: float) -> np.ndarray:
     with np.errstate(divide="ignore"):
         reach_m = (distance_m - SENSOR.origins @ normal) / toward
     ranges_m = np.where((toward > 0.02) & (reach_m > 0), reach_m + SENSOR.beam_origin_m, 0.0)
-    return destaggered(SENSOR, ranges_m)[None]
+    return destagger(SENSOR, ranges_m)[None]
 
 
 def test_destaggering_is_undone_and_shifts_each_row_by_its_own_columns() -> None:
     image = np.arange(SENSOR.height * SENSOR.width, dtype=np.float64).reshape(SENSOR.height, SENSOR.width)
-    shifted = destaggered(SENSOR, image)
-    np.testing.assert_array_equal(staggered(SENSOR, shifted), image)
+    shifted = destagger(SENSOR, image)
+    np.testing.assert_array_equal(stagger(SENSOR, shifted), image)
     assert shifted[8, 24] == image[8, 0]  # the table shifts row 8 by 24 columns
 
 
@@ -94,14 +94,14 @@ def test_noise_on_a_bent_surface_is_found_to_three_percent() -> None:
     bend_m = 10.0 + 3.0 * np.sin(np.linspace(0.0, 4.0 * np.pi, SENSOR.width, endpoint=False))
     noise_m = 0.02 * np.random.default_rng(1).standard_normal((8, SENSOR.height, SENSOR.width))
     revolutions = with_ranges(bend_m + noise_m)
-    assert noise_sigma_m(revolutions, np.ones(noise_m.shape, bool)) == pytest.approx(0.02, rel=0.03)
+    assert measure_noise_sigma_m(revolutions, np.ones(noise_m.shape, bool)) == pytest.approx(0.02, rel=0.03)
 
 
 def test_noise_estimate_does_not_see_edges() -> None:
     """A jump of 4 m spoils two second differences of 64: their root mean square would be 29 times off."""
     steps_m = np.where(np.arange(SENSOR.width) // 64 % 2 == 0, 8.0, 12.0)
     noise_m = 0.01 * np.random.default_rng(2).standard_normal((1, SENSOR.height, SENSOR.width))
-    assert noise_sigma_m(with_ranges(steps_m + noise_m), EVERYWHERE) == pytest.approx(0.01, rel=0.1)
+    assert measure_noise_sigma_m(with_ranges(steps_m + noise_m), EVERYWHERE) == pytest.approx(0.01, rel=0.1)
 
 
 def test_smooth_windows_need_seven_returns_and_ignore_the_middle() -> None:
@@ -114,14 +114,14 @@ def test_smooth_windows_need_seven_returns_and_ignore_the_middle() -> None:
 
 
 def test_spread_of_hand_made_values() -> None:
-    assert spread(np.array([1.0, 2.0, 3.0, 4.0, 100.0])) == pytest.approx(1.4826)
-    assert np.isnan(spread(np.zeros(0)))
+    assert measure_spread(np.array([1.0, 2.0, 3.0, 4.0, 100.0])) == pytest.approx(1.4826)
+    assert np.isnan(measure_spread(np.zeros(0)))
 
 
 def test_incidence_of_a_wall_is_that_of_its_normal() -> None:
     normal = np.array([1.0, 0.0, 0.0])
     revolutions = with_ranges(wall_ranges(normal, 4.0))
-    toward = destaggered(SENSOR, SENSOR.directions @ normal)
+    toward = destagger(SENSOR, SENSOR.directions @ normal)
     found = revolutions.incidence_cosine[0]
     known = np.isfinite(found)
     assert known.sum() > 3000
@@ -132,7 +132,7 @@ def test_incidence_of_a_wall_is_that_of_its_normal() -> None:
 def test_return_share_counts_each_beam() -> None:
     range_m = np.full((2, SENSOR.height, SENSOR.width), 5.0)
     range_m[:, 7, :256] = 0.0
-    shares = return_share(with_ranges(range_m))
+    shares = measure_return_share(with_ranges(range_m))
     assert shares[7] == 0.75
     assert (np.delete(shares, 7) == 1.0).all()
 
@@ -140,9 +140,9 @@ def test_return_share_counts_each_beam() -> None:
 def test_photons_per_percent_is_the_constant_of_the_inverse_square_law() -> None:
     range_m = np.linspace(5.0, 50.0, SENSOR.width) * np.ones((1, SENSOR.height, 1))
     revolutions = Revolutions(SENSOR, range_m, 1400.0 * 30.0 / range_m**2, np.full(range_m.shape, 30.0))
-    np.testing.assert_allclose(photons_per_percent(revolutions, EVERYWHERE), 1400.0)
+    np.testing.assert_allclose(measure_photons_per_percent(revolutions, EVERYWHERE), 1400.0)
     bright = replace(revolutions, reflectivity=np.full(range_m.shape, 150.0))
-    assert len(photons_per_percent(bright, EVERYWHERE)) == 0
+    assert len(measure_photons_per_percent(bright, EVERYWHERE)) == 0
 
 
 def test_expected_photons_come_from_both_neighbours_of_one_surface() -> None:
@@ -150,7 +150,7 @@ def test_expected_photons_come_from_both_neighbours_of_one_surface() -> None:
     revolutions.signal[0, 2, [9, 11]] = 4.0, 25.0
     revolutions.range_m[0, 2, 10] = 0.0  # its own return has no say
     revolutions.range_m[0, 3, 21] = 9.0
-    expected = expected_photons(revolutions)
+    expected = estimate_photons(revolutions)
     assert expected[0, 2, 10] == pytest.approx(10.0)
     assert np.isnan(expected[0, 2, [9, 11]]).all()  # a neighbour is missing
     assert np.isnan(expected[0, 3, [20, 22]]).all()  # the neighbours are two surfaces
@@ -164,7 +164,7 @@ def test_isolated_returns_are_those_unlike_all_eight_neighbours() -> None:
     range_m[0, 20:23, 90:93] = 0.0
     range_m[0, 21, 91] = 8.0  # nothing around it
     range_m[0, 0, 0] = 3.0  # at the corner of the image, whose left neighbour is the last column
-    found = {tuple(each) for each in np.argwhere(isolated(with_ranges(range_m)))}
+    found = {tuple(each) for each in np.argwhere(find_isolated(with_ranges(range_m)))}
     assert found == {(0, 5, 50), (0, 21, 91), (0, 0, 0)}
 
 
@@ -174,7 +174,7 @@ def test_edges_tell_mixed_missing_and_clean_pixels_apart() -> None:
     range_m[0, 4, 500] = 6.5
     range_m[0, 5, 500] = 5.2  # 0.2 m behind the near surface: not far enough from it
     range_m[0, 6, 500] = 0.0
-    jump_m, is_mixed, is_missing = edges(with_ranges(range_m))
+    jump_m, is_mixed, is_missing = find_edges(with_ranges(range_m))
     assert np.argwhere(is_mixed).tolist() == [[0, 4, 500]]
     assert np.argwhere(is_missing).tolist() == [[0, 6, 500]]
     assert jump_m[0, 5, 500] == pytest.approx(3.0)
@@ -184,10 +184,10 @@ def test_edges_tell_mixed_missing_and_clean_pixels_apart() -> None:
 def test_novel_share_of_hand_made_points() -> None:
     before = np.array([[0.05, 0.05, 0.05], [1.05, 0.0, 0.0]])
     after = np.array([[0.09, 0.01, 0.02], [0.11, 0.05, 0.05], [1.01, 0.09, 0.0], [-0.01, 0.05, 0.05]])
-    assert novel_share(after, before, 0.1) == 0.5  # over the border at 0.1, and below zero
-    assert novel_share(after, before, 0.2) == 0.25  # only below zero
-    assert novel_share(before, after, 0.1) == 0.0
-    np.testing.assert_allclose(novel_shares((before, after), (0.1, 0.2)), [0.25, 0.125])
+    assert measure_novel_share(after, before, 0.1) == 0.5  # over the border at 0.1, and below zero
+    assert measure_novel_share(after, before, 0.2) == 0.25  # only below zero
+    assert measure_novel_share(before, after, 0.1) == 0.0
+    np.testing.assert_allclose(measure_novel_shares((before, after), (0.1, 0.2)), [0.25, 0.125])
 
 
 def test_novelty_of_uniform_points_is_the_chance_of_an_empty_voxel() -> None:
@@ -195,7 +195,7 @@ def test_novelty_of_uniform_points_is_the_chance_of_an_empty_voxel() -> None:
     generator = np.random.default_rng(5)
     halves = [generator.random((2000, 3)) for _ in range(2)]
     expected = (1.0 - 1.0 / 1000.0) ** 2000
-    assert novel_shares(halves, (0.1,))[0] == pytest.approx(expected, rel=0.1)
+    assert measure_novel_shares(halves, (0.1,))[0] == pytest.approx(expected, rel=0.1)
 
 
 def test_rebuilt_scene_gives_a_recording_back_and_closes_small_holes_only(drive: Drive) -> None:
@@ -209,7 +209,7 @@ def test_rebuilt_scene_gives_a_recording_back_and_closes_small_holes_only(drive:
     holes[0, row, column + 10 : column + 13] = 0.0
     recorded = with_ranges(holes)
     scene, is_surface = rebuild(recorded, drive.scene)
-    again = as_revolutions(SENSOR, [cast_at_origin(scene, SENSOR, OFF, 0)])
+    again = gather_revolutions(SENSOR, [cast_at_origin(scene, SENSOR, OFF, 0)])
     assert is_surface[row, column : column + 2].all()
     assert not is_surface[row, column + 10 : column + 13].any()
     np.testing.assert_array_equal(again.is_return[0], is_surface)
@@ -221,10 +221,10 @@ def test_rebuilt_scene_gives_a_recording_back_and_closes_small_holes_only(drive:
 
 
 def test_standing_sensor_without_effects_sees_nothing_new_and_noise_alone_makes_it(drive: Drive) -> None:
-    variants = effect_variants(drive.scenario.sensor)
+    variants = list_effect_variants(drive.scenario.sensor)
 
     def found(variant: str, way: Way) -> Shares:
-        return static_novelty(drive, Case(way, variant, variants[variant], 4), 0)
+        return measure_static_novelty(drive, Case(way, variant, variants[variant], 4), 0)
 
     off, default, driving = found("all off", "standing"), found("default", "standing"), found("all off", "driving")
     assert off == (0.0, 0.0, 0.0)
@@ -236,14 +236,14 @@ def test_standing_sensor_without_effects_sees_nothing_new_and_noise_alone_makes_
 
 def test_no_case_of_novelty_is_the_same_as_another() -> None:
     default = Sensor()
-    cases = novelty_cases(default)
+    cases = list_novelty_cases(default)
     assert [each.n_revolutions for each in cases if (each.way, each.variant) == ("standing", "default")] == list(
         STANDING_NUMBERS
     )
     assert N_REVOLUTIONS in STANDING_NUMBERS
     driving = [each for each in cases if each.way == "driving"]
-    assert {each.variant: each.settings for each in driving} == effect_variants(default)
-    assert len(driving) == len(effect_variants(default))
+    assert {each.variant: each.settings for each in driving} == list_effect_variants(default)
+    assert len(driving) == len(list_effect_variants(default))
     told = [(each.way, each.variant) for each in cases if each.n_revolutions == N_REVOLUTIONS]
     assert len(told) == len(set(told)) == 3 * len(driving) - 1  # how it rolls is no matter to a sensor that stands
     assert ("standing", "rolling_scan off") not in told
@@ -253,16 +253,16 @@ def test_a_drive_with_an_effect_off_is_the_drive_of_a_scenario_that_says_so(driv
     said = ["sensor.profile=os1-32-g", "sensor.rolling_scan=false", "sensor.false_positives=false"]
     told = plan_drives(load_scenario("smoke/one_box", 0, said), SENSOR, 0)[0]
     default = drive.scenario.sensor
-    off = with_effects(drive, default.model_copy(update={"rolling_scan": False, "false_positives": False}))
-    rolls = with_effects(drive, default.model_copy(update={"false_positives": False}))
+    off = change_effects(drive, default.model_copy(update={"rolling_scan": False, "false_positives": False}))
+    rolls = change_effects(drive, default.model_copy(update={"false_positives": False}))
     stands, wanted, bent = (cast_revolution(each, 3)[1].range_mm for each in (off, told, rolls))
     np.testing.assert_array_equal(stands, wanted)
     assert (stands != bent).mean() > 0.3
-    np.testing.assert_array_equal(cast_revolution(with_effects(off, default), 3)[1].range_mm, _range_mm(drive, 3))
+    np.testing.assert_array_equal(cast_revolution(change_effects(off, default), 3)[1].range_mm, _range_mm(drive, 3))
 
 
 def test_revolutions_of_a_standing_sensor_share_one_pose_and_no_noise(drive: Drive) -> None:
-    still = standing(drive, 5, 3)
+    still = stop_drive(drive, 5, 3)
     poses = still.trajectory.world_T_column(slice(0, 3))
     middle = drive.trajectory.world_T_column(slice(5, 6))[0, SENSOR.width // 2]
     np.testing.assert_array_equal(poses, np.broadcast_to(middle, (3, SENSOR.width, 4, 4)))
@@ -278,11 +278,11 @@ def _range_mm(drive: Drive, number: int) -> np.ndarray:
 
 
 def test_points_of_a_moved_sensor_lie_on_the_same_wall(drive: Drive) -> None:
-    off = with_effects(drive, OFF)
+    off = change_effects(drive, OFF)
     _, result = cast_revolution(off, 0)
     poses = off.trajectory.world_T_column(slice(0, 1))[0]
-    points = world_points(SENSOR, result, poses)
-    moved = world_points(SENSOR, result, make_pose(translation=(1.0, 2.0, 3.0)) @ poses)
+    points = find_world_points(SENSOR, result, poses)
+    moved = find_world_points(SENSOR, result, make_pose(translation=(1.0, 2.0, 3.0)) @ poses)
     np.testing.assert_allclose(moved - points, np.broadcast_to([1.0, 2.0, 3.0], points.shape), atol=1e-9)
     seen = (invert(poses[0]) @ np.c_[points, np.ones(len(points))].T).T[:, :3]  # it does not roll: all as the first
     expected = SENSOR.project(result.range_mm / 1000.0).swapaxes(0, 1)[result.range_mm.T > 0]
@@ -291,7 +291,7 @@ def test_points_of_a_moved_sensor_lie_on_the_same_wall(drive: Drive) -> None:
 
 def test_effect_variants_differ_from_default_in_what_they_say() -> None:
     default = Sensor()
-    variants = effect_variants(default)
+    variants = list_effect_variants(default)
     for name in ("rolling_scan", "range_noise", "dropouts", "false_positives"):
         assert variants[f"{name} off"] == default.model_copy(update={name: False})
         assert not getattr(variants["all off"], name)
@@ -301,14 +301,16 @@ def test_effect_variants_differ_from_default_in_what_they_say() -> None:
 def test_tables_put_sources_side_by_side_and_beams_as_extremes() -> None:
     range_m = np.full((1, SENSOR.height, SENSOR.width), 5.0)
     range_m[0, 3, :512] = 0.0
-    table = pd.concat([measured(with_ranges(range_m), "a"), measured(with_ranges(np.full_like(range_m, 5.0)), "b")])
+    table = pd.concat(
+        [tabulate_measures(with_ranges(range_m), "a"), tabulate_measures(with_ranges(np.full_like(range_m, 5.0)), "b")]
+    )
     assert tuple(table.columns) == COLUMNS
-    wide = side_by_side(table).set_index(["measure", "where"])
+    wide = arrange_by_source(table).set_index(["measure", "where"])
     assert wide.loc[("returns by beam", "lowest"), ["a", "b"]].tolist() == [0.5, 1.0]
     assert wide.loc[("range noise, smooth", "4 to 6 m"), "b"] == 0.0
     assert wide.loc[("photons x range^2 per percent", "4 to 6 m"), "a"] == pytest.approx(100.0 * 25.0 / 20.0)
     assert ("range noise, smooth", "6 to 9 m") not in wide.index
-    assert markdown(pd.DataFrame({"x": [1.23456, np.nan], "y": ["p", "q"]})) == (
+    assert format_markdown(pd.DataFrame({"x": [1.23456, np.nan], "y": ["p", "q"]})) == (
         "| x | y |\n|---|---|\n| 1.23 | p |\n| - | q |\n"
     )
 
@@ -316,12 +318,12 @@ def test_tables_put_sources_side_by_side_and_beams_as_extremes() -> None:
 def test_plots_are_written(tmp_path: Path) -> None:
     noisy = 6.0 + 0.01 * np.random.default_rng(3).standard_normal((1, SENSOR.height, SENSOR.width))
     revolutions = with_ranges(noisy)
-    draw_measures(measured(revolutions, "real"), tmp_path / "a.png")
+    draw_measures(tabulate_measures(revolutions, "real"), tmp_path / "a.png")
     draw_scene(revolutions, revolutions, tmp_path / "b.png")
     results = [(Case("standing", "default", Sensor(), n), (0.05 / n, 0.02 / n, 0.01 / n)) for n in (4, 8)]
     draw_novelty(results, tmp_path / "c.png")
     assert [path.read_bytes()[:4] for path in sorted(tmp_path.iterdir())] == [b"\x89PNG"] * 3
-    assert novelty_table(results).iloc[0, -3:].tolist() == pytest.approx([6.1, 2.1, 0.8])
+    assert tabulate_novelty(results).iloc[0, -3:].tolist() == pytest.approx([6.1, 2.1, 0.8])
 
 
 def test_missing_recording_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -335,7 +337,7 @@ def test_missing_recording_is_one_line(tmp_path: Path, monkeypatch: pytest.Monke
     assert find_recording(tmp_path) == tmp_path / "ouster" / f"{reality_scenes.RECORDING}.pcap"
     monkeypatch.setitem(sys.modules, "ouster.sdk", None)
     with pytest.raises(InputError, match=r"tunnelcd\[ouster\]"):
-        real_revolution(find_recording(tmp_path))
+        read_real_revolution(find_recording(tmp_path))
 
 
 @pytest.fixture(scope="module")
@@ -343,39 +345,39 @@ def real() -> Iterator[Revolutions]:
     pytest.importorskip("ouster.sdk.core", reason="pip install 'tunnelcd[ouster]'")
     if DATA_VARIABLE not in os.environ:
         pytest.skip("real recordings: TUNNELCD_REAL_DATA is not set")
-    yield real_revolution(find_recording(Path(os.environ[DATA_VARIABLE])))
+    yield read_real_revolution(find_recording(Path(os.environ[DATA_VARIABLE])))
 
 
 def test_real_unit_returns_three_quarters_to_nine_tenths_of_each_beam(real: Revolutions) -> None:
     assert int(real.is_return.sum()) == 27310
-    shares = return_share(real)
+    shares = measure_return_share(real)
     assert (round(shares.min(), 3), round(shares.max(), 3)) == (0.723, 0.908)
 
 
 def test_real_range_noise_is_three_to_four_millimetres_on_facing_surfaces_nearby(real: Revolutions) -> None:
     near = real.is_smooth & real.is_facing & (real.range_m > 4) & (real.range_m < 9)
     assert near.sum() > 500
-    assert 0.0025 < noise_sigma_m(real, near) < 0.0045
+    assert 0.0025 < measure_noise_sigma_m(real, near) < 0.0045
 
 
 def test_real_photons_follow_the_inverse_square_beyond_twenty_metres_and_fall_short_before(real: Revolutions) -> None:
-    far = float(np.median(photons_per_percent(real, real.range_m > 20.0)))
+    far = float(np.median(measure_photons_per_percent(real, real.range_m > 20.0)))
     assert 1300.0 < far < 1500.0
-    at_3_m = float(np.median(photons_per_percent(real, (real.range_m > 2.4) & (real.range_m < 3.0))))
+    at_3_m = float(np.median(measure_photons_per_percent(real, (real.range_m > 2.4) & (real.range_m < 3.0))))
     assert at_3_m < 0.02 * far
 
 
 def test_real_returns_are_lost_at_the_data_sheets_photons(real: Revolutions) -> None:
     """10 % at 45 m, seen 9 times in 10, are 1398 x 10 / 45^2 = 6.9 photons."""
-    expected = np.nan_to_num(expected_photons(real))
+    expected = np.nan_to_num(estimate_photons(real))
     weak, strong = (expected >= 6) & (expected < 9), expected >= 48
     assert 0.82 < real.is_return[weak].mean() < 0.93
     assert 0.994 < real.is_return[strong].mean() < 0.999
 
 
 def test_real_isolated_returns_and_mixed_pixels(real: Revolutions) -> None:
-    assert 0.011 < isolated(real).sum() / real.is_return.sum() < 0.014
-    jump_m, is_mixed, is_missing = edges(real)
+    assert 0.011 < find_isolated(real).sum() / real.is_return.sum() < 0.014
+    jump_m, is_mixed, is_missing = find_edges(real)
     n_edges = np.isfinite(jump_m).sum()
     assert n_edges > 2500
     assert 0.08 < is_mixed.sum() / n_edges < 0.13
