@@ -68,6 +68,10 @@ class ScoringPoints:
         """Return the scan of each of some rows."""
         return self.returns[rows] // self.n_pixels
 
+    def pixels(self, rows: Int64Array) -> Int64Array:
+        """Return the pixel of each of some rows, row * W + column."""
+        return self.returns[rows] % self.n_pixels
+
     def rows_of_change(self, change_id: int) -> Int64Array:
         """Return the rows that belong to a change: the cells of its truth."""
         return np.flatnonzero(self.change == change_id)
