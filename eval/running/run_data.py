@@ -14,6 +14,7 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
+from eval.core.statistics import mean, median
 from eval.core.tablefile import table_file
 from eval.plans.coverage import Coverage, measure_coverage
 from eval.plans.targets import read_targets
@@ -139,9 +140,7 @@ def defined(rows: Iterable[Row], column: str) -> Float64Array:
 def over_pairs(rows: Iterable[Row], column: str) -> float:
     """Return the mean of the defined values of a column, their median for times; NaN where there is none."""
     values = defined(rows, column)
-    if len(values) == 0:
-        return math.nan
-    return float(np.median(values) if column.startswith("t_") else values.mean())
+    return median(values) if column.startswith("t_") else mean(values)
 
 
 def of(rows: Iterable[Row], **wanted: Any) -> list[Row]:
