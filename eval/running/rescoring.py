@@ -43,7 +43,7 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
         InputError: An answer is damaged, or its pair has no truth.
     """
     progress = progress or Silent()
-    folders = list(run.answer_folders())
+    folders = sorted(file.parent for file in run.path.glob("answers/*/*/*/answer.json"))
     documents: dict[Path, dict[str, Any]] = {}
     place: Sequence[int]
     for (slug, seed), group in groupby(folders, key=lambda folder: folder.parts[-3:-1]):

@@ -80,10 +80,6 @@ class RunFolder:
         cells = (self.read_cell(path) for path in sorted(self.path.glob("cells/*/*/*.json")))
         return [cell for cell in cells if cell is not None]
 
-    def answer_folders(self) -> Iterator[Path]:
-        """Yield the folder of every stored answer, sorted."""
-        yield from sorted(file.parent for file in self.path.glob("answers/*/*/*/answer.json"))
-
     def read_cell(self, path: Path) -> dict[str, Any] | None:
         """Read a finished cell; None where there is none, or what is there was cut short."""
         document = read_json(path)

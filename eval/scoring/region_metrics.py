@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform_each
 from cdpipe.model.report import ChangeReport
 from eval.core.ranking import auroc, average_precision
 from eval.truth.ground_truth import GroundTruth, SessionTruth
@@ -56,8 +56,7 @@ def transform_to_map(places_world: Float64Array, before: SessionTruth, keyframe_
     world_T_keyframe = before.world_T_sensor[keyframe_scans]
     _, nearest = cKDTree(world_T_keyframe[:, :3, 3]).query(places_world)
     map_T_world = before.odom_T_sensor[keyframe_scans[nearest]] @ invert(world_T_keyframe[nearest])
-    moved = np.einsum("nij,nj->ni", map_T_world[:, :3, :3], places_world) + map_T_world[:, :3, 3]
-    return np.asarray(moved, dtype=np.float64)
+    return transform_each(map_T_world, places_world)
 
 
 def match_regions(
