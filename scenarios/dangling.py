@@ -28,15 +28,10 @@ def find_dangling(tree: Any) -> list[Mistake]:
         if len(set(pair)) == 2
     }
     of_drifts = list(_drift_mistakes(tunnel, nodes))
-    others = [
-        *_niche_mistakes(tunnel, nodes, edges),
-        *_area_mistakes(tree),
-        *_prop_mistakes(tree, nodes, edges),
-        *_route_mistakes(tree, nodes, edges),
-    ]
-    if of_drifts:  # a misspelt drift joins nothing; what follows from that is not worth telling
-        others = [(key, rule) for key, rule in others if not rule.startswith(_NO_DRIFT)]
-    return of_drifts + others
+    of_edges = [(key, _no_drift(pair, nodes)) for key, pair in _edges_named(tree) if frozenset(pair) not in edges]
+    if of_drifts:  # a misspelt drift joins nothing: only nodes that do not exist are worth a line of their own
+        of_edges = [(key, rule) for key, rule in of_edges if not rule.startswith(_NO_DRIFT)]
+    return [*of_drifts, *of_edges, *_repeated_names(tree), *_area_mistakes(tree)]
 
 
 def _drift_mistakes(tunnel: Any, nodes: list[str]) -> Iterator[Mistake]:
@@ -50,47 +45,39 @@ def _drift_mistakes(tunnel: Any, nodes: list[str]) -> Iterator[Mistake]:
                 yield key, "a drift cannot go from a node to itself"
 
 
-def _niche_mistakes(tunnel: Any, nodes: list[str], edges: set[frozenset[str]]) -> Iterator[Mistake]:
-    for index, niche in enumerate(items_at(tunnel, "niches")):
-        pair = items_at(niche, "between")
-        if len(_names(pair)) == 2 and frozenset(pair) not in edges:
-            yield ("tunnel", "niches", index, "between"), _no_drift(pair, nodes)
+def _edges_named(tree: Any) -> list[tuple[Key, list[str]]]:
+    """Return every pair of nodes between which something lies or drives, as (key path, pair)."""
+    found: list[tuple[Key, Any]] = []
+    for index, niche in enumerate(items_at(mapping_at(tree, "tunnel"), "niches")):
+        found.append((("tunnel", "niches", index, "between"), items_at(niche, "between")))
+    for key, place in _places(tree):
+        found.append(((*key, "between"), items_at(place, "between")))
+    for session in ("before", "after"):
+        for position, pair in enumerate(pairwise(items_at(mapping_at(tree, session), "route")), start=1):
+            found.append(((session, "route", position), list(pair)))
+    return [(key, pair) for key, pair in found if len(_names(pair)) == 2]
+
+
+def _repeated_names(tree: Any) -> Iterator[Mistake]:
+    for kind in ("area", "prop"):
+        names = [item.get("name") if isinstance(item, dict) else None for item in items_at(tree, f"{kind}s")]
+        for index, name in enumerate(names):
+            if isinstance(name, str) and name in names[:index]:
+                yield (f"{kind}s", index, "name"), f"another {kind} has this name"
 
 
 def _area_mistakes(tree: Any) -> Iterator[Mistake]:
-    names = [mapping_at({"area": area}, "area").get("name") for area in items_at(tree, "areas")]
-    for index, name in enumerate(names):
-        if isinstance(name, str) and name in names[:index]:
-            yield ("areas", index, "name"), "another area has this name"
-    known = _names(names)
+    known = _names([area.get("name") for area in items_at(tree, "areas") if isinstance(area, dict)])
+    for key, place in _places(tree):
+        area = place.get("area")
+        if isinstance(area, str) and area not in known:
+            yield (*key, "area"), f"no area is called {area}{suggest(area, known)}" if known else "there are no areas"
+
+
+def _places(tree: Any) -> Iterator[tuple[Key, dict[str, Any]]]:
+    """Yield both places of every prop, empty where there is none."""
     for index, prop in enumerate(items_at(tree, "props")):
-        for place in ("place", "to"):
-            area = mapping_at(prop, place).get("area")
-            if isinstance(area, str) and area not in known:
-                rule = f"no area is called {area}{suggest(area, known)}" if known else "there are no areas"
-                yield ("props", index, place, "area"), rule
-
-
-def _prop_mistakes(tree: Any, nodes: list[str], edges: set[frozenset[str]]) -> Iterator[Mistake]:
-    seen: set[str] = set()
-    for index, prop in enumerate(items_at(tree, "props")):
-        name = prop.get("name") if isinstance(prop, dict) else None
-        if isinstance(name, str):
-            if name in seen:
-                yield ("props", index, "name"), "another prop has this name"
-            seen.add(name)
-        for place in ("place", "to"):
-            pair = items_at(mapping_at(prop, place), "between")
-            if len(_names(pair)) == 2 and frozenset(pair) not in edges:
-                yield ("props", index, place, "between"), _no_drift(pair, nodes)
-
-
-def _route_mistakes(tree: Any, nodes: list[str], edges: set[frozenset[str]]) -> Iterator[Mistake]:
-    for session in ("before", "after"):
-        route = items_at(mapping_at(tree, session), "route")
-        for position, pair in enumerate(pairwise(route), start=1):
-            if len(_names(list(pair))) == 2 and frozenset(pair) not in edges:
-                yield (session, "route", position), _no_drift(list(pair), nodes)
+        yield from ((("props", index, name), mapping_at(prop, name)) for name in ("place", "to"))
 
 
 def _no_drift(pair: list[str], nodes: list[str]) -> str:

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import stream
 from cdpipe.core.yamlfile import Key
 
@@ -36,20 +35,8 @@ class Drawing:
     broken: set[Key] = field(default_factory=set)
 
 
-def draw(tree: Any, seed: int) -> Any:
-    """Return the tree with every distribution replaced by its draw, and repeated list items written out.
-
-    Raises:
-        ScenarioError: A distribution, `repeat`, `chance` or `one_of` is malformed; the message lists all of them.
-    """
-    mistakes = find_malformed(tree)
-    if mistakes:
-        raise ScenarioError("\n".join(f"{join_key(key)}: {rule}" for key, rule in mistakes.items()))
-    return draw_with_origins(tree, seed).value
-
-
-def draw_with_origins(tree: Any, seed: int) -> Drawing:
-    """Draw as `draw` does, record the origin of each value, and put None where a distribution is malformed."""
+def draw(tree: Any, seed: int) -> Drawing:
+    """Replace every distribution of a tree by its draw, a malformed one by None, and write repeated items out."""
     drawer = _Drawer(seed)
     value = drawer.value(tree, (), (), ())
     return Drawing(value, drawer.origins, drawer.broken)

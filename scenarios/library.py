@@ -13,7 +13,7 @@ from cdpipe.core.geometry import stream
 from cdpipe.core.yamlfile import Document, Key, apply_settings, read_yaml, suggest, validate
 from scenarios.catalogue import family_files, family_of, prop_files, prop_names, read_prop
 from scenarios.dangling import Mistake, find_dangling, items_at
-from scenarios.distributions import Drawing, draw_with_origins, find_malformed, is_distribution, join_key, merge_trees
+from scenarios.distributions import draw, find_malformed, is_distribution, join_key, merge_trees
 from scenarios.references import file_keys, find_contradictions
 from scenarios.schema import PROP_KINDS, Prop, Scenario
 
@@ -67,7 +67,7 @@ def _require_valid(scenario: Scenario | None, mistakes: list[str]) -> Scenario:
 def _draw_scenario(document: Document, seed: int) -> tuple[Scenario | None, list[str]]:
     """Draw a scenario, and return it with every mistake found; None if it does not fit the schema."""
     mistakes = [_format_mistake(document, key, rule) for key, rule in find_malformed(document.value).items()]
-    drawn = draw_with_origins(document.value, seed)
+    drawn = draw(document.value, seed)
     tree = dict(drawn.value)
     is_frozen = tree.pop("frozen", False)
     if not isinstance(is_frozen, bool):
@@ -76,7 +76,7 @@ def _draw_scenario(document: Document, seed: int) -> tuple[Scenario | None, list
     if isinstance(turnover, bool) or not isinstance(turnover, int | float) or not 0 <= turnover <= 1:
         mistakes.append(_format_mistake(document, ("turnover",), "expected a share between 0 and 1"))
         turnover = 0.0
-    place = Document(document.source, tree, _drawn_origins(document, drawn))
+    place = Document(document.source, tree, {key: document.where(source) for key, source in drawn.origins.items()})
     tree, unknown = _resolve_props(place)
     tree, missing = _resolve_files(replace(place, value=tree))
     mistakes += missing
@@ -93,17 +93,17 @@ def _draw_scenario(document: Document, seed: int) -> tuple[Scenario | None, list
 def _freeze(scenario: Scenario) -> Scenario:
     """Return the scenario without its changes: the world stays as in the before session."""
     stay = {"change": "none", "to": None, "shift": None, "loaded_share": None}
-    props: list[Prop] = [prop.model_copy(update=stay) for prop in scenario.props if prop.change != "added"]
-    return scenario.model_copy(update={"props": tuple(props)})
+    props = tuple(prop.model_copy(update=stay) for prop in scenario.props if prop.change != "added")
+    return scenario.model_copy(update={"props": props})
 
 
 def _turn_over(scenario: Scenario, turnover: float, seed: int) -> Scenario:
     """Return the scenario with this share of its unchanged props added or removed instead, in equal parts."""
     props: list[Prop] = []
     for prop in scenario.props:
-        draw = stream(seed, "turnover", prop.name).random()
-        is_turned = prop.change == "none" and draw < turnover
-        update = {"change": "added" if draw < turnover / 2 else "removed"} if is_turned else {}
+        number = stream(seed, "turnover", prop.name).random()
+        is_turned = prop.change == "none" and number < turnover
+        update = {"change": "added" if number < turnover / 2 else "removed"} if is_turned else {}
         props.append(prop.model_copy(update=update))
     return scenario.model_copy(update={"props": tuple(props)})
 
@@ -147,10 +147,6 @@ def _replace_at(value: Any, key: Key, new: str) -> Any:
     parts: Any = dict(value) if isinstance(value, dict) else list(value)
     parts[key[0]] = _replace_at(parts[key[0]], key[1:], new)
     return parts
-
-
-def _drawn_origins(document: Document, drawn: Drawing) -> dict[Key, str]:
-    return {key: document.where(source) for key, source in drawn.origins.items()}
 
 
 def _drop_repeated(lines: list[str], broken: set[Key], told: list[Mistake]) -> list[str]:

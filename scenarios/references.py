@@ -83,10 +83,8 @@ def _room_mistakes(scenario: Scenario) -> Iterator[Mistake]:
         yield ("platform", "clearance_m"), f"leaves the platform no room in a drift {width_m:.1f} m wide"
     roof_m = min(section.height_m for section in sections)
     for name, plan in (("before", scenario.before), ("after", scenario.after)):
-        is_own = plan.height_m is not None
-        flown_m = plan.height_m if plan.height_m is not None else scenario.platform.sensor_height_m
-        if flown_m >= roof_m and plan.trajectory is None:
-            key: Key = (name, "height_m") if is_own else ("platform", "sensor_height_m")
+        if plan.trajectory is None and (plan.height_m or scenario.platform.sensor_height_m) >= roof_m:
+            key: Key = (name, "height_m") if plan.height_m else ("platform", "sensor_height_m")
             yield key, f"the sensor would be above the roof of a drift {roof_m:.1f} m high"
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 
 class TunnelcdError(Exception):
-    """Base of every error caused by the input; its text says what is wrong, where, what is expected, how to mend it."""
+    """Base of every error caused by the input; its text says what is wrong, where, what is expected, and a remedy."""
 
 
 class InputError(TunnelcdError):

@@ -79,6 +79,12 @@ def transform(dst_T_src: Float64Array, points: Float64Array) -> Float64Array:
     return points @ dst_T_src[:3, :3].T + dst_T_src[:3, 3]
 
 
+def transform_each(dst_T_src: Float64Array, points: Float64Array) -> Float64Array:
+    """Transform each of (N, 3) points by its own pose of (N, 4, 4) from frame src into frame dst."""
+    moved = np.einsum("nij,nj->ni", dst_T_src[:, :3, :3], points) + dst_T_src[:, :3, 3]
+    return np.asarray(moved, dtype=np.float64)
+
+
 def yaw_rad(pose: Float64Array) -> float:
     """Return the heading of a (4, 4) pose: the angle of its x axis in the x-y plane, in (-pi, pi]."""
     return float(np.arctan2(pose[1, 0], pose[0, 0]))

@@ -77,7 +77,7 @@ def search_folders(kind: str) -> tuple[Path, ...]:
     folders = [Path(entry) for entry in os.environ.get(SEARCH_PATH, "").split(os.pathsep) if entry]
     for folder in folders:
         if not folder.is_dir():
-            raise InputError(f"{SEARCH_PATH}: {folder}: no such folder: mend or unset the variable")
+            raise InputError(f"{SEARCH_PATH}: {folder}: no such folder: correct or unset the variable")
     return tuple(folder / kind for folder in folders if (folder / kind).is_dir())
 
 

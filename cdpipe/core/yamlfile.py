@@ -272,7 +272,7 @@ def _plain(node: Any, key: Key, lines: dict[Key, int], mistakes: list[str], sour
         for name_node, item in node.value:
             name = _scalar(name_node)
             if name in content:
-                mistakes.append(f"{source}:{name_node.start_mark.line + 1}: {name}: the key stands here a second time")
+                mistakes.append(f"{source}:{name_node.start_mark.line + 1}: {name}: the key is here a second time")
             lines[(*key, name)] = name_node.start_mark.line + 1
             content[name] = _plain(item, (*key, name), lines, mistakes, source)
         return content

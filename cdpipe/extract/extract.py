@@ -29,6 +29,9 @@ FIGURES = ("v_sphere_m3", "v_oe_m3", "s_points", "oe_points")
 def cut_objects(merged: MergedMaps, regions: ChangeRegions, config: PipelineConfig) -> list[PointGroup]:
     """Return the groups of points that only one map has inside the reported regions, best region first.
 
+    `voxel` and `nearest` compare map points region by region, as in the paper: an object across two regions becomes two
+    objects, and the best region takes a point that lies in several.
+
     Args:
         merged: Both maps.
         regions: Candidates; only the reported ones are used.
@@ -36,7 +39,23 @@ def cut_objects(merged: MergedMaps, regions: ChangeRegions, config: PipelineConf
     """
     if config.extract.method == "surface":
         return cut_by_surface(merged, regions, config.extract)
-    return _cut_by_points(merged, regions, config)
+    is_voxel, extract = config.extract.method == "voxel", config.extract
+    # a voxel that intersects the sphere extends at most its diagonal beyond it
+    reach_m = np.sqrt(3.0) * extract.voxel_m if is_voxel else extract.distance_m
+    crops = Crops(merged, reach_m)
+    is_taken = {name: np.zeros(len(merged.map_of(name).points), np.bool_) for name in SESSIONS}
+    groups: list[PointGroup] = []
+    for region in np.flatnonzero(regions.is_reported).tolist():
+        spheres = crops.around(regions.centres_map[region], regions.radius_m)
+        for session, other in DIRECTIONS:
+            indices, points = spheres[session].inside
+            others = spheres[other].points
+            is_old = ~new_points_mask(points, others, extract) if is_voxel else is_within(points, others, reach_m)
+            new = np.flatnonzero(~is_old & ~is_taken[session][indices])
+            for members in cluster_inliers(points, new, config):
+                groups.append(PointGroup(session, indices[members], points[members], region))
+                is_taken[session][indices[members]] = True
+    return groups
 
 
 def withdraw_empty_regions(
@@ -142,27 +161,3 @@ def hull_volume_m3(points: Float64Array) -> float:
         return float(ConvexHull(points).volume)
     except QhullError:
         return 0.0
-
-
-def _cut_by_points(merged: MergedMaps, regions: ChangeRegions, config: PipelineConfig) -> list[PointGroup]:
-    """Compare map points region by region; the best region takes a point that lies in several.
-
-    As in the paper, each region is cut separately, so an object across two regions becomes two objects.
-    """
-    is_voxel, extract = config.extract.method == "voxel", config.extract
-    # a voxel that intersects the sphere extends at most its diagonal beyond it
-    reach_m = np.sqrt(3.0) * extract.voxel_m if is_voxel else extract.distance_m
-    crops = Crops(merged, reach_m)
-    is_taken = {name: np.zeros(len(merged.map_of(name).points), np.bool_) for name in SESSIONS}
-    groups: list[PointGroup] = []
-    for region in np.flatnonzero(regions.is_reported).tolist():
-        spheres = crops.around(regions.centres_map[region], regions.radius_m)
-        for session, other in DIRECTIONS:
-            indices, points = spheres[session].inside
-            others = spheres[other].points
-            is_old = ~new_points_mask(points, others, extract) if is_voxel else is_within(points, others, reach_m)
-            new = np.flatnonzero(~is_old & ~is_taken[session][indices])
-            for members in cluster_inliers(points, new, config):
-                groups.append(PointGroup(session, indices[members], points[members], region))
-                is_taken[session][indices[members]] = True
-    return groups

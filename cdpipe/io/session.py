@@ -236,7 +236,7 @@ def read_session(path: Path) -> Session:
     try:
         require_poses("odom_T_sensor", poses)
     except ValueError as error:
-        raise InputError(f"{path / 'odometry.npz'}: {error}: mend the pose, or leave the scan out") from error
+        raise InputError(f"{path / 'odometry.npz'}: {error}: correct the pose, or remove the scan") from error
     sensor = parse_metadata(header.sensor, str(source))
     return Session(path, sensor, poses, header.chunk_scans, document["provenance"])
 

@@ -97,7 +97,7 @@ def require_unit_poses(poses: Float64Array, where: Callable[[int], str]) -> None
     """Raise `InputError` unless (N, 7) poses x, y, z, qx, qy, qz, qw are finite with unit quaternions."""
     is_finite = np.isfinite(poses).all(axis=1)
     if not is_finite.all():
-        raise InputError(f"{where(int(np.argmin(is_finite)))}: the pose is not finite: mend it or leave the scan out")
+        raise InputError(f"{where(int(np.argmin(is_finite)))}: the pose is not finite: correct it or remove the scan")
     norms = np.linalg.norm(poses[:, 3:], axis=1)
     is_unit = np.abs(norms - 1.0) < _UNIT_TOLERANCE
     if not is_unit.all():

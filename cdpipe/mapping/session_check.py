@@ -47,7 +47,7 @@ def check_session(source: ScanSource, config: MapConfig, other: ScanSource | Non
     try:
         require_poses("the pose of scan", poses)
     except ValueError as error:
-        raise InputError(f"{source.name}: {error}: mend it, or leave the scan out") from error
+        raise InputError(f"{source.name}: {error}: correct it, or remove the scan") from error
     if len(poses) < 2:
         raise InputError(
             f"{source.name}: {len(poses)} scan: expected a drive, at least two scans along a path: what one scan sees "

@@ -81,7 +81,8 @@ def find_candidates(before: MappedSession, after: MappedSession, config: MergeCo
             continue
         is_open &= ~agrees[pair]
         guess = _fit_common_motion(before_poses, after_poses, pairs.yaws_rad, agrees[pair], pair)
-        if any(_is_same(guess, other.before_T_after, after_poses[pair, :3, 3]) for other in chosen):
+        motions = [motion_between(guess, other.before_T_after, after_poses[pair, :3, 3]) for other in chosen]
+        if any(apart_m < _SAME_M and apart_rad < _YAW_RAD for apart_m, apart_rad in motions):
             continue
         chosen.append(Candidate(int(pairs.i[pair]), int(pairs.j[pair]), float(pairs.distances[pair]), guess))
         if len(chosen) == config.n_candidates:
@@ -123,11 +124,6 @@ def count_votes(
     agrees[one, other] = True
     votes: Float64Array = np.bincount(one, np.exp(-apart_m / _VOTE_REACH_M), len(yaws_rad)).astype(np.float64)
     return agrees, votes
-
-
-def _is_same(one: Float64Array, other: Float64Array, position: Float64Array) -> bool:
-    apart_m, apart_rad = motion_between(one, other, position)
-    return apart_m < _SAME_M and apart_rad < _YAW_RAD
 
 
 @dataclass(frozen=True, slots=True, eq=False)

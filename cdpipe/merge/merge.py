@@ -24,7 +24,6 @@ from cdpipe.merge.registration import (
     MIN_SPHERE_POINTS,
     IndexedMap,
     align_by_gicp,
-    eigenvalue_ratio,
     fit_rigid,
     motion_between,
     register,
@@ -292,4 +291,5 @@ def _hessian_ratio(walked: Walk) -> float:
     """Return the eigenvalue ratio of the translation's Hessian, summed over all places: one bend constrains all."""
     rotations = walked.before_T_after[:, :3, :3]
     hessians = rotations @ walked.information[:, 3:, 3:] @ rotations.transpose(0, 2, 1)
-    return eigenvalue_ratio(hessians.sum(axis=0))
+    eigenvalues = np.linalg.eigvalsh(hessians.sum(axis=0))
+    return float(eigenvalues[0] / eigenvalues[-1]) if eigenvalues[-1] > 0 else 0.0

@@ -238,12 +238,6 @@ def solve_point_to_plane(jacobian: Float64Array, distances_m: Float64Array, valu
     return np.linalg.solve(damped, weighted.T @ values_m)
 
 
-def eigenvalue_ratio(hessian: Float64Array) -> float:
-    """Return the ratio of the smallest to the largest eigenvalue of a symmetric (n, n) matrix; 0 for a zero matrix."""
-    eigenvalues = np.linalg.eigvalsh(hessian)
-    return float(eigenvalues[0] / eigenvalues[-1]) if eigenvalues[-1] > 0 else 0.0
-
-
 def fit_rigid(positions: Float64Array, dst_T_src: Float64Array) -> Float64Array:
     """Return the (4, 4) rigid transform that best fits several local transforms.
 

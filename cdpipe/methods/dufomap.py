@@ -16,6 +16,7 @@ import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array
 from cdpipe.core.threads import THREADS
+from cdpipe.extract.point_comparison import is_within
 from cdpipe.methods.whole_map import PlacedMaps, WholeMap
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.types import SessionName
@@ -41,7 +42,7 @@ def dufomap(maps: PlacedMaps, session: SessionName, other: SessionName, config: 
         (N,) mask of the points of `session`.
     """
     points = maps.points[session]
-    compared = np.flatnonzero(maps.is_comparable(points, other, config.query.radius_m))
+    compared = np.flatnonzero(is_within(points, maps.path[other], config.query.radius_m))
     point_map, points_odom = maps.merged.map_of(other), maps.merged.to_odom(other, points[compared])
     settings = config.dufomap
     void_map = load_dufomap().dufomap(settings.voxel_m, settings.hit_inflation_m, _UNKNOWN_VOXELS, THREADS)

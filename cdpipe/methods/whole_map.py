@@ -17,7 +17,7 @@ from cdpipe.core.grid_index import GridIndex
 from cdpipe.extract.crops import DIRECTIONS, SESSIONS
 from cdpipe.extract.extract import make_report, measure_regions
 from cdpipe.extract.objects import PointGroup, assemble_objects
-from cdpipe.extract.point_comparison import cluster_inliers
+from cdpipe.extract.point_comparison import cluster_inliers, is_within
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.report import ChangeRegions, ChangeReport
 from cdpipe.model.types import DescriptorSet, MergedMaps, SessionName
@@ -38,10 +38,6 @@ class PlacedMaps:
     merged: MergedMaps
     points: dict[SessionName, Float64Array]
     path: dict[SessionName, Float64Array]
-
-    def is_comparable(self, points: Float64Array, other: SessionName, radius_m: float) -> BoolArray:
-        """(N,) whether the session `other` passed within `radius_m` of each of (N, 3) points, map frame."""
-        return query_nearest(points, self.path[other])[0] <= radius_m
 
 
 NewMask = Callable[[PlacedMaps, SessionName, SessionName, PipelineConfig], BoolArray]
@@ -76,13 +72,16 @@ class WholeMap:
             config: `outlier`, `cluster` and `query` are used, and whatever `new_mask` uses.
         """
         start = perf_counter()
-        maps = place_maps(merged, before, after)
+        before_path, after_path = merged.keyframe_positions(before, after)
+        clouds = {name: merged.to_map(name, merged.map_of(name).points) for name in SESSIONS}
+        maps = PlacedMaps(merged, clouds, {"before": before_path, "after": after_path})
+        radius_m = config.query.radius_m
         groups: list[PointGroup] = []
         is_changed: dict[SessionName, BoolArray] = {}
         for session, other in DIRECTIONS:
             points = maps.points[session]
             new = np.flatnonzero(self.new_mask(maps, session, other, config))
-            new = new[maps.is_comparable(points[new], other, config.query.radius_m)]
+            new = new[is_within(points[new], maps.path[other], radius_m)]
             found = cluster_inliers(points, new, config)
             groups += [PointGroup(session, indices, points[indices], -1) for indices in found]
             is_changed[session] = np.zeros(len(points), dtype=np.bool_)
@@ -94,19 +93,13 @@ class WholeMap:
         objects = assemble_objects(merged, answered)
         end = perf_counter()
         seconds = {"t_cd_s": compared - start, "t_oe_s": end - compared, "t_returns_s": end - grouped}
-        regions = replace(regions, keyframe_scores=_changed_share(maps, is_changed, config))
+        marked = [(points, is_changed[session]) for session, points in maps.points.items()]
+        scores = marked_share(marked, before_path, radius_m)
+        scores[~is_within(before_path, after_path, config.query.max_pair_m)] = np.nan
+        regions = replace(regions, keyframe_scores=scores)
         index = GridIndex(maps.points["after"])
         figures = measure_regions(regions, answered, index.points_within)
         return make_report(merged, (before, after), regions, objects, figures, seconds, config)
-
-
-def place_maps(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet) -> PlacedMaps:
-    """Return the maps and keyframe positions of both sessions in the map frame."""
-    before_path, after_path = merged.keyframe_positions(before, after)
-    points: dict[SessionName, Float64Array] = {
-        name: merged.to_map(name, merged.map_of(name).points) for name in SESSIONS
-    }
-    return PlacedMaps(merged, points, {"before": before_path, "after": after_path})
 
 
 def _cluster_regions(groups: Sequence[PointGroup], maps: PlacedMaps, config: PipelineConfig) -> ChangeRegions:
@@ -138,11 +131,3 @@ def _in_reported_regions(
 
 def _centroids(groups: Sequence[PointGroup]) -> Float64Array:
     return np.array([group.points_map.mean(axis=0) for group in groups], dtype=np.float64).reshape(-1, 3)
-
-
-def _changed_share(maps: PlacedMaps, is_changed: dict[SessionName, BoolArray], config: PipelineConfig) -> Float64Array:
-    """Return the (K,) changed share around each before keyframe; NaN where the after session never came near."""
-    clouds = [(points, is_changed[session]) for session, points in maps.points.items()]
-    scores = marked_share(clouds, maps.path["before"], config.query.radius_m)
-    gaps_m, _ = query_nearest(maps.path["before"], maps.path["after"])
-    return np.where(gaps_m <= config.query.max_pair_m, scores, np.nan)

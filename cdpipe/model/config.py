@@ -36,7 +36,7 @@ class MapConfig(Settings):
     """From scans to a thinned map and keyframes."""
 
     voxel_m: Cell = Field(0.2, description="cell of the thinned map")
-    max_range_m: Positive = Field(60.0, description="returns beyond are not mapped")
+    max_range_m: Positive = Field(60.0, description="returns beyond this range are not mapped")
     keyframe_spacing_m: Positive = Field(1.0, description="path between keyframes")
 
 
@@ -58,12 +58,12 @@ class MergeConfig(Settings):
     n_candidates: Count = Field(4, description="hypotheses tried by `voting`")
     sphere_radius_m: Positive = Field(10.0, description="submap around a pair (FRAME: 10 m)")
     voxel_m: Cell = Field(0.4, description="thinning of a sphere before it is registered")
-    seen_within_m: Positive = Field(15.0, description="map points that were only seen from farther are left out")
+    seen_within_m: Positive = Field(15.0, description="map points seen only from farther away are not used")
     target_voxel_m: Cell = Field(0.3, description="thinning of the before map, which the spheres are registered to")
     coarse_voxel_m: Cell = Field(0.8, description="the same while hypotheses are tried")
     gicp_correspondence_m: Positive = Field(3.0, description="FRAME: 3 m")
     vgicp_correspondence_m: Positive = Field(1.0, description="FRAME: 1 m")
-    inlier_m: Positive = Field(0.1, description="a point this near the other map's surface is an inlier")
+    inlier_m: Positive = Field(0.1, description="a point within this distance of the other map's surface is an inlier")
     min_overlap: Share = Field(0.15, description="accept at least this share of the shorter path beside the other")
     min_inlier_share: Share = Field(0.85, description="accept at least this share of inliers in the sphere")
     min_hessian_ratio: Share = Field(0.015, description="smallest to largest translational eigenvalue: degeneracy")
@@ -71,8 +71,8 @@ class MergeConfig(Settings):
     min_distinctness: Annotated[float, Field(ge=1)] = Field(
         1.3, description="accept if any other alignment that fits has a residual this many times larger"
     )
-    accept_all: bool = Field(False, description="accept whatever was found, as FRAME does")
-    fallback: bool = Field(True, description="where nothing is accepted, let KISS-Matcher (extra `kiss`) try")
+    accept_all: bool = Field(False, description="accept every alignment, as FRAME does")
+    fallback: bool = Field(True, description="if nothing is accepted, try KISS-Matcher (extra `kiss`)")
     kiss_voxel_m: Cell = Field(0.6, description="cell of KISS-Matcher")
     refine: Literal["none", "local"] = Field("local", description="align again every few metres along the overlap")
 
@@ -81,7 +81,7 @@ class QueryConfig(Settings):
     """From descriptors to changed regions: inverted query, threshold, suppression."""
 
     compare: Literal["scan", "sphere", "difference"] = Field(
-        "scan", description="scan descriptors; sphere descriptors of both maps; or, by hand, the spheres' points"
+        "scan", description="scan descriptors; sphere descriptors; or the points of both maps, without learning"
     )
     reading: Literal["nearest", "paired"] = Field(
         "nearest", description="A: nearest in descriptor space; B: the same place after alignment"
@@ -99,7 +99,7 @@ class ExtractConfig(Settings):
     method: Literal["surface", "voxel", "nearest"] = Field(
         "surface", description="distance from the other session's surface; the paper's voxels; or the nearest point's"
     )
-    withdraw: bool = Field(True, description="take regions back in which nothing is found")
+    withdraw: bool = Field(True, description="withdraw regions in which no object is found")
     voxel_m: Cell = Field(0.65, description="`voxel`: size (paper: 0.65)")
     min_points: Count = Field(1, description="`voxel`: points that make a voxel occupied")
     origin_m: float = Field(0.0, ge=-1000, le=1000, description="`voxel`: offset of the grid along every axis")
@@ -107,15 +107,15 @@ class ExtractConfig(Settings):
         0.3, description="`nearest`, `c2c`, `m3c2`: a point farther than this from the other cloud is new"
     )
     realign: bool = Field(True, description="`surface`: align each sphere once more before comparing")
-    seed_m: Positive = Field(0.12, description="`surface`: an object somewhere stands this clear of the surface")
+    seed_m: Positive = Field(0.12, description="`surface`: an object has cells at least this far from the surface")
     border_m: Positive = Field(
-        0.04, description="`surface`: and ends where it stands less clear than this, or than 5 times the noise there"
+        0.04, description="`surface`: its other cells are this far from it, or 5 times the local noise if that is more"
     )
     min_cells: Count = Field(
-        30, description="`surface`: cells of 0.05 m that stand so clear and were seen through, at least"
+        30, description="`surface`: fewest cells of 0.05 m that are `seed_m` from the surface and were seen through"
     )
     min_views: Positive = Field(
-        2.5, description="`surface`: keyframes by which an object was seen through, less those that hit it, in the mean"
+        2.5, description="`surface`: least mean number of keyframes that saw through a cell, minus those that hit it"
     )
 
 
@@ -136,17 +136,17 @@ class ClusterConfig(Settings):
 class M3C2Config(Settings):
     """Distances along normals (M3C2)."""
 
-    normal_m: Positive = Field(1.0, description="`m3c2`: radius of the plane a point's normal is taken from")
+    normal_m: Positive = Field(1.0, description="`m3c2`: radius within which a point's normal is estimated")
     cylinder_m: Positive = Field(0.25, description="`m3c2`: radius of the cylinder along the normal")
-    depth_m: Positive = Field(1.5, description="`m3c2`: how far the cylinder reaches to either side")
+    depth_m: Positive = Field(1.5, description="`m3c2`: length of the cylinder to either side")
 
 
 class DufomapConfig(Settings):
     """Voxels that rays passed through (DUFOMap)."""
 
     voxel_m: Cell = Field(0.1, description="`dufomap`: voxel of the void map")
-    hit_inflation_m: NonNegative = Field(0.2, description="`dufomap`: no void this near in front of a return (d_s)")
-    every_scan: Count = Field(1, description="`dufomap`: every n-th scan's rays are cast")
+    hit_inflation_m: NonNegative = Field(0.2, description="`dufomap`: not void within this distance of a return (d_s)")
+    every_scan: Count = Field(1, description="`dufomap`: the rays of every n-th scan are cast")
 
 
 class PipelineConfig(Settings):

@@ -23,7 +23,7 @@ import small_gicp
 from scipy.spatial import cKDTree
 
 from cdpipe.core.errors import MergeFailedError
-from cdpipe.core.geometry import Float64Array, invert, make_pose, transform
+from cdpipe.core.geometry import Float64Array, invert, make_pose, transform, transform_each
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import describe_scans, use_threads
 from cdpipe.mapping.mapping import build_map
@@ -170,9 +170,9 @@ class MergeSite:
         """Return the median distance of the after keyframes from their true places, metres."""
         before, after = self.sessions
         positions = after.mapped.map.odom_T_keyframe[:, :3, 3]
-        places_before = _moved(before.world_T_odom, before.mapped.map.odom_T_keyframe[:, :3, 3])
-        _, nearest = cKDTree(places_before).query(_moved(after.world_T_odom, positions))
-        true = _moved(invert(before.world_T_odom[nearest]) @ after.world_T_odom, positions)
+        places_before = transform_each(before.world_T_odom, before.mapped.map.odom_T_keyframe[:, :3, 3])
+        _, nearest = cKDTree(places_before).query(transform_each(after.world_T_odom, positions))
+        true = transform_each(invert(before.world_T_odom[nearest]) @ after.world_T_odom, positions)
         return float(np.median(np.linalg.norm(transform(before_T_after, positions) - true, axis=1)))
 
     @cached_property
@@ -267,7 +267,3 @@ class _ScansInMemory(WrappedScans):
 
     def scans(self) -> Iterator[PosedScan]:
         return iter(self._scans.values())
-
-
-def _moved(dst_T_src: Float64Array, points: Float64Array) -> Float64Array:
-    return np.asarray(np.einsum("nij,nj->ni", dst_T_src[:, :3, :3], points) + dst_T_src[:, :3, 3])

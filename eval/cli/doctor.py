@@ -15,6 +15,7 @@ import tempfile
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Literal
@@ -106,7 +107,8 @@ def _package(requirement: str) -> Finding:
     if _numbers(version) < _numbers(lowest):
         told = f"{version} is older than {lowest}"
         return Finding(name, "broken", told, True, f"pip install --upgrade '{requirement}'")
-    return _tried(name, _check_of(name), f"pip install --force-reinstall '{requirement}'", f"{version}")
+    check = doctor_checks.OF_PACKAGE.get(name, partial(_import, name))
+    return _tried(name, check, f"pip install --force-reinstall '{requirement}'", version)
 
 
 def _extra(extra: str, requirements: Sequence[str]) -> Finding:
@@ -133,19 +135,13 @@ def _tried(what: str, check: Callable[[], str], mend: str, told: str = "", *, is
     return Finding(what, "ok", "; ".join(part for part in (told, found) if part), is_required)
 
 
-def _check_of(name: str) -> Callable[[], str]:
-    """Return the check of a package; for a package without a check of its own, importing it."""
-
-    def imported() -> str:
-        importlib.import_module(_MODULES.get(name, name.replace("-", "_")))
-        return ""
-
-    return doctor_checks.OF_PACKAGE.get(name, imported)
+def _import(name: str) -> str:
+    importlib.import_module(_MODULES.get(name, name.replace("-", "_")))
+    return ""
 
 
 def _name(requirement: str) -> str:
-    match = re.match(r"[\w.-]+", requirement)
-    return match[0] if match else requirement
+    return re.split(r"[^\w.-]", requirement)[0]
 
 
 def _numbers(version: str) -> tuple[int, ...]:

@@ -40,15 +40,14 @@ def print_results(folder: Path, quiet: bool) -> None:
     shown = [name for name in _SHOWN if name in results.columns and results[name].notna().any()]
     print_table("means over pairs", counts.join(groups[shown].mean()).reset_index())
     cases = zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
-    is_told = (folder / "provenance.json").is_file()
-    provenance = RunFolder(folder).provenance() if is_told else {}
+    provenance = RunFolder(folder).stored_provenance()
     covered = measure_coverage(provenance, cases)
     targets = merge_overview(results, read_targets(provenance), is_whole=covered.is_whole)
     if not covered.is_whole:
         typer.echo(f"{covered.sentence}\n")
     if len(targets):
         print_table("merge: share of the pairs within the target of their kind, with its 95 % interval", targets)
-    for line in list_incomplete_variants(provenance, results) if is_told else []:
+    for line in list_incomplete_variants(provenance, results):
         typer.echo(f"note: {line}\n")
     if (folder / "regions_table.csv").is_file():
         _region_results(folder)

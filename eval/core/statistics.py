@@ -148,19 +148,16 @@ def _summary(
 ) -> dict[str, Any]:
     statistic = statistic_of(metric)
     low, high = bootstrap_interval(values, statistic, seed)
+    average = median if statistic == "median" else mean
     return {
         "statistic": statistic,
-        "value": _of_numbers(values, statistic),
+        "value": average(values),
         "low": low,
         "high": high,
-        "value_ok": _of_numbers(values[is_ok], statistic),
+        "value_ok": average(values[is_ok]),
         "n_used": int(np.count_nonzero(~np.isnan(values))),
         "n_used_ok": int(np.count_nonzero(~np.isnan(values[is_ok]))),
     }
-
-
-def _of_numbers(values: Float64Array, statistic: Statistic) -> float:
-    return mean(values) if statistic == "mean" else median(values)
 
 
 def _pooled(keyframes: pd.DataFrame) -> list[dict[str, Any]]:

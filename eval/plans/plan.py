@@ -104,19 +104,14 @@ def _find_unknown_worlds(plan: Plan) -> Iterator[InitErrorDetails]:
                 rule = f"scenarios of {variant.preset} names {name!r}, which is no world of the plan"
                 yield _mistake(("variants", place, "scenarios", index), name, rule + suggest(name, labels))
     known = dict.fromkeys(name for world in worlds for name in (world.name, world.label))
-    asked: list[tuple[tuple[str | int, ...], str, str]] = [
-        (("wide", index), "wide", name) for index, name in enumerate(plan.wide)
-    ]
+    asked: list[tuple[tuple[str | int, ...], str, str]]
+    asked = [(("wide", index), "wide", name) for index, name in enumerate(plan.wide)]
     for place, variant in enumerate(plan.variants):
-        asked += [
-            (("variants", place, "per_scenario", name), f"per_scenario of {variant.preset}", name)
-            for name in variant.per_scenario
-        ]
+        who = f"per_scenario of {variant.preset}"
+        asked += [(("variants", place, "per_scenario", name), who, name) for name in variant.per_scenario]
     for place, grid in enumerate(plan.grid):
-        asked += [
-            (("grid", place, "scenarios", index), f"the grid of {grid.variant}", name)
-            for index, name in enumerate(grid.scenarios)
-        ]
+        who = f"the grid of {grid.variant}"
+        asked += [(("grid", place, "scenarios", index), who, name) for index, name in enumerate(grid.scenarios)]
     for where, who, name in asked:
         if name not in known:
             yield _mistake(where, name, f"{who} names {name!r}, which is not in scenarios{suggest(name, known)}")

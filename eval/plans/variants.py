@@ -72,16 +72,8 @@ class Method:
 
     def cell(self, world: World, seed: int, config: PipelineConfig, until: Until | None) -> Cell:
         """Return its cell for one seed of a world."""
-        return Cell(
-            scenario=world.label,
-            seed=seed,
-            preset=_strip_suffix(self.preset),
-            variant=self.variant,
-            config=config,
-            oracle=self.oracle,
-            until=until,
-            oracle_regions=self.oracle_regions,
-        )
+        preset = _strip_suffix(self.preset)
+        return Cell(world.label, seed, preset, self.variant, config, self.oracle, until, self.oracle_regions)
 
 
 def name_variant(

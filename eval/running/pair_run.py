@@ -60,13 +60,9 @@ class Pair:
 
     Attributes:
         name: Label of the world.
-        family: Its scenario's.
         kind: What the plan calls such pairs, or "".
-        seed: The seed.
-        scenario: The drawn scenario, None where the seed draws none.
+        scenario: The drawn scenario; None where the seed draws none, and `error` says why.
         files: Digests of the files that the scenario names.
-        error: Why the scenario cannot be drawn.
-        todo: Its cells.
     """
 
     name: str

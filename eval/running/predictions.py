@@ -9,7 +9,7 @@ variants. A pair that the program could not do gets an answer.json of status `fa
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +63,12 @@ def add_predictions(run: RunFolder, folder: Path, name: str, progress: RunProgre
         raise InputError("\n".join(mistakes))
     for pair, document in documents.items():
         scenario, seed = document["row"]["scenario"], int(pair.name)
-        _copy(found[pair], run.answer(scenario, seed, name))
+        answer = run.answer(scenario, seed, name)
+        remove(answer)
+        answer.mkdir(parents=True)
+        for file in _FILES:
+            if (found[pair] / file).is_file():
+                shutil.copyfile(found[pair] / file, answer / file)
         write_json(run.cell(scenario, seed, name), document)
     progress.cells("done", len(documents), len(documents))
     write_tables(run)
@@ -113,7 +118,10 @@ def _matched(run: RunFolder, folder: Path, pairs: Sequence[Path]) -> dict[Path, 
             mistakes.append(f"{' and '.join(map(str, sorted(places)))}: two predictions for one pair: leave one out")
         known |= places
         found.update((pair, place) for place in places)
-    mistakes += _strangers(folder, given - known, list(wanted.values()))
+    names = list(wanted.values())
+    for place in sorted(given - known):
+        near = suggest(str(place.relative_to(folder)), names)
+        mistakes.append(f"{place}: the run has no such pair{near or f'; it has {_listed(names)}'}")
     if missing := [name for pair, name in wanted.items() if pair not in found]:
         mistakes.append(
             f"{folder}: no prediction for {_listed(missing)} of {run.path}: write "
@@ -122,12 +130,6 @@ def _matched(run: RunFolder, folder: Path, pairs: Sequence[Path]) -> dict[Path, 
     if mistakes:
         raise InputError("\n".join(mistakes))
     return found
-
-
-def _strangers(folder: Path, places: set[Path], names: Sequence[str]) -> Iterator[str]:
-    for place in sorted(places):
-        name = str(place.relative_to(folder))
-        yield f"{place}: the run has no such pair{suggest(name, names) or f'; it has {_listed(names)}'}"
 
 
 def _require_free(run: RunFolder, name: str) -> None:
@@ -150,14 +152,6 @@ def _require_current(run: RunFolder) -> None:
             f"{run.path}: has rows of metrics version {told}, but predictions are scored by {METRICS_VERSION}: "
             f"`tunnelcd score {run.path}` first, which scores all of it again"
         )
-
-
-def _copy(prediction: Path, answer: Path) -> None:
-    remove(answer)
-    answer.mkdir(parents=True)
-    for file in _FILES:
-        if (prediction / file).is_file():
-            shutil.copyfile(prediction / file, answer / file)
 
 
 def _listed(names: Sequence[str]) -> str:

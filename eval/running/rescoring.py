@@ -43,7 +43,7 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
         InputError: An answer is damaged, or its pair has no truth.
     """
     progress = progress or Silent()
-    folders = list(run.answer_folders())
+    folders = sorted(file.parent for file in run.path.glob("answers/*/*/*/answer.json"))
     documents: dict[Path, dict[str, Any]] = {}
     place: Sequence[int]
     for (slug, seed), group in groupby(folders, key=lambda folder: folder.parts[-3:-1]):
@@ -55,9 +55,9 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
                 identity = foreign_identity(run, slug, seed, folder.name)
                 key, place = NO_KEY, LAST
             else:
-                identity = {name: stored["row"].get(name) for name in (*IDENTITY, "preset", "commit")}
-                identity["pair_kind"] = stored["row"].get("pair_kind", "")
-                identity["is_contended"] = stored["row"].get("is_contended", False)
+                row = {"pair_kind": "", "is_contended": False, **stored["row"]}  # older cells lack these two
+                names = (*IDENTITY, "preset", "commit", "pair_kind", "is_contended")
+                identity = {name: row.get(name) for name in names}
                 key, place = stored["key"], stored["order"]
             progress.cells("{scenario} {seed} {variant}".format(**identity), len(documents), len(folders))
             documents[path] = cell_document(score_stored(truth, folder), identity, key, place)

@@ -14,7 +14,7 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
-from eval.core.statistics import bootstrap_interval, statistic_of
+from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
 from eval.core.tablefile import table_file
 from eval.plans.coverage import Coverage, measure_coverage
 from eval.plans.targets import read_targets
@@ -140,9 +140,7 @@ def defined(rows: Iterable[Row], column: str) -> Float64Array:
 def over_pairs(rows: Iterable[Row], column: str) -> float:
     """Return the mean of the defined values of a column, their median for times; NaN where there is none."""
     values = defined(rows, column)
-    if len(values) == 0:
-        return math.nan
-    return float(np.median(values) if statistic_of(column) == "median" else values.mean())
+    return median(values) if statistic_of(column) == "median" else mean(values)
 
 
 def interval_over_pairs(rows: Iterable[Row], column: str) -> tuple[float, float]:

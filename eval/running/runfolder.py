@@ -80,10 +80,6 @@ class RunFolder:
         cells = (self.read_cell(path) for path in sorted(self.path.glob("cells/*/*/*.json")))
         return [cell for cell in cells if cell is not None]
 
-    def answer_folders(self) -> Iterator[Path]:
-        """Yield the folder of every stored answer, sorted."""
-        yield from sorted(file.parent for file in self.path.glob("answers/*/*/*/answer.json"))
-
     def read_cell(self, path: Path) -> dict[str, Any] | None:
         """Read a finished cell; None where there is none, or what is there was cut short."""
         document = read_json(path)
@@ -106,9 +102,9 @@ class RunFolder:
             raise InputError(f"{path}: not written by {TOOL}: name a run folder made by `{TOOL} run`")
         return document
 
-    def write_provenance(self, document: Mapping[str, Any]) -> None:
-        """Write provenance.json."""
-        write_json(self.path / "provenance.json", document)
+    def stored_provenance(self) -> dict[str, Any]:
+        """Read provenance.json; {} where there is none."""
+        return self.provenance() if (self.path / "provenance.json").is_file() else {}
 
 
 def start_run_folder(path: Path) -> RunFolder:
@@ -173,7 +169,7 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     _write_csv(run.path / "summary.csv", summarise(results, keyframes=items["keyframes"]))
     tables = {
         "effects": effects(results),
-        "merge": merge_table(results, read_targets(_provenance(run))),
+        "merge": merge_table(results, read_targets(run.stored_provenance())),
         **_report_tables(run, results, items),
     }
     for name, found in tables.items():
@@ -225,7 +221,7 @@ def _report_tables(
 ) -> Mapping[str, pd.DataFrame]:
     """Return the tables that the plan asks for, and empty ones for those that it does not."""
     tables = {name: pd.DataFrame() for name in (*REGION_FILES, *OBJECT_FILES)}
-    provenance = _provenance(run)
+    provenance = run.stored_provenance()
     subjects, targets = reported(provenance), read_targets(provenance)
     if not subjects or "region_auroc" not in results:
         return tables
@@ -236,10 +232,6 @@ def _report_tables(
     if "objects" in subjects:
         tables |= object_tables(results, items["changes"], targets, is_whole=is_whole)
     return tables
-
-
-def _provenance(run: RunFolder) -> Mapping[str, Any]:
-    return run.provenance() if (run.path / "provenance.json").is_file() else {}
 
 
 def read_json(path: Path) -> dict[str, Any]:

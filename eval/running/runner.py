@@ -27,7 +27,7 @@ from eval.plans.variants import Cell
 from eval.plans.worlds import list_worlds
 from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Todo, Tools, cell_key, is_finished, pair_lock
 from eval.running.run_workers import remove_traces, run_on_workers
-from eval.running.runfolder import RunFolder, current_results, remove, write_tables
+from eval.running.runfolder import RunFolder, current_results, remove, write_json, write_tables
 from scenarios.references import file_digests
 from sim.session.truth import read_pair_truth
 
@@ -80,12 +80,11 @@ def run_plan(
     _require_extras(chosen)
     _tell_idle(where, len(chosen), progress)
     made = Made(provenance["git_commit"])
-    earlier = run.provenance() if (run.path / "provenance.json").is_file() else {}
-    results = None if n_todo else current_results(run, earlier, provenance)
+    results = None if n_todo else current_results(run, run.stored_provenance(), provenance)
     # an unusable cluster is reported before anything is written
     with nullcontext() if where == HERE or not chosen else connected(where, len(chosen)) as client:
         if results is None:
-            run.write_provenance(provenance)
+            write_json(run.path / "provenance.json", provenance)
         remove_traces(run)
         # cells left by --limit may be stale too; no table may hold them
         for pair in pairs:
@@ -97,7 +96,7 @@ def run_plan(
     progress.cells("done", n_run, n_run)
     if results is None:
         results = write_tables(run)
-        run.write_provenance({**provenance, "finished": tools.now()})
+        write_json(run.path / "provenance.json", {**provenance, "finished": tools.now()})
     n_died = int((results["status"] == "worker_died").sum())
     return RunOutcome(n_run, len(all_cells) - n_todo, n_todo - n_run, n_died)
 

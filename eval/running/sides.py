@@ -20,12 +20,7 @@ _MAX_NAMED = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Side:
-    """One side of a comparison.
-
-    Attributes:
-        data: Its run.
-        variant: The only variant that is compared, "" for all of them.
-    """
+    """One side of a comparison: its run, and the only variant that is compared, "" for all of them."""
 
     data: RunData
     variant: str = ""

@@ -65,24 +65,21 @@ class StageCache:
 
     def find(self, name: str) -> Kept | None:
         """Return the result of a name; None where there is none or it is damaged."""
-        kept = self._held.get(name)
-        if kept is None and self._folder is not None:
-            kept = _read(self._folder / f"{name}.npz")
-            if kept is not None:
-                self._hold(name, kept)
+        if name in self._held or self._folder is None:
+            return self._held.get(name)
+        kept = _read(self._folder / f"{name}.npz")
+        if kept is not None and not _is_maps(name):
+            self._held[name] = kept
         return kept
 
     def keep(self, name: str, kept: Kept) -> None:
         """Keep a result; one that cannot be written is computed again by the next process."""
-        self._hold(name, kept)
+        if not _is_maps(name):
+            self._held[name] = kept
         if self._folder is None or (_is_maps(name) and _maps_bytes(self._folder) >= MAPS_BYTES):
             return
         with suppress(OSError), whole_file(self._folder / f"{name}.npz") as partial:
             _write(partial, kept)
-
-    def _hold(self, name: str, kept: Kept) -> None:
-        if not _is_maps(name):
-            self._held[name] = kept
 
 
 def open_cache(folder: Path, sessions: tuple[Path, Path]) -> StageCache:

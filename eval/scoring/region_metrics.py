@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform_each
 from cdpipe.model.report import ChangeReport
 from eval.core.ranking import auroc, average_precision
 from eval.truth.ground_truth import GroundTruth, SessionTruth
@@ -47,22 +47,16 @@ def transform_to_world(centres_map: Float64Array, before: SessionTruth, keyframe
 
     The map frame is the before session's odom frame, which drifts against the world, so one transform is not enough.
     """
-    if len(centres_map) == 0:
-        return np.zeros((0, 3))
-    tree = cKDTree(before.odom_T_sensor[keyframe_scans, :3, 3])
-    _, nearest = tree.query(centres_map)
+    _, nearest = cKDTree(before.odom_T_sensor[keyframe_scans, :3, 3]).query(centres_map)
     return before.to_world(centres_map, keyframe_scans[nearest])
 
 
 def transform_to_map(places_world: Float64Array, before: SessionTruth, keyframe_scans: Int64Array) -> Float64Array:
     """Transform (N, 3) true places into the map frame, each by the true pose of the keyframe truly nearest to it."""
-    if len(places_world) == 0:
-        return np.zeros((0, 3))
     world_T_keyframe = before.world_T_sensor[keyframe_scans]
     _, nearest = cKDTree(world_T_keyframe[:, :3, 3]).query(places_world)
     map_T_world = before.odom_T_sensor[keyframe_scans[nearest]] @ invert(world_T_keyframe[nearest])
-    moved = np.einsum("nij,nj->ni", map_T_world[:, :3, :3], places_world) + map_T_world[:, :3, 3]
-    return np.asarray(moved, dtype=np.float64)
+    return transform_each(map_T_world, places_world)
 
 
 def match_regions(
@@ -219,16 +213,15 @@ def _count_found(matches: RegionMatches, truth: GroundTruth) -> int:
 
 def score_unanswered_regions(n_changes: int, n_observable: int) -> RegionScores:
     """Return the scores of a case without an answer: recall 0; rates over reported regions are NaN."""
-    nan = float("nan")
-    recall = 0.0 if n_observable else nan
-    undefined = ("region_precision", "region_auroc", "region_ap", "false_regions_per_100m", "region_coverage")
-    rates = dict.fromkeys((*undefined, "region_precision_proposed", "false_regions_per_100m_proposed"), nan)
-    outcomes = ("true_regions", "false_regions", "duplicate_regions", "ignored_regions")
-    counts = ("regions", "withdrawn", *outcomes, "found_changes")
-    columns = {
-        **dict.fromkeys(("region_recall", "region_recall_at_k"), recall),
-        **dict.fromkeys(("region_recall_proposed", "region_recall_at_k_proposed"), recall),
-        **rates,
-        **dict.fromkeys((f"n_{name}" for name in counts), 0),
-    }
+    recalls = ("region_recall", "region_recall_at_k", "region_recall_proposed", "region_recall_at_k_proposed")
+    rates = (
+        "region_precision", "region_auroc", "region_ap", "false_regions_per_100m", "region_coverage",
+        "region_precision_proposed", "false_regions_per_100m_proposed",
+    )  # fmt: skip
+    counts = (
+        "n_regions", "n_withdrawn", "n_true_regions", "n_false_regions", "n_duplicate_regions", "n_ignored_regions",
+        "n_found_changes",
+    )  # fmt: skip
+    recall = 0.0 if n_observable else float("nan")
+    columns = {**dict.fromkeys(recalls, recall), **dict.fromkeys(rates, float("nan")), **dict.fromkeys(counts, 0)}
     return RegionScores(columns, RegionMatches((), (), np.full(n_changes, -1)), np.zeros(0, dtype=np.int64))

@@ -6,13 +6,17 @@ scored again whenever the metrics change, and so can an answer that another prog
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, travelled_m
+from cdpipe.core.plugins import METRICS, entry_points, load_entry_point
 from cdpipe.extract.extract import FIGURES, hull_volume_m3
 from cdpipe.io.answer import Answer, read_answer
 from cdpipe.model.report import ChangedObject, ChangeReport
@@ -29,12 +33,13 @@ from eval.scoring.object_metrics import (
     summarise_objects,
 )
 from eval.scoring.object_sizes import SizeErrors, compute_size_errors, summarise_size_errors
-from eval.scoring.plugins import compute_plugin_columns
 from eval.scoring.region_metrics import RegionScores, choose_judged_scans, score_regions, score_unanswered_regions
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
 METRICS_VERSION = 4
 _NAN = float("nan")
+Metric = Callable[[GroundTruth, Answer], Mapping[str, float]]
+"""`metric(truth, answer)`: columns by name; NaN where undefined. `answer.report` is None where a method gave none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,6 +133,31 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
             for index, (score, label) in enumerate(zip(keyframe_scores, regions.keyframe_labels, strict=True))
         ],
     )
+
+
+def compute_plugin_columns(truth: GroundTruth, answer: Answer, taken: Mapping[str, object]) -> dict[str, float]:
+    """Return the columns of every metric of others, an entry point of the group `tunnelcd.metrics` (HOWTO.md).
+
+    Args:
+        truth: The pair's truth.
+        answer: What a method answered.
+        taken: Columns that the row has already.
+
+    Raises:
+        InputError: A metric cannot be imported, gives no numbers, or a column that the row has already.
+    """
+    columns: dict[str, float] = {}
+    for name in entry_points(METRICS):
+        metric: Metric = load_entry_point(METRICS, name)
+        for column, value in metric(truth, answer).items():
+            if column in taken or column in columns:
+                raise InputError(f"{METRICS}: {name!r}: column {column!r} exists already: give it another name")
+            if not isinstance(value, Real):
+                raise InputError(
+                    f"{METRICS}: {name!r}: column {column!r} = {value!r}: expected a number, NaN if undefined"
+                )
+            columns[column] = float(value)
+    return columns
 
 
 def make_change_rows(

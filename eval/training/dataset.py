@@ -7,7 +7,7 @@ frame and a rotation about the anchor, each component normal, drawn from (seed, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -29,7 +29,7 @@ from cdpipe.training.shard import CHANGE_KINDS, FORMAT_VERSION, encode_shard, sp
 from eval.core.provenance import digest
 from eval.oracles.merge import OracleMerge, merged_by_truth
 from eval.scoring.merge_metrics import PAIR_RADIUS_M
-from eval.scoring.region_metrics import label_keyframes
+from eval.scoring.region_metrics import label_keyframes, transform_to_map
 from eval.truth.adapters import WrappedScans, held_input
 from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth, ground_truth
 from eval.truth.universe import UniverseBuilder
@@ -111,7 +111,7 @@ def make_shard(family: str, seed: int, recipe: Recipe) -> bytes:
         **_render_images(before, after, merged.alignment.to_map(after.map.points), truth, recipe, seed),
         **_find_places(before, after, truth),
         **_list_changes(before, truth),
-        **_prefix_names("draw", draw_merge_errors(recipe, seed)),
+        **{f"draw_{name}": array for name, array in draw_merge_errors(recipe, seed).items()},
     }
     about = {
         "family": family,
@@ -299,26 +299,16 @@ def _find_places(before: _Mapped, after: _Mapped, truth: GroundTruth) -> Arrays:
 
 def _list_changes(before: _Mapped, truth: GroundTruth) -> Arrays:
     changes, centroids = truth.pair.changes, truth.centroids_world
-    scans = before.map.keyframe_scans
-    world_T_keyframe, odom_T_keyframe = before.truth.world_T_sensor[scans], before.map.odom_T_keyframe
-    _, nearest = cKDTree(world_T_keyframe[:, :3, 3]).query(centroids)
-    odom_T_world = odom_T_keyframe[nearest] @ invert(world_T_keyframe[nearest])
-    in_odom = np.einsum("nij,nj->ni", odom_T_world[:, :3, :3], centroids) + odom_T_world[:, :3, 3]
-    table: Arrays = {
-        "ids": np.array([change.id for change in changes], dtype=np.int64),
-        "session": np.array([SESSIONS.index(change.session) for change in changes], dtype=np.uint8),
-        "kind": np.array([CHANGE_KINDS.index(change.kind) for change in changes], dtype=np.uint8),
-        "is_partial": truth.is_partial,
-        "is_observable": truth.is_observable,
-        "n_cells": np.array([len(rows) for rows in truth.change_rows], dtype=np.int64),
-        "centroid_world": centroids,
-        "centroid_odom": np.asarray(in_odom, dtype=np.float64),
+    return {
+        "change_ids": np.array([change.id for change in changes], dtype=np.int64),
+        "change_session": np.array([SESSIONS.index(change.session) for change in changes], dtype=np.uint8),
+        "change_kind": np.array([CHANGE_KINDS.index(change.kind) for change in changes], dtype=np.uint8),
+        "change_is_partial": truth.is_partial,
+        "change_is_observable": truth.is_observable,
+        "change_n_cells": np.array([len(rows) for rows in truth.change_rows], dtype=np.int64),
+        "change_centroid_world": centroids,
+        "change_centroid_odom": transform_to_map(centroids, before.truth, before.map.keyframe_scans),
     }
-    return _prefix_names("change", table)
-
-
-def _prefix_names(prefix: str, arrays: Mapping[str, npt.NDArray[Any]]) -> Arrays:
-    return {f"{prefix}_{name}": array for name, array in arrays.items()}
 
 
 def _count_arrays(arrays: Arrays) -> dict[str, int]:

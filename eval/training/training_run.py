@@ -67,7 +67,8 @@ def train_descriptor(
 
     def on_validation(done: Progress) -> None:
         latest.append(done)
-        write_curves(out / "curves.csv", latest)
+        rows = [{"step": each.step, **each.losses, **each.scores, "is_best": each.is_best} for each in latest]
+        pd.DataFrame(rows).to_csv(out / "curves.csv", index=False, lineterminator="\r\n")
 
     history = fit(task, config, out, f"{name} {' '.join(digests)}", on_step, on_validation)
     draw_curves(out / "curves.png", name, history)
@@ -106,12 +107,6 @@ def data_digest(tunnels: Sequence[TunnelShard]) -> str:
     for tunnel in sorted(tunnels, key=lambda tunnel: (tunnel.family, tunnel.seed)):
         hasher.update(hashlib.sha256(tunnel.path.read_bytes()).digest())
     return hasher.hexdigest()[:16]
-
-
-def write_curves(path: Path, history: Sequence[Progress]) -> None:
-    """Write one row per validation: step, losses, scores, whether it was the best so far."""
-    rows = [{"step": done.step, **done.losses, **done.scores, "is_best": done.is_best} for done in history]
-    pd.DataFrame(rows).to_csv(path, index=False, lineterminator="\r\n")
 
 
 def draw_curves(path: Path, name: str, history: Sequence[Progress]) -> None:

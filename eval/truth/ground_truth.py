@@ -9,7 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, require_poses, require_shape
+from cdpipe.core.geometry import (
+    BoolArray,
+    Float64Array,
+    Int64Array,
+    invert,
+    require_poses,
+    require_shape,
+    transform_each,
+)
 from cdpipe.io.session import read_session
 from cdpipe.model.types import SessionName
 from eval.truth.universe import ScoringPoints, load_universe
@@ -39,9 +47,7 @@ class SessionTruth:
 
     def to_world(self, points_odom: Float64Array, scans: Int64Array) -> Float64Array:
         """Transform (N, 3) odom points into the world, each by the true pose of one of (N,) scans."""
-        world_T_odom = self.world_T_sensor[scans] @ invert(self.odom_T_sensor[scans])
-        moved = np.einsum("nij,nj->ni", world_T_odom[:, :3, :3], points_odom) + world_T_odom[:, :3, 3]
-        return np.asarray(moved, dtype=np.float64)
+        return transform_each(self.world_T_sensor[scans] @ invert(self.odom_T_sensor[scans]), points_odom)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,6 +23,8 @@ _BESIDE_WHEELS_M = 0.1
 # The body checked against the walls: the true gap may be this share of the clearance where the wall bulges.
 _TIGHTEST_SHARE = 0.5
 
+Span = tuple[Float64Array, Float64Array]  # lowest and highest forbidden offset, (N,) each, NaN where all are free
+
 
 def find_obstacles(
     world: World, scenario: Scenario, session: str, line: Float64Array, headings: Float64Array, height_m: float
@@ -46,32 +48,21 @@ def find_obstacles(
     return found
 
 
-def pass_by(
-    session: str,
-    name: str,
-    wanted: Float64Array,
-    low: Float64Array,
-    high: Float64Array,
-    near_low: Float64Array,
-    near_high: Float64Array,
-) -> None:
-    """Narrow the bounds `low`, `high` in place so that the line passes a prop on one side, each time it comes by.
-
-    Raises:
-        ScenarioError: It leaves no room on either side.
-    """
-    barred = sidestep(wanted, low, high, near_low, near_high)
-    if barred is not None:
-        raise ScenarioError(
-            f"{session}: prop {name!r} bars the way {barred * STEP_M:.1f} m along the route: "
-            "move it to a side, make it smaller, or lower platform.clearance_m"
-        )
-
-
 def sidestep(
     wanted: Float64Array, low: Float64Array, high: Float64Array, near_low: Float64Array, near_high: Float64Array
 ) -> int | None:
-    """Narrow the bounds as `pass_by` does; return the first sample where there is no room on either side, or None."""
+    """Narrow the bounds of a line in place so that it passes an obstacle on one side, each time it comes by.
+
+    Args:
+        wanted: (N,) wanted offset to the left at each sample of the line, metres.
+        low: (N,) lower bound of the offset; changed in place.
+        high: (N,) upper bound; changed in place.
+        near_low: (N,) lowest offset that the obstacle forbids, NaN where it is far.
+        near_high: (N,) highest one.
+
+    Returns:
+        The first sample where neither side leaves room, or None.
+    """
     stations = np.flatnonzero(np.isfinite(near_low))
     for visit in np.split(stations, np.flatnonzero(np.diff(stations) > 1 / STEP_M) + 1):
         if len(visit) == 0 or (near_low[visit] > high[visit]).all() or (near_high[visit] < low[visit]).all():
@@ -91,10 +82,10 @@ def sidestep(
 
 def find_boulders(
     world: World, scenario: Scenario, line: Float64Array, headings: Float64Array, width_m: float
-) -> list[tuple[Float64Array, Float64Array]]:
-    """Return for each loose stone too high to drive over the offsets it forbids, (N,) to (N,), NaN where it is far.
+) -> list[Span]:
+    """Return the offsets that each loose stone too high to drive over forbids.
 
-    Found by rays down: where what is fixed lies higher than the bare floor by more than 0.15 m.
+    Rays down find the stones: where a fixture lies more than 0.15 m above the bare floor.
     """
     if scenario.platform.kind == "quadrotor" or not world.fixtures:
         return []

@@ -14,7 +14,7 @@ import numpy as np
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, stream
 from scenarios.schema import Scenario, SessionPlan
-from sim.drive.obstacles import find_boulders, find_obstacles, pass_by, sidestep
+from sim.drive.obstacles import Span, find_boulders, find_obstacles, sidestep
 from sim.geometry.line import STEP_M, smooth_between, smooth_line, tighten_bound
 from sim.geometry.noise import smooth_noise
 from sim.placement.lanes import body_heights_m, side_bounds
@@ -68,7 +68,7 @@ def plan_path(world: World, scenario: Scenario, seed: int, session: str, is_wary
     """
     plan: SessionPlan = getattr(scenario, session)
     line, width_m = _reference_line(world, plan, session)
-    offset_m = _plan_offsets(world, scenario, seed, session, line, width_m, _heights_m(scenario, plan, is_wary))
+    offset_m = _plan_offsets(world, scenario, seed, session, line, width_m, is_wary)
     left = left_of(headings_of(line))
     shifted = resample(np.column_stack([line[:, :2] + offset_m[:, None] * left, line[:, 2]]), STEP_M)
     xy = smooth_line(shifted[:, :2], _LAST_SMOOTHING_M)
@@ -86,10 +86,8 @@ def _reference_line(world: World, plan: SessionPlan, session: str) -> tuple[Floa
         points, section = world.centreline.edge(a, b)
         pieces.append(points if not pieces else points[1:])
         widths.append(np.full(len(pieces[-1]), section.width_m))
-        if len(pieces) > 1:
-            turn = _turn_deg(pieces[-2], pieces[-1])
-            if turn > _SHARPEST_DEG:
-                raise ScenarioError(f"{session}.route turns back at node {a!r}: a route may not reverse")
+        if len(pieces) > 1 and _turn_deg(pieces[-2], pieces[-1]) > _SHARPEST_DEG:
+            raise ScenarioError(f"{session}.route turns back at node {a!r}: a route may not reverse")
     points = resample(np.concatenate(pieces), STEP_M)
     share = np.linspace(0.0, 1.0, len(points))
     all_widths = np.concatenate(widths)
@@ -122,39 +120,36 @@ def _heights_m(scenario: Scenario, plan: SessionPlan, is_wary: bool) -> Float64A
 
 
 def _plan_offsets(
-    world: World,
-    scenario: Scenario,
-    seed: int,
-    session: str,
-    line: Float64Array,
-    width_m: Float64Array,
-    heights_m: Float64Array,
+    world: World, scenario: Scenario, seed: int, session: str, line: Float64Array, width_m: Float64Array, is_wary: bool
 ) -> Float64Array:
-    """Sideways offset (N,) from the reference line, positive to the left."""
+    """Return the sideways offset (N,) from the reference line, positive to the left."""
     plan: SessionPlan = getattr(scenario, session)
+    heights_m = _heights_m(scenario, plan, is_wary)
     clearance_m = scenario.platform.clearance_m
     headings = headings_of(line)
     height_m = plan.height_m or scenario.platform.sensor_height_m
     room_m = np.maximum(width_m / 2 - clearance_m, 0.0)
     turn = smooth_line(np.gradient(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0]))) / STEP_M, 0.25)
     low, high = side_bounds(world.fixed, line, headings, turn, heights_m, width_m, clearance_m)
-    wanted = plan.lateral * room_m + scenario.platform.wander_m * _wander(len(line), seed, session)
+    along_m: Float64Array = np.arange(len(line), dtype=np.float64) * STEP_M
+    key = int(stream(seed, session, "wander").integers(2**63))
+    wanted = plan.lateral * room_m + scenario.platform.wander_m * smooth_noise((along_m,), _WANDER_LENGTH_M, key)
     _refuse_narrow(scenario, session, low, high)
     for name, near_low, near_high in find_obstacles(world, scenario, session, line, headings, height_m):
-        pass_by(session, name, wanted, low, high, near_low, near_high)
+        barred = sidestep(wanted, low, high, near_low, near_high)
+        if barred is not None:
+            raise ScenarioError(
+                f"{session}: prop {name!r} bars the way {barred * STEP_M:.1f} m along the route: "
+                "move it to a side, make it smaller, or lower platform.clearance_m"
+            )
     stones = find_boulders(world, scenario, line, headings, float(width_m.max()))
     return _swerve_between(session, wanted, low, high, stones, _CHICANE_SHARE * clearance_m)
 
 
 def _swerve_between(
-    session: str,
-    wanted: Float64Array,
-    low: Float64Array,
-    high: Float64Array,
-    stones: list[tuple[Float64Array, Float64Array]],
-    give_m: float,
+    session: str, wanted: Float64Array, low: Float64Array, high: Float64Array, stones: list[Span], give_m: float
 ) -> Float64Array:
-    """Smooth offset (N,) at most `give_m` beyond the bounds; stones are driven over if there is no other way."""
+    """Return a smooth offset (N,) at most `give_m` beyond the bounds; it drives over stones where it must."""
     while True:
         inner_low, inner_high = low.copy(), high.copy()
         for near_low, near_high in stones:
@@ -184,11 +179,6 @@ def _find_smoothest(
             share = np.clip(smooth_line(tighten_bound(is_bad.astype(np.float64), 2.0, np.max), 2.0), 0.0, 1.0)
             offset_m = share * smooth_between(wanted, low, high, half_m) + (1.0 - share) * offset_m
     return offset_m, np.maximum(low - offset_m, offset_m - high)
-
-
-def _wander(n_samples: int, seed: int, session: str) -> Float64Array:
-    along_m: Float64Array = np.arange(n_samples, dtype=np.float64) * STEP_M
-    return smooth_noise((along_m,), _WANDER_LENGTH_M, int(stream(seed, session, "wander").integers(2**63)))
 
 
 def _refuse_narrow(scenario: Scenario, session: str, low: Float64Array, high: Float64Array) -> None:

@@ -15,6 +15,7 @@ from sim.geometry.noise import smooth_noise
 from sim.geometry.raycast import Caster
 from sim.placement.lanes import AIR_BELOW_M
 from sim.placement.placing import PROBE_UP_M, floor_heights
+from sim.rock.centreline import left_of
 
 _GRAVITY_MPS2 = 9.81
 # Correlation lengths of what the platform adds: tilt and bounce of suspension or rotors, and the driver's foot.
@@ -45,9 +46,8 @@ def ride(path: Path, floor: Caster, standing: Caster, scenario: Scenario, seed: 
     """
     platform, plan = scenario.platform, getattr(scenario, session)
     height_m = plan.height_m or platform.sensor_height_m
-    time_s = integrate_time(
-        path.distance_m, plan.speed_mps or platform.speed_mps, platform.speed_variation, seed, session
-    )
+    speed_mps = plan.speed_mps or platform.speed_mps
+    time_s = integrate_time(path.distance_m, speed_mps, platform.speed_variation, seed, session)
     keys = stream(seed, session, "tilt").integers(2**63, size=2).tolist()
     tilt = [np.deg2rad(platform.tilt_deg) * smooth_noise((path.distance_m,), _TILT_LENGTH_M, key) for key in keys]
     bounce_key = int(stream(seed, session, "bounce").integers(2**63))
@@ -90,7 +90,7 @@ def follow_floor(path: Path, floor: Caster, platform: Platform) -> tuple[Float64
     and rise across are their means and mean differences, as on a rocker suspension.
     """
     forward = np.stack([np.cos(path.yaw_rad), np.sin(path.yaw_rad)], axis=1)
-    left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
+    left = left_of(forward)
     heights = {}
     for ahead in (1, -1):
         for side in (1, -1):
@@ -127,11 +127,11 @@ def _keep_between(
     low, high = np.full(len(wanted_m), -np.inf), np.full(len(wanted_m), np.inf)
     for offset in around:
         origins = np.column_stack([path.points[:, :2] + offset, path.points[:, 2] + PROBE_UP_M])
-        up_m, _, _ = floor.cast(origins, np.tile([0.0, 0.0, 1.0], (len(origins), 1)))
+        up_m, _, _ = floor.cast(origins, (0.0, 0.0, 1.0))
         roof_m = origins[:, 2] + up_m
         high = np.minimum(high, roof_m - clearance_m)
         origins[:, 2] = np.minimum(wanted_m, roof_m - clearance_m / 2)
-        down_m, _, _ = standing.cast(origins, np.tile([0.0, 0.0, -1.0], (len(origins), 1)))
+        down_m, _, _ = standing.cast(origins, (0.0, 0.0, -1.0))
         low = np.maximum(low, origins[:, 2] - down_m + min(clearance_m, AIR_BELOW_M))
     if (low > high).any():
         worst = int(np.argmax(low - high))

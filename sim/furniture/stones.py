@@ -18,8 +18,9 @@ from sim.furniture.furniture import Fixture
 from sim.geometry.mesh import Mesh, join_meshes
 from sim.geometry.noise import lattice_values
 from sim.geometry.raycast import Caster
+from sim.geometry.sweep import repeat_body
 from sim.props.rocks import passing_share, rock_mesh
-from sim.rock.axis import Axis, find_nearest, measure_axes, wall_distances
+from sim.rock.axis import UP, Axis, find_nearest, measure_axes, wall_distances
 from sim.rock.centreline import Centreline
 
 SMALLEST_SHARE = 1 / 3  # of the characteristic size; smaller ones are part of the floor
@@ -27,17 +28,26 @@ _CELL_M = 0.5
 _N_SHAPES = 24
 _AT_MIDDLE, _AT_WALL = 0.6, 1.8  # density against the mean; grows with the square of the way to the wall
 _DRAWS = ("x", "y", "is-there", "stays", "size", "shape", "yaw", "roll", "pitch", "depth")
-_UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Spots:
-    """Places for stones: which cell and slot (N, 3), where on the floor (N, 3), how far above the eye was (N,)."""
+    """Places for stones.
+
+    Attributes:
+        cell: (N, 3) cell of the grid, and slot in it.
+        floor: (N, 3) point on the floor, world frame, metres.
+        eye_z: (N,) height from which the floor was looked for.
+        from_axis_m: (N,) distance from the axis of the drift.
+    """
 
     cell: Int64Array
     floor: Float64Array
     eye_z: Float64Array
     from_axis_m: Float64Array
+
+    def part(self, chosen: BoolArray | Int64Array) -> _Spots:
+        return _Spots(self.cell[chosen], self.floor[chosen], self.eye_z[chosen], self.from_axis_m[chosen])
 
 
 def strew_stones(
@@ -55,9 +65,8 @@ def strew_stones(
     stones = tunnel.floor.stones
     if stones is None or stones.per_m2 == 0 or not centreline.drifts:
         return None
-    keys = dict(
-        zip(_DRAWS, stream(seed, "furniture", "stones").integers(2**63, size=len(_DRAWS)).tolist(), strict=True)
-    )
+    draws = stream(seed, "furniture", "stones").integers(2**63, size=len(_DRAWS)).tolist()
+    keys = dict(zip(_DRAWS, draws, strict=True))
     niche_m = max((niche.depth_m for niche in tunnel.niches), default=0.0)
     found = [_spots_of(axis, stones, niche_m, keys) for axis in measure_axes(centreline, walls)]
     if not found:
@@ -67,8 +76,7 @@ def strew_stones(
     keep = ~_touches_any(spots.floor[:, :2], size_m / 2, outlines)
     if not keep.any():
         return None
-    spots = _Spots(spots.cell[keep], spots.floor[keep], spots.eye_z[keep], spots.from_axis_m[keep])
-    return Fixture("stones", "rock", _lay_stones(spots, size_m[keep], walls, keys, seed))
+    return Fixture("stones", "rock", _lay_stones(spots.part(keep), size_m[keep], walls, keys, seed))
 
 
 def draw_stone_sizes(uniform: Float64Array, stones: Stones) -> Float64Array:
@@ -96,31 +104,29 @@ def _spots_of(axis: Axis, stones: Stones, niche_m: float, keys: dict[str, int]) 
     from_axis_m, nearest = find_nearest(stations[:, :2], xy, reach_m)
     near = np.isfinite(from_axis_m)
     cell, xy, from_axis_m, nearest = cell[near], xy[near], from_axis_m[near], nearest[near]
-    eye = stations[nearest] + 0.5 * axis.height_m[axis.is_inside][nearest][:, None] * _UP
+    eye = stations[nearest] + 0.5 * axis.height_m[axis.is_inside][nearest][:, None] * UP
     towards = np.column_stack([xy - eye[:, :2], np.zeros(len(xy))]) / np.maximum(from_axis_m, 1e-9)[:, None]
     share = from_axis_m / wall_distances(axis.walls, eye, towards)
     wanted = _AT_MIDDLE + 3 * (1 - _AT_MIDDLE) * share**2
     stays = (share < 1.0) & (_uniform(cell, keys["stays"]) < wanted / _AT_WALL)
     above = np.column_stack([xy, eye[:, 2]])[stays]
-    ranges_m, _, normals = axis.walls.hits(above, np.broadcast_to(-_UP, above.shape).copy())
-    floor = above - np.where(np.isfinite(ranges_m), ranges_m, 0.0)[:, None] * _UP
+    ranges_m, _, normals = axis.walls.hits(above, -UP)
+    floor = above - np.where(np.isfinite(ranges_m), ranges_m, 0.0)[:, None] * UP
     level = np.abs(floor[:, 2] - stations[nearest[stays], 2]) < 0.8
     is_floor = np.isfinite(ranges_m) & (normals[:, 2] > 0.5) & level
-    return _Spots(cell[stays][is_floor], floor[is_floor], above[is_floor, 2], from_axis_m[stays][is_floor])
+    return _Spots(cell[stays], floor, above[:, 2], from_axis_m[stays]).part(is_floor)
 
 
 def _drop_repeats(found: Sequence[_Spots]) -> _Spots:
     """Join the drifts' spots; a cell that two drifts share on one level counts for the nearer of them."""
-    cell, floor, eye_z, from_axis_m = (
-        np.concatenate([getattr(spots, name) for spots in found]) for name in ("cell", "floor", "eye_z", "from_axis_m")
-    )
-    order = np.lexsort((from_axis_m, *cell.T))
-    cell, floor, eye_z, from_axis_m = cell[order], floor[order], eye_z[order], from_axis_m[order]
-    is_repeat = np.zeros(len(cell), dtype=bool)
+    names = ("cell", "floor", "eye_z", "from_axis_m")
+    spots = _Spots(*(np.concatenate([getattr(each, name) for each in found]) for name in names))
+    spots = spots.part(np.lexsort((spots.from_axis_m, *spots.cell.T)))
+    is_repeat = np.zeros(len(spots.cell), dtype=bool)
     for back in range(1, len(found)):
-        same = (cell[back:] == cell[:-back]).all(axis=1) & (np.abs(floor[back:, 2] - floor[:-back, 2]) < 1.0)
-        is_repeat[back:] |= same
-    return _Spots(cell[~is_repeat], floor[~is_repeat], eye_z[~is_repeat], from_axis_m[~is_repeat])
+        is_level = np.abs(spots.floor[back:, 2] - spots.floor[:-back, 2]) < 1.0
+        is_repeat[back:] |= (spots.cell[back:] == spots.cell[:-back]).all(axis=1) & is_level
+    return spots.part(~is_repeat)
 
 
 def _lay_stones(spots: _Spots, size_m: Float64Array, walls: Caster, keys: dict[str, int], seed: int) -> Mesh:
@@ -142,8 +148,7 @@ def _lay_stones(spots: _Spots, size_m: Float64Array, walls: Caster, keys: dict[s
         sunk_m = np.minimum(spots.floor[chosen, 2] - lowest_z[chosen] + depth_share[chosen] * height_m, 0.7 * height_m)
         vertices += spots.floor[chosen, None]
         vertices[..., 2] -= (bottom + sunk_m)[:, None]
-        starts = np.arange(len(chosen))[:, None, None] * len(mesh.vertices)
-        parts.append(Mesh(vertices.reshape(-1, 3), (starts + mesh.faces).reshape(-1, 3).astype(np.int32)))
+        parts.append(repeat_body(vertices, mesh.faces))
     return join_meshes(parts)
 
 
@@ -153,7 +158,7 @@ def _lowest_floor(spots: _Spots, size_m: Float64Array, walls: Caster) -> Float64
     above = np.column_stack([spots.floor[:, :2], spots.eye_z])[:, None].repeat(4, axis=1)
     above[..., :2] += 0.4 * size_m[:, None, None] * sides
     flat = above.reshape(-1, 3)
-    floor_z = (flat[:, 2] - wall_distances(walls, flat, np.broadcast_to(-_UP, flat.shape))).reshape(-1, 4)
+    floor_z = (flat[:, 2] - wall_distances(walls, flat, -UP)).reshape(-1, 4)
     # Near a wall a ray may start in the rock: what it finds below is no floor.
     floor_z = np.where(np.abs(floor_z - spots.floor[:, 2:]) < size_m[:, None], floor_z, spots.floor[:, 2:])
     return np.asarray(np.minimum(floor_z.min(axis=1), spots.floor[:, 2]))

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cdpipe.core.geometry import Float64Array, Int64Array, stream
+from cdpipe.core.geometry import Float64Array, stream
 from scenarios.schema import CableTray, Duct, Furniture, Pipe
 from sim.furniture.wall_line import Cross, Line, WallPlan, roof_lines, stack_plans, wall_lines
 from sim.geometry.mesh import Mesh, join_meshes
 from sim.geometry.sweep import EMPTY, bars, circle, frames_along, sweep
-from sim.rock.axis import STATION_M, Axis, wall_distances
+from sim.rock.axis import STATION_M, UP, Axis, wall_distances
 
 FIXING_M = 0.05  # how deep brackets and hangers reach into the rock
 _PIPE_STANDOFF_M = 0.08
@@ -25,22 +25,17 @@ _HANGER_M = 2.5
 _LONGEST_ARM_M = 0.9
 
 
-def pipe_plan(pipe: Pipe) -> WallPlan:
-    """Where a pipe wants to run."""
-    radius_m = pipe.diameter_m / 2
-    return WallPlan(_sign(pipe.side), pipe.height_share, Cross(radius_m, radius_m, _PIPE_STANDOFF_M))
-
-
-def tray_plan(tray: CableTray) -> WallPlan:
-    """Where a cable tray wants to run."""
-    cross = Cross(tray.width_m / 2, _TRAY_HALF_HEIGHT_M, _TRAY_STANDOFF_M)
-    return WallPlan(_sign(tray.side), tray.height_share, cross)
-
-
 def wall_plans(furniture: Furniture) -> list[WallPlan]:
-    """Plans of all pipes, then of all trays, with their heights over openings."""
+    """Return the plans of all pipes, then of all trays, with their heights over openings."""
+    pipes, trays = furniture.pipes, furniture.cable_trays
+    items: list[Pipe | CableTray] = [*pipes, *trays]
+    crosses = [Cross(pipe.diameter_m / 2, pipe.diameter_m / 2, _PIPE_STANDOFF_M) for pipe in pipes]
+    crosses += [Cross(tray.width_m / 2, _TRAY_HALF_HEIGHT_M, _TRAY_STANDOFF_M) for tray in trays]
     return stack_plans(
-        [pipe_plan(pipe) for pipe in furniture.pipes] + [tray_plan(tray) for tray in furniture.cable_trays]
+        [
+            WallPlan(1.0 if item.side == "left" else -1.0, item.height_share, cross)
+            for item, cross in zip(items, crosses, strict=True)
+        ]
     )
 
 
@@ -66,13 +61,13 @@ def duct_meshes(axes: Sequence[Axis], duct: Duct, name: str, seed: int) -> tuple
         for line in roof_lines(axis, duct.lateral, cross, DUCT_LOWEST_M):
             every = round(_HANGER_M / STATION_M)
             phase = (np.arange(len(line.path)) % every) / every
-            depth_m = generator.uniform(0.02, 0.08, size=len(line.path) // every + 1)[
-                np.arange(len(line.path)) // every
-            ]
+            sags_m = generator.uniform(0.02, 0.08, size=len(line.path) // every + 1)
+            depth_m = sags_m[np.arange(len(line.path)) // every]
             path = line.path - np.column_stack([np.zeros((len(phase), 2)), 4 * depth_m * phase * (1 - phase)])
             ribs = np.where(np.arange(len(path)) % 2, 0.97, 1.0) * generator.uniform(0.985, 1.0, len(path))
             tubes.append(sweep(path, circle(radius_m, 12), ribs))
-            hangers.append(_roof_wires(axis, path[::every], line.left[::every], radius_m))
+            left = line.left[::every]
+            hangers += [_wires(axis, path[::every] + shift * radius_m * left) for shift in (-0.85, 0.85)]
     return _join(tubes), _join(hangers)
 
 
@@ -100,9 +95,8 @@ def thin_path(path: Float64Array, tolerance_m: float = 0.004) -> Float64Array:
 
 
 def _couplings(line: Line, radius_m: float) -> list[Mesh]:
-    middles = np.arange(3, len(line.path) - 2, round(_COUPLING_M / STATION_M))
     collars = []
-    for middle in middles:
+    for middle in range(3, len(line.path) - 2, round(_COUPLING_M / STATION_M)):
         along = line.path[middle + 1] - line.path[middle - 1]
         along *= 0.06 / np.linalg.norm(along)
         ends = np.stack([line.path[middle] - along, line.path[middle] + along])
@@ -123,18 +117,12 @@ def _wall_arms(axis: Axis, line: Line, plan: WallPlan, every_m: float, width_m: 
     return join_meshes([arms, _wires(axis, hung)])
 
 
-def _roof_wires(axis: Axis, path: Float64Array, left: Float64Array, radius_m: float) -> Mesh:
-    sides = [_wires(axis, path + shift * radius_m * left) for shift in (-0.85, 0.85)]
-    return join_meshes(sides)
-
-
 def _wires(axis: Axis, points: Float64Array) -> Mesh:
-    up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     if len(points) == 0:
-        return bars(points, points, 0.012)
-    reach_m = wall_distances(axis.walls, points, up)
+        return EMPTY
+    reach_m = wall_distances(axis.walls, points, UP)
     is_near = reach_m < 3.0
-    return bars(points[is_near], (points + (reach_m + FIXING_M)[:, None] * up)[is_near], 0.012)
+    return bars(points[is_near], (points + (reach_m + FIXING_M)[:, None] * UP)[is_near], 0.012)
 
 
 def _u_profile(width_m: float, height_m: float) -> Float64Array:
@@ -151,20 +139,12 @@ def _cables(path: Float64Array, width_m: float, generator: np.random.Generator) 
     cables = []
     for slot, radius_m in zip(slots, radii_m, strict=True):
         room_m = max(free_m / len(radii_m) / 2 - radius_m, 0.0)
-        wander_m = room_m * np.interp(np.arange(len(path)), *_knots(len(path), generator))
+        knots = np.arange(0, len(path) + 6, 6)
+        wander_m = room_m * np.interp(np.arange(len(path)), knots, generator.uniform(-1.0, 1.0, len(knots)))
         bottom_m = radius_m + _SHEET_M - _TRAY_HALF_HEIGHT_M
         cables.append(sweep(path + (slot * free_m + wander_m)[:, None] * left + bottom_m * up, circle(radius_m, 5)))
     return cables
 
 
-def _knots(count: int, generator: np.random.Generator) -> tuple[Int64Array, Float64Array]:
-    knots = np.arange(0, count + 6, 6)
-    return knots, generator.uniform(-1.0, 1.0, len(knots))
-
-
 def _join(meshes: Sequence[Mesh]) -> Mesh:
     return join_meshes(list(meshes)) if meshes else EMPTY
-
-
-def _sign(side: str) -> float:
-    return 1.0 if side == "left" else -1.0

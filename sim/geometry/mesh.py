@@ -9,7 +9,7 @@ import numpy.typing as npt
 import trimesh
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, require_shape, transform
+from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, Int64Array, require_shape, transform
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,8 +43,10 @@ def join_meshes(meshes: list[Mesh]) -> Mesh:
 
 def drop_unused_vertices(vertices: Float64Array, faces: npt.NDArray[np.integer]) -> Mesh:
     """Return faces (M, 3) as a mesh that holds only the vertices (N, 3) they use."""
-    used, renumbered = np.unique(faces, return_inverse=True)
-    return Mesh(vertices[used], renumbered.reshape(-1, 3).astype(np.int32))
+    is_used = np.zeros(len(vertices), dtype=bool)
+    is_used[faces] = True
+    renumbered = (np.cumsum(is_used) - 1).astype(np.int32)
+    return Mesh(vertices[is_used], renumbered[faces])
 
 
 def box_mesh(half_size_m: npt.ArrayLike) -> Mesh:
@@ -55,6 +57,12 @@ def box_mesh(half_size_m: npt.ArrayLike) -> Mesh:
 def cylinder_mesh(radius_m: float, half_height_m: float, segments: int) -> Mesh:
     """Return a closed cylinder about the z axis, facing outwards."""
     return _from_trimesh(trimesh.creation.cylinder(radius=radius_m, height=2.0 * half_height_m, sections=segments))
+
+
+def drop_flat_faces(faces: Int64Array) -> Int64Array:
+    """Return the faces (M, 3) whose three corners differ."""
+    a, b, c = faces.T
+    return np.asarray(faces[(a != b) & (b != c) & (c != a)])
 
 
 def crop_near(mesh: Mesh, target: Mesh, within_m: float) -> Mesh:

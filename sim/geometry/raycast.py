@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
@@ -34,20 +35,18 @@ class Caster:
         # Embree builds the scene at its first use, which must not happen in two threads at once.
         self.cast(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))
 
-    def cast(
-        self, origins: Float64Array | Float32Array, directions: Float64Array | Float32Array
-    ) -> tuple[Float32Array, Int32Array, Float32Array]:
+    def cast(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Int32Array, Float32Array]:
         """Return the first hit of each ray; safe to call from several threads.
 
         Args:
-            origins: (N, 3) starting points, world frame, metres.
-            directions: (N, 3) unit vectors.
+            origins: (N, 3) starting points, world frame, metres; or one (3,) for all rays.
+            directions: (N, 3) unit vectors; or one (3,) for all rays.
 
         Returns:
             (N,) float32 distance, metres, infinite where nothing is hit; (N,) int32 number of the mesh hit, or -1;
             (N,) float32 absolute cosine between ray and surface normal, 0 for a miss.
         """
-        return self._first(self._local(origins), np.ascontiguousarray(directions, dtype=np.float32))
+        return self._first(*self._rays(origins, directions))
 
     def cast_columns(
         self, origins: Float64Array, directions: Float32Array
@@ -59,15 +58,13 @@ class Caster:
             directions: (W, H, 3) float32 unit vectors, contiguous.
         """
         width, height, _ = directions.shape
-        local = np.repeat(self._local(origins), height, axis=0)
+        local = np.repeat((origins - self._centre_m).astype(np.float32), height, axis=0)
         ranges_m, ids, cosines = self._first(local, directions.reshape(-1, 3))
         return ranges_m.reshape(width, height), ids.reshape(width, height), cosines.reshape(width, height)
 
-    def hits(
-        self, origins: Float64Array | Float32Array, directions: Float64Array | Float32Array
-    ) -> tuple[Float32Array, Int32Array, Float32Array]:
+    def hits(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Int32Array, Float32Array]:
         """Return distances and mesh numbers as `cast` does, and the (N, 3) unit normals (0 for a miss)."""
-        answer = self._scene.run(self._local(origins), np.ascontiguousarray(directions, dtype=np.float32), output=1)
+        answer = self._scene.run(*self._rays(origins, directions), output=1)
         ids = answer["geomID"]
         is_hit = ids >= 0
         normals = answer["Ng"]
@@ -75,8 +72,10 @@ class Caster:
         normals = np.where(is_hit[:, None], normals / np.maximum(length, 1e-30)[:, None], 0.0)
         return np.where(is_hit, answer["tfar"], np.float32(np.inf)), ids, normals.astype(np.float32)
 
-    def _local(self, origins: Float64Array | Float32Array) -> Float32Array:
-        return np.ascontiguousarray(origins - self._centre_m, dtype=np.float32)
+    def _rays(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Float32Array]:
+        """Return origins, from the centre of the scene, and directions, both (N, 3) contiguous."""
+        local, ways = np.broadcast_arrays(np.asarray(origins) - self._centre_m, directions)
+        return np.ascontiguousarray(local, np.float32), np.ascontiguousarray(ways, np.float32)
 
     def _first(self, origins: Float32Array, directions: Float32Array) -> tuple[Float32Array, Int32Array, Float32Array]:
         """First hits of rays (N, 3) that start at local points; written with few passes over memory for speed."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from cdpipe.core.geometry import Float64Array, Int64Array
 from sim.geometry.mesh import Mesh
@@ -28,18 +29,11 @@ def sweep(path: Float64Array, profile: Float64Array, scale: Float64Array | None 
         scale: (N,) factor on the profile at each point.
         is_capped: Whether both ends are closed; the profile must then be convex.
     """
-    n, k = len(path), len(profile)
     left, up = frames_along(path)
     across = profile[None, :, :, None] * (1.0 if scale is None else scale[:, None, None, None])
     vertices = path[:, None] + across[:, :, 0] * left[:, None] + across[:, :, 1] * up[:, None]
-    ring = np.arange(n - 1)[:, None] * k
-    here, there = np.arange(k)[None], np.roll(np.arange(k), -1)[None]
-    a, b, c, d = ring + here, ring + there, ring + k + there, ring + k + here
-    faces = [np.stack([a, b, c], axis=-1).reshape(-1, 3), np.stack([a, c, d], axis=-1).reshape(-1, 3)]
-    if is_capped:
-        fan = np.stack([np.zeros(k - 2, np.int64), np.arange(1, k - 1), np.arange(2, k)], axis=1)
-        faces += [fan[:, ::-1], fan + (n - 1) * k]
-    return Mesh(vertices.reshape(-1, 3), np.concatenate(faces).astype(np.int32))
+    faces = _tube_faces(len(path), len(profile), is_capped)
+    return Mesh(vertices.reshape(-1, 3), faces.astype(np.int32))
 
 
 def frames_along(path: Float64Array) -> tuple[Float64Array, Float64Array]:
@@ -66,18 +60,22 @@ def bars(starts: Float64Array, ends: Float64Array, width_m: float) -> Mesh:
     return repeat_body(vertices, _BAR_FACES)
 
 
-def repeat_body(vertices: Float64Array, faces: Int64Array) -> Mesh:
+def repeat_body(vertices: Float64Array, faces: npt.NDArray[np.integer]) -> Mesh:
     """Return N copies of one body as one mesh: vertices (N, V, 3), faces (F, 3) of the body."""
     starts = np.arange(len(vertices)) * vertices.shape[1]
     return Mesh(vertices.reshape(-1, 3), (starts[:, None, None] + faces).reshape(-1, 3).astype(np.int32))
 
 
-def prism_faces(sides: int) -> Int64Array:
-    """Return the faces of a prism: ring 0 .. sides-1, then the ring ahead of it, both counter-clockwise."""
-    here, there = np.arange(sides), np.roll(np.arange(sides), -1)
-    walls = [np.stack([here, there, there + sides], axis=1), np.stack([here, there + sides, here + sides], axis=1)]
-    fan = np.stack([np.zeros(sides - 2, np.int64), np.arange(1, sides - 1), np.arange(2, sides)], axis=1)
-    return np.concatenate([*walls, fan[:, ::-1], fan + sides])
+def _tube_faces(n: int, k: int, is_capped: bool) -> Int64Array:
+    """Return the faces of a tube of n rings of k counter-clockwise corners each, numbered ring by ring."""
+    ring = np.arange(n - 1)[:, None] * k
+    here, there = np.arange(k)[None], np.roll(np.arange(k), -1)[None]
+    a, b, c, d = ring + here, ring + there, ring + k + there, ring + k + here
+    faces = [np.stack([a, b, c], axis=-1).reshape(-1, 3), np.stack([a, c, d], axis=-1).reshape(-1, 3)]
+    if is_capped:
+        fan = np.stack([np.zeros(k - 2, np.int64), np.arange(1, k - 1), np.arange(2, k)], axis=1)
+        faces += [fan[:, ::-1], fan + (n - 1) * k]
+    return np.concatenate(faces)
 
 
-_BAR_FACES = prism_faces(4)
+_BAR_FACES = _tube_faces(2, 4, is_capped=True)

@@ -9,7 +9,7 @@ from itertools import chain
 import numpy as np
 
 from cdpipe.core.errors import ScenarioError
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array, stream
 from scenarios.schema import Place, Prop, Scenario
 from sim.placement.fitting import Spot, place_prop
 from sim.placement.lanes import Lane, build_lanes
@@ -38,8 +38,12 @@ Outline = Callable[[Standing], Float64Array]
 
 @dataclass(slots=True, eq=False)
 class _Board:
-    """The props placed so far, and for each lane the span of the way that each of them bars."""
+    """The tunnel, the props placed so far, and for each lane the span of the way that each of them bars."""
 
+    scenario: Scenario
+    centreline: Centreline
+    around: Surroundings
+    seed: int
     lanes: tuple[Lane, ...]
     standing: list[Standing] = field(default_factory=list)
     taken: list[list[Float64Array]] = field(default_factory=list)
@@ -48,23 +52,24 @@ class _Board:
         self.standing.extend(items)
         self.taken.extend([lane.taken_by(item) for lane in self.lanes] for item in items)
 
-    def neighbour(
-        self, item: Standing, apart_m: float, outline: Outline = standing_corners
-    ) -> tuple[Standing, str] | None:
-        """Return a prop that stands in this one's way, and the session."""
-        corners = grow_rectangle(outline(item), apart_m)
-        for other in self.standing:
-            shared = item.sessions & other.sessions
-            if shared and rectangles_overlap(corners, outline(other)):
-                return other, max(shared)
+    def clash(
+        self, items: Sequence[Standing], apart_m: float, outline: Outline = standing_corners
+    ) -> tuple[str, str, str] | None:
+        """Return the first placed prop within `apart_m` of one of the items, that item, and the session."""
+        for item in items:
+            corners = grow_rectangle(outline(item), apart_m)
+            for other in self.standing:
+                shared = item.sessions & other.sessions
+                if shared and rectangles_overlap(corners, outline(other)):
+                    return other.prop.name, item.prop.name, max(shared)
         return None
 
     def is_passable(self, items: Sequence[Standing]) -> bool:
-        for item in items:
-            for number, lane in enumerate(self.lanes):
-                if not lane.is_open([*(each[number] for each in self.taken), lane.taken_by(item)]):
-                    return False
-        return True
+        return all(
+            lane.is_open([*(each[number] for each in self.taken), lane.taken_by(item)])
+            for item in items
+            for number, lane in enumerate(self.lanes)
+        )
 
 
 def place_props(scenario: Scenario, centreline: Centreline, around: Surroundings, seed: int) -> list[Standing]:
@@ -78,7 +83,7 @@ def place_props(scenario: Scenario, centreline: Centreline, around: Surroundings
     Raises:
         ScenarioError: A prop does not fit, stands in another, does not come to rest, or finds no place.
     """
-    board = _Board(build_lanes(scenario, centreline, around.fixed))
+    board = _Board(scenario, centreline, around, seed, build_lanes(scenario, centreline, around.fixed))
     areas = draw_areas(scenario, centreline, seed)
     anywhere = way(scenario, centreline)
     found: dict[tuple[str, bool], list[Standing]] = {}
@@ -86,12 +91,12 @@ def place_props(scenario: Scenario, centreline: Centreline, around: Surroundings
     spots = [given_spot(job.place, scenario, centreline) for job in jobs]
     for job, spot in zip(jobs, spots, strict=True):
         if spot is not None:
-            found[job.key] = _set_down(job, spot, around, seed, board)
+            found[job.key] = _set_down(job, spot, board)
             board.add(found[job.key])
     for job, spot in zip(jobs, spots, strict=True):
         if spot is None:
             stretches = (anywhere,) if job.place.area is None else areas[job.place.area]
-            found[job.key] = _find_place(job, stretches, scenario, centreline, around, seed, board)
+            found[job.key] = _find_place(job, stretches, board)
             board.add(found[job.key])
     return [item for job in jobs for item in found[job.key]]
 
@@ -126,10 +131,10 @@ def _is_banked(prop: Prop, place: Place) -> bool:
     return place.posture == "leaning" and prop.kind == "muck_pile"
 
 
-def _at_spot(job: _Job, spot: Spot, around: Surroundings, seed: int) -> list[Standing]:
+def _at_spot(job: _Job, spot: Spot, board: _Board) -> list[Standing]:
     """Return the prop before it settles; with a short shift or reshaped, also as it stands after."""
     prop, place, shape = job.prop, job.place, job.shape
-    pose, wall = place_prop(prop, shape, place, spot, around, seed)
+    pose, wall = place_prop(prop, shape, place, spot, board.around, board.seed)
     items = [Standing(prop, shape, job.sessions, pose, place.posture, wall)]
     if job.rest is not None:
         items.append(replace(items[0], shape=job.rest, sessions=_AFTER))
@@ -137,15 +142,15 @@ def _at_spot(job: _Job, spot: Spot, around: Surroundings, seed: int) -> list[Sta
         heading = np.arctan2(spot.heading[1], spot.heading[0]) + np.deg2rad(prop.shift.heading_deg)
         goal = pose[:2, 3] + prop.shift.distance_m * np.array([np.cos(heading), np.sin(heading)])
         moved_to = np.append(goal, np.deg2rad(prop.shift.turn_deg))
-        pose, wall = place_prop(prop, shape, place, spot, around, seed, moved_to)
+        pose, wall = place_prop(prop, shape, place, spot, board.around, board.seed, moved_to)
         items.append(Standing(prop, shape, _AFTER, pose, place.posture, wall))
     return items
 
 
-def _set_down(job: _Job, spot: Spot, around: Surroundings, seed: int, board: _Board) -> list[Standing]:
-    items = _at_spot(job, spot, around, seed)
+def _set_down(job: _Job, spot: Spot, board: _Board) -> list[Standing]:
+    items = _at_spot(job, spot, board)
     _refuse_overlap(items, board)
-    rested = [settle(item, around) for item in items]
+    rested = [settle(item, board.around) for item in items]
     _refuse_overlap([item for item in rested if item.posture != "upright"], board)
     if why := _touching(rested, board):
         raise ScenarioError(f"prop {job.prop.name!r} cannot come to rest there: {why}: set them farther apart")
@@ -153,24 +158,14 @@ def _set_down(job: _Job, spot: Spot, around: Surroundings, seed: int, board: _Bo
 
 
 def _refuse_overlap(items: Sequence[Standing], board: _Board) -> None:
-    for item in items:
-        clash = board.neighbour(item, 0.0)
-        if clash is not None:
-            raise ScenarioError(
-                f"props {clash[0].prop.name!r} and {item.prop.name!r} stand in one another in the {clash[1]} session: "
-                "give one another fraction or lateral"
-            )
+    if clash := board.clash(items, 0.0):
+        raise ScenarioError(
+            f"props {clash[0]!r} and {clash[1]!r} stand in one another in the {clash[2]} session: "
+            "give one another fraction or lateral"
+        )
 
 
-def _find_place(
-    job: _Job,
-    stretches: Sequence[Stations],
-    scenario: Scenario,
-    centreline: Centreline,
-    around: Surroundings,
-    seed: int,
-    board: _Board,
-) -> list[Standing]:
+def _find_place(job: _Job, stretches: Sequence[Stations], board: _Board) -> list[Standing]:
     where = "on the way of the sessions" if job.place.area is None else f"in area {job.place.area!r}"
     if len(stretches[0]) == 0:
         raise ScenarioError(f"prop {job.prop.name!r}: a mesh without drifts has no stations to draw: give `place.at`")
@@ -181,8 +176,9 @@ def _find_place(
     why = ""
     for number, (stations, wanted, over_humps) in enumerate(rounds):
         purpose = ("to" if job.is_goal else "place") + (f"-{number}" if number else "")
-        spots = drawn_spots(job.prop.name, purpose, stations, scenario, centreline, seed, over_humps)
-        items, why = _first_fit(wanted, spots, around, seed, board)
+        purposes = ("props", job.prop.name, purpose)
+        spots = drawn_spots(stream(board.seed, *purposes), stations, board.scenario, board.centreline, over_humps)
+        items, why = _first_fit(wanted, spots, board)
         if items:
             return items
     n_tries = len(rounds) * PLACE_TRIES
@@ -192,19 +188,17 @@ def _find_place(
     )
 
 
-def _first_fit(
-    job: _Job, spots: Iterable[Spot], around: Surroundings, seed: int, board: _Board
-) -> tuple[list[Standing], str]:
+def _first_fit(job: _Job, spots: Iterable[Spot], board: _Board) -> tuple[list[Standing], str]:
     """Return the prop at rest at the first suitable spot, or an empty list and why the last spot failed."""
     why, drops = "every one lies in the mouth of a junction", 0
     for spot in spots:
         try:
-            items = _at_spot(job, spot, around, seed)
+            items = _at_spot(job, spot, board)
             why = _clash(items, board)
             if why:
                 continue
             drops += 1
-            items = [settle(item, around) for item in items]
+            items = [settle(item, board.around) for item in items]
             why = _clash([item for item in items if item.posture != "upright"], board) or _touching(items, board)
             if not why:
                 return items, ""
@@ -217,13 +211,11 @@ def _first_fit(
 
 def _touching(items: Sequence[Standing], board: _Board) -> str:
     """Return which prop a prop at rest collides with after tilting on its floor; "" if none."""
-    clashes = [board.neighbour(item, 0.0, bounding_rectangle) for item in items]
-    return next((f"prop {clash[0].prop.name!r} is in the way" for clash in clashes if clash), "")
+    clash = board.clash(items, 0.0, bounding_rectangle)
+    return f"prop {clash[0]!r} is in the way" if clash else ""
 
 
 def _clash(items: Sequence[Standing], board: _Board) -> str:
-    for item in items:
-        clash = board.neighbour(item, _BETWEEN_M)
-        if clash is not None:
-            return f"prop {clash[0].prop.name!r} stands there"
+    if clash := board.clash(items, _BETWEEN_M):
+        return f"prop {clash[0]!r} stands there"
     return "" if board.is_passable(items) else "the robot could not get by"

@@ -7,11 +7,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, transform
+from cdpipe.core.geometry import BoolArray, Float64Array, transform
+from cdpipe.core.voxel import thin
 from sim.geometry.mesh import Mesh, join_meshes, move_mesh, split_triangles
 from sim.geometry.raycast import Caster
-from sim.placement.placing import Standing, corners_object, standing_points
-from sim.props.shapes import Shape, solid_mesh
+from sim.placement.placing import Standing, standing_points
+from sim.props.shapes import Shape, shape_mesh, solid_mesh
 
 _STEP_M = 0.06  # between the sample points of a surface
 _CELL_M = 0.03  # one sample point per cell is kept
@@ -21,16 +22,9 @@ _TELLTALES = np.array([[0.1, 0.2, 1], [0.9, 0.3, 0.5], [-0.7, 0.6, 0.4], [0.2, -
 @lru_cache(maxsize=32)
 def surface_points(shape: Shape) -> Float64Array:
     """Return points (N, 3) on a prop's surface, object frame: its corners (to 1 cm) and others at most 6 cm apart."""
-    meshes = [solid_mesh(solid) for solid in shape.solids]
-    corners = corners_object(shape)
-    pieces = split_triangles(np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), _STEP_M).reshape(-1, 3)
-    return np.concatenate([corners[_pick_one_a_cell(corners, _CELL_M / 3)], pieces[_pick_one_a_cell(pieces, _CELL_M)]])
-
-
-def _pick_one_a_cell(points: Float64Array, cell_m: float) -> Int64Array:
-    """Numbers of the first of the points (N, 3) in every cell that has any."""
-    cells = np.floor(points / cell_m).astype(np.int64) + (1 << 20)
-    return np.asarray(np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2], return_index=True)[1])
+    mesh = shape_mesh(shape)
+    pieces = split_triangles(mesh.vertices[mesh.faces], _STEP_M).reshape(-1, 3)
+    return np.concatenate([thin(mesh.vertices, _CELL_M / 3), thin(pieces, _CELL_M)])
 
 
 def interpenetration_m(standing: Standing, walls: Caster, others: Sequence[Standing] = ()) -> float:

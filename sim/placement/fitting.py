@@ -12,10 +12,9 @@ from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float32Array, Float64Array, make_pose, stream, yaw_pose
 from scenarios.schema import Place, Prop
 from sim.geometry.mesh import split_triangles
-from sim.geometry.raycast import Caster
 from sim.placement.placing import PROBE_UP_M, WALL_GAP_M, Surroundings, corners_object, floor_heights, free_width
 from sim.props.bed import BEHIND_M
-from sim.props.shapes import Shape, footprint_corners, solid_mesh
+from sim.props.shapes import Shape, footprint_corners, shape_mesh, solid_mesh
 
 # A prop may lean on a wall that is this even; at a drift's mouth it is not.
 _UNEVEN_WALL_M = 0.8
@@ -83,35 +82,33 @@ def place_prop(
     if place.posture == "leaning":
         return _at_wall(prop, shape, place, spot, around, seed, yaw, start)
     rotation = draw_rotation(prop.name, shape, place.posture, seed)
-    low, high = _bounds(shape, rotation, place.posture)
+    low, high = box = _bounds(shape, rotation, place.posture)
     if spot.is_line and start is None:
         position = _across(prop, (high - low) / 2, place, spot, around)
     else:
         position = spot.point[:2] if start is None else start
-        _require_clear(prop, low, high, yaw, position, spot, around)
-    floor_m = _floor_under(prop, low, high, position, yaw, float(spot.point[2]), around.walls)
+        _require_clear(prop, high - low, yaw, position, spot, around)
+    floor_m = _floor_under(prop, box, position, yaw, spot, around)
     centre = np.append((low[:2] + high[:2]) / 2, low[2])
     pose = yaw_pose(yaw)
     origin = np.append(position, floor_m) - pose[:3, :3] @ centre
     return make_pose(pose[:3, :3] @ rotation, origin), None
 
 
-def _bounds(shape: Shape, rotation: Float64Array, posture: str) -> tuple[Float64Array, Float64Array]:
-    """Low and high corner (3,) of a prop turned into its posture; upright, what is below the floor does not count."""
+def _bounds(shape: Shape, rotation: Float64Array, posture: str) -> Float64Array:
+    """Low and high corner (2, 3) of a prop turned into its posture; upright, what is below the floor does not count."""
     if posture == "upright":
         length, width, height = shape.size_m
-        return np.array([-length / 2, -width / 2, 0.0]), np.array([length / 2, width / 2, height])
-    points = corners_object(shape) @ rotation.T
-    return points.min(axis=0), points.max(axis=0)
+        return np.array([[-length / 2, -width / 2, 0.0], [length / 2, width / 2, height]])
+    return _span(corners_object(shape) @ rotation.T)
 
 
 def _across(prop: Prop, half: Float64Array, place: Place, spot: Spot, around: Surroundings) -> Float64Array:
     """Place (2,) of the middle of a prop of this half size (3,) across the drift."""
     left = np.array([-spot.heading[1], spot.heading[0]])
     turn = yaw_pose(np.deg2rad(place.yaw_deg))[:2, :2]
-    extent = np.abs(footprint_corners((2 * half[0], 2 * half[1], 0.0)) @ turn.T).max(
-        axis=0
-    )  # half, along and across the drift
+    # Half sizes along and across the drift.
+    extent = np.abs(footprint_corners((2 * half[0], 2 * half[1], 0.0)) @ turn.T).max(axis=0)
     stations = spot.point[:2] + np.linspace(-extent[0], extent[0], max(7, int(extent[0] / 0.1)))[:, None] * spot.heading
     origins = np.column_stack([stations, np.full(len(stations), spot.point[2])])
     top = min(2 * half[2], 0.5 * spot.height_m)
@@ -128,16 +125,10 @@ def _across(prop: Prop, half: Float64Array, place: Place, spot: Spot, around: Su
 
 
 def _require_clear(
-    prop: Prop,
-    low: Float64Array,
-    high: Float64Array,
-    yaw: float,
-    position: Float64Array,
-    spot: Spot,
-    around: Surroundings,
+    prop: Prop, size_m: Float64Array, yaw: float, position: Float64Array, spot: Spot, around: Surroundings
 ) -> None:
-    """Look from the middle of a prop to its outline, a gap beyond it: no rock may be in between."""
-    half = (high - low)[:2] / 2 + WALL_GAP_M
+    """Cast rays from the middle of a prop to its outline, grown by a gap: they may meet no rock."""
+    half = size_m[:2] / 2 + WALL_GAP_M
     share = np.linspace(-1.0, 1.0, 9)
     ends = np.concatenate([np.column_stack([share, np.full(9, side)]) for side in (-1.0, 1.0)])
     outline = np.concatenate([ends, ends[:, ::-1]]) * half @ yaw_pose(yaw)[:2, :2].T
@@ -145,27 +136,21 @@ def _require_clear(
     floor = floor_heights(around.walls, np.array([[*position, spot.point[2] + PROBE_UP_M / 2]]))[0]
     if np.isnan(floor):
         raise ScenarioError(f"prop {prop.name!r}: there is no floor {spot.where}, looked for from 0.6 m above it")
-    for height in np.linspace(0.25, max(0.3, float(high[2] - low[2])), 5):
-        origins = np.tile([*position, floor + height], (len(outline), 1))
+    for height in np.linspace(0.25, max(0.3, float(size_m[2])), 5):
         directions = np.column_stack([outline / reach_m[:, None], np.zeros(len(outline))])
-        if (around.fixed.cast(origins, directions)[0] < reach_m).any():
+        if (around.fixed.cast([*position, floor + height], directions)[0] < reach_m).any():
             raise ScenarioError(f"prop {prop.name!r} does not fit {spot.where}: it would stand in rock or pipes")
 
 
 def _floor_under(
-    prop: Prop,
-    low: Float64Array,
-    high: Float64Array,
-    position: Float64Array,
-    yaw: float,
-    level_m: float,
-    walls: Caster,
+    prop: Prop, box: Float64Array, position: Float64Array, yaw: float, spot: Spot, around: Surroundings
 ) -> float:
+    """Return the median height of the floor below a box (2, 3) whose middle stands at a position (2,)."""
     share = np.linspace(-0.5, 0.5, 7)
-    size = high - low
+    size = box[1] - box[0]
     grid = np.stack(np.meshgrid(share * size[0], share * size[1]), axis=-1).reshape(-1, 2)
     xy = grid @ yaw_pose(yaw)[:2, :2].T + position
-    heights = floor_heights(walls, np.column_stack([xy, np.full(len(xy), level_m + PROBE_UP_M)]))
+    heights = floor_heights(around.walls, np.column_stack([xy, np.full(len(xy), spot.point[2] + PROBE_UP_M)]))
     if np.isnan(heights).all():
         raise ScenarioError(f"prop {prop.name!r}: there is no floor where it should stand, looked for from 1.2 m above")
     return float(np.nanmedian(heights))
@@ -187,19 +172,18 @@ def _at_wall(
     aside = np.array([-wall[1], wall[0]])
     if shape.is_settled:
         rotation = lean_towards(prop.name, shape, wall, yaw, seed)
-        meshes = [solid_mesh(solid) for solid in shape.solids]
-        skin = split_triangles(np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), _BULGE_M)
-        points = skin.reshape(-1, 3) @ rotation.T
+        mesh = shape_mesh(shape)
+        points = split_triangles(mesh.vertices[mesh.faces], _BULGE_M).reshape(-1, 3) @ rotation.T
     else:
         rotation = yaw_pose(float(np.arctan2(wall[1], wall[0]) - np.pi / 2))[:3, :3]  # +y faces the wall
         points = _back(shape) @ rotation.T
     foot_m = points[:, 2].min()
-    level_m = _floor_under(prop, *_span(points), base[:2], 0.0, float(spot.point[2]), around.walls)
+    level_m = _floor_under(prop, _span(points), base[:2], 0.0, spot, around)
     along = (points[:, :2] @ aside)[:, None] * aside
     origins = np.column_stack([base[:2] + along, level_m + np.maximum(points[:, 2] - foot_m, 0.1)])
     is_pile = prop.kind == "muck_pile"
     caster = around.walls if is_pile else around.fixed
-    reach_m, _, normals = caster.hits(origins, np.tile([*wall, 0.0], (len(origins), 1)))
+    reach_m, _, normals = caster.hits(origins, [*wall, 0.0])
     if not _is_even(reach_m, is_pile, spot):
         # Under a long prop the floor may rise above its foot: a ray from there starts in rock, or meets the floor.
         is_wall = np.isfinite(reach_m) & (normals[:, :2] @ wall < 0) & (normals[:, 2] < _FLOOR_UP)
@@ -214,7 +198,7 @@ def _at_wall(
         return make_pose(rotation, np.append(position, level_m - foot_m)), wall
     half = np.array([*shape.size_m[:2], 0.0]) / 2
     yaw = float(np.arctan2(rotation[1, 0], rotation[0, 0]))
-    floor_m = _floor_under(prop, -half, half, position, yaw, float(spot.point[2]), around.walls)
+    floor_m = _floor_under(prop, np.stack([-half, half]), position, yaw, spot, around)
     return make_pose(rotation, np.append(position, floor_m)), wall
 
 
@@ -236,8 +220,8 @@ def _back(shape: Shape) -> Float64Array:
     return np.column_stack([grid[:, 0], np.full(len(grid), width / 2), grid[:, 1]])
 
 
-def _span(points: Float64Array) -> tuple[Float64Array, Float64Array]:
-    return points.min(axis=0), points.max(axis=0)
+def _span(points: Float64Array) -> Float64Array:
+    return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def _nearer_wall(prop: Prop, place: Place, spot: Spot, base: Float64Array, around: Surroundings) -> Float64Array:
@@ -249,7 +233,7 @@ def _nearer_wall(prop: Prop, place: Place, spot: Spot, base: Float64Array, aroun
     if spot.is_line:
         angle = np.arctan2(spot.heading[1], spot.heading[0]) + np.array([-np.pi / 2, np.pi / 2])
     level = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
-    reach_m = around.walls.cast(np.tile(base + np.array([0.0, 0.0, 0.6]), (len(level), 1)), level)[0]
+    reach_m = around.walls.cast(base + np.array([0.0, 0.0, 0.6]), level)[0]
     if not np.isfinite(reach_m).any():
         raise ScenarioError(f"prop {prop.name!r}: there is no wall to lean against {spot.where}")
     return np.asarray(level[int(np.argmin(reach_m)), :2])

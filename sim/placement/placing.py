@@ -11,7 +11,7 @@ import numpy as np
 from cdpipe.core.geometry import Float64Array, transform
 from scenarios.schema import Prop
 from sim.geometry.raycast import Caster
-from sim.props.shapes import Shape, footprint_corners, solid_mesh
+from sim.props.shapes import Shape, footprint_corners, shape_mesh
 
 Posture = Literal["upright", "tipped", "leaning"]
 
@@ -60,8 +60,7 @@ class Surroundings:
 
 def floor_heights(walls: Caster, points: Float64Array) -> Float64Array:
     """Return the floor's z (N,) under points (N, 3) that lie in the void; NaN where no floor faces up below them."""
-    down = np.tile([0.0, 0.0, -1.0], (len(points), 1))
-    ranges_m, _, normals = walls.hits(points, down)
+    ranges_m, _, normals = walls.hits(points, (0.0, 0.0, -1.0))
     return np.where(np.isfinite(ranges_m) & (normals[:, 2] > 0.1), points[:, 2] - ranges_m, np.nan)
 
 
@@ -160,4 +159,4 @@ def grow_rectangle(corners: Float64Array, by_m: float) -> Float64Array:
 @lru_cache(maxsize=_REMEMBERED)
 def corners_object(shape: Shape) -> Float64Array:
     """Return the corners (N, 3) of all of a prop's primitives, object frame."""
-    return np.concatenate([solid_mesh(solid).vertices for solid in shape.solids])
+    return shape_mesh(shape).vertices

@@ -83,7 +83,7 @@ def _model(item: Standing, points: Float64Array, around: Surroundings) -> mujoco
     contact = _CONTACT if item.posture == "upright" else _CHOCKED
     _add_floor(spec, item, points, around.walls, contact)
     if item.wall is not None:
-        _add_wall(spec, item, item.wall, points, around.fixed, contact)
+        _add_wall(spec, item.wall, transform(item.world_T_object, points), around.fixed, contact)
     pose = item.world_T_object.copy()
     pose[2, 3] += _DROP_M - _floor_gap_m(pose, points, around.walls)
     body = spec.worldbody.add_body(name="prop", pos=pose[:3, 3], quat=quaternion(pose))
@@ -109,7 +109,7 @@ def _model(item: Standing, points: Float64Array, around: Surroundings) -> mujoco
 def _add_floor(
     spec: mujoco.MjSpec, item: Standing, points: Float64Array, walls: Caster, contact: dict[str, Any]
 ) -> None:
-    """Put a height field of the real floor under a prop; rock is level with the floor beside it."""
+    """Add a height field of the real floor below a prop; rock beside it is set to the level of the floor."""
     world = transform(item.world_T_object, points)
     size = np.ptp(world, axis=0)
     # One that is not upright may yet turn on any side.
@@ -134,15 +134,9 @@ def _add_floor(
 
 
 def _add_wall(
-    spec: mujoco.MjSpec,
-    item: Standing,
-    wall: Float64Array,
-    points: Float64Array,
-    fixed: Caster,
-    contact: dict[str, Any],
+    spec: mujoco.MjSpec, wall: Float64Array, world: Float64Array, fixed: Caster, contact: dict[str, Any]
 ) -> None:
-    """Put up a height field of the wall, and what hangs on it, as level rays from the prop's middle find it."""
-    world = transform(item.world_T_object, points)
+    """Add a height field of the wall and its fixtures, as level rays from the prop, `world` (N, 3), measure them."""
     low, high = world.min(axis=0), world.max(axis=0)
     middle = (low + high) / 2
     out = np.append(-wall, 0.0)
@@ -151,9 +145,8 @@ def _add_wall(
     columns, rows = (2 * int(np.ceil(extent / _WALL_STEP_M)) + 1 for extent in half)
     u, v = np.meshgrid(np.linspace(-half[0], half[0], columns), np.linspace(-half[1], half[1], rows))
     origins = middle + u.reshape(-1, 1) * aside + v.reshape(-1, 1) * [0.0, 0.0, 1.0]
-    directions = np.tile(-out, (len(origins), 1))
-    ranges_m, _, normals = fixed.hits(origins, directions)
-    is_wall = ((normals * directions).sum(axis=1) < 0) & (ranges_m < 3.0)
+    ranges_m, _, normals = fixed.hits(origins, -out)
+    is_wall = ((normals * -out).sum(axis=1) < 0) & (ranges_m < 3.0)
     depth_m = ranges_m.astype(np.float64)
     far_m = float(depth_m[is_wall].max(initial=0.5)) + 0.01
     depth_m = np.where(is_wall, depth_m, far_m)  # below the floor, or through an opening
@@ -189,7 +182,7 @@ def _wall_gap_m(pose: Float64Array, wall: Float64Array, points: Float64Array, fi
     """Least level distance of a prop's upper two thirds to the true wall."""
     world = transform(pose, points)
     world = world[world[:, 2] > world[:, 2].min() + np.ptp(world[:, 2]) / 3]
-    return float(fixed.cast(world, np.tile([*wall, 0.0], (len(world), 1)))[0].min())
+    return float(fixed.cast(world, [*wall, 0.0])[0].min())
 
 
 def _run_to_rest(model: mujoco.MjModel, data: mujoco.MjData, item: Standing) -> None:

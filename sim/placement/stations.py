@@ -51,12 +51,9 @@ def stations_of(edges: Sequence[Edge], centreline: Centreline) -> Stations:
     """Return the stations of some edges, in the order given."""
     points = [centreline.edge(a, b)[0] for a, b in edges]
     counts = [len(each) for each in points]
-    if not points:
-        return Stations((), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)))
-    fractions = [np.linspace(0.0, 1.0, count) for count in counts]
-    return Stations(
-        tuple(edges), np.repeat(np.arange(len(edges)), counts), np.concatenate(fractions), np.concatenate(points)
-    )
+    fractions = np.concatenate([np.zeros(0), *(np.linspace(0.0, 1.0, count) for count in counts)])
+    numbers = np.repeat(np.arange(len(edges)), np.array(counts, np.int64))
+    return Stations(tuple(edges), numbers, fractions, np.concatenate([np.zeros((0, 3)), *points]))
 
 
 def spot_between(edge: Edge, fraction: float, centreline: Centreline, over_humps: bool = False) -> Spot:
@@ -80,16 +77,9 @@ def given_spot(place: Place, scenario: Scenario, centreline: Centreline) -> Spot
 
 
 def drawn_spots(
-    name: str,
-    purpose: str,
-    stations: Stations,
-    scenario: Scenario,
-    centreline: Centreline,
-    seed: int,
-    over_humps: bool = False,
+    generator: np.random.Generator, stations: Stations, scenario: Scenario, centreline: Centreline, over_humps: bool
 ) -> Iterator[Spot]:
-    """Yield up to 80 spots drawn for one prop, none in the mouth of a junction, independent of all other props."""
-    generator = stream(seed, "props", name, purpose)
+    """Yield the spots at up to 80 drawn stations, those in the mouth of a junction left out."""
     is_free = ~_in_mouth(stations.points, scenario)
     for index in (generator.random(PLACE_TRIES) * len(stations)).astype(int).tolist():
         if is_free[index]:
@@ -99,10 +89,8 @@ def drawn_spots(
 
 def way(scenario: Scenario, centreline: Centreline) -> Stations:
     """Return the stations of every edge that either session drives."""
-    return stations_of(
-        list(dict.fromkeys([*_driven_edges(scenario, scenario.before), *_driven_edges(scenario, scenario.after)])),
-        centreline,
-    )
+    edges = [*_driven_edges(scenario, scenario.before), *_driven_edges(scenario, scenario.after)]
+    return stations_of(list(dict.fromkeys(edges)), centreline)
 
 
 def draw_areas(scenario: Scenario, centreline: Centreline, seed: int) -> dict[str, tuple[Stations, Stations]]:

@@ -18,7 +18,7 @@ from sim.geometry.noise import smooth_noise
 from sim.geometry.raycast import Caster
 from sim.props.bed import BEHIND_M, Bed, bed_mesh, build_bed
 from sim.props.rocks import Rubble, confine, draw_sizes, join_rubble, lay_fragments, shift_rubble
-from sim.props.shapes import BELOW_FLOOR_M, Shape, Size, solid_mesh, visible_part
+from sim.props.shapes import BELOW_FLOOR_M, Shape, Size, shape_mesh, visible_part
 
 _MOST_FRAGMENTS = 900
 _COVERAGE = 1.5
@@ -115,9 +115,7 @@ def flank_angle_deg(shape: Shape) -> float:
     """
     _, width, height = shape.size_m
     smooth_m = 0.08 * height
-    heights, y, area_m2 = _columns(
-        join_meshes([solid_mesh(solid) for solid in shape.solids]), shape.size_m, 0.3, 60_000
-    )
+    heights, y, area_m2 = _columns(shape_mesh(shape), shape.size_m, 0.3, 60_000)
     step_m = float(np.sqrt(area_m2))
     smooth = gaussian_filter(heights, smooth_m / step_m)
     slope = np.hypot(*np.gradient(smooth, step_m))
@@ -134,7 +132,7 @@ def _columns(mesh: Mesh, size_m: Size, margin_m: float, count: int) -> tuple[Flo
     x, y = np.meshgrid(*axes, indexing="ij")
     start_m = float(mesh.vertices[:, 2].max()) + 1.0
     origins = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, start_m)])
-    ranges_m, _, _ = Caster([mesh]).cast(origins, np.tile([0.0, 0.0, -1.0], (x.size, 1)))
+    ranges_m, _, _ = Caster([mesh]).cast(origins, (0.0, 0.0, -1.0))
     heights = np.where(np.isfinite(ranges_m), start_m - ranges_m.astype(np.float64), -BELOW_FLOOR_M)
     return heights.reshape(x.shape), y, float(4 * half.prod() / x.size)
 

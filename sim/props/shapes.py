@@ -68,6 +68,11 @@ def solid_mesh(solid: Solid) -> Mesh:
     return move_mesh(local, solid.object_T_solid)
 
 
+def shape_mesh(shape: Shape) -> Mesh:
+    """Return the surfaces of all of a shape's primitives as one mesh, object frame."""
+    return join_meshes([solid_mesh(solid) for solid in shape.solids])
+
+
 def footprint_corners(size_m: tuple[float, float, float]) -> Float64Array:
     """Return the four corners (4, 2) of a prop's bounding rectangle, object frame, counter-clockwise."""
     half = np.array([size_m[0], size_m[1]]) / 2

@@ -15,6 +15,7 @@ from sim.geometry.raycast import Caster
 from sim.rock.centreline import STEP_M, Centreline, headings_of, left_of, resample
 
 STATION_M = 0.25
+UP = np.array([0.0, 0.0, 1.0])
 _FACE_M = 1.0  # nothing is hung nearer to the face of a blind drift
 _ASKEW = np.array([1.3e-3, 1.7e-3, 1.1e-3])
 _NOTHING_M = 1e3  # distance where a ray leaves through a hole of a foreign mesh
@@ -57,14 +58,13 @@ class Axis:
     def to_side(self, up_m: Float64Array | float, side: float) -> Float64Array:
         """Return the (S,) distance to the wall at a height above the floor; side 1 is left, -1 right."""
         up = np.minimum(up_m, self.clear_m - 0.1)
-        sideways = np.column_stack([side * self.left, np.zeros(len(self.left))])
+        sideways = np.insert(side * self.left, 2, 0.0, axis=1)
         return fill_from_nearest(wall_distances(self.walls, self.at(0.0, up), sideways), self.is_inside)
 
     def to_roof(self, across_m: Float64Array | float) -> Float64Array:
         """Return the (S,) height of the roof above the floor, seen from half the drift's height."""
         middle_m = 0.5 * self.height_m
-        up = np.broadcast_to([0.0, 0.0, 1.0], self.points.shape)
-        return fill_from_nearest(middle_m + wall_distances(self.walls, self.at(across_m, middle_m), up), self.is_inside)
+        return fill_from_nearest(middle_m + wall_distances(self.walls, self.at(across_m, middle_m), UP), self.is_inside)
 
 
 def measure_axes(centreline: Centreline, walls: Caster) -> list[Axis]:
@@ -83,7 +83,7 @@ def measure_axes(centreline: Centreline, walls: Caster) -> list[Axis]:
 
 
 def wall_distances(walls: Caster, origins: Float64Array, directions: Float64Array) -> Float64Array:
-    """Return the (N,) float64 distance to the rock, 1000 m where there is none."""
+    """Return the (N,) float64 distance to the rock along directions (N, 3) or (3,), 1000 m where there is none."""
     ranges_m, _ = _hits(walls, origins, directions)
     return np.where(np.isfinite(ranges_m), ranges_m, _NOTHING_M)
 
@@ -162,9 +162,8 @@ def _given_way(points: Float64Array, index: int, centreline: Centreline) -> Bool
 def _measure(points: Float64Array, section: Section, walls: Caster, gives_way: BoolArray, ways: Float64Array) -> Axis:
     forward = headings_of(points)
     middle = points + np.array([0.0, 0.0, 0.5 * section.height_m])
-    level = np.column_stack([forward, np.zeros(len(points))])
-    up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    floor, roof, ahead, behind = (_face(walls, middle, way) for way in (-up, up, level, -level))
+    level = np.insert(forward, 2, 0.0, axis=1)
+    floor, roof, ahead, behind = (_face(walls, middle, way) for way in (-UP, UP, level, -level))
     is_inside = np.isfinite(floor) & np.isfinite(roof) & ~(ahead < _FACE_M) & ~(behind < _FACE_M)
     stations = np.arange(len(points))
     if is_inside.any():
@@ -185,10 +184,10 @@ def _face(walls: Caster, origins: Float64Array, directions: Float64Array) -> Flo
 
 def _hits(walls: Caster, origins: Float64Array, directions: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return distances (N,), infinite for a miss, and normals (N, 3); a miss is cast again slightly tilted."""
-    ranges_m, _, normals = walls.hits(origins, np.ascontiguousarray(directions))
+    ranges_m, _, normals = walls.hits(origins, directions)
     missed = np.flatnonzero(~np.isfinite(ranges_m))
     if len(missed):
-        askew = directions[missed] + _ASKEW
+        askew = np.broadcast_to(directions, origins.shape)[missed] + _ASKEW
         askew /= np.linalg.norm(askew, axis=1, keepdims=True)
         ranges_m[missed], _, normals[missed] = walls.hits(origins[missed], askew)
     return ranges_m.astype(np.float64), normals.astype(np.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -100,10 +101,7 @@ def build_centreline(tunnel: Tunnel, seed: int) -> Centreline:
     Raises:
         ScenarioError: Two neighbouring nodes of a drift coincide, or a niche is higher than its drift.
     """
-    uses: dict[str, int] = {}
-    for drift in tunnel.drifts:
-        for node in drift.nodes:
-            uses[node] = uses.get(node, 0) + 1
+    uses = Counter(node for drift in tunnel.drifts for node in drift.nodes)
     drifts = tuple(_drift_line(tunnel, index, drift, uses, seed) for index, drift in enumerate(tunnel.drifts))
     edges: dict[tuple[str, str], tuple[int, int, int]] = {}
     for index, (drift, line) in enumerate(zip(tunnel.drifts, drifts, strict=True)):
@@ -133,7 +131,7 @@ def left_of(headings: Float64Array) -> Float64Array:
     return np.stack([-headings[:, 1], headings[:, 0]], axis=1)
 
 
-def _drift_line(tunnel: Tunnel, index: int, drift: Drift, uses: dict[str, int], seed: int) -> DriftLine:
+def _drift_line(tunnel: Tunnel, index: int, drift: Drift, uses: Counter[str], seed: int) -> DriftLine:
     section = drift.section or tunnel.section
     nodes = np.array([tunnel.nodes[name] for name in drift.nodes], dtype=np.float64)
     spans = np.linalg.norm(np.diff(nodes[:, :2], axis=0), axis=1)

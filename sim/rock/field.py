@@ -16,7 +16,7 @@ from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, stream
 from scenarios.schema import Section, Tunnel
 from sim.geometry.noise import smooth_noise
 from sim.rock.centreline import Centreline, Recess
-from sim.rock.floor import floor_heights, level_shares, smooth_step
+from sim.rock.floor import floor_heights, level_share, smooth_step
 from sim.rock.frame import DriftFrame, Frame
 from sim.rock.sections import cave_floor_m, profile_distance
 
@@ -82,7 +82,7 @@ class Field:
         near = [frame for drift in self.frames if (frame := drift.place(x_m, y_m)) is not None]
         if not near:
             return np.empty((0, 0, 0), np.float32), np.empty(0, np.int64)
-        shares = level_shares(near)
+        shares = [[level_share(mine, other) for other in near] for mine in near]
         floors = floor_heights(near, shares, self._tunnel.floor)
         iz = self._levels(near, floors)
         grid = self._grid(x_m, y_m, iz.astype(np.float64) * self._cell_m)

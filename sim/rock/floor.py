@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array
-from scenarios.schema import Floor, Ruts
+from scenarios.schema import Floor
 from sim.rock.frame import Frame
 
 # Floors less than the first share of a drift's height apart are one floor; beyond the second share, two levels.
@@ -15,11 +15,6 @@ _SAME_LEVEL = 0.3
 _OTHER_LEVEL = 0.8
 _OWN_WEIGHT = 1e-6  # gives a drift far from all others its own floor
 _RUTS_END_M = 1.5  # ruts fade over this distance before the face of a blind drift
-
-
-def level_shares(frames: Sequence[Frame]) -> list[list[Float64Array]]:
-    """Return for every drift and every other the share (M,) of being on one level: 1 same, 0 other level or far."""
-    return [[_share(mine, other) for other in frames] for mine in frames]
 
 
 def floor_heights(
@@ -32,7 +27,7 @@ def floor_heights(
 
     Args:
         frames: Where the same columns lie in each of the drifts.
-        shares: Which of them are on one level, from `level_shares`.
+        shares: `level_share` of every drift with every other.
         floor: Crossfall and ruts.
     """
     own = [_own_floor(index, frames, shares[index], floor) for index in range(len(frames))]
@@ -52,13 +47,8 @@ def smooth_step(value: Float64Array) -> Float64Array:
     return np.asarray(share**2 * (3.0 - 2.0 * share))
 
 
-def rut_depth_m(ruts: Ruts, lateral_m: Float64Array) -> Float64Array:
-    """Return how deep the two wheel tracks are at a distance from the middle: raised cosines."""
-    from_track = np.clip(np.abs(np.abs(lateral_m) - ruts.gauge_m / 2) / ruts.width_m, 0.0, 0.5)
-    return np.asarray(ruts.depth_m * 0.5 * (1.0 + np.cos(2 * np.pi * from_track)))
-
-
-def _share(mine: Frame, other: Frame) -> Float64Array:
+def level_share(mine: Frame, other: Frame) -> Float64Array:
+    """Return how far two drifts share one level (M,): 1 on the same level, 0 on another one or far away."""
     height_m = np.minimum(mine.height_m, other.height_m)
     apart = np.abs(mine.level_m - other.level_m) / np.maximum(height_m, 1e-9)
     share = 1.0 - smooth_step((apart - _SAME_LEVEL) / (_OTHER_LEVEL - _SAME_LEVEL))
@@ -68,10 +58,14 @@ def _share(mine: Frame, other: Frame) -> Float64Array:
 def _own_floor(index: int, frames: Sequence[Frame], shares: Sequence[Float64Array], floor: Floor) -> Float64Array:
     frame = frames[index]
     fall_m = floor.crossfall_percent / 100 * np.clip(frame.lateral_m, -frame.half_m, frame.half_m)
-    if floor.ruts is None:
+    ruts = floor.ruts
+    if ruts is None:
         return frame.level_m + fall_m
     fade = smooth_step(-frame.beyond_m / _RUTS_END_M)
     for number, (other, share) in enumerate(zip(frames, shares, strict=True)):
         if number != index:
             fade = fade * (1.0 - share * smooth_step(3.0 * other.mouth))
-    return np.asarray(frame.level_m + fall_m - fade * rut_depth_m(floor.ruts, frame.lateral_m))
+    # The two wheel tracks are raised cosines.
+    from_track = np.clip(np.abs(np.abs(frame.lateral_m) - ruts.gauge_m / 2) / ruts.width_m, 0.0, 0.5)
+    depth_m = ruts.depth_m * 0.5 * (1.0 + np.cos(2 * np.pi * from_track))
+    return np.asarray(frame.level_m + fall_m - fade * depth_m)

@@ -10,8 +10,8 @@ import trimesh
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from scenarios.schema import MeshFile
-from sim.geometry.mesh import Mesh
-from sim.geometry.topology import Edges, closed_volume_m3, edges_of, largest_hole, void_winding
+from sim.geometry.mesh import Mesh, drop_flat_faces, drop_unused_vertices
+from sim.geometry.topology import closed_volume_m3, edges_of, largest_hole, void_winding
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 _UNIT_WORDS = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches", "ft": "feet"}
@@ -46,10 +46,10 @@ def tunnel_mesh(file: MeshFile) -> Mesh:
     mesh = _read(file, key)
     edges = edges_of(mesh)
     volume_m3 = closed_volume_m3(mesh, edges)
-    across_m = 4.0 * abs(volume_m3) / _area_m2(mesh) if volume_m3 is not None else None
-    if across_m is not None and not _DRIFT_M[0] <= across_m <= _DRIFT_M[1]:
-        what = f"its drifts are {_length(across_m)} across"
-        raise ScenarioError(_wrong_units(file, key, what, across_m, _LIKELY_DRIFT_M, _DRIFT_M))
+    if volume_m3 is not None:
+        area_m2 = trimesh.triangles.area(mesh.vertices[mesh.faces]).sum()
+        across_m = 4.0 * abs(volume_m3) / float(area_m2)
+        _refuse_length(f"its drifts are {_length(across_m)} across", across_m, file, key, _DRIFT_M, _LIKELY_DRIFT_M)
     _refuse_size(mesh, file, key, _TUNNEL_M, _LIKELY_TUNNEL_M)
     reach_m = float(np.abs(mesh.vertices).max())
     if reach_m > _FAR_M:
@@ -64,7 +64,11 @@ def tunnel_mesh(file: MeshFile) -> Mesh:
             f"{_length(around_m)} around, is at {_place(middle)}: close it, "
             f"or let rays leave with {key}.allow_open: true"
         )
-    _refuse_disagreement(mesh, edges, file, key)
+    if len(wrong := edges.disagreeing):
+        raise ScenarioError(
+            f"{key}: {file.path}: at {len(wrong)} edges the two faces do not face the same way, first at "
+            f"{_place(mesh.vertices[wrong[0]].mean(axis=0))}: make its normals consistent and export it again"
+        )
     _refuse_facing_rock(mesh, file, key)
     return mesh
 
@@ -144,49 +148,33 @@ def _weld(vertices: Float64Array, faces: Int64Array) -> Mesh:
     _, first, inverse = np.unique(mixed, return_index=True, return_inverse=True)
     if (keys[first[inverse]] != keys).any():
         _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    welded = inverse.reshape(-1)[faces]
-    has_area = (welded[:, 0] != welded[:, 1]) & (welded[:, 1] != welded[:, 2]) & (welded[:, 2] != welded[:, 0])
-    is_used = np.zeros(len(first), dtype=bool)
-    is_used[welded[has_area]] = True
-    renumbered = (np.cumsum(is_used) - 1).astype(np.int32)
-    return Mesh(vertices[first[is_used]], renumbered[welded[has_area]])
+    return drop_unused_vertices(vertices[first], drop_flat_faces(inverse.reshape(-1)[faces]))
 
 
 def _refuse_size(
     mesh: Mesh, file: MeshFile, key: str, allowed_m: tuple[float, float], likely_m: tuple[float, float]
 ) -> None:
     length_m = float(np.ptp(mesh.vertices, axis=0).max())
-    if not allowed_m[0] <= length_m <= allowed_m[1]:
-        raise ScenarioError(_wrong_units(file, key, f"{_length(length_m)} long", length_m, likely_m, allowed_m))
+    _refuse_length(f"{_length(length_m)} long", length_m, file, key, allowed_m, likely_m)
 
 
-def _wrong_units(
-    file: MeshFile,
-    key: str,
-    what: str,
-    length_m: float,
-    likely_m: tuple[float, float],
-    allowed_m: tuple[float, float],
-) -> str:
-    """Say that a length cannot be meant, and in which units it could be, the likeliest first."""
+def _refuse_length(
+    what: str, length_m: float, file: MeshFile, key: str, allowed_m: tuple[float, float], likely_m: tuple[float, float]
+) -> None:
+    """Refuse a length outside the allowed ones, and name the units in which it is likely, the likeliest first."""
+    if allowed_m[0] <= length_m <= allowed_m[1]:
+        return
     middle_m = float(np.sqrt(likely_m[0] * likely_m[1]))
     lengths = {units: length_m / UNIT_M[file.units] * scale for units, scale in UNIT_M.items() if units != file.units}
     likely = [units for units, length in lengths.items() if likely_m[0] <= length <= likely_m[1]]
     likely.sort(key=lambda units: abs(np.log(lengths[units] / middle_m)))
     say = f"{key}: {file.path}: {what}"
     if not likely:
-        return f"{say} in every unit known: expected {allowed_m[0]:g} to {allowed_m[1]:g} m: scale the file"
-    words = " or ".join(f"{_UNIT_WORDS[units]} ({_length(lengths[units])})" for units in likely)
-    return f"{say}: is the file in {words}? set {key}.units: {' or '.join(likely)}"
-
-
-def _refuse_disagreement(mesh: Mesh, edges: Edges, file: MeshFile, key: str) -> None:
-    wrong = edges.disagreeing
-    if len(wrong):
         raise ScenarioError(
-            f"{key}: {file.path}: at {len(wrong)} edges the two faces do not face the same way, first at "
-            f"{_place(mesh.vertices[wrong[0]].mean(axis=0))}: make its normals consistent and export it again"
+            f"{say} in every unit known: expected {allowed_m[0]:g} to {allowed_m[1]:g} m: scale the file"
         )
+    words = " or ".join(f"{_UNIT_WORDS[units]} ({_length(lengths[units])})" for units in likely)
+    raise ScenarioError(f"{say}: is the file in {words}? set {key}.units: {' or '.join(likely)}")
 
 
 def _refuse_facing_rock(mesh: Mesh, file: MeshFile, key: str) -> None:
@@ -213,11 +201,6 @@ def _flip_hint(file: MeshFile, key: str) -> str:
 
 def _length(length_m: float) -> str:
     return f"{length_m:.3g} m" if length_m < 1000 else f"{length_m / 1000:.3g} km"
-
-
-def _area_m2(mesh: Mesh) -> float:
-    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
 
 def _place(point: Float64Array) -> str:

@@ -90,18 +90,8 @@ class DriftFrame:
         lateral_m = cosine * columns[:, 1] - sine * columns[:, 0] - offset
         across_m, beyond_m = self._at_faces(columns, nearest, distance_m)
         mouth = np.maximum(1.0 - (distance_m / (MOUTH_SHARE * half_m)) ** 2, 0.0) ** 2
-        return Frame(
-            self._line,
-            recesses,
-            is_near,
-            np.copysign(across_m, lateral_m),
-            lateral_m,
-            beyond_m,
-            level_m,
-            half_m,
-            height_m,
-            mouth,
-        )
+        side_m = np.copysign(across_m, lateral_m)
+        return Frame(self._line, recesses, is_near, side_m, lateral_m, beyond_m, level_m, half_m, height_m, mouth)
 
     def _means(self, x_m: Float64Array, y_m: Float64Array, reach_m: float) -> Float64Array:
         """Weighted means (6, M) of what the centreline's samples carry."""

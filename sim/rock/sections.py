@@ -29,21 +29,18 @@ _TINY = 1e-9
 Sizes = Float64Array | float
 
 
-def section_distance(section: Section, side_m: Float64Array, up_m: Float64Array) -> Float64Array:
-    """Return the distance to walls and roof (not to a flat floor), exact on the surface and near it.
-
-    Args:
-        section: Shape and size.
-        side_m: Distance from the middle, positive to the left.
-        up_m: Height above the floor, broadcastable against `side_m`.
-    """
-    return profile_distance(section.shape, section.width_m / 2, section.height_m, side_m, up_m)
-
-
 def profile_distance(
     shape: str, half_m: Sizes, height_m: Sizes, side_m: Float64Array, up_m: Float64Array
 ) -> Float64Array:
-    """Return what `section_distance` does, for half widths and heights that may differ from point to point."""
+    """Return the distance to walls and roof (not to a flat floor), exact on the surface and near it.
+
+    Args:
+        shape: Shape of the section.
+        half_m: Half its width; like `height_m` one number, or one for each point.
+        height_m: Its height.
+        side_m: Distance from the middle, positive to the left.
+        up_m: Height above the floor, broadcastable against `side_m`.
+    """
     across_m = np.abs(side_m)
     if shape == "rectangle":
         return np.maximum(across_m - half_m, up_m - height_m)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
@@ -13,7 +12,7 @@ from skimage.measure import marching_cubes
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from scenarios.schema import Tunnel
-from sim.geometry.mesh import Mesh
+from sim.geometry.mesh import Mesh, drop_flat_faces, drop_unused_vertices
 from sim.rock.centreline import Centreline
 from sim.rock.field import Field
 
@@ -39,9 +38,7 @@ def mesh_tunnel(tunnel: Tunnel, centreline: Centreline, seed: int) -> Mesh:
     counts = np.cumsum([0] + [len(piece[0]) for piece in pieces])
     faces = np.concatenate([piece[2] + start for piece, start in zip(pieces, counts[:-1], strict=True)])
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    faces = inverse.reshape(-1)[faces]
-    has_area = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    return _without_small_parts(vertices[first], faces[has_area])
+    return _drop_small_parts(vertices[first], drop_flat_faces(inverse.reshape(-1)[faces]))
 
 
 def _block_meshes(
@@ -83,15 +80,11 @@ def _blocks_near(centreline: Centreline, field: Field, cell_m: float) -> Int64Ar
     return np.unique(np.concatenate(found), axis=0)
 
 
-def _without_small_parts(vertices: Float64Array, faces: Int64Array) -> Mesh:
+def _drop_small_parts(vertices: Float64Array, faces: Int64Array) -> Mesh:
     """Drop bubbles in the rock and stones hanging in the air, and the vertices only they use."""
     links = np.concatenate([faces[:, :2], faces[:, 1:]])
     graph = coo_array((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), shape=(len(vertices),) * 2)
     _, part_of_vertex = connected_components(graph, directed=False)
     part = part_of_vertex[faces[:, 0]]
     sizes = np.bincount(part)
-    faces = faces[sizes[part] > _SMALL_PART * sizes.max()]
-    used: npt.NDArray[np.int64] = np.unique(faces)
-    renumber = np.zeros(len(vertices), np.int32)
-    renumber[used] = np.arange(len(used), dtype=np.int32)
-    return Mesh(vertices[used], renumber[faces])
+    return drop_unused_vertices(vertices, faces[sizes[part] > _SMALL_PART * sizes.max()])

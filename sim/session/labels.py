@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array
+from cdpipe.core.voxel import cell_keys
 from scenarios.schema import Scenario
 from sim.geometry.mesh import Mesh, NearSurface, crop_near, drop_unused_vertices, join_meshes, split_triangles
 from sim.geometry.raycast import Caster
@@ -16,7 +16,7 @@ from sim.placement.contact import standing_surface
 from sim.placement.placing import Standing
 from sim.scene import Scene, World
 from sim.sensor.rays import Rays
-from sim.session.truth import Change
+from sim.session.truth import Change, Group, Kind, SessionName
 
 CELL_M = 0.1
 NEAR_OLD_SURFACE_M = 0.1
@@ -77,6 +77,19 @@ class Ghost:
 
 
 @dataclass(slots=True, eq=False)
+class Returns:
+    """The number of returns counted so far, and the keys of the 0.1 m cells they fill in their session's odom frame."""
+
+    n: int = 0
+    cells: set[int] = field(default_factory=set)
+
+    def add(self, points_odom: Float64Array) -> None:
+        """Count returns (N, 3), as measured, odom frame, metres."""
+        self.n += len(points_odom)
+        self.cells.update(np.unique(cell_keys(points_odom, CELL_M)).tolist())
+
+
+@dataclass(slots=True, eq=False)
 class Tally:
     """The running counts of one change while the sessions are simulated.
 
@@ -84,38 +97,34 @@ class Tally:
         change: The change, its counts still zero.
         ghost: The object, to be met by the rays of the other session.
         other_surface: For a partial change, the surfaces near it in the other session; else None.
-        n_returns: Returns that belong to the change so far.
-        cells: Keys of the cells they fill, in the odom frame of its session.
-        n_ghost_rays: Rays of the other session that meet its ghost so far.
-        n_returns_other: Returns of the other session on the same prop so far.
-        cells_other: Keys of the cells these fill, in the odom frame of that session.
+        own: Returns that belong to the change.
+        other: Returns of the other session on the same prop.
+        n_ghost_rays: Rays of the other session that meet the ghost so far.
     """
 
     change: Change
     ghost: Ghost
     other_surface: NearSurface | None
-    n_returns: int = 0
-    cells: set[int] = field(default_factory=set)
+    own: Returns = field(default_factory=Returns)
+    other: Returns = field(default_factory=Returns)
     n_ghost_rays: int = 0
-    n_returns_other: int = 0
-    cells_other: set[int] = field(default_factory=set)
 
     def finished(self) -> Change:
         """Return the change with its counts and whether it is observable."""
         reasons = []
-        if len(self.cells) < MIN_CELLS:
-            reasons.append(f"{len(self.cells)} cells of {CELL_M:g} m filled, {MIN_CELLS} needed")
+        if len(self.own.cells) < MIN_CELLS:
+            reasons.append(f"{len(self.own.cells)} cells of {CELL_M:g} m filled, {MIN_CELLS} needed")
         if self.n_ghost_rays < MIN_GHOST_RAYS:
             reasons.append(f"{self.n_ghost_rays} rays of the other session reach it, {MIN_GHOST_RAYS} needed")
         return replace(
             self.change,
-            n_returns=self.n_returns,
-            n_cells=len(self.cells),
+            n_returns=self.own.n,
+            n_cells=len(self.own.cells),
             n_ghost_rays=self.n_ghost_rays,
             is_observable=not reasons,
             why_not="; ".join(reasons),
-            n_returns_other=self.n_returns_other,
-            n_cells_other=len(self.cells_other),
+            n_returns_other=self.other.n,
+            n_cells_other=len(self.other.cells),
         )
 
 
@@ -139,7 +148,9 @@ def list_changes(scenario: Scenario, world: World) -> list[Tally]:
         if prop.loaded_share is not None:
             tallies.append(_tally_reshaped(len(tallies) + 1, instance, start, world))
             continue
-        group: Literal["full", "partial"] = "partial" if _is_short_move(start, end) else "full"
+        moved_m = np.linalg.norm(end.world_T_object[:3, 3] - start.world_T_object[:3, 3])
+        # A short move is one by less than the longer side of the prop's footprint.
+        group: Group = "partial" if moved_m < max(start.shape.size_m[:2]) else "full"
         first_id = len(tallies) + 1
         tallies.append(_tally(first_id, instance, start, world, group, first_id + 1))
         tallies.append(_tally(first_id + 1, instance, end, world, group, first_id))
@@ -153,27 +164,9 @@ def mark_belonging(tally: Tally, points_world: Float64Array) -> BoolArray:
     return ~tally.other_surface.marks(points_world)
 
 
-def claim_returns(tally: Tally, points_odom: Float64Array) -> None:
-    """Add returns (N, 3) that belong to a change, as measured in the session's odom frame, to its tally."""
-    tally.n_returns += len(points_odom)
-    tally.cells.update(cell_keys(points_odom).tolist())
-
-
-def cell_keys(points: Float64Array) -> Int64Array:
-    """Return a number for each 0.1 m cell that points (N, 3) fill."""
-    cells = np.floor(points / CELL_M).astype(np.int64) + (1 << 20)
-    return np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2])
-
-
-def count_other(tally: Tally, points_odom: Float64Array) -> None:
-    """Add returns (N, 3) of the other session on the same prop, as measured in that session, to the tally."""
-    tally.n_returns_other += len(points_odom)
-    tally.cells_other.update(cell_keys(points_odom).tolist())
-
-
 def _standing_in(world: World, name: str, session: str) -> Standing | None:
-    found = [item for item in world.standing if item.prop.name == name and session in item.sessions]
-    return found[0] if found else None
+    here = (item for item in world.standing if item.prop.name == name and session in item.sessions)
+    return next(here, None)
 
 
 def _is_same(start: Standing, end: Standing) -> bool:
@@ -184,18 +177,11 @@ def _is_same(start: Standing, end: Standing) -> bool:
     return a.shape == b.shape and bool((np.linalg.norm(a - b, axis=1) <= UNMOVED_M).all())
 
 
-def _tally(
-    change_id: int,
-    instance: int,
-    item: Standing,
-    world: World,
-    group: Literal["full", "partial"],
-    partner: int | None,
-) -> Tally:
-    session: Literal["before", "after"] = "before" if "before" in item.sessions else "after"
+def _tally(change_id: int, instance: int, item: Standing, world: World, group: Group, partner: int | None) -> Tally:
+    session: SessionName = "before" if "before" in item.sessions else "after"
     scene, other = (world.before, world.after) if session == "before" else (world.after, world.before)
     surface = _surface_in(scene, instance)
-    kind: Literal["added", "removed", "moved"] = "added" if session == "after" else "removed"
+    kind: Kind = "added" if session == "after" else "removed"
     change = Change(
         id=change_id,
         name=item.prop.name,
@@ -267,9 +253,3 @@ def _near(scene: Scene, surface: Mesh) -> NearSurface:
 
 def _compact(mesh: Mesh) -> Mesh:
     return drop_unused_vertices(mesh.vertices, mesh.faces)
-
-
-def _is_short_move(start: Standing, end: Standing) -> bool:
-    """Tell whether a prop moved by less than its own length, the longer side of its footprint."""
-    moved_m = np.linalg.norm(end.world_T_object[:3, 3] - start.world_T_object[:3, 3])
-    return bool(moved_m < max(start.shape.size_m[:2]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -15,10 +14,8 @@ from sim.drive.trajectory import Trajectory
 from sim.scene import Scene
 from sim.sensor.lidar import Scan, scan
 from sim.sensor.rays import Rays, revolution_rays
-from sim.session.labels import Tally, claim_returns, count_other, mark_belonging
-from sim.session.truth import Int16Array
-
-SessionName = Literal["before", "after"]
+from sim.session.labels import Tally, mark_belonging
+from sim.session.truth import Int16Array, SessionName
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,13 +113,13 @@ def label_changes(drive: Drive, revolutions: list[Revolution]) -> Int16Array:
         change_id = tally.change.id
         tally.n_ghost_rays += sum(each.ghost_rays.get(change_id, 0) for each in revolutions)
         for place, each in enumerate(revolutions):
-            if change_id not in each.hits:
+            hits = each.hits.get(change_id)
+            if hits is None:
                 continue
-            hits = each.hits[change_id]
             if tally.change.session != drive.name:
-                count_other(tally, hits.points_odom)
+                tally.other.add(hits.points_odom)
                 continue
-            claim_returns(tally, hits.points_odom[hits.belongs])
+            tally.own.add(hits.points_odom[hits.belongs])
             labels[place, hits.row[hits.belongs], hits.column[hits.belongs]] = change_id
     return labels
 

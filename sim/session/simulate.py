@@ -27,8 +27,16 @@ from sim.drive.odometry import register_scans, start_pose
 from sim.drive.trajectory import plan_trajectory
 from sim.scene import build_world
 from sim.session.labels import list_changes
-from sim.session.revolution import Drive, Revolution, SessionName, cast_revolution, label_changes, simulate_revolution
-from sim.session.truth import Int16Array, PairTruth, write_labels, write_pair_truth, write_true_poses
+from sim.session.revolution import Drive, Revolution, cast_revolution, label_changes, simulate_revolution
+from sim.session.truth import (
+    SESSIONS,
+    Int16Array,
+    PairTruth,
+    SessionName,
+    write_labels,
+    write_pair_truth,
+    write_true_poses,
+)
 
 CHUNK_SCANS = 64
 _THREADS = 2
@@ -83,15 +91,10 @@ def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progres
             KISS-ICP is asked for and not installed.
         ScenarioError: The world contradicts itself.
     """
-    report = on_progress or (lambda stage, done, total: None)
-    _refuse_taken(out)
-    if "kiss-icp" in (scenario.before.odometry.source, scenario.after.odometry.source):
-        require_extra("odometry", "odometry.source = kiss-icp")
-    files = file_digests(scenario)
-    sensor = load_profile(scenario.sensor.profile, scenario.sensor.mode)
-    report("world", 0, 1)
-    drives = plan_drives(scenario, sensor, seed)
-    report("world", 1, 1)
+    report = on_progress or _report_nothing
+    if (out.exists() or out.is_symlink()) and not (out.is_dir() and not any(out.iterdir())):
+        raise InputError(f"{out}: exists and is not an empty folder: name a new one or remove it")
+    drives, files = _plan(scenario, seed, report)
     home = out.absolute()
     partial = home.with_name(f".{home.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -115,11 +118,20 @@ def collect_truth(scenario: Scenario, seed: int, drives: Sequence[Drive], files:
     return PairTruth(scenario.family, seed, scenario.score_radius_m, changes, drawn, dict(files))
 
 
-def _refuse_taken(out: Path) -> None:
-    if out.is_dir() and not any(out.iterdir()):
-        return
-    if out.exists() or out.is_symlink():
-        raise InputError(f"{out}: exists and is not an empty folder: name a new one or remove it")
+def _report_nothing(stage: str, done: int, total: int) -> None:
+    pass
+
+
+def _plan(scenario: Scenario, seed: int, report: Progress) -> tuple[list[Drive], dict[str, str]]:
+    """Return both drives and the digests of the scenario's files; refuse what cannot be simulated."""
+    if "kiss-icp" in (scenario.before.odometry.source, scenario.after.odometry.source):
+        require_extra("odometry", "odometry.source = kiss-icp")
+    files = file_digests(scenario)
+    sensor = load_profile(scenario.sensor.profile, scenario.sensor.mode)
+    report("world", 0, 1)
+    drives = plan_drives(scenario, sensor, seed)
+    report("world", 1, 1)
+    return drives, files
 
 
 def plan_drives(scenario: Scenario, sensor: SensorMetadata, seed: int) -> list[Drive]:
@@ -131,21 +143,13 @@ def plan_drives(scenario: Scenario, sensor: SensorMetadata, seed: int) -> list[D
     """
     world = build_world(scenario, seed)
     tallies = tuple(list_changes(scenario, world))
-    names: tuple[SessionName, SessionName] = ("before", "after")
-    scenes = (world.before, world.after)
-    return [
-        Drive(
-            name,
-            scenario,
-            scene,
-            np.append(scene.instance, [-2, -1]).astype(np.int16),
-            sensor,
-            plan_trajectory(world, scenario, sensor, seed, name),
-            tallies,
-            seed,
-        )
-        for name, scene in zip(names, scenes, strict=True)
-    ]
+    drives = []
+    for name in SESSIONS:
+        scene = world.before if name == "before" else world.after
+        labels = np.append(scene.instance, [-2, -1]).astype(np.int16)
+        trajectory = plan_trajectory(world, scenario, sensor, seed, name)
+        drives.append(Drive(name, scenario, scene, labels, sensor, trajectory, tallies, seed))
+    return drives
 
 
 def estimate_odometry(drive: Drive, pool: Executor, report: Progress) -> Drive:
@@ -155,14 +159,8 @@ def estimate_odometry(drive: Drive, pool: Executor, report: Progress) -> Drive:
         return drive
     trajectory = drive.trajectory
     start = start_pose(trajectory.true, float(trajectory.revolution_s[0]))
-    estimated = register_scans(
-        _range_images(drive, pool, report),
-        drive.sensor,
-        trajectory.revolution_s,
-        trajectory.column_s,
-        start,
-        drive.name,
-    )
+    images = _range_images(drive, pool, report)
+    estimated = register_scans(images, drive.sensor, trajectory.revolution_s, trajectory.column_s, start, drive.name)
     return replace(drive, trajectory=replace(trajectory, estimated=estimated))
 
 
@@ -182,11 +180,8 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
         OSError: It cannot be written.
     """
     n_scans = drive.trajectory.n_scans
-    provenance = {
-        "made_by": "tunnelcd simulate",
-        "session": drive.name,
-        "sensor_profile": drive.scenario.sensor.profile,
-    }
+    profile = drive.scenario.sensor.profile
+    provenance = {"made_by": "tunnelcd simulate", "session": drive.name, "sensor_profile": profile}
     report(drive.name, 0, n_scans)
     with (
         SessionWriter(folder, drive.sensor, CHUNK_SCANS, provenance) as writer,
@@ -281,17 +276,14 @@ def simulate_in_memory(scenario: Scenario, seed: int, n_threads: int = 1) -> Hel
             installed.
         ScenarioError: The world contradicts itself.
     """
-    if "kiss-icp" in (scenario.before.odometry.source, scenario.after.odometry.source):
-        require_extra("odometry", "odometry.source = kiss-icp")
-    files = file_digests(scenario)
-    drives = plan_drives(scenario, load_profile(scenario.sensor.profile, scenario.sensor.mode), seed)
+    drives, files = _plan(scenario, seed, _report_nothing)
     with ThreadPoolExecutor(min(n_threads, os.cpu_count() or 1)) as pool:
         sessions = {drive.name: _hold_session(drive, pool) for drive in drives}
     return HeldPair(collect_truth(scenario, seed, drives, files), sessions)
 
 
 def _hold_session(drive: Drive, pool: Executor) -> LabelledSession:
-    drive = estimate_odometry(drive, pool, lambda stage, done, total: None)
+    drive = estimate_odometry(drive, pool, _report_nothing)
     with closing(simulate_chunks(drive, pool)) as chunks:
         chunk, instance, change = zip(*chunks, strict=True)
     session = HeldSession(

@@ -29,6 +29,10 @@ from cdpipe.core.geometry import Float64Array
 from cdpipe.io.session import load_arrays
 
 Int16Array = npt.NDArray[np.int16]
+SessionName = Literal["before", "after"]
+SESSIONS: tuple[SessionName, ...] = ("before", "after")
+Kind = Literal["added", "removed", "moved", "reshaped"]
+Group = Literal["full", "partial"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,10 +65,10 @@ class Change:
     id: int
     name: str
     prop_kind: str
-    kind: Literal["added", "removed", "moved", "reshaped"]
-    session: Literal["before", "after"]
+    kind: Kind
+    session: SessionName
     partner: int | None
-    group: Literal["full", "partial"]
+    group: Group
     instance: int
     world_T_object: list[list[float]]
     hull_volume_m3: float
@@ -102,8 +106,7 @@ class PairTruth:
 def write_pair_truth(pair: Path, truth: PairTruth) -> None:
     """Write `PAIR/truth/changes.json`."""
     (pair / "truth").mkdir(parents=True, exist_ok=True)
-    document = asdict(truth)
-    (pair / "truth" / "changes.json").write_text(json.dumps(document, indent=1))
+    (pair / "truth" / "changes.json").write_text(json.dumps(asdict(truth), indent=1))
 
 
 def read_pair_truth(pair: str | Path) -> PairTruth:

@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array
 from sim.geometry.raycast import Caster
+from sim.rock.axis import find_runs
 from sim.rock.centreline import STEP_M, Centreline, DriftLine, left_of
 from sim.rock.sections import profile_distance
 
@@ -92,7 +93,8 @@ def _deviations(walls: Caster, centreline: Centreline, index: int) -> list[Float
     reach_m = np.where(is_front, ranges_m, np.nan).reshape(len(points), len(angles)).astype(np.float64)
     side_m, up_m = reach_m * np.cos(angles), _ORIGIN_UP * height_m + reach_m * np.sin(angles)
     deviation_m = profile_distance(line.section.shape, half_m, height_m, side_m, up_m)
-    return _stretches(deviation_m, _is_plain(centreline, index, points))
+    is_plain = _is_plain(centreline, index, points) & np.isfinite(deviation_m).all(axis=1)
+    return [deviation_m[first:end] for first, end in find_runs(is_plain, _LEAST_RUN)]
 
 
 def _is_plain(centreline: Centreline, index: int, points: Float64Array) -> BoolArray:
@@ -120,14 +122,7 @@ def _is_near_kink(line: DriftLine, points: Float64Array) -> BoolArray:
     corners = line.points[1:-1][turn > 0.2]
     if len(corners) == 0:
         return np.zeros(len(points), dtype=bool)
-    distance_m, _ = cKDTree(corners).query(points)
-    return np.asarray(distance_m < line.section.width_m)
-
-
-def _stretches(deviation_m: Float64Array, is_plain: BoolArray) -> list[Float64Array]:
-    is_plain = is_plain & np.isfinite(deviation_m).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_plain, [False]]).astype(np.int8)))
-    return [deviation_m[first:end] for first, end in edges.reshape(-1, 2) if end - first >= _LEAST_RUN]
+    return np.asarray(cKDTree(corners).query(points)[0] < line.section.width_m)
 
 
 def _without_openings(runs: Sequence[Float64Array]) -> list[Float64Array]:
@@ -166,7 +161,5 @@ def _bands(runs: Sequence[Float64Array]) -> tuple[tuple[float, float, float], ..
         sigma = _HALVING * length_m / _STATION_M
         left.append(_mean_square([gaussian_filter1d(run, sigma, axis=0) for run in runs]))
     left.append(0.0)
-    squares = np.maximum(-np.diff(left), 0.0)
-    return tuple(
-        (low, high, float(rms)) for low, high, rms in zip(edges[:-1], edges[1:], np.sqrt(squares), strict=True)
-    )
+    rms_m = np.sqrt(np.maximum(-np.diff(left), 0.0)).tolist()
+    return tuple(zip(edges[:-1], edges[1:], rms_m, strict=True))

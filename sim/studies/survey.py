@@ -21,6 +21,7 @@ from sim.geometry.raycast import Caster
 from sim.placement.contact import interpenetration_m
 from sim.placement.placing import standing_middle
 from sim.props.heap import flank_angle_deg
+from sim.rock.axis import UP
 from sim.rock.centreline import headings_of, left_of
 from sim.scene import World, build_world
 from sim.session.labels import list_changes
@@ -196,8 +197,7 @@ def keyframes(points: Float64Array) -> tuple[Float64Array, Float64Array]:
 def void_size_m(walls: Caster, places: Float64Array, headings: Float64Array) -> tuple[float, float]:
     """Return the median width and height of the void about places (N, 3) on a path; junctions weigh little."""
     left = np.column_stack([left_of(headings), np.zeros(len(headings))])
-    up = np.broadcast_to([0.0, 0.0, 1.0], left.shape)
-    reach_m = [walls.cast(places, np.ascontiguousarray(way))[0] for way in (left, -left, up, -up)]
+    reach_m = [walls.cast(places, way)[0] for way in (left, -left, UP, -UP)]
     return float(np.median(reach_m[0] + reach_m[1])), float(np.median(reach_m[2] + reach_m[3]))
 
 

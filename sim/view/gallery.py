@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,7 @@ from cdpipe.core.geometry import Float64Array, stream, yaw_pose, yaw_rad
 from cdpipe.core.yamlfile import suggest
 from scenarios import load_scenario, scenario_names
 from scenarios.schema import Drift, Place, Prop, Roughness, Scenario, Section, SessionPlan, Tunnel
-from sim.placement.placing import Standing, standing_box, standing_middle
+from sim.placement.placing import Posture, Standing, standing_box, standing_middle
 from sim.scene import Scene, World, build_world
 from sim.view.picture import render
 
@@ -46,7 +46,6 @@ _EYE_M = 1.6
 _FRACTIONS = (0.5, 0.4, 0.6, 0.3)
 _QUALITY = 82
 Pixels = npt.NDArray[np.uint8]
-Posture = Literal["upright", "tipped", "leaning"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,16 +78,11 @@ def draw_gallery(out: Path, only: Sequence[str] = ()) -> list[Path]:
             raise ScenarioError(f"{name}: neither a family nor a kind of prop{suggest(name, [*families, *SIZES])}")
     out.mkdir(parents=True, exist_ok=True)
     written = []
-    for name in families:
-        if not only or name in only:
-            path = out / f"family-{name.replace('/', '-')}.jpg"
-            _save(path, [(family_picture(load_scenario(name, SEED), SEED), "")])
-            written.append(path)
-    for kind in SIZES:
-        if not only or kind in only:
-            path = out / f"prop-{kind}.jpg"
-            _save(path, prop_pictures(kind))
-            written.append(path)
+    for name in [name for name in (*families, *SIZES) if not only or name in only]:
+        is_prop = name in SIZES
+        pictures = prop_pictures(name) if is_prop else [(family_picture(load_scenario(name, SEED), SEED), "")]
+        written.append(out / f"{'prop' if is_prop else 'family'}-{name.replace('/', '-')}.jpg")
+        _save(written[-1], pictures)
     return written
 
 
@@ -102,14 +96,12 @@ def family_picture(scenario: Scenario, seed: int) -> Pixels:
     numbers = {prop.name: number for number, prop in enumerate(scenario.props, start=1)}
     wanted = {numbers[item.prop.name] for item in changed}
     stations = np.concatenate([line.points[::10] for line in world.centreline.drifts]) + np.array([0.0, 0.0, _EYE_M])
-    best = (-1.0, stations[0], stations[1])
+    views = [(stations[0], stations[1], -1.0)]
     for target in targets:
         distance_m = np.linalg.norm(stations - target, axis=1)
-        for eye in stations[(distance_m > 3.0) & (distance_m < 9.0)]:
-            score = _score(scene, eye, target, wanted)
-            if score > best[0]:
-                best = (score, eye, target)
-    _, eye, target = best
+        eyes = stations[(distance_m > 3.0) & (distance_m < 9.0)]
+        views += [(eye, target, _score(scene, eye, target, wanted)) for eye in eyes]
+    eye, target, _ = max(views, key=lambda view: view[2])
     return render(scene, eye, target, *_FAMILY_PX, field_of_view_deg=78.0, samples=2)
 
 
@@ -147,18 +139,10 @@ def _first_world(kind: str, case: _Case, refused: list[str]) -> World | None:
 
 def _stage(kind: str, case: _Case, fraction: float) -> Scenario:
     """Return a short drift with one prop."""
-    where: dict[str, Any] = {"between": ("a", "b"), "fraction": fraction}
-    lateral = 0.95 if case.posture == "leaning" else 0.1
-    prop = Prop.model_validate(
-        {
-            "name": kind,
-            "kind": kind,
-            "size_m": SIZES[kind],
-            "place": Place(**where, lateral=lateral, yaw_deg=20.0 if lateral < 0.5 else 0.0, posture=case.posture),
-            "change": "none" if case.loaded_share is None else "reshaped",
-            "loaded_share": case.loaded_share,
-        }
-    )
+    lateral, yaw_deg = (0.95, 0.0) if case.posture == "leaning" else (0.1, 20.0)
+    place = Place(between=("a", "b"), fraction=fraction, lateral=lateral, yaw_deg=yaw_deg, posture=case.posture)
+    change: Literal["none", "reshaped"] = "none" if case.loaded_share is None else "reshaped"
+    prop = Prop(name=kind, kind=kind, size_m=SIZES[kind], place=place, change=change, loaded_share=case.loaded_share)
     tunnel = Tunnel(
         nodes={"a": (0, 0, 0), "b": (18, 0, 0)},
         drifts=(Drift(nodes=("a", "b")),),
@@ -202,7 +186,7 @@ def _score(scene: Scene, eye: Float64Array, target: Float64Array, wanted: set[in
     across, along = np.meshgrid(np.linspace(-0.75, 0.75, 40), np.linspace(-0.45, 0.45, 24))
     rays = forward + across.reshape(-1, 1) * side + along.reshape(-1, 1) * up
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    ranges_m, geom, _ = scene.caster.cast(np.broadcast_to(eye, rays.shape), rays)
+    ranges_m, geom, _ = scene.caster.cast(eye, rays)
     if np.isinf(ranges_m).any() or (ranges_m < 0.4).mean() > 0.02:
         return -1.0
     seen = scene.instance[geom]
@@ -212,10 +196,9 @@ def _score(scene: Scene, eye: Float64Array, target: Float64Array, wanted: set[in
 
 def _free_m(world: World, eye: Float64Array) -> float:
     """Return the distance from a place to the nearest rock or fixture, 0 outside the tunnel."""
-    generator = stream(0, "gallery")
-    rays = generator.normal(size=(64, 3))
+    rays = stream(0, "gallery").normal(size=(64, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    ranges_m, _, normals = world.fixed.hits(np.broadcast_to(eye, rays.shape), rays)
+    ranges_m, _, normals = world.fixed.hits(eye, rays)
     is_inside = np.isfinite(ranges_m).all() and ((normals * rays).sum(axis=1) < 0).all()
     return float(ranges_m.min()) if is_inside else 0.0
 

@@ -12,7 +12,7 @@ from collections.abc import Collection
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, stream
+from cdpipe.core.geometry import Float32Array, Float64Array, stream
 from sim.scene import Scene
 
 COLOURS: dict[str, tuple[float, float, float]] = {
@@ -71,12 +71,8 @@ def render(
     colours = part_colours(scene)
     colours[np.isin(scene.instance, sorted(highlight))] = HIGHLIGHT_RGB
     generator = stream(0, "picture")
-    light = np.concatenate(
-        [
-            _shaded(scene, eye_m, lamp_m, directions[start : start + _CHUNK], colours, generator)
-            for start in range(0, len(directions), _CHUNK)
-        ]
-    )
+    chunks = np.split(directions, range(_CHUNK, len(directions), _CHUNK))
+    light = np.concatenate([_shaded(scene, eye_m, lamp_m, chunk, colours, generator) for chunk in chunks])
     pixels = light.reshape(height, samples, width, samples, 3).mean(axis=(1, 3))
     return np.asarray(np.clip(pixels, 0.0, 1.0) ** (1 / 2.2) * 255, dtype=np.uint8)
 
@@ -101,7 +97,7 @@ def _shaded(
     generator: np.random.Generator,
 ) -> Float64Array:
     """Return the linear light (N, 3) that comes back along each direction."""
-    ranges_m, geom, normals = scene.caster.hits(np.broadcast_to(eye_m, directions.shape), directions)
+    ranges_m, geom, normals = scene.caster.hits(eye_m, directions)
     light = np.zeros((len(directions), 3))
     seen = np.flatnonzero(geom >= 0)
     if not len(seen):
@@ -111,7 +107,8 @@ def _shaded(
     to_lamp = lamp_m + _LAMP_RADIUS_M * generator.normal(size=points.shape) - points
     distance_m = np.linalg.norm(to_lamp, axis=1)
     towards = to_lamp / distance_m[:, None]
-    lit = np.clip((facing * towards).sum(axis=1), 0.0, None) * ~_is_blocked(scene, points, towards, distance_m)
+    is_lit = scene.caster.cast(points, towards)[0] >= distance_m
+    lit = np.clip((facing * towards).sum(axis=1), 0.0, None) * is_lit
     lamp = lit / (1.0 + (distance_m / 12.0) ** 2)
     # from above a little more than from below, as light from a lit drift has it
     around = _openness(scene, points, facing, generator) * (0.8 + 0.2 * facing[:, 2])
@@ -128,11 +125,6 @@ def _openness(scene: Scene, points: Float64Array, facing: Float64Array, generato
         ranges_m, _, _ = scene.caster.cast(points, _unit(facing + 0.999 * spread))
         total += np.minimum(ranges_m / _OCCLUSION_M, 1.0)
     return total / np.float32(_OCCLUSION_RAYS)
-
-
-def _is_blocked(scene: Scene, points: Float64Array, towards: Float64Array, distance_m: Float64Array) -> BoolArray:
-    ranges_m, _, _ = scene.caster.cast(points, towards)
-    return np.asarray(ranges_m < distance_m)
 
 
 def _axes(forward: Float64Array) -> tuple[Float64Array, Float64Array, Float64Array]:

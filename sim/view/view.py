@@ -9,7 +9,6 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from pydantic import ValidationError
@@ -25,30 +24,21 @@ from sim.geometry.mesh import Mesh, drop_unused_vertices, join_meshes, move_mesh
 from sim.placement.placing import Standing, standing_box
 from sim.props.shapes import solid_mesh
 from sim.scene import World, build_world
-from sim.session.truth import PairTruth, read_pair_truth, read_true_poses
+from sim.session.truth import SESSIONS, PairTruth, read_pair_truth, read_true_poses
 from sim.view.picture import material_colour
 from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Rgb, session_cloud
 
-SessionName = Literal["before", "after"]
-SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
 _N_BANDS = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """A mesh in one colour, world frame, metres."""
+    """A mesh in one colour, world frame, metres; a band of the walls begins `from_m` above the floor."""
 
     name: str
     mesh: Mesh
     rgb: Rgb
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Band:
-    """The part of the walls from one height above the floor up to the next band."""
-
-    from_m: float
-    surface: Surface
+    from_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +65,7 @@ class View:
 
     Attributes:
         title: What it is.
-        bands: The walls, cut into bands of height above the floor, lowest first.
+        bands: The walls in bands of height above the floor, lowest first; each ends where the next begins.
         surfaces: Fixtures, props that stay and changed props.
         lines: Paths of the sensor.
         clouds: Returns of sessions.
@@ -85,7 +75,7 @@ class View:
     """
 
     title: str
-    bands: tuple[Band, ...]
+    bands: tuple[Surface, ...]
     surfaces: tuple[Surface, ...]
     lines: tuple[Line, ...]
     clouds: tuple[Cloud, ...]
@@ -168,7 +158,7 @@ def view_folder(folder: Path) -> View:
     raise InputError(f"{folder}: neither a simulated pair nor a session: expected truth/changes.json or session.json")
 
 
-def wall_bands(wall: Mesh, floor_points: Float64Array, n_bands: int = _N_BANDS) -> tuple[Band, ...]:
+def wall_bands(wall: Mesh, floor_points: Float64Array, n_bands: int = _N_BANDS) -> tuple[Surface, ...]:
     """Cut walls into bands of equal height above the floor (N, 3) nearest to each face, lowest first."""
     centres = wall.vertices[wall.faces].mean(axis=1)
     # A face belongs to the floor below it even where another level runs above.
@@ -178,17 +168,11 @@ def wall_bands(wall: Mesh, floor_points: Float64Array, n_bands: int = _N_BANDS) 
     step_m = max(0.1, round(top_m / n_bands, 1))
     number = np.clip(np.floor(height_m / step_m), 0, n_bands - 1).astype(int)
     rgb = _rgb(material_colour("wall", "rock"))
-    return tuple(
-        Band(
-            band * step_m,
-            Surface(
-                f"walls/from {band * step_m:.1f} m",
-                drop_unused_vertices(wall.vertices, wall.faces[number == band]),
-                rgb,
-            ),
-        )
-        for band in np.unique(number).tolist()
-    )
+    bands = []
+    for band in np.unique(number).tolist():
+        mesh = drop_unused_vertices(wall.vertices, wall.faces[number == band])
+        bands.append(Surface(f"walls/from {band * step_m:.1f} m", mesh, rgb, band * step_m))
+    return tuple(bands)
 
 
 def _world_view(
@@ -198,14 +182,11 @@ def _world_view(
     floor = [line.points for line in world.centreline.drifts]
     floor += [] if floor else [path.points - (0.0, 0.0, 1.0) for path in lines]
     floor_points = np.concatenate(floor) if floor else wall.vertices[[int(np.argmin(wall.vertices[:, 2]))]]
-    fixtures = [
-        Surface(
-            f"fixtures/{_kind(fixture.name)}/{fixture.name}",
-            fixture.mesh,
-            _rgb(material_colour(fixture.name, fixture.material)),
-        )
-        for fixture in world.fixtures
-    ]
+    fixtures = []
+    for fixture in world.fixtures:
+        kind = re.split(r"[\W_]*\d", fixture.name, maxsplit=1)[0]
+        rgb = _rgb(material_colour(fixture.name, fixture.material))
+        fixtures.append(Surface(f"fixtures/{kind}/{fixture.name}", fixture.mesh, rgb))
     props = [surface for item in world.standing for surface in _prop_surfaces(item)]
     changed = [item for item in world.standing if item.prop.change != "none"]
     if changed:
@@ -253,10 +234,6 @@ def _scenario_of(pair: Path, truth: PairTruth) -> Scenario:
             f"{pair / 'truth' / 'changes.json'}: its scenario is not one of this version "
             f"({error.errors()[0]['msg']}): simulate the pair again, or view its sessions one by one"
         ) from error
-
-
-def _kind(fixture: str) -> str:
-    return re.split(r"[\W_]*\d", fixture, maxsplit=1)[0]
 
 
 def _rgb(colour: tuple[float, float, float]) -> Rgb:

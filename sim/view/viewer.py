@@ -6,7 +6,7 @@ import contextlib
 import html
 import io
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -90,15 +90,12 @@ def _add_nodes(server: Any, view: View) -> dict[str, Any]:
     server.initial_camera.position = view.eye
     server.initial_camera.look_at = view.target
     handles: dict[str, Any] = {}
-    names = [band.surface.name for band in view.bands]
-    names += [part.name for parts in (view.surfaces, view.lines, view.clouds, view.labels) for part in parts]
-    for name in names:
-        words = name.split("/")[:-1]
-        for depth in range(1, len(words) + 1):
-            group = "/".join(words[:depth])
-            if group not in handles:
-                handles[group] = scene.add_frame(f"/{group}", show_axes=False)
-    for surface in (*(band.surface for band in view.bands), *view.surfaces):
+    parts = (view.bands, view.surfaces, view.lines, view.clouds, view.labels)
+    for name in [part.name for some in parts for part in some]:
+        for group in reversed(PurePosixPath(name).parents[:-1]):
+            if str(group) not in handles:
+                handles[str(group)] = scene.add_frame(f"/{group}", show_axes=False)
+    for surface in (*view.bands, *view.surfaces):
         mesh = surface.mesh
         # One-sided: whoever looks in from outside looks through the near wall.
         side = "front" if surface.name.startswith("walls/") else "double"
@@ -153,7 +150,7 @@ def _add_switches(server: Any, view: View, handles: dict[str, Any]) -> None:
 
 
 def _add_wall_switches(gui: Any, view: View, handles: dict[str, Any]) -> None:
-    bands = [(band.from_m, handles[band.surface.name]) for band in view.bands]
+    bands = [(band.from_m, handles[band.name]) for band in view.bands]
     step_m = round(bands[1][0] - bands[0][0], 1) if len(bands) > 1 else 1.0
     top_m = round(bands[-1][0] + step_m, 1)
     cut = gui.add_slider("walls up to, m above floor", min=0.0, max=top_m, step=step_m, initial_value=top_m)
@@ -182,12 +179,11 @@ def _add_switch(gui: Any, group: str, handle: Any) -> None:
 
 def _switched(handles: dict[str, Any]) -> list[str]:
     """Return the groups that get a switch: the outermost, and one level below where the kinds are told apart."""
-    groups = [
-        name for name in handles if name.count("/") == 0 and name not in ("fixtures", "changes", "paths", "returns")
-    ]
-    kinds = [name for name in handles if name.count("/") == 1 and name.split("/")[0] in ("fixtures", "changes")]
-    sessions = [name for name in handles if name.count("/") == 1 and name.split("/")[0] == "paths"]
-    return [*groups, *sorted(kinds), *sessions]
+    inner = [name for name in handles if name.count("/") == 1]
+    split = ("fixtures", "changes", "paths", "returns")
+    groups = [name for name in handles if "/" not in name and name not in split]
+    kinds = sorted(name for name in inner if name.startswith(("fixtures/", "changes/")))
+    return [*groups, *kinds, *(name for name in inner if name.startswith("paths/"))]
 
 
 def _legend(view: View) -> str:

@@ -67,27 +67,22 @@ def measure(
         key = _key(scenario, seed)
         document = read_json(path)
         if document.get("key") != key or "rows" not in document:
-            measured = _simulated(scenario, seed, out / "pairs" / path.stem, progress, keep=keep)
+            pair = out / "pairs" / path.stem
+            try:
+                if not pair.exists():
+                    pair.parent.mkdir(parents=True, exist_ok=True)
+                    simulate_pair(scenario, seed, pair, on_progress=progress.stage)
+                progress.stage("describe", 0, 1)
+                measured = measure_pair(pair)
+            finally:
+                if not keep:
+                    remove(pair)
             own = [{"family": family, "seed": seed, **row} for row in measured]
             document = {"key": key, "commit": git_commit(), "machine": machine(), "rows": own}
             write_json(path, document)
         rows += document["rows"]
     progress.cells("done", len(todo), len(todo))
     return pd.DataFrame(rows)
-
-
-def _simulated(
-    scenario: Scenario, seed: int, pair: Path, progress: RunProgress, *, keep: bool
-) -> list[dict[str, object]]:
-    try:
-        if not pair.exists():
-            pair.parent.mkdir(parents=True, exist_ok=True)
-            simulate_pair(scenario, seed, pair, on_progress=progress.stage)
-        progress.stage("describe", 0, 1)
-        return measure_pair(pair)
-    finally:
-        if not keep:
-            remove(pair)
 
 
 def _key(scenario: Scenario, seed: int) -> str:

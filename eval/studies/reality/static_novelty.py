@@ -37,14 +37,7 @@ _THREADS = 2
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What is to be found.
-
-    Attributes:
-        way: How the sensor moves.
-        variant: What to call the settings.
-        settings: Which effects are on.
-        n_revolutions: In both halves together.
-    """
+    """How the sensor moves, which effects are on and what they are called, and the revolutions of both halves."""
 
     way: Way
     variant: str

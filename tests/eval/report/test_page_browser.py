@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from eval.report.page import write_page
-from eval.running.runfolder import RunFolder
+from eval.running.runfolder import write_json
 
 METHODS = (
     "paper", "paper-topn", "paper-paired", "tunnelcd", "scan-context", "solid", "random-regions", "voxel-diff", "c2c",
@@ -71,7 +71,9 @@ def write_large_run(folder: Path) -> Path:
                "region_precision": 0.5, "bytes_ratio": 1.0, "t_descriptor_per_keyframe_s": 0.01,
                "t_cd_per_region_s": 0.01, "km_unchanged": 0.0}  # fmt: skip
     pd.DataFrame(table).assign(**missing).to_csv(folder / "regions_table.csv", index=False)
-    RunFolder(folder).write_provenance({"tool": "tunnelcd", "plan": {"name": "main", "report": ["regions", "objects"]}})
+    write_json(
+        folder / "provenance.json", {"tool": "tunnelcd", "plan": {"name": "main", "report": ["regions", "objects"]}}
+    )
     return folder
 
 

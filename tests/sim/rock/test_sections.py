@@ -7,7 +7,7 @@ import pytest
 
 from cdpipe.core.geometry import Float64Array
 from scenarios.schema import Section
-from sim.rock.sections import cave_floor_m, profile_distance, section_distance
+from sim.rock.sections import cave_floor_m, profile_distance
 
 SHAPES = get_args(Section.model_fields["shape"].annotation)
 SIZES = ((5.0, 4.0), (10.0, 5.0), (3.0, 5.0))  # usual, flat, tall
@@ -17,9 +17,12 @@ def section(shape: str, width_m: float = 5.0, height_m: float = 4.0) -> Section:
     return Section.model_validate({"shape": shape, "width_m": width_m, "height_m": height_m})
 
 
+def section_distance(which: Section, side_m: Float64Array, up_m: Float64Array) -> Float64Array:
+    return profile_distance(which.shape, which.width_m / 2, which.height_m, side_m, up_m)
+
+
 def distance(which: Section, *points: tuple[float, float]) -> Float64Array:
-    side, up = np.array(points).T
-    return section_distance(which, side, up)
+    return section_distance(which, *np.array(points).T)
 
 
 def test_d_by_hand() -> None:

@@ -14,7 +14,7 @@ from sim.geometry.raycast import Caster
 from sim.scene import World, build_world
 from sim.sensor.lidar import scan
 from sim.sensor.rays import Rays, revolution_rays
-from sim.session.labels import Ghost, cell_keys, claim_returns, list_changes, mark_belonging
+from sim.session.labels import Ghost, Returns, list_changes, mark_belonging
 from sim.session.simulate import simulate_pair
 from sim.session.truth import Change, read_pair_truth
 
@@ -61,7 +61,10 @@ def test_no_ray_that_meets_a_ghost_is_left_out(sensor: SensorMetadata) -> None:
 
 def test_cells_by_hand() -> None:
     points = np.array([[0.01, 0.01, 0.01], [0.09, 0.05, 0.02], [0.11, 0.05, 0.02], [-0.01, 0.05, 0.02]])
-    assert len(cell_keys(points)) == 3
+    counted = Returns()
+    counted.add(points[:2])
+    counted.add(points)
+    assert (counted.n, len(counted.cells)) == (6, 3)
 
 
 def sweep(world: World, scenario: Scenario, sensor: SensorMetadata, session: str, change: int = 0) -> tuple[int, int]:
@@ -143,12 +146,12 @@ def test_of_a_short_move_only_what_is_off_the_old_surface_counts(
     points = local @ end[:3, :3].T + end[:3, 3]
     belongs = mark_belonging(added, points)
     np.testing.assert_array_equal(belongs, [True, False, True, False, False, True])
-    claim_returns(added, points[belongs])
-    assert (added.n_returns, len(added.cells)) == (3, 3)
+    added.own.add(points[belongs])
+    assert (added.own.n, len(added.own.cells)) == (3, 3)
     assert np.linalg.norm(end[:3, 3] - start[:3, 3]) < 0.8
     assert mark_belonging(removed, np.empty((0, 3))).shape == (0,)
-    claim_returns(removed, np.empty((0, 3)))
-    assert (removed.n_returns, removed.cells) == (0, set())
+    removed.own.add(np.empty((0, 3)))
+    assert (removed.own.n, removed.own.cells) == (0, set())
 
 
 def test_a_change_nobody_could_notice_says_why(
@@ -159,7 +162,7 @@ def test_a_change_nobody_could_notice_says_why(
     change = tally.finished()
     assert not change.is_observable
     assert change.why_not == "0 cells of 0.1 m filled, 10 needed; 0 rays of the other session reach it, 10 needed"
-    tally.cells.update(range(10))
+    tally.own.cells.update(range(10))
     tally.n_ghost_rays = 9
     assert tally.finished().why_not == "9 rays of the other session reach it, 10 needed"
     tally.n_ghost_rays = 10

@@ -62,7 +62,7 @@ def server() -> Iterator[Any]:
 
 
 def named(view: View) -> dict[str, Any]:
-    parts = (*view.surfaces, *view.lines, *view.clouds, *view.labels, *(band.surface for band in view.bands))
+    parts = (*view.surfaces, *view.lines, *view.clouds, *view.labels, *view.bands)
     names = [part.name for part in parts]
     assert len(names) == len(set(names))
     return dict(zip(names, parts, strict=True))
@@ -90,8 +90,8 @@ def test_a_world_is_shown_with_walls_paths_and_changes_in_their_colours(shown: V
 
 def test_bands_hold_every_face_of_the_walls_once_and_by_height(shown: View, scenario: Scenario) -> None:
     wall = build_world(scenario, 3).before.meshes[0]
-    assert sum(len(band.surface.mesh.faces) for band in shown.bands) == len(wall.faces)
-    corners = np.concatenate([band.surface.mesh.vertices[band.surface.mesh.faces] for band in shown.bands])
+    assert sum(len(band.mesh.faces) for band in shown.bands) == len(wall.faces)
+    corners = np.concatenate([band.mesh.vertices[band.mesh.faces] for band in shown.bands])
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     whole = wall.vertices[wall.faces]
     cross = np.cross(whole[:, 1] - whole[:, 0], whole[:, 2] - whole[:, 0])
@@ -101,7 +101,7 @@ def test_bands_hold_every_face_of_the_walls_once_and_by_height(shown: View, scen
     assert starts[0] == 0
     # the floor of this drift is level, at 0
     for band, end_m in zip(shown.bands, [*starts[1:], np.inf], strict=True):
-        centres = band.surface.mesh.vertices[band.surface.mesh.faces].mean(axis=1)
+        centres = band.mesh.vertices[band.mesh.faces].mean(axis=1)
         low_m = band.from_m if band.from_m else -np.inf
         assert (centres[:, 2] >= low_m - 1e-9).all()
         assert (centres[:, 2] < end_m + 1e-9).all()
@@ -114,10 +114,10 @@ def test_heights_follow_the_floor_of_a_ramp() -> None:
     vertices = np.asarray(box.vertices) + np.array([30.0, 0.0, 1.5])
     vertices[:, 2] += 0.2 * vertices[:, 0]
     bands = wall_bands(Mesh(vertices, np.asarray(box.faces, dtype=np.int32)), floor, 3)
-    roof = bands[-1].surface.mesh
+    roof = bands[-1].mesh
     # the roof is 3 m above the floor everywhere: all of it is in the last band, from one end to the other
     assert np.ptp(roof.vertices[:, 0]) == pytest.approx(40)
-    lowest = bands[0].surface.mesh
+    lowest = bands[0].mesh
     height_m = lowest.vertices[:, 2] - 0.2 * lowest.vertices[:, 0]
     assert height_m.max() < 2.0
 
@@ -185,9 +185,9 @@ def test_the_server_holds_every_part_and_its_switches_work(server: Any, shown: V
         assert handle.visible is not before
     flip(switches["walls up to, m above floor"], 1.0)
     for band in view.bands:
-        assert nodes[band.surface.name].visible == (band.from_m < 1.0 - 1e-6)
+        assert nodes[band.name].visible == (band.from_m < 1.0 - 1e-6)
     flip(switches["walls seen"], "from both sides")
-    assert {nodes[band.surface.name].side for band in view.bands} == {"double"}
+    assert {nodes[band.name].side for band in view.bands} == {"double"}
     flip(switches["returns by"], "session")
     np.testing.assert_array_equal(nodes["returns/after"].colors, view.clouds[1].colours["session"])
     vertices = nodes["changes/added/came"].vertices

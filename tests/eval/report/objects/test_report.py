@@ -15,7 +15,7 @@ from eval.report.objects.tables import OBJECT_COLUMNS, OBJECT_COUNTS, WITHDRAWAL
 from eval.report.page import write_page
 from eval.report.tables import methods_table
 from eval.running.run_data import RunData, read_run
-from eval.running.runfolder import RunFolder
+from eval.running.runfolder import RunFolder, write_json
 from eval.tables.object_table import FILES, ORACLE_VARIANT, object_tables
 from eval.tables.rows import with_domain
 
@@ -116,7 +116,9 @@ def run_fixture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, table in {"changes": changes, **object_tables(results, changes, TARGETS)}.items():
         table.to_csv(folder / f"{name}.csv", index=False)
     plan = {"name": "made-up", "report": "objects", "targets": TARGETS.model_dump()}
-    RunFolder(folder).write_provenance({"tool": "tunnelcd", "plan": plan, "machine": {}, "command": "tunnelcd run x"})
+    write_json(
+        folder / "provenance.json", {"tool": "tunnelcd", "plan": plan, "machine": {}, "command": "tunnelcd run x"}
+    )
     return folder
 
 

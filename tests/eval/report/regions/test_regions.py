@@ -14,7 +14,7 @@ from eval.report.page import write_page
 from eval.report.regions.regions import draw_regions
 from eval.report.summary import draw_summary
 from eval.running.run_data import read_run
-from eval.running.runfolder import RunFolder
+from eval.running.runfolder import write_json
 from eval.tables.region_table import FILES, region_tables
 
 TARGETS = Targets(
@@ -82,13 +82,14 @@ def write_run(folder: Path, results: pd.DataFrame, items: dict[str, pd.DataFrame
     for name, found in {**items, **region_tables(results, items, TARGETS)}.items():
         if len(found):
             found.to_csv(folder / f"{name}.csv", index=False)
-    RunFolder(folder).write_provenance(
+    write_json(
+        folder / "provenance.json",
         {
             "tool": "tunnelcd",
             "plan": {**plan, "targets": TARGETS.model_dump()},
             "machine": {},
             "command": "tunnelcd run x",
-        }
+        },
     )
     return folder
 
