@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, make_pose, transform
+from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 from sim.placement.contact import find_way_out, surface_points
 from sim.placement.placing import PROBE_UP_M, Standing, Surroundings, floor_heights
@@ -58,12 +59,21 @@ def settle(item: Standing, around: Surroundings) -> Standing:
     return replace(item, world_T_object=_freeze_pose(data, item, points, around))
 
 
-def add_solid(body: mujoco.MjsBody, solid: Solid, mesh_name: str = "", **options: object) -> None:
-    """Add a primitive to a body that has the object frame; a mesh must be in the spec under `mesh_name`."""
+def add_mesh(spec: mujoco.MjSpec, name: str, mesh: Mesh, is_hull: bool = False) -> None:
+    """Add a surface to a spec, with the mass of its convex hull or of its shell."""
+    inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX if is_hull else mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    spec.add_mesh(name=name, uservert=mesh.vertices.ravel(), userface=mesh.faces.ravel(), inertia=inertia)
+
+
+def add_solid(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, solid: Solid, name: str, is_hull: bool = False, **options: object
+) -> None:
+    """Add a primitive to a body that has the object frame, a mesh under this name and as `add_mesh` does."""
     pose = solid.object_T_solid
     common = {"pos": pose[:3, 3], "quat": quaternion(pose), **options}
     if solid.mesh is not None:
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh_name, **common)
+        add_mesh(spec, name, solid.mesh, is_hull)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **common)
     else:
         kind = mujoco.mjtGeom.mjGEOM_BOX if solid.kind == "box" else mujoco.mjtGeom.mjGEOM_CYLINDER
         body.add_geom(type=kind, size=solid.size_m, **common)
@@ -89,15 +99,8 @@ def _model(item: Standing, points: Float64Array, around: Surroundings) -> mujoco
     body = spec.worldbody.add_body(name="prop", pos=pose[:3, 3], quat=quaternion(pose))
     body.add_freejoint()
     for index, solid in enumerate(item.shape.solids):
-        if solid.mesh is not None:
-            # Its hull collides and has its mass: that serves open surfaces too.
-            spec.add_mesh(
-                name=str(index),
-                uservert=solid.mesh.vertices.ravel(),
-                userface=solid.mesh.faces.ravel(),
-                inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,
-            )
-        add_solid(body, solid, mesh_name=str(index), density=300.0, **contact)
+        # The hull of a mesh collides and gives the mass, which also works for open surfaces.
+        add_solid(spec, body, solid, str(index), is_hull=True, density=300.0, **contact)
     model = spec.compile()
     # Drag ends the rocking that stiff contacts keep alive; it changes no resting pose.
     speed_hz, turn_hz = _DRAG_HZ[item.posture]
@@ -122,15 +125,9 @@ def _add_floor(
     grid = np.stack(np.meshgrid(x + axis, y + axis), axis=-1).reshape(-1, 2)  # rows along y, as MuJoCo wants
     heights = floor_heights(walls, np.column_stack([grid, np.full(len(grid), z + PROBE_UP_M)]))
     heights = np.where(np.isnan(heights) | (np.abs(heights - z) > 0.5), z, heights)
-    low, span = heights.min(), max(float(np.ptp(heights)), 1e-3)
-    spec.add_hfield(
-        name="floor",
-        size=[half_m, half_m, span, 0.5],
-        nrow=count,
-        ncol=count,
-        userdata=((heights - low) / span).astype(np.float32),
-    )
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="floor", pos=[x, y, low], **contact)
+    low = float(heights.min())
+    field = heights.reshape(count, count)
+    _add_field(spec, "floor", (half_m, half_m), field, low, pos=[x, y, low], **contact)
 
 
 def _add_wall(
@@ -150,22 +147,20 @@ def _add_wall(
     depth_m = ranges_m.astype(np.float64)
     far_m = float(depth_m[is_wall].max(initial=0.5)) + 0.01
     depth_m = np.where(is_wall, depth_m, far_m)  # below the floor, or through an opening
-    span = max(float(far_m - depth_m.min()), 1e-3)
-    spec.add_hfield(
-        name="wall",
-        size=[half[0], half[1], span, 0.5],
-        nrow=rows,
-        ncol=columns,
-        userdata=((far_m - depth_m) / span).astype(np.float32),
-    )
     frame = make_pose(np.stack([aside, [0.0, 0.0, 1.0], out], axis=1))
-    spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_HFIELD,
-        hfieldname="wall",
-        pos=middle - far_m * out,
-        quat=quaternion(frame),
-        **contact,
-    )
+    pose = {"pos": middle - far_m * out, "quat": quaternion(frame)}
+    _add_field(spec, "wall", (half[0], half[1]), -depth_m.reshape(rows, columns), -far_m, **pose, **contact)
+
+
+def _add_field(
+    spec: mujoco.MjSpec, name: str, half_m: tuple[float, float], heights: Float64Array, low: float, **options: object
+) -> None:
+    """Add a height field (rows, columns) whose lowest height is `low`."""
+    span = max(float(heights.max()) - low, 1e-3)
+    data = ((heights - low) / span).astype(np.float32).ravel()
+    rows, columns = heights.shape
+    spec.add_hfield(name=name, size=[*half_m, span, 0.5], nrow=rows, ncol=columns, userdata=data)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=name, **options)
 
 
 def _floor_gap_m(pose: Float64Array, points: Float64Array, walls: Caster) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from cdpipe.core.geometry import make_pose, stream
 from scenarios.schema import Prop
 from sim.geometry.mesh import move_mesh
-from sim.geometry.topology import closed_volume_m3, edges_of
+from sim.geometry.topology import closed_volume_m3
 from sim.props import equipment, storage
 from sim.props.heap import build_heap, column_volume_m3, load_away, whole_mesh
 from sim.props.parts import surface
@@ -36,10 +36,10 @@ def shape_of(prop: Prop, seed: int, *, is_banked: bool = False, is_loaded: bool 
     """Return the shape of a prop.
 
     Args:
-        prop: What is built.
-        seed: Of the scenario; with the prop's name it draws what is irregular.
-        is_banked: Of a muck pile: it lies against a wall at y = +width/2 and goes on behind it.
-        is_loaded: Of a muck pile: what is left of it once `prop.loaded_share` of its volume is taken.
+        prop: The prop.
+        seed: Of the scenario; seed and name of the prop draw its irregular parts.
+        is_banked: Whether a muck pile lies against a wall at y = +width/2 and continues behind it.
+        is_loaded: Whether `prop.loaded_share` of a muck pile's volume has been removed.
 
     Raises:
         ValueError: `is_loaded` without `prop.loaded_share`.
@@ -49,7 +49,7 @@ def shape_of(prop: Prop, seed: int, *, is_banked: bool = False, is_loaded: bool 
         mesh = prop_mesh(prop.mesh, prop.name)
         size = np.ptp(mesh.vertices, axis=0)
         solids: tuple[Solid, ...] = (surface(mesh, "paint"),)
-        return _shape(solids, (float(size[0]), float(size[1]), float(size[2])), closed_volume_m3(mesh, edges_of(mesh)))
+        return _shape(solids, (float(size[0]), float(size[1]), float(size[2])), closed_volume_m3(mesh))
     if prop.size_m is None:
         raise ValueError(f"prop {prop.name!r} has neither size_m nor mesh")
     if prop.kind == "muck_pile":

@@ -1,11 +1,11 @@
-"""How rough the walls of a finished mesh are, measured by rays from the centreline.
+"""Roughness of the walls of a mesh, measured by rays from the centreline.
 
-A fan of rays goes out at right angles to the drift every 0.2 m, to walls and roof. How far a hit lies outside the
-drift's own smooth section (perpendicular to it, overbreak positive) is its deviation; the standard deviation about
-zero is the contour roughness. Mouths of other drifts, niches and the faces of blind ends are left out.
+Every 0.2 m a fan of rays at right angles to the drift meets walls and roof. The deviation of a hit is its distance from
+the smooth section of the drift, overbreak positive. The contour roughness is the root mean square of the deviations.
+Mouths of other drifts, niches and the faces of blind ends are left out.
 
-A foreign mesh follows no section that is known so well: there `fit_m` takes the running mean of each ray's deviation
-for the section, and what is longer than about `fit_m` along the drift is no longer roughness.
+The section of a foreign mesh is not known well. There the running mean over `fit_m` of each ray's deviation is the
+section, and features longer than about `fit_m` along the drift do not count as roughness.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _LONGEST_LAG_M = 12.0
 
 @dataclass(frozen=True, slots=True)
 class ContourRoughness:
-    """Roughness of walls and roof; NaN where there was nothing to measure.
+    """Roughness of walls and roof; NaN without measurements.
 
     Attributes:
         rms_m: Standard deviation about the smooth section.
@@ -58,7 +58,7 @@ def contour_roughness(walls: Caster, centreline: Centreline, fit_m: float | None
     Args:
         walls: Caster of the bare rock.
         centreline: Its drifts, with the size they have along the way.
-        fit_m: For foreign meshes: length of the running mean that is taken for the section.
+        fit_m: For foreign meshes: length of the running mean that stands for the section.
     """
     runs = [run for index in range(len(centreline.drifts)) for run in _deviations(walls, centreline, index)]
     runs = _without_openings(runs)
@@ -116,7 +116,7 @@ def _is_plain(centreline: Centreline, index: int, points: Float64Array) -> BoolA
 
 
 def _is_near_kink(line: DriftLine, points: Float64Array) -> BoolArray:
-    """Mark the stations (S,) near corners that are not rounded: their cross-sections are not those of the walls."""
+    """Mark the stations (S,) near sharp corners, where rays at right angles do not measure the section."""
     start, end = line.headings[:-2], line.headings[2:]
     turn = np.abs(start[:, 0] * end[:, 1] - start[:, 1] * end[:, 0])
     corners = line.points[1:-1][turn > 0.2]
@@ -126,7 +126,7 @@ def _is_near_kink(line: DriftLine, points: Float64Array) -> BoolArray:
 
 
 def _without_openings(runs: Sequence[Float64Array]) -> list[Float64Array]:
-    """Set deviations far outside the others to the middle of all: rays that leave through what is no wall."""
+    """Replace outliers, rays that leave through openings, by the median of all deviations."""
     if not runs:
         return []
     every = np.concatenate([run.ravel() for run in runs])
