@@ -119,8 +119,9 @@ class _Job:
 
 def _jobs(prop: Prop, seed: int) -> list[_Job]:
     sessions = {"none": _BOTH, "added": _AFTER}.get(prop.change, _BEFORE)
-    rest = shape_of(prop, seed, is_banked=_is_banked(prop, prop.place), is_loaded=True) if prop.loaded_share else None
-    jobs = [_Job(prop, prop.place, sessions, shape_of(prop, seed, is_banked=_is_banked(prop, prop.place)), rest)]
+    is_banked, share = _is_banked(prop, prop.place), prop.loaded_share
+    rest = None if share is None else shape_of(prop, seed, is_banked=is_banked, loaded_share=share)
+    jobs = [_Job(prop, prop.place, sessions, shape_of(prop, seed, is_banked=is_banked), rest)]
     if prop.to is not None:
         shape = shape_of(prop, seed, is_banked=_is_banked(prop, prop.to))
         jobs.append(_Job(prop, prop.to, _AFTER, shape, is_goal=True))

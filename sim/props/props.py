@@ -32,17 +32,16 @@ BUILDERS = {
 }
 
 
-def shape_of(prop: Prop, seed: int, *, is_banked: bool = False, is_loaded: bool = False) -> Shape:
+def shape_of(prop: Prop, seed: int, *, is_banked: bool = False, loaded_share: float | None = None) -> Shape:
     """Return the shape of a prop.
 
     Args:
         prop: The prop.
         seed: Of the scenario; seed and name of the prop draw its irregular parts.
         is_banked: Whether a muck pile lies against a wall at y = +width/2 and continues behind it.
-        is_loaded: Whether `prop.loaded_share` of a muck pile's volume has been removed.
+        loaded_share: Share of a muck pile's volume that has been removed; None for a whole pile.
 
     Raises:
-        ValueError: `is_loaded` without `prop.loaded_share`.
         ScenarioError: The file of a mesh cannot be used.
     """
     if prop.mesh is not None:
@@ -53,15 +52,14 @@ def shape_of(prop: Prop, seed: int, *, is_banked: bool = False, is_loaded: bool 
     if prop.size_m is None:
         raise ValueError(f"prop {prop.name!r} has neither size_m nor mesh")
     if prop.kind == "muck_pile":
-        return _pile(prop, prop.size_m, seed, is_banked, is_loaded)
+        return _pile(prop, prop.size_m, seed, is_banked, loaded_share)
     if prop.kind == "box":
         solids = storage.box(prop.size_m, is_cardboard=max(prop.size_m) <= _CARDBOARD_M)
         return _shape(solids, prop.size_m, float(sum(8.0 * np.prod(solid.size_m) for solid in solids)))
     if prop.kind == "rock":
         key = int(stream(seed, "props", prop.name, "rock").integers(2**31))
-        rock = move_mesh(
-            rock_mesh(prop.size_m, key, _ROCK_SUBDIVISIONS), make_pose(translation=(0, 0, prop.size_m[2] / 2))
-        )
+        pose = make_pose(translation=(0, 0, prop.size_m[2] / 2))
+        rock = move_mesh(rock_mesh(prop.size_m, key, _ROCK_SUBDIVISIONS), pose)
         return _shape((surface(rock, "rock"),), prop.size_m, signed_volume_m3(rock))
     shape = _shape(BUILDERS[prop.kind](prop.size_m), prop.size_m, None)
     return replace(shape, is_settled=False) if prop.kind == "railing" else shape
@@ -71,12 +69,10 @@ def _shape(solids: tuple[Solid, ...], size_m: Size, volume_m3: float | None) -> 
     return Shape(solids, size_m, True, hull_volume_m3(solids), volume_m3)
 
 
-def _pile(prop: Prop, size_m: Size, seed: int, is_banked: bool, is_loaded: bool) -> Shape:
+def _pile(prop: Prop, size_m: Size, seed: int, is_banked: bool, loaded_share: float | None) -> Shape:
     heap = build_heap(size_m, prop.repose_deg, prop.fragment_m, is_banked, seed, prop.name)
-    if is_loaded:
-        if prop.loaded_share is None:
-            raise ValueError(f"prop {prop.name!r} has no loaded_share")
-        heap = load_away(heap, prop.loaded_share, prop.fragment_m, seed, prop.name)
+    if loaded_share is not None:
+        heap = load_away(heap, loaded_share, prop.fragment_m, seed, prop.name)
     mesh = whole_mesh(heap)
     solids = (surface(mesh, "rock"),)
     length, width, _ = heap.size_m

@@ -29,9 +29,6 @@ _ANGLES_DEG = np.linspace(-10.0, 190.0, 25)  # from the left wall over the roof 
 _ORIGIN_UP = 0.45  # of the height
 _LEAST_RUN = 16  # stations without a gap
 _WILD_SIGMA = 6.0  # robust standard deviations beyond which a hit is an opening
-_BANDS_M = (0.5, 1.0, 2.0, 4.0, 8.0)
-# Smoothing with this share of an octave's correlation length halves its variance: 1 / sqrt(1 + 4 share^2) = 1/2.
-_HALVING = float(np.sqrt(3.0) / 2)
 _LONGEST_LAG_M = 12.0
 
 
@@ -42,13 +39,11 @@ class ContourRoughness:
     Attributes:
         rms_m: Standard deviation about the smooth section.
         length_m: Distance along the drift at which the correlation of deviations has fallen to 1/e; NaN below 1 mm.
-        bands: Shares of `rms_m` by correlation length, (from metres, to metres, rms metres), squares adding up.
         n_rays: Number of deviations.
     """
 
     rms_m: float
     length_m: float
-    bands: tuple[tuple[float, float, float], ...]
     n_rays: int
 
 
@@ -66,10 +61,10 @@ def contour_roughness(walls: Caster, centreline: Centreline, fit_m: float | None
         runs = [run - gaussian_filter1d(run, fit_m / 4 / _STATION_M, axis=0) for run in runs]
     n_rays = sum(run.size for run in runs)
     if n_rays == 0:
-        return ContourRoughness(float("nan"), float("nan"), (), 0)
-    rms_m = float(np.sqrt(_mean_square(runs)))
+        return ContourRoughness(float("nan"), float("nan"), 0)
+    rms_m = float(np.sqrt(sum((run**2).sum() for run in runs) / n_rays))
     length_m = _correlation_length_m(runs) if rms_m > 1e-3 else float("nan")
-    return ContourRoughness(rms_m, length_m, _bands(runs), n_rays)
+    return ContourRoughness(rms_m, length_m, n_rays)
 
 
 def _deviations(walls: Caster, centreline: Centreline, index: int) -> list[Float64Array]:
@@ -135,10 +130,6 @@ def _without_openings(runs: Sequence[Float64Array]) -> list[Float64Array]:
     return [np.where(np.abs(run - middle) > limit_m, middle, run) for run in runs]
 
 
-def _mean_square(runs: Sequence[Float64Array]) -> float:
-    return float(sum((run**2).sum() for run in runs) / sum(run.size for run in runs))
-
-
 def _correlation_length_m(runs: Sequence[Float64Array]) -> float:
     """First lag at which the correlation along the way, over all rays, falls below 1/e; NaN if none does."""
     before = 1.0
@@ -152,14 +143,3 @@ def _correlation_length_m(runs: Sequence[Float64Array]) -> float:
             return float((lag - 1 + (before - np.exp(-1.0)) / (before - now)) * _STATION_M)
         before = now
     return float("nan")
-
-
-def _bands(runs: Sequence[Float64Array]) -> tuple[tuple[float, float, float], ...]:
-    edges = (0.0, *_BANDS_M, float("inf"))
-    left = [_mean_square(runs)]
-    for length_m in _BANDS_M:
-        sigma = _HALVING * length_m / _STATION_M
-        left.append(_mean_square([gaussian_filter1d(run, sigma, axis=0) for run in runs]))
-    left.append(0.0)
-    rms_m = np.sqrt(np.maximum(-np.diff(left), 0.0)).tolist()
-    return tuple(zip(edges[:-1], edges[1:], rms_m, strict=True))

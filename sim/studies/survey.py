@@ -6,7 +6,7 @@ import csv
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -302,8 +302,7 @@ def markdown(surveys: Sequence[Survey]) -> str:
 
 def _csv_row(world: WorldFigures) -> dict[str, object]:
     row: dict[str, object] = {}
-    for name in (each.name for each in fields(world)):
-        value = getattr(world, name)
+    for name, value in asdict(world).items():
         if not isinstance(value, tuple):
             row[name] = value
             continue
