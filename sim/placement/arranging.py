@@ -1,4 +1,4 @@
-"""Places all props of a scenario in turn: first those with a given place, then those whose place the seed draws."""
+"""Placing of all props of a scenario: first those with a given place, then those whose place the seed draws."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Outline = Callable[[Standing], Float64Array]
 
 @dataclass(slots=True, eq=False)
 class _Board:
-    """The tunnel, the props placed so far, and for each lane the span of the way that each of them bars."""
+    """The tunnel, the props placed so far, and for each lane the offsets that each of them blocks."""
 
     scenario: Scenario
     centreline: Centreline
@@ -103,7 +103,7 @@ def place_props(scenario: Scenario, centreline: Centreline, around: Surroundings
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Job:
-    """A prop to set down at one of its places, and what is left of it in the after session if it is reshaped."""
+    """A prop for one of its places, and the rest of it in the after session if it is reshaped."""
 
     prop: Prop
     place: Place

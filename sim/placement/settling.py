@@ -1,4 +1,4 @@
-"""Physics, run once per prop: it is dropped on the floor until it rests."""
+"""Settling by physics: each prop is dropped on the floor once and comes to rest."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ _REST_MPS = 2e-3
 _REST_RADPS = 1e-2
 _FALLEN_DEG = 45.0
 _WINDOW_S = 0.2
-# Rough ground, and contacts damped beyond critical, or a box on three points rocks for ever. Friction against rolling
-# stands for the stones that keep a barrel that lies or leans from rolling away.
+# Rough ground, with overdamped contacts: otherwise a box on three points rocks for ever. Rolling friction stands for
+# the stones that keep a lying or leaning barrel from rolling away.
 _CONTACT: dict[str, Any] = {"friction": [1.0, 0.01, 0.001], "solref": [0.02, 2.0]}
 _CHOCKED: dict[str, Any] = {"friction": [1.0, 0.05, 0.1], "solref": [0.02, 2.0], "condim": 6}
 _DRAG_HZ = {"upright": (2.0, 20.0), "leaning": (2.0, 8.0), "tipped": (2.0, 5.0)}  # of speed and of turning
 _TOUCH_M = 0.002
-# A prop that leans is no farther from the true wall than the field may be off, and brought to it.
+# A leaning prop this near the true wall, the error of the field, is moved to it.
 _NEAR_WALL_M = 0.08
 _LEANING_GAP_M = 0.02
 
 
 def settle(item: Standing, around: Surroundings) -> Standing:
-    """Drop a prop on the floor until it rests, and return it at its frozen pose; one set into the floor stays.
+    """Drop a prop on the floor until it rests, and return it at its final pose; props set into the floor keep theirs.
 
-    It drops alone, so that its pose depends on no other prop. It drops on height fields cast from the rock below it and
-    from the wall it leans against, because MuJoCo would collide the wall mesh as its convex hull, a solid plug. The
-    fields are coarser than the rock; at the end the prop is moved until its true surface touches the true rock.
+    Each prop drops alone, so that its pose depends on no other prop. Height fields measured by rays stand for the floor
+    below it and the wall it leans against, because MuJoCo would collide with the convex hull of the wall mesh. The
+    fields are coarser than the rock. At the end the prop is moved until its true surface touches the true rock.
 
     Raises:
         ScenarioError: It falls over, is not at rest after 8 s, rolls away, or cannot be freed from the rock.
@@ -85,7 +85,7 @@ def quaternion(pose: Float64Array) -> Float64Array:
 
 
 def _model(item: Standing, points: Float64Array, around: Surroundings) -> mujoco.MjModel:
-    """One prop above its floor, with the wall it leans against."""
+    """Return the model of one prop above its floor, with the wall it leans against."""
     spec = mujoco.MjSpec()
     spec.option.timestep = _TIMESTEP_S
     spec.option.impratio = 10.0
@@ -164,7 +164,7 @@ def _add_field(
 
 
 def _floor_gap_m(pose: Float64Array, points: Float64Array, walls: Caster) -> float:
-    """Least height of a prop's lower points above the true floor; the floor under a wall's overhang does not count."""
+    """Return the least height of a prop's lower points above the true floor, floor far from its foot left out."""
     world = transform(pose, points)
     foot = world[:, 2].min()
     world = world[world[:, 2] < foot + 0.3]
@@ -174,21 +174,21 @@ def _floor_gap_m(pose: Float64Array, points: Float64Array, walls: Caster) -> flo
 
 
 def _wall_gap_m(pose: Float64Array, wall: Float64Array, points: Float64Array, fixed: Caster) -> float:
-    """Least level distance of a prop's upper two thirds to the true wall."""
+    """Return the least horizontal distance from a prop's upper two thirds to the true wall."""
     world = transform(pose, points)
     world = world[world[:, 2] > world[:, 2].min() + np.ptp(world[:, 2]) / 3]
     return float(fixed.cast(world, [*wall, 0.0])[0].min())
 
 
 def _run_to_rest(model: mujoco.MjModel, data: mujoco.MjData, item: Standing) -> None:
-    """Step until it has not moved for two windows; contacts chatter from step to step even under a prop at rest."""
+    """Step until the prop does not move for two windows; single steps show contact noise even at rest."""
     calm = 0
     up = np.asarray(Rotation.from_quat(model.body("prop").quat, scalar_first=True).as_matrix()).T[:, 2]
     for _ in range(int(_LONGEST_S / _WINDOW_S)):
         start = data.qpos.copy()
         mujoco.mj_step(model, data, round(_WINDOW_S / _TIMESTEP_S))
         turned = Rotation.from_quat(data.qpos[3:], scalar_first=True)
-        # Tipped ones may roll on; all others keep what was up at the start up.
+        # Tipped props may roll; the up axis of all others stays up.
         if item.posture != "tipped" and (turned.as_matrix() @ up)[2] < np.cos(np.deg2rad(_FALLEN_DEG)):
             raise ScenarioError(f"prop {item.prop.name!r} falls over where it stands: place it on more level floor")
         speed_mps = np.linalg.norm(data.qpos[:3] - start[:3]) / _WINDOW_S
@@ -230,9 +230,9 @@ def _freeze_pose(data: mujoco.MjData, item: Standing, points: Float64Array, arou
 
 
 def _bring_to_contact(pose: Float64Array, item: Standing, points: Float64Array, around: Surroundings) -> Float64Array:
-    """Bring a prop to the true floor and wall, then push it the shortest way out of rock until it no more than touches.
+    """Move a prop to the true floor and wall, then the shortest way out of rock until it only touches it.
 
-    The way is that by which the fields differ from the rock, a few centimetres.
+    The distance is the error of the height fields, a few centimetres.
     """
     pose = pose.copy()
     pose[2, 3] -= max(_floor_gap_m(pose, points, around.walls), 0.0)
