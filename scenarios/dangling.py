@@ -1,7 +1,7 @@
-"""References of a scenario that lead nowhere: to nodes, drifts and areas that it does not have, and names given twice.
+"""Dangling references of a scenario, to nodes, drifts and areas that do not exist, and repeated names.
 
-Works on the plain tree and not on the model, so that these mistakes are told together with those of the schema; parts
-of the wrong type are passed over, the schema speaks of them.
+The functions read the plain tree, so that these mistakes are reported together with those of the schema. They skip
+values of the wrong type, which the schema reports.
 """
 
 from __future__ import annotations

@@ -165,31 +165,23 @@ def _distribution_rule(tree: dict[str, Any]) -> str:
         return f'unknown distribution; did you mean "{close[0]}"?' if is_misspelt else ""
     if len(tree) > 1:
         return f"a distribution has one key, one of {', '.join(NAMES)}; got {', '.join(map(str, tree))}"
-    return _ARGUMENT_RULES[named[0]](tree[named[0]])
+    form, is_valid = _FORMS[named[0]]
+    return "" if is_valid(tree[named[0]]) else f"expected {named[0]}: {form}"
 
 
-def _pair_rule(argument: Any, form: str, is_ordered: Callable[[float, float], bool]) -> str:
-    is_pair = isinstance(argument, list) and len(argument) == 2 and all(map(_is_number, argument))
-    return "" if is_pair and is_ordered(*argument) else f"expected {form}"
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
 
 
-def _integers_rule(argument: Any) -> str:
-    rule = _pair_rule(argument, "", lambda low, high: low < high)
-    is_whole = not rule and all(isinstance(part, int) for part in argument)
-    return "" if is_whole else "expected integers: [a, b] with whole a < b, b excluded"
+def _is_range(value: Any) -> bool:
+    return _is_pair(value) and all(isinstance(part, int) for part in value) and bool(value[0] < value[1])
 
 
-def _choice_rule(argument: Any) -> str:
-    return "" if isinstance(argument, list) and argument else "expected choice: [..] with at least one alternative"
-
-
-_ARGUMENT_RULES: dict[str, Callable[[Any], str]] = {
-    "uniform": lambda argument: _pair_rule(argument, "uniform: [a, b] with a <= b", lambda low, high: low <= high),
-    "normal": lambda argument: _pair_rule(
-        argument, "normal: [mean, sigma] with sigma >= 0", lambda _, sigma: sigma >= 0
-    ),
-    "integers": _integers_rule,
-    "choice": _choice_rule,
+_FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "uniform": ("[a, b] with a <= b", lambda value: _is_pair(value) and value[0] <= value[1]),
+    "normal": ("[mean, sigma] with sigma >= 0", lambda value: _is_pair(value) and value[1] >= 0),
+    "integers": ("[a, b] with whole a < b, b excluded", _is_range),
+    "choice": ("[..] with at least one alternative", lambda value: isinstance(value, list) and len(value) > 0),
 }
 
 

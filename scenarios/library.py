@@ -47,7 +47,7 @@ def check_scenario(name_or_path: str, settings: Iterable[str] = ()) -> Scenario:
         settings: `a.b=value` pairs written over the file before anything is drawn.
 
     Raises:
-        ScenarioError: The name is unknown, or the file has mistakes, told once each whatever the seed.
+        ScenarioError: The name is unknown, or the file has mistakes; each is reported once for all seeds.
         InputError: The file cannot be read, or a setting has no valid form.
     """
     document = _read(name_or_path, settings)
@@ -150,7 +150,7 @@ def _replace_at(value: Any, key: Key, new: str) -> Any:
 
 
 def _drop_repeated(lines: list[str], broken: set[Key], told: list[Mistake]) -> list[str]:
-    """Drop the schema's mistakes about values that could not be drawn, and those reported with their line already."""
+    """Drop the schema's mistakes about values that could not be drawn, and those already reported with their line."""
     names = [f": {join_key(key)} = " for key in broken] + [rule.partition(";")[0] for _, rule in told]
     return [line for line in lines if not any(name in line for name in names)]
 

@@ -1,4 +1,4 @@
-"""What a whole scenario says beyond its single values: the files it names, and what cannot be built or driven."""
+"""Checks of a whole scenario: the files it names, and contradictions between its values."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def _room_mistakes(scenario: Scenario) -> Iterator[Mistake]:
 def _sensor_mistakes(scenario: Scenario) -> Iterator[Mistake]:
     sensor = scenario.sensor
     if sensor.profile.endswith(".json") and not Path(sensor.profile).is_file():
-        return  # told as a missing file
+        return  # already reported as a missing file
     key: Key = ("sensor", "profile")
     try:
         load_profile(sensor.profile)
@@ -102,7 +102,7 @@ def _sensor_mistakes(scenario: Scenario) -> Iterator[Mistake]:
 
 
 def _foreign_mistakes(scenario: Scenario) -> Iterator[Mistake]:
-    """Tell what cannot be done to walls that come from a file, or without drifts along them."""
+    """Yield settings that do not apply to walls from a file, or that need drifts along them."""
     tunnel = scenario.tunnel
     if tunnel.mesh is None:
         return
@@ -126,7 +126,7 @@ def _foreign_mistakes(scenario: Scenario) -> Iterator[Mistake]:
 
 
 def _undrawable(scenario: Scenario) -> Iterator[Mistake]:
-    """Tell which places the seed cannot draw along the way of both sessions, because a session has no route."""
+    """Yield places that the seed cannot draw, because a session has a trajectory and no route."""
     without = [name for name, plan in (("before", scenario.before), ("after", scenario.after)) if not plan.route]
     if not without:
         return

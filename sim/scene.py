@@ -22,7 +22,7 @@ from sim.geometry.raycast import Caster, model_meshes
 from sim.materials import REFLECTIVITY
 from sim.placement.arranging import place_props
 from sim.placement.placing import WALL_GAP_M, Standing, Surroundings, grow_rectangle, standing_corners
-from sim.placement.settling import add_solid, quaternion
+from sim.placement.settling import add_mesh, add_solid, quaternion
 from sim.rock.centreline import Centreline, build_centreline
 from sim.rock.foreign import tunnel_mesh
 from sim.rock.tunnel import mesh_tunnel
@@ -149,26 +149,14 @@ def compile_model(fixed: Iterable[Mesh], standing: Iterable[Standing]) -> tuple[
     spec = mujoco.MjSpec()
     for number, mesh in enumerate(fixed):
         name = f"fixed/{number}"
-        _add_mesh(spec, name, mesh)
+        add_mesh(spec, name, mesh)
         spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, contype=0, conaffinity=0)
     for item in standing:
         pose = item.world_T_object
         body = spec.worldbody.add_body(name=f"prop/{item.prop.name}", pos=pose[:3, 3], quat=quaternion(pose))
         for index, solid in enumerate(item.shape.solids):
-            name = f"prop/{item.prop.name}/{index}"
-            if solid.mesh is not None:
-                _add_mesh(spec, name, solid.mesh)
-            add_solid(body, solid, mesh_name=name, contype=0, conaffinity=0)
+            add_solid(spec, body, solid, f"prop/{item.prop.name}/{index}", contype=0, conaffinity=0)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     return model, data
-
-
-def _add_mesh(spec: mujoco.MjSpec, name: str, mesh: Mesh) -> None:
-    spec.add_mesh(
-        name=name,
-        uservert=mesh.vertices.ravel(),
-        userface=mesh.faces.ravel(),
-        inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
-    )

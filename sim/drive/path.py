@@ -1,4 +1,4 @@
-"""The line a robot drives: along the route's centrelines, on its own side, round props, clear of the walls.
+"""The path of a robot: along the centrelines of its route, on its side, around props, clear of the walls.
 
 The reference line is the route with rounded corners. Bounds on the sideways offset from it are collected along the
 route, and a smooth offset is found between them.
@@ -23,7 +23,7 @@ from sim.scene import World
 
 _SHARPEST_DEG = 150.0
 _WANDER_LENGTH_M = 8.0  # correlation length of the line's way from side to side
-# Takes the edge off turns that tighten where bend and swerve meet; it moves the line by a few centimetres at most.
+# Softens turns where bend and swerve meet; it moves the line by a few centimetres at most.
 _LAST_SMOOTHING_M = 0.7
 # Corners of the route are rounded over this share of the drift's width to either side.
 _CORNER_SHARE = 0.55
@@ -31,9 +31,9 @@ _CORNER_SHARE = 0.55
 _SWERVES_M = (2.0, 1.4, 1.0, 0.7, 0.5)
 # Rather than swerve sharply between props on both sides, this share of the clearance is given up.
 _CHICANE_SHARE = 0.3
-# Where no smooth way is found, the stones within this distance are driven over.
+# Where no smooth line exists, the robot drives over the stones within this distance.
 _STONE_REACH_M = 4.0
-# Between the heights of a wary look: no pipe is thinner.
+# Between the heights at which a wary line looks for walls: no pipe is thinner.
 _WARY_STEP_M = 0.1
 
 
@@ -56,12 +56,11 @@ def plan_path(world: World, scenario: Scenario, seed: int, session: str, is_wary
     """Return the line of one session; the seed draws its wander.
 
     Args:
-        world: What is driven through.
+        world: The world.
         scenario: Its platform and its sessions.
-        seed: What the wander is drawn from.
+        seed: Seed of the wander.
         session: "before" or "after".
-        is_wary: Keep clear also of obstacles within the clearance above and below the sensor, not only of those level
-            with it.
+        is_wary: Also keep clear of obstacles within the clearance above and below the sensor, not only at its height.
 
     Raises:
         ScenarioError: The route turns back on itself, nothing is left of it, or the walls and props leave no room.

@@ -1,4 +1,4 @@
-"""From a line to the sensor's movement: wheels on the floor or a quadrotor's flight, and the speed along the way."""
+"""The movement of the sensor along a path: on wheels over the floor or in flight, with the speed along the path."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _GRAVITY_MPS2 = 9.81
 _TILT_LENGTH_M = 2.5
 _BOUNCE_LENGTH_M = 2.5
 _SPEED_LENGTH_M = 8.0
-# A tyre touches the floor over about this length, and what is shorter it swallows.
+# A tyre touches the floor over about this length; shorter bumps do not move the robot.
 _CONTACT_M = 0.2
 # A quadrotor holds its height over the floor as averaged over this half width, not over every bump.
 _ALTITUDE_M = 3.0
@@ -35,10 +35,10 @@ def ride(path: Path, floor: Caster, standing: Caster, scenario: Scenario, seed: 
 
     Args:
         path: The line.
-        floor: What wheels roll on and a quadrotor measures its height to: rock, stones, and whatever else is fixed.
-        standing: The same with the session's props, over which a quadrotor flies.
-        scenario: Names the platform and the session's plan.
-        seed: Draws the noise of tilt, bounce and speed.
+        floor: Rock, stones and furniture: the floor under the wheels, and the level of a quadrotor's height.
+        standing: The same with the session's props, which a quadrotor flies over.
+        scenario: The platform and the session's plan.
+        seed: Seed of the noise of tilt, bounce and speed.
         session: "before" or "after".
 
     Raises:
@@ -113,7 +113,7 @@ def lean_angles(path: Path, time_s: Float64Array) -> tuple[Float64Array, Float64
 
 
 def _floor_under(points: Float64Array, level_m: Float64Array, floor: Caster) -> Float64Array:
-    """Floor height (N,) under points (N, 3), bridged where there is none, at `level_m` where there is none at all."""
+    """Return the floor height (N,) under points (N, 3), interpolated over gaps; `level_m` without any floor."""
     heights = floor_heights(floor, points + np.array([0.0, 0.0, PROBE_UP_M]))
     known = np.flatnonzero(np.isfinite(heights))
     return np.interp(np.arange(len(heights)), known, heights[known]) if len(known) else level_m.copy()
@@ -122,7 +122,7 @@ def _floor_under(points: Float64Array, level_m: Float64Array, floor: Caster) -> 
 def _keep_between(
     path: Path, floor: Caster, standing: Caster, wanted_m: Float64Array, clearance_m: float, session: str
 ) -> Float64Array:
-    """Heights (N,) near the wanted ones that keep the clearance to the roof and air to what lies or stands below."""
+    """Return heights (N,) near the wanted ones that keep clear of the roof above and of all surfaces below."""
     around = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]) * clearance_m / 2
     low, high = np.full(len(wanted_m), -np.inf), np.full(len(wanted_m), np.inf)
     for offset in around:

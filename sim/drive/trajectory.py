@@ -1,4 +1,4 @@
-"""From a drive to poses: time and pose of each column of each recorded revolution, true and as estimated."""
+"""Trajectories: time, true pose and estimated pose of each column of each recorded revolution."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sim.drive.ride import ride
 from sim.placement.recorded import check_inside, read_drive
 from sim.scene import Scene, World
 
-# Revolutions and ways are compared with this much slack, so that rounding loses none.
+# Tolerance for comparing times and distances, so that rounding drops no revolution.
 _SLACK = 1e-6
 
 
@@ -29,7 +29,7 @@ class Trajectory:
 
     Attributes:
         true: Movement of the sensor in the world frame.
-        estimated: The same as the session's odometry has it, in its odom frame.
+        estimated: The movement that the session's odometry estimates, in its odom frame.
         revolution_s: (S,) time of the middle column of each recorded revolution.
         column_s: (W,) time of each column's pose after the middle one's; all 0 where the scan does not roll.
         column_offsets_ns: (W,) time of each column from the start of its revolution.
@@ -102,7 +102,7 @@ def _from(start: Float64Array, end: Float64Array) -> Float64Array:
 def plan_trajectory(world: World, scenario: Scenario, sensor: SensorMetadata, seed: int, session: str) -> Trajectory:
     """Return the drive of one session.
 
-    Where KISS-ICP is to estimate it, which needs the scans, `estimated` is the truth as seen from the first revolution.
+    For KISS-ICP, which needs the scans, `estimated` is the true movement relative to the first revolution.
 
     Raises:
         InputError: The trajectory file cannot be read.
@@ -121,7 +121,7 @@ def plan_trajectory(world: World, scenario: Scenario, sensor: SensorMetadata, se
 def _drive_route(
     world: World, scene: Scene, scenario: Scenario, seed: int, session: str, is_wary: bool = False
 ) -> Motion:
-    """Drive the session's line; where it comes too near to something, a wary one is tried."""
+    """Drive the path of a session; if it comes too near a surface, try a wary path."""
     path = plan_path(world, scenario, seed, session, is_wary)
     true = ride(path, world.fixed, scene.caster, scenario, seed, session)
     try:

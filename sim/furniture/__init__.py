@@ -1,1 +1,5 @@
 """Fixtures of both sessions, never a change: pipes, ducts, cable trays, rock support, loose stones."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -98,12 +98,10 @@ def _arcs(axis: Axis, radius_m: Float64Array, lowest_share: float) -> tuple[Floa
     crown = len(_ANGLES) // 2
     arc_m -= arc_m[:, [crown]]
     is_low = up < (lowest_share - _EYE_SHARE) * axis.height_m[:, None]
-    ends = [np.min(np.where(is_low[:, part], np.abs(arc_m[:, part]), np.inf), axis=1) for part in _SIDES]
+    low_m = np.where(is_low, np.abs(arc_m), np.inf)
+    ends = [np.min(low_m[:, part], axis=1) for part in (slice(crown), slice(crown + 1, None))]
     half_arc_m = np.minimum(np.min(ends, axis=0), np.minimum(arc_m[:, -1], -arc_m[:, 0]))
     n_steps = int(np.ceil(np.abs(arc_m).max() / _ARC_STEP_M))
     wanted = np.arange(-n_steps, n_steps + 1) * _ARC_STEP_M
     angles = np.stack([np.interp(wanted, row, _ANGLES) for row in arc_m])
     return angles, half_arc_m
-
-
-_SIDES = (slice(0, len(_ANGLES) // 2), slice(len(_ANGLES) // 2 + 1, None))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -32,16 +31,8 @@ _PIN_REACH_M = 0.5
 _SEGMENT_M = 0.3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pins:
-    """Where the bolts of one drift are on its shell: metres along, metres of arc."""
-
-    along_m: Float64Array
-    arc_m: Float64Array
-
-
-def bolt_pins(shell: Shell, spacing_m: float, number: int, seed: int) -> Pins:
-    """Lay a square pattern with some jitter over roof and upper walls of a drift."""
+def bolt_pins(shell: Shell, spacing_m: float, number: int, seed: int) -> Float64Array:
+    """Return places (N, 2) for a drift's bolts on its shell, metres along and of arc: a square grid with jitter."""
     generator = stream(seed, "furniture", "bolts", str(number))
     half_arc_m = float(np.median(shell.half_arc_m))
     n_rows, n_across = round(shell.length_m / spacing_m), max(1, round(2 * half_arc_m / spacing_m))
@@ -50,11 +41,11 @@ def bolt_pins(shell: Shell, spacing_m: float, number: int, seed: int) -> Pins:
     jitter = np.clip(generator.normal(0.0, _JITTER_M, (2, n_rows, n_across)), -2 * _JITTER_M, 2 * _JITTER_M)
     along_m, arc_m = (along_m + jitter[0]).ravel(), (arc_m + jitter[1]).ravel()
     is_bare = shell.is_bare(along_m, shell.angles_at(along_m, arc_m))
-    return Pins(along_m[is_bare], arc_m[is_bare])
+    return np.column_stack([along_m, arc_m])[is_bare]
 
 
-def bolt_mesh(shells: Sequence[Shell], pins: Sequence[Pins], bolts: Bolts) -> Mesh:
-    """Return all bolts: a domed square plate flat on the rock, and a stub; of two that nearly coincide, one."""
+def bolt_mesh(shells: Sequence[Shell], pins: Sequence[Float64Array], bolts: Bolts) -> Mesh:
+    """Return all bolts: a domed square plate flat on the rock, and a stub. Of two bolts that nearly meet one stays."""
     if not shells:
         return EMPTY
     found = [_seats(shell, pin) for shell, pin in zip(shells, pins, strict=True)]
@@ -67,7 +58,7 @@ def bolt_mesh(shells: Sequence[Shell], pins: Sequence[Pins], bolts: Bolts) -> Me
     return _bolts_at(seats[keep], normals[keep])
 
 
-def screen_mesh(shells: Sequence[Shell], pins: Sequence[Pins], screen: Screen, seed: int) -> Mesh:
+def screen_mesh(shells: Sequence[Shell], pins: Sequence[Float64Array], screen: Screen, seed: int) -> Mesh:
     """Return the wire mesh of all drifts; `pins` are the bolts that hold it."""
     parts = [
         _screen_of(shell, pin, screen, stream(seed, "furniture", "screen", str(number)))
@@ -96,10 +87,11 @@ def _parts_of(total: int, n: int, least: int, generator: np.random.Generator) ->
     return np.asarray(np.diff(np.concatenate([[0], cuts, [total - n * least]])) + least, dtype=np.int64)
 
 
-def _seats(shell: Shell, pins: Pins) -> tuple[Float64Array, Float64Array]:
-    """Middle of each plate's underside (N, 3) and its normal (N, 3) into the void, from five rays a bolt."""
-    angle = shell.angles_at(pins.along_m, pins.arc_m)
-    eye, outwards = shell.rays_at(pins.along_m, angle)
+def _seats(shell: Shell, pins: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Return the middle of each plate's underside (N, 3) and its normal (N, 3) into the void, from five rays a bolt."""
+    along_m, arc_m = pins.T
+    angle = shell.angles_at(along_m, arc_m)
+    eye, outwards = shell.rays_at(along_m, angle)
     first_m = wall_distances(shell.axis.walls, eye, outwards)
     aside = np.stack([outwards[:, 1], -outwards[:, 0], np.zeros(len(eye))], axis=1)
     flat = np.linalg.norm(aside, axis=1) < 0.1
@@ -137,7 +129,7 @@ def _bolts_at(seats: Float64Array, normals: Float64Array) -> Mesh:
     return repeat_body(seats[:, None] + offsets, _BOLT_FACES)
 
 
-def _screen_of(shell: Shell, pins: Pins, screen: Screen, generator: np.random.Generator) -> Mesh:
+def _screen_of(shell: Shell, pins: Float64Array, screen: Screen, generator: np.random.Generator) -> Mesh:
     n_rows = int((shell.length_m - _OVERLAP_M) / _PANEL_M[0])
     rows = np.flatnonzero(covered_rows(n_rows, screen.share, generator)) if n_rows else np.empty(0, np.int64)
     if len(rows) == 0:
@@ -150,15 +142,13 @@ def _screen_of(shell: Shell, pins: Pins, screen: Screen, generator: np.random.Ge
     low = np.stack([start + row * _PANEL_M[0], -half_arc_m + column * (wide_m - _OVERLAP_M)], axis=1)
     low += generator.uniform(-0.03, 0.03, low.shape)
     lift_m = np.where((row + column) % 2, 0.008, 0.0)  # where panels overlap, one lies on the other
-    wires = [
-        _wire_mesh(shell, pins, low, lift_m, long_m, wide_m, screen.opening_m, is_along) for is_along in (True, False)
-    ]
-    return join_meshes(wires)
+    panels = (shell, pins, low, lift_m, long_m, wide_m, screen.opening_m)
+    return join_meshes([_wire_mesh(*panels, is_along=True), _wire_mesh(*panels, is_along=False)])
 
 
 def _wire_mesh(
     shell: Shell,
-    pins: Pins,
+    pins: Float64Array,
     low: Float64Array,
     lift_m: Float64Array,
     long_m: float,
@@ -172,14 +162,12 @@ def _wire_mesh(
     n_knots = max(2, round(extent_m / max(_SEGMENT_M, 2 * opening_m)) + 1)
     knots = np.linspace(0.0, extent_m, n_knots)
     offsets = (np.arange(n_wires) - (n_wires - 1) / 2) * opening_m + pitch_m / 2
-    local = np.stack(
-        np.broadcast_arrays(*((knots[None], offsets[:, None]) if is_along else (offsets[:, None], knots[None]))), -1
-    )
-    places = low[:, None, None] + local[None]
-    along_m, arc_m = places[..., 0], places[..., 1]
-    angle = shell.angles_at(along_m, arc_m)
+    local = np.stack(np.broadcast_arrays(knots[None], offsets[:, None]), axis=-1)
+    places = low[:, None, None] + (local if is_along else local[..., ::-1])[None]
+    along_m = places[..., 0]
+    angle = shell.angles_at(along_m, places[..., 1])
     eye, outwards = shell.rays_at(along_m, angle)
-    reach_m = _hung_at(shell, pins, along_m, arc_m, angle) - lift_m[:, None, None]
+    reach_m = _hung_at(shell, pins, places, angle) - lift_m[:, None, None]
     rock_m = wall_distances(shell.axis.walls, eye.reshape(-1, 3), outwards.reshape(-1, 3)).reshape(reach_m.shape)
     reach_m = np.minimum(reach_m, rock_m - _PINNED_M)
     middle = eye + reach_m[..., None] * outwards
@@ -204,13 +192,13 @@ def _is_in_sight(shell: Shell, eye: Float64Array, middle: Float64Array) -> BoolA
     return np.asarray(rock_m > length_m - _PINNED_M)
 
 
-def _hung_at(shell: Shell, pins: Pins, along_m: Float64Array, arc_m: Float64Array, angle: Float64Array) -> Float64Array:
+def _hung_at(shell: Shell, pins: Float64Array, places: Float64Array, angle: Float64Array) -> Float64Array:
     """Distance from the eye of a screen that hangs taut between bolts and is pulled to the rock at each of them."""
+    along_m = places[..., 0]
     taut_m = shell.radii_at(shell.taut_m, along_m, angle) - SCREEN_STANDOFF_M
-    if len(pins.along_m) == 0:
+    if len(pins) == 0:
         return taut_m
-    places = np.stack([along_m, arc_m], axis=-1).reshape(-1, 2)
-    distance_m, _ = find_nearest(np.stack([pins.along_m, pins.arc_m], axis=1), places, _PIN_REACH_M)
+    distance_m, _ = find_nearest(pins, places.reshape(-1, 2), _PIN_REACH_M)
     pull = np.clip(1 - distance_m.reshape(along_m.shape) / _PIN_REACH_M, 0, 1)
     pull = pull**2 * (3 - 2 * pull)
     return np.asarray(taut_m + pull * (shell.radii_at(shell.rock_m, along_m, angle) - _PINNED_M - taut_m))

@@ -100,7 +100,7 @@ def wall_lines(axis: Axis, plan: WallPlan) -> list[Line]:
             stations = np.arange(len(up_m))
             away = np.maximum(np.maximum(first - stations, stations - end + 1) - _SHOULDER, 0)
             up_m = np.maximum(up_m, base_m + (over_m - base_m) * np.clip(1 - away / _RAMP, 0, 1))
-    up_m = _smooth(up_m, 1)
+    up_m = np.convolve(np.pad(up_m, 1, mode="edge"), np.ones(3) / 3, mode="valid")
     wall_m = _nearest(axis, up_m, plan)
     is_open = binary_dilation(is_opening(wall_m), iterations=2) & axis.is_inside
     limit_m = bridge_openings(wall_m, is_open) - cross.half_width_m - cross.standoff_m
@@ -187,11 +187,6 @@ def _inside_only(values: Float64Array, is_inside: BoolArray, reach: int = _STIFF
     """Envelope (S,) of the stations in the void, the others standing for nothing."""
     stations = np.arange(len(values))
     return lower_envelope(np.interp(stations, stations[is_inside], values[is_inside]), reach)
-
-
-def _smooth(values: Float64Array, reach: int) -> Float64Array:
-    width = 2 * reach + 1
-    return np.convolve(np.pad(values, reach, mode="edge"), np.ones(width) / width, mode="valid")
 
 
 def _pieces(axis: Axis, across_m: Float64Array, up_m: Float64Array, is_usable: BoolArray) -> list[Line]:

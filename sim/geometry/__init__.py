@@ -1,1 +1,5 @@
 """Geometry without tunnels: meshes, noise fields, sweeps, lines, and ray casting with Embree."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,4 +1,4 @@
-"""Places all props of a scenario in turn: first those with a given place, then those whose place the seed draws."""
+"""Placing of all props of a scenario: first those with a given place, then those whose place the seed draws."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Outline = Callable[[Standing], Float64Array]
 
 @dataclass(slots=True, eq=False)
 class _Board:
-    """The tunnel, the props placed so far, and for each lane the span of the way that each of them bars."""
+    """The tunnel, the props placed so far, and for each lane the offsets that each of them blocks."""
 
     scenario: Scenario
     centreline: Centreline
@@ -103,7 +103,7 @@ def place_props(scenario: Scenario, centreline: Centreline, around: Surroundings
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Job:
-    """A prop to set down at one of its places, and what is left of it in the after session if it is reshaped."""
+    """A prop for one of its places, and the rest of it in the after session if it is reshaped."""
 
     prop: Prop
     place: Place
@@ -119,8 +119,9 @@ class _Job:
 
 def _jobs(prop: Prop, seed: int) -> list[_Job]:
     sessions = {"none": _BOTH, "added": _AFTER}.get(prop.change, _BEFORE)
-    rest = shape_of(prop, seed, is_banked=_is_banked(prop, prop.place), is_loaded=True) if prop.loaded_share else None
-    jobs = [_Job(prop, prop.place, sessions, shape_of(prop, seed, is_banked=_is_banked(prop, prop.place)), rest)]
+    is_banked, share = _is_banked(prop, prop.place), prop.loaded_share
+    rest = None if share is None else shape_of(prop, seed, is_banked=is_banked, loaded_share=share)
+    jobs = [_Job(prop, prop.place, sessions, shape_of(prop, seed, is_banked=is_banked), rest)]
     if prop.to is not None:
         shape = shape_of(prop, seed, is_banked=_is_banked(prop, prop.to))
         jobs.append(_Job(prop, prop.to, _AFTER, shape, is_goal=True))

@@ -94,7 +94,7 @@ def _is_inside(points: Float64Array, caster: Caster, is_solid_inside: bool) -> B
 
 
 def _directions() -> Float64Array:
-    """Give 92 directions spread evenly over the sphere (a Fibonacci lattice), and the six axes."""
+    """Return 92 unit vectors: 86 spread evenly over the sphere (a Fibonacci lattice), and the six axes."""
     number = np.arange(86) + 0.5
     z = 1.0 - 2.0 * number / 86
     angle = np.pi * (3.0 - np.sqrt(5.0)) * number

@@ -1,4 +1,4 @@
-"""From a prop's place in a scenario to a pose on the floor: across the free width, clear of rock and furniture."""
+"""The pose of a prop on the floor from its place in a scenario: across the free width, clear of rock and furniture."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from sim.props.shapes import Shape, footprint_corners, shape_mesh, solid_mesh
 
 # A prop may lean on a wall that is this even; at a drift's mouth it is not.
 _UNEVEN_WALL_M = 0.8
-# What rises no more steeply is floor; of a wall at least half must be seen over it.
+# Surfaces with a steeper normal are floor; at least half of the rays must reach the wall over it.
 _FLOOR_UP = 0.7
 _SEEN_SHARE = 0.5
 _LEAN_GAP_M = 0.01
 _BULGE_M = 0.15  # of rock that a leaning prop may meet between its corners
 _LEAN_DEG = (10.0, 25.0)
-# Farther than where the centre of mass stands over the foot, or a prop rocks back upright.
+# Beyond the lean at which the centre of mass is above the foot; otherwise a prop falls back upright.
 _BEYOND_BALANCE_DEG = 6.0
 _STEEP_DEG, _STEEPEST_LEAN_DEG = 28.0, 40.0
 _FOOT_M = 0.03
@@ -39,9 +39,9 @@ class Spot:
         point: (3,) on the centreline at floor level, or a given point above the floor.
         heading: (2,) direction of the drift; of the x axis for a given point.
         width_m, height_m: Nominal size of the drift.
-        where: How a message calls it.
-        is_line: Whether the drift's width is shared out by `lateral`; else the prop stands at the point itself.
-        over_humps: Whether an uneven wall is judged again, by what is seen of it over humps of the floor.
+        where: Its name in messages.
+        is_line: Whether `lateral` places the prop across the drift; else it stands at the point itself.
+        over_humps: Whether an uneven wall is checked again without the rays that humps of the floor block.
     """
 
     point: Float64Array
@@ -96,7 +96,7 @@ def place_prop(
 
 
 def _bounds(shape: Shape, rotation: Float64Array, posture: str) -> Float64Array:
-    """Low and high corner (2, 3) of a prop turned into its posture; upright, what is below the floor does not count."""
+    """Return the low and high corner (2, 3) of a prop in its posture; upright without the part below the floor."""
     if posture == "upright":
         length, width, height = shape.size_m
         return np.array([[-length / 2, -width / 2, 0.0], [length / 2, width / 2, height]])
@@ -104,7 +104,7 @@ def _bounds(shape: Shape, rotation: Float64Array, posture: str) -> Float64Array:
 
 
 def _across(prop: Prop, half: Float64Array, place: Place, spot: Spot, around: Surroundings) -> Float64Array:
-    """Place (2,) of the middle of a prop of this half size (3,) across the drift."""
+    """Return the middle (2,) of a prop of this half size (3,) at its place across the drift."""
     left = np.array([-spot.heading[1], spot.heading[0]])
     turn = yaw_pose(np.deg2rad(place.yaw_deg))[:2, :2]
     # Half sizes along and across the drift.
@@ -166,7 +166,7 @@ def _at_wall(
     yaw: float,
     start: Float64Array | None,
 ) -> tuple[Float64Array, Float64Array]:
-    """Pose of a prop tilted towards the nearer wall until it all but touches it, or of a pile banked up against it."""
+    """Return the pose of a prop that leans almost in contact with the nearer wall, or of a pile against it."""
     base = np.array([*(spot.point[:2] if start is None else start), spot.point[2]])
     wall = _nearer_wall(prop, place, spot, base, around)
     aside = np.array([-wall[1], wall[0]])
@@ -203,7 +203,7 @@ def _at_wall(
 
 
 def _is_even(reach_m: Float32Array, is_pile: bool, spot: Spot) -> bool:
-    """Tell whether a wall at these distances (N,) is one to lean against, infinite where no rock was met."""
+    """Tell whether a wall at these distances (N,) is even enough to lean on; a ray without a hit is infinite."""
     if not np.isfinite(reach_m).all() or reach_m.max() > spot.width_m + 2.0:
         return False
     # A pile goes on behind its plane, which is put at the mean of the wall.
@@ -213,7 +213,7 @@ def _is_even(reach_m: Float32Array, is_pile: bool, spot: Spot) -> bool:
 
 
 def _back(shape: Shape) -> Float64Array:
-    """Points (N, 3) on the flat back of a prop that is set against a wall, object frame."""
+    """Return points (N, 3) on the flat back of a prop against a wall, object frame."""
     length, width, height = shape.size_m
     heights, sides = np.linspace(0.1, max(height, 0.2), 5), np.linspace(-0.5, 0.5, 9) * length
     grid = np.stack(np.meshgrid(sides, heights), axis=-1).reshape(-1, 2)
@@ -225,7 +225,7 @@ def _span(points: Float64Array) -> Float64Array:
 
 
 def _nearer_wall(prop: Prop, place: Place, spot: Spot, base: Float64Array, around: Surroundings) -> Float64Array:
-    """Direction (2,) of the wall: the side that `lateral` names in a drift, else the nearest rock all round."""
+    """Return the direction (2,) of the wall: the side that `lateral` names in a drift, else the nearest rock."""
     if spot.is_line and place.lateral != 0.0:
         left = np.array([-spot.heading[1], spot.heading[0]])
         return np.asarray(np.sign(place.lateral) * left)
@@ -286,7 +286,7 @@ def lean_towards(name: str, shape: Shape, wall: Float64Array, yaw_rad: float, se
 
 
 def _balance_deg(shape: Shape, rotation: Float64Array, wall: Float64Array) -> float:
-    """Lean at which a prop's middle of mass stands over the edge of its foot on the side of the wall."""
+    """Return the lean at which a prop's centre of mass is above the edge of its foot on the side of the wall."""
     meshes = [solid_mesh(solid) for solid in shape.solids]
     hulls = [trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).convex_hull for mesh in meshes]
     weights = np.array([hull.volume for hull in hulls])

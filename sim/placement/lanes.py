@@ -1,4 +1,4 @@
-"""Whether a robot still gets past the props: the free width of its line in each session, and what props bar of it."""
+"""Lanes: the free width along the path of each session, and the part of it that props block."""
 
 from __future__ import annotations
 
@@ -61,12 +61,12 @@ class Lane:
         return span
 
     def is_open(self, taken: Sequence[Float64Array]) -> bool:
-        """Tell whether at every station a gap is left between the sides of the drift and what props bar (N, 2)."""
+        """Tell whether every station has a gap between the sides of the drift and the blocked offsets (N, 2)."""
         if not taken:
             return True
         spans = np.stack(taken, axis=1)
         for row in np.flatnonzero(np.isfinite(spans[:, -1, 0])):
-            # The newest prop is the last one; only where it bars something can it have closed the way.
+            # The last prop is the new one; it can have closed the lane only where it blocks something.
             bars = spans[row][np.isfinite(spans[row, :, 0])]
             bars = bars[np.argsort(bars[:, 0])]
             edge, widest = self.low_m[row], -np.inf
@@ -94,7 +94,7 @@ def build_lanes(scenario: Scenario, centreline: Centreline, fixed: Caster) -> tu
 
 
 def _recorded_lane(scenario: Scenario, session: str, trajectory: Path) -> Lane:
-    """Lane of a recorded trajectory, which swerves for nothing and may be at any height."""
+    """Return the lane of a recorded trajectory, which avoids no obstacle and may have any height."""
     line = resample(read_drive(trajectory)[0].points[:, :2], _STEP_M)
     room_m = np.full(len(line), _SPARE_M / 2)
     return Lane(session, line, headings_of(line), -room_m, room_m, scenario.platform.clearance_m, 0.0)

@@ -39,11 +39,11 @@ def read_drive(path: Path) -> tuple[Motion, tuple[int, ...]]:
 
 
 def check_inside(motion: Motion, surroundings: Caster, where: str, numbers: tuple[int, ...]) -> None:
-    """Refuse a trajectory that leaves the void or comes within 0.2 m of what stands there.
+    """Refuse a trajectory that leaves the void or comes within 0.2 m of a surface.
 
     Args:
         motion: The trajectory, world frame.
-        surroundings: Rock and whatever else there is; every surface faces the void.
+        surroundings: Rock, furniture and props; every surface faces the void.
         where: Session and file, for the message.
         numbers: Line of each sample of `motion`.
 

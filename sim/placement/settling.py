@@ -1,4 +1,4 @@
-"""Physics, run once per prop: it is dropped on the floor until it rests."""
+"""Settling by physics: each prop is dropped on the floor once and comes to rest."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, make_pose, transform
+from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 from sim.placement.contact import find_way_out, surface_points
 from sim.placement.placing import PROBE_UP_M, Standing, Surroundings, floor_heights
@@ -28,23 +29,23 @@ _REST_MPS = 2e-3
 _REST_RADPS = 1e-2
 _FALLEN_DEG = 45.0
 _WINDOW_S = 0.2
-# Rough ground, and contacts damped beyond critical, or a box on three points rocks for ever. Friction against rolling
-# stands for the stones that keep a barrel that lies or leans from rolling away.
+# Rough ground, with overdamped contacts: otherwise a box on three points rocks for ever. Rolling friction stands for
+# the stones that keep a lying or leaning barrel from rolling away.
 _CONTACT: dict[str, Any] = {"friction": [1.0, 0.01, 0.001], "solref": [0.02, 2.0]}
 _CHOCKED: dict[str, Any] = {"friction": [1.0, 0.05, 0.1], "solref": [0.02, 2.0], "condim": 6}
 _DRAG_HZ = {"upright": (2.0, 20.0), "leaning": (2.0, 8.0), "tipped": (2.0, 5.0)}  # of speed and of turning
 _TOUCH_M = 0.002
-# A prop that leans is no farther from the true wall than the field may be off, and brought to it.
+# A leaning prop this near the true wall, the error of the field, is moved to it.
 _NEAR_WALL_M = 0.08
 _LEANING_GAP_M = 0.02
 
 
 def settle(item: Standing, around: Surroundings) -> Standing:
-    """Drop a prop on the floor until it rests, and return it at its frozen pose; one set into the floor stays.
+    """Drop a prop on the floor until it rests, and return it at its final pose; props set into the floor keep theirs.
 
-    It drops alone, so that its pose depends on no other prop. It drops on height fields cast from the rock below it and
-    from the wall it leans against, because MuJoCo would collide the wall mesh as its convex hull, a solid plug. The
-    fields are coarser than the rock; at the end the prop is moved until its true surface touches the true rock.
+    Each prop drops alone, so that its pose depends on no other prop. Height fields measured by rays stand for the floor
+    below it and the wall it leans against, because MuJoCo would collide with the convex hull of the wall mesh. The
+    fields are coarser than the rock. At the end the prop is moved until its true surface touches the true rock.
 
     Raises:
         ScenarioError: It falls over, is not at rest after 8 s, rolls away, or cannot be freed from the rock.
@@ -58,12 +59,21 @@ def settle(item: Standing, around: Surroundings) -> Standing:
     return replace(item, world_T_object=_freeze_pose(data, item, points, around))
 
 
-def add_solid(body: mujoco.MjsBody, solid: Solid, mesh_name: str = "", **options: object) -> None:
-    """Add a primitive to a body that has the object frame; a mesh must be in the spec under `mesh_name`."""
+def add_mesh(spec: mujoco.MjSpec, name: str, mesh: Mesh, is_hull: bool = False) -> None:
+    """Add a surface to a spec, with the mass of its convex hull or of its shell."""
+    inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX if is_hull else mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    spec.add_mesh(name=name, uservert=mesh.vertices.ravel(), userface=mesh.faces.ravel(), inertia=inertia)
+
+
+def add_solid(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, solid: Solid, name: str, is_hull: bool = False, **options: object
+) -> None:
+    """Add a primitive to a body that has the object frame, a mesh under this name and as `add_mesh` does."""
     pose = solid.object_T_solid
     common = {"pos": pose[:3, 3], "quat": quaternion(pose), **options}
     if solid.mesh is not None:
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh_name, **common)
+        add_mesh(spec, name, solid.mesh, is_hull)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **common)
     else:
         kind = mujoco.mjtGeom.mjGEOM_BOX if solid.kind == "box" else mujoco.mjtGeom.mjGEOM_CYLINDER
         body.add_geom(type=kind, size=solid.size_m, **common)
@@ -75,7 +85,7 @@ def quaternion(pose: Float64Array) -> Float64Array:
 
 
 def _model(item: Standing, points: Float64Array, around: Surroundings) -> mujoco.MjModel:
-    """One prop above its floor, with the wall it leans against."""
+    """Return the model of one prop above its floor, with the wall it leans against."""
     spec = mujoco.MjSpec()
     spec.option.timestep = _TIMESTEP_S
     spec.option.impratio = 10.0
@@ -89,15 +99,8 @@ def _model(item: Standing, points: Float64Array, around: Surroundings) -> mujoco
     body = spec.worldbody.add_body(name="prop", pos=pose[:3, 3], quat=quaternion(pose))
     body.add_freejoint()
     for index, solid in enumerate(item.shape.solids):
-        if solid.mesh is not None:
-            # Its hull collides and has its mass: that serves open surfaces too.
-            spec.add_mesh(
-                name=str(index),
-                uservert=solid.mesh.vertices.ravel(),
-                userface=solid.mesh.faces.ravel(),
-                inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,
-            )
-        add_solid(body, solid, mesh_name=str(index), density=300.0, **contact)
+        # The hull of a mesh collides and gives the mass, which also works for open surfaces.
+        add_solid(spec, body, solid, str(index), is_hull=True, density=300.0, **contact)
     model = spec.compile()
     # Drag ends the rocking that stiff contacts keep alive; it changes no resting pose.
     speed_hz, turn_hz = _DRAG_HZ[item.posture]
@@ -122,15 +125,9 @@ def _add_floor(
     grid = np.stack(np.meshgrid(x + axis, y + axis), axis=-1).reshape(-1, 2)  # rows along y, as MuJoCo wants
     heights = floor_heights(walls, np.column_stack([grid, np.full(len(grid), z + PROBE_UP_M)]))
     heights = np.where(np.isnan(heights) | (np.abs(heights - z) > 0.5), z, heights)
-    low, span = heights.min(), max(float(np.ptp(heights)), 1e-3)
-    spec.add_hfield(
-        name="floor",
-        size=[half_m, half_m, span, 0.5],
-        nrow=count,
-        ncol=count,
-        userdata=((heights - low) / span).astype(np.float32),
-    )
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="floor", pos=[x, y, low], **contact)
+    low = float(heights.min())
+    field = heights.reshape(count, count)
+    _add_field(spec, "floor", (half_m, half_m), field, low, pos=[x, y, low], **contact)
 
 
 def _add_wall(
@@ -150,26 +147,24 @@ def _add_wall(
     depth_m = ranges_m.astype(np.float64)
     far_m = float(depth_m[is_wall].max(initial=0.5)) + 0.01
     depth_m = np.where(is_wall, depth_m, far_m)  # below the floor, or through an opening
-    span = max(float(far_m - depth_m.min()), 1e-3)
-    spec.add_hfield(
-        name="wall",
-        size=[half[0], half[1], span, 0.5],
-        nrow=rows,
-        ncol=columns,
-        userdata=((far_m - depth_m) / span).astype(np.float32),
-    )
     frame = make_pose(np.stack([aside, [0.0, 0.0, 1.0], out], axis=1))
-    spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_HFIELD,
-        hfieldname="wall",
-        pos=middle - far_m * out,
-        quat=quaternion(frame),
-        **contact,
-    )
+    pose = {"pos": middle - far_m * out, "quat": quaternion(frame)}
+    _add_field(spec, "wall", (half[0], half[1]), -depth_m.reshape(rows, columns), -far_m, **pose, **contact)
+
+
+def _add_field(
+    spec: mujoco.MjSpec, name: str, half_m: tuple[float, float], heights: Float64Array, low: float, **options: object
+) -> None:
+    """Add a height field (rows, columns) whose lowest height is `low`."""
+    span = max(float(heights.max()) - low, 1e-3)
+    data = ((heights - low) / span).astype(np.float32).ravel()
+    rows, columns = heights.shape
+    spec.add_hfield(name=name, size=[*half_m, span, 0.5], nrow=rows, ncol=columns, userdata=data)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=name, **options)
 
 
 def _floor_gap_m(pose: Float64Array, points: Float64Array, walls: Caster) -> float:
-    """Least height of a prop's lower points above the true floor; the floor under a wall's overhang does not count."""
+    """Return the least height of a prop's lower points above the true floor, floor far from its foot left out."""
     world = transform(pose, points)
     foot = world[:, 2].min()
     world = world[world[:, 2] < foot + 0.3]
@@ -179,21 +174,21 @@ def _floor_gap_m(pose: Float64Array, points: Float64Array, walls: Caster) -> flo
 
 
 def _wall_gap_m(pose: Float64Array, wall: Float64Array, points: Float64Array, fixed: Caster) -> float:
-    """Least level distance of a prop's upper two thirds to the true wall."""
+    """Return the least horizontal distance from a prop's upper two thirds to the true wall."""
     world = transform(pose, points)
     world = world[world[:, 2] > world[:, 2].min() + np.ptp(world[:, 2]) / 3]
     return float(fixed.cast(world, [*wall, 0.0])[0].min())
 
 
 def _run_to_rest(model: mujoco.MjModel, data: mujoco.MjData, item: Standing) -> None:
-    """Step until it has not moved for two windows; contacts chatter from step to step even under a prop at rest."""
+    """Step until the prop does not move for two windows; single steps show contact noise even at rest."""
     calm = 0
     up = np.asarray(Rotation.from_quat(model.body("prop").quat, scalar_first=True).as_matrix()).T[:, 2]
     for _ in range(int(_LONGEST_S / _WINDOW_S)):
         start = data.qpos.copy()
         mujoco.mj_step(model, data, round(_WINDOW_S / _TIMESTEP_S))
         turned = Rotation.from_quat(data.qpos[3:], scalar_first=True)
-        # Tipped ones may roll on; all others keep what was up at the start up.
+        # Tipped props may roll; the up axis of all others stays up.
         if item.posture != "tipped" and (turned.as_matrix() @ up)[2] < np.cos(np.deg2rad(_FALLEN_DEG)):
             raise ScenarioError(f"prop {item.prop.name!r} falls over where it stands: place it on more level floor")
         speed_mps = np.linalg.norm(data.qpos[:3] - start[:3]) / _WINDOW_S
@@ -235,9 +230,9 @@ def _freeze_pose(data: mujoco.MjData, item: Standing, points: Float64Array, arou
 
 
 def _bring_to_contact(pose: Float64Array, item: Standing, points: Float64Array, around: Surroundings) -> Float64Array:
-    """Bring a prop to the true floor and wall, then push it the shortest way out of rock until it no more than touches.
+    """Move a prop to the true floor and wall, then the shortest way out of rock until it only touches it.
 
-    The way is that by which the fields differ from the rock, a few centimetres.
+    The distance is the error of the height fields, a few centimetres.
     """
     pose = pose.copy()
     pose[2, 3] -= max(_floor_gap_m(pose, points, around.walls), 0.0)

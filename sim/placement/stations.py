@@ -1,4 +1,4 @@
-"""Stations along the tunnel for props: given ones, and those that the seed draws on the way of both sessions."""
+"""Stations of props along the tunnel: given ones, and those that the seed draws on the routes of both sessions."""
 
 from __future__ import annotations
 

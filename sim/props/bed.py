@@ -9,7 +9,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
+from cdpipe.core.geometry import BoolArray, Float64Array, stream
 from sim.geometry.mesh import Mesh, drop_unused_vertices
 from sim.geometry.noise import smooth_noise
 from sim.props.shapes import BELOW_FLOOR_M, Size
@@ -73,9 +73,9 @@ def build_bed(size_m: Size, repose_deg: float, is_banked: bool, seed: int, name:
 def _outline(
     length: float, width: float, is_banked: bool, generator: np.random.Generator
 ) -> tuple[Float64Array, Float64Array]:
-    """Draw a closed line (K, 2) that touches the sides of the footprint, star-shaped about a centre (2,).
+    """Draw a closed outline (K, 2) that touches the sides of the footprint and is star-shaped about a centre (2,).
 
-    That of a banked pile is twice as wide, about a centre on the wall: only its near half is real.
+    The outline of a banked pile is twice as wide and its centre lies on the wall: half of it is behind the wall.
     """
     angle = np.arange(1440) * (2 * np.pi / 1440)
     radius = np.ones_like(angle)
@@ -108,7 +108,9 @@ def bed_mesh(bed: Bed) -> Mesh:
     start, end = top.ravel(), np.roll(top, -1, axis=1).ravel()
     is_rim = ~np.isin(start * nodes.size + end, end * nodes.size + start)
     start, end = start[is_rim], end[is_rim]
-    rim, (low_start, low_end) = _numbered(start, end, nodes.size)
+    # The rim has a copy at the bottom, numbered after the nodes.
+    rim = np.unique(start)
+    low_start, low_end = (nodes.size + np.searchsorted(rim, each) for each in (start, end))
     bottom = np.full(len(start), nodes.size + len(rim))
     sides = [np.stack(part, axis=1) for part in ((end, start, low_start), (end, low_start, low_end))]
     floor = np.stack([low_end, low_start, bottom], axis=1)
@@ -117,9 +119,3 @@ def bed_mesh(bed: Bed) -> Mesh:
     low = vertices[rim] * (1, 1, 0) - (0, 0, BELOW_FLOOR_M + _SKIRT_M)
     vertices = np.concatenate([vertices, low, low.mean(axis=0, keepdims=True)])
     return drop_unused_vertices(vertices, np.concatenate([top, *sides, floor]))
-
-
-def _numbered(start: Int64Array, end: Int64Array, first: int) -> tuple[Int64Array, tuple[Int64Array, Int64Array]]:
-    """Nodes of the rim, and the numbers of their copies at the bottom for the start and end of each edge."""
-    rim = np.unique(start)
-    return rim, (first + np.searchsorted(rim, start), first + np.searchsorted(rim, end))

@@ -9,7 +9,7 @@ from sim.props.shapes import BELOW_FLOOR_M, Size, Solid
 
 
 def chair(size_m: Size) -> tuple[Solid, ...]:
-    """Build a visitor's chair: four tubular legs, a seat pad at half height and a back rest at the rear (-x)."""
+    """Build a visitor's chair: four tubular legs, a seat pad at half height, a back rest at the rear (-x)."""
     length, width, height = size_m
     x, y, seat = length / 2, width / 2, 0.48 * height
     tube = min(0.014, 0.04 * min(length, width))
@@ -29,7 +29,7 @@ def chair(size_m: Size) -> tuple[Solid, ...]:
 
 
 def trolley(size_m: Size) -> tuple[Solid, ...]:
-    """Build a sack truck standing upright: toe plate in front, two wheels, a ladder frame and a handle at the rear."""
+    """Build an upright sack truck: toe plate in front, two wheels, ladder frame and handle at the rear."""
     length, width, height = size_m
     x, y = length / 2, width / 2
     wheel = min(0.28 * length, 0.13 * height)
@@ -56,7 +56,7 @@ def trolley(size_m: Size) -> tuple[Solid, ...]:
 
 
 def cone(size_m: Size) -> tuple[Solid, ...]:
-    """Build a traffic cone: a square foot, a cone open at the top, and reflecting bands."""
+    """Build a traffic cone: square foot, cone open at the top, two reflective bands."""
     length, width, height = size_m
     foot = 0.06 * height
     low, high = 0.74, 0.13  # radii above the foot and at the top, as shares of the half size
@@ -77,7 +77,7 @@ def cone(size_m: Size) -> tuple[Solid, ...]:
 
 
 def railing(size_m: Size) -> tuple[Solid, ...]:
-    """Build posts set into the floor, at most 1.5 m apart, with foot plates, three rails and a toe board."""
+    """Build a railing: posts set into the floor at most 1.5 m apart, foot plates, three rails and a toe board."""
     length, width, height = size_m
     x = length / 2
     post, rail = min(0.03, width / 2), min(0.024, width / 2)

@@ -41,10 +41,10 @@ _FRESH_BELOW_M = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Heap:
-    """A pile, whole.
+    """A whole pile.
 
     Attributes:
-        bed: What its fragments lie on.
+        bed: The surface on which its fragments lie.
         rubble: Its fragments, and the loose blocks at its foot.
         size_m: Length, width and height above the floor.
         is_banked: Whether it lies against a wall at y = +width/2.
@@ -54,10 +54,6 @@ class Heap:
     rubble: Rubble
     size_m: Size
     is_banked: bool
-
-    def limits(self) -> tuple[Float64Array, Float64Array]:
-        """Return the corners (3,) of the box that no fragment leaves."""
-        return _limits(self.size_m, self.is_banked)
 
 
 def largest_size_m(fragment_m: float, height_m: float) -> float:
@@ -85,9 +81,8 @@ def build_heap(size_m: Size, repose_deg: float, fragment_m: float, is_banked: bo
     cell_m2 = float(bed.x[1] - bed.x[0]) * float(bed.y[1] - bed.y[0])
     area_m2 = float((bed.z > 0.0).sum()) * cell_m2
     sizes = draw_sizes(area_m2, _COVERAGE, fragment_m, largest_m, _MOST_FRAGMENTS, generator)
-    pile = lay_fragments(
-        sizes, _places(bed, (-0.03, np.inf), low, high, len(sizes), generator), bed.heights, BURIED, generator
-    )
+    places = _places(bed, (-0.03, np.inf), low, high, len(sizes), generator)
+    pile = lay_fragments(sizes, places, bed.heights, BURIED, generator)
     n_loose = min(_MOST_LOOSE, 3 + int(length + width))
     blocks = largest_m * generator.uniform(0.4, 1.0, n_loose)
     feet = _places(bed, _BESIDE_M, low, np.minimum(high, (np.inf, width / 2, np.inf)), n_loose, generator)
@@ -139,22 +134,23 @@ def _columns(mesh: Mesh, size_m: Size, margin_m: float, count: int) -> tuple[Flo
 
 def _places(
     bed: Bed,
-    between_m: tuple[float, float],
+    range_m: tuple[float, float],
     low: Float64Array,
     high: Float64Array,
     n: int,
     generator: np.random.Generator,
 ) -> Float64Array:
-    """Draw places (n, 2) inside a box where the bed's height lies between two heights."""
+    """Draw places (n, 2) inside a box where the height of the bed lies in a range."""
     found = np.empty((0, 2))
     while len(found) < n:
         drawn = generator.uniform(low[:2], high[:2], (512, 2))
         heights = bed.heights(drawn)
-        found = np.concatenate([found, drawn[(heights > between_m[0]) & (heights < between_m[1])]])
+        found = np.concatenate([found, drawn[(heights > range_m[0]) & (heights < range_m[1])]])
     return found[:n]
 
 
 def _limits(size_m: Size, is_banked: bool) -> tuple[Float64Array, Float64Array]:
+    """Return the corners (3,) of the box that no fragment leaves."""
     length, width, height = size_m
     low = np.array([-length / 2, -width / 2, -np.inf])
     return low, np.array([length / 2, width / 2 + (BEHIND_M if is_banked else 0.0), height])
@@ -266,5 +262,5 @@ def _bite(heap: Heap, face: Face, fresh: Rubble) -> Heap:
     old = old.kept(old.centres[:, 2] < face.heights(old.centres[:, :2]))
     shift = np.append(face.foot_m * face.into, 0.0)
     is_cut = bed.heights(fresh.centres[:, :2] + shift[:2]) > fresh.centres[:, 2] + _FRESH_BELOW_M
-    new = confine(shift_rubble(fresh.kept(is_cut), shift), *heap.limits())
+    new = confine(shift_rubble(fresh.kept(is_cut), shift), *_limits(heap.size_m, heap.is_banked))
     return replace(heap, bed=left, rubble=join_rubble(old, new))

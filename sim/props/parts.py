@@ -1,4 +1,4 @@
-"""The parts that props are built of: bars, plates, tubes, and convex or turned pieces. Lengths in metres."""
+"""The primitives of props: boxes, rods, beams, prisms, convex hulls and surfaces of revolution. Lengths in metres."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def rod(start: Point, end: Point, radius_m: float, material: str) -> Solid:
 
 
 def beam(start: Point, end: Point, width_m: float, depth_m: float, material: str) -> Solid:
-    """Return a square-edged bar between two points; its width lies level where the bar is not upright."""
+    """Return a rectangular bar between two points; its width is horizontal unless the bar is upright."""
     a, b = np.array(start), np.array(end)
     half = (width_m / 2, depth_m / 2, float(np.linalg.norm(b - a)) / 2)
     return Solid("box", half, make_pose(_along(b - a), (a + b) / 2), material=material)
@@ -53,7 +53,7 @@ def hull_mesh(points: npt.ArrayLike) -> Mesh:
 
 
 def prism(outline: Sequence[tuple[float, float]], half_width: float, material: str) -> Solid:
-    """Return the piece between y = -half_width and +half_width over a convex outline given in x and z."""
+    """Return the prism from y = -half_width to +half_width over a convex outline in x and z."""
     ends = [(x, side * half_width, z) for side in (-1, 1) for x, z in outline]
     return surface(hull_mesh(ends), material)
 

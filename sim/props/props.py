@@ -9,7 +9,7 @@ import numpy as np
 from cdpipe.core.geometry import make_pose, stream
 from scenarios.schema import Prop
 from sim.geometry.mesh import move_mesh
-from sim.geometry.topology import closed_volume_m3, edges_of
+from sim.geometry.topology import closed_volume_m3
 from sim.props import equipment, storage
 from sim.props.heap import build_heap, column_volume_m3, load_away, whole_mesh
 from sim.props.parts import surface
@@ -32,36 +32,34 @@ BUILDERS = {
 }
 
 
-def shape_of(prop: Prop, seed: int, *, is_banked: bool = False, is_loaded: bool = False) -> Shape:
+def shape_of(prop: Prop, seed: int, *, is_banked: bool = False, loaded_share: float | None = None) -> Shape:
     """Return the shape of a prop.
 
     Args:
-        prop: What is built.
-        seed: Of the scenario; with the prop's name it draws what is irregular.
-        is_banked: Of a muck pile: it lies against a wall at y = +width/2 and goes on behind it.
-        is_loaded: Of a muck pile: what is left of it once `prop.loaded_share` of its volume is taken.
+        prop: The prop.
+        seed: Of the scenario; seed and name of the prop draw its irregular parts.
+        is_banked: Whether a muck pile lies against a wall at y = +width/2 and continues behind it.
+        loaded_share: Share of a muck pile's volume that has been removed; None for a whole pile.
 
     Raises:
-        ValueError: `is_loaded` without `prop.loaded_share`.
         ScenarioError: The file of a mesh cannot be used.
     """
     if prop.mesh is not None:
         mesh = prop_mesh(prop.mesh, prop.name)
         size = np.ptp(mesh.vertices, axis=0)
         solids: tuple[Solid, ...] = (surface(mesh, "paint"),)
-        return _shape(solids, (float(size[0]), float(size[1]), float(size[2])), closed_volume_m3(mesh, edges_of(mesh)))
+        return _shape(solids, (float(size[0]), float(size[1]), float(size[2])), closed_volume_m3(mesh))
     if prop.size_m is None:
         raise ValueError(f"prop {prop.name!r} has neither size_m nor mesh")
     if prop.kind == "muck_pile":
-        return _pile(prop, prop.size_m, seed, is_banked, is_loaded)
+        return _pile(prop, prop.size_m, seed, is_banked, loaded_share)
     if prop.kind == "box":
         solids = storage.box(prop.size_m, is_cardboard=max(prop.size_m) <= _CARDBOARD_M)
         return _shape(solids, prop.size_m, float(sum(8.0 * np.prod(solid.size_m) for solid in solids)))
     if prop.kind == "rock":
         key = int(stream(seed, "props", prop.name, "rock").integers(2**31))
-        rock = move_mesh(
-            rock_mesh(prop.size_m, key, _ROCK_SUBDIVISIONS), make_pose(translation=(0, 0, prop.size_m[2] / 2))
-        )
+        pose = make_pose(translation=(0, 0, prop.size_m[2] / 2))
+        rock = move_mesh(rock_mesh(prop.size_m, key, _ROCK_SUBDIVISIONS), pose)
         return _shape((surface(rock, "rock"),), prop.size_m, signed_volume_m3(rock))
     shape = _shape(BUILDERS[prop.kind](prop.size_m), prop.size_m, None)
     return replace(shape, is_settled=False) if prop.kind == "railing" else shape
@@ -71,12 +69,10 @@ def _shape(solids: tuple[Solid, ...], size_m: Size, volume_m3: float | None) -> 
     return Shape(solids, size_m, True, hull_volume_m3(solids), volume_m3)
 
 
-def _pile(prop: Prop, size_m: Size, seed: int, is_banked: bool, is_loaded: bool) -> Shape:
+def _pile(prop: Prop, size_m: Size, seed: int, is_banked: bool, loaded_share: float | None) -> Shape:
     heap = build_heap(size_m, prop.repose_deg, prop.fragment_m, is_banked, seed, prop.name)
-    if is_loaded:
-        if prop.loaded_share is None:
-            raise ValueError(f"prop {prop.name!r} has no loaded_share")
-        heap = load_away(heap, prop.loaded_share, prop.fragment_m, seed, prop.name)
+    if loaded_share is not None:
+        heap = load_away(heap, loaded_share, prop.fragment_m, seed, prop.name)
     mesh = whole_mesh(heap)
     solids = (surface(mesh, "rock"),)
     length, width, _ = heap.size_m

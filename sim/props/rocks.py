@@ -33,11 +33,11 @@ def rosin_rammler(n: int, size_m: float, generator: np.random.Generator) -> Floa
     Args:
         n: How many.
         size_m: Characteristic size L: 82 % of the fragments are smaller, half of them smaller than 0.35 L.
-        generator: Where the randomness comes from.
+        generator: Source of the draws.
 
     Returns:
-        (n,) sizes, metres. The law is one of passing mass; here it is read as a share of the number of fragments,
-        without which the fines, too small for any ray to meet, would be nearly all that is drawn.
+        (n,) sizes, metres. The law gives passing mass; here its shares are shares of the number of fragments.
+        Otherwise nearly all draws would be fines, which are too small for the sensor.
     """
     return np.asarray(size_m / _SCALE * (-np.log1p(-generator.random(n))) ** (1.0 / _EXPONENT))
 
@@ -119,7 +119,7 @@ class Rubble:
 def draw_sizes(
     plan_m2: float, coverage: float, fragment_m: float, largest_m: float, most: int, generator: np.random.Generator
 ) -> Float64Array:
-    """Draw fragments that cover a share of an area, or the largest `most` of them.
+    """Draw the sizes of fragments that cover a share of an area, at most the `most` largest.
 
     Args:
         plan_m2: Area to be covered, seen from above.
@@ -127,7 +127,7 @@ def draw_sizes(
         fragment_m: Characteristic size of the Rosin-Rammler law.
         largest_m: Larger ones are not drawn.
         most: How many at most.
-        generator: Where the randomness comes from.
+        generator: Source of the draws.
 
     Returns:
         Sizes from the largest to the smallest, metres; none below 5 cm, or half the largest of a low pile.
@@ -156,8 +156,8 @@ def lay_fragments(
         sizes_m: (N,) longest side of each.
         xy: (N, 2) where they lie.
         heights: The surface.
-        buried: Where their middles lie along its normal, from and to, in their own sizes.
-        generator: Where the randomness comes from.
+        buried: Range of their centres along the normal of the surface, in multiples of their size.
+        generator: Source of the draws.
     """
     n = len(sizes_m)
     keys = generator.integers(2**31, size=_TEMPLATES)
@@ -175,19 +175,19 @@ def lay_fragments(
 
 
 def confine(rubble: Rubble, low: Float64Array, high: Float64Array) -> Rubble:
-    """Move every fragment that reaches over a box (3,) to (3,), limits may be infinite, back inside it."""
-    fragments, centres = [], rubble.centres.copy()
-    for number, fragment in enumerate(rubble.fragments):
-        over = np.maximum(low - fragment.vertices.min(axis=0), 0) - np.maximum(fragment.vertices.max(axis=0) - high, 0)
-        fragments.append(Mesh(fragment.vertices + over, fragment.faces))
-        centres[number] += over
-    return Rubble(tuple(fragments), centres)
+    """Move every fragment that reaches out of a box, from corner (3,) to corner (3,), infinite or not, back into it."""
+    over_m = [
+        np.maximum(low - each.vertices.min(axis=0), 0) - np.maximum(each.vertices.max(axis=0) - high, 0)
+        for each in rubble.fragments
+    ]
+    return shift_rubble(rubble, np.reshape(over_m, (-1, 3)))
 
 
 def shift_rubble(rubble: Rubble, shift_m: Float64Array) -> Rubble:
-    """Return the fragments shifted by a vector (3,)."""
-    fragments = tuple(Mesh(fragment.vertices + shift_m, fragment.faces) for fragment in rubble.fragments)
-    return Rubble(fragments, rubble.centres + shift_m)
+    """Return the fragments shifted by one vector (3,), or by one each (N, 3)."""
+    shifts_m = np.broadcast_to(shift_m, rubble.centres.shape)
+    moved = (Mesh(each.vertices + by_m, each.faces) for each, by_m in zip(rubble.fragments, shifts_m, strict=True))
+    return Rubble(tuple(moved), rubble.centres + shifts_m)
 
 
 def join_rubble(first: Rubble, second: Rubble) -> Rubble:

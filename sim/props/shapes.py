@@ -1,4 +1,4 @@
-"""The shape of a prop: its primitives, their surfaces, and the measures of its part above the floor.
+"""The shape of a prop: its primitives, their surfaces, and the size and volume of the part above the floor.
 
 Object frame: origin on the floor in the middle of the footprint, x along the length, y across, z up.
 """
@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 from cdpipe.core.geometry import Float64Array
 from sim.geometry.mesh import Mesh, box_mesh, cylinder_mesh, join_meshes, move_mesh
 
-# Posts of a railing and the foot of a heap reach this far below floor level, so that no gap opens on rough floor.
+# Posts of a railing and the foot of a pile reach this far below the floor, so that rough floor leaves no gap.
 BELOW_FLOOR_M = 0.6
 
 Size = tuple[float, float, float]
@@ -41,7 +41,7 @@ class Solid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
-    """What a prop is made of.
+    """The primitives and measures of a prop.
 
     Attributes:
         solids: Its primitives.
@@ -80,13 +80,13 @@ def footprint_corners(size_m: tuple[float, float, float]) -> Float64Array:
 
 
 def visible_part(mesh: Mesh, back_y_m: float = np.inf) -> Float64Array:
-    """Return the triangles (N, 3, 3) of a surface above the floor and before the plane y = `back_y_m`, cut exactly."""
+    """Return the triangles (N, 3, 3) of a surface above the floor and in front of the plane y = `back_y_m`."""
     triangles = _cut(mesh.vertices[mesh.faces], np.array([0.0, 0.0, 1.0]), 0.0)
     return _cut(triangles, np.array([0.0, -1.0, 0.0]), back_y_m) if np.isfinite(back_y_m) else triangles
 
 
 def hull_volume_m3(solids: Iterable[Solid], back_y_m: float = np.inf) -> float:
-    """Return the volume of the convex hull of what is above the floor and before the plane y = `back_y_m`."""
+    """Return the convex hull's volume of the part above the floor and in front of the plane y = `back_y_m`."""
     part = visible_part(join_meshes([solid_mesh(solid) for solid in solids]), back_y_m)
     return float(ConvexHull(part.reshape(-1, 3)).volume)
 
@@ -98,7 +98,7 @@ def signed_volume_m3(mesh: Mesh) -> float:
 
 
 def _cut(triangles: Float64Array, inward: Float64Array, offset_m: float) -> Float64Array:
-    """Keep what of triangles (N, 3, 3) lies where `inward @ point + offset_m >= 0`."""
+    """Return the part of triangles (N, 3, 3) where `inward @ point + offset_m >= 0`, cut exactly."""
     inside_m = triangles @ inward + offset_m
     n_inside = (inside_m >= 0).sum(axis=1)
     parts = [triangles[n_inside == 3]]

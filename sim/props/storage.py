@@ -1,4 +1,4 @@
-"""Boxes, crates, barrels and pallets: what is stored in a tunnel."""
+"""Storage props: boxes, crates, barrels and pallets."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _EUR_PALLET_M = 0.144
 
 
 def box(size_m: Size, is_cardboard: bool) -> tuple[Solid, ...]:
-    """Build a cardboard box, or a steel one, with the groove of its lid."""
+    """Build a box of cardboard or steel with a groove below its lid."""
     length, width, height = size_m
     material = "paper" if is_cardboard else "paint"
     x, y, low, high = length / 2, width / 2, 0.8 * height, 0.83 * height
@@ -22,7 +22,7 @@ def box(size_m: Size, is_cardboard: bool) -> tuple[Solid, ...]:
 
 
 def crate(size_m: Size) -> tuple[Solid, ...]:
-    """Build an open-slatted crate: skids, a floor, slats with gaps, and battens over them at corners and across."""
+    """Build a slatted crate: skids, floor, slats with gaps, battens at the corners, diagonal battens, lid."""
     length, width, height = size_m
     x, y = length / 2, width / 2
     board = min(0.022, 0.04 * min(size_m))
@@ -48,7 +48,7 @@ def crate(size_m: Size) -> tuple[Solid, ...]:
 
 
 def _slats(start: float, stop: float, pitch: float, gap: float) -> list[tuple[float, float]]:
-    """Ranges of boards from `start` to `stop`, with gaps between them."""
+    """Return the ranges of boards from `start` to `stop` with gaps between them."""
     n = max(3, round((stop - start) / pitch))
     size = (stop - start - (n - 1) * gap) / n
     return [(start + number * (size + gap), start + number * (size + gap) + size) for number in range(n)]
@@ -77,7 +77,7 @@ def barrel(size_m: Size) -> tuple[Solid, ...]:
 
 
 def pallet(size_m: Size) -> tuple[Solid, ...]:
-    """Build a EUR pallet (EN 13698-1, scaled to the size), or as many on top of one another as the height holds."""
+    """Build a EUR pallet (EN 13698-1, scaled to the size), or a stack of as many as the height holds."""
     length, width, height = size_m
     n = max(1, round(height / _EUR_PALLET_M))
     return tuple(part for level in range(n) for part in _one_pallet(length, width, level * height / n, height / n))

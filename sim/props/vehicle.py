@@ -13,7 +13,7 @@ _SILL, _WAIST, _DECK, _ROOF = 0.25, 0.56, 0.42, 0.92
 
 
 def vehicle(size_m: Size) -> tuple[Solid, ...]:
-    """Build a pick-up that looks along +x: chassis, bonnet, cab with pillars and panes, load bed, wheels, beacon."""
+    """Build a pick-up that faces +x: chassis, wheels, bonnet, cab with pillars and panes, load bed, beacon."""
     length, _, height = size_m
     wheel = min(0.2 * height, 0.1 * length)
     return (*_running_gear(size_m, wheel), *_body(size_m), *_cab(size_m), *_load_bed(size_m))
@@ -36,10 +36,10 @@ def _running_gear(size_m: Size, wheel: float) -> list[Solid]:
 
 
 def _body(size_m: Size) -> list[Solid]:
-    """Bonnet, wings between the wheels, lamps and plate."""
+    """Build bonnet, wings between the wheels, lamps and plate."""
     length, width, height = size_m
     nose, half = 0.48 * length, 0.46 * width
-    arch = 0.4 * height  # the wheels stand free below it
+    arch = 0.4 * height  # above the wheels
     bonnet = [(0.19 * length, arch), (nose, arch), (nose, 0.5 * height), (0.46 * length, 0.53 * height)]
     solids = [prism([*bonnet, (_CAB_FRONT * length, _WAIST * height), (0.19 * length, _WAIST * height)], half, "paint")]
     solids.append(block((0.41 * length, -half, _SILL * height), (nose, half, arch), "paint"))
@@ -55,7 +55,7 @@ def _body(size_m: Size) -> list[Solid]:
 
 
 def _cab(size_m: Size) -> list[Solid]:
-    """Pillars and panes that lean inwards from the waist to the roof, mirrors and a beacon."""
+    """Build pillars and panes that lean inwards from the waist to the roof, mirrors and a beacon."""
     length, width, height = size_m
     waist, roof = _WAIST * height, _ROOF * height
     base, top, edge, glass = 0.44 * width, 0.40 * width, 0.012 * length, 0.004
@@ -89,7 +89,7 @@ def _cab(size_m: Size) -> list[Solid]:
 
 
 def _load_bed(size_m: Size) -> list[Solid]:
-    """Floor, two sides that stand free above the wheels, head board, tail gate and rear reflectors."""
+    """Build floor, two sides above the wheels, head board, tail gate and rear reflectors."""
     length, width, height = size_m
     rear, front, half, wall = -0.49 * length, (_CAB_REAR - 0.005) * length, 0.46 * width, 0.02 * width
     deck, top = _DECK * height, (_WAIST + 0.01) * height

@@ -1,1 +1,5 @@
 """The LiDAR: rays of a beam table, echoes, photons, noise, dropouts and false returns."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -16,7 +16,7 @@ from sim.placement.contact import standing_surface
 from sim.placement.placing import Standing
 from sim.scene import Scene, World
 from sim.sensor.rays import Rays
-from sim.session.truth import Change, Group, Kind, SessionName
+from sim.session.truth import SESSIONS, Change, Group, Kind, SessionName
 
 CELL_M = 0.1
 NEAR_OLD_SURFACE_M = 0.1
@@ -137,8 +137,8 @@ def list_changes(scenario: Scenario, world: World) -> list[Tally]:
     """
     tallies: list[Tally] = []
     for instance, prop in enumerate(scenario.props, start=1):
-        stood = _standing_in(world, prop.name, "before"), _standing_in(world, prop.name, "after")
-        items = [item for item in stood if item is not None]
+        placed = [item for item in world.standing if item.prop.name == prop.name]
+        items = [item for session in SESSIONS for item in placed if session in item.sessions]
         if len(items) < 2:
             tallies.extend(_tally(len(tallies) + 1, instance, item, world, "full", None) for item in items)
             continue
@@ -146,7 +146,7 @@ def list_changes(scenario: Scenario, world: World) -> list[Tally]:
         if _is_same(start, end):
             continue
         if prop.loaded_share is not None:
-            tallies.append(_tally_reshaped(len(tallies) + 1, instance, start, world))
+            tallies.append(_tally_reshaped(len(tallies) + 1, instance, start, end, world))
             continue
         moved_m = np.linalg.norm(end.world_T_object[:3, 3] - start.world_T_object[:3, 3])
         # A short move is one by less than the longer side of the prop's footprint.
@@ -162,11 +162,6 @@ def mark_belonging(tally: Tally, points_world: Float64Array) -> BoolArray:
     if tally.other_surface is None:
         return np.ones(len(points_world), dtype=bool)
     return ~tally.other_surface.marks(points_world)
-
-
-def _standing_in(world: World, name: str, session: str) -> Standing | None:
-    here = (item for item in world.standing if item.prop.name == name and session in item.sessions)
-    return next(here, None)
 
 
 def _is_same(start: Standing, end: Standing) -> bool:
@@ -203,7 +198,7 @@ def _tally(change_id: int, instance: int, item: Standing, world: World, group: G
     return Tally(change, Ghost(surface), _near(other, surface) if group == "partial" else None)
 
 
-def _tally_reshaped(change_id: int, instance: int, item: Standing, world: World) -> Tally:
+def _tally_reshaped(change_id: int, instance: int, start: Standing, end: Standing, world: World) -> Tally:
     """Return the change of a pile that was partly loaded away.
 
     Its ghost is the missing part of the old surface. This surface is open, which is enough: a ray that would have met
@@ -214,17 +209,16 @@ def _tally_reshaped(change_id: int, instance: int, item: Standing, world: World)
     is_gone = np.asarray(near_rest.query(full.vertices[full.faces].mean(axis=1))[0] > NEAR_OLD_SURFACE_M)
     skin = drop_unused_vertices(full.vertices, full.faces[is_gone])
     # The part removed lies between the old skin and the new face below it.
-    floor_m = item.world_T_object[2, 3]
+    floor_m = start.world_T_object[2, 3]
     ends = np.concatenate([_corners_off(full, near_rest, floor_m), _corners_off(rest, near_full, floor_m)])
-    after = _standing_in(world, item.prop.name, "after")
-    volumes = (item.shape.mesh_volume_m3, after.shape.mesh_volume_m3 if after is not None else None)
-    tally = _tally(change_id, instance, item, world, "partial", None)
+    whole_m3, rest_m3 = start.shape.mesh_volume_m3, end.shape.mesh_volume_m3
+    tally = _tally(change_id, instance, start, world, "partial", None)
     tally.ghost = Ghost(skin if len(skin.faces) else full)
     tally.change = replace(
         tally.change,
         kind="reshaped",
         hull_volume_m3=float(ConvexHull(ends).volume) if len(ends) > 3 else 0.0,
-        mesh_volume_m3=None if volumes[0] is None or volumes[1] is None else volumes[0] - volumes[1],
+        mesh_volume_m3=None if whole_m3 is None or rest_m3 is None else whole_m3 - rest_m3,
     )
     return tally
 

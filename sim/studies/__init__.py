@@ -1,1 +1,5 @@
 """Measurements of the simulator itself: figures of worlds, roughness of walls, charts of the sensor, speed."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

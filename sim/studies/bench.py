@@ -1,4 +1,4 @@
-"""Speed of the sensor: ray casting against its rivals, and whole sessions against real time, in one world."""
+"""Speed of the simulator in one world: ray casting against rivals, whole sessions against real time."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ from sim.session.simulate import plan_drives, write_session
 from sim.studies.timing import Contest, raced, timed
 
 THREADS = 2
-# Of the fewest geoms, three each: a crate of 36 would make the rival nine times slower still.
+# Props of few geoms, three each. A crate has 36, which would slow the rival down nine times more.
 _PROP_SIZES_M: dict[PropKind, Size] = {"box": (0.8, 0.6, 0.6), "barrel": (0.58, 0.58, 0.88)}
 
 
 @dataclass(frozen=True)
 class BenchSite:
-    """The world that is measured, built when it is first asked for.
+    """The world of the measurement, built at its first use.
 
     Attributes:
         scenario: Name of a scenario; its walls should have some 300,000 triangles.
-        seed: Draws the world: one that nothing is tested on.
-        n_props: Props that stand along the way in the crowded model.
-        repeats: How often short work is timed; long work a fifth as often.
-        spread_spacing_m: Way between the revolutions of the session with sub-rays, so that it stays short.
+        seed: Seed of the world; no test uses it.
+        n_props: Number of props along the path in the crowded model.
+        repeats: Repetitions of short work; long work has a fifth of them.
+        spread_spacing_m: Distance between the revolutions of the session with sub-rays; it keeps that session short.
     """
 
     scenario: str = "narrow"
@@ -97,7 +97,7 @@ class BenchSite:
 
 
 def sensor_contests(site: BenchSite) -> dict[str, Callable[[], Contest]]:
-    """Return what can be measured of the sensor, by name, in the order of the table."""
+    """Return the measurements by name, in the order of the table."""
     return {
         "world": lambda: Contest("s", (site.planned[1],)),
         "casting": lambda: against_mujoco(site, 0, 6.0),
@@ -138,7 +138,7 @@ def mujoco_hits(
 
 
 def against_embree(site: BenchSite) -> Contest:
-    """Time the cast of one revolution in one thread against Embree alone, its arrays lying ready."""
+    """Time the cast of one revolution in one thread against Embree alone, whose arrays are prepared beforehand."""
     rays, scene = site.rays, EmbreeScene()
     meshes = [
         TriangleMesh(scene, (mesh.vertices - rays.origins[0]).astype(np.float32), mesh.faces)
@@ -173,7 +173,7 @@ def two_threads(site: BenchSite) -> Contest:
 
 
 def crowd(site: BenchSite, n_props: int) -> list[Standing]:
-    """Return boxes and barrels that stand on the floor along the way, none where the sensor is."""
+    """Return boxes and barrels on the floor along the path, none near the sensor."""
     generator = stream(site.seed, "bench", "crowd")
     way = site.drive.trajectory.true.points
     middle = site.rays.origins[0]
@@ -195,7 +195,7 @@ def crowd(site: BenchSite, n_props: int) -> list[Standing]:
 
 
 def spread_drive(site: BenchSite) -> Drive:
-    """Return the same drive with 19 sub-rays and fewer revolutions, spread over the whole way."""
+    """Return the same drive with 19 sub-rays and fewer revolutions over the whole path."""
     scenario = site.drawn
     spread = scenario.model_copy(
         update={
@@ -209,7 +209,7 @@ def spread_drive(site: BenchSite) -> Drive:
 
 
 def time_session(site: BenchSite, drive: Drive, target: float) -> Contest:
-    """Time one session, truth included, from its planned drive to files, with two threads against the clock it kept."""
+    """Time one session with its truth, from the planned drive to files, with two threads, against real time."""
     names = count()
     with TemporaryDirectory() as folder, ThreadPoolExecutor(THREADS) as pool:
         seconds = timed(

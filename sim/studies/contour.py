@@ -1,11 +1,11 @@
-"""How rough the walls of a finished mesh are, measured by rays from the centreline.
+"""Roughness of the walls of a mesh, measured by rays from the centreline.
 
-A fan of rays goes out at right angles to the drift every 0.2 m, to walls and roof. How far a hit lies outside the
-drift's own smooth section (perpendicular to it, overbreak positive) is its deviation; the standard deviation about
-zero is the contour roughness. Mouths of other drifts, niches and the faces of blind ends are left out.
+Every 0.2 m a fan of rays at right angles to the drift meets walls and roof. The deviation of a hit is its distance from
+the smooth section of the drift, overbreak positive. The contour roughness is the root mean square of the deviations.
+Mouths of other drifts, niches and the faces of blind ends are left out.
 
-A foreign mesh follows no section that is known so well: there `fit_m` takes the running mean of each ray's deviation
-for the section, and what is longer than about `fit_m` along the drift is no longer roughness.
+The section of a foreign mesh is not known well. There the running mean over `fit_m` of each ray's deviation is the
+section, and features longer than about `fit_m` along the drift do not count as roughness.
 """
 
 from __future__ import annotations
@@ -29,26 +29,21 @@ _ANGLES_DEG = np.linspace(-10.0, 190.0, 25)  # from the left wall over the roof 
 _ORIGIN_UP = 0.45  # of the height
 _LEAST_RUN = 16  # stations without a gap
 _WILD_SIGMA = 6.0  # robust standard deviations beyond which a hit is an opening
-_BANDS_M = (0.5, 1.0, 2.0, 4.0, 8.0)
-# Smoothing with this share of an octave's correlation length halves its variance: 1 / sqrt(1 + 4 share^2) = 1/2.
-_HALVING = float(np.sqrt(3.0) / 2)
 _LONGEST_LAG_M = 12.0
 
 
 @dataclass(frozen=True, slots=True)
 class ContourRoughness:
-    """Roughness of walls and roof; NaN where there was nothing to measure.
+    """Roughness of walls and roof; NaN without measurements.
 
     Attributes:
         rms_m: Standard deviation about the smooth section.
         length_m: Distance along the drift at which the correlation of deviations has fallen to 1/e; NaN below 1 mm.
-        bands: Shares of `rms_m` by correlation length, (from metres, to metres, rms metres), squares adding up.
         n_rays: Number of deviations.
     """
 
     rms_m: float
     length_m: float
-    bands: tuple[tuple[float, float, float], ...]
     n_rays: int
 
 
@@ -58,7 +53,7 @@ def contour_roughness(walls: Caster, centreline: Centreline, fit_m: float | None
     Args:
         walls: Caster of the bare rock.
         centreline: Its drifts, with the size they have along the way.
-        fit_m: For foreign meshes: length of the running mean that is taken for the section.
+        fit_m: For foreign meshes: length of the running mean that stands for the section.
     """
     runs = [run for index in range(len(centreline.drifts)) for run in _deviations(walls, centreline, index)]
     runs = _without_openings(runs)
@@ -66,10 +61,10 @@ def contour_roughness(walls: Caster, centreline: Centreline, fit_m: float | None
         runs = [run - gaussian_filter1d(run, fit_m / 4 / _STATION_M, axis=0) for run in runs]
     n_rays = sum(run.size for run in runs)
     if n_rays == 0:
-        return ContourRoughness(float("nan"), float("nan"), (), 0)
-    rms_m = float(np.sqrt(_mean_square(runs)))
+        return ContourRoughness(float("nan"), float("nan"), 0)
+    rms_m = float(np.sqrt(sum((run**2).sum() for run in runs) / n_rays))
     length_m = _correlation_length_m(runs) if rms_m > 1e-3 else float("nan")
-    return ContourRoughness(rms_m, length_m, _bands(runs), n_rays)
+    return ContourRoughness(rms_m, length_m, n_rays)
 
 
 def _deviations(walls: Caster, centreline: Centreline, index: int) -> list[Float64Array]:
@@ -116,7 +111,7 @@ def _is_plain(centreline: Centreline, index: int, points: Float64Array) -> BoolA
 
 
 def _is_near_kink(line: DriftLine, points: Float64Array) -> BoolArray:
-    """Mark the stations (S,) near corners that are not rounded: their cross-sections are not those of the walls."""
+    """Mark the stations (S,) near sharp corners, where rays at right angles do not measure the section."""
     start, end = line.headings[:-2], line.headings[2:]
     turn = np.abs(start[:, 0] * end[:, 1] - start[:, 1] * end[:, 0])
     corners = line.points[1:-1][turn > 0.2]
@@ -126,17 +121,13 @@ def _is_near_kink(line: DriftLine, points: Float64Array) -> BoolArray:
 
 
 def _without_openings(runs: Sequence[Float64Array]) -> list[Float64Array]:
-    """Set deviations far outside the others to the middle of all: rays that leave through what is no wall."""
+    """Replace outliers, rays that leave through openings, by the median of all deviations."""
     if not runs:
         return []
     every = np.concatenate([run.ravel() for run in runs])
     middle = float(np.median(every))
     limit_m = _WILD_SIGMA * 1.4826 * float(np.median(np.abs(every - middle))) + 0.05
     return [np.where(np.abs(run - middle) > limit_m, middle, run) for run in runs]
-
-
-def _mean_square(runs: Sequence[Float64Array]) -> float:
-    return float(sum((run**2).sum() for run in runs) / sum(run.size for run in runs))
 
 
 def _correlation_length_m(runs: Sequence[Float64Array]) -> float:
@@ -152,14 +143,3 @@ def _correlation_length_m(runs: Sequence[Float64Array]) -> float:
             return float((lag - 1 + (before - np.exp(-1.0)) / (before - now)) * _STATION_M)
         before = now
     return float("nan")
-
-
-def _bands(runs: Sequence[Float64Array]) -> tuple[tuple[float, float, float], ...]:
-    edges = (0.0, *_BANDS_M, float("inf"))
-    left = [_mean_square(runs)]
-    for length_m in _BANDS_M:
-        sigma = _HALVING * length_m / _STATION_M
-        left.append(_mean_square([gaussian_filter1d(run, sigma, axis=0) for run in runs]))
-    left.append(0.0)
-    rms_m = np.sqrt(np.maximum(-np.diff(left), 0.0)).tolist()
-    return tuple(zip(edges[:-1], edges[1:], rms_m, strict=True))

@@ -1,4 +1,4 @@
-"""One plot for each effect of the simulated sensor, drawn from its own functions and from simulated revolutions.
+"""One plot per effect of the simulated sensor, from its functions and from simulated revolutions.
 
 python -m sim.studies.sensor_plots OUT
 
@@ -47,7 +47,7 @@ _REAL_LIGHT = (
 
 
 def draw_plots(out: Path) -> list[Path]:
-    """Write every plot as a PNG into a folder, which is made if need be, and return the files."""
+    """Write every plot as a PNG into a folder, made where it is missing, and return the files."""
     out.mkdir(parents=True, exist_ok=True)
     files = []
     for name, draw in _PLOTS.items():
@@ -228,7 +228,7 @@ def _steps(figure: Figure) -> None:
 
 
 def _facing_share(sensor: SensorMetadata, settings: Sensor, share: float, wall_m: float) -> float:
-    """Share of the beams that return from the middle of a wall: within 5 degrees of square."""
+    """Return the share of beams within 5 degrees of the normal of a wall that have a return."""
     result = _still_scan(_room((wall_m, 150.0, 150.0), share), sensor, settings, int(wall_m))
     return float((result.range_mm > 0)[np.abs(sensor.directions[..., 0]) > np.cos(np.deg2rad(5.0))].mean())
 

@@ -1,4 +1,4 @@
-"""Figures of the worlds of a family, measured on worlds that are built and driven but not scanned."""
+"""Figures of the worlds of a family. The worlds are built and their paths planned, but no scan is simulated."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import csv
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from sim.session.labels import list_changes
 from sim.studies.contour import contour_roughness
 
 _KEYFRAME_M = 1.0
-_FIT_M = 8.0  # what is longer along a drift of a foreign mesh counts as its section
+_FIT_M = 8.0  # longer features along a drift of a foreign mesh belong to its section
 
 Progress = Callable[[str, int, int], None]
 _KINDS = ("added", "removed", "moved", "reshaped")
@@ -36,12 +36,12 @@ _KINDS = ("added", "removed", "moved", "reshaped")
 
 @dataclass(frozen=True, slots=True)
 class WorldFigures:
-    """One world in figures; NaN where it has nothing to measure.
+    """The figures of one world; NaN without measurements.
 
     Attributes:
         family: Scenario family.
         seed: Its seed.
-        before_path_m, after_path_m: Horizontal way of the sensor.
+        before_path_m, after_path_m: Horizontal length of the path of the sensor.
         width_m, height_m: Void to the sides of the sensor and above and below it, median over the before path.
         n_added, n_removed, n_moved, n_reshaped: Changes by kind; a moved prop counts once.
         hull_m3: Hull volume of every change.
@@ -82,7 +82,7 @@ class WorldFigures:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A seed whose world could not be built or driven, and why."""
+    """A seed whose world could not be built or driven, with the reason."""
 
     family: str
     seed: int
@@ -109,15 +109,15 @@ def survey(family: str, seeds: Sequence[int], workers: int = 1, on_progress: Pro
 
     Args:
         family: Name of a scenario, or a YAML file.
-        seeds: Which.
-        workers: Processes; the figures do not depend on it, but for `build_s`.
+        seeds: The seeds.
+        workers: Number of processes; only `build_s` depends on it.
         on_progress: Called with the family, the seeds done and their number.
 
     Raises:
         ScenarioError: The scenario is unknown, or its file has mistakes.
     """
     report = on_progress or (lambda label, done, total: None)
-    load_scenario(family, seeds[0])  # a mistake in the file is no property of a seed
+    load_scenario(family, seeds[0])  # mistakes in the file concern all seeds
     report(family, 0, len(seeds))
     found: dict[int, WorldFigures | Failure] = {}
     for result in _results(family, seeds, workers):
@@ -195,7 +195,7 @@ def keyframes(points: Float64Array) -> tuple[Float64Array, Float64Array]:
 
 
 def void_size_m(walls: Caster, places: Float64Array, headings: Float64Array) -> tuple[float, float]:
-    """Return the median width and height of the void about places (N, 3) on a path; junctions weigh little."""
+    """Return the median width and height of the void about places (N, 3) on a path."""
     left = np.column_stack([left_of(headings), np.zeros(len(headings))])
     reach_m = [walls.cast(places, way)[0] for way in (left, -left, UP, -UP)]
     return float(np.median(reach_m[0] + reach_m[1])), float(np.median(reach_m[2] + reach_m[3]))
@@ -218,7 +218,7 @@ def _try_seed(family: str, seed: int) -> WorldFigures | Failure:
         return survey_seed(family, seed)
     except TunnelcdError as error:
         return Failure(family, seed, " ".join(str(error).split()))
-    except Exception as error:  # a bug of one seed is a finding of the survey, told by its type
+    except Exception as error:  # a bug with one seed is a result of the survey, recorded with its type
         return Failure(family, seed, f"{type(error).__name__}: {' '.join(str(error).split())}")
 
 
@@ -227,13 +227,13 @@ def _way_m(points: Float64Array) -> Float64Array:
 
 
 def _repose_deg(world: World) -> tuple[float, ...]:
-    """Angles of the whole piles; what a loader left has no angle of its own."""
+    """Return the angles of repose of all whole piles; partly loaded ones are left out."""
     whole = {item.prop.name: item for item in reversed(world.standing) if item.prop.kind == "muck_pile"}
     return tuple(flank_angle_deg(item.shape) for item in whole.values())
 
 
 def _deepest_m(world: World) -> float:
-    """Deepest that a settled prop is in rock or in a prop of the same session; piles may run into one another."""
+    """Return the largest depth of a settled prop in rock or another prop of its session; piles may overlap."""
     depths = [0.0]
     for index, item in enumerate(world.standing):
         others = [
@@ -302,8 +302,7 @@ def markdown(surveys: Sequence[Survey]) -> str:
 
 def _csv_row(world: WorldFigures) -> dict[str, object]:
     row: dict[str, object] = {}
-    for name in (each.name for each in fields(world)):
-        value = getattr(world, name)
+    for name, value in asdict(world).items():
         if not isinstance(value, tuple):
             row[name] = value
             continue

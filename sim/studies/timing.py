@@ -1,4 +1,4 @@
-"""Timing something against its rival in the same run."""
+"""Timing of a piece of work against a rival in the same run."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ class Contest:
     """Times of one piece of work, and of the same work done by a rival.
 
     Attributes:
-        unit: What the figure counts, e.g. "Mray/s"; of a figure that is a time, "s".
+        unit: Unit of the figure, e.g. "Mray/s", or "s" for a time.
         seconds: Time of each repetition.
-        work: How much of it one repetition does, in `unit` times seconds; None: the figure is the time itself.
-        rival: What it is compared with, or None.
-        rival_seconds: Times of the rival's repetitions for as much work.
-        target: How many times faster than the rival it is to be, or None.
+        work: Work of one repetition in `unit` times seconds; None: the figure is the time itself.
+        rival: Name of the rival, or None.
+        rival_seconds: Times of the rival's repetitions for the same work.
+        target: Factor by which it should be faster than the rival, or None.
     """
 
     unit: str
@@ -40,13 +40,13 @@ def timed(action: Callable[[], Any], repeats: int, clock: Clock = time.perf_coun
 def raced(
     ours: Callable[[], Any], rival: Callable[[], Any], repeats: int, clock: Clock
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Time two actions in turns, so that whatever else the machine does falls on both; the first calls do not count.
+    """Time two actions in turns, so that other load affects both; the first calls do not count.
 
     Args:
         ours: One piece of work.
-        rival: As much of it.
-        repeats: How often each is timed.
-        clock: `time.thread_time` for work in this thread alone: other programs do not count then.
+        rival: The same amount of work.
+        repeats: Repetitions of each.
+        clock: `time.thread_time` for work in this thread alone, which excludes other programs.
     """
     ours()
     rival()

@@ -1,1 +1,5 @@
 """Views of worlds and sessions: in the browser, as one HTML file, or as pictures."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

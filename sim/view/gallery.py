@@ -87,7 +87,7 @@ def draw_gallery(out: Path, only: Sequence[str] = ()) -> list[Path]:
 
 
 def family_picture(scenario: Scenario, seed: int) -> Pixels:
-    """Return a picture of a world as the after session meets it, from the place that shows most of what changed."""
+    """Return a picture of a world in the after session, from the place that shows most of the changes."""
     world = build_world(scenario, seed)
     scene = world.after
     changed = [item for item in world.standing if item.prop.change != "none" and "after" in item.sessions]
@@ -106,10 +106,10 @@ def family_picture(scenario: Scenario, seed: int) -> Pixels:
 
 
 def prop_pictures(kind: str) -> list[tuple[Pixels, str]]:
-    """Return a picture and caption of a kind of prop for each posture it can have, from two metres away.
+    """Return a picture and a caption for each posture of a kind of prop, from two metres away.
 
     Raises:
-        ScenarioError: It can be put down in none.
+        ScenarioError: No posture is possible.
     """
     cases = _PILE_CASES if kind == "muck_pile" else _FIXED_CASES if kind in ("railing", "vehicle") else _CASES
     pictures: list[tuple[Pixels, str]] = []
@@ -128,7 +128,7 @@ def prop_pictures(kind: str) -> list[tuple[Pixels, str]]:
 
 
 def _first_world(kind: str, case: _Case, refused: list[str]) -> World | None:
-    """Return a world at the first place where the prop comes to rest; None, and why, if it does so nowhere."""
+    """Return a world with the prop at the first place where it rests; else None, with the reasons in `refused`."""
     for fraction in _FRACTIONS:
         try:
             return build_world(_stage(kind, case, fraction), SEED)
@@ -155,7 +155,7 @@ def _stage(kind: str, case: _Case, fraction: float) -> Scenario:
 
 
 def _close_up(world: World, scene: Scene, item: Standing) -> Pixels:
-    """Return a picture from two metres off a prop's side, obliquely, from a place in the open."""
+    """Return an oblique picture of a prop, two metres from its side, taken from a free place."""
     middle, half_m = standing_middle(item), np.ptp(standing_box(item), axis=0) / 2
     gone = standing_middle(world.standing[0]) - middle  # where a loaded pile is missing something
     best = (-1.0, middle + 1.0)
@@ -179,7 +179,7 @@ def _close_up(world: World, scene: Scene, item: Standing) -> Pixels:
 
 
 def _score(scene: Scene, eye: Float64Array, target: Float64Array, wanted: set[int]) -> float:
-    """Tell how much of the changes a view shows: every one seen counts, and the area of all."""
+    """Return the score of a view: the number of changed props in it, and the area they cover."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     side = np.cross(forward, (0.0, 0.0, 1.0))
     up = np.cross(side, forward)

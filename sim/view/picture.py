@@ -1,8 +1,4 @@
-"""Pictures of a scene: ray-cast, each part in the colour of its material, under a lamp beside the camera.
-
-The lamp casts shadows, and corners are darker where less of the surroundings sends light in (ambient occlusion), so
-that shapes can be told on bare rock.
-"""
+"""Ray-cast pictures of a scene: material colours, a lamp beside the camera, shadows and ambient occlusion."""
 
 from __future__ import annotations
 
@@ -49,21 +45,21 @@ def render(
     """Return a picture (height, width, 3) of a scene.
 
     Args:
-        scene: What is there.
+        scene: The surfaces.
         eye: (3,) camera, world frame, metres.
-        target: (3,) what it looks at.
+        target: (3,) point in the middle of the picture.
         width: Pixels across.
         height: Pixels down.
         field_of_view_deg: Horizontal.
-        highlight: Instance numbers to be drawn red.
-        samples: Rays across and down each pixel; more make edges and shadows smooth.
+        highlight: Instance numbers drawn in red.
+        samples: Rays across and down each pixel; more rays smooth edges and shadows.
     """
     eye_m = np.asarray(eye, dtype=np.float64)
     forward, right, down = _axes(np.asarray(target, dtype=np.float64) - eye_m)
     lamp_m = eye_m + _LAMP_M[0] * right - _LAMP_M[1] * down
     aside_m = float(np.linalg.norm(lamp_m - eye_m))
     free_m = float(scene.caster.cast(eye_m[None], _unit(lamp_m - eye_m)[None])[0][0])
-    lamp_m = eye_m + (lamp_m - eye_m) * min(1.0, 0.7 * free_m / aside_m)  # short of rock beside the camera
+    lamp_m = eye_m + (lamp_m - eye_m) * min(1.0, 0.7 * free_m / aside_m)  # before any rock beside the camera
     half = np.tan(np.deg2rad(field_of_view_deg) / 2)
     across = np.linspace(-half, half, width * samples)[None, :, None]
     along = np.linspace(-half, half, height * samples)[:, None, None] * (height / width)
@@ -96,7 +92,7 @@ def _shaded(
     colours: Float64Array,
     generator: np.random.Generator,
 ) -> Float64Array:
-    """Return the linear light (N, 3) that comes back along each direction."""
+    """Return the linear light (N, 3) that the camera receives from each direction."""
     ranges_m, geom, normals = scene.caster.hits(eye_m, directions)
     light = np.zeros((len(directions), 3))
     seen = np.flatnonzero(geom >= 0)
@@ -110,7 +106,7 @@ def _shaded(
     is_lit = scene.caster.cast(points, towards)[0] >= distance_m
     lit = np.clip((facing * towards).sum(axis=1), 0.0, None) * is_lit
     lamp = lit / (1.0 + (distance_m / 12.0) ** 2)
-    # from above a little more than from below, as light from a lit drift has it
+    # a little more light from above than from below
     around = _openness(scene, points, facing, generator) * (0.8 + 0.2 * facing[:, 2])
     fog = 1.0 / (1.0 + (distance_m / 25.0) ** 2)
     light[seen] = colours[geom[seen]] * (1.9 * lamp + 0.6 * around**1.4 * fog)[:, None]
@@ -118,7 +114,7 @@ def _shaded(
 
 
 def _openness(scene: Scene, points: Float64Array, facing: Float64Array, generator: np.random.Generator) -> Float32Array:
-    """Return the share (N,) of directions in front of each point that meet nothing close by, nearer counting more."""
+    """Return how open the space in front of each point is (N,): mean ray length over `_OCCLUSION_M`, at most 1."""
     total = np.zeros(len(points), dtype=np.float32)
     for _ in range(_OCCLUSION_RAYS):
         spread = _unit(generator.normal(size=points.shape))

@@ -1,4 +1,4 @@
-"""Returns of a recorded session as points to look at: thinned, and coloured by what they belong to."""
+"""A sample of the returns of a session as coloured points."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class Cloud:
     """Points of one session.
 
     Attributes:
-        name: Its name in the view.
+        name: Name in the view.
         points: (N, 3) float32, metres.
-        colours: (N, 3) uint8 by what it shows, e.g. "change"; the first is the usual one.
+        colours: (N, 3) uint8 for each quantity, e.g. "change"; the first one is shown first.
         size_m: Edge of a point, metres.
-        is_shown: Whether it is shown from the start, where there are no walls around it.
+        is_shown: Whether the points are visible at the start, in a view without walls.
     """
 
     name: str
@@ -52,14 +52,14 @@ def session_cloud(
     kinds: Mapping[int, str] | None,
     max_points: int = MAX_POINTS,
 ) -> Cloud:
-    """Return about `max_points` of a session's returns, evenly from all its revolutions.
+    """Return about `max_points` of a session's returns, taken evenly from all its revolutions.
 
     Args:
         name: "group/session".
         session: The session.
         frame_T_sensor: (S, 4, 4) pose of each revolution; the points come in its frame.
-        kinds: Kind of each change by id, to colour by truth; None leaves the truth unread.
-        max_points: How many are wanted at most.
+        kinds: Kind of each change by id, for colours by truth; None: the truth is not read.
+        max_points: Largest number of points.
 
     Raises:
         InputError: A chunk, or its truth, is missing or damaged.
@@ -95,7 +95,7 @@ def session_cloud(
 
 
 def _place_returns(session: Session, chunk: ScanChunk, frame_T_sensor: Float64Array) -> Float64Array:
-    """Return the places (s, H, W, 3) of a chunk's pixels, every column at its own pose."""
+    """Return the points (s, H, W, 3) of a chunk's pixels, each column at its own pose."""
     poses = chunk.column_poses.astype(np.float64)
     turns = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).as_matrix().reshape(*poses.shape[:2], 3, 3)
     placed = np.empty((*chunk.range_mm.shape, 3))
@@ -107,7 +107,7 @@ def _place_returns(session: Session, chunk: ScanChunk, frame_T_sensor: Float64Ar
 
 
 def _by_instance(instance: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
-    """Give walls one grey, and every prop a colour of its own, far from its neighbours' (golden angle)."""
+    """Colour the walls grey and each prop by its number; steps of the golden angle keep neighbours distinct."""
     hue = 2 * np.pi * np.modf(instance * 0.618034)[0]
     wheel = 140 + 100 * np.cos(hue[:, None] + np.array([0.0, 2.1, 4.2]))
     return np.where((instance > 0)[:, None], wheel, _ROCK_RGB).astype(np.uint8)

@@ -1,6 +1,6 @@
-"""What there is to look at in a world, a simulated pair or a session: named surfaces, lines, points and labels.
+"""The content of a view of a world, a simulated pair or a session: named surfaces, lines, points and labels.
 
-Names are paths: their first word is the group that a viewer shows or hides as a whole, e.g. `changes/added/box`.
+A name is a path. Its first word is the group that a viewer shows or hides as a whole, e.g. `changes/added/box`.
 """
 
 from __future__ import annotations
@@ -61,17 +61,17 @@ class Label:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Everything to be shown.
+    """The parts of a view.
 
     Attributes:
-        title: What it is.
+        title: Its heading.
         bands: The walls in bands of height above the floor, lowest first; each ends where the next begins.
-        surfaces: Fixtures, props that stay and changed props.
+        surfaces: Fixtures, unchanged props and changed props.
         lines: Paths of the sensor.
         clouds: Returns of sessions.
         labels: Names of the props.
-        eye, target: (3,) where to look from, and at what.
-        notes: What could not be shown, and why.
+        eye, target: (3,) position of the camera, and the point it looks at.
+        notes: Parts that could not be shown, with the reason.
     """
 
     title: str
@@ -91,9 +91,9 @@ def is_pair(path: Path) -> bool:
 
 
 def view_scenario(scenario: Scenario, seed: int) -> View:
-    """Return the world of a drawn scenario, with the paths that would be driven.
+    """Return the world of a drawn scenario with the paths of both sessions.
 
-    A path that cannot be driven is left out and told in the notes, so that its obstacle can be seen.
+    A path that cannot be driven becomes a note, so that the obstacle is visible.
 
     Raises:
         ScenarioError: The world cannot be built.
@@ -112,7 +112,7 @@ def view_scenario(scenario: Scenario, seed: int) -> View:
 
 
 def view_pair(pair: Path) -> View:
-    """Return the world of a simulated pair, its true paths, and a thinned part of both sessions' returns.
+    """Return the world of a simulated pair, its true paths, and a sample of the returns of both sessions.
 
     Raises:
         InputError: The pair or its truth is missing, damaged, or of a version whose scenario cannot be built here.
@@ -129,7 +129,7 @@ def view_pair(pair: Path) -> View:
 
 
 def view_session(folder: Path) -> View:
-    """Return a session as its robot has it, in its odom frame: the path, and a thinned part of its returns.
+    """Return the path of a session and a sample of its returns, both in its odom frame.
 
     Raises:
         InputError: The session is missing or damaged.
@@ -144,7 +144,7 @@ def view_session(folder: Path) -> View:
 
 
 def view_folder(folder: Path) -> View:
-    """Return what a folder holds: a simulated pair or a session.
+    """Return the view of a folder that holds a simulated pair or a session.
 
     Raises:
         InputError: It holds neither, or what it holds is damaged.
@@ -201,7 +201,7 @@ def _world_view(
 
 
 def _prop_surfaces(item: Standing) -> Iterator[Surface]:
-    """Yield a prop that stays material by material, a changed one in the colour of its change."""
+    """Yield an unchanged prop by material, a changed one as one surface in the colour of its change."""
     name, change = item.prop.name, item.prop.change
     parts: dict[str, list[Mesh]] = {}
     for solid in item.shape.solids:
@@ -222,7 +222,7 @@ def _label(item: Standing) -> Label:
 
 
 def _where(item: Standing) -> str:
-    """Tell the two halves of a move, or of a reshaping, apart."""
+    """Return the session in brackets for the two places of a moved prop and the two shapes of a reshaped one."""
     return f" ({min(item.sessions)})" if item.prop.change in ("moved", "reshaped") else ""
 
 

@@ -1,4 +1,4 @@
-"""A view in the browser, by viser: live with switches, or as one offline file."""
+"""A view in the browser with viser: a live page with switches, or one offline file."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ def write_html(view: View, file: Path, legend: str = "") -> None:
     """Write a view as one file that needs no server and no network; its scene tree shows and hides every part.
 
     Args:
-        view: What to show.
-        file: Where to write it.
-        legend: Elements of HTML that lie over the scene.
+        view: The view.
+        file: The file to write.
+        legend: HTML elements laid over the scene.
 
     Raises:
         InputError: viser is not installed, or the file cannot be written.
@@ -97,7 +97,7 @@ def _add_nodes(server: Any, view: View) -> dict[str, Any]:
                 handles[str(group)] = scene.add_frame(f"/{group}", show_axes=False)
     for surface in (*view.bands, *view.surfaces):
         mesh = surface.mesh
-        # One-sided: whoever looks in from outside looks through the near wall.
+        # Walls are one-sided, so that the camera sees through the near wall from outside.
         side = "front" if surface.name.startswith("walls/") else "double"
         handles[surface.name] = scene.add_mesh_simple(
             f"/{surface.name}",
@@ -121,7 +121,7 @@ def _add_nodes(server: Any, view: View) -> dict[str, Any]:
             point_size=cloud.size_m,
             precision="float32",
             point_shading="flat",
-            visible=cloud.is_shown and not view.bands,  # they would hide the walls
+            visible=cloud.is_shown and not view.bands,  # points would hide the walls
         )
     for label in view.labels:
         handles[label.name] = scene.add_label(f"/{label.name}", label.text, position=label.position)
@@ -178,7 +178,7 @@ def _add_switch(gui: Any, group: str, handle: Any) -> None:
 
 
 def _switched(handles: dict[str, Any]) -> list[str]:
-    """Return the groups that get a switch: the outermost, and one level below where the kinds are told apart."""
+    """Return the groups with a switch: the outermost, and for fixtures, changes and paths the level below."""
     inner = [name for name in handles if name.count("/") == 1]
     split = ("fixtures", "changes", "paths", "returns")
     groups = [name for name in handles if "/" not in name and name not in split]

@@ -172,20 +172,15 @@ def test_shapes_of_a_reshaped_pile_give_the_volume_that_is_gone() -> None:
     prop = Prop(
         name="p", kind="muck_pile", size_m=(2.0, 1.5, 0.5), change="reshaped", loaded_share=0.45, repose_deg=36.0
     )
-    whole, left = shape_of(prop, 3), shape_of(prop, 3, is_loaded=True)
+    whole, left = shape_of(prop, 3), shape_of(prop, 3, loaded_share=0.45)
     assert whole.mesh_volume_m3 is not None
     assert left.mesh_volume_m3 is not None
     assert left.mesh_volume_m3 / whole.mesh_volume_m3 == pytest.approx(0.55, abs=0.02)
     assert left.size_m[:2] == whole.size_m[:2]
     assert left.size_m[2] == solid_mesh(left.solids[0]).vertices[:, 2].max()
     assert left.hull_volume_m3 < whole.hull_volume_m3
-    again = shape_of(prop, 3, is_loaded=True)
+    again = shape_of(prop, 3, loaded_share=0.45)
     np.testing.assert_array_equal(solid_mesh(again.solids[0]).vertices, solid_mesh(left.solids[0]).vertices)
-
-
-def test_a_pile_cannot_be_loaded_without_a_share() -> None:
-    with pytest.raises(ValueError, match="loaded_share"):
-        shape_of(Prop(name="p", kind="muck_pile", size_m=(4.0, 3.0, 1.0)), 3, is_loaded=True)
 
 
 @pytest.mark.parametrize("size_m", [(1.6, 1.2, 0.14), (0.5, 0.4, 0.05)])
@@ -196,4 +191,4 @@ def test_a_pile_too_low_for_fragments_of_5_cm_is_built_of_finer_ones(
     assert shape.mesh_volume_m3 is not None
     assert 0 < shape.mesh_volume_m3 < size_m[0] * size_m[1] * size_m[2]
     less = make_prop("low", kind="muck_pile", size_m=size_m, change="reshaped", loaded_share=0.4)
-    assert (shape_of(less, 0, is_loaded=True).mesh_volume_m3 or 0) < shape.mesh_volume_m3
+    assert (shape_of(less, 0, loaded_share=0.4).mesh_volume_m3 or 0) < shape.mesh_volume_m3

@@ -32,11 +32,7 @@ def test_known_roughness_is_found_again(amplitude_m: float, length_m: float) -> 
     assert found.rms_m == pytest.approx(amplitude_m, rel=0.15)
     assert found.length_m == pytest.approx(length_m, rel=0.2)
     assert found.n_rays > 10_000
-    rms_m = np.array([rms for _, _, rms in found.bands])
-    assert np.sqrt((rms_m**2).sum()) == pytest.approx(found.rms_m, rel=0.02)
-    # Half the variance of an octave is in bands below its length; a foreign mesh loses what is longer than `fit_m`.
-    below = sum(rms**2 for _, high, rms in found.bands if high <= length_m)
-    assert below / found.rms_m**2 == pytest.approx(0.5, abs=0.12)
+    # In a foreign mesh features longer than `fit_m` do not count.
     assert 0.7 * found.rms_m < contour_roughness(walls, centreline, fit_m=20.0).rms_m < found.rms_m
 
 

@@ -1,0 +1,11 @@
+from .view import View, is_pair, view_folder, view_scenario
+from .viewer import running_server, write_html
+
+__all__ = [
+    "View",
+    "is_pair",
+    "running_server",
+    "view_folder",
+    "view_scenario",
+    "write_html",
+]
