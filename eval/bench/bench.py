@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -191,11 +190,6 @@ def _query(site: MergeSite) -> Contest:
     before, after = (session.mapped for session in site.sessions)
     merged = merge_maps(before, after, site.config.merge)
     config = load_config("paper-topn", [f"query.n_regions={_N_REGIONS}"]).query
-
-    def once() -> float:
-        start = perf_counter()
-        find_regions(merged, before.descriptors, after.descriptors, config)
-        return (perf_counter() - start) / _N_REGIONS
-
-    seconds = [once() for _ in range(site.repeats + 1)][1:]
-    return against_limit(seconds, _QUERY_LIMITS_S.get(site.size, _QUERY_LIMITS_S["60k"]))
+    seconds = timed(lambda: find_regions(merged, before.descriptors, after.descriptors, config), site.repeats)
+    per_region_s = [each / _N_REGIONS for each in seconds]
+    return against_limit(per_region_s, _QUERY_LIMITS_S.get(site.size, _QUERY_LIMITS_S["60k"]))

@@ -121,11 +121,6 @@ class PairRun:
         use_threads(THREADS)
 
     @property
-    def folder(self) -> Path:
-        """Folder of the simulated pair."""
-        return self._run.pair(self._pair.name, self._pair.seed)
-
-    @property
     def is_open(self) -> bool:
         """Whether `open` was called."""
         return self._opened is not None

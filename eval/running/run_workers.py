@@ -187,7 +187,7 @@ def _death_of_opening(task: Task, here: PairRun) -> str:
     """Simulate and open a pair, first in a process of its own where that killed a worker; return the cause of death."""
     if here.is_open:
         return ""
-    trace = here.folder.with_name(f".{here.folder.name}{_TRACE}")
+    trace = RunFolder(task.folder).pair(task.pair.name, task.pair.seed).with_name(f".{task.pair.seed}{_TRACE}")
     with _traced(trace) as n_begun:
         if n_begun >= _TRIES:
             return "several times"

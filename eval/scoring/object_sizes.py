@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -66,7 +65,8 @@ def find_true_displacements_map(truth: GroundTruth, keyframe_scans: Int64Array) 
     changes = truth.pair.changes
     if not changes:
         return np.zeros((0, 3))
-    heights_m = _list_heights_m(truth.pair.scenario)
+    props = truth.pair.scenario.get("props", ())
+    heights_m = {prop["name"]: float(prop["size_m"][2]) for prop in props if prop.get("size_m")}
     middles_world = np.array([_find_middle_world(change, heights_m.get(change.name, 0.0)) for change in changes])
     places = transform_to_map(middles_world, truth.before, keyframe_scans)
     at = {change.id: index for index, change in enumerate(changes)}
@@ -95,11 +95,6 @@ def summarise_size_errors(errors: SizeErrors, truth: GroundTruth) -> dict[str, f
         "displacement_error_m": median(errors.displacement_m),
         "pile_volume_error": median(np.abs(errors.volume_share[is_pile])),
     }
-
-
-def _list_heights_m(scenario: Mapping[str, Any]) -> dict[str, float]:
-    """Return the height of every prop whose scenario states its size."""
-    return {prop["name"]: float(prop["size_m"][2]) for prop in scenario.get("props", ()) if prop.get("size_m")}
 
 
 def _find_middle_world(change: Change, height_m: float) -> Float64Array:

@@ -116,7 +116,7 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
         **(found if answer.until is None else dict.fromkeys(found, _NAN)),
         **_score_merge(answer, truth),
         **_list_times(answer, n_regions + int(regions.columns["n_withdrawn"])),
-        **_average_figures(report),
+        **{name: mean(read_figure(report, name)[report.regions.is_reported]) if report else _NAN for name in FIGURES},
         **_list_sizes(answer, truth, n_regions, float(after_travelled_m[-1])),
     }
     row |= compute_plugin_columns(truth, answer, row)
@@ -305,10 +305,6 @@ def _list_times(answer: Answer, n_proposed: int) -> dict[str, float]:
         "t_total_with_merge_s": index + merge + refine + descriptor + cd + oe,
         "t_total_paper_s": cd + oe,
     }
-
-
-def _average_figures(report: ChangeReport | None) -> dict[str, float]:
-    return {name: mean(read_figure(report, name)[report.regions.is_reported]) if report else _NAN for name in FIGURES}
 
 
 def _list_sizes(answer: Answer, truth: GroundTruth, n_regions: int, after_path_m: float) -> dict[str, Any]:

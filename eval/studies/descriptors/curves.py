@@ -276,14 +276,11 @@ def main(
         cpu_s = round(process_time() - began, 1)
         found = make_rows(network, held, {"point": name, **run, **of_point, "cpu_s": cpu_s})
         rows += found
-        _write(pd.DataFrame(rows), path)
+        table = pd.DataFrame(rows)
+        with whole_file(path) as partial:
+            table.to_csv(partial, index=False, float_format="%.5g")
+        path.with_suffix(".png").write_bytes(png(picture(curves_chart(table))))
         typer.echo(f"{name}: log-likelihood {found[0]['log_likelihood']:.4f}, AUROC {found[0]['auroc']:.4f}")
-
-
-def _write(table: pd.DataFrame, path: Path) -> None:
-    with whole_file(path) as partial:
-        table.to_csv(partial, index=False, float_format="%.5g")
-    path.with_suffix(".png").write_bytes(png(picture(curves_chart(table))))
 
 
 if __name__ == "__main__":
