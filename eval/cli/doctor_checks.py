@@ -108,7 +108,7 @@ def odometry() -> str:
     motion = estimate_motion(images, sensor, np.array([0.0, 0.1, 0.2]), np.arange(512) / 5120.0 - 0.05, np.eye(4))
     off_m = float(np.abs(motion.points).max())
     _require(off_m < 0.01, f"a sensor that stood still was moved by {off_m:.3f} m")
-    return "a sensor that stands still is told so"
+    return "finds no motion of a sensor that stands still"
 
 
 def surface_distance() -> str:
@@ -134,7 +134,7 @@ def surface_distance() -> str:
 
 
 def void() -> str:
-    """Ask what lies in the air that rays to a wall passed through (dufomap)."""
+    """Tell a point in free space from a point on a wall, by rays that end on the wall (dufomap)."""
     import numpy as np
 
     from cdpipe.methods.dufomap import load_dufomap
@@ -146,7 +146,7 @@ def void() -> str:
     voids = load_dufomap().dufomap(0.1, 0.2, 1, 1)
     voids.run(wall, pose, False)
     in_air, on_wall = voids.segment(np.array([[2.0, 0.0, 0.0], [4.0, 0.0, 0.0]]), pose, False)
-    _require(bool(in_air) and not on_wall, "what rays passed through and what they hit was not told apart")
+    _require(bool(in_air) and not on_wall, "a point in free space and a point on a wall were not told apart")
     return "tells air from wall"
 
 

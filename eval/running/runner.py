@@ -86,7 +86,7 @@ def run_plan(
         if results is None:
             write_json(run.path / "provenance.json", provenance)
         remove_traces(run)
-        # cells left by --limit may be stale too; no table may hold them
+        # cells left by --limit may be outdated as well, and no table may hold outdated cells
         for pair in pairs:
             _remove_stale(run, pair, force)
         if client is None:

@@ -64,7 +64,8 @@ def card(rows: Sequence[Row], recipe: Mapping[str, Any], commands: Sequence[str]
     made_by = "\n".join(commands)
     return f"""# Training data of change descriptors, made by `tunnelcd dataset`
 
-Simulated tunnels, each driven twice by a ray-cast Ouster OS1-32; between the drives some objects came, went or moved.
+Simulated tunnels, each driven twice by a ray-cast Ouster OS1-32; between the drives, objects are added, removed or
+moved.
 One shard is one tunnel, and a tunnel is of one split: seeds below 10000 train, 10000 to 19999 validate, 20000 to 29999
 test and are never trained on.
 

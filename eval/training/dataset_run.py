@@ -99,7 +99,7 @@ def make_dataset(
         progress.cells("the first tunnel", 0, len(todo))
     try:
         for tunnel in todo:
-            (out / tunnel.file).unlink(missing_ok=True)  # of another digest: not to be read while it is made anew
+            (out / tunnel.file).unlink(missing_ok=True)  # of another digest, and not to be read any more
         with closing(_computed(todo, recipe, where)) as results:
             for n_done, (tunnel, result) in enumerate(results, start=1):
                 _keep(out, tunnel, result)

@@ -88,14 +88,14 @@ def measure(
 def _key(scenario: Scenario, seed: int) -> str:
     config = load_config("tunnelcd")
     # the scores do not depend on these settings of the query
-    unasked = {"query": {"threshold", "n_regions", "suppression", "radius_m"}}
+    unused = {"query": {"threshold", "n_regions", "suppression", "radius_m"}}
     return digest(
         {
             "version": _VERSION,
             "scenario": scenario.model_dump(mode="json"),
             "files": file_digests(scenario),
             "seed": seed,
-            "config": config.model_dump(mode="json", include={"map", "descriptor", "merge", "query"}, exclude=unasked),
+            "config": config.model_dump(mode="json", include={"map", "descriptor", "merge", "query"}, exclude=unused),
             "checkpoints": [
                 checkpoint_digest(config.descriptor.model_copy(update={"method": method})) for method in METHODS
             ],

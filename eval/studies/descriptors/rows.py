@@ -1,9 +1,8 @@
 """Recognition of each descriptor in one pair of sessions, and its cost: bytes per keyframe, milliseconds to compute it.
 
-Descriptors of scans are asked for places and headings (`eval.studies.descriptors.place_metrics`). `sphere` is asked for
-changes: the AUROC of the before keyframes, after the pipeline's own merge, with its numbers kept as float32 and as
-int8. Milliseconds are CPU time of the one thread that describes, reading left out, so that a busy machine does not
-show.
+Descriptors of scans are measured by the places and headings that they recognise (`find_places`), `sphere` by changes:
+the AUROC of the before keyframes, after the pipeline's own merge, with its numbers kept as float32 and as int8.
+Milliseconds are CPU time of the one thread that describes, without reading, so that other programs have no effect.
 """
 
 from __future__ import annotations

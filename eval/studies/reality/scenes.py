@@ -105,7 +105,7 @@ def find_world_points(sensor: SensorMetadata, result: Scan, poses: Float64Array)
 
 
 _N_LEVELS = 96
-_LEVELS = np.geomspace(0.002, 200.0, _N_LEVELS)  # reflectivities that a rebuilt scene tells apart
+_LEVELS = np.geomspace(0.002, 200.0, _N_LEVELS)  # steps of reflectivity in a rebuilt scene
 _ROW_RATIO, _COLUMN_RATIO = 1.3, 1.03  # of ranges: neighbouring pixels of one surface
 _HOLE = 2  # columns
 _SMOOTHING = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0  # Savitzky-Golay, parabola through seven

@@ -23,9 +23,9 @@ EDGE_M = 1.0
 BETWEEN_M = 0.25  # a mixed pixel keeps this far from both surfaces
 _NORMAL = 1.4826
 _REACH = 3  # columns each way that a window has
-_SMOOTH_SHARE = 0.02  # of the range: the ends of a smooth window are this alike
+_SMOOTH_SHARE = 0.02  # of the range: the ends of a smooth window agree within this
 _ALIKE_SHARE = 0.03  # of the range: neighbours on one surface
-_PLANE_M = 0.05  # points of a plane keep this near to it
+_PLANE_M = 0.05  # largest distance of a plane's points from it
 _FACING = 0.85  # cosine of incidence
 
 
@@ -59,7 +59,7 @@ class Revolutions:
     def is_smooth(self) -> BoolArray:
         """(N, H, W) mask of returns in a run of seven whose two ends on either side are alike within 2 %.
 
-        The middle has no say, so that noise is not selected by what it is.
+        The middle pixel is left out of the test, so that the selection does not depend on its noise.
         """
         window = np.stack([np.roll(self.range_m, shift, -1) for shift in range(-_REACH, _REACH + 1)])
         ends = window[[0, 1, -2, -1]]
@@ -116,9 +116,9 @@ def measure_photons_per_percent(revolutions: Revolutions, where: BoolArray) -> F
 
 
 def estimate_photons(revolutions: Revolutions) -> Float64Array:
-    """Return the signal (N, H, W) that a pixel's two neighbours along the beam let expect, their geometric mean.
+    """Return the expected signal (N, H, W) of each pixel: the geometric mean of its two neighbours along the beam.
 
-    NaN unless both returned from one surface. Whether the pixel itself returned has no say.
+    NaN unless both returned from one surface. The pixel itself is not considered.
     """
     left_m, right_m = (np.roll(revolutions.range_m, shift, -1) for shift in (1, -1))
     left, right = (np.roll(revolutions.signal, shift, -1) for shift in (1, -1))

@@ -46,7 +46,7 @@ class Case:
 
 
 def list_effect_variants(default: Sensor) -> dict[str, Sensor]:
-    """Return the settings to be told apart: default, each effect off, both divergences, coarse steps, nothing."""
+    """Return the settings to compare: default, each effect off, both divergences, coarse steps, nothing."""
     switches = ("rolling_scan", "range_noise", "dropouts", "false_positives")
     variants = {"default": default}
     variants |= {f"{name} off": default.model_copy(update={name: False}) for name in switches}
@@ -59,7 +59,7 @@ def list_effect_variants(default: Sensor) -> dict[str, Sensor]:
 def list_novelty_cases(default: Sensor) -> list[Case]:
     """Return every case once: standing with default effects, by number of revolutions, then each way and variant.
 
-    How a scan rolls is no matter to a sensor that stands, so that there is no such case.
+    The rolling scan has no effect on a sensor that stands still, so that case is left out.
     """
     cases = [Case("standing", "default", default, number) for number in STANDING_NUMBERS]
     cases += [
