@@ -23,6 +23,7 @@ _SHEET_M = 0.006
 _COUPLING_M = 6.0
 _HANGER_M = 2.5
 _LONGEST_ARM_M = 0.9
+_STRAIGHT_M = 0.004
 
 
 def wall_plans(furniture: Furniture) -> list[WallPlan]:
@@ -84,13 +85,13 @@ def tray_meshes(axes: Sequence[Axis], tray: CableTray, plan: WallPlan, name: str
     return _join(trays), _join(brackets), _join(cables)
 
 
-def thin_path(path: Float64Array, tolerance_m: float = 0.004) -> Float64Array:
+def thin_path(path: Float64Array) -> Float64Array:
     """Leave out every second point of a path where it hardly bends, both ends kept."""
     if len(path) < 4:
         return path
     bend_m = np.linalg.norm(path[1:-1] - (path[:-2] + path[2:]) / 2, axis=1)
     keep = np.ones(len(path), dtype=bool)
-    keep[1:-1] = (np.arange(1, len(path) - 1) % 2 == 0) | (bend_m > tolerance_m)
+    keep[1:-1] = (np.arange(1, len(path) - 1) % 2 == 0) | (bend_m > _STRAIGHT_M)
     return path[keep]
 
 

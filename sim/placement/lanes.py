@@ -84,13 +84,13 @@ def build_lanes(scenario: Scenario, centreline: Centreline, fixed: Caster) -> tu
     Raises:
         InputError: A recorded trajectory cannot be read.
     """
-    plans: tuple[tuple[str, SessionPlan], ...] = (("before", scenario.before), ("after", scenario.after))
-    return tuple(
-        _recorded_lane(scenario, session, Path(plan.trajectory))
-        if plan.trajectory is not None
-        else _route_lane(scenario, session, plan, centreline, fixed)
-        for session, plan in plans
-    )
+    lanes = []
+    for session, plan in (("before", scenario.before), ("after", scenario.after)):
+        if plan.trajectory is None:
+            lanes.append(_route_lane(scenario, session, plan, centreline, fixed))
+        else:
+            lanes.append(_recorded_lane(scenario, session, Path(plan.trajectory)))
+    return tuple(lanes)
 
 
 def _recorded_lane(scenario: Scenario, session: str, trajectory: Path) -> Lane:

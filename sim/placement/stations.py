@@ -56,7 +56,7 @@ def stations_of(edges: Sequence[Edge], centreline: Centreline) -> Stations:
     return Stations(tuple(edges), numbers, fractions, np.concatenate([np.zeros((0, 3)), *points]))
 
 
-def spot_between(edge: Edge, fraction: float, centreline: Centreline, over_humps: bool = False) -> Spot:
+def spot_between(edge: Edge, fraction: float, centreline: Centreline, over_humps: bool) -> Spot:
     """Return the spot a share of the way along an edge."""
     point, heading, section = centreline.at(*edge, fraction)
     where = f"between {edge[0]!r} and {edge[1]!r} at {fraction:.2f}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Collection
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +23,6 @@ COLOURS: dict[str, tuple[float, float, float]] = {
     "glass": (0.14, 0.19, 0.22),
 }
 _PAINTS = ((0.80, 0.58, 0.10), (0.16, 0.36, 0.62), (0.20, 0.46, 0.28), (0.74, 0.34, 0.10), (0.42, 0.47, 0.52))
-HIGHLIGHT_RGB = (0.85, 0.10, 0.10)
 _LAMP_M = (1.1, 0.8)  # right of the camera and above it
 _LAMP_RADIUS_M = 0.05
 _OCCLUSION_RAYS = 4
@@ -39,7 +37,6 @@ def render(
     width: int = 640,
     height: int = 480,
     field_of_view_deg: float = 70.0,
-    highlight: Collection[int] = (),
     samples: int = 1,
 ) -> npt.NDArray[np.uint8]:
     """Return a picture (height, width, 3) of a scene.
@@ -51,7 +48,6 @@ def render(
         width: Pixels across.
         height: Pixels down.
         field_of_view_deg: Horizontal.
-        highlight: Instance numbers drawn in red.
         samples: Rays across and down each pixel; more rays smooth edges and shadows.
     """
     eye_m = np.asarray(eye, dtype=np.float64)
@@ -65,7 +61,6 @@ def render(
     along = np.linspace(-half, half, height * samples)[:, None, None] * (height / width)
     directions = _unit((forward + across * right + along * down).reshape(-1, 3))
     colours = part_colours(scene)
-    colours[np.isin(scene.instance, sorted(highlight))] = HIGHLIGHT_RGB
     generator = stream(0, "picture")
     chunks = np.split(directions, range(_CHUNK, len(directions), _CHUNK))
     light = np.concatenate([_shaded(scene, eye_m, lamp_m, chunk, colours, generator) for chunk in chunks])
