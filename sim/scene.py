@@ -57,9 +57,9 @@ class World:
     """A scenario built.
 
     Attributes:
-        centreline: Where the drifts run.
+        centreline: The drifts.
         walls: Ray caster of the bare tunnel.
-        fixed: Ray caster of the tunnel and everything fixed to it, stones included: the obstacles of a robot.
+        fixed: Ray caster of the tunnel with furniture and stones, the obstacles of a robot.
         fixtures: Furniture and stones.
         standing: Every prop at each of its places, settled.
         before, after: The two scenes.

@@ -1,4 +1,4 @@
-"""Drives: the line of a robot, its movement over the floor, its odometry, and the poses of every revolution."""
+"""Drives: the path of a robot, its movement over the floor, its odometry, and the poses of every revolution."""
 
 import lazy_loader
 

@@ -109,7 +109,7 @@ def find_boulders(
 
 
 def check_clearance(world: World, scenario: Scenario, session: str, way_m: Float64Array, points: Float64Array) -> None:
-    """Cast level rays all round and one up from every tenth sample: the sensor must keep off rock and furniture.
+    """Refuse a path whose sensor comes too near rock or furniture: level rays all round and one up, every 0.5 m.
 
     Raises:
         ScenarioError: With the place, its distance (N,) along the route and in the world (N, 3).

@@ -1,4 +1,4 @@
-"""Fixtures of both sessions, never a change: pipes, ducts, cable trays, rock support, loose stones."""
+"""Furniture, the same in both sessions: pipes, ducts, cable trays, rock support, loose stones."""
 
 import lazy_loader
 

@@ -1,6 +1,6 @@
-"""What is fixed to the rock in both sessions: pipes, ducts, cable trays, rock bolts and wire mesh.
+"""The fixtures of both sessions: pipes, ducts, cable trays, rock bolts and wire mesh.
 
-Everything follows the bare wall as measured by rays, so it also works in a foreign mesh. Each item and material is one
+Rays measure the wall that the fixtures follow, so foreign meshes can have them too. Each item and material is one
 fixture over all drifts, which keeps the number of geoms small.
 """
 
@@ -23,7 +23,7 @@ _PIN_SPACING_M = 1.2  # of the pins that hold a screen in a tunnel without bolts
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fixture:
-    """Something fixed, of one material.
+    """A fixed surface of one material.
 
     Attributes:
         name: Unique in the tunnel, e.g. "pipe-1".
@@ -40,10 +40,10 @@ def furnish(tunnel: Tunnel, centreline: Centreline, walls: Caster, seed: int) ->
     """Return the furniture of all drifts; empty if the tunnel has no furniture or no drifts.
 
     Args:
-        tunnel: Its `furniture`; nothing else is read.
-        centreline: Where the drifts run.
+        tunnel: The tunnel; only its `furniture` is read.
+        centreline: Its drifts.
         walls: Caster of the bare rock, facing into the void.
-        seed: What jitter, sag and panels are drawn from.
+        seed: Seed of jitter, sag and panels.
     """
     furniture = tunnel.furniture
     if furniture == Furniture() or not centreline.drifts:

@@ -1,6 +1,6 @@
-"""Loose stones on the floor of every drift, partly buried, more of them towards the walls.
+"""Loose stones on the floor of every drift, partly buried, denser near the walls.
 
-Every stone is drawn from the position of its cell alone: a prop that displaces some stones changes no other.
+The draws of a stone depend on its cell alone, so a prop that displaces some stones changes no others.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ def strew_stones(
     """Return the stones of all drifts as one fixture, or None where there are none.
 
     Args:
-        tunnel: Its `floor.stones`; a stone's size is the largest distance between two of its corners.
-        centreline: Where the drifts run.
+        tunnel: The tunnel with its `floor.stones`; a stone's size is the largest distance between two of its corners.
+        centreline: Its drifts.
         walls: Caster of the bare rock, facing into the void.
         outlines: (K, 2) polygons, world frame, metres, that no stone may touch.
-        seed: What everything is drawn from.
+        seed: Seed of all draws.
     """
     stones = tunnel.floor.stones
     if stones is None or stones.per_m2 == 0 or not centreline.drifts:
@@ -88,7 +88,7 @@ def draw_stone_sizes(uniform: Float64Array, stones: Stones) -> Float64Array:
 
 
 def _spots_of(axis: Axis, stones: Stones, niche_m: float, keys: dict[str, int]) -> _Spots:
-    """Where stones lie in one drift, before outlines."""
+    """Return the places of stones in one drift, those inside outlines included."""
     stations = axis.points[axis.is_inside]
     reach_m = 0.75 * axis.section.width_m + niche_m + 1.0
     reach = int(np.ceil(reach_m / _CELL_M))
@@ -144,7 +144,7 @@ def _lay_stones(spots: _Spots, size_m: Float64Array, walls: Caster, keys: dict[s
         chosen = np.flatnonzero(shape == number)
         vertices = np.einsum("nij,vj->nvi", turns[chosen], mesh.vertices) * size_m[chosen, None, None]
         bottom, height_m = vertices[..., 2].min(axis=1), np.ptp(vertices[..., 2], axis=1)
-        # On uneven floor it sinks until no edge floats, but at least 30 % of its height stays visible.
+        # On uneven floor a stone sinks until no edge floats, but at least 30 % of its height stays visible.
         sunk_m = np.minimum(spots.floor[chosen, 2] - lowest_z[chosen] + depth_share[chosen] * height_m, 0.7 * height_m)
         vertices += spots.floor[chosen, None]
         vertices[..., 2] -= (bottom + sunk_m)[:, None]
@@ -159,7 +159,7 @@ def _lowest_floor(spots: _Spots, size_m: Float64Array, walls: Caster) -> Float64
     above[..., :2] += 0.4 * size_m[:, None, None] * sides
     flat = above.reshape(-1, 3)
     floor_z = (flat[:, 2] - wall_distances(walls, flat, -UP)).reshape(-1, 4)
-    # Near a wall a ray may start in the rock: what it finds below is no floor.
+    # Near a wall a ray may start in the rock; its hit is not the floor.
     floor_z = np.where(np.abs(floor_z - spots.floor[:, 2:]) < size_m[:, None], floor_z, spots.floor[:, 2:])
     return np.asarray(np.minimum(floor_z.min(axis=1), spots.floor[:, 2]))
 

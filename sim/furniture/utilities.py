@@ -86,7 +86,7 @@ def tray_meshes(axes: Sequence[Axis], tray: CableTray, plan: WallPlan, name: str
 
 
 def thin_path(path: Float64Array) -> Float64Array:
-    """Leave out every second point of a path where it hardly bends, both ends kept."""
+    """Drop every second point where a path is nearly straight; both ends stay."""
     if len(path) < 4:
         return path
     bend_m = np.linalg.norm(path[1:-1] - (path[:-2] + path[2:]) / 2, axis=1)
@@ -106,7 +106,7 @@ def _couplings(line: Line, radius_m: float) -> list[Mesh]:
 
 
 def _wall_arms(axis: Axis, line: Line, plan: WallPlan, every_m: float, width_m: float) -> Mesh:
-    """Bars from the rock to below a line; where the rock is too far, a wire down from the roof."""
+    """Return bars from the rock to below a line; where the rock is too far, wires from the roof."""
     chosen = np.arange(2, len(line.path) - 1, round(every_m / STATION_M))
     below = np.array([0.0, 0.0, plan.cross.half_height_m + 0.5 * width_m])
     inner = line.path[chosen] - below - plan.side * plan.cross.half_width_m * line.left[chosen]
@@ -132,7 +132,7 @@ def _u_profile(width_m: float, height_m: float) -> Float64Array:
 
 
 def _cables(path: Float64Array, width_m: float, generator: np.random.Generator) -> list[Mesh]:
-    """Three or so cables side by side on the tray's bottom, wandering a little."""
+    """Return one to four cables side by side on the bottom of the tray, with a slight wander."""
     radii_m = generator.uniform(0.015, 0.035, size=max(1, min(4, int(width_m / 0.09))))
     left, up = frames_along(path)
     free_m = width_m - 2 * _SHEET_M

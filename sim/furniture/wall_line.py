@@ -31,7 +31,7 @@ _STACK_GAP_M = 0.08
 
 @dataclass(frozen=True, slots=True)
 class Cross:
-    """The room of a line around its axis: half its width, half its height, and its gap to the rock."""
+    """The cross-section of a line: half its width, half its height, and its gap to the rock."""
 
     half_width_m: float
     half_height_m: float
@@ -77,7 +77,7 @@ def stack_plans(plans: Sequence[WallPlan]) -> list[WallPlan]:
 
 
 def wall_lines(axis: Axis, plan: WallPlan) -> list[Line]:
-    """Lay a line out along one wall of a drift."""
+    """Return the pieces of a line along one wall of a drift."""
     cross = plan.cross
     base_m = plan.height_share * axis.height_m
     wall_m = _nearest(axis, base_m, plan)
@@ -107,12 +107,12 @@ def wall_lines(axis: Axis, plan: WallPlan) -> list[Line]:
     across_m = _inside_only(limit_m, axis.is_inside)
     is_low = up_m - cross.half_height_m < PASSING_M - 0.05
     is_usable &= ~(is_low & _is_on_a_way(axis, axis.at(plan.side * across_m, up_m)))
-    is_usable &= across_m < axis.section.width_m  # farther off is the view down another drift, no wall of this one
+    is_usable &= across_m < axis.section.width_m  # a farther hit lies in another drift
     return _pieces(axis, plan.side * across_m, up_m, is_usable)
 
 
 def roof_lines(axis: Axis, lateral: float, cross: Cross, lowest_m: float) -> list[Line]:
-    """Lay a line out below the roof.
+    """Return the pieces of a line below the roof.
 
     Args:
         axis: The drift.
@@ -151,14 +151,14 @@ def _nearest(axis: Axis, up_m: Float64Array, plan: WallPlan) -> Float64Array:
 
 
 def _reach(axis: Axis, up_m: Float64Array, side: float, cross: Cross, share: float) -> Float64Array:
-    """How far sideways (S,) the axis of a round line may lie, by the wall at `share` of its half height above it."""
+    """Return how far sideways (S,) a round line may lie, limited by the wall at `share` of its half height."""
     wall_m = axis.to_side(up_m, side)
     wall_m = bridge_openings(wall_m, is_opening(wall_m))
     return np.asarray(wall_m - np.sqrt(1 - share**2) * cross.half_width_m - cross.standoff_m)
 
 
 def _below_roof(axis: Axis, across_m: Float64Array, cross: Cross) -> Float64Array:
-    """How high (S,) the axis of a round line may lie."""
+    """Return the greatest height (S,) of the axis of a round line."""
     heights = []
     for share in (-1.0, -0.7, 0.0, 0.7, 1.0):
         roof_m = axis.to_roof(across_m + share * cross.half_width_m)
@@ -184,7 +184,7 @@ def _touches_end(is_barred: BoolArray) -> BoolArray:
 
 
 def _inside_only(values: Float64Array, is_inside: BoolArray, reach: int = _STIFFNESS) -> Float64Array:
-    """Envelope (S,) of the stations in the void, the others standing for nothing."""
+    """Return the lower envelope (S,) of the values at the stations in the void."""
     stations = np.arange(len(values))
     return lower_envelope(np.interp(stations, stations[is_inside], values[is_inside]), reach)
 
@@ -195,7 +195,7 @@ def _pieces(axis: Axis, across_m: Float64Array, up_m: Float64Array, is_usable: B
     pieces = []
     for first, end in find_runs(is_usable, _SHORTEST_RUN):
         path, stations = points[first:end], np.arange(first, end)
-        # On the inner side of a sharp corner the offset line would run backwards for a while.
+        # On the inner side of a sharp corner the offset line would run backwards.
         progress = (np.diff(path[:, :2], axis=0) * axis.forward[first : end - 1]).sum(axis=1)
         keep = np.concatenate([[True], progress > 0.2 * STATION_M])
         if keep.sum() >= _SHORTEST_RUN // 2:

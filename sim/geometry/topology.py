@@ -1,4 +1,4 @@
-"""What a triangle surface encloses: its open edges, holes, orientation and volume."""
+"""Topology of a triangle surface: open edges, holes, orientation, enclosed volume and winding number."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Placement of props: on the floor, clear of rock and of each other, settled by physics, with a way left for robots."""
+"""Placement of props: on the floor, clear of rock and of each other, settled by physics, with a lane for robots."""
 
 import lazy_loader
 

@@ -89,7 +89,7 @@ def wall_distances(walls: Caster, origins: Float64Array, directions: Float64Arra
 
 
 def fill_from_nearest(values: Float64Array, is_inside: BoolArray) -> Float64Array:
-    """Give the stations (S, ...) in the rock, where rays measure nothing, the value of the nearest one in the void."""
+    """Replace the values (S, ...) of stations in the rock by that of the nearest station in the void."""
     inside = np.flatnonzero(is_inside)
     after = np.minimum(np.searchsorted(inside, np.arange(len(values))), len(inside) - 1)
     before = np.maximum(after - 1, 0)
@@ -105,7 +105,7 @@ def find_nearest(known: Float64Array, points: Float64Array, within_m: float) -> 
 
 
 def is_opening(distance_m: Float64Array) -> BoolArray:
-    """Mark the stations (S, ...) where the rock is much farther than at their neighbours: branch, niche, crossing."""
+    """Mark the stations (S, ...) at branches, niches and crossings: the rock is much farther than nearby."""
     every = 4
     thin = distance_m[::every]
     size = (17,) + (1,) * (distance_m.ndim - 1)  # 17 m
@@ -144,7 +144,7 @@ def _round_corners(points: Float64Array, width_m: float) -> Float64Array:
 
 
 def _given_way(points: Float64Array, index: int, centreline: Centreline) -> BoolArray:
-    """Mark the stations (S,) in a drift that runs on where this one ends, or in one that comes earlier in the list."""
+    """Mark the stations (S,) inside a drift that continues where this one ends, or inside an earlier drift."""
     gives_way = np.zeros(len(points), dtype=bool)
     for number, other in enumerate(centreline.drifts):
         if number == index:

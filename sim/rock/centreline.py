@@ -1,4 +1,4 @@
-"""The graph of centrelines: the tunnel's nodes and drifts, corners rounded and the meander drawn."""
+"""The graph of centrelines: nodes and drifts of a tunnel with rounded corners and a drawn meander."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def _drift_line(tunnel: Tunnel, index: int, drift: Drift, uses: Counter[str], se
 
 
 def _sizes(tunnel: Tunnel, section: Section, points: Float64Array, seed: int) -> tuple[Float64Array, Float64Array]:
-    """Width and height (N,) along a drift. Both depend on the place alone: drifts agree where they meet."""
+    """Return width and height (N,) along a drift; both depend on the place alone, so drifts agree where they meet."""
     variation = tunnel.variation
     if variation is None or tunnel.mesh is not None:
         return np.full(len(points), section.width_m), np.full(len(points), section.height_m)
@@ -212,7 +212,7 @@ def _round_corners(nodes: Float64Array, spans: Float64Array, is_shared: list[boo
 
 
 def _meander(tunnel: Tunnel, index: int, points: Float64Array, fixed: list[int], seed: int) -> Float64Array:
-    """Sideways wander (N, 3) of a drift, zero at the samples `fixed` where it meets another drift."""
+    """Return the sideways meander (N, 3) of a drift, zero at the samples `fixed` where it meets another drift."""
     if tunnel.meander_m == 0.0 or tunnel.mesh is not None:
         return np.zeros_like(points)
     along_m: Float64Array = np.arange(len(points), dtype=np.float64) * STEP_M

@@ -1,4 +1,4 @@
-"""Foreign surfaces: read from a file, converted to metres with z up, and refused if their size cannot be right."""
+"""Foreign meshes: read from a file, converted to metres with z up, and checked for size and orientation."""
 
 from __future__ import annotations
 

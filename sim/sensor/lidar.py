@@ -57,10 +57,10 @@ def scan(
 ) -> Scan:
     """Cast one revolution and apply the effects of the sensor.
 
-    Random numbers are drawn for every pixel, whatever it hits. So another prop changes only the beams that meet it.
+    Every pixel has random numbers, even without a hit. Another prop therefore changes only the beams that meet it.
 
     Args:
-        scene: What is there.
+        scene: The surfaces.
         sensor: Beam table.
         settings: Range limits, and which effects are on.
         rays: The revolution's rays.

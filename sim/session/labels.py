@@ -1,4 +1,4 @@
-"""The truth about changes: which returns belong to each change, and whether the other session could observe it."""
+"""The truth of each change: the returns that belong to it, and whether the other session could observe it."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Ghost:
         return int((ghost_m <= ranges_m[column, row] + 1e-3).sum())
 
     def _near(self, rays: Rays, ranges_m: Float32Array) -> tuple[Int64Array, Int64Array]:
-        """Columns and rows of all rays that can meet the ball around the object, and of a few others.
+        """Return columns and rows of all rays that can meet the ball around the object, and of a few others.
 
         A ray that starts within `spread` of the middle column's origin and meets the ball has the direction of a ray
         that starts at that origin and meets the ball grown by `spread`.
@@ -95,7 +95,7 @@ class Tally:
 
     Attributes:
         change: The change, its counts still zero.
-        ghost: The object, to be met by the rays of the other session.
+        ghost: The object that the rays of the other session are cast against.
         other_surface: For a partial change, the surfaces near it in the other session; else None.
         own: Returns that belong to the change.
         other: Returns of the other session on the same prop.
@@ -224,7 +224,7 @@ def _tally_reshaped(change_id: int, instance: int, start: Standing, end: Standin
 
 
 def _corners_off(mesh: Mesh, other: cKDTree, floor_m: float) -> Float64Array:
-    """Corners (N, 3) of a surface above the floor that lie off the samples of another one."""
+    """Return the corners (N, 3) of a surface above the floor that lie off the samples of another one."""
     corners = mesh.vertices[mesh.vertices[:, 2] >= floor_m]
     return np.asarray(corners[other.query(corners)[0] > _SAME_SURFACE_M])
 

@@ -1,4 +1,4 @@
-"""Measurements of the simulator itself: figures of worlds, roughness of walls, charts of the sensor, speed."""
+"""Measurements of the simulator: figures of worlds, roughness of walls, charts of the sensor, speed."""
 
 import lazy_loader
 
