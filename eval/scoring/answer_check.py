@@ -15,7 +15,7 @@ from cdpipe.model.report import ChangedObject, ChangeRegions
 from cdpipe.model.types import SessionName
 from eval.scoring.answer_rows import POINT_RADIUS_M, find_rows_near_points
 from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth
-from eval.truth.universe import ScoringPoints
+from eval.truth.scoring_points import ScoringPoints
 
 SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns"))
 _MANY = 100  # so many valid returns include the first return of some cell
@@ -45,8 +45,8 @@ def check_answer(answer: Answer, truth: GroundTruth, folder: Path) -> None:
             _check_object(index, item, len(report.objects), len(report.regions.scores))
         for session in SESSIONS:
             _check_returns(session, report.objects, truth.sessions[session])
-            _check_points(session, report.objects, answer.points_odom, truth.sessions[session].universe)
-        _check_places(report.objects, truth.before.universe)
+            _check_points(session, report.objects, answer.points_odom, truth.sessions[session].scoring_points)
+        _check_places(report.objects, truth.before.scoring_points)
     except ValueError as error:
         raise InputError(f"{folder}: not an answer to this pair: {error}") from error
 
@@ -118,7 +118,7 @@ def _check_object(index: int, item: ChangedObject, n_objects: int, n_regions: in
 
 
 def _check_returns(session: SessionName, objects: tuple[ChangedObject, ...], truth: SessionTruth) -> None:
-    n_scans, n_pixels = truth.universe.n_scans, truth.universe.n_pixels
+    n_scans, n_pixels = truth.scoring_points.n_scans, truth.scoring_points.n_pixels
     taken = []
     for index, item in enumerate(objects):
         if item.session != session:
@@ -137,7 +137,10 @@ def _check_returns(session: SessionName, objects: tuple[ChangedObject, ...], tru
     if not taken:
         return
     keys, counts = np.unique(np.concatenate(taken), return_counts=True)
-    if len(keys) >= _MANY and len(truth.universe.rows_of_returns(np.column_stack(np.divmod(keys, n_pixels)))) == 0:
+    if (
+        len(keys) >= _MANY
+        and len(truth.scoring_points.rows_of_returns(np.column_stack(np.divmod(keys, n_pixels)))) == 0
+    ):
         raise ValueError(
             f"object_returns of the {session} session: nothing returned at any of their {len(keys)} (scan, pixel): "
             "a pixel is row * columns + column of the staggered image"
@@ -150,16 +153,16 @@ def _check_returns(session: SessionName, objects: tuple[ChangedObject, ...], tru
         )
 
 
-def _check_places(objects: tuple[ChangedObject, ...], universe: ScoringPoints) -> None:
+def _check_places(objects: tuple[ChangedObject, ...], scoring_points: ScoringPoints) -> None:
     """Raise if no object of the before session lies near its returns; the before odom frame is the map frame.
 
     This finds swapped sessions: most pixels return in both sessions, so the other checks pass.
     """
     aside_m = {}
     for index, item in enumerate(objects):
-        rows = universe.rows_of_returns(item.returns) if item.session == "before" and len(item.returns) else ()
+        rows = scoring_points.rows_of_returns(item.returns) if item.session == "before" and len(item.returns) else ()
         if len(rows) and len(item.points_map):
-            points = universe.points_odom[rows]
+            points = scoring_points.points_odom[rows]
             gap = np.maximum(points.min(axis=0) - item.points_map.max(axis=0), 0.0)
             gap += np.maximum(item.points_map.min(axis=0) - points.max(axis=0), 0.0)
             aside_m[index] = float(np.linalg.norm(gap))
@@ -175,7 +178,7 @@ def _check_points(
     session: SessionName,
     objects: tuple[ChangedObject, ...],
     points_odom: tuple[Float64Array, ...] | None,
-    universe: ScoringPoints,
+    scoring_points: ScoringPoints,
 ) -> None:
     if points_odom is None:
         return
@@ -189,7 +192,7 @@ def _check_points(
             all_points.append(distinct)
     if sum(map(len, all_points)) == 0:
         return
-    if not any(len(rows) for rows in find_rows_near_points(universe, all_points)):
+    if not any(len(rows) for rows in find_rows_near_points(scoring_points, all_points)):
         raise ValueError(
             f"object_points_odom of the {session} session: none of its {sum(map(len, all_points))} points is within "
             f"{POINT_RADIUS_M:g} m of a return of that session: give them in its own odom frame, not in the map's"

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.io.answer import Answer
 from eval.truth.ground_truth import SESSIONS, GroundTruth
-from eval.truth.universe import ScoringPoints
+from eval.truth.scoring_points import ScoringPoints
 
 POINT_RADIUS_M = 0.1
 
@@ -23,24 +23,24 @@ def find_answer_rows(answer: Answer, truth: GroundTruth) -> tuple[Int64Array, ..
         return ()
     objects = answer.report.objects
     if answer.points_odom is None:
-        return tuple(truth.sessions[item.session].universe.rows_of_returns(item.returns) for item in objects)
+        return tuple(truth.sessions[item.session].scoring_points.rows_of_returns(item.returns) for item in objects)
     rows: list[Int64Array] = [np.zeros(0, dtype=np.int64)] * len(objects)
     for session in SESSIONS:
         of_session = [index for index, item in enumerate(objects) if item.session == session]
         points = [answer.points_odom[index] for index in of_session]
-        near = find_rows_near_points(truth.sessions[session].universe, points)
+        near = find_rows_near_points(truth.sessions[session].scoring_points, points)
         for index, found in zip(of_session, near, strict=True):
             rows[index] = found
     return tuple(rows)
 
 
 def find_rows_near_points(
-    universe: ScoringPoints, objects_odom: list[Float64Array], radius_m: float = POINT_RADIUS_M
+    scoring_points: ScoringPoints, objects_odom: list[Float64Array], radius_m: float = POINT_RADIUS_M
 ) -> list[Int64Array]:
     """Return, for each object, the rows whose nearest predicted point is its own and within a radius.
 
     Args:
-        universe: Scoring points of the session.
+        scoring_points: Scoring points of the session.
         objects_odom: Per object, (P, 3) points in the session's odom frame, metres.
         radius_m: Radius that a point stands for.
     """
@@ -54,12 +54,12 @@ def find_rows_near_points(
             rows.append(np.zeros(0, dtype=np.int64))
             continue
         low, high = points.min(axis=0) - radius_m, points.max(axis=0) + radius_m
-        inside = np.ones(len(universe), dtype=np.bool_)
+        inside = np.ones(len(scoring_points), dtype=np.bool_)
         for axis in range(3):
-            values = universe.points_odom[:, axis]
+            values = scoring_points.points_odom[:, axis]
             inside &= (values >= low[axis]) & (values <= high[axis])
         candidates = np.flatnonzero(inside)
-        points_odom = universe.points_odom[candidates].astype(np.float64)
+        points_odom = scoring_points.points_odom[candidates].astype(np.float64)
         # the bound is exclusive; without a neighbour the index is the number of points
         _, nearest = tree.query(points_odom, distance_upper_bound=np.nextafter(radius_m, np.inf))
         rows.append(candidates[np.append(owners, -1)[nearest] == index])

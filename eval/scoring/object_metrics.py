@@ -15,7 +15,7 @@ from cdpipe.core.voxel import cell_keys
 from cdpipe.model.report import ChangedObject
 from eval.core.statistics import mean
 from eval.truth.ground_truth import SESSIONS, GroundTruth
-from eval.truth.universe import CELL_M
+from eval.truth.scoring_points import CELL_M
 
 Outcome = Literal["match", "false", "ignored"]
 _PHASES = tuple(itertools.product((0.0, 0.5), repeat=3))
@@ -91,14 +91,14 @@ def match_objects(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], 
 
     Args:
         objects: The answer's O objects.
-        rows: Per object, the rows of its session's universe.
+        rows: Per object, the rows of its session's scoring points.
         truth: The pair's truth, C changes.
     """
     changes = truth.pair.changes
     n_shared = np.zeros((len(changes), len(objects)), dtype=np.int64)
     iou = np.zeros((len(changes), len(objects)))
     for column, (item, of_object) in enumerate(zip(objects, rows, strict=True)):
-        labels = truth.sessions[item.session].universe.change[of_object]
+        labels = truth.sessions[item.session].scoring_points.change[of_object]
         for row, change in enumerate(changes):
             n_shared[row, column] = np.count_nonzero(labels == change.id)  # ids are unique in the pair, so 0 elsewhere
             n_union = len(truth.change_rows[row]) + len(of_object) - n_shared[row, column]
@@ -113,7 +113,7 @@ def match_objects(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], 
         for index, column in match_best(iou[candidates]):
             row = candidates[index]
             matched_object[row], matched_change[column] = column, row
-            points = truth.sessions[session].universe.points_odom
+            points = truth.sessions[session].scoring_points.points_odom
             true, answered = (points[of].astype(np.float64) for of in (truth.change_rows[row], rows[column]))
             ious["point"][row] = iou[row, column]
             ious["voxel"][row] = compute_voxel_iou(true, answered)

@@ -32,7 +32,7 @@ from eval.scoring.merge_metrics import PAIR_RADIUS_M
 from eval.scoring.region_metrics import label_keyframes, transform_to_map
 from eval.truth.adapters import WrappedScans, held_input
 from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth, ground_truth
-from eval.truth.universe import UniverseBuilder
+from eval.truth.scoring_points import ScoringPointsBuilder
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
@@ -148,17 +148,17 @@ def _map_held(held: LabelledSession) -> _Mapped:
     """Map a session, reading it once."""
     config, session = _load_map_config(), held.session
     chosen = set(choose_keyframes(session.odom_T_sensor, config.keyframe_spacing_m).tolist())
-    universe = UniverseBuilder(str(session.path), session.sensor.height, session.sensor.width)
+    builder = ScoringPointsBuilder(str(session.path), session.sensor.height, session.sensor.width)
     ranges_m, stamps_ns = [], []
 
     def watch(scan: PosedScan) -> None:
-        universe.add(scan, held.instance[scan.index], held.change[scan.index])
+        builder.add(scan, held.instance[scan.index], held.change[scan.index])
         if scan.index in chosen:
             ranges_m.append(range_image(scan.points_sensor))
             stamps_ns.append(int(scan.stamps_ns.min()))
 
     point_map = build_map(_WatchedScans(held_input(session), watch), config, _BATCH_SCANS)
-    truth = SessionTruth(session.odom_T_sensor, held.world_T_sensor, universe.finish(session.n_scans))
+    truth = SessionTruth(session.odom_T_sensor, held.world_T_sensor, builder.finish(session.n_scans))
     return _Mapped(
         point_map,
         truth,

@@ -1,7 +1,7 @@
 from .adapters import held_input, pipeline_input
 from .aligned import alignment_of
 from .ground_truth import GroundTruth, SessionTruth, load_ground_truth
-from .universe import ScoringPoints, load_universe
+from .scoring_points import ScoringPoints, load_scoring_points
 
 __all__ = [
     "GroundTruth",
@@ -10,6 +10,6 @@ __all__ = [
     "alignment_of",
     "held_input",
     "load_ground_truth",
-    "load_universe",
+    "load_scoring_points",
     "pipeline_input",
 ]

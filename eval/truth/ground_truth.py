@@ -20,7 +20,7 @@ from cdpipe.core.geometry import (
 )
 from cdpipe.io.session import read_session
 from cdpipe.model.types import SessionName
-from eval.truth.universe import ScoringPoints, load_universe
+from eval.truth.scoring_points import ScoringPoints, load_scoring_points
 from sim.session.truth import PairTruth, read_pair_truth, read_true_poses
 
 SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
@@ -33,12 +33,12 @@ class SessionTruth:
     Attributes:
         odom_T_sensor: (S, 4, 4) poses of the robot's odometry.
         world_T_sensor: (S, 4, 4) true poses.
-        universe: Returns that objects are scored against.
+        scoring_points: Returns that objects are scored against.
     """
 
     odom_T_sensor: Float64Array
     world_T_sensor: Float64Array
-    universe: ScoringPoints
+    scoring_points: ScoringPoints
 
     def __post_init__(self) -> None:
         require_poses("odom_T_sensor", self.odom_T_sensor)
@@ -57,7 +57,7 @@ class GroundTruth:
     Attributes:
         pair: Family, seed, radius and the C changes.
         sessions: The two sessions.
-        change_rows: C arrays: the rows of its session's universe that belong to each change.
+        change_rows: C arrays: the rows of its session's scoring points that belong to each change.
         centroids_world: (C, 3) centroid of those rows through the true poses, world frame; the object's own origin for
             a change that fills no cell.
         is_observable: (C,) observable changes; a change that fills no cell is never observable.
@@ -84,12 +84,12 @@ class GroundTruth:
     def range_m(self, index: int) -> float:
         """Return the shortest range at which the session that holds a change saw it, metres; NaN where it did not."""
         change = self.pair.changes[index]
-        return self.sessions[change.session].universe.range_of_change(change.id)
+        return self.sessions[change.session].scoring_points.range_of_change(change.id)
 
     def points_odom(self, index: int) -> Float64Array:
         """Return the (N, 3) cells of a change's truth, that session's odom frame, metres."""
-        universe = self.sessions[self.pair.changes[index].session].universe
-        return universe.points_odom[self.change_rows[index]].astype(np.float64)
+        scoring_points = self.sessions[self.pair.changes[index].session].scoring_points
+        return scoring_points.points_odom[self.change_rows[index]].astype(np.float64)
 
     @property
     def n_observable(self) -> int:
@@ -111,13 +111,13 @@ def ground_truth(truth: PairTruth, sessions: Mapping[SessionName, SessionTruth])
     rows, centroids = [], []
     for change in truth.changes:
         session = sessions[change.session]
-        of_change = session.universe.rows_of_change(change.id)
+        of_change = session.scoring_points.rows_of_change(change.id)
         rows.append(of_change)
         if len(of_change) == 0:
             centroids.append(np.asarray(change.world_T_object, dtype=np.float64)[:3, 3])
             continue
-        points_odom = session.universe.points_odom[of_change].astype(np.float64)
-        centroids.append(session.to_world(points_odom, session.universe.scans(of_change)).mean(axis=0))
+        points_odom = session.scoring_points.points_odom[of_change].astype(np.float64)
+        centroids.append(session.to_world(points_odom, session.scoring_points.scans(of_change)).mean(axis=0))
     return GroundTruth(
         pair=truth,
         sessions=sessions,
@@ -134,6 +134,6 @@ def ground_truth(truth: PairTruth, sessions: Mapping[SessionName, SessionTruth])
 def _load_session(path: Path) -> SessionTruth:
     odom_T_sensor = read_session(path).odom_T_sensor
     try:
-        return SessionTruth(odom_T_sensor, read_true_poses(path), load_universe(path))
+        return SessionTruth(odom_T_sensor, read_true_poses(path), load_scoring_points(path))
     except (KeyError, ValueError) as error:
         raise InputError(f"{path / 'truth'}: not the truth of this session: {error}") from error

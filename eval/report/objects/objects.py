@@ -15,7 +15,7 @@ from eval.running.run_data import SHOWN_PRESETS, RunData, flag, named_variants, 
 from eval.scoring.answer_rows import find_answer_rows
 from eval.tables.columns import share
 from eval.truth.ground_truth import GroundTruth
-from eval.truth.universe import CELL_M
+from eval.truth.scoring_points import CELL_M
 from sim.session.truth import Change
 
 _CONTEXT_M = 1.5
@@ -63,7 +63,7 @@ class AnsweredPair:
         """
         change, true_rows = self.truth.pair.changes[index], self.truth.change_rows[index]
         session = self.truth.sessions[change.session]
-        places, true_points = session.universe.points_odom, session.universe.points_odom[true_rows]
+        places, true_points = session.scoring_points.points_odom, session.scoring_points.points_odom[true_rows]
         low, high = true_points.min(axis=0) - _CONTEXT_M, true_points.max(axis=0) + _CONTEXT_M
         rows = np.flatnonzero(((places > low) & (places < high)).all(axis=1))
         points, is_true = places[rows].astype(np.float64), np.isin(rows, true_rows)

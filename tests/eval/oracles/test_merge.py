@@ -9,7 +9,7 @@ from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMa
 from eval.oracles.merge import OracleMerge, merged_by_truth
 from eval.scoring.merge_metrics import MergeErrors, compute_merge_errors
 from eval.truth.ground_truth import SessionTruth
-from eval.truth.universe import ScoringPoints
+from eval.truth.scoring_points import ScoringPoints
 
 N = 60
 KEYFRAMES = (np.arange(0, N, 2), np.arange(1, N, 3))
@@ -33,8 +33,8 @@ def session(world_T_sensor: np.ndarray, odom_T_world: np.ndarray, drift_deg_per_
         yaw_pose(np.deg2rad(drift_deg_per_m * way), (0.01 * way * (drift_deg_per_m > 0), 0, 0)) for way in travelled
     ]
     none = np.zeros(0, dtype=np.int16)
-    universe = ScoringPoints(np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.float32), none, none, N, 1)
-    return SessionTruth(odom_T_world @ np.stack(slip) @ world_T_sensor, world_T_sensor, universe)
+    scoring_points = ScoringPoints(np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.float32), none, none, N, 1)
+    return SessionTruth(odom_T_world @ np.stack(slip) @ world_T_sensor, world_T_sensor, scoring_points)
 
 
 def mapped(truth: SessionTruth, keyframes: np.ndarray) -> MappedSession:

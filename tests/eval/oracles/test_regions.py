@@ -15,7 +15,7 @@ from eval.plans.variants import name_variant, slug
 from eval.scoring.region_metrics import match_regions, transform_to_world
 from eval.tables.merge_table import is_oracle
 from eval.truth.ground_truth import GroundTruth, SessionTruth
-from eval.truth.universe import ScoringPoints
+from eval.truth.scoring_points import ScoringPoints
 from sim.session.truth import PairTruth
 from tests.eval.changes import change
 
@@ -28,13 +28,13 @@ def truth_of(places: list[tuple[float, float]], n_cells: list[int], is_observabl
     world = np.stack([make_pose(translation=(float(index), 0.0, 1.0)) for index in range(N_SCANS)])
     bends = np.stack([yaw_pose(0.004 * index, (5.0 + 0.01 * index, -3.0, 0.0)) for index in range(N_SCANS)])
     none = np.zeros(0, dtype=np.int16)
-    universe = ScoringPoints(np.zeros(0, np.int64), np.zeros((0, 3), np.float32), none, none, N_SCANS, 1)
+    scoring_points = ScoringPoints(np.zeros(0, np.int64), np.zeros((0, 3), np.float32), none, none, N_SCANS, 1)
     changes = tuple(change(number) for number in range(1, len(places) + 1))
     return GroundTruth(
         pair=PairTruth("test", 0, 4.5, changes, {}),
         sessions={
-            "before": SessionTruth(bends @ world, world, universe),
-            "after": SessionTruth(world, world, universe),
+            "before": SessionTruth(bends @ world, world, scoring_points),
+            "after": SessionTruth(world, world, scoring_points),
         },
         change_rows=tuple(np.arange(count) for count in n_cells),
         centroids_world=np.array([(x, y, 0.0) for x, y in places]).reshape(-1, 3),

@@ -29,9 +29,9 @@ SEEDS = (3, 4)
 def arrays_of(pair: Path, merge: np.ndarray) -> dict[str, Any]:
     """The truth about the after session's changes, as a foreign program writes it: nothing that may be left out."""
     truth = load_ground_truth(pair)
-    universe = truth.after.universe
-    rows = [universe.rows_of_change(change.id) for change in truth.pair.changes if change.session == "after"]
-    points = [universe.points_odom[own].astype(np.float64) for own in rows]
+    scoring_points = truth.after.scoring_points
+    rows = [scoring_points.rows_of_change(change.id) for change in truth.pair.changes if change.session == "after"]
+    points = [scoring_points.points_odom[own].astype(np.float64) for own in rows]
     return {
         "region_centres_map": transform(merge, np.array([cloud.mean(axis=0) for cloud in points])),
         "region_scores": np.arange(len(rows), 0.0, -1.0),
@@ -342,10 +342,10 @@ def test_an_answer_to_the_sessions_the_other_way_round_is_named(
     tiny_pair: Path, command: Command, good: tuple[dict[str, Any], dict[str, Any]]
 ) -> None:
     document, arrays = good
-    universe = load_ground_truth(tiny_pair).before.universe
+    scoring_points = load_ground_truth(tiny_pair).before.scoring_points
     rows = np.arange(200)
-    own = universe.points_odom[rows].astype(np.float64)
-    returns = np.column_stack([universe.scans(rows), universe.pixels(rows)])
+    own = scoring_points.points_odom[rows].astype(np.float64)
+    returns = np.column_stack([scoring_points.scans(rows), scoring_points.pixels(rows)])
     whole = {name: value for name, value in arrays.items() if name.startswith("region")} | {
         "object_returns": returns,
         "object_return_offsets": np.array([0, 200]),

@@ -12,7 +12,7 @@ from eval.scoring.merge_metrics import (
     summarise_merge_errors,
 )
 from eval.truth.ground_truth import SessionTruth
-from eval.truth.universe import ScoringPoints
+from eval.truth.scoring_points import ScoringPoints
 
 
 def session(world_T_sensor: np.ndarray, odom_T_world: np.ndarray) -> SessionTruth:
@@ -81,7 +81,7 @@ def test_drift_of_either_session_counts_as_misalignment() -> None:
     after = drive(20)
     stretched = after.copy()
     stretched[:, 0, 3] *= 1.01
-    truth = SessionTruth(AFTER_T_WORLD @ stretched, after, session(after, AFTER_T_WORLD).universe)
+    truth = SessionTruth(AFTER_T_WORLD @ stretched, after, session(after, AFTER_T_WORLD).scoring_points)
     errors = compute_merge_errors(session(drive(20), BEFORE_T_WORLD), truth, TRUE_MERGE, ALL)
     np.testing.assert_allclose(errors.along_m, 0.005 * np.arange(20), atol=1e-9)
     columns = summarise_merge_errors(errors)
@@ -94,7 +94,7 @@ def test_a_local_merge_is_taken_at_each_after_keyframe() -> None:
     after = drive(20, start_x_m=-6.0)
     stretched = after.copy()
     stretched[:, 0, 3] += 0.005 * np.arange(20)
-    truth = SessionTruth(AFTER_T_WORLD @ stretched, after, session(after, AFTER_T_WORLD).universe)
+    truth = SessionTruth(AFTER_T_WORLD @ stretched, after, session(after, AFTER_T_WORLD).scoring_points)
     back = np.stack([make_pose(translation=(-0.005 * k, 0.0, 0.0)) for k in range(20)])
     local = BEFORE_T_WORLD @ back @ invert(AFTER_T_WORLD)
     before = session(drive(20), BEFORE_T_WORLD)
@@ -153,10 +153,10 @@ def test_errors_equal_the_definition_written_out() -> None:
     odom_i = np.stack([yaw_pose(draw.uniform(-3, 3), draw.uniform(0, 8, 3)) for _ in range(9)])
     odom_j = np.stack([yaw_pose(draw.uniform(-3, 3), draw.uniform(0, 8, 3)) for _ in range(7)])
     guess = yaw_pose(0.7, (1.0, 2.0, 3.0))
-    universe = session(world_i, np.eye(4)).universe
+    scoring_points = session(world_i, np.eye(4)).scoring_points
     errors = compute_merge_errors(
-        SessionTruth(odom_i, world_i, universe),
-        SessionTruth(odom_j, world_j, universe),
+        SessionTruth(odom_i, world_i, scoring_points),
+        SessionTruth(odom_j, world_j, scoring_points),
         guess,
         (np.arange(9), np.arange(7)),
     )

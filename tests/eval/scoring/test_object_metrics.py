@@ -18,7 +18,7 @@ from eval.scoring.object_metrics import (
     summarise_objects,
 )
 from eval.truth.ground_truth import GroundTruth, SessionTruth
-from eval.truth.universe import ScoringPoints
+from eval.truth.scoring_points import ScoringPoints
 from sim.session.truth import Change, PairTruth
 from tests.eval.changes import change
 
@@ -26,7 +26,7 @@ N_CELLS = 40
 NAN = float("nan")
 
 
-def line_universe(change: list[int]) -> ScoringPoints:
+def line_points(change: list[int]) -> ScoringPoints:
     """One cell every 0.1 m along x: row i is pixel i of the only scan."""
     n = len(change)
     points = np.column_stack([0.05 + 0.1 * np.arange(n), np.full(n, 0.05), np.full(n, 0.05)])
@@ -42,11 +42,11 @@ def line_universe(change: list[int]) -> ScoringPoints:
 
 def ground_truth(changes: list[Change], before: list[int] | None = None, after: list[int] | None = None) -> GroundTruth:
     poses = np.eye(4)[None]
-    universes = {"before": line_universe(before or [0] * N_CELLS), "after": line_universe(after or [0] * N_CELLS)}
+    by_session = {"before": line_points(before or [0] * N_CELLS), "after": line_points(after or [0] * N_CELLS)}
     return GroundTruth(
         pair=PairTruth("test", 0, 4.5, tuple(changes), {}),
-        sessions={name: SessionTruth(poses, poses, universe) for name, universe in universes.items()},
-        change_rows=tuple(universes[item.session].rows_of_change(item.id) for item in changes),
+        sessions={name: SessionTruth(poses, poses, points) for name, points in by_session.items()},
+        change_rows=tuple(by_session[item.session].rows_of_change(item.id) for item in changes),
         centroids_world=np.zeros((len(changes), 3)),
         is_observable=np.array([item.is_observable for item in changes], dtype=np.bool_),
         is_partial=np.array([item.group == "partial" for item in changes], dtype=np.bool_),
@@ -302,28 +302,31 @@ def test_point_iou_equals_python_sets(seed: int) -> None:
 
 
 def test_rows_near_points_by_hand() -> None:
-    universe = line_universe([0] * 6)  # cells at x = 0.05, 0.15, ... 0.55
-    points = universe.points_odom.astype(np.float64)
+    scoring_points = line_points([0] * 6)  # cells at x = 0.05, 0.15, ... 0.55
+    points = scoring_points.points_odom.astype(np.float64)
     # exactly on cell 1: its neighbours are 0.1 m away and within reach up to rounding, the next are not
-    near = find_rows_near_points(universe, [points[1:2]], radius_m=0.1001)
+    near = find_rows_near_points(scoring_points, [points[1:2]], radius_m=0.1001)
     assert near[0].tolist() == [0, 1, 2]
     # two objects compete for cells 2 and 3: each keeps the nearer one
-    near = find_rows_near_points(universe, [points[1:2] + np.array([0.04, 0, 0]), points[4:5]], radius_m=0.19)
+    near = find_rows_near_points(scoring_points, [points[1:2] + np.array([0.04, 0, 0]), points[4:5]], radius_m=0.19)
     assert [rows.tolist() for rows in near] == [[0, 1, 2], [3, 4, 5]]
-    assert [len(rows) for rows in find_rows_near_points(universe, [np.zeros((0, 3)), points[:1] + 50.0])] == [0, 0]
-    assert find_rows_near_points(universe, []) == []
+    assert [len(rows) for rows in find_rows_near_points(scoring_points, [np.zeros((0, 3)), points[:1] + 50.0])] == [
+        0,
+        0,
+    ]
+    assert find_rows_near_points(scoring_points, []) == []
 
 
 def test_rows_near_points_equal_brute_force() -> None:
     draw = stream(2, "near")
     points = draw.uniform(0, 1, (400, 3)).astype(np.float32)
     zeros = np.zeros(400, dtype=np.int16)
-    universe = ScoringPoints(np.arange(400), points, zeros, zeros, 1, 400)
+    scoring_points = ScoringPoints(np.arange(400), points, zeros, zeros, 1, 400)
     objects = [draw.uniform(0, 1, (20, 3)), draw.uniform(0.3, 0.8, (30, 3)), draw.uniform(0, 0.5, (5, 3))]
     every, owners = np.concatenate(objects), np.repeat([0, 1, 2], [20, 30, 5])
     distances = np.linalg.norm(points[:, None].astype(np.float64) - every[None], axis=2)
     owner = np.where(distances.min(axis=1) <= 0.1, owners[distances.argmin(axis=1)], -1)
-    for index, rows in enumerate(find_rows_near_points(universe, objects)):
+    for index, rows in enumerate(find_rows_near_points(scoring_points, objects)):
         assert rows.tolist() == np.flatnonzero(owner == index).tolist()
 
 

@@ -13,7 +13,7 @@ from cdpipe.core.geometry import stream
 from cdpipe.model.report import ChangedObject
 from eval.scoring.object_metrics import judge_kinds, match_objects, summarise_objects
 from eval.truth.ground_truth import GroundTruth, SessionTruth
-from eval.truth.universe import ScoringPoints
+from eval.truth.scoring_points import ScoringPoints
 from sim.session.truth import Change, PairTruth
 from tests.eval.changes import change
 
@@ -28,25 +28,25 @@ class Case:
     def __init__(self, seed: int) -> None:
         draw = stream(seed, "object reference")
         self.changes = self._changes(draw)
-        universes = {}
+        scoring_points = {}
         for session in SESSIONS:
             ids = [0, *(change.id for change in self.changes if change.session == session)]
             points = draw.uniform(0.0, 1.2, (N_ROWS, 3)).astype(np.float32)
             # things are lumps of the cloud, not salt and pepper
             owner = np.array(ids)[np.digitize(points[:, 0], np.sort(draw.uniform(0, 1.2, len(ids) - 1)))]
             zeros = np.zeros(N_ROWS, dtype=np.int16)
-            universes[session] = ScoringPoints(
+            scoring_points[session] = ScoringPoints(
                 np.arange(N_ROWS, dtype=np.int64), points, owner.astype(np.int16), zeros, 1, N_ROWS
             )
         self.truth = GroundTruth(
             pair=PairTruth("test", 0, 4.5, tuple(self.changes), {}),
-            sessions={name: SessionTruth(np.eye(4)[None], np.eye(4)[None], universes[name]) for name in SESSIONS},
-            change_rows=tuple(universes[change.session].rows_of_change(change.id) for change in self.changes),
+            sessions={name: SessionTruth(np.eye(4)[None], np.eye(4)[None], scoring_points[name]) for name in SESSIONS},
+            change_rows=tuple(scoring_points[change.session].rows_of_change(change.id) for change in self.changes),
             centroids_world=np.zeros((len(self.changes), 3)),
             is_observable=np.array([change.is_observable for change in self.changes]),
             is_partial=np.array([change.group == "partial" for change in self.changes]),
         )
-        self.objects, self.rows = self._answer(draw, universes)
+        self.objects, self.rows = self._answer(draw, scoring_points)
 
     def _changes(self, draw: np.random.Generator) -> list[Change]:
         changes = []
@@ -66,13 +66,13 @@ class Case:
         return changes
 
     def _answer(
-        self, draw: np.random.Generator, universes: dict[str, ScoringPoints]
+        self, draw: np.random.Generator, scoring_points: dict[str, ScoringPoints]
     ) -> tuple[list[ChangedObject], list[np.ndarray]]:
         objects, rows = [], []
         for session in SESSIONS:
             n_objects = int(draw.integers(0, 5))
             edges = np.sort(draw.uniform(0, 1.2, n_objects))
-            owner = np.digitize(universes[session].points_odom[:, 0], edges)
+            owner = np.digitize(scoring_points[session].points_odom[:, 0], edges)
             owner[draw.random(N_ROWS) < 0.2] = 0  # some rows are nobody's
             for number in range(1, n_objects + 1):
                 kind = str(draw.choice(["added", "removed", "moved", "reshaped"]))
@@ -96,7 +96,7 @@ def slow_point_iou(case: Case, change: int, item: int) -> float:
 
 
 def slow_voxel_iou(case: Case, change: int, item: int) -> float:
-    points = case.truth.sessions[case.changes[change].session].universe.points_odom.astype(np.float64)
+    points = case.truth.sessions[case.changes[change].session].scoring_points.points_odom.astype(np.float64)
     found = []
     for shift in itertools.product((0.0, 0.05), repeat=3):
         cells = [
@@ -108,7 +108,7 @@ def slow_voxel_iou(case: Case, change: int, item: int) -> float:
 
 
 def slow_box_iou(case: Case, change: int, item: int) -> float:
-    points = case.truth.sessions[case.changes[change].session].universe.points_odom.astype(np.float64)
+    points = case.truth.sessions[case.changes[change].session].scoring_points.points_odom.astype(np.float64)
     shared = volume_a = volume_b = 1.0
     for axis in range(3):
         a, b = ([points[row][axis] for row in rows] for rows in (case.truth.change_rows[change], case.rows[item]))

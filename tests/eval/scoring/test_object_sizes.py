@@ -17,14 +17,14 @@ from eval.scoring.object_sizes import (
     summarise_size_errors,
 )
 from eval.truth.ground_truth import GroundTruth, SessionTruth
-from eval.truth.universe import ScoringPoints
+from eval.truth.scoring_points import ScoringPoints
 from sim.session.truth import Change, PairTruth
 from tests.eval.changes import change
 
 N_SCANS = 11
 KEYFRAMES = np.array([0, 5, 10])
 NAN = float("nan")
-# things stand at rows 10 n to 10 n + 9 of their session's universe
+# things stand at rows 10 n to 10 n + 9 of their session's scoring points
 WIDTH = 10
 
 
@@ -40,7 +40,7 @@ def moved(start: np.ndarray, end: np.ndarray, **fields: object) -> list[Change]:
     ]
 
 
-def universe(ids: list[int]) -> ScoringPoints:
+def scoring_points(ids: list[int]) -> ScoringPoints:
     labels = np.repeat(np.array(ids, dtype=np.int16), WIDTH)
     n = len(labels)
     points = np.column_stack([np.arange(n) * 0.1, np.zeros(n), np.zeros(n)]).astype(np.float32)
@@ -52,13 +52,13 @@ def truth_of(changes: list[Change], odom_T_world: np.ndarray | None = None, **sc
     world = np.stack([make_pose(translation=(2.0 * index, 0.0, 0.0)) for index in range(N_SCANS)])
     odom = (np.eye(4) if odom_T_world is None else odom_T_world) @ world
     sessions = {
-        name: SessionTruth(odom, world, universe([each.id for each in changes if each.session == name] or [0]))
+        name: SessionTruth(odom, world, scoring_points([each.id for each in changes if each.session == name] or [0]))
         for name in ("before", "after")
     }
     return GroundTruth(
         pair=PairTruth("test", 0, 4.5, tuple(changes), scenario),
         sessions=sessions,
-        change_rows=tuple(sessions[each.session].universe.rows_of_change(each.id) for each in changes),
+        change_rows=tuple(sessions[each.session].scoring_points.rows_of_change(each.id) for each in changes),
         centroids_world=np.array([np.array(each.world_T_object)[:3, 3] for each in changes]).reshape(-1, 3),
         is_observable=np.ones(len(changes), dtype=np.bool_),
         is_partial=np.array([each.group == "partial" for each in changes], dtype=np.bool_),

@@ -14,7 +14,7 @@ from eval.scoring.region_metrics import (
     transform_to_world,
 )
 from eval.truth.ground_truth import SessionTruth
-from eval.truth.universe import ScoringPoints
+from eval.truth.scoring_points import ScoringPoints
 
 EMPTY = ScoringPoints(
     returns=np.zeros(0, dtype=np.int64),

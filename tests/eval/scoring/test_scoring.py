@@ -56,10 +56,10 @@ def true_objects(truth: GroundTruth) -> tuple[ChangedObject, ...]:
     place = {change.id: index for index, change in enumerate(truth.pair.changes)}
     objects = []
     for change, rows in zip(truth.pair.changes, truth.change_rows, strict=True):
-        universe = truth.sessions[change.session].universe
-        returns = np.column_stack([universe.scans(rows), universe.pixels(rows)]).astype(np.int32)
+        scoring_points = truth.sessions[change.session].scoring_points
+        returns = np.column_stack([scoring_points.scans(rows), scoring_points.pixels(rows)]).astype(np.int32)
         partner = -1 if change.partner is None else place[change.partner]
-        points = universe.points_odom[rows].astype(np.float64)
+        points = scoring_points.points_odom[rows].astype(np.float64)
         objects.append(ChangedObject(change.session, change.kind, place[change.id], returns, points, 1.0, partner))
     return tuple(objects)
 
@@ -169,7 +169,7 @@ def test_centroids_are_true_places_even_when_the_odometry_drifts(write_tiny_pair
         session = truth.sessions[change.session]
         scans = {scan.index: scan for scan in open_session(pair / change.session).scans()}
         places = []
-        for index, pixel in zip(session.universe.scans(rows), session.universe.pixels(rows), strict=True):
+        for index, pixel in zip(session.scoring_points.scans(rows), session.scoring_points.pixels(rows), strict=True):
             scan = scans[int(index)]
             point = scan.points_sensor[scan.pixels == pixel]
             places.append(transform(session.world_T_sensor[index], point)[0])

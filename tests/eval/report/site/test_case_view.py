@@ -60,7 +60,7 @@ def test_roof_is_what_is_high_over_the_nearest_place_of_the_path() -> None:
 
 def test_both_maps_and_all_changes_are_in_one_frame(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
     truth = load_ground_truth(tiny_pair)
-    before = truth.before.universe.points_odom[::5].astype(np.float64)
+    before = truth.before.scoring_points.points_odom[::5].astype(np.float64)
     # the same world points as the after robot has them
     after = (before - tiny_merge[:3, 3]) @ tiny_merge[:3, :3]
     rows = {"changes": [{"id": 1, "is_found": True}, {"id": 2, "is_found": False}]}

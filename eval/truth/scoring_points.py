@@ -90,24 +90,24 @@ class ScoringPoints:
         return np.unique(place[self.returns[place] == wanted])
 
 
-def load_universe(session: Path) -> ScoringPoints:
-    """Return the universe of a simulated session, from `truth/universe.npz` if that fits, else built and stored there.
+def load_scoring_points(session: Path) -> ScoringPoints:
+    """Return the scoring points of a simulated session: from `truth/scoring_points.npz`, or built and stored there.
 
     Raises:
         InputError: The session or its truth is missing or damaged.
     """
     opened = read_session(session)
-    path = session / "truth" / "universe.npz"
+    path = session / "truth" / "scoring_points.npz"
     fingerprint = _fingerprint(opened)
     cached = _read_cache(path, fingerprint, opened)
     if cached is not None:
         return cached
-    universe = build_universe(opened)
-    _write_cache(path, fingerprint, universe)
-    return universe
+    scoring_points = build_scoring_points(opened)
+    _write_cache(path, fingerprint, scoring_points)
+    return scoring_points
 
 
-def build_universe(session: Session) -> ScoringPoints:
+def build_scoring_points(session: Session) -> ScoringPoints:
     """Return the first return of each 0.1 m cell, in the order of scans and of row-major pixels.
 
     Reads the session as a stream; memory grows by about 60 bytes per cell.
@@ -116,7 +116,7 @@ def build_universe(session: Session) -> ScoringPoints:
         InputError: The session or its truth is missing or damaged.
     """
     shape = session.sensor.height, session.sensor.width
-    builder = UniverseBuilder(str(session.path), *shape)
+    builder = ScoringPointsBuilder(str(session.path), *shape)
     scans = open_session(session.path).scans()
     for index, (instance, change) in enumerate(read_labels(session.path, session.n_chunks)):
         n_scans = min(session.chunk_scans, session.n_scans - index * session.chunk_scans)
@@ -131,7 +131,7 @@ def build_universe(session: Session) -> ScoringPoints:
     return builder.finish(session.n_scans)
 
 
-class UniverseBuilder:
+class ScoringPointsBuilder:
     """Receives the scans of a session in order and keeps the first return of each cell."""
 
     def __init__(self, name: str, height: int, width: int) -> None:
@@ -176,7 +176,7 @@ class UniverseBuilder:
             self._folded, self._pending = [_first_per_cell([*self._folded, *self._pending])], []
 
     def finish(self, n_scans: int) -> ScoringPoints:
-        """Return the universe of the session, which has so many scans."""
+        """Return the scoring points of the session, which has so many scans."""
         cells = _first_per_cell([*self._folded, *self._pending, *self._batch])
         order = np.argsort(cells["returns"])
         columns = {name: values[order] for name, values in cells.items() if name != "cells"}
@@ -228,9 +228,9 @@ def _read_cache(path: Path, fingerprint: str, session: Session) -> ScoringPoints
         return None  # absent or damaged: rebuilt from the session
 
 
-def _write_cache(path: Path, fingerprint: str, universe: ScoringPoints) -> None:
+def _write_cache(path: Path, fingerprint: str, scoring_points: ScoringPoints) -> None:
     names = ("returns", "points_odom", "change", "instance", "nearest_m")
-    arrays = {name: getattr(universe, name) for name in names}
+    arrays = {name: getattr(scoring_points, name) for name in names}
     # a read-only folder is scored without the cache, more slowly
     with suppress(OSError), whole_file(path) as partial, partial.open("wb") as file:
         np.savez(file, allow_pickle=False, fingerprint=np.array(fingerprint), **arrays)

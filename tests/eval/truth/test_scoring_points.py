@@ -1,4 +1,4 @@
-"""The universe against a dictionary of cells, its lookups, its cache, and labels that do not belong."""
+"""The scoring points against a dictionary of cells, its lookups, its cache, and labels that do not belong."""
 
 from pathlib import Path
 
@@ -9,12 +9,12 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import transform
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
-from eval.truth import universe as module
-from eval.truth.universe import build_universe, load_universe
+from eval.truth import scoring_points as module
+from eval.truth.scoring_points import build_scoring_points, load_scoring_points
 from sim.session.truth import read_labels, write_labels
 
 
-def universe_by_dictionary(session: Path) -> dict[tuple[int, ...], tuple[int, int, int, int, np.ndarray]]:
+def points_by_dictionary(session: Path) -> dict[tuple[int, ...], tuple[int, int, int, int, np.ndarray]]:
     """First return of each cell in the order of scans and pixels: scan, pixel, change, instance, point."""
     opened = read_session(session)
     labels = list(read_labels(session, opened.n_chunks))
@@ -37,8 +37,8 @@ def test_equals_a_dictionary_of_cells(
     monkeypatch.setattr(module, "_BATCH_RETURNS", batch)
     monkeypatch.setattr(module, "_PENDING_ROWS", pending)
     session = tiny_pair / name
-    built = build_universe(read_session(session))
-    expected = sorted(universe_by_dictionary(session).values(), key=lambda row: row[:2])
+    built = build_scoring_points(read_session(session))
+    expected = sorted(points_by_dictionary(session).values(), key=lambda row: row[:2])
     every = np.arange(len(built))
     assert len(built) == len(expected)
     assert list(zip(built.scans(every), built.pixels(every), strict=True)) == [row[:2] for row in expected]
@@ -49,7 +49,7 @@ def test_equals_a_dictionary_of_cells(
 
 
 def test_rows_are_found_again_by_their_returns(tiny_pair: Path) -> None:
-    built = load_universe(tiny_pair / "after")
+    built = load_scoring_points(tiny_pair / "after")
     chosen = np.array([0, 5, len(built) - 1])
     returns = np.column_stack([built.scans(chosen), built.pixels(chosen)]).astype(np.int32)
     assert built.rows_of_returns(returns[::-1]).tolist() == chosen.tolist()
@@ -60,10 +60,10 @@ def test_rows_are_found_again_by_their_returns(tiny_pair: Path) -> None:
 
 def test_the_cache_is_used_until_the_session_changes(tiny_pair: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     session = tiny_pair / "after"
-    built = load_universe(session)
+    built = load_scoring_points(session)
     with monkeypatch.context() as patch:
-        patch.setattr(module, "build_universe", lambda _: pytest.fail("built again"))
-        cached = load_universe(session)
+        patch.setattr(module, "build_scoring_points", lambda _: pytest.fail("built again"))
+        cached = load_scoring_points(session)
     for name in ("returns", "points_odom", "change", "instance"):
         np.testing.assert_array_equal(getattr(cached, name), getattr(built, name))
         assert getattr(cached, name).dtype == getattr(built, name).dtype
@@ -71,21 +71,21 @@ def test_the_cache_is_used_until_the_session_changes(tiny_pair: Path, monkeypatc
 
     instance, change = next(read_labels(session, 1))
     write_labels(session, 0, instance, np.where(change == 1, 9, change).astype(np.int16))
-    assert 9 in load_universe(session).change
+    assert 9 in load_scoring_points(session).change
 
 
 def test_a_damaged_cache_is_built_again(tiny_pair: Path) -> None:
     session = tiny_pair / "after"
-    built = load_universe(session)
-    (session / "truth" / "universe.npz").write_bytes(b"PK\x03\x04 not an archive")
-    np.testing.assert_array_equal(load_universe(session).returns, built.returns)
+    built = load_scoring_points(session)
+    (session / "truth" / "scoring_points.npz").write_bytes(b"PK\x03\x04 not an archive")
+    np.testing.assert_array_equal(load_scoring_points(session).returns, built.returns)
 
 
 def test_labels_of_another_session_are_refused(tiny_pair: Path) -> None:
     session = tiny_pair / "before"
     write_labels(session, 1, np.zeros((5, 4, 32), np.int16), np.zeros((5, 4, 32), np.int16))
     with pytest.raises(InputError, match=r"labels of chunk 1 are \(5, 4, 32\)"):
-        load_universe(session)
+        load_scoring_points(session)
     (session / "truth" / "00001.npz").unlink()
     with pytest.raises(InputError, match=r"00001\.npz: missing"):
-        load_universe(session)
+        load_scoring_points(session)
