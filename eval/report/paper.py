@@ -6,7 +6,17 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 from eval.report.tables import Cell, Table
-from eval.running.run_data import SHOWN_PRESETS, Row, RunData, defined, named_variants, of, over_pairs, scenarios, text
+from eval.running.run_data import (
+    Row,
+    RunData,
+    defined,
+    named_variants,
+    of,
+    over_pairs,
+    pictured_variants,
+    scenarios,
+    text,
+)
 from eval.tables.columns import EN_DASH, THIN_SPACE, UNDEFINED, count, significant
 
 # Stathoulopoulos, Koval, Nikolakopoulos, IROS 2023, as printed; "-" alone: the paper gives no value
@@ -73,7 +83,7 @@ def _beside_the_paper(
         rows += [
             (scenario, (Cell(f"ours, {name}"), *map(Cell, ours(scenario, name))))
             for name in named_variants(data, scenario)
-            if name in SHOWN_PRESETS
+            if name in pictured_variants(data, scenario)
         ]
     return Table(("method", *headings), tuple(rows), caption)
 

@@ -24,7 +24,7 @@ from eval.tables.rows import records, with_domain
 
 Row = Mapping[str, Any]
 REQUIRED = ("scenario", "seed", "variant", "status")
-SHOWN_PRESETS = ("paper", "tunnelcd", "voxel-diff")
+_PICTURED = ("paper", "tunnelcd", "voxel-diff")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,6 +190,12 @@ def named_variants(data: RunData, scenario: str) -> list[str]:
     names = dict.fromkeys(name for world, name, _ in _cases(data) if world == scenario and (world, name) not in held)
     points = grid_points(data)
     return [name for name in names if (scenario, name) not in points]
+
+
+def pictured_variants(data: RunData, scenario: str) -> list[str]:
+    """Return the variants of pictures and of tables I and II: the paper's, ours and a rival, else the first three."""
+    names = named_variants(data, scenario)
+    return [name for name in _PICTURED if name in names] or names[:3]
 
 
 def first_seed(data: RunData, scenario: str) -> int:

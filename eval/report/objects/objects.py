@@ -11,7 +11,7 @@ from cdpipe.io.answer import Answer
 from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.report.objects.figures import Layers, Panel, object_panels
 from eval.report.tables import Picture
-from eval.running.run_data import SHOWN_PRESETS, RunData, flag, named_variants, number, of, text
+from eval.running.run_data import RunData, flag, number, of, pictured_variants, text
 from eval.scoring.answer_rows import find_answer_rows
 from eval.tables.columns import share
 from eval.truth.ground_truth import GroundTruth
@@ -25,7 +25,7 @@ def object_pictures(
     data: RunData, scenario: str, seed: int, answers: Mapping[str, Answer], truth: GroundTruth
 ) -> list[Picture]:
     """Draw every observable change of a pair beside what the shown presets answered."""
-    names = [name for name in SHOWN_PRESETS if name in named_variants(data, scenario)]
+    names = pictured_variants(data, scenario)
     pair = AnsweredPair(data, (scenario, seed), truth, {name: answers[name] for name in names if name in answers})
     pictures = []
     for index in np.flatnonzero(truth.is_observable).tolist():

@@ -16,13 +16,13 @@ from eval.report.maps import Points, RegionMark, State, TruthMark, distance_map,
 from eval.report.objects.objects import object_pictures
 from eval.report.tables import Picture
 from eval.running.run_data import (
-    SHOWN_PRESETS,
     Row,
     RunData,
     first_seed,
     flag,
     named_variants,
     number,
+    pictured_variants,
     rows_of_case,
     text,
 )
@@ -54,7 +54,7 @@ def draw_site(data: RunData, scenario: str) -> Site:
     truth = _truth(data.folder.pair(scenario, seed), missing)
     maps_drawn = [] if maps is None else _map_pictures(maps, answers, truth, missing)
     regions = []
-    for name in SHOWN_PRESETS:
+    for name in pictured_variants(data, scenario):
         report = answers[name].report if name in answers else None
         if maps is not None and report is not None:
             rows = rows_of_case(data, scenario, seed, name)
@@ -66,10 +66,9 @@ def draw_site(data: RunData, scenario: str) -> Site:
 def _answers(data: RunData, scenario: str, seed: int, missing: list[str]) -> dict[str, Answer]:
     """Return the readable answers with a report, the shown presets first."""
     variants = named_variants(data, scenario)
-    missing += [f"Preset {name} was not run on {scenario}." for name in SHOWN_PRESETS if name not in variants]
     found: dict[str, Answer] = {}
     refused: dict[str, list[str]] = {}
-    for name in dict.fromkeys([*(name for name in SHOWN_PRESETS if name in variants), *variants]):
+    for name in dict.fromkeys([*pictured_variants(data, scenario), *variants]):
         try:
             answer = read_answer(data.folder.answer(scenario, seed, name))
         except InputError:

@@ -430,8 +430,6 @@ def test_results_alone_make_a_page(run: Path, tmp_path: Path) -> None:
     page = write_page(alone).read_text()
     missing = page.partition('id="missing"')[2]
     for named in (
-        "preset paper was not run",
-        "preset tunnelcd was not run",
         "unchanged pair",
         "grid",
         "provenance.json",
