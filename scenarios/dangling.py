@@ -55,7 +55,7 @@ def _edges_named(tree: Any) -> list[tuple[Key, list[str]]]:
     for session in ("before", "after"):
         for position, pair in enumerate(pairwise(items_at(mapping_at(tree, session), "route")), start=1):
             found.append(((session, "route", position), list(pair)))
-    return [(key, pair) for key, pair in found if len(_names(pair)) == 2]
+    return [(key, pair) for key, pair in found if len(pair) == len(_names(pair)) == 2]
 
 
 def _repeated_names(tree: Any) -> Iterator[Mistake]:

@@ -21,8 +21,8 @@ _EXTRAS = {"m3c2": "py4dgeo", "dufomap": "dufomap", "kiss": "kiss_matcher", "odo
 
 
 def has_extra(name: str) -> bool:
-    """Return whether an extra is installed; True for a name that is no extra."""
-    return name not in _EXTRAS or find_spec(_EXTRAS[name]) is not None
+    """Return whether an extra of `_EXTRAS` is installed."""
+    return find_spec(_EXTRAS[name]) is not None
 
 
 def require_extra(name: str, asked_by: str) -> None:

@@ -189,7 +189,11 @@ def _report(
     returns, points_map = split("object_returns", np.zeros((0, 2), np.int32)), split("object_points_map", no_points)
     objects = tuple(
         ChangedObject(
-            **{name: getattr(part, name) for name in _OBJECT_FIELDS},
+            session=part.session,
+            kind=part.kind,
+            region=part.region,
+            score=part.score,
+            partner=part.partner,
             returns=of_object,
             points_map=points,
             shape=None if part.shape is None else _shape(part.shape),

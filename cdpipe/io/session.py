@@ -20,11 +20,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, field_validator
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, require_poses, require_shape, require_shapes
@@ -185,25 +185,23 @@ class SessionWriter:
             raise InputError(f"{self._path}: cannot write there: {error.strerror}") from error
 
 
-class _Provenance(Settings):
-    """The field of the provenance that readers use; its value fits int64 stamps."""
-
-    model_config = ConfigDict(extra="allow", strict=True)
-
-    sensor_clock_start_ns: Annotated[int, Field(ge=0, lt=2**62)] = 0
-
-
 class _Header(Settings):
     """The fields of session.json that readers use."""
 
     model_config = ConfigDict(extra="ignore", strict=True)
 
-    format: Literal["tunnelcd-session"]
-    format_version: Literal[2]
     n_scans: int
     chunk_scans: Annotated[int, Field(ge=1)]
     sensor: dict[str, Any]
-    provenance: _Provenance
+    provenance: dict[str, Any]
+
+    @field_validator("provenance")
+    @classmethod
+    def _fits_stamps(cls, provenance: dict[str, Any]) -> dict[str, Any]:
+        start_ns = provenance.get("sensor_clock_start_ns", 0)
+        if type(start_ns) is not int or not 0 <= start_ns < 2**62:
+            raise ValueError(f"sensor_clock_start_ns = {start_ns!r:.40}: expected nanoseconds, 0 to 2^62")
+        return provenance
 
 
 def is_session(path: Path) -> bool:
@@ -222,8 +220,16 @@ def read_session(path: Path) -> Session:
     if not is_session(path):
         raise InputError(f"{path}: no session.json in it: expected a session written by `tunnelcd simulate`")
     source = path / "session.json"
-    document = read_json(source, "expected a session written by `tunnelcd simulate`, copy it again")
-    header = validate(_Header, Document(str(source), document))
+    expected = "expected a session written by `tunnelcd simulate`, copy it again"
+    document = read_json(source, expected)
+    written_as = document.get("format"), document.get("format_version")
+    if written_as != (FORMAT, FORMAT_VERSION):
+        said = f"format {written_as[0]} {written_as[1]}: this version reads {FORMAT} {FORMAT_VERSION}"
+        raise InputError(f"{source}: {said}")
+    try:
+        header = validate(_Header, Document(str(source), document))
+    except InputError as error:
+        raise InputError(f"{error}: {expected}") from error
     n_scans = header.n_scans
     poses = load_arrays(path / "odometry.npz").get("odom_T_sensor")
     if poses is None or len(poses) != n_scans:
@@ -238,7 +244,7 @@ def read_session(path: Path) -> Session:
     except ValueError as error:
         raise InputError(f"{path / 'odometry.npz'}: {error}: correct the pose, or remove the scan") from error
     sensor = parse_metadata(header.sensor, str(source))
-    return Session(path, sensor, poses, header.chunk_scans, document["provenance"])
+    return Session(path, sensor, poses, header.chunk_scans, header.provenance)
 
 
 def chunk_path(folder: Path, index: int) -> Path:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import Float64Array, make_pose
+from cdpipe.core.geometry import Float64Array, make_pose, transform_each
 
 # Prior on an unconstrained anchor; it keeps the system regular.
 _WEAKEST = 1e-6
@@ -62,7 +62,7 @@ class PoseGraph:
         """Return the (K, 3) map position of each place as predicted from one anchor, given by index."""
         apart = places - self.positions[anchors]
         stretched = self.positions[anchors] + (1 + self.stretch) * apart
-        return _apply(self.before_T_after[anchors], stretched)
+        return transform_each(self.before_T_after[anchors], stretched)
 
 
 def solve_pose_graph(
@@ -80,7 +80,7 @@ def solve_pose_graph(
             without a registration.
         per_stretch: (A, 6) error of each registration, rotation and translation, per unit of stretch.
     """
-    measured = _State(before_T_after[:, :3, :3], _apply(before_T_after, positions), 0.0)
+    measured = _State(before_T_after[:, :3, :3], transform_each(before_T_after, positions), 0.0)
     state = measured
     steps = np.diff(positions, axis=0)
     for _ in range(_STEPS):
@@ -166,7 +166,3 @@ def _solve(system: _System, corner: float, slope: float) -> tuple[Float64Array, 
 def _make_poses(rotations: Float64Array, translations: Float64Array, positions: Float64Array) -> Float64Array:
     """Return the (N, 4, 4) transforms with the given rotations that map positions to translations."""
     return make_pose(rotations, translations - np.einsum("aij,aj->ai", rotations, positions))
-
-
-def _apply(dst_T_src: Float64Array, points: Float64Array) -> Float64Array:
-    return np.asarray(np.einsum("aij,aj->ai", dst_T_src[:, :3, :3], points) + dst_T_src[:, :3, 3])

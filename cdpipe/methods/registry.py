@@ -26,6 +26,9 @@ from cdpipe.model.types import DescriptorSet, MergedMaps
 Detect = Callable[[MergedMaps, DescriptorSet, DescriptorSet, PipelineConfig], ChangeReport]
 Propose = Callable[[MergedMaps, DescriptorSet, DescriptorSet, PipelineConfig], ChangeRegions]
 
+# Methods of ours that need an extra of the same name (`cdpipe.core.plugins`).
+_WITH_EXTRAS = ("m3c2", "dufomap")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Method:
@@ -49,7 +52,8 @@ def load_method(name: str) -> Method:
         InputError: No method has this name, it cannot be imported, its extra is not installed, or it is of none of the
             three kinds.
     """
-    require_extra(name, f"method {name}")
+    if name in _WITH_EXTRAS:
+        require_extra(name, f"method {name}")
     found: Any = load_entry_point(METHODS, name)
     made = found() if isinstance(found, type) else found
     propose = getattr(made, "propose", None)

@@ -175,10 +175,8 @@ class PipelineConfig(Settings):
     def _is_registered(cls, method: str) -> str:
         known = entry_points(METHODS)
         if method not in known:
-            raise ValueError(
-                f"no such method{suggest(method, known)} (registered: {', '.join(known)}): "
-                "install the package that has it, or this one again after a new line in its pyproject.toml"
-            )
+            hint = suggest(method, known) or ": install the package that has it"
+            raise ValueError(f"no such method (registered: {', '.join(known)}){hint}")
         return method
 
     @model_serializer(mode="wrap")

@@ -97,12 +97,19 @@ def read_sphere_data(tunnels: Sequence[TunnelShard]) -> SphereData:
         parts["labels"].append(arrays["labels"][covered])
         parts["tunnels"].append(np.full(covered.sum(), place))
         parts["score_radius_m"].append(np.full(covered.sum(), about["score_radius_m"]))
-    joined: dict[str, Any] = {name: np.concatenate(arrays) for name, arrays in parts.items()}
+    joined = {name: np.concatenate(arrays) for name, arrays in parts.items()}
     if len(joined["labels"]) == 0:
         raise InputError("no keyframe of these tunnels was seen by both sessions: make a larger dataset")
-    joined["labels"] = joined["labels"].astype(np.int64)
-    images = ("before_m", "after_m", "before_marks", "after_marks")
-    return SphereData(**joined | {name: torch.from_numpy(joined[name]) for name in images})
+    return SphereData(
+        before_m=torch.from_numpy(joined["before_m"]),
+        after_m=torch.from_numpy(joined["after_m"]),
+        before_marks=torch.from_numpy(joined["before_marks"]),
+        after_marks=torch.from_numpy(joined["after_marks"]),
+        positions=joined["positions"],
+        labels=joined["labels"].astype(np.int64),
+        tunnels=joined["tunnels"],
+        score_radius_m=joined["score_radius_m"],
+    )
 
 
 def sector_targets(before_marks: Tensor, after_marks: Tensor) -> Tensor:

@@ -36,7 +36,7 @@ def run_command(
     seeds: Annotated[str | None, typer.Option(metavar="A:B", help="replaces the plan's seeds; B excluded")] = None,
     preset: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="replaces the plan's variants: a preset or a .yaml file; may be repeated"),
+        typer.Option(metavar="NAME", help="run this preset in place of the plan's variants; may be repeated"),
     ] = None,
     settings: SetSettings = None,
     grid: Annotated[

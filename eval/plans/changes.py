@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -28,7 +29,8 @@ def change_plan(
     Args:
         plan: The plan.
         seeds: "A:B", replaces the plan's seeds.
-        presets: Names or files, replace the plan's variants and its own grids.
+        presets: Names or files, replace the plan's variants, its own grids and its targets. A variant that is a preset
+            alone keeps what the plan sets for it by scenario.
         settings: `key=value`, written over every variant and every grid point.
         grid: `key=v1,v2`; every variant runs at every combination. The plan's own grids stay. Variants merged by the
             truth get neither settings nor grids of `merge`; variants with regions from the truth get none of `query`
@@ -43,7 +45,8 @@ def change_plan(
     if seeds is not None:
         document["seeds"] = parse_seeds(seeds)
     if presets:
-        document |= {"variants": [{"preset": name, "set": [], "per_scenario": {}} for name in presets], "grid": []}
+        document |= {"variants": [_find_variant(document["variants"], name) for name in presets]}
+        document |= {"grid": [], "targets": {}}
     overridden = {get_key(setting) for setting in (*settings, *itertools.chain(*axes))}
     document["variants"] = [
         {
@@ -57,6 +60,14 @@ def change_plan(
     for each in document["grid"]:
         each["keys"].update({get_key(setting): [yaml.safe_load(setting.partition("=")[2])] for setting in settings})
     return validate(Plan, Document(f"plan {plan.name} with the settings of the command line", document))
+
+
+def _find_variant(variants: Sequence[Mapping[str, Any]], preset: str) -> Mapping[str, Any]:
+    """Return the variant of a plan that is this preset alone, or a new one."""
+    name = str(Path(preset).resolve()) if preset.endswith((".yaml", ".yml")) else preset
+    plain = [each for each in variants if each["preset"] == name and not each["set"] and "oracle_merge" not in each]
+    alone = [each for each in plain if not each.get("oracle_regions")]
+    return alone[0] if alone else {"preset": name, "set": [], "per_scenario": {}}
 
 
 def _list_additions(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -109,19 +110,22 @@ def read_targets(provenance: Mapping[str, Any]) -> Targets:
         return Targets()
 
 
-def _take_from_plan(value: Any) -> Any:
+def _take_from_plan(value: Any, named: tuple[str, ...] = ()) -> Any:
     """Replace the name of a plan by the targets of that plan, which may in turn name another plan."""
-    named: set[str] = set()
-    while isinstance(value, str):
-        if value in named:
-            raise ValueError(f"the targets of {value} are those of {value}")
-        named.add(value)
-        try:
-            document = read_plan(value).value
-        except InputError as error:
-            raise ValueError(str(error)) from error
-        value = document.get("targets") if isinstance(document, dict) else None
-    return {} if value is None else value
+    if not isinstance(value, str):
+        return {} if value is None else value
+    if value in named:
+        raise ValueError(f"the targets of {value} are those of {value}")
+    try:
+        document = read_plan(value)
+        if not isinstance(document.value, dict) or "targets" not in document.value:
+            raise ValueError(f"{document.source}: expected a plan with targets")
+        targets = document.value["targets"]
+        if isinstance(targets, str):
+            return _take_from_plan(targets, (*named, value))
+        return validate(_Section, replace(document, value={"targets": targets})).targets
+    except InputError as error:
+        raise ValueError(str(error)) from error
 
 
 PlanTargets = Annotated[Targets, BeforeValidator(_take_from_plan)]

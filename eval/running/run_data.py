@@ -193,9 +193,9 @@ def named_variants(data: RunData, scenario: str) -> list[str]:
 
 
 def pictured_variants(data: RunData, scenario: str) -> list[str]:
-    """Return the variants of pictures and of tables I and II: the paper's, ours and a rival, else the first three."""
+    """Return three variants for pictures and tables I and II: the paper's, ours and a rival, else the first ones."""
     names = named_variants(data, scenario)
-    return [name for name in _PICTURED if name in names] or names[:3]
+    return list(dict.fromkeys([*(name for name in _PICTURED if name in names), *names]))[:3]
 
 
 def first_seed(data: RunData, scenario: str) -> int:

@@ -235,10 +235,10 @@ def _report_tables(
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; {} where it is missing or damaged."""
+    """Read a JSON object; {} where it is missing or damaged. A file that cannot be read is an `OSError`."""
     try:
         document = json.loads(path.read_text())
-    except (OSError, ValueError):
+    except (FileNotFoundError, ValueError):
         return {}
     return document if isinstance(document, dict) else {}
 

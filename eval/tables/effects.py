@@ -1,7 +1,7 @@
 """What a setting of the world does to a method: the same seeds with it and without it, and the mean of the differences.
 
-A world `narrow[sensor.range_noise=false]` is held against `narrow` in the same folder (`eval.plans.worlds.references`).
-A seed draws the same tunnel, the same changes and the same drives in both, so each pair is its own control.
+A world `narrow[sensor.range_noise=false]` is compared with `narrow` in the same folder (`find_references`). A seed
+draws the same tunnel, the same changes and the same drives in both, so each pair is its own control.
 """
 
 from __future__ import annotations

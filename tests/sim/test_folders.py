@@ -15,7 +15,7 @@ ROOT = Path(str(sim.__file__)).parent
 FOLDERS = sorted(".".join(file.relative_to(ROOT.parent).parent.parts) for file in ROOT.rglob("__init__.pyi"))
 
 
-def test_every_folder_exports_what_others_use() -> None:
+def test_every_folder_has_a_stub() -> None:
     assert len(FOLDERS) == len(list(ROOT.rglob("__init__.py")))
 
 
@@ -23,6 +23,7 @@ def test_every_folder_exports_what_others_use() -> None:
 def test_exported_names_exist(name: str) -> None:
     folder = importlib.import_module(name)
     assert folder.__doc__
+    assert folder.__all__
     assert all(getattr(folder, exported) is not None for exported in folder.__all__)
 
 

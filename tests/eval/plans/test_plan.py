@@ -9,6 +9,7 @@ from eval.plans import plan as plan_module
 from eval.plans.changes import change_plan
 from eval.plans.files import plan_names
 from eval.plans.plan import Plan, expand_cells, list_planned_cases, load_plan, parse_seeds
+from eval.plans.targets import Targets
 from eval.plans.variants import name_variant, slug
 from eval.plans.worlds import format_setting, world_slug
 from eval.running.runfolder import reported
@@ -192,6 +193,10 @@ def test_presets_of_the_command_line_replace_the_plan_s_variants_and_grids(tmp_p
     plan = change_plan(read(tmp_path), presets=["c2c", "voxel-diff"], settings=["query.radius_m=6"])
     assert {c.variant for c in expand_cells(plan)} == {"c2c[query.radius_m=6]", "voxel-diff[query.radius_m=6]"}
     assert len(expand_cells(plan)) == 2 * 2 * 2
+    # a preset alone keeps what the plan sets for it at a site; the plan's targets are about its own variants
+    of_plan = {c.scenario: c.config for c in expand_cells(read(tmp_path)) if c.variant == "paper"}
+    assert {c.scenario: c.config for c in expand_cells(change_plan(read(tmp_path), presets=["paper"]))} == of_plan
+    assert change_plan(load_plan("main"), presets=["c2c"]).targets == Targets()
     with pytest.raises(InputError, match=r"voxel-dif.*voxel-diff"):
         change_plan(plan, presets=["voxel-dif"])
 

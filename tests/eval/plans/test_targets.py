@@ -35,8 +35,22 @@ def test_a_run_finds_its_targets_whether_its_plan_was_stored_with_them_or_before
 
 def test_a_plan_that_takes_its_own_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "tiny.yaml"
-    with pytest.raises(InputError, match="targets"):
+    with pytest.raises(InputError, match="are those of"):
         load_plan(written(tmp_path, targets=str(path)))
+
+
+def test_mistakes_of_the_plan_whose_targets_are_taken_are_told_at_its_lines(tmp_path: Path) -> None:
+    other = tmp_path / "other.yaml"
+    for text, told in (
+        ("name: other\ntargts: {}\n", "other.yaml: expected a plan with targets"),
+        ("[1]\n", "other.yaml: expected a plan with targets"),
+        ("targets:\n  regions:\n  - {column: a, nam: x, at_least: 1}\n", 'other.yaml:3: .*did you mean "name"'),
+    ):
+        other.write_text(text)
+        with pytest.raises(InputError, match=told):
+            load_plan(written(tmp_path, targets=str(other)))
+    other.write_text("targets: main\n")
+    assert load_plan(written(tmp_path, targets=str(other))).targets == load_plan("main").targets
 
 
 def test_a_run_of_an_unknown_plan_has_none() -> None:
