@@ -110,20 +110,20 @@ def read_targets(provenance: Mapping[str, Any]) -> Targets:
         return Targets()
 
 
-def _take_from_plan(value: Any, named: tuple[str, ...] = ()) -> Any:
+def _take_from_plan(value: Any) -> Any:
     """Replace the name of a plan by the targets of that plan, which may in turn name another plan."""
-    if not isinstance(value, str):
-        return {} if value is None else value
-    if value in named:
-        raise ValueError(f"the targets of {value} are those of {value}")
+    named: list[str] = []
+    document = Document("", {})
     try:
-        document = read_plan(value)
-        if not isinstance(document.value, dict) or "targets" not in document.value:
-            raise ValueError(f"{document.source}: expected a plan with targets")
-        targets = document.value["targets"]
-        if isinstance(targets, str):
-            return _take_from_plan(targets, (*named, value))
-        return validate(_Section, replace(document, value={"targets": targets})).targets
+        while isinstance(value, str):
+            if value in named:
+                raise ValueError(f"the targets of {value} are those of {value}")
+            named.append(value)
+            document = read_plan(value)
+            if not isinstance(document.value, dict) or "targets" not in document.value:
+                raise ValueError(f"{document.source}: expected a plan with targets")
+            value = document.value["targets"]
+        return validate(_Section, replace(document, value={"targets": value})).targets if named else value or {}
     except InputError as error:
         raise ValueError(str(error)) from error
 
