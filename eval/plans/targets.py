@@ -123,9 +123,11 @@ def _take_from_plan(value: Any) -> Any:
             if not isinstance(document.value, dict) or "targets" not in document.value:
                 raise ValueError(f"{document.source}: expected a plan with targets")
             value = document.value["targets"]
-        return validate(_Section, replace(document, value={"targets": value})).targets if named else value or {}
+        if named:
+            return validate(_Section, replace(document, value={"targets": value})).targets
     except InputError as error:
         raise ValueError(str(error)) from error
+    return {} if value is None else value
 
 
 PlanTargets = Annotated[Targets, BeforeValidator(_take_from_plan)]
