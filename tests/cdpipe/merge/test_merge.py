@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.io.ply import read_ply_points
 from cdpipe.merge.evidence import explain_refusal
+from cdpipe.merge.global_registration import is_kiss_matcher_installed
 from cdpipe.merge.merge import merge_maps
 from cdpipe.merge.registration import register
 from cdpipe.model.config import MergeConfig, load_config
@@ -101,6 +102,7 @@ def test_frame_finds_the_tunnel_too(
     assert map_error_m(merged.before_T_after, true_before_T_after, tunnel_after.map.points) < 0.3
 
 
+@pytest.mark.skipif(not is_kiss_matcher_installed(), reason="needs the extra `kiss`: KISS-Matcher")
 def test_what_is_refused_is_left_to_kiss_matcher(
     tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
 ) -> None:
