@@ -34,10 +34,12 @@ def require_shape(name: str, array: npt.NDArray[Any], shape: tuple[int | None, .
 
 
 def require_shapes(owner: object, **shapes: tuple[int | None, ...]) -> None:
-    """Raise `ValueError` unless each named attribute of `owner` has its shape (`require_shape`) or is None."""
+    """Raise `ValueError` unless each named field of a dataclass has its shape, or is None where its type says so."""
+    fields = owner.__dataclass_fields__  # type: ignore[attr-defined]
     for name, shape in shapes.items():
-        if getattr(owner, name) is not None:
-            require_shape(name, getattr(owner, name), shape)
+        array = getattr(owner, name)
+        if array is not None or "None" not in str(fields[name].type):
+            require_shape(name, np.asarray(array), shape)
 
 
 def require_poses(name: str, poses: npt.NDArray[Any]) -> None:

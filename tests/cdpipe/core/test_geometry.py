@@ -13,6 +13,7 @@ from cdpipe.core.geometry import (
     yaw_pose,
     yaw_rad,
 )
+from cdpipe.model.report import ObjectShape
 
 
 def test_yaw_pose_turns_then_moves() -> None:
@@ -37,6 +38,9 @@ def test_travelled_path_is_a_running_sum() -> None:
 def test_wrong_arrays_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"points must be \(N, 3\), got \(4, 2\)"):
         require_shape("points", np.zeros((4, 2)), (None, 3))
+    with pytest.raises(ValueError, match=r"box_m must be \(3\), got \(\)"):
+        ObjectShape(np.eye(4), None, 1.0)  # type: ignore[arg-type]
+    assert ObjectShape(np.eye(4), np.ones(3), 1.0).box_m.shape == (3,)
     poses = np.stack([np.eye(4)] * 3)
     poses[1, 0, 3] = np.nan
     with pytest.raises(ValueError, match=r"poses\[1\] is not finite"):
