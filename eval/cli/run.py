@@ -11,7 +11,7 @@ import typer
 
 from eval.cli.options import Quiet, RunOut, Scheduler, SetSettings, Workers
 from eval.cli.printed_results import print_comparison, print_results
-from eval.core.printing import print_row, say
+from eval.core.printing import print_row, say, warn
 from eval.core.progress import shown_progress
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def run_command(
     quiet: Quiet = False,
 ) -> None:
     """Run a plan: scenarios x seeds x variants. Finished cells are kept."""
-    from eval.core.cluster import Where, require_reachable, require_usable
+    from eval.core.cluster import Where, exposure, require_reachable, require_usable
     from eval.plans.changes import change_plan
     from eval.plans.plan import load_plan
 
@@ -62,6 +62,7 @@ def run_command(
         _list_cells(chosen, out, force=force, limit=limit)
     else:
         require_reachable(where)
+        warn(exposure(where))
         _run(chosen, out, where, force=force, limit=limit, quiet=quiet)
 
 

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from eval.cli.options import Families, Quiet, Scheduler, SetSettings, Workers
-from eval.core.printing import say
+from eval.core.printing import say, warn
 from eval.core.progress import shown_progress
 
 
@@ -31,13 +31,16 @@ def dataset(
     quiet: Quiet = False,
 ) -> None:
     """Make training data for descriptors, one shard per tunnel. Finished tunnels are kept."""
-    from eval.core.cluster import Where
+    from eval.core.cluster import Where, exposure, require_reachable, require_usable
     from eval.training.dataset import Recipe
     from eval.training.dataset_run import make_dataset
 
-    recipe = Recipe(draws, error_m, error_deg, tuple(settings or ()))
+    recipe, where = Recipe(draws, error_m, error_deg, tuple(settings or ())), Where(workers, scheduler)
+    require_usable(where)
+    require_reachable(where)
+    warn(exposure(where))
     with shown_progress(quiet, rate="tunnels") as progress:
-        command, where = shlex.join(["tunnelcd", *sys.argv[1:]]), Where(workers, scheduler)
+        command = shlex.join(["tunnelcd", *sys.argv[1:]])
         outcome = make_dataset(families, seeds, recipe, out, where, limit, command, progress)
     left = f", {outcome.n_left} left by --limit" if outcome.n_left else ""
     refused = f", {outcome.n_refused} refused (README.md says why)" if outcome.n_refused else ""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from eval.cli.options import Families, OutFolder, Quiet, SetSettings
-from eval.core.printing import print_table, say
+from eval.core.printing import print_table, say, warn
 from eval.core.progress import shown_progress
 
 if TYPE_CHECKING:
@@ -80,7 +80,9 @@ def view(
     ] = None,
     settings: SetSettings = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port of the server; 0 takes a free one")] = 8080,
-    host: Annotated[str, typer.Option(help="address of the server; 0.0.0.0 admits other machines")] = "localhost",
+    host: Annotated[
+        str, typer.Option(help="address of the server; 0.0.0.0 admits other machines, with a warning")
+    ] = "localhost",
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="write one offline page and end", show_default=False)
     ] = None,
@@ -90,6 +92,7 @@ def view(
     import time
 
     from cdpipe.core.errors import InputError
+    from eval.core.exposure import is_loopback
     from sim.view.viewer import require_viser, running_server, show, write_html
 
     require_viser()
@@ -99,6 +102,8 @@ def view(
         write_html(load_view(what, seed, settings or ()), html)
         say(quiet, f"{html}: {what}, {html.stat().st_size / 1e6:.1f} MB, opens in any browser")
         return
+    if not is_loopback(host):
+        warn(f"--host {host}: everybody who reaches port {port} sees the scene; the server asks for no password")
     with running_server(port, host) as server:
         shown = load_view(what, seed, settings or ())
         show(server, shown)

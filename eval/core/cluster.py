@@ -15,15 +15,18 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import urlsplit
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.threads import THREAD_VARIABLES, THREADS, fix_threads
+from eval.core.exposure import is_loopback
 from eval.core.provenance import versions
 
 # By this variable Dask's workers return freed memory to the system at once, which takes a quarter of a pair's time.
 _ENVIRONMENT, _TRIM = "distributed.nanny.pre-spawn-environ", "MALLOC_TRIM_THRESHOLD_"
+_SCRATCH, _LOOPBACK = "temporary-directory", "127.0.0.1"
 _PROBE_S, _CONNECT_S = 3.0, 6.0  # an unreachable address is reported within ten seconds
 
 
@@ -67,6 +70,16 @@ def require_reachable(where: Where) -> None:
         raise _unreachable(where.scheduler, error) from error
 
 
+def exposure(where: Where) -> str:
+    """Return a warning where other machines may reach the scheduler without a certificate, "" where they may not."""
+    if where.scheduler is None or where.scheduler.startswith("tls://") or is_loopback(_host(where.scheduler)):
+        return ""
+    return (
+        f"--scheduler {where.scheduler}: who reaches this port can run code on the scheduler, its workers and here: "
+        "use tls:// (eval/running/RUNNING.md tells how), or a network in which you trust everybody"
+    )
+
+
 @contextmanager
 def connected(where: Where, n_tasks: int) -> Iterator[Any]:
     """Yield a Dask client of the named scheduler, or of local worker processes, at most one per task.
@@ -101,24 +114,47 @@ def _of_this_machine(where: Where, n_tasks: int) -> Iterator[Any]:
     settings = {
         "n_workers": min(where.workers or 1, n_tasks),
         "threads_per_worker": 1,
-        "dashboard_address": ":0",  # any free port, so that two runs can work at the same time
+        "host": _LOOPBACK,  # whoever reaches a port can run code
+        "dashboard_address": f"{_LOOPBACK}:0",  # any free port, so that two runs can work at the same time
         "memory_limit": None,
         "silence_logs": logging.CRITICAL,
         # Ctrl-C reaches every process of the terminal; workers ignore it and are ended by this process
         "preload": [__name__],
     }
-    with dask.config.set({_ENVIRONMENT: environment}), LocalCluster(**settings) as cluster, Client(cluster) as client:
+    # workers search their scratch folder for packages: it must not be one that another user may have made
+    with (
+        TemporaryDirectory(prefix="tunnelcd-", ignore_cleanup_errors=True) as scratch,
+        dask.config.set({_ENVIRONMENT: environment, _SCRATCH: scratch}),
+        _safe_path(),
+        LocalCluster(**settings) as cluster,
+        Client(cluster) as client,
+    ):
         yield client
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Let Python processes that are started meanwhile not begin with the working folder on their path."""
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONSAFEPATH"]
 
 
 @contextmanager
 def _of_scheduler(address: str) -> Iterator[Any]:
     from distributed import Client  # noqa: PLC0415 - as above
+    from distributed.security import Security  # noqa: PLC0415 - as above
 
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # the error is one line of ours
     try:
         _probe(address)
+        if address.startswith("tls://") and Security().get_connection_args("client")["ssl_context"] is None:
+            raise ValueError("Dask's settings name no certificate: eval/running/RUNNING.md tells which it needs")
         client = Client(address, timeout=_CONNECT_S)
     except (OSError, ValueError, MemoryError) as error:  # MemoryError: the peer speaks another protocol
         raise _unreachable(address, error) from error
@@ -144,6 +180,13 @@ def _probe(address: str) -> None:
             # a scheduler sends first; Dask would wait for its full timeout on a silent peer
             if parts.scheme == "tcp" and not knocked.recv(1):
                 raise OSError("what listens there is no scheduler")
+
+
+def _host(address: str) -> str:
+    try:
+        return urlsplit(address).hostname or ""
+    except ValueError:
+        return ""
 
 
 def _unreachable(address: str, error: Exception) -> InputError:

@@ -42,6 +42,12 @@ def say(quiet: bool, text: str) -> None:
         typer.echo(text)
 
 
+def warn(text: str) -> None:
+    """Print a warning on standard error, also with --quiet; nothing for an empty text."""
+    if text:
+        typer.echo(f"warning: {text}", err=True)
+
+
 def _cell(value: Any) -> str:
     if value is None:
         return "-"

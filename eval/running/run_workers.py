@@ -9,7 +9,6 @@ too. Other cells are not suspected, also where a worker has several threads.
 
 from __future__ import annotations
 
-import pickle
 import socket
 import time
 import uuid
@@ -21,9 +20,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter, ValidationError
+
 from cdpipe.core.errors import InputError
+from cdpipe.core.isolation import ProcessDiedError, run_isolated
 from eval.core.cluster import is_shared, n_slots
-from eval.core.isolation import run_isolated
 from eval.core.progress import RunProgress, Silent
 from eval.running.pair_run import Made, Pair, PairRun, Todo, cell_key, is_finished, pair_lock
 from eval.running.runfolder import RunFolder
@@ -46,6 +47,13 @@ class Task:
     pair: Pair
     made: Made
     metrics_version: int = METRICS_VERSION
+
+    def as_json(self) -> str:
+        """Return the document that a worker receives."""
+        return _TASK.dump_json(self).decode()
+
+
+_TASK = TypeAdapter(Task)
 
 
 def run_on_workers(client: Any, run: RunFolder, pairs: Sequence[Pair], made: Made, progress: RunProgress) -> None:
@@ -119,7 +127,7 @@ class _Dispatch:
             pair = self._waiting.popleft()
             made = replace(self._made, is_contended=is_shared(self._client))
             task = Task(self._run.path, self._token, pair, made)
-            self._flying[self._client.submit(work_on, pickle.dumps(task), pure=False)] = pair
+            self._flying[self._client.submit(work_on, task.as_json(), pure=False)] = pair
 
     def _take(self, future: Any, pair: Pair) -> None:
         from distributed import KilledWorker  # noqa: PLC0415 - as above
@@ -149,13 +157,17 @@ class _Dispatch:
         self._progress.cells(names, n_done, self._n_total)
 
 
-def work_on(pickled: bytes) -> str:
-    """Run a pair's unfinished cells; runs on a worker.
+def work_on(document: str) -> str:
+    """Run the unfinished cells of a task; runs on a worker.
 
     Returns:
         "", or why this worker cannot.
     """
-    task: Task = pickle.loads(pickled)
+    try:
+        task = _TASK.validate_json(document)
+    except ValidationError as error:
+        mistake = f"a worker on {socket.gethostname()} cannot read its task ({error.errors()[0]['msg']})"
+        return f"{mistake}: start it anew with the same version of tunnelcd and of its plug-ins"
     if problem := _unfit(task):
         return problem
     run, pair = RunFolder(task.folder), task.pair
@@ -175,8 +187,9 @@ def work_on(pickled: bytes) -> str:
     return ""
 
 
-def open_or_do(task: Task) -> None:
-    """Open a task's pair, and run its cells."""
+def open_or_do(document: str) -> None:
+    """Open a task's pair, and run its cells; runs in a process of its own."""
+    task = _TASK.validate_json(document)
     alone = PairRun(RunFolder(task.folder), task.pair, task.made, Silent())
     alone.open()
     for each in task.pair.todo:
@@ -191,7 +204,7 @@ def _death_of_opening(task: Task, here: PairRun) -> str:
     with _traced(trace) as n_begun:
         if n_begun >= _TRIES:
             return "several times"
-        if n_begun and (death := run_isolated(open_or_do, _only(task))):
+        if n_begun and (death := _death_alone(_only(task))):
             return death
         here.open()
     return ""
@@ -203,8 +216,17 @@ def _death_of_cell(task: Task, here: PairRun, each: Todo, trace: Path) -> str:
         if n_begun >= _TRIES:
             return "several times"
         if n_begun:
-            return run_isolated(open_or_do, _only(task, each))
+            return _death_alone(_only(task, each))
         here.do(each)
+    return ""
+
+
+def _death_alone(task: Task) -> str:
+    """Run a task in a process of its own, and return what killed it, "" if nothing did."""
+    try:
+        run_isolated(open_or_do, task.as_json())
+    except ProcessDiedError as death:
+        return str(death)
     return ""
 
 

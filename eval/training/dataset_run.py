@@ -15,6 +15,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.training.shard import FORMAT, FORMAT_VERSION, SUFFIX, read_about
 from eval.core.cluster import HERE, Where, connected, n_slots, require_usable
@@ -196,8 +198,15 @@ def _keep(out: Path, tunnel: Tunnel, result: bytes | str) -> None:
     (out / tunnel.refusal).unlink(missing_ok=True)
 
 
-def _attempt(tunnel: Tunnel, recipe: Recipe) -> bytes | str:
+def attempt_task(document: str) -> bytes | str:
     """Return a tunnel's shard, or the reason why it cannot be built; runs on the worker."""
+    return _attempt(*_TASK.validate_json(document))
+
+
+_TASK = TypeAdapter(tuple[Tunnel, Recipe])
+
+
+def _attempt(tunnel: Tunnel, recipe: Recipe) -> bytes | str:
     try:
         return make_shard(tunnel.family, tunnel.seed, recipe)
     except ScenarioError as error:
@@ -224,7 +233,7 @@ def _from_cluster(client: Any, tunnels: Sequence[Tunnel], recipe: Recipe) -> Ite
     def submitted(n: int) -> list[Any]:
         futures = []
         for _, tunnel in zip(range(n), waiting, strict=False):
-            futures.append(client.submit(_attempt, tunnel, recipe, pure=False))
+            futures.append(client.submit(attempt_task, _TASK.dump_json((tunnel, recipe)).decode(), pure=False))
             tunnel_of[futures[-1].key] = tunnel
         return futures
 

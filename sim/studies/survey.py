@@ -5,15 +5,17 @@ from __future__ import annotations
 import csv
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from cdpipe.core.errors import InputError, TunnelcdError
 from cdpipe.core.geometry import Float64Array
+from cdpipe.core.isolation import ProcessDiedError, run_isolated
 from cdpipe.sensor.ouster import load_profile
 from scenarios.library import load_scenario
 from sim.drive.trajectory import plan_trajectory
@@ -205,12 +207,25 @@ def _results(family: str, seeds: Sequence[int], workers: int) -> Iterator[WorldF
     if workers == 1:
         yield from (_try_seed(family, seed) for seed in seeds)
         return
-    # forked children would inherit the locks of the ray caster's threads
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        tasks = {pool.submit(_try_seed, family, seed): seed for seed in seeds}
-        for task in as_completed(tasks):
-            error = task.exception()
-            yield task.result() if error is None else Failure(family, tasks[task], f"the process died: {error}")
+    with ThreadPoolExecutor(workers) as pool:
+        for task in as_completed([pool.submit(_try_isolated, family, seed) for seed in seeds]):
+            yield task.result()
+
+
+def _try_isolated(family: str, seed: int) -> WorldFigures | Failure:
+    """Try a seed in a process of its own."""
+    try:
+        return _RESULT.validate_python(run_isolated(try_document, [family, seed]))
+    except ProcessDiedError as death:
+        return Failure(family, seed, f"the process died: {death}")
+
+
+def try_document(document: list[Any]) -> dict[str, Any]:
+    """Try a seed, given [family, seed], and return the fields of its result."""
+    return asdict(_try_seed(*document))
+
+
+_RESULT: TypeAdapter[WorldFigures | Failure] = TypeAdapter(WorldFigures | Failure)
 
 
 def _try_seed(family: str, seed: int) -> WorldFigures | Failure:

@@ -4,7 +4,6 @@ import errno
 import importlib
 import json
 import os
-import pickle
 import shutil
 import signal
 import subprocess
@@ -13,24 +12,25 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pandas as pd
 import pytest
+from pydantic import TypeAdapter
 
 from cdpipe.core.errors import InputError
 from eval.core import cluster, progress
 from eval.core.cluster import Where
-from eval.core.isolation import run_isolated
 from eval.core.progress import Lines
+from eval.plans.files import plan_names
 from eval.plans.plan import Plan, expand_cells, load_plan
 from eval.plans.variants import slug
 from eval.running import pair_run, runner
 from eval.running.pair_run import Made, Tools
-from eval.running.run_workers import Task, remove_traces, work_on
+from eval.running.run_workers import Task, _unfit, remove_traces, work_on
 from eval.running.runfolder import RunFolder, start_run_folder, write_json
 from eval.running.runner import RunOutcome, run_plan
 
@@ -334,11 +334,16 @@ def test_a_machine_is_shared_where_two_tasks_run_at_a_time() -> None:
     assert cluster.n_slots(cluster_of(a_1=2, b_1=1)) == 3
 
 
-def test_what_ends_a_process_of_its_own_is_told() -> None:
-    assert run_isolated(os.getpid) == ""
-    assert run_isolated(os._exit, 3) == "exit code 3"
-    with pytest.raises(FileNotFoundError):
-        run_isolated(os.stat, "/nowhere")
+@pytest.mark.parametrize("name", plan_names())
+def test_a_task_is_the_same_after_its_way_through_json(tmp_path: Path, name: str) -> None:
+    plan = load_plan(name)
+    plan = plan.model_copy(update={"seeds": plan.seeds[:1]})
+    for pair in runner._pairs(RunFolder(tmp_path), plan, expand_cells(plan), False, Tools()):
+        task = Task(tmp_path, "token", pair, Made("commit"))
+        came = TypeAdapter(Task).validate_json(task.as_json())
+        assert came.as_json() == task.as_json()
+        assert _unfit(replace(came, token="")) == ""
+        assert asdict(came) == asdict(task)
 
 
 @pytest.mark.usefixtures("copies")
@@ -425,9 +430,9 @@ def test_a_worker_that_cannot_do_what_its_client_would_says_why(tmp_path: Path, 
         (replace(task, pair=stale), "has other files, weights, extras or metrics"),
         (replace(task, metrics_version=-1), "has other files, weights, extras or metrics"),
     ):
-        assert told in work_on(pickle.dumps(changed))
+        assert told in work_on(changed.as_json())
         assert [path.name for path in (tmp_path / "run").rglob("*")] == [".workers"]
-    assert work_on(pickle.dumps(task)) == ""
+    assert work_on(task.as_json()) == ""
     cell = RunFolder(task.folder).read_cell(RunFolder(task.folder).cell("smoke/one_box", 20000, FIRST))
     assert cell is not None
     assert (cell["row"]["status"], cell["row"]["commit"], cell["row"]["is_contended"]) == ("ok", "commit", True)
@@ -445,7 +450,7 @@ def test_what_was_begun_too_often_is_not_begun_again(tmp_path: Path, plan: Plan,
     }
     traces[place].parent.mkdir(parents=True)
     traces[place].write_text("3")
-    assert work_on(pickle.dumps(task)) == ""
+    assert work_on(task.as_json()) == ""
     states = [
         json.loads(run.cell("smoke/one_box", 20000, name).read_text())["row"]["status"] for name in (FIRST, SECOND)
     ]
@@ -468,7 +473,7 @@ def test_a_run_that_is_stopped_ends_after_the_cell_in_flight(
         remove_traces(RunFolder(task.folder))  # as another run does that takes the folder
 
     monkeypatch.setattr(pair_run, "_answer", answer)
-    assert work_on(pickle.dumps(task)) == "the run was stopped"
+    assert work_on(task.as_json()) == "the run was stopped"
     assert [path.name.partition(".")[0] for path in task.folder.glob("cells/*/*/*.json")] == [slug(FIRST)]
 
 
@@ -483,6 +488,38 @@ def test_lines_tell_the_pace_and_the_time_left(
         lines.cells("narrow 7", done, total)
     told = ["[10/40] narrow 7", "[16/40] narrow 7; 6 cells/min, 4 min 00 s left", "[18/18] narrow 7; 2.67 cells/min"]
     assert capsys.readouterr().err.splitlines() == told
+
+
+PROGRAM = """
+import json, os, psutil, sys
+from eval.core import cluster
+
+if __name__ == "__main__":
+    with cluster.connected(cluster.Where(workers=2), 2) as client:
+        own = [psutil.Process(), *psutil.Process().children(recursive=True)]
+        pids, listed = {each.pid for each in own}, psutil.net_connections("inet")
+        hosts = {each.laddr.ip for each in listed if each.pid in pids and each.status == "LISTEN"}
+        scratch = client.run(lambda dask_worker: dask_worker.local_directory)
+        top = {os.path.dirname(os.path.dirname(folder)) for folder in scratch.values()}
+        modes = [os.stat(folder).st_mode & 0o777 for folder in top]
+        print(json.dumps({"hosts": sorted(hosts), "modes": modes, "folders": sorted(top), "n_processes": len(own)}))
+"""
+
+
+def test_workers_of_this_machine_let_nobody_in(tmp_path: Path, environment: dict[str, str]) -> None:
+    hostile, program = tmp_path / "hostile", tmp_path / "bin" / "program"
+    hostile.mkdir()
+    for name in ("json", "pickle", "multiprocessing", "cdpipe"):
+        (hostile / f"{name}.py").write_text("from pathlib import Path\nPath('run').touch()\n")
+    program.parent.mkdir()
+    program.write_text(PROGRAM)
+    argv, options = [sys.executable, str(program)], {"cwd": hostile, "env": environment, "capture_output": True}
+    told = json.loads(subprocess.run(argv, check=True, **options).stdout)  # type: ignore[call-overload]
+    assert told["n_processes"] > 2
+    assert told["hosts"] == ["127.0.0.1"]
+    assert told["modes"] == [0o700]
+    assert not any(Path(folder).exists() for folder in told["folders"])
+    assert not (hostile / "run").exists()
 
 
 def test_workers_of_this_machine_keep_freed_memory_and_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ import pytest
 from cdpipe.core.errors import InputError
 from eval.cli.tools import check_file
 from eval.core import cluster
-from eval.core.cluster import Where, require_reachable
+from eval.core.cluster import Where, exposure, require_reachable
 from eval.core.progress import Lines, Silent
 from eval.plans.plan import Plan, load_plan
 from eval.running import runner
@@ -99,6 +99,34 @@ def test_what_accepts_and_does_not_speak_is_no_scheduler(monkeypatch: pytest.Mon
             require_reachable(Where(scheduler=address))
         assert 0.4 < time.monotonic() - start < 5
     require_reachable(Where(workers=2))
+
+
+@pytest.mark.parametrize(
+    ("address", "is_told"),
+    [
+        ("tcp://127.0.0.1:8786", False), ("tcp://[::1]:8786", False), ("tcp://localhost:8786", False),
+        ("tls://10.0.0.7:8786", False), ("tcp://10.0.0.7:8786", True), ("tcp://node:8786", True),
+        ("10.0.0.7:8786", True), ("tcp://[::2]:8786", True), ("tcp://[:8786", True), (None, False),
+    ],
+)  # fmt: skip
+def test_a_scheduler_that_other_machines_reach_without_a_certificate_is_told(
+    address: str | None, is_told: bool
+) -> None:
+    assert ("can run code" in exposure(Where(scheduler=address))) == is_told
+
+
+def test_the_warning_is_one_line_before_the_run_also_with_quiet(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object) -> None:
+        raise InputError("far enough")
+
+    monkeypatch.setattr(cluster, "_probe", lambda address: None)
+    monkeypatch.setattr(runner, "connected", stopped)
+    argv = ("run", "smoke", "--scheduler", "tcp://10.0.0.7:8786", "--quiet", "--out", tmp_path / "run")
+    warning, error = command(*argv)[2].splitlines()
+    assert warning == f"warning: {exposure(Where(scheduler='tcp://10.0.0.7:8786'))}"
+    assert error == "error: far enough"
 
 
 def test_a_scheduler_is_knocked_at_before_anything_is_loaded(

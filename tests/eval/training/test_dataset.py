@@ -349,8 +349,12 @@ def test_an_unreachable_scheduler_is_named_and_leaves_no_folder(
 
     monkeypatch.setattr(cluster.importlib.util, "find_spec", lambda name: object())  # as if the extra were there
     monkeypatch.setattr(dataset_run, "_computed", unreachable)
-    code, _, err = command("dataset", FAMILY, "--seeds", "0", "--scheduler", "tcp://a:1", "--out", tmp_path / "d", "-q")
-    assert (code, err) == (2, "error: --scheduler tcp://a:1: cannot be reached\n")
+    with pytest.raises(InputError, match="cannot be reached"):
+        make_dataset([FAMILY], "0", RECIPE, tmp_path / "d", Where(scheduler="tcp://a:1"))
+    assert not (tmp_path / "d").exists()
+    argv = ("dataset", FAMILY, "--seeds", "0", "--scheduler", "tcp://127.0.0.1:9", "--out", tmp_path / "d", "-q")
+    code, _, err = command(*argv)
+    assert code == 2 and err.startswith("error: --scheduler tcp://127.0.0.1:9: cannot") and err.count("\n") == 1
     assert not (tmp_path / "d").exists()
 
 

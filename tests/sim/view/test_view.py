@@ -24,6 +24,7 @@ from sim.scene import build_world
 from sim.session.simulate import simulate_pair
 from sim.session.truth import read_pair_truth, read_true_poses
 from sim.view import view as view_module
+from sim.view import viewer
 from sim.view.returns import CHANGE_RGB, session_cloud
 from sim.view.view import View, view_folder, view_pair, view_scenario, wall_bands
 from sim.view.viewer import require_viser, running_server, show, write_html
@@ -295,6 +296,27 @@ def test_the_server_runs_until_interrupted(
     assert not caught.value.code
     assert re.fullmatch(rf"{re.escape(str(pair / 'after'))}: http://localhost:\d+ \(Ctrl-C ends\)\n", out)
     assert err == ""
+
+
+@pytest.mark.parametrize(("host", "n_warnings"), [("127.0.0.1", 0), ("::1", 0), ("0.0.0.0", 1), ("gate.example", 1)])
+def test_an_address_that_other_machines_reach_is_told(
+    host: str, n_warnings: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*_: object) -> None:
+        raise InputError("far enough")
+
+    monkeypatch.setattr(viewer, "running_server", stopped)
+    with pytest.raises(SystemExit):
+        main(["view", "smoke/one_box", "--host", host, "--quiet"])
+    *warnings, error = capsys.readouterr().err.splitlines()
+    assert [line.partition(":")[0] for line in warnings] == ["warning"] * n_warnings
+    assert error == "error: far enough"
+
+
+def test_the_server_listens_on_loopback_unless_told_otherwise(server: Any) -> None:
+    with socket.socket() as asked, pytest.raises(ConnectionRefusedError):
+        asked.connect(("127.0.0.2", server.get_port()))  # of this machine too, and answered where all addresses are
+    socket.create_connection(("127.0.0.1", server.get_port())).close()
 
 
 def test_a_foreign_mesh_without_drifts_is_shown(tmp_path: Path, make_scenario: Callable[..., Scenario]) -> None:
