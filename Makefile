@@ -8,10 +8,12 @@ TEST_PROCESSES ?= 2
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 EXTRAS := cluster,dufomap,kiss,m3c2,odometry,ouster,view
 LOWEST := .venv-lowest
+NEWEST := .venv-newest
+PYTHONS ?= python3.11 python3.13
 # One process per core and one thread in each; the tests of one file stay in one process and share what it has set up.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
 
-.PHONY: setup demo test test-lowest lowest soak check report clean
+.PHONY: setup demo test test-lowest lowest test-newest test-pythons soak check report clean
 
 setup: $(VENV)/.installed-dev
 
@@ -53,6 +55,27 @@ lowest: $(BIN)/python
 		$(foreach extra,test $(subst $(comma), ,$(EXTRAS)),--extra $(extra)) \
 		--no-annotate --custom-compile-command 'make lowest' --output-file .constraints-lowest.txt
 
+# All tests with the newest version of every package that pyproject.toml allows, on the day of the installation.
+test-newest: $(NEWEST)/.installed
+	OMP_NUM_THREADS=1 $(NEWEST)/bin/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
+
+$(NEWEST)/.installed: pyproject.toml
+	$(PYTHON) -m venv --clear $(NEWEST)
+	$(NEWEST)/bin/python -m pip --disable-pip-version-check install --quiet --editable '.[test,$(EXTRAS)]'
+	touch $@
+
+# Plan smoke on each of PYTHONS with the pinned packages: answers and rows are equal to the byte.
+test-pythons: $(BIN)/python $(PYTHONS:%=.venv-%/.installed)
+	rm -rf out/pythons
+	for python in $(PYTHONS); do .venv-$$python/bin/tunnelcd run smoke --out out/pythons/$$python --quiet || exit; done
+	for python in $(wordlist 2,9,$(PYTHONS)); do \
+		$(BIN)/python tests/same_numbers.py out/pythons/$(firstword $(PYTHONS)) out/pythons/$$python || exit; done
+
+$(PYTHONS:%=.venv-%/.installed): .venv-%/.installed: pyproject.toml constraints.txt
+	$* -m venv --clear .venv-$*
+	.venv-$*/bin/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt --editable .
+	touch $@
+
 soak: $(VENV)/.installed-dev
 	$(PYTEST) -m soak
 
@@ -66,5 +89,5 @@ report: $(VENV)/.installed
 	$(BIN)/tunnelcd report $(OUT)
 
 clean:
-	rm -rf $(VENV) $(LOWEST) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) $(LOWEST) $(NEWEST) .venv-python* build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
