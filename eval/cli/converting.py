@@ -27,8 +27,8 @@ def convert(
     odometry: Annotated[
         str | None, typer.Option(metavar="kiss-icp", help="estimate the poses", show_default=False)
     ] = None,
-    without_truth: Annotated[
-        bool, typer.Option("--without-truth", help="leave LABEL and INSTANCE out of the .osf")
+    with_truth: Annotated[
+        bool, typer.Option("--with-truth/--without-truth", help="write the truth into the .osf as LABEL and INSTANCE")
     ] = False,
     quiet: Quiet = False,
 ) -> None:
@@ -43,13 +43,13 @@ def convert(
             if value is not None:
                 raise InputError(f"{source}: a session has its own poses and sensor: leave --{name} out")
         with shown_progress(quiet) as progress:
-            say(quiet, _export(source, out, progress, without_truth=without_truth))
+            say(quiet, _export(source, out, progress, with_truth=with_truth))
         return
     if source.suffix.lower() not in RECORDING_SUFFIXES:
         what = "expected a session folder" if source.exists() else "no such file or folder: expected a session"
         raise InputError(f"{source}: {what}, or a recording ({', '.join(RECORDING_SUFFIXES)})")
-    if without_truth:
-        raise InputError(f"{source}: a recording has no truth: leave --without-truth out")
+    if with_truth:
+        raise InputError(f"{source}: a recording has no truth: leave --with-truth out")
     if out.suffix.lower() in RECORDING_SUFFIXES:
         raise InputError(f"{out}: a recording becomes a session: name a new folder")
     with shown_progress(quiet) as progress, made_parents(out):
@@ -62,7 +62,9 @@ def convert(
     say(quiet, told)
 
 
-def _export(source: Path, out: Path, progress: RunProgress, *, without_truth: bool) -> str:
+def _export(source: Path, out: Path, progress: RunProgress, *, with_truth: bool) -> str:
+    from dataclasses import replace
+
     import numpy as np
 
     from cdpipe.core.errors import InputError
@@ -76,13 +78,17 @@ def _export(source: Path, out: Path, progress: RunProgress, *, without_truth: bo
     if is_session(source / "before"):
         raise InputError(f"{source}: a pair of sessions: convert {source / 'before'} and {source / 'after'} one by one")
     session = read_session(source)
-    has_truth = (source / "truth").is_dir() and not without_truth
+    if with_truth and not (source / "truth").is_dir():
+        raise InputError(f"{source}: there is no truth in it: leave --with-truth out")
+    if not with_truth:  # a profile of one's own is a path, which can tell the scenario
+        told = {name: value for name, value in session.provenance.items() if name != "sensor_profile"}
+        session = replace(session, provenance=told)
     # LABEL is the change's id, 0 none; INSTANCE is as in sim.session.truth
     labels = read_labels(session.path, session.n_chunks)
     fields = ({"LABEL": of.astype(np.uint16), "INSTANCE": instance.astype(np.int16)} for instance, of in labels)
     with made_parents(out):
-        write_osf(session, out, fields if has_truth else None, progress.stage)
-    also = "with truth as fields LABEL and INSTANCE" if has_truth else "without truth"
+        write_osf(session, out, fields if with_truth else None, progress.stage)
+    also = "with truth as fields LABEL and INSTANCE" if with_truth else "without truth"
     return f"{out}: {_revolutions(session.n_scans)}, {also}, {out.stat().st_size / 1e6:.1f} MB"
 
 

@@ -35,7 +35,7 @@ class _Funnel(TyperGroup):
             raise typer.Exit(130) from error
 
 
-_KEPT = {"run": "cells", "demo": "cells", "dataset": "tunnels"}
+_KEPT = {"run": "cells", "demo": "cells", "dataset": "tunnels", "export": "pairs"}
 app = typer.Typer(
     cls=_Funnel,
     no_args_is_help=True,
@@ -54,6 +54,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "convert": converting.convert,
     "score": commands_run.score,
     "run": commands_run.run_command,
+    "export": commands_run.export,
     "report": commands_run.report,
     "dataset": commands_training.dataset,
     "train": commands_training.train,

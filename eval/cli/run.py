@@ -106,6 +106,28 @@ def score(
     say(quiet, f"{folder}: {n_scored} {told}, tables rewritten")
 
 
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="a run folder")],
+    out: Annotated[
+        Path, typer.Option("--out", help="folder: new, empty, or of an earlier export to continue", show_default=False)
+    ],
+    blind: Annotated[
+        bool,
+        typer.Option("--blind/--with-truth", help="without truth and under opaque names; or the pairs as they are"),
+    ] = True,
+    quiet: Quiet = False,
+) -> None:
+    """Copy the sessions of a run for another program: without truth, under names that tell nothing."""
+    from eval.running.export import export_blind, export_with_truth
+    from eval.running.runfolder import open_run_folder
+
+    run = open_run_folder(folder)
+    with shown_progress(quiet) as progress:
+        n_written = (export_blind if blind else export_with_truth)(run, out, progress)
+    told = "without truth; blind.json of the run says which is which" if blind else "with truth"
+    say(quiet, f"{out}: {n_written} pairs of sessions {told}")
+
+
 def report(
     folder: Annotated[str, typer.Argument(metavar="RUN", help="a run folder")],
     other: Annotated[

@@ -1,6 +1,7 @@
 """Adds the predictions of another program to a run, as a variant.
 
     DIR/<scenario>/<seed>/answer.json, answer.npz     in the format of eval/scoring/ANSWERS.md
+    DIR/<opaque name>/answer.json, answer.npz         the same, of a pair that `tunnelcd export` handed out blind
 
 Every pair of the run needs a prediction; otherwise its means would be over other pairs than those of the other
 variants. A pair that the program could not do gets an answer.json of status `failed` and scores like our failures.
@@ -9,8 +10,9 @@ variants. A pair that the program could not do gets an answer.json of status `fa
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pandas as pd
@@ -22,8 +24,9 @@ from eval.core.progress import RunProgress, Silent
 from eval.plans.coverage import read_stored_plan
 from eval.plans.plan import list_planned_cases
 from eval.plans.variants import slug
+from eval.running.export import copy_pair, list_pairs, name_blindly
 from eval.running.rescoring import LAST, NO_KEY, cell_document, foreign_identity
-from eval.running.runfolder import RunFolder, remove, write_json, write_tables
+from eval.running.runfolder import RunFolder, open_run_folder, remove, write_json, write_tables
 from eval.running.sides import list_versions
 from eval.scoring.scoring import METRICS_VERSION, score_stored
 from eval.truth.ground_truth import load_ground_truth
@@ -45,8 +48,7 @@ def add_predictions(run: RunFolder, folder: Path, name: str, progress: RunProgre
             at once), the name is taken, or the run was scored by other metrics.
     """
     progress = progress or Silent()
-    pairs = sorted(run.path.glob("pairs/*/*/truth"))
-    found = _matched(run, folder, [truth.parent for truth in pairs])
+    found = _matched(run, folder, list_pairs(run))
     _require_free(run, name)
     _require_current(run)
     documents: dict[Path, dict[str, Any]] = {}
@@ -75,6 +77,40 @@ def add_predictions(run: RunFolder, folder: Path, name: str, progress: RunProgre
     return len(documents)
 
 
+def evaluate(predict: Callable[[Path, Path], object], run: Path | str, name: str) -> pd.DataFrame:
+    """Let a function answer every pair of a run, blind, and score its answers as the variant `name`.
+
+    Args:
+        predict: Called with a folder that holds the sessions `before` and `after` of one pair without their truth, and
+            with the folder that it writes `answer.json` and `answer.npz` to.
+        run: Folder of a run whose pairs are kept.
+        name: Its variant in the tables.
+
+    Returns:
+        Its rows of results.csv.
+
+    Raises:
+        InputError: As `add_predictions`, or a session is damaged. What `predict` raises is passed on; nothing is
+            written to the run then.
+    """
+    folder = open_run_folder(Path(run))
+    _require_free(folder, name)
+    _require_current(folder)
+    with TemporaryDirectory(prefix="tunnelcd-") as place:
+        pair, answer, answers = (Path(place) / part for part in ("pair", "answer", "answers"))
+        for original in list_pairs(folder):
+            pair.mkdir()
+            answer.mkdir()
+            copy_pair(original, pair)
+            predict(pair, answer)
+            shutil.copytree(answer, answers / original.parent.name / original.name)
+            remove(pair)
+            remove(answer)
+        add_predictions(folder, answers, name)
+    results = pd.read_csv(folder.path / "results.csv")
+    return results[results["variant"] == name]
+
+
 def list_incomplete_variants(provenance: Mapping[str, Any], results: pd.DataFrame) -> list[str]:
     """Return one line for each variant outside the plan that lacks pairs of the run, naming the pairs."""
     plan = read_stored_plan(provenance)
@@ -100,10 +136,9 @@ def _matched(run: RunFolder, folder: Path, pairs: Sequence[Path]) -> dict[Path, 
     Raises:
         InputError: A pair has none, or one is for no pair.
     """
-    if not pairs:
-        raise InputError(f"{run.path}: holds no simulated pairs: run the plan again, which makes them")
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder: expected {folder}/<scenario>/<seed>/answer.json")
+    opaque = name_blindly(run)
     given = {file.parent for file in folder.glob("**/answer.json")}
     found: dict[Path, Path] = {}
     wanted: dict[Path, str] = {}
@@ -112,12 +147,15 @@ def _matched(run: RunFolder, folder: Path, pairs: Sequence[Path]) -> dict[Path, 
     for pair in pairs:
         scenario = foreign_identity(run, pair.parent.name, pair.name, "")["scenario"]
         wanted[pair] = f"{scenario}/{pair.name}"
-        # by the name of the scenario or by that of its folder in the run
-        places = {folder / wanted[pair], folder / pair.parent.name / pair.name} & given
+        # by the name of the scenario, by that of its folder in the run, or blind
+        called = wanted[pair], f"{pair.parent.name}/{pair.name}", opaque.get(pair, wanted[pair])
+        places = {folder / name for name in called} & given
         if len(places) > 1:
             mistakes.append(f"{' and '.join(map(str, sorted(places)))}: two predictions for one pair: leave one out")
         known |= places
         found.update((pair, place) for place in places)
+    if given & {folder / name for name in opaque.values()}:
+        wanted = opaque
     names = list(wanted.values())
     for place in sorted(given - known):
         near = suggest(str(place.relative_to(folder)), names)

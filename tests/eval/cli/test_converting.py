@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -43,9 +44,9 @@ def refused(result: Result, expected: str) -> None:
     assert expected in lines[0]
 
 
-def test_a_simulated_session_leaves_with_its_truth(pair: Path, tmp_path: Path, command: Command) -> None:
+def test_a_simulated_session_leaves_with_its_truth_on_demand(pair: Path, tmp_path: Path, command: Command) -> None:
     path = tmp_path / "new" / "before.osf"
-    code, out, err = command("convert", pair / "before", path)
+    code, out, err = command("convert", pair / "before", path, "--with-truth")
     session = read_session(pair / "before")
     assert (code, err.splitlines()) == (0, ["  write"])
     assert out.startswith(f"{path}: {session.n_scans} revolutions, with truth as fields LABEL and INSTANCE, ")
@@ -59,13 +60,22 @@ def test_a_simulated_session_leaves_with_its_truth(pair: Path, tmp_path: Path, c
     assert change.max() == 0 or (change > 0).any()
 
 
-def test_truth_stays_behind_on_demand(pair: Path, tmp_path: Path, command: Command) -> None:
-    code, out, err = command("convert", pair / "after", tmp_path / "a.osf", "--without-truth", "--quiet")
-    assert (code, out, err) == (0, "", "")
-    assert set(frames_of(tmp_path / "a.osf")[0].fields) == {"RANGE", "REFLECTIVITY", "SIGNAL"}
-    shutil.copytree(pair / "after", tmp_path / "handed_out", ignore=shutil.ignore_patterns("truth"))
-    code, out, _ = command("convert", tmp_path / "handed_out", tmp_path / "b.osf")
-    assert (code, "without truth" in out) == (0, True)
+def test_truth_stays_behind_by_default(pair: Path, tmp_path: Path, command: Command) -> None:
+    shutil.copytree(pair / "after", tmp_path / "told")
+    document = json.loads((tmp_path / "told" / "session.json").read_text())
+    document["provenance"]["sensor_profile"] = "/home/nobody/gallery/os1.json"
+    (tmp_path / "told" / "session.json").write_text(json.dumps(document))
+    for number, options in enumerate(((), ("--without-truth",))):
+        path = tmp_path / f"{number}.osf"
+        code, out, _ = command("convert", tmp_path / "told", path, *options)
+        assert (code, "without truth" in out) == (0, True)
+        frames = frames_of(path)
+        assert set(frames[0].fields) == {"RANGE", "REFLECTIVITY", "SIGNAL"}
+        assert json.loads(frames[0].sensor_info.user_data) == {
+            "tunnelcd": {"made_by": "tunnelcd simulate", "session": "after"}
+        }
+    shutil.rmtree(tmp_path / "told" / "truth")
+    refused(command("convert", tmp_path / "told", tmp_path / "b.osf", "--with-truth"), "leave --with-truth out")
 
 
 def test_a_pair_there_and_back_gives_the_same_answer(pair: Path, tmp_path: Path, command: Command) -> None:
@@ -124,7 +134,7 @@ def test_names_and_options_that_do_not_go_together(pair: Path, tmp_path: Path, c
         ((before, tmp_path / "a.osf", "--odometry", "kiss-icp"), "leave --odometry out"),
         ((before, tmp_path / "a.osf", "--metadata", "m.json"), "leave --metadata out"),
         ((there, tmp_path / "b.osf"), "a recording becomes a session: name a new folder"),
-        ((there, tmp_path / "b", "--without-truth"), "leave --without-truth out"),
+        ((there, tmp_path / "b", "--with-truth"), "leave --with-truth out"),
         ((there, tmp_path / "new" / "b"), "there.osf: not an OSF file"),
         ((there, tmp_path / "b", "--odometry", "lio"), "--odometry lio: expected kiss-icp"),
     ):

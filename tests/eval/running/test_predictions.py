@@ -89,12 +89,12 @@ def test_the_documented_script_finds_the_box(tmp_path: Path, command: Command) -
     script = re.search(r"```python\n(.*?)```", text, re.DOTALL)
     assert script is not None
     (tmp_path / "predict.py").write_text(script[1])
-    command("simulate", "smoke/one_box", "--seed", 10600, "--out", tmp_path / "pair", "--quiet")
-    argv = [tmp_path / "pair" / "before", tmp_path / "pair" / "after", tmp_path / "answer"]
+    command("simulate", "smoke/one_box", "--seed", 10600, "--out", tmp_path / "pairs" / "one", "--quiet")
+    argv = [tmp_path / "pairs", tmp_path / "mine"]
     subprocess.run(
         [sys.executable, tmp_path / "predict.py", *argv], cwd=ROOT, env={"PYTHONPATH": str(ROOT)}, check=True
     )
-    code, out, _ = command("score", tmp_path / "pair", tmp_path / "answer")
+    code, out, _ = command("score", tmp_path / "pairs" / "one", tmp_path / "mine" / "one")
     row = dict(line.split(None, 1) for line in out.splitlines() if len(line.split()) > 1)
     assert code == 0
     assert [float(row[name]) for name in ("region_recall", "region_precision", "object_f1_50")] == [1, 1, 1]
