@@ -152,7 +152,7 @@ def void() -> str:
 
 def sdk() -> str:
     """Let the vendor's SDK load (ouster-sdk)."""
-    from cdpipe.io.ouster.captures import require_sdk
+    from cdpipe.io.ouster.sdk import require_sdk
 
     core = require_sdk()
     info = core.SensorInfo.from_default(core.LidarMode._1024x10)

@@ -1,17 +1,12 @@
-"""Read a sensor recording, OSF or PCAP, revolution by revolution with the vendor's SDK.
+"""Read a sensor recording, OSF or PCAP, revolution by revolution.
 
-The SDK is an extra. It is imported only here and in `cdpipe.io.ouster.osf`, when a recording is opened.
+The vendor's SDK reads it in a process of its own (`cdpipe.io.ouster.sdk`); what comes from there is checked here.
 """
-
-# ruff: noqa: PLC0415 - the vendor's SDK is an extra, and everybody else must be able to import this
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +15,7 @@ import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.isolated import Arrays, IsolatedReader
 from cdpipe.core.yamlfile import read_json
 from cdpipe.io.ouster.integrity import check_osf_integrity, check_pcap_integrity
 from cdpipe.io.readers import RECORDING_SUFFIXES
@@ -32,8 +28,7 @@ _LEAST_SHARE = 0.5
 _PACKET_OVERHEAD_BYTES = 58
 # Called with the stage, the number of finished revolutions, and their (estimated) total.
 Progress = Callable[[str, int, int], None]
-# Exceptions of the SDK for a faulty file; C++ exceptions arrive as any of these.
-SDK_ERRORS = (OSError, RuntimeError, ValueError, LookupError, ArithmeticError)
+_SDK_CALLS = "cdpipe.io.ouster.sdk"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,31 +53,29 @@ class Revolution:
     odom_T_column: Float64Array
 
 
-@dataclass(frozen=True, slots=False, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Recording:
     """A recording of one sensor; it can be read several times.
 
     Attributes:
         path: The file.
         sensor: Its sensor.
-        info: The SDK's description of the sensor.
         metadata: The metadata file of a PCAP; None for an OSF, which includes its metadata.
+        sensor_to_body: (4, 4) pose of the sensor in the body frame, metres.
+        n_window_columns: Number of columns that the sensor sends per revolution.
+        n_guessed: Estimated number of revolutions, for progress.
+        packet_bytes: Size of a lidar packet of a PCAP.
+        reader: Process of the vendor's SDK.
     """
 
     path: Path
     sensor: SensorMetadata
-    info: Any
     metadata: Path | None
-
-    @cached_property
-    def n_guessed(self) -> int:
-        """Estimated number of revolutions, for progress."""
-        if self.metadata is None:
-            with closing(_open_source(self)) as source:
-                return max(len(source), 1)
-        packet_bytes = _packet_bytes(self.info) + _PACKET_OVERHEAD_BYTES
-        n_packets = max(self.info.format.lidar_packets_per_frame(), 1)
-        return max(self.path.stat().st_size // int(packet_bytes * n_packets), 1)
+    sensor_to_body: Float64Array
+    n_window_columns: int
+    n_guessed: int
+    packet_bytes: int
+    reader: IsolatedReader
 
     def revolutions(self, on_left_out: Callable[[int], object] = lambda number: None) -> Iterator[Revolution]:
         """Read all revolutions with more than half of their columns.
@@ -94,31 +87,30 @@ class Recording:
             InputError: The file is damaged, the clock went backwards, or no revolution qualifies.
         """
         n_kept, n_seen, last_ns = 0, 0, None
-        mounting = np.asarray(self.info.sensor_to_body, dtype=np.float64)
-        window = max(self.info.format.valid_columns_per_frame(), 1)
-        with closing(_open_source(self)) as source:
-            for frames in _read_guarded(source, self.path):
-                frame = frames[0]
-                if frame is None:
-                    continue
-                n_seen += 1
-                if np.count_nonzero(frame.status & 1) <= _LEAST_SHARE * window:
-                    on_left_out(n_seen - 1)
-                    continue
-                revolution = _decode(frame, self.sensor, mounting, f"{self.path}: revolution {n_seen - 1}")
-                if last_ns is not None and revolution.column_stamps_ns[0] <= last_ns:
-                    raise InputError(
-                        f"{self.path}: revolution {n_seen - 1} does not come after the one before it: the sensor's "
-                        "clock was set during the recording, cut it there"
-                    )
-                last_ns = revolution.column_stamps_ns[-1]
-                n_kept += 1
-                yield revolution
-            self._check_end(source, n_seen, n_kept)
+        metadata = None if self.metadata is None else str(self.metadata)
+        for about, arrays in self.reader.read("read_frames", path=str(self.path), metadata=metadata):
+            if not arrays:
+                self._check_end(about, n_seen, n_kept)
+                continue
+            n_seen += 1
+            where = f"{self.path}: revolution {n_seen - 1}"
+            _check_shapes(arrays, self.sensor, about["fields"], where)
+            if np.count_nonzero(arrays["status"] & 1) <= _LEAST_SHARE * max(self.n_window_columns, 1):
+                on_left_out(n_seen - 1)
+                continue
+            revolution = _decode(arrays, self.sensor, self.sensor_to_body, where)
+            if last_ns is not None and revolution.column_stamps_ns[0] <= last_ns:
+                raise InputError(
+                    f"{where} does not come after the one before it: the sensor's clock was set during the recording, "
+                    "cut it there"
+                )
+            last_ns = revolution.column_stamps_ns[-1]
+            n_kept += 1
+            yield revolution
 
-    def _check_end(self, source: Any, n_seen: int, n_kept: int) -> None:
-        if self.metadata is None and n_seen < len(source):
-            raise InputError(f"{self.path}: damaged: {n_seen} of its {len(source)} revolutions can be read")
+    def _check_end(self, about: dict[str, Any], n_seen: int, n_kept: int) -> None:
+        if self.metadata is None and n_seen < about["n_stated"]:
+            raise InputError(f"{self.path}: damaged: {n_seen} of its {about['n_stated']} revolutions can be read")
         if n_kept:
             return
         if n_seen:
@@ -127,10 +119,10 @@ class Recording:
                 f"recording is too short, or was not made in mode {self.sensor.mode}"
             )
         if self.metadata is not None:
-            n_other = source.size_error_count + source.id_error_count
             raise InputError(
                 f"{self.path}: no lidar packet of the sensor in {self.metadata} ({self.sensor.product}, "
-                f"{_packet_bytes(self.info)} bytes each); {n_other or 'none'} of its packets look like another Ouster's"
+                f"{self.packet_bytes} bytes each); {about['n_other'] or 'none'} of its packets look like another "
+                "Ouster's"
             )
         raise InputError(f"{self.path}: holds no revolution")
 
@@ -142,7 +134,6 @@ def open_recording(path: Path, metadata: Path | None = None) -> Recording:
         InputError: A file is missing, truncated or of another kind, the metadata is of another sensor or mode, the OSF
             holds several sensors, or the vendor's SDK is not installed.
     """
-    core = require_sdk()
     suffix = path.suffix.lower()
     if suffix not in RECORDING_SUFFIXES:
         raise InputError(f"{path}: expected a recording, {', '.join(RECORDING_SUFFIXES)}")
@@ -151,82 +142,79 @@ def open_recording(path: Path, metadata: Path | None = None) -> Recording:
     if suffix == ".osf":
         if metadata is not None:
             raise InputError(f"{path}: an OSF carries its sensor's metadata: leave --metadata out")
-        check_osf_integrity(path)
-        info = _only_sensor(path)
-        sensor = parse_metadata(json.loads(info.to_json_string()), str(path))
-        require_mode(sensor.mode, str(path))
-        return Recording(path, sensor, info, None)
+        return _open_osf(path)
     check_pcap_integrity(path)
     beside = path.with_suffix(".json")
     if metadata is None and not beside.exists():
         raise InputError(f"{path}: {beside.name} is not beside it: give the sensor's metadata .json with --metadata")
-    metadata = metadata or beside
+    return _open_pcap(path, metadata or beside)
+
+
+def _open_osf(path: Path) -> Recording:
+    check_osf_integrity(path)
+    reader = IsolatedReader(_SDK_CALLS, path, "the vendor's SDK")
+    ((about, _),) = reader.read("describe_osf", path=str(path))
+    sensor = parse_metadata(about["document"], str(path))
+    require_mode(sensor.mode, str(path))
+    n_guessed = max(about["n_revolutions"], 1)
+    return Recording(path, sensor, None, np.array(about["sensor_to_body"]), about["window"], n_guessed, 0, reader)
+
+
+def _open_pcap(path: Path, metadata: Path) -> Recording:
     sensor = parse_metadata(read_json(metadata, METADATA_FILE), str(metadata))
     require_mode(sensor.mode, str(metadata))
-    try:
-        info = core.SensorInfo(metadata.read_text(encoding="utf-8"))
-    except SDK_ERRORS as error:
-        raise InputError(f"{metadata}: the vendor's SDK does not take it: {one_line(error)}") from error
-    recording = Recording(path, sensor, info, metadata)
-    _check_columns(recording)
-    return recording
+    reader = IsolatedReader(_SDK_CALLS, path, "the vendor's SDK")
+    ((about, _),) = reader.read("describe_pcap", path=str(path), metadata=str(metadata))
+    if about["highest_column"] >= sensor.width:
+        raise InputError(
+            f"{metadata}: lidar_mode = {sensor.mode}, but the packets of {path} count columns up to "
+            f"{about['highest_column']}: it is the metadata of another mode"
+        )
+    n_bytes = (about["packet_bytes"] + _PACKET_OVERHEAD_BYTES) * max(about["n_packets"], 1)
+    n_guessed = max(path.stat().st_size // n_bytes, 1)
+    pose = np.array(about["sensor_to_body"])
+    return Recording(path, sensor, metadata, pose, about["window"], n_guessed, about["packet_bytes"], reader)
 
 
-def require_sdk() -> Any:
-    """Import the vendor's SDK and return its module `core`.
-
-    Raises:
-        InputError: It is not installed.
-    """
-    try:
-        from ouster.sdk import core
-    except ImportError as error:
-        raise InputError("OSF and PCAP need the vendor's SDK: pip install 'tunnelcd[ouster]'") from error
-    core.init_logger("off")  # the SDK also raises what it logs
-    return core
+def _check_shapes(arrays: Arrays, sensor: SensorMetadata, fields: list[str], where: str) -> None:
+    """Raise `InputError` if a revolution has no ranges, or an array has another size than the metadata says."""
+    if "RANGE" not in arrays:
+        raise InputError(f"{where} has no channel RANGE (there is {', '.join(fields) or 'none'})")
+    columns = (sensor.width,)
+    shapes = {"status": columns, "timestamp": columns, "body_to_world": (*columns, 4, 4)}
+    for name, array in arrays.items():
+        if array.shape != (expected := shapes.get(name, (sensor.height, sensor.width))):
+            raise InputError(f"{where}: {name} is {array.shape}, its metadata says {expected}")
 
 
-def one_line(error: BaseException) -> str:
-    """Return the text of an error of the SDK or the disk on one line."""
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return " ".join(str(error).split())
-
-
-def _decode(frame: Any, sensor: SensorMetadata, sensor_to_body: Float64Array, where: str) -> Revolution:
-    """Convert one of the SDK's `LidarFrame`s.
+def _decode(arrays: Arrays, sensor: SensorMetadata, sensor_to_body: Float64Array, where: str) -> Revolution:
+    """Convert the arrays of one revolution with at least one column.
 
     Args:
-        frame: The frame, with at least one column.
+        arrays: As `cdpipe.io.ouster.sdk.read_frames` yields them, of the sensor's size.
         sensor: The recording's sensor.
-        sensor_to_body: (4, 4) pose of the sensor in the body frame, whose poses the frame holds.
-        where: Name of the frame in messages.
+        sensor_to_body: (4, 4) pose of the sensor in the body frame, whose poses the revolution holds.
+        where: Name of the revolution in messages.
 
     Raises:
-        InputError: It has no ranges, another size, or its column stamps do not rise.
+        InputError: Its column stamps do not rise.
     """
-    is_valid = (frame.status & 1).astype(bool)
-    if not frame.has_field("RANGE"):
-        raise InputError(f"{where} has no channel RANGE (there is {', '.join(frame.fields) or 'none'})")
-    shape = (sensor.height, sensor.width)
-    if frame.field("RANGE").shape != shape:
-        raise InputError(f"{where} is {frame.field('RANGE').shape}, its metadata says {shape}")
-    odom_T_column = np.asarray(frame.body_to_world, dtype=np.float64) @ sensor_to_body
+    is_valid = (arrays["status"] & 1).astype(bool)
     return Revolution(
-        range_mm=_channel(frame, "RANGE", is_valid, 2**32 - 1).astype(np.uint32),
-        reflectivity=_channel(frame, "REFLECTIVITY", is_valid, 255).astype(np.uint8),
-        signal=_channel(frame, "SIGNAL", is_valid, 2**16 - 1).astype(np.uint16),
-        column_stamps_ns=_stamps_ns(frame.timestamp.astype(np.int64), is_valid, sensor, where),
+        range_mm=_channel(arrays, "RANGE", is_valid, 2**32 - 1).astype(np.uint32),
+        reflectivity=_channel(arrays, "REFLECTIVITY", is_valid, 255).astype(np.uint8),
+        signal=_channel(arrays, "SIGNAL", is_valid, 2**16 - 1).astype(np.uint16),
+        column_stamps_ns=_stamps_ns(arrays["timestamp"].astype(np.int64), is_valid, sensor, where),
         is_valid=is_valid,
-        odom_T_column=odom_T_column,
+        odom_T_column=arrays["body_to_world"] @ sensor_to_body,
     )
 
 
-def _channel(frame: Any, name: str, is_valid: BoolArray, most: int) -> npt.NDArray[Any]:
+def _channel(arrays: Arrays, name: str, is_valid: BoolArray, most: int) -> npt.NDArray[Any]:
     """Return a channel (H, W), clipped to `most`; zero in missing columns and for a missing channel."""
-    if not frame.has_field(name):
-        return np.zeros((frame.h, frame.w), np.uint8)
-    return np.where(is_valid, np.minimum(frame.field(name), most), 0)
+    if name not in arrays:
+        return np.zeros(arrays["RANGE"].shape, np.uint8)
+    return np.where(is_valid, np.minimum(arrays[name], most), 0)
 
 
 def _stamps_ns(stamps_ns: Int64Array, is_valid: BoolArray, sensor: SensorMetadata, where: str) -> Int64Array:
@@ -239,66 +227,3 @@ def _stamps_ns(stamps_ns: Int64Array, is_valid: BoolArray, sensor: SensorMetadat
     late_ns = (stamps_ns[known] - start_ns) - nominal_ns[known]
     filled_ns = nominal_ns + np.interp(np.arange(len(stamps_ns)), known, late_ns)
     return np.where(is_valid, stamps_ns, start_ns + np.round(filled_ns).astype(np.int64))
-
-
-def _open_source(recording: Recording) -> Any:
-    """Return the SDK's source of a recording; the caller closes it."""
-    from ouster.sdk import osf, pcap
-
-    with _sdk_reads(recording.path):
-        if recording.metadata is None:
-            return osf.OsfFrameSetSource(str(recording.path))
-        return pcap.PcapFrameSetSource(str(recording.path), sensor_info=[recording.info])
-
-
-@contextmanager
-def _sdk_reads(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except SDK_ERRORS as error:
-        raise InputError(f"{path}: the vendor's SDK cannot read it: {one_line(error)}") from error
-
-
-def _read_guarded(source: Any, path: Path) -> Iterator[Any]:
-    with _sdk_reads(path):
-        yield from source
-
-
-def _only_sensor(path: Path) -> Any:
-    from ouster.sdk import osf
-
-    with _sdk_reads(path), closing(osf.OsfFrameSetSource(str(path))) as source:
-        infos = list(source.sensor_info)
-    if len(infos) != 1:
-        sensors = ", ".join(f"{info.prod_line} {info.sn}" for info in infos) or "none"
-        raise InputError(f"{path}: expected the recording of one sensor, it holds {len(infos)} ({sensors})")
-    return infos[0]
-
-
-def _packet_bytes(info: Any) -> int:
-    from ouster.sdk import core
-
-    return int(core.PacketFormat.from_info(info).lidar_packet_size)
-
-
-def _check_columns(recording: Recording) -> None:
-    """Raise `InputError` if packets have more columns than the metadata's mode: the SDK would drop them silently."""
-    from ouster.sdk import core, pcap
-
-    layout = core.PacketFormat.from_info(recording.info)
-    n_looked_at = 2 * recording.sensor.width // max(layout.columns_per_packet, 1)
-    highest = -1
-    with _sdk_reads(recording.path):
-        source = pcap.PcapPacketSource(str(recording.path), sensor_info=[recording.info])
-    with closing(source):
-        for _, packet in _read_guarded(source, recording.path):
-            if isinstance(packet, core.LidarPacket):
-                highest = max(highest, int(layout.packet_header(core.ColHeader.MEASUREMENT_ID, packet.buf).max()))
-                n_looked_at -= 1
-            if n_looked_at <= 0:
-                break
-    if highest >= recording.sensor.width:
-        raise InputError(
-            f"{recording.metadata}: lidar_mode = {recording.sensor.mode}, but the packets of {recording.path} count "
-            f"columns up to {highest}: it is the metadata of another mode"
-        )

@@ -104,6 +104,8 @@ def _osf_header(header: bytes) -> tuple[int, int]:
 
 def _is_sound(file: BinaryIO, at: int, n_bytes: int) -> bool:
     """Return whether the block at an offset is complete and its CRC-32, over length and content, is correct."""
+    if at + 8 > n_bytes:
+        return False
     file.seek(at)
     prefix = file.read(4)
     end = at + 4 + int.from_bytes(prefix, "little")

@@ -23,7 +23,8 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import make_pose
-from cdpipe.io.ouster.captures import Progress, one_line, require_sdk
+from cdpipe.io.ouster.captures import Progress
+from cdpipe.io.ouster.sdk import one_line, require_sdk
 from cdpipe.io.session import ScanChunk, Session
 
 _CHANNELS = {"RANGE": "range_mm", "REFLECTIVITY": "reflectivity", "SIGNAL": "signal"}

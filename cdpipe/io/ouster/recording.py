@@ -114,7 +114,7 @@ def _read_times(recording: Recording, report: Progress) -> _Times:
     for number, revolution in enumerate(recording.revolutions(left_out.append)):
         report("look through", number, recording.n_guessed)
         stamps_ns.append(revolution.column_stamps_ns[[0, middle, -1]])
-        off = np.abs(revolution.odom_T_column[revolution.is_valid] - recording.info.sensor_to_body)
+        off = np.abs(revolution.odom_T_column[revolution.is_valid] - recording.sensor_to_body)
         has_own_pose.append(off.max() > _OWN_POSE_TOLERANCE)
     report("look through", len(stamps_ns), len(stamps_ns))
     first_ns, middle_ns, last_ns = np.array(stamps_ns).T

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import builtins
 import json
 import struct
+import sys
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,38 @@ def test_an_osf_whose_header_or_metadata_were_damaged_is_named(tmp_path: Path) -
     path.write_bytes(whole + b"x")
     told = said(lambda: open_recording(path))
     assert f"damaged: {len(whole) + 1} bytes where its header says {len(whole)}: copy it again" in told
+
+
+def test_an_osf_that_crashes_the_sdk_is_one_line(tmp_path: Path) -> None:
+    """Changed offsets under correct checksums; the SDK 1.0.1 follows them out of the file (segmentation fault)."""
+    info = info_of(SENSOR)
+    whole = write_frames(tmp_path / "whole.osf", info, frames(info, 1)).read_bytes()
+    path = tmp_path / "bad.osf"
+    told = []
+    for block, at, new in ((0, 31, "80800001"), (2, 175, "8080807f"), (3, 167, "ff"), (3, 492, "80")):
+        path.write_bytes(with_checksum(whole, block, at, bytes.fromhex(new)))
+        told.append(said(lambda: list(open_recording(path).revolutions())))
+    assert [line for line in told if "the vendor's SDK crashed while it read it (SIG" in line] == told
+
+
+def with_checksum(osf_bytes: bytes, block: int, at: int, new: bytes) -> bytes:
+    """Replace bytes in one of the four blocks of an OSF, and correct its checksum."""
+    data, start = bytearray(osf_bytes), 0
+    for _ in range(block):
+        start += 8 + struct.unpack_from("<I", data, start)[0]
+    end = start + 4 + struct.unpack_from("<I", data, start)[0]
+    data[start + at : start + at + len(new)] = new
+    data[end : end + 4] = struct.pack("<I", zlib.crc32(data[start:end]))
+    return bytes(data)
+
+
+def test_an_osf_whose_header_points_beyond_the_file_is_named(tmp_path: Path) -> None:
+    info = info_of(SENSOR)
+    whole = write_frames(tmp_path / "whole.osf", info, frames(info, 1)).read_bytes()
+    path = tmp_path / "bad.osf"
+    for last in ("7f", "ff"):
+        path.write_bytes(with_checksum(whole, 0, 47, bytes.fromhex(last)))
+        assert "damaged: its metadata" in said(lambda: open_recording(path))
 
 
 def test_an_osf_of_two_sensors_is_refused(tmp_path: Path) -> None:
@@ -204,16 +237,14 @@ def _empty(path: Path) -> Path:
 
 
 def test_without_the_sdk_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real_import = builtins.__import__
-
-    def no_ouster(name: str, *rest: Any) -> Any:
-        if name.startswith("ouster"):
-            raise ImportError(name)
-        return real_import(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", no_ouster)
-    for call in (lambda: open_recording(tmp_path / "a.osf"), lambda: write_osf(_none(), tmp_path / "a.osf")):
-        assert "pip install 'tunnelcd[ouster]'" in said(call)
+    info = info_of(SENSOR)
+    path = write_frames(tmp_path / "a.osf", info, frames(info, 1))
+    monkeypatch.setitem(sys.modules, "ouster.sdk", None)
+    assert "pip install 'tunnelcd[ouster]'" in said(lambda: write_osf(_none(), path))
+    (tmp_path / "without" / "ouster").mkdir(parents=True)
+    (tmp_path / "without" / "ouster" / "__init__.py").write_text("raise ImportError")
+    monkeypatch.syspath_prepend(tmp_path / "without")
+    assert "pip install 'tunnelcd[ouster]'" in said(lambda: open_recording(path))
 
 
 def _none() -> Any:
