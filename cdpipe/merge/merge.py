@@ -292,4 +292,5 @@ def _hessian_ratio(walked: Walk) -> float:
     rotations = walked.before_T_after[:, :3, :3]
     hessians = rotations @ walked.information[:, 3:, 3:] @ rotations.transpose(0, 2, 1)
     eigenvalues = np.linalg.eigvalsh(hessians.sum(axis=0))
-    return float(eigenvalues[0] / eigenvalues[-1]) if eigenvalues[-1] > 0 else 0.0
+    # the smallest one of a singular matrix may be computed as -1e-17
+    return float(max(eigenvalues[0], 0.0) / eigenvalues[-1]) if eigenvalues[-1] > 0 else 0.0

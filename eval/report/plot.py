@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cdpipe.model.report import ChangeReport
-from eval.scoring.region_metrics import choose_judged_scans, transform_to_map
+from eval.scoring.region_metrics import transform_to_map
 from eval.truth.ground_truth import load_ground_truth
 from sim.view.returns import CHANGE_RGB
 
@@ -35,10 +35,10 @@ def plot(report: ChangeReport, pair: Path | str | None = None) -> Figure:
     axes = figure.add_subplot(aspect="equal", xlabel="x of the map frame [m]", ylabel="y of the map frame [m]")
     if pair is not None:
         truth = load_ground_truth(Path(pair))
-        scans = choose_judged_scans(report.keyframe_scans[0], len(truth.before.odom_T_sensor))
-        axes.plot(*truth.before.odom_T_sensor[scans, :2, 3].T, color="0.7", label="path of the before session")
+        path_m = truth.before.odom_T_sensor[truth.before.judged_scans, :2, 3]
+        axes.plot(*path_m.T, color="0.7", label="path of the before session")
         changes = truth.centroids_world[truth.is_observable].reshape(-1, 3)
-        axes.plot(*transform_to_map(changes, truth.before, scans)[:, :2].T, "kx", markersize=10, label="true change")
+        axes.plot(*transform_to_map(changes, truth.before)[:, :2].T, "kx", markersize=10, label="true change")
     angle = np.linspace(0.0, 2 * np.pi, 100)
     circle = report.regions.radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
     for centre in report.regions.centres_map[report.regions.is_reported, :2]:

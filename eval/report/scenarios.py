@@ -12,7 +12,7 @@ from eval.report.regions.charts import look_of
 from eval.running.run_data import RunData, interval_over_pairs, named_variants, of, over_pairs, scenarios, split_variant
 from eval.tables.columns import RESULT_COLUMNS, select
 
-_COLUMNS = select(RESULT_COLUMNS, "region_recall_at_k", "region_auroc", "object_iou_point")
+_COLUMNS = select(RESULT_COLUMNS, "region_recall_at_k", "region_auroc", "object_iou_point", "object_f1_50")
 _MAX_METHODS = 14
 
 
@@ -43,7 +43,7 @@ def draw_scenarios(data: RunData) -> list[Chart]:
         x = Axis(ticks=ticks if is_last else dict.fromkeys(ticks, ""))
         rows.append([Panel(x, Axis(column.heading, (0.0, 1.05)), series)])
     caption = (
-        "Means over the n session pairs of each scenario, 0 for a pair without an answer (AUROC: left out); bars: 95 % "
+        "Means over the n session pairs of each scenario, 0 for a pair without an answer (AUROC: 0.5); bars: 95 % "
         "interval over pairs. A click on a name hides a method, two show it alone."
     )
     return [Chart("by_scenario", "Every method on every scenario", Drawing(rows, 190), caption)]

@@ -144,7 +144,7 @@ class PairRun:
         folder = self._run.answer(self._pair.name, self._pair.seed, cell.variant)
         try:
             _answer(stages, cell, truth, folder)
-            self._finish(each, score_stored(truth, folder), is_contended=stages.is_contended)
+            self._finish(each, score_stored(truth, folder, may_end_early=True), is_contended=stages.is_contended)
         except BaseException as error:
             remove(folder)
             if isinstance(error, OSError) and error.filename is None:
@@ -161,7 +161,7 @@ class PairRun:
         settings = each.cell.config.model_dump(mode="json")
         remove(folder)  # left by the process that died
         write_failure(folder, each.cell.variant, status, error, {}, settings, each.cell.until)
-        self._finish(each, score_stored(load_ground_truth(path), folder))
+        self._finish(each, score_stored(load_ground_truth(path), folder, may_end_early=True))
 
     def _finish(self, each: Todo, score: CaseScore, *, is_contended: bool = False) -> None:
         pair, cell = self._pair, each.cell

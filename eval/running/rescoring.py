@@ -60,7 +60,8 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
                 identity = {name: row.get(name) for name in names}
                 key, place = stored["key"], stored["order"]
             progress.cells("{scenario} {seed} {variant}".format(**identity), len(documents), len(folders))
-            documents[path] = cell_document(score_stored(truth, folder), identity, key, place)
+            score = score_stored(truth, folder, may_end_early=key != NO_KEY)
+            documents[path] = cell_document(score, identity, key, place)
     for path, document in documents.items():
         write_json(path, document)
     progress.cells("done", len(documents), len(documents))

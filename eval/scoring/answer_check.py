@@ -18,6 +18,9 @@ from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth
 from eval.truth.scoring_points import ScoringPoints
 
 SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns"))
+MAX_SECONDS = 1e8  # three years
+MAX_AMOUNT = 1e15  # of bytes, points, and every other figure of the evidence
+MAX_M = 1e7  # a quarter of the way around the Earth
 _MANY = 100  # so many valid returns include the first return of some cell
 _ASIDE_M = 2.0  # largest gap between an object's points and its returns
 
@@ -26,21 +29,25 @@ def check_answer(answer: Answer, truth: GroundTruth, folder: Path) -> None:
     """Raise `InputError`, naming the folder and the field, unless an ok answer can be scored against this pair.
 
     Raises:
-        InputError: A number is NaN, an index lies outside of its session, a return is named twice, or none of the
-            named returns or points exists.
+        InputError: A number is NaN or too large to be one, an index lies outside of its session, a return is named
+            twice, or none of the named returns or points exists.
     """
     report = answer.report
     try:
         _check_seconds(answer.seconds)
+        _check_evidence(answer.evidence)
         if report is None:
             return
         require_poses("before_T_after", report.before_T_after[None])
+        _require_near("before_T_after", report.before_T_after[None, :3, 3])
         for session, scans in zip(SESSIONS, report.keyframe_scans, strict=True):
             _check_scans(f"{session}_keyframe_scans", scans, len(truth.sessions[session].odom_T_sensor))
         _check_local(report.local_before_T_after, len(report.keyframe_scans[1]), len(truth.after.odom_T_sensor))
         _check_regions(report.regions, len(report.keyframe_scans[0]), len(truth.before.odom_T_sensor))
         for name, values in report.figures.items():
             require_shape(f"figure_{name}", values, (len(report.regions.scores),))
+            if not (np.isnan(values) | ((values >= 0) & (values <= MAX_AMOUNT))).all():
+                raise ValueError(f"figure_{name}: expected numbers from 0 to {MAX_AMOUNT:g}, NaN where there is none")
         for index, item in enumerate(report.objects):
             _check_object(index, item, len(report.objects), len(report.regions.scores))
         for session in SESSIONS:
@@ -55,14 +62,23 @@ def _check_seconds(seconds: Mapping[str, float]) -> None:
     for name, value in seconds.items():
         if name not in SECONDS:
             raise ValueError(f"seconds.{name} is unknown{suggest(name, SECONDS)} (known: {', '.join(SECONDS)})")
-        if not 0 <= value < np.inf:
-            raise ValueError(f"seconds.{name} = {value}: expected seconds, 0 or more; leave out what was not measured")
+        if not 0 <= value <= MAX_SECONDS:
+            raise ValueError(
+                f"seconds.{name} = {value}: expected 0 to {MAX_SECONDS:g} s; leave out what was not measured"
+            )
+
+
+def _check_evidence(evidence: Mapping[str, float]) -> None:
+    for name, value in evidence.items():
+        if not (np.isnan(value) or 0 <= value <= MAX_AMOUNT):
+            raise ValueError(f"evidence.{name} = {value}: expected 0 to {MAX_AMOUNT:g}, NaN if it was not measured")
 
 
 def _check_local(local_before_T_after: Float64Array | None, n_keyframes: int, n_scans: int) -> None:
     if local_before_T_after is None:
         return
     require_poses("local_before_T_after", local_before_T_after)
+    _require_near("local_before_T_after", local_before_T_after[:, :3, 3])
     n_wanted = n_keyframes or n_scans
     if len(local_before_T_after) != n_wanted:
         raise ValueError(
@@ -74,8 +90,9 @@ def _check_local(local_before_T_after: Float64Array | None, n_keyframes: int, n_
 def _check_regions(regions: ChangeRegions, n_keyframes: int, n_scans: int) -> None:
     for name, values in (("region_centres_map", regions.centres_map), ("region_scores", regions.scores)):
         _require_finite(name, values)
-    if not np.isfinite(regions.radius_m):
-        raise ValueError(f"radius_m = {regions.radius_m}: expected a length in metres")
+    _require_near("region_centres_map", regions.centres_map)
+    if not 0 < regions.radius_m <= MAX_M:
+        raise ValueError(f"radius_m = {regions.radius_m}: expected a length in metres, up to {MAX_M:g}")
     if np.isinf(regions.keyframe_scores).any():
         raise ValueError("keyframe_scores: a score is infinite: expected a number, or NaN where nothing was compared")
     n_scored = n_keyframes or n_scans
@@ -105,16 +122,18 @@ def _check_object(index: int, item: ChangedObject, n_objects: int, n_regions: in
         raise ValueError(f"{where}.partner = {item.partner}: there are {n_objects} objects; -1 means none")
     if not -1 <= item.region < n_regions:
         raise ValueError(f"{where}.region = {item.region}: there are {n_regions} regions; -1 means none")
-    _require_finite(f"{where}: object_points_map", item.points_map)
+    _require_near(f"{where}: object_points_map", item.points_map)
+    if not np.isfinite(item.score):
+        raise ValueError(f"{where}.score = {item.score}: expected a number")
     if item.shape is not None:
         edges = item.shape.box_m.tolist()
-        if not all(np.isfinite(size) and size >= 0 for size in (*edges, item.shape.volume_m3)):
+        if not (all(0 <= edge <= MAX_M for edge in edges) and 0 <= item.shape.volume_m3 <= MAX_AMOUNT):
             raise ValueError(
                 f"{where}.shape: edges {', '.join(f'{edge:g}' for edge in edges)} m and volume "
-                f"{item.shape.volume_m3:g} m3: expected finite numbers, none below 0"
+                f"{item.shape.volume_m3:g} m3: expected 0 to {MAX_M:g} m and 0 to {MAX_AMOUNT:g} m3"
             )
     if item.displacement_map is not None:
-        _require_finite(f"{where}.displacement_map", item.displacement_map)
+        _require_near(f"{where}.displacement_map", item.displacement_map[None])
 
 
 def _check_returns(session: SessionName, objects: tuple[ChangedObject, ...], truth: SessionTruth) -> None:
@@ -185,7 +204,7 @@ def _check_points(
     owners, all_points = [], []
     for index, (item, points) in enumerate(zip(objects, points_odom, strict=True)):
         require_shape(f"objects[{index}]: object_points_odom", points, (None, 3))
-        _require_finite(f"objects[{index}]: object_points_odom", points)
+        _require_near(f"objects[{index}]: object_points_odom", points)
         if item.session == session:
             distinct = np.unique(points, axis=0)
             owners.append(np.full(len(distinct), index))
@@ -203,6 +222,14 @@ def _check_points(
         raise ValueError(
             f"objects[{owner}] shares a point of object_points_odom with another object: one owner at most"
         )
+
+
+def _require_near(name: str, places_m: Float64Array) -> None:
+    """Raise unless (N, 3) places are finite and near enough to be places."""
+    _require_finite(name, places_m)
+    is_far = (np.abs(places_m) > MAX_M).any(axis=1)
+    if is_far.any():
+        raise ValueError(f"{name}: entry {int(np.argmax(is_far))} is farther than {MAX_M:g} m from the origin")
 
 
 def _require_finite(name: str, values: Float64Array) -> None:

@@ -1,7 +1,7 @@
-"""Errors of a merge between keyframes of both sessions that are close to each other in the world.
+"""Errors of a merge between places of both sessions that are close to each other in the world.
 
 Both odometries drift, so no single transform is right everywhere. The error is that of the relative pose of an after
-keyframe and its truly nearest before keyframe.
+place and its truly nearest before place. The places are the judged scans of the sessions, whatever an answer names.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import Float64Array, Int64Array, invert, travelled_m
+from cdpipe.core.geometry import Float64Array, invert, travelled_m
 from eval.core.statistics import median
 from eval.truth.ground_truth import SessionTruth
 
@@ -28,7 +28,7 @@ _STEP_M = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MergeErrors:
-    """Errors of P keyframe pairs.
+    """Errors of P pairs of judged scans.
 
     Attributes:
         metres: (P,) length of the translation of E = (true i_T_j)^-1 (estimated i_T_j).
@@ -41,25 +41,19 @@ class MergeErrors:
     along_m: Float64Array
 
 
-def compute_merge_errors(
-    before: SessionTruth,
-    after: SessionTruth,
-    before_T_after: Float64Array,
-    keyframe_scans: tuple[Int64Array, Int64Array],
-) -> MergeErrors:
+def compute_merge_errors(before: SessionTruth, after: SessionTruth, before_T_after: Float64Array) -> MergeErrors:
     """Compare estimated and true relative poses.
 
     Args:
         before: The before session.
         after: The after session.
         before_T_after: The merge: pose of the after odom frame in the before odom frame, (4, 4) for the whole map or
-            (Ka, 4, 4) for each after keyframe.
-        keyframe_scans: Scans of the before and of the Ka after keyframes.
+            (J, 4, 4) for each judged scan of the after session.
 
     Returns:
-        One error for every after keyframe with a before keyframe within 5 m of it in the world.
+        One error for every judged after scan with a judged before scan within 5 m of it in the world.
     """
-    scans_i, scans_j = keyframe_scans
+    scans_i, scans_j = before.judged_scans, after.judged_scans
     world_T_j = after.world_T_sensor[scans_j]
     distance_m, nearest = cKDTree(before.world_T_sensor[scans_i, :3, 3]).query(world_T_j[:, :3, 3])
     is_paired = np.asarray(distance_m) <= PAIR_RADIUS_M
@@ -69,7 +63,7 @@ def compute_merge_errors(
     true_i_T_j = invert(before.world_T_sensor[scans_i]) @ world_T_j
     estimated_i_T_j = invert(before.odom_T_sensor[scans_i]) @ before_T_after @ after.odom_T_sensor[scans_j]
     errors = invert(true_i_T_j) @ estimated_i_T_j
-    # rotate the tunnel axis into the frame of keyframe j, that of E's translation
+    # rotate the tunnel axis into the frame of scan j, that of E's translation
     axes_world = find_travel_directions(after.world_T_sensor)[scans_j]
     axes_j = np.einsum("pji,pj->pi", world_T_j[:, :3, :3], axes_world)
     return MergeErrors(

@@ -162,9 +162,9 @@ def summarise_objects(matches: ObjectMatches, right: Float64Array, truth: Ground
         **columns,
         "object_f1_25": f1_25 if n_main else float("nan"),
         "object_f1_50": f1_50 if n_main else float("nan"),
-        "object_precision_50": precision_50,
+        "object_precision_50": 0.0 if n_main and np.isnan(precision_50) else precision_50,
         "object_pq": quality if n_main else float("nan"),
-        "kind_accuracy": mean(right[~np.isnan(right)]),
+        "kind_accuracy": 0.0 if truth.n_observable and np.isnan(right).all() else mean(right[~np.isnan(right)]),
         "n_objects": len(matches.matched_change),
         "n_matched": int(np.count_nonzero(matches.matched_object >= 0)),
         "n_ignored_objects": matches.outcomes.count("ignored"),
@@ -174,14 +174,9 @@ def summarise_objects(matches: ObjectMatches, right: Float64Array, truth: Ground
 
 
 def score_unanswered_objects(truth: GroundTruth) -> tuple[ObjectMatches, dict[str, float]]:
-    """Return the scores of a case without an answer: 0 in every object column where observable changes exist."""
+    """Return the scores of a case without an answer, those of an empty one: 0 where observable changes exist."""
     matches = match_objects((), (), truth)
-    columns = summarise_objects(matches, np.full(len(truth.pair.changes), np.nan), truth)
-    if (truth.is_observable & ~truth.is_partial).any():
-        columns["object_precision_50"] = 0.0
-    if truth.n_observable:
-        columns["kind_accuracy"] = 0.0
-    return matches, columns
+    return matches, summarise_objects(matches, np.full(len(truth.pair.changes), np.nan), truth)
 
 
 def _score_instances(matches: ObjectMatches, is_main: BoolArray, min_iou: float) -> tuple[float, float, float]:

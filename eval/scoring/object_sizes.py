@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.core.geometry import Float64Array
 from cdpipe.model.report import ChangedObject
 from eval.core.statistics import median
 from eval.scoring.object_metrics import ObjectMatches
@@ -31,20 +31,17 @@ class SizeErrors:
     volume_share: Float64Array
 
 
-def compute_size_errors(
-    objects: Sequence[ChangedObject], matches: ObjectMatches, truth: GroundTruth, keyframe_scans: Int64Array
-) -> SizeErrors:
+def compute_size_errors(objects: Sequence[ChangedObject], matches: ObjectMatches, truth: GroundTruth) -> SizeErrors:
     """Compare the displacement and the volume of each matched object with its change's.
 
     Args:
         objects: The answer's objects.
         matches: Matching of objects and changes.
         truth: The pair's truth.
-        keyframe_scans: Scans of the before keyframes, whose poses transform places into the map frame.
     """
     changes = truth.pair.changes
     errors = SizeErrors(*(np.full(len(changes), np.nan) for _ in range(2)))
-    moves = find_true_displacements_map(truth, keyframe_scans)
+    moves = find_true_displacements_map(truth)
     for index in np.flatnonzero(matches.matched_object >= 0):
         item = objects[matches.matched_object[index]]
         if item.displacement_map is not None:
@@ -55,11 +52,11 @@ def compute_size_errors(
     return errors
 
 
-def find_true_displacements_map(truth: GroundTruth, keyframe_scans: Int64Array) -> Float64Array:
+def find_true_displacements_map(truth: GroundTruth) -> Float64Array:
     """Return the (C, 3) displacement of each moved object, map frame, metres; NaN for objects that did not move.
 
     A displacement joins the centres of the object's bounding box before and after the move. Each centre is transformed
-    into the map frame by the true pose of the before keyframe nearest to it in the world. The drift of the before
+    into the map frame by the true pose of the judged before scan nearest to it in the world. The drift of the before
     odometry between both places belongs to the map frame and is no error of the answer.
     """
     changes = truth.pair.changes
@@ -68,7 +65,7 @@ def find_true_displacements_map(truth: GroundTruth, keyframe_scans: Int64Array) 
     props = truth.pair.scenario.get("props", ())
     heights_m = {prop["name"]: float(prop["size_m"][2]) for prop in props if prop.get("size_m")}
     middles_world = np.array([_find_middle_world(change, heights_m.get(change.name, 0.0)) for change in changes])
-    places = transform_to_map(middles_world, truth.before, keyframe_scans)
+    places = transform_to_map(middles_world, truth.before)
     at = {change.id: index for index, change in enumerate(changes)}
     moves = np.full((len(changes), 3), np.nan)
     for index, change in enumerate(changes):

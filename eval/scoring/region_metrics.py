@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform_each
 from cdpipe.model.report import ChangeReport
 from eval.core.ranking import auroc, average_precision
+from eval.scoring.judged_places import carry_scores
 from eval.truth.ground_truth import GroundTruth, SessionTruth
 
 Outcome = Literal["true", "duplicate", "false", "ignored", "unreported"]
@@ -37,25 +38,20 @@ class RegionMatches:
         return self.outcomes.count(outcome)
 
 
-def choose_judged_scans(keyframe_scans: Int64Array, n_scans: int) -> Int64Array:
-    """Return the scans an answer names as keyframes; an answer that names none is judged on every scan."""
-    return keyframe_scans if len(keyframe_scans) else np.arange(n_scans)
-
-
-def transform_to_world(centres_map: Float64Array, before: SessionTruth, keyframe_scans: Int64Array) -> Float64Array:
-    """Transform (R, 3) centres from the map frame into the world, each by the true pose of the nearest keyframe.
+def transform_to_world(centres_map: Float64Array, before: SessionTruth) -> Float64Array:
+    """Transform (R, 3) centres from the map frame into the world, each by the true pose of the nearest judged scan.
 
     The map frame is the before session's odom frame, which drifts against the world, so one transform is not enough.
     """
-    _, nearest = cKDTree(before.odom_T_sensor[keyframe_scans, :3, 3]).query(centres_map)
-    return before.to_world(centres_map, keyframe_scans[nearest])
+    _, nearest = cKDTree(before.odom_T_sensor[before.judged_scans, :3, 3]).query(centres_map)
+    return before.to_world(centres_map, before.judged_scans[nearest])
 
 
-def transform_to_map(places_world: Float64Array, before: SessionTruth, keyframe_scans: Int64Array) -> Float64Array:
-    """Transform (N, 3) true places into the map frame, each by the true pose of the keyframe truly nearest to it."""
-    world_T_keyframe = before.world_T_sensor[keyframe_scans]
-    _, nearest = cKDTree(world_T_keyframe[:, :3, 3]).query(places_world)
-    map_T_world = before.odom_T_sensor[keyframe_scans[nearest]] @ invert(world_T_keyframe[nearest])
+def transform_to_map(places_world: Float64Array, before: SessionTruth) -> Float64Array:
+    """Transform (N, 3) true places into the map frame, each by the pose of the judged scan truly nearest to it."""
+    world_T_judged = before.world_T_sensor[before.judged_scans]
+    _, nearest = cKDTree(world_T_judged[:, :3, 3]).query(places_world)
+    map_T_world = before.odom_T_sensor[before.judged_scans[nearest]] @ invert(world_T_judged[nearest])
     return transform_each(map_T_world, places_world)
 
 
@@ -147,11 +143,13 @@ class RegionScores:
     Attributes:
         columns: Its columns of results.csv.
         matches: Outcome of each region and change.
-        keyframe_labels: (K,) 1, 0 or -1 of each scored before keyframe.
+        keyframe_scores: (J,) score at each judged place of the before session, NaN where the answer states none.
+        keyframe_labels: (J,) 1, 0 or -1 of each.
     """
 
     columns: dict[str, float]
     matches: RegionMatches
+    keyframe_scores: Float64Array
     keyframe_labels: Int64Array
 
 
@@ -164,25 +162,20 @@ def score_regions(report: ChangeReport, truth: GroundTruth, after_travelled_m: F
         after_travelled_m: (S,) path length of the after session up to each scan.
     """
     regions, radius_m = report.regions, truth.pair.score_radius_m
-    keyframes = choose_judged_scans(report.keyframe_scans[0], len(truth.before.odom_T_sensor))
-    centres = transform_to_world(regions.centres_map, truth.before, keyframes)
+    centres = transform_to_world(regions.centres_map, truth.before)
     matches = match_regions(centres, regions.is_reported, truth.centroids_world, truth.is_observable, radius_m)
     path_m = float(after_travelled_m[-1])
     is_withdrawn = regions.is_proposed & ~regions.is_reported
     kept = [found for found, is_gone in zip(matches.found, is_withdrawn, strict=True) if not is_gone]
     proposed = match_regions(centres, regions.is_proposed, truth.centroids_world, truth.is_observable, radius_m)
 
-    scores = regions.keyframe_scores
-    positions = truth.before.world_T_sensor[keyframes[: len(scores)], :3, 3]
-    labels = label_keyframes(positions, truth.centroids_world, truth.is_observable, radius_m)
-    used = labels >= 0
+    scores, labels, ranking = _rank_keyframes(report, truth)
     columns = {
         **_compute_rates(matches, truth, path_m),
         **{f"{name}_proposed": value for name, value in _compute_rates(proposed, truth, path_m).items()},
         "region_recall_at_k": compute_recall_at_k(kept, truth.is_observable),
         "region_recall_at_k_proposed": compute_recall_at_k(matches.found, truth.is_observable),
-        "region_auroc": auroc(scores[used], labels[used] == 1),
-        "region_ap": average_precision(scores[used], labels[used] == 1),
+        **ranking,
         "region_coverage": measure_covered_share(
             truth.after.world_T_sensor[:, :3, 3], after_travelled_m, centres[regions.is_reported], regions.radius_m
         ),
@@ -194,15 +187,37 @@ def score_regions(report: ChangeReport, truth: GroundTruth, after_travelled_m: F
         "n_ignored_regions": matches.count("ignored"),
         "n_found_changes": _count_found(matches, truth),
     }
-    return RegionScores(columns, matches, labels)
+    return RegionScores(columns, matches, scores, labels)
+
+
+def _rank_keyframes(
+    report: ChangeReport | None, truth: GroundTruth
+) -> tuple[Float64Array, Int64Array, dict[str, float]]:
+    """Return scores and labels of the judged places of the before session, and the columns that follow from them.
+
+    Places without a score tie below all others, so a method without any score has an AUROC of 0.5.
+    """
+    scores = carry_scores(report, truth.before)
+    positions = truth.before.world_T_sensor[truth.before.judged_scans, :3, 3]
+    labels = label_keyframes(positions, truth.centroids_world, truth.is_observable, truth.pair.score_radius_m)
+    used = labels >= 0
+    area = auroc(scores[used], labels[used] == 1)
+    columns = {
+        "region_auroc": area,
+        "region_ap": average_precision(scores[used], labels[used] == 1),
+        "keyframe_coverage": float(np.mean(~np.isnan(scores))),
+        "is_auroc_assumed": float(not np.isnan(area) and np.isnan(scores[used]).all()),
+    }
+    return scores, labels, columns
 
 
 def _compute_rates(matches: RegionMatches, truth: GroundTruth, path_m: float) -> dict[str, float]:
     """Return recall, precision and false alarms of the matched regions."""
     n_true, n_false = matches.count("true"), matches.count("false")
+    nothing = 0.0 if truth.n_observable else float("nan")
     return {
         "region_recall": _count_found(matches, truth) / truth.n_observable if truth.n_observable else float("nan"),
-        "region_precision": n_true / (n_true + n_false) if n_true + n_false else float("nan"),
+        "region_precision": n_true / (n_true + n_false) if n_true + n_false else nothing,
         "false_regions_per_100m": 100.0 * n_false / path_m if path_m > 0 else float("nan"),
     }
 
@@ -211,17 +226,24 @@ def _count_found(matches: RegionMatches, truth: GroundTruth) -> int:
     return int(np.count_nonzero(truth.is_observable & (matches.best_region >= 0)))
 
 
-def score_unanswered_regions(n_changes: int, n_observable: int) -> RegionScores:
-    """Return the scores of a case without an answer: recall 0; rates over reported regions are NaN."""
-    recalls = ("region_recall", "region_recall_at_k", "region_recall_proposed", "region_recall_at_k_proposed")
-    rates = (
-        "region_precision", "region_auroc", "region_ap", "false_regions_per_100m", "region_coverage",
-        "region_precision_proposed", "false_regions_per_100m_proposed",
+def score_unanswered_regions(truth: GroundTruth) -> RegionScores:
+    """Return the scores of a case without an answer: those of an empty one, and no rates over the path."""
+    shares = (
+        "region_recall", "region_recall_at_k", "region_precision",
+        "region_recall_proposed", "region_recall_at_k_proposed", "region_precision_proposed",
     )  # fmt: skip
+    rates = ("false_regions_per_100m", "false_regions_per_100m_proposed", "region_coverage")
     counts = (
         "n_regions", "n_withdrawn", "n_true_regions", "n_false_regions", "n_duplicate_regions", "n_ignored_regions",
         "n_found_changes",
     )  # fmt: skip
-    recall = 0.0 if n_observable else float("nan")
-    columns = {**dict.fromkeys(recalls, recall), **dict.fromkeys(rates, float("nan")), **dict.fromkeys(counts, 0)}
-    return RegionScores(columns, RegionMatches((), (), np.full(n_changes, -1)), np.zeros(0, dtype=np.int64))
+    share = 0.0 if truth.n_observable else float("nan")
+    scores, labels, ranking = _rank_keyframes(None, truth)
+    columns = {
+        **dict.fromkeys(shares, share),
+        **dict.fromkeys(rates, float("nan")),
+        **dict.fromkeys(counts, 0),
+        **ranking,
+    }
+    matches = RegionMatches((), (), np.full(len(truth.pair.changes), -1))
+    return RegionScores(columns, matches, scores, labels)

@@ -24,6 +24,7 @@ from eval.core.domains import domain_of, is_change_in_distribution
 from eval.core.statistics import mean
 from eval.scoring.answer_check import SECONDS, check_answer
 from eval.scoring.answer_rows import find_answer_rows
+from eval.scoring.judged_places import carry_merge
 from eval.scoring.merge_metrics import compute_merge_errors, list_evidence, measure_overlap, summarise_merge_errors
 from eval.scoring.object_metrics import (
     ObjectMatches,
@@ -33,10 +34,10 @@ from eval.scoring.object_metrics import (
     summarise_objects,
 )
 from eval.scoring.object_sizes import SizeErrors, compute_size_errors, summarise_size_errors
-from eval.scoring.region_metrics import RegionScores, choose_judged_scans, score_regions, score_unanswered_regions
+from eval.scoring.region_metrics import RegionScores, score_regions, score_unanswered_regions
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
-METRICS_VERSION = 4
+METRICS_VERSION = 5
 _NAN = float("nan")
 Metric = Callable[[GroundTruth, Answer], Mapping[str, float]]
 """`metric(truth, answer)`: columns by name; NaN where undefined. `answer.report` is None where a method gave none."""
@@ -51,7 +52,8 @@ class CaseScore:
         changes: One dict per change of the truth.
         regions: One dict per candidate region.
         objects: One dict per answered object.
-        keyframes: One dict per scored before keyframe: keyframe, score, label (1, 0, or -1 for left out).
+        keyframes: One dict per judged place of the before session: keyframe (its number), scan, score (NaN where the
+            answer states none), label (1, 0, or -1 for left out).
     """
 
     row: dict[str, Any]
@@ -75,13 +77,23 @@ def score(answer: ChangeReport | Path | str, pair: Path | str) -> dict[str, Any]
     return score_answer(whole, truth).row
 
 
-def score_stored(truth: GroundTruth, folder: Path) -> CaseScore:
+def score_stored(truth: GroundTruth, folder: Path, *, may_end_early: bool = False) -> CaseScore:
     """Score the answer stored in a folder.
+
+    Args:
+        truth: The pair's truth.
+        folder: Folder of the answer.
+        may_end_early: Whether a plan asked for the answer, and may have ended it at the merge.
 
     Raises:
         InputError: A file is damaged, or the answer cannot be an answer to this pair.
     """
     answer = read_answer(folder)
+    if answer.until is not None and not may_end_early:
+        raise InputError(
+            f"{folder / 'answer.json'}: until = {answer.until!r}: a plan alone ends a method early; leave it out, and "
+            "give the whole answer"
+        )
     check_answer(answer, truth, folder)
     return score_answer(answer, truth)
 
@@ -95,7 +107,7 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
     after_travelled_m = travelled_m(truth.after.odom_T_sensor)
     report = answer.report
     if report is None or answer.until == "merge":
-        regions = score_unanswered_regions(len(truth.pair.changes), truth.n_observable)
+        regions = score_unanswered_regions(truth)
         objects, object_scores = score_unanswered_objects(truth)
         right = np.full(len(truth.pair.changes), np.nan)
         sizes = SizeErrors(right, right)
@@ -106,8 +118,7 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
         objects = match_objects(report.objects, rows, truth)
         right = judge_kinds(report.objects, objects, truth)
         object_scores = summarise_objects(objects, right, truth)
-        before_scans = choose_judged_scans(report.keyframe_scans[0], len(truth.before.odom_T_sensor))
-        sizes = compute_size_errors(report.objects, objects, truth, before_scans)
+        sizes = compute_size_errors(report.objects, objects, truth)
         items = make_object_rows(report.objects, objects, [len(of_object) for of_object in rows], truth)
     n_regions = int(regions.columns["n_regions"])
     found: dict[str, float] = {**regions.columns, **object_scores, **summarise_size_errors(sizes, truth)}
@@ -122,15 +133,15 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
     row |= compute_plugin_columns(truth, answer, row)
     if answer.until == "merge":
         return CaseScore(row=row, changes=[], regions=[], objects=[])
-    keyframe_scores = np.zeros(0) if report is None else report.regions.keyframe_scores
+    judged = zip(truth.before.judged_scans, regions.keyframe_scores, regions.keyframe_labels, strict=True)
     return CaseScore(
         row=row,
         changes=make_change_rows(regions, (objects, sizes), right, truth, report),
         regions=make_region_rows(report, regions, truth),
         objects=items,
         keyframes=[
-            {"keyframe": index, "score": float(score), "label": int(label)}
-            for index, (score, label) in enumerate(zip(keyframe_scores, regions.keyframe_labels, strict=True))
+            {"keyframe": index, "scan": int(scan), "score": float(score), "label": int(label)}
+            for index, (scan, score, label) in enumerate(judged)
         ],
     )
 
@@ -272,13 +283,7 @@ def _make_identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
 def _score_merge(answer: Answer, truth: GroundTruth) -> dict[str, float]:
     report, errors = answer.report, None
     if report is not None:
-        before_scans, after_scans = (
-            choose_judged_scans(scans, len(session.odom_T_sensor))
-            for scans, session in zip(report.keyframe_scans, (truth.before, truth.after), strict=True)
-        )
-        local = report.local_before_T_after
-        merge = report.before_T_after if local is None else local
-        errors = compute_merge_errors(truth.before, truth.after, merge, (before_scans, after_scans))
+        errors = compute_merge_errors(truth.before, truth.after, carry_merge(report, truth.after))
     overlap = measure_overlap(truth.before.world_T_sensor, truth.after.world_T_sensor)
     return {**summarise_merge_errors(errors), "overlap_true": overlap, **list_evidence(answer.evidence)}
 

@@ -86,14 +86,14 @@ RESULT_COLUMNS = (
            "radius of the change's centroid.", _NO_CHANGE),
     Column("region_precision", "region precision", "high", share,
            "Share of true regions among the reported true and false ones; a second region on a found change counts as "
-           "neither.", "Undefined where no region was reported that counts."),
+           "neither.", "0 where none was reported that counts; undefined where nothing changed and none was."),
     Column("region_recall_at_k", "recall at K", "high", share,
            "Region recall of the K best-scored candidates, whatever the threshold says; K is the number of observable "
            "changes.", _NO_CHANGE),
     Column("region_auroc", "AUROC", "high", share,
-           "How well the score of each before keyframe tells those near an observable change from those far from any; "
-           "0.5 is chance.",
-           "Undefined where a pair has keyframes of one class only, or the method gives no keyframe scores."),
+           "How well the scores along the before path, one per metre, tell places near an observable change from those "
+           "far from any; 0.5 is chance, also for a pair without scores or without an answer.",
+           "Undefined where a pair has places of one class only."),
     Column("false_regions_per_100m", "false regions / 100 m", "low", share,
            "Reported regions that find no change, per 100 m of the after drive.", _NOT_OK),
     Column("object_iou_point", "object IoU", "high", share,
@@ -103,9 +103,10 @@ RESULT_COLUMNS = (
            "Objects right at an IoU of at least 0.5, as the harmonic mean of their precision and recall.", _NO_CHANGE),
     Column("kind_accuracy", "kind", "high", share,
            "Share of the matched changes that were called added, removed, moved or reshaped rightly.",
-           "Undefined where no change was matched."),
+           "0 where none was matched; undefined where nothing changed."),
     Column("merge_error_m", "merge error [m]", "low", fine,
-           "Median translation error between every after keyframe and the truly nearest before keyframe.", _NOT_OK),
+           "Median translation error between every metre of the after path and the truly nearest of the before path.",
+           _NOT_OK),
     Column("merge_error_deg", "merge error [deg]", "low", fine, "The same in rotation.", _NOT_OK),
     Column("t_total_s", "time [s]", "low", significant,
            "Descriptors, change detection and object extraction of one pair, without the merge; one thread.", _NOT_OK),

@@ -1,7 +1,7 @@
 """What a run says about regions: a row for every method, in and out of the training distribution.
 
-The unit is the session pair. A pair without an answer counts as missing all its changes and is never silent; what it
-would have said about its keyframes is unknown, so AUROC is over the answered pairs, and `n_auroc` says how many.
+The unit is the session pair. A pair without an answer counts as missing all its changes, has an AUROC of 0.5, and is
+never silent. `n_auroc` counts the pairs with places near a change and far from any.
 """
 
 from __future__ import annotations

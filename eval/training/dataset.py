@@ -307,7 +307,7 @@ def _list_changes(before: _Mapped, truth: GroundTruth) -> Arrays:
         "change_is_observable": truth.is_observable,
         "change_n_cells": np.array([len(rows) for rows in truth.change_rows], dtype=np.int64),
         "change_centroid_world": centroids,
-        "change_centroid_odom": transform_to_map(centroids, before.truth, before.map.keyframe_scans),
+        "change_centroid_odom": transform_to_map(centroids, before.truth),
     }
 
 

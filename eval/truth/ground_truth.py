@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +19,13 @@ from cdpipe.core.geometry import (
     transform_each,
 )
 from cdpipe.io.session import read_session
+from cdpipe.mapping.mapping import choose_keyframes
 from cdpipe.model.types import SessionName
 from eval.truth.scoring_points import ScoringPoints, load_scoring_points
 from sim.session.truth import PairTruth, read_pair_truth, read_true_poses
 
 SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
+JUDGED_SPACING_M = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,16 +36,20 @@ class SessionTruth:
         odom_T_sensor: (S, 4, 4) poses of the robot's odometry.
         world_T_sensor: (S, 4, 4) true poses.
         scoring_points: Returns that objects are scored against.
+        judged_scans: (J,) the first scan and one per metre of odometry. Keyframe scores and merges are judged there,
+            whatever keyframes an answer names.
     """
 
     odom_T_sensor: Float64Array
     world_T_sensor: Float64Array
     scoring_points: ScoringPoints
+    judged_scans: Int64Array = field(init=False)
 
     def __post_init__(self) -> None:
         require_poses("odom_T_sensor", self.odom_T_sensor)
         require_poses("world_T_sensor", self.world_T_sensor)
         require_shape("world_T_sensor", self.world_T_sensor, self.odom_T_sensor.shape)
+        object.__setattr__(self, "judged_scans", choose_keyframes(self.odom_T_sensor, JUDGED_SPACING_M))
 
     def to_world(self, points_odom: Float64Array, scans: Int64Array) -> Float64Array:
         """Transform (N, 3) odom points into the world, each by the true pose of one of (N,) scans."""

@@ -16,11 +16,11 @@ from eval.tables.rows import records, with_domain
 _ms = scaled(1000.0)
 REGION_COLUMNS = (
     Column("region_auroc", "AUROC", "high", share,
-           "How well keyframe scores tell places near a change from places far from any; mean over pairs, below it the "
-           "95 % bootstrap interval over pairs.",
-           "Undefined for a pair without an answer, or with keyframes of one class only."),
+           "How well scores tell places near a change from places far from any; mean over pairs, 0.5 for one without "
+           "an answer, below it the 95 % bootstrap interval over pairs.",
+           "Undefined for a pair with places of one class only."),
     Column("region_auroc_pooled", "pooled", "high", share,
-           "The same over all keyframes of all pairs at once, scores as they are."),
+           "The same over all places of all pairs at once, scores as they are."),
     Column("region_recall_at_k", "recall at K", "high", share,
            "Share of the K observable changes of a pair that its K best candidates find, without what was withdrawn.",
            "0 without an answer."),
@@ -33,7 +33,7 @@ REGION_COLUMNS = (
            "At 0.1 false regions per 100 m as if no region had been withdrawn: what the scores alone can do."),
     Column("region_recall", "recall", "high", share, "Share found at the method's own, calibrated threshold."),
     Column("region_precision", "precision", "high", share, "True among true and false regions.",
-           "Undefined where nothing was reported."),
+           "0 for a changed pair where nothing was reported."),
     Column("false_regions_per_100m", "false / 100 m", None, share,
            "False regions at the method's own threshold, over the whole way of all pairs together."),
     Column("bytes_ratio", "map / kept", None, significant,

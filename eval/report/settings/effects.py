@@ -23,9 +23,9 @@ from eval.tables.rows import records
 COLUMNS = (
     Column("n_observable", "observable changes", None, count),
     *select(RESULT_COLUMNS, "region_recall", "region_recall_at_k", "region_auroc", "false_regions_per_100m",
-            "object_iou_point", "merge_error_m"),
+            "object_iou_point", "object_f1_50", "merge_error_m"),
 )  # fmt: skip
-_DRAWN = ("region_recall_at_k", "object_iou_point")
+_DRAWN = ("region_recall_at_k", "object_iou_point", "object_f1_50")
 _MINUS = "\u2212"
 _ROW_PX, _LINES_PER_ROW, _MARGIN_PX = 30, 0.45, 50
 _ZERO = Look(BLACK, 0.8)

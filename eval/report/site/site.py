@@ -177,7 +177,7 @@ def truth_marks(truth: GroundTruth, rows: Sequence[Row]) -> list[TruthMark]:
         rows: Rows of changes.csv of one variant.
     """
     is_found = {int(number(row, "id")): flag(row, "is_found") for row in rows}
-    places = transform_to_map(truth.centroids_world, truth.before, np.arange(len(truth.before.odom_T_sensor)))
+    places = transform_to_map(truth.centroids_world, truth.before)
     marks = []
     for change, (x_m, y_m, _), is_observable in zip(truth.pair.changes, places, truth.is_observable, strict=True):
         state = _STATES[is_found.get(change.id)] if is_observable else "unobservable"

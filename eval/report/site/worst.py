@@ -66,8 +66,9 @@ def _words(row: Row) -> str:
     n = number(row, "n_observable")
     of_changes = "" if math.isnan(n) else f" of {n:.0f} observable changes"
     return (
-        f"object IoU {share(number(row, 'object_iou_point'))}, region recall {share(number(row, 'region_recall'))}"
-        f"{of_changes}, false regions per 100 m {share(number(row, 'false_regions_per_100m'))}{merge}"
+        f"object IoU {share(number(row, 'object_iou_point'))}, F1 at 0.5 {share(number(row, 'object_f1_50'))}, "
+        f"region recall {share(number(row, 'region_recall'))}{of_changes}, "
+        f"false regions per 100 m {share(number(row, 'false_regions_per_100m'))}{merge}"
     )
 
 

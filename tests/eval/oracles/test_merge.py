@@ -12,7 +12,6 @@ from eval.truth.ground_truth import SessionTruth
 from eval.truth.scoring_points import ScoringPoints
 
 N = 60
-KEYFRAMES = (np.arange(0, N, 2), np.arange(1, N, 3))
 
 
 def winding(start_m: float, *, backwards: bool = False) -> np.ndarray:
@@ -48,13 +47,13 @@ def mapped(truth: SessionTruth, keyframes: np.ndarray) -> MappedSession:
 
 
 def oracle(truth: tuple[SessionTruth, SessionTruth], noise: OracleMerge, seed: int = 3) -> MergedMaps:
-    before, after = (mapped(each, keyframes) for each, keyframes in zip(truth, KEYFRAMES, strict=True))
+    before, after = (mapped(each, each.judged_scans) for each in truth)
     return merged_by_truth(before, after, truth, noise, seed)
 
 
 def errors_of(truth: tuple[SessionTruth, SessionTruth], merged: MergedMaps) -> MergeErrors:
     assert merged.local is not None
-    return compute_merge_errors(*truth, merged.local.before_T_after, KEYFRAMES)
+    return compute_merge_errors(*truth, merged.local.before_T_after)
 
 
 def pair(drift_deg_per_m: float = 0.0, start_m: float = 4.0, *, backwards: bool = False) -> tuple[SessionTruth, ...]:
@@ -74,7 +73,7 @@ def test_the_error_of_every_keyframe_is_the_noise(
     merged = oracle(truth, OracleMerge(noise_m=metres, noise_deg=degrees))
     assert merged.is_accepted
     errors = errors_of(truth, merged)
-    assert len(errors.metres) == len(KEYFRAMES[1])
+    assert len(errors.metres) == len(truth[1].judged_scans)
     np.testing.assert_allclose(errors.metres, metres, atol=1e-9)
     np.testing.assert_allclose(errors.degrees, degrees, atol=1e-5)
 
@@ -85,7 +84,7 @@ def test_the_noise_stands_still_in_the_map_and_scales() -> None:
     places = []
     for merged in (exact, near, far):
         assert merged.local is not None
-        places.append((merged.local.before_T_after @ truth[1].odom_T_sensor[KEYFRAMES[1]])[:, :3, 3])
+        places.append((merged.local.before_T_after @ truth[1].odom_T_sensor[truth[1].judged_scans])[:, :3, 3])
     shifts = places[1] - places[0]
     np.testing.assert_allclose(shifts - shifts[0], 0.0, atol=1e-9)
     np.testing.assert_allclose(places[2] - places[0], 3 * shifts, atol=1e-9)
@@ -113,23 +112,23 @@ def test_keyframes_without_a_partner_take_the_alignment_of_the_nearest_that_has_
     truth = pair(0.05, start_m=20.0)
     merged = oracle(truth, OracleMerge(noise_m=0.1))
     assert merged.local is not None
-    assert 0 < len(errors_of(truth, merged).metres) < len(KEYFRAMES[1])
+    assert 0 < len(errors_of(truth, merged).metres) < len(truth[1].judged_scans)
     n_paired = len(errors_of(truth, merged).metres)
     # the drives part at the before session's end, and the after session drives on
-    for index in range(n_paired, len(KEYFRAMES[1])):
+    for index in range(n_paired, len(truth[1].judged_scans)):
         np.testing.assert_array_equal(merged.local.before_T_after[index], merged.local.before_T_after[n_paired - 1])
     np.testing.assert_array_equal(merged.before_T_after, merged.local.before_T_after[n_paired // 2])
-    np.testing.assert_array_equal(merged.local.anchors_odom, truth[1].odom_T_sensor[KEYFRAMES[1], :3, 3])
+    np.testing.assert_array_equal(merged.local.anchors_odom, truth[1].odom_T_sensor[truth[1].judged_scans, :3, 3])
 
 
 def test_of_two_keyframes_at_one_place_each_keeps_its_own() -> None:
     there = winding(0.0)[: N // 2]
     world = np.concatenate([there, there[::-1]])
     truth = (session(winding(0.0), np.eye(4)), session(world, yaw_pose(1.0), 0.1))
-    before, after = mapped(truth[0], np.arange(N)), mapped(truth[1], np.arange(N))
+    before, after = (mapped(each, each.judged_scans) for each in truth)
     merged = merged_by_truth(before, after, truth, OracleMerge(), 1)
     assert merged.local is not None
-    errors = compute_merge_errors(*truth, merged.local.before_T_after, (np.arange(N), np.arange(N)))
+    errors = compute_merge_errors(*truth, merged.local.before_T_after)
     np.testing.assert_allclose(errors.metres, 0.0, atol=1e-9)
 
 

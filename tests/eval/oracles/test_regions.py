@@ -46,8 +46,8 @@ def truth_of(places: list[tuple[float, float]], n_cells: list[int], is_observabl
 def test_every_change_gets_a_region_that_finds_it_however_the_map_drifts() -> None:
     truth = truth_of([(3.2, 1.0), (17.9, -1.5), (33.0, 0.5)], [5, 9, 7], [True, True, True])
     regions = regions_by_truth(truth, SCANS, QueryConfig(radius_m=4.5))
-    # the largest first; the places are exact, for the keyframe that carries them there carries them back
-    back = transform_to_world(regions.centres_map, truth.before, SCANS[0])
+    # the largest first; the places are exact, for the scan that carries them there carries them back
+    back = transform_to_world(regions.centres_map, truth.before)
     np.testing.assert_allclose(back, truth.centroids_world[[1, 2, 0]], atol=1e-9)
     assert regions.is_reported.all()
     matches = match_regions(back, regions.is_reported, truth.centroids_world, truth.is_observable, 0.01)
@@ -57,13 +57,15 @@ def test_every_change_gets_a_region_that_finds_it_however_the_map_drifts() -> No
     assert np.linalg.norm(start - back, axis=1).max() > 0.3
     # keyframes 4 m and 3 m apart, before from scan 0, after from scan 1
     assert regions.pairs.tolist() == [[4, 6], [8, 11], [1, 1]]
-    assert regions.keyframe_scores.shape == (0,)
+    # the nearer a keyframe is to a change, the higher it scores: AUROC 1
+    gaps_m = np.linalg.norm(truth.before.world_T_sensor[SCANS[0], None, :3, 3] - truth.centroids_world, axis=2)
+    np.testing.assert_allclose(regions.keyframe_scores, -gaps_m.min(axis=1))
 
 
 def test_what_nobody_could_see_gets_no_region_and_a_near_neighbour_of_a_larger_one_none_of_its_own() -> None:
     truth = truth_of([(5.0, 0.0), (8.0, 0.0), (20.0, 0.0), (30.0, 0.0)], [5, 9, 7, 3], [True, True, False, True])
     regions = regions_by_truth(truth, SCANS, QueryConfig(radius_m=4.5))
-    back = transform_to_world(regions.centres_map, truth.before, SCANS[0])
+    back = transform_to_world(regions.centres_map, truth.before)
     np.testing.assert_allclose(back[:, 0], [8.0, 30.0], atol=1e-9)
     closer = regions_by_truth(truth, SCANS, QueryConfig(radius_m=4.5, suppression=0.5))
     assert len(closer.scores) == 3
@@ -80,6 +82,7 @@ def test_an_unchanged_pair_has_no_region() -> None:
     regions = regions_by_truth(truth_of([], [], []), SCANS, QueryConfig())
     assert regions.centres_map.shape == (0, 3)
     assert regions.pairs.shape == (0, 2)
+    assert np.isnan(regions.keyframe_scores).all()
 
 
 PLAN = """\

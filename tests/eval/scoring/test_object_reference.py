@@ -176,7 +176,7 @@ def slow_columns(case: Case, matching: dict[int, int]) -> dict[str, float]:
             n_false += item not in hits.values() and not on_others > len(case.rows[item]) / 2
         n_missed = len(main) - len(hits)
         weight = len(hits) + (n_false + n_missed) / 2
-        precision = len(hits) / (len(hits) + n_false) if len(hits) + n_false else NAN
+        precision = len(hits) / (len(hits) + n_false) if len(hits) + n_false else 0.0 if main else NAN
         if not main:
             return NAN, precision, NAN
         return len(hits) / weight, precision, sum(slow_point_iou(case, *pair) for pair in hits.items()) / weight
@@ -189,7 +189,7 @@ def slow_columns(case: Case, matching: dict[int, int]) -> dict[str, float]:
         "object_f1_50": scores(0.5)[0],
         "object_precision_50": scores(0.5)[1],
         "object_pq": scores(0.5)[2],
-        "kind_accuracy": sum(right) / len(right) if right else NAN,
+        "kind_accuracy": sum(right) / len(right) if right else (0.0 if any(case.truth.is_observable) else NAN),
         "object_iou_point_partial": sum(of_partial) / len(of_partial) if of_partial else NAN,
     }
 

@@ -22,7 +22,6 @@ from sim.session.truth import Change, PairTruth
 from tests.eval.changes import change
 
 N_SCANS = 11
-KEYFRAMES = np.array([0, 5, 10])
 NAN = float("nan")
 # things stand at rows 10 n to 10 n + 9 of their session's scoring points
 WIDTH = 10
@@ -75,7 +74,7 @@ def thing(session: str, *, moved_by: tuple[float, ...] | None = None, volume_m3:
 
 def errors_of(truth: GroundTruth, objects: list[ChangedObject], places: list[int]) -> tuple[np.ndarray, np.ndarray]:
     rows = [np.arange(WIDTH * place, WIDTH * (place + 1)) for place in places]
-    errors = compute_size_errors(objects, match_objects(objects, rows, truth), truth, KEYFRAMES)
+    errors = compute_size_errors(objects, match_objects(objects, rows, truth), truth)
     return errors.displacement_m, errors.volume_share
 
 
@@ -91,10 +90,10 @@ def test_what_is_not_matched_or_never_moved_has_no_displacement() -> None:
     truth = truth_of(
         [change_at(1, "after", "added", np.eye(4)), change_at(2, "after", "moved", np.eye(4), partner=None)]
     )
-    assert np.isnan(find_true_displacements_map(truth, KEYFRAMES)).all()
+    assert np.isnan(find_true_displacements_map(truth)).all()
     displacement_m, _ = errors_of(truth, [thing("after", moved_by=(1.0, 0.0, 0.0))], [0])
     assert np.isnan(displacement_m).all()
-    assert find_true_displacements_map(truth_of([]), KEYFRAMES).shape == (0, 3)
+    assert find_true_displacements_map(truth_of([])).shape == (0, 3)
 
 
 @pytest.mark.parametrize("height_m", [0.0, 1.0])
@@ -104,25 +103,25 @@ def test_it_is_the_middle_that_moves_when_a_thing_falls_over(height_m: float) ->
     props = {"props": [{"name": "thing", "size_m": [0.5, 0.5, height_m]}, {"name": "mesh", "size_m": None}]}
     truth = truth_of(moved(make_pose(translation=(2.0, 0.0, 0.0)), lying), **(props if height_m else {}))
     expected = (2.0 + height_m / 2, 0.0, -height_m / 2)
-    np.testing.assert_allclose(find_true_displacements_map(truth, KEYFRAMES), [expected, expected], atol=1e-12)
+    np.testing.assert_allclose(find_true_displacements_map(truth), [expected, expected], atol=1e-12)
 
 
 def test_both_halves_say_the_same_and_a_turned_map_turns_it() -> None:
     changes = moved(make_pose(translation=(4.0, 1.0, 0.0)), make_pose(translation=(7.0, 1.0, 0.0)))
     truth = truth_of(changes, yaw_pose(np.pi / 2, (50.0, -3.0, 1.0)))
-    np.testing.assert_allclose(find_true_displacements_map(truth, KEYFRAMES), [[0, 3, 0], [0, 3, 0]], atol=1e-12)
+    np.testing.assert_allclose(find_true_displacements_map(truth), [[0, 3, 0], [0, 3, 0]], atol=1e-12)
 
 
 def test_drift_between_the_two_places_belongs_to_the_map() -> None:
     # odometry believes 1 % more than it drove: the map puts the far place 0.1 m too far, where the answer sees it too
     stretched = np.stack([make_pose(translation=(0.02 * index, 0.0, 0.0)) for index in range(N_SCANS)])
     truth = truth_of(moved(make_pose(translation=(0.5, 0, 0)), make_pose(translation=(10.5, 0, 0))), stretched)
-    np.testing.assert_allclose(find_true_displacements_map(truth, KEYFRAMES)[0], [10.1, 0.0, 0.0])
+    np.testing.assert_allclose(find_true_displacements_map(truth)[0], [10.1, 0.0, 0.0])
     displacement_m, _ = errors_of(truth, [thing("before", moved_by=(10.1, 0, 0))], [0])
     assert displacement_m[0] == pytest.approx(0.0, abs=1e-12)
-    # of places between two keyframes, at x = 0, 10 and 20, the nearer one counts
+    # of places between two scans, at x = 4 and 6, the nearer one counts
     near = truth_of(moved(make_pose(translation=(4.9, 0, 0)), make_pose(translation=(5.1, 0, 0))), stretched)
-    np.testing.assert_allclose(find_true_displacements_map(near, KEYFRAMES)[0], [0.3, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(find_true_displacements_map(near)[0], [0.22, 0.0, 0.0], atol=1e-12)
 
 
 def test_volumes_by_hand() -> None:
@@ -154,10 +153,10 @@ def test_columns_are_medians_of_what_is_there() -> None:
     truth = truth_of(changes)
     objects = [thing("after", volume_m3=volume) for volume in (2.2, 1.4, 20.0)]
     matches = match_objects(objects, [np.arange(WIDTH * i, WIDTH * (i + 1)) for i in range(3)], truth)
-    columns = summarise_size_errors(compute_size_errors(objects, matches, truth, KEYFRAMES), truth)
+    columns = summarise_size_errors(compute_size_errors(objects, matches, truth), truth)
     # piles alone: +10 % and -30 %
     assert columns == pytest.approx({"displacement_error_m": NAN, "pile_volume_error": 0.2}, nan_ok=True)
-    none = summarise_size_errors(compute_size_errors([], match_objects([], [], truth), truth, KEYFRAMES), truth)
+    none = summarise_size_errors(compute_size_errors([], match_objects([], [], truth), truth), truth)
     assert np.isnan(list(none.values())).all()
 
 
@@ -167,7 +166,7 @@ def slow_place(truth: GroundTruth, scenario: dict[str, float], each: Change) -> 
     for axis in range(3):
         middle[axis] = turn[axis][3] + turn[axis][2] * scenario.get(each.name, 0.0) / 2
     world, odom = truth.before.world_T_sensor, truth.before.odom_T_sensor
-    nearest = min(KEYFRAMES.tolist(), key=lambda scan: sum((world[scan][i][3] - middle[i]) ** 2 for i in range(3)))
+    nearest = min(range(N_SCANS), key=lambda scan: sum((world[scan][i][3] - middle[i]) ** 2 for i in range(3)))
     # seen from that keyframe, then from where odometry believes it was
     seen = [sum(world[nearest][j][i] * (middle[j] - world[nearest][j][3]) for j in range(3)) for i in range(3)]
     return [sum(odom[nearest][i][j] * seen[j] for j in range(3)) + odom[nearest][i][3] for i in range(3)]
@@ -205,7 +204,7 @@ def test_errors_of_displacement_and_volume_equal_their_slow_twins(seed: int) -> 
                 places.append(place)
     rows = [np.arange(WIDTH * place, WIDTH * (place + 1)) for place in places]
     matches = match_objects(objects, rows, truth)
-    errors = compute_size_errors(objects, matches, truth, KEYFRAMES)
+    errors = compute_size_errors(objects, matches, truth)
 
     of_moves, of_piles = [], []
     for index, each in enumerate(changes):
