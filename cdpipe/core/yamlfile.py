@@ -58,7 +58,7 @@ def read_yaml(path: Path, text: str | None = None) -> Document:
         InputError: The file is missing, not YAML, or names a key twice.
     """
     try:
-        document = _parse(str(path), path.read_text() if text is None else text)
+        document = _parse(str(path), path.read_text(encoding="utf-8") if text is None else text)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:  # not text

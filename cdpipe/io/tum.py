@@ -25,7 +25,7 @@ def read_tum(path: Path) -> tuple[Float64Array, tuple[int, ...]]:
         InputError: The file cannot be read, or a line is not eight finite numbers with a unit quaternion.
     """
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as text: {error}") from error
     numbers = tuple(n for n, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith("#"))

@@ -245,7 +245,7 @@ def _preset_document(preset: str) -> Document:
     presets = _presets()
     if preset not in presets:
         raise InputError(f"preset {preset!r} is unknown{suggest(preset, presets)} (known: {', '.join(presets)})")
-    return read_yaml(Path(f"{preset}.yaml"), presets[preset].read_text())
+    return read_yaml(Path(f"{preset}.yaml"), presets[preset].read_text(encoding="utf-8"))
 
 
 def _presets() -> dict[str, Traversable]:

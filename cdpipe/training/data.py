@@ -194,7 +194,7 @@ def _read_index(folder: Path) -> list[TunnelShard]:
     path = folder / "index.csv"
     if not path.is_file():
         raise InputError(f"{path}: missing: expected a folder made by `tunnelcd dataset`")
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row.get("status") == "ok"]
     try:
         return [

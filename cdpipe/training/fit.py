@@ -168,11 +168,12 @@ def _save(
         tensors |= {f"optimiser.{index}.{name}": tensor for name, tensor in state.items()}
     about = json.dumps({"identity": identity, "history": [asdict(done) for done in history]})
     content = save({name: tensor.clone().contiguous() for name, tensor in tensors.items()}, {"about": about})
+    partial = path.with_suffix(".partial")
     try:
-        partial = path.with_suffix(".partial")
         partial.write_bytes(content)
         partial.replace(path)
     except OSError as error:
+        partial.unlink(missing_ok=True)
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
 
 

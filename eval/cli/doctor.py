@@ -86,7 +86,7 @@ def _requirements() -> tuple[list[str], dict[str, list[str]]]:
     """Return the requirements of tunnelcd and of each extra, from pyproject.toml if it runs from a source tree."""
     file = Path(__file__).resolve().parents[2] / "pyproject.toml"
     if file.is_file():
-        project = tomllib.loads(file.read_text())["project"]
+        project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
         return project["dependencies"], project["optional-dependencies"]
     needed: list[str] = []
     extras: dict[str, list[str]] = {}

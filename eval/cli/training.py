@@ -54,7 +54,7 @@ def train(
     descriptor: Annotated[str, typer.Option(help="sphere or 3deg")] = "sphere",
     steps: Annotated[int, typer.Option(min=1, help="largest number of training steps")] = 4000,
     seed: Annotated[int, typer.Option(min=0, help="seed of the initial weights and of every draw")] = 0,
-    threads: Annotated[int, typer.Option(min=1, help="number of torch's threads")] = 2,
+    threads: Annotated[int, typer.Option(min=1, help="number of torch's threads; another gives other weights")] = 2,
     patience: Annotated[int, typer.Option(min=1, help="stop after this many validations without a better score")] = 6,
     quiet: Quiet = False,
 ) -> None:

@@ -30,7 +30,7 @@ def read_plan(name_or_path: str) -> Document:
             f"plan {name_or_path!r} is unknown{suggest(name_or_path, plans)} "
             f"(known: {', '.join(plans)}, or the path of a .yaml file)"
         )
-    return read_yaml(Path(f"{name_or_path}.yaml"), plans[name_or_path].read_text())
+    return read_yaml(Path(f"{name_or_path}.yaml"), plans[name_or_path].read_text(encoding="utf-8"))
 
 
 def _find_plans() -> dict[str, Traversable]:

@@ -126,7 +126,7 @@ def main(run: Annotated[Path, typer.Argument(help="folder of `tunnelcd run calib
     table = find_thresholds(read_table(run / "results.csv", "calibrate"), read_table(run / "regions.csv", "calibrate"))
     table.to_csv(run / "thresholds.csv", index=False)
     settings = format_settings(table)
-    (run / "thresholds.yaml").write_text(settings)
+    (run / "thresholds.yaml").write_text(settings, encoding="utf-8")
     typer.echo(f"{table.to_string(index=False)}\n\n{settings}")
 
 

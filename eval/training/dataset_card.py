@@ -37,7 +37,7 @@ def write_card(out: Path) -> None:
         pd.DataFrame(rows, columns=list(INDEX_COLUMNS)).to_csv(partial, index=False)
     document = json.loads((out / "dataset.json").read_text())
     with whole_file(out / "README.md") as partial:
-        partial.write_text(card(rows, document["recipe"], document["commands"]))
+        partial.write_text(card(rows, document["recipe"], document["commands"]), encoding="utf-8")
 
 
 def fields_table() -> str:

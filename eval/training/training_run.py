@@ -21,7 +21,7 @@ from cdpipe.training.scan_training import PlaceTask
 from cdpipe.training.sphere_training import SphereTask, read_sphere_data
 from eval.core.charts import BLUE, VERMILLION, Axis, Drawing, Look, Panel, Series
 from eval.core.figures import picture, png
-from eval.core.output import make_writable
+from eval.core.output import make_writable, whole_file
 from eval.core.progress import RunProgress
 from eval.core.provenance import git_commit
 
@@ -68,9 +68,12 @@ def train_descriptor(
     def on_validation(done: Progress) -> None:
         latest.append(done)
         rows = [{"step": each.step, **each.losses, **each.scores, "is_best": each.is_best} for each in latest]
-        pd.DataFrame(rows).to_csv(out / "curves.csv", index=False, lineterminator="\r\n")
+        with whole_file(out / "curves.csv") as partial:
+            pd.DataFrame(rows).to_csv(partial, index=False, lineterminator="\r\n")
 
-    history = fit(task, config, out, f"{name} {' '.join(digests)}", on_step, on_validation)
+    # another number of threads adds in another order, and gives other weights
+    identity = " ".join([name, *digests, f"{threads} threads"])
+    history = fit(task, config, out, identity, on_step, on_validation)
     draw_curves(out / "curves.png", name, history)
     finished = task.finish()
     content = checkpoint_bytes(task.network)
@@ -96,8 +99,10 @@ def train_descriptor(
         "seconds": round(history[-1].seconds, 1),
     }
     checkpoint = out / f"{name}.safetensors"
-    checkpoint.write_bytes(content)
-    (out / f"{name}.json").write_text(json.dumps(card, indent=1) + "\n")
+    with whole_file(checkpoint) as partial:
+        partial.write_bytes(content)
+    with whole_file(out / f"{name}.json") as partial:
+        partial.write_text(json.dumps(card, indent=1) + "\n")
     return checkpoint, card
 
 
@@ -121,7 +126,8 @@ def draw_curves(path: Path, name: str, history: Sequence[Progress]) -> None:
         Panel(Axis(f"training step of {name}"), Axis(title), [Series(steps, values, Look(colour))])
         for title, (colour, values) in drawn.items()
     ]
-    path.write_bytes(png(picture(Drawing([panels], 240))))
+    with whole_file(path) as partial:
+        partial.write_bytes(png(picture(Drawing([panels], 240))))
 
 
 def _make_task(name: str, training: Sequence[TunnelShard], validation: Sequence[TunnelShard], seed: int) -> Task:

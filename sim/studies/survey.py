@@ -272,7 +272,7 @@ def write_csv(path: Path, surveys: Sequence[Survey]) -> None:
     ]
     names = list(dict.fromkeys(name for row in rows for name in row))
     try:
-        with path.open("w", newline="") as file:
+        with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, [*(name for name in names if name != "failure"), "failure"])
             writer.writeheader()
             writer.writerows(rows)

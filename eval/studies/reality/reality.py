@@ -113,7 +113,7 @@ def main(
     text = "\n".join(format_markdown(table) for table in (arrange_by_source(measures), novelty))
     measures.to_csv(out / "reality.csv", index=False, float_format="%.5g")
     novelty.to_csv(out / "reality-novelty.csv", index=False, float_format="%.4g")
-    (out / "reality.md").write_text(text)
+    (out / "reality.md").write_text(text, encoding="utf-8")
     draw_measures(measures, out / "reality-measures.png")
     draw_scene(real, recast, out / "reality-scene.png")
     draw_novelty(shares, out / "reality-novelty.png")

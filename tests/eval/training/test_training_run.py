@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict
@@ -45,6 +47,33 @@ def test_from_a_dataset_to_a_checkpoint_with_its_card(data: Path, tmp_path: Path
     content = checkpoint.read_bytes()
     assert command(*arguments)[0] == 0
     assert checkpoint.read_bytes() == content
+    # weights depend on the number of threads: a run goes on with its own
+    code, _, err = command("train", data, "--out", out, "--steps", "3", "--threads", "2", "--quiet")
+    assert code == 2 and "with other settings" in err
+
+
+def test_a_disk_that_runs_full_leaves_no_half_of_a_file(
+    data: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = ("train", data, "--out", tmp_path, "--descriptor", "3deg", "--steps", "1", "--quiet")
+    usual = Path.write_bytes
+    written: list[str] = []
+
+    def full(path: Path, content: bytes) -> int:
+        if path.parent != tmp_path or path.name in written:
+            return usual(path, content)
+        written.append(path.name)
+        usual(path, content[: len(content) // 2])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    for _ in range(3):  # the state, the curves, the checkpoint
+        whole = {path.name for path in tmp_path.iterdir()}
+        code, _, err = command(*arguments)
+        assert code == 2 and "No space left on device" in err and err.count("\n") == 1
+        assert {path.name for path in tmp_path.iterdir()} - whole <= {"state.safetensors", "curves.csv", "curves.png"}
+    assert not (tmp_path / "3deg.safetensors").exists()
+    assert command(*arguments)[0] == 0
 
 
 def test_the_place_descriptor_is_trained_by_the_same_command(data: Path, tmp_path: Path, command: Command) -> None:
