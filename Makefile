@@ -9,11 +9,12 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constr
 EXTRAS := cluster,dufomap,kiss,m3c2,odometry,ouster,view
 LOWEST := .venv-lowest
 NEWEST := .venv-newest
+AUDIT := .venv-audit
 PYTHONS ?= python3.11 python3.13
 # One process per core and one thread in each; the tests of one file stay in one process and share what it has set up.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
 
-.PHONY: setup demo test test-lowest lowest test-newest test-pythons soak check report clean
+.PHONY: setup demo test test-lowest lowest test-newest test-pythons audit soak check report clean
 
 setup: $(VENV)/.installed-dev
 
@@ -51,7 +52,7 @@ $(LOWEST)/.installed: pyproject.toml .constraints-lowest.txt
 # Write .constraints-lowest.txt again, after a bound in pyproject.toml has moved.
 lowest: $(BIN)/python
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet uv
-	$(BIN)/uv pip compile pyproject.toml --quiet --resolution lowest-direct --python-version 3.11 --only-binary :all: \
+	$(BIN)/uv pip compile pyproject.toml --quiet --upgrade --resolution lowest-direct --python-version 3.11 --only-binary :all: \
 		$(foreach extra,test $(subst $(comma), ,$(EXTRAS)),--extra $(extra)) \
 		--no-annotate --custom-compile-command 'make lowest' --output-file .constraints-lowest.txt
 
@@ -76,6 +77,16 @@ $(PYTHONS:%=.venv-%/.installed): .venv-%/.installed: pyproject.toml constraints.
 	.venv-$*/bin/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt --editable .
 	touch $@
 
+# Licences of all packages, and known vulnerabilities among the pins; the latter need a network.
+audit: $(VENV)/.installed-dev $(AUDIT)/.installed
+	$(AUDIT)/bin/python tests/audit.py $(BIN)/python
+
+$(AUDIT)/.installed: constraints.txt
+	$(PYTHON) -m venv --clear $(AUDIT)
+	$(AUDIT)/bin/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt \
+		pip-audit pip-licenses
+	touch $@
+
 soak: $(VENV)/.installed-dev
 	$(PYTEST) -m soak
 
@@ -89,5 +100,5 @@ report: $(VENV)/.installed
 	$(BIN)/tunnelcd report $(OUT)
 
 clean:
-	rm -rf $(VENV) $(LOWEST) $(NEWEST) .venv-python* build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) $(LOWEST) $(NEWEST) $(AUDIT) .venv-python* build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

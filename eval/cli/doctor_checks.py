@@ -173,7 +173,8 @@ def cluster() -> str:
     from distributed import Client
 
     settings = {"processes": False, "n_workers": 1, "threads_per_worker": 1, "silence_logs": 50}
-    with Client(**settings, dashboard_address=":0") as client:  # any free port: another program may hold Dask's own
+    # any free port: another program may hold Dask's own
+    with Client(**settings, dashboard_address="127.0.0.1:0") as client:
         found = client.submit(sum, (2, 3)).result(timeout=5)
     _require(found == 5, f"a worker made {found} of 2 + 3")
     return "a worker computes"

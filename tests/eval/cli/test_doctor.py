@@ -9,9 +9,11 @@ import socket
 import sys
 import tomllib
 from collections.abc import Callable
+from email.message import Message
 from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,7 +67,7 @@ def test_every_fault_is_told_with_what_mends_it(command: Command, monkeypatch: p
     assert code == 2
     wanted = {line.partition(">")[0]: line for line in PROJECT["dependencies"]}
     assert err.splitlines() == [
-        f"error: numpy: 1.26.4 is older than 2.2: pip install --upgrade '{wanted['numpy']}'",
+        f"error: numpy: 1.26.4 is not >=2.2: pip install --upgrade '{wanted['numpy']}'",
         f"error: mujoco: not installed: pip install '{wanted['mujoco']}'",
         "error: small_gicp: 99.0; ModuleNotFoundError: import of small_gicp halted; None in sys.modules: "
         f"pip install --force-reinstall '{wanted['small_gicp']}'",
@@ -73,6 +75,69 @@ def test_every_fault_is_told_with_what_mends_it(command: Command, monkeypatch: p
     # an extra that is not there is no fault
     assert "extra view      absent  no viser: pip install 'tunnelcd[view]'" in out.splitlines()
     assert "extra cluster   ok      dask 2026.8.0" in out.splitlines()
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize(
+    ("name", "version", "what", "state"),
+    [
+        ("numpy", "2.1.3", "numpy", "broken"),
+        ("numpy", "2.10.0", "numpy", "ok"),
+        ("numpy", "2.2.0rc1", "numpy", "broken"),
+        ("torch", "2.13.0+cpu", "torch", "ok"),
+        ("embreex", "4.4.0", "embreex", "broken"),  # needs its post-release
+        ("embreex", "4.4.0.post1", "embreex", "ok"),
+        ("pandas", "unknown", "pandas", "broken"),
+        ("py4dgeo", "0.9.9", "extra m3c2", "broken"),
+        ("pytest", "8.1.0", "extra dev", "broken"),  # by way of the extra `test`
+        ("pytest", "8.1.0", "extra test", "broken"),
+    ],
+)
+def test_what_is_installed_is_held_against_the_ranges(
+    name: str, version: str, what: str, state: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = {"py4dgeo": "1.2.0", name: version}
+    fake = SimpleNamespace(**vars(metadata) | {"version": lambda asked: found.get(asked, "9999.0")})
+    monkeypatch.setattr(doctor, "metadata", fake)
+    monkeypatch.setattr(doctor, "_import", lambda name: "")
+    told = row(what)
+    assert told.state == state
+    if state == "broken":
+        assert f"{version} is not >=" in told.told and "pip install --upgrade '" in f"{told.told}{told.mend}"
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_python_outside_the_range_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor.platform, "python_version", lambda: "3.10.13")
+    (line,) = faults([row("Python")])
+    assert line.startswith("Python: 3.10.13, ") and line.endswith("tunnelcd needs Python >=3.11: install one")
+    monkeypatch.setattr(doctor.platform, "python_version", lambda: "3.14.0rc1")
+    assert row("Python").state == "ok"
+
+
+def test_an_installed_package_tells_the_same_requirements_as_a_source_tree(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines = [*PROJECT["dependencies"]]
+    for extra, own in PROJECT["optional-dependencies"].items():
+        for line in own:
+            wanted, _, marker = line.partition(";")
+            both = f"({marker.strip()}) and " if marker else ""
+            lines.append(f'{wanted.strip()}; {both}extra == "{extra}"')
+    about = Message()
+    about["Requires-Python"] = PROJECT["requires-python"]
+    for extra in PROJECT["optional-dependencies"]:
+        about["Provides-Extra"] = extra
+    told = {"metadata": lambda name: about, "requires": lambda name: lines}
+    monkeypatch.setattr(doctor, "metadata", SimpleNamespace(**vars(metadata) | told))
+
+    def plain(needs: Any) -> dict[str, list[tuple[str, str]]]:
+        groups = {"": needs.packages, **needs.extras}
+        return {name: [(each.name, str(each.specifier)) for each in own] for name, own in groups.items()}
+
+    installed, source = (doctor._read_requirements(place) for place in (tmp_path / "absent", doctor._PYPROJECT))
+    assert (installed.python, plain(installed)) == (source.python, plain(source))
+    assert ("pytest", ">=8.2") in plain(source)["dev"]
 
 
 @pytest.mark.usefixtures("quick")
