@@ -10,7 +10,8 @@ from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
 
-from cdpipe.core.yamlfile import Key, suggest
+from cdpipe.core.files import Key
+from cdpipe.core.yamlfile import suggest
 
 Mistake = tuple[Key, str]
 

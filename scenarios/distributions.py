@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from cdpipe.core.files import Key
 from cdpipe.core.geometry import stream
-from cdpipe.core.yamlfile import Key
 
 NAMES = ("uniform", "normal", "integers", "choice")
 

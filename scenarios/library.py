@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.files import Key
 from cdpipe.core.geometry import stream
-from cdpipe.core.yamlfile import Document, Key, apply_settings, read_yaml, suggest, validate
+from cdpipe.core.yamlfile import Document, apply_settings, read_yaml, suggest, validate
 from scenarios.catalogue import family_files, family_of, prop_files, prop_names, read_prop
 from scenarios.dangling import Mistake, find_dangling, items_at
 from scenarios.distributions import draw, find_malformed, is_distribution, join_key, merge_trees

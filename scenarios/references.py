@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import Key
+from cdpipe.core.files import Key
 from cdpipe.sensor.ouster import load_profile
 from scenarios.dangling import Mistake, items_at, mapping_at
 from scenarios.schema import Furniture, Scenario, SessionPlan, Tunnel

@@ -1,4 +1,4 @@
-"""YAML and JSON files checked against pydantic models; all mistakes of a file are reported at once."""
+"""YAML files and other documents checked against pydantic models; all mistakes of a file are reported at once."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files.plain_file import read_bytes
+from cdpipe.core.files.yaml_file import MAX_BYTES as MAX_YAML_BYTES
+from cdpipe.core.files.yaml_file import Key, YamlError, parse_yaml, parse_yaml_value
 
-Key = tuple[str | int, ...]
+_MAX_TOLD = 20
 
 
 class Settings(BaseModel):
@@ -52,16 +54,14 @@ class Document:
 
 
 def read_yaml(path: Path, text: str | None = None) -> Document:
-    """Parse a YAML file (or `text` under that name) with the safe loader.
+    """Parse a YAML file (or `text` under that name).
 
     Raises:
-        InputError: The file is missing, not YAML, or names a key twice.
+        InputError: The file is missing, cannot be read, is not YAML or too large, or names a key twice.
     """
     try:
-        document = _parse(str(path), path.read_text(encoding="utf-8") if text is None else text)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:  # not text
+        document = _parse(str(path), read_bytes(path, MAX_YAML_BYTES).decode() if text is None else text)
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: not YAML: {error}") from error
     return replace(document, value=deepcopy(document.value))
 
@@ -70,37 +70,13 @@ def read_yaml(path: Path, text: str | None = None) -> Document:
 def _parse(path: str, text: str) -> Document:
     """Parse a text; cached, because one family is drawn with many seeds and parsing is the slow part."""
     try:
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
-        lines: dict[Key, int] = {}
-        mistakes: list[str] = []
-        value = _plain(node, (), lines, mistakes, path)
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise InputError(f"{path}:{line}: not YAML: {error.problem}") from error
-    except (yaml.YAMLError, ValueError, TypeError) as error:
-        raise InputError(f"{path}: not YAML: {error}") from error
-    if mistakes:
-        raise InputError("\n".join(mistakes))
-    return Document(path, value, {key: f"{path}:{line}" for key, line in lines.items()})
-
-
-def read_json(path: Path, expected: str) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        InputError: The file is missing, cannot be read, or holds no JSON object; the message ends with `expected`.
-    """
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: missing: {expected}") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}): {expected}") from error
-    except (ValueError, RecursionError) as error:  # not text, not JSON, numbers too long or nesting too deep
-        raise InputError(f"{path}: damaged, not JSON ({error}): {expected}") from error
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: damaged, holds a JSON {type(document).__name__}: {expected}")
-    return document
+        parsed = parse_yaml(text)
+    except YamlError as error:
+        where = path if error.line is None else f"{path}:{error.line}"
+        raise InputError(f"{where}: not YAML: {error}") from error
+    if parsed.mistakes:
+        raise InputError("\n".join(f"{path}:{line}: {mistake}" for line, mistake in parsed.mistakes[:_MAX_TOLD]))
+    return Document(path, parsed.value, {key: f"{path}:{line}" for key, line in parsed.lines.items()})
 
 
 def validate(model: type[ModelT], document: Document) -> ModelT:
@@ -142,8 +118,8 @@ def apply_settings(document: Document, settings: Iterable[str]) -> Document:
         if not equals or not name:
             raise InputError(f"--set {setting}: expected key=value, e.g. extract.voxel_m=0.4")
         try:
-            parsed = yaml.safe_load(text)
-        except yaml.YAMLError as error:
+            parsed = parse_yaml_value(text)
+        except YamlError as error:
             raise InputError(f"--set {setting}: the value is not YAML") from error
         *parents, last = name.split(".")
         place = value
@@ -259,29 +235,3 @@ def _overlay(below: Any, above: Any) -> Any:
     if not isinstance(below, dict) or not isinstance(above, dict):
         return deepcopy(above)
     return {key: _overlay(below.get(key), above[key]) if key in above else below[key] for key in {**below, **above}}
-
-
-def _plain(node: Any, key: Key, lines: dict[Key, int], mistakes: list[str], source: str) -> Any:
-    if node is None:
-        return None
-    lines.setdefault(key, node.start_mark.line + 1)
-    if isinstance(node, yaml.SequenceNode):
-        return [_plain(item, (*key, index), lines, mistakes, source) for index, item in enumerate(node.value)]
-    if isinstance(node, yaml.MappingNode):
-        content: dict[Any, Any] = {}
-        for name_node, item in node.value:
-            name = _scalar(name_node)
-            if name in content:
-                mistakes.append(f"{source}:{name_node.start_mark.line + 1}: {name}: the key is here a second time")
-            lines[(*key, name)] = name_node.start_mark.line + 1
-            content[name] = _plain(item, (*key, name), lines, mistakes, source)
-        return content
-    return _scalar(node)
-
-
-def _scalar(node: Any) -> Any:
-    loader = yaml.SafeLoader("")
-    try:
-        return loader.construct_object(node)
-    finally:
-        loader.dispose()

@@ -12,22 +12,30 @@ import numpy.typing as npt
 import torch
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import ArraySpec, read_npz
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
 from cdpipe.descriptors.handmade import HANDMADE, VERSION
 from cdpipe.descriptors.network import (
     PlaceNetwork,
-    checkpoint_bytes,
-    digest,
     load_trained_network,
     make_untrained_network,
 )
 from cdpipe.descriptors.range_image import range_image
 from cdpipe.descriptors.sphere import sphere_digest
-from cdpipe.io.session import load_arrays
+from cdpipe.descriptors.weights_file import checkpoint_bytes, digest
 from cdpipe.model.config import DescriptorConfig, MapConfig
 from cdpipe.model.types import DescriptorSet, PosedScan, ScanSource
 
 _BATCH = 32
+_FILE = {
+    "checkpoint": ArraySpec("", "str"),
+    "q": ArraySpec("K,D", "float32"),
+    "w": ArraySpec("K,E", "float32", is_optional=True),
+    "keyframe_scans": ArraySpec("K", "int64"),
+    "odom_T_sensor": ArraySpec("S,4,4", "float64"),
+    "spheres": ArraySpec("K,F", "float32 int8", is_optional=True),
+    "spheres_of": ArraySpec("", "str", is_optional=True),
+}
 
 
 def describe_scan(scan: PosedScan, config: DescriptorConfig) -> tuple[Float32Array, Float32Array]:
@@ -99,19 +107,16 @@ def load_descriptors(
     path = folder / "descriptors" / f"{config.method}.npz"
     if not path.is_file():
         return None
-    arrays = load_arrays(path)
-    try:
-        checkpoint = str(arrays["checkpoint"])
-        is_of_session = np.array_equal(arrays["odom_T_sensor"], odom_T_sensor)
-        if not is_of_session or checkpoint != checkpoint_digest(config):
-            return None
-        spheres = arrays.get("spheres")
-        if spheres is not None:
-            is_present = str(arrays["spheres_of"]) == _spheres_of(map_config) and spheres.dtype == config.precision
-            spheres = spheres if is_present else None
-        return DescriptorSet(arrays["q"], arrays.get("w"), arrays["keyframe_scans"], config.method, checkpoint, spheres)
-    except (KeyError, ValueError) as error:
-        raise InputError(f"{path}: damaged ({error}): remove it and describe the session again") from error
+    arrays = read_npz(path, _FILE, remedy="remove it and describe the session again")
+    checkpoint = str(arrays["checkpoint"])
+    is_of_session = np.array_equal(arrays["odom_T_sensor"], odom_T_sensor)
+    if not is_of_session or checkpoint != checkpoint_digest(config):
+        return None
+    spheres = arrays.get("spheres")
+    if spheres is not None:
+        is_present = str(arrays.get("spheres_of")) == _spheres_of(map_config) and spheres.dtype == config.precision
+        spheres = spheres if is_present else None
+    return DescriptorSet(arrays["q"], arrays.get("w"), arrays["keyframe_scans"], config.method, checkpoint, spheres)
 
 
 def _spheres_of(map_config: MapConfig) -> str:

@@ -8,15 +8,14 @@ are ours.
 
 from __future__ import annotations
 
-import hashlib
 from importlib import resources
 
 import numpy as np
 import torch
-from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from cdpipe.descriptors.range_image import COLUMNS
+from cdpipe.descriptors.weights_file import digest, list_weights, parse_weights
 
 DIMENSIONS = 64
 _CHANNELS = (24, 48, 64, 64)
@@ -101,18 +100,8 @@ def load_trained_network() -> tuple[PlaceNetwork, str]:
     """Return the shipped network and the digest of its checkpoint."""
     content = (resources.files("cdpipe") / "descriptors" / "weights" / "3deg.safetensors").read_bytes()
     network = PlaceNetwork()
-    network.load_state_dict(load(content))
+    network.load_state_dict(parse_weights(content, "3deg.safetensors", list_weights(network)))
     return network.eval(), digest(content)
-
-
-def checkpoint_bytes(network: nn.Module) -> bytes:
-    """Return the weights as safetensors."""
-    return save({name: tensor.contiguous() for name, tensor in network.state_dict().items()})
-
-
-def digest(content: bytes) -> str:
-    """Return the first 16 hex digits of the SHA-256 of a checkpoint, its name."""
-    return hashlib.sha256(content).hexdigest()[:16]
 
 
 assert np.prod([stride[1] for stride in _STRIDES]) * DIMENSIONS == COLUMNS

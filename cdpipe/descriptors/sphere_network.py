@@ -7,21 +7,25 @@ of each sector. It is trained on simulated changes (`cdpipe.training.sphere_trai
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 
 import torch
-from safetensors.torch import load
 from torch import Tensor, nn
 
-from cdpipe.descriptors.network import CircularConv, digest
+from cdpipe.core.files import ArrayType, check_types
+from cdpipe.descriptors.network import CircularConv
 from cdpipe.descriptors.sphere_image import COLUMNS, ROWS
+from cdpipe.descriptors.weights_file import digest, list_weights, parse_weights
 
 SECTORS = 16
 PER_SECTOR = 4
 _CHANNELS = (16, 32, 48)
 _SEEN = 64
 _HIDDEN = (96, 64)
+# Largest network that is loaded: 64 times as wide as the shipped one.
+_MOST_PER_SECTOR, _MOST_CHANNELS = 1024, 64 * 48
 # (row, column); rows end as ROWS / 4, columns as SECTORS.
 _STRIDES = ((1, 2), (2, 3), (2, 1))
 _RANGE_SCALE_M = 6.0
@@ -118,13 +122,35 @@ def make_untrained_sphere_network(seed: int = 0, size: SphereSize | None = None)
         return SphereNetwork(size).eval()
 
 
-def load_sphere_network(content: bytes) -> SphereNetwork:
-    """Return the network of a checkpoint; its size follows from the shapes of the weights."""
-    tensors = load(content)
-    per_sector, channels = tensors["kept.weight"].shape[:2]
-    network = SphereNetwork(SphereSize(per_sector, channels / _CHANNELS[-1], "seen.weight" in tensors))
+def load_sphere_network(content: bytes, source: str = "sphere.safetensors") -> SphereNetwork:
+    """Return the network of a checkpoint; its size follows from the shapes of the weights.
+
+    Raises:
+        InputError: The checkpoint is damaged, of another format, or of another network.
+    """
+    sizes: list[SphereSize] = []
+
+    def check(types: Mapping[str, ArrayType]) -> None:
+        sizes.append(_size_of(types))
+        with torch.device("meta"):  # a network without values: those of the file may be of any size
+            check_types(types, list_weights(SphereNetwork(sizes[0])), {})
+
+    tensors = parse_weights(content, source, check)
+    network = SphereNetwork(sizes[0])
     network.load_state_dict(tensors)
     return network.eval()
+
+
+def _size_of(types: Mapping[str, ArrayType]) -> SphereSize:
+    """Return the size of the network that a checkpoint is of.
+
+    Raises:
+        ValueError: It is of none.
+    """
+    shape = types["kept.weight"].shape if "kept.weight" in types else ()
+    if len(shape) != 4 or not 0 < shape[0] <= _MOST_PER_SECTOR or not 0 < shape[1] <= _MOST_CHANNELS:
+        raise ValueError(f"kept.weight is {shape or 'missing'}: no sphere network has it")
+    return SphereSize(shape[0], shape[1] / _CHANNELS[-1], "seen.weight" in types)
 
 
 def load_trained_sphere_network() -> tuple[SphereNetwork, str]:

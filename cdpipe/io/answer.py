@@ -32,8 +32,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import read_json, read_npz
 from cdpipe.core.geometry import Float64Array
-from cdpipe.core.yamlfile import read_json
 from cdpipe.io.answer_parts import (
     FORMAT,
     FORMAT_VERSION,
@@ -41,10 +41,10 @@ from cdpipe.io.answer_parts import (
     AnswerPart,
     ShapePart,
     Until,
-    check_arrays,
+    check_array_types,
     check_document,
+    check_offsets,
 )
-from cdpipe.io.session import load_arrays
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 
 # Fields of an object that answer.json holds as they are.
@@ -164,12 +164,13 @@ def read_answer(folder: Path) -> Answer:
     if not isinstance(document, AnswerPart):
         status, method, seconds, until = document.status, document.method, document.seconds, document.until
         return Answer(status, document.error, method, None, seconds, document.evidence, until=until)
-    arrays = load_arrays(folder / "answer.npz")
-    check_arrays(folder / "answer.npz", arrays, len(document.objects))
+    file, n_objects = folder / "answer.npz", len(document.objects)
+    arrays = read_npz(file, lambda types: check_array_types(file, types, n_objects))
+    check_offsets(file, arrays, n_objects)
     try:
         report, points_odom = _report(document, arrays)
     except ValueError as error:
-        raise InputError(f"{folder / 'answer.npz'}: arrays that do not go together: {error}") from error
+        raise InputError(f"{file}: arrays that do not go together: {error}") from error
     return Answer("ok", "", document.method, report, report.seconds, report.evidence, points_odom, document.until)
 
 

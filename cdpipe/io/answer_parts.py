@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -11,6 +11,7 @@ import numpy.typing as npt
 from pydantic import ConfigDict, Field, PositiveFloat
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import ArrayType
 from cdpipe.core.yamlfile import Document, Settings, suggest, validate
 from cdpipe.model.types import Kind, SessionName
 
@@ -105,8 +106,8 @@ def check_document(path: Path, value: Any) -> AnswerPart | FailurePart:
     return validate(FailurePart if is_failure else AnswerPart, document)
 
 
-def check_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects: int) -> None:
-    """Check names, types, shapes and completeness of the arrays of answer.npz.
+def check_array_types(path: Path, arrays: Mapping[str, ArrayType], n_objects: int) -> None:
+    """Check names, types, shapes and completeness of the arrays of answer.npz, before any is read.
 
     Raises:
         InputError: One line for each mistake.
@@ -131,10 +132,23 @@ def check_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects: 
             f"array object_points_odom is missing: the {n_objects} objects of answer.json need their points, (P, 3), "
             "or their object_returns, (M, 2)"
         )
-    if not mistakes:
-        for name, offsets in OFFSETS.items():
-            if name in arrays:
-                mistakes += _offset_mistakes(offsets, arrays[offsets], name, len(arrays[name]), n_objects)
+    _raise_all(path, mistakes)
+
+
+def check_offsets(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects: int) -> None:
+    """Check that the offsets of answer.npz cut the points and returns into those of each object.
+
+    Raises:
+        InputError: One line for each mistake.
+    """
+    mistakes: list[str] = []
+    for name, offsets in OFFSETS.items():
+        if name in arrays:
+            mistakes += _offset_mistakes(offsets, arrays[offsets], name, len(arrays[name]), n_objects)
+    _raise_all(path, mistakes)
+
+
+def _raise_all(path: Path, mistakes: Sequence[str]) -> None:
     if mistakes:
         raise InputError("\n".join(f"{path}: {mistake}" for mistake in mistakes))
 

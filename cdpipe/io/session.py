@@ -13,11 +13,9 @@ from __future__ import annotations
 
 import json
 import shutil
-import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any
@@ -27,12 +25,23 @@ import numpy.typing as npt
 from pydantic import ConfigDict, Field, field_validator
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import ArraySpec, read_json, read_npz, require_format
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, require_poses, require_shape, require_shapes
-from cdpipe.core.yamlfile import Document, Settings, read_json, validate
+from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
 
 FORMAT = "tunnelcd-session"
 FORMAT_VERSION = 2
+_CHUNK = {
+    "range_mm": ArraySpec("s,H,W", "uint32"),
+    "reflectivity": ArraySpec("s,H,W", "uint8"),
+    "signal": ArraySpec("s,H,W", "uint16"),
+    "column_stamps_ns": ArraySpec("s,W", "int64"),
+    "column_poses": ArraySpec("s,W,7", "float32", is_finite=False),  # checked when read, by scan and column
+}
+# Format 1 had no signal channel.
+_CHUNKS = {1: {name: spec for name, spec in _CHUNK.items() if name != "signal"}, FORMAT_VERSION: _CHUNK}
+_ODOMETRY = {"odom_T_sensor": ArraySpec("S,4,4", "float64", is_finite=False)}  # checked with the number of the scan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,6 +78,7 @@ class Session:
         odom_T_sensor: (S, 4, 4) float64 pose of each revolution at its middle column, in the session's own odom frame.
         chunk_scans: Revolutions per chunk; the last chunk may hold fewer.
         provenance: How it was made, as stored.
+        format_version: Number of the format that its files are in.
     """
 
     path: Path
@@ -76,6 +86,7 @@ class Session:
     odom_T_sensor: Float64Array
     chunk_scans: int
     provenance: dict[str, Any]
+    format_version: int = field(default=FORMAT_VERSION, kw_only=True)
 
     @property
     def n_scans(self) -> int:
@@ -93,15 +104,12 @@ class Session:
         Raises:
             InputError: The file is missing or does not hold what the format promises.
         """
-        path = chunk_path(self.path, index)
         n_scans = min(self.chunk_scans, self.n_scans - index * self.chunk_scans)
-        arrays = load_arrays(path)
-        try:
-            chunk = ScanChunk(**arrays)
-            require_shape("range_mm", chunk.range_mm, (n_scans, self.sensor.height, self.sensor.width))
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{path}: not a chunk of this session: {error}") from error
-        return chunk
+        lengths = {"s": n_scans, "H": self.sensor.height, "W": self.sensor.width}
+        arrays = read_npz(chunk_path(self.path, index), _CHUNKS[self.format_version], lengths=lengths)
+        if "signal" not in arrays:
+            arrays["signal"] = np.zeros(arrays["range_mm"].shape, dtype=np.uint16)
+        return ScanChunk(**arrays)
 
     def chunks(self) -> Iterator[ScanChunk]:
         """Read all chunks in order."""
@@ -222,20 +230,18 @@ def read_session(path: Path) -> Session:
     source = path / "session.json"
     expected = "expected a session written by `tunnelcd simulate`, copy it again"
     document = read_json(source, expected)
-    written_as = document.get("format"), document.get("format_version")
-    if written_as != (FORMAT, FORMAT_VERSION):
-        said = f"format {written_as[0]} {written_as[1]}: this version reads {FORMAT} {FORMAT_VERSION}"
-        raise InputError(f"{source}: {said}")
+    found = document.get("format"), document.get("format_version")
+    remedy = "make it again with `tunnelcd simulate` or `tunnelcd convert`"
+    version = require_format(source, found, FORMAT, FORMAT_VERSION, remedy)
     try:
         header = validate(_Header, Document(str(source), document))
     except InputError as error:
         raise InputError(f"{error}: {expected}") from error
     n_scans = header.n_scans
-    poses = load_arrays(path / "odometry.npz").get("odom_T_sensor")
-    if poses is None or len(poses) != n_scans:
+    poses = read_npz(path / "odometry.npz", _ODOMETRY)["odom_T_sensor"]
+    if len(poses) != n_scans:
         raise InputError(
-            f"{path / 'odometry.npz'}: {0 if poses is None else len(poses)} poses for {n_scans} scans: "
-            "one pose for each scan is needed"
+            f"{path / 'odometry.npz'}: {len(poses)} poses for {n_scans} scans: one pose for each scan is needed"
         )
     if n_scans == 0:
         raise InputError(f"{path}: the session holds no scan: record it, or convert the recording, again")
@@ -244,24 +250,9 @@ def read_session(path: Path) -> Session:
     except ValueError as error:
         raise InputError(f"{path / 'odometry.npz'}: {error}: correct the pose, or remove the scan") from error
     sensor = parse_metadata(header.sensor, str(source))
-    return Session(path, sensor, poses, header.chunk_scans, header.provenance)
+    return Session(path, sensor, poses, header.chunk_scans, header.provenance, format_version=version)
 
 
 def chunk_path(folder: Path, index: int) -> Path:
     """Return the path of one chunk file."""
     return folder / "chunks" / f"{index:05d}.npz"
-
-
-def load_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """Read the arrays of an npz file; nothing is unpickled.
-
-    Raises:
-        InputError: The file is missing, cut short or not an npz of plain arrays.
-    """
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: missing") from error
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}: unreadable, the file is damaged or cut short ({error})") from error

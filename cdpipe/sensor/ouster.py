@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import read_json
 from cdpipe.core.geometry import Float64Array, require_shapes, transform
-from cdpipe.core.yamlfile import read_json
 from cdpipe.sensor.ouster_metadata import METADATA_FILE, parse_fields, require_mode
 
 

@@ -13,7 +13,8 @@ True
 from __future__ import annotations
 
 import csv
-from collections.abc import Collection, Sequence
+import io
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,14 @@ import torch
 from torch import Tensor
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import read_bytes
 from cdpipe.core.geometry import yaw_rad
 from cdpipe.training.scan_training import PlaceData
 from cdpipe.training.shard import FIELDS, read_shard, split_of
 
 _SPLITS = ("train", "validation")
+_MOST_INDEX_BYTES = 50_000_000
+_MOST_KEYFRAMES = 1_000_000  # of one session
 _PER_PAIR = ("before_images", "after_images", "before_labels", "after_labels", "labels", "is_covered")
 
 
@@ -190,18 +194,20 @@ def _keyframe_axis(name: str) -> tuple[str, int]:
     return found
 
 
+def _tunnel(folder: Path, row: Mapping[str, str]) -> TunnelShard:
+    shard, n_before, n_after = row["shard"], int(row["n_before"]), int(row["n_after"])
+    if Path(shard).name != shard:
+        raise ValueError(f"shard = {shard[:40]!r} is no name of a file in the folder")
+    if not 0 < n_before <= _MOST_KEYFRAMES or not 0 < n_after <= _MOST_KEYFRAMES:
+        raise ValueError(f"{row['n_before'][:20]} and {row['n_after'][:20]} keyframes in {shard}")
+    return TunnelShard(folder / shard, row["family"], int(row["seed"]), n_before, n_after)
+
+
 def _read_index(folder: Path) -> list[TunnelShard]:
     path = folder / "index.csv"
-    if not path.is_file():
-        raise InputError(f"{path}: missing: expected a folder made by `tunnelcd dataset`")
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if row.get("status") == "ok"]
+    content = read_bytes(path, _MOST_INDEX_BYTES, "expected a folder made by `tunnelcd dataset`")
     try:
-        return [
-            TunnelShard(
-                folder / row["shard"], row["family"], int(row["seed"]), int(row["n_before"]), int(row["n_after"])
-            )
-            for row in rows
-        ]
-    except (KeyError, ValueError) as error:
+        rows = csv.DictReader(io.StringIO(content.decode(), newline=""))
+        return [_tunnel(folder, row) for row in rows if row.get("status") == "ok"]
+    except (AttributeError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise InputError(f"{path}: damaged ({error}): run the command that made the folder again") from error

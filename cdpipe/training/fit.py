@@ -8,19 +8,24 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Protocol
 
 import torch
-from safetensors import SafetensorError, safe_open
+from pydantic import TypeAdapter
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import ArraySpec, parse_json, read_tensors, require_format
+from cdpipe.descriptors.weights_file import list_tensors
 
+FORMAT = "tunnelcd-training"
+FORMAT_VERSION = 1
 _STATE = "state.safetensors"
+_REMEDY = "remove it to train from the start"
 _WARM_UP = 0.1
 
 
@@ -166,7 +171,8 @@ def _save(
     tensors |= {f"best.{name}": tensor for name, tensor in best.items()}
     for index, state in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{index}.{name}": tensor for name, tensor in state.items()}
-    about = json.dumps({"identity": identity, "history": [asdict(done) for done in history]})
+    document = {"format": FORMAT, "format_version": FORMAT_VERSION, "identity": identity}
+    about = json.dumps({**document, "history": [asdict(done) for done in history]})
     content = save({name: tensor.clone().contiguous() for name, tensor in tensors.items()}, {"about": about})
     partial = path.with_suffix(".partial")
     try:
@@ -184,12 +190,16 @@ def _restore(
     if not path.is_file():
         return [], {name: tensor.clone() for name, tensor in network.state_dict().items()}
     try:
-        with safe_open(path, framework="pt") as file:
-            about = json.loads(file.metadata()["about"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
+        _, metadata = read_tensors(path, lambda types: None, (), remedy=_REMEDY)
+        about = parse_json(metadata["about"])
+        # the first states carry no number; they hold the same as those of format 1
+        found = about.get("format", FORMAT), about.get("format_version", 1)
+        require_format(path, found, FORMAT, FORMAT_VERSION, _REMEDY)
         if about["identity"] != identity:
             raise InputError(f"{path}: of a run on other data or with other settings: name another --out")
-        history = [Progress(**done) for done in about["history"]]
+        history = TypeAdapter(list[Progress]).validate_python(about["history"])
+        arrays, _ = read_tensors(path, _list_state(network), remedy=_REMEDY)
+        tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         network.load_state_dict(_below("last.", tensors))
         states: dict[int, dict[str, Tensor]] = {}
         for key, tensor in _below("optimiser.", tensors).items():
@@ -197,8 +207,20 @@ def _restore(
             states.setdefault(int(index), {})[name] = tensor
         optimiser.load_state_dict({**optimiser.state_dict(), "state": states})
         return history, _below("best.", tensors)
-    except (SafetensorError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise InputError(f"{path}: damaged ({error}): remove it to train from the start") from error
+    except (AttributeError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        told = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: damaged ({told}): {_REMEDY}") from error
+
+
+def _list_state(network: nn.Module) -> dict[str, ArraySpec]:
+    """Return what the state of a training run holds: two sets of weights, and AdamW's moments of each parameter."""
+    weights = {name: replace(spec, is_finite=False) for name, spec in list_tensors(network.state_dict()).items()}
+    state = {f"{part}.{name}": spec for part in ("last", "best") for name, spec in weights.items()}
+    for index, parameter in enumerate(network.parameters()):
+        moments = {"step": torch.zeros(()), "exp_avg": parameter, "exp_avg_sq": parameter}
+        parts = list_tensors({f"optimiser.{index}.{name}": tensor for name, tensor in moments.items()})
+        state |= {name: replace(spec, is_optional=True, is_finite=False) for name, spec in parts.items()}
+    return state
 
 
 def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

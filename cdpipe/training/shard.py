@@ -14,10 +14,10 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import ArraySpec, parse_json, read_tensors, require_format
 
 FORMAT = "tunnelcd-dataset"
 FORMAT_VERSION = 1
@@ -82,6 +82,13 @@ FIELDS = (
     Field("draw_turn_rad", "D,3", "float64", "rad", "before odom", "and turn about the anchor, a rotation vector"),
 )  # fmt: skip
 
+_MAY_BE_UNDEFINED = ("nearest_m", "nearest_yaw_rad", "change_centroid_world", "change_centroid_odom")
+_SPECS = {
+    field.name: ArraySpec(field.shape.replace("I", "..."), field.dtype, is_finite=field.name not in _MAY_BE_UNDEFINED)
+    for field in FIELDS
+}
+_REMEDY = "remove it, and run the command that made the folder again"
+
 
 def split_of(seed: int) -> Split:
     """Return the split of a seed."""
@@ -114,40 +121,29 @@ def read_about(path: Path) -> dict[str, Any]:
     Raises:
         InputError: It is missing, damaged, or of another format.
     """
-    with _open(path) as file:
-        return _about(path, file)
+    return _read(path, ())[1]
 
 
 def read_shard(path: Path, names: tuple[str, ...] = ()) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Read the named arrays of a shard, by default all, and its metadata.
 
     Raises:
-        InputError: It is missing, damaged, of another format, or lacks a named array.
+        InputError: It is missing, damaged, of another format, or has no array of a name.
     """
-    with _open(path) as file:
-        about = _about(path, file)
-        held = set(file.keys())
-        for name in names:
-            if name not in held:
-                raise InputError(f"{path}: holds no {name}: expected one of {', '.join(sorted(held))}")
-        return {name: file.get_tensor(name) for name in names or [field.name for field in FIELDS]}, about
+    for name in names:
+        if name not in _SPECS:
+            raise InputError(f"{path}: holds no {name}: expected one of {', '.join(sorted(_SPECS))}")
+    return _read(path, names or tuple(_SPECS))
 
 
-def _open(path: Path) -> Any:
+def _read(path: Path, names: tuple[str, ...]) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such shard: run the command that made the folder again")
+    arrays, metadata = read_tensors(path, _SPECS, names, remedy=_REMEDY)
     try:
-        return safe_open(path, framework="numpy")
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such shard: run the command that made the folder again") from error
-    except (SafetensorError, OSError) as error:
-        raise InputError(f"{path}: damaged ({error}): remove it, and run the command that made the folder") from error
-
-
-def _about(path: Path, file: Any) -> dict[str, Any]:
-    try:
-        about: dict[str, Any] = json.loads((file.metadata() or {})["tunnelcd"])
+        about = parse_json(metadata["tunnelcd"])
         found = about["format"], about["format_version"]
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: not a shard of `tunnelcd dataset`") from error
-    if found != (FORMAT, FORMAT_VERSION):
-        raise InputError(f"{path}: format {found[0]} {found[1]}: this version reads {FORMAT} {FORMAT_VERSION}")
-    return about
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: not a shard of `tunnelcd dataset`: {_REMEDY}") from error
+    require_format(path, found, FORMAT, FORMAT_VERSION, _REMEDY)
+    return arrays, about

@@ -7,9 +7,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import parse_yaml_value
 from cdpipe.core.yamlfile import Document, validate
 from eval.plans.parts import get_key, has_effect_on_true_regions, require_valid_setting, require_valid_settings
 from eval.plans.plan import Plan, parse_seeds
@@ -58,7 +57,7 @@ def change_plan(
         for added in _list_additions(variant, axes, settings)
     ]
     for each in document["grid"]:
-        each["keys"].update({get_key(setting): [yaml.safe_load(setting.partition("=")[2])] for setting in settings})
+        each["keys"].update({get_key(setting): [parse_yaml_value(setting.partition("=")[2])] for setting in settings})
     return validate(Plan, Document(f"plan {plan.name} with the settings of the command line", document))
 
 

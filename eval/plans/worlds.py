@@ -36,6 +36,7 @@ from pydantic import (
 )
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import YamlError, parse_yaml_value
 from cdpipe.core.yamlfile import Settings, suggest
 from cdpipe.model.config import PipelineConfig
 from scenarios import check_scenario, scenario_names
@@ -82,8 +83,8 @@ def _normalise_setting(setting: str) -> str:
     """Normalise the value as YAML reads it: `off` and `false ` give the same world as `false`."""
     key, equals, text = setting.partition("=")
     try:
-        return format_setting(key, yaml.safe_load(text)) if equals else setting
-    except yaml.YAMLError:
+        return format_setting(key, parse_yaml_value(text)) if equals else setting
+    except YamlError:
         return setting
 
 

@@ -23,7 +23,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import Document, Settings, read_json, validate
+from cdpipe.core.files import read_json
+from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.session import SessionWriter, read_session
 from eval.core.output import make_writable, new_folder
 from eval.core.progress import RunProgress, Silent

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from eval.core.progress import RunProgress, Silent
+from eval.core.provenance import FORMAT_VERSION
 from eval.running.runfolder import IDENTITY, ITEM_TABLES, RunFolder, write_json, write_tables
 from eval.scoring.scoring import CaseScore, score_stored
 from eval.truth.ground_truth import load_ground_truth
@@ -27,7 +28,8 @@ def cell_document(score: CaseScore, identity: Mapping[str, Any], key: str, place
     """
     names = {name: identity[name] for name in IDENTITY}
     items = {table: [{**names, **item} for item in getattr(score, table)] for table in ITEM_TABLES}
-    return {"key": key, "order": list(place), "row": {**score.row, **identity}, **items}
+    head = {"format_version": FORMAT_VERSION, "key": key, "order": list(place)}
+    return {**head, "row": {**score.row, **identity}, **items}
 
 
 def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:

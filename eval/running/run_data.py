@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import lzma
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ import pandas as pd
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
-from eval.core.tablefile import table_file
+from eval.core.tablefile import read_table, table_file
 from eval.plans.coverage import Coverage, measure_coverage
 from eval.plans.targets import read_targets
 from eval.plans.worlds import find_references
@@ -82,7 +81,7 @@ def read_run(run: Path) -> RunData:
 def stored_table(data: RunData, name: str) -> pd.DataFrame:
     """Return a table of the run folder, empty where it is not there."""
     path = table_file(data.folder.path / f"{name}.csv")
-    return pd.read_csv(path) if path.is_file() else pd.DataFrame()
+    return read_table(path) if path.is_file() else pd.DataFrame()
 
 
 def ends_at_merge(data: RunData) -> bool:
@@ -303,10 +302,4 @@ def _require_cases(path: Path, results: pd.DataFrame) -> None:
 
 
 def _rows(path: Path) -> tuple[Row, ...]:
-    try:
-        frame = pd.read_csv(path)
-    except pd.errors.EmptyDataError:
-        return ()
-    except (OSError, EOFError, lzma.LZMAError, UnicodeDecodeError, pd.errors.ParserError) as error:
-        raise InputError(f"{path}: cannot be read as a table: {error}") from error
-    return tuple(records(frame))
+    return tuple(records(read_table(path)))

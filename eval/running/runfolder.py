@@ -27,12 +27,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 
+from cdpipe.core import files
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import ArraySpec, read_npz
 from eval.core.output import make_writable, whole_file
-from eval.core.provenance import TOOL
+from eval.core.provenance import FORMAT_VERSION, TOOL
 from eval.core.statistics import summarise
+from eval.core.tablefile import read_table
 from eval.plans.coverage import measure_coverage
 from eval.plans.targets import read_targets
 from eval.plans.variants import slug
@@ -46,6 +50,7 @@ from eval.tables.region_table import region_tables
 
 IDENTITY = ("scenario", "seed", "variant")
 ITEM_TABLES = ("changes", "regions", "objects", "keyframes")
+_MAPS = {"before_points": ArraySpec("N,3", "float32"), "after_points": ArraySpec("M,3", "float32")}
 # what readers of an empty table may ask for
 _MINIMAL_COLUMNS = {"keyframes": ("keyframe", "score", "label")}
 
@@ -72,6 +77,15 @@ class RunFolder:
         """File of the thinned maps of a pair."""
         return self.path / "maps" / world_slug(scenario) / f"{seed}.npz"
 
+    def read_maps(self, scenario: str, seed: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+        """Read the (N, 3) and (M, 3) points of the thinned before and after maps, each in its odom frame, metres.
+
+        Raises:
+            InputError: They are missing or damaged.
+        """
+        maps = read_npz(self.maps(scenario, seed), _MAPS)
+        return maps["before_points"], maps["after_points"]
+
     def stages(self, scenario: str, seed: int) -> Path:
         """Folder of what the stages of a pair gave."""
         return self.path / "stages" / world_slug(scenario) / str(seed)
@@ -82,9 +96,16 @@ class RunFolder:
         return [cell for cell in cells if cell is not None]
 
     def read_cell(self, path: Path) -> dict[str, Any] | None:
-        """Read a finished cell; None where there is none, or what is there was cut short."""
+        """Read a finished cell; None where there is none, or what is there was cut short.
+
+        Raises:
+            InputError: It is of a newer tunnelcd.
+        """
         document = read_json(path)
-        return document if {"key", "order", "row", *ITEM_TABLES} <= set(document) else None
+        if not {"key", "order", "row", *ITEM_TABLES} <= set(document):
+            return None
+        _require_format(path, document)
+        return document
 
     def provenance(self) -> dict[str, Any]:
         """Read provenance.json.
@@ -93,14 +114,12 @@ class RunFolder:
             InputError: It is missing, damaged or another program's.
         """
         path = self.path / "provenance.json"
-        try:
-            document = json.loads(path.read_text())
-        except FileNotFoundError as error:
-            raise InputError(f"{self.path}: not a run folder (no provenance.json): name one made by `run`") from error
-        except (OSError, json.JSONDecodeError) as error:
-            raise InputError(f"{path}: damaged: {error}") from error
-        if not isinstance(document, dict) or document.get("tool") != TOOL:
+        if not path.exists():
+            raise InputError(f"{self.path}: not a run folder (no provenance.json): name one made by `run`")
+        document = files.read_json(path, f"name a run folder made by `{TOOL} run`")
+        if document.get("tool") != TOOL:
             raise InputError(f"{path}: not written by {TOOL}: name a run folder made by `{TOOL} run`")
+        _require_format(path, document)
         return document
 
     def stored_provenance(self) -> dict[str, Any]:
@@ -202,7 +221,7 @@ def current_results(run: RunFolder, earlier: Mapping[str, Any], now: Mapping[str
         return None
     if max(cell.stat().st_mtime_ns for cell in cells) >= min(table.stat().st_mtime_ns for table in tables):
         return None
-    results = pd.read_csv(run.path / "results.csv", low_memory=False)
+    results = read_table(run.path / "results.csv", low_memory=False)
     return results if len(results) == len(cells) else None
 
 
@@ -236,12 +255,23 @@ def _report_tables(
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; {} where it is missing or damaged. A file that cannot be read is an `OSError`."""
+    """Read a JSON object; {} where it is missing or damaged.
+
+    Raises:
+        InputError: It cannot be read, for example because its disk is not mounted.
+    """
     try:
-        document = json.loads(path.read_text())
-    except (FileNotFoundError, ValueError):
+        return files.read_json(path, "")
+    except InputError as error:
+        if isinstance(error.__cause__, OSError) and not isinstance(error.__cause__, FileNotFoundError):
+            raise
         return {}
-    return document if isinstance(document, dict) else {}
+
+
+def _require_format(path: Path, document: Mapping[str, Any]) -> None:
+    """Refuse a file of a newer format; the first cells carry no number and hold the same as those of format 1."""
+    found = TOOL, document.get("format_version", 1)
+    files.require_format(path, found, TOOL, FORMAT_VERSION, "run the plan again in a new folder")
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

@@ -9,10 +9,7 @@ not at all; a damaged one is ignored.
 from __future__ import annotations
 
 import hashlib
-import io
-import struct
 import zipfile
-import zlib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -23,6 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 import cdpipe
+from cdpipe.core.errors import InputError
+from cdpipe.core.files import ArrayType, read_npz
 from eval.core.output import whole_file
 from eval.core.provenance import digest
 
@@ -33,7 +32,6 @@ _FORMAT = 1  # rises when eval/running/stage_results.py makes something else of 
 _SECONDS, _IS_CONTENDED, _N_ARRAYS = "seconds.", "is_contended", "n_arrays"
 # Deflating noise takes as long as computing it, and saves nothing.
 _NOISE = ".return_offsets"
-_DAMAGES = (OSError, EOFError, KeyError, ValueError, RuntimeError, struct.error, zlib.error, zipfile.BadZipFile)
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
@@ -136,19 +134,20 @@ def _add(file: zipfile.ZipFile, arrays: Arrays) -> None:
 
 def _read(path: Path) -> Kept | None:
     try:
-        with zipfile.ZipFile(path) as file:
-            # read each member whole: its checksum is compared at its end
-            arrays = {
-                name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(file.read(name)), allow_pickle=False)
-                for name in file.namelist()
-            }
-        is_contended, n_arrays = bool(arrays.pop(_IS_CONTENDED)), int(arrays.pop(_N_ARRAYS))
-    except _DAMAGES:
+        arrays = read_npz(path, _check)
+    except InputError:
         return None
+    is_contended, n_arrays = bool(arrays.pop(_IS_CONTENDED)), int(arrays.pop(_N_ARRAYS))
     seconds = {name: arrays.pop(name) for name in list(arrays) if name.startswith(_SECONDS)}
     told = {name.removeprefix(_SECONDS): float(number) for name, number in seconds.items()}
-    # a damaged table of contents may end early
     return Kept(arrays, told, is_contended) if len(arrays) == n_arrays else None
+
+
+def _check(types: Mapping[str, ArrayType]) -> None:
+    """Raise ValueError unless the numbers beside the result are there; its arrays are those of its stage."""
+    for name in (_IS_CONTENDED, _N_ARRAYS, *(name for name in types if name.startswith(_SECONDS))):
+        if name not in types or types[name].shape or types[name].dtype.kind not in "biuf":
+            raise ValueError(f"{name} must be one number")
 
 
 def _is_maps(name: str) -> bool:

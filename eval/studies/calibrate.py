@@ -17,6 +17,7 @@ import typer
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 from eval.core.exits import run_program
+from eval.core.tablefile import read_table as read_stored_table
 from eval.core.tablefile import table_file
 
 ALARM_SHARE = 0.05
@@ -137,10 +138,9 @@ def read_table(path: Path, plan: str) -> pd.DataFrame:
         InputError: The file is missing or is no table.
     """
     try:
-        return pd.read_csv(table_file(path))
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{path}: {reason}: name a folder that `tunnelcd run {plan}` made") from error
+        return read_stored_table(table_file(path))
+    except InputError as error:
+        raise InputError(f"{error}: name a folder that `tunnelcd run {plan}` made") from error
 
 
 def _find_lowest_examined(regions: pd.DataFrame) -> float | None:

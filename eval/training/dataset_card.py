@@ -6,7 +6,6 @@ Both are made from the shards in the folder, so that they are right after an int
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import read_json
 from cdpipe.training.shard import FIELDS, SUFFIX, read_about, split_of
 from eval.core.output import whole_file
 
@@ -21,6 +21,7 @@ COUNTS = ("n_before", "n_after", "n_covered", "n_positive", "n_negative", "n_cha
 INDEX_COLUMNS = (
     "family", "seed", "split", "status", "shard", *COUNTS, "score_radius_m", "bytes", "sha256", "digest", "reason",
 )  # fmt: skip
+_REMEDY = "remove it and run the command again"
 Row = dict[str, Any]
 
 
@@ -35,7 +36,7 @@ def write_card(out: Path) -> None:
     rows.sort(key=lambda row: (row["family"], row["seed"]))
     with whole_file(out / "index.csv") as partial:
         pd.DataFrame(rows, columns=list(INDEX_COLUMNS)).to_csv(partial, index=False)
-    document = json.loads((out / "dataset.json").read_text())
+    document = read_json(out / "dataset.json", "expected a folder made by `tunnelcd dataset`")
     with whole_file(out / "README.md") as partial:
         partial.write_text(card(rows, document["recipe"], document["commands"]), encoding="utf-8")
 
@@ -148,11 +149,14 @@ def _shard_row(path: Path) -> Row:
             "sha256": hashlib.sha256(content).hexdigest(),
             "reason": "",
         }
-    except KeyError as error:
-        raise InputError(f"{path}: damaged: its metadata lacks {error}: remove it and run the command again") from error
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: damaged: its metadata lacks {error}: {_REMEDY}") from error
 
 
 def _refused_row(path: Path) -> Row:
-    about = json.loads(path.read_text())
-    told = {name: about[name] for name in ("family", "seed", "digest", "reason")}
-    return {**dict.fromkeys(INDEX_COLUMNS, ""), **told, "status": "refused", "split": split_of(about["seed"])}
+    about = read_json(path, _REMEDY)
+    try:
+        told = {name: about[name] for name in ("family", "seed", "digest", "reason")}
+        return {**dict.fromkeys(INDEX_COLUMNS, ""), **told, "status": "refused", "split": split_of(about["seed"])}
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: damaged: it lacks {error}: {_REMEDY}") from error

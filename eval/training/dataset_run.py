@@ -17,6 +17,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from cdpipe.core import files
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.training.shard import FORMAT, FORMAT_VERSION, SUFFIX, read_about
 from eval.core.cluster import HERE, Where, connected, n_slots, require_usable
@@ -150,11 +151,13 @@ def _take_folder(out: Path, recipe: Recipe, command: str) -> None:
     present = {"format": FORMAT, "format_version": FORMAT_VERSION, "recipe": json.loads(json.dumps(asdict(recipe)))}
     commands: list[str] = []
     if path.is_file():
+        document = files.read_json(path, "name a new folder")
         try:
-            document = json.loads(path.read_text())
             commands = list(document.pop("commands"))
-        except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        except (KeyError, TypeError) as error:
             raise InputError(f"{path}: damaged ({error}): name a new folder") from error
+        found = document.get("format"), document.get("format_version")
+        files.require_format(path, found, FORMAT, FORMAT_VERSION, "name a new folder, and run the command again")
         if document != present:
             raise InputError(
                 f"{out}: made with {_told(document.get('recipe'))}, not with {_told(present['recipe'])}: all shards of "

@@ -13,8 +13,9 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.descriptors import use_threads
-from cdpipe.descriptors.network import checkpoint_bytes, digest, make_untrained_network
+from cdpipe.descriptors.network import make_untrained_network
 from cdpipe.descriptors.sphere_network import SphereNetwork, make_untrained_sphere_network
+from cdpipe.descriptors.weights_file import digest, numbered_checkpoint_bytes
 from cdpipe.training.data import TunnelShard, open_dataset, read_place_data
 from cdpipe.training.fit import FitConfig, Progress, Task, fit
 from cdpipe.training.scan_training import PlaceTask
@@ -76,7 +77,7 @@ def train_descriptor(
     history = fit(task, config, out, identity, on_step, on_validation)
     draw_curves(out / "curves.png", name, history)
     finished = task.finish()
-    content = checkpoint_bytes(task.network)
+    content = numbered_checkpoint_bytes(task.network)
     best = next(done for done in reversed(history) if done.is_best)
     card = {
         "descriptor": f"{name}: {SOURCES[name]}",

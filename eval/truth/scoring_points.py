@@ -18,10 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import ArraySpec, read_npz
 from cdpipe.core.geometry import Float32Array, Int32Array, Int64Array, require_shape, transform
 from cdpipe.core.voxel import cell_keys
 from cdpipe.io.readers import open_session
-from cdpipe.io.session import Session, chunk_path, load_arrays, read_session
+from cdpipe.io.session import Session, chunk_path, read_session
 from cdpipe.model.types import PosedScan
 from eval.core.output import whole_file
 from sim.session.truth import Int16Array, read_labels
@@ -30,6 +31,14 @@ CELL_M = 0.1
 _CACHE_VERSION = 3
 _BATCH_RETURNS = 500_000
 _PENDING_ROWS = 4_000_000
+_CACHE = {
+    "fingerprint": ArraySpec("", "str"),
+    "returns": ArraySpec("N", "int64"),
+    "points_odom": ArraySpec("N,3", "float32"),
+    "change": ArraySpec("N", "int16"),
+    "instance": ArraySpec("N", "int16"),
+    "nearest_m": ArraySpec("C", "float32", is_finite=False),  # infinite where a change was not seen
+}
 _Rows = dict[str, npt.NDArray[Any]]  # the columns of `ScoringPoints`, and the cell of each
 
 
@@ -220,17 +229,16 @@ def _fingerprint(session: Session) -> str:
 
 def _read_cache(path: Path, fingerprint: str, session: Session) -> ScoringPoints | None:
     try:
-        arrays = load_arrays(path)
+        arrays = read_npz(path, _CACHE)
         if str(arrays.pop("fingerprint")) != fingerprint:
             return None
         return ScoringPoints(**arrays, n_scans=session.n_scans, n_pixels=session.sensor.height * session.sensor.width)
-    except (InputError, KeyError, TypeError, ValueError):
+    except InputError:
         return None  # absent or damaged: rebuilt from the session
 
 
 def _write_cache(path: Path, fingerprint: str, scoring_points: ScoringPoints) -> None:
-    names = ("returns", "points_odom", "change", "instance", "nearest_m")
-    arrays = {name: getattr(scoring_points, name) for name in names}
+    arrays = {name: getattr(scoring_points, name) for name in _CACHE if name != "fingerprint"}
     # a read-only folder is scored without the cache, more slowly
     with suppress(OSError), whole_file(path) as partial, partial.open("wb") as file:
         np.savez(file, allow_pickle=False, fingerprint=np.array(fingerprint), **arrays)

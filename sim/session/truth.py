@@ -18,21 +18,27 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import ArraySpec, read_json, read_npz
 from cdpipe.core.geometry import Float64Array
-from cdpipe.io.session import load_arrays
 
 Int16Array = npt.NDArray[np.int16]
 SessionName = Literal["before", "after"]
 SESSIONS: tuple[SessionName, ...] = ("before", "after")
 Kind = Literal["added", "removed", "moved", "reshaped"]
 Group = Literal["full", "partial"]
+_Four = Field(min_length=4, max_length=4)
+_CHECKS = ConfigDict(extra="forbid", allow_inf_nan=False)
+_LABELS = {"instance": ArraySpec("s,H,W", "int16"), "change": ArraySpec("s,H,W", "int16")}
+_POSES = {"world_T_sensor": ArraySpec("S,4,4", "float64")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +68,8 @@ class Change:
         n_cells_other: Cells of 0.1 m that these fill, in that session's odom frame.
     """
 
-    id: int
+    __pydantic_config__ = _CHECKS
+    id: Annotated[int, Field(ge=1, le=32767)]
     name: str
     prop_kind: str
     kind: Kind
@@ -70,7 +77,7 @@ class Change:
     partner: int | None
     group: Group
     instance: int
-    world_T_object: list[list[float]]
+    world_T_object: Annotated[list[Annotated[list[float], _Four]], _Four]
     hull_volume_m3: float
     n_returns: int
     n_cells: int
@@ -95,6 +102,7 @@ class PairTruth:
         files: SHA-256 of every file that the scenario names, by its path as seen from the working folder.
     """
 
+    __pydantic_config__ = _CHECKS
     family: str
     seed: int
     score_radius_m: float
@@ -116,14 +124,17 @@ def read_pair_truth(pair: str | Path) -> PairTruth:
         InputError: The pair has no truth, or it is damaged.
     """
     path = Path(pair) / "truth" / "changes.json"
-    if not path.is_file():
-        raise InputError(f"{path}: missing: only simulated pairs have truth to score against")
+    document = read_json(path, "only simulated pairs have truth to score against", is_finite=True)
     try:
-        document = json.loads(path.read_text())
-        changes = tuple(Change(**change) for change in document.pop("changes"))
-        return PairTruth(changes=changes, **document)
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: damaged: {error}") from error
+        return _reader().validate_python(document)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"{path}: damaged: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+
+
+@cache
+def _reader() -> TypeAdapter[PairTruth]:
+    return TypeAdapter(PairTruth)
 
 
 def write_labels(session: Path, index: int, instance: Int16Array, change: Int16Array) -> None:
@@ -140,11 +151,11 @@ def write_true_poses(session: Path, world_T_sensor: Float64Array) -> None:
 
 def read_true_poses(session: Path) -> Float64Array:
     """Read the (S, 4, 4) true poses of one session."""
-    return np.asarray(load_arrays(session / "truth" / "poses.npz")["world_T_sensor"], dtype=np.float64)
+    return read_npz(session / "truth" / "poses.npz", _POSES)["world_T_sensor"]
 
 
 def read_labels(session: Path, n_chunks: int) -> Iterator[tuple[Int16Array, Int16Array]]:
     """Yield (instance, change) of every chunk, each (s, H, W) int16."""
     for index in range(n_chunks):
-        arrays = load_arrays(session / "truth" / f"{index:05d}.npz")
+        arrays = read_npz(session / "truth" / f"{index:05d}.npz", _LABELS)
         yield arrays["instance"], arrays["change"]

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import invert, travelled_m
 from cdpipe.io.answer import read_answer
-from cdpipe.io.session import load_arrays, read_session
+from cdpipe.io.session import read_session
 from cdpipe.merge.evidence import GATES
 from cdpipe.model.alignment import PathAlignment
 from eval.report.merge.figures import FULL_M, alignment_picture
@@ -118,8 +118,8 @@ def draw_case(data: RunData, case: Case, missing: list[str]) -> Picture | None:
     scenario, seed, variant = str(case.row["scenario"]), int(case.row["seed"]), str(case.row["variant"])
     name = f"{scenario}, seed {seed}"
     try:
-        maps = load_arrays(data.folder.maps(scenario, seed))
-        before, after = maps["before_points"], maps["after_points"].astype(np.float64)
+        before, after_odom = data.folder.read_maps(scenario, seed)
+        after = after_odom.astype(np.float64)
         pair = data.folder.pair(scenario, seed)
         if text(case.row, "status") == "ok":
             report = read_answer(data.folder.answer(scenario, seed, variant)).report
@@ -129,7 +129,7 @@ def draw_case(data: RunData, case: Case, missing: list[str]) -> Picture | None:
             alignment = None if report is None else alignment_of(report, poses)
         else:
             alignment = true_alignment(pair)
-    except (InputError, KeyError) as error:
+    except InputError as error:
         missing.append(f"The aligned maps of {name} are not shown: {error}")
         return None
     if alignment is None or len(before) == 0 or len(after) == 0:

@@ -17,7 +17,6 @@ from scipy.spatial import cKDTree
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.io.answer import read_answer
-from cdpipe.io.session import load_arrays
 from cdpipe.model.report import ChangeReport
 from eval.running.run_data import Row, flag, number, text
 from eval.running.runfolder import RunFolder
@@ -56,10 +55,7 @@ def write_case_view(run: RunFolder, case: tuple[str, int], variant: str, rows: M
     if answer.report is None:
         raise InputError(f"{scenario}, seed {seed}: {variant} gave no answer, so the maps have no common frame")
     truth = load_ground_truth(run.pair(scenario, seed))
-    maps = load_arrays(run.maps(scenario, seed))
-    view = case_view(
-        f"{scenario}, seed {seed}", (maps["before_points"], maps["after_points"]), truth, answer.report, rows
-    )
+    view = case_view(f"{scenario}, seed {seed}", run.read_maps(scenario, seed), truth, answer.report, rows)
     file = view_file(run, scenario, seed)
     file.parent.mkdir(parents=True, exist_ok=True)
     write_html(view, file, _legend(view.title, variant))

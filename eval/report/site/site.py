@@ -10,7 +10,6 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.io.answer import Answer, read_answer
-from cdpipe.io.session import load_arrays
 from cdpipe.model.report import ChangeReport
 from eval.report.maps import Points, RegionMark, State, TruthMark, distance_map, overlay_map, region_map
 from eval.report.objects.objects import object_pictures
@@ -26,6 +25,7 @@ from eval.running.run_data import (
     rows_of_case,
     text,
 )
+from eval.running.runfolder import RunFolder
 from eval.scoring.region_metrics import transform_to_map
 from eval.truth.aligned import alignment_of
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
@@ -50,7 +50,7 @@ def draw_site(data: RunData, scenario: str) -> Site:
     seed = first_seed(data, scenario)
     missing: list[str] = []
     answers = _answers(data, scenario, seed, missing)
-    maps = _maps(data.folder.maps(scenario, seed), missing)
+    maps = _maps(data.folder, scenario, seed, missing)
     truth = _truth(data.folder.pair(scenario, seed), missing)
     maps_drawn = [] if maps is None else _map_pictures(maps, answers, truth, missing)
     regions = []
@@ -82,14 +82,14 @@ def _answers(data: RunData, scenario: str, seed: int, missing: list[str]) -> dic
     return found
 
 
-def _maps(path: Path, missing: list[str]) -> tuple[Points, Points] | None:
+def _maps(run: RunFolder, scenario: str, seed: int, missing: list[str]) -> tuple[Points, Points] | None:
+    path = run.maps(scenario, seed)
     try:
-        arrays = load_arrays(path)
-        maps = arrays["before_points"], arrays["after_points"]
-    except (InputError, KeyError):
+        maps = run.read_maps(scenario, seed)
+    except InputError:
         missing.append(f"The maps for pictures (maps/{path.parent.name}/{path.name}) are missing or damaged.")
         return None
-    if any(cloud.ndim != 2 or cloud.shape[1] != 3 or len(cloud) == 0 for cloud in maps):
+    if any(len(cloud) == 0 for cloud in maps):
         missing.append(f"The maps for pictures (maps/{path.parent.name}/{path.name}) hold no points.")
         return None
     return maps

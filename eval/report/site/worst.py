@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from cdpipe.core.errors import InputError
 from cdpipe.io.answer import read_answer
-from cdpipe.io.session import load_arrays
 from eval.report.site.site import region_picture
 from eval.report.tables import Picture
 from eval.running.run_data import Row, RunData, number, of, rows_of_case, scenarios, text
@@ -77,9 +76,9 @@ def _picture(data: RunData, variant: str, row: Row) -> Picture | None:
     scenario, seed = str(row["scenario"]), int(row["seed"])
     try:
         report = read_answer(data.folder.answer(scenario, seed, variant)).report
-        before = load_arrays(data.folder.maps(scenario, seed))["before_points"]
+        before = data.folder.read_maps(scenario, seed)[0]
         truth = load_ground_truth(data.folder.pair(scenario, seed))
-    except (InputError, KeyError):
+    except InputError:
         return None
     if report is None or len(before) == 0:
         return None

@@ -41,6 +41,7 @@ from eval.core.figures import picture, png
 from eval.core.output import make_writable, whole_file
 from eval.core.ranking import auroc
 from eval.core.statistics import mean
+from eval.core.tablefile import read_table
 from eval.studies.descriptors.curve_plots import curves_chart
 from eval.tables.rows import records
 from eval.training.training_run import data_digest
@@ -239,9 +240,9 @@ def read_rows(path: Path, run: Mapping[str, Any]) -> list[dict[str, Any]]:
     if not path.is_file():
         return []
     try:
-        table = pd.read_csv(path)
+        table = read_table(path)
         is_same = all((table[name] == value).all() for name, value in run.items())
-    except (OSError, ValueError, KeyError) as error:
+    except (InputError, ValueError, KeyError) as error:
         raise InputError(f"{path}: damaged ({error}): remove it; networks that were trained are kept") from error
     if not is_same:
         raise InputError(f"{path}: of other data or another number of steps: name another --out")

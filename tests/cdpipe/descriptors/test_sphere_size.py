@@ -8,7 +8,6 @@ from importlib import resources
 import pytest
 import torch
 
-from cdpipe.descriptors.network import checkpoint_bytes
 from cdpipe.descriptors.sphere_image import COLUMNS, ROWS
 from cdpipe.descriptors.sphere_network import (
     SECTORS,
@@ -17,6 +16,7 @@ from cdpipe.descriptors.sphere_network import (
     load_trained_sphere_network,
     make_untrained_sphere_network,
 )
+from cdpipe.descriptors.weights_file import checkpoint_bytes
 
 SIZES = (SphereSize(), SphereSize(per_sector=1, width=0.5), SphereSize(per_sector=8, width=2.0, reads_after=False))
 

@@ -141,7 +141,7 @@ def test_an_unreadable_description_is_named(tmp_path: Path, monkeypatch: pytest.
     def unreadable(*_: object, **__: object) -> str:
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_text", unreadable)
+    monkeypatch.setattr(Path, "open", unreadable)
     with pytest.raises(InputError, match=r"session\.json: .*Permission denied"):
         read_session(path)
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from cdpipe.descriptors.network import digest
 from cdpipe.descriptors.sphere_network import load_sphere_network
+from cdpipe.descriptors.weights_file import digest
 from eval.core.progress import Silent
 from eval.training.dataset import Recipe
 from eval.training.dataset_run import Where, make_dataset

@@ -1,0 +1,26 @@
+from .array_spec import ArraySpec, ArrayType, Expected, check_types
+from .format_number import require_format
+from .json_file import parse_json, read_json
+from .npz_file import read_npz
+from .plain_file import read_bytes, require_plain_file
+from .tensor_file import parse_tensors, read_tensors
+from .yaml_file import Key, YamlError, parse_yaml, parse_yaml_value
+
+__all__ = [
+    "ArraySpec",
+    "ArrayType",
+    "Expected",
+    "Key",
+    "YamlError",
+    "check_types",
+    "parse_json",
+    "parse_tensors",
+    "parse_yaml",
+    "parse_yaml_value",
+    "read_bytes",
+    "read_json",
+    "read_npz",
+    "read_tensors",
+    "require_format",
+    "require_plain_file",
+]

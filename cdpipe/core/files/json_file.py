@@ -1,0 +1,85 @@
+"""JSON: bounded in size and depth; a key that stands twice and numbers beyond 64 bits are refused."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.files.plain_file import read_bytes
+
+MAX_BYTES = 24_000_000
+"""The largest JSON of ours, the cell of a tunnel of 10 km, takes a tenth of it; parsed, a byte takes up to 35."""
+MAX_DEPTH = 64
+_MAX_INTEGER = 2**64
+
+
+def parse_json(text: str | bytes, *, is_finite: bool = False) -> Any:
+    """Parse JSON.
+
+    Args:
+        text: UTF-8.
+        is_finite: Whether NaN and infinite numbers are mistakes; Python writes and reads both.
+
+    Raises:
+        ValueError: It is no JSON, is nested deeper than `MAX_DEPTH`, names a key twice, or holds a whole number beyond
+            64 bits or one that is not finite.
+    """
+    if len(text) > MAX_BYTES:
+        raise ValueError(f"{len(text) / 1e6:.0f} MB, more than the {MAX_BYTES / 1e6:.0f} MB it may have")
+    try:
+        document = json.loads(text, object_pairs_hook=_unique)
+    except RecursionError as error:
+        raise ValueError(f"nested deeper than {MAX_DEPTH} levels") from error
+    level: list[Any] = [document]
+    for _ in range(MAX_DEPTH + 1):
+        level = [inner for outer in level for inner in _check_values(outer, is_finite)]
+        if not level:
+            return document
+    raise ValueError(f"nested deeper than {MAX_DEPTH} levels")
+
+
+def read_json(path: Path, expected: str, *, is_finite: bool = False) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        InputError: The file is missing, cannot be read, or holds no JSON object by the rules of `parse_json`; the
+            message ends with `expected`.
+    """
+    content = read_bytes(path, MAX_BYTES, expected)
+    try:
+        document = parse_json(content, is_finite=is_finite)
+    except ValueError as error:  # not UTF-8 is one as well
+        raise InputError(f"{path}: damaged, not JSON ({error}): {expected}") from error
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: damaged, holds a JSON {type(document).__name__}: {expected}")
+    return document
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the key {twice[:40]!r} stands there twice")
+    return found
+
+
+def _check_values(outer: Any, is_finite: bool) -> list[Any]:
+    """Return the lists and objects within a value; refuse numbers that do not fit."""
+    values: Iterable[Any] = (
+        outer.values() if isinstance(outer, dict) else outer if isinstance(outer, list) else (outer,)
+    )
+    within = []
+    for value in values:
+        kind = type(value)
+        if kind is dict or kind is list:
+            within.append(value)
+        elif kind is int and abs(value) >= _MAX_INTEGER:
+            raise ValueError("a whole number is beyond 64 bits")
+        elif is_finite and kind is float and not math.isfinite(value):
+            raise ValueError(f"{value} is no finite number")
+    return within
