@@ -14,7 +14,7 @@ PYTHONS ?= python3.11 python3.13
 # One process per core and one thread in each; the tests of one file stay in one process and share what it has set up.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
 
-.PHONY: setup demo test test-lowest lowest test-newest test-pythons audit soak check report clean
+.PHONY: setup demo test test-lowest lowest test-newest test-pythons audit soak sweep check report clean
 
 setup: $(VENV)/.installed-dev
 
@@ -87,7 +87,14 @@ $(AUDIT)/.installed: constraints.txt
 		pip-audit pip-licenses
 	touch $@
 
+# Kill and disturb a plan and every command that writes, for MINUTES; nothing may be lost. The table is SOAK/soak.md.
+MINUTES ?= 30
+SOAK ?= soak
 soak: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.soak --minutes $(MINUTES) --out $(SOAK)
+
+# The broad sweeps that `make test` leaves out.
+sweep: $(VENV)/.installed-dev
 	$(PYTEST) -m soak
 
 check: $(VENV)/.installed-dev

@@ -13,6 +13,7 @@ import signal
 import socket
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass
 from tempfile import TemporaryDirectory
@@ -85,10 +86,24 @@ def connected(where: Where, n_tasks: int) -> Iterator[Any]:
     """Yield a Dask client of the named scheduler, or of local worker processes, at most one per task.
 
     Raises:
-        InputError: The scheduler cannot be reached, has no workers, or a worker differs from this process.
+        InputError: The scheduler cannot be reached, has no workers, or goes away, also within the block; a worker
+            differs from this process; or several workers end during one task.
     """
-    with _of_scheduler(where.scheduler) if where.scheduler is not None else _of_this_machine(where, n_tasks) as client:
-        yield client
+    from distributed import KilledWorker  # noqa: PLC0415 - an extra, and slow to import
+
+    try:
+        with _of_scheduler(where.scheduler) if where.scheduler else _of_this_machine(where, n_tasks) as client:
+            yield client
+    except KilledWorker as error:
+        raise InputError(
+            "several workers ended during one task; what is finished is kept: go on without them"
+        ) from error
+    except (CancelledError, OSError) as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # of a file; those of Dask have no number
+        raise InputError(
+            "the scheduler went away; what is finished is kept, the same command goes on from there"
+        ) from error
 
 
 def n_slots(client: Any) -> int:
@@ -107,7 +122,7 @@ def is_shared(client: Any) -> bool:
 @contextmanager
 def _of_this_machine(where: Where, n_tasks: int) -> Iterator[Any]:
     import dask  # noqa: PLC0415 - an extra, and slow to import
-    from distributed import Client, LocalCluster  # noqa: PLC0415 - as above
+    from distributed import Client  # noqa: PLC0415 - as above
 
     fix_threads()
     environment = {name: value for name, value in dask.config.get(_ENVIRONMENT).items() if name != _TRIM}
@@ -126,10 +141,22 @@ def _of_this_machine(where: Where, n_tasks: int) -> Iterator[Any]:
         TemporaryDirectory(prefix="tunnelcd-", ignore_cleanup_errors=True) as scratch,
         dask.config.set({_ENVIRONMENT: environment, _SCRATCH: scratch}),
         _safe_path(),
-        LocalCluster(**settings) as cluster,
+        _start_workers(settings) as cluster,
         Client(cluster) as client,
     ):
         yield client
+
+
+def _start_workers(settings: Mapping[str, Any]) -> Any:
+    from distributed import LocalCluster  # noqa: PLC0415 - as above
+
+    try:
+        return LocalCluster(**settings)
+    except (RuntimeError, TimeoutError) as error:
+        raise InputError(
+            "--workers: a process ended while it started, or took too long: run the same command again, perhaps with "
+            "fewer workers"
+        ) from error
 
 
 @contextmanager

@@ -14,7 +14,6 @@ import time
 import uuid
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -62,17 +61,11 @@ def run_on_workers(client: Any, run: RunFolder, pairs: Sequence[Pair], made: Mad
     Raises:
         InputError: The workers do not see the folder, or go away.
     """
-    from distributed.comm import CommClosedError  # noqa: PLC0415 - an extra, and slow to import
-
     folder = run.path.absolute()
     token = uuid.uuid4().hex
     (folder / _TOKEN).write_text(token)
     try:
         _Dispatch(client, folder, token, pairs, made, progress).run()
-    except (CancelledError, CommClosedError) as error:
-        raise InputError(
-            "the scheduler went away; finished cells are kept, the same command goes on from there"
-        ) from error
     finally:
         # workers of a cluster outlive this process; without the token they stop after their present cell
         if _token(folder) == token:

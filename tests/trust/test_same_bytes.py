@@ -6,7 +6,6 @@ Workers and clusters are compared in `tests/eval/running/test_distributed.py`, `
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
@@ -16,11 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from safetensors.numpy import load_file
 
 from cdpipe.core.threads import THREAD_VARIABLES
+from tests.trust.contents import contents
 
 ROOT = Path(__file__).parents[2]
 SCENARIO = """\
@@ -55,8 +53,7 @@ class Chain:
         """Wait for its end; return the content of every file that it wrote, by its name."""
         _, told = self.process.communicate(timeout=300)
         assert self.process.returncode == 0, told
-        paths = (path for path in self.folder.rglob("*") if path.is_file())
-        return {path.relative_to(self.folder).as_posix(): content_of(path) for path in paths}
+        return contents(self.folder)
 
 
 @pytest.fixture(scope="module", name="locales")
@@ -105,22 +102,3 @@ def test_the_place_does_not_matter(start_chain: Callable[..., Chain], usual: Cha
     assert sorted(ours) == sorted(theirs)
     assert {"pair/truth/changes.json", "answer/answer.npz", "row.txt", "sphere/sphere.safetensors"} < set(ours)
     assert [name for name in ours if ours[name] != theirs[name]] == []
-
-
-def content_of(path: Path) -> Any:
-    match path.name:
-        case "state.safetensors":  # its header holds the seconds of every validation
-            return {name: array.tobytes() for name, array in load_file(path).items()}
-        case "scoring_points.npz":  # a cache that knows the session's files by their stamps
-            with np.load(path, allow_pickle=False) as arrays:
-                return {name: array.tobytes() for name, array in arrays.items() if name != "fingerprint"}
-        case name if name.endswith(".json"):
-            return without_seconds(json.loads(path.read_text(encoding="utf-8")))
-        case _:
-            return path.read_bytes()
-
-
-def without_seconds(document: Any) -> Any:
-    if isinstance(document, dict):
-        return {name: without_seconds(part) for name, part in document.items() if name != "seconds"}
-    return document

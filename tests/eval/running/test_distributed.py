@@ -12,6 +12,8 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -45,6 +47,9 @@ variants:
   - {preset: voxel-diff, oracle_merge: {}}
   - {preset: random-regions, oracle_merge: {}}
 """
+
+
+THERE = Where(scheduler="tcp://127.0.0.1:8786")
 
 
 class Workers:
@@ -303,6 +308,38 @@ def test_what_is_no_address_is_named(address: str) -> None:
         pytest.raises(InputError, match=r"tcp://HOST:PORT"),
         cluster.connected(Where(scheduler=address), 1),
     ):
+        pass
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        distributed.comm.CommClosedError("in <TCP>: Stream is closed"),
+        OSError("Timed out trying to connect to tcp://127.0.0.1:8786 after 30 s"),
+        CancelledError("work_on-1"),
+    ],
+)
+def test_a_scheduler_that_goes_away_at_any_moment_is_one_line(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "_of_scheduler", lambda address: nullcontext())
+    with pytest.raises(InputError, match="went away; what is finished is kept"), cluster.connected(THERE, 1):
+        raise error
+
+
+def test_a_full_disk_of_a_worker_is_no_scheduler_that_went_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "_of_scheduler", lambda address: nullcontext())
+    with pytest.raises(OSError, match="No space"), cluster.connected(THERE, 1):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("error", [RuntimeError("Nanny failed to start."), TimeoutError()])
+def test_a_worker_that_dies_while_it_starts_is_one_line(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(**_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(distributed, "LocalCluster", fail)
+    with pytest.raises(InputError, match="run the same command again"), cluster.connected(Where(workers=2), 2):
         pass
 
 
