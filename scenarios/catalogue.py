@@ -9,7 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from cdpipe.core.errors import ScenarioError
-from cdpipe.core.plugins import SEARCH_PATH, search_folders
+from cdpipe.core.names import folded
+from cdpipe.core.plugins import SEARCH_PATH, require_file_name, search_folders
 from cdpipe.core.yamlfile import read_yaml, validate
 from scenarios.schema import PROP_KINDS, PropFile
 
@@ -65,13 +66,18 @@ def read_prop(kind: str) -> PropFile:
 
 
 def _found(what: str, taken: dict[str, Path], folders: tuple[Path, ...]) -> dict[str, Path]:
-    known, found = dict(taken), {}
+    known, found = {_place(name): path for name, path in taken.items()}, {}
     for folder in folders:
         for path in sorted(folder.rglob("*.yaml")):
-            name = path.relative_to(folder).with_suffix("").as_posix()
-            if name in known:
+            name = require_file_name(path, path.relative_to(folder).as_posix().removesuffix(".yaml"))
+            if (other := known.setdefault(_place(name), path)) is not path:
                 raise ScenarioError(
-                    f"{SEARCH_PATH}: {path}: there is a {what} {name!r} already, in {known[name]}: rename the file"
+                    f"{SEARCH_PATH}: {path}: there is a {what} {name!r} already, in {other}: rename the file"
                 )
-            known[name] = found[name] = path
+            found[name] = path
     return found
+
+
+def _place(name: str) -> str:
+    """Return what two names share where their worlds would share a folder."""
+    return folded(name.replace("/", "__"))

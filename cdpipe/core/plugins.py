@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.names import folded, require_name, visible
 
 METHODS = "tunnelcd.methods"
 METRICS = "tunnelcd.metrics"
@@ -90,7 +91,8 @@ def find_yaml(kind: str, *shipped: Traversable, group: str | None = None) -> dic
         group: Entry-point group; each entry names a package that contains such files.
 
     Raises:
-        InputError: Two files claim one name, or a plugin's package cannot be found.
+        InputError: Two files claim one name or one folder's name, a name is none (`require_name`), or a plugin's
+            package cannot be found.
     """
     folders = [*shipped]
     for entry in entry_points(group).values() if group else ():
@@ -99,9 +101,23 @@ def find_yaml(kind: str, *shipped: Traversable, group: str | None = None) -> dic
         except ImportError as error:
             raise InputError(f"{group}: {entry.name!r} = {entry.value}: no such package: {error}") from error
     found: dict[str, Traversable] = {}
+    places: dict[str, Traversable] = {}
     for file in (file for folder in (*folders, *search_folders(kind)) for file in folder.iterdir()):
-        if file.name.endswith(".yaml") and found.setdefault(file.name.removesuffix(".yaml"), file) is not file:
-            raise InputError(
-                f"{file}: there is another of this name, {found[file.name.removesuffix('.yaml')]}: rename it"
-            )
+        if file.name.endswith(".yaml"):
+            name = require_file_name(file, file.name.removesuffix(".yaml"))
+            if (other := places.setdefault(folded(name), file)) is not file:
+                raise InputError(f"{file}: there is another of this name, {other}: rename it")
+            found[name] = file
     return dict(sorted(found.items()))
+
+
+def require_file_name(file: Traversable, name: str) -> str:
+    """Return the name that a file gives to what it holds.
+
+    Raises:
+        InputError: It is none (`require_name`).
+    """
+    try:
+        return require_name(name)
+    except ValueError as error:
+        raise InputError(f"{visible(str(file))}: {error}: rename the file") from error

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.names import visible
 
 
 @contextmanager
@@ -17,7 +20,8 @@ def new_folder(path: Path) -> Iterator[Path]:
     Raises:
         InputError: `path` is a file or a folder with something in it, or cannot be made.
     """
-    path = path.absolute()
+    # a link to an empty folder, or to none yet, is that folder
+    path = path.resolve() if path.is_symlink() else path.absolute()
     partial = path.with_name(f".{path.name}.partial")
     made = _missing_parents(path)
     try:
@@ -28,9 +32,7 @@ def new_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
         if path.exists():
-            probe = path / partial.name
-            probe.touch()
-            probe.unlink()
+            _write_nothing(path)
     except OSError as error:
         _remove_empty(made)
         raise unwritable(path, error) from error
@@ -51,6 +53,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     partial = path.with_name(f".{path.name}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        partial.unlink(missing_ok=True)  # it may be a link, which a writer would follow
         yield partial
         partial.replace(path)
     finally:
@@ -83,18 +86,45 @@ def make_writable(path: Path) -> None:
     Raises:
         InputError: The path is a file, or nothing can be written there.
     """
-    probe = path / ".tunnelcd.partial"
     try:
         path.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
+        _write_nothing(path)
     except OSError as error:
         raise unwritable(path, error) from error
+
+
+def require_no_links(folder: Path) -> None:
+    """Refuse a folder with a link in it: what is written, replaced or removed below the folder would lie elsewhere.
+
+    Raises:
+        InputError: It holds a link, at any depth.
+    """
+    for parent, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            if (path := Path(parent, name)).is_symlink():
+                raise InputError(
+                    f"{visible(str(path))}: is a link, and nothing outside of {folder} may be written or removed: "
+                    "put the file or folder itself there"
+                )
+
+
+def remove(path: Path) -> None:
+    """Remove a file, a folder, or a link but not what it leads to, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def unwritable(path: Path, error: OSError) -> InputError:
     """Return the error that says why an output folder cannot be used."""
     return InputError(f"{path}: cannot write there ({error.strerror}): name a folder you may write to")
+
+
+def _write_nothing(folder: Path) -> None:
+    """Make a file without a name in a folder, which shows that it can be written."""
+    with tempfile.TemporaryFile(dir=folder):
+        pass
 
 
 def _missing_parents(path: Path) -> list[Path]:

@@ -27,7 +27,6 @@ grid:
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, Literal
 
@@ -35,16 +34,15 @@ from pydantic import BeforeValidator, Field, ValidationError, field_validator, m
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.names import folded
 from cdpipe.core.yamlfile import Settings, suggest, validate
 from cdpipe.model.config import Site
 from eval.plans.files import read_plan
 from eval.plans.parts import Grid, Label, NotEmpty, Variant
 from eval.plans.targets import PlanTargets, Targets
-from eval.plans.variants import Cell, Method, Until, slug
+from eval.plans.variants import Cell, Method, Until
 from eval.plans.worlds import OneOrMore, ScenarioItem, World, get_group, list_worlds, world_slug
 
-_TOO_LONG = "is too long for a folder's name: put the settings into a file of their own"
-_LONGEST_SLUG = 200  # file systems take names of 255 bytes
 _AFTER_MERGE = ("query", "extract", "outlier", "cluster", "m3c2", "dufomap")
 
 
@@ -60,17 +58,18 @@ def _refuse(mistakes: list[InitErrorDetails]) -> None:
 
 
 def _find_repeated_worlds(items: Iterable[ScenarioItem]) -> Iterator[InitErrorDetails]:
-    """Yield the worlds that are listed twice or whose label is too long for a folder's name."""
-    known: set[object] = set()
+    """Yield the worlds that are listed twice, and those that would share a folder."""
+    known: dict[object, str] = {}
     for place, item in enumerate(items):
         for index, world in enumerate(list_worlds([item])):
-            folder = world_slug(world.label)
-            names = {folder, (world.name, world.settings)}
-            rule = _TOO_LONG if len(folder) > _LONGEST_SLUG else "is listed twice" if known & names else ""
-            if rule:
+            names = (world.label, (world.name, world.settings), world_slug(world.label).casefold())
+            other = next((known[name] for name in names if name in known), None)
+            if other is not None:
                 where = (place, "each", index - 1) if index else (place,)
+                is_same = other == world.label or known.get(names[1]) == other
+                rule = "is listed twice" if is_same else f"would share the folder of {other}: rename one"
                 yield _mistake(where, ",".join(world.own) or world.name, f"scenario {world.label} {rule}")
-            known |= names
+            known |= {name: world.label for name in names if name not in known}
 
 
 def _find_settings_past_the_end(plan: Plan) -> Iterator[InitErrorDetails]:
@@ -118,14 +117,20 @@ def _find_unknown_worlds(plan: Plan) -> Iterator[InitErrorDetails]:
 
 
 def _find_repeated_variants(plan: Plan) -> Iterator[InitErrorDetails]:
+    """Yield the variants that a world has twice, and those that would share a folder."""
     told = set()
     for world in list_worlds(plan.scenarios):
-        folders = Counter(slug(method.variant) for method in list_methods(plan, world))
-        for folder, n in folders.items():
-            if folder not in told and (n > 1 or len(folder) > _LONGEST_SLUG):
-                told.add(folder)
-                rule = f"stands twice in the plan for {world.label}" if n > 1 else _TOO_LONG
-                yield _mistake(("variants",), folder, f"variant {folder} {rule}")
+        names: dict[str, str] = {}
+        for method in list_methods(plan, world):
+            name, folder = method.variant, folded(method.variant)
+            if folder in names and name not in told:
+                told.add(name)
+                twice, shared = (
+                    f"stands twice in the plan for {world.label}",
+                    f"would share the folder of {names[folder]}",
+                )
+                yield _mistake(("variants",), name, f"variant {name} {twice if names[folder] == name else shared}")
+            names.setdefault(folder, name)
 
 
 def parse_seeds(value: Any) -> tuple[int, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,11 +90,6 @@ def name_variant(
         stem = "+".join([ORACLE_MERGE] * (oracle is not None) + [ORACLE_REGIONS] * oracle_regions)
     joined = ",".join(settings)
     return f"{stem}[{joined}]" if joined else stem
-
-
-def slug(variant: str) -> str:
-    """Return a variant's name as a folder name."""
-    return re.sub(r"[^A-Za-z0-9._=,-]", "_", variant)
 
 
 def _strip_suffix(preset: str) -> str:

@@ -37,6 +37,7 @@ from pydantic import (
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import YamlError, parse_yaml_value
+from cdpipe.core.names import path_part
 from cdpipe.core.yamlfile import Settings, suggest
 from cdpipe.model.config import PipelineConfig
 from scenarios import check_scenario, scenario_names
@@ -184,7 +185,7 @@ def require_known_label(label: str) -> str:
 
 def world_slug(label: str) -> str:
     """Return a world's label as a folder name."""
-    return re.sub(r"[^A-Za-z0-9._=,-]", "_", label.replace("/", "__"))
+    return path_part(label.replace("/", "__"))
 
 
 def find_references(cases: Iterable[tuple[str, str, int]]) -> dict[tuple[str, str], str]:

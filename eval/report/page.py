@@ -17,6 +17,7 @@ import pandas as pd
 
 from cdpipe.model.config import settings_table
 from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
+from eval.core.output import require_no_links
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.targets import read_targets
 from eval.report.charts import Chart, plotly_script
@@ -77,8 +78,10 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
         Path of the page.
 
     Raises:
-        InputError: There are no results, they are of several metrics versions, or the folder cannot be written.
+        InputError: There are no results, they are of several metrics versions, or the folder holds a link or cannot be
+            written.
     """
+    require_no_links(run)
     data = read_run(run)
     check_versions(Side(data), Side(data))
     merges = merge_table(pd.DataFrame(list(data.results)), read_targets(data.provenance))

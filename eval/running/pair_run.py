@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpipe.core.errors import MergeFailedError, ScenarioError, TunnelcdError
+from cdpipe.core.errors import InputError, MergeFailedError, ScenarioError, TunnelcdError
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import checkpoint_digest, sphere_digest, use_threads
 from cdpipe.io.answer import write_answer, write_failure
@@ -24,14 +24,14 @@ from cdpipe.merge.global_registration import is_kiss_matcher_installed
 from cdpipe.model.config import MapConfig
 from cdpipe.pipeline import OnStage
 from eval.core.domains import domain_of
-from eval.core.output import whole_file
+from eval.core.output import remove, whole_file
 from eval.core.progress import RunProgress
 from eval.core.provenance import digest, git_commit, now
 from eval.oracles.merge import merged_by_truth
 from eval.oracles.regions import regions_by_truth
 from eval.plans.variants import Cell
 from eval.running.rescoring import cell_document
-from eval.running.runfolder import RunFolder, remove, write_json
+from eval.running.runfolder import RunFolder, write_json
 from eval.running.stage_cache import open_cache
 from eval.running.stages import PairStages
 from eval.scoring.scoring import METRICS_VERSION, CaseScore, score_stored
@@ -173,10 +173,23 @@ class PairRun:
 
 
 def is_finished(run: RunFolder, each: Todo) -> bool:
-    """Tell whether a cell's file exists, is complete, and holds the present digest and metrics version."""
+    """Tell whether a cell's file exists, is complete, and holds the present digest and metrics version.
+
+    Raises:
+        InputError: The file is that of another world or variant, whose name gives the same path.
+    """
     cell = each.cell
-    stored = run.read_cell(run.cell(cell.scenario, cell.seed, cell.variant))
-    return stored is not None and stored["key"] == each.key and stored["row"].get("metrics_version") == METRICS_VERSION
+    path = run.cell(cell.scenario, cell.seed, cell.variant)
+    stored = run.read_cell(path)
+    if stored is None:
+        return False
+    world, variant = stored["row"].get("scenario"), stored["row"].get("variant")
+    if (world, variant) != (cell.scenario, cell.variant):
+        raise InputError(
+            f"{path}: holds {variant} on {world}, and {cell.variant} on {cell.scenario} has the same path: rename one, "
+            "or name another run folder"
+        )
+    return bool(stored["key"] == each.key and stored["row"].get("metrics_version") == METRICS_VERSION)
 
 
 @contextmanager

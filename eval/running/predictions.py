@@ -9,6 +9,7 @@ variants. A pair that the program could not do gets an answer.json of status `fa
 
 from __future__ import annotations
 
+import filecmp
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -18,15 +19,16 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.names import folded, require_name, visible
 from cdpipe.core.yamlfile import suggest
 from cdpipe.model.config import preset_names
+from eval.core.output import remove
 from eval.core.progress import RunProgress, Silent
 from eval.plans.coverage import read_stored_plan
 from eval.plans.plan import list_planned_cases
-from eval.plans.variants import slug
 from eval.running.export import copy_pair, list_pairs, name_blindly
 from eval.running.rescoring import LAST, NO_KEY, cell_document, foreign_identity
-from eval.running.runfolder import RunFolder, open_run_folder, remove, write_json, write_tables
+from eval.running.runfolder import RunFolder, open_run_folder, write_json, write_tables
 from eval.running.sides import list_versions
 from eval.scoring.scoring import METRICS_VERSION, score_stored
 from eval.truth.ground_truth import load_ground_truth
@@ -56,6 +58,7 @@ def add_predictions(run: RunFolder, folder: Path, name: str, progress: RunProgre
     for pair, prediction in found.items():
         identity = foreign_identity(run, pair.parent.name, pair.name, name)
         progress.cells("{scenario} {seed} {variant}".format(**identity), len(documents), len(found))
+        mistakes += _find_unscored(run, identity, prediction)
         try:
             score = score_stored(load_ground_truth(pair), prediction)
             documents[pair] = cell_document(score, identity, NO_KEY, LAST)
@@ -171,14 +174,31 @@ def _matched(run: RunFolder, folder: Path, pairs: Sequence[Path]) -> dict[Path, 
 
 
 def _require_free(run: RunFolder, name: str) -> None:
-    """Refuse the name of a variant of the run, of a preset or of an oracle."""
-    if not slug(name).strip("._"):
-        raise InputError(f"--as {name!r}: expected a name")
-    if name.partition("[")[0] in preset_names() or name.startswith("oracle-"):
+    """Refuse the name of a variant of the run, of a preset or of an oracle, and one that would share its folder."""
+    try:
+        require_name(name)
+    except ValueError as error:
+        raise InputError(f"--as {name!r}: {error}") from error
+    if folded(name.partition("[")[0]) in map(folded, preset_names()) or folded(name).startswith("oracle-"):
         raise InputError(f"--as {name}: a preset or an oracle of tunnelcd is called so: choose another")
-    for path in sorted(run.path.glob(f"cells/*/*/{slug(name)}.json")):
-        if (stored := run.read_cell(path)) is not None and stored["key"] != NO_KEY:
-            raise InputError(f"--as {name}: the run has a variant of this name: choose another")
+    for path in sorted(run.path.glob("cells/*/*/*.json")):
+        if path.stem.casefold() == folded(name) and (stored := run.read_cell(path)) is not None:
+            if stored["key"] != NO_KEY:
+                raise InputError(f"--as {name}: the run has a variant of this name: choose another")
+            if stored["row"]["variant"] != name:
+                other = visible(str(stored["row"]["variant"]))
+                raise InputError(f"--as {name}: would take the folder of the variant {other}: choose another")
+
+
+def _find_unscored(run: RunFolder, identity: Mapping[str, Any], prediction: Path) -> list[str]:
+    """Return the mistake that an answer of the name lies in the run without a score; no mistake if it is this one."""
+    names = identity["scenario"], identity["seed"], identity["variant"]
+    answer = run.answer(*names)
+    is_scored = run.read_cell(run.cell(*names)) is not None
+    _, others, unreadable = filecmp.cmpfiles(answer, prediction, _FILES, shallow=False)
+    if is_scored or not answer.exists() or not (others or any((answer / name).exists() for name in unreadable)):
+        return []
+    return [f"{answer}: holds an answer that is not scored: `tunnelcd score {run.path}` takes it in, or remove it"]
 
 
 def _require_current(run: RunFolder) -> None:

@@ -76,10 +76,7 @@ def foreign_identity(run: RunFolder, slug: str, seed: str, name: str) -> dict[st
 
     The world gets the name that the run's own cells give it, or that of its folder where there are none.
     """
-    world = {"scenario": slug.replace("__", "/"), "pair_kind": ""}
-    for path in sorted((run.path / "cells" / slug).glob("*/*.json")):
-        if (stored := run.read_cell(path)) is not None:
-            world = {"scenario": stored["row"]["scenario"], "pair_kind": stored["row"].get("pair_kind", "")}
-            break
+    row = run.any_row(slug) or {"scenario": slug.replace("__", "/")}
+    world = {"scenario": row["scenario"], "pair_kind": row.get("pair_kind", "")}
     who = {"seed": int(seed), "variant": name, "preset": name, "commit": None, "is_contended": False}
     return {**world, **who}

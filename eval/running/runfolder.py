@@ -19,7 +19,6 @@ effects.csv                                   where a world was run with and wit
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -33,13 +32,13 @@ import pandas as pd
 from cdpipe.core import files
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_npz
-from eval.core.output import make_writable, whole_file
+from cdpipe.core.names import path_part
+from eval.core.output import make_writable, remove, require_no_links, whole_file
 from eval.core.provenance import FORMAT_VERSION, TOOL
 from eval.core.statistics import summarise
 from eval.core.tablefile import read_table
 from eval.plans.coverage import measure_coverage
 from eval.plans.targets import read_targets
-from eval.plans.variants import slug
 from eval.plans.worlds import world_slug
 from eval.tables.effects import effects
 from eval.tables.merge_table import merge_table
@@ -67,11 +66,11 @@ class RunFolder:
 
     def answer(self, scenario: str, seed: int, variant: str) -> Path:
         """Folder of a raw answer."""
-        return self.path / "answers" / world_slug(scenario) / str(seed) / slug(variant)
+        return self.path / "answers" / world_slug(scenario) / str(seed) / path_part(variant)
 
     def cell(self, scenario: str, seed: int, variant: str) -> Path:
         """File of a finished cell."""
-        return self.path / "cells" / world_slug(scenario) / str(seed) / f"{slug(variant)}.json"
+        return self.path / "cells" / world_slug(scenario) / str(seed) / f"{path_part(variant)}.json"
 
     def maps(self, scenario: str, seed: int) -> Path:
         """File of the thinned maps of a pair."""
@@ -107,6 +106,11 @@ class RunFolder:
         _require_format(path, document)
         return document
 
+    def any_row(self, world_folder: str) -> dict[str, Any] | None:
+        """Return the row of a finished cell of a world, None where there is none; the row has the world's name."""
+        cells = map(self.read_cell, sorted((self.path / "cells" / world_folder).glob("*/*.json")))
+        return next((cell["row"] for cell in cells if cell is not None), None)
+
     def provenance(self) -> dict[str, Any]:
         """Read provenance.json.
 
@@ -131,7 +135,7 @@ def start_run_folder(path: Path) -> RunFolder:
     """Open a folder to run in: new, empty, or of an earlier run.
 
     Raises:
-        InputError: It holds something else, or cannot be written.
+        InputError: It holds something else or a link, or cannot be written.
     """
     make_writable(path)
     run = RunFolder(path)
@@ -139,6 +143,7 @@ def start_run_folder(path: Path) -> RunFolder:
         if not (path / "provenance.json").exists():
             raise InputError(f"{path}: not empty and not a run folder: name a new folder, or empty this one")
         run.provenance()
+        require_no_links(path)
     return run
 
 
@@ -158,12 +163,13 @@ def open_run_folder(path: Path) -> RunFolder:
     """Open the folder of an earlier run.
 
     Raises:
-        InputError: There is none.
+        InputError: There is none, or it holds a link.
     """
     if not path.is_dir():
         raise InputError(f"{path}: no such run folder")
     run = RunFolder(path)
     run.provenance()
+    require_no_links(path)
     return run
 
 
@@ -278,14 +284,6 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write JSON that appears whole or not at all; numpy scalars become plain numbers."""
     with whole_file(path) as partial:
         partial.write_text(json.dumps(document, indent=1, default=_plain))
-
-
-def remove(path: Path) -> None:
-    """Remove a file or a folder, if it is there."""
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
 
 
 def _items(table: str, cells: Sequence[Mapping[str, Any]]) -> pd.DataFrame:

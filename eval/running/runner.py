@@ -20,14 +20,15 @@ from cdpipe.descriptors import checkpoint_digest, sphere_digest
 from cdpipe.methods.registry import load_method
 from cdpipe.model.config import DescriptorConfig
 from eval.core.cluster import HERE, Where, connected, require_usable
+from eval.core.output import remove
 from eval.core.progress import RunProgress, Silent
 from eval.core.provenance import describe_run, digest
 from eval.plans.plan import Plan, expand_cells
 from eval.plans.variants import Cell
-from eval.plans.worlds import list_worlds
+from eval.plans.worlds import list_worlds, world_slug
 from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Todo, Tools, cell_key, is_finished, pair_lock
 from eval.running.run_workers import remove_traces, run_on_workers
-from eval.running.runfolder import RunFolder, current_results, remove, write_json, write_tables
+from eval.running.runfolder import RunFolder, current_results, write_json, write_tables
 from scenarios.references import file_digests
 from sim.session.truth import read_pair_truth
 
@@ -66,8 +67,8 @@ def run_plan(
         tools: What draws and simulates worlds, and names the code and the time; workers simulate with their own.
 
     Raises:
-        InputError: A setting is wrong, a method's extra is missing, the folder cannot be written, or the cluster cannot
-            be used.
+        InputError: A setting is wrong, a method's extra is missing, the folder cannot be written or holds another
+            world or variant where one of the plan belongs, or the cluster cannot be used.
     """
     progress, tools = progress or Silent(), tools or TOOLS
     require_usable(where)
@@ -134,6 +135,12 @@ def _run_here(run: RunFolder, pairs: Sequence[Pair], made: Made, progress: RunPr
 def _pairs(run: RunFolder, plan: Plan, all_cells: Sequence[Cell], force: bool, tools: Tools) -> list[Pair]:
     variants = list(dict.fromkeys(cell.variant for cell in all_cells))
     places = {world.label: (place, world) for place, world in enumerate(list_worlds(plan.scenarios))}
+    for label in places:
+        if (row := run.any_row(world_slug(label))) is not None and row["scenario"] != label:
+            raise InputError(
+                f"{run.path}: holds the world {row['scenario']}, and {label} has the same folder: rename one, or name "
+                "another run folder"
+            )
     pairs = []
     for (label, seed), group in groupby(all_cells, key=lambda cell: (cell.scenario, cell.seed)):
         place, world = places[label]
@@ -147,7 +154,7 @@ def _pairs(run: RunFolder, plan: Plan, all_cells: Sequence[Cell], force: bool, t
             Todo(cell, cell_key(cell, world.pair_kind, scenario, files), (place, variants.index(cell.variant)))
             for cell in group
         ]
-        todo = [each for each in every if force or not is_finished(run, each)]
+        todo = [each for each in every if not is_finished(run, each) or force]
         # cells with the same map settings run one after the other: only one pair of maps is held
         todo.sort(key=lambda each: each.cell.config.map.model_dump_json())
         family = world.name if scenario is None else scenario.family

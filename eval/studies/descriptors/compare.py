@@ -22,13 +22,13 @@ from cdpipe.descriptors import checkpoint_digest, sphere_digest, use_threads
 from cdpipe.model.config import load_config
 from eval.core.domains import domain_of
 from eval.core.exits import run_program
-from eval.core.output import make_writable
+from eval.core.output import make_writable, remove
 from eval.core.progress import RunProgress, shown_progress
 from eval.core.provenance import digest, git_commit, machine
 from eval.core.statistics import bootstrap_interval, mean_with_interval, median
 from eval.plans.plan import parse_seeds_option
 from eval.plans.worlds import world_slug
-from eval.running.runfolder import read_json, remove, write_json
+from eval.running.runfolder import read_json, write_json
 from eval.studies.descriptors.rows import METHODS, SPHERE, measure_pair
 from eval.tables.rows import numbers
 from scenarios.library import load_scenario

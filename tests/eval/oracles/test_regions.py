@@ -7,11 +7,12 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import make_pose, yaw_pose
+from cdpipe.core.names import path_part
 from cdpipe.model.config import QueryConfig
 from eval.oracles.regions import regions_by_truth
 from eval.plans.changes import change_plan
 from eval.plans.plan import Plan, expand_cells, load_plan
-from eval.plans.variants import name_variant, slug
+from eval.plans.variants import name_variant
 from eval.scoring.region_metrics import match_regions, transform_to_world
 from eval.tables.merge_table import is_oracle
 from eval.truth.ground_truth import GroundTruth, SessionTruth
@@ -112,7 +113,7 @@ def test_oracles_are_named_after_what_they_know(tmp_path: Path) -> None:
     ]
     assert [cell.oracle_regions for cell in found] == [True, True, True, False]
     assert [is_oracle(cell.variant) for cell in found] == [False, True, True, False]
-    assert slug("oracle-merge+oracle-regions") == "oracle-merge_oracle-regions"
+    assert path_part("oracle-merge+oracle-regions") == "oracle-merge_oracle-regions"
     assert name_variant("tunnelcd", ["a.b=1"], oracle_regions=True) == "oracle-regions[a.b=1]"
 
 

@@ -4,13 +4,14 @@ from pathlib import Path
 import pytest
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.names import path_part
 from cdpipe.model.config import load_config
 from eval.plans import plan as plan_module
 from eval.plans.changes import change_plan
 from eval.plans.files import plan_names
 from eval.plans.plan import Plan, expand_cells, list_planned_cases, load_plan, parse_seeds
 from eval.plans.targets import Targets
-from eval.plans.variants import name_variant, slug
+from eval.plans.variants import name_variant
 from eval.plans.worlds import format_setting, world_slug
 from eval.running.runfolder import reported
 
@@ -170,7 +171,7 @@ def test_what_is_no_seeds(value: object) -> None:
 def test_names_and_slugs() -> None:
     assert name_variant("paper", ()) == "paper"
     assert name_variant("tunnelcd", ("a.b=0.3", "c=4")) == "tunnelcd[a.b=0.3,c=4]"
-    assert slug("tunnelcd[a.b=0.3,c=4]") == "tunnelcd_a.b=0.3,c=4_"
+    assert path_part("tunnelcd[a.b=0.3,c=4]") == "tunnelcd_a.b=0.3,c=4_"
     assert name_variant("my/own.yaml", ()) == "own"
     assert world_slug("paper/site1") == "paper__site1"
     assert format_setting("query.n_regions", None) == "query.n_regions=null"

@@ -226,11 +226,6 @@ def test_a_profile_that_is_not_there_is_told_before_anything_runs(tmp_path: Path
         ("sensor.range_noise=false]: [", "sensor.range_nose=false]: [", "did you mean"),
         ("scenarios: [smoke/one_box]", "scenarios: [paper/site1]", "not in scenarios"),
         ("[0.3]", "[0.3, 0.3]", f"stands twice in the plan for {PLAIN}"),
-        (
-            "      - sensor.range_noise=false\n",
-            f"      - tunnel.nodes.{'n' * 200}=[0, 0, 0]\n",
-            "too long for a folder",
-        ),
     ],
 )
 def test_worlds_that_do_not_fit(tmp_path: Path, old: str, new: str, words: str) -> None:

@@ -24,12 +24,12 @@ import pytest
 from pydantic import TypeAdapter
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.names import path_part
 from eval.core import cluster, progress
 from eval.core.cluster import Where
 from eval.core.progress import Lines
 from eval.plans.files import plan_names
 from eval.plans.plan import Plan, expand_cells, load_plan
-from eval.plans.variants import slug
 from eval.running import pair_run, runner
 from eval.running.pair_run import Made, Tools
 from eval.running.run_workers import Task, _unfit, remove_traces, work_on
@@ -511,7 +511,7 @@ def test_a_run_that_is_stopped_ends_after_the_cell_in_flight(
 
     monkeypatch.setattr(pair_run, "_answer", answer)
     assert work_on(task.as_json()) == "the run was stopped"
-    assert [path.name.partition(".")[0] for path in task.folder.glob("cells/*/*/*.json")] == [slug(FIRST)]
+    assert [path.name.partition(".")[0] for path in task.folder.glob("cells/*/*/*.json")] == [path_part(FIRST)]
 
 
 def test_lines_tell_the_pace_and_the_time_left(

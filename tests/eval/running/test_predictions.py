@@ -361,3 +361,44 @@ def test_an_answer_to_the_sessions_the_other_way_round_is_named(
     gap_m = np.linalg.norm(np.maximum(40.0 - extents_m, 0.0))
     assert err.count("\n") == 1 and "or to the sessions the other way round?" in err
     assert f"objects[0]: object_points_map is {gap_m:.0f} m off the returns" in err
+
+
+@pytest.mark.parametrize("other", ["my_method", "MY method"])
+def test_a_name_that_would_take_the_folder_of_another_is_refused(
+    tmp_path: Path, run: RunFolder, command: Command, good: tuple[dict[str, Any], dict[str, Any]], other: str
+) -> None:
+    for seed in SEEDS:
+        write_prediction(tmp_path / f"mine/tiny/pair/{seed}", *good)
+    given = ("score", run.path, "--predictions", tmp_path / "mine", "--quiet", "--as")
+    assert command(*given, "my method")[0] == 0
+    stored = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
+    code, _, err = command(*given, other)
+    assert code == 2 and err == f"error: --as {other}: would take the folder of the variant my method: choose another\n"
+    assert {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()} == stored
+
+
+@pytest.mark.parametrize("name", ["..", "Paper", "oracle-mine", "a\x1b[2Jb", "n" * 201])
+def test_what_no_method_may_be_called(
+    tmp_path: Path, run: RunFolder, command: Command, good: tuple[dict[str, Any], dict[str, Any]], name: str
+) -> None:
+    for seed in SEEDS:
+        write_prediction(tmp_path / f"mine/tiny/pair/{seed}", *good)
+    code, _, err = command("score", run.path, "--predictions", tmp_path / "mine", "--as", name)
+    assert code == 2 and err.startswith("error: --as ") and err.count("\n") == 1 and "\x1b" not in err
+
+
+def test_an_answer_that_was_never_scored_is_not_replaced(
+    tmp_path: Path, run: RunFolder, command: Command, good: tuple[dict[str, Any], dict[str, Any]]
+) -> None:
+    for seed in SEEDS:
+        write_prediction(tmp_path / f"mine/tiny/pair/{seed}", *good)
+    answer = run.answer("tiny/pair", SEEDS[0], "theirs")
+    write_prediction(answer, {**good[0], "method": "of somebody else"}, good[1])
+    argv = ("score", run.path, "--predictions", tmp_path / "mine", "--as", "theirs")
+    code, _, err = command(*argv)
+    assert code == 2 and "holds an answer that is not scored: `tunnelcd score" in err
+    assert "somebody else" in (answer / "answer.json").read_text()
+    # an interrupt leaves the same answer without a cell: the same command goes on
+    for name in ("answer.json", "answer.npz"):
+        shutil.copyfile(tmp_path / f"mine/tiny/pair/{SEEDS[0]}" / name, answer / name)
+    assert command(*argv)[0] == 0

@@ -1,0 +1,61 @@
+"""Names of users and files: as parts of paths, and as text that a terminal or a page shows."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import unicodedata
+
+LONGEST = 200  # file systems take names of 255 bytes; suffixes and the marks of unfinished files need the rest
+# Names that Windows keeps for devices, with any suffix.
+_DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
+_DIGEST_LENGTH = 16
+
+
+def path_part(name: str) -> str:
+    """Return a name as one part of a path: ASCII, visible, at most `LONGEST` characters, and valid on every system.
+
+    Other characters than letters, digits and `._=,-` become `_`. A leading or trailing dot and the name of a device get
+    a `_` beside it, so that no name is hidden or leads out of its folder. A longer name is cut and ends with its
+    digest. Two names may give one part; whoever makes folders from names refuses names that are equal when `folded`.
+    """
+    part = re.sub(r"[^A-Za-z0-9._=,-]", "_", name)
+    if not part or part.startswith(".") or _DEVICES.fullmatch(part):
+        part = f"_{part}"
+    if part.endswith("."):
+        part = f"{part}_"
+    if len(part) > LONGEST:
+        digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:_DIGEST_LENGTH]
+        part = f"{part[: LONGEST - _DIGEST_LENGTH - 1]}-{digest}"
+    return part
+
+
+def folded(name: str) -> str:
+    """Return what two names share where they would share a folder; file systems may ignore case."""
+    return path_part(name).casefold()
+
+
+def require_name(name: str) -> str:
+    """Return a name that a user chose.
+
+    Raises:
+        ValueError: It has no letter or digit, is too long for a folder's name, or holds a character that is not shown.
+    """
+    if not re.search(r"[A-Za-z0-9]", name):
+        raise ValueError("expected a name with a letter or a digit of ASCII")
+    if len(name) > LONGEST:
+        raise ValueError(f"is too long: expected at most {LONGEST} characters")
+    if visible(name) != name:
+        raise ValueError("expected a name without control characters")
+    return name
+
+
+def visible(text: str) -> str:
+    r"""Return a line of text with everything that is not shown as it is (ESC, newline, bidi marks) as `\x1b`, `\n`."""
+    if text.isprintable():
+        return text
+    return "".join(letter if _is_shown(letter) else letter.encode("unicode_escape").decode() for letter in text)
+
+
+def _is_shown(letter: str) -> bool:
+    return letter.isprintable() or unicodedata.category(letter) == "Zs"

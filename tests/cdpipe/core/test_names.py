@@ -1,0 +1,64 @@
+import re
+from pathlib import Path
+
+import pytest
+
+from cdpipe.core.names import LONGEST, folded, path_part, require_name, visible
+
+HOSTILE = (
+    "", ".", "..", "...", "/", "../..", "../../etc/passwd", ".hidden", "a/b", "a\\b", "C:\\x", "a\0b", "a\nb", "CON",
+    "nul.txt", "com1", "x.", "x ", " ", "~", "-rf", "*", "$HOME", "ä", "日本", "\ud800", "\x1b[31m", "n" * 5000,
+    "." * 300, "\u202egpj",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_path_part_stays_in_its_folder_on_every_system(name: str, tmp_path: Path) -> None:
+    part = path_part(name)
+    assert re.fullmatch(r"[A-Za-z0-9_=,-][A-Za-z0-9._=,-]*", part)
+    assert len(part) <= LONGEST and not part.endswith(".")
+    assert part.partition(".")[0].lower() not in {"con", "nul", "com1"}
+    (tmp_path / f".{part}.json.partial").write_text("")  # the longest name that is made of it
+    assert (tmp_path / part).resolve().parent == tmp_path.resolve()
+    assert path_part(part) == part
+
+
+def test_shipped_names_keep_their_folders() -> None:
+    for name in ("tunnelcd", "paper-topn", "site1", "narrow_platform.speed_mps=0.5_", "oracle-merge"):
+        assert path_part(name) == name
+    assert (
+        path_part("tunnelcd[query.radius_m=3,extract.voxel_m=0.4]") == "tunnelcd_query.radius_m=3,extract.voxel_m=0.4_"
+    )
+
+
+def test_long_names_that_begin_alike_stay_apart() -> None:
+    assert path_part("n" * 5000) != path_part("n" * 5001)
+    assert path_part("n" * LONGEST) == "n" * LONGEST
+
+
+@pytest.mark.parametrize("names", [("my method", "my_method"), ("A", "a"), ("x[a=1]", "x_a=1_"), ("..", "_..")])
+def test_names_that_would_share_a_folder_are_equal_when_folded(names: tuple[str, str]) -> None:
+    assert folded(names[0]) == folded(names[1])
+
+
+@pytest.mark.parametrize("name", ["", "..", "___", "ä", "n" * 201, "a\x1bb", "a\nb", "a\u202eb"])
+def test_what_is_no_name(name: str) -> None:
+    with pytest.raises(ValueError, match=r"name|too long"):
+        require_name(name)
+    assert require_name("my method 2 (ä)") == "my method 2 (ä)"
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("plain ä 日本 5\u20096", "plain ä 日本 5\u20096"),
+        ("\x1b]0;x\x07", r"\x1b]0;x\x07"),
+        ("a\nb\tc\rd", r"a\nb\tc\rd"),
+        ("\x9b31m", r"\x9b31m"),
+        ("\u202eabc\u2066", r"\u202eabc\u2066"),
+        ("\u2028\ufeff\ud800", r"\u2028\ufeff\ud800"),
+    ],
+)
+def test_what_is_not_shown_becomes_an_escape(text: str, shown: str) -> None:
+    assert visible(text) == shown
+    assert visible(visible(text)) == shown

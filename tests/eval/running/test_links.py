@@ -1,0 +1,79 @@
+"""Links inside of an output folder: nothing outside of it is written or removed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cdpipe.core.errors import InputError
+from eval.core.output import make_writable, new_folder, remove, whole_file
+from eval.report.page import write_page
+from eval.running.runfolder import open_run_folder, start_run_folder, write_json
+
+
+@pytest.fixture
+def outside(tmp_path: Path) -> Path:
+    folder = tmp_path / "outside"
+    (folder / "3" / "ours").mkdir(parents=True)
+    (folder / "3" / "ours" / "answer.json").write_text("precious")
+    return folder
+
+
+@pytest.mark.parametrize("place", ["answers", "answers/world", "pairs/world", "stages/world/3/x", "index.html"])
+@pytest.mark.parametrize("opened", [start_run_folder, open_run_folder, write_page])
+def test_a_run_folder_with_a_link_is_refused(
+    tmp_path: Path, outside: Path, place: str, opened: Callable[[Path], object]
+) -> None:
+    write_json(tmp_path / "run" / "provenance.json", {"tool": "tunnelcd"})
+    link = tmp_path / "run" / place
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.symlink_to(outside)
+    with pytest.raises(InputError, match=rf"{place}: is a link, and nothing outside of .*: put the"):
+        opened(tmp_path / "run")
+    assert (outside / "3" / "ours" / "answer.json").read_text() == "precious"
+
+
+def test_the_run_folder_itself_may_be_a_link(tmp_path: Path) -> None:
+    write_json(tmp_path / "run" / "provenance.json", {"tool": "tunnelcd"})
+    (tmp_path / "link").symlink_to(tmp_path / "run")
+    assert start_run_folder(tmp_path / "link").provenance() == {"tool": "tunnelcd"}
+
+
+def test_a_link_is_removed_and_not_what_it_leads_to(tmp_path: Path, outside: Path) -> None:
+    for target in (outside, outside / "3" / "ours" / "answer.json", tmp_path / "nowhere"):
+        link = tmp_path / "link"
+        link.symlink_to(target)
+        remove(link)
+        assert not link.is_symlink()
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "link").symlink_to(outside)
+    remove(tmp_path / "folder")
+    assert (outside / "3" / "ours" / "answer.json").read_text() == "precious"
+
+
+def test_a_link_in_the_place_of_an_unfinished_file_is_not_followed(tmp_path: Path, outside: Path) -> None:
+    precious = outside / "3" / "ours" / "answer.json"
+    (tmp_path / ".table.csv.partial").symlink_to(precious)
+    (tmp_path / "table.csv").symlink_to(precious)
+    with whole_file(tmp_path / "table.csv") as partial:
+        partial.write_text("new")
+    assert (tmp_path / "table.csv").read_text() == "new" and precious.read_text() == "precious"
+
+
+def test_looking_whether_a_folder_can_be_written_follows_no_link(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".tunnelcd.partial").symlink_to(tmp_path / "made")
+    make_writable(tmp_path / "out")
+    assert not (tmp_path / "made").exists() and (tmp_path / "out" / ".tunnelcd.partial").is_symlink()
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_link_to_an_empty_folder_or_to_none_is_that_folder(tmp_path: Path, *, is_there: bool) -> None:
+    if is_there:
+        (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    with new_folder(tmp_path / "link") as partial:
+        (partial / "file").write_text("x")
+    assert (tmp_path / "real" / "file").read_text() == "x" and (tmp_path / "link").is_symlink()
