@@ -11,6 +11,7 @@ from typing import Any
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.files import Key
 from cdpipe.core.geometry import stream
+from cdpipe.core.names import visible
 from cdpipe.core.yamlfile import Document, apply_settings, read_yaml, suggest, validate
 from scenarios.catalogue import family_files, family_of, prop_files, prop_names, read_prop
 from scenarios.dangling import Mistake, find_dangling, items_at
@@ -157,14 +158,15 @@ def _drop_repeated(lines: list[str], broken: set[Key], told: list[Mistake]) -> l
 
 
 def _format_mistake(document: Document, key: Key, rule: str) -> str:
+    """Return one line: where a mistake is, what stands there, and the rule that it breaks."""
     value = document.value
     for part in key:
         is_there = part in value if isinstance(value, dict) else isinstance(value, list) and part in range(len(value))
         if not is_there:
-            return f"{document.where(key)}: {join_key(key)}: {rule}"
+            return visible(f"{document.where(key)}: {join_key(key)}: {rule}")
         value = value[part]
     text = repr(value)
-    return f"{document.where(key)}: {join_key(key)} = {text if len(text) <= 60 else text[:57] + '...'}: {rule}"
+    return visible(f"{document.where(key)}: {join_key(key)} = {text if len(text) <= 60 else text[:57] + '...'}: {rule}")
 
 
 def _key_of(line: str) -> str:
@@ -188,9 +190,11 @@ def _path_of(name_or_path: str) -> Path:
     if path.is_file():
         return path
     if path.suffix in SUFFIXES:
-        raise ScenarioError(f"{path}: no such file; a scenario is a YAML file or a name such as {min(files)}")
+        raise ScenarioError(
+            f"{visible(str(path))}: no such file; a scenario is a YAML file or a name such as {min(files)}"
+        )
     hint = suggest(name_or_path, files) or f"; known are {', '.join(sorted(files))}"
-    raise ScenarioError(f'scenario "{name_or_path}": unknown{hint}')
+    raise ScenarioError(f'scenario "{visible(name_or_path)}": unknown{hint}')
 
 
 def _shorten(path: Path) -> Path:

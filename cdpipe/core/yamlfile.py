@@ -19,6 +19,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files.plain_file import read_bytes
 from cdpipe.core.files.yaml_file import MAX_BYTES as MAX_YAML_BYTES
 from cdpipe.core.files.yaml_file import Key, YamlError, parse_yaml, parse_yaml_value
+from cdpipe.core.names import visible
 
 _MAX_TOLD = 20
 
@@ -73,9 +74,9 @@ def _parse(path: str, text: str) -> Document:
         parsed = parse_yaml(text)
     except YamlError as error:
         where = path if error.line is None else f"{path}:{error.line}"
-        raise InputError(f"{where}: not YAML: {error}") from error
+        raise InputError(f"{where}: not YAML: {' '.join(str(error).split())}") from error
     if parsed.mistakes:
-        raise InputError("\n".join(f"{path}:{line}: {mistake}" for line, mistake in parsed.mistakes[:_MAX_TOLD]))
+        raise InputError("\n".join(f"{path}:{line}: {visible(told)}" for line, told in parsed.mistakes[:_MAX_TOLD]))
     return Document(path, parsed.value, {key: f"{path}:{line}" for key, line in parsed.lines.items()})
 
 
@@ -90,7 +91,7 @@ def validate(model: type[ModelT], document: Document) -> ModelT:
     try:
         return model.model_validate(document.value)
     except ValidationError as error:
-        lines = [_describe_mistake(model, document, item) for item in error.errors()]
+        lines = [visible(_describe_mistake(model, document, item)) for item in error.errors()]
         raise InputError("\n".join(dict.fromkeys(lines))) from error
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from eval.cli.options import KindOfSite, OutFolder, Preset, Quiet, SetSettings
-from eval.core.printing import print_table, say
+from eval.core.printing import echo, print_table, say
 from eval.core.progress import shown_progress
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def detect(
     config = cdpipe.load_config(preset, settings or (), site)
     if is_same_session(cdpipe.open_session(before), cdpipe.open_session(after)):
         same = f"{before} and {after} are one and the same recording: nothing can have changed between them"
-        typer.echo(f"note: {same}", err=True)
+        echo(f"note: {same}", err=True)
     try:
         with new_folder(out) as partial, shown_progress(quiet) as progress:
             report = cdpipe.detect(before, after, preset, settings or (), site, cdpipe.Hooks(progress.stage))
@@ -65,15 +65,16 @@ def detect(
     print_table("regions (map frame = the before session's odometry)", report.to_pandas("regions"))
     if not report.regions.is_reported.any():
         scores = report.regions.scores
-        typer.echo(
+        echo(
             f"nothing reaches query.threshold = {config.query.threshold:g}; "
             f"the best of {len(scores)} candidates scores {scores[:1].max(initial=0.0):.4g}; "
-            "--set query.n_regions=3 reports the best three whatever they score\n"
+            "--set query.n_regions=3 reports the best three whatever they score",
+            "",
         )
     objects = report.to_pandas("objects")
     print_table("objects", objects[[name for name in objects.columns if not name.startswith(("min_", "max_", "box_"))]])
     times = ", ".join(f"{name[2:-2]} {seconds:.3f} s" for name, seconds in report.seconds.items())
-    typer.echo(f"{out}: answer.json, answer.npz, regions.csv, objects.csv, objects.ply ({times})")
+    echo(f"{out}: answer.json, answer.npz, regions.csv, objects.csv, objects.ply ({times})")
 
 
 def _evidence_table(evidence: Mapping[str, float], config: PipelineConfig) -> pd.DataFrame:

@@ -6,9 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
-from eval.core.printing import MET, print_table
+from eval.core.printing import MET, echo, print_table
 
 if TYPE_CHECKING:
     from eval.report.comparison import Comparison
@@ -44,11 +42,11 @@ def print_results(folder: Path, quiet: bool) -> None:
     covered = measure_coverage(provenance, cases)
     targets = merge_overview(results, read_targets(provenance), is_whole=covered.is_whole)
     if not covered.is_whole:
-        typer.echo(f"{covered.sentence}\n")
+        echo(covered.sentence, "")
     if len(targets):
         print_table("merge: share of the pairs within the target of their kind, with its 95 % interval", targets)
     for line in list_incomplete_variants(provenance, results):
-        typer.echo(f"note: {line}\n")
+        echo(f"note: {line}", "")
     if (folder / "regions_table.csv").is_file():
         _region_results(folder)
     if (folder / "objects_table.csv").is_file():
@@ -97,7 +95,7 @@ def print_comparison(found: Comparison) -> None:
     if len(table):
         print_table(title, table)
     for line in sentences(found):
-        typer.echo(line)
+        echo(line)
 
 
 def _targets(folder: Path, subject: str) -> None:

@@ -11,7 +11,7 @@ import typer
 
 from eval.cli.options import Quiet, RunOut, Scheduler, SetSettings, Workers
 from eval.cli.printed_results import print_comparison, print_results
-from eval.core.printing import print_row, say, warn
+from eval.core.printing import echo, print_row, say, warn
 from eval.core.progress import shown_progress
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def demo(out: RunOut, quiet: Quiet = False) -> None:
 
     _run(load_plan("paper"), out, HERE, force=False, limit=None, quiet=quiet)
     page = write_page(out)
-    typer.echo(f"page: {page}")
+    echo(f"page: {page}")
 
 
 def run_command(
@@ -157,7 +157,7 @@ def report(
 
         if out is not None:
             raise InputError("--out: the page of a run lies in its folder: leave --out to a comparison")
-        typer.echo(f"page: {write_page(open_run_folder(Path(folder)).path, views)}")
+        echo(f"page: {write_page(open_run_folder(Path(folder)).path, views)}")
         return
     if other is not None and against is not None:
         raise InputError(f"--against {against}: a second run is named too: write {folder}:{against} {other} instead")
@@ -170,7 +170,7 @@ def report(
     page = write_comparison(found, out or b.path)
     if not quiet:
         print_comparison(found)
-    typer.echo(f"page: {page}")
+    echo(f"page: {page}")
 
 
 def _list_cells(plan: Plan, out: Path, *, force: bool, limit: int | None) -> None:
@@ -180,12 +180,10 @@ def _list_cells(plan: Plan, out: Path, *, force: bool, limit: int | None) -> Non
 
     every = list_cells(plan, out, force=force, limit=limit)
     for cell, state in every:
-        typer.echo(f"{state:<8}  {cell.scenario} {cell.seed} {cell.variant}")
+        echo(f"{state:<8}  {cell.scenario} {cell.seed} {cell.variant}")
     count = Counter(state for _, state in every)
     left = f", {count['left']} left by --limit" if count["left"] else ""
-    typer.echo(
-        f"{out}: {len(every)} cells: {count['finished']} finished, {count['to do']} to do{left}; nothing was run"
-    )
+    echo(f"{out}: {len(every)} cells: {count['finished']} finished, {count['to do']} to do{left}; nothing was run")
 
 
 def _run(plan: Plan, out: Path, where: Where, *, force: bool, limit: int | None, quiet: bool) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from eval.cli.options import Quiet
-from eval.core.printing import MET, print_table
+from eval.core.printing import MET, echo, print_table
 
 
 def bench(
@@ -38,8 +38,8 @@ def bench(
     cpu, cores = table["machine"]["cpu"], table["machine"]["cores"]
     print_table(f"speed, {cpu}, {cores} cores; ratio: times faster than the rival", shown)
     for line in list_reasons(table["rows"]):
-        typer.echo(line)
-    typer.echo(f"{summarise(table['rows'])}{'' if out is None else f'; {out}'}")
+        echo(line)
+    echo(f"{summarise(table['rows'])}{'' if out is None else f'; {out}'}")
 
 
 def list_command() -> None:
@@ -60,7 +60,7 @@ def list_command() -> None:
         "sensor profiles": profile_names(),
     }
     for title, names in groups.items():
-        typer.echo("\n  ".join([f"{title}:", *names]))
+        echo(f"{title}:", *(f"  {name}" for name in names))
 
 
 def doctor() -> None:
@@ -71,10 +71,10 @@ def doctor() -> None:
     found = []
     for each in examine():
         found.append(each)
-        typer.echo(f"{each.what:<15} {each.state:<7} {each.told}")
+        echo(f"{each.what:<15} {each.state:<7} {each.told}")
     if wrong := faults(found):
         raise InputError("\n".join(wrong))
-    typer.echo("all that is required works")
+    echo("all that is required works")
 
 
 def check(files: Annotated[list[str], typer.Argument(help="scenario, plan or preset: a name or a .yaml file")]) -> None:
@@ -84,9 +84,9 @@ def check(files: Annotated[list[str], typer.Argument(help="scenario, plan or pre
     mistakes: list[str] = []
     for file in files:
         try:
-            typer.echo(f"{file}: {check_file(file)}, no mistakes")
+            echo(f"{file}: {check_file(file)}, no mistakes")
         except InputError as error:
-            mistakes += str(error).splitlines()
+            mistakes += str(error).split("\n")
     if mistakes:
         raise InputError("\n".join(mistakes))
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from eval.cli.options import Families, OutFolder, Quiet, SetSettings
-from eval.core.printing import print_table, say, warn
+from eval.core.printing import echo, print_table, say, warn
 from eval.core.progress import shown_progress
 
 if TYPE_CHECKING:
@@ -62,13 +62,13 @@ def survey(
     if out is not None:
         write_csv(out, found)
     if markdown:
-        typer.echo(as_markdown(found))
+        echo(*as_markdown(found).split("\n"))
     elif not quiet:
         table = pd.DataFrame([summary(one) for one in found]).T.reset_index()
         print_table("figures", table.iloc[1:].set_axis(["", *families], axis=1))
     failures = [failure for one in found for failure in one.failures]
     for failure in failures:
-        typer.echo(f"failed: {failure.family}, seed {failure.seed}: {failure.reason}")
+        echo(f"failed: {failure.family}, seed {failure.seed}: {failure.reason}")
     n_worlds = sum(len(one.worlds) for one in found)
     say(quiet, f"{n_worlds} worlds built, {len(failures)} failed{'' if out is None else f'; one row each in {out}'}")
 
@@ -108,7 +108,7 @@ def view(
         shown = load_view(what, seed, settings or ())
         show(server, shown)
         for note in shown.notes:
-            typer.echo(note, err=True)
+            echo(note, err=True)
         say(quiet, f"{what}: http://{host}:{server.get_port()} (Ctrl-C ends)")
         try:
             while True:

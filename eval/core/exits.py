@@ -11,6 +11,7 @@ from typing import NoReturn
 import typer
 
 from cdpipe.core.errors import TunnelcdError
+from cdpipe.core.names import visible
 
 # A full disk, a read-only one, a file too large for it, a folder or file of another user.
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EACCES, errno.EPERM)
@@ -22,15 +23,14 @@ def input_errors() -> Iterator[None]:
     try:
         yield
     except TunnelcdError as error:
-        for line in str(error).splitlines():
-            sys.stderr.write(f"error: {line}\n")
+        for line in str(error).split("\n"):
+            sys.stderr.write(f"error: {visible(line)}\n")
         raise SystemExit(2) from error
     except OSError as error:
         if error.errno not in _DISK_ERRORS:
             raise
-        sys.stderr.write(
-            f"error: {error.filename or 'the output'}: {error.strerror}: give it a disk with room and leave to write\n"
-        )
+        what = visible(f"{error.filename or 'the output'}: {error.strerror}")
+        sys.stderr.write(f"error: {what}: give it a disk with room and leave to write\n")
         raise SystemExit(2) from error
 
 
@@ -60,7 +60,7 @@ def run_app(app: typer.Typer, name: str, words: Sequence[str], subcommands: Sequ
         # typer alone would draw a box; "Value error" is pydantic's, and choices come one a line
         message = " ".join(error.format_message().replace("Value error, ", "").split()).rstrip(".")
         if message:  # there is none for `tunnelcd` alone, which has printed its help
-            sys.stderr.write(f"error: {command}: {message}: `{command} --help` lists its arguments\n")
+            sys.stderr.write(f"error: {command}: {visible(message)}: `{command} --help` lists its arguments\n")
         raise SystemExit(error.exit_code) from error
     except typer.Abort as error:
         sys.stderr.write("interrupted\n")

@@ -1,4 +1,8 @@
-"""How the command line prints tables, rows and lines."""
+"""How the command line prints tables, rows and lines.
+
+Names and messages come from users and files, so every line is written as `cdpipe.core.names.visible` shows it: a
+terminal obeys none of it.
+"""
 
 # ruff: noqa: PLC0415 - heavy imports stand inside the functions, so that --help and completion are instant
 from __future__ import annotations
@@ -7,6 +11,8 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import typer
+
+from cdpipe.core.names import visible
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -20,32 +26,38 @@ def print_table(title: str, frame: pd.DataFrame) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    table = Table(title=visible(title), title_justify="left", box=box.SIMPLE_HEAD)
     for name in frame.columns:
-        table.add_column(str(name), no_wrap=True)
+        table.add_column(visible(str(name)), no_wrap=True)
     for row in frame.itertuples(index=False):
         table.add_row(*(_cell(value) for value in row))
     # wider than any table: the terminal then wraps long lines, where rich would cut numbers off
-    Console(width=500, markup=False).print(table)
+    Console(width=500, markup=False, emoji=False).print(table)
 
 
 def print_row(row: dict[str, Any]) -> None:
     """Print one row, one line per column."""
     width = max(map(len, row))
     for name, value in row.items():
-        typer.echo(f"{name:<{width}}  {_cell(value)}")
+        echo(f"{name:<{width}}  {_cell(value)}")
+
+
+def echo(*lines: str, err: bool = False) -> None:
+    """Print lines to standard output, or to standard error."""
+    for line in lines:
+        typer.echo(visible(line), err=err)
 
 
 def say(quiet: bool, text: str) -> None:
     """Print a line, unless --quiet."""
     if not quiet:
-        typer.echo(text)
+        echo(text)
 
 
 def warn(text: str) -> None:
     """Print a warning on standard error, also with --quiet; nothing for an empty text."""
     if text:
-        typer.echo(f"warning: {text}", err=True)
+        echo(f"warning: {text}", err=True)
 
 
 def _cell(value: Any) -> str:
@@ -53,4 +65,4 @@ def _cell(value: Any) -> str:
         return "-"
     if isinstance(value, float):
         return "-" if math.isnan(value) else f"{value:.4g}"
-    return str(value)
+    return visible(str(value))

@@ -12,6 +12,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from cdpipe.core.names import visible
+
 _PACE_S = 1800.0  # a cell may take minutes, and a rate needs two cells
 
 
@@ -61,18 +63,19 @@ class Bars(RunProgress):
 
     def cells(self, label: str, done: int, total: int) -> None:
         """Move the bar of the run."""
-        self._progress.update(self._cells, description=label, completed=done, total=total, visible=True)
+        self._progress.update(self._cells, description=visible(label), completed=done, total=total, visible=True)
 
     def stage(self, name: str, done: int, total: int) -> None:
         """Move the bar of the stage; a new name starts a new bar."""
         if name != self._stage_name:
-            self._progress.reset(self._stage, description=f"  {name}", total=total)
+            self._progress.reset(self._stage, description=f"  {visible(name)}", total=total)
             self._stage_name = name
         self._progress.update(self._stage, completed=done, total=total, visible=done < total)
 
     def note(self, text: str) -> None:
         """Write a line above the bars."""
-        self._progress.console.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)
+        line = f"note: {visible(text)}"
+        self._progress.console.print(line, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 class Lines(RunProgress):
@@ -111,7 +114,7 @@ class Lines(RunProgress):
 
     def _write(self, line: str, pace: str = "") -> None:
         if line != self._last:
-            sys.stderr.write(f"{line}{pace}\n")
+            sys.stderr.write(f"{visible(line)}{pace}\n")
             self._last = line
 
 

@@ -243,7 +243,7 @@ def expand_cells(plan: Plan) -> list[Cell]:
             try:
                 methods.append((method, method.config()))
             except InputError as error:
-                mistakes += str(error).splitlines()
+                mistakes += str(error).split("\n")
         found += [
             method.cell(world, seed, config, plan.until)
             for seed in plan.seeds[: world.n_seeds]

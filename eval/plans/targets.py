@@ -126,7 +126,7 @@ def _take_from_plan(value: Any) -> Any:
         if named:
             return validate(_Section, replace(document, value={"targets": value})).targets
     except InputError as error:
-        raise ValueError(str(error)) from error
+        raise ValueError(str(error).replace("\n", "; ")) from error
     return {} if value is None else value
 
 

@@ -236,4 +236,4 @@ def _require_draws(name: str, settings: tuple[str, ...]) -> None:
 
 def _strip_option(told: str) -> list[str]:
     """Return the lines of an error without a leading `--set`, which is wrong for a plan's file."""
-    return [re.sub(r"^(--set)?:? ", "", line) for line in told.splitlines()]
+    return [re.sub(r"^(--set)?:? ", "", line) for line in told.split("\n")]

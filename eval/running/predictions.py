@@ -63,7 +63,7 @@ def add_predictions(run: RunFolder, folder: Path, name: str, progress: RunProgre
             score = score_stored(load_ground_truth(pair), prediction)
             documents[pair] = cell_document(score, identity, NO_KEY, LAST)
         except InputError as error:
-            mistakes += str(error).splitlines()
+            mistakes += str(error).split("\n")
     if mistakes:
         raise InputError("\n".join(mistakes))
     for pair, document in documents.items():
@@ -162,7 +162,7 @@ def _matched(run: RunFolder, folder: Path, pairs: Sequence[Path]) -> dict[Path, 
     names = list(wanted.values())
     for place in sorted(given - known):
         near = suggest(str(place.relative_to(folder)), names)
-        mistakes.append(f"{place}: the run has no such pair{near or f'; it has {_listed(names)}'}")
+        mistakes.append(f"{visible(str(place))}: the run has no such pair{near or f'; it has {_listed(names)}'}")
     if missing := [name for pair, name in wanted.items() if pair not in found]:
         mistakes.append(
             f"{folder}: no prediction for {_listed(missing)} of {run.path}: write "

@@ -17,6 +17,7 @@ import typer
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 from eval.core.exits import run_program
+from eval.core.printing import echo
 from eval.core.tablefile import read_table as read_stored_table
 from eval.core.tablefile import table_file
 
@@ -128,7 +129,7 @@ def main(run: Annotated[Path, typer.Argument(help="folder of `tunnelcd run calib
     table.to_csv(run / "thresholds.csv", index=False)
     settings = format_settings(table)
     (run / "thresholds.yaml").write_text(settings, encoding="utf-8")
-    typer.echo(f"{table.to_string(index=False)}\n\n{settings}")
+    echo(*table.to_string(index=False).split("\n"), "", *settings.split("\n"))
 
 
 def read_table(path: Path, plan: str) -> pd.DataFrame:

@@ -28,6 +28,7 @@ from eval.core.charts import BLACK, BLUE, VERMILLION, Axis, Drawing, Look, Panel
 from eval.core.exits import run_program
 from eval.core.figures import picture, png
 from eval.core.output import make_writable
+from eval.core.printing import echo
 from eval.plans.coverage import read_stored_plan
 from eval.plans.plan import expand_cells
 from eval.running.runfolder import read_json
@@ -219,14 +220,14 @@ def main(
     table = tabulate_gates(cases, thresholds)
     table.to_csv(out / "gates.csv", index=False)
     (out / "gates.png").write_bytes(png(picture(draw_gates(cases, table))))
-    typer.echo(table.to_string(index=False, na_rep="-"))
+    echo(*table.to_string(index=False, na_rep="-").split("\n"), "")
     n_other = len(results) - len(cases)
-    typer.echo(f"\n{len(cases)} merges; {n_other} further rows of results.csv were not merged or are of other variants")
+    echo(f"{len(cases)} merges; {n_other} further rows of results.csv were not merged or are of other variants")
     passed, right = pass_gates(cases, thresholds), cases["right"].to_numpy(dtype=np.bool_)
     for title, mask in (("wrong, but let through", passed & ~right), ("right, but refused", right & ~passed)):
-        typer.echo(f"\n{title}: {int(mask.sum())}")
+        echo("", f"{title}: {int(mask.sum())}")
         if mask.any():
-            typer.echo(cases[mask].drop(columns="right").to_string(index=False, na_rep="-"))
+            echo(*cases[mask].drop(columns="right").to_string(index=False, na_rep="-").split("\n"))
 
 
 def _count_refused(right: BoolArray, refused: BoolArray, alone: BoolArray) -> dict[str, int]:
