@@ -65,7 +65,8 @@ class Series:
         high: (N,) upper ends.
         is_across: Whether the intervals lie along x.
         labels: (N,) texts written beside the points; () for none.
-        hover: What the page shows under the pointer: one template of plotly, or one text for each point.
+        hover: What the page shows under the pointer: one template of plotly, or one for each point. Names of users
+            and files in it need `eval.report.charts.plotly_text`.
     """
 
     x: npt.ArrayLike

@@ -16,6 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from PIL import Image
 
+from cdpipe.core.names import visible
 from eval.core.charts import (
     BAR_SHARE,
     BLACK,
@@ -81,10 +82,15 @@ def picture(drawing: Drawing) -> Figure:
     return figure
 
 
+def plain_text(words: str) -> str:
+    """Return text that matplotlib draws as it is: a name with dollars is no formula."""
+    return "\n".join(map(visible, words.split("\n"))).replace("$", r"\$")
+
+
 def _draw_panel(axes: Axes, panel: Panel) -> None:
     axes.grid(color=GRID_COLOUR, linewidth=0.6)
     axes.set_axisbelow(True)
-    axes.set_title(panel.heading, fontsize=9)
+    axes.set_title(plain_text(panel.heading), fontsize=9)
     if panel.heat is not None:
         _draw_heat(axes, panel.heat)
     bars = [each for each in panel.series if each.style == "bars"]
@@ -93,9 +99,9 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     for name, axis in (("x", panel.x), ("y", panel.y)):
         own = axes.xaxis if name == "x" else axes.yaxis
         axes.set(**{f"{name}scale": "log" if axis.is_log else "linear"})
-        own.set_label_text(axis.title, fontsize=8)
+        own.set_label_text(plain_text(axis.title), fontsize=8)
         if axis.marks is not None:
-            own.set_ticks(list(axis.marks), list(axis.marks.values()))
+            own.set_ticks(list(axis.marks), list(map(plain_text, axis.marks.values())))
         if axis.span is not None:  # after the ticks, which widen it
             axes.set(**{f"{name}lim": axis.span})
         own.set_tick_params(labelsize=axis.tick_pt)
@@ -118,14 +124,16 @@ def _draw_series(axes: Axes, series: Series, bars: list[Series]) -> None:
         colour = BLACK if series.style == "bars" else look.colour
         axes.errorbar(x, y, lengths_y, lengths_x, fmt="none", ecolor=colour, elinewidth=1.0, alpha=0.6)
     for place, label in zip(zip(x, y, strict=True), series.labels, strict=False):
-        axes.annotate(label, place, (-3, 2), textcoords="offset points", fontsize=7, ha="right", va="bottom")
+        axes.annotate(
+            plain_text(label), place, (-3, 2), textcoords="offset points", fontsize=7, ha="right", va="bottom"
+        )
 
 
 def _draw_heat(axes: Axes, heat: Heat) -> None:
     colours = LinearSegmentedColormap.from_list("heat", HEAT_COLOURS)
     axes.imshow(heat.values, cmap=colours, vmin=heat.low, vmax=heat.high, origin="lower", aspect="auto")
     for (row, column), _ in np.ndenumerate(heat.values):
-        axes.text(column, row, heat.texts[row][column], ha="center", va="center", fontsize=7)
+        axes.text(column, row, plain_text(heat.texts[row][column]), ha="center", va="center", fontsize=7)
 
 
 def _line(look: Look) -> dict[str, Any]:
@@ -138,5 +146,5 @@ def _line(look: Look) -> dict[str, Any]:
 
 def _legend_entry(name: str, series: Series) -> Line2D | Patch:
     if series.style == "bars":
-        return Patch(color=series.look.colour, label=name)
-    return Line2D([], [], label=name, **_line(series.look))
+        return Patch(color=series.look.colour, label=plain_text(name))
+    return Line2D([], [], label=plain_text(name), **_line(series.look))

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from cdpipe.core.names import visible
 from eval.core.charts import BAR_SHARE, BLACK, GRID_COLOUR, HEAT_COLOURS, Axis, Drawing, Heat, Series
 from eval.core.figures import picture, png
 
@@ -21,6 +22,8 @@ _COLUMN_GAP, _ROW_GAP_PX, _ABOVE_PX, _BELOW_PX = 0.09, 84, 34, 56
 _LEGEND_ROW_PX, _NAMES_IN_ROW = 22, 6
 _PX_PER_PT = 1.6
 _SHORT_DIGITS = 5
+_IN_SCRIPT = {letter: f"\\u{ord(letter):04x}" for letter in "<>&"}
+_IN_TEXT = {letter: f"&#{ord(letter)};" for letter in "<>&{$"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,10 +56,14 @@ class Chart:
 
     @property
     def json(self) -> str:
-        """The figure as JSON that may stand inside a script element: it cannot end that element."""
-        return json.dumps(_plain(plotly_figure(self.drawing)), separators=(",", ":"), allow_nan=False).replace(
-            "</", "<\\/"
-        )
+        """The figure as JSON that may stand inside a script element: it can neither end it nor begin a comment."""
+        text = json.dumps(_plain(plotly_figure(self.drawing)), separators=(",", ":"), allow_nan=False)
+        return "".join(_IN_SCRIPT.get(letter, letter) for letter in text)
+
+
+def plotly_text(words: str) -> str:
+    """Return text as plotly shows it: it would read tags, entities, `$formulas$`, and `%{x}` under the pointer."""
+    return "".join(_IN_TEXT.get(letter, letter) for letter in visible(words))
 
 
 def plotly_script() -> str:
@@ -112,12 +119,20 @@ def _span(place: int, n: int, gap: float) -> list[float]:
 
 def _heading(words: str, x: list[float], y: list[float]) -> dict[str, Any]:
     place = {"x": sum(x) / 2, "y": y[1], "xanchor": "center", "yanchor": "bottom", "yshift": 4}
-    return {"xref": "paper", "yref": "paper", "showarrow": False, "text": words, "font": {"size": 13}, **place}
+    return {
+        "xref": "paper",
+        "yref": "paper",
+        "showarrow": False,
+        "text": plotly_text(words),
+        "font": {"size": 13},
+        **place,
+    }
 
 
 def _axis(axis: Axis) -> dict[str, Any]:
     found: dict[str, Any] = {
-        "title": {"text": axis.title, "font": {"size": 12}}, "showline": True, "linecolor": BLACK, "linewidth": 1,
+        "title": {"text": plotly_text(axis.title), "font": {"size": 12}}, "showline": True, "linecolor": BLACK,
+        "linewidth": 1,
         "gridcolor": GRID_COLOUR, "zeroline": False, "ticks": "outside", "ticklen": 4, "tickangle": 0,
         "tickfont": {"size": round(_PX_PER_PT * axis.tick_pt)}, "automargin": True,
     }  # fmt: skip
@@ -133,7 +148,7 @@ def _axis(axis: Axis) -> dict[str, Any]:
 def _trace(series: Series) -> dict[str, Any]:
     look = series.look
     found: dict[str, Any] = {"x": np.asarray(series.x), "y": np.asarray(series.y)}
-    found |= {"name": series.name, "legendgroup": series.name}
+    found |= {"name": plotly_text(series.name), "legendgroup": series.name}
     found |= {"hovertemplate": series.hover} if series.hover else {"hoverinfo": "skip"}
     if series.intervals is not None:
         below, above = series.intervals
@@ -159,15 +174,16 @@ def _trace(series: Series) -> dict[str, Any]:
 
 
 def _heat(heat: Heat) -> dict[str, Any]:
+    texts = [[plotly_text(text) for text in row] for row in heat.texts]
     return {
-        "type": "heatmap", "z": heat.values, "text": heat.texts, "texttemplate": "%{text}", "zmin": heat.low,
+        "type": "heatmap", "z": heat.values, "text": texts, "texttemplate": "%{text}", "zmin": heat.low,
         "zmax": heat.high, "colorscale": list(enumerate(HEAT_COLOURS)), "showscale": False, "xgap": 1, "ygap": 1,
         "textfont": {"size": 11, "color": BLACK}, "hovertemplate": heat.hover,
     }  # fmt: skip
 
 
 def _lines(text: str) -> str:
-    return text.replace("\n", "<br>")
+    return "<br>".join(map(plotly_text, text.split("\n")))
 
 
 def _plain(value: Any) -> Any:

@@ -17,7 +17,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array
 from eval.core.charts import BLACK, BLUE, SYMBOLS, Axis, Drawing, Look, Panel, Series, log_span
 from eval.core.domains import domain_name
 from eval.core.statistics import mean, mean_with_interval, median
-from eval.report.charts import Chart
+from eval.report.charts import Chart, plotly_text
 from eval.report.regions.charts import look_of
 from eval.running.run_data import RunData, comparable, stored_table
 from eval.tables.rows import ALL_DOMAINS, DOMAINS, is_told_the_truth, numbers, records
@@ -167,7 +167,8 @@ def _series(point: dict[str, Any], names: Sequence[str], title: str) -> Series:
     return Series(
         [point["x"]], [point["quality_value"]], Look(colour, 0.0, marker=marker, is_hollow=not point["competes"]),
         name if has_legend else "", low=[point["low"]], high=[point["high"]], labels=[label],
-        hover=f"<b>{name}</b><br>{point['quality_value']:.3f} ({interval})<br>{point['x']:.3g}, {title}<extra></extra>",
+        hover=f"<b>{plotly_text(name)}</b><br>{point['quality_value']:.3f} ({interval})<br>{point['x']:.3g}, {title}"
+        "<extra></extra>",
     )  # fmt: skip
 
 

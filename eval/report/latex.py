@@ -16,6 +16,7 @@ from typing import Any
 
 import pandas as pd
 
+from cdpipe.core.names import visible
 from eval.core.statistics import paired_difference
 from eval.report.compared_columns import COMPARED, POOLED
 from eval.report.comparing import BETTER, WORSE, pooled_difference, verdict
@@ -175,5 +176,6 @@ def _stacked(heading: str) -> str:
 
 
 def _escaped(words: str) -> str:
-    """Return text with the characters that LaTeX treats as commands escaped."""
-    return re.sub("|".join(map(re.escape, _LATEX)), lambda found: _LATEX[found[0]], words)
+    """Return text that LaTeX sets as it is; after the end of a line it would read `*` or `[` as an argument."""
+    safe = re.sub("|".join(map(re.escape, _LATEX)), lambda found: _LATEX[found[0]], visible(words))
+    return f"{{}}{safe}" if safe.startswith(("*", "[")) else safe

@@ -10,6 +10,7 @@ from typing import Any
 import jinja2
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.names import visible
 from eval.core.output import whole_file
 
 _FILES = ("page.html", "comparison.html", "parts.html", "page.css", "charts.js")
@@ -21,11 +22,18 @@ def render_page(template: str, content: Mapping[str, Any]) -> str:
     environment = jinja2.Environment(
         loader=jinja2.DictLoader({name: (folder / name).read_text(encoding="utf-8") for name in _FILES}),
         autoescape=True,
+        finalize=_shown,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     return environment.get_template(template).render(content)
+
+
+def _shown(value: Any) -> Any:
+    """Return a value of the content with control characters as escapes, line breaks apart; markup stays as it is."""
+    is_text = isinstance(value, str) and not hasattr(value, "__html__")
+    return "\n".join(map(visible, value.split("\n"))) if is_text else value
 
 
 def write_file(path: Path, content: str | bytes) -> None:

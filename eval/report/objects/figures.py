@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from cdpipe.core.geometry import Float64Array
 from eval.core.charts import BLACK, CONTEXT
-from eval.core.figures import blank_figure, data_address
+from eval.core.figures import blank_figure, data_address, plain_text
 
 # (points (N, 3) in metres, colour) of each
 Layers = tuple[tuple[Float64Array, str], ...]
@@ -60,8 +60,8 @@ def object_panels(panels: Sequence[Panel], truth: Float64Array, view_from: Float
             size = 1.5 if colour == CONTEXT else 5.0
             axes.scatter(shown[near, 0], shown[near, 1], s=size, c=colour, linewidths=0)
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
-        axes.set_title(panel.title, fontsize=11, pad=4)
-        axes.set_xlabel(panel.note.replace(", ", "\n", 1), fontsize=9, labelpad=4)
+        axes.set_title(plain_text(panel.title), fontsize=11, pad=4)
+        axes.set_xlabel(plain_text(panel.note).replace(", ", "\n", 1), fontsize=9, labelpad=4)
         axes.spines[:].set_color("#bbbbbb")
     _scale_bar(figure.axes[0], low, high)
     return data_address(figure)

@@ -92,7 +92,7 @@ def test_undefined_is_null_and_no_text_ends_the_script() -> None:
     text = Chart("a", "", one_panel(Series([1.23456789, NAN], [0, 1], name="</script><b>")), "").json
     assert "</" not in text
     found = json.loads(text)["data"][0]
-    assert (found["x"], found["name"]) == ([1.2346, None], "</script><b>")
+    assert (found["x"], found["name"]) == ([1.2346, None], "&#60;/script&#62;&#60;b&#62;")
 
 
 def test_page_and_picture_draw_the_same_numbers_in_the_same_looks() -> None:
@@ -163,7 +163,7 @@ def test_bins_carry_their_counts_and_only_the_last_method_its_interval() -> None
     chart = draw_sizes(sizes, TABLE, ["tunnelcd"])
     assert chart is not None
     figure = accepted(chart.drawing)
-    assert figure.layout.xaxis.ticktext == ("<1<br>n 4", "≥1<br>n 2")
+    assert figure.layout.xaxis.ticktext == ("&#60;1<br>n 4", "≥1<br>n 2")
     paper, ours = figure.data
     assert paper.error_y.array is None
     assert (ours.y, ours.error_y.array) == ((0.5, None), pytest.approx((0.3, None)))
