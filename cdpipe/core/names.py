@@ -10,6 +10,8 @@ LONGEST = 200  # file systems take names of 255 bytes; suffixes and the marks of
 # Names that Windows keeps for devices, with any suffix.
 _DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 _DIGEST_LENGTH = 16
+# Besides numbers, what `pandas.read_csv` takes for something else than a text.
+_NO_NAMES = ("na", "n/a", "nan", "none", "null", "true", "false", "1.#ind", "1.#qnan")
 
 
 def path_part(name: str) -> str:
@@ -39,7 +41,8 @@ def require_name(name: str) -> str:
     """Return a name that a user chose.
 
     Raises:
-        ValueError: It has no letter or digit, is too long for a folder's name, or holds a character that is not shown.
+        ValueError: It has no letter or digit, is too long for a folder's name, holds a character that is not shown, or
+            would be read from a table as a number, a truth value or a missing value.
     """
     if not re.search(r"[A-Za-z0-9]", name):
         raise ValueError("expected a name with a letter or a digit of ASCII")
@@ -47,6 +50,8 @@ def require_name(name: str) -> str:
         raise ValueError(f"is too long: expected at most {LONGEST} characters")
     if visible(name) != name:
         raise ValueError("expected a name without control characters")
+    if name.strip("<>#-").casefold() in _NO_NAMES or _is_number(name):
+        raise ValueError("expected a name that a table does not read as a number or as missing")
     return name
 
 
@@ -59,3 +64,11 @@ def visible(text: str) -> str:
 
 def _is_shown(letter: str) -> bool:
     return letter.isprintable() or unicodedata.category(letter) == "Zs"
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -177,10 +177,11 @@ def log_span(values: npt.ArrayLike, below: float = 1.5, above: float = 1.5) -> t
     """Return the ends of a logarithmic axis around the positive ones of (N,) values; around 1 where there are none.
 
     Args:
-        values: NaN and what is not positive is left out.
+        values: What is not positive or not finite is left out.
         below: How many times smaller than the least the lower end is.
         above: How many times larger than the greatest the upper end is.
     """
     found = np.asarray(values, dtype=np.float64)
-    found = found[found > 0] if (found > 0).any() else np.ones(1)
+    is_shown = (found > 0) & np.isfinite(found)
+    found = found[is_shown] if is_shown.any() else np.ones(1)
     return float(found.min()) / below, float(found.max()) * above

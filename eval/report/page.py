@@ -97,7 +97,7 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
         files["results.tex"] = to_latex(content["results"])
         for name in ("table1", "table2"):
             files |= {f"{name}.csv": to_csv(content[name]), f"{name}.tex": to_latex(content[name])}
-    content["missing"] = list(dict.fromkeys([*content["missing"], *content["merge"].missing]))
+    content["missing"] = list(dict.fromkeys([*data.left_out, *content["missing"], *content["merge"].missing]))
     files["index.html"] = render_page("page.html", content)
     files |= {f"{chart.name}.png": chart.png for chart in content["charts"] if chart.has_png}
     for name, file in files.items():

@@ -23,6 +23,10 @@ from eval.tables.rows import records, with_domain
 
 Row = Mapping[str, Any]
 REQUIRED = ("scenario", "seed", "variant", "status")
+# No figure of a pair is larger: a terabyte has 1e12 bytes, a century 3e9 seconds.
+LARGEST = 1e15
+# ends of bins and of intervals, of which the last bin has none
+_UNBOUNDED = ("low", "high")
 _PICTURED = ("paper", "tunnelcd", "voxel-diff")
 
 
@@ -37,6 +41,7 @@ class RunData:
         regions: Rows of regions.csv.
         provenance: Content of provenance.json, {} where there is none.
         missing: Files that a complete run folder holds and this one lacks, one sentence each.
+        left_out: One sentence for each table with figures that are read as NaN: infinite, or larger than `LARGEST`.
     """
 
     folder: RunFolder
@@ -45,6 +50,7 @@ class RunData:
     regions: tuple[Row, ...]
     provenance: Mapping[str, Any]
     missing: tuple[str, ...]
+    left_out: tuple[str, ...] = ()
 
 
 def read_run(run: Path) -> RunData:
@@ -56,7 +62,8 @@ def read_run(run: Path) -> RunData:
     path = table_file(run / "results.csv")
     if not path.is_file():
         raise InputError(f"{path}: missing: name a folder made by `tunnelcd run` or `tunnelcd demo`")
-    results = _rows(path)
+    left_out: list[str] = []
+    results = _rows(path, left_out)
     if not results:
         raise InputError(f"{path}: holds no row: no case was finished, run the plan again")
     absent = [name for name in REQUIRED if name not in results[0]]
@@ -67,7 +74,7 @@ def read_run(run: Path) -> RunData:
     items: dict[str, tuple[Row, ...]] = {"changes": (), "regions": ()}
     for name in items:
         if (path := table_file(run / f"{name}.csv")).is_file():
-            items[name] = _rows(path)
+            items[name] = _rows(path, left_out)
         else:
             missing.append(f"{path.name} is not in the run folder: what it would show is left out.")
     provenance = read_json(run / "provenance.json")
@@ -75,13 +82,14 @@ def read_run(run: Path) -> RunData:
         missing.append(
             "provenance.json is not in the run folder or damaged: machine, command and versions are unknown."
         )
-    return RunData(RunFolder(run), results, items["changes"], items["regions"], provenance, tuple(missing))
+    tables = results, items["changes"], items["regions"]
+    return RunData(RunFolder(run), *tables, provenance, tuple(missing), tuple(left_out))
 
 
 def stored_table(data: RunData, name: str) -> pd.DataFrame:
-    """Return a table of the run folder, empty where it is not there."""
+    """Return a table of the run folder, empty where it is not there; what `read_run` leaves out is NaN."""
     path = table_file(data.folder.path / f"{name}.csv")
-    return read_table(path) if path.is_file() else pd.DataFrame()
+    return _without_unusable(read_table(path)) if path.is_file() else pd.DataFrame()
 
 
 def ends_at_merge(data: RunData) -> bool:
@@ -301,5 +309,24 @@ def _require_cases(path: Path, results: pd.DataFrame) -> None:
         raise InputError(f"{path}:{index + 2}: {case} stands there twice")
 
 
-def _rows(path: Path) -> tuple[Row, ...]:
-    return tuple(records(read_table(path)))
+def _rows(path: Path, left_out: list[str]) -> tuple[Row, ...]:
+    """Return the rows of a table; a sentence about figures that are read as NaN is added to `left_out`."""
+    frame = read_table(path)
+    counts = {name: int((frame[name].abs() > LARGEST).sum()) for name in _figures(frame)}
+    if told := ", ".join(f"{name} ({n})" for name, n in counts.items() if n):
+        left_out.append(
+            f"{path.name}: infinite or larger than {LARGEST:g}, and therefore left out: {told}. "
+            f"`tunnelcd score {path.parent}` scores the answers again."
+        )
+    return tuple(records(_without_unusable(frame)))
+
+
+def _without_unusable(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return a table with NaN for figures that no mean, axis or cell can hold."""
+    names = _figures(frame)
+    return frame.assign(**{name: frame[name].mask(frame[name].abs() > LARGEST) for name in names})
+
+
+def _figures(frame: pd.DataFrame) -> list[str]:
+    """Return the columns of a table that hold figures, ends of bins and intervals apart."""
+    return [name for name in frame.select_dtypes("float").columns if name not in _UNBOUNDED]

@@ -156,6 +156,7 @@ def cautions(a: Side, b: Side) -> list[str]:
     if why := why_no_times(a, b):
         found.append(f"Times are not judged: {why}.")
     for side in {each.path: each for each in (a, b)}.values():
+        found += side.data.left_out
         covered = covered_by(side.data)
         if not covered.is_whole:
             found.append(

@@ -16,12 +16,12 @@ UNDEFINED = EN_DASH
 
 def share(value: float) -> str:
     """Write two decimals, for shares and rates."""
-    return UNDEFINED if math.isnan(value) else f"{value:.2f}"
+    return f"{value:.2f}" if math.isfinite(value) else UNDEFINED
 
 
 def fine(value: float) -> str:
     """Write three decimals, for errors in metres and degrees."""
-    return UNDEFINED if math.isnan(value) else f"{value:.3f}"
+    return f"{value:.3f}" if math.isfinite(value) else UNDEFINED
 
 
 def spaced(variant: str) -> str:
@@ -31,7 +31,7 @@ def spaced(variant: str) -> str:
 
 def significant(value: float) -> str:
     """Write three significant digits without an exponent, for seconds and volumes."""
-    if math.isnan(value):
+    if not math.isfinite(value):
         return UNDEFINED
     if abs(value) >= 100:
         return f"{value:.0f}"
@@ -40,7 +40,7 @@ def significant(value: float) -> str:
 
 def count(value: float) -> str:
     """Write a whole number with thin spaces between the thousands; a mean that is not whole gets one decimal."""
-    if math.isnan(value):
+    if not math.isfinite(value):
         return UNDEFINED
     return f"{value:,.0f}".replace(",", THIN_SPACE) if value == round(value) else f"{value:.1f}"
 

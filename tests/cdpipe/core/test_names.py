@@ -41,11 +41,13 @@ def test_names_that_would_share_a_folder_are_equal_when_folded(names: tuple[str,
     assert folded(names[0]) == folded(names[1])
 
 
-@pytest.mark.parametrize("name", ["", "..", "___", "ä", "n" * 201, "a\x1bb", "a\nb", "a\u202eb"])
+@pytest.mark.parametrize(
+    "name", ["", "..", "___", "ä", "n" * 201, "a\x1bb", "a\nb", "a\u202eb", "NA", "<NA>", "1e5", "007", "inf", "True"]
+)
 def test_what_is_no_name(name: str) -> None:
     with pytest.raises(ValueError, match=r"name|too long"):
         require_name(name)
-    assert require_name("my method 2 (ä)") == "my method 2 (ä)"
+    assert all(require_name(name) == name for name in ("my method 2 (ä)", "3deg", "nano", "v1.5e"))
 
 
 @pytest.mark.parametrize(

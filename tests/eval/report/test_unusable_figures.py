@@ -1,0 +1,72 @@
+"""Figures that nothing can draw, in the tables of an older run."""
+
+from __future__ import annotations
+
+import html
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from cdpipe.core.errors import InputError
+from eval.report.comparison import compare_sides, write_comparison
+from eval.report.page import write_page
+from eval.running.run_data import read_run
+from eval.running.runfolder import write_json
+from eval.running.sides import read_side
+from eval.tables.columns import UNDEFINED
+from tests.eval.report.test_hostile_names import PLAIN, write_run
+
+INF = float("inf")
+UNUSABLE = {
+    "bytes_regions_before": INF, "t_total_s": 1.5e308, "t_total_with_merge_s": INF, "merge_error_m": 1e300,
+    "n_observable": INF, "region_recall": -INF, "object_iou_point": INF, "false_regions_per_100m": 1e300,
+    "after_path_m": INF, "overlap_true": INF, "map_points_before": INF,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_run(tmp_path_factory.mktemp("unusable") / "run", PLAIN[:6])
+    results = pd.read_csv(folder / "results.csv").astype(dict.fromkeys(["n_observable"], "float64"))
+    for name, value in UNUSABLE.items():
+        results[name] = results.get(name, 1.0)
+        results.loc[results["variant"] == PLAIN[1], name] = value
+    results.to_csv(folder / "results.csv", index=False)
+    items = results[["scenario", "seed", "variant"]]
+    items.assign(region=0, score=INF, outcome="true", v_sphere_m3=INF, s_points=INF, is_reported=True).to_csv(
+        folder / "regions.csv", index=False
+    )
+    return folder
+
+
+def test_the_page_shows_them_as_undefined_and_says_so(run: Path) -> None:
+    text = html.unescape(write_page(run).read_text())
+    (told,) = [line for line in text.splitlines() if "results.csv: infinite or larger than 1e+15" in line]
+    assert all(f"{name} (4)" in told for name in UNUSABLE) and f"`tunnelcd score {run}`" in told
+    assert "regions.csv: infinite" in text
+    table = text.partition('id="results"')[2]
+    assert f"<td>{PLAIN[1]}</td><td>{UNDEFINED}</td>" in table and "inf<" not in table
+    assert f'<td>{PLAIN[0]}</td><td class="best">0.90' in table
+
+
+def test_a_comparison_says_so_too(run: Path, tmp_path: Path) -> None:
+    sides = (read_side(f"{run}:{PLAIN[place]}") for place in (0, 1))
+    assert "infinite or larger than 1e+15" in write_comparison(compare_sides(*sides), tmp_path / "out").read_text()
+
+
+def test_the_page_of_a_run_that_ends_at_the_merge(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "results.csv").write_bytes((run / "results.csv").read_bytes())
+    write_json(folder / "provenance.json", {"tool": "tunnelcd", "plan": {"name": "x", "until": "merge"}})
+    assert "results.csv: infinite or larger" in write_page(folder).read_text()
+
+
+def test_a_seed_that_is_none_is_refused(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", PLAIN[:6])
+    results = pd.read_csv(folder / "results.csv").astype({"seed": "float64"})
+    results.loc[0, "seed"] = INF
+    results.to_csv(folder / "results.csv", index=False)
+    with pytest.raises(InputError, match="seed = nan: expected a whole number"):
+        read_run(folder)
