@@ -70,7 +70,7 @@ def save_descriptors(
     digest of the weights and the map settings.
 
     Raises:
-        InputError: The file cannot be written.
+        InputError: The file cannot be written, or would lie elsewhere because `descriptors` is a link.
     """
     path = folder / "descriptors" / f"{descriptors.name}.npz"
     partial = path.with_suffix(".partial.npz")
@@ -78,7 +78,10 @@ def save_descriptors(
     if descriptors.spheres is not None:
         optional |= {"spheres": descriptors.spheres, "spheres_of": np.array(_spheres_of(map_config))}
     try:
+        if path.parent.is_symlink():
+            raise InputError(f"{path.parent}: is a link, and nothing outside of {folder} may be written: remove it")
         path.parent.mkdir(exist_ok=True)
+        partial.unlink(missing_ok=True)  # it may be a link, which a writer would follow
         np.savez(
             partial,
             allow_pickle=False,

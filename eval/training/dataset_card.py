@@ -14,6 +14,7 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_json
+from cdpipe.core.names import visible
 from cdpipe.training.shard import FIELDS, SUFFIX, read_about, split_of
 from eval.core.output import whole_file
 
@@ -61,8 +62,8 @@ def card(rows: Sequence[Row], recipe: Mapping[str, Any], commands: Sequence[str]
     made = [row for row in rows if row["status"] == "ok"]
     refused = [row for row in rows if row["status"] == "refused"]
     settings = ", ".join(f"`{each}`" for each in recipe["settings"]) or "none"
-    told = "\n".join(f"- {row['family']} {row['seed']}: {row['reason']}" for row in refused) or "None."
-    made_by = "\n".join(commands)
+    told = "\n".join(f"- {_text(row['family'])} {row['seed']}: {_text(row['reason'])}" for row in refused) or "None."
+    made_by = "\n".join(map(visible, commands))
     return f"""# Training data of change descriptors, made by `tunnelcd dataset`
 
 Simulated tunnels, each driven twice by a ray-cast Ouster OS1-32; between the drives, objects are added, removed or
@@ -77,7 +78,7 @@ score radius of an observable change, negative beyond 1.5 radii of every change,
 
 | | |
 |---|---|
-| families | {", ".join(sorted({row["family"] for row in made})) or "none"} |
+| families | {", ".join(sorted({_text(row["family"]) for row in made})) or "none"} |
 | set over the scenarios | {settings} |
 | after images of each pair | {recipe["draws"]}: the first merged exactly, each other off by a merge error of its own |
 | that error, standard deviation of each component | {recipe["error_m"]:g} m and {recipe["error_deg"]:g} deg |
@@ -122,6 +123,11 @@ def digest_of(rows: Sequence[Row]) -> str:
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
 
+def _text(words: object) -> str:
+    """Return text for a cell of a Markdown table: no end of the cell, no element of HTML, no line of its own."""
+    return visible(str(words)).replace("&", "&amp;").replace("<", "&lt;").replace("|", "\\|").replace("`", "\\`")
+
+
 def _counts_table(made: Sequence[Row]) -> str:
     counts = [name for name in COUNTS if name != "n_after"]
     lines = [
@@ -131,7 +137,7 @@ def _counts_table(made: Sequence[Row]) -> str:
     table = pd.DataFrame(made, columns=["family", "split", "seed", *counts])
     for (family, split), own in table.groupby(["family", "split"]):
         sums = " | ".join(f"{count:,}" for count in (len(own), *own[counts].sum()))
-        lines.append(f"| {family} | {split} | {own['seed'].min()} to {own['seed'].max()} | {sums} |")
+        lines.append(f"| {_text(family)} | {split} | {own['seed'].min()} to {own['seed'].max()} | {sums} |")
     sums = " | ".join(f"{count:,}" for count in (len(table), *table[counts].sum()))
     return "\n".join([*lines, f"| all | | | {sums} |"])
 

@@ -127,8 +127,8 @@ def make_dataset(
 def _tunnels(families: Sequence[str], seeds: str, recipe: Recipe) -> list[Tunnel]:
     """Return the tunnels seed by seed, so that an interrupted run has tunnels of every family."""
     numbers = parse_seeds_option(seeds)
-    if len(set(families)) < len(families):
-        raise InputError(f"families {', '.join(families)}: one is named twice")
+    if len({world_slug(family).casefold() for family in families}) < len(families):
+        raise InputError(f"families {', '.join(families)}: one is named twice, or two would share their files")
     tunnels = [_tunnel(family, seed, recipe) for seed in numbers for family in families]
     # the data card lists single bad draws; a family without any draw is a mistake of the user
     of_family = ([tunnel for tunnel in tunnels if tunnel.family == family] for family in families)

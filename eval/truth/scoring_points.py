@@ -112,7 +112,8 @@ def load_scoring_points(session: Path) -> ScoringPoints:
     if cached is not None:
         return cached
     scoring_points = build_scoring_points(opened)
-    _write_cache(path, fingerprint, scoring_points)
+    if not session.is_symlink() and not path.parent.is_symlink():  # else the file would lie in another pair
+        _write_cache(path, fingerprint, scoring_points)
     return scoring_points
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.names import visible
 from sim.view.returns import CHANGE_RGB, SESSION_RGB
 from sim.view.view import View
 
@@ -82,6 +83,11 @@ def write_html(view: View, file: Path, legend: str = "") -> None:
         file.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{file}: cannot be written: {error.strerror}") from error
+
+
+def markdown_text(words: str) -> str:
+    """Return text as Markdown shows it literally, with HTML or without: a family may be called `<img>`."""
+    return "".join(letter if letter.isalnum() or letter == " " else f"&#{ord(letter)};" for letter in visible(words))
 
 
 def _add_nodes(server: Any, view: View) -> dict[str, Any]:
@@ -191,5 +197,6 @@ def _legend(view: View) -> str:
     kinds = [kind for kind in CHANGE_RGB if any(part.name.startswith(f"changes/{kind}/") for part in view.surfaces)]
     sessions = [name for name in SESSION_RGB if any(line.name == f"paths/{name}" for line in view.lines)]
     colours = [(CHANGE_RGB[kind], kind) for kind in kinds] + [(SESSION_RGB[name], f"path {name}") for name in sessions]
-    lines = [f"**{view.title}**", " ".join(swatch.format(rgb, name) for rgb, name in colours), *view.notes]
+    head = f"**{markdown_text(view.title)}**", " ".join(swatch.format(rgb, name) for rgb, name in colours)
+    lines = [*head, *map(markdown_text, view.notes)]
     return "\n\n".join(line for line in lines if line)

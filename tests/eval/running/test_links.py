@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cdpipe.core.errors import InputError
+from cdpipe.descriptors.describe import save_descriptors
+from cdpipe.model.config import MapConfig
+from cdpipe.model.types import DescriptorSet
 from eval.core.output import make_writable, new_folder, remove, whole_file
 from eval.report.page import write_page
 from eval.running.runfolder import open_run_folder, start_run_folder, write_json
+from eval.truth.ground_truth import load_ground_truth
 
 
 @pytest.fixture
@@ -77,3 +83,30 @@ def test_a_link_to_an_empty_folder_or_to_none_is_that_folder(tmp_path: Path, *, 
     with new_folder(tmp_path / "link") as partial:
         (partial / "file").write_text("x")
     assert (tmp_path / "real" / "file").read_text() == "x" and (tmp_path / "link").is_symlink()
+
+
+def test_the_cache_of_scoring_is_not_written_through_a_link(tmp_path: Path, tiny_pair: Path) -> None:
+    pair = tmp_path / "linked"
+    pair.mkdir()
+    (pair / "truth").mkdir()
+    shutil.copytree(tiny_pair / "truth", pair / "truth", dirs_exist_ok=True)
+    for name in ("before", "after"):
+        (pair / name).symlink_to(tiny_pair / name)
+    assert len(load_ground_truth(pair).after.scoring_points)
+    assert not (tiny_pair / "after" / "truth" / "scoring_points.npz").exists()
+    assert len(load_ground_truth(tiny_pair).after.scoring_points)
+    assert (tiny_pair / "after" / "truth" / "scoring_points.npz").is_file()
+
+
+def test_descriptors_are_not_written_through_a_link(tmp_path: Path, outside: Path) -> None:
+    precious = outside / "3" / "ours" / "answer.json"
+    descriptors = DescriptorSet(np.zeros((1, 2), np.float32), None, np.zeros(1, np.int64), "x", "")
+    (tmp_path / "session" / "descriptors").mkdir(parents=True)
+    (tmp_path / "session" / "descriptors" / "x.partial.npz").symlink_to(precious)
+    save_descriptors(tmp_path / "session", descriptors, np.eye(4)[None], MapConfig())
+    assert precious.read_text() == "precious"
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "descriptors").symlink_to(outside)
+    with pytest.raises(InputError, match="descriptors: is a link"):
+        save_descriptors(tmp_path / "other", descriptors, np.eye(4)[None], MapConfig())
+    assert [path.name for path in outside.iterdir()] == ["3"]
