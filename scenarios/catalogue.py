@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cdpipe.core.errors import ScenarioError
-from cdpipe.core.names import folded
+from cdpipe.core.names import folded, require_table_name
 from cdpipe.core.plugins import SEARCH_PATH, require_file_name, search_folders
 from cdpipe.core.yamlfile import read_yaml, validate
 from scenarios.schema import PROP_KINDS, PropFile
@@ -69,7 +69,8 @@ def _found(what: str, taken: dict[str, Path], folders: tuple[Path, ...]) -> dict
     known, found = {_place(name): path for name, path in taken.items()}, {}
     for folder in folders:
         for path in sorted(folder.rglob("*.yaml")):
-            name = require_file_name(path, path.relative_to(folder).as_posix().removesuffix(".yaml"))
+            name = path.relative_to(folder).as_posix().removesuffix(".yaml")
+            require_file_name(path, name, require_table_name)
             if (other := known.setdefault(_place(name), path)) is not path:
                 raise ScenarioError(
                     f"{SEARCH_PATH}: {path}: there is a {what} {name!r} already, in {other}: rename the file"

@@ -41,8 +41,7 @@ def require_name(name: str) -> str:
     """Return a name that a user chose.
 
     Raises:
-        ValueError: It has no letter or digit, is too long for a folder's name, holds a character that is not shown, or
-            would be read from a table as a number, a truth value or a missing value.
+        ValueError: It has no letter or digit, is too long for a folder's name, or holds a character that is not shown.
     """
     if not re.search(r"[A-Za-z0-9]", name):
         raise ValueError("expected a name with a letter or a digit of ASCII")
@@ -50,9 +49,18 @@ def require_name(name: str) -> str:
         raise ValueError(f"is too long: expected at most {LONGEST} characters")
     if visible(name) != name:
         raise ValueError("expected a name without control characters")
+    return name
+
+
+def require_table_name(name: str) -> str:
+    """Return a name that a user chose for a column of a table.
+
+    Raises:
+        ValueError: As `require_name`; or the name would be read back as a number, a truth value or a missing value.
+    """
     if name.strip("<>#-").casefold() in _NO_NAMES or _is_number(name):
         raise ValueError("expected a name that a table does not read as a number or as missing")
-    return name
+    return require_name(name)
 
 
 def visible(text: str) -> str:

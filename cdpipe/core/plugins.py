@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from functools import cache
 from importlib import metadata, resources
 from importlib.resources.abc import Traversable
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.names import folded, require_name, visible
+from cdpipe.core.names import folded, require_name, require_table_name, visible
 
 METHODS = "tunnelcd.methods"
 METRICS = "tunnelcd.metrics"
@@ -104,20 +105,21 @@ def find_yaml(kind: str, *shipped: Traversable, group: str | None = None) -> dic
     places: dict[str, Traversable] = {}
     for file in (file for folder in (*folders, *search_folders(kind)) for file in folder.iterdir()):
         if file.name.endswith(".yaml"):
-            name = require_file_name(file, file.name.removesuffix(".yaml"))
+            check = require_table_name if kind == "presets" else require_name
+            name = require_file_name(file, file.name.removesuffix(".yaml"), check)
             if (other := places.setdefault(folded(name), file)) is not file:
                 raise InputError(f"{file}: there is another of this name, {other}: rename it")
             found[name] = file
     return dict(sorted(found.items()))
 
 
-def require_file_name(file: Traversable, name: str) -> str:
+def require_file_name(file: Traversable, name: str, check: Callable[[str], str] = require_name) -> str:
     """Return the name that a file gives to what it holds.
 
     Raises:
-        InputError: It is none (`require_name`).
+        InputError: `check` raises ValueError.
     """
     try:
-        return require_name(name)
+        return check(name)
     except ValueError as error:
         raise InputError(f"{visible(str(file))}: {error}: rename the file") from error

@@ -16,7 +16,7 @@ from pydantic import (
     model_validator,
 )
 
-from cdpipe.core.names import require_name
+from cdpipe.core.names import require_table_name
 from cdpipe.core.yamlfile import Document, Settings, apply_settings, suggest, validate
 from cdpipe.model.config import PipelineConfig, load_config, preset_names
 from eval.oracles.merge import OracleMerge
@@ -71,7 +71,7 @@ def require_valid_settings(settings: Iterable[str]) -> None:
 def _require_known_preset(name: str) -> str:
     if name.endswith((".yaml", ".yml")):
         raise_as_value_error(lambda: load_config(name))
-        require_name(Path(name).stem)
+        require_table_name(Path(name).stem)
     elif name not in preset_names():
         raise ValueError(f"unknown preset{suggest(name, preset_names())} (known: {', '.join(preset_names())})")
     return name

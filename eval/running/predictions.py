@@ -19,7 +19,7 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.names import folded, require_name, visible
+from cdpipe.core.names import folded, require_table_name, visible
 from cdpipe.core.yamlfile import suggest
 from cdpipe.model.config import preset_names
 from eval.core.output import remove
@@ -176,7 +176,7 @@ def _matched(run: RunFolder, folder: Path, pairs: Sequence[Path]) -> dict[Path, 
 def _require_free(run: RunFolder, name: str) -> None:
     """Refuse the name of a variant of the run, of a preset or of an oracle, and one that would share its folder."""
     try:
-        require_name(name)
+        require_table_name(name)
     except ValueError as error:
         raise InputError(f"--as {name!r}: {error}") from error
     if folded(name.partition("[")[0]) in map(folded, preset_names()) or folded(name).startswith("oracle-"):

@@ -1,9 +1,11 @@
+import io
 import re
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
-from cdpipe.core.names import LONGEST, folded, path_part, require_name, visible
+from cdpipe.core.names import LONGEST, folded, path_part, require_name, require_table_name, visible
 
 HOSTILE = (
     "", ".", "..", "...", "/", "../..", "../../etc/passwd", ".hidden", "a/b", "a\\b", "C:\\x", "a\0b", "a\nb", "CON",
@@ -41,13 +43,20 @@ def test_names_that_would_share_a_folder_are_equal_when_folded(names: tuple[str,
     assert folded(names[0]) == folded(names[1])
 
 
-@pytest.mark.parametrize(
-    "name", ["", "..", "___", "ä", "n" * 201, "a\x1bb", "a\nb", "a\u202eb", "NA", "<NA>", "1e5", "007", "inf", "True"]
-)
+@pytest.mark.parametrize("name", ["", "..", "___", "ä", "n" * 201, "a\x1bb", "a\nb", "a\u202eb"])
 def test_what_is_no_name(name: str) -> None:
     with pytest.raises(ValueError, match=r"name|too long"):
         require_name(name)
-    assert all(require_name(name) == name for name in ("my method 2 (ä)", "3deg", "nano", "v1.5e"))
+
+
+def test_what_a_table_reads_as_something_else_is_no_name_there() -> None:
+    for name in ("NA", "<NA>", "null", "1e5", "007", "inf", "True", "#N/A", "-nan"):
+        read = pd.read_csv(io.StringIO(f"name,value\n{name},1\n"))["name"].iloc[0]
+        assert require_name(name) == name and not isinstance(read, str)
+        with pytest.raises(ValueError, match="does not read as a number or as missing"):
+            require_table_name(name)
+    for name in ("my method 2 (ä)", "3deg", "nano", "v1.5e"):
+        assert require_table_name(name) == name
 
 
 @pytest.mark.parametrize(
