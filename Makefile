@@ -10,11 +10,12 @@ EXTRAS := cluster,dufomap,kiss,m3c2,odometry,ouster,view
 LOWEST := .venv-lowest
 NEWEST := .venv-newest
 AUDIT := .venv-audit
+MUTANTS := .venv-mutants
 PYTHONS ?= python3.11 python3.13
 # One process per core and one thread in each; the tests of one file stay in one process and share what it has set up.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
 
-.PHONY: setup demo test test-lowest lowest test-newest test-pythons audit soak sweep check report clean
+.PHONY: setup demo test test-lowest lowest test-newest test-pythons audit soak sweep mutants check report clean
 
 setup: $(VENV)/.installed-dev
 
@@ -97,6 +98,18 @@ soak: $(VENV)/.installed-dev
 sweep: $(VENV)/.installed-dev
 	$(PYTEST) -m soak
 
+# Mutants of the code that computes scores: a test kills each, or tests/mutants.yaml says why none can. mutmut has an
+# environment of its own, as it needs a newer click than the pinned one.
+mutants: $(MUTANTS)/.installed
+	OMP_NUM_THREADS=1 $(MUTANTS)/bin/python tests/mutants.py --processes $(TEST_PROCESSES)
+
+$(MUTANTS)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv --clear $(MUTANTS)
+	$(MUTANTS)/bin/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt \
+		--editable '.[test]'
+	$(MUTANTS)/bin/python -m pip --disable-pip-version-check install --quiet mutmut==3.8.1
+	touch $@
+
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -107,5 +120,5 @@ report: $(VENV)/.installed
 	$(BIN)/tunnelcd report $(OUT)
 
 clean:
-	rm -rf $(VENV) $(LOWEST) $(NEWEST) $(AUDIT) .venv-python* build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf mutants $(VENV) $(LOWEST) $(NEWEST) $(AUDIT) $(MUTANTS) .venv-python* build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

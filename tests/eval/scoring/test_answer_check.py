@@ -1,0 +1,297 @@
+"""Every limit that an answer must keep: the value at the limit is taken, the next one is refused, and named."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cdpipe.core.geometry import make_pose
+from cdpipe.model.report import ChangedObject, ChangeRegions, ObjectShape
+from eval.scoring import answer_check as module
+from eval.scoring.answer_check import MAX_AMOUNT, MAX_M, MAX_SECONDS, SECONDS
+from eval.truth.ground_truth import SessionTruth
+from eval.truth.scoring_points import ScoringPoints
+from tests.eval.scoring.test_object_metrics import line_points
+
+NAN, INF = float("nan"), float("inf")
+FAR = np.nextafter(MAX_M, np.inf)
+POINTS = np.zeros((1, 3))
+
+
+def taken_or_refused(told: str | None) -> Any:
+    """Expect no error, or one that says this."""
+    return nullcontext() if told is None else pytest.raises(ValueError, match=told)
+
+
+def item(session: str = "after", returns: object = (), points: np.ndarray = POINTS, **fields: Any) -> ChangedObject:
+    pixels = np.array(returns, dtype=np.int32).reshape(-1, 2)
+    return ChangedObject(
+        session, "added", **{"region": -1, "returns": pixels, "points_map": points, "score": 1.0, **fields}
+    )
+
+
+@pytest.mark.parametrize(
+    ("seconds", "told"),
+    [
+        ({}, None),
+        (dict.fromkeys(SECONDS, 0.0), None),
+        ({"t_cd_s": MAX_SECONDS}, None),
+        ({"t_oe_s": np.nextafter(MAX_SECONDS, INF)}, r"seconds\.t_oe_s = 1"),
+        ({"t_cd_s": -1e-300}, r"seconds\.t_cd_s = -1e-300"),
+        ({"t_cd_s": NAN}, r"seconds\.t_cd_s = nan"),
+        ({"t_cd_s": 1.0, "t_cd": 1.0}, r"seconds\.t_cd is unknown; did you mean"),
+    ],
+)
+def test_seconds(seconds: dict[str, float], told: str | None) -> None:
+    with taken_or_refused(told):
+        module._check_seconds(seconds)
+
+
+def test_the_seconds_that_an_answer_may_state() -> None:
+    assert SECONDS == (
+        "t_index_s", "t_merge_s", "t_refine_s", "t_descriptor_s", "t_cd_s", "t_oe_s", "t_returns_s",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        (0.0, None),
+        (NAN, None),
+        (MAX_AMOUNT, None),
+        (np.nextafter(MAX_AMOUNT, INF), r"evidence\.overlap = "),
+        (-1e-300, r"evidence\.overlap = -1e-300"),
+        (INF, r"evidence\.overlap = inf"),
+    ],
+)
+def test_evidence(value: float, told: str | None) -> None:
+    with taken_or_refused(told):
+        module._check_evidence({"agreement": 1.0, "overlap": value})
+
+
+def poses(n: int, x_m: float = 0.0) -> np.ndarray:
+    return np.stack([make_pose(translation=(0.0, 0.0, x_m))] * n)
+
+
+@pytest.mark.parametrize(
+    ("local", "n_keyframes", "told"),
+    [
+        (None, 3, None),
+        (poses(3), 3, None),
+        (poses(5), 0, None),
+        (poses(3), 0, "has 3 poses: expected one for each of the 5 scans of the after session"),
+        (poses(5), 3, "has 5 poses: expected one for each of the 3 after keyframes"),
+        (poses(3, MAX_M), 3, None),
+        (poses(3, FAR), 3, "local_before_T_after: entry 0 is farther"),
+        (poses(3) * 2, 3, r"local_before_T_after\[0\] is not a rigid"),
+        (poses(3) * NAN, 3, "local_before_T_after"),
+    ],
+)
+def test_the_local_merge(local: np.ndarray | None, n_keyframes: int, told: str | None) -> None:
+    with taken_or_refused(told):
+        module._check_local(local, n_keyframes, 5)
+
+
+REGIONS = ChangeRegions(
+    centres_map=np.full((2, 3), MAX_M),
+    radius_m=4.5,
+    scores=np.array([2.0, 1.0]),
+    pairs=np.zeros((2, 2), np.int64),
+    is_reported=np.ones(2, np.bool_),
+    keyframe_scores=np.array([1.0, NAN, -3.0]),
+)
+
+
+@pytest.mark.parametrize(
+    ("changed", "n_keyframes", "told"),
+    [
+        ({}, 3, None),
+        ({}, 4, "keyframe_scores has 3 entries: expected one for each of the 4 before"),
+        ({}, 0, "keyframe_scores has 3 entries: expected one for each of the 5 before"),
+        ({"keyframe_scores": np.zeros(5)}, 0, None),
+        ({"keyframe_scores": np.zeros(0)}, 3, None),
+        ({"keyframe_scores": np.zeros(1)}, 3, "keyframe_scores has 1 entries"),
+        ({"keyframe_scores": np.array([0.0, INF, 0.0])}, 3, "keyframe_scores: a score is infinite"),
+        ({"keyframe_scores": np.array([0.0, -INF, 0.0])}, 3, "keyframe_scores: a score is infinite"),
+        ({"radius_m": 1e-9}, 3, None),
+        ({"radius_m": 0.0}, 3, "radius_m = 0.0: "),
+        ({"radius_m": MAX_M}, 3, None),
+        ({"radius_m": FAR}, 3, "radius_m = 1"),
+        ({"radius_m": NAN}, 3, "radius_m = nan: "),
+        ({"scores": np.array([INF, 1.0])}, 3, "region_scores: entry 0 is not"),
+        ({"scores": np.array([1.0, NAN])}, 3, "region_scores: entry 1 is not"),
+        ({"centres_map": np.array([(0.0, 0.0, 0.0), (0.0, NAN, 0.0)])}, 3, "region_centres_map: entry 1 is not"),
+        ({"centres_map": np.array([(0.0, 0.0, 0.0), (0.0, 0.0, -FAR)])}, 3, "region_centres_map: entry 1 is farther"),
+    ],
+)
+def test_regions(changed: dict[str, Any], n_keyframes: int, told: str | None) -> None:
+    with taken_or_refused(told):
+        module._check_regions(replace(REGIONS, **changed), n_keyframes, 5)
+
+
+@pytest.mark.parametrize(
+    ("scans", "told"),
+    [
+        (np.array([0, 4, 2]), None),
+        (np.array([3]), None),
+        (np.zeros(0), None),
+        (np.array([0, 5]), "k names scans 0 to 5, the session has 0 to 4"),
+        (np.array([-1, 2]), "k names scans -1 to 2"),
+        (np.array([1, 2, 1]), "k names a scan twice"),
+        (np.array([1.0]), r"k must be a list of whole numbers, got float64 \(1,\)"),
+        (np.array([[1]]), r"k must be a list of whole numbers, got int64 \(1, 1\)"),
+        (np.zeros((0, 2)), r"k must be a list of whole numbers, got float64 \(0, 2\)"),
+    ],
+)
+def test_scans(scans: np.ndarray, told: str | None) -> None:
+    with taken_or_refused(told):
+        module._check_scans("k", scans, 5)
+
+
+def shape(edge_m: float = 1.0, volume_m3: float = 1.0) -> ObjectShape:
+    return ObjectShape(np.eye(4), np.array([1.0, 1.0, edge_m]), volume_m3)
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({}, None),
+        ({"partner": 3}, None),
+        ({"partner": 0}, None),
+        ({"partner": 4}, r"objects\[2\]\.partner = 4: there are 4 objects"),
+        ({"partner": -2}, r"objects\[2\]\.partner = -2: there are 4 objects"),
+        ({"partner": 2}, r"objects\[2\]\.partner = 2: that is itself"),
+        ({"region": 0}, None),
+        ({"region": 1}, None),
+        ({"region": 2}, r"objects\[2\]\.region = 2: there are 2 regions"),
+        ({"region": -2}, r"objects\[2\]\.region = -2: there are 2 regions"),
+        ({"points": np.full((2, 3), -MAX_M)}, None),
+        ({"points": np.array([(0, 0, 0), (FAR, 0, 0)])}, r"objects\[2\]: object_points_map: entry 1 is farther"),
+        ({"points": np.array([(0, 0, 0), (0, 0, INF)])}, r"objects\[2\]: object_points_map: entry 1 is not"),
+        ({"score": NAN}, r"objects\[2\]\.score = nan: expected a number"),
+        ({"score": -INF}, r"objects\[2\]\.score = -inf: expected a number"),
+        ({"shape": shape(0.0, 0.0)}, None),
+        ({"shape": shape(MAX_M, MAX_AMOUNT)}, None),
+        ({"shape": shape(FAR)}, r"objects\[2\]\.shape: edges 1, 1, 1e\+07 m and volume 1 m3"),
+        ({"shape": shape(-0.1)}, r"objects\[2\]\.shape: edges 1, 1, -0.1 m"),
+        ({"shape": shape(NAN)}, r"objects\[2\]\.shape: edges 1, 1, nan m"),
+        ({"shape": shape(1.0, -0.1)}, "volume -0.1 m3"),
+        ({"shape": shape(1.0, np.nextafter(MAX_AMOUNT, INF))}, r"volume 1e\+15 m3"),
+        ({"displacement_map": np.array([0.0, 0.0, MAX_M])}, None),
+        ({"displacement_map": np.array([0.0, 0.0, FAR])}, r"objects\[2\]\.displacement_map: entry 0 is farther"),
+        ({"displacement_map": np.array([0.0, NAN, 0.0])}, r"objects\[2\]\.displacement_map: entry 0 is not"),
+    ],
+)
+def test_objects(fields: dict[str, Any], told: str | None) -> None:
+    with taken_or_refused(told):
+        module._check_object(2, item(**fields), 4, 2)
+
+
+def session_of(n: int, n_scans: int) -> SessionTruth:
+    """Scan 0 returned at each of n pixels, the other scans at none."""
+    points = line_points([0] * n)
+    posed = np.stack([make_pose(translation=(2.0 * scan, 0.0, 0.0)) for scan in range(n_scans)])
+    return SessionTruth(posed, posed, replace(points, n_scans=n_scans))
+
+
+@pytest.mark.parametrize(
+    ("returns", "told"),
+    [
+        ([[(0, 0), (2, 149)]], None),
+        ([[(0, 150)]], r"objects\[1\] names return \(scan 0, pixel 150\), outside .* 3 scans of 150 pixels"),
+        ([[(0, 1), (0, -1)]], r"objects\[1\] names return \(scan 0, pixel -1\)"),
+        ([[(0, 1), (3, 0)]], r"objects\[1\] names return \(scan 3, pixel 0\)"),
+        ([[(-1, 0)]], r"objects\[1\] names return \(scan -1, pixel 0\)"),
+        ([[(1, 7), (1, 7)]], r"return \(scan 1, pixel 7\) of the after session twice"),
+        ([[(1, 7)], [(0, 1), (1, 7)]], r"return \(scan 1, pixel 7\) of the after session twice"),
+        ([[], [(0, 1)]], None),
+        # 99 that did not return may each share a cell with one that did; 100 may not
+        ([[(1, pixel) for pixel in range(99)]], None),
+        ([[(1, pixel) for pixel in range(100)]], r"nothing returned at any of their 100 \(scan, pixel\)"),
+        ([[(1, pixel) for pixel in range(50)], [(2, pixel) for pixel in range(50)]], "any of their 100"),
+        ([[*((1, pixel) for pixel in range(100)), (0, 3)]], None),
+    ],
+)
+def test_returns(returns: list[list[tuple[int, int]]], told: str | None) -> None:
+    # the object of the other session is none of this session's concern
+    objects = (item("before", [(9, 999)]), *(item("after", each) for each in returns))
+    with taken_or_refused(told):
+        module._check_returns("after", objects, session_of(150, 3))
+
+
+def test_returns_of_another_type() -> None:
+    with pytest.raises(ValueError, match=r"objects\[0\]: object_returns must be whole numbers, got float64"):
+        module._check_returns("after", (replace(item(), returns=np.zeros((1, 2))),), session_of(5, 1))
+    # large numbers of scans do not overflow
+    many = ScoringPoints(
+        np.array([70_000 * 40_000]),
+        POINTS.astype(np.float32),
+        np.zeros(1, np.int16),
+        np.zeros(1, np.int16),
+        80_000,
+        40_000,
+    )
+    poses_once = np.eye(4)[None]
+    twice = item("after", [(70_000, 0), (70_000, 0)])
+    with pytest.raises(ValueError, match=r"\(scan 70000, pixel 0\)"):
+        module._check_returns("after", (twice,), SessionTruth(poses_once, poses_once, many))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("aside_m", "is_refused"), [(1.99, False), (2.01, True)])
+def test_points_beside_their_returns(axis: int, sign: float, aside_m: float, is_refused: bool) -> None:
+    scoring_points = line_points([0] * 20)
+    rows = np.arange(5, 15)
+    own = scoring_points.points_odom[rows].astype(np.float64)
+    beside = own.copy()
+    beside[:, axis] += sign * (aside_m + np.ptp(own[:, axis]))
+    returns = [(0, pixel) for pixel in rows]
+    with taken_or_refused(r"objects\[0\]: object_points_map is 2 m off" if is_refused else None):
+        module._check_places((item("before", returns, beside),), scoring_points)
+    # the after session's odom frame is not the map's, and an object without points or returns says nothing
+    module._check_places((item("after", returns, beside),), scoring_points)
+    module._check_places((item("before", returns, np.zeros((0, 3))), item("before", (), beside)), scoring_points)
+
+
+def test_gaps_add_up_over_the_axes() -> None:
+    scoring_points = line_points([0] * 20)
+    rows = np.arange(5, 15)
+    returns, own = [(0, pixel) for pixel in rows], scoring_points.points_odom[rows].astype(np.float64)
+    # 1.5 m in y and in z are 2.12 m
+    with pytest.raises(ValueError, match="is 2 m off"):
+        module._check_places((item("before", returns, own + np.array([0.0, 1.5, -1.5])),), scoring_points)
+
+
+CELLS = line_points([0] * 20)
+ON_CELL_3 = CELLS.points_odom[3:4].astype(np.float64)
+
+
+@pytest.mark.parametrize(
+    ("points", "told"),
+    [
+        ([ON_CELL_3], None),
+        ([np.zeros((0, 3))], None),
+        ([ON_CELL_3 + np.array([0.0, 0.0, 0.099])], None),
+        ([ON_CELL_3 + np.array([0.0, 0.0, 0.101])], "after session: none of its 1 points is within 0.1 m of a return"),
+        ([ON_CELL_3 + 5.0, ON_CELL_3], None),
+        ([ON_CELL_3 + 5.0, np.concatenate([ON_CELL_3, ON_CELL_3]) + 7.0], "none of its 2 points"),
+        ([ON_CELL_3, np.concatenate([ON_CELL_3 + 0.2, ON_CELL_3])], r"objects\[1\] shares a point"),
+        # a point that one object names twice has one owner
+        ([np.concatenate([ON_CELL_3, ON_CELL_3])], None),
+        ([np.full((2, 3), NAN)], r"objects\[1\]: object_points_odom: entry 0 is not"),
+        ([np.full((2, 3), FAR)], r"objects\[1\]: object_points_odom: entry 0 is farther"),
+        ([np.zeros((2, 2))], r"objects\[1\]: object_points_odom must be \(N, 3\)|object_points_odom"),
+    ],
+)
+def test_points_of_other_programs(points: list[np.ndarray], told: str | None) -> None:
+    # the object of the other session may hold the same point
+    objects = (item("before"), *(item("after") for _ in points))
+    with taken_or_refused(told):
+        module._check_points("after", objects, (ON_CELL_3, *points), CELLS)
+    module._check_points("after", objects, None, CELLS)
+    module._check_points("before", (item("before"),), (ON_CELL_3,), CELLS)

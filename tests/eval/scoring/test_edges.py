@@ -1,0 +1,121 @@
+"""Edges of the definitions, each with an answer or a truth on which a nearly right metric would be wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import make_pose
+from cdpipe.model.report import ChangedObject
+from eval.scoring.merge_metrics import compute_merge_errors, measure_overlap
+from eval.scoring.object_metrics import judge_kinds, match_objects
+from eval.scoring.region_metrics import transform_to_map, transform_to_world
+from eval.truth.ground_truth import SessionTruth, ground_truth, load_ground_truth
+from eval.truth.scoring_points import ScoringPoints
+from tests.eval.scoring.test_object_metrics import moved_pair, span, thing
+from tests.eval.scoring.test_region_metrics import EMPTY
+from tests.eval.scoring.test_scoring import scored, true_report
+
+
+def at(*places: tuple[float, float, float]) -> np.ndarray:
+    return np.stack([make_pose(translation=place) for place in places])
+
+
+# a shaft: the robot is twice at the same place in plan, 6 m apart in height; odometry is 1 m off in y up there
+SHAFT = at((0.0, 0.0, 0.0), (3.0, 0.0, 3.0), (0.0, 0.0, 6.0))
+SHAFT_ODOM = at((0.0, 0.0, 0.0), (3.0, 0.0, 3.0), (0.0, 1.0, 6.0))
+
+
+def test_the_nearest_place_is_nearest_in_height_as_well() -> None:
+    before = SessionTruth(SHAFT_ODOM, SHAFT, EMPTY)
+    assert before.judged_scans.tolist() == [0, 1, 2]
+    centres_map = np.array([(0.2, 0.0, 0.0), (0.2, 1.0, 6.0)])
+    places_world = np.array([(0.2, 0.0, 0.0), (0.2, 0.0, 6.0)])
+    np.testing.assert_allclose(transform_to_world(centres_map, before), places_world)
+    np.testing.assert_allclose(transform_to_map(places_world, before), centres_map)
+
+
+def test_a_merge_is_judged_against_the_place_that_is_nearest_in_height_as_well() -> None:
+    before = SessionTruth(SHAFT_ODOM, SHAFT, EMPTY)
+    after = SessionTruth(SHAFT, SHAFT, EMPTY)
+    errors = compute_merge_errors(before, after, np.eye(4))
+    # at the top, the before odometry is 1 m off and the after odometry is right
+    np.testing.assert_allclose(errors.metres, [0.0, 0.0, 1.0], atol=1e-12)
+    # 5 m are 5 m in any direction
+    for height_m, n_pairs in ((4.9, 1), (5.1, 0)):
+        above = at((0.0, 0.0, 6.0 + height_m))
+        assert len(compute_merge_errors(before, SessionTruth(above, above, EMPTY), np.eye(4)).metres) == n_pairs
+
+
+@pytest.mark.parametrize(("height_m", "share"), [(4.9, 1.0), (5.1, 0.0)])
+def test_a_level_above_overlaps_only_within_five_metres(height_m: float, share: float) -> None:
+    level = at((0.0, 0.0, 0.0), (10.0, 0.0, 0.0))
+    assert measure_overlap(level, level + make_pose(translation=(0, 0, height_m)) - np.eye(4)) == share
+
+
+def test_coverage_is_of_reported_regions_alone(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
+    report = true_report(tiny_pair, tiny_merge)
+    first = replace(report.regions, is_reported=np.array([True, False, False]))
+    alone = replace(
+        report.regions,
+        centres_map=report.regions.centres_map[:1],
+        scores=np.ones(1),
+        pairs=np.zeros((1, 2), np.int64),
+        is_reported=np.ones(1, np.bool_),
+    )
+    without = replace(report, objects=(), figures={})
+    coverage = [
+        scored(tiny_pair, replace(without, regions=regions)).row["region_coverage"]
+        for regions in (report.regions, first, alone)
+    ]
+    assert coverage[1] == coverage[2] < coverage[0]
+
+
+def before_object(rows: np.ndarray, points: ScoringPoints, aside_m: float) -> ChangedObject:
+    returns = np.column_stack([points.scans(rows), points.pixels(rows)]).astype(np.int32)
+    at_m = points.points_odom[rows].astype(np.float64) + np.array([0.0, 0.0, aside_m])
+    return ChangedObject("before", "removed", -1, returns, at_m, 1.0)
+
+
+@pytest.mark.parametrize(("asides_m", "is_refused"), [((0.0, 40.0), False), ((40.0, 0.0), False), ((40.0, 30.0), True)])
+def test_an_answer_is_of_another_pair_only_if_all_its_objects_lie_aside(
+    tiny_pair: Path, tiny_merge: np.ndarray, asides_m: tuple[float, float], is_refused: bool
+) -> None:
+    points = load_ground_truth(tiny_pair).before.scoring_points
+    objects = tuple(
+        before_object(np.arange(first, first + 50), points, aside_m)
+        for first, aside_m in zip((0, 100), asides_m, strict=True)
+    )
+    report = replace(true_report(tiny_pair, tiny_merge), objects=objects)
+    if not is_refused:
+        assert scored(tiny_pair, report).row["n_objects"] == 2
+        return
+    # the object that lies nearest to its returns is the one that is named
+    with pytest.raises(InputError, match=r"objects\[1\]: object_points_map is \d+ m off"):
+        scored(tiny_pair, report)
+
+
+def test_a_change_that_no_row_belongs_to_is_not_observable(tiny_pair: Path) -> None:
+    truth = load_ground_truth(tiny_pair)
+    unseen = replace(
+        truth.pair.changes[0], id=9, partner=None, world_T_object=make_pose(translation=(7, 8, 9)).tolist()
+    )
+    more = ground_truth(replace(truth.pair, changes=(*truth.pair.changes, unseen)), truth.sessions)
+    assert unseen.is_observable
+    assert more.is_observable.tolist() == [*truth.is_observable.tolist(), False]
+    assert more.n_observable == truth.n_observable == 3
+    np.testing.assert_allclose(more.centroids_world[3], (7, 8, 9))
+
+
+def test_a_half_of_a_move_that_names_no_partner_is_wrong_where_the_other_half_was_missed() -> None:
+    truth = moved_pair()
+    objects = [thing("after", "moved", -1)]
+    matches = match_objects(objects, [span(20, 30)], truth)
+    assert matches.matched_object.tolist() == [-1, 0]
+    right = judge_kinds(objects, matches, truth)
+    assert np.isnan(right[0])
+    assert right[1] == 0.0
