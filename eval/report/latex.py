@@ -24,7 +24,7 @@ from eval.report.objects.tables import OBJECT_COLUMNS
 from eval.report.regions.regions import REGION_COLUMNS
 from eval.report.summary import is_unmade, means_by_method
 from eval.report.tables import Table, methods_table
-from eval.running.run_data import RunData, comparable, off_grids, stored_table
+from eval.running.run_data import RunData, comparable, off_grids, plan_name, stored_table
 from eval.running.sides import Side, is_contended
 from eval.tables.columns import EN_DASH, RESULT_COLUMNS, THIN_SPACE, Column, select
 from eval.tables.rows import ALL_DOMAINS, PAIR, is_told_the_truth, numbers, records, texts, with_domain
@@ -151,7 +151,7 @@ def _is_told_apart(cases: pd.DataFrame, column: Column, first: str, second: str,
 def _caption(words: str, data: RunData, results: pd.DataFrame) -> str:
     """Return the caption: the subject of a table, its number of pairs, and the meaning of its marks."""
     n_pairs, n_failed = len(results[PAIR].drop_duplicates()), int((texts(results, "status") != "ok").sum())
-    name = data.provenance.get("plan", {}).get("name", "")
+    name = plan_name(data)
     told = f"{words}{f', plan {name}' if name else ''}: {n_pairs} session pairs, {results['variant'].nunique()} methods"
     n_unmade = sum(is_unmade(row) for row in records(results))
     failed = f"{n_failed - n_unmade} of {len(results)} cases without an answer, which miss all their changes"

@@ -46,6 +46,7 @@ from eval.running.run_data import (
     flag,
     named_variants,
     of,
+    plan_name,
     read_run,
     scenarios,
     shown_variant,
@@ -108,7 +109,7 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
 def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
     """Return what every page shows: the run, its summary and its merges, and nothing of regions and objects."""
     return {
-        "plan": str(data.provenance.get("plan", {}).get("name", "")),
+        "plan": plan_name(data),
         "machine": describe_machine(data.provenance),
         "command": str(data.provenance.get("command") or "unknown"),
         "finished": str(data.provenance.get("finished") or "unknown"),
@@ -223,7 +224,8 @@ def tabulate_settings(data: RunData) -> Table:
         for name in named_variants(data, scenario):
             if of(data.results, scenario=scenario, seed=seed, variant=name):
                 document = read_json(data.folder.answer(scenario, seed, name) / "answer.json")
-                found.setdefault(name, []).append(_flat(document.get("config") or {}))
+                config = document.get("config")
+                found.setdefault(name, []).append(_flat(config) if isinstance(config, Mapping) else {})
     keys = [key for key, _, _ in settings_table()]
     keys += sorted({key for configs in found.values() for config in configs for key in config} - set(keys))
     rows = []

@@ -92,6 +92,12 @@ def stored_table(data: RunData, name: str) -> pd.DataFrame:
     return _without_unusable(read_table(path)) if path.is_file() else pd.DataFrame()
 
 
+def plan_name(data: RunData) -> str:
+    """Return the name of the plan of a run, "" where it is not known."""
+    plan = data.provenance.get("plan")
+    return str(plan.get("name", "")) if isinstance(plan, Mapping) else ""
+
+
 def ends_at_merge(data: RunData) -> bool:
     """Tell whether a run's plan ended every method at the merge."""
     plan = data.provenance.get("plan")

@@ -239,7 +239,7 @@ def reported(provenance: Mapping[str, Any]) -> tuple[str, ...]:
     """Return what the plan of a run asks a report of: "regions", "objects", both or nothing."""
     plan = provenance.get("plan")
     subjects = (plan.get("report") or ()) if isinstance(plan, Mapping) else ()
-    return (subjects,) if isinstance(subjects, str) else tuple(subjects)
+    return tuple(subjects) if isinstance(subjects, list | tuple) else (str(subjects),)
 
 
 def _report_tables(

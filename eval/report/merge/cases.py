@@ -157,7 +157,7 @@ def _gates(config: object) -> dict[str, float] | None:
     merge = config.get("merge") if isinstance(config, Mapping) else None
     if not isinstance(merge, Mapping):
         return None
-    return {} if merge.get("accept_all") else {name: float(merge[key]) for name, key in GATES if key in merge}
+    return {} if merge.get("accept_all") else {name: number(merge, key) for name, key in GATES if key in merge}
 
 
 def _cells(case: Case, *, by_kind: bool) -> tuple[Cell, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -11,8 +12,8 @@ import pytest
 from cdpipe.core.errors import InputError
 from eval.report.comparison import compare_sides, write_comparison
 from eval.report.page import write_page
-from eval.running.run_data import read_run
-from eval.running.runfolder import write_json
+from eval.running.run_data import plan_name, read_run
+from eval.running.runfolder import RunFolder, reported, write_json
 from eval.running.sides import read_side
 from eval.tables.columns import UNDEFINED
 from tests.eval.report.test_hostile_names import PLAIN, write_run
@@ -70,3 +71,16 @@ def test_a_seed_that_is_none_is_refused(tmp_path: Path) -> None:
     results.to_csv(folder / "results.csv", index=False)
     with pytest.raises(InputError, match="seed = nan: expected a whole number"):
         read_run(folder)
+
+
+def test_a_provenance_and_an_answer_that_hold_anything_kill_no_page(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", PLAIN[:6])
+    plan = {"name": ["\ud800"], "report": 1, "targets": 1, "until": "merge"}
+    write_json(folder / "provenance.json", {"tool": "tunnelcd", "plan": plan, "machine": [], "command": {}})
+    answer = RunFolder(folder).answer(f"{PLAIN[0]}/one", 1, PLAIN[0])
+    write_json(answer / "answer.json", {"config": {"merge": {"min_overlap": "x"}}, "evidence": {"overlap": "x"}})
+    write_json(answer.with_name("method_1") / "answer.json", {"config": ["x"], "evidence": 1})
+    assert write_page(folder).is_file()
+    assert reported({"plan": plan}) == ("1",)
+    for plan in ([], "x", None):
+        assert plan_name(replace(read_run(folder), provenance={"plan": plan})) == ""
