@@ -1,7 +1,11 @@
-"""From scans to a voxel map in one pass; memory grows with the map and by eleven bytes per return."""
+"""From scans to a voxel map in one pass; memory grows with the map.
+
+Returns and range images go to a temporary file where they are large: eleven bytes per return.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import islice
 
 import numpy as np
@@ -9,12 +13,14 @@ import numpy as np
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array, invert, transform, travelled_m
 from cdpipe.core.grid_index import column_keys
+from cdpipe.core.spooled import SpooledArray
 from cdpipe.core.voxel import UniqueCells, cell_corners, cell_keys, max_coordinate_m
-from cdpipe.mapping.free_space import render_view
+from cdpipe.mapping.free_space import COLUMNS, ROWS, render_view
 from cdpipe.model.config import MapConfig
-from cdpipe.model.types import PLACES, Float16Array, KeyframeViews, PointMap, PosedScan, ScanSource, UInt8Array
+from cdpipe.model.types import PLACES, KeyframeViews, PointMap, PosedScan, ScanSource
 
 _BATCH_SCANS = 64
+_BLOCK_RETURNS = 1 << 22
 # Lower limit of the range in a return's weight.
 _MIN_RANGE_M = 1.0
 # Distance from the border, as a share of the cell, of a mean that rounding moved out of its cell.
@@ -62,14 +68,14 @@ class _MapAccumulator:
     def __init__(self, config: MapConfig, keyframe_scans: frozenset[int]) -> None:
         self._config = config
         self._keyframe_scans = keyframe_scans
-        self._views: list[Float16Array] = []
         self._cells = UniqueCells()
-        self._batch_cells: list[Int64Array] = []
-        self._batch_sums: list[Float64Array] = []
+        # for each cell the weighted sums of the returns and of the sensor positions, and the sum of the weights
+        self._sums: Float64Array = np.zeros((0, 7))
         self._nearest_m2: Float64Array = np.zeros(0)
-        self._return_cells: list[Int32Array] = []
-        self._return_pixels: list[Int32Array] = []
-        self._return_offsets: list[UInt8Array] = []
+        self._views = SpooledArray(np.float16, (ROWS, COLUMNS))
+        self._return_cells = SpooledArray(np.int32)
+        self._return_pixels = SpooledArray(np.int32)
+        self._return_offsets = SpooledArray(np.uint8, (3,))
         self._n_returns: list[int] = []
 
     def add(self, scans: list[PosedScan]) -> None:
@@ -85,48 +91,62 @@ class _MapAccumulator:
                 self._views.append(render_view(scan.points_sensor))
         self._n_returns += n_near
         points = np.concatenate(clouds)
-        sensors = np.array([scan.odom_T_sensor[:3, 3] for scan in scans])
         ids = self._cells.add(cell_keys(points, self._config.voxel_m))
-        self._return_cells.append(ids.astype(np.int32))
+        self._return_cells.append(ids)
         in_cells = points / self._config.voxel_m
         # just below a border the fraction rounds to 1
-        places = np.minimum((in_cells - np.floor(in_cells)) * PLACES, PLACES - 1)
-        self._return_offsets.append(places.astype(np.uint8))
-        n_cells, squared_m2 = len(self._cells), np.concatenate(ranges_m2)
+        self._return_offsets.append(np.minimum((in_cells - np.floor(in_cells)) * PLACES, PLACES - 1).astype(np.uint8))
+        sensors = np.array([scan.odom_T_sensor[:3, 3] for scan in scans])
+        squared_m2 = np.concatenate(ranges_m2)
         weights = 1 / squared_m2
-        parts = [np.bincount(ids, points[:, axis] * weights, n_cells) for axis in range(3)]
-        parts += [np.bincount(ids, np.repeat(sensors[:, axis], n_near) * weights, n_cells) for axis in range(3)]
-        sums: Float64Array = np.column_stack([*parts, np.bincount(ids, weights, n_cells)])
-        self._nearest_m2 = np.append(self._nearest_m2, np.full(n_cells - len(self._nearest_m2), np.inf))
+        columns = [points[:, axis] * weights for axis in range(3)]
+        columns += [np.repeat(sensors[:, axis], n_near) * weights for axis in range(3)]
+        self._add_sums(ids, [*columns, weights], squared_m2)
+
+    def _add_sums(self, ids: Int64Array, columns: Sequence[Float64Array], squared_m2: Float64Array) -> None:
+        n_known, n_cells = len(self._sums), len(self._cells)
+        self._sums.resize((n_cells, 7), refcheck=False)  # in place: the map is not copied for each batch
+        self._nearest_m2.resize(n_cells, refcheck=False)
+        self._nearest_m2[n_known:] = np.inf
         np.minimum.at(self._nearest_m2, ids, squared_m2)
-        is_touched = np.bincount(ids, minlength=n_cells) > 0
-        self._batch_cells.append(np.flatnonzero(is_touched))
-        self._batch_sums.append(sums[is_touched])
+        is_touched = np.zeros(n_cells, dtype=np.bool_)
+        is_touched[ids] = True
+        touched = np.flatnonzero(is_touched)
+        place = np.empty(n_cells, dtype=np.int32)
+        place[touched] = np.arange(len(touched), dtype=np.int32)
+        in_batch = place[ids]
+        self._sums[touched] += np.column_stack([np.bincount(in_batch, column, len(touched)) for column in columns])
 
     def finish(self, source: ScanSource, keyframe_scans: Int64Array) -> PointMap:
         if len(self._cells) == 0:
             raise InputError(f"{source.name}: no return within map.max_range_m = {self._config.max_range_m} m")
-        cells, sums = np.concatenate(self._batch_cells), np.concatenate(self._batch_sums)
-        totals = np.column_stack([np.bincount(cells, column, len(self._cells)) for column in sums.T])
-        points, seen_from = totals[:, :3] / totals[:, 6:], totals[:, 3:6] / totals[:, 6:]
-        points = _clip_to_cells(points, self._cells.keys, self._config.voxel_m)
-        order = np.lexsort((self._cells.keys, column_keys(points)))
-        rank = np.empty(len(order), dtype=np.int32)
-        rank[order] = np.arange(len(order), dtype=np.int32)
-        return_points = np.concatenate([rank[part] for part in self._return_cells])
+        means = self._sums
+        means[:, :6] /= means[:, 6:]
+        keys = self._cells.keys
+        points = _clip_to_cells(means[:, :3].copy(), keys, self._config.voxel_m)
+        order = np.lexsort((keys, column_keys(points)))
         return PointMap(
             points=points[order],
             nearest_m=np.sqrt(self._nearest_m2[order]).astype(np.float32),
             voxel_m=self._config.voxel_m,
             odom_T_sensor=source.odom_T_sensor,
             keyframe_scans=keyframe_scans,
-            return_points=return_points,
-            return_pixels=np.concatenate(self._return_pixels),
+            return_points=self._rank_returns(order),
+            return_pixels=self._return_pixels.finish(),
             scan_offsets=np.concatenate([[0], np.cumsum(self._n_returns)]).astype(np.int64),
-            seen_from=seen_from[order].astype(np.float32),
-            return_offsets=np.concatenate(self._return_offsets),
-            views=KeyframeViews(np.stack(self._views), invert(source.odom_T_sensor[keyframe_scans])),
+            seen_from=means[:, 3:6].astype(np.float32)[order],
+            return_offsets=self._return_offsets.finish(),
+            views=KeyframeViews(self._views.finish(), invert(source.odom_T_sensor[keyframe_scans])),
         )
+
+    def _rank_returns(self, order: Int64Array) -> Int32Array:
+        """Return the (M,) map point of each return, the map points being the (N,) cells in an order."""
+        rank = np.empty(len(order), dtype=np.int32)
+        rank[order] = np.arange(len(order), dtype=np.int32)
+        cells, ranked = self._return_cells.finish(), SpooledArray(np.int32)
+        for start in range(0, len(cells), _BLOCK_RETURNS):
+            ranked.append(rank[cells[start : start + _BLOCK_RETURNS]])
+        return ranked.finish()
 
 
 def _clip_to_cells(points: Float64Array, keys: Int64Array, voxel_m: float) -> Float64Array:
