@@ -78,7 +78,9 @@ def find_moves(
             the before and the after session have around both objects; the objects' own points may be included.
     """
     gone, come = [_Cloud.of(points) for points in removed], [_Cloud.of(points) for points in added]
-    beside = [(r, a) for r, start in enumerate(gone) for a in _neighbours(start, come)]
+    boxes = np.array([_box_xy(end) for end in come]).reshape(-1, 2, 2)
+    extents = np.array([end.log_extents for end in come]).reshape(-1, 3)
+    beside = [(r, a) for r, start in enumerate(gone) for a in _neighbours(start, come, boxes)]
     gain = np.zeros((len(gone), len(come)))
     moves: dict[tuple[int, int], Move] = {}
 
@@ -89,9 +91,10 @@ def find_moves(
 
     for (r, a), (before, after) in zip(beside, around(beside), strict=True):
         note(r, a, _match_pair(gone[r].with_rest(before), come[a].with_rest(after), _BESIDE_SHARE))
+    tried = set(beside)
     for r, start in enumerate(gone):
-        for a in _similar(start, come) if may_go_far[r] else ():
-            if (r, a) not in beside:
+        for a in _similar(start, extents) if may_go_far[r] else ():
+            if (r, a) not in tried:
                 note(r, a, _match_pair(start, come[a], _SAME_SHARE))
     rows, columns = linear_sum_assignment(gain, maximize=True)
     return [moves[r, a] for r, a in zip(rows.tolist(), columns.tolist(), strict=True) if (r, a) in moves]
@@ -133,16 +136,27 @@ def _tree(points: Float64Array) -> cKDTree:
     return cKDTree(points, leafsize=_LEAF_POINTS)
 
 
-def _neighbours(start: _Cloud, come: Sequence[_Cloud]) -> list[int]:
-    """Return the indices of the neighbouring objects, nearest first, at most `_MOST_TRIED`."""
-    tree = cKDTree(start.few[:, :2])
-    gaps_m = np.array([np.min(tree.query(end.few[:, :2])[0]) for end in come])
+def _box_xy(cloud: _Cloud) -> tuple[Float64Array, Float64Array]:
+    """Return the lower and the upper corner, (2,) each, of the upright box along x and y around an object."""
+    return cloud.few[:, :2].min(axis=0), cloud.few[:, :2].max(axis=0)
+
+
+def _neighbours(start: _Cloud, come: Sequence[_Cloud], boxes: Float64Array) -> list[int]:
+    """Return the indices of the neighbouring objects, nearest first, at most `_MOST_TRIED`.
+
+    Distances are measured only to the objects whose box, of (N, 2, 2) boxes, is near.
+    """
+    tree, (low, high) = cKDTree(start.few[:, :2]), _box_xy(start)
+    apart_m = np.linalg.norm(np.maximum(np.maximum(boxes[:, 0] - high, low - boxes[:, 1]), 0.0), axis=1)
+    gaps_m = np.full(len(come), np.inf)
+    for a in np.flatnonzero(apart_m < 2 * _BESIDE_M).tolist():
+        gaps_m[a] = np.min(tree.query(come[a].few[:, :2])[0])
     return [a for a in np.argsort(gaps_m, kind="stable").tolist() if gaps_m[a] < _BESIDE_M][:_MOST_TRIED]
 
 
-def _similar(start: _Cloud, come: Sequence[_Cloud]) -> list[int]:
-    """Return the indices of the objects of similar extents, most similar first, at most `_MOST_TRIED`."""
-    misfits = np.array([np.abs(start.log_extents - end.log_extents).max() for end in come])
+def _similar(start: _Cloud, extents: Float64Array) -> list[int]:
+    """Return which of (N, 3) log extents are similar to an object's, most similar first, at most `_MOST_TRIED`."""
+    misfits = np.abs(start.log_extents - extents).max(axis=1)
     return [a for a in np.argsort(misfits, kind="stable").tolist() if misfits[a] <= np.log(_FAR_FACTOR)][:_MOST_TRIED]
 
 

@@ -94,7 +94,8 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     before_T_after, local = best.before_T_after, None
     if not reason and config.refine == "local":
         refining = perf_counter()
-        local, measured = refine(*maps, best.walk, config)
+        del maps  # the refinement indexes both maps anew: at no time are there two indices of one map
+        local, measured = refine(before.map, after.map, best.walk, config)
         evidence |= measured
         if local is not None:
             before_T_after = fit_rigid(local.anchors_odom, local.before_T_after)

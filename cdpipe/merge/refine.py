@@ -21,6 +21,7 @@ from cdpipe.merge.registration import IndexedMap, plane_jacobian, solve_point_to
 from cdpipe.merge.walk import Step, Walk, walk
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import MergeConfig
+from cdpipe.model.types import PointMap
 
 # Distance between anchors: a multiple of the sphere radius, and its minimum in metres (reports/merge/notes).
 _SPACING, _SPACING_M = 0.6, 4.0
@@ -45,7 +46,7 @@ _MIN_GOOD_SHARE = 0.5
 
 
 def refine(
-    before: IndexedMap, after: IndexedMap, found: Walk, config: MergeConfig
+    before_map: PointMap, after_map: PointMap, found: Walk, config: MergeConfig
 ) -> tuple[PathAlignment | None, dict[str, float]]:
     """Return the alignment along the after path, and its evidence.
 
@@ -53,8 +54,8 @@ def refine(
     displacement of an anchor by the refinement).
 
     Args:
-        before: The before map, indexed as a target.
-        after: The after map.
+        before_map: The before map.
+        after_map: The after map.
         found: The accepted walk.
         config: Settings of the merge.
 
@@ -63,12 +64,12 @@ def refine(
     """
     if not np.isfinite(found.fits).any():
         return None, {"n_refined": 0.0}
-    wall_m = float(np.percentile(after.map.nearest_m, _WALL_PERCENTILE))
+    wall_m = float(np.percentile(after_map.nearest_m, _WALL_PERCENTILE))
     seen_within_m = min(max(_SEEN_WITHIN * wall_m, _SEEN_WITHIN_M), config.seen_within_m)
     closer = config.model_copy(update={"seen_within_m": seen_within_m})
-    before = IndexedMap(before.map, closer, is_target=True, has_coarse_target=False)
-    after = IndexedMap(after.map, closer, is_target=False)
-    path_m = travelled_m(after.map.odom_T_keyframe)
+    before = IndexedMap(before_map, closer, is_target=True, has_coarse_target=False)
+    after = IndexedMap(after_map, closer, is_target=False)
+    path_m = travelled_m(after_map.odom_T_keyframe)
     radius_m = max(_RADIUS * wall_m, _RADIUS_M)
     keyframes, start = _choose_anchors(path_m, found, max(_SPACING * radius_m, _SPACING_M))
     coarse = PathAlignment(after.positions[found.keyframes], found.before_T_after)

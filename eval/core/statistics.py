@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
-from cdpipe.core.geometry import BoolArray, Float64Array, stream
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from eval.core.ranking import auroc, average_precision
 
 Statistic = Literal["mean", "median"]
@@ -42,6 +43,7 @@ def summarise(
         ok, and the counts of defined numbers (not NaN) `n_used` and `n_used_ok`.
     """
     metrics = [name for name in results.columns if name not in IDENTITY_COLUMNS]
+    of_groups = {} if keyframes is None else dict(list(keyframes.groupby([by, "variant"])))
     rows: list[dict[str, Any]] = []
     for (group, variant), cases in results.groupby([by, "variant"], sort=False):
         is_ok = (cases["status"] == "ok").to_numpy()
@@ -51,7 +53,7 @@ def summarise(
             values = pd.to_numeric(cases[metric], errors="coerce").to_numpy(dtype=np.float64)
             rows.append({**names, "metric": metric, **_summary(metric, values, is_ok, seed), **counts})
         if keyframes is not None:
-            of_group = keyframes[(keyframes[by] == group) & (keyframes["variant"] == variant)]
+            of_group = of_groups.get((group, variant), keyframes[:0])
             rows += [{**names, **pooled, **counts} for pooled in _pooled(of_group)]
     columns = [by, "variant", "metric", "statistic", "value", "low", "high", "value_ok"]
     return pd.DataFrame(rows, columns=[*columns, "n", "n_failed", "n_used", "n_used_ok"])
@@ -82,11 +84,19 @@ def bootstrap_interval(values: Float64Array, statistic: Statistic = "mean", seed
     """
     if np.count_nonzero(~np.isnan(values)) < 2:
         return float("nan"), float("nan")
-    draws = stream(seed, "bootstrap").integers(len(values), size=(N_RESAMPLES, len(values)))
-    samples = values[draws]
-    samples = samples[~np.isnan(samples).all(axis=1)]
-    results = np.nanmean(samples, axis=1) if statistic == "mean" else np.nanmedian(samples, axis=1)
+    samples = values[_draws(seed, len(values))]
+    if np.isnan(values).any():
+        samples = samples[~np.isnan(samples).all(axis=1)]
+        results = np.nanmean(samples, axis=1) if statistic == "mean" else np.nanmedian(samples, axis=1)
+    else:
+        results = samples.mean(axis=1) if statistic == "mean" else np.median(samples, axis=1)  # the same, but faster
     return interval_of(results)
+
+
+@lru_cache(maxsize=2)
+def _draws(seed: int, n: int) -> Int64Array:
+    """Return the (N_RESAMPLES, n) pairs that each bootstrap sample draws; a table asks for the same ones many times."""
+    return stream(seed, "bootstrap").integers(n, size=(N_RESAMPLES, n))
 
 
 def interval_of(samples: Float64Array) -> tuple[float, float]:

@@ -7,7 +7,8 @@ pairs. A verdict needs at least six pairs and an interval that excludes 0.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,9 @@ import pandas as pd
 from cdpipe.core.errors import InputError
 from eval.core.statistics import ENOUGH_PAIRS, paired_difference
 from eval.report.compared_columns import COMPARED, POOLED, POOLED_RATE_PER_100M, figures_of, is_time
+from eval.running.run_data import RunData
 from eval.running.sides import Side, check_versions, matched_variants
-from eval.tables.region_curves import ranked_pairs, recall_at, recall_difference
+from eval.tables.region_curves import RankedPairs, ranked_pairs, recall_at, recall_difference
 from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers
 
 BETTER, WORSE, NOISE = "better", "worse", "no difference beyond noise"
@@ -140,18 +142,14 @@ def pooled_difference(
     Returns:
         One row as of `paired_differences`, or none where it is undefined.
     """
-    ranked = []
-    for side, variant in zip(sides, variants, strict=True):
-        data = side.data
-        tables = [_items(rows, variant, pairs) for rows in (data.results, data.regions, data.changes)]
-        if not all(needed <= set(table) for needed, table in zip(_NEEDED, tables, strict=True)):
-            return []
-        ranked.append(ranked_pairs(*tables))
-    first, second = ranked
+    wanted = tuple(pairs)
+    first, second = (_ranked(side.data, variant, wanted) for side, variant in zip(sides, variants, strict=True))
+    if first is None or second is None:
+        return []
     n_used = int(np.count_nonzero(first.n_observable))
     if n_used == 0 or first.pairs != second.pairs:
         return []
-    recalls = [recall_at(each, POOLED_RATE_PER_100M) for each in ranked]
+    recalls = [recall_at(each, POOLED_RATE_PER_100M) for each in (first, second)]
     difference, low, high = recall_difference(first, second, POOLED_RATE_PER_100M, seed)
     return [
         {
@@ -161,7 +159,16 @@ def pooled_difference(
     ]  # fmt: skip
 
 
-def _items(rows: Sequence[Mapping[str, Any]], variant: str, pairs: pd.Index[Any]) -> pd.DataFrame:
+@lru_cache(maxsize=8)  # one method is compared with all others
+def _ranked(data: RunData, variant: str, pairs: tuple[tuple[str, int], ...]) -> RankedPairs | None:
+    """Return the candidates and changes of one variant on some pairs; None where columns are missing."""
+    tables = [_items(rows, variant, pairs) for rows in (data.results, data.regions, data.changes)]
+    if not all(needed <= set(table) for needed, table in zip(_NEEDED, tables, strict=True)):
+        return None
+    return ranked_pairs(*tables)
+
+
+def _items(rows: Sequence[Mapping[str, Any]], variant: str, pairs: Iterable[tuple[str, int]]) -> pd.DataFrame:
     """Return the rows of one variant on some pairs, in their order."""
     wanted = set(pairs)
     kept = [row for row in rows if row["variant"] == variant and (row["scenario"], row["seed"]) in wanted]

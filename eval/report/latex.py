@@ -82,8 +82,9 @@ def _float(
     domains = table.groupby("domain", sort=False)
     for (domain, own), (group, rows) in zip(domains, methods_table(table, shown, cases).groups(), strict=True):
         of_domain = cases if domain == ALL_DOMAINS else cases[cases["domain"] == domain]
+        of_method = {str(name): part.set_index(PAIR).sort_index() for name, part in of_domain.groupby("variant")}
         marks = [
-            _marks(records(own), column, [cells[place].is_best for cells in rows], of_domain, data, untested)
+            _marks(records(own), column, [cells[place].is_best for cells in rows], of_method, data, untested)
             for place, column in enumerate(shown, start=2)
         ]
         for place, (method, n_pairs, *values) in enumerate(rows):
@@ -114,7 +115,7 @@ def _marks(
     rows: Sequence[Mapping[str, Any]],
     column: Column,
     is_best: Sequence[bool],
-    cases: pd.DataFrame,
+    of_method: Mapping[str, pd.DataFrame],
     data: RunData,
     untested: set[str],
 ) -> list[str]:
@@ -127,21 +128,23 @@ def _marks(
     )[1]
     for place, row in enumerate(rows):
         if not marks[place] and not is_told_the_truth(str(row["variant"])) and not math.isnan(float(row[column.key])):
-            apart = _is_told_apart(cases, column, str(rows[top]["variant"]), str(row["variant"]), data)
+            apart = _is_told_apart(of_method, column, str(rows[top]["variant"]), str(row["variant"]), data)
             marks[place] = "dagger" if apart is False else ""
             if apart is None:
                 untested.add(column.key)
     return marks
 
 
-def _is_told_apart(cases: pd.DataFrame, column: Column, first: str, second: str, data: RunData) -> bool | None:
+def _is_told_apart(
+    of_method: Mapping[str, pd.DataFrame], column: Column, first: str, second: str, data: RunData
+) -> bool | None:
     """Tell whether two methods differ beyond noise in a column; None where it has no number for each pair."""
-    own = [cases[cases["variant"] == name].set_index(PAIR).sort_index() for name in (first, second)]
+    own = [of_method[first], of_method[second]]
     pairs = own[0].index.intersection(own[1].index)
     if column.key == POOLED:
         rows = pooled_difference((Side(data), Side(data)), (first, second), pairs)
-    elif column.key in cases:
-        a, b = (numbers(frame.loc[pairs], column.key) for frame in own)
+    elif column.key in own[0]:
+        a, b = (numbers(frame[[column.key]].loc[pairs], column.key) for frame in own)
         rows = [paired_difference(a, b)]
     else:
         rows = []

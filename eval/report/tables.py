@@ -167,18 +167,20 @@ def best(values: Sequence[float], column: Column, n_used: Sequence[int] | None =
     return [word != UNDEFINED and float(word) == winner for word in written]
 
 
-def used_pairs(cases: pd.DataFrame, variant: str, key: str) -> tuple[int, int]:
-    """Return over how many pairs a method has a number in a column of results.csv, and of how many that could have.
+def used_pairs(cases: pd.DataFrame, variants: Sequence[str], key: str) -> list[tuple[int, int]]:
+    """Return over how many pairs each method has a number in a column of results.csv, and of how many that could have.
 
     Those that no method has (a pair without changes has no precision) could not. A figure that is no column of
     results.csv is over all.
     """
-    own = cases[cases["variant"] == variant]
-    if key not in cases:
-        return len(own), len(own)
-    pairs = pd.MultiIndex.from_frame(own[PAIR])
-    could = pd.MultiIndex.from_frame(cases.loc[~np.isnan(numbers(cases, key)), PAIR])
-    return int((~np.isnan(numbers(own, key))).sum()), int(pairs.isin(could).sum())
+    has_number = ~np.isnan(numbers(cases, key)) if key in cases else np.ones(len(cases), dtype=np.bool_)
+    pair = cases.groupby(PAIR, sort=False).ngroup().to_numpy()
+    could = np.isin(pair, pair[has_number])
+    variant = cases["variant"].to_numpy()
+    return [
+        (int(np.count_nonzero(has_number & is_own)), int(np.count_nonzero(could & is_own)))
+        for is_own in (variant == name for name in variants)
+    ]
 
 
 def beside(interval: str, n_used: int, n: int) -> str:
@@ -287,7 +289,7 @@ def _cells(
     if count_column is not None:
         used = [(int(row[count_column]), int(row[count_column])) for row in rows]
     else:
-        used = [used_pairs(cases, str(row["variant"]), column.key) for row in rows]
+        used = used_pairs(cases, [str(row["variant"]) for row in rows], column.key)
     cells = []
     for row, n, is_best in zip(rows, used, best_rows(rows, column, [n for n, _ in used]), strict=True):
         below = beside(interval_of_row(row, column.key, column.shown), *n)

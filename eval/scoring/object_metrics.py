@@ -95,14 +95,16 @@ def match_objects(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], 
         truth: The pair's truth, C changes.
     """
     changes = truth.pair.changes
+    ids = np.array([change.id for change in changes], dtype=np.int64)
+    by_id = np.argsort(ids)
     n_shared = np.zeros((len(changes), len(objects)), dtype=np.int64)
-    iou = np.zeros((len(changes), len(objects)))
     for column, (item, of_object) in enumerate(zip(objects, rows, strict=True)):
         labels = truth.sessions[item.session].scoring_points.change[of_object]
-        for row, change in enumerate(changes):
-            n_shared[row, column] = np.count_nonzero(labels == change.id)  # ids are unique in the pair, so 0 elsewhere
-            n_union = len(truth.change_rows[row]) + len(of_object) - n_shared[row, column]
-            iou[row, column] = n_shared[row, column] / n_union if n_union else 0.0
+        found, counts = np.unique(labels[np.isin(labels, ids)], return_counts=True)
+        n_shared[by_id[np.searchsorted(ids, found, sorter=by_id)], column] = counts  # ids are unique in the pair
+    n_cells = np.array([len(of_change) for of_change in truth.change_rows], dtype=np.int64)
+    n_rows = np.array([len(of_object) for of_object in rows], dtype=np.int64)
+    iou = n_shared / np.maximum(n_cells[:, None] + n_rows - n_shared, 1)
 
     matched_object = np.full(len(changes), -1, dtype=np.int64)
     matched_change = np.full(len(objects), -1, dtype=np.int64)
@@ -119,7 +121,6 @@ def match_objects(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], 
             ious["voxel"][row] = compute_voxel_iou(true, answered)
             ious["box"][row] = compute_box_iou(true, answered)
     is_main = truth.is_observable & ~truth.is_partial
-    n_rows = np.array([len(of_object) for of_object in rows], dtype=np.int64)
     is_excused = 2 * n_shared[~is_main].sum(axis=0) > n_rows
     return ObjectMatches(matched_object, matched_change, ious["point"], ious["voxel"], ious["box"], is_excused)
 

@@ -18,7 +18,7 @@ from eval.core.statistics import median
 from eval.plans.targets import Targets
 from eval.scoring.object_sizes import PILE_KIND
 from eval.tables.groups import clustered_interval, main_changes, objects_by_group, pair_numbers
-from eval.tables.rows import by_domain, means_with_intervals, numbers, of_cases, texts, with_domain
+from eval.tables.rows import by_domain, by_variant, means_with_intervals, numbers, of_cases, texts, with_domain
 from eval.tables.targets import judged_targets
 
 FILES = ("objects_table", "objects_by_group", "objects_targets")
@@ -47,10 +47,11 @@ def object_tables(
     """
     rows: list[dict[str, Any]] = []
     groups: list[dict[str, Any]] = []
+    changes_by_variant = by_variant(changes)
     for domain, cases in by_domain(with_domain(results)):
         for variant, own in cases.groupby("variant", sort=False):
             names = {"domain": domain, "variant": str(variant)}
-            own_changes = of_cases(changes, own)
+            own_changes = of_cases(changes_by_variant.get(str(variant), changes[:0]), own)
             rows.append({**names, **_counts(own, own_changes), **_means(own), **_over_changes(own_changes)})
             groups += [{**names, **row} for row in objects_by_group(own_changes)]
     table = pd.DataFrame(rows)

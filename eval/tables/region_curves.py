@@ -12,6 +12,7 @@ A pair without an answer misses all its changes, and its way is not counted.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import pandas as pd
@@ -90,8 +91,9 @@ def ranked_pairs(
     change_score = np.full(len(rows), -np.inf)
     change_rank = np.full(len(rows), len(scores), np.int64)
     ranks = np.zeros(len(pairs), np.int64)
+    found_changes = regions["found_changes"].tolist()
     for candidate in np.lexsort((np.arange(len(scores)), -scores, of_pair)).tolist():
-        pair, found = int(of_pair[candidate]), parsed_ids(regions["found_changes"].iloc[candidate])
+        pair, found = int(of_pair[candidate]), parsed_ids(found_changes[candidate])
         is_false[candidate] = not found
         new = [i for change in found if (i := number.get((pair, change))) is not None and change_score[i] == -np.inf]
         change_score[new], change_rank[new] = scores[candidate], ranks[pair]
@@ -151,6 +153,7 @@ def recall_at(ranked: RankedPairs, rate_per_100m: float) -> float:
     return float(_recalls(ranked, rate_per_100m, np.ones((1, len(ranked.pairs))))[0])
 
 
+@lru_cache(maxsize=64)  # a method is compared with all others, at each rate
 def resampled_recalls(ranked: RankedPairs, rate_per_100m: float, seed: int = 0) -> Float64Array:
     """Return `recall_at` of bootstrap draws of pairs within each kind of site, thresholds set anew in each draw.
 
@@ -158,10 +161,11 @@ def resampled_recalls(ranked: RankedPairs, rate_per_100m: float, seed: int = 0) 
     """
     n_pairs = len(ranked.pairs)
     weights = np.zeros((N_RESAMPLES, n_pairs))
+    row_starts = n_pairs * np.arange(N_RESAMPLES)[:, None]
     for site in np.unique(ranked.site):
         own = np.flatnonzero(ranked.site == site)
         draws = own[stream(seed, "bootstrap", f"site {site}").integers(len(own), size=(N_RESAMPLES, len(own)))]
-        np.add.at(weights, (np.arange(N_RESAMPLES)[:, None], draws), 1.0)
+        weights += np.bincount((row_starts + draws).ravel(), minlength=weights.size).reshape(weights.shape)
     batches = range(0, N_RESAMPLES, _BATCH)
     return np.concatenate([_recalls(ranked, rate_per_100m, weights[first : first + _BATCH]) for first in batches])
 

@@ -26,7 +26,7 @@ from eval.tables.region_curves import (
     resampled_recalls,
     roc_curve,
 )
-from eval.tables.rows import by_domain, means_with_intervals, numbers, of_cases, with_domain
+from eval.tables.rows import by_domain, by_variant, means_with_intervals, numbers, of_cases, with_domain
 from eval.tables.targets import is_unchanged_pair, judged_targets
 
 FILES = ("regions_table", "regions_targets", "regions_by_size", "roc", "froc")
@@ -58,11 +58,13 @@ def region_tables(
     sizes: list[dict[str, Any]] = []
     curves: dict[str, list[pd.DataFrame]] = {"roc": [], "froc": []}
     ranked: dict[tuple[str, str], RankedPairs] = {}
+    items_by_variant = {name: by_variant(items[name]) for name in ("regions", "changes", "keyframes")}
     for domain, cases in by_domain(results):
         for variant, own in cases.groupby("variant", sort=False):
             names = {"domain": domain, "variant": str(variant)}
             regions, changes, keyframes = (
-                of_cases(items[name], own, _NEEDED) for name in ("regions", "changes", "keyframes")
+                of_cases(part.get(str(variant), items[name][:0]), own, _NEEDED)
+                for name, part in items_by_variant.items()
             )
             each = ranked[domain, str(variant)] = ranked_pairs(own, regions, changes)
             labelled = keyframes[keyframes["label"] >= 0]

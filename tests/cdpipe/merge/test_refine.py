@@ -70,7 +70,7 @@ def test_the_walls_of_a_wide_drift_are_looked_at() -> None:
     keyframes = np.array([10, 25, 40])
     coarse = np.repeat(make_pose(translation=(0.15, 0, 0))[None], 3, axis=0)
     found = Walk(keyframes, coarse, np.zeros((3, 6, 6)), np.ones(3), np.zeros(3))
-    alignment, evidence = refine(*maps, found, config)
+    alignment, evidence = refine(maps[0].map, maps[1].map, found, config)
     assert alignment is not None
     assert evidence["n_refined"] > 8
     path = after.odom_T_keyframe[:, :3, 3]
