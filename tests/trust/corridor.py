@@ -24,9 +24,8 @@ _N_WAVES, _WAVES_M, _ROUGHNESS_M = 60, (1.5, 60.0), 0.25
 _NODE_M, _NODES_AROUND = 0.25, 96
 # The centreline swings to either side by this much, once in this length.
 _SWING_M, _SWING_LENGTH_M = 12.0, 330.0
-# A heap at the lower right: half length, half width as an angle, and height.
-_HEAP_M, _HEAP_RAD, _HEAP_HEIGHT_M = 0.8, 0.2, 0.7
-_HEAP_AT_RAD = -1.2
+# A heap on the lower left wall: where around the centreline, half length, half width as an angle, and height.
+_HEAP_AT_RAD, _HEAP_M, _HEAP_RAD, _HEAP_HEIGHT_M = -1.2, 0.8, 0.2, 0.7
 
 
 class CorridorScans:
@@ -51,29 +50,32 @@ class CorridorScans:
         odom_T_world: Float64Array | None = None,
     ) -> None:
         self.name = f"corridor {seed}"
-        self._radius_m, self._seed = radius_m, seed
+        self._seed = seed
         self._heaps_m = np.array(heaps_m, dtype=np.float64)
         self._way_m = np.arange(0.0, length_m + 1e-6, spacing_m)
         self._wall_m = radius_m + _relief(length_m + 2 * _MAX_RANGE_M)
-        odom_T_world = make_pose() if odom_T_world is None else odom_T_world
-        self.odom_T_sensor = odom_T_world @ _centreline(self._way_m)
+        row, column = np.divmod(np.arange(ROWS * COLUMNS), COLUMNS)
+        elevation, azimuth = _ELEVATION_RAD * (1 - 2 * (row + 0.5) / ROWS), -2 * np.pi * (column + 0.5) / COLUMNS
+        y, z = np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
+        ahead_m = radius_m * np.cos(elevation) * np.cos(azimuth) / np.hypot(y, z)
+        self._pixels = np.flatnonzero(np.hypot(ahead_m, radius_m) < _MAX_RANGE_M).astype(np.int32)
+        self._ahead_m, self._angle_rad = ahead_m[self._pixels], np.arctan2(z, y)[self._pixels]
+        centre, left = _centreline(self._way_m)
+        forward = np.column_stack([left[:, 1], -left[:, 0], left[:, 2]])
+        up = np.broadcast_to((0.0, 0.0, 1.0), left.shape)
+        self._world_T_sensor = make_pose(np.stack([forward, left, up], axis=2), centre)
+        self.odom_T_sensor = (make_pose() if odom_T_world is None else odom_T_world) @ self._world_T_sensor
 
     def scan(self, index: int) -> PosedScan:
         """Make one scan."""
         rng = stream(self._seed, "scan", str(index))
-        row, column = np.divmod(np.arange(ROWS * COLUMNS), COLUMNS)
-        elevation = _ELEVATION_RAD * (1 - 2 * (row + rng.uniform()) / ROWS)
-        azimuth = -2 * np.pi * (column + rng.uniform()) / COLUMNS
-        flat = np.cos(elevation)
-        x, y, z = flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)
-        ahead_m = self._radius_m * x / np.hypot(y, z)
-        pixels = np.flatnonzero(np.hypot(ahead_m, self._radius_m) < _MAX_RANGE_M)
-        way_m, angle_rad = self._way_m[index] + ahead_m[pixels], np.arctan2(z, y)[pixels]
-        world_T_sensor = _centreline(self._way_m[index : index + 1])[0]
-        points = transform(invert(world_T_sensor), self._wall(way_m, angle_rad))
-        points += rng.normal(0.0, _NOISE_M, points.shape)
+        # every scan looks in slightly other directions
+        way_m = self._way_m[index] + self._ahead_m * rng.uniform(0.97, 1.03)
+        angle_rad = self._angle_rad + rng.uniform(0.0, 2 * np.pi / COLUMNS)
+        points = transform(invert(self._world_T_sensor[index]), self._wall(way_m, angle_rad))
+        points += _NOISE_M * rng.standard_normal(points.shape, dtype=np.float32)
         stamps_ns = np.full(len(points), int(self._way_m[index] * 1e9))
-        return PosedScan(index, points, self.odom_T_sensor[index], stamps_ns, pixels.astype(np.int32))
+        return PosedScan(index, points, self.odom_T_sensor[index], stamps_ns, self._pixels)
 
     def scans(self) -> Iterator[PosedScan]:
         """Make all scans in order."""
@@ -84,20 +86,24 @@ class CorridorScans:
         nodes = (way_m + _MAX_RANGE_M) / _NODE_M, angle_rad / (2 * np.pi) * _NODES_AROUND
         radius_m = map_coordinates(self._wall_m, nodes, order=1, mode="grid-wrap")
         for heap_m in self._heaps_m[(self._heaps_m > way_m.min() - 1.0) & (self._heaps_m < way_m.max() + 1.0)]:
-            aside = np.maximum(np.abs(way_m - heap_m) / _HEAP_M, np.abs(angle_rad - _HEAP_AT_RAD) / _HEAP_RAD)
-            radius_m -= _HEAP_HEIGHT_M * np.clip(3 * (1 - aside), 0.0, 1.0)
-        poses = _centreline(way_m)
-        across_m, up_m = radius_m * np.cos(angle_rad), radius_m * np.sin(angle_rad)
-        return np.asarray(poses[:, :3, 3] + across_m[:, None] * poses[:, :3, 1] + up_m[:, None] * poses[:, :3, 2])
+            near = np.flatnonzero(np.abs(way_m - heap_m) < _HEAP_M)
+            aside = np.maximum(
+                np.abs(way_m[near] - heap_m) / _HEAP_M, np.abs(angle_rad[near] - _HEAP_AT_RAD) / _HEAP_RAD
+            )
+            radius_m[near] -= _HEAP_HEIGHT_M * np.clip(3 * (1 - aside), 0.0, 1.0)
+        points, left = _centreline(way_m)
+        points += left * (radius_m * np.cos(angle_rad))[:, None]
+        points[:, 2] += radius_m * np.sin(angle_rad)
+        return points
 
 
-def _centreline(way_m: Float64Array) -> Float64Array:
-    """Return the (N, 4, 4) poses on the centreline, x forward and z up; the path length is that of its x axis."""
+def _centreline(way_m: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Return the (N, 3) points of the centreline and the (N, 3) directions to its left, at path lengths along x."""
     turn = 2 * np.pi / _SWING_LENGTH_M
-    yaw_rad = np.arctan(_SWING_M * turn * np.cos(turn * way_m))
-    c, s, zero = np.cos(yaw_rad), np.sin(yaw_rad), np.zeros_like(way_m)
-    rotations = np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1.0], axis=-1).reshape(-1, 3, 3)
-    return make_pose(rotations, np.column_stack([way_m, _SWING_M * np.sin(turn * way_m), zero]))
+    slope = _SWING_M * turn * np.cos(turn * way_m)
+    cosine, zero = 1 / np.sqrt(1 + slope * slope), np.zeros_like(way_m)
+    points = np.column_stack([way_m, _SWING_M * np.sin(turn * way_m), zero])
+    return points, np.column_stack([-slope * cosine, cosine, zero])
 
 
 def _relief(length_m: float) -> Float64Array:
