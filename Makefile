@@ -62,8 +62,9 @@ test-newest: $(NEWEST)/.installed
 	OMP_NUM_THREADS=1 $(NEWEST)/bin/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
 
 $(NEWEST)/.installed: pyproject.toml
-	$(PYTHON) -m venv --clear $(NEWEST)
-	$(NEWEST)/bin/python -m pip --disable-pip-version-check install --quiet --editable '.[test,$(EXTRAS)]'
+	$(PYTHON) -m venv $(NEWEST)
+	$(NEWEST)/bin/python -m pip --disable-pip-version-check install --quiet --upgrade --upgrade-strategy eager \
+		--editable '.[test,$(EXTRAS)]'
 	touch $@
 
 # Plan smoke on each of PYTHONS with the pinned packages: answers and rows are equal to the byte.
@@ -74,7 +75,7 @@ test-pythons: $(BIN)/python $(PYTHONS:%=.venv-%/.installed)
 		$(BIN)/python tests/same_numbers.py out/pythons/$(firstword $(PYTHONS)) out/pythons/$$python || exit; done
 
 $(PYTHONS:%=.venv-%/.installed): .venv-%/.installed: pyproject.toml constraints.txt
-	$* -m venv --clear .venv-$*
+	$* -m venv .venv-$*
 	.venv-$*/bin/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt --editable .
 	touch $@
 
@@ -83,7 +84,7 @@ audit: $(VENV)/.installed-dev $(AUDIT)/.installed
 	$(AUDIT)/bin/python tests/audit.py $(BIN)/python
 
 $(AUDIT)/.installed: constraints.txt
-	$(PYTHON) -m venv --clear $(AUDIT)
+	$(PYTHON) -m venv $(AUDIT)
 	$(AUDIT)/bin/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt \
 		pip-audit pip-licenses
 	touch $@

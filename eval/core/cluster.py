@@ -130,7 +130,9 @@ def _of_this_machine(where: Where, n_tasks: int) -> Iterator[Any]:
         "n_workers": min(where.workers or 1, n_tasks),
         "threads_per_worker": 1,
         "host": _LOOPBACK,  # whoever reaches a port can run code
-        "dashboard_address": f"{_LOOPBACK}:0",  # any free port, so that two runs can work at the same time
+        # any free port, so that two runs can work at the same time; unless told, older workers listen everywhere
+        "dashboard_address": f"{_LOOPBACK}:0",
+        "worker_dashboard_address": f"{_LOOPBACK}:0",
         "memory_limit": None,
         "silence_logs": logging.CRITICAL,
         # Ctrl-C reaches every process of the terminal; workers ignore it and are ended by this process
