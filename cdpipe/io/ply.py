@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import read_bytes
 from cdpipe.core.geometry import Float64Array
 
 _TYPES = {
@@ -27,6 +28,7 @@ _TYPES = {
 _BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _N_WORDS = {"format": 3, "element": 3, "property": 3}
 _MAX_HEADER_BYTES = 1 << 16
+_BLOCK = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,14 +45,11 @@ def read_ply_points(path: Path) -> Float64Array:
     Raises:
         InputError: The file is missing, not PLY, cut short, or its vertices have no x, y, z.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    content = read_bytes(path)
     try:
         header = _parse_header(content)
         return _vertices(content, header)
-    except ValueError as error:
+    except (OverflowError, ValueError) as error:
         raise InputError(f"{path}: not a readable PLY scan: {error}") from error
 
 
@@ -91,11 +90,15 @@ def _vertices(content: bytes, header: _Header) -> Float64Array:
     names = [name for name, _ in header.properties]
     if header.encoding == "ascii":
         lines = content[header.size :].split(b"\n", header.n_vertices)[: header.n_vertices]
-        rows = [line.split() for line in lines]
-        n_found = sum(len(row) == len(names) for row in rows)
         columns = [names.index(axis) for axis in "xyz"]
+        n_found, parts = 0, [np.zeros((0, 3))]
+        # in blocks: a word as an object takes ten times its bytes
+        for start in range(0, len(lines), _BLOCK):
+            rows = [row for row in map(bytes.split, lines[start : start + _BLOCK]) if len(row) == len(names)]
+            n_found += len(rows)
+            parts.append(np.array([[row[c] for c in columns] for row in rows], dtype=np.float64).reshape(-1, 3))
         if n_found == header.n_vertices:
-            return np.array([[row[c] for c in columns] for row in rows], dtype=np.float64).reshape(-1, 3)
+            return np.concatenate(parts)
     else:
         order = _BYTE_ORDERS[header.encoding]
         dtype = np.dtype([(f"{index}", order + kind) for index, (_, kind) in enumerate(header.properties)])

@@ -9,11 +9,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import read_bytes
 from cdpipe.core.geometry import Float64Array
 from cdpipe.core.motion import Motion, make_motion
 
 TUM_LINE = "stamp tx ty tz qx qy qz qw"
 _UNIT_TOLERANCE = 1e-3
+_FARTHEST_M = 1e8  # around the Earth twice; UTM coordinates are below 1e7
+_MOST_BYTES = 32_000_000
+_MOST_STAMP_S = 9e9  # of Unix time until the year 2255; as nanoseconds it fits into 64 bits
 # Poses farther apart than this say nothing about the columns between them.
 _LONGEST_GAP_S = 1.0
 
@@ -24,16 +28,20 @@ def read_tum(path: Path) -> tuple[Float64Array, tuple[int, ...]]:
     Raises:
         InputError: The file cannot be read, or a line is not eight finite numbers with a unit quaternion.
     """
+    content = read_bytes(path, _MOST_BYTES)
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        lines = content.decode().splitlines()
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read as text: {error}") from error
     numbers = tuple(n for n, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith("#"))
     rows = np.array([_row(f"{path}:{number}", lines[number - 1]) for number in numbers], np.float64).reshape(-1, 8)
     require_unit_poses(rows[:, 1:], lambda index: f"{path}:{numbers[index]}")
-    is_finite = np.isfinite(rows[:, 0])
-    if not is_finite.all():
-        raise InputError(f"{path}:{numbers[int(np.argmin(is_finite))]}: the stamp is not finite")
+    is_stamp = np.abs(rows[:, 0]) < _MOST_STAMP_S  # NaN is none, either
+    if not is_stamp.all():
+        bad = int(np.argmin(is_stamp))
+        raise InputError(
+            f"{path}:{numbers[bad]}: stamp = {rows[bad, 0]:g}: expected seconds, finite and below {_MOST_STAMP_S:g}"
+        )
     return rows, numbers
 
 
@@ -95,9 +103,11 @@ def motion_along(path: Path, first_ns: int, last_ns: int, slack_s: float) -> Mot
 
 def require_unit_poses(poses: Float64Array, where: Callable[[int], str]) -> None:
     """Raise `InputError` unless (N, 7) poses x, y, z, qx, qy, qz, qw are finite with unit quaternions."""
-    is_finite = np.isfinite(poses).all(axis=1)
-    if not is_finite.all():
-        raise InputError(f"{where(int(np.argmin(is_finite)))}: the pose is not finite: correct it or remove the scan")
+    is_near = (np.abs(poses) < _FARTHEST_M).all(axis=1)  # NaN is not
+    if not is_near.all():
+        index = int(np.argmin(is_near))
+        fault = "is not finite" if not np.isfinite(poses[index]).all() else f"lies beyond {_FARTHEST_M:g} m"
+        raise InputError(f"{where(index)}: the pose {fault}: correct it or remove the scan")
     norms = np.linalg.norm(poses[:, 3:], axis=1)
     is_unit = np.abs(norms - 1.0) < _UNIT_TOLERANCE
     if not is_unit.all():

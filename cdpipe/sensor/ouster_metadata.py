@@ -23,7 +23,10 @@ _SECTIONS = ("sensor_info", "config_params", "beam_intrinsics", "lidar_intrinsic
 _BEAM_ORIGIN_MM = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762}
 _OTHER_BEAM_ORIGIN_MM = 12.163
 _FARTHEST_BEAM_ORIGIN_MM = 100.0
+_LARGEST_ENTRY = 1e5  # of a transform within a sensor, millimetres
 _LIDAR_TO_SENSOR_MM = (-1.0, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 36.18, 0, 0, 0, 1)
+# Four times what the largest sensor has; tables of its directions are made before any scan is read.
+_MOST_BEAMS, _MOST_COLUMNS = 512, 16_384
 _BEAMS_OF_PRODUCT = re.compile(r"^OS-[0-9A-Za-z]+-(\d+)")
 
 
@@ -115,6 +118,8 @@ def _beams(flat: Mapping[str, Any], source: str, product: str) -> tuple[Float64A
     for key, angles_deg, most_deg in (("altitude", altitude_deg, 90.0), ("azimuth", azimuth_deg, 180.0)):
         if np.abs(angles_deg).max(initial=0.0) > most_deg:
             raise InputError(f"{source}: beam_{key}_angles exceed {most_deg:g} deg: expected degrees")
+    if len(altitude_deg) > _MOST_BEAMS:
+        raise InputError(f"{source}: {len(altitude_deg)} beam angles are listed: a sensor has {_MOST_BEAMS} at most")
     if len(altitude_deg) == 0 or (np.diff(altitude_deg) >= 0).any():
         raise InputError(f"{source}: beam_altitude_angles must fall from the top beam to the bottom one")
     return altitude_deg, azimuth_deg
@@ -123,7 +128,7 @@ def _beams(flat: Mapping[str, Any], source: str, product: str) -> tuple[Float64A
 def _columns(mode: str, source: str) -> int:
     columns, _, rate = mode.partition("x")
     is_number = all(word.isdecimal() and len(word) < 6 for word in (columns, rate))
-    if not is_number or int(columns) == 0 or int(rate) == 0:
+    if not is_number or not 0 < int(columns) <= _MOST_COLUMNS or int(rate) == 0:
         raise InputError(f"{source}: lidar_mode = {mode!r:.40}: expected <columns>x<Hz>, one of {', '.join(MODES)}")
     return int(columns)
 
@@ -143,6 +148,8 @@ def _pixel_shift(document: Mapping[str, Any], source: str, height: int, columns:
         raise InputError(
             f"{source}: pixel_shift_by_row must hold {height} numbers, one for each beam, got {len(shift)}"
         )
+    if np.abs(shift).max(initial=0.0) > _MOST_COLUMNS:
+        raise InputError(f"{source}: pixel_shift_by_row exceeds the {_MOST_COLUMNS} columns that a revolution may have")
     return [int(value) for value in shift]
 
 
@@ -183,4 +190,6 @@ def _matrix(values: Any, source: str, key: str) -> Float64Array:
     numbers = _numbers(values, source, key)
     if len(numbers) != 16:
         raise InputError(f"{source}: {key} must hold 16 numbers, got {len(numbers)}")
+    if np.abs(numbers).max() > _LARGEST_ENTRY:
+        raise InputError(f"{source}: {key} holds numbers beyond {_LARGEST_ENTRY:g}: expected millimetres")
     return numbers.reshape(4, 4).copy()

@@ -137,8 +137,6 @@ def read_shard(path: Path, names: tuple[str, ...] = ()) -> tuple[dict[str, npt.N
 
 
 def _read(path: Path, names: tuple[str, ...]) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-    if not path.is_file():
-        raise InputError(f"{path}: no such shard: run the command that made the folder again")
     arrays, metadata = read_tensors(path, _SPECS, names, remedy=_REMEDY)
     try:
         about = parse_json(metadata["tunnelcd"])

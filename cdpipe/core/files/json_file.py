@@ -35,7 +35,7 @@ def parse_json(text: str | bytes, *, is_finite: bool = False) -> Any:
     except RecursionError as error:
         raise ValueError(f"nested deeper than {MAX_DEPTH} levels") from error
     level: list[Any] = [document]
-    for _ in range(MAX_DEPTH + 1):
+    for _ in range(MAX_DEPTH):
         level = [inner for outer in level for inner in _check_values(outer, is_finite)]
         if not level:
             return document

@@ -54,7 +54,7 @@ def read_npz(
         InputError: The file is missing, cut short, damaged, no npz of plain arrays, or holds other arrays than
             expected.
     """
-    n_bytes = require_plain_file(path)
+    n_bytes = require_plain_file(path, expected=remedy)
     end = f": {remedy}" if remedy else ""
     try:
         with path.open("rb") as file, zipfile.ZipFile(file) as archive:
@@ -79,8 +79,8 @@ def _list_members(file: IO[bytes], archive: zipfile.ZipFile, n_bytes: int) -> di
     """Return the members by the name of their array, after checking that they and the directory are the whole file."""
     members = archive.infolist()
     file.seek(-_END.size, io.SEEK_END)
-    signature, _, _, n_here, n_all, *_ = _END.unpack(file.read(_END.size))
-    if signature != b"PK\x05\x06" or {n_here, n_all} - {len(members), _IN_ZIP64_RECORD}:
+    signature, _, _, n_here, n_all, _, _, n_comment = _END.unpack(file.read(_END.size))
+    if signature != b"PK\x05\x06" or n_comment or {n_here, n_all} - {len(members), _IN_ZIP64_RECORD}:
         raise ValueError(f"its directory lists {len(members)} arrays and counts {n_all}")
     end, allowed_gaps = 0, {0}
     for member in sorted(members, key=lambda member: member.header_offset):

@@ -49,7 +49,7 @@ def read_tensors(
     Raises:
         InputError: The file is missing, damaged, or holds other tensors than expected.
     """
-    n_bytes = require_plain_file(path)
+    n_bytes = require_plain_file(path, expected=remedy)
     end = f": {remedy}" if remedy else ""
     try:
         if n_bytes < _LENGTH_BYTES:
