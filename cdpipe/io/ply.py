@@ -105,5 +105,6 @@ def _vertices(content: bytes, header: _Header) -> Float64Array:
         n_found = (len(content) - header.size) // dtype.itemsize
         if n_found >= header.n_vertices:
             table = np.frombuffer(content, dtype, header.n_vertices, header.size)
-            return np.column_stack([table[f"{names.index(axis)}"] for axis in "xyz"]).astype(np.float64)
+            with np.errstate(invalid="ignore"):  # a NaN that signals; readers refuse any
+                return np.column_stack([table[f"{names.index(axis)}"] for axis in "xyz"]).astype(np.float64)
     raise ValueError(f"{header.n_vertices} vertices are announced, {n_found} are there: it is damaged or cut short")

@@ -40,7 +40,7 @@ def read_tum(path: Path) -> tuple[Float64Array, tuple[int, ...]]:
     if not is_stamp.all():
         bad = int(np.argmin(is_stamp))
         raise InputError(
-            f"{path}:{numbers[bad]}: stamp = {rows[bad, 0]:g}: expected seconds, finite and below {_MOST_STAMP_S:g}"
+            f"{path}:{numbers[bad]}: the stamp is {rows[bad, 0]:g}: expected seconds below {_MOST_STAMP_S:g}"
         )
     return rows, numbers
 

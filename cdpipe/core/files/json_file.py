@@ -79,7 +79,12 @@ def _check_values(outer: Any, is_finite: bool) -> list[Any]:
         if kind is dict or kind is list:
             within.append(value)
         elif kind is int and abs(value) >= _MAX_INTEGER:
-            raise ValueError("a whole number is beyond 64 bits")
+            raise ValueError(f"{_name(outer, value)} is beyond 64 bits")
         elif is_finite and kind is float and not math.isfinite(value):
-            raise ValueError(f"{value} is no finite number")
+            raise ValueError(f"{_name(outer, value)} is {value}, no finite number")
     return within
+
+
+def _name(outer: Any, value: Any) -> str:
+    names = [name for name, each in outer.items() if each is value] if isinstance(outer, dict) else []
+    return f"{names[0]:.40}" if names else "a number"

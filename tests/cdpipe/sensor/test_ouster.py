@@ -120,7 +120,7 @@ UP_TO = [20.0 - n for n in range(32)]
         ({"beam_azimuth_angles": ["left"]}, r"beam_azimuth_angles\[0\] .*'left'"),
         ({"beam_altitude_angles": [*UP_TO[:3], "12.5"]}, r"beam_altitude_angles\[3\] .*'12.5'"),
         ({"beam_altitude_angles": [True]}, r"beam_altitude_angles\[0\] .*True"),
-        ({"beam_altitude_angles": [10**400]}, r"beam_altitude_angles\[0\] "),
+        ({"beam_altitude_angles": [10**400]}, "beyond 64 bits"),
         ({"beam_azimuth_angles": 4.0}, "beam_azimuth_angles "),
         ({"beam_azimuth_angles": [UP_TO]}, r"beam_azimuth_angles\[0\] .*\[20.0"),
         ({"beam_azimuth_angles": {"0": 1.0}}, "beam_azimuth_angles "),
@@ -143,7 +143,7 @@ UP_TO = [20.0 - n for n in range(32)]
         ({"lidar_origin_to_beam_origin_mm": float("inf")}, "inf mm"),
         ({"lidar_origin_to_beam_origin_mm": "far"}, "'far'"),
         ({"lidar_origin_to_beam_origin_mm": "15.8"}, "must be a number, got '15.8'"),
-        ({"lidar_origin_to_beam_origin_mm": 10**400}, "lidar_origin_to_beam_origin_mm "),
+        ({"lidar_origin_to_beam_origin_mm": 10**400}, "lidar_origin_to_beam_origin_mm is beyond 64 bits"),
         ({"lidar_mode": "9" * 5000 + "x10"}, "expected <columns>x<Hz>"),
         (
             {"beam_to_lidar_transform": [1, 0, 0, 15.806, 0, 1, 0, 0, 0, 0, 1, 65.0, 0, 0, 0, 1]},
@@ -192,7 +192,7 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.json: missing: expected the metadata"):
         load_profile(str(tmp_path / "none.json"))
     (tmp_path / "folder.json").mkdir()
-    with pytest.raises(InputError, match="directory"):
+    with pytest.raises(InputError, match="folder"):
         load_profile(str(tmp_path / "folder.json"))
 
 

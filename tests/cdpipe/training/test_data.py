@@ -152,7 +152,7 @@ def test_a_damaged_shard_is_told(folder: Path) -> None:
     with pytest.raises(InputError, match="damaged"):
         read_about(path)
     path.unlink()
-    with pytest.raises(InputError, match="missing: .*run the command that made the folder"):
+    with pytest.raises(InputError, match=r"missing: .*run the command that made the folder"):
         ChangePairs(open_dataset(folder, "train"))
 
 

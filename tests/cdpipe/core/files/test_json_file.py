@@ -41,7 +41,7 @@ def test_64_levels_are_read() -> None:
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
 def test_undefined_numbers_are_refused_where_none_may_be(number: str) -> None:
     assert isinstance(parse_json(f'{{"a": [{number}]}}')["a"][0], float)
-    with pytest.raises(ValueError, match="is no finite number"):
+    with pytest.raises(ValueError, match=r"a number is .*, no finite number"):
         parse_json(f'{{"a": [{number}]}}', is_finite=True)
 
 
