@@ -121,5 +121,5 @@ report: $(VENV)/.installed
 	$(BIN)/tunnelcd report $(OUT)
 
 clean:
-	rm -rf mutants $(VENV) $(LOWEST) $(NEWEST) $(AUDIT) $(MUTANTS) .venv-python* build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf mutants $(VENV) $(LOWEST) $(NEWEST) $(AUDIT) $(MUTANTS) .venv-python* build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -156,6 +156,8 @@ def _sentence(data: RunData, merges: pd.DataFrame) -> str:
         parts.append(f"{len(bad) - n_unmade} of {len(results)} cases {meaning}")
     if n_unmade:
         parts.append(f"{n_unmade} have no world and are left out")
+    if n_assumed := int((numbers(results, "is_auroc_assumed")[(results["status"] == "ok").to_numpy()] == 1).sum()):
+        parts.append(f"{_counted(n_assumed, 'answer')} without keyframe scores: AUROC 0.5 is assumed")
     own = merges[merges["family"] == ALL_FAMILIES] if len(merges) else merges
     wrong = (numbers(results, "merge_error_m") > RIGHT_M) | (numbers(results, "merge_error_deg") > RIGHT_DEG)
     # where pairs have a kind, a merge of sessions without a common place is wrong too

@@ -1,7 +1,7 @@
 """What a run says about regions: a row for every method, in and out of the training distribution.
 
 The unit is the session pair. A pair without an answer counts as missing all its changes, has an AUROC of 0.5, and is
-never silent. `n_auroc` counts the pairs with places near a change and far from any.
+never silent. `n_auroc` counts the pairs with places near a change and far from any, `n_auroc_assumed` those without any score.
 """
 
 from __future__ import annotations
@@ -117,6 +117,7 @@ def _counts(own: pd.DataFrame) -> dict[str, Any]:
         "n_refused": int((own["status"] == "merge_refused").sum()),
         "n_failed": int((own["status"] != "ok").sum()),
         "n_auroc": int(np.count_nonzero(~np.isnan(numbers(own, "region_auroc")))),
+        "n_auroc_assumed": int(np.nansum(numbers(own, "is_auroc_assumed"))),
         "n_changed": int(np.count_nonzero(numbers(own, "n_observable") > 0)),
         "n_observable": int(np.nansum(numbers(own, "n_observable"))),
         "n_found": int(np.nansum(numbers(own, "n_found_changes"))),
