@@ -220,15 +220,15 @@ def test_a_grid_holds_means_and_frames_the_best_as_written() -> None:
 def test_every_scenario_has_a_bar_for_each_method_over_its_pairs() -> None:
     rows = [
         {"scenario": world, "seed": seed, "variant": name, "region_recall_at_k": 0.5, "region_auroc": 0.25 * seed,
-         "object_iou_point": 0.1}
+         "object_iou_point": 0.1, "object_f1_50": 0.2}
         for world in ("narrow", "wide") for name in ("a", "b") for seed in (1, 3)
     ]  # fmt: skip
     (chart,) = draw_scenarios(run(rows))
     figure = accepted(chart.drawing)
     traces = figure.data
-    assert len(traces) == 6
+    assert len(traces) == 8
     auroc = [trace for trace in traces if trace.yaxis == "y2"]
-    assert figure.layout.xaxis3.ticktext == ("narrow<br>n 2", "wide<br>n 2")
+    assert figure.layout.xaxis4.ticktext == ("narrow<br>n 2", "wide<br>n 2")
     assert auroc[0].y == (0.5, 0.5)
     # two pairs of 0.25 and 0.75: some draws hold one of them only
     assert auroc[0].error_y.array == pytest.approx((0.25, 0.25))

@@ -644,6 +644,10 @@ def test_the_kind_of_a_pair_is_a_column(merges: RunFolder) -> None:
 def test_scoring_again_keeps_the_kind_and_the_end(merges_copy: RunFolder) -> None:
     before = table(merges_copy)
     shutil.copytree(merges_copy.answer(ONE_BOX, 20000, "tunnelcd"), merges_copy.answer(ONE_BOX, 20000, "theirs"))
+    foreign = merges_copy.answer(ONE_BOX, 20000, "theirs") / "answer.json"
+    with pytest.raises(InputError, match=r"theirs/answer\.json: until = 'merge': a plan alone"):
+        rescore(merges_copy)
+    foreign.write_text(foreign.read_text().replace('"until": "merge"', '"until": null'))
     rescore(merges_copy)
     after = table(merges_copy)
     theirs = after[after["variant"] == "theirs"]
