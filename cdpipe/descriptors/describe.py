@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,7 @@ def save_descriptors(
         InputError: The file cannot be written, or would lie elsewhere because `descriptors` is a link.
     """
     path = folder / "descriptors" / f"{descriptors.name}.npz"
-    partial = path.with_suffix(".partial.npz")
+    partial = path.with_name(f".{path.stem}.partial.npz")
     optional: dict[str, npt.NDArray[Any]] = {} if descriptors.w is None else {"w": descriptors.w}
     if descriptors.spheres is not None:
         optional |= {"spheres": descriptors.spheres, "spheres_of": np.array(_spheres_of(map_config))}
@@ -93,6 +94,8 @@ def save_descriptors(
         )
         partial.replace(path)
     except OSError as error:
+        with suppress(OSError):  # a closed folder does not even let look
+            partial.unlink()
         raise InputError(f"{path}: cannot write there: {error.strerror}") from error
     return path
 

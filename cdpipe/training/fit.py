@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
@@ -174,12 +175,13 @@ def _save(
     document = {"format": FORMAT, "format_version": FORMAT_VERSION, "identity": identity}
     about = json.dumps({**document, "history": [asdict(done) for done in history]})
     content = save({name: tensor.clone().contiguous() for name, tensor in tensors.items()}, {"about": about})
-    partial = path.with_suffix(".partial")
+    partial = path.with_name(f".{path.name}.partial")
     try:
         partial.write_bytes(content)
         partial.replace(path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # a closed folder does not even let look
+            partial.unlink()
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
 
 

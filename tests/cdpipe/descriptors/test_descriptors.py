@@ -1,3 +1,5 @@
+import errno
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,6 +75,21 @@ def test_descriptors_are_unit_vectors_and_survive_the_disk(tmp_path: Path, metho
     np.savez(path, q=made.q)
     with pytest.raises(InputError, match=r"damaged"):
         load_descriptors(tmp_path, config, poses, MapConfig())
+
+
+def test_descriptors_that_do_not_fit_on_the_disk_leave_no_part_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = describe_scans(_Source(), np.array([0, 2]), DescriptorConfig())
+
+    def full(path: Path, **_: object) -> None:
+        path.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(InputError, match="No space left on device"):
+        save_descriptors(tmp_path, made, _Source.odom_T_sensor, MapConfig())
+    assert list((tmp_path / "descriptors").iterdir()) == []
 
 
 def test_stored_spheres_are_used_with_their_weights_precision_and_map_alone(
