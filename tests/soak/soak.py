@@ -104,9 +104,10 @@ COMMANDS: Mapping[str, Written] = {
     "convert to OSF": Written("convert pair/before osf/a.osf", "osf", {"pair": "simulate/pair"}),
     "convert from OSF": Written("convert osf/a.osf session", "session", {"osf": "convert to OSF/osf"}, is_once=True),
     "dataset": Written(f"dataset smoke/one_box --seeds 9998:10002 --draws 1 {_SET} --out data", "data"),
-    "train sphere": Written("train data --steps 6 --threads 1 --out weights", "weights", {"data": "dataset/data"}),
+    # two validations, and so a state to go on from
+    "train sphere": Written("train data --steps 300 --threads 1 --out weights", "weights", {"data": "dataset/data"}),
     "train 3deg": Written(
-        "train data --descriptor 3deg --steps 600 --threads 1 --out weights", "weights", {"data": "dataset/data"}
+        "train data --descriptor 3deg --steps 2 --threads 1 --out weights", "weights", {"data": "dataset/data"}
     ),
     "report": Written("report run", "run", {"run": "run/run"}),
     "score a run": Written("score run", "run", {"run": "run/run"}),
