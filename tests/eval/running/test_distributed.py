@@ -28,7 +28,6 @@ from cdpipe.core.names import path_part
 from eval.core import cluster, progress
 from eval.core.cluster import Where
 from eval.core.progress import Lines
-from eval.plans.files import plan_names
 from eval.plans.plan import Plan, expand_cells, load_plan
 from eval.running import pair_run, runner
 from eval.running.pair_run import Made, Tools
@@ -371,7 +370,7 @@ def test_a_machine_is_shared_where_two_tasks_run_at_a_time() -> None:
     assert cluster.n_slots(cluster_of(a_1=2, b_1=1)) == 3
 
 
-@pytest.mark.parametrize("name", plan_names())
+@pytest.mark.parametrize("name", ["objects", "merge-noise", "merge-gates"])  # oracles, an early end
 def test_a_task_is_the_same_after_its_way_through_json(tmp_path: Path, name: str) -> None:
     plan = load_plan(name)
     plan = plan.model_copy(update={"seeds": plan.seeds[:1]})
