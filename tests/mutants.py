@@ -113,7 +113,6 @@ def report_results(
     alive = {mutant for mutant, code in results if code in (_SURVIVED, _UNTESTED)}
     listed = {mutant for mutant in alive if mutant in single or any(equal.explains(mutant) for equal in everywhere)}
     wrong = [f"survives and is not listed in {LIST.name}:\n  {mutant}" for mutant in sorted(alive - listed)]
-    wrong += [f"listed, but dead or gone:\n  {mutant}" for mutant in sorted(set(single) - alive)]
     wrong += [f"not run:\n  {mutant}" for mutant, code in results if code is _NOT_RUN]
     rows = ["| file | mutants | dead | alive, listed | alive, not listed | dead [%] |", "|---|---|---|---|---|---|"]
     for file in [*sorted({mutant.file for mutant, _ in results}), "all"]:
@@ -143,8 +142,10 @@ def main() -> int:
         shutil.rmtree(MADE, ignore_errors=True)
         mutmut = [sys.executable, "-m", "mutmut", "run", "--max-children", str(asked.processes)]
         subprocess.run(mutmut, cwd=ROOT, check=True)
-    table, wrong = report_results(list(read_results()), *read_list())
-    print("\n".join([*wrong, "", table]))
+    results, (everywhere, single) = list(read_results()), read_list()
+    table, wrong = report_results(results, everywhere, single)
+    dead = sorted(set(single) & {mutant for mutant, code in results if code not in (_SURVIVED, _UNTESTED, _NOT_RUN)})
+    print("\n".join([*wrong, *(f"listed, but dead: remove\n  {mutant}" for mutant in dead), "", table]))
     if asked.out is not None:
         asked.out.write_text(table + "\n")
     return 1 if wrong else 0

@@ -71,7 +71,6 @@ def test_the_table_by_hand() -> None:
 @pytest.mark.parametrize(
     ("codes", "listed", "told"),
     [
-        ((1, 1), [FIRST], "dead or gone"),
         ((1, 0), [SECOND], "at least 92%"),
         ((1, None), [], "not run"),
     ],

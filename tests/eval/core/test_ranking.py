@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import stream
-from eval.core.ranking import auroc, average_precision
+from eval.core.ranking import auroc, average_precision, last_of_ties
 
 
 def auroc_by_pairs(scores: np.ndarray, is_positive: np.ndarray) -> float:
@@ -63,3 +63,13 @@ def test_a_keyframe_without_a_score_ranks_last() -> None:
     for score in (auroc, average_precision):
         assert score(np.array([-5.0, np.nan, np.nan]), labels) == 1.0
         assert score(np.array([np.nan, -5.0, 0.0]), labels) == score(np.array([-9.0, -5.0, 0.0]), labels)
+
+
+@pytest.mark.parametrize(
+    ("falling", "last"),
+    [([3.0, 3.0, 2.0, 1.0, 1.0], [1, 2, 4]), ([5.0], [0]), ([2.0, 1.0], [0, 1]), ([1.0, 1.0], [1]), ([], [])],
+)
+def test_a_threshold_lies_behind_the_last_of_equal_scores(falling: list[float], last: list[int]) -> None:
+    found = last_of_ties(np.array(falling))
+    assert found.tolist() == last
+    assert found.dtype == np.int64

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import make_pose
+from cdpipe.core.geometry import make_pose, stream
 from cdpipe.model.report import ChangedObject
-from eval.scoring.merge_metrics import compute_merge_errors, measure_overlap
+from eval.scoring.merge_metrics import _along, compute_merge_errors, find_travel_directions, measure_overlap
 from eval.scoring.object_metrics import judge_kinds, match_objects
-from eval.scoring.region_metrics import transform_to_map, transform_to_world
+from eval.scoring.region_metrics import measure_covered_share, transform_to_map, transform_to_world
 from eval.truth.ground_truth import SessionTruth, ground_truth, load_ground_truth
 from eval.truth.scoring_points import ScoringPoints
+from tests.eval.changes import change
+from tests.eval.scoring.test_object_metrics import ground_truth as object_truth
 from tests.eval.scoring.test_object_metrics import moved_pair, span, thing
 from tests.eval.scoring.test_region_metrics import EMPTY
 from tests.eval.scoring.test_scoring import scored, true_report
@@ -46,12 +48,13 @@ def test_a_merge_is_judged_against_the_place_that_is_nearest_in_height_as_well()
     # at the top, the before odometry is 1 m off and the after odometry is right
     np.testing.assert_allclose(errors.metres, [0.0, 0.0, 1.0], atol=1e-12)
     # 5 m are 5 m in any direction
-    for height_m, n_pairs in ((4.9, 1), (5.1, 0)):
+    for height_m, n_pairs in ((4.9, 1), (5.0, 1), (5.1, 0)):
         above = at((0.0, 0.0, 6.0 + height_m))
-        assert len(compute_merge_errors(before, SessionTruth(above, above, EMPTY), np.eye(4)).metres) == n_pairs
+        errors = compute_merge_errors(before, SessionTruth(above, above, EMPTY), np.eye(4))
+        assert [len(part) for part in (errors.metres, errors.degrees, errors.along_m)] == [n_pairs] * 3
 
 
-@pytest.mark.parametrize(("height_m", "share"), [(4.9, 1.0), (5.1, 0.0)])
+@pytest.mark.parametrize(("height_m", "share"), [(4.9, 1.0), (5.0, 1.0), (5.1, 0.0)])
 def test_a_level_above_overlaps_only_within_five_metres(height_m: float, share: float) -> None:
     level = at((0.0, 0.0, 0.0), (10.0, 0.0, 0.0))
     assert measure_overlap(level, level + make_pose(translation=(0, 0, height_m)) - np.eye(4)) == share
@@ -119,3 +122,51 @@ def test_a_half_of_a_move_that_names_no_partner_is_wrong_where_the_other_half_wa
     right = judge_kinds(objects, matches, truth)
     assert np.isnan(right[0])
     assert right[1] == 0.0
+
+
+def test_the_middle_of_a_step_at_exactly_the_radius_is_covered() -> None:
+    x_m = np.arange(41) * 0.25
+    positions = np.column_stack([x_m, np.zeros(41), np.zeros(41)])
+    sphere = np.array([(2.0, 0.0, 0.0)])
+    # the middles at 1.875 and 2.125 m
+    assert measure_covered_share(positions, x_m, sphere, 0.125) == 2 / 40
+    assert measure_covered_share(positions, x_m, sphere, np.nextafter(0.125, 0.0)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("length_m", "middles_m"),
+    [(0.0, []), (0.05, [0.025]), (0.1, [0.05]), (0.25, [0.25 / 6, 0.125, 1.25 / 6])],
+)
+def test_a_path_is_cut_into_equal_steps_of_at_most_a_tenth_of_a_metre(length_m: float, middles_m: list[float]) -> None:
+    # two thirds of the way along x, the last third along z; a robot at rest at either end adds nothing
+    corner, end = (length_m * 2 / 3, 1.0, 2.0), (length_m * 2 / 3, 1.0, 2.0 + length_m / 3)
+    found = _along(at((0.0, 1.0, 2.0), (0.0, 1.0, 2.0), corner, end, end))
+    on_x = np.minimum(middles_m, length_m * 2 / 3)
+    np.testing.assert_allclose(found[:, 0], on_x, atol=1e-12)
+    np.testing.assert_allclose(found[:, 2] - 2.0, middles_m - on_x, atol=1e-12)
+    assert found.shape == (len(middles_m), 3) and (found[:, 1] == 1.0).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_direction_of_travel_equals_its_slow_twin(seed: int) -> None:
+    draw = stream(seed, "travel")
+    # steps of 0, 1/8 or 1/2 m along the axes, so that chords end exactly half a metre away
+    steps = np.eye(3)[draw.integers(0, 3, 40)] * draw.choice([0.0, 0.125, 0.5], 40)[:, None]
+    places = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
+    found = find_travel_directions(at(*(tuple(place) for place in places)))
+    for index in range(len(places)):
+        behind = [k for k in range(len(places)) if along[k] <= along[index] - 0.5] or [0]
+        ahead = [k for k in range(len(places)) if along[k] >= along[index] + 0.5] or [len(places) - 1]
+        chord = places[ahead[0]] - places[behind[-1]]
+        np.testing.assert_allclose(found[index], chord / np.linalg.norm(chord), atol=1e-12)
+
+
+def test_an_object_with_exactly_half_of_its_rows_elsewhere_is_false() -> None:
+    # cells 20 to 29 are on a change that nobody could see
+    hidden = change(1, is_observable=False)
+    truth = object_truth([hidden], after=[0] * 20 + [1] * 10 + [0] * 10)
+    matches = match_objects([thing(), thing()], [span(15, 25), span(14, 25)], truth)
+    assert matches.outcomes == ("false", "false")
+    assert match_objects([thing()], [span(16, 25)], truth).outcomes == ("ignored",)
+    assert (matches.matched_object.tolist(), matches.matched_change.tolist()) == ([-1], [-1, -1])
