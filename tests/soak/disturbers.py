@@ -87,8 +87,7 @@ class OwnCluster:
         if self._scheduler is None or self._scheduler.poll() is not None:
             host = ("--host", "127.0.0.1", "--port", str(self._port))
             self._scheduler = self._dask("distributed.cli.dask_scheduler", *host)
-        self._resize(self._rng.randint(1, MOST_WORKERS))
-        self._wait_for_a_worker()
+        self._wait_for_a_worker(self._rng.randint(1, MOST_WORKERS))
         return Command(["run", self._plan, "--out", "run", "--quiet", "--scheduler", self._address], self._folder)
 
     def disturb(self, client: Command) -> str:
@@ -119,11 +118,12 @@ class OwnCluster:
             self._dask("distributed.cli.dask_worker", self._address, "--nthreads", "1") for _ in range(missing)
         ]
 
-    def _wait_for_a_worker(self) -> None:
+    def _wait_for_a_worker(self, n_workers: int) -> None:
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
-        for _ in range(20):
-            with contextlib.suppress(OSError, TimeoutError), distributed.Client(self._address, timeout=10) as client:
-                client.wait_for_workers(1, timeout=60)
+        for _ in range(60):
+            self._resize(n_workers)  # workers of a killed scheduler end after a while
+            with contextlib.suppress(OSError), distributed.Client(self._address, timeout=10) as client:
+                client.wait_for_workers(1, timeout=10)
                 return
             time.sleep(0.2)
         raise TimeoutError(f"{self._address}: no worker comes")
