@@ -82,11 +82,14 @@ class Series:
 
     @property
     def intervals(self) -> Float64Array | None:
-        """(2, N) lengths of the intervals below and above the points."""
+        """(2, N) lengths of the intervals below and above the points; 0 where a point lies beyond its interval's end.
+
+        A bootstrap interval need not hold its estimate.
+        """
         if self.low is None or self.high is None:
             return None
         middle = np.asarray(self.x if self.is_across else self.y, dtype=np.float64)
-        return np.stack([middle - np.asarray(self.low), np.asarray(self.high) - middle])
+        return np.maximum([middle - np.asarray(self.low), np.asarray(self.high) - middle], 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -239,3 +239,10 @@ def test_the_library_can_stand_inside_a_page() -> None:
     script = plotly_script()
     assert "</script" not in script
     assert len(script) > 1_000_000
+
+
+def test_a_point_beyond_its_interval_is_drawn() -> None:
+    series = Series([0.0, 1.0], [0.5, NAN], low=[0.6, NAN], high=[0.8, NAN])
+    np.testing.assert_allclose(series.intervals, [[0.0, NAN], [0.3, NAN]])
+    (drawn,) = picture(one_panel(series)).axes[0].collections
+    np.testing.assert_allclose(drawn.get_segments()[0][:, 1], [0.5, 0.8])
