@@ -1,0 +1,261 @@
+"""Large input: peak memory and time of `detect` on 10 km, of a score of 1,000 changes, and of a plan of 5,000 cells.
+
+    python -m tests.trust.load [--only maps|changes|cells] [--km 10] [--changes 1000] [--cells 5000]
+
+Every row is measured in a process of its own; `maps` has a row for each stage. Ends with 1 if a limit is exceeded.
+Needs Linux, which says the peak memory of a part of a process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+import cdpipe
+from cdpipe.core.geometry import make_pose, stream, yaw_pose
+from cdpipe.io.answer import Answer
+from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
+from cdpipe.pipeline import Done, Hooks
+from eval.plans.plan import expand_cells, load_plan
+from eval.plans.worlds import list_worlds
+from eval.running.pair_run import cell_key
+from eval.running.runfolder import RunFolder, write_json
+from eval.scoring.scoring import score_answer
+from eval.truth.ground_truth import GroundTruth, SessionTruth, ground_truth
+from eval.truth.scoring_points import ScoringPoints
+from scenarios.library import load_scenario
+from scenarios.references import file_digests
+from sim.session.truth import PairTruth
+from tests.eval.changes import change
+from tests.trust.corridor import CorridorScans
+
+MAPS_GB, SCORE_S, PLAN_S, PAGE_MB = 8.0, 60.0, 60.0, 30.0
+# A tunnel of this radius has a million map points a kilometre. A heap lies every 50 m in one session or the other.
+_RADIUS_M, _SPACING_M, _HEAPS_M = 4.4, 2.0, 50.0
+_CELLS_OF_CHANGE, _OTHER_CELLS = 300, 2_000_000
+_N_PIXELS = 1 << 15
+# A cell of the plan `smoke` has a short tunnel; these are the numbers of items of a usual one.
+_ITEMS = {"keyframes": 150, "regions": 15, "objects": 4, "changes": 4}
+
+
+class Row(NamedTuple):
+    """One row of the table; a limit that is not a number is none."""
+
+    what: str
+    size: str
+    peak_gb: float
+    seconds: float
+    limit: str = ""
+    is_within: bool = True
+
+
+class _Meter(Hooks):
+    """Measures the peak memory and the time of each stage of `detect`."""
+
+    def __init__(self) -> None:
+        super().__init__(self._start)
+        self.rows: list[tuple[str, float, float]] = []
+        self._begun: tuple[str, float] | None = None
+
+    def _start(self, name: str, done: int = 0, total: int = 0) -> None:
+        self.stop()
+        Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
+        self._begun = name, time.monotonic()
+
+    def stop(self) -> None:
+        if self._begun is not None:
+            self.rows.append((self._begun[0], _peak_gb(), time.monotonic() - self._begun[1]))
+        self._begun = None
+
+    def time(self, compute: Any) -> Done[Any]:
+        self._start("extract")
+        return super().time(compute)
+
+
+def measure_maps(km: float) -> list[Row]:
+    """Detect changes between two drives of some kilometres."""
+    places = np.arange(_HEAPS_M / 2, 1000 * km, _HEAPS_M)
+    before = CorridorScans(1000 * km, _RADIUS_M, _SPACING_M, places[::2].tolist(), seed=1)
+    pose = yaw_pose(0.7, (30.0, -20.0, 1.0))
+    after = CorridorScans(1000 * km, _RADIUS_M, _SPACING_M, places[1::2].tolist(), seed=2, odom_T_world=pose)
+    meter = _Meter()
+    report = cdpipe.detect(before, after, hooks=meter, settings=["query.threshold=-20"])
+    meter.stop()
+    n_points = [report.evidence[f"map_points_{name}"] / 1e6 for name in ("before", "after")]
+    size = f"{km:g} km, {n_points[0]:.1f} + {n_points[1]:.1f} million map points"
+    stages = [Row(f"detect: {name}", "", peak_gb, seconds) for name, peak_gb, seconds in meter.rows]
+    peak_gb, seconds = max(row.peak_gb for row in stages), sum(row.seconds for row in stages)
+    return [*stages, Row("detect", size, peak_gb, seconds, f"{MAPS_GB:g} GB", peak_gb <= MAPS_GB)]
+
+
+def measure_changes(n: int) -> list[Row]:
+    """Score an answer that finds all of many changes, 10 m apart."""
+    truth = _crowded_truth(n)
+    objects = [_answered(truth, index) for index in range(n)]
+    centres = np.column_stack([10.0 * np.arange(n) + 5.0, np.zeros((n, 2))])
+    pairs = np.zeros((n, 2), dtype=np.int64)
+    scores = stream(0, "scores").random(10 * n + 1)
+    regions = ChangeRegions(centres, 4.5, -np.arange(n, dtype=np.float64), pairs, np.ones(n, np.bool_), scores)
+    scans = np.arange(10 * n + 1)
+    report = ChangeReport(make_pose(), {}, regions, tuple(objects), {}, {}, (scans, scans))
+    start = time.monotonic()
+    row = score_answer(Answer("ok", "", "all", report, {}, {}), truth).row
+    seconds = time.monotonic() - start
+    assert row["object_iou_point"] == row["region_recall"] == 1.0
+    size = f"{n} changes, objects and regions"
+    return [Row("score", size, _peak_gb(), seconds, f"{SCORE_S:g} s", seconds <= SCORE_S)]
+
+
+def measure_cells(n: int) -> list[Row]:
+    """Run a plan whose cells are all finished, and write its tables and its page."""
+    with tempfile.TemporaryDirectory() as folder:
+        plan, run = _finished_plan(Path(folder), n)
+        start = time.monotonic()
+        run_gb = _tunnelcd("run", str(plan), "--out", str(run), "--quiet")
+        run_s = time.monotonic() - start
+        page_gb = _tunnelcd("report", str(run))
+        both_s = time.monotonic() - start
+        page_mb = (run / "index.html").stat().st_size / 1e6
+    return [
+        Row("run: nothing left to do, tables written", f"{n} cells", run_gb, run_s),
+        Row("report", f"page of {page_mb:.1f} MB", page_gb, both_s - run_s, f"{PAGE_MB:g} MB", page_mb <= PAGE_MB),
+        Row("run and report", f"{n} cells", max(run_gb, page_gb), both_s, f"{PLAN_S:g} s", both_s <= PLAN_S),
+    ]
+
+
+def _peak_gb() -> float:
+    status = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in status if line.startswith("VmHWM")) / 1e6
+
+
+def _crowded_truth(n: int) -> GroundTruth:
+    changes = []
+    for number in range(1, n + 1):
+        session, kind = ("before", "removed") if number % 2 else ("after", "added")
+        pose = make_pose(translation=(10.0 * number - 5.0, 0.0, 0.0)).tolist()
+        changes.append(change(number, session, kind, world_T_object=pose))
+    pair = PairTruth("narrow", 0, 4.5, tuple(changes), {}, {})
+    return ground_truth(pair, {"before": _crowded_session(n, 1), "after": _crowded_session(n, 0)})
+
+
+def _crowded_session(n: int, parity: int) -> SessionTruth:
+    """Return a session that drives along x past those of n changes whose number has a parity."""
+    rng = stream(parity, "crowded")
+    ids = np.concatenate([np.repeat(np.arange(2 - parity, n + 1, 2), _CELLS_OF_CHANGE), np.zeros(_OTHER_CELLS, int)])
+    x_m = np.where(ids > 0, 10.0 * ids - 5.0 + rng.uniform(-0.5, 0.5, len(ids)), rng.uniform(0.0, 10.0 * n, len(ids)))
+    order = np.argsort(x_m)
+    points = np.column_stack([x_m, rng.uniform(-0.5, 0.5, (len(ids), 2))])[order].astype(np.float32)
+    scans = np.sort(x_m.astype(np.int64))
+    pixels = np.arange(len(scans)) - np.searchsorted(scans, scans)
+    poses = make_pose(translation=np.column_stack([np.arange(10.0 * n + 1), np.zeros((10 * n + 1, 2))]))
+    nearest_m = np.full(n + 1, 2.0, dtype=np.float32)
+    change_of, instance = ids[order].astype(np.int16), np.zeros(len(ids), dtype=np.int16)
+    found = ScoringPoints(scans * _N_PIXELS + pixels, points, change_of, instance, len(poses), _N_PIXELS, nearest_m)
+    return SessionTruth(poses, poses, found)
+
+
+def _answered(truth: GroundTruth, index: int) -> ChangedObject:
+    """Return the object that is exactly a change."""
+    item, rows = truth.pair.changes[index], truth.change_rows[index]
+    points = truth.sessions[item.session].scoring_points
+    returns = np.column_stack([points.scans(rows), points.pixels(rows)]).astype(np.int32)
+    shape = ObjectShape(make_pose(), np.ones(3), 1.0)
+    return ChangedObject(item.session, item.kind, index, returns, truth.points_odom(index), 1.0, shape=shape)
+
+
+def _finished_plan(folder: Path, n: int) -> tuple[Path, Path]:
+    """Run the plan `smoke`, and copy its cells to as many seeds as make n cells.
+
+    Returns:
+        The plan and its run folder.
+    """
+    plan, run, made = folder / "load.yaml", RunFolder(folder / "run"), RunFolder(folder / "made")
+    _tunnelcd("run", "smoke", "--out", str(made.path), "--quiet")
+    smoke = load_plan("smoke")
+    n_seeds = n // (len(smoke.scenarios) * len(smoke.variants))
+    document = {**smoke.model_dump(mode="json", exclude_unset=True), "seeds": f"20000:{20000 + n_seeds}"}
+    plan.write_text(yaml.safe_dump({**document, "name": "load", "report": ["regions", "objects"]}))
+    cells = expand_cells(load_plan(str(plan)))
+    worlds = {world.label: world for world in list_worlds(smoke.scenarios)}
+    rng = stream(0, "cells")
+    for (name, seed), group in groupby(cells, key=lambda cell: (cell.scenario, cell.seed)):
+        scenario = load_scenario(worlds[name].name, seed, worlds[name].settings)
+        for cell in group:
+            stored = made.read_cell(made.cell(name, smoke.seeds[0], cell.variant))
+            assert stored is not None
+            key = cell_key(cell, worlds[name].pair_kind, scenario, file_digests(scenario))
+            copied = {**_copied(stored, seed, float(rng.uniform(0.9, 1.0))), "key": key}
+            write_json(run.cell(name, seed, cell.variant), copied)
+    write_json(run.path / "provenance.json", made.provenance())
+    return plan, run.path
+
+
+def _copied(stored: Mapping[str, Any], seed: int, factor: float) -> dict[str, Any]:
+    """Return a cell for another seed, its scores times a factor, with as many items as a usual cell has."""
+    copy = json.loads(json.dumps(stored))
+    shares = [
+        key for key, value in copy["row"].items() if type(value) is float and key.startswith(("region_", "object_"))
+    ]
+    copy["row"] |= {"seed": seed, **{key: factor * copy["row"][key] for key in shares}}
+    for table, n in _ITEMS.items():
+        items = [{**item, "seed": seed} for item in copy[table]]
+        if table in ("keyframes", "regions"):
+            items = [{**items[k % len(items)], table[:-1]: k} for k in range(n if items else 0)]
+        copy[table] = items
+    return copy
+
+
+def _tunnelcd(*words: str) -> float:
+    """Run a command and return its peak memory."""
+    command = [sys.executable, "-c", "from eval.cli.main import main; main()", *words]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise RuntimeError(f"{' '.join(words)}: exit code {process.returncode}")
+    return usage.ru_maxrss / 1e6
+
+
+def main() -> int:
+    """Measure, print the table as it grows, and return 1 if a limit is exceeded."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=["maps", "changes", "cells"])
+    parser.add_argument("--km", type=float, default=10.0)
+    parser.add_argument("--changes", type=int, default=1000)
+    parser.add_argument("--cells", type=int, default=5000)
+    chosen = parser.parse_args()
+    every = {
+        "maps": (measure_maps, chosen.km),
+        "changes": (measure_changes, chosen.changes),
+        "cells": (measure_cells, chosen.cells),
+    }
+    sys.stdout.write("| what | size | peak GB | seconds | limit |\n| --- | --- | --- | --- | --- |\n")
+    is_within = True
+    for name, (measure, size) in every.items():
+        if chosen.only in (None, name):
+            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+                rows = process.submit(measure, size).result()
+            for row in rows:
+                verdict = f"{row.limit}: {'met' if row.is_within else 'exceeded'}" if row.limit else ""
+                sys.stdout.write(f"| {row.what} | {row.size} | {row.peak_gb:.2f} | {row.seconds:.1f} | {verdict} |\n")
+            sys.stdout.flush()
+            is_within &= all(row.is_within for row in rows)
+    return 0 if is_within else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
