@@ -1,7 +1,8 @@
 """What a run says about regions: a row for every method, in and out of the training distribution.
 
 The unit is the session pair. A pair without an answer counts as missing all its changes, has an AUROC of 0.5, and is
-never silent. `n_auroc` counts the pairs with places near a change and far from any, `n_auroc_assumed` those without any score.
+never silent. `n_auroc` counts the pairs with places near a change and far from any, `n_auroc_assumed` those without any
+score.
 """
 
 from __future__ import annotations
