@@ -24,6 +24,7 @@ from cdpipe.core.yamlfile import suggest
 from cdpipe.model.config import preset_names
 from eval.core.output import remove
 from eval.core.progress import RunProgress, Silent
+from eval.core.tablefile import read_table
 from eval.plans.coverage import read_stored_plan
 from eval.plans.plan import list_planned_cases
 from eval.running.export import copy_pair, list_pairs, name_blindly
@@ -110,7 +111,7 @@ def evaluate(predict: Callable[[Path, Path], object], run: Path | str, name: str
             remove(pair)
             remove(answer)
         add_predictions(folder, answers, name)
-    results = pd.read_csv(folder.path / "results.csv")
+    results = read_table(folder.path / "results.csv")
     return results[results["variant"] == name]
 
 
