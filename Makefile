@@ -15,7 +15,9 @@ PYTHONS ?= python3.11 python3.13
 # One process per core and one thread in each; the tests of one file stay in one process and share what it has set up.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
 
-.PHONY: setup demo test test-lowest lowest test-newest test-pythons audit soak load sweep mutants check report clean
+FUZZ_INPUTS ?= 100000
+
+.PHONY: setup demo test test-lowest lowest test-newest test-pythons audit fuzz soak load sweep mutants check report clean
 
 setup: $(VENV)/.installed-dev
 
@@ -114,6 +116,10 @@ $(MUTANTS)/.installed: pyproject.toml constraints.txt
 		--editable '.[test]'
 	$(MUTANTS)/bin/python -m pip --disable-pip-version-check install --quiet mutmut==3.8.1
 	touch $@
+
+# Damaged files for every reader; fuzz/kept holds what was not read as it should, fuzz/table.md the counts.
+fuzz: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.trust.fuzz --inputs $(FUZZ_INPUTS) --processes $(TEST_PROCESSES) --keep fuzz --out fuzz/table.md
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

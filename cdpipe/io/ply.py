@@ -87,6 +87,8 @@ def _parse_header(content: bytes) -> _Header:
 
 
 def _vertices(content: bytes, header: _Header) -> Float64Array:
+    if header.n_vertices > len(content):
+        raise ValueError(f"{header.n_vertices:.3g} vertices are announced in a file of {len(content)} bytes")
     names = [name for name, _ in header.properties]
     if header.encoding == "ascii":
         lines = content[header.size :].split(b"\n", header.n_vertices)[: header.n_vertices]

@@ -87,6 +87,8 @@ def read_sphere_data(tunnels: Sequence[TunnelShard]) -> SphereData:
     for place, tunnel in enumerate(tunnels):
         arrays, about = read_shard(tunnel.path, names)
         covered = arrays["is_covered"]
+        if not ((ids := arrays["change_ids"]) > 0).all() or (ids > 255).any():
+            raise InputError(f"{tunnel.path}: damaged: change_ids are 1 to 255: make the dataset again")
         marks = np.zeros(256, np.uint8)
         marks[arrays["change_ids"]] = np.where(arrays["change_is_observable"], _CHANGED, _UNCOUNTED)
         parts["before_m"].append(arrays["before_images"][covered])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,11 +23,18 @@ from eval.running.runfolder import RunFolder, read_json
 from eval.tables.rows import records, with_domain
 
 Row = Mapping[str, Any]
-REQUIRED = ("scenario", "seed", "variant", "status")
+_CASE = ("scenario", "seed", "variant")
+REQUIRED = (*_CASE, "status")
 # No figure of a pair is larger: a terabyte has 1e12 bytes, a century 3e9 seconds.
 LARGEST = 1e15
 # ends of bins and of intervals, of which the last bin has none
 _UNBOUNDED = ("low", "high")
+# Columns of text; every other one holds numbers or truth values.
+_TEXTS = {
+    "scenario", "variant", "preset", "family", "pair_kind", "domain", "commit", "status", "error", "session", "name",
+    "kind", "prop_kind", "group", "why_not", "matched_kind", "outcome", "found_changes",
+}  # fmt: skip
+_IDS = re.compile(r"\d{1,9}(;\d{1,9})*")
 _PICTURED = ("paper", "tunnelcd", "voxel-diff")
 
 
@@ -318,6 +326,7 @@ def _require_cases(path: Path, results: pd.DataFrame) -> None:
 def _rows(path: Path, left_out: list[str]) -> tuple[Row, ...]:
     """Return the rows of a table; a sentence about figures that are read as NaN is added to `left_out`."""
     frame = read_table(path)
+    _require_values(path, frame)
     counts = {name: int((frame[name].abs() > LARGEST).sum()) for name in _figures(frame)}
     if told := ", ".join(f"{name} ({n})" for name, n in counts.items() if n):
         left_out.append(
@@ -325,6 +334,19 @@ def _rows(path: Path, left_out: list[str]) -> tuple[Row, ...]:
             f"`tunnelcd score {path.parent}` scores the answers again."
         )
     return tuple(records(_without_unusable(frame)))
+
+
+def _require_values(path: Path, frame: pd.DataFrame) -> None:
+    """Refuse text among numbers, which no mean or chart can hold, and rows without the columns that name them."""
+    if absent := {*_CASE} - set(frame) if len(frame) else set():
+        raise InputError(f"{path}: column {', '.join(sorted(absent))} is missing: expected a table of `tunnelcd run`")
+    for name in frame:
+        if pd.api.types.is_numeric_dtype(frame[name]) or (name in _TEXTS and name != "found_changes"):
+            continue
+        for line, value in enumerate(frame[name], start=2):
+            is_right = _IDS.fullmatch(value) if name == "found_changes" and isinstance(value, str) else None
+            if not (is_right or isinstance(value, bool) or pd.isna(value)):
+                raise InputError(f"{path}:{line}: {name} = {value!r:.40}: expected a number")
 
 
 def _without_unusable(frame: pd.DataFrame) -> pd.DataFrame:

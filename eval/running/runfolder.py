@@ -48,6 +48,7 @@ from eval.tables.region_table import FILES as REGION_FILES
 from eval.tables.region_table import region_tables
 
 IDENTITY = ("scenario", "seed", "variant")
+_NAMED = {"scenario": str, "seed": int, "variant": str}
 ITEM_TABLES = ("changes", "regions", "objects", "keyframes")
 _MAPS = {"before_points": ArraySpec("N,3", "float32"), "after_points": ArraySpec("M,3", "float32")}
 # what readers of an empty table may ask for
@@ -101,7 +102,7 @@ class RunFolder:
             InputError: It is of a newer tunnelcd.
         """
         document = read_json(path)
-        if not {"key", "order", "row", *ITEM_TABLES} <= set(document):
+        if not {"key", "order", "row", *ITEM_TABLES} <= set(document) or not _holds_rows(document):
             return None
         _require_format(path, document)
         return document
@@ -300,3 +301,15 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"{type(value).__name__} does not fit into JSON")
+
+
+def _holds_rows(document: Mapping[str, Any]) -> bool:
+    """Return whether a cell holds rows of plain values, and names its case in each."""
+    tables = [[document["row"]], *(document[table] for table in ITEM_TABLES)]
+    if not all(isinstance(rows, list) and all(isinstance(row, dict) for row in rows) for rows in tables):
+        return False
+    is_plain = all(not isinstance(value, list | dict) for rows in tables for row in rows for value in row.values())
+    names = [(type(row.get(name)), kind) for rows in tables for row in rows for name, kind in _NAMED.items()]
+    order = document["order"]
+    is_placed = isinstance(order, list) and [type(place) for place in order] == [int, int]
+    return is_plain and is_placed and all(found is kind for found, kind in names)

@@ -137,7 +137,7 @@ def _read(path: Path) -> Kept | None:
         arrays = read_npz(path, _check)
     except InputError:
         return None
-    is_contended, n_arrays = bool(arrays.pop(_IS_CONTENDED)), int(arrays.pop(_N_ARRAYS))
+    is_contended, n_arrays = bool(arrays.pop(_IS_CONTENDED)), float(arrays.pop(_N_ARRAYS))
     seconds = {name: arrays.pop(name) for name in list(arrays) if name.startswith(_SECONDS)}
     told = {name.removeprefix(_SECONDS): float(number) for name, number in seconds.items()}
     return Kept(arrays, told, is_contended) if len(arrays) == n_arrays else None

@@ -142,9 +142,21 @@ def _counts_table(made: Sequence[Row]) -> str:
     return "\n".join([*lines, f"| all | | | {sums} |"])
 
 
+def _require_identity(path: Path, about: Mapping[str, Any]) -> None:
+    """Raise `InputError` unless what names, sorts and sums the rows is of its type."""
+    kinds: dict[str, Any] = {"family": str, "seed": int, "digest": str, "reason": str, "score_radius_m": (int, float)}
+    values = {name: about[name] for name in kinds if name in about}
+    if isinstance(counts := about.get("counts"), dict):
+        values |= counts
+    for name, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, kinds.get(name, int)):
+            raise InputError(f"{path}: damaged: {name} = {value!r:.40}: {_REMEDY}")
+
+
 def _shard_row(path: Path) -> Row:
     about, content = read_about(path), path.read_bytes()
     try:
+        _require_identity(path, about)
         return {
             **{name: about[name] for name in ("family", "seed", "digest", "score_radius_m")},
             **{name: about["counts"][name] for name in COUNTS},
@@ -161,6 +173,7 @@ def _shard_row(path: Path) -> Row:
 
 def _refused_row(path: Path) -> Row:
     about = read_json(path, _REMEDY)
+    _require_identity(path, about)
     try:
         told = {name: about[name] for name in ("family", "seed", "digest", "reason")}
         return {**dict.fromkeys(INDEX_COLUMNS, ""), **told, "status": "refused", "split": split_of(about["seed"])}

@@ -153,7 +153,7 @@ def _take_folder(out: Path, recipe: Recipe, command: str) -> None:
     if path.is_file():
         document = files.read_json(path, "name a new folder")
         try:
-            commands = list(document.pop("commands"))
+            commands = [str(words) for words in document.pop("commands")]
         except (KeyError, TypeError) as error:
             raise InputError(f"{path}: damaged ({error}): name a new folder") from error
         found = document.get("format"), document.get("format_version")

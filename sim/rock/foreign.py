@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,8 @@ SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 MAX_TRIANGLES = 5_000_000
 _MAX_BYTES = 2_000_000_000
 _WELD_M = 1e-6
+# What trimesh logs about a damaged file, tracebacks included, it also raises.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 _MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 _MIN_THICKNESS_M = 1e-3
 _TUNNEL_M = (2.0, 20_000.0)  # longest side
@@ -134,6 +137,8 @@ def _parse(path: Path, say: str) -> tuple[Float64Array, Int64Array]:
     except Exception as error:  # the readers of trimesh let through whatever a damaged file provokes
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ScenarioError(f"{say}: unreadable, the file is damaged or of another kind ({reason})") from error
+    if any(part.shape[1:] != (3,) for part in (*vertices, *faces)):
+        raise ScenarioError(f"{say}: unreadable, the file is damaged: its vertices or its triangles are not of three")
     if not solids:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
     starts = np.cumsum([0] + [len(part) for part in vertices])

@@ -26,7 +26,7 @@ def parse_json(text: str | bytes, *, is_finite: bool = False) -> Any:
 
     Raises:
         ValueError: It is no JSON, is nested deeper than `MAX_DEPTH`, names a key twice, or holds a whole number beyond
-            64 bits or one that is not finite.
+            64 bits, one that is not finite, or half a surrogate pair, which no file can hold.
     """
     if len(text) > MAX_BYTES:
         raise ValueError(f"{len(text) / 1e6:.0f} MB, more than the {MAX_BYTES / 1e6:.0f} MB it may have")
@@ -74,10 +74,15 @@ def _check_values(outer: Any, is_finite: bool) -> list[Any]:
         outer.values() if isinstance(outer, dict) else outer if isinstance(outer, list) else (outer,)
     )
     within = []
+    if type(outer) is dict:
+        for name in outer:
+            _check_text(name)
     for value in values:
         kind = type(value)
         if kind is dict or kind is list:
             within.append(value)
+        elif kind is str:
+            _check_text(value)
         elif kind is int and abs(value) >= _MAX_INTEGER:
             raise ValueError(f"{_name(outer, value)} is beyond 64 bits")
         elif is_finite and kind is float and not math.isfinite(value):
@@ -88,3 +93,8 @@ def _check_values(outer: Any, is_finite: bool) -> list[Any]:
 def _name(outer: Any, value: Any) -> str:
     names = [name for name, each in outer.items() if each is value] if isinstance(outer, dict) else []
     return f"{names[0]:.40}" if names else "a number"
+
+
+def _check_text(text: str) -> None:
+    if not text.isascii() and any("\ud800" <= letter <= "\udfff" for letter in text):
+        raise ValueError(f"{text[:40]!r} holds half a surrogate pair")

@@ -1,0 +1,49 @@
+"""Damaged files are read, or refused on one line: a short form of `make fuzz`, in this process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.trust.fuzz import DEFECTS, Server, Tally, make_examples, read_one, share_inputs
+from tests.trust.readers import READERS
+
+N_INPUTS, SEED = 2000, 24
+# These take 0.3 s an input: `make fuzz` reads more, and pages, which take 3 s.
+SLOW = ("OSF", "PCAP and metadata")
+N_SLOW = 2
+NAMES = [reader.name for reader in READERS if reader.name != "page of a run"]
+
+
+@pytest.fixture(name="folder", scope="module")
+def folder_fixture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder with the examples of all readers."""
+    folder = tmp_path_factory.mktemp("fuzz")
+    make_examples(folder / "examples", NAMES)
+    return folder
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_the_examples_are_read(folder: Path) -> None:
+    for name, example in make_examples(folder / "examples", NAMES).items():
+        if name not in SLOW:
+            assert read_one(name, example) == ("read", "")
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_damaged_files_are_read_or_refused_on_one_line(folder: Path, tmp_path: Path) -> None:
+    names = list(make_examples(folder / "examples", NAMES))
+    counts = share_inputs(N_INPUTS, [name for name in names if name not in SLOW])
+    counts |= dict.fromkeys((name for name in names if name in SLOW), N_SLOW)
+    server, tallies, told = Server(folder, SEED, tmp_path / "input"), {name: Tally() for name in names}, []
+    for name, n in counts.items():
+        for number in range(n):
+            answer = server.answer(name, number)
+            tallies[name].outcomes[answer["outcome"]] += 1
+            if answer["outcome"] in DEFECTS:
+                told.append(f"{name} {number}: {answer['outcome']}: {answer['text']}")
+    assert told == []
+    # most damage is seen, and some of it does no harm
+    assert sum(tally.outcomes["one line"] for tally in tallies.values()) > N_INPUTS / 2
+    assert sum(tally.outcomes["read"] for tally in tallies.values()) > N_INPUTS / 10
