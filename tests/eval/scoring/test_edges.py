@@ -11,8 +11,9 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import make_pose, stream
 from cdpipe.model.report import ChangedObject
+from eval.scoring.answer_rows import find_rows_near_points
 from eval.scoring.merge_metrics import _along, compute_merge_errors, find_travel_directions, measure_overlap
-from eval.scoring.object_metrics import judge_kinds, match_objects
+from eval.scoring.object_metrics import compute_box_iou, judge_kinds, match_objects
 from eval.scoring.region_metrics import measure_covered_share, transform_to_map, transform_to_world
 from eval.truth.ground_truth import SessionTruth, ground_truth, load_ground_truth
 from eval.truth.scoring_points import ScoringPoints
@@ -170,3 +171,37 @@ def test_an_object_with_exactly_half_of_its_rows_elsewhere_is_false() -> None:
     assert matches.outcomes == ("false", "false")
     assert match_objects([thing()], [span(16, 25)], truth).outcomes == ("ignored",)
     assert (matches.matched_object.tolist(), matches.matched_change.tolist()) == ([-1], [-1, -1])
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_rows_at_exactly_the_radius_belong_to_a_point(axis: int) -> None:
+    cells = np.zeros((3, 3), dtype=np.float32)
+    cells[:, axis] = (-0.25, 0.25, 0.2501)
+    zeros = np.zeros(3, dtype=np.int16)
+    (near,) = find_rows_near_points(ScoringPoints(np.arange(3), cells, zeros, zeros, 1, 3), [np.zeros((1, 3))], 0.25)
+    assert near.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("n_points", [(0, 0), (0, 1)])
+def test_an_object_without_points_has_no_rows(n_points: tuple[int, int]) -> None:
+    scoring_points = ScoringPoints(np.arange(1), np.zeros((1, 3), np.float32), *[np.zeros(1, np.int16)] * 2, 1, 1)
+    rows = find_rows_near_points(scoring_points, [np.zeros((n, 3)) for n in n_points])
+    assert [len(own) for own in rows] == list(n_points)
+    assert [own.dtype for own in rows] == [np.int64] * 2
+
+
+def test_the_box_of_one_point_is_a_cell() -> None:
+    one = np.array([(0.05, 0.05, 0.05)])
+    assert compute_box_iou(one, one) == 1.0
+    # two cells in a row, one of them shared
+    assert compute_box_iou(one, np.concatenate([one, one + np.array([0.1, 0.0, 0.0])])) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(("kind", "expected"), [("removed", 1.0), ("moved", 1.0), ("added", 0.0), ("reshaped", 0.0)])
+def test_what_went_may_be_called_removed_where_nobody_could_see_it_arrive(kind: str, expected: float) -> None:
+    halves = [change(1, "before", "moved", partner=2), change(2, "after", "moved", partner=1, is_observable=False)]
+    truth = object_truth(halves, before=[1] * 10 + [0] * 30, after=[0] * 20 + [2] * 10 + [0] * 10)
+    objects = [thing("before", kind)]
+    right = judge_kinds(objects, match_objects(objects, [span(0, 10)], truth), truth)
+    assert right[0] == expected
+    assert np.isnan(right[1])

@@ -42,7 +42,12 @@ def test_a_local_answer_lies_along_its_keyframes_or_all_scans(keyframes: np.ndar
 
 def test_answers_to_another_pair_are_refused() -> None:
     local = np.stack([RIGID] * len(KEYFRAMES))
-    for wrong in (report(local[:3]), report(local, KEYFRAMES + 30), report(local, KEYFRAMES - 1)):
+    for wrong in (
+        report(local[:3]),
+        report(local, KEYFRAMES + 30),
+        report(local, KEYFRAMES + 2),
+        report(local, KEYFRAMES - 1),
+    ):
         with pytest.raises(InputError, match="is it an answer to this pair"):
             alignment_of(wrong, POSES)
     bad = replace(report(local), local_before_T_after=local * 2)

@@ -1,5 +1,6 @@
 """The scoring points against a dictionary of cells, its lookups, its cache, and labels that do not belong."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from cdpipe.core.geometry import transform
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
 from eval.truth import scoring_points as module
-from eval.truth.scoring_points import build_scoring_points, load_scoring_points
+from eval.truth.scoring_points import ScoringPoints, build_scoring_points, load_scoring_points
 from sim.session.truth import read_labels, write_labels
 
 
@@ -89,3 +90,37 @@ def test_labels_of_another_session_are_refused(tiny_pair: Path) -> None:
     (session / "truth" / "00001.npz").unlink()
     with pytest.raises(InputError, match=r"00001\.npz: missing"):
         load_scoring_points(session)
+
+
+def few_points(n: int, nearest_m: tuple[float, ...] = ()) -> ScoringPoints:
+    zeros = np.zeros(n, dtype=np.int16)
+    returns = 5 + 3 * np.arange(n)
+    return ScoringPoints(returns, np.zeros((n, 3), np.float32), zeros, zeros, 4, 10, np.array(nearest_m, np.float32))
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3])
+def test_every_row_is_found_however_few_there_are(n: int) -> None:
+    points = few_points(n)
+    every = np.column_stack([np.repeat(np.arange(4), 10), np.tile(np.arange(10), 4)])
+    found = points.rows_of_returns(every)
+    assert found.tolist() == list(range(n)) and found.dtype == np.int64
+    assert points.rows_of_returns(every[::-1][:5]).tolist() == []
+    # 5, 8 and 11 are (scan 0, pixel 5), (0, 8) and (1, 1)
+    rows = np.arange(n)
+    assert list(zip(points.scans(rows), points.pixels(rows), strict=True)) == [(0, 5), (0, 8), (1, 1)][:n]
+    assert points.rows_of_returns(np.array([(1, 1), (0, 5), (0, 5)])).tolist() == [row for row in (0, 2) if row < n]
+
+
+def test_the_range_of_a_change_that_no_return_met_is_undefined() -> None:
+    points = few_points(1, (np.inf, 2.5, np.inf))
+    assert points.range_of_change(1) == 2.5
+    assert np.isnan([points.range_of_change(number) for number in (0, 2, 3, 9)]).all()
+    assert np.isnan(few_points(1).range_of_change(0))
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong"), [("points_odom", np.zeros((2, 3))), ("change", np.zeros(2)), ("instance", np.zeros(2))]
+)
+def test_columns_of_unequal_length_are_refused(field: str, wrong: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=field):
+        replace(few_points(1), **{field: wrong})
