@@ -24,6 +24,8 @@ from eval.tables.rows import PAIR
 
 RATES_PER_100M = (0.1, 0.5)
 _BATCH = 100
+# So many of the best candidates are looked at first.
+_FIRST_CANDIDATES = 256
 _MAX_ROC_POINTS = 400
 _ROUNDING = 1e-9
 
@@ -228,8 +230,14 @@ def _recalls(ranked: RankedPairs, rate_per_100m: float, weights: Float64Array) -
     """Return the (B,) recalls of (B, P) weights of the pairs; NaN where no drawn pair has an observable change."""
     n_found = np.zeros(len(weights))
     for site in np.unique(ranked.site):
-        n_false, found, path_m, _ = _cumulated(ranked, int(site), weights)
-        is_allowed = n_false <= (rate_per_100m * path_m / 100.0)[:, None] + _ROUNDING
+        n_first, n_candidates = _FIRST_CANDIDATES, len(ranked.score)
+        while True:
+            n_false, found, path_m, _ = _cumulated(ranked, int(site), weights, n_first)
+            is_allowed = n_false <= (rate_per_100m * path_m / 100.0)[:, None] + _ROUNDING
+            # worse candidates only add false regions
+            if n_first >= n_candidates or not is_allowed[:, -1:].any():
+                break
+            n_first *= 4
         n_found += np.where(is_allowed, found, 0.0).max(axis=1, initial=0.0)
     n_observable = weights @ ranked.n_observable
     recalls = np.full(len(weights), np.nan)
@@ -238,15 +246,15 @@ def _recalls(ranked: RankedPairs, rate_per_100m: float, weights: Float64Array) -
 
 
 def _cumulated(
-    ranked: RankedPairs, site: int, weights: Float64Array
+    ranked: RankedPairs, site: int, weights: Float64Array, n_first: int | None = None
 ) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
-    """Let the threshold fall at one kind of site.
+    """Let the threshold fall at one kind of site, over its `n_first` best candidates, all of them by default.
 
     Returns:
         (B, N) false regions and changes found at each of N thresholds, (B,) way in metres, (N,) thresholds.
     """
     own = np.flatnonzero(ranked.site[ranked.pair] == site)
-    own = own[np.argsort(-ranked.score[own], kind="stable")]
+    own = own[np.argsort(-ranked.score[own], kind="stable")][:n_first]
     last = last_of_ties(ranked.score[own])
     drawn = weights[:, ranked.pair[own]]
     n_false = np.cumsum(drawn * ranked.is_false[own], axis=1)[:, last]

@@ -8,6 +8,7 @@ import pytest
 
 from eval.core.ranking import auroc
 from eval.core.statistics import interval_of
+from eval.tables import region_curves
 from eval.tables.groups import clustered_interval, recall_by_size
 from eval.tables.region_curves import (
     RankedPairs,
@@ -219,3 +220,12 @@ def test_the_interval_of_a_share_draws_pairs() -> None:
     hits, pair = np.repeat([1.0, 0.0], 10), np.repeat([3, 8], 10)
     assert clustered_interval(hits, pair) == (0.0, 1.0)
     assert all(np.isnan(clustered_interval(hits[:10], pair[:10])))
+
+
+@pytest.mark.parametrize("rate", [0.5, 50.0, 500.0])
+def test_candidates_too_bad_for_any_draw_need_not_be_looked_at(rate: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    ranked = ranked_pairs(*random_case(0))
+    every = resampled_recalls(ranked, rate)
+    monkeypatch.setattr(region_curves, "_FIRST_CANDIDATES", 1)
+    resampled_recalls.cache_clear()
+    np.testing.assert_array_equal(resampled_recalls(ranked, rate), every)
