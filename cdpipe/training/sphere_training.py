@@ -89,6 +89,9 @@ def read_sphere_data(tunnels: Sequence[TunnelShard]) -> SphereData:
         covered = arrays["is_covered"]
         if not ((ids := arrays["change_ids"]) > 0).all() or (ids > 255).any():
             raise InputError(f"{tunnel.path}: damaged: change_ids are 1 to 255: make the dataset again")
+        radius_m = about.get("score_radius_m")
+        if not isinstance(radius_m, int | float) or not 0 < radius_m < np.inf:
+            raise InputError(f"{tunnel.path}: damaged: score_radius_m = {radius_m!r:.40}: make the dataset again")
         marks = np.zeros(256, np.uint8)
         marks[arrays["change_ids"]] = np.where(arrays["change_is_observable"], _CHANGED, _UNCOUNTED)
         parts["before_m"].append(arrays["before_images"][covered])
@@ -98,7 +101,7 @@ def read_sphere_data(tunnels: Sequence[TunnelShard]) -> SphereData:
         parts["positions"].append(arrays["before_world_T_keyframe"][covered, :3, 3])
         parts["labels"].append(arrays["labels"][covered])
         parts["tunnels"].append(np.full(covered.sum(), place))
-        parts["score_radius_m"].append(np.full(covered.sum(), about["score_radius_m"]))
+        parts["score_radius_m"].append(np.full(covered.sum(), radius_m))
     joined = {name: np.concatenate(arrays) for name, arrays in parts.items()}
     if len(joined["labels"]) == 0:
         raise InputError("no keyframe of these tunnels was seen by both sessions: make a larger dataset")

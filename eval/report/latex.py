@@ -76,7 +76,7 @@ def _float(
     data: RunData, name: str, words: str, table: pd.DataFrame, columns: Sequence[Column], cases: pd.DataFrame
 ) -> str:
     """Return one `table*`: a line of values for each method and, where there are intervals, a small one below it."""
-    shown = [column for column in columns if table[column.key].notna().any()]
+    shown = [column for column in columns if column.key in table and table[column.key].notna().any()]
     lines: list[list[str]] = []
     untested: set[str] = set()
     domains = table.groupby("domain", sort=False)

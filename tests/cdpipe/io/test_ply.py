@@ -79,3 +79,11 @@ def test_a_real_scan_reads_as_with_meshio() -> None:
     points = read_ply_points(path)
     assert points.shape == (69792, 3)
     np.testing.assert_array_equal(points, meshio.ply.read(path).points.astype(np.float64))
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_a_count_beyond_any_file_is_named(tmp_path: Path, kind: str) -> None:
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    (tmp_path / "a.ply").write_text(f"ply\nformat {kind} 1.0\nelement vertex {10**29}\n{axes}end_header\n1 2 3\n")
+    with pytest.raises(InputError, match="1e\\+29 vertices are announced"):
+        read_ply_points(tmp_path / "a.ply")
