@@ -205,3 +205,16 @@ def test_what_went_may_be_called_removed_where_nobody_could_see_it_arrive(kind: 
     right = judge_kinds(objects, match_objects(objects, [span(0, 10)], truth), truth)
     assert right[0] == expected
     assert np.isnan(right[1])
+
+
+def test_changes_may_be_numbered_in_any_order() -> None:
+    labels = [0] * 5 + [1] * 10 + [2] * 10 + [3] * 10 + [0] * 5
+    truth = object_truth([change(3), change(1), change(2)], after=labels)
+    matches = match_objects([thing(), thing(), thing()], [span(5, 15), span(15, 25), span(25, 35)], truth)
+    assert matches.matched_object.tolist() == [2, 0, 1]
+    assert matches.iou_point.tolist() == [1.0, 1.0, 1.0]
+
+
+def test_one_cell_answered_by_one_cell_is_a_whole_match() -> None:
+    matches = match_objects([thing()], [span(5, 6)], object_truth([change(1)], after=[0] * 5 + [1] + [0] * 34))
+    assert matches.iou_point.tolist() == [1.0]

@@ -283,8 +283,8 @@ def test_an_alarm_is_a_region_on_an_unchanged_pair(
     assert row["is_alarm"] is is_alarm or (np.isnan(is_alarm) and np.isnan(row["is_alarm"]))
     # nothing was proposed: no time for each of them
     assert np.isnan(row["t_cd_per_region_s"])
-    ended = score_answer(replace(answer, until="merge"), truth)
-    assert np.isnan(ended.row["is_alarm"])
+    ended = score_answer(replace(answer, until="merge", seconds={"t_cd_s": 1.0}), truth)
+    assert np.isnan([ended.row["is_alarm"], ended.row["t_cd_per_region_s"]]).all()
     assert (ended.changes, ended.regions, ended.objects, ended.keyframes) == ([], [], [], [])
 
 
@@ -387,3 +387,23 @@ def test_a_report_in_memory_scores_like_the_stored_one(tiny_pair: Path, tiny_mer
     assert (unnamed["t_merge_s"], unnamed["map_points_before"]) == (1.0, 123.0)
     with pytest.raises(InputError, match=r"^report: not an answer to this pair: evidence\.overlap"):
         score(replace(report, evidence={"overlap": -1.0}), tiny_pair)
+
+
+def test_the_first_region_may_find_several_changes(report: ChangeReport, truth: GroundTruth) -> None:
+    regions = report.regions
+    one = replace(
+        regions,
+        centres_map=regions.centres_map[1:2],
+        scores=np.ones(1),
+        pairs=np.zeros((1, 2), np.int64),
+        is_reported=np.ones(1, np.bool_),
+        is_withdrawn=None,
+    )
+    near = replace(truth, centroids_world=np.repeat(truth.centroids_world[:1], 3, axis=0))
+    figures = {"s_points": np.array([3], dtype=np.int32)}
+    answer = Answer("ok", "", "mine", replace(report, regions=one, objects=(), figures=figures), {}, {})
+    case = score_answer(answer, near)
+    assert [(row["is_found"], row["best_region"]) for row in case.changes] == [(True, 0)] * 3
+    assert case.regions[0]["found_changes"] == "1;2;3"
+    assert (type(case.row["s_points"]), case.row["s_points"]) == (float, 3.0)
+    assert scoring.read_figure(answer.report, "s_points").dtype == np.float64
