@@ -209,6 +209,7 @@ def session_of(n: int, n_scans: int) -> SessionTruth:
         ([[(1, 7), (1, 7)]], r"return \(scan 1, pixel 7\) of the after session twice"),
         ([[(1, 7)], [(0, 1), (1, 7)]], r"return \(scan 1, pixel 7\) of the after session twice"),
         ([[], [(0, 1)]], None),
+        ([[], [(1, 7), (1, 7)]], r"return \(scan 1, pixel 7\) of the after session twice"),
         # 99 that did not return may each share a cell with one that did; 100 may not
         ([[(1, pixel) for pixel in range(99)]], None),
         ([[(1, pixel) for pixel in range(100)]], r"nothing returned at any of their 100 \(scan, pixel\)"),
@@ -258,6 +259,14 @@ def test_points_beside_their_returns(axis: int, sign: float, aside_m: float, is_
     module._check_places((item("before", returns, np.zeros((0, 3))), item("before", (), beside)), scoring_points)
 
 
+def test_points_exactly_two_metres_beside_their_returns_are_near() -> None:
+    zeros = np.zeros(1, dtype=np.int16)
+    origin = ScoringPoints(np.arange(1), np.zeros((1, 3), np.float32), zeros, zeros, 1, 1)
+    module._check_places((item("before", [(0, 0)], np.array([(0.0, -2.0, 0.0)])),), origin)
+    with pytest.raises(ValueError, match="is 2 m off"):
+        module._check_places((item("before", [(0, 0)], np.array([(0.0, -2.0 - 1e-9, 0.0)])),), origin)
+
+
 def test_gaps_add_up_over_the_axes() -> None:
     scoring_points = line_points([0] * 20)
     rows = np.arange(5, 15)
@@ -281,6 +290,7 @@ ON_CELL_3 = CELLS.points_odom[3:4].astype(np.float64)
         ([ON_CELL_3 + 5.0, ON_CELL_3], None),
         ([ON_CELL_3 + 5.0, np.concatenate([ON_CELL_3, ON_CELL_3]) + 7.0], "none of its 2 points"),
         ([ON_CELL_3, np.concatenate([ON_CELL_3 + 0.2, ON_CELL_3])], r"objects\[1\] shares a point"),
+        ([ON_CELL_3 - np.array([0.1, 0.0, 0.0]), ON_CELL_3, ON_CELL_3], r"objects\[2\] shares a point"),
         # a point that one object names twice has one owner
         ([np.concatenate([ON_CELL_3, ON_CELL_3])], None),
         ([np.full((2, 3), NAN)], r"objects\[1\]: object_points_odom: entry 0 is not"),

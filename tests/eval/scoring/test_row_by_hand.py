@@ -235,7 +235,9 @@ def test_the_keyframes(case: CaseScore) -> None:
 
 
 def test_a_case_without_an_answer(truth: GroundTruth) -> None:
-    case = score_answer(Answer("failed", "too dark", "mine", None, {"t_merge_s": 2.0}, {"overlap": 0.5}), truth)
+    case = score_answer(
+        Answer("failed", "too dark", "mine", None, {"t_merge_s": 2.0, "t_descriptor_s": 8.0}, {"overlap": 0.5}), truth
+    )
     zeros = [
         "region_recall", "region_recall_at_k", "region_precision", "region_recall_proposed",
         "region_recall_at_k_proposed", "region_precision_proposed", "object_iou_point", "object_iou_voxel",
@@ -252,7 +254,8 @@ def test_a_case_without_an_answer(truth: GroundTruth) -> None:
         "scenario": "narrow", "family": "narrow", "pair_kind": "", "seed": 7, "variant": "mine", "preset": "mine",
         "status": "failed", "error": "too dark", "metrics_version": METRICS_VERSION, "domain": "in", "n_changes": 3,
         "n_observable": 2, "score_radius_m": 3.0, "region_auroc": 0.5, "region_ap": 12 / (12 + n_far),
-        "is_auroc_assumed": 1.0, "overlap_true": 1.0, "evidence_overlap": 0.5, "t_merge_s": 2.0, "after_path_m": 50.0,
+        "is_auroc_assumed": 1.0, "overlap_true": 1.0, "evidence_overlap": 0.5, "t_merge_s": 2.0, "t_descriptor_s": 8.0,
+        "after_path_m": 50.0,
         "is_unchanged_pair": False, **dict.fromkeys(zeros, 0.0), **dict.fromkeys(counts, 0),
     }  # fmt: skip
     assert_equal({name: value for name, value in case.row.items() if value == value}, {
