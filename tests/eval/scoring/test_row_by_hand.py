@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from cdpipe.core.geometry import make_pose
 from cdpipe.io.answer import Answer
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 from eval.scoring import scoring
+from eval.scoring.answer_check import MAX_AMOUNT, check_answer
 from eval.scoring.judged_places import carry_merge, carry_scores, find_nearest_keyframes
 from eval.scoring.merge_metrics import EVIDENCE
 from eval.scoring.region_metrics import score_regions
@@ -410,3 +412,15 @@ def test_the_first_region_may_find_several_changes(report: ChangeReport, truth: 
     assert case.regions[0]["found_changes"] == "1;2;3"
     assert (type(case.row["s_points"]), case.row["s_points"]) == (float, 3.0)
     assert scoring.read_figure(answer.report, "s_points").dtype == np.float64
+
+
+def test_a_figure_at_the_limit_is_taken_and_one_above_is_refused(report: ChangeReport, truth: GroundTruth) -> None:
+    for value, is_refused in (
+        (MAX_AMOUNT, False),
+        (0.0, False),
+        (np.nextafter(MAX_AMOUNT, np.inf), True),
+        (-0.1, True),
+    ):
+        answer = Answer("ok", "", "mine", replace(report, figures={"s_points": np.full(7, value)}), {}, {})
+        with pytest.raises(InputError, match="figure_s_points: expected") if is_refused else nullcontext():
+            check_answer(answer, truth, Path("answer"))
