@@ -28,16 +28,17 @@ def at(*places: tuple[float, float, float]) -> np.ndarray:
     return np.stack([make_pose(translation=place) for place in places])
 
 
-# a shaft: the robot is twice at the same place in plan, 6 m apart in height; odometry is 1 m off in y up there
+# a shaft: the robot is twice at the same place in plan, 6 m apart in height; odometry is 0.1 and 1 m off up there
 SHAFT = at((0.0, 0.0, 0.0), (3.0, 0.0, 3.0), (0.0, 0.0, 6.0))
-SHAFT_ODOM = at((0.0, 0.0, 0.0), (3.0, 0.0, 3.0), (0.0, 1.0, 6.0))
+SHAFT_ODOM = at((0.0, 0.0, 0.0), (3.0, 0.0, 3.0), (0.1, 0.0, 7.0))
 
 
 def test_the_nearest_place_is_nearest_in_height_as_well() -> None:
     before = SessionTruth(SHAFT_ODOM, SHAFT, EMPTY)
     assert before.judged_scans.tolist() == [0, 1, 2]
-    centres_map = np.array([(0.2, 0.0, 0.0), (0.2, 1.0, 6.0)])
-    places_world = np.array([(0.2, 0.0, 0.0), (0.2, 0.0, 6.0)])
+    # in plan, each centre lies nearer to the place on the other level
+    centres_map = np.array([(0.1, 0.0, 0.0), (0.0, 0.0, 7.0)])
+    places_world = np.array([(0.1, 0.0, 0.0), (-0.1, 0.0, 6.0)])
     np.testing.assert_allclose(transform_to_world(centres_map, before), places_world)
     np.testing.assert_allclose(transform_to_map(places_world, before), centres_map)
 
@@ -46,8 +47,8 @@ def test_a_merge_is_judged_against_the_place_that_is_nearest_in_height_as_well()
     before = SessionTruth(SHAFT_ODOM, SHAFT, EMPTY)
     after = SessionTruth(SHAFT, SHAFT, EMPTY)
     errors = compute_merge_errors(before, after, np.eye(4))
-    # at the top, the before odometry is 1 m off and the after odometry is right
-    np.testing.assert_allclose(errors.metres, [0.0, 0.0, 1.0], atol=1e-12)
+    # at the top, the before odometry is off and the after odometry is right
+    np.testing.assert_allclose(errors.metres, [0.0, 0.0, np.hypot(0.1, 1.0)], atol=1e-12)
     # 5 m are 5 m in any direction
     for height_m, n_pairs in ((4.9, 1), (5.0, 1), (5.1, 0)):
         above = at((0.0, 0.0, 6.0 + height_m))
