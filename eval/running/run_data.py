@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,14 @@ _TEXTS = {
     "scenario", "variant", "preset", "family", "pair_kind", "domain", "commit", "status", "error", "session", "name",
     "kind", "prop_kind", "group", "why_not", "matched_kind", "outcome", "found_changes",
 }  # fmt: skip
+# likewise of the derived tables
+_DERIVED_TEXTS = {"domain", "variant"}
+_MORE_TEXTS = {
+    "regions_targets": ("target", "asked", "is_met"), "objects_targets": ("target", "asked", "is_met"),
+    "regions_by_size": ("measure",), "objects_by_group": ("measure", "value"),
+}  # fmt: skip
+_COUNT = re.compile(r"n(_|$)")
+_NUMBER = re.compile(r"[-+.\deE]+")
 _IDS = re.compile(r"\d{1,9}(;\d{1,9})*")
 _PICTURED = ("paper", "tunnelcd", "voxel-diff")
 
@@ -95,9 +103,22 @@ def read_run(run: Path) -> RunData:
 
 
 def stored_table(data: RunData, name: str) -> pd.DataFrame:
-    """Return a table of the run folder, empty where it is not there; what `read_run` leaves out is NaN."""
+    """Return a derived table of the run folder, empty where it is not there; what `read_run` leaves out is NaN.
+
+    Raises:
+        InputError: A column of numbers holds text, or a count is missing.
+    """
     path = table_file(data.folder.path / f"{name}.csv")
-    return _without_unusable(read_table(path)) if path.is_file() else pd.DataFrame()
+    if not path.is_file():
+        return pd.DataFrame()
+    frame = read_table(path)
+    _require_numbers(path, frame, {*_DERIVED_TEXTS, *_MORE_TEXTS.get(name, ())})
+    for column in frame:
+        if _COUNT.match(str(column)) and frame[column].isna().any():
+            raise InputError(
+                f"{path}: column {column} lacks a count: `tunnelcd score {path.parent}` makes the table anew"
+            )
+    return _without_unusable(frame)
 
 
 def plan_name(data: RunData) -> str:
@@ -340,13 +361,22 @@ def _require_values(path: Path, frame: pd.DataFrame) -> None:
     """Refuse text among numbers, which no mean or chart can hold, and rows without the columns that name them."""
     if absent := {*_CASE} - set(frame) if len(frame) else set():
         raise InputError(f"{path}: column {', '.join(sorted(absent))} is missing: expected a table of `tunnelcd run`")
+    _require_numbers(path, frame, _TEXTS)
+
+
+def _require_numbers(path: Path, frame: pd.DataFrame, texts: Collection[str]) -> None:
     for name in frame:
-        if pd.api.types.is_numeric_dtype(frame[name]) or (name in _TEXTS and name != "found_changes"):
+        if pd.api.types.is_numeric_dtype(frame[name]) or (name in texts and name != "found_changes"):
             continue
-        for line, value in enumerate(frame[name], start=2):
-            is_right = _IDS.fullmatch(value) if name == "found_changes" and isinstance(value, str) else None
-            if not (is_right or isinstance(value, bool) or pd.isna(value)):
-                raise InputError(f"{path}:{line}: {name} = {value!r:.40}: expected a number")
+        are_ids = name == "found_changes"
+        wrong = [
+            (line, value)
+            for line, value in enumerate(frame[name], start=2)
+            if not (isinstance(value, bool) or pd.isna(value) or (are_ids and _IDS.fullmatch(str(value))))
+        ]
+        if wrong:  # one text makes all numbers of its column texts
+            line, value = next((each for each in wrong if not _NUMBER.fullmatch(str(each[1]))), wrong[0])
+            raise InputError(f"{path}:{line}: {name} = {value!r:.40}: expected a number")
 
 
 def _without_unusable(frame: pd.DataFrame) -> pd.DataFrame:

@@ -12,7 +12,7 @@ import pytest
 from cdpipe.core.errors import InputError
 from eval.report.comparison import compare_sides, write_comparison
 from eval.report.page import write_page
-from eval.running.run_data import plan_name, read_run
+from eval.running.run_data import plan_name, read_run, stored_table
 from eval.running.runfolder import RunFolder, reported, write_json
 from eval.running.sides import read_side
 from eval.tables.columns import UNDEFINED
@@ -84,3 +84,22 @@ def test_a_provenance_and_an_answer_that_hold_anything_kill_no_page(tmp_path: Pa
     assert reported({"plan": plan}) == ("1",)
     for plan in ([], "x", None):
         assert plan_name(replace(read_run(folder), provenance={"plan": plan})) == ""
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (
+            "domain,variant,false_positive_rate\nin,a,0.5\nin,a,true-ish\n",
+            "roc.csv:3: false_positive_rate = 'true-ish'",
+        ),
+        ("domain,variant,n_pairs\nin,a,3\nin,b,\n", "roc.csv: column n_pairs lacks a count: `tunnelcd score"),
+    ],
+)
+def test_a_derived_table_with_text_among_its_numbers_is_one_line(tmp_path: Path, content: str, message: str) -> None:
+    (tmp_path / "roc.csv").write_text(content)
+    run = replace(read_run(write_run(tmp_path / "run", PLAIN[:6])), folder=RunFolder(tmp_path))
+    with pytest.raises(InputError) as caught:
+        stored_table(run, "roc")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
