@@ -16,7 +16,7 @@ import numpy.typing as npt
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_json
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.core.isolated import Arrays, IsolatedReader
+from cdpipe.core.isolated_reader import Arrays, IsolatedReader
 from cdpipe.io.ouster.integrity import check_osf_integrity, check_pcap_integrity
 from cdpipe.io.readers import RECORDING_SUFFIXES
 from cdpipe.sensor.ouster import SensorMetadata, parse_metadata

@@ -1,4 +1,4 @@
-"""Calls of the vendor's SDK on foreign recordings; they run in a process of their own (`cdpipe.core.isolated`).
+"""Calls of the vendor's SDK on foreign recordings; they run in a process of their own (`cdpipe.core.isolated_reader`).
 
 A damaged file with correct checksums can crash the SDK, which follows its offsets wherever they lead. These functions
 hand over what the SDK reads, and `cdpipe.io.ouster.captures` checks it.
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.isolated import Message
+from cdpipe.core.isolated_reader import Message
 
 CHANNELS = ("RANGE", "REFLECTIVITY", "SIGNAL")
 # Exceptions of the SDK for a faulty file; C++ exceptions arrive as any of these.

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpipe.core import isolated
+from cdpipe.core import isolated_reader
 from cdpipe.core.errors import InputError
-from cdpipe.core.isolated import IsolatedReader
+from cdpipe.core.isolated_reader import IsolatedReader
 
 ROOT = Path(__file__).parents[3]
 HOSTILE = """
@@ -48,7 +48,7 @@ def where(): yield {"path": sys.path, "pid": os.getpid()}, {}
 
 
 @pytest.fixture(name="read")
-def read_fixture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[isolated.Message]]:
+def read_fixture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[isolated_reader.Message]]:
     """Return what reads with a function of `HOSTILE`, in one process after the other."""
     (tmp_path / "modules").mkdir()
     (tmp_path / "modules" / "hostile.py").write_text(HOSTILE)
@@ -58,7 +58,7 @@ def read_fixture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..
     return lambda name, **arguments: list(reader.read(name, **arguments))
 
 
-def test_dicts_and_arrays_arrive_as_they_were(read: Callable[..., list[isolated.Message]]) -> None:
+def test_dicts_and_arrays_arrive_as_they_were(read: Callable[..., list[isolated_reader.Message]]) -> None:
     for _ in range(2):
         messages = read("arrays", n=3)
         assert [about for about, _ in messages] == [{"number": number, "half": 0.5} for number in range(3)]
@@ -76,7 +76,7 @@ def test_dicts_and_arrays_arrive_as_they_were(read: Callable[..., list[isolated.
         ("mistake", "x.osf: not good"),
     ],
 )
-def test_a_death_is_one_line(read: Callable[..., list[isolated.Message]], function: str, expected: str) -> None:
+def test_a_death_is_one_line(read: Callable[..., list[isolated_reader.Message]], function: str, expected: str) -> None:
     with pytest.raises(InputError) as caught:
         read(function)
     assert expected in str(caught.value)
@@ -86,25 +86,25 @@ def test_a_death_is_one_line(read: Callable[..., list[isolated.Message]], functi
 
 @pytest.mark.parametrize(("function", "cpu_s", "wait_factor"), [("spin", 0.1, 100.0), ("wait", 6, 0.1)])
 def test_too_long_is_one_line(
-    read: Callable[..., list[isolated.Message]],
+    read: Callable[..., list[isolated_reader.Message]],
     monkeypatch: pytest.MonkeyPatch,
     function: str,
     cpu_s: float,
     wait_factor: float,
 ) -> None:
-    monkeypatch.setattr(isolated, "CPU_S", cpu_s)
-    monkeypatch.setattr(isolated, "_WAIT_FACTOR", wait_factor)
+    monkeypatch.setattr(isolated_reader, "CPU_S", cpu_s)
+    monkeypatch.setattr(isolated_reader, "_WAIT_FACTOR", wait_factor)
     with pytest.raises(InputError, match=r"x\.osf: the library took too long to read it: "):
         read(function)
 
 
-def test_a_bug_stays_a_traceback(read: Callable[..., list[isolated.Message]]) -> None:
+def test_a_bug_stays_a_traceback(read: Callable[..., list[isolated_reader.Message]]) -> None:
     with pytest.raises(RuntimeError, match="KeyError: 'lost'"):
         read("bug")
 
 
 def test_the_working_folder_is_not_on_its_path(
-    read: Callable[..., list[isolated.Message]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    read: Callable[..., list[isolated_reader.Message]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "numpy.py").write_text("raise RuntimeError('from the working folder')")
     monkeypatch.chdir(tmp_path)
@@ -120,7 +120,7 @@ def test_it_ends_with_its_parent(tmp_path: Path) -> None:
 import sys
 from pathlib import Path
 sys.path.insert(0, {str(tmp_path)!r})
-from cdpipe.core.isolated import IsolatedReader
+from cdpipe.core.isolated_reader import IsolatedReader
 reader = IsolatedReader("hostile", Path(sys.path[0]) / "hostile.py", "the library")
 print(next(reader.read("where"))[0]["pid"], flush=True)
 messages = reader.read("where")
