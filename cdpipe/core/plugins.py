@@ -19,7 +19,7 @@ METRICS = "tunnelcd.metrics"
 PRESETS = "tunnelcd.presets"
 SEARCH_PATH = "TUNNELCD_PATH"
 # Optional dependency of pyproject.toml -> the module that it installs.
-_EXTRAS = {"m3c2": "py4dgeo", "dufomap": "dufomap", "kiss": "kiss_matcher", "odometry": "kiss_icp"}
+_EXTRAS = {"m3c2": "py4dgeo", "dufomap": "dufomap", "kiss": "kiss_matcher", "odometry": "kiss_icp", "ouster": "ouster"}
 
 
 def has_extra(name: str) -> bool:

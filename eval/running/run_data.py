@@ -361,7 +361,7 @@ def _require_values(path: Path, frame: pd.DataFrame) -> None:
     """Refuse text among numbers, which no mean or chart can hold, and rows without the columns that name them."""
     if absent := {*_CASE} - set(frame) if len(frame) else set():
         raise InputError(f"{path}: column {', '.join(sorted(absent))} is missing: expected a table of `tunnelcd run`")
-    _require_numbers(path, frame, _TEXTS)
+    _require_numbers(path, frame, {*_TEXTS, "seed"})  # seeds are checked by their values
 
 
 def _require_numbers(path: Path, frame: pd.DataFrame, texts: Collection[str]) -> None:

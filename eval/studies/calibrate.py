@@ -136,12 +136,16 @@ def read_table(path: Path, plan: str) -> pd.DataFrame:
     """Read a CSV of the folder of `tunnelcd run PLAN`.
 
     Raises:
-        InputError: The file is missing or is no table.
+        InputError: The file is missing, is no table, or has no rows.
     """
+    expected = f"name a folder that `tunnelcd run {plan}` made"
     try:
-        return read_stored_table(table_file(path))
+        table = read_stored_table(table_file(path))
     except InputError as error:
-        raise InputError(f"{error}: name a folder that `tunnelcd run {plan}` made") from error
+        raise InputError(f"{error}: {expected}") from error
+    if table.empty:
+        raise InputError(f"{path}: has no rows: {expected}")
+    return table
 
 
 def _find_lowest_examined(regions: pd.DataFrame) -> float | None:

@@ -125,7 +125,8 @@ def test_a_damaged_truth_is_named(tmp_path: Path, mistake: dict[str, Any]) -> No
 
 def test_cells_without_a_number_are_read_and_those_of_a_newer_format_are_refused(tmp_path: Path) -> None:
     run = RunFolder(tmp_path)
-    cell = {"key": "a", "order": [0, 0], "row": {}, "changes": [], "regions": [], "objects": [], "keyframes": []}
+    row = {"scenario": "world", "seed": 1, "variant": "ours"}
+    cell = {"key": "a", "order": [0, 0], "row": row, "changes": [], "regions": [], "objects": [], "keyframes": []}
     write_json(tmp_path / "cells" / "world" / "1" / "ours.json", cell)
     assert run.finished_cells() == [cell]
     write_json(tmp_path / "cells" / "world" / "1" / "ours.json", {"format_version": 2, **cell})

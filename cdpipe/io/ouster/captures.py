@@ -17,6 +17,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_json
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.isolated_reader import Arrays, IsolatedReader
+from cdpipe.core.plugins import require_extra
 from cdpipe.io.ouster.integrity import check_osf_integrity, check_pcap_integrity
 from cdpipe.io.readers import RECORDING_SUFFIXES
 from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
@@ -139,6 +140,7 @@ def open_recording(path: Path, metadata: Path | None = None) -> Recording:
         raise InputError(f"{path}: expected a recording, {', '.join(RECORDING_SUFFIXES)}")
     if not path.is_file():
         raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}: expected a recording")
+    require_extra("ouster", str(path))
     if suffix == ".osf":
         if metadata is not None:
             raise InputError(f"{path}: an OSF carries its sensor's metadata: leave --metadata out")

@@ -483,9 +483,9 @@ def test_help_loads_nothing_heavy() -> None:
 @pytest.mark.parametrize(
     ("program", "arguments", "words"),
     [
-        ("calibrate", ["absent"], ["absent/results.csv", "No such file"]),
-        ("calibrate", ["empty"], ["empty/results.csv", "No such file"]),
-        ("calibrate", ["damaged"], ["damaged/results.csv", "No columns to parse"]),
+        ("calibrate", ["absent"], ["absent/results.csv", "missing", "name a folder"]),
+        ("calibrate", ["empty"], ["empty/results.csv", "missing", "name a folder"]),
+        ("calibrate", ["damaged"], ["damaged/results.csv", "no rows", "name a folder"]),
         ("calibrate", ["absent", "--quick"], ["--quick", "--help`"]),
         ("merge_gates", ["absent"], ["'--out'"]),
     ],

@@ -335,7 +335,7 @@ def test_missing_recording_is_one_line(tmp_path: Path, monkeypatch: pytest.Monke
     for suffix in (".pcap", ".json"):
         (tmp_path / "ouster" / f"{reality_scenes.RECORDING}{suffix}").touch()
     assert find_recording(tmp_path) == tmp_path / "ouster" / f"{reality_scenes.RECORDING}.pcap"
-    monkeypatch.setitem(sys.modules, "ouster.sdk", None)
+    monkeypatch.setitem(sys.modules, "ouster", None)
     with pytest.raises(InputError, match=r"tunnelcd\[ouster\]"):
         read_real_revolution(find_recording(tmp_path))
 
