@@ -15,6 +15,7 @@ from typing import Any
 
 import pandas as pd
 
+from cdpipe.core.errors import InputError
 from cdpipe.model.config import settings_table
 from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.core.output import require_no_links
@@ -79,12 +80,25 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
         Path of the page.
 
     Raises:
-        InputError: There are no results, they are of several metrics versions, or the folder holds a link or cannot be
-            written.
+        InputError: There are no results, they are of several metrics versions, a table lacks a column, or the folder
+            holds a link or cannot be written.
     """
     require_no_links(run)
     data = read_run(run)
     check_versions(Side(data), Side(data))
+    try:
+        files = _draw(data, views)
+    except KeyError as error:
+        raise InputError(
+            f"{run}: a table lacks column {error}: `tunnelcd score {run}` makes the tables anew"
+        ) from error
+    for name, file in files.items():
+        write_file(run / name, file)
+    return run / "index.html"
+
+
+def _draw(data: RunData, views: Views) -> dict[str, str | bytes]:
+    """Return every file of a page by its name."""
     merges = merge_table(pd.DataFrame(list(data.results)), read_targets(data.provenance))
     content = _about(data, merges)
     files: dict[str, str | bytes] = {**latex_tables(data)}
@@ -101,9 +115,7 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
     content["missing"] = list(dict.fromkeys([*data.left_out, *content["missing"], *content["merge"].missing]))
     files["index.html"] = render_page("page.html", content)
     files |= {f"{chart.name}.png": chart.png for chart in content["charts"] if chart.has_png}
-    for name, file in files.items():
-        write_file(run / name, file)
-    return run / "index.html"
+    return files
 
 
 def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from eval.core.tablefile import read_table, table_file
 from eval.plans.coverage import Coverage, measure_coverage
 from eval.plans.targets import read_targets
 from eval.plans.worlds import find_references
-from eval.running.runfolder import RunFolder, read_json
+from eval.running.runfolder import TEXT_COLUMNS, RunFolder, read_json
 from eval.tables.rows import records, with_domain
 
 Row = Mapping[str, Any]
@@ -29,12 +29,7 @@ REQUIRED = (*_CASE, "status")
 LARGEST = 1e15
 # ends of bins and of intervals, of which the last bin has none
 _UNBOUNDED = ("low", "high")
-# Columns of text; every other one holds numbers or truth values.
-_TEXTS = {
-    "scenario", "variant", "preset", "family", "pair_kind", "domain", "commit", "status", "error", "session", "name",
-    "kind", "prop_kind", "group", "why_not", "matched_kind", "outcome", "found_changes",
-}  # fmt: skip
-# likewise of the derived tables
+# columns of text of the derived tables
 _DERIVED_TEXTS = {"domain", "variant"}
 _MORE_TEXTS = {
     "regions_targets": ("target", "asked", "is_met"), "objects_targets": ("target", "asked", "is_met"),
@@ -361,7 +356,7 @@ def _require_values(path: Path, frame: pd.DataFrame) -> None:
     """Refuse text among numbers, which no mean or chart can hold, and rows without the columns that name them."""
     if absent := {*_CASE} - set(frame) if len(frame) else set():
         raise InputError(f"{path}: column {', '.join(sorted(absent))} is missing: expected a table of `tunnelcd run`")
-    _require_numbers(path, frame, {*_TEXTS, "seed"})  # seeds are checked by their values
+    _require_numbers(path, frame, {*TEXT_COLUMNS, "seed"})  # seeds are checked by their values
 
 
 def _require_numbers(path: Path, frame: pd.DataFrame, texts: Collection[str]) -> None:

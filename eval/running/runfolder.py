@@ -48,6 +48,11 @@ from eval.tables.region_table import FILES as REGION_FILES
 from eval.tables.region_table import region_tables
 
 IDENTITY = ("scenario", "seed", "variant")
+# columns of text of results.csv and the item tables; every other one holds numbers or truth values
+TEXT_COLUMNS = {
+    "scenario", "variant", "preset", "family", "pair_kind", "domain", "commit", "status", "error", "session", "name",
+    "kind", "prop_kind", "group", "why_not", "matched_kind", "outcome", "found_changes",
+}  # fmt: skip
 _NAMED = {"scenario": str, "seed": int, "variant": str}
 ITEM_TABLES = ("changes", "regions", "objects", "keyframes")
 _MAPS = {"before_points": ArraySpec("N,3", "float32"), "after_points": ArraySpec("M,3", "float32")}
@@ -304,11 +309,16 @@ def _plain(value: Any) -> Any:
 
 
 def _holds_rows(document: Mapping[str, Any]) -> bool:
-    """Return whether a cell holds rows of plain values, and names its case in each."""
+    """Return whether a cell holds rows of numbers, and of texts where texts belong, and names its case in each."""
     tables = [[document["row"]], *(document[table] for table in ITEM_TABLES)]
     if not all(isinstance(rows, list) and all(isinstance(row, dict) for row in rows) for rows in tables):
         return False
-    is_plain = all(not isinstance(value, list | dict) for rows in tables for row in rows for value in row.values())
+    is_plain = all(
+        not isinstance(value, list | dict) and (not isinstance(value, str) or name in TEXT_COLUMNS)
+        for rows in tables
+        for row in rows
+        for name, value in row.items()
+    )
     names = [(type(row.get(name)), kind) for rows in tables for row in rows for name, kind in _NAMED.items()]
     order = document["order"]
     is_placed = isinstance(order, list) and [type(place) for place in order] == [int, int]

@@ -103,3 +103,12 @@ def test_a_derived_table_with_text_among_its_numbers_is_one_line(tmp_path: Path,
         stored_table(run, "roc")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_derived_table_without_a_column_is_one_line(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", PLAIN[:6])
+    write_json(folder / "provenance.json", {"tool": "tunnelcd", "plan": {"name": "x", "report": "objects"}})
+    (folder / "objects_table.csv").write_text("domain,variant,n_pairs\nin,a,3\n")
+    with pytest.raises(InputError, match="run: a table lacks column 'object_iou_point': `tunnelcd score") as caught:
+        write_page(folder)
+    assert "\n" not in str(caught.value)
