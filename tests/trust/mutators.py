@@ -28,6 +28,7 @@ _WORDS = (
     b"nan", b"inf", b"-inf", b"1e999", b"-1", b"0", b"1e308", b"9" * 30, b"9" * 5000, b"", b"x", b"true", b"\x00",
     b"\xff\xfe", b"\xf0\x9f\x92\xa5", b"\x1b[31m", b"<script>", b"../../x", b"1_0", b"0x10", b"1.5", b"'", b'"', b",",
 )  # fmt: skip
+_MOST_HELD_BYTES = 10_000_000
 _VALUES: tuple[Any, ...] = (
     None, True, False, 0, -1, 1, 0.5, -0.0, 1e308, -1e308, 1e-320, 2**31, 2**53 + 1, 2**63, -(2**63) - 1, 10**400,
     float("nan"), float("inf"), float("-inf"), "", "x", "1", "nan", "\0", "\x1b[31m", "\ud800", "a\nb", "../../x", "/",
@@ -195,8 +196,15 @@ def change_cells(content: bytes, rng: random.Random) -> bytes:
 
 
 def within_xz(mutator: Mutator) -> Mutator:
-    """Return a mutator of what an .xz file holds."""
-    return lambda content, rng: lzma.compress(mutator(lzma.decompress(content), rng), preset=0)
+    """Return a mutator of what an .xz file holds; of a bomb it damages the file itself."""
+
+    def damage(content: bytes, rng: random.Random) -> bytes:
+        held = lzma.LZMADecompressor().decompress(content, max_length=_MOST_HELD_BYTES + 1)
+        if len(held) > _MOST_HELD_BYTES or content == _xz_bomb():
+            return flip(content, rng)
+        return lzma.compress(mutator(held, rng), preset=0)
+
+    return damage
 
 
 def bomb_xz(content: bytes, rng: random.Random) -> bytes:
