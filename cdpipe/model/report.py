@@ -55,7 +55,7 @@ class ChangeRegions:
             raise ValueError("is_withdrawn and is_reported: a region is one or the other")
         if self.direction is not None and (self.direction.dtype != np.uint8 or (self.direction > 1).any()):
             raise ValueError("direction must be uint8: 0 for a queried before keyframe, 1 for an after keyframe")
-        if (np.diff(self.scores) > 0).any():
+        if (self.scores[1:] > self.scores[:-1]).any():
             raise ValueError("scores must fall: best candidate first")
 
 

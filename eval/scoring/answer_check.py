@@ -19,7 +19,7 @@ from eval.truth.scoring_points import ScoringPoints
 
 SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns"))
 MAX_SECONDS = 1e8  # three years
-MAX_AMOUNT = 1e15  # of bytes, points, and every other figure of the evidence
+MAX_AMOUNT = 1e15  # of bytes, points, scores and every other figure; a page shows no larger one
 MAX_M = 1e7  # a quarter of the way around the Earth
 _MANY = 100  # so many valid returns include the first return of some cell
 _ASIDE_M = 2.0  # largest gap between an object's points and its returns
@@ -88,13 +88,14 @@ def _check_local(local_before_T_after: Float64Array | None, n_keyframes: int, n_
 
 
 def _check_regions(regions: ChangeRegions, n_keyframes: int, n_scans: int) -> None:
-    for name, values in (("region_centres_map", regions.centres_map), ("region_scores", regions.scores)):
-        _require_finite(name, values)
     _require_near("region_centres_map", regions.centres_map)
+    _require_finite("region_scores", regions.scores)
+    _require_scores("region_scores", regions.scores)
     if not 0 < regions.radius_m <= MAX_M:
         raise ValueError(f"radius_m = {regions.radius_m}: expected a length in metres, up to {MAX_M:g}")
     if np.isinf(regions.keyframe_scores).any():
         raise ValueError("keyframe_scores: a score is infinite: expected a number, or NaN where nothing was compared")
+    _require_scores("keyframe_scores", regions.keyframe_scores)
     n_scored = n_keyframes or n_scans
     if len(regions.keyframe_scores) not in (0, n_scored):
         raise ValueError(
@@ -123,9 +124,10 @@ def _check_object(index: int, item: ChangedObject, n_objects: int, n_regions: in
     if not -1 <= item.region < n_regions:
         raise ValueError(f"{where}.region = {item.region}: there are {n_regions} regions; -1 means none")
     _require_near(f"{where}: object_points_map", item.points_map)
-    if not np.isfinite(item.score):
-        raise ValueError(f"{where}.score = {item.score}: expected a number")
+    if not abs(item.score) <= MAX_AMOUNT:
+        raise ValueError(f"{where}.score = {item.score}: expected a number, at most {MAX_AMOUNT:g} in size")
     if item.shape is not None:
+        _require_near(f"{where}.shape: map_T_box", item.shape.map_T_box[None, :3, 3])
         edges = item.shape.box_m.tolist()
         if not (all(0 <= edge <= MAX_M for edge in edges) and 0 <= item.shape.volume_m3 <= MAX_AMOUNT):
             raise ValueError(
@@ -230,6 +232,13 @@ def _require_near(name: str, places_m: Float64Array) -> None:
     is_far = (np.abs(places_m) > MAX_M).any(axis=1)
     if is_far.any():
         raise ValueError(f"{name}: entry {int(np.argmax(is_far))} is farther than {MAX_M:g} m from the origin")
+
+
+def _require_scores(name: str, scores: Float64Array) -> None:
+    """Raise for a score that a page would leave out as too large; NaN passes."""
+    is_beyond = (scores > MAX_AMOUNT) | (scores < -MAX_AMOUNT)
+    if is_beyond.any():
+        raise ValueError(f"{name}: entry {int(np.argmax(is_beyond))} is larger than {MAX_AMOUNT:g} in size")
 
 
 def _require_finite(name: str, values: Float64Array) -> None:

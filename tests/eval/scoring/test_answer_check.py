@@ -19,6 +19,7 @@ from tests.eval.scoring.test_object_metrics import line_points
 
 NAN, INF = float("nan"), float("inf")
 FAR = np.nextafter(MAX_M, np.inf)
+TOO_MUCH = np.nextafter(MAX_AMOUNT, np.inf)
 POINTS = np.zeros((1, 3))
 
 
@@ -63,7 +64,7 @@ def test_the_seconds_that_an_answer_may_state() -> None:
         (0.0, None),
         (NAN, None),
         (MAX_AMOUNT, None),
-        (np.nextafter(MAX_AMOUNT, INF), r"evidence\.overlap = "),
+        (TOO_MUCH, r"evidence\.overlap = "),
         (-1e-300, r"evidence\.overlap = -1e-300"),
         (INF, r"evidence\.overlap = inf"),
     ],
@@ -124,6 +125,12 @@ REGIONS = ChangeRegions(
         ({"radius_m": NAN}, 3, "radius_m = nan: "),
         ({"scores": np.array([INF, 1.0])}, 3, "region_scores: entry 0 is not"),
         ({"scores": np.array([1.0, NAN])}, 3, "region_scores: entry 1 is not"),
+        ({"scores": np.array([MAX_AMOUNT, -MAX_AMOUNT])}, 3, None),
+        ({"scores": np.array([TOO_MUCH, 1.0])}, 3, r"region_scores: entry 0 is larger than 1e\+15 in size"),
+        ({"scores": np.array([1.0, -TOO_MUCH])}, 3, "region_scores: entry 1 is larger"),
+        ({"scores": np.array([2, 1], np.uint8), "keyframe_scores": np.array([True, False, True])}, 3, None),
+        ({"keyframe_scores": np.array([-MAX_AMOUNT, NAN, MAX_AMOUNT])}, 3, None),
+        ({"keyframe_scores": np.array([0.0, TOO_MUCH, NAN])}, 3, "keyframe_scores: entry 1 is larger"),
         ({"centres_map": np.array([(0.0, 0.0, 0.0), (0.0, NAN, 0.0)])}, 3, "region_centres_map: entry 1 is not"),
         ({"centres_map": np.array([(0.0, 0.0, 0.0), (0.0, 0.0, -FAR)])}, 3, "region_centres_map: entry 1 is farther"),
     ],
@@ -152,8 +159,8 @@ def test_scans(scans: np.ndarray, told: str | None) -> None:
         module._check_scans("k", scans, 5)
 
 
-def shape(edge_m: float = 1.0, volume_m3: float = 1.0) -> ObjectShape:
-    return ObjectShape(np.eye(4), np.array([1.0, 1.0, edge_m]), volume_m3)
+def shape(edge_m: float = 1.0, volume_m3: float = 1.0, x_m: float = 0.0) -> ObjectShape:
+    return ObjectShape(make_pose(translation=(x_m, 0.0, 0.0)), np.array([1.0, 1.0, edge_m]), volume_m3)
 
 
 @pytest.mark.parametrize(
@@ -174,13 +181,17 @@ def shape(edge_m: float = 1.0, volume_m3: float = 1.0) -> ObjectShape:
         ({"points": np.array([(0, 0, 0), (0, 0, INF)])}, r"objects\[2\]: object_points_map: entry 1 is not"),
         ({"score": NAN}, r"objects\[2\]\.score = nan: expected a number"),
         ({"score": -INF}, r"objects\[2\]\.score = -inf: expected a number"),
+        ({"score": MAX_AMOUNT}, None),
+        ({"score": -TOO_MUCH}, r"objects\[2\]\.score = -1000000000000000\.1: expected a number, at most 1e\+15"),
         ({"shape": shape(0.0, 0.0)}, None),
         ({"shape": shape(MAX_M, MAX_AMOUNT)}, None),
         ({"shape": shape(FAR)}, r"objects\[2\]\.shape: edges 1, 1, 1e\+07 m and volume 1 m3"),
         ({"shape": shape(-0.1)}, r"objects\[2\]\.shape: edges 1, 1, -0.1 m"),
         ({"shape": shape(NAN)}, r"objects\[2\]\.shape: edges 1, 1, nan m"),
         ({"shape": shape(1.0, -0.1)}, "volume -0.1 m3"),
-        ({"shape": shape(1.0, np.nextafter(MAX_AMOUNT, INF))}, r"volume 1e\+15 m3"),
+        ({"shape": shape(x_m=-MAX_M)}, None),
+        ({"shape": shape(x_m=FAR)}, r"objects\[2\]\.shape: map_T_box: entry 0 is farther"),
+        ({"shape": shape(1.0, TOO_MUCH)}, r"volume 1e\+15 m3"),
         ({"displacement_map": np.array([0.0, 0.0, MAX_M])}, None),
         ({"displacement_map": np.array([0.0, 0.0, FAR])}, r"objects\[2\]\.displacement_map: entry 0 is farther"),
         ({"displacement_map": np.array([0.0, NAN, 0.0])}, r"objects\[2\]\.displacement_map: entry 0 is not"),
