@@ -2,11 +2,12 @@
 
 Cost is the median time of a pair, or the mean of the bytes kept of the before session. A method is on the front if no
 other method is at least as good and as cheap, and better in one of the two. A method competes if it is not told the
-truth, finds something, and ran as many pairs as any other.
+truth, finds something, ran as many pairs as any other, and states its cost for each of its answers.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -90,8 +91,11 @@ def _quality(own: pd.DataFrame, quality: str, stored: pd.DataFrame) -> dict[str,
 
 
 def _cost(own: pd.DataFrame, cost: str) -> dict[str, float]:
+    """Return the cost over all answers of a method; NaN if one lacks it: else a method would choose where it is low."""
     values = numbers(own[own["status"] == "ok"], cost)
-    return {"n_cost": int((~np.isnan(values)).sum()), "cost_value": (median if cost == _TIME else mean)(values)}
+    n_cost = int(np.count_nonzero(~np.isnan(values)))
+    value = (median if cost == _TIME else mean)(values) if n_cost == len(values) else math.nan
+    return {"n_cost": n_cost, "cost_value": value}
 
 
 def _marked(table: pd.DataFrame) -> pd.DataFrame:

@@ -133,7 +133,7 @@ def _counts(own: pd.DataFrame) -> dict[str, Any]:
         "false_regions_per_100m_unchanged": 100.0 * n_false_unchanged / unchanged_m if unchanged_m > 0 else math.nan,
         "bytes_map_before": mean(map_bytes),
         "bytes_regions_before": mean(kept_bytes),
-        "bytes_ratio": mean(map_bytes / np.where(kept_bytes > 0, kept_bytes, math.nan)),
+        "bytes_ratio": mean(map_bytes / np.where(kept_bytes >= 1, kept_bytes, math.nan)),
         **{name: median(numbers(answered, name)) for name in _MEDIANS},
     }
 

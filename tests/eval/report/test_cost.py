@@ -1,5 +1,6 @@
 """The front of quality against cost, by brute force, and who may stand on it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +74,20 @@ def test_who_is_told_the_truth_finds_nothing_or_ran_fewer_pairs_does_not_compete
     assert set(table["variant"]) == set(methods)
     assert on_front(table, "t_total_s") == ["tunnelcd", "voxel-diff"]
     assert on_front(table, "bytes_regions_before") == ["tunnelcd"]
+
+
+def test_a_cost_that_is_stated_for_some_answers_only_does_not_compete(tmp_path: Path) -> None:
+    data = run(tmp_path, {"slow": (0.9, 4.0, 10.0), "fast": (0.5, 1.0, 20.0), "chosen": (0.9, 0.1, 0.1)})
+    rows = [
+        {**row, "bytes_regions_before": NAN} if (row["variant"], row["seed"]) == ("chosen", 3) else dict(row)
+        for row in data.results
+    ]
+    table = pareto_table(replace(data, results=tuple(rows)))
+    assert on_front(table, "t_total_s") == ["chosen"]
+    assert on_front(table, "bytes_regions_before") == ["slow"]
+    # a pair without an answer has no cost, and its method competes
+    rows = [{**row, "status": "failed"} if np.isnan(row["bytes_regions_before"]) else row for row in rows]
+    assert on_front(pareto_table(replace(data, results=tuple(rows))), "bytes_regions_before") == ["chosen"]
 
 
 def test_recall_at_a_rate_is_taken_from_the_table_of_regions(tmp_path: Path) -> None:

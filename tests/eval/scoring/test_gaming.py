@@ -126,6 +126,40 @@ def test_spheres_everywhere_cost_precision_and_false_regions(tiny_pair: Path, ho
     assert row["false_regions_per_100m"] > 10
 
 
+def test_a_tiny_radius_moves_the_coverage_alone(tiny_pair: Path, honest: ChangeReport) -> None:
+    row = scored(tiny_pair, honest).row
+    tiny = scored(tiny_pair, replace(honest, regions=replace(honest.regions, radius_m=1e-9))).row
+    assert {name for name in row if repr(tiny[name]) != repr(row[name])} == {"region_coverage"}
+    assert tiny["region_coverage"] < row["region_coverage"]
+
+
+def test_the_surest_object_alone_misses_all_other_changes(tiny_pair: Path, honest: ChangeReport) -> None:
+    row = scored(tiny_pair, replace(honest, objects=honest.objects[:1])).row
+    assert (row["kind_accuracy"], row["n_matched"]) == (1.0, 1)
+    figures = ("object_iou_point", "object_f1_25", "object_f1_50", "object_pq")
+    whole = scored(tiny_pair, honest).row
+    assert all(row[name] < whole[name] for name in figures)
+
+
+def test_objects_without_regions_find_nothing(tiny_pair: Path, honest: ChangeReport) -> None:
+    objects = tuple(replace(item, region=-1) for item in honest.objects)
+    row = scored(tiny_pair, replace(without_objects_and_regions(honest), objects=objects)).row
+    assert row["region_recall"] == row["region_precision"] == row["region_recall_at_k"] == 0.0
+
+
+def test_objects_without_regions_are_false_where_nothing_changed(write_tiny_pair: Any, tiny_merge: np.ndarray) -> None:
+    pair = write_tiny_pair(has_changes=False)
+    silent = without_objects_and_regions(true_report(pair, tiny_merge))
+    loud = scored(pair, with_wrong(silent, load_ground_truth(pair), "object")).row
+    assert (loud["is_alarm"], loud["object_precision_50"]) == (False, 0.0)
+
+
+def test_times_and_bytes_that_are_left_out_are_not_zero(tiny_pair: Path, honest: ChangeReport) -> None:
+    row = scored(tiny_pair, replace(honest, seconds={"t_cd_s": 0.0}, evidence={})).row
+    unknown = ("t_total_s", "t_total_with_merge_s", "t_total_paper_s", "bytes_map_before", "bytes_regions_before")
+    assert all(np.isnan(row[name]) for name in unknown)
+
+
 @pytest.mark.parametrize("what", ["region", "object"])
 def test_something_wrong_raises_no_score(tiny_pair: Path, honest: ChangeReport, what: str) -> None:
     truth = load_ground_truth(tiny_pair)

@@ -109,6 +109,9 @@ def test_a_row_by_hand() -> None:
     assert (row["bytes_map_before"], row["bytes_regions_before"], row["bytes_ratio"]) == (1000.0, 100.0, 10.0)
     assert row["recall_at_0.1"] == pytest.approx(2 / 3)
     assert row["t_descriptor_per_keyframe_s"] == 0.01
+    # nobody keeps less than a byte
+    fraction = the_row(tables([changed("regions/narrow", 1, bytes_regions_before=5e-324)])["regions_table"], "in")
+    assert np.isnan(fraction["bytes_ratio"])
 
 
 def test_domains_are_apart_and_all_is_both() -> None:
