@@ -18,6 +18,7 @@ from cdpipe.core.files.plain_file import require_plain_file
 
 _LENGTH_BYTES = 8
 _MAX_TABLE_BYTES = 8 << 20
+_MAX_AXES = 32
 _DTYPES = {
     "F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "|i1",
     "U64": "<u8", "U32": "<u4", "U16": "<u2", "U8": "|u1", "BOOL": "|b1",
@@ -117,6 +118,8 @@ def _parse_tensor(name: str, entry: Any) -> _Tensor:
         dtype, shape, (begin, end) = np.dtype(_DTYPES[entry["dtype"]]), tuple(entry["shape"]), entry["data_offsets"]
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{name[:40]!r} is no tensor of numbers") from error
+    if len(shape) > _MAX_AXES:
+        raise ValueError(f"{name[:40]!r} has {len(shape)} axes, more than {_MAX_AXES}")
     if not all(type(number) is int and number >= 0 for number in (*shape, begin, end)):
         raise ValueError(f"{name[:40]!r} has a shape or place that is no whole number")
     return _Tensor(ArrayType(dtype, shape), begin, end)

@@ -1,5 +1,6 @@
 import json
 import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,14 @@ def test_what_json_writes_is_read(value: Any) -> None:
 def test_what_no_reader_can_use_is_refused(text: str | bytes, told: str) -> None:
     with pytest.raises(ValueError, match=told):
         parse_json(text)
+
+
+def test_a_key_that_stands_twice_is_found_at_once_among_many() -> None:
+    names = [*map(str, range(100_000)), "last", "last"]
+    start_s = time.process_time()
+    with pytest.raises(ValueError, match="the key 'last' stands there twice"):
+        parse_json("{" + ",".join(f'"{name}":0' for name in names) + "}")
+    assert time.process_time() - start_s < 10.0  # 0.1 s; 130 s where each name is counted among all
 
 
 def test_64_levels_are_read() -> None:

@@ -62,6 +62,7 @@ def _entry(dtype: Any = "U8", shape: Any = (4,), offsets: Any = (0, 4)) -> dict[
         (_file({"a": _entry(shape=[-4])}, bytes(4)), "no whole number"),
         (_file({"a": _entry(shape=[2**40])}, bytes(4)), "declares 1099511627776 bytes"),
         (_file({"a": _entry(shape=[2**40, 2**40], offsets=[0, 2**63])}), "declares"),
+        (_file({"a": _entry(shape=[2**63] * 100_000 + [0], offsets=[0, 0])}), "100001 axes, more than 32"),
         (_file({"a": _entry(offsets=[1, 5])}, bytes(5)), "at 1 to 5, not at 0"),
         (_file({"a": _entry(), "b": _entry()}, bytes(4)), "at 0 to 4, not at 4"),
         (_file({"a": _entry()}, bytes(5)), "its tensors end at byte"),
