@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from cdpipe.core.geometry import Float64Array, Int64Array
 from scenarios.schema import MeshFile
 from sim.geometry.mesh import Mesh, drop_flat_faces, drop_unused_vertices
 from sim.geometry.topology import closed_volume_m3, edges_of, largest_hole, void_winding
+from sim.rock.glb import count_glb
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 _UNIT_WORDS = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches", "ft": "feet"}
@@ -25,6 +27,8 @@ _WORLD_R_FILE = {
 SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 MAX_TRIANGLES = 5_000_000
 _MAX_BYTES = 2_000_000_000
+_MAX_PARTS = 5_000  # trimesh takes 4 s for so many materials, and the square of it
+_MAX_DEPTH = 64  # of nodes within nodes; trimesh walks up from each
 _WELD_M = 1e-6
 # What trimesh logs about a damaged file, tracebacks included, it also raises.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
@@ -114,8 +118,6 @@ def _read(file: MeshFile, key: str) -> Mesh:
     vertices, faces = _parse(path, say)
     if len(faces) == 0:
         raise ScenarioError(f"{say}: no triangles in it: cut short, or points and lines only? export a surface")
-    if len(faces) > MAX_TRIANGLES:
-        raise ScenarioError(f"{say}: {len(faces):,} triangles: decimate it to {MAX_TRIANGLES:,} at most")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ScenarioError(f"{say}: a triangle names a vertex that is not there: export it again")
     is_bad = ~np.isfinite(vertices).all(axis=1)
@@ -130,10 +132,14 @@ def _read(file: MeshFile, key: str) -> Mesh:
 def _parse(path: Path, say: str) -> tuple[Float64Array, Int64Array]:
     """Return all triangles of a file, its scene graph applied, in its own units and axes."""
     try:
+        _refuse_contents(path, say)
         scene = trimesh.load_scene(path, process=False, skip_materials=True)
+        _refuse_scene(scene, say)
         solids = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
         vertices = [np.asarray(solid.vertices, dtype=np.float64) for solid in solids]
         faces = [np.asarray(solid.faces, dtype=np.int64) for solid in solids]
+    except ScenarioError:
+        raise
     except Exception as error:  # the readers of trimesh let through whatever a damaged file provokes
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ScenarioError(f"{say}: unreadable, the file is damaged or of another kind ({reason})") from error
@@ -143,6 +149,44 @@ def _parse(path: Path, say: str) -> tuple[Float64Array, Int64Array]:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
     starts = np.cumsum([0] + [len(part) for part in vertices])
     return np.concatenate(vertices), np.concatenate([part + at for part, at in zip(faces, starts[:-1], strict=True)])
+
+
+def _refuse_contents(path: Path, say: str) -> None:
+    """Refuse more parts than are read, and more triangles in a GLB, before trimesh makes a mesh of each part."""
+    kind = path.suffix.lower()
+    if kind == ".glb":
+        found = count_glb(path)
+        _refuse_numbers(found.parts, found.vertices, found.triangles, say)
+    elif kind == ".obj":
+        _refuse_numbers(len(set(re.findall(rb"usemtl [^\r\n]*", path.read_bytes()))), 0, 0, say)
+    elif kind == ".stl":
+        _refuse_numbers(len(re.findall(b"endsolid", path.read_bytes(), re.IGNORECASE)), 0, 0, say)
+
+
+def _refuse_scene(scene: trimesh.Scene, say: str) -> None:
+    """Refuse more parts and triangles than are read, before a copy is made of a part for each place it stands at."""
+    nodes = scene.graph.nodes_geometry
+    solids = [scene.geometry[scene.graph.transforms.node_data[node]["geometry"]] for node in nodes]
+    n_vertices = sum(len(solid.vertices) for solid in solids)
+    n_triangles = sum(len(solid.faces) for solid in solids if isinstance(solid, trimesh.Trimesh))
+    _refuse_numbers(len(nodes), n_vertices, n_triangles, say)
+    parents = scene.graph.transforms.parents
+    for node in nodes:
+        for _ in range(_MAX_DEPTH):
+            node = parents.get(node)  # noqa: PLW2901 - a walk up
+            if node is None:
+                break
+        else:
+            raise ScenarioError(f"{say}: nodes within nodes, deeper than {_MAX_DEPTH} levels: join its parts to one")
+
+
+def _refuse_numbers(n_parts: int, n_vertices: int, n_triangles: int, say: str) -> None:
+    if n_parts > _MAX_PARTS:
+        raise ScenarioError(f"{say}: {n_parts:,} parts: join them to {_MAX_PARTS:,} at most")
+    if n_triangles > MAX_TRIANGLES:
+        raise ScenarioError(f"{say}: {n_triangles:,} triangles: decimate it to {MAX_TRIANGLES:,} at most")
+    if n_vertices > 3 * MAX_TRIANGLES:
+        raise ScenarioError(f"{say}: {n_vertices:,} vertices: decimate it to {3 * MAX_TRIANGLES:,} at most")
 
 
 def _weld(vertices: Float64Array, faces: Int64Array) -> Mesh:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -133,6 +135,56 @@ def test_files_that_hold_no_surface_are_named(tmp_path: Path, monkeypatch: pytes
     assert "1 vertices are not finite" in told("nan.ply", solid.export(file_type="ply"))
     monkeypatch.setattr(foreign, "MAX_TRIANGLES", 100)
     assert "192 triangles" in told("big.stl", tube().export(file_type="stl"))
+
+
+def glb_of(path: Path, nodes: list[dict[str, Any]], n_primitives: int = 1, **accessor: Any) -> MeshFile:
+    """Write a GLB of a tetrahedron with 1 m edges along the axes, as many times as primitives, at nodes."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.uint32)
+    data = corners.tobytes() + faces.tobytes()
+    table = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": nodes,
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}] * n_primitives}],
+        "buffers": [{"byteLength": len(data)}],
+        "bufferViews": [{"buffer": 0, "byteLength": 48}, {"buffer": 0, "byteOffset": 48, "byteLength": 48}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
+            {"componentType": 5125, "count": 12, "type": "SCALAR", **(accessor or {"bufferView": 1})},
+        ],
+    }
+    text = json.dumps(table).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<L4s", len(text), b"JSON") + text + struct.pack("<L4s", len(data), b"BIN\0") + data
+    path.write_bytes(struct.pack("<4sLL", b"glTF", 2, 12 + len(chunks)) + chunks)
+    return MeshFile(path=str(path))
+
+
+def test_a_small_file_that_asks_for_much_time_or_memory_is_refused(tmp_path: Path) -> None:
+    def told(*content: Any, **accessor: Any) -> str:
+        return refusal(lambda: prop_mesh(glb_of(tmp_path / "a.glb", *content, **accessor), "x"))
+
+    chain = [{"mesh": 0, "children": [index + 1]} for index in range(60)]
+    assert len(prop_mesh(glb_of(tmp_path / "a.glb", [*chain, {}], 2), "x").faces) == 2 * 4 * 60
+    assert "20,000 parts: join them to 5,000 at most" in told([{"mesh": 0}], 20_000)
+    instances = [{"children": list(range(1, 5002))}, *[{"mesh": 0}] * 5001]
+    assert "5,001 parts: join them to 5,000 at most" in told(instances)
+    assert "deeper than 64 levels" in told([*({"mesh": 0, "children": [index + 1]} for index in range(100)), {}])
+    assert "20,000,000 triangles" in told([{"mesh": 0}], count=60_000_000)
+    assert "bytes would expand to 4" in told([{"mesh": 0}], count=10**9)
+    for name, content in (
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "".join(f"usemtl m{n}\nf 1 2 3\n" for n in range(6000))),
+        ("a.stl", "solid x\nendsolid x\n" * 6000),
+    ):
+        (tmp_path / name).write_text(content)
+        assert "6,000 parts" in refusal(lambda name=name: prop_mesh(MeshFile(path=str(tmp_path / name)), "x"))
+
+
+def test_a_part_placed_many_times_counts_each_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foreign, "MAX_TRIANGLES", 39)
+    nodes = [{"children": list(range(1, 11))}, *[{"mesh": 0}] * 10]
+    assert "40 triangles" in refusal(lambda: prop_mesh(glb_of(tmp_path / "a.glb", nodes), "x"))
 
 
 def test_a_chair_of_90_m_is_asked_for_its_units(tmp_path: Path) -> None:
