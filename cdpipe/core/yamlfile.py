@@ -21,7 +21,7 @@ from cdpipe.core.files.yaml_file import MAX_BYTES as MAX_YAML_BYTES
 from cdpipe.core.files.yaml_file import Key, YamlError, parse_yaml, parse_yaml_value
 from cdpipe.core.names import visible
 
-_MAX_TOLD = 20
+_MAX_TOLD = 100  # mistakes of a file; the closest known name to each takes time
 
 
 class Settings(BaseModel):
@@ -84,14 +84,17 @@ def validate(model: type[ModelT], document: Document) -> ModelT:
     """Check a document against a model.
 
     Raises:
-        InputError: One line per mistake: `file:line: key = value: rule; did you mean …`.
+        InputError: One line per mistake, `file:line: key = value: rule; did you mean …`, and after 100 their number.
     """
     if not isinstance(document.value, dict):
         raise InputError(f"{document.source}: expected keys and values, got {type(document.value).__name__}")
     try:
         return model.model_validate(document.value)
     except ValidationError as error:
-        lines = [visible(_describe_mistake(model, document, item)) for item in error.errors()]
+        mistakes = error.errors()
+        lines = [visible(_describe_mistake(model, document, item)) for item in mistakes[:_MAX_TOLD]]
+        if len(mistakes) > _MAX_TOLD:
+            lines.append(f"{document.source}: and {len(mistakes) - _MAX_TOLD} more mistakes")
         raise InputError("\n".join(dict.fromkeys(lines))) from error
 
 

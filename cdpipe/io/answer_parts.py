@@ -93,6 +93,7 @@ OFFSETS = {
 }
 _MASKS = ("region_is_reported", "region_is_withdrawn")
 _FIGURE = "figure_"
+_MOST_TOLD = 100
 
 
 def check_document(path: Path, value: Any) -> AnswerPart | FailurePart:
@@ -112,12 +113,14 @@ def check_array_types(path: Path, arrays: Mapping[str, ArrayType], n_objects: in
     Raises:
         InputError: One line for each mistake.
     """
-    mistakes = []
+    mistakes: list[str] = []
     for name, array in arrays.items():
+        if len(mistakes) == _MOST_TOLD:
+            break
         shape = ("R",) if name.startswith(_FIGURE) else _SHAPES.get(name)
         if shape is None:
             near = suggest(name, _SHAPES) or f" (known: {', '.join(_SHAPES)})"
-            mistakes.append(f"array {name} is unknown{near}")
+            mistakes.append(f"array {name[:200]} is unknown{near}")
         elif array.dtype.kind not in ("b" if name in _MASKS else "biuf"):
             wanted = "true or false" if name in _MASKS else "numbers"
             mistakes.append(f"array {name}: expected {wanted}, got {array.dtype}")

@@ -16,7 +16,7 @@ from cdpipe.core.motion import Motion, make_motion
 TUM_LINE = "stamp tx ty tz qx qy qz qw"
 _UNIT_TOLERANCE = 1e-3
 _FARTHEST_M = 1e8  # around the Earth twice; UTM coordinates are below 1e7
-_MOST_BYTES = 32_000_000
+_MOST_BYTES = 100_000_000  # two hours at 200 Hz
 _MOST_STAMP_S = 9e9  # of Unix time until the year 2255; as nanoseconds it fits into 64 bits
 # Poses farther apart than this say nothing about the columns between them.
 _LONGEST_GAP_S = 1.0

@@ -21,7 +21,9 @@ def new_folder(path: Path) -> Iterator[Path]:
         InputError: `path` is a file or a folder with something in it, or cannot be made.
     """
     # a link to an empty folder, or to none yet, is that folder
-    path = path.resolve() if path.is_symlink() else path.absolute()
+    path = Path(os.path.realpath(path)) if path.is_symlink() else path.absolute()
+    if path.is_symlink():
+        raise InputError(f"{path}: is a link that leads to itself: name a folder you may write to")
     partial = path.with_name(f".{path.name}.partial")
     made = _missing_parents(path)
     try:

@@ -168,7 +168,7 @@ def _opaque_name(salt: str, pair: Path) -> str:
 
 def _require_own(run: RunFolder, out: Path, names: set[str]) -> None:
     """Refuse an output folder inside the run, or one that holds something that this export does not write."""
-    if out.resolve().is_relative_to(run.path.resolve()):
+    if Path(os.path.realpath(out)).is_relative_to(run.path.resolve()):  # Path.resolve dies of a loop
         raise InputError(f"{out}: lies in the run folder, beside the truth: name a folder outside of {run.path}")
     make_writable(out)
     own = names | {f".{name}.partial" for name in names}

@@ -57,9 +57,10 @@ def parse_yaml(text: str) -> ParsedYaml:
     except YamlError:
         raise
     except yaml.MarkedYAMLError as error:
-        raise YamlError(str(error.problem), error.problem_mark.line + 1 if error.problem_mark else 1) from error
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        raise YamlError(f"{error.problem!s:.200}", line) from error
     except Exception as error:  # constructors of explicit types (`!!int ""`) let through whatever a value provokes
-        raise YamlError(str(error).splitlines()[0] if str(error) else type(error).__name__) from error
+        raise YamlError(str(error).splitlines()[0][:200] if str(error) else type(error).__name__) from error
     return ParsedYaml(value, builder.lines, builder.mistakes)
 
 
@@ -124,7 +125,7 @@ class _Builder:
             name = self._scalar(name_node)
             line = name_node.start_mark.line + 1
             if name in content:
-                self.mistakes.append((line, f"{name}: the key is here a second time"))
+                self.mistakes.append((line, f"{name!s:.200}: the key is here a second time"))
             self.lines[(*key, name)] = line
             content[name] = self.build(item, (*key, name))
         return content

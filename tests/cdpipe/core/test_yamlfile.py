@@ -35,6 +35,14 @@ def test_all_mistakes_are_told_at_once_by_line() -> None:
         assert any(line.startswith(head) and hint in line for line in lines), head
 
 
+def test_mistakes_without_end_are_counted() -> None:
+    text = "name: x\n" + "".join(f"unknown{number}: 1\n" for number in range(1000))
+    with pytest.raises(InputError) as caught:
+        validate(Box, read_yaml(Path("a.yaml"), text))
+    lines = str(caught.value).split("\n")
+    assert len(lines) == 101 and lines[-1] == "a.yaml: and 900 more mistakes"
+
+
 def test_settings_are_written_over_the_file() -> None:
     document = read_yaml(Path("box.yaml"), "name: a\nspare: {radius_m: 1}\n")
     box = validate(Box, apply_settings(document, ["spare.radius_m=2.5", "name=b"]))

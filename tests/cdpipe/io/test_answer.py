@@ -164,3 +164,11 @@ def test_damage_is_named(tmp_path: Path) -> None:
     (tmp_path / "answer.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match="object_return_offsets has 4 entries"):
         read_answer(tmp_path)
+
+
+def test_of_many_unknown_arrays_the_first_are_named(tmp_path: Path) -> None:
+    write_answer(tmp_path, "paper", _report())
+    np.savez(tmp_path / "answer.npz", **{f"unknown_{number}": np.zeros(1) for number in range(300)})
+    with pytest.raises(InputError, match="array unknown_0 is unknown") as caught:
+        read_answer(tmp_path)
+    assert len(str(caught.value).split("\n")) < 110

@@ -85,6 +85,12 @@ def test_a_link_to_an_empty_folder_or_to_none_is_that_folder(tmp_path: Path, *, 
     assert (tmp_path / "real" / "file").read_text() == "x" and (tmp_path / "link").is_symlink()
 
 
+def test_a_link_to_itself_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(InputError, match=r"loop: is a link that leads to itself"), new_folder(tmp_path / "loop"):
+        pass
+
+
 def test_the_cache_of_scoring_is_not_written_through_a_link(tmp_path: Path, tiny_pair: Path) -> None:
     pair = tmp_path / "linked"
     pair.mkdir()

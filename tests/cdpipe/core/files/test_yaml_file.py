@@ -75,6 +75,14 @@ def test_a_file_says_the_line(tmp_path: Path) -> None:
         read_yaml(tmp_path / "a.yaml")
 
 
+def test_messages_are_short() -> None:
+    name = "a" * 10_000
+    for text in (f"!<{name}> 1", f"*{name}", f"{name[:900]}: 1\n{name[:900]}: 1"):
+        with pytest.raises(YamlError) as caught:
+            parse_yaml_value(text)
+        assert len(str(caught.value)) < 300
+
+
 def test_each_key_has_its_line() -> None:
     parsed: Any = parse_yaml("a:\n  b: [1,\n   2]\n")
     assert parsed.lines[("a", "b")] == 2 and parsed.lines[("a", "b", 1)] == 3
