@@ -56,7 +56,7 @@ def find_damaged(folder: Path) -> Iterator[str]:
     """Yield the files under their final names that are cut short; hidden ones and answers in work do not count."""
     for path in sorted(folder.rglob("*")):
         parts = path.relative_to(folder).parts
-        in_work = parts[0] == "answers" and not (path.parent / "answer.json").exists()
+        in_work = "answers" in parts and not (path.parent / "answer.json").exists()
         if not path.is_file() or in_work or any(part.startswith(".") for part in parts):
             continue
         try:

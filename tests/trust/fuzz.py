@@ -30,6 +30,7 @@ import traceback
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -92,11 +93,9 @@ def fuzz(
                     if not quiet and n_done % 2000 == 0:
                         print(f"{n_done} of {n_inputs} inputs, {time.monotonic() - started:.0f} s", flush=True)
 
-    workers = [threading.Thread(target=work) for _ in range(n_processes)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
+    with ThreadPoolExecutor(n_processes) as pool:
+        for worker in [pool.submit(work) for _ in range(n_processes)]:
+            worker.result()  # a mistake in the harness ends it: inputs that nobody read would look harmless
     return [tally.row(name) for name, tally in tallies.items()]
 
 

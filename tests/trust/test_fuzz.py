@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.trust.fuzz import DEFECTS, Server, Tally, make_examples, read_one, share_inputs
+from tests.trust.fuzz import DEFECTS, Server, Tally, Watched, fuzz, make_examples, read_one, share_inputs
 from tests.trust.readers import READERS
 
 N_INPUTS, SEED = 2000, 24
@@ -29,6 +29,15 @@ def test_the_examples_are_read(folder: Path) -> None:
     for name, example in make_examples(folder / "examples", NAMES).items():
         if name not in SLOW:
             assert read_one(name, example) == ("read", "")
+
+
+def test_inputs_that_nobody_reads_do_not_look_harmless(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def read(watched: Watched, name: str, number: int) -> None:
+        raise TimeoutError("a reader did not start")
+
+    monkeypatch.setattr(Watched, "read", read)
+    with pytest.raises(TimeoutError, match="did not start"):
+        fuzz(folder, 1, SEED, 1, [name for name in NAMES if name not in SLOW][:1], quiet=True)
 
 
 @pytest.mark.filterwarnings("ignore")

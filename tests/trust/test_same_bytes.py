@@ -1,7 +1,7 @@
 """The same input gives the same bytes: in another folder, locale, time zone, with other threads, for another user.
 
 Workers and clusters are compared in `tests/eval/running/test_distributed.py`, `tests/eval/training/test_dataset.py` and
-`tests/soak.py`, the threads of the simulator in `tests/sim/session/test_simulate.py`.
+`tests/soak`, the threads of the simulator in `tests/sim/session/test_simulate.py`.
 """
 
 from __future__ import annotations
