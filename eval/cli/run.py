@@ -125,7 +125,7 @@ def export(
     with shown_progress(quiet) as progress:
         n_written = (export_blind if blind else export_with_truth)(run, out, progress)
     told = "without truth; blind.json of the run says which is which" if blind else "with truth"
-    say(quiet, f"{out}: {n_written} pairs of sessions {told}")
+    say(quiet, f"{out}: {n_written} pairs of sessions written now, {told}")
 
 
 def report(

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from cdpipe.core.geometry import Float64Array
 from eval.core.ranking import auroc
 from eval.core.statistics import interval_of, mean, median, wilson_interval
 from eval.plans.targets import Targets
@@ -131,11 +132,16 @@ def _counts(own: pd.DataFrame) -> dict[str, Any]:
         **dict(zip(("silent_low", "silent_high"), wilson_interval(n_silent, n_unchanged), strict=True)),
         "km_unchanged": unchanged_m / 1000.0,
         "false_regions_per_100m_unchanged": 100.0 * n_false_unchanged / unchanged_m if unchanged_m > 0 else math.nan,
-        "bytes_map_before": mean(map_bytes),
-        "bytes_regions_before": mean(kept_bytes),
-        "bytes_ratio": mean(map_bytes / np.where(kept_bytes >= 1, kept_bytes, math.nan)),
+        "bytes_map_before": _mean_of_all(map_bytes),
+        "bytes_regions_before": _mean_of_all(kept_bytes),
+        "bytes_ratio": _mean_of_all(map_bytes / np.where(kept_bytes >= 1, kept_bytes, math.nan)),
         **{name: median(numbers(answered, name)) for name in _MEDIANS},
     }
+
+
+def _mean_of_all(values: Float64Array) -> float:
+    """Return the mean over all answers; NaN if one lacks the number: else a method would choose where it is good."""
+    return math.nan if np.isnan(values).any() else mean(values)
 
 
 def _operating(ranked: RankedPairs) -> dict[str, float]:

@@ -212,11 +212,11 @@ def test_pairs_with_truth_keep_their_names_and_all_their_files(run: RunFolder, t
 
 def test_the_command_exports_blind_unless_told_otherwise(run: RunFolder, tmp_path: Path, command: Command) -> None:
     code, out, err = command("export", run.path, "--out", tmp_path / "blind")
-    told = "2 pairs of sessions without truth; blind.json of the run says which is which"
+    told = "2 pairs of sessions written now, without truth; blind.json of the run says which is which"
     assert (code, out) == (0, f"{tmp_path / 'blind'}: {told}\n")
     assert WORLD not in out + err.replace(str(tmp_path), "")
     code, out, _ = command("export", run.path, "--out", tmp_path / "open", "--with-truth")
-    assert (code, out) == (0, f"{tmp_path / 'open'}: 2 pairs of sessions with truth\n")
+    assert (code, out) == (0, f"{tmp_path / 'open'}: 2 pairs of sessions written now, with truth\n")
 
 
 def failed(folder: Path) -> None:

@@ -114,6 +114,13 @@ def test_a_row_by_hand() -> None:
     assert np.isnan(fraction["bytes_ratio"])
 
 
+def test_bytes_that_some_answers_lack_have_no_mean() -> None:
+    rows = [changed("regions/narrow", seed, bytes_regions_before=n) for seed, n in ((1, 10.0), (2, NAN))]
+    row = the_row(tables(rows)["regions_table"], "in")
+    assert row["bytes_map_before"] == 1000.0
+    assert np.isnan([row["bytes_regions_before"], row["bytes_ratio"]]).all()
+
+
 def test_domains_are_apart_and_all_is_both() -> None:
     rows = [
         changed("regions/wide", 1, region_auroc=1.0),
