@@ -22,6 +22,7 @@ from cdpipe.core.files.yaml_file import Key, YamlError, parse_yaml, parse_yaml_v
 from cdpipe.core.names import visible
 
 _MAX_TOLD = 100  # mistakes of a file; the closest known name to each takes time
+_MAX_LISTED = 50_000  # pydantic's list of all mistakes takes a kilobyte for each
 
 
 class Settings(BaseModel):
@@ -84,13 +85,18 @@ def validate(model: type[ModelT], document: Document) -> ModelT:
     """Check a document against a model.
 
     Raises:
-        InputError: One line per mistake, `file:line: key = value: rule; did you mean …`, and after 100 their number.
+        InputError: One line per mistake, `file:line: key = value: rule; did you mean …`, and the number of those beyond
+            100; of more than 50,000 the number alone.
     """
     if not isinstance(document.value, dict):
         raise InputError(f"{document.source}: expected keys and values, got {type(document.value).__name__}")
     try:
         return model.model_validate(document.value)
     except ValidationError as error:
+        if error.error_count() > _MAX_LISTED:
+            raise InputError(
+                f"{document.source}: {error.error_count()} mistakes: is it another kind of file?"
+            ) from error
         mistakes = error.errors()
         lines = [visible(_describe_mistake(model, document, item)) for item in mistakes[:_MAX_TOLD]]
         if len(mistakes) > _MAX_TOLD:

@@ -15,6 +15,8 @@ from cdpipe.core.files.plain_file import read_bytes
 MAX_BYTES = 24_000_000
 """The largest JSON of ours, the cell of a tunnel of 10 km, takes a tenth of it; parsed, a byte takes up to 35."""
 MAX_DEPTH = 64
+MAX_VALUES = 1_000_000
+"""A mistake about each of so many takes 400 MB; the cell of a tunnel of 10 km holds less than a fifth."""
 _MAX_INTEGER = 2**64
 
 
@@ -26,8 +28,9 @@ def parse_json(text: str | bytes, *, is_finite: bool = False) -> Any:
         is_finite: Whether NaN and infinite numbers are mistakes; Python writes and reads both.
 
     Raises:
-        ValueError: It is no JSON, is nested deeper than `MAX_DEPTH`, names a key twice, or holds a whole number beyond
-            64 bits, one that is not finite, or half a surrogate pair, which no file can hold.
+        ValueError: It is no JSON, is nested deeper than `MAX_DEPTH`, names a key twice, or holds more than `MAX_VALUES`
+            values, a whole number beyond 64 bits, one that is not finite, or half a surrogate pair, which no file can
+            hold.
     """
     if len(text) > MAX_BYTES:
         raise ValueError(f"{len(text) / 1e6:.0f} MB, more than the {MAX_BYTES / 1e6:.0f} MB it may have")
@@ -36,7 +39,11 @@ def parse_json(text: str | bytes, *, is_finite: bool = False) -> Any:
     except RecursionError as error:
         raise ValueError(f"nested deeper than {MAX_DEPTH} levels") from error
     level: list[Any] = [document]
+    n_values = 0
     for _ in range(MAX_DEPTH):
+        n_values += sum(len(outer) for outer in level if isinstance(outer, dict | list))
+        if n_values > MAX_VALUES:
+            raise ValueError(f"more than {MAX_VALUES} values")
         level = [inner for outer in level for inner in _check_values(outer, is_finite)]
         if not level:
             return document

@@ -4,7 +4,7 @@ import pytest
 from pydantic import Field
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import Settings, apply_settings, read_yaml, validate
+from cdpipe.core.yamlfile import Document, Settings, apply_settings, read_yaml, validate
 
 
 class Ball(Settings):
@@ -41,6 +41,8 @@ def test_mistakes_without_end_are_counted() -> None:
         validate(Box, read_yaml(Path("a.yaml"), text))
     lines = str(caught.value).split("\n")
     assert len(lines) == 101 and lines[-1] == "a.yaml: and 900 more mistakes"
+    with pytest.raises(InputError, match=r"^a\.json: 50003 mistakes: is it another kind of file\?$"):
+        validate(Box, Document("a.json", {str(number): 1 for number in range(50_002)}))
 
 
 def test_settings_are_written_over_the_file() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import parse_json, read_json
+from cdpipe.core.files import json_file, parse_json, read_json
 
 
 @pytest.mark.parametrize("value", [{}, [], 1, -1.5, "a", None, {"a": [1, {"b": None}], "c": 2**64 - 1}])
@@ -41,6 +41,13 @@ def test_a_key_that_stands_twice_is_found_at_once_among_many() -> None:
     with pytest.raises(ValueError, match="the key 'last' stands there twice"):
         parse_json("{" + ",".join(f'"{name}":0' for name in names) + "}")
     assert time.process_time() - start_s < 10.0  # 0.1 s; 130 s where each name is counted among all
+
+
+def test_values_are_counted_at_all_levels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(json_file, "MAX_VALUES", 6)
+    assert parse_json('{"a": [1, 2], "b": [{"c": 3}]}')["b"] == [{"c": 3}]
+    with pytest.raises(ValueError, match="more than 6 values"):
+        parse_json('{"a": [1, 2, 4], "b": [{"c": 3}]}')
 
 
 def test_64_levels_are_read() -> None:
