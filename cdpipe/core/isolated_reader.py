@@ -2,7 +2,8 @@
 
 A library in C++ that parses a hostile file can crash, hang or use all memory. The process that calls it
 
-- starts without the working folder, the user's site folder and the `PYTHON*` variables (`python -I`);
+- searches packages where the present process does, without the working folder, and reads no `PYTHON*` variable
+  (`python -I`);
 - has limits on memory, on CPU time and on the size of files it writes;
 - ends when the process that started it ends;
 - sends JSON and plain arrays through a pipe. Nothing is pickled, and both are checked where they arrive.
@@ -22,7 +23,7 @@ import threading
 import time
 import traceback
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -53,33 +54,17 @@ _MAX_HEADER_BYTES = 16 << 20
 _MAX_MESSAGE_BYTES = 1 << 30
 _MAX_WRITTEN_BYTES = 1 << 20
 _NO_TIME, _NO_MEMORY = "took too long to read it", "ran out of memory while it read it"
-# Imports the packages by their files, so that the folder that holds them is not on the path.
+# Imports this package by its file, so that the folder that holds it is not on the path.
 _START = """
 import importlib, importlib.util as util, json, os, sys
-sys.path[:], packages, name = json.loads(sys.argv[1])
-for package, file in packages.items():
-    spec = util.spec_from_file_location(package, file, submodule_search_locations=[os.path.dirname(file)])
-    sys.modules[package] = util.module_from_spec(spec)
-    spec.loader.exec_module(sys.modules[package])
-module, _, function = name.partition(":")
-getattr(importlib.import_module(module), function)()
+sys.path[:], file, name = json.loads(sys.argv[1])
+package = name.partition(".")[0]
+spec = util.spec_from_file_location(package, file, submodule_search_locations=[os.path.dirname(file)])
+sys.modules[package] = util.module_from_spec(spec)
+spec.loader.exec_module(sys.modules[package])
+importlib.import_module(name).serve()
 """
-
-
-def isolated_command(function: str, packages: Sequence[str] = ("cdpipe",)) -> list[str]:
-    """Return the command that calls a function without arguments in a Python process of its own.
-
-    The process imports from the folders of this process without the working folder. The named packages are imported
-    from where this process has them, also if that is the working folder.
-
-    Args:
-        function: "package.module:function".
-        packages: Top-level packages that the function needs and that may not be installed.
-    """
-    here = Path.cwd()
-    folders = [folder for folder in sys.path if folder and Path(folder).absolute() != here]
-    files = {name: str(Path(str(import_module(name).__file__)).absolute()) for name in packages}
-    return [sys.executable, "-I", "-c", _START, json.dumps([folders, files, function])]
+_PACKAGE_FILE = Path(__file__).absolute().parents[1] / "__init__.py"
 
 
 class IsolatedReader:
@@ -137,6 +122,13 @@ class _ArrayHeader:
     shape: tuple[int, ...]
 
 
+def _command() -> list[str]:
+    """Return the command that calls `serve` in a process of its own, on our import path without the working folder."""
+    here = Path.cwd()
+    folders = [folder for folder in sys.path if folder and Path(folder).absolute() != here]
+    return [sys.executable, "-I", "-c", _START, json.dumps([folders, str(_PACKAGE_FILE), __name__])]
+
+
 class _Process:
     """A started process: requests go to its standard input, messages come from its standard output."""
 
@@ -144,7 +136,7 @@ class _Process:
         environment = {**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(THREADS))}
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
         self._process = subprocess.Popen(
-            isolated_command(f"{__name__}:serve"),
+            _command(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
