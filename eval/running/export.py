@@ -102,6 +102,15 @@ def list_pairs(run: RunFolder) -> list[Path]:
     return pairs
 
 
+def list_pairs_blindly(run: RunFolder) -> list[Path]:
+    """Return the same folders in the order of their opaque names, which tells nothing of scenarios and seeds.
+
+    Raises:
+        InputError: As `list_pairs`, or blind.json is damaged.
+    """
+    return sorted(list_pairs(run), key=partial(_opaque_name, _stored_salt(run) or _draw_salt()))
+
+
 def name_blindly(run: RunFolder) -> dict[Path, str]:
     """Return the opaque name of each pair of a run that was exported blind; {} if it never was.
 

@@ -27,7 +27,7 @@ from eval.core.progress import RunProgress, Silent
 from eval.core.tablefile import read_table
 from eval.plans.coverage import read_stored_plan
 from eval.plans.plan import list_planned_cases
-from eval.running.export import copy_pair, list_pairs, name_blindly
+from eval.running.export import copy_pair, list_pairs, list_pairs_blindly, name_blindly
 from eval.running.rescoring import LAST, NO_KEY, cell_document, foreign_identity
 from eval.running.runfolder import RunFolder, open_run_folder, write_json, write_tables
 from eval.running.sides import list_versions
@@ -86,7 +86,8 @@ def evaluate(predict: Callable[[Path, Path], object], run: Path | str, name: str
 
     Args:
         predict: Called with a folder that holds the sessions `before` and `after` of one pair without their truth, and
-            with the folder that it writes `answer.json` and `answer.npz` to.
+            with the folder that it writes `answer.json` and `answer.npz` to. The order of the pairs tells nothing; it
+            is that of the opaque names in RUN/blind.json, or drawn anew where there is none.
         run: Folder of a run whose pairs are kept.
         name: Its variant in the tables.
 
@@ -102,7 +103,7 @@ def evaluate(predict: Callable[[Path, Path], object], run: Path | str, name: str
     _require_current(folder)
     with TemporaryDirectory(prefix="tunnelcd-") as place:
         pair, answer, answers = (Path(place) / part for part in ("pair", "answer", "answers"))
-        for original in list_pairs(folder):
+        for original in list_pairs_blindly(folder):
             pair.mkdir()
             answer.mkdir()
             copy_pair(original, pair)

@@ -15,7 +15,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.io.readers import open_session
-from eval.running import export
+from eval.running import export, predictions
 from eval.running.export import export_blind, export_with_truth, name_blindly
 from eval.running.predictions import evaluate
 from eval.running.runfolder import RunFolder, write_json
@@ -269,6 +269,27 @@ def test_a_function_is_evaluated_on_blind_copies(run: RunFolder, tmp_path: Path)
     rows = evaluate(predict, run.path, "theirs")
     assert seen == [14, 14]
     assert rows[["scenario", "seed", "status"]].to_numpy().tolist() == [[WORLD, seed, "failed"] for seed in SEEDS]
+
+
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_the_order_of_the_copies_is_that_of_their_opaque_names(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch, is_reversed: bool
+) -> None:
+    def order_of(salt: str) -> list[int]:
+        return sorted(SEEDS, key=lambda seed: export._opaque_name(salt, run.pair(WORLD, seed)))
+
+    wanted = sorted(SEEDS, reverse=is_reversed)
+    salt = next(salt for n in range(1000) if order_of(salt := f"{n:064x}") == wanted)
+    write_json(run.path / "blind.json", {"format": "tunnelcd-blind", "format_version": 1, "salt": salt})
+    copied: list[int] = []
+
+    def copy_pair(original: Path, target: Path) -> None:
+        copied.append(int(original.name))
+        export.copy_pair(original, target)
+
+    monkeypatch.setattr(predictions, "copy_pair", copy_pair)
+    evaluate(lambda pair, out: failed(out), run.path, "theirs")
+    assert copied == wanted
 
 
 def test_a_name_that_is_taken_is_refused_before_the_function_is_called(run: RunFolder) -> None:
