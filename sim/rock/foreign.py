@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import re
 from pathlib import Path
@@ -32,6 +33,10 @@ _MAX_DEPTH = 64  # of nodes within nodes; trimesh walks up from each
 _WELD_M = 1e-6
 # What trimesh logs about a damaged file, tracebacks included, it also raises.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
+# trimesh names the place of each primitive of a GLB by six random digits, and of two equal names one part is lost: of
+# 500 primitives in one file of 130, of 5,000 in every second one. Numbers in order are never equal.
+_PLACES = itertools.count()
+trimesh.util.unique_id = lambda length=12: f"place-{next(_PLACES):0{length}d}"
 _MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 _MIN_THICKNESS_M = 1e-3
 _TUNNEL_M = (2.0, 20_000.0)  # longest side

@@ -181,6 +181,12 @@ def test_a_small_file_that_asks_for_much_time_or_memory_is_refused(tmp_path: Pat
         assert "6,000 parts" in refusal(lambda name=name: prop_mesh(MeshFile(path=str(tmp_path / name)), "x"))
 
 
+def test_no_primitive_is_lost(tmp_path: Path) -> None:
+    # trimesh's random names lose one in two such files
+    mesh = prop_mesh(glb_of(tmp_path / "a.glb", [{"mesh": 0}], 5_000), "x")
+    assert len(mesh.faces) == 4 * 5_000
+
+
 def test_a_part_placed_many_times_counts_each_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(foreign, "MAX_TRIANGLES", 39)
     nodes = [{"children": list(range(1, 11))}, *[{"mesh": 0}] * 10]
