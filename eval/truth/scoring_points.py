@@ -233,8 +233,13 @@ def _read_cache(path: Path, fingerprint: str, session: Session) -> ScoringPoints
         arrays = read_npz(path, _CACHE)
         if str(arrays.pop("fingerprint")) != fingerprint:
             return None
-        return ScoringPoints(**arrays, n_scans=session.n_scans, n_pixels=session.sensor.height * session.sensor.width)
-    except InputError:
+        n_pixels = session.sensor.height * session.sensor.width
+        returns = arrays["returns"]
+        is_rising = (np.diff(returns) > 0).all() and (returns[:1] >= 0).all()
+        if not is_rising or (returns[-1:] >= session.n_scans * n_pixels).any():
+            return None
+        return ScoringPoints(**arrays, n_scans=session.n_scans, n_pixels=n_pixels)
+    except (InputError, ValueError):
         return None  # absent or damaged: rebuilt from the session
 
 

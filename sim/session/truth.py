@@ -33,6 +33,7 @@ from cdpipe.core.geometry import Float64Array
 Int16Array = npt.NDArray[np.int16]
 SessionName = Literal["before", "after"]
 SESSIONS: tuple[SessionName, ...] = ("before", "after")
+_FARTHEST_M = 1e7  # a quarter of the way around the Earth; no world is as large
 Kind = Literal["added", "removed", "moved", "reshaped"]
 Group = Literal["full", "partial"]
 _Four = Field(min_length=4, max_length=4)
@@ -126,10 +127,14 @@ def read_pair_truth(pair: str | Path) -> PairTruth:
     path = Path(pair) / "truth" / "changes.json"
     document = read_json(path, "only simulated pairs have truth to score against", is_finite=True)
     try:
-        return _reader().validate_python(document)
+        truth = _reader().validate_python(document)
     except ValidationError as error:
         first = error.errors()[0]
         raise InputError(f"{path}: damaged: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    for index, change in enumerate(truth.changes):
+        if any(abs(value) > _FARTHEST_M for row in change.world_T_object for value in row):
+            raise InputError(f"{path}: damaged: changes.{index}: farther than {_FARTHEST_M:g} m from the origin")
+    return truth
 
 
 @cache
@@ -150,8 +155,16 @@ def write_true_poses(session: Path, world_T_sensor: Float64Array) -> None:
 
 
 def read_true_poses(session: Path) -> Float64Array:
-    """Read the (S, 4, 4) true poses of one session."""
-    return read_npz(session / "truth" / "poses.npz", _POSES)["world_T_sensor"]
+    """Read the (S, 4, 4) true poses of one session.
+
+    Raises:
+        InputError: The file is missing or damaged, or a pose is too far away to be one.
+    """
+    path = session / "truth" / "poses.npz"
+    world_T_sensor = read_npz(path, _POSES)["world_T_sensor"]
+    if (np.abs(world_T_sensor) > _FARTHEST_M).any():
+        raise InputError(f"{path}: damaged: a pose is farther than {_FARTHEST_M:g} m from the origin")
+    return world_T_sensor
 
 
 def read_labels(session: Path, n_chunks: int) -> Iterator[tuple[Int16Array, Int16Array]]:

@@ -137,6 +137,10 @@ class _Builder:
         is_text = node.tag == "tag:yaml.org,2002:str"
         if not is_text and len(node.value) > _MAX_NUMBER_LENGTH:
             raise YamlError(f"{node.value[:20]}...: too long for a number", line)
+        try:
+            node.value.encode()
+        except UnicodeEncodeError as error:
+            raise YamlError(f"{node.value[:40]!a}: half of a surrogate pair is no character", line) from error
         value = node.value if is_text else self._constructor.construct_object(node)
         if isinstance(value, int) and abs(value) >= _MAX_INTEGER:
             raise YamlError(f"{node.value[:40]}: beyond 64 bits", line)

@@ -1,5 +1,6 @@
 """The scoring points against a dictionary of cells, its lookups, its cache, and labels that do not belong."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,9 @@ from cdpipe.core.geometry import transform
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
 from eval.truth import scoring_points as module
+from eval.truth.ground_truth import load_ground_truth
 from eval.truth.scoring_points import ScoringPoints, build_scoring_points, load_scoring_points
-from sim.session.truth import read_labels, write_labels
+from sim.session.truth import read_labels, read_true_poses, write_labels, write_true_poses
 
 
 def points_by_dictionary(session: Path) -> dict[tuple[int, ...], tuple[int, int, int, int, np.ndarray]]:
@@ -80,6 +82,32 @@ def test_a_damaged_cache_is_built_again(tiny_pair: Path) -> None:
     built = load_scoring_points(session)
     (session / "truth" / "scoring_points.npz").write_bytes(b"PK\x03\x04 not an archive")
     np.testing.assert_array_equal(load_scoring_points(session).returns, built.returns)
+
+
+@pytest.mark.parametrize("place", [0, -1])
+def test_a_cache_that_names_returns_that_are_not_there_is_built_again(tiny_pair: Path, place: int) -> None:
+    session = tiny_pair / "after"
+    built = load_scoring_points(session)
+    path = session / "truth" / "scoring_points.npz"
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    arrays["returns"][place] = (-1, 14 * 4 * 64)[place]
+    np.savez(path, **arrays)
+    np.testing.assert_array_equal(load_scoring_points(session).returns, built.returns)
+
+
+def test_truth_that_is_too_far_away_is_one_line(tiny_pair: Path) -> None:
+    poses = read_true_poses(tiny_pair / "before")
+    poses[3, 0, 3] = 1e200
+    write_true_poses(tiny_pair / "before", poses)
+    with pytest.raises(InputError, match=r"poses\.npz: damaged: a pose is farther than 1e\+07 m"):
+        load_ground_truth(tiny_pair)
+    changes = tiny_pair / "truth" / "changes.json"
+    document = json.loads(changes.read_text())
+    document["changes"][1]["world_T_object"][0][3] = 1e308
+    changes.write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"changes\.json: damaged: changes\.1: farther"):
+        load_ground_truth(tiny_pair)
 
 
 def test_labels_of_another_session_are_refused(tiny_pair: Path) -> None:

@@ -38,6 +38,8 @@ def test_aliases_are_copies(tmp_path: Path) -> None:
         ("a: " + "9" * 5000, "too long for a number"),
         ("a: 1" + ":1" * 50_000, "too long for a number"),
         ("a: 99999999999999999999", "beyond 64 bits"),
+        (r'a: "\ud800"', "half of a surrogate pair"),
+        (r'"\ud800": 1', "half of a surrogate pair"),
         ('!!int ""', "string index out of range"),
         ("!!timestamp x", "groupdict"),
         ("!!bool x", "'x'"),
