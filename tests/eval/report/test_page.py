@@ -134,10 +134,12 @@ def result_rows() -> list[dict[str, Any]]:
         for (v, r), x in GRID.items()
     ]
     rows += [
-        result_row(EMPTY, "paper", is_alarm=True, n_regions=3.0, n_objects=2.0, false_regions_per_100m=1.77),
-        result_row(EMPTY, "tunnelcd", is_alarm=False, n_regions=0.0, n_objects=0.0, false_regions_per_100m=0.0),
+        result_row(EMPTY, "paper", is_alarm=True, n_regions=3.0, n_objects=2.0, false_regions_per_100m=1.77,
+                   t_total_s=0.5),
+        result_row(EMPTY, "tunnelcd", is_alarm=False, n_regions=0.0, n_objects=0.0, false_regions_per_100m=0.0,
+                   t_total_s=0.0625),
         result_row(EMPTY, "voxel-diff", is_alarm=np.nan, n_regions=0.0, status="merge_refused"),
-    ]
+    ]  # fmt: skip
     return rows
 
 
@@ -268,8 +270,8 @@ def test_every_value_of_the_results_stands_in_its_cell_and_the_best_is_bold(page
 def test_the_unchanged_pair_has_its_own_rows(page: Path) -> None:
     table = tables_of(page)["preset / alarm"]
     assert [texts(row) for row in table[2:]] == [
-        ["paper", "alarm", "3", "2", "1.77", "-", "-", "-", "ok"],
-        ["tunnelcd", "silent", "0", "0", "0.00", "-", "-", "-", "ok"],
+        ["paper", "alarm", "3", "2", "1.77", "-", "-", "0.5", "ok"],
+        ["tunnelcd", "silent", "0", "0", "0.00", "-", "-", "0.0625", "ok"],
         ["voxel-diff", "refused", "0", "-", "-", "-", "-", "-", "merge refused"],
     ]
 
