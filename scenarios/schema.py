@@ -141,7 +141,7 @@ class Furniture(Settings):
 class MeshFile(Settings):
     """A surface someone else made: STL, OBJ, PLY or GLB. A relative path starts at the scenario's file."""
 
-    path: str
+    path: Annotated[str, Field(pattern=r"^[^\x00]+$")]
     units: Literal["m", "cm", "mm", "in", "ft"] = "m"
     up: Literal["x", "y", "z"] = "z"  # which axis of the file points up
     flip: bool = False  # turn the surface inside out

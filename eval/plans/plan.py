@@ -43,6 +43,7 @@ from eval.plans.targets import PlanTargets, Targets
 from eval.plans.variants import Cell, Method, Until
 from eval.plans.worlds import OneOrMore, ScenarioItem, World, get_group, list_worlds, world_slug
 
+_MOST_SEEDS = 100_000
 _AFTER_MERGE = ("query", "extract", "outlier", "cluster", "m3c2", "dufomap")
 
 
@@ -141,11 +142,13 @@ def parse_seeds(value: Any) -> tuple[int, ...]:
     """
     rule = 'expected "A:B" in quotes (B excluded) or a list of seeds, all 0 or larger'
     if isinstance(value, str):
-        match = re.fullmatch(r"(\d+)(?::(\d+))?", value.strip())
+        match = re.fullmatch(r"(\d{1,15})(?::(\d{1,15}))?", value.strip())
         if match is None:
             raise ValueError(rule)
-        first = int(match[1])
-        value = list(range(first, int(match[2]))) if match[2] else [first]
+        first, end = int(match[1]), int(match[2] or match[1]) + (match[2] is None)
+        if end - first > _MOST_SEEDS:
+            raise ValueError(f"{rule}; at most {_MOST_SEEDS} of them")
+        value = list(range(first, end))
         if not value:
             raise ValueError(f"{rule}; this range is empty")
     # YAML 1.1 reads an unquoted 1:40 as the number 100, so a bare number is refused

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from scenarios.schema import Odometry, Prop, Sensor, SessionPlan
+from scenarios.schema import MeshFile, Odometry, Prop, Sensor, SessionPlan
 
 
 @pytest.mark.parametrize(
@@ -43,3 +43,8 @@ def test_settings_that_would_be_ignored_are_refused(model: Any, settings: dict[s
 def test_a_recorded_drive_survives_being_written_down() -> None:
     plan = SessionPlan(trajectory="t.tum")
     assert SessionPlan.model_validate(plan.model_dump(mode="json")) == plan
+
+
+def test_a_path_with_a_null_character_is_a_mistake() -> None:
+    with pytest.raises(ValidationError, match="path"):
+        MeshFile(path="mine\0.stl")

@@ -49,6 +49,8 @@ def mutate(name: str, content: bytes, rng: random.Random) -> bytes:
             content = flip(content, rng)  # the first damage left nothing that the second understands
         except (yaml.YAMLError, lzma.LZMAError, zlib.error, EOFError, NotImplementedError, SyntaxError, OSError):
             content = flip(content, rng)
+        except MemoryError:  # the first damage asks for more than there is
+            content = flip(content, rng)
     return content
 
 

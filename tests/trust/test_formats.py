@@ -66,6 +66,7 @@ def test_a_session_of_format_1_is_read_without_its_signal(session: Path) -> None
         ({"format_version": None}, "make it again with `tunnelcd simulate`"),
         ({"format": "their-session"}, "make it again with `tunnelcd simulate`"),
         ({"format_version": 3}, NEWER),
+        ({"format": "a\nb"}, r"format a\\nb 2: this version reads"),
         ({"format_version": [2]}, "format tunnelcd-session list: this version reads tunnelcd-session 1 to 2"),
     ],
 )

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.names import visible
 
 
 def require_format(path: Path, found: tuple[Any, Any], name: str, version: int, remedy: str, oldest: int = 1) -> int:
@@ -35,4 +36,4 @@ def require_format(path: Path, found: tuple[Any, Any], name: str, version: int, 
 
 
 def _brief(value: Any) -> str:
-    return f"{value!s:.40}" if isinstance(value, str | int | None) else type(value).__name__
+    return visible(f"{value!s:.40}") if isinstance(value, str | int | None) else type(value).__name__

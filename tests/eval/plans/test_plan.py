@@ -162,7 +162,10 @@ def test_seeds_by_hand() -> None:
     assert parse_seeds([900001, 0]) == (900001, 0)
 
 
-@pytest.mark.parametrize("value", ["6:6", "6:3", "-1:2", "a:b", "1:2:3", "", [], [1, 1], [-1], [1.5], [True], 12, None])
+@pytest.mark.parametrize(
+    "value",
+    ["6:6", "6:3", "-1:2", "a:b", "1:2:3", "", [], [1, 1], [-1], [1.5], [True], 12, None, f"0:{10**30}", "0:100001"],
+)
 def test_what_is_no_seeds(value: object) -> None:
     with pytest.raises(ValueError, match='expected "A:B"'):
         parse_seeds(value)
