@@ -18,6 +18,7 @@ Int8Array = npt.NDArray[np.int8]
 Int64Array = npt.NDArray[np.int64]
 Int32Array = npt.NDArray[np.int32]
 BoolArray = npt.NDArray[np.bool_]
+FARTHEST_M = 1e7  # a quarter of the way around the Earth: nothing lies farther from its origin
 
 
 def stream(seed: int, *purpose: str) -> np.random.Generator:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, Int64Array, require_poses, require_shape
+from cdpipe.core.geometry import FARTHEST_M, Float64Array, Int64Array, require_poses, require_shape
 from cdpipe.core.yamlfile import suggest
 from cdpipe.io.answer import Answer
 from cdpipe.model.report import ChangedObject, ChangeRegions
@@ -20,7 +20,6 @@ from eval.truth.scoring_points import ScoringPoints
 SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns"))
 MAX_SECONDS = 1e8  # three years
 MAX_AMOUNT = 1e15  # of bytes, points, scores and every other figure; a page shows no larger one
-MAX_M = 1e7  # a quarter of the way around the Earth
 _MANY = 100  # so many valid returns include the first return of some cell
 _ASIDE_M = 2.0  # largest gap between an object's points and its returns
 
@@ -91,8 +90,8 @@ def _check_regions(regions: ChangeRegions, n_keyframes: int, n_scans: int) -> No
     _require_near("region_centres_map", regions.centres_map)
     _require_finite("region_scores", regions.scores)
     _require_scores("region_scores", regions.scores)
-    if not 0 < regions.radius_m <= MAX_M:
-        raise ValueError(f"radius_m = {regions.radius_m}: expected a length in metres, up to {MAX_M:g}")
+    if not 0 < regions.radius_m <= FARTHEST_M:
+        raise ValueError(f"radius_m = {regions.radius_m}: expected a length in metres, up to {FARTHEST_M:g}")
     if np.isinf(regions.keyframe_scores).any():
         raise ValueError("keyframe_scores: a score is infinite: expected a number, or NaN where nothing was compared")
     _require_scores("keyframe_scores", regions.keyframe_scores)
@@ -129,10 +128,10 @@ def _check_object(index: int, item: ChangedObject, n_objects: int, n_regions: in
     if item.shape is not None:
         _require_near(f"{where}.shape: map_T_box", item.shape.map_T_box[None, :3, 3])
         edges = item.shape.box_m.tolist()
-        if not (all(0 <= edge <= MAX_M for edge in edges) and 0 <= item.shape.volume_m3 <= MAX_AMOUNT):
+        if not (all(0 <= edge <= FARTHEST_M for edge in edges) and 0 <= item.shape.volume_m3 <= MAX_AMOUNT):
             raise ValueError(
                 f"{where}.shape: edges {', '.join(f'{edge:g}' for edge in edges)} m and volume "
-                f"{item.shape.volume_m3:g} m3: expected 0 to {MAX_M:g} m and 0 to {MAX_AMOUNT:g} m3"
+                f"{item.shape.volume_m3:g} m3: expected 0 to {FARTHEST_M:g} m and 0 to {MAX_AMOUNT:g} m3"
             )
     if item.displacement_map is not None:
         _require_near(f"{where}.displacement_map", item.displacement_map[None])
@@ -229,9 +228,9 @@ def _check_points(
 def _require_near(name: str, places_m: Float64Array) -> None:
     """Raise unless (N, 3) places are finite and near enough to be places."""
     _require_finite(name, places_m)
-    is_far = (np.abs(places_m) > MAX_M).any(axis=1)
+    is_far = (np.abs(places_m) > FARTHEST_M).any(axis=1)
     if is_far.any():
-        raise ValueError(f"{name}: entry {int(np.argmax(is_far))} is farther than {MAX_M:g} m from the origin")
+        raise ValueError(f"{name}: entry {int(np.argmax(is_far))} is farther than {FARTHEST_M:g} m from the origin")
 
 
 def _require_scores(name: str, scores: Float64Array) -> None:

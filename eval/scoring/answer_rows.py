@@ -24,14 +24,13 @@ def find_answer_rows(answer: Answer, truth: GroundTruth) -> tuple[Int64Array, ..
     objects = answer.report.objects
     if answer.points_odom is None:
         return tuple(truth.sessions[item.session].scoring_points.rows_of_returns(item.returns) for item in objects)
-    rows: list[Int64Array] = [np.zeros(0, dtype=np.int64)] * len(objects)
+    rows: dict[int, Int64Array] = {}
     for session in SESSIONS:
         of_session = [index for index, item in enumerate(objects) if item.session == session]
         points = [answer.points_odom[index] for index in of_session]
         near = find_rows_near_points(truth.sessions[session].scoring_points, points)
-        for index, found in zip(of_session, near, strict=True):
-            rows[index] = found
-    return tuple(rows)
+        rows.update(zip(of_session, near, strict=True))
+    return tuple(rows[index] for index in range(len(objects)))
 
 
 def find_rows_near_points(

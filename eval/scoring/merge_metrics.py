@@ -107,8 +107,8 @@ def find_travel_directions(poses: Float64Array) -> Float64Array:
     """
     along = travelled_m(poses)
     last = len(poses) - 1
-    first = np.clip(np.searchsorted(along, along - _CHORD_M / 2, side="right") - 1, 0, last)
-    second = np.clip(np.searchsorted(along, along + _CHORD_M / 2, side="left"), 0, last)
+    first = np.maximum(np.searchsorted(along, along - _CHORD_M / 2, side="right") - 1, 0)
+    second = np.minimum(np.searchsorted(along, along + _CHORD_M / 2), last)
     chords = poses[second, :3, 3] - poses[first, :3, 3]
     lengths = np.linalg.norm(chords, axis=1, keepdims=True)
     return np.asarray(np.divide(chords, lengths, out=np.full_like(chords, np.nan), where=lengths > 0))

@@ -96,5 +96,5 @@ def summarise_size_errors(errors: SizeErrors, truth: GroundTruth) -> dict[str, f
 
 def _find_middle_world(change: Change, height_m: float) -> Float64Array:
     """Return the (3,) centre of an object, whose own origin is on the floor, in any orientation."""
-    pose = np.asarray(change.world_T_object, dtype=np.float64)
+    pose = np.asarray(change.world_T_object)
     return np.asarray(pose[:3, :3] @ (0.0, 0.0, height_m / 2) + pose[:3, 3])

@@ -120,7 +120,7 @@ def ground_truth(truth: PairTruth, sessions: Mapping[SessionName, SessionTruth])
         of_change = session.scoring_points.rows_of_change(change.id)
         rows.append(of_change)
         if len(of_change) == 0:
-            centroids.append(np.asarray(change.world_T_object, dtype=np.float64)[:3, 3])
+            centroids.append(np.asarray(change.world_T_object)[:3, 3])
             continue
         points_odom = session.scoring_points.points_odom[of_change].astype(np.float64)
         centroids.append(session.to_world(points_odom, session.scoring_points.scans(of_change)).mean(axis=0))

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_npz
-from cdpipe.core.geometry import Float32Array, Int32Array, Int64Array, require_shape, transform
+from cdpipe.core.geometry import Float32Array, Int32Array, Int64Array, require_shapes, transform
 from cdpipe.core.voxel import cell_keys
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import Session, chunk_path, read_session
@@ -66,9 +66,7 @@ class ScoringPoints:
 
     def __post_init__(self) -> None:
         n = len(self.returns)
-        require_shape("points_odom", self.points_odom, (n, 3))
-        require_shape("change", self.change, (n,))
-        require_shape("instance", self.instance, (n,))
+        require_shapes(self, points_odom=(n, 3), change=(n,), instance=(n,))
 
     def __len__(self) -> int:
         return len(self.returns)
@@ -199,7 +197,7 @@ def _nearer(nearest_m: Float32Array, scan: PosedScan, change: Int16Array) -> Flo
     is_change = ids > 0
     extended = np.full(max(len(nearest_m), int(ids.max(initial=0)) + 1), np.inf, dtype=np.float32)
     extended[: len(nearest_m)] = nearest_m
-    range_m = np.linalg.norm(scan.points_sensor[is_change], axis=1).astype(np.float32)
+    range_m = np.linalg.norm(scan.points_sensor[is_change], axis=1)
     np.minimum.at(extended, ids[is_change], range_m)
     return extended
 
@@ -235,8 +233,8 @@ def _read_cache(path: Path, fingerprint: str, session: Session) -> ScoringPoints
             return None
         n_pixels = session.sensor.height * session.sensor.width
         returns = arrays["returns"]
-        is_rising = (np.diff(returns) > 0).all() and (returns[:1] >= 0).all()
-        if not is_rising or (returns[-1:] >= session.n_scans * n_pixels).any():
+        is_within = (returns >= 0) & (returns < session.n_scans * n_pixels)
+        if not is_within.all() or (np.diff(returns) <= 0).any():
             return None
         return ScoringPoints(**arrays, n_scans=session.n_scans, n_pixels=n_pixels)
     except (InputError, ValueError):

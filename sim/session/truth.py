@@ -28,12 +28,11 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_json, read_npz
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import FARTHEST_M, Float64Array
 
 Int16Array = npt.NDArray[np.int16]
 SessionName = Literal["before", "after"]
 SESSIONS: tuple[SessionName, ...] = ("before", "after")
-_FARTHEST_M = 1e7  # a quarter of the way around the Earth; no world is as large
 Kind = Literal["added", "removed", "moved", "reshaped"]
 Group = Literal["full", "partial"]
 _Four = Field(min_length=4, max_length=4)
@@ -132,8 +131,8 @@ def read_pair_truth(pair: str | Path) -> PairTruth:
         first = error.errors()[0]
         raise InputError(f"{path}: damaged: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
     for index, change in enumerate(truth.changes):
-        if any(abs(value) > _FARTHEST_M for row in change.world_T_object for value in row):
-            raise InputError(f"{path}: damaged: changes.{index}: farther than {_FARTHEST_M:g} m from the origin")
+        if any(abs(value) > FARTHEST_M for row in change.world_T_object for value in row):
+            raise InputError(f"{path}: damaged: changes.{index}: farther than {FARTHEST_M:g} m from the origin")
     return truth
 
 
@@ -162,8 +161,8 @@ def read_true_poses(session: Path) -> Float64Array:
     """
     path = session / "truth" / "poses.npz"
     world_T_sensor = read_npz(path, _POSES)["world_T_sensor"]
-    if (np.abs(world_T_sensor) > _FARTHEST_M).any():
-        raise InputError(f"{path}: damaged: a pose is farther than {_FARTHEST_M:g} m from the origin")
+    if (np.abs(world_T_sensor) > FARTHEST_M).any():
+        raise InputError(f"{path}: damaged: a pose is farther than {FARTHEST_M:g} m from the origin")
     return world_T_sensor
 
 

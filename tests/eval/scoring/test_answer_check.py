@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cdpipe.core.geometry import make_pose
+from cdpipe.core.geometry import FARTHEST_M, make_pose
 from cdpipe.model.report import ChangedObject, ChangeRegions, ObjectShape
 from eval.scoring import answer_check as module
-from eval.scoring.answer_check import MAX_AMOUNT, MAX_M, MAX_SECONDS, SECONDS
+from eval.scoring.answer_check import MAX_AMOUNT, MAX_SECONDS, SECONDS
 from eval.truth.ground_truth import SessionTruth
 from eval.truth.scoring_points import ScoringPoints
 from tests.eval.scoring.test_object_metrics import line_points
 
 NAN, INF = float("nan"), float("inf")
-FAR = np.nextafter(MAX_M, np.inf)
+FAR = np.nextafter(FARTHEST_M, np.inf)
 TOO_MUCH = np.nextafter(MAX_AMOUNT, np.inf)
 POINTS = np.zeros((1, 3))
 
@@ -86,7 +86,7 @@ def poses(n: int, x_m: float = 0.0) -> np.ndarray:
         (poses(5), 0, None),
         (poses(3), 0, "has 3 poses: expected one for each of the 5 scans of the after session"),
         (poses(5), 3, "has 5 poses: expected one for each of the 3 after keyframes"),
-        (poses(3, MAX_M), 3, None),
+        (poses(3, FARTHEST_M), 3, None),
         (poses(3, FAR), 3, "local_before_T_after: entry 0 is farther"),
         (poses(3) * 2, 3, r"local_before_T_after\[0\] is not a rigid"),
         (poses(3) * NAN, 3, "local_before_T_after"),
@@ -98,7 +98,7 @@ def test_the_local_merge(local: np.ndarray | None, n_keyframes: int, told: str |
 
 
 REGIONS = ChangeRegions(
-    centres_map=np.full((2, 3), MAX_M),
+    centres_map=np.full((2, 3), FARTHEST_M),
     radius_m=4.5,
     scores=np.array([2.0, 1.0]),
     pairs=np.zeros((2, 2), np.int64),
@@ -120,7 +120,7 @@ REGIONS = ChangeRegions(
         ({"keyframe_scores": np.array([0.0, -INF, 0.0])}, 3, "keyframe_scores: a score is infinite"),
         ({"radius_m": 1e-9}, 3, None),
         ({"radius_m": 0.0}, 3, "radius_m = 0.0: "),
-        ({"radius_m": MAX_M}, 3, None),
+        ({"radius_m": FARTHEST_M}, 3, None),
         ({"radius_m": FAR}, 3, "radius_m = 1"),
         ({"radius_m": NAN}, 3, "radius_m = nan: "),
         ({"scores": np.array([INF, 1.0])}, 3, "region_scores: entry 0 is not"),
@@ -176,7 +176,7 @@ def shape(edge_m: float = 1.0, volume_m3: float = 1.0, x_m: float = 0.0) -> Obje
         ({"region": 1}, None),
         ({"region": 2}, r"objects\[2\]\.region = 2: there are 2 regions"),
         ({"region": -2}, r"objects\[2\]\.region = -2: there are 2 regions"),
-        ({"points": np.full((2, 3), -MAX_M)}, None),
+        ({"points": np.full((2, 3), -FARTHEST_M)}, None),
         ({"points": np.array([(0, 0, 0), (FAR, 0, 0)])}, r"objects\[2\]: object_points_map: entry 1 is farther"),
         ({"points": np.array([(0, 0, 0), (0, 0, INF)])}, r"objects\[2\]: object_points_map: entry 1 is not"),
         ({"score": NAN}, r"objects\[2\]\.score = nan: expected a number"),
@@ -184,15 +184,15 @@ def shape(edge_m: float = 1.0, volume_m3: float = 1.0, x_m: float = 0.0) -> Obje
         ({"score": MAX_AMOUNT}, None),
         ({"score": -TOO_MUCH}, r"objects\[2\]\.score = -1000000000000000\.1: expected a number, at most 1e\+15"),
         ({"shape": shape(0.0, 0.0)}, None),
-        ({"shape": shape(MAX_M, MAX_AMOUNT)}, None),
+        ({"shape": shape(FARTHEST_M, MAX_AMOUNT)}, None),
         ({"shape": shape(FAR)}, r"objects\[2\]\.shape: edges 1, 1, 1e\+07 m and volume 1 m3"),
         ({"shape": shape(-0.1)}, r"objects\[2\]\.shape: edges 1, 1, -0.1 m"),
         ({"shape": shape(NAN)}, r"objects\[2\]\.shape: edges 1, 1, nan m"),
         ({"shape": shape(1.0, -0.1)}, "volume -0.1 m3"),
-        ({"shape": shape(x_m=-MAX_M)}, None),
+        ({"shape": shape(x_m=-FARTHEST_M)}, None),
         ({"shape": shape(x_m=FAR)}, r"objects\[2\]\.shape: map_T_box: entry 0 is farther"),
         ({"shape": shape(1.0, TOO_MUCH)}, r"volume 1e\+15 m3"),
-        ({"displacement_map": np.array([0.0, 0.0, MAX_M])}, None),
+        ({"displacement_map": np.array([0.0, 0.0, FARTHEST_M])}, None),
         ({"displacement_map": np.array([0.0, 0.0, FAR])}, r"objects\[2\]\.displacement_map: entry 0 is farther"),
         ({"displacement_map": np.array([0.0, NAN, 0.0])}, r"objects\[2\]\.displacement_map: entry 0 is not"),
     ],

@@ -1,6 +1,8 @@
 """The scoring points against a dictionary of cells, its lookups, its cache, and labels that do not belong."""
 
 import json
+import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +13,10 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import transform
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
+from cdpipe.model.types import PosedScan
 from eval.truth import scoring_points as module
 from eval.truth.ground_truth import load_ground_truth
-from eval.truth.scoring_points import ScoringPoints, build_scoring_points, load_scoring_points
+from eval.truth.scoring_points import ScoringPoints, ScoringPointsBuilder, build_scoring_points, load_scoring_points
 from sim.session.truth import read_labels, read_true_poses, write_labels, write_true_poses
 
 
@@ -84,16 +87,23 @@ def test_a_damaged_cache_is_built_again(tiny_pair: Path) -> None:
     np.testing.assert_array_equal(load_scoring_points(session).returns, built.returns)
 
 
-@pytest.mark.parametrize("place", [0, -1])
-def test_a_cache_that_names_returns_that_are_not_there_is_built_again(tiny_pair: Path, place: int) -> None:
+@pytest.mark.parametrize(
+    ("place", "number", "is_used"),
+    [(0, -1, False), (0, 0, True), (1, "as the first", False), (-1, 14 * 4 * 64, False), (-1, 14 * 4 * 64 - 1, True)],
+)
+def test_a_cache_that_names_returns_that_are_not_there_is_built_again(
+    tiny_pair: Path, place: int, number: int | str, is_used: bool
+) -> None:
     session = tiny_pair / "after"
     built = load_scoring_points(session)
     path = session / "truth" / "scoring_points.npz"
     with np.load(path) as archive:
         arrays = dict(archive)
-    arrays["returns"][place] = (-1, 14 * 4 * 64)[place]
+    arrays["returns"][place] = arrays["returns"][0] if number == "as the first" else number
+    arrays["points_odom"] += 1.0
     np.savez(path, **arrays)
-    np.testing.assert_array_equal(load_scoring_points(session).returns, built.returns)
+    expected = arrays["points_odom"] if is_used else built.points_odom
+    np.testing.assert_array_equal(load_scoring_points(session).points_odom, expected)
 
 
 def test_truth_that_is_too_far_away_is_one_line(tiny_pair: Path) -> None:
@@ -150,5 +160,59 @@ def test_the_range_of_a_change_that_no_return_met_is_undefined() -> None:
     ("field", "wrong"), [("points_odom", np.zeros((2, 3))), ("change", np.zeros(2)), ("instance", np.zeros(2))]
 )
 def test_columns_of_unequal_length_are_refused(field: str, wrong: np.ndarray) -> None:
-    with pytest.raises(ValueError, match=field):
+    with pytest.raises(ValueError, match=f"^{field} must be"):
         replace(few_points(1), **{field: wrong})
+
+
+def scan_of_one_row(points_sensor: list[tuple[float, float, float]], pixels: list[int]) -> PosedScan:
+    stamps_ns = np.zeros(len(pixels), dtype=np.int64)
+    points = np.array(points_sensor, dtype=np.float64).reshape(-1, 3)
+    return PosedScan(0, points, np.eye(4), stamps_ns, np.array(pixels, dtype=np.int32))
+
+
+@pytest.mark.parametrize(
+    ("change", "points", "pixels", "expected"),
+    [
+        ((0, 0, 0, 0), [(1.0, 0, 0)], [1], []),  # a session that shows no change
+        ((0, 2, 0, 0), [(3.0, 4.0, 0), (0, 0, 1.0)], [1, 2], [np.inf, np.inf, 5.0]),
+        ((0, 2, 0, 0), [(0, 0, 1.0)], [2], [np.inf]),  # labelled, but its only ray came back from nowhere
+        ((0, 2, 0, 0), [], [], [np.inf]),
+    ],
+)
+def test_shortest_ranges_end_with_the_last_change_that_returned(
+    change: tuple[int, ...], points: list[tuple[float, float, float]], pixels: list[int], expected: list[float]
+) -> None:
+    builder = ScoringPointsBuilder("one", 1, 4)
+    labels = np.array([change], dtype=np.int16)
+    builder.add(scan_of_one_row(points, pixels), labels, labels)
+    nearest_m = builder.finish(1).nearest_m
+    assert nearest_m.tolist() == expected and nearest_m.dtype == np.float32
+
+
+def test_a_point_too_far_out_for_a_cell_names_its_session_and_scan(tiny_pair: Path) -> None:
+    session = read_session(tiny_pair / "before")
+    with np.load(session.path / "odometry.npz") as archive:
+        arrays = dict(archive)
+    arrays["odom_T_sensor"][2, 0, 3] = 9e6
+    np.savez(session.path / "odometry.npz", **arrays)
+    with pytest.raises(InputError, match=f"^{re.escape(str(session.path))}: scan 2: "):
+        build_scoring_points(session)
+
+
+@pytest.mark.parametrize("is_session", [True, False])
+def test_nothing_is_stored_through_a_link(tiny_pair: Path, tmp_path: Path, is_session: bool) -> None:
+    session, linked = tiny_pair / "after", tmp_path / "linked"
+    if is_session:
+        linked.symlink_to(session)
+    else:
+        shutil.copytree(session, linked)
+        shutil.rmtree(linked / "truth")
+        (linked / "truth").symlink_to(session / "truth")
+    (session / "truth" / "scoring_points.npz").unlink(missing_ok=True)
+    assert len(load_scoring_points(linked)) > 0
+    assert not (session / "truth" / "scoring_points.npz").exists()
+
+
+def test_a_place_that_cannot_be_written_is_done_without(tiny_pair: Path) -> None:
+    (tiny_pair / "after" / "truth" / "scoring_points.npz").mkdir()
+    assert len(load_scoring_points(tiny_pair / "after")) > 0
