@@ -179,7 +179,7 @@ def _refuse_scene(scene: trimesh.Scene, say: str) -> None:
     for node in nodes:
         for _ in range(_MAX_DEPTH):
             node = parents.get(node)  # noqa: PLW2901 - a walk up
-            if node is None:
+            if node in (None, scene.graph.base_frame):  # old trimesh makes the base its own parent
                 break
         else:
             raise ScenarioError(f"{say}: nodes within nodes, deeper than {_MAX_DEPTH} levels: join its parts to one")
