@@ -6,6 +6,7 @@ folder, without `.yaml`.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from cdpipe.core.errors import ScenarioError
@@ -61,7 +62,7 @@ def read_prop(kind: str) -> PropFile:
     """
     path = prop_files()[kind]
     prop = validate(PropFile, read_yaml(path))
-    mesh = prop.mesh.model_copy(update={"path": str((path.parent / prop.mesh.path).resolve())})
+    mesh = prop.mesh.model_copy(update={"path": os.path.realpath(path.parent / prop.mesh.path)})
     return prop.model_copy(update={"mesh": mesh})
 
 

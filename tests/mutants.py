@@ -141,7 +141,8 @@ def main() -> int:
     if not asked.keep:
         shutil.rmtree(MADE, ignore_errors=True)
         mutmut = [sys.executable, "-m", "mutmut", "run", "--max-children", str(asked.processes)]
-        subprocess.run(mutmut, cwd=ROOT, check=True)
+        progress = None if sys.stdout.isatty() else subprocess.DEVNULL  # a bar that is drawn ten times a second
+        subprocess.run(mutmut, cwd=ROOT, check=True, stdout=progress)
     results, (everywhere, single) = list(read_results()), read_list()
     table, wrong = report_results(results, everywhere, single)
     dead = sorted(set(single) & {mutant for mutant, code in results if code not in (_SURVIVED, _UNTESTED, _NOT_RUN)})

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from cdpipe.core.errors import InputError
@@ -63,7 +63,7 @@ def change_plan(
 
 def _find_variant(variants: Sequence[Mapping[str, Any]], preset: str) -> Mapping[str, Any]:
     """Return the variant of a plan that is this preset alone, or a new one."""
-    name = str(Path(preset).resolve()) if preset.endswith((".yaml", ".yml")) else preset
+    name = os.path.realpath(preset) if preset.endswith((".yaml", ".yml")) else preset
     plain = [each for each in variants if each["preset"] == name and not each["set"] and "oracle_merge" not in each]
     alone = [each for each in plain if not each.get("oracle_regions")]
     return alone[0] if alone else {"preset": name, "set": [], "per_scenario": {}}

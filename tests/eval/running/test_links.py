@@ -17,6 +17,7 @@ from eval.core.output import make_writable, new_folder, remove, whole_file
 from eval.report.page import write_page
 from eval.running.runfolder import open_run_folder, start_run_folder, write_json
 from eval.truth.ground_truth import load_ground_truth
+from scenarios.catalogue import read_prop
 
 
 @pytest.fixture
@@ -45,6 +46,20 @@ def test_the_run_folder_itself_may_be_a_link(tmp_path: Path) -> None:
     write_json(tmp_path / "run" / "provenance.json", {"tool": "tunnelcd"})
     (tmp_path / "link").symlink_to(tmp_path / "run")
     assert start_run_folder(tmp_path / "link").provenance() == {"tool": "tunnelcd"}
+
+
+def test_links_in_a_circle_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Callable[..., tuple[int, str, str]]
+) -> None:
+    loop = tmp_path / "loop.yaml"
+    loop.symlink_to(loop)
+    code, _, err = command("run", "smoke", "--preset", loop, "--out", tmp_path / "run")
+    assert code == 2 and len(err.splitlines()) == 1 and str(loop) in err
+    prop = tmp_path / "props" / "own_crate.yaml"
+    prop.parent.mkdir()
+    prop.write_text("mesh: {path: ../loop.yaml}\n")
+    monkeypatch.setenv("TUNNELCD_PATH", str(tmp_path))
+    assert read_prop("own_crate").mesh.path == str(loop)
 
 
 def test_a_link_is_removed_and_not_what_it_leads_to(tmp_path: Path, outside: Path) -> None:
