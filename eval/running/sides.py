@@ -172,7 +172,7 @@ def other_worlds(a: Side, b: Side) -> list[str]:
     for key in ("n_changes", "n_observable", "after_path_m"):
         if key not in a.results or key not in b.results:
             continue
-        first, second = (pd.to_numeric(group[key].first(), errors="coerce") for group in worlds)
+        first, second = (pd.to_numeric(group[key].first(), errors="coerce").astype(float) for group in worlds)
         first, second = first.align(second, join="inner")
         differs = (first - second).abs() > 1e-6 * first.abs().clip(lower=1.0)
         found += [f"{scenario} {number}" for scenario, number in first.index[differs]]

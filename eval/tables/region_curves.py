@@ -11,12 +11,14 @@ A pair without an answer misses all its changes, and its way is not counted.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import pandas as pd
 
+from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from eval.core.ranking import comparable, last_of_ties
 from eval.core.statistics import N_RESAMPLES, interval_of
@@ -73,6 +75,9 @@ def ranked_pairs(
         regions: Its rows of regions.csv, candidates of a pair best first.
         changes: Its rows of changes.csv.
         is_proposal: Count the candidates that were withdrawn as well.
+
+    Raises:
+        InputError: A region or an observable change is of a pair without a row of results.csv that counts its changes.
     """
     if not is_proposal:
         regions = regions[~regions["is_withdrawn"].astype(bool)]
@@ -81,6 +86,8 @@ def ranked_pairs(
     place = {pair: index for index, pair in enumerate(pairs)}
     is_observable = changes["is_observable"].astype(bool).to_numpy() & (changes["n_truth_cells"].to_numpy() > 0)
     rows = np.flatnonzero(is_observable)
+    for each in (changes.iloc[rows], regions):
+        _require_pairs(each, place)
     number = {
         (place[str(scenario), int(seed)], int(change)): index
         for index, (scenario, seed, change) in enumerate(
@@ -116,6 +123,15 @@ def ranked_pairs(
         change_rank=change_rank,
         change_rows=rows,
     )
+
+
+def _require_pairs(items: pd.DataFrame, place: Mapping[tuple[str, int], int]) -> None:
+    for scenario, seed in items[PAIR].drop_duplicates().itertuples(index=False, name=None):
+        if (str(scenario), int(seed)) not in place:
+            raise InputError(
+                f"{scenario}, seed {seed}: regions or changes without a row of results.csv that counts the changes "
+                "(n_observable): `tunnelcd score RUN` makes the tables anew"
+            )
 
 
 def parsed_ids(value: object) -> tuple[int, ...]:

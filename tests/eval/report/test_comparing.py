@@ -267,6 +267,13 @@ def test_cautions_about_worlds_and_machines(write: Write) -> None:
     assert short_names(*sides) == ("a", "b")
 
 
+def test_a_column_of_truth_values_is_compared_as_numbers(write: Write) -> None:
+    a = write("a", [row(1, n_changes=True), row(2, n_changes=True)])
+    b = write("b", [row(1, n_changes=True), row(2, n_changes=False)])
+    (told,) = cautions(read_side(str(a)), read_side(str(b)))
+    assert told.endswith("(regions/narrow 2).")
+
+
 def test_times_measured_beside_other_work_are_not_judged(write: Write) -> None:
     quiet = write("quiet", [row(1, is_contended=False), row(2, is_contended=NAN)])
     busy = write("busy", [row(1, is_contended=False), row(2, is_contended=True)])

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from cdpipe.core.errors import InputError
 from eval.core.ranking import auroc
 from eval.core.statistics import interval_of
 from eval.tables import region_curves
@@ -229,3 +230,12 @@ def test_candidates_too_bad_for_any_draw_need_not_be_looked_at(rate: float, monk
     monkeypatch.setattr(region_curves, "_FIRST_CANDIDATES", 1)
     resampled_recalls.cache_clear()
     np.testing.assert_array_equal(resampled_recalls(ranked, rate), every)
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_regions_and_changes_of_a_pair_that_results_does_not_count_are_refused(seed: int) -> None:
+    counted = results()
+    lost = counted.assign(n_observable=counted["n_observable"].where(counted["seed"] != seed))
+    for without in (lost, counted[counted["seed"] != seed]):
+        with pytest.raises(InputError, match=f"^a, seed {seed}: regions or changes without a row of results.csv"):
+            ranked_pairs(without, regions(), changes())
