@@ -14,10 +14,10 @@ from cdpipe.core.geometry import stream
 from cdpipe.core.names import visible
 from cdpipe.core.yamlfile import Document, apply_settings, read_yaml, suggest, validate
 from scenarios.catalogue import family_files, family_of, prop_files, prop_names, read_prop
-from scenarios.dangling import Mistake, find_dangling, items_at
+from scenarios.dangling import Mistake, find_dangling, items_at, mapping_at
 from scenarios.distributions import draw, find_malformed, is_distribution, join_key, merge_trees
 from scenarios.references import file_keys, find_contradictions
-from scenarios.schema import PROP_KINDS, Prop, Scenario
+from scenarios.schema import DEFAULT_SOURCE, PROP_KINDS, Prop, Scenario
 
 CHECKED_SEEDS = range(8)
 SUFFIXES = (".yaml", ".yml")
@@ -179,7 +179,22 @@ def _line_of(line: str) -> tuple[str, int]:
 
 
 def _read(name_or_path: str, settings: Iterable[str]) -> Document:
-    return apply_settings(_read_extended(_path_of(name_or_path), ()), settings)
+    settings = list(settings)
+    document = _read_extended(_path_of(name_or_path), ())
+    return apply_settings(_without_old_odometry(document, apply_settings(Document("--set", {}), settings)), settings)
+
+
+def _without_old_odometry(base: Document, over: Document) -> Document:
+    """Return `base` without each session's odometry to which `over` gives another source: it starts anew."""
+    for session in ("before", "after"):
+        key: Key = (session, "odometry")
+        old, new = (mapping_at(mapping_at(each.value, session), "odometry") for each in (base, over))
+        if "source" not in new or new["source"] == old.get("source", DEFAULT_SOURCE):
+            continue
+        kept = {name: value for name, value in mapping_at(base.value, session).items() if name != "odometry"}
+        origins = {place: where for place, where in base.origins.items() if place[:2] != key}
+        base = replace(base, value=base.value | {session: kept}, origins=origins) if old else base
+    return base
 
 
 def _path_of(name_or_path: str) -> Path:
@@ -214,6 +229,7 @@ def _read_extended(path: Path, children: tuple[Path, ...]) -> Document:
     if base_name is None:
         return Document(str(path), value, origins)
     base = _read_extended(_base_path(base_name, path, origins[("extends",)], children), (*children, path))
+    base = _without_old_odometry(base, Document(str(path), value))
     kept = {key: where for key, where in base.origins.items() if not _is_replaced(key, base.value, value)}
     return Document(str(path), merge_trees(base.value, value), kept | origins)
 

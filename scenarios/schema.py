@@ -300,6 +300,9 @@ class Platform(Settings):
     wander_m: NotNegative = 0.0  # standard deviation of the line from side to side, where there is room
 
 
+DEFAULT_SOURCE = "drift"
+
+
 class Odometry(Settings):
     """What a session's poses come from: truth with a systematic error in KITTI's terms, or KISS-ICP on its own scans.
 

@@ -11,7 +11,7 @@ from cdpipe.sensor.ouster import load_profile, profile_names
 from scenarios import check_scenario, load_scenario, scenario_names
 from scenarios.catalogue import FAMILIES
 from scenarios.references import file_digests, route_length_m
-from scenarios.schema import Scenario
+from scenarios.schema import Odometry, Scenario
 
 WORLD = """\
 tunnel:
@@ -74,6 +74,39 @@ def test_settings_are_written_over_the_file_before_drawing(tmp_path: Path) -> No
     assert changed.tunnel.section.width_m == plain.tunnel.section.width_m
     assert changed.props == plain.props
     assert load_scenario(path, 3, ["tunnel.section.width_m=3.25"]).tunnel.section.width_m == 3.25
+
+
+@pytest.mark.parametrize("name", [name for name in scenario_names() if not name.startswith("odometry/")])
+def test_a_setting_of_another_source_of_odometry_drops_the_keys_of_the_family_s(name: str) -> None:
+    plain = load_scenario(name, 10001)
+    changed = load_scenario(name, 10001, ["before.odometry.source=kiss-icp"])
+    assert changed.before == plain.before.model_copy(update={"odometry": Odometry(source="kiss-icp")})
+    assert changed.after == plain.after
+
+
+def test_odometry_of_another_source_starts_anew_in_a_file_that_extends(tmp_path: Path) -> None:
+    drifting = "{odometry: {translation_percent: 0.4, yaw_deg_per_100m: 0.2}}"
+    written(tmp_path, f"extends: world.yaml\nafter: {drifting}\n", "drifting.yaml")
+    path = written(tmp_path, "extends: drifting.yaml\nafter: {odometry: {source: kiss-icp}}\n", "kiss.yaml")
+    written(tmp_path, WORLD)
+    assert load_scenario(path, 1).after.odometry == Odometry(source="kiss-icp")
+    back = written(
+        tmp_path, "extends: kiss.yaml\nafter: {odometry: {source: drift, yaw_deg_per_100m: 1}}\n", "back.yaml"
+    )
+    assert load_scenario(back, 1).after.odometry == Odometry(yaw_deg_per_100m=1)
+    same = written(
+        tmp_path, "extends: drifting.yaml\nafter: {odometry: {source: drift, yaw_deg_per_100m: 1}}\n", "same.yaml"
+    )
+    assert load_scenario(same, 1).after.odometry == Odometry(translation_percent=0.4, yaw_deg_per_100m=1)
+
+
+def test_odometry_keys_of_two_sources_at_one_place_are_one_mistake(tmp_path: Path) -> None:
+    path = written(tmp_path, WORLD)
+    both = ["after.odometry.source=kiss-icp", "after.odometry.translation_percent=0.5"]
+    for settings in (both, both[::-1], ["after.odometry={source: kiss-icp, translation_percent: 0.5}"]):
+        with pytest.raises(ScenarioError, match=r"^--set: after\.odometry = .*kiss-icp") as error:
+            load_scenario(path, 1, settings)
+        assert len(str(error.value).splitlines()) == 1
 
 
 def test_mistakes_in_settings_are_told_as_such(tmp_path: Path) -> None:
