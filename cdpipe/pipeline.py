@@ -18,7 +18,13 @@ import numpy as np
 from cdpipe.core.errors import MergeFailedError
 from cdpipe.core.geometry import Int64Array
 from cdpipe.core.threads import THREADS
-from cdpipe.descriptors.describe import describe_scans, load_descriptors, save_descriptors, use_threads
+from cdpipe.descriptors.describe import (
+    describe_scans,
+    list_checkpoints,
+    load_descriptors,
+    save_descriptors,
+    use_threads,
+)
 from cdpipe.descriptors.sphere import describe_map
 from cdpipe.extract.extract import extract_changes, make_report
 from cdpipe.io.readers import open_session
@@ -90,7 +96,8 @@ def detect(
         InputError: A session or a setting cannot be used, or the method's extra is not installed.
     """
     config = load_config(preset, settings, site)
-    load_method(config.method)  # report a missing extra before the mapping
+    load_method(config.method)  # report a missing extra, or bad weights, before the mapping
+    list_checkpoints(config)
     use_threads(THREADS)
     hooks = hooks or Hooks()
     (before, stored_before), (after, stored_after) = (_open(each, config) for each in (before, after))
@@ -115,6 +122,7 @@ def describe(
         InputError: The session or a setting cannot be used, or the session's folder cannot be written.
     """
     config = load_config(preset, settings)
+    list_checkpoints(config)  # report bad weights before the mapping
     use_threads(THREADS)
     source = open_session(Path(session))
     if config.query.compare == "sphere":
@@ -122,7 +130,7 @@ def describe(
     else:
         chosen = choose_keyframes(source.odom_T_sensor, config.map.keyframe_spacing_m)
         descriptors = describe_scans(source, chosen, config.descriptor)
-    return descriptors, save_descriptors(Path(session), descriptors, source.odom_T_sensor, config.map)
+    return descriptors, save_descriptors(Path(session), descriptors, source.odom_T_sensor, config.map, config.sphere)
 
 
 def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
@@ -135,7 +143,8 @@ def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
     thin_map = build_map(source, config.map)
     descriptors = describe_scans(source, thin_map.keyframe_scans, config.descriptor)
     if config.query.compare == "sphere":
-        descriptors = replace(descriptors, spheres=describe_map(thin_map, thin_map.odom_T_keyframe, config.descriptor))
+        spheres = describe_map(thin_map, thin_map.odom_T_keyframe, config.descriptor, config.sphere)
+        descriptors = replace(descriptors, spheres=spheres)
     return MappedSession(thin_map, descriptors)
 
 
@@ -169,7 +178,7 @@ def map_pair(
         return describe_scans(sources[session], maps[session].keyframe_scans[chosen], config.descriptor)
 
     def surroundings(session: int, chosen: slice) -> Spheres:
-        return describe_map(maps[session], maps[session].odom_T_keyframe[chosen], config.descriptor)
+        return describe_map(maps[session], maps[session].odom_T_keyframe[chosen], config.descriptor, config.sphere)
 
     scans = hooks.run("descriptors", config, lambda: _describe_both("describe keyframes", keyframes, kept, hooks))
     (before, after), seconds = scans.value, dict(scans.seconds)
@@ -255,6 +264,7 @@ def detect_changes(
         done.value,
         seconds={**done.seconds, **merged.seconds},
         evidence={**done.value.evidence, **_sizes(merged)},
+        checkpoints=list_checkpoints(config),
     )
 
 
@@ -273,7 +283,7 @@ def detect_merge(
         np.zeros((0, 3)), config.query.radius_m, none, np.zeros((0, 2), dtype=np.int64), none.astype(np.bool_), none
     )
     report = make_report(merged, (before.descriptors, after.descriptors), regions, (), {}, merged.seconds, config)
-    return replace(report, evidence={**merged.evidence, **_sizes(merged)})
+    return replace(report, evidence={**merged.evidence, **_sizes(merged)}, checkpoints=list_checkpoints(config))
 
 
 def merge_mapped(
@@ -308,7 +318,7 @@ def _open(session: Path | str | ScanSource, config: PipelineConfig) -> tuple[Sca
     if not isinstance(session, Path | str):
         return session, None
     source = open_session(Path(session))
-    return source, load_descriptors(Path(session), config.descriptor, source.odom_T_sensor, config.map)
+    return source, load_descriptors(Path(session), config.descriptor, source.odom_T_sensor, config.map, config.sphere)
 
 
 def _describe_both(

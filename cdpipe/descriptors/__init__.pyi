@@ -1,4 +1,12 @@
-from .describe import checkpoint_digest, describe_scan, describe_scans, load_descriptors, save_descriptors, use_threads
+from .describe import (
+    checkpoint_digest,
+    describe_scan,
+    describe_scans,
+    list_checkpoints,
+    load_descriptors,
+    save_descriptors,
+    use_threads,
+)
 from .sphere import describe_map, sphere_digest
 from .yaw import relative_yaws_rad
 
@@ -7,6 +15,7 @@ __all__ = [
     "describe_map",
     "describe_scan",
     "describe_scans",
+    "list_checkpoints",
     "load_descriptors",
     "relative_yaws_rad",
     "save_descriptors",

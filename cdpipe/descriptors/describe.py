@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import suppress
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +18,18 @@ from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
 from cdpipe.descriptors.handmade import HANDMADE, VERSION
 from cdpipe.descriptors.network import (
     PlaceNetwork,
+    load_network,
     load_trained_network,
     make_untrained_network,
 )
 from cdpipe.descriptors.range_image import range_image
 from cdpipe.descriptors.sphere import sphere_digest
-from cdpipe.descriptors.weights_file import checkpoint_bytes, digest
-from cdpipe.model.config import DescriptorConfig, MapConfig
+from cdpipe.descriptors.weights_file import checkpoint_bytes, digest, read_weights
+from cdpipe.model.config import DescriptorConfig, MapConfig, PipelineConfig, SphereConfig
 from cdpipe.model.types import DescriptorSet, PosedScan, ScanSource
 
 _BATCH = 32
+_SHIPPED = SphereConfig()
 _FILE = {
     "checkpoint": ArraySpec("", "str"),
     "q": ArraySpec("K,D", "float32"),
@@ -41,7 +43,7 @@ _FILE = {
 
 def describe_scan(scan: PosedScan, config: DescriptorConfig) -> tuple[Float32Array, Float32Array]:
     """Return q (D,) and w (64,) of one scan; D is 64, or the number of rings of a hand-made descriptor."""
-    q, w = _describe([scan.points_sensor], config.method)
+    q, w = _describe([scan.points_sensor], config)
     return q[0], w[0]
 
 
@@ -51,19 +53,26 @@ def describe_scans(source: ScanSource, keyframe_scans: Int64Array, config: Descr
     Args:
         source: The session.
         keyframe_scans: (K,) indices of the keyframe scans, rising.
-        config: `method` names the descriptor.
+        config: `method` names the descriptor, `weights` the file of its weights.
+
+    Raises:
+        InputError: The file of weights cannot be used.
     """
     parts = []
     for start in range(0, len(keyframe_scans), _BATCH):
         batch = keyframe_scans[start : start + _BATCH].tolist()
-        parts.append(_describe((source.scan(index).points_sensor for index in batch), config.method))
+        parts.append(_describe((source.scan(index).points_sensor for index in batch), config))
     q = np.concatenate([part[0] for part in parts])
     w = np.concatenate([part[1] for part in parts])
     return DescriptorSet(q, w, keyframe_scans, config.method, checkpoint_digest(config))
 
 
 def save_descriptors(
-    folder: Path, descriptors: DescriptorSet, odom_T_sensor: Float64Array, map_config: MapConfig
+    folder: Path,
+    descriptors: DescriptorSet,
+    odom_T_sensor: Float64Array,
+    map_config: MapConfig,
+    sphere: SphereConfig = _SHIPPED,
 ) -> Path:
     """Write descriptors to `folder/descriptors/<name>.npz` and return the file.
 
@@ -77,7 +86,7 @@ def save_descriptors(
     partial = path.with_name(f".{path.stem}.partial.npz")
     optional: dict[str, npt.NDArray[Any]] = {} if descriptors.w is None else {"w": descriptors.w}
     if descriptors.spheres is not None:
-        optional |= {"spheres": descriptors.spheres, "spheres_of": np.array(_spheres_of(map_config))}
+        optional |= {"spheres": descriptors.spheres, "spheres_of": np.array(_spheres_of(map_config, sphere))}
     try:
         if path.parent.is_symlink():
             raise InputError(f"{path.parent}: is a link, and nothing outside of {folder} may be written: remove it")
@@ -101,14 +110,18 @@ def save_descriptors(
 
 
 def load_descriptors(
-    folder: Path, config: DescriptorConfig, odom_T_sensor: Float64Array, map_config: MapConfig
+    folder: Path,
+    config: DescriptorConfig,
+    odom_T_sensor: Float64Array,
+    map_config: MapConfig,
+    sphere: SphereConfig = _SHIPPED,
 ) -> DescriptorSet | None:
-    """Read stored descriptors; None if there are none for this checkpoint and these poses.
+    """Read stored descriptors; None if there are none for these weights and these poses.
 
-    Sphere descriptors are included if they are for the current weights, precision and map settings.
+    Sphere descriptors are included if they are for these weights, this precision and these map settings.
 
     Raises:
-        InputError: The file is damaged.
+        InputError: The file, or one of weights, is damaged.
     """
     path = folder / "descriptors" / f"{config.method}.npz"
     if not path.is_file():
@@ -120,18 +133,32 @@ def load_descriptors(
         return None
     spheres = arrays.get("spheres")
     if spheres is not None:
-        is_present = str(arrays.get("spheres_of")) == _spheres_of(map_config) and spheres.dtype == config.precision
-        spheres = spheres if is_present else None
+        is_same = str(arrays.get("spheres_of")) == _spheres_of(map_config, sphere)
+        spheres = spheres if is_same and spheres.dtype == config.precision else None
     return DescriptorSet(arrays["q"], arrays.get("w"), arrays["keyframe_scans"], config.method, checkpoint, spheres)
 
 
-def _spheres_of(map_config: MapConfig) -> str:
-    return f"{sphere_digest()} {map_config.model_dump_json()}"
+def _spheres_of(map_config: MapConfig, sphere: SphereConfig) -> str:
+    return f"{sphere_digest(sphere)} {map_config.model_dump_json()}"
 
 
 def checkpoint_digest(config: DescriptorConfig) -> str:
-    """Return the digest of the weights of the descriptor in `config`; of a hand-made one its version."""
-    return f"version {VERSION}" if config.method in HANDMADE else _network(config.method)[1]
+    """Return the digest of the weights of the descriptor in `config`; of a hand-made one its version.
+
+    Raises:
+        InputError: The file of weights cannot be used.
+    """
+    return f"version {VERSION}" if config.method in HANDMADE else _network(config)[1]
+
+
+def list_checkpoints(config: PipelineConfig) -> dict[str, str]:
+    """Return the digests of the weights that a method uses: by its scan descriptor, and by `sphere` if it compares so.
+
+    Raises:
+        InputError: A file of weights cannot be used.
+    """
+    found = {config.descriptor.method: checkpoint_digest(config.descriptor)}
+    return found | ({"sphere": sphere_digest(config.sphere)} if config.query.compare == "sphere" else {})
 
 
 def use_threads(n_threads: int) -> None:
@@ -139,20 +166,31 @@ def use_threads(n_threads: int) -> None:
     torch.set_num_threads(n_threads)
 
 
-def _describe(clouds_sensor: Iterable[Float64Array], method: str) -> tuple[Float32Array, Float32Array]:
+def _describe(clouds_sensor: Iterable[Float64Array], config: DescriptorConfig) -> tuple[Float32Array, Float32Array]:
     """Return q (N, D) and w (N, 64) of N scans, each (M, 3) points in the sensor frame."""
-    if method in HANDMADE:
-        vectors = [HANDMADE[method](points) for points in clouds_sensor]
+    if config.method in HANDMADE:
+        vectors = [HANDMADE[config.method](points) for points in clouds_sensor]
         return np.stack([q for q, _ in vectors]), np.stack([w for _, w in vectors])
     images = torch.from_numpy(np.stack([range_image(points) for points in clouds_sensor]))
     with torch.inference_mode():
-        q, w = _network(method)[0](images)
+        q, w = _network(config)[0](images)
     return q.numpy().astype(np.float32), w.numpy().astype(np.float32)
 
 
+def _network(config: DescriptorConfig) -> tuple[PlaceNetwork, str]:
+    if config.method == "3deg" and config.weights:
+        return _parse(read_weights(config.weights), config.weights)
+    return _shipped(config.method)
+
+
 @cache
-def _network(method: str) -> tuple[PlaceNetwork, str]:
+def _shipped(method: str) -> tuple[PlaceNetwork, str]:
     if method == "untrained":
         network = make_untrained_network()
         return network, digest(checkpoint_bytes(network))
     return load_trained_network()
+
+
+@lru_cache(maxsize=4)
+def _parse(content: bytes, source: str) -> tuple[PlaceNetwork, str]:
+    return load_network(content, source), digest(content)

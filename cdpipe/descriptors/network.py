@@ -96,12 +96,21 @@ def make_untrained_network(seed: int = 0) -> PlaceNetwork:
         return PlaceNetwork().eval()
 
 
+def load_network(content: bytes, source: str = "3deg.safetensors") -> PlaceNetwork:
+    """Return the network of a checkpoint.
+
+    Raises:
+        InputError: The checkpoint is damaged, of another format, or of another network.
+    """
+    network = PlaceNetwork()
+    network.load_state_dict(parse_weights(content, source, list_weights(network)))
+    return network.eval()
+
+
 def load_trained_network() -> tuple[PlaceNetwork, str]:
     """Return the shipped network and the digest of its checkpoint."""
     content = (resources.files("cdpipe") / "descriptors" / "weights" / "3deg.safetensors").read_bytes()
-    network = PlaceNetwork()
-    network.load_state_dict(parse_weights(content, "3deg.safetensors", list_weights(network)))
-    return network.eval(), digest(content)
+    return load_network(content), digest(content)
 
 
 assert np.prod([stride[1] for stride in _STRIDES]) * DIMENSIONS == COLUMNS

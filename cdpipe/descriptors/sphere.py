@@ -6,7 +6,7 @@ at the before keyframes. The log-odds of a keyframe are the maximum over its sec
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 import torch
@@ -15,35 +15,50 @@ from scipy.spatial import cKDTree
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, invert
 from cdpipe.core.grid_index import GridIndex
 from cdpipe.descriptors.sphere_image import render
-from cdpipe.descriptors.sphere_network import PER_SECTOR, SECTORS, SphereNetwork, load_trained_sphere_network
-from cdpipe.model.config import DescriptorConfig
+from cdpipe.descriptors.sphere_network import (
+    SECTORS,
+    SphereNetwork,
+    load_sphere_network,
+    load_trained_sphere_network,
+)
+from cdpipe.descriptors.weights_file import digest, read_weights
+from cdpipe.model.config import DescriptorConfig, SphereConfig
 from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap, Spheres
 
 _BATCH = 64
 _INT8_SCALE = 127.0
 # Consecutive keyframes farther apart than this are no neighbours.
 _NEIGHBOUR_M = 2.5
+_SHIPPED = SphereConfig()
 
 
-def describe_map(thin_map: PointMap, map_T_anchor: Float64Array, config: DescriptorConfig) -> Spheres:
-    """Return the (K, 64) sphere descriptors of a map at K poses: float32 in (-1, 1), or int8 in units of 1/127.
+def describe_map(
+    thin_map: PointMap, map_T_anchor: Float64Array, config: DescriptorConfig, sphere: SphereConfig = _SHIPPED
+) -> Spheres:
+    """Return the (K, E) sphere descriptors of a map at K poses: float32 in (-1, 1), or int8 in units of 1/127.
 
     Args:
         thin_map: The map.
         map_T_anchor: (K, 4, 4) sensor poses in the map's frame.
         config: `precision` is used.
+        sphere: The weights; E is 64 with the shipped ones.
+
+    Raises:
+        InputError: The file of weights cannot be used.
     """
-    network, _ = _network()
+    network, _ = _network(sphere)
     images = render(GridIndex(thin_map.points), map_T_anchor)
     with torch.inference_mode():
         parts = [network.encode(batch).flatten(1).numpy() for batch in torch.split(torch.from_numpy(images), _BATCH)]
-    spheres = np.concatenate([np.zeros((0, PER_SECTOR * SECTORS), np.float32), *parts])
+    spheres = np.concatenate([np.zeros((0, network.size.numbers), np.float32), *parts])
     if config.precision == "int8":
         return np.rint(spheres * _INT8_SCALE).astype(np.int8)
     return spheres
 
 
-def change_logits(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArray) -> Float64Array:
+def change_logits(
+    merged: MergedMaps, before: DescriptorSet, is_covered: BoolArray, sphere: SphereConfig = _SHIPPED
+) -> Float64Array:
     """Return the (K, SECTORS) log-odds of change of each sector of each before keyframe.
 
     Keyframe poses are transformed into the after odom frame by the local alignment; the after map stays in place.
@@ -52,13 +67,15 @@ def change_logits(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArr
         merged: Both maps.
         before: Its `spheres` are compared.
         is_covered: (K,) whether the after session came near a keyframe; the others get NaN.
+        sphere: The weights with which the before map was described.
 
     Raises:
         ValueError: The before session has no sphere descriptors.
+        InputError: The file of weights cannot be used.
     """
     if before.spheres is None:
         raise ValueError("the before session has no sphere descriptors: describe its map")
-    network, _ = _network()
+    network, _ = _network(sphere)
     logits = np.full((len(is_covered), SECTORS), np.nan)
     map_T_anchor = merged.before.odom_T_sensor[before.keyframe_scans[is_covered]]
     positions_odom = merged.alignment.to_odom(map_T_anchor[:, :3, 3])
@@ -68,23 +85,25 @@ def change_logits(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArr
     with torch.inference_mode():
         batches = (torch.split(torch.from_numpy(array), _BATCH) for array in (spheres, images))
         parts = [
-            network.compare(stored.reshape(-1, PER_SECTOR, SECTORS), image).numpy()
+            network.compare(stored.reshape(-1, network.size.per_sector, SECTORS), image).numpy()
             for stored, image in zip(*batches, strict=True)
         ]
     logits[is_covered] = np.concatenate([np.zeros((0, SECTORS)), *parts])
     return logits
 
 
-def change_log_odds(merged: MergedMaps, before: DescriptorSet, is_covered: BoolArray) -> Float64Array:
+def change_log_odds(
+    merged: MergedMaps, before: DescriptorSet, is_covered: BoolArray, sphere: SphereConfig = _SHIPPED
+) -> Float64Array:
     """Return the (K,) calibrated log-odds of change around each before keyframe; NaN if not covered.
 
     Their sigmoid is a probability, calibrated on validation tunnels. Arguments as of `change_logits`.
     """
     log_odds = np.full(len(is_covered), np.nan)
-    logits = change_logits(merged, before, is_covered)[is_covered]
+    logits = change_logits(merged, before, is_covered, sphere)[is_covered]
     positions = merged.before.odom_T_sensor[before.keyframe_scans[is_covered], :3, 3]
     most_changed = torch.from_numpy(average_neighbours(logits, positions).max(axis=1))
-    log_odds[is_covered] = _network()[0].calibrate(most_changed).numpy()
+    log_odds[is_covered] = _network(sphere)[0].calibrate(most_changed).numpy()
     return log_odds
 
 
@@ -119,11 +138,24 @@ def dequantise(spheres: Spheres) -> Float32Array:
     return spheres.astype(np.float32)
 
 
-def sphere_digest() -> str:
-    """Return the digest of the weights."""
-    return _network()[1]
+def sphere_digest(sphere: SphereConfig = _SHIPPED) -> str:
+    """Return the digest of the weights.
+
+    Raises:
+        InputError: The file of weights cannot be used.
+    """
+    return _network(sphere)[1]
+
+
+def _network(sphere: SphereConfig) -> tuple[SphereNetwork, str]:
+    return _parse(read_weights(sphere.weights), sphere.weights) if sphere.weights else _shipped()
 
 
 @cache
-def _network() -> tuple[SphereNetwork, str]:
+def _shipped() -> tuple[SphereNetwork, str]:
     return load_trained_sphere_network()
+
+
+@lru_cache(maxsize=4)
+def _parse(content: bytes, source: str) -> tuple[SphereNetwork, str]:
+    return load_sphere_network(content, source), digest(content)

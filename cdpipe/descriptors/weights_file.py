@@ -8,16 +8,28 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import ArraySpec, Expected, parse_json, parse_tensors, require_format
+from cdpipe.core.files import ArraySpec, Expected, parse_json, parse_tensors, read_bytes, require_format
 
 FORMAT = "tunnelcd-weights"
 FORMAT_VERSION = 1
+_MOST_BYTES = 256 << 20
 _METADATA = "tunnelcd"  # a single entry, because safetensors writes several in no fixed order
+
+
+def read_weights(path: str) -> bytes:
+    """Return the content of a file of weights that a setting names.
+
+    Raises:
+        InputError: The file is missing, too large, or cannot be read.
+    """
+    return read_bytes(Path(path), _MOST_BYTES, "expected weights as `tunnelcd train` writes them")
 
 
 def checkpoint_bytes(network: nn.Module) -> bytes:
@@ -41,10 +53,12 @@ def parse_weights(content: bytes, source: str, expected: Expected) -> dict[str, 
     The first checkpoints carry no metadata; they hold the same tensors as those of format 1.
 
     Raises:
-        InputError: The checkpoint is damaged, of another format, or of another network; the text names `source`.
+        InputError: The checkpoint is damaged, of another format or network, or holds numbers that are not finite; the
+            text names `source`.
     """
     try:
         arrays, metadata = parse_tensors(content, expected)
+        _require_finite(arrays)
         about = parse_json(metadata[_METADATA]) if _METADATA in metadata else None
     except ValueError as error:
         raise InputError(f"{source}: damaged, or weights of another network ({error})") from error
@@ -65,6 +79,12 @@ def list_tensors(tensors: Mapping[str, Tensor]) -> dict[str, ArraySpec]:
         name: ArraySpec(",".join(map(str, tensor.shape)), str(tensor.dtype).removeprefix("torch."))
         for name, tensor in tensors.items()
     }
+
+
+def _require_finite(arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} holds numbers that are not finite")
 
 
 def _encode(network: nn.Module, metadata: dict[str, str] | None) -> bytes:

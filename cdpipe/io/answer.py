@@ -1,8 +1,9 @@
 """The answer of a method on disk, written by `detect` or another program and read by `score`.
 
-    answer.json   format, status, method, config, seconds, evidence, before_T_after, radius_m, objects (session, kind,
-                  region, score and partner of each; if known, shape: map_T_box (4, 4), box_m (3,) and volume_m3; for
-                  moved objects displacement_map (3,)); until: "merge" if the method was stopped after the merge
+    answer.json   format, status, method, config, checkpoints (digest of each descriptor's weights), seconds, evidence,
+                  before_T_after, radius_m, objects (session, kind, region, score and partner of each; if known, shape:
+                  map_T_box (4, 4), box_m (3,) and volume_m3; for moved objects displacement_map (3,)); until: "merge"
+                  if the method was stopped after the merge
     answer.npz    region_centres_map (R, 3), region_scores (R,), region_pairs (R, 2), region_is_reported (R,),
                   region_is_withdrawn (R,), regions above the threshold without an object (optional),
                   region_direction (R,) uint8, session of the queried keyframe, 0 before, 1 after (optional),
@@ -23,7 +24,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,7 @@ class Answer:
         evidence: Evidence of the merge.
         points_odom: For each object the (P, 3) odom points of a foreign answer without returns; None otherwise.
         until: Last stage of a method that was stopped on purpose; None if it ran to its end.
+        checkpoints: Digest of the weights of each descriptor that was used, by its name.
     """
 
     status: str
@@ -74,6 +76,7 @@ class Answer:
     evidence: Mapping[str, float]
     points_odom: tuple[Float64Array, ...] | None = None
     until: Until | None = None
+    checkpoints: Mapping[str, str] = field(default_factory=dict)
 
 
 def write_answer(folder: Path, method: str, report: ChangeReport, until: Until | None = None) -> None:
@@ -108,6 +111,7 @@ def write_answer(folder: Path, method: str, report: ChangeReport, until: Until |
         "seconds": dict(report.seconds),
         "evidence": dict(report.evidence),
         "config": dict(report.config),
+        "checkpoints": dict(report.checkpoints),
         "objects": [_object_document(item) for item in objects],
     }
     _write_json(folder, document, until)
@@ -143,13 +147,15 @@ def write_failure(
     config: Mapping[str, Any],
     until: Until | None = None,
     seconds: Mapping[str, float] | None = None,
+    checkpoints: Mapping[str, str] | None = None,
 ) -> None:
     """Write the record of a case without an answer, with the seconds measured until then."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "answer.npz").unlink(missing_ok=True)
     document: dict[str, Any] = {"status": status, "error": error, "method": method}
     document |= {"seconds": dict(seconds or {}), "evidence": dict(evidence)}
-    _write_json(folder, {**document, "config": dict(config)}, until)
+    document |= {"config": dict(config), "checkpoints": dict(checkpoints or {})}
+    _write_json(folder, document, until)
 
 
 def read_answer(folder: Path) -> Answer:
@@ -162,8 +168,8 @@ def read_answer(folder: Path) -> Answer:
     value = read_json(path, "expected an answer written by `tunnelcd detect` or by another method")
     document = check_document(path, value)
     if not isinstance(document, AnswerPart):
-        status, method, seconds, until = document.status, document.method, document.seconds, document.until
-        return Answer(status, document.error, method, None, seconds, document.evidence, until=until)
+        failed = document.status, document.error, document.method, None, document.seconds, document.evidence
+        return Answer(*failed, until=document.until, checkpoints=document.checkpoints)
     file, n_objects = folder / "answer.npz", len(document.objects)
     arrays = read_npz(file, lambda types: check_array_types(file, types, n_objects))
     check_offsets(file, arrays, n_objects)
@@ -171,7 +177,8 @@ def read_answer(folder: Path) -> Answer:
         report, points_odom = _report(document, arrays)
     except ValueError as error:
         raise InputError(f"{file}: arrays that do not go together: {error}") from error
-    return Answer("ok", "", document.method, report, report.seconds, report.evidence, points_odom, document.until)
+    measured = report.seconds, report.evidence
+    return Answer("ok", "", document.method, report, *measured, points_odom, document.until, report.checkpoints)
 
 
 def _report(
@@ -224,6 +231,7 @@ def _report(
         keyframe_scans=(arrays.get("before_keyframe_scans", no_scans), arrays.get("after_keyframe_scans", no_scans)),
         config=document.config,
         local_before_T_after=arrays.get("local_before_T_after"),
+        checkpoints=document.checkpoints,
     )
     return report, points_odom
 

@@ -63,6 +63,7 @@ class FailurePart(_Part):
     seconds: dict[str, float] = Field(default_factory=dict)
     evidence: dict[str, float] = Field(default_factory=dict)
     config: dict[str, Any] = Field(default_factory=dict)
+    checkpoints: dict[str, str] = Field(default_factory=dict)
     # fields of an answer are allowed and ignored
     before_T_after: Any = None
     radius_m: Any = None

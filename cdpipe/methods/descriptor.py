@@ -17,4 +17,4 @@ class DescriptorQuery:
         self, merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig
     ) -> ChangeRegions:
         """Return the candidate regions, ranked by the descriptors of the keyframes."""
-        return find_regions(merged, before, after, config.query)
+        return find_regions(merged, before, after, config.query, config.sphere)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -30,6 +31,16 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[float, Field(ge=0)]
 Site = Literal["narrow", "wide"]
+WEIGHTS = ("descriptor.weights", "sphere.weights")
+"""Settings that name a file; a relative path starts at the file that holds the setting."""
+
+
+class _WithWeights(Settings):
+    """Settings with a file of weights, which a dump leaves out where there is none."""
+
+    @model_serializer(mode="wrap")
+    def _without_empty_weights(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {name: value for name, value in handler(self).items() if name != "weights" or value}
 
 
 class MapConfig(Settings):
@@ -40,13 +51,20 @@ class MapConfig(Settings):
     keyframe_spacing_m: Positive = Field(1.0, description="path between keyframes")
 
 
-class DescriptorConfig(Settings):
+class DescriptorConfig(_WithWeights):
     """The descriptor of every keyframe, computed while mapping."""
 
     method: Literal["3deg", "untrained", "scan-context", "solid"] = Field(
         "3deg", description="trained weights, the same network untrained, or one made by hand"
     )
     precision: Literal["float32", "int8"] = Field("float32", description="of stored sphere descriptors")
+    weights: str = Field("", description="`3deg`: file of weights that `tunnelcd train` wrote; empty: the shipped ones")
+
+
+class SphereConfig(_WithWeights):
+    """The sphere descriptor."""
+
+    weights: str = Field("", description="file of weights that `tunnelcd train` wrote; empty: the shipped ones")
 
 
 class MergeConfig(Settings):
@@ -159,6 +177,7 @@ class PipelineConfig(Settings):
     seed: Annotated[int, Field(ge=0)] = Field(0, description="for methods that draw at random")
     map: MapConfig = MapConfig()
     descriptor: DescriptorConfig = DescriptorConfig()
+    sphere: SphereConfig = SphereConfig()
     merge: MergeConfig = MergeConfig()
     query: QueryConfig = QueryConfig()
     extract: ExtractConfig = ExtractConfig()
@@ -180,8 +199,8 @@ class PipelineConfig(Settings):
         return method
 
     @model_serializer(mode="wrap")
-    def _without_empty_options(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {name: value for name, value in handler(self).items() if name != "options" or value}
+    def _without_empty_groups(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {name: value for name, value in handler(self).items() if name not in ("options", "sphere") or value}
 
 
 def preset_names() -> list[str]:
@@ -196,9 +215,10 @@ def load_config(
 
     Args:
         preset: Name of a preset, or the path of a .yaml file. Its settings are for narrow drifts; the section `wide`
-            has those that differ in wide drifts: the radius, and with it the threshold.
+            has those that differ in wide drifts: the radius, and with it the threshold. Relative paths in it start at
+            that file.
         settings: Replace those of the preset: `["query.radius_m=6"]`, `{"query.radius_m": 6}` or
-            `{"query": {"radius_m": 6}}`.
+            `{"query": {"radius_m": 6}}`. Relative paths start at the working folder.
         site: Narrow or wide drifts.
 
     Raises:
@@ -241,11 +261,24 @@ def settings_table() -> list[tuple[str, Any, str]]:
 
 def _preset_document(preset: str) -> Document:
     if preset.endswith((".yaml", ".yml")):
-        return read_yaml(Path(preset))
+        return _resolve_files(read_yaml(Path(preset)), Path(preset).parent)
     presets = _presets()
     if preset not in presets:
         raise InputError(f"preset {preset!r} is unknown{suggest(preset, presets)} (known: {', '.join(presets)})")
-    return read_yaml(Path(f"{preset}.yaml"), presets[preset].read_text(encoding="utf-8"))
+    document = read_yaml(Path(f"{preset}.yaml"), presets[preset].read_text(encoding="utf-8"))
+    return _resolve_files(document, Path(str(presets[preset])).parent)
+
+
+def _resolve_files(document: Document, folder: Path) -> Document:
+    """Return a preset whose relative paths start at its folder, as seen from the working folder."""
+
+    def resolve(tree: Any, key: str = "") -> Any:
+        if isinstance(tree, dict):
+            return {name: resolve(value, f"{key}.{name}".removeprefix(".")) for name, value in tree.items()}
+        is_file = key.removeprefix("wide.") in WEIGHTS and isinstance(tree, str) and tree
+        return str(folder / tree) if is_file else tree
+
+    return replace(document, value=resolve(document.value))
 
 
 def _presets() -> dict[str, Traversable]:

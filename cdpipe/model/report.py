@@ -124,6 +124,7 @@ class ChangeReport:
         config: The effective settings.
         local_before_T_after: (Ka, 4, 4) refined alignment at each after keyframe; None if `before_T_after` holds
             everywhere.
+        checkpoints: Digest of the weights of each descriptor that was used, by its name.
     """
 
     before_T_after: Float64Array
@@ -135,6 +136,7 @@ class ChangeReport:
     keyframe_scans: tuple[Int64Array, Int64Array]
     config: Mapping[str, object] = field(default_factory=dict)
     local_before_T_after: Float64Array | None = None
+    checkpoints: Mapping[str, str] = field(default_factory=dict)
 
     def to_pandas(self, table: Literal["objects", "regions"] = "objects") -> pd.DataFrame:
         """Return the objects or the reported regions as a table; positions in the map frame, metres.

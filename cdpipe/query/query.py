@@ -15,16 +15,23 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.descriptors.sphere import change_log_odds, max_within_reach
-from cdpipe.model.config import QueryConfig
+from cdpipe.model.config import QueryConfig, SphereConfig
 from cdpipe.model.report import ChangeRegions
 from cdpipe.model.types import DescriptorSet, MergedMaps, UInt8Array
 from cdpipe.query.difference import sphere_difference
 
 # Values of `ChangeRegions.direction`: the session whose keyframe is queried in the other session.
 BEFORE, AFTER = 0, 1
+_SHIPPED = SphereConfig()
 
 
-def find_regions(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> ChangeRegions:
+def find_regions(
+    merged: MergedMaps,
+    before: DescriptorSet,
+    after: DescriptorSet,
+    config: QueryConfig,
+    sphere: SphereConfig = _SHIPPED,
+) -> ChangeRegions:
     """Score the keyframes by the comparison that `query.compare` names, and rank them as regions.
 
     Args:
@@ -32,12 +39,13 @@ def find_regions(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet
         before: Descriptors of the before session; `pairs[:, 0]` indexes its keyframes.
         after: Descriptors of the after session; `pairs[:, 1]` indexes its keyframes.
         config: Comparison, reading, radius, threshold, suppression.
+        sphere: Weights of the sphere descriptors, if they are compared.
     """
     places = _Places(merged, before, after, config)
     if config.compare == "scan":
         return _score_by_scans(places, before, after, config)
     if config.compare == "sphere":
-        return _score_by_spheres(places, change_log_odds(merged, before, places.is_covered_b), config)
+        return _score_by_spheres(places, change_log_odds(merged, before, places.is_covered_b, sphere), config)
     scores = sphere_difference(merged, before, after, config)
     return rank_regions(places.before, scores, places.pairs_b, scores, config, _from(BEFORE, scores))
 

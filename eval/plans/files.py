@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import Any
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import YamlError, parse_yaml_value
 from cdpipe.core.plugins import find_yaml
 from cdpipe.core.yamlfile import Document, read_yaml, suggest
+from cdpipe.model.config import WEIGHTS
+from eval.plans.worlds import format_setting
 
 
 def plan_names() -> list[str]:
@@ -19,18 +24,44 @@ def plan_names() -> list[str]:
 def read_plan(name_or_path: str) -> Document:
     """Read the file of a plan: by the plan's name, or by the path of any .yaml file.
 
+    Returns:
+        The document; files of weights that its settings name by relative paths start at the plan's folder.
+
     Raises:
         InputError: It is unknown, or no YAML.
     """
     if name_or_path.endswith((".yaml", ".yml")):
-        return read_yaml(Path(name_or_path))
+        return _resolve_files(read_yaml(Path(name_or_path)), Path(name_or_path).parent)
     plans = _find_plans()
     if name_or_path not in plans:
         raise InputError(
             f"plan {name_or_path!r} is unknown{suggest(name_or_path, plans)} "
             f"(known: {', '.join(plans)}, or the path of a .yaml file)"
         )
-    return read_yaml(Path(f"{name_or_path}.yaml"), plans[name_or_path].read_text(encoding="utf-8"))
+    document = read_yaml(Path(f"{name_or_path}.yaml"), plans[name_or_path].read_text(encoding="utf-8"))
+    return _resolve_files(document, Path(str(plans[name_or_path])).parent)
+
+
+def _resolve_files(document: Document, folder: Path) -> Document:
+    """Return a plan whose weights are paths as seen from the working folder, in `key=value` settings and in grids."""
+
+    def resolve(tree: Any, key: str = "") -> Any:
+        if isinstance(tree, dict):
+            return {name: resolve(value, str(name)) for name, value in tree.items()}
+        if isinstance(tree, list):
+            return [resolve(value, key) for value in tree]
+        if not isinstance(tree, str):
+            return tree
+        if key in WEIGHTS:
+            return str(folder / tree) if tree else tree
+        name, _, text = tree.partition("=")
+        try:
+            file = parse_yaml_value(text) if name in WEIGHTS else None
+        except YamlError:
+            return tree  # whoever reads the setting says so
+        return format_setting(name, str(folder / file)) if file and isinstance(file, str) else tree
+
+    return replace(document, value=resolve(document.value))
 
 
 def _find_plans() -> dict[str, Traversable]:

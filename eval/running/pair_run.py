@@ -18,7 +18,7 @@ import numpy as np
 
 from cdpipe.core.errors import InputError, MergeFailedError, ScenarioError, TunnelcdError
 from cdpipe.core.threads import THREADS
-from cdpipe.descriptors import checkpoint_digest, sphere_digest, use_threads
+from cdpipe.descriptors import checkpoint_digest, list_checkpoints, sphere_digest, use_threads
 from cdpipe.io.answer import write_answer, write_failure
 from cdpipe.merge.global_registration import is_kiss_matcher_installed
 from cdpipe.model.config import MapConfig
@@ -160,7 +160,8 @@ class PairRun:
             return
         settings = each.cell.config.model_dump(mode="json")
         remove(folder)  # left by the process that died
-        write_failure(folder, each.cell.variant, status, error, {}, settings, each.cell.until)
+        used = list_checkpoints(each.cell.config)
+        write_failure(folder, each.cell.variant, status, error, {}, settings, each.cell.until, checkpoints=used)
         self._finish(each, score_stored(load_ground_truth(path), folder, may_end_early=True))
 
     def _finish(self, each: Todo, score: CaseScore, *, is_contended: bool = False) -> None:
@@ -223,9 +224,10 @@ def cell_key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mappi
             "scenario": None if scenario is None else scenario.model_dump(mode="json"),
             "files": dict(files),
             "seed": cell.seed,
-            "config": cell.config.model_dump(mode="json"),
+            # the digests name the weights, wherever their files lie
+            "config": cell.config.model_dump(mode="json", exclude={"descriptor": {"weights"}, "sphere": {"weights"}}),
             "checkpoint": checkpoint_digest(cell.config.descriptor),
-            **({"sphere": sphere_digest()} if cell.config.query.compare == "sphere" else {}),
+            **({"sphere": sphere_digest(cell.config.sphere)} if cell.config.query.compare == "sphere" else {}),
             "oracle": None if cell.oracle is None else cell.oracle.model_dump(mode="json"),
             **({"oracle_regions": True} if cell.oracle_regions else {}),
             "until": cell.until,
@@ -280,9 +282,10 @@ def _answer(stages: PairStages, cell: Cell, truth: GroundTruth, folder: Path) ->
         report = stages.answer(cell.config, merge, propose, cell.until)
     except MergeFailedError as error:
         measured = error.evidence, settings, cell.until, error.seconds
-        write_failure(folder, cell.variant, "merge_refused", str(error), *measured)
+        write_failure(folder, cell.variant, "merge_refused", str(error), *measured, list_checkpoints(cell.config))
     except TunnelcdError as error:
-        write_failure(folder, cell.variant, "failed", str(error), {}, settings, cell.until)
+        used = list_checkpoints(cell.config)
+        write_failure(folder, cell.variant, "failed", str(error), {}, settings, cell.until, checkpoints=used)
     else:
         write_answer(folder, cell.variant, report, cell.until)
 

@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from cdpipe.core.errors import InputError, ScenarioError
-from cdpipe.descriptors import checkpoint_digest, sphere_digest
+from cdpipe.descriptors import list_checkpoints
 from cdpipe.methods.registry import load_method
-from cdpipe.model.config import DescriptorConfig
 from eval.core.cluster import HERE, Where, connected, require_usable
 from eval.core.output import remove
 from eval.core.progress import RunProgress, Silent
@@ -222,8 +221,9 @@ def _is_simulated(path: Path, pair: Pair) -> bool:
 
 def _provenance(plan: Plan, all_cells: Sequence[Cell], command: Sequence[str], tools: Tools) -> Mapping[str, Any]:
     configs = {f"{cell.scenario} {cell.variant}": cell.config.model_dump(mode="json") for cell in all_cells}
-    methods = dict.fromkeys(cell.config.descriptor.method for cell in all_cells)
-    checkpoints: dict[str, str] = {method: checkpoint_digest(DescriptorConfig(method=method)) for method in methods}
-    if any(cell.config.query.compare == "sphere" for cell in all_cells):
-        checkpoints["sphere"] = sphere_digest()
+    checkpoints: dict[str, str] = {}
+    for cell in all_cells:
+        files = {"sphere": cell.config.sphere.weights, cell.config.descriptor.method: cell.config.descriptor.weights}
+        for name, digest_of_weights in list_checkpoints(cell.config).items():
+            checkpoints[f"{name} {files[name]}".strip()] = digest_of_weights
     return describe_run(plan.model_dump(mode="json"), configs, checkpoints, command, tools.commit(), tools.now())

@@ -43,8 +43,8 @@ def name_result(stage: Stage, config: PipelineConfig) -> str:
                 "weights": checkpoint_digest(config.descriptor),
             }
         case "spheres":
-            precision = config.descriptor.precision
-            read = {"maps": name_result("maps", config), "precision": precision, "weights": sphere_digest()}
+            precision, weights = config.descriptor.precision, sphere_digest(config.sphere)
+            read = {"maps": name_result("maps", config), "precision": precision, "weights": weights}
         case "merge":
             read = {
                 "maps": name_result("maps", config),

@@ -72,7 +72,8 @@ def score(answer: ChangeReport | Path | str, pair: Path | str) -> dict[str, Any]
     truth = load_ground_truth(Path(pair))
     if not isinstance(answer, ChangeReport):
         return score_stored(truth, Path(answer)).row
-    whole = Answer("ok", "", str(answer.config.get("method", "")), answer, answer.seconds, answer.evidence)
+    method, measured = str(answer.config.get("method", "")), (answer.seconds, answer.evidence)
+    whole = Answer("ok", "", method, answer, *measured, checkpoints=answer.checkpoints)
     check_answer(whole, truth, Path("report"))
     return score_answer(whole, truth).row
 
@@ -277,6 +278,7 @@ def _make_identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
         "n_changes": len(truth.pair.changes),
         "n_observable": truth.n_observable,
         "score_radius_m": truth.pair.score_radius_m,
+        "checkpoints": ";".join(f"{name} {digest}" for name, digest in answer.checkpoints.items()),
     }
 
 

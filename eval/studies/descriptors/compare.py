@@ -18,7 +18,7 @@ import pandas as pd
 import typer
 
 from cdpipe.core.threads import THREADS
-from cdpipe.descriptors import checkpoint_digest, sphere_digest, use_threads
+from cdpipe.descriptors import checkpoint_digest, list_checkpoints, sphere_digest, use_threads
 from cdpipe.model.config import load_config
 from eval.core.domains import domain_of
 from eval.core.exits import run_program
@@ -42,7 +42,13 @@ _VERSION = 1  # of a row; raised when its figures change, so that stored rows ar
 
 
 def measure(
-    families: Sequence[str], seeds: Sequence[int], out: Path, progress: RunProgress, *, keep: bool = False
+    families: Sequence[str],
+    seeds: Sequence[int],
+    out: Path,
+    progress: RunProgress,
+    settings: Sequence[str] = (),
+    *,
+    keep: bool = False,
 ) -> pd.DataFrame:
     """Return one row for each pair, descriptor and precision; stored pairs are not measured again.
 
@@ -51,12 +57,14 @@ def measure(
         seeds: Seeds of each family.
         out: Folder of the run.
         progress: Receives each pair and stage.
+        settings: Over those of `tunnelcd`, e.g. `sphere.weights=mine/sphere.safetensors`.
         keep: Keep the simulated pairs, in `out`/pairs.
 
     Raises:
         ScenarioError: A world cannot be drawn or built.
-        InputError: `out` cannot be written.
+        InputError: `out` cannot be written, or a setting is wrong.
     """
+    list_checkpoints(load_config("tunnelcd", settings))
     make_writable(out)
     use_threads(THREADS)
     todo = [(family, seed, load_scenario(family, seed)) for seed in seeds for family in families]
@@ -64,7 +72,7 @@ def measure(
     for done, (family, seed, scenario) in enumerate(todo):
         progress.cells(f"{family} {seed}", done, len(todo))
         path = out / "rows" / f"{world_slug(family)}-{seed}.json"
-        key = _key(scenario, seed)
+        key = _key(scenario, seed, settings)
         document = read_json(path)
         if document.get("key") != key or "rows" not in document:
             pair = out / "pairs" / path.stem
@@ -73,7 +81,7 @@ def measure(
                     pair.parent.mkdir(parents=True, exist_ok=True)
                     simulate_pair(scenario, seed, pair, on_progress=progress.stage)
                 progress.stage("describe", 0, 1)
-                measured = measure_pair(pair)
+                measured = measure_pair(pair, settings)
             finally:
                 if not keep:
                     remove(pair)
@@ -85,10 +93,10 @@ def measure(
     return pd.DataFrame(rows)
 
 
-def _key(scenario: Scenario, seed: int) -> str:
-    config = load_config("tunnelcd")
-    # the scores do not depend on these settings of the query
-    unused = {"query": {"threshold", "n_regions", "suppression", "radius_m"}}
+def _key(scenario: Scenario, seed: int, settings: Sequence[str]) -> str:
+    config = load_config("tunnelcd", settings)
+    # the scores do not depend on these settings of the query, nor on where a file of weights lies
+    unused = {"query": {"threshold", "n_regions", "suppression", "radius_m"}, "descriptor": {"weights"}}
     return digest(
         {
             "version": _VERSION,
@@ -99,7 +107,7 @@ def _key(scenario: Scenario, seed: int) -> str:
             "checkpoints": [
                 checkpoint_digest(config.descriptor.model_copy(update={"method": method})) for method in METHODS
             ],
-            "sphere": sphere_digest(),
+            "sphere": sphere_digest(config.sphere),
         }
     )
 
@@ -199,12 +207,15 @@ def main(
         list[str] | None, typer.Argument(metavar="FAMILY...", help="names from `tunnelcd list`, or .yaml files")
     ] = None,
     seeds: Annotated[str, typer.Option(metavar="A:B", help="B excluded")] = _SEEDS,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="one setting; may be repeated")
+    ] = None,
     keep: Annotated[bool, typer.Option("--keep", help="keep the simulated pairs, about 0.3 GB each")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q")] = False,
 ) -> None:
     """Measure every descriptor on simulated pairs."""
     with shown_progress(quiet, "pairs") as progress:
-        rows = measure(families or _FAMILIES, parse_seeds_option(seeds), out, progress, keep=keep)
+        rows = measure(families or _FAMILIES, parse_seeds_option(seeds), out, progress, settings or (), keep=keep)
     tables = {"descriptors": rows, "places": tabulate_places(rows), "spheres": tabulate_spheres(rows)}
     for name, table in tables.items():
         table.to_csv(out / f"{name}.csv", index=False)

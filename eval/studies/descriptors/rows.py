@@ -38,21 +38,23 @@ Row = dict[str, Any]
 Described = tuple[DescriptorSet, Float64Array]
 
 
-def measure_pair(pair: Path) -> list[Row]:
+def measure_pair(pair: Path, settings: Iterable[str] = ()) -> list[Row]:
     """Return one row for each descriptor of scans, and one for each precision of `sphere`.
 
     Args:
         pair: Folder of a simulated pair.
+        settings: Over those of `tunnelcd`.
 
     Raises:
         InputError: A session or its truth is missing or damaged.
     """
     truth = load_ground_truth(pair)
     # what a region's size is belongs to the site, as in the plans
-    config = load_config("tunnelcd", [f"query.radius_m={truth.pair.score_radius_m}"])
+    config = load_config("tunnelcd", [f"query.radius_m={truth.pair.score_radius_m}", *settings])
     sources = {name: pipeline_input(pair, name) for name in SESSIONS}
     maps = {name: build_map(sources[name], config.map) for name in SESSIONS}
-    described = {name: describe_keyframes(sources[name], maps[name], METHODS) for name in SESSIONS}
+    weights = config.descriptor.weights
+    described = {name: describe_keyframes(sources[name], maps[name], METHODS, weights) for name in SESSIONS}
     rows = [measure_scans(method, described["before"][method], described["after"][method], truth) for method in METHODS]
     method = config.descriptor.method
     mapped = [MappedSession(maps[name], described[name][method][0]) for name in SESSIONS]
@@ -60,13 +62,21 @@ def measure_pair(pair: Path) -> list[Row]:
     return rows + measure_spheres(merged, mapped[0].descriptors, mapped[1].descriptors, truth, config)
 
 
-def describe_keyframes(source: ScanSource, thin_map: PointMap, methods: Iterable[str]) -> Mapping[str, Described]:
+def describe_keyframes(
+    source: ScanSource, thin_map: PointMap, methods: Iterable[str], weights: str = ""
+) -> Mapping[str, Described]:
     """Describe every keyframe of a session by several descriptors of scans, reading each scan once.
+
+    Args:
+        source: The session.
+        thin_map: Its map.
+        methods: The descriptors.
+        weights: File of the weights of `3deg`, "" for the shipped ones.
 
     Returns:
         By method, the descriptors and the seconds that each keyframe took.
     """
-    configs = {method: DescriptorConfig(method=method) for method in methods}
+    configs = {method: DescriptorConfig(method=method, weights=weights) for method in methods}
     parts: dict[str, list[tuple[Any, Any, float]]] = {method: [] for method in configs}
     for index in thin_map.keyframe_scans.tolist():
         scan = source.scan(index)
@@ -112,13 +122,14 @@ def measure_spheres(
     world = truth.before.world_T_sensor[before.keyframe_scans, :3, 3]
     labels = label_keyframes(world, truth.centroids_world, truth.is_observable, truth.pair.score_radius_m)
     used = labels >= 0
-    describe_map(merged.before, poses[:1], config.descriptor)  # loads the network
+    describe_map(merged.before, poses[:1], config.descriptor, config.sphere)  # loads the network
     rows = []
     for precision in PRECISIONS:
         start = thread_time()
         of_precision = config.descriptor.model_copy(update={"precision": precision})
-        spheres = describe_map(merged.before, poses, of_precision)
-        scores = find_regions(merged, replace(before, spheres=spheres), after, config.query).keyframe_scores
+        spheres = describe_map(merged.before, poses, of_precision, config.sphere)
+        described = replace(before, spheres=spheres)
+        scores = find_regions(merged, described, after, config.query, config.sphere).keyframe_scores
         seconds = thread_time() - start
         rows.append(
             {

@@ -108,7 +108,7 @@ def test_stored_spheres_are_used_with_their_weights_precision_and_map_alone(
     np.testing.assert_array_equal(read(config, MapConfig()), spheres)
     assert read(config, MapConfig(voxel_m=0.3)) is None
     assert read(DescriptorConfig(precision="int8"), MapConfig()) is None
-    monkeypatch.setattr("cdpipe.descriptors.describe.sphere_digest", lambda: "other")
+    monkeypatch.setattr("cdpipe.descriptors.describe.sphere_digest", lambda *_: "other")
     assert read(config, MapConfig()) is None
 
 

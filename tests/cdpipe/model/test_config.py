@@ -100,3 +100,34 @@ def test_every_setting_has_a_meaning() -> None:
     rows = settings_table()
     assert ("extract.voxel_m", 0.65) in [row[:2] for row in rows]
     assert all(meaning for _, _, meaning in rows)
+
+
+def test_weights_of_a_preset_start_at_its_file_and_those_of_a_setting_at_the_working_folder(tmp_path: Path) -> None:
+    preset = tmp_path / "presets" / "mine.yaml"
+    preset.parent.mkdir()
+    preset.write_text(
+        "descriptor: &both {weights: a/3deg.safetensors}\n"
+        "sphere: {weights: /b.safetensors}\n"
+        "wide: {descriptor: *both}\n"
+    )
+    for site in ("narrow", "wide"):
+        config = load_config(str(preset), site=site)
+        assert config.descriptor.weights == str(preset.parent / "a/3deg.safetensors")
+        assert config.sphere.weights == "/b.safetensors"
+    config = load_config(str(preset), ["descriptor.weights=c.safetensors", "sphere.weights=''"])
+    assert (config.descriptor.weights, config.sphere.weights) == ("c.safetensors", "")
+
+
+def test_a_preset_on_the_search_path_has_its_weights_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "presets").mkdir()
+    (tmp_path / "presets" / "mine.yaml").write_text("sphere: {weights: w.safetensors}\n")
+    monkeypatch.setenv("TUNNELCD_PATH", str(tmp_path))
+    assert load_config("mine").sphere.weights == str(tmp_path / "presets" / "w.safetensors")
+
+
+def test_settings_without_weights_are_dumped_as_before_there_were_any() -> None:
+    dumped = load_config("tunnelcd").model_dump(mode="json")
+    assert "sphere" not in dumped and "weights" not in dumped["descriptor"]
+    dumped = load_config("tunnelcd", ["sphere.weights=a"]).model_dump(mode="json")
+    assert dumped["sphere"] == {"weights": "a"}
+    assert PipelineConfig.model_validate(dumped).sphere.weights == "a"

@@ -444,3 +444,23 @@ def test_every_option_of_the_command_line_is_checked_at_once(tmp_path: Path) -> 
         "--seeds a", "--set query.radus_m=3", "--set x", "--grid extract.voxel=1", "--grid extract.voxel_m",
     ]  # fmt: skip
     assert [line.count("did you mean") for line in lines] == [0, 1, 0, 1, 0]
+
+
+def test_weights_of_a_plan_start_at_its_file(tmp_path: Path) -> None:
+    text = """
+name: mine
+scenarios: [smoke/one_box]
+seeds: [1]
+variants:
+  - {preset: tunnelcd, set: "sphere.weights=w/a.safetensors"}
+  - {preset: tunnelcd, per_scenario: {smoke/one_box: ["descriptor.weights=/b.safetensors"]}}
+grid:
+  - {variant: tunnelcd, scenarios: [smoke/one_box], keys: {sphere.weights: [c.safetensors, ""]}}
+"""
+    plan = read(tmp_path, text)
+    configs = [cell.config for cell in expand_cells(change_plan(plan, settings=["descriptor.weights=d.safetensors"]))]
+    assert [config.sphere.weights for config in configs] == [
+        str(tmp_path / "w/a.safetensors"), "", str(tmp_path / "c.safetensors"), "",
+    ]  # fmt: skip
+    assert {config.descriptor.weights for config in configs} == {"d.safetensors"}
+    assert expand_cells(plan)[1].config.descriptor.weights == "/b.safetensors"

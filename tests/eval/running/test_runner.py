@@ -13,6 +13,8 @@ import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.descriptors.sphere_network import make_untrained_sphere_network
+from cdpipe.descriptors.weights_file import numbered_checkpoint_bytes
 from cdpipe.io.answer import read_answer
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.mapping import build_map
@@ -21,12 +23,13 @@ from cdpipe.pipeline import Done
 from cdpipe.sensor.ouster import load_profile
 from eval.core.output import remove
 from eval.core.progress import Silent
+from eval.plans.changes import change_plan
 from eval.plans.plan import Plan, expand_cells, load_plan
 from eval.running import pair_run
 from eval.running.pair_run import Tools
 from eval.running.rescoring import rescore
 from eval.running.runfolder import RunFolder, open_run_folder, start_run_folder, write_json, write_tables
-from eval.running.runner import RunOutcome, run_plan
+from eval.running.runner import RunOutcome, _provenance, run_plan
 from eval.running.stages import time_parts
 from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
@@ -740,6 +743,18 @@ def test_cells_made_without_kiss_matcher_are_made_again_once_it_is_there(monkeyp
     there, missing = keys(is_installed=True), keys(is_installed=False)
     changed = {variant: there[variant] != missing[variant] for variant in there}
     assert changed == {"tunnelcd": True, "frame": False, "kiss-matcher": True, "oracle-merge": False}
+
+
+def test_a_cell_and_the_provenance_name_weights_by_what_the_file_holds(tmp_path: Path) -> None:
+    def keyed(file: str, seed: int) -> tuple[str, Any]:
+        (tmp_path / file).write_bytes(numbered_checkpoint_bytes(make_untrained_sphere_network(seed)))
+        plan = change_plan(load_plan("smoke"), presets=["tunnelcd"], settings=[f"sphere.weights={tmp_path / file}"])
+        cell = expand_cells(plan)[0]
+        return pair_run.cell_key(cell, "", None, {}), _provenance(plan, [cell], [], Tools())["checkpoints"]
+
+    (one, used), (moved, _), (other, _) = keyed("a", 1), keyed("b", 1), keyed("a", 2)
+    assert one == moved != other
+    assert list(used) == ["3deg", f"sphere {tmp_path / 'a'}"] and len(set(used.values())) == 2
 
 
 def test_tables_that_are_there_are_put_together_again_only_where_something_may_have_changed(

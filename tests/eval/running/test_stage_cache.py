@@ -14,6 +14,9 @@ import pytest
 
 from cdpipe import pipeline
 from cdpipe.core.errors import MergeFailedError
+from cdpipe.descriptors.network import make_untrained_network
+from cdpipe.descriptors.sphere_network import make_untrained_sphere_network
+from cdpipe.descriptors.weights_file import numbered_checkpoint_bytes
 from cdpipe.methods import descriptor
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import PipelineConfig, load_config
@@ -379,8 +382,23 @@ def test_weights_are_part_of_what_is_read(monkeypatch: pytest.MonkeyPatch) -> No
         return [name_result(stage, config) for stage in stages]
 
     usual = names()
-    monkeypatch.setattr(stage_results, "sphere_digest", lambda: "other")
+    monkeypatch.setattr(stage_results, "sphere_digest", lambda *_: "other")
     of_spheres = names()
     assert [mine == its for mine, its in zip(usual, of_spheres, strict=True)] == [True, False, True, False]
     monkeypatch.setattr(stage_results, "checkpoint_digest", lambda _: "other")
     assert not set(names()) & set(usual)
+
+
+def test_files_of_weights_are_told_apart_by_what_they_hold(tmp_path: Path) -> None:
+    def name(stage: Stage, key: str, seed: int, file: str) -> str:
+        network = make_untrained_network(seed) if key == "descriptor" else make_untrained_sphere_network(seed)
+        (tmp_path / file).write_bytes(numbered_checkpoint_bytes(network))
+        return name_result(stage, config_of("tunnelcd", f"{key}.weights={tmp_path / file}"))
+
+    read: dict[Stage, str] = {
+        "descriptors": "descriptor", "merge": "descriptor", "spheres": "sphere", "regions": "sphere",
+    }  # fmt: skip
+    for stage, key in read.items():
+        one, other, moved = name(stage, key, 1, "a"), name(stage, key, 2, "a"), name(stage, key, 1, "b")
+        assert one == moved != other
+        assert name_result(stage, config_of("tunnelcd")) not in (one, other)

@@ -103,7 +103,8 @@ def report_fixture() -> ChangeReport:
 
 @pytest.fixture(name="case")
 def case_fixture(report: ChangeReport, truth: GroundTruth) -> CaseScore:
-    return score_answer(Answer("ok", "", "mine", report, report.seconds, report.evidence), truth)
+    used = {"3deg": "ab", "sphere": "cd"}
+    return score_answer(Answer("ok", "", "mine", report, report.seconds, report.evidence, checkpoints=used), truth)
 
 
 def assert_equal(found: dict[str, Any], expected: dict[str, Any]) -> None:
@@ -129,7 +130,7 @@ def test_the_row(case: CaseScore) -> None:
     expected = {
         "scenario": "narrow", "family": "narrow", "pair_kind": "", "seed": 7, "variant": "mine", "preset": "mine",
         "status": "ok", "error": "", "metrics_version": METRICS_VERSION, "domain": "in", "n_changes": 3,
-        "n_observable": 2, "score_radius_m": 3.0,
+        "n_observable": 2, "score_radius_m": 3.0, "checkpoints": "3deg ab;sphere cd",
         # one of two is found by what stands, both by what was proposed
         "region_recall": 0.5, "region_precision": 0.5, "false_regions_per_100m": 2.0,
         "region_recall_proposed": 1.0, "region_precision_proposed": 0.5, "false_regions_per_100m_proposed": 4.0,
@@ -255,7 +256,8 @@ def test_a_case_without_an_answer(truth: GroundTruth) -> None:
     known = {
         "scenario": "narrow", "family": "narrow", "pair_kind": "", "seed": 7, "variant": "mine", "preset": "mine",
         "status": "failed", "error": "too dark", "metrics_version": METRICS_VERSION, "domain": "in", "n_changes": 3,
-        "n_observable": 2, "score_radius_m": 3.0, "region_auroc": 0.5, "region_ap": 12 / (12 + n_far),
+        "n_observable": 2, "score_radius_m": 3.0, "checkpoints": "",
+        "region_auroc": 0.5, "region_ap": 12 / (12 + n_far),
         "is_auroc_assumed": 1.0, "overlap_true": 1.0, "evidence_overlap": 0.5, "t_merge_s": 2.0, "t_descriptor_s": 8.0,
         "after_path_m": 50.0,
         "is_unchanged_pair": False, **dict.fromkeys(zeros, 0.0), **dict.fromkeys(counts, 0),

@@ -13,9 +13,12 @@ import pytest
 
 from cdpipe.descriptors.sphere_network import load_sphere_network
 from cdpipe.descriptors.weights_file import digest
+from cdpipe.io.answer import read_answer
 from eval.core.progress import Silent
 from eval.training.dataset import Recipe
 from eval.training.dataset_run import Where, make_dataset
+from scenarios.library import load_scenario
+from scenarios.schema import Scenario
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -50,6 +53,36 @@ def test_from_a_dataset_to_a_checkpoint_with_its_card(data: Path, tmp_path: Path
     # weights depend on the number of threads: a run goes on with its own
     code, _, err = command("train", data, "--out", out, "--steps", "3", "--threads", "2", "--quiet")
     assert code == 2 and "with other settings" in err
+
+
+def test_what_was_trained_is_used_at_once(
+    data: Path, tmp_path: Path, command: Command, simulated_once: Callable[[Scenario, int], Path]
+) -> None:
+    pair = tmp_path / "pair"
+    shutil.copytree(simulated_once(load_scenario("smoke/one_box", 20000), 20000), pair)
+    digests, settings = {}, []
+    for descriptor, group in (("3deg", "descriptor"), ("sphere", "sphere")):
+        options = ("--descriptor", descriptor, "--steps", "1", "--threads", "1", "--quiet")
+        assert command("train", data, "--out", tmp_path / descriptor, *options)[0] == 0
+        digests[descriptor] = json.loads((tmp_path / descriptor / f"{descriptor}.json").read_text())["checkpoint"]
+        settings += ["--set", f"{group}.weights={tmp_path / descriptor / descriptor}.safetensors"]
+    sessions = pair / "before", pair / "after"
+    code, out, _ = command("describe", sessions[0], *settings)
+    assert code == 0 and digests["3deg"] in out
+    assert command("detect", *sessions, *settings, "--out", tmp_path / "mine", "--quiet")[0] == 0
+    assert json.loads((tmp_path / "mine" / "answer.json").read_text())["checkpoints"] == digests
+    _, out, _ = command("score", pair, tmp_path / "mine")
+    row = dict(line.split(None, 1) for line in out.splitlines() if len(line.split(None, 1)) == 2)
+    assert row["checkpoints"].strip() == ";".join(f"{name} {digest}" for name, digest in digests.items())
+    # the shipped weights do not find what was described with others
+    assert command("detect", *sessions, "--out", tmp_path / "shipped", "--quiet")[0] == 0
+    mine, shipped = (read_answer(tmp_path / name) for name in ("mine", "shipped"))
+    assert mine.report is not None and shipped.report is not None
+    assert set(shipped.checkpoints.values()).isdisjoint(digests.values())
+    assert mine.report.regions.scores[0] != pytest.approx(shipped.report.regions.scores[0])
+    wrong = ("--set", f"sphere.weights={tmp_path}/3deg/3deg.safetensors", "--out", tmp_path / "wrong")
+    code, _, err = command("detect", *sessions, *wrong)
+    assert code == 2 and "weights of another network" in err and len(err.splitlines()) == 1
 
 
 def test_a_disk_that_runs_full_leaves_no_half_of_a_file(

@@ -10,6 +10,8 @@ import pandas as pd
 import pytest
 
 from cdpipe.descriptors import describe_map, describe_scans
+from cdpipe.descriptors.sphere_network import make_untrained_sphere_network
+from cdpipe.descriptors.weights_file import numbered_checkpoint_bytes
 from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import load_config
 from cdpipe.model.types import MappedSession, MergedMaps
@@ -159,7 +161,7 @@ def fast(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         made.append(pair.name)
 
     monkeypatch.setattr(command, "simulate_pair", simulated)
-    monkeypatch.setattr(command, "measure_pair", lambda pair: [{"descriptor": "solid", "of": pair.name}])
+    monkeypatch.setattr(command, "measure_pair", lambda pair, _: [{"descriptor": "solid", "of": pair.name}])
     return made
 
 
@@ -181,6 +183,10 @@ def test_what_was_measured_is_kept_and_what_was_simulated_is_not(tmp_path: Path,
     assert fast[2:] == ["smoke__one_box-3"] * 2
     command.measure(["smoke/one_box"], [5], tmp_path, Silent(), keep=True)
     assert [path.name for path in (tmp_path / "pairs").iterdir()] == ["smoke__one_box-5"]
+    # with other weights every pair is measured again
+    (tmp_path / "mine").write_bytes(numbered_checkpoint_bytes(make_untrained_sphere_network()))
+    command.measure(["smoke/one_box"], [3], tmp_path, Silent(), [f"sphere.weights={tmp_path / 'mine'}"])
+    assert fast[-1] == "smoke__one_box-3"
 
 
 @pytest.mark.parametrize(
