@@ -10,10 +10,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from cdpipe.core.errors import MergeFailedError
 from cdpipe.core.geometry import Int64Array
@@ -27,10 +29,11 @@ from cdpipe.descriptors.describe import (
 )
 from cdpipe.descriptors.sphere import describe_map
 from cdpipe.extract.extract import extract_changes, make_report
+from cdpipe.io.known_merge import require_rigid
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.session_check import check_session, unit_hint
-from cdpipe.merge.merge import merge_maps
+from cdpipe.merge.merge import merge_maps, take_known_merge
 from cdpipe.methods.registry import load_method
 from cdpipe.model.config import PipelineConfig, Site, load_config
 from cdpipe.model.report import ChangeRegions, ChangeReport
@@ -77,6 +80,7 @@ def detect(
     settings: Iterable[str] | Mapping[str, Any] = (),
     site: Site = "narrow",
     hooks: Hooks | None = None,
+    before_T_after: npt.ArrayLike | None = None,
 ) -> ChangeReport:
     """Find what changed between two recorded sessions.
 
@@ -90,11 +94,15 @@ def detect(
         settings: Settings that replace those of the preset, e.g. `{"query.radius_m": 6}`.
         site: Section of the preset that applies: for narrow or for wide drifts.
         hooks: Called around the stages.
+        before_T_after: (4, 4) transform of the after session's odom frame into the before session's, if it is known:
+            no place is searched and no gate is asked. It is still refined along the path where `merge.refine` says so.
 
     Raises:
         MergeFailedError: The sessions could not be aligned with enough evidence; it contains the evidence.
         InputError: A session or a setting cannot be used, or the method's extra is not installed.
+        ValueError: `before_T_after` is no rigid transform.
     """
+    known = None if before_T_after is None else require_rigid(before_T_after)
     config = load_config(preset, settings, site)
     load_method(config.method)  # report a missing extra, or bad weights, before the mapping
     list_checkpoints(config)
@@ -104,7 +112,8 @@ def detect(
     sources, stored = (before, after), (stored_before, stored_after)
     mapped = map_pair(sources, config, hooks, stored)
     try:
-        report = detect_changes(*mapped.value, config, hooks)
+        merge = None if known is None else partial(take_known_merge, before_T_after=known, config=config.merge)
+        report = detect_changes(*mapped.value, config, hooks, merge=merge)
     except MergeFailedError as error:
         raise MergeFailedError(f"{before.name} and {after.name}: {error}", error.evidence, error.seconds) from error
     return replace(report, seconds={**report.seconds, **mapped.seconds})

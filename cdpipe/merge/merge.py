@@ -75,8 +75,7 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     Returns:
         The best hypothesis with the reason of a refusal; the identity if nothing could be registered.
     """
-    n_near = [np.count_nonzero(session.map.nearest_m <= config.seen_within_m) for session in (before, after)]
-    if min(n_near) < MIN_SPHERE_POINTS:
+    if not _have_points(before, after, config):
         none = {"t_index_s": 0.0, "t_merge_s": 0.0, "t_refine_s": 0.0}
         return MergedMaps(before.map, after.map, np.eye(4), {"n_hypotheses": 0.0}, False, _TOO_FEW, seconds=none)
     start = perf_counter()
@@ -101,6 +100,51 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
             before_T_after = fit_rigid(local.anchors_odom, local.before_T_after)
         seconds["t_refine_s"] = perf_counter() - refining
     return MergedMaps(before.map, after.map, before_T_after, evidence, not reason, reason, local, seconds)
+
+
+def take_known_merge(
+    before: MappedSession, after: MappedSession, before_T_after: Float64Array, config: MergeConfig
+) -> MergedMaps:
+    """Return both maps with an alignment that the user knows; no gate is asked.
+
+    Evidence: `is_known` is 1; the other measurements are those of a walk that starts at the known alignment. With
+    `config.refine` the alignment is refined along the path, and stays as it is where the refinement does not fit.
+
+    Args:
+        before: The before session.
+        after: The after session.
+        before_T_after: (4, 4) the known alignment.
+        config: Settings of the merge.
+    """
+    start = perf_counter()
+    seconds = {"t_index_s": 0.0, "t_merge_s": 0.0, "t_refine_s": 0.0}
+    known = {"n_hypotheses": 0.0, "is_known": 1.0}
+    merged = MergedMaps(before.map, after.map, before_T_after, known, True, seconds=seconds)
+    if not _have_points(before, after, config):
+        return merged
+    maps = (IndexedMap(before.map, config, is_target=True), IndexedMap(after.map, config, is_target=False))
+    indexed = perf_counter()
+    distances_m, _ = maps[0].path.query(transform(before_T_after, maps[1].positions))
+    found = _judge(_Start(int(np.argmin(distances_m)), before_T_after, known), maps, config)
+    evidence, local = dict(found.evidence), None
+    walked = perf_counter()
+    if config.refine == "local":
+        del maps
+        local, measured = refine(before.map, after.map, found.walk, config)
+        evidence |= measured
+    seconds = {
+        "t_index_s": indexed - start,
+        "t_merge_s": walked - indexed,
+        "t_refine_s": perf_counter() - walked if config.refine == "local" else 0.0,
+    }
+    refined = before_T_after if local is None else fit_rigid(local.anchors_odom, local.before_T_after)
+    return replace(merged, before_T_after=refined, evidence=evidence, local=local, seconds=seconds)
+
+
+def _have_points(before: MappedSession, after: MappedSession, config: MergeConfig) -> bool:
+    """Return whether both maps hold enough points, seen from near, for one registration."""
+    n_near = [np.count_nonzero(session.map.nearest_m <= config.seen_within_m) for session in (before, after)]
+    return bool(min(n_near) >= MIN_SPHERE_POINTS)
 
 
 def _find_hypothesis(

@@ -16,6 +16,7 @@ from eval.core.progress import shown_progress
 if TYPE_CHECKING:
     import pandas as pd
 
+    from cdpipe.core.geometry import Float64Array
     from cdpipe.model.config import PipelineConfig
 
 
@@ -39,6 +40,13 @@ def detect(
     preset: Preset = "tunnelcd",
     site: KindOfSite = "narrow",
     settings: SetSettings = None,
+    assume_aligned: Annotated[
+        bool, typer.Option("--assume-aligned", help="both sessions are in one frame already: do not search the merge")
+    ] = False,
+    before_T_after: Annotated[
+        Path | None,
+        typer.Option("--before-T-after", metavar="FILE", help="known merge, 4x4 as text or JSON", show_default=False),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Find what changed between two sessions, simulated or recorded; needs no truth."""
@@ -48,12 +56,13 @@ def detect(
     from eval.core.output import new_folder
 
     config = cdpipe.load_config(preset, settings or (), site)
+    known = _read_known_merge(before_T_after, assume_aligned=assume_aligned)
     if is_same_session(cdpipe.open_session(before), cdpipe.open_session(after)):
         same = f"{before} and {after} are one and the same recording: nothing can have changed between them"
         echo(f"note: {same}", err=True)
     try:
         with new_folder(out) as partial, shown_progress(quiet) as progress:
-            report = cdpipe.detect(before, after, preset, settings or (), site, cdpipe.Hooks(progress.stage))
+            report = cdpipe.detect(before, after, preset, settings or (), site, cdpipe.Hooks(progress.stage), known)
             cdpipe.save_report(report, partial, preset)
     except MergeFailedError as error:
         if not quiet:
@@ -61,7 +70,8 @@ def detect(
         raise
     if quiet:
         return
-    print_table("merge: accepted", _evidence_table(report.evidence, config))
+    verdict = "accepted" if known is None else "known, not judged"
+    print_table(f"merge: {verdict}", _evidence_table(report.evidence, config))
     print_table("regions (map frame = the before session's odometry)", report.to_pandas("regions"))
     if not report.regions.is_reported.any():
         scores = report.regions.scores
@@ -77,6 +87,19 @@ def detect(
     echo(f"{out}: answer.json, answer.npz, regions.csv, objects.csv, objects.ply ({times})")
 
 
+def _read_known_merge(path: Path | None, *, assume_aligned: bool) -> Float64Array | None:
+    import numpy as np
+
+    from cdpipe.core.errors import InputError
+    from cdpipe.io.known_merge import read_known_merge
+
+    if path is None:
+        return np.eye(4) if assume_aligned else None
+    if assume_aligned:
+        raise InputError(f"--before-T-after {path}: --assume-aligned says another merge: give one of them")
+    return read_known_merge(path)
+
+
 def _evidence_table(evidence: Mapping[str, float], config: PipelineConfig) -> pd.DataFrame:
     """Return one row per figure that a merge measured: what it is, from where on it is accepted, and whether it is."""
     import numpy as np
@@ -90,6 +113,7 @@ def _evidence_table(evidence: Mapping[str, float], config: PipelineConfig) -> pd
         if name.startswith("map_points_"):
             continue
         setting, least = gates.get(name, ("", np.nan))
-        passed = "-" if name not in gates else ("yes" if value >= least else "no")
+        is_judged = name in gates and "is_known" not in evidence
+        passed = "-" if not is_judged else ("yes" if value >= least else "no")
         rows.append((name, float(value), least, passed, setting))
     return pd.DataFrame(rows, columns=["evidence", "measured", "at least", "passed", "setting"])

@@ -13,7 +13,7 @@ from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transf
 from cdpipe.io.ply import read_ply_points
 from cdpipe.merge.evidence import explain_refusal
 from cdpipe.merge.global_registration import is_kiss_matcher_installed
-from cdpipe.merge.merge import merge_maps
+from cdpipe.merge.merge import merge_maps, take_known_merge
 from cdpipe.merge.registration import register
 from cdpipe.model.config import MergeConfig, load_config
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps
@@ -209,6 +209,35 @@ def test_maps_too_small_to_register_are_refused(tunnel_before: MappedSession) ->
         assert set(merged.seconds) == {"t_index_s", "t_merge_s", "t_refine_s"}
         assert merged.seconds["t_refine_s"] == 0.0
         np.testing.assert_array_equal(merged.before_T_after, np.eye(4))
+
+
+def test_a_known_merge_is_taken_as_it_is_or_refined(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
+) -> None:
+    known = make_pose(translation=(0.1, 0.1, 0.0)) @ true_before_T_after
+    rigid = take_known_merge(tunnel_before, tunnel_after, known, CONFIG.model_copy(update={"refine": "none"}))
+    assert rigid.is_accepted and rigid.local is None
+    np.testing.assert_array_equal(rigid.before_T_after, known)
+    assert (rigid.evidence["is_known"], rigid.evidence["n_hypotheses"]) == (1, 0)
+    assert rigid.evidence["agreement"] > 0.95
+    refined = take_known_merge(tunnel_before, tunnel_after, known, CONFIG)
+    assert refined.is_accepted and refined.local is not None
+    assert path_error_m(rigid, true_before_T_after) > 0.1
+    assert path_error_m(refined, true_before_T_after) < 0.02
+    assert set(refined.seconds) == {"t_index_s", "t_merge_s", "t_refine_s"}
+
+
+def test_no_gate_is_asked_about_a_known_merge(tunnel_before: MappedSession, other_tunnel: MappedSession) -> None:
+    for far_m in (0.0, 1000.0):
+        known = make_pose(translation=(0.0, far_m, 0.0))
+        merged = take_known_merge(tunnel_before, other_tunnel, known, CONFIG)
+        assert merged.is_accepted and merged.local is None
+        np.testing.assert_array_equal(merged.before_T_after, known)
+        assert explain_refusal(merged.evidence, CONFIG)
+    one, points = tunnel_before.map.nearest_m[:1], tunnel_before.map.points[:1]
+    small = replace(tunnel_before.map, points=points, nearest_m=one, seen_from=None)
+    merged = take_known_merge(MappedSession(small, tunnel_before.descriptors), other_tunnel, np.eye(4), CONFIG)
+    assert merged.is_accepted and merged.evidence == {"n_hypotheses": 0.0, "is_known": 1.0}
 
 
 def test_the_real_pair_is_solved() -> None:

@@ -174,6 +174,29 @@ def test_describe_stores_what_detect_then_uses(
     assert calls[1:] == [str(pair / "before"), str(pair / "after")]
 
 
+def test_detect_takes_a_merge_that_is_known(pair: Path, tmp_path: Path, command: Command) -> None:
+    detect = ("detect", pair / "before", pair / "after", *FINE)
+    assert command(*detect, "--quiet", "--out", tmp_path / "found")[0] == 0
+    found = json.loads((tmp_path / "found" / "answer.json").read_text())
+    known = ("--before-T-after", tmp_path / "found" / "answer.json", "--set", "merge.refine=none")
+    code, out, _ = command(*detect, *known, "--out", tmp_path / "known")
+    assert code == 0 and "merge: known, not judged" in out and "is_known" in out
+    stored = json.loads((tmp_path / "known" / "answer.json").read_text())
+    np.testing.assert_allclose(stored["before_T_after"], found["before_T_after"], atol=1e-9)
+    assert (stored["evidence"]["is_known"], "is_known" in found["evidence"]) == (1, False)
+    assert command("score", pair, tmp_path / "known", "--quiet")[0] == 0
+    aligned = ("--assume-aligned", "--set", "merge.refine=none", "--quiet", "--out", tmp_path / "aligned")
+    assert command(*detect, *aligned)[0] == 0
+    stored = json.loads((tmp_path / "aligned" / "answer.json").read_text())
+    np.testing.assert_array_equal(stored["before_T_after"], np.eye(4))
+    code, _, err = command(*detect, "--assume-aligned", *known[:2], "--out", tmp_path / "both")
+    assert code == 2 and "give one of them" in err
+    (tmp_path / "T.txt").write_text("1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n")
+    code, _, err = command(*detect, "--before-T-after", tmp_path / "T.txt", "--out", tmp_path / "bad")
+    assert code == 2 and "is not rigid" in err and len(err.splitlines()) == 1
+    assert not (tmp_path / "bad").exists()
+
+
 def test_score_of_one_answer(pair: Path, tmp_path: Path, command: Command) -> None:
     command("detect", pair / "before", pair / "after", *FINE, "--out", tmp_path / "out")
     code, out, _ = command("score", pair, tmp_path / "out")
