@@ -9,6 +9,10 @@ class TunnelcdError(Exception):
     """Base of every error caused by the input; its text says what is wrong, where, what is expected, and a remedy."""
 
 
+class InputWarning(UserWarning):
+    """Input that is used, though not as it is; the text says what was left out."""
+
+
 class InputError(TunnelcdError):
     """A file, folder, array or setting that cannot be used as given."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.errors import InputError
+from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.geometry import Float64Array, Int64Array, make_pose
 from cdpipe.io.ply import read_ply_points
 from cdpipe.io.session import ScanChunk, Session, chunk_path, is_session, read_session
@@ -33,7 +34,8 @@ def open_session(path: Path) -> ScanSource:
     Args:
         path: A session folder (`cdpipe.io.session`), or a folder of `*.ply` scans in the order of their names with one
             trajectory `*.txt` or `*.tum`: one line `stamp tx ty tz qx qy qz qw` for each scan, in the same order. PLY
-            points are deskewed and in the sensor frame of their pose, metres; `pixels` are rows of the file.
+            points are deskewed and in the sensor frame of their pose, metres; `pixels` are rows of the file. Points
+            at (0, 0, 0), and those that are all NaN, are missing returns.
 
     Raises:
         InputError: The folder is missing or holds neither, or its trajectory does not fit its scans. Mistakes inside a
@@ -125,38 +127,50 @@ class PlyScans:
         """Read one file.
 
         Raises:
-            InputError: It is not a PLY scan, is empty, or holds a point that is not finite.
+            InputError: It is not a PLY scan, holds no return, or a point that is not finite.
         """
-        path = self._files[index]
-        points = read_ply_points(path)
-        if len(points) == 0:
-            raise InputError(f"{path}: holds no point: remove the scan and its line of the trajectory")
-        is_finite = np.isfinite(points).all(axis=1)
-        if not is_finite.all():
-            raise InputError(
-                f"{path}: vertex {int(np.argmin(is_finite))} is not finite ({np.count_nonzero(~is_finite)} are not): "
-                "remove them from the file"
-            )
-        return PosedScan(
-            index=index,
-            points_sensor=points,
-            odom_T_sensor=self.odom_T_sensor[index],
-            stamps_ns=np.full(len(points), self._stamps_ns[index]),
-            pixels=np.arange(len(points), dtype=np.int32),
-        )
+        return self._read(index)[0]
 
     def scans(self) -> Iterator[PosedScan]:
-        """Read all scans in order.
+        """Read all scans in order; an `InputWarning` says how many missing returns were dropped.
 
         Raises:
             InputError: As `scan`; or two files hold the same scan.
         """
         repeats = _Repeats()
+        n_missing, n_points = 0, 0
         for index, file in enumerate(self._files):
-            scan = self.scan(index)
+            scan, n_dropped = self._read(index)
+            n_missing, n_points = n_missing + n_dropped, n_points + n_dropped + len(scan.pixels)
             stamp_ns = int(self._stamps_ns[index])
             repeats.require_new(str(file), file.name, scan.points_sensor, self.odom_T_sensor[index], stamp_ns)
             yield scan
+        if n_missing:
+            told = f"{n_missing} of {n_points} points are (0, 0, 0) or NaN: taken for missing returns and left out"
+            warnings.warn(f"{self.name}: {told}", InputWarning, stacklevel=2)
+
+    def _read(self, index: int) -> tuple[PosedScan, int]:
+        """Return a scan, and the number of its missing returns; organised clouds store them as (0, 0, 0) or NaN."""
+        path = self._files[index]
+        points = read_ply_points(path)
+        is_return = points.any(axis=1) & ~np.isnan(points).all(axis=1)
+        if not is_return.any():
+            raise InputError(f"{path}: holds no return: remove the scan and its line of the trajectory")
+        is_wrong = is_return & ~np.isfinite(points).all(axis=1)
+        if is_wrong.any():
+            raise InputError(
+                f"{path}: vertex {int(np.argmax(is_wrong))} is not finite ({np.count_nonzero(is_wrong)} are not): "
+                "remove them from the file"
+            )
+        pixels = np.flatnonzero(is_return).astype(np.int32)
+        scan = PosedScan(
+            index=index,
+            points_sensor=points[is_return],
+            odom_T_sensor=self.odom_T_sensor[index],
+            stamps_ns=np.full(len(pixels), self._stamps_ns[index]),
+            pixels=pixels,
+        )
+        return scan, len(points) - len(pixels)
 
 
 class _Repeats:

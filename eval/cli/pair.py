@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from eval.cli.options import KindOfSite, OutFolder, Preset, Quiet, SetSettings
-from eval.core.printing import echo, print_table, say
+from eval.core.printing import echo, print_table, say, shown_warnings
 from eval.core.progress import shown_progress
 
 if TYPE_CHECKING:
@@ -29,7 +29,8 @@ def describe(
     """Compute a session's descriptors and store them beside it, as a robot would while mapping."""
     import cdpipe
 
-    descriptors, path = cdpipe.describe(session, preset, settings or ())
+    with shown_warnings():
+        descriptors, path = cdpipe.describe(session, preset, settings or ())
     say(quiet, f"{path}: {len(descriptors.q)} keyframes, {descriptors.name} {descriptors.checkpoint}")
 
 
@@ -61,7 +62,7 @@ def detect(
         same = f"{before} and {after} are one and the same recording: nothing can have changed between them"
         echo(f"note: {same}", err=True)
     try:
-        with new_folder(out) as partial, shown_progress(quiet) as progress:
+        with shown_warnings(), new_folder(out) as partial, shown_progress(quiet) as progress:
             report = cdpipe.detect(before, after, preset, settings or (), site, cdpipe.Hooks(progress.stage), known)
             cdpipe.save_report(report, partial, preset)
     except MergeFailedError as error:

@@ -8,10 +8,14 @@ terminal obeys none of it.
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import typer
 
+from cdpipe.core.errors import InputWarning
 from cdpipe.core.names import visible
 
 if TYPE_CHECKING:
@@ -58,6 +62,21 @@ def warn(text: str) -> None:
     """Print a warning on standard error, also with --quiet; nothing for an empty text."""
     if text:
         echo(f"warning: {text}", err=True)
+
+
+@contextmanager
+def shown_warnings() -> Iterator[None]:
+    """Print what the readers warn of, one line each, when the block ends."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        try:
+            yield
+        finally:
+            for text in dict.fromkeys(str(each.message) for each in caught if each.category is InputWarning):
+                warn(text)
+    for each in caught:
+        if each.category is not InputWarning:
+            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
 
 
 def _cell(value: Any) -> str:

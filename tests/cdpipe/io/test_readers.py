@@ -6,7 +6,7 @@ import meshio
 import numpy as np
 import pytest
 
-from cdpipe.core.errors import InputError
+from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.geometry import yaw_pose
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import ScanChunk, Session, SessionWriter
@@ -125,6 +125,27 @@ def test_no_trajectory_and_two_of_them(tmp_path: Path) -> None:
 )
 def test_a_bad_line_of_the_trajectory_is_named(tmp_path: Path, line: str, expected: str) -> None:
     assert expected in said(recording(tmp_path / "run", 2, f"0 0 0 0 0 0 0 1\n{line}\n"))
+
+
+@pytest.mark.parametrize("missing", [(0.0, 0.0, 0.0), (0.0, -0.0, 0.0), (np.nan, np.nan, np.nan)])
+def test_missing_returns_of_organised_clouds_are_dropped_and_said(tmp_path: Path, missing: tuple[float, ...]) -> None:
+    folder = recording(tmp_path / "run")
+    write_scan(folder / "scan_001.ply", np.array([missing, (1.0, 2.0, 3.0), missing, (0.0, 0.0, 4.0)]))
+    source = open_session(folder)
+    with pytest.warns(InputWarning) as caught:
+        _, scan, _ = source.scans()
+    told = f"{folder}: 2 of 8 points are (0, 0, 0) or NaN: taken for missing returns and left out"
+    assert [str(each.message) for each in caught] == [told]
+    np.testing.assert_array_equal(scan.points_sensor, [(1, 2, 3), (0, 0, 4)])
+    # a return is named by the row of its file
+    np.testing.assert_array_equal(scan.pixels, [1, 3])
+    assert len(scan.stamps_ns) == 2
+    np.testing.assert_array_equal(source.scan(1).pixels, [1, 3])
+    write_scan(folder / "scan_001.ply", np.array([missing, missing]))
+    assert "scan_001.ply: holds no return" in said(folder, read=True)
+    # a point that lacks one coordinate is no missing return
+    write_scan(folder / "scan_001.ply", np.array([missing, (1.0, np.nan, 3.0)]))
+    assert "scan_001.ply: vertex 1 is not finite (1 are not)" in said(folder, read=True)
 
 
 def test_bad_scans_are_named(tmp_path: Path) -> None:

@@ -146,6 +146,25 @@ def test_detect_finds_the_box_in_recorded_files_as_in_the_session(
     np.testing.assert_allclose(ours.regions.centres_map[0], theirs.regions.centres_map[0], atol=0.3)
 
 
+def test_missing_returns_are_said_once_and_change_no_answer(recorded: Path, tmp_path: Path, command: Command) -> None:
+    shutil.copytree(recorded, tmp_path / "organised")
+    scan = tmp_path / "organised" / "after" / "003.ply"
+    content = scan.read_bytes()
+    n, body = int(content.split(b"vertex ")[1].split()[0]), content.index(b"end_header\n") + 11
+    scan.write_bytes(content[:body].replace(b"vertex %d" % n, b"vertex %d" % (n + 5)) + content[body:] + bytes(60))
+    answers = []
+    for name, folder in (("a", recorded), ("b", tmp_path / "organised")):
+        code, _, err = command("detect", folder / "before", folder / "after", "--quiet", "--out", tmp_path / name)
+        assert code == 0
+        told = [line for line in err.splitlines() if "missing returns" in line]
+        assert len(told) == (name == "b") and all(line.startswith("warning: ") and " 5 of " in line for line in told)
+        answers.append(read_answer(tmp_path / name).report)
+    one, other = answers
+    assert one is not None and other is not None
+    np.testing.assert_array_equal(one.before_T_after, other.before_T_after)
+    np.testing.assert_array_equal(one.regions.scores, other.regions.scores)
+
+
 def test_describe_stores_what_detect_then_uses(
     pair: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
