@@ -17,7 +17,7 @@ from scenarios.catalogue import family_files, family_of, prop_files, prop_names,
 from scenarios.dangling import Mistake, find_dangling, items_at, mapping_at
 from scenarios.distributions import draw, find_malformed, is_distribution, join_key, merge_trees
 from scenarios.references import file_keys, find_contradictions
-from scenarios.schema import DEFAULT_SOURCE, PROP_KINDS, Prop, Scenario
+from scenarios.schema import PROP_KINDS, Prop, Scenario, source_of
 
 CHECKED_SEEDS = range(8)
 SUFFIXES = (".yaml", ".yml")
@@ -189,7 +189,7 @@ def _without_old_odometry(base: Document, over: Document) -> Document:
     for session in ("before", "after"):
         key: Key = (session, "odometry")
         old, new = (mapping_at(mapping_at(each.value, session), "odometry") for each in (base, over))
-        if "source" not in new or new["source"] == old.get("source", DEFAULT_SOURCE):
+        if not {"source", "file"} & new.keys() or source_of(new) == source_of(old):
             continue
         kept = {name: value for name, value in mapping_at(base.value, session).items() if name != "odometry"}
         origins = {place: where for place, where in base.origins.items() if place[:2] != key}

@@ -25,6 +25,10 @@ def file_keys(tree: Any) -> list[tuple[Key, str]]:
     ]
     files = [((*key, "path"), name) for key, name in places]
     files += [((session, "trajectory"), mapping_at(tree, session).get("trajectory")) for session in ("before", "after")]
+    files += [
+        ((session, "odometry", "file"), mapping_at(mapping_at(tree, session), "odometry").get("file"))
+        for session in ("before", "after")
+    ]
     profile = mapping_at(tree, "sensor").get("profile")
     files += [(("sensor", "profile"), profile)] if str(profile).endswith(".json") else []  # else a shipped one's name
     return [(key, name) for key, name in files if isinstance(name, str)]

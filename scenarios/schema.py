@@ -7,9 +7,9 @@ from the first to the second node of `between` (drawn places: as driven); of a s
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from cdpipe.core.yamlfile import Settings
 from scenarios.dangling import find_dangling
@@ -284,39 +284,153 @@ class Sensor(Settings):
         return self
 
 
-class Platform(Settings):
-    """What carries the sensor."""
+class Lean(Settings):
+    """Settings that leave keys added later out of their dump while these have their defaults.
 
-    kind: Literal["ground_robot", "quadrotor"] = "ground_robot"
+    So the truth of an older scenario keeps its bytes.
+    """
+
+    _LATER: ClassVar[frozenset[str]] = frozenset()
+
+    @model_serializer(mode="wrap")
+    def _leave_out(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields = type(self).model_fields
+        dumped: dict[str, Any] = handler(self)
+        return {key: value for key, value in dumped.items() if key not in self._LATER or value != fields[key].default}
+
+
+class Gait(Settings):
+    """What walking adds to the movement of the sensor: amplitudes of oscillations; a stride is two steps."""
+
+    step_hz: Annotated[float, Field(gt=0, le=5)]  # steps a second
+    bob_m: NotNegative  # up and down, once a step
+    sway_m: NotNegative  # to the sides, once a stride
+    pitch_deg: NotNegative  # once a step
+    roll_deg: NotNegative  # once a stride
+    yaw_deg: NotNegative  # once a stride
+
+
+# Of platforms that walk. A hand: fitted to real walks; a legged robot: unverified (sim/drive/DRIVES.md).
+GAITS: dict[str, dict[str, float]] = {
+    "handheld": {"step_hz": 1.4, "bob_m": 0.05, "sway_m": 0.08, "pitch_deg": 0.5, "roll_deg": 0.4, "yaw_deg": 0.95},
+    "legged": {"step_hz": 2.6, "bob_m": 0.012, "sway_m": 0.01, "pitch_deg": 1.0, "roll_deg": 1.0, "yaw_deg": 0.5},
+}
+
+
+class Platform(Lean):
+    """What carries the sensor, and how the sensor is mounted on it."""
+
+    _LATER: ClassVar[frozenset[str]] = frozenset({"mount_yaw_deg", "mount_pitch_deg", "gait"})
+
+    kind: Literal["ground_robot", "quadrotor", "handheld", "legged"] = "ground_robot"
     sensor_height_m: Positive = 0.8  # above the floor
     speed_mps: Positive = 1.0
     speed_variation: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # standard deviation, as a share of the speed
     scan_spacing_m: Positive = 0.25  # path between the recorded revolutions
     clearance_m: Positive = 0.5  # kept to walls and props
-    wheelbase_m: Positive = 0.6  # the robot's four wheels find the floor: roll, pitch and bounce follow
+    wheelbase_m: Positive = 0.6  # the robot's four wheels or feet find the floor: roll, pitch and bounce follow
     track_m: Positive = 0.5
     tilt_deg: NotNegative = 1.0  # standard deviation of roll and pitch on top of that
     bounce_m: NotNegative = 0.0  # and of the height
     wander_m: NotNegative = 0.0  # standard deviation of the line from side to side, where there is room
+    mount_yaw_deg: Finite = 0.0  # of the sensor's x axis against the platform's, to the left; recorded drives have none
+    mount_pitch_deg: Annotated[float, Field(ge=-30, le=30)] = 0.0  # of the sensor then, nose down positive
+    gait: Gait | None = None  # of a platform that walks; keys left out are those of its kind
+
+    @model_validator(mode="before")
+    @classmethod
+    def _walk(cls, given: Any) -> Any:
+        usual = GAITS.get(str(given.get("kind"))) if isinstance(given, dict) else None
+        gait = given.get("gait") or {} if usual else None
+        return {**given, "gait": usual | gait} if usual and isinstance(gait, dict) else given
+
+    @model_validator(mode="after")
+    def _only_walkers_have_a_gait(self) -> Platform:
+        if self.gait is not None and self.kind not in GAITS:
+            raise ValueError(f"a {self.kind} has no gait: leave gait out, or give kind {' or '.join(GAITS)}")
+        return self
 
 
 DEFAULT_SOURCE = "drift"
+# The random walk fitted to KISS-ICP on validation pairs of narrow, wide and cave together: sim/drive/DRIVES.md.
+FITTED_WALK: dict[str, float] = {
+    "scale_percent": 0.88,
+    "scale_length_m": 1.0,
+    "yaw_deg_per_m": 0.0048,
+    "yaw_length_m": 23.0,
+    "tilt_deg": 0.34,
+    "tilt_length_m": 200.0,
+    "jitter_along_m": 0.032,
+    "jitter_across_m": 0.0056,
+    "jitter_yaw_deg": 0.034,
+    "jitter_roll_deg": 0.29,
+    "jitter_pitch_deg": 0.054,
+}
+_KEYS_OF_SOURCE: dict[str, tuple[str, ...]] = {
+    "drift": ("translation_percent", "yaw_deg_per_100m"),
+    "kiss-icp": (),
+    "random-walk": tuple(FITTED_WALK),
+    "file": ("file",),
+}
 
 
-class Odometry(Settings):
-    """What a session's poses come from: truth with a systematic error in KITTI's terms, or KISS-ICP on its own scans.
+def source_of(odometry: dict[str, Any]) -> Any:
+    """Return the source that a plain tree of `Odometry` names; a file names itself."""
+    return odometry.get("source", "file" if "file" in odometry else DEFAULT_SOURCE)
 
-    The signs of the error are drawn from the seed; both figures 0 give true poses.
+
+class Odometry(Lean):
+    """What a session's poses come from.
+
+    - `drift`: truth with a systematic error in KITTI's terms, its signs drawn from the seed; both figures 0: truth.
+    - `random-walk`: truth with the errors of a scan-matching odometry, drawn from the seed. Errors of scale, yaw rate
+      and tilt are first-order Gauss-Markov processes over the path; jitter is white noise of each revolution's pose.
+      Keys left out have the values fitted to KISS-ICP.
+    - `kiss-icp`: KISS-ICP on the session's own scans.
+    - `file`: the poses of a TUM file; naming the file is enough.
     """
 
-    source: Literal["drift", "kiss-icp"] = "drift"
+    _LATER: ClassVar[frozenset[str]] = frozenset({*FITTED_WALK, "file"})
+
+    source: Literal["drift", "kiss-icp", "random-walk", "file"] = "drift"
     translation_percent: NotNegative = 0.0
     yaw_deg_per_100m: NotNegative = 0.0
+    scale_percent: NotNegative | None = None  # standard deviation of the error of scale
+    scale_length_m: Positive | None = None  # correlation length of the error of scale
+    yaw_deg_per_m: NotNegative | None = None  # standard deviation of the error of the yaw rate
+    yaw_length_m: Positive | None = None
+    tilt_deg: NotNegative | None = None  # standard deviation of the error of roll and of pitch, which gravity bounds
+    tilt_length_m: Positive | None = None
+    jitter_along_m: NotNegative | None = None  # standard deviation of each pose along the direction of travel
+    jitter_across_m: NotNegative | None = None  # and to the side and up
+    jitter_yaw_deg: NotNegative | None = None
+    jitter_roll_deg: NotNegative | None = None  # about the direction of travel
+    jitter_pitch_deg: NotNegative | None = None
+    file: Annotated[str, Field(pattern=r"^[^\x00]+$")] | None = (
+        None  # TUM file of odom_T_sensor; from the scenario's file
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_in(cls, given: Any) -> Any:
+        if not isinstance(given, dict):
+            return given
+        source = source_of(given)
+        said = {key: value for key, value in given.items() if value is not None}
+        return {"source": source, **(FITTED_WALK if source == "random-walk" else {}), **said}
 
     @model_validator(mode="after")
     def _one_source(self) -> Odometry:
-        if self.source == "kiss-icp" and (self.translation_percent or self.yaw_deg_per_100m):
-            raise ValueError("kiss-icp has an error of its own: leave translation_percent and yaw_deg_per_100m out")
+        fields = type(self).model_fields
+        for source, keys in _KEYS_OF_SOURCE.items():
+            said = [key for key in keys if getattr(self, key) != fields[key].default]
+            if source != self.source and said:
+                raise ValueError(
+                    f"source {self.source} has no {', '.join(said)} (of source {source}): leave that out, "
+                    f"or give source: {source}"
+                )
+        if self.source == "file" and self.file is None:
+            raise ValueError("source file needs file: the name of a TUM file")
         return self
 
 

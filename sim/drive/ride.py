@@ -1,4 +1,4 @@
-"""The movement of the sensor along a path: on wheels over the floor or in flight, with the speed along the path."""
+"""The movement of the sensor along a path: on wheels, on legs, in a hand or in flight, with the speed along it."""
 
 from __future__ import annotations
 
@@ -21,12 +21,15 @@ _GRAVITY_MPS2 = 9.81
 # Correlation lengths of what the platform adds: tilt and bounce of suspension or rotors, and the driver's foot.
 _TILT_LENGTH_M = 2.5
 _BOUNCE_LENGTH_M = 2.5
+_HAND_TILT_LENGTH_M = 8.0  # of real walks: DRIVES.md
 _SPEED_LENGTH_M = 8.0
 # A tyre touches the floor over about this length; shorter bumps do not move the robot.
 _CONTACT_M = 0.2
 # A quadrotor holds its height over the floor as averaged over this half width, not over every bump.
 _ALTITUDE_M = 3.0
-# It takes this half width of way to change its lean.
+# Who walks follows the floor as averaged over this half width, about the length of a step.
+_STEP_LENGTH_M = 0.6
+# A quadrotor takes this half width of way to change its lean.
 _LEAN_M = 1.0
 
 
@@ -49,10 +52,14 @@ def ride(path: Path, floor: Caster, standing: Caster, scenario: Scenario, seed: 
     speed_mps = plan.speed_mps or platform.speed_mps
     time_s = integrate_time(path.distance_m, speed_mps, platform.speed_variation, seed, session)
     keys = stream(seed, session, "tilt").integers(2**63, size=2).tolist()
-    tilt = [np.deg2rad(platform.tilt_deg) * smooth_noise((path.distance_m,), _TILT_LENGTH_M, key) for key in keys]
+    tilt_m = _HAND_TILT_LENGTH_M if platform.kind == "handheld" else _TILT_LENGTH_M
+    tilt = [np.deg2rad(platform.tilt_deg) * smooth_noise((path.distance_m,), tilt_m, key) for key in keys]
     bounce_key = int(stream(seed, session, "bounce").integers(2**63))
     bounce_m = platform.bounce_m * smooth_noise((path.distance_m,), _BOUNCE_LENGTH_M, bounce_key)
-    if platform.kind == "ground_robot":
+    if platform.gait is not None:
+        points, rotations = _walk(path, floor, platform, time_s, height_m, tilt, seed, session)
+        points[:, 2] += bounce_m
+    elif platform.kind == "ground_robot":
         centre_m, pitch, roll = follow_floor(path, floor, platform)
         rotations = Rotation.from_euler("ZYX", np.stack([path.yaw_rad, pitch + tilt[0], roll + tilt[1]], axis=1))
         mast = rotations.as_matrix()[:, :, 2] * height_m
@@ -63,7 +70,49 @@ def ride(path: Path, floor: Caster, standing: Caster, scenario: Scenario, seed: 
         level_m = smooth_line(_floor_under(path.points, path.points[:, 2], floor), _ALTITUDE_M)
         flight_m = _keep_between(path, floor, standing, level_m + height_m + bounce_m, platform.clearance_m, session)
         points = np.column_stack([path.points[:, :2], flight_m])
+    if platform.mount_yaw_deg or platform.mount_pitch_deg:
+        mount_deg = [platform.mount_yaw_deg, platform.mount_pitch_deg]
+        rotations *= Rotation.from_euler("ZY", mount_deg, degrees=True)
     return make_motion(time_s, path.distance_m, points, rotations)
+
+
+def _walk(
+    path: Path,
+    floor: Caster,
+    platform: Platform,
+    time_s: Float64Array,
+    height_m: float,
+    tilt: list[Float64Array],
+    seed: int,
+    session: str,
+) -> tuple[Float64Array, Rotation]:
+    """Return positions (N, 3) and N rotations of a sensor that a person holds or a legged robot carries.
+
+    The trunk of a legged robot is parallel to the floor under its feet, and its sensor stands on a mast; a person holds
+    the sensor level, at the given height over the floor. Both follow the floor as averaged over a step.
+    """
+    gait = platform.gait
+    assert gait is not None
+    phase = 2 * np.pi * stream(seed, session, "gait").random(5)
+    step_rad = 2 * np.pi * gait.step_hz * time_s
+    bob_m, sway_m = gait.bob_m * np.sin(step_rad + phase[0]), gait.sway_m * np.sin(step_rad / 2 + phase[1])
+    pitch_deg = gait.pitch_deg * np.sin(step_rad + phase[2])
+    roll_deg, yaw_deg = gait.roll_deg * np.sin(step_rad / 2 + phase[3]), gait.yaw_deg * np.sin(step_rad / 2 + phase[4])
+    if platform.kind == "legged":
+        level_m, pitch, roll = follow_floor(path, floor, platform, _STEP_LENGTH_M)
+    else:
+        level_m = smooth_line(_floor_under(path.points, path.points[:, 2], floor), _STEP_LENGTH_M)
+        pitch = roll = np.zeros_like(level_m)
+    angles = [
+        path.yaw_rad + np.deg2rad(yaw_deg),
+        pitch + tilt[0] + np.deg2rad(pitch_deg),
+        roll + tilt[1] + np.deg2rad(roll_deg),
+    ]
+    rotations = Rotation.from_euler("ZYX", np.stack(angles, axis=1))
+    left = left_of(np.stack([np.cos(path.yaw_rad), np.sin(path.yaw_rad)], axis=1))
+    points = np.column_stack([path.points[:, :2] + sway_m[:, None] * left, level_m + bob_m])
+    mast = rotations.as_matrix()[:, :, 2] if platform.kind == "legged" else np.array([0.0, 0.0, 1.0])
+    return points + height_m * mast, rotations
 
 
 def integrate_time(
@@ -83,11 +132,14 @@ def integrate_time(
     return np.concatenate([[0.0], np.cumsum(steps_s)])
 
 
-def follow_floor(path: Path, floor: Caster, platform: Platform) -> tuple[Float64Array, Float64Array, Float64Array]:
+def follow_floor(
+    path: Path, floor: Caster, platform: Platform, contact_m: float = _CONTACT_M
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return height (N,) of the robot's middle at the floor, pitch (nose down positive) and roll (left up), radians.
 
     The chassis lies in the plane through the four wheels' contact points that is nearest to them: middle, rise along
-    and rise across are their means and mean differences, as on a rocker suspension.
+    and rise across are their means and mean differences, as on a rocker suspension. The floor under each is averaged
+    over `contact_m` to either side.
     """
     forward = np.stack([np.cos(path.yaw_rad), np.sin(path.yaw_rad)], axis=1)
     left = left_of(forward)
@@ -96,7 +148,7 @@ def follow_floor(path: Path, floor: Caster, platform: Platform) -> tuple[Float64
         for side in (1, -1):
             offset = ahead * platform.wheelbase_m / 2 * forward + side * platform.track_m / 2 * left
             wheel = np.column_stack([path.points[:, :2] + offset, path.points[:, 2]])
-            heights[ahead, side] = smooth_line(_floor_under(wheel, path.points[:, 2], floor), _CONTACT_M)
+            heights[ahead, side] = smooth_line(_floor_under(wheel, path.points[:, 2], floor), contact_m)
     front, rear = ((heights[ahead, 1] + heights[ahead, -1]) / 2 for ahead in (1, -1))
     port, starboard = ((heights[1, side] + heights[-1, side]) / 2 for side in (1, -1))
     pitch = -np.arctan((front - rear) / platform.wheelbase_m)

@@ -13,7 +13,7 @@ from cdpipe.core.motion import Motion, rotation_matrices
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Platform, Scenario, SessionPlan
 from sim.drive.obstacles import check_clearance
-from sim.drive.odometry import drift_motion
+from sim.drive.odometry import drift_motion, read_odometry, walk_motion
 from sim.drive.path import plan_path
 from sim.drive.ride import ride
 from sim.placement.recorded import check_inside, read_drive
@@ -105,7 +105,7 @@ def plan_trajectory(world: World, scenario: Scenario, sensor: SensorMetadata, se
     For KISS-ICP, which needs the scans, `estimated` is the true movement relative to the first revolution.
 
     Raises:
-        InputError: The trajectory file cannot be read.
+        InputError: The trajectory or the odometry file cannot be read.
         ScenarioError: The route leaves no room, the trajectory leaves the tunnel, or revolutions are too far apart.
     """
     plan: SessionPlan = getattr(scenario, session)
@@ -140,6 +140,7 @@ def record(true: Motion, scenario: Scenario, sensor: SensorMetadata, seed: int, 
     """Choose the revolutions to be recorded and let odometry estimate the movement.
 
     Raises:
+        InputError: The odometry file cannot be read, or does not cover the drive.
         ScenarioError: The drive is shorter than a revolution, or `scan_spacing_m` asks for more revolutions than turn.
     """
     plan: SessionPlan = getattr(scenario, session)
@@ -148,8 +149,14 @@ def record(true: Motion, scenario: Scenario, sensor: SensorMetadata, seed: int, 
     column_s /= sensor.rate_hz * sensor.width
     if not scenario.sensor.rolling_scan:
         column_s[:] = 0.0
-    estimated = drift_motion(true, float(revolution_s[0]), plan.odometry, seed, session)
-    return Trajectory(true, estimated, revolution_s, column_s, sensor.column_offsets_ns())
+    offsets_ns, odometry = sensor.column_offsets_ns(), plan.odometry
+    if odometry.file is not None:
+        estimated = read_odometry(Path(odometry.file), revolution_s, offsets_ns, session)
+    elif odometry.source == "random-walk":
+        estimated = walk_motion(true, revolution_s, column_s, odometry, seed, session)
+    else:
+        estimated = drift_motion(true, float(revolution_s[0]), odometry, seed, session)
+    return Trajectory(true, estimated, revolution_s, column_s, offsets_ns)
 
 
 def recorded(true: Motion, platform: Platform, rate_hz: float, session: str) -> Float64Array:

@@ -109,6 +109,20 @@ def test_odometry_keys_of_two_sources_at_one_place_are_one_mistake(tmp_path: Pat
         assert len(str(error.value).splitlines()) == 1
 
 
+def test_a_file_of_odometry_is_a_source_and_is_looked_for_beside_its_scenario(tmp_path: Path) -> None:
+    (tmp_path / "own.tum").write_text("")
+    written(tmp_path, WORLD)
+    over = "extends: world.yaml\nbefore: {odometry: {translation_percent: 1}}\n"
+    written(tmp_path, over, "drifting.yaml")
+    path = written(tmp_path, "extends: drifting.yaml\nbefore: {odometry: {file: own.tum}}\n", "filed.yaml")
+    scenario = load_scenario(path, 1)
+    assert scenario.before.odometry == Odometry(source="file", file=str(tmp_path / "own.tum"))
+    assert list(file_digests(scenario)) == [str(tmp_path / "own.tum")]
+    assert load_scenario(path, 1, ["before.odometry.source=drift"]).before.odometry == Odometry()
+    missing = written(tmp_path, "extends: drifting.yaml\nbefore: {odometry: {file: not.tum}}\n", "missing.yaml")
+    assert_each_begins(mistakes_of(missing), [":2: before.odometry.file = 'not.tum': no such file"])
+
+
 def test_mistakes_in_settings_are_told_as_such(tmp_path: Path) -> None:
     path = written(tmp_path, WORLD)
     with pytest.raises(ScenarioError, match=r"^--set: platform.speed_mps = -1: "):

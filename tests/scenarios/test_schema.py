@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from scenarios.schema import MeshFile, Odometry, Prop, Sensor, SessionPlan
+from scenarios.schema import FITTED_WALK, GAITS, MeshFile, Odometry, Platform, Prop, Sensor, SessionPlan
 
 
 @pytest.mark.parametrize(
@@ -15,7 +15,15 @@ from scenarios.schema import MeshFile, Odometry, Prop, Sensor, SessionPlan
         (SessionPlan, {"route": ["a"], "trajectory": "t.tum"}, "a route of two nodes or more"),
         (SessionPlan, {"route": ["a", "b"], "trajectory": "t.tum"}, "or a trajectory"),
         (SessionPlan, {"trajectory": "t.tum", "start_m": 8, "lateral": 0.1}, "leave lateral, start_m out"),
-        (Odometry, {"source": "kiss-icp", "translation_percent": 1}, "kiss-icp has an error of its own"),
+        (Odometry, {"source": "kiss-icp", "translation_percent": 1}, "source kiss-icp has no translation_percent"),
+        (Odometry, {"source": "random-walk", "yaw_deg_per_100m": 1}, "source random-walk has no yaw_deg_per_100m"),
+        (Odometry, {"jitter_yaw_deg": 1}, "source drift has no jitter_yaw_deg .of source random-walk.: leave that out"),
+        (Odometry, {"source": "kiss-icp", "file": "a.tum"}, "source kiss-icp has no file"),
+        (Odometry, {"file": "a.tum", "scale_percent": 1}, "source file has no scale_percent"),
+        (Odometry, {"source": "file"}, "source file needs file"),
+        (Platform, {"gait": {}}, "step_hz"),
+        (Platform, {"gait": GAITS["legged"]}, "a ground_robot has no gait"),
+        (Platform, {"mount_pitch_deg": 31}, "less than or equal to 30"),
         (Sensor, {"min_range_m": 20, "max_range_m": 5}, "leaves nothing below max_range_m"),
         (
             Prop,
@@ -48,3 +56,23 @@ def test_a_recorded_drive_survives_being_written_down() -> None:
 def test_a_path_with_a_null_character_is_a_mistake() -> None:
     with pytest.raises(ValidationError, match="path"):
         MeshFile(path="mine\0.stl")
+
+
+def test_keys_of_a_random_walk_and_of_a_gait_that_are_left_out_are_the_fitted_ones() -> None:
+    walk = Odometry.model_validate({"source": "random-walk", "jitter_yaw_deg": 0.0, "scale_percent": None})
+    assert walk.model_dump(exclude_defaults=True) == {"source": "random-walk", **FITTED_WALK, "jitter_yaw_deg": 0.0}
+    hand = Platform.model_validate({"kind": "handheld", "gait": {"step_hz": 2.0}})
+    assert hand.gait is not None and hand.gait.model_dump() == {**GAITS["handheld"], "step_hz": 2.0}
+    assert Platform(kind="legged").gait is not None and Platform().gait is None
+    for model in (walk, hand):
+        assert type(model).model_validate(model.model_dump(mode="json")) == model
+
+
+def test_the_dump_of_an_older_scenario_has_no_key_that_came_later() -> None:
+    assert Odometry(source="kiss-icp").model_dump() == {
+        "source": "kiss-icp",
+        "translation_percent": 0.0,
+        "yaw_deg_per_100m": 0.0,
+    }
+    assert not {"gait", "mount_yaw_deg", "mount_pitch_deg"} & Platform().model_dump().keys()
+    assert Platform(mount_yaw_deg=90).model_dump()["mount_yaw_deg"] == 90

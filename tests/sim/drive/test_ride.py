@@ -153,3 +153,51 @@ def test_a_plan_s_own_speed_and_height_count(make_scenario: Callable[..., Scenar
     motion = ride(straight(), level, level, make_scenario(platform=ROBOT, before=plan), 0, "before")
     assert motion.time_s[-1] == pytest.approx(20.0 / 2.5)
     np.testing.assert_allclose(motion.points[:, 2], 1.3, atol=1e-5)
+
+
+@pytest.mark.parametrize(("kind", "step_hz"), [("handheld", 1.5), ("legged", 2.5)])
+def test_who_walks_bobs_and_pitches_once_a_step_and_rolls_sways_and_turns_once_a_stride(
+    make_scenario: Callable[..., Scenario], kind: str, step_hz: float
+) -> None:
+    gait = {"step_hz": step_hz, "bob_m": 0.04, "sway_m": 0.03, "pitch_deg": 0.6, "roll_deg": 0.4, "yaw_deg": 0.8}
+    platform = Platform.model_validate({"kind": kind, "sensor_height_m": 1.2, "tilt_deg": 0, "gait": gait})
+    motion = driven(make_scenario, floor_of(lambda along, _: 0.0 * along), platform)
+    yaw, pitch, roll = np.rad2deg(angles(motion).T)
+    across_m = (motion.points[:, :2] - straight().points[:, :2]) @ LEFT
+    for values, amplitude, hertz in (
+        (motion.points[:, 2] - 1.2, 0.04, step_hz),
+        (pitch, 0.6, step_hz),
+        (roll, 0.4, step_hz / 2),
+        (yaw - np.rad2deg(HEADING), 0.8, step_hz / 2),
+        (across_m, 0.03, step_hz / 2),
+    ):
+        waves = np.stack([np.cos(2 * np.pi * hertz * motion.time_s), np.sin(2 * np.pi * hertz * motion.time_s)], axis=1)
+        found, _, _, _ = np.linalg.lstsq(waves, values, rcond=None)
+        assert np.linalg.norm(found) == pytest.approx(amplitude, rel=0.1)
+        # the mast of a legged robot leans with it, and that moves its sensor by up to 2 cm more
+        assert np.abs(values - waves @ found).max() < 0.1 * amplitude + (0.03 if kind == "legged" else 0.0)
+
+
+def test_a_hand_is_level_on_a_slope_and_a_legged_robot_is_not(make_scenario: Callable[..., Scenario]) -> None:
+    still = dict.fromkeys(("bob_m", "sway_m", "pitch_deg", "roll_deg", "yaw_deg"), 0.0)
+    slope = floor_of(lambda along, _: 0.1 * along)
+    for kind, pitch in (("handheld", 0.0), ("legged", -np.arctan(0.1))):
+        platform = Platform.model_validate({"kind": kind, "tilt_deg": 0, "sensor_height_m": 1.0, "gait": still})
+        motion = ride(straight(0.1), slope, slope, make_scenario(platform=platform), 0, "before")
+        np.testing.assert_allclose(angles(motion)[:, 1], pitch, atol=1e-4)
+        foot = motion.points - Rotation.from_quat(motion.quaternions).as_matrix()[:, :, 2]
+        np.testing.assert_allclose(foot[:, 2], 0.1 * (foot[:, :2] @ FORWARD), atol=1e-3)
+
+
+def test_a_turned_mount_turns_the_sensor_where_it_is(make_scenario: Callable[..., Scenario]) -> None:
+    rough = floor_of(lambda along, across: 0.1 * np.sin(along) + 0.05 * across)
+    plain = driven(make_scenario, rough, ROBOT)
+    mount = {"mount_yaw_deg": 130.0, "mount_pitch_deg": 20.0}
+    turned = driven(make_scenario, rough, ROBOT.model_copy(update=mount))
+    np.testing.assert_array_equal(turned.points, plain.points)
+    body, sensor = (Rotation.from_quat(motion.quaternions).as_matrix() for motion in (plain, turned))
+    # the x axis of the sensor in the platform: 130 degrees to the left, and 20 degrees down
+    ahead = np.einsum("nji,nj->ni", body, sensor[:, :, 0])
+    level = np.cos(np.deg2rad(20.0))
+    expected = (level * np.cos(np.deg2rad(130.0)), level * np.sin(np.deg2rad(130.0)), -np.sin(np.deg2rad(20.0)))
+    np.testing.assert_allclose(ahead, np.tile(expected, (len(ahead), 1)), atol=1e-9)
