@@ -115,3 +115,14 @@ def test_a_sensor_that_does_not_roll_jitters_all_the_same() -> None:
     assert np.isfinite(motion.points).all()
     errors_m = motion.poses(REVOLUTION_S)[:, 0, 3] - (REVOLUTION_S - REVOLUTION_S[0])
     assert errors_m.std() == pytest.approx(0.05, rel=0.1)
+
+
+def test_a_standing_sensor_has_jitter_alone() -> None:
+    time_s = np.array([0.0, 1.0, 2.0])
+    still = make_motion(time_s, np.zeros(3), np.ones((3, 3)), Rotation.from_quat(np.tile([0.0, 0.0, 0.0, 1.0], (3, 1))))
+    odometry = Odometry.model_validate(
+        {"source": "random-walk", **NOTHING, **{"scale_percent": 5, "jitter_yaw_deg": 1}}
+    )
+    poses = walk_motion(still, np.array([0.5, 1.5]), COLUMN_S, odometry, 1, "before").poses(np.array([0.5, 1.5]))
+    np.testing.assert_allclose(poses[:, :3, 3], 0.0, atol=1e-9)
+    assert (np.abs(poses[:, 1, 0]) > 1e-4).all()

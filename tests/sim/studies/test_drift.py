@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import importlib.util
 import os
 from pathlib import Path
 
@@ -11,7 +12,16 @@ from cdpipe.core.geometry import Float64Array, make_pose
 from cdpipe.core.motion import make_motion
 from scenarios.schema import GAITS, Odometry
 from sim.drive.odometry import walk_motion
-from sim.studies.drift import ROLLOUTS, fit_walk, main, measure_gait, read_rollouts, relative_errors, tabulate_errors
+from sim.studies.drift import (
+    ROLLOUTS,
+    estimate_poses,
+    fit_walk,
+    main,
+    measure_gait,
+    read_rollouts,
+    relative_errors,
+    tabulate_errors,
+)
 
 needs_real_data = pytest.mark.skipif(
     "TUNNELCD_REAL_DATA" not in os.environ, reason="real rollouts: TUNNELCD_REAL_DATA is not set"
@@ -89,6 +99,41 @@ def test_a_gait_is_measured_from_the_poses_of_a_walk() -> None:
 def test_a_command_without_words_tells_its_usage() -> None:
     with pytest.raises(SystemExit, match=r"sim.studies.drift kiss narrow:10001"):
         main([])
+
+
+def test_rollouts_are_reported_level_by_level(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "hall" / "sequence_1"
+    folder.mkdir(parents=True)
+    for name, step_m in (
+        ("none", 0.5),
+        ("light_1", 0.505),
+        ("moderate_1", 0.51),
+        ("strong_1", 0.52),
+        ("severe_1", 0.55),
+    ):
+        poses = straight_poses(300, step_m)
+        quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        np.savetxt(folder / f"{name}.csv", np.column_stack([poses[:, :3, 3], quaternions]), delimiter=", ")
+    main(["rollouts", str(tmp_path)])
+    told = capsys.readouterr().out
+    assert [line.split(":")[0] for line in told.splitlines() if "sessions" in line] == list(ROLLOUTS)
+    # 1, 2, 4 and 10 % of 100 m
+    assert [line.split()[1] for line in told.splitlines() if line.lstrip().startswith("100 ")] == [
+        "1.0000",
+        "2.0000",
+        "4.0000",
+        "10.0000",
+    ]
+
+
+@pytest.mark.skipif(importlib.util.find_spec("kiss_icp") is None, reason="needs the extra `odometry`: KISS-ICP")
+def test_kiss_icp_is_measured_on_both_sessions_of_a_pair() -> None:
+    sessions = estimate_poses("smoke/one_box", 3, ["platform.scan_spacing_m=1.5", "sensor.mode=512x10"])
+    assert len(sessions) == 2
+    for true, found in sessions:
+        assert true.shape == found.shape
+        errors = relative_errors(true, found, 0.0)
+        assert 1e-3 < np.sqrt((errors[:, :3] ** 2).mean()) < 0.2
 
 
 @needs_real_data
