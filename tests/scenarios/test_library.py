@@ -76,7 +76,7 @@ def test_settings_are_written_over_the_file_before_drawing(tmp_path: Path) -> No
     assert load_scenario(path, 3, ["tunnel.section.width_m=3.25"]).tunnel.section.width_m == 3.25
 
 
-@pytest.mark.parametrize("name", [name for name in scenario_names() if not name.startswith("odometry/")])
+@pytest.mark.parametrize("name", scenario_names())
 def test_a_setting_of_another_source_of_odometry_drops_the_keys_of_the_family_s(name: str) -> None:
     plain = load_scenario(name, 10001)
     changed = load_scenario(name, 10001, ["before.odometry.source=kiss-icp"])
