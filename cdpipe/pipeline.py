@@ -8,6 +8,7 @@ compares the merged maps.
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -17,7 +18,7 @@ from typing import Any, Generic, Literal, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.core.errors import MergeFailedError
+from cdpipe.core.errors import InputWarning, MergeFailedError
 from cdpipe.core.geometry import Int64Array
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors.describe import (
@@ -112,6 +113,7 @@ def detect(
     sources, stored = (before, after), (stored_before, stored_after)
     mapped = map_pair(sources, config, hooks, stored)
     try:
+        _warn_of_few_views(mapped.value, config)
         merge = None if known is None else partial(take_known_merge, before_T_after=known, config=config.merge)
         report = detect_changes(*mapped.value, config, hooks, merge=merge)
     except MergeFailedError as error:
@@ -320,6 +322,17 @@ def merge_mapped(
         merged.evidence,
         {name: merged.seconds[name] for name in ("t_index_s", "t_merge_s") if name in merged.seconds},
     )
+
+
+def _warn_of_few_views(mapped: Sequence[MappedSession], config: PipelineConfig) -> None:
+    """Warn where the sessions have too few keyframes for any object to be seen through often enough."""
+    n_views = min(len(session.map.keyframe_scans) for session in mapped)
+    if config.extract.method == "surface" and n_views < config.extract.min_views:
+        text = (
+            f"keyframes of the shorter session: {n_views}; extract.min_views = {config.extract.min_views:g} asks for more "
+            "views of an object, so none can be found: record a path, or lower it (--set extract.min_views=0.5)"
+        )
+        warnings.warn(text, InputWarning, stacklevel=3)
 
 
 def _open(session: Path | str | ScanSource, config: PipelineConfig) -> tuple[ScanSource, DescriptorSet | None]:

@@ -1,4 +1,4 @@
-"""Checks of a session before it is mapped: path, unit, up axis.
+"""Checks of a session before it is mapped: scans, unit, up axis.
 
 Five scans are read. Lengths that no tunnel has in metres are refused. A session in feet passes; if the merge then
 fails, `unit_hint` compares the sizes of the two sessions.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, Int64Array, require_poses, travelled_m
+from cdpipe.core.geometry import Float64Array, Int64Array, require_poses
 from cdpipe.mapping.mapping import choose_keyframes
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PointMap, ScanSource
@@ -40,25 +40,20 @@ def check_session(source: ScanSource, config: MapConfig, other: ScanSource | Non
         other: Another session of the same tunnel, which narrows down the unit.
 
     Raises:
-        InputError: A pose is not finite; there is one scan or no path; points or trajectory are not in metres; z is
-            not up.
+        InputError: A pose is not finite; there is no scan; points or trajectory are not in metres; z is not up.
     """
     poses = source.odom_T_sensor
     try:
         require_poses("the pose of scan", poses)
     except ValueError as error:
         raise InputError(f"{source.name}: {error}: correct it, or remove the scan") from error
-    if len(poses) < 2:
-        raise InputError(
-            f"{source.name}: {len(poses)} scan: expected a drive, at least two scans along a path: what one scan sees "
-            "cannot be told from a place that looks alike (cdpipe.merge.registration.register aligns two single clouds)"
-        )
+    if len(poses) == 0:
+        raise InputError(f"{source.name}: holds no scan: record it again")
     points = _sampled_points(source)
     if len(points) == 0:
         raise InputError(f"{source.name}: none of the scans that were looked at holds a return")
     ranges_m = np.linalg.norm(points, axis=1)
     _require_metres(source, ranges_m, other)
-    _require_path(source, config.keyframe_spacing_m)
     _require_up(source, points[ranges_m > 0] / ranges_m[ranges_m > 0, None], config.keyframe_spacing_m)
 
 
@@ -104,24 +99,13 @@ def _require_metres(source: ScanSource, ranges_m: Float64Array, other: ScanSourc
             f"{source.name}: half of the returns lie {side} {median_m:.4g} m: expected metres; "
             f"{_likely('the points', median_m, usual_m)}, and the trajectory too where it is in the same unit"
         )
-    positions = source.odom_T_sensor[:, :3, 3]
-    step_m = float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
+    steps_m = np.linalg.norm(np.diff(source.odom_T_sensor[:, :3, 3], axis=0), axis=1)
+    step_m = float(np.median(steps_m)) if len(steps_m) else 0.0
     reach_m = float(np.quantile(ranges_m, 0.95))
     if step_m > reach_m:
         raise InputError(
             f"{source.name}: neighbouring scans lie {step_m:.4g} m apart and see {reach_m:.3g} m far: expected a "
             f"trajectory in metres; {_likely('the trajectory', step_m, _USUAL_STEP_M)}"
-        )
-
-
-def _require_path(source: ScanSource, spacing_m: float) -> None:
-    poses = source.odom_T_sensor
-    if len(choose_keyframes(poses, spacing_m)) < 2:
-        way_m = float(travelled_m(poses)[-1])
-        raise InputError(
-            f"{source.name}: its {len(poses)} scans lie along {way_m:.3g} m: expected a path of at least "
-            f"map.keyframe_spacing_m = {spacing_m:g} m: drive farther"
-            + ("; if the trajectory is in kilometres, scale it by 1000" if way_m > 0 else "")
         )
 
 

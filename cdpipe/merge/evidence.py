@@ -26,6 +26,8 @@ GATES = (
     ("agreement", "min_agreement"),
     ("distinctness", "min_distinctness"),
 )
+# Largest motion between the registration of one place from after to before and the one from before to after.
+BOTH_WAYS_M, BOTH_WAYS_DEG = 0.05, 0.5
 # Points sampled from a sphere, and the longest correspondence.
 _SAMPLES = 300
 _COUNTERPART_M = 0.5
@@ -107,10 +109,25 @@ def explain_refusal(evidence: Mapping[str, float], config: MergeConfig) -> str:
         value, least = evidence.get(name, np.nan), getattr(config, setting)
         # this form also refuses NaN, a value that could not be measured
         if not value >= least:
+            if np.isnan(value):
+                told = _UNMEASURED.get(name, f"{name} could not be measured")
+                return f"{told}: {_RECORD}; merge.{setting} asks for it"
             is_share = name not in ("hessian_ratio", "distinctness")
             said, asked = (f"{value:.0%}", f"{least:.0%}") if is_share else (f"{value:.4g}", f"{least:g}")
-            return f"{_REASONS[name].format(value=said)}; merge.{setting} asks for {asked}"
-    return ""
+            reasons = _REASONS | (_OF_ONE_PLACE if "both_ways_m" in evidence else {})
+            return f"{reasons[name].format(value=said)}; merge.{setting} asks for {asked}"
+    return _explain_both_ways(evidence)
+
+
+def _explain_both_ways(evidence: Mapping[str, float]) -> str:
+    """Return why the registrations of one place in both directions are refused, "" if they agree or there are none."""
+    apart_m, apart_deg = evidence.get("both_ways_m", 0.0), evidence.get("both_ways_deg", 0.0)
+    if apart_m <= BOTH_WAYS_M and apart_deg <= BOTH_WAYS_DEG:
+        return ""
+    return (
+        f"the registrations from after to before and from before to after differ by {apart_m:.2g} m and "
+        f"{apart_deg:.2g} deg (both_ways): {_RECORD}; at most {BOTH_WAYS_M:g} m and {BOTH_WAYS_DEG:g} deg are accepted"
+    )
 
 
 def _plane_distances(
@@ -132,3 +149,17 @@ _REASONS = {
     "distinctness": "another alignment fits nearly as well (its residual is {value} times this one's): the tunnel "
     "repeats itself; drive on to where it does not",
 }
+
+_RECORD = "record a path of ten metres or more through the place, in both sessions"
+# One place shows less than a path: what to record instead.
+_OF_ONE_PLACE = {
+    "overlap": "after the best registration {value} of the shorter recording lies within 5 m of the other: they are of "
+    f"other places; {_RECORD}",
+    "inlier_share": "only {value} of the points around the place fit the other map: the recordings may be of other "
+    f"places, or too much has changed; {_RECORD}",
+    "hessian_ratio": "the alignment can slide (degenerate): its Hessian's eigenvalue ratio is {value}, one place of a "
+    f"smooth drift does not tell where along it the sensor stood; {_RECORD}, up to a bend, a branch or a niche",
+    "agreement": "only {value} of all points near the place fit the other map, in the worse of both directions: the "
+    f"recordings see too little of one another, or are of other places; {_RECORD}",
+}
+_UNMEASURED = {"agreement": "the best pair of places fits, and fewer than three further places could be compared"}

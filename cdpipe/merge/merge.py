@@ -15,7 +15,7 @@ from time import perf_counter
 
 import numpy as np
 
-from cdpipe.core.geometry import Float64Array, Int64Array, transform
+from cdpipe.core.geometry import Float64Array, Int64Array, invert, transform
 from cdpipe.merge.candidates import Candidate, find_candidates, find_closest_pair
 from cdpipe.merge.evidence import SurfaceFit, explain_refusal, measure_fit, sample_evenly
 from cdpipe.merge.global_registration import is_kiss_matcher_installed, register_globally
@@ -48,6 +48,8 @@ _OTHER_MOTION_M = 1.0
 _DISTINCT = 10.0
 # Fewest places besides the start that make evidence; lowest fit of a place that contributes to the alignment.
 _MIN_PLACES, _GOOD_FIT = 3, 0.7
+# A recording of one place: voxel size, correspondences one after the other, and points that measure the fit.
+_FINE_M, _FINE_REACHES_M, _ALL_SAMPLES = 0.2, (1.0, 0.5, 0.25, 0.25), 2000
 # Cosine of 15 degrees, the largest tilt between the two maps.
 _UPRIGHT = 0.966
 # Longest correspondences of the walk, metres: above the drift between two stops, below the width of a narrow drift.
@@ -91,7 +93,7 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     if reason and config.fallback and not is_kiss_matcher_installed():
         reason += " (KISS-Matcher could not be asked: pip install 'tunnelcd[kiss]')"
     before_T_after, local = best.before_T_after, None
-    if not reason and config.refine == "local":
+    if not reason and config.refine == "local" and "both_ways_m" not in evidence:  # one place is one registration
         refining = perf_counter()
         del maps  # the refinement indexes both maps anew: at no time are there two indices of one map
         local, measured = refine(before.map, after.map, best.walk, config)
@@ -126,18 +128,20 @@ def take_known_merge(
     indexed = perf_counter()
     distances_m, _ = maps[0].path.query(transform(before_T_after, maps[1].positions))
     found = _judge(_Start(int(np.argmin(distances_m)), before_T_after, known), maps, config)
-    evidence, local = dict(found.evidence), None
+    evidence, local, refined = dict(found.evidence), None, before_T_after
     walked = perf_counter()
-    if config.refine == "local":
+    if config.refine == "local" and "both_ways_m" in evidence:
+        refined = before_T_after if explain_refusal(evidence, config) else found.before_T_after
+    elif config.refine == "local":
         del maps
         local, measured = refine(before.map, after.map, found.walk, config)
         evidence |= measured
+        refined = before_T_after if local is None else fit_rigid(local.anchors_odom, local.before_T_after)
     seconds = {
         "t_index_s": indexed - start,
         "t_merge_s": walked - indexed,
         "t_refine_s": perf_counter() - walked if config.refine == "local" else 0.0,
     }
-    refined = before_T_after if local is None else fit_rigid(local.anchors_odom, local.before_T_after)
     return replace(merged, before_T_after=refined, evidence=evidence, local=local, seconds=seconds)
 
 
@@ -313,10 +317,43 @@ def _judge(start: _Start, maps: tuple[IndexedMap, IndexedMap], config: MergeConf
         "agreement": float(fits.mean()) if len(fits) >= _MIN_PLACES else float("nan"),
         "distinctness": _DISTINCT,
     }
+    if config.method != "frame" and min(len(before.positions), len(after.positions)) <= _MIN_PLACES:
+        pose, of_place = _judge_one_place(start, pose, maps, config)
+        evidence |= of_place
+        walked = replace(walked, before_T_after=np.repeat(pose[None], len(walked.keyframes), axis=0))
     is_good = walked.fits >= _GOOD_FIT
     if config.method != "frame" and is_good.any():
         pose = fit_rigid(after.positions[walked.keyframes[is_good]], walked.before_T_after[is_good])
     return _Hypothesis(pose, walked, evidence)
+
+
+def _judge_one_place(
+    start: _Start, pose: Float64Array, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
+) -> tuple[Float64Array, dict[str, float]]:
+    """Register all that both sessions saw of one place, in both directions, and judge it.
+
+    A recording too short for further places has this evidence instead: `agreement` (share of inliers among all points
+    of both maps, the lower of both directions), `both_ways_m` and `both_ways_deg` (how far the registrations from after
+    to before and from before to after differ).
+    """
+    finer = config.model_copy(update={"target_voxel_m": _FINE_M})
+    before, after = (IndexedMap(each.map, finer, is_target=True, has_coarse_target=False) for each in maps)
+    centre = after.positions[start.keyframe]
+    forward, backward = pose, invert(pose)
+    there = transform(pose, centre[None])[0]
+    own, theirs = after.sphere(centre, config.seen_within_m), before.sphere(there, config.seen_within_m)
+    if min(len(own), len(theirs)) < MIN_SPHERE_POINTS:
+        return pose, {"agreement": 0.0, "both_ways_m": 0.0, "both_ways_deg": 0.0}
+    for reach_m in _FINE_REACHES_M:
+        forward = align_by_gicp(own, centre, before.target, forward, reach_m, _FINE_M)
+        backward = align_by_gicp(theirs, there, after.target, backward, reach_m, _FINE_M)
+    apart_m, apart_rad = motion_between(forward, invert(backward), centre)
+    fit = measure_fit(before, after, forward, sample_evenly(own, _ALL_SAMPLES), centre, config.seen_within_m)
+    return forward, {
+        "agreement": fit.inlier_share(config.inlier_m),
+        "both_ways_m": apart_m,
+        "both_ways_deg": float(np.degrees(apart_rad)),
+    }
 
 
 def _register_start(

@@ -78,7 +78,7 @@ def detect(
         scores = report.regions.scores
         echo(
             f"nothing reaches query.threshold = {config.query.threshold:g}; "
-            f"the best of {len(scores)} candidates scores {scores[:1].max(initial=0.0):.4g}; "
+            f"the best of {len(scores)} candidates scores {max(scores.tolist(), default=0.0):.4g}; "
             "--set query.n_regions=3 reports the best three whatever they score",
             "",
         )

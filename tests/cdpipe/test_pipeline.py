@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.errors import InputError, MergeFailedError
+from cdpipe.core.errors import MergeFailedError
 from cdpipe.core.geometry import Float64Array, stream, yaw_pose
 from cdpipe.io.answer import read_answer, write_answer
 from cdpipe.io.readers import open_session
@@ -92,11 +92,11 @@ def test_a_folder_of_ply_scans_is_mapped(tmp_path: Path) -> None:
     assert len(session.map.return_points) == 8000
 
 
-def test_a_single_scan_is_refused_because_it_has_no_path(tmp_path: Path) -> None:
+def test_a_single_scan_is_one_keyframe(tmp_path: Path) -> None:
     meshio.ply.write(tmp_path / "0.ply", meshio.Mesh(stream(0, "one").normal(size=(50, 3)), []))
     (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
-    with pytest.raises(InputError, match="1 scan: expected a drive, at least two scans along a path"):
-        map_session(open_session(tmp_path), PipelineConfig())
+    session = map_session(open_session(tmp_path), PipelineConfig())
+    assert session.map.keyframe_scans.tolist() == session.descriptors.keyframe_scans.tolist() == [0]
 
 
 def test_two_sessions_of_few_points_are_refused_and_not_a_crash(tmp_path: Path) -> None:

@@ -95,10 +95,26 @@ def test_each_gate_refuses_alone_and_says_why(name: str, value: float, said: str
     assert f"merge.min_{name} asks for" in reason
 
 
-def test_what_could_not_be_measured_is_refused() -> None:
+def test_what_could_not_be_measured_is_refused_without_a_number() -> None:
     for name in GOOD:
-        assert explain_refusal({**GOOD, name: float("nan")}, CONFIG)
-        assert explain_refusal({key: value for key, value in GOOD.items() if key != name}, CONFIG)
+        without = {key: value for key, value in GOOD.items() if key != name}
+        for evidence in ({**GOOD, name: float("nan")}, without):
+            reason = explain_refusal(evidence, CONFIG)
+            assert "nan" not in reason and "record a path" in reason and f"merge.min_{name} " in reason
+
+
+@pytest.mark.parametrize("name", ["overlap", "inlier_share", "hessian_ratio", "agreement"])
+def test_of_one_place_each_gate_says_what_to_record(name: str) -> None:
+    place = {**GOOD, "both_ways_m": 0.05, "both_ways_deg": 0.5}
+    assert explain_refusal(place, CONFIG) == ""
+    reason = explain_refusal({**place, name: 0.001}, CONFIG)
+    assert "record a path of ten metres or more" in reason and f"merge.min_{name} asks for" in reason
+
+
+@pytest.mark.parametrize("wrong", [{"both_ways_m": 0.06}, {"both_ways_deg": 0.6}])
+def test_registrations_of_one_place_that_differ_are_refused(wrong: dict[str, float]) -> None:
+    reason = explain_refusal({**GOOD, "both_ways_m": 0.0, "both_ways_deg": 0.0, **wrong}, CONFIG)
+    assert "(both_ways)" in reason and "record a path of ten metres or more" in reason
 
 
 def test_the_gate_itself_is_enough() -> None:

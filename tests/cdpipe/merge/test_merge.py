@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cdpipe.core.errors import InputWarning
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.io.ply import read_ply_points
 from cdpipe.merge.evidence import explain_refusal
@@ -17,6 +18,8 @@ from cdpipe.merge.merge import merge_maps, take_known_merge
 from cdpipe.merge.registration import register
 from cdpipe.model.config import MergeConfig, load_config
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps
+from cdpipe.pipeline import detect
+from tests.cdpipe.conftest import AFTER_ODOM_T_WORLD, CloudScans, bend, mapped, tunnel_points
 
 CONFIG = MergeConfig(fallback=False)
 Bend = Callable[[MappedSession, float], tuple[MappedSession, Float64Array]]
@@ -238,6 +241,81 @@ def test_no_gate_is_asked_about_a_known_merge(tunnel_before: MappedSession, othe
     small = replace(tunnel_before.map, points=points, nearest_m=one, seen_from=None)
     merged = take_known_merge(MappedSession(small, tunnel_before.descriptors), other_tunnel, np.eye(4), CONFIG)
     assert merged.is_accepted and merged.evidence == {"n_hypotheses": 0.0, "is_known": 1.0}
+
+
+def stand(along_m: float, sample: int, odom_T_world: Float64Array, n_scans: int = 5) -> MappedSession:
+    """A sensor that stands in the tunnel at `along_m` and sees 6000 of the points within 12 m in each scan."""
+    rng = stream(sample, "standing")
+    points = tunnel_points(0, sample)
+    world_T_sensor = yaw_pose(rng.uniform(-1, 1), (along_m, bend(np.array(along_m), 0), 1.5))
+    near = points[np.linalg.norm(points - world_T_sensor[:3, 3], axis=1) < 12.0]
+    clouds = [transform(invert(world_T_sensor), rng.choice(near, 6000, replace=False)) for _ in range(n_scans)]
+    poses = np.repeat((odom_T_world @ world_T_sensor)[None], n_scans, axis=0)
+    return mapped(CloudScans("standing", poses, clouds), odom_T_world)
+
+
+@pytest.mark.parametrize("n_scans", [1, 5])
+def test_a_standing_sensor_is_merged_by_what_there_is(n_scans: int) -> None:
+    true = invert(AFTER_ODOM_T_WORLD)
+    before, after = stand(30.0, 0, np.eye(4), n_scans), stand(30.6, 1, AFTER_ODOM_T_WORLD, n_scans)
+    merged = merge_maps(before, after, CONFIG)
+    assert merged.is_accepted, merged.reason
+    assert path_error_m(merged, true) < 0.02
+    assert merged.evidence["agreement"] > 0.9
+    assert merged.evidence["both_ways_m"] < 0.02 and merged.evidence["both_ways_deg"] < 0.3
+    # a known merge of it is refined by that registration, or stays where it is
+    off = make_pose(translation=(0.2, 0.1, 0.0)) @ true
+    assert path_error_m(take_known_merge(before, after, off, CONFIG), true) < 0.02
+    as_it_is = take_known_merge(before, after, off, CONFIG.model_copy(update={"refine": "none"}))
+    np.testing.assert_array_equal(as_it_is.before_T_after, off)
+
+
+def test_a_standing_sensor_finds_its_place_in_a_drive(tunnel_before: MappedSession) -> None:
+    true = invert(AFTER_ODOM_T_WORLD)
+    merged = merge_maps(tunnel_before, stand(30.6, 1, AFTER_ODOM_T_WORLD), CONFIG)
+    assert merged.is_accepted, merged.reason
+    assert path_error_m(merged, true) < 0.02
+
+
+def test_two_standing_sensors_at_other_places_are_refused() -> None:
+    before = stand(14.0, 0, np.eye(4))
+    for along_m in (26.0, 44.0):
+        merged = merge_maps(before, stand(along_m, 1, AFTER_ODOM_T_WORLD), CONFIG)
+        assert not merged.is_accepted
+        assert "record a path of ten metres or more" in merged.reason and "nan" not in merged.reason
+
+
+def test_one_place_of_a_smooth_drift_is_refused_because_it_slides() -> None:
+    sessions = []
+    for sample in (0, 1):
+        rng = stream(sample, "smooth")
+        along, section = rng.uniform(-12, 12, 30_000), rng.uniform(-1, 1, (30_000, 2))
+        wall = rng.integers(0, 2, 30_000)
+        section[np.arange(30_000), wall] = np.sign(section[np.arange(30_000), wall])
+        points = np.column_stack([along, 3 * section]) + rng.normal(0, 0.005, (30_000, 3))
+        source = CloudScans("smooth", np.eye(4)[None], [points[np.linalg.norm(points, axis=1) < 12.0]])
+        sessions.append(mapped(source, np.eye(4)))
+    merged = merge_maps(*sessions, CONFIG)
+    assert not merged.is_accepted
+    assert "can slide" in merged.reason and "one place of a smooth drift" in merged.reason
+
+
+@pytest.mark.parametrize("swap", [False, True])
+def test_two_real_scans_are_merged(tmp_path: Path, swap: bool) -> None:
+    if "TUNNELCD_REAL_DATA" not in os.environ:
+        pytest.skip("TUNNELCD_REAL_DATA is unset: the real registration pair is not at hand")
+    folder = Path(os.environ["TUNNELCD_REAL_DATA"]) / "registration_pair"
+    true = np.loadtxt(folder / "T_target_source.txt")
+    names = ("source", "target") if swap else ("target", "source")
+    for name in names:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "0.ply").symlink_to(folder / f"{name}.ply")
+        (tmp_path / name / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
+    with pytest.warns(InputWarning, match=r"missing returns|extract\.min_views"):
+        report = detect(tmp_path / names[0], tmp_path / names[1])
+    error = invert(invert(true) if swap else true) @ report.before_T_after
+    assert np.linalg.norm(error[:3, 3]) < 0.02
+    assert np.degrees(Rotation.from_matrix(error[:3, :3]).magnitude()) < 0.5
 
 
 def test_the_real_pair_is_solved() -> None:
