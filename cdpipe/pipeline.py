@@ -328,9 +328,10 @@ def _warn_of_few_views(mapped: Sequence[MappedSession], config: PipelineConfig) 
     """Warn where the sessions have too few keyframes for any object to be seen through often enough."""
     n_views = min(len(session.map.keyframe_scans) for session in mapped)
     if config.extract.method == "surface" and n_views < config.extract.min_views:
+        asked = f"extract.min_views = {config.extract.min_views:g}"
         text = (
-            f"keyframes of the shorter session: {n_views}; extract.min_views = {config.extract.min_views:g} asks for more "
-            "views of an object, so none can be found: record a path, or lower it (--set extract.min_views=0.5)"
+            f"{n_views} keyframes in the shorter session, {asked}: no object is seen through often enough to be found: "
+            "record a path, or lower it (--set extract.min_views=0.5)"
         )
         warnings.warn(text, InputWarning, stacklevel=3)
 
