@@ -9,12 +9,11 @@ from __future__ import annotations
 import importlib.util
 import logging
 import os
-import signal
 import socket
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from concurrent.futures import CancelledError
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -23,6 +22,7 @@ from urllib.parse import urlsplit
 from cdpipe.core.errors import InputError
 from cdpipe.core.threads import THREAD_VARIABLES, THREADS, fix_threads
 from eval.core.exposure import is_loopback
+from eval.core.interrupts import interrupts_held
 from eval.core.provenance import versions
 
 # By this variable Dask's workers return freed memory to the system at once, which takes a quarter of a pair's time.
@@ -125,6 +125,7 @@ def _of_this_machine(where: Where, n_tasks: int) -> Iterator[Any]:
     from distributed import Client  # noqa: PLC0415 - as above
 
     fix_threads()
+    _silence_dask()
     environment = {name: value for name, value in dask.config.get(_ENVIRONMENT).items() if name != _TRIM}
     settings = {
         "n_workers": min(where.workers or 1, n_tasks),
@@ -135,30 +136,38 @@ def _of_this_machine(where: Where, n_tasks: int) -> Iterator[Any]:
         "worker_dashboard_address": f"{_LOOPBACK}:0",
         "memory_limit": None,
         "silence_logs": logging.CRITICAL,
-        # Ctrl-C reaches every process of the terminal; workers ignore it and are ended by this process
-        "preload": [__name__],
     }
     # workers search their scratch folder for packages: it must not be one that another user may have made
     with (
         TemporaryDirectory(prefix="tunnelcd-", ignore_cleanup_errors=True) as scratch,
         dask.config.set({_ENVIRONMENT: environment, _SCRATCH: scratch}),
         _safe_path(),
-        _start_workers(settings) as cluster,
+        _started_workers(settings) as cluster,
         Client(cluster) as client,
     ):
         yield client
 
 
-def _start_workers(settings: Mapping[str, Any]) -> Any:
+@contextmanager
+def _started_workers(settings: Mapping[str, Any]) -> Iterator[Any]:
     from distributed import LocalCluster  # noqa: PLC0415 - as above
 
-    try:
-        return LocalCluster(**settings)
-    except (RuntimeError, TimeoutError) as error:
-        raise InputError(
-            "--workers: a process ended while it started, or took too long: run the same command again, perhaps with "
-            "fewer workers"
-        ) from error
+    with ExitStack() as started:
+        try:
+            with interrupts_held():
+                cluster = started.enter_context(LocalCluster(**settings))
+        except (RuntimeError, TimeoutError) as error:
+            raise InputError(
+                "--workers: a process ended while it started, or took too long: run the same command again, perhaps "
+                "with fewer workers"
+            ) from error
+        yield cluster
+
+
+def _silence_dask() -> None:
+    """Let Dask write no log of this process: its errors are one line of ours."""
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 @contextmanager
@@ -178,8 +187,7 @@ def _of_scheduler(address: str) -> Iterator[Any]:
     from distributed import Client  # noqa: PLC0415 - as above
     from distributed.security import Security  # noqa: PLC0415 - as above
 
-    for name in ("distributed", "distributed.client"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # the error is one line of ours
+    _silence_dask()
     try:
         _probe(address)
         if address.startswith("tls://") and Security().get_connection_args("client")["ssl_context"] is None:
@@ -223,11 +231,6 @@ def _unreachable(address: str, error: Exception) -> InputError:
     return InputError(
         f"--scheduler {address}: cannot be reached ({told}): expected tcp://HOST:PORT of a running `dask scheduler`"
     )
-
-
-def dask_setup(worker: object) -> None:
-    """Make a local worker ignore Ctrl-C; Dask calls this function in each worker that it starts."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _about() -> tuple[Mapping[str, str], Mapping[str, str]]:

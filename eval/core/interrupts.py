@@ -1,0 +1,70 @@
+"""Ctrl-C waits where it would do harm: during imports, and while worker processes start.
+
+Libraries swallow an interrupt that reaches them while they are imported, and then do without what they were importing
+(`try: import x / except BaseException`), or turn it into an `ImportError`. Ctrl-C also reaches every process of a
+terminal, also one that is just starting and knows no better than to print a traceback.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from threading import Timer, current_thread, main_thread
+from types import FrameType
+
+_AGAIN_S = 0.05
+_IMPORT = "<frozen importlib._bootstrap>"
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let Ctrl-C raise `KeyboardInterrupt` in the main thread as always, but not before an import has ended."""
+    if current_thread() is not main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGINT, _interrupt_or_wait)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
+@contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Hold Ctrl-C back; it is raised at the end.
+
+    Threads and processes that start meanwhile, and those that they start, never get it: this process ends them.
+    """
+    if current_thread() is not main_thread() or not hasattr(signal, "pthread_sigmask"):
+        yield  # a thread that no signal reaches, or Windows
+        return
+    resource_tracker.ensure_running()  # its start would let Ctrl-C through again
+    pressed: list[int] = []
+    # the mask holds for this thread and what it starts; a signal that another thread takes comes to the handler
+    handler = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, handler)
+    if pressed:
+        signal.raise_signal(signal.SIGINT)
+
+
+def _interrupt_or_wait(number: int, frame: FrameType | None) -> None:
+    if not _is_importing(frame):
+        signal.default_int_handler(number, frame)
+    again = Timer(_AGAIN_S, signal.raise_signal, (number,))
+    again.daemon = True
+    again.start()
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename == _IMPORT:
+            return True
+        frame = frame.f_back
+    return False

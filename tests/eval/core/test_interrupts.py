@@ -1,0 +1,55 @@
+"""Ctrl-C during an import, and while processes start."""
+
+from __future__ import annotations
+
+import importlib
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from eval.core.interrupts import interruptible, interrupts_held
+
+LIBRARY = """import signal
+try:
+    signal.raise_signal(signal.SIGINT)
+    is_whole = True
+except BaseException:
+    is_whole = False
+"""
+IS_HELD = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))"
+
+
+def is_held_in_a_new_process() -> bool:
+    return subprocess.run([sys.executable, "-c", IS_HELD], check=True, capture_output=True).stdout == b"True\n"
+
+
+def test_an_import_ends_before_the_interrupt_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "swallows_every_exception.py").write_text(LIBRARY)
+    monkeypatch.syspath_prepend(tmp_path)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        library = importlib.import_module("swallows_every_exception")
+        assert library.is_whole
+        time.sleep(10)
+    assert signal.getsignal(signal.SIGINT) == before
+
+
+def test_an_interrupt_comes_at_once_without_an_import() -> None:
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("it waited")
+
+
+def test_a_held_interrupt_comes_at_the_end_and_never_to_processes_started_meanwhile() -> None:
+    reached = []
+    with pytest.raises(KeyboardInterrupt), interrupts_held():
+        signal.raise_signal(signal.SIGINT)
+        reached.append(is_held_in_a_new_process())
+    assert reached == [True]
+    assert not is_held_in_a_new_process()
+    with interrupts_held():
+        pass  # nobody pressed anything
