@@ -154,7 +154,7 @@ def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
     thin_map = build_map(source, config.map)
     descriptors = describe_scans(source, thin_map.keyframe_scans, config.descriptor)
     if config.query.compare == "sphere":
-        spheres = describe_map(thin_map, thin_map.odom_T_keyframe, config.descriptor, config.sphere)
+        spheres = describe_map(thin_map, thin_map.odom_T_anchor, config.descriptor, config.sphere)
         descriptors = replace(descriptors, spheres=spheres)
     return MappedSession(thin_map, descriptors)
 
@@ -189,7 +189,7 @@ def map_pair(
         return describe_scans(sources[session], maps[session].keyframe_scans[chosen], config.descriptor)
 
     def surroundings(session: int, chosen: slice) -> Spheres:
-        return describe_map(maps[session], maps[session].odom_T_keyframe[chosen], config.descriptor, config.sphere)
+        return describe_map(maps[session], maps[session].odom_T_anchor[chosen], config.descriptor, config.sphere)
 
     scans = hooks.run("descriptors", config, lambda: _describe_both("describe keyframes", keyframes, kept, hooks))
     (before, after), seconds = scans.value, dict(scans.seconds)

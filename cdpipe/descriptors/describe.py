@@ -15,6 +15,7 @@ import torch
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_npz
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
+from cdpipe.core.path_frames import FRAMES
 from cdpipe.descriptors.handmade import HANDMADE, VERSION
 from cdpipe.descriptors.network import (
     PlaceNetwork,
@@ -139,7 +140,7 @@ def load_descriptors(
 
 
 def _spheres_of(map_config: MapConfig, sphere: SphereConfig) -> str:
-    return f"{sphere_digest(sphere)} {map_config.model_dump_json()}"
+    return f"{sphere_digest(sphere)} {FRAMES} {map_config.model_dump_json()}"
 
 
 def checkpoint_digest(config: DescriptorConfig) -> str:

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, invert
 from cdpipe.core.grid_index import GridIndex
+from cdpipe.core.path_frames import path_frames
 from cdpipe.descriptors.sphere_image import render
 from cdpipe.descriptors.sphere_network import (
     SECTORS,
@@ -39,7 +40,7 @@ def describe_map(
 
     Args:
         thin_map: The map.
-        map_T_anchor: (K, 4, 4) sensor poses in the map's frame.
+        map_T_anchor: (K, 4, 4) frames by path and gravity in the map's frame (`PointMap.odom_T_anchor`).
         config: `precision` is used.
         sphere: The weights; E is 64 with the shipped ones.
 
@@ -77,7 +78,7 @@ def change_logits(
         raise ValueError("the before session has no sphere descriptors: describe its map")
     network, _ = _network(sphere)
     logits = np.full((len(is_covered), SECTORS), np.nan)
-    map_T_anchor = merged.before.odom_T_sensor[before.keyframe_scans[is_covered]]
+    map_T_anchor = path_frames(merged.before.odom_T_sensor, before.keyframe_scans[is_covered])
     positions_odom = merged.alignment.to_odom(map_T_anchor[:, :3, 3])
     after_T_anchor = np.asarray(invert(merged.alignment.at(positions_odom)) @ map_T_anchor)
     images = render(GridIndex(merged.after.points), after_T_anchor)

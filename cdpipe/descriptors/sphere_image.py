@@ -1,7 +1,9 @@
 """The input image of the sphere descriptor: the tunnel wall around a keyframe, unrolled on a cylinder.
 
-Rows are metres along the keyframe's forward axis, columns are the angle about it, and a pixel is the distance of its
-nearest point from the axis. Keyframes are a metre apart, so an image covers only 2 m of tunnel before and behind.
+The anchor frame stands on path and gravity (`cdpipe.core.path_frames`), so the image does not depend on how the sensor
+is mounted, held or turned. Rows are metres along its x axis, columns are the angle about it, and a pixel is the
+distance of its nearest point from the axis. Keyframes are a metre apart, so an image covers only 2 m of tunnel before
+and behind.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ def pixels(points_anchor: Float64Array) -> Int64Array:
     """Return the (N,) pixel of each point, row * COLUMNS + column; -1 outside the image.
 
     Args:
-        points_anchor: (N, 3) points in the keyframe's sensor frame, metres.
+        points_anchor: (N, 3) points in the keyframe's anchor frame, metres.
     """
     x, y, z = points_anchor.T
     row = np.floor((x + HALF_LENGTH_M) * (ROWS / (2 * HALF_LENGTH_M))).astype(np.int64)
@@ -37,7 +39,7 @@ def sphere_image(points_anchor: Float64Array) -> Float32Array:
     """Return the (ROWS, COLUMNS) float32 image: distance of the nearest point from the axis, metres, 0 without one.
 
     Args:
-        points_anchor: (N, 3) points in the keyframe's sensor frame, metres.
+        points_anchor: (N, 3) points in the keyframe's anchor frame, metres.
     """
     pixel = pixels(points_anchor)
     is_inside = pixel >= 0
@@ -50,7 +52,7 @@ def render(index: GridIndex, map_T_anchor: Float64Array) -> Float32Array:
 
     Args:
         index: The points of the map.
-        map_T_anchor: (K, 4, 4) sensor poses in the map's frame.
+        map_T_anchor: (K, 4, 4) anchor frames in the map's frame.
     """
     images = [
         sphere_image(transform(anchor_T_map, index.points_within(map_T_here[:3, 3], CROP_M)))

@@ -175,7 +175,7 @@ def _sphere(site: MergeSite) -> Contest:
     """Time both halves of a comparison: describing the before map, and comparing the after map with it."""
     before, after = (session.mapped for session in site.sessions)
     merged = merge_maps(before, after, site.config.merge)
-    poses = before.map.odom_T_keyframe
+    poses = before.map.odom_T_anchor
     is_covered = np.ones(len(poses), np.bool_)
 
     def both() -> None:

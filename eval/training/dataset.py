@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, stream, transform, yaw_rad
 from cdpipe.core.grid_index import GridIndex
+from cdpipe.core.path_frames import FRAMES
 from cdpipe.descriptors import sphere_image
 from cdpipe.descriptors.range_image import range_image
 from cdpipe.descriptors.sphere_image import COLUMNS, CROP_M, HALF_LENGTH_M, REACH_M, ROWS, pixels, render
@@ -74,7 +75,7 @@ class _Mapped:
 
 def shard_digest(scenario: Scenario, seed: int, recipe: Recipe) -> str:
     """Return the digest of all inputs of a shard except code; known before the simulation."""
-    image = ROWS, COLUMNS, HALF_LENGTH_M, REACH_M, list(sphere_image.sphere_image(np.zeros((0, 3))).shape)
+    image = ROWS, COLUMNS, HALF_LENGTH_M, REACH_M, list(sphere_image.sphere_image(np.zeros((0, 3))).shape), FRAMES
     return digest(
         {
             "format_version": FORMAT_VERSION,
@@ -234,7 +235,7 @@ def displace_poses(map_T_anchor: Float64Array, shift_m: Float64Array, turn_rad: 
 def _render_images(
     before: _Mapped, after: _Mapped, after_map: Float64Array, truth: GroundTruth, recipe: Recipe, seed: int
 ) -> Arrays:
-    anchors = before.map.odom_T_keyframe
+    anchors = before.map.odom_T_anchor
     draws = draw_merge_errors(recipe, seed)
     poses = [displace_poses(anchors, *error) for error in zip(draws["shift_m"], draws["turn_rad"], strict=True)]
     after_index = GridIndex(after_map)

@@ -118,7 +118,7 @@ def measure_spheres(
         truth: The pair's truth.
         config: All settings; the precision is replaced.
     """
-    poses = merged.before.odom_T_keyframe
+    poses = merged.before.odom_T_anchor
     world = truth.before.world_T_sensor[before.keyframe_scans, :3, 3]
     labels = label_keyframes(world, truth.centroids_world, truth.is_observable, truth.pair.score_radius_m)
     used = labels >= 0

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, transform, yaw_pose
 from cdpipe.descriptors.sphere import change_logits, dequantise, describe_map
@@ -101,7 +102,7 @@ def _map_of(points: Float64Array, odom_T_sensor: Float64Array) -> PointMap:
 
 def _set_of(thin_map: PointMap, precision: str = "float32") -> DescriptorSet:
     n = len(thin_map.keyframe_scans)
-    spheres = describe_map(thin_map, thin_map.odom_T_keyframe, DescriptorConfig(precision=precision))
+    spheres = describe_map(thin_map, thin_map.odom_T_anchor, DescriptorConfig(precision=precision))
     return DescriptorSet(np.ones((n, 1), np.float32), None, thin_map.keyframe_scans, "by hand", "", spheres)
 
 
@@ -180,3 +181,22 @@ def test_a_bent_alignment_is_followed_keyframe_by_keyframe() -> None:
         replace(merged, after=after, local=bent), _set_of(merged.before), np.ones(N_KEYFRAMES, np.bool_)
     )
     assert abs(int(np.argmax(logits.max(axis=1))) - 12) <= 1
+
+
+@pytest.mark.parametrize("turn_deg", [(90, 0, 0), (180, 20, 0), (0, -15, 10), None])
+def test_rolling_pitching_and_turning_the_sensor_changes_nothing(turn_deg: tuple[int, ...] | None) -> None:
+    level = _merged(12.0, make_pose())
+    turns = (
+        Rotation.random(N_KEYFRAMES, rng=0)
+        if turn_deg is None
+        else Rotation.from_euler("ZYX", np.tile(turn_deg, (N_KEYFRAMES, 1)), degrees=True)
+    )
+    before = replace(
+        level.before,
+        odom_T_sensor=level.before.odom_T_sensor @ make_pose(turns.as_matrix(), np.zeros((N_KEYFRAMES, 3))),
+    )
+    descriptors, of_level = _set_of(before), _set_of(level.before)
+    np.testing.assert_allclose(dequantise(descriptors.spheres), dequantise(of_level.spheres), atol=1e-5)
+    covered = np.ones(N_KEYFRAMES, np.bool_)
+    logits = change_logits(replace(level, before=before), descriptors, covered)
+    np.testing.assert_allclose(logits, change_logits(level, of_level, covered), atol=1e-3)
