@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from cdpipe.core.geometry import Float64Array
+from cdpipe.extract.centring import centre_regions
 from cdpipe.extract.crops import DIRECTIONS, SESSIONS, Crops
 from cdpipe.extract.objects import PointGroup, assemble_objects
 from cdpipe.extract.point_comparison import cluster_inliers, is_within, new_points_mask
@@ -106,7 +107,7 @@ def extract_changes(
     t_cd_s: float,
     config: PipelineConfig,
 ) -> ChangeReport:
-    """Extract the objects of the reported regions, and withdraw the regions without an object.
+    """Extract the objects of the reported regions, withdraw the regions without an object, and centre the others.
 
     Args:
         merged: Both maps.
@@ -118,6 +119,8 @@ def extract_changes(
     start = perf_counter()
     groups = cut_objects(merged, regions, config)
     regions = withdraw_empty_regions(regions, groups, config)
+    if groups and config.extract.method == "surface" and config.extract.recentre:
+        regions, groups = centre_regions(regions, groups, withdraw=config.extract.withdraw)
     grouped = perf_counter()
     objects = assemble_objects(merged, groups)
     end = perf_counter()

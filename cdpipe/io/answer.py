@@ -5,8 +5,10 @@
                   map_T_box (4, 4), box_m (3,) and volume_m3; for moved objects displacement_map (3,)); until: "merge"
                   if the method was stopped after the merge
     answer.npz    region_centres_map (R, 3), region_scores (R,), region_pairs (R, 2), region_is_reported (R,),
-                  region_is_withdrawn (R,), regions above the threshold without an object (optional),
+                  region_is_withdrawn (R,), regions above the threshold without an object of their own (optional),
                   region_direction (R,) uint8, session of the queried keyframe, 0 before, 1 after (optional),
+                  region_proposed_centres_map (R, 3), where regions were proposed that are now centred on their objects
+                  (optional),
                   keyframe_scores (Kb,), before_keyframe_scans (Kb,), after_keyframe_scans (Ka,),
                   object_returns (M, 2) int32 with object_return_offsets (O + 1,),
                   object_points_map (P, 3) with object_point_offsets (O + 1,), and figure_<name> (R,) each;
@@ -98,6 +100,7 @@ def write_answer(folder: Path, method: str, report: ChangeReport, until: Until |
     optional = {
         "region_is_withdrawn": regions.is_withdrawn,
         "region_direction": regions.direction,
+        "region_proposed_centres_map": regions.proposed_centres_map,
         "local_before_T_after": report.local_before_T_after,
     }
     arrays |= {name: array for name, array in optional.items() if array is not None}
@@ -219,6 +222,7 @@ def _report(
         keyframe_scores=arrays.get("keyframe_scores", np.zeros(0)),
         is_withdrawn=arrays.get("region_is_withdrawn"),
         direction=arrays.get("region_direction"),
+        proposed_centres_map=arrays.get("region_proposed_centres_map"),
     )
     no_scans = np.zeros(0, dtype=np.int64)
     report = ChangeReport(

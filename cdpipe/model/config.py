@@ -112,12 +112,16 @@ class QueryConfig(Settings):
 
 
 class ExtractConfig(Settings):
-    """Object extraction: the paper's point-to-voxel comparison, distances, or surfaces."""
+    """Object extraction: the paper's point-to-voxel comparison, distances, or surfaces.
+
+    A dump leaves out `recentre` where it is true, so that the answers of other rules do not name it.
+    """
 
     method: Literal["surface", "voxel", "nearest"] = Field(
         "surface", description="distance from the other session's surface; the paper's voxels; or the nearest point's"
     )
     withdraw: bool = Field(True, description="withdraw regions in which no object is found")
+    recentre: bool = Field(True, description="`surface`: centre each reported region on its objects")
     voxel_m: Cell = Field(0.65, description="`voxel`: size (paper: 0.65)")
     min_points: Count = Field(1, description="`voxel`: points that make a voxel occupied")
     origin_m: float = Field(0.0, ge=-1000, le=1000, description="`voxel`: offset of the grid along every axis")
@@ -135,6 +139,10 @@ class ExtractConfig(Settings):
     min_views: Positive = Field(
         2.5, description="`surface`: least mean number of keyframes that saw through a cell, minus those that hit it"
     )
+
+    @model_serializer(mode="wrap")
+    def _without_recentre(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {name: value for name, value in handler(self).items() if name != "recentre" or not value}
 
 
 class OutlierConfig(Settings):

@@ -27,9 +27,12 @@ class ChangeRegions:
         is_reported: (R,) whether the region is in the answer: it passed the threshold (or the fixed number of regions)
             and was not withdrawn.
         keyframe_scores: (K,) score of every before keyframe, NaN if the after session never came near.
-        is_withdrawn: (R,) whether the region passed the threshold but contains no object; None if none was withdrawn.
-        direction: (R,) uint8 session whose keyframe was queried in the other session: 0 before, 1 after. The centre is
-            the position of that keyframe. None for methods that query no keyframes.
+        is_withdrawn: (R,) whether the region passed the threshold but contains no object, or none that a better region
+            does not contain; None if none was withdrawn.
+        direction: (R,) uint8 session whose keyframe was queried in the other session: 0 before, 1 after. The proposed
+            centre is the position of that keyframe. None for methods that query no keyframes.
+        proposed_centres_map: (R, 3) centres at which the regions were proposed, before the reported ones were centred
+            on their objects; None if no region was centred.
     """
 
     centres_map: Float64Array
@@ -40,6 +43,7 @@ class ChangeRegions:
     keyframe_scores: Float64Array
     is_withdrawn: BoolArray | None = None
     direction: UInt8Array | None = None
+    proposed_centres_map: Float64Array | None = None
 
     @property
     def is_proposed(self) -> BoolArray:
@@ -49,6 +53,7 @@ class ChangeRegions:
     def __post_init__(self) -> None:
         n = len(self.scores)
         require_shapes(self, centres_map=(n, 3), pairs=(n, 2), is_reported=(n,), is_withdrawn=(n,), direction=(n,))
+        require_shapes(self, proposed_centres_map=(n, 3))
         if self.is_reported.dtype != np.bool_:
             raise ValueError(f"is_reported must be a boolean mask, got {self.is_reported.dtype}")
         if self.is_withdrawn is not None and (self.is_withdrawn & self.is_reported).any():
@@ -145,8 +150,8 @@ class ChangeReport:
         one is the length), height and yaw of its upright box, volume, and displacement if moved. Unknown values are
         empty.
 
-        `regions`: one row per region that passed the threshold, best first. A withdrawn region contains no object and
-        is not in the answer.
+        `regions`: one row per region that passed the threshold, best first. A withdrawn region contains no object, or
+        none that a better region does not contain, and is not in the answer.
 
         Raises:
             ValueError: There is no such table.

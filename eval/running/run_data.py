@@ -38,6 +38,7 @@ _MORE_TEXTS = {
 _COUNT = re.compile(r"n(_|$)")
 _NUMBER = re.compile(r"[-+.\deE]+")
 _IDS = re.compile(r"\d{1,9}(;\d{1,9})*")
+_ID_LISTS = ("found_changes", "found_changes_proposed")
 _PICTURED = ("paper", "tunnelcd", "voxel-diff")
 
 
@@ -361,9 +362,9 @@ def _require_values(path: Path, frame: pd.DataFrame) -> None:
 
 def _require_numbers(path: Path, frame: pd.DataFrame, texts: Collection[str]) -> None:
     for name in frame:
-        if pd.api.types.is_numeric_dtype(frame[name]) or (name in texts and name != "found_changes"):
+        if pd.api.types.is_numeric_dtype(frame[name]) or (name in texts and name not in _ID_LISTS):
             continue
-        are_ids = name == "found_changes"
+        are_ids = name in _ID_LISTS
         wrong = [
             (line, value)
             for line, value in enumerate(frame[name], start=2)

@@ -51,7 +51,8 @@ IDENTITY = ("scenario", "seed", "variant")
 # columns of text of results.csv and the item tables; every other one holds numbers or truth values
 TEXT_COLUMNS = {
     "scenario", "variant", "preset", "family", "pair_kind", "domain", "commit", "status", "error", "session", "name",
-    "kind", "prop_kind", "group", "why_not", "matched_kind", "outcome", "found_changes", "checkpoints",
+    "kind", "prop_kind", "group", "why_not", "matched_kind", "outcome", "found_changes",
+    "found_changes_proposed", "checkpoints",
 }  # fmt: skip
 _NAMED = {"scenario": str, "seed": int, "variant": str}
 ITEM_TABLES = ("changes", "regions", "objects", "keyframes")

@@ -88,6 +88,8 @@ def _check_local(local_before_T_after: Float64Array | None, n_keyframes: int, n_
 
 def _check_regions(regions: ChangeRegions, n_keyframes: int, n_scans: int) -> None:
     _require_near("region_centres_map", regions.centres_map)
+    if regions.proposed_centres_map is not None:
+        _require_near("region_proposed_centres_map", regions.proposed_centres_map)
     _require_finite("region_scores", regions.scores)
     _require_scores("region_scores", regions.scores)
     if not 0 < regions.radius_m <= FARTHEST_M:

@@ -143,12 +143,14 @@ class RegionScores:
     Attributes:
         columns: Its columns of results.csv.
         matches: Outcome of each region and change.
+        proposed: The same at the centres at which the regions were proposed, and before any was withdrawn.
         keyframe_scores: (J,) score at each judged place of the before session, NaN where the answer states none.
         keyframe_labels: (J,) 1, 0 or -1 of each.
     """
 
     columns: dict[str, float]
     matches: RegionMatches
+    proposed: RegionMatches
     keyframe_scores: Float64Array
     keyframe_labels: Int64Array
 
@@ -167,14 +169,20 @@ def score_regions(report: ChangeReport, truth: GroundTruth, after_travelled_m: F
     path_m = float(after_travelled_m[-1])
     is_withdrawn = regions.is_proposed & ~regions.is_reported
     kept = [found for found, is_gone in zip(matches.found, is_withdrawn, strict=True) if not is_gone]
-    proposed = match_regions(centres, regions.is_proposed, truth.centroids_world, truth.is_observable, radius_m)
+    if regions.proposed_centres_map is not None:
+        centres_proposed = transform_to_world(regions.proposed_centres_map, truth.before)
+    else:
+        centres_proposed = centres
+    proposed = match_regions(
+        centres_proposed, regions.is_proposed, truth.centroids_world, truth.is_observable, radius_m
+    )
 
     scores, labels, ranking = _rank_keyframes(report, truth)
     columns = {
         **_compute_rates(matches, truth, path_m),
         **{f"{name}_proposed": value for name, value in _compute_rates(proposed, truth, path_m).items()},
         "region_recall_at_k": compute_recall_at_k(kept, truth.is_observable),
-        "region_recall_at_k_proposed": compute_recall_at_k(matches.found, truth.is_observable),
+        "region_recall_at_k_proposed": compute_recall_at_k(proposed.found, truth.is_observable),
         **ranking,
         "region_coverage": measure_covered_share(
             truth.after.world_T_sensor[:, :3, 3], after_travelled_m, centres[regions.is_reported], regions.radius_m
@@ -187,7 +195,7 @@ def score_regions(report: ChangeReport, truth: GroundTruth, after_travelled_m: F
         "n_ignored_regions": matches.count("ignored"),
         "n_found_changes": _count_found(matches, truth),
     }
-    return RegionScores(columns, matches, scores, labels)
+    return RegionScores(columns, matches, proposed, scores, labels)
 
 
 def _rank_keyframes(
@@ -246,4 +254,4 @@ def score_unanswered_regions(truth: GroundTruth) -> RegionScores:
         **ranking,
     }
     matches = RegionMatches((), (), np.full(len(truth.pair.changes), -1))
-    return RegionScores(columns, matches, scores, labels)
+    return RegionScores(columns, matches, matches, scores, labels)

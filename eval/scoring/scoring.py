@@ -221,6 +221,9 @@ def make_region_rows(report: ChangeReport | None, scored: RegionScores, truth: G
             "outcome": scored.matches.outcomes[index],
             **dict(zip(("x_m", "y_m", "z_m"), map(float, regions.centres_map[index]), strict=True)),
             "found_changes": ";".join(str(truth.pair.changes[change].id) for change in scored.matches.found[index]),
+            "found_changes_proposed": ";".join(
+                str(truth.pair.changes[change].id) for change in scored.proposed.found[index]
+            ),
             **{name: float(values[index]) for name, values in figures.items()},
         }
         for index in range(len(regions.scores))

@@ -74,7 +74,7 @@ def ranked_pairs(
         results: Its rows of results.csv.
         regions: Its rows of regions.csv, candidates of a pair best first.
         changes: Its rows of changes.csv.
-        is_proposal: Count the candidates that were withdrawn as well.
+        is_proposal: Count the candidates that were withdrawn as well, and all of them where they were proposed.
 
     Raises:
         InputError: A region or an observable change is of a pair without a row of results.csv that counts its changes.
@@ -100,7 +100,8 @@ def ranked_pairs(
     change_score = np.full(len(rows), -np.inf)
     change_rank = np.full(len(rows), len(scores), np.int64)
     ranks = np.zeros(len(pairs), np.int64)
-    found_changes = regions["found_changes"].tolist()
+    is_told = is_proposal and "found_changes_proposed" in regions  # tables of older runs lack the column
+    found_changes = regions["found_changes_proposed" if is_told else "found_changes"].tolist()
     for candidate in np.lexsort((np.arange(len(scores)), -scores, of_pair)).tolist():
         pair, found = int(of_pair[candidate]), parsed_ids(found_changes[candidate])
         is_false[candidate] = not found

@@ -94,6 +94,7 @@ def test_the_first_answers_are_read(tmp_path: Path) -> None:
     (tmp_path / "answer.json").write_text(json.dumps(document))
     report = read_answer(tmp_path).report
     assert report is not None and len(report.objects[0].points_map) == 3 and report.objects[0].shape is None
+    assert report.regions.proposed_centres_map is None
 
 
 def test_the_first_truth_is_read(tmp_path: Path) -> None:

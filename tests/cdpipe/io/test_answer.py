@@ -73,7 +73,10 @@ def test_shapes_moves_and_withdrawn_regions_survive_the_disk_and_need_not_be_the
         replace(third, session="before", kind="moved", partner=0, displacement_map=went),
     )
     direction = np.array([1, 0], np.uint8)
-    regions = replace(report.regions, is_withdrawn=np.array([False, True]), direction=direction)
+    proposed = report.regions.centres_map + np.array([1.0, 0.0, 0.0])
+    regions = replace(
+        report.regions, is_withdrawn=np.array([False, True]), direction=direction, proposed_centres_map=proposed
+    )
     write_answer(tmp_path, "paper", replace(report, objects=objects, regions=regions))
     read = read_answer(tmp_path).report
     assert read is not None
@@ -88,6 +91,7 @@ def test_shapes_moves_and_withdrawn_regions_survive_the_disk_and_need_not_be_the
     assert read.objects[1].displacement_map is None
     np.testing.assert_array_equal(read.regions.is_withdrawn, [False, True])
     np.testing.assert_array_equal(read.regions.direction, direction)
+    np.testing.assert_array_equal(read.regions.proposed_centres_map, proposed)
     np.testing.assert_array_equal(read.regions.is_proposed, [True, True])
     # an answer without them, as others write it, is as good
     write_answer(tmp_path, "paper", report)
@@ -97,6 +101,24 @@ def test_shapes_moves_and_withdrawn_regions_survive_the_disk_and_need_not_be_the
     first = read.objects[0]
     assert all(value is None for value in (first.shape, first.displacement_map, read.regions.is_withdrawn))
     assert read.regions.direction is None
+    assert read.regions.proposed_centres_map is None
+
+
+@pytest.mark.parametrize(
+    ("proposed", "words"),
+    [
+        (np.zeros((1, 3)), r"proposed_centres_map"),
+        (np.zeros((2, 2)), r"region_proposed_centres_map must be \(R, 3\)"),
+        (np.full((2, 3), "x"), r"region_proposed_centres_map: expected numbers"),
+    ],
+)
+def test_damaged_proposed_centres_are_named(proposed: np.ndarray, words: str, tmp_path: Path) -> None:
+    write_answer(tmp_path, "paper", _report())
+    with np.load(tmp_path / "answer.npz") as stored:
+        arrays = dict(stored)
+    np.savez_compressed(tmp_path / "answer.npz", region_proposed_centres_map=proposed, **arrays)
+    with pytest.raises(InputError, match=rf"answer\.npz: .*{words}"):
+        read_answer(tmp_path)
 
 
 @pytest.mark.parametrize("direction", [np.array([0, 2], np.uint8), np.array([0, 1]), np.array([0], np.uint8)])

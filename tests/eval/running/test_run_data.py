@@ -19,7 +19,8 @@ TABLES = {
         for seed in (1, 2)
     ],
     "changes": [{**IDENTITY, "seed": 1, "id": 1, "is_observable": True, "n_truth_cells": 20}],
-    "regions": [{**IDENTITY, "seed": 1, "region": 0, "score": 0.7, "outcome": "true", "found_changes": "1"}],
+    "regions": [{**IDENTITY, "seed": 1, "region": 0, "score": 0.7, "outcome": "true", "found_changes": "1",
+                 "found_changes_proposed": "1;2"}],
 }  # fmt: skip
 
 

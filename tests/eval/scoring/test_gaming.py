@@ -210,6 +210,25 @@ def test_on_an_unchanged_pair_something_wrong_helps_nothing(
     assert loud["is_alarm"] >= silent["is_alarm"]
 
 
+def test_proposed_centres_of_ones_own_choice_move_the_columns_of_proposals_alone(
+    tiny_pair: Path, honest: ChangeReport
+) -> None:
+    # all regions lie on nothing; they are said to have been proposed where the honest ones are
+    regions = honest.regions
+    on_nothing = replace(regions, centres_map=regions.centres_map + 500.0)
+    nothing = scored(tiny_pair, replace(honest, regions=on_nothing)).row
+    stated = replace(on_nothing, proposed_centres_map=regions.centres_map)
+    row = scored(tiny_pair, replace(honest, regions=stated)).row
+    moved = {name for name, value in row.items() if value != nothing[name] and not name.startswith("t_")}
+    moved -= {name for name, value in row.items() if isinstance(value, float) and np.isnan(value)}
+    assert moved == {
+        "region_recall_proposed", "region_precision_proposed", "false_regions_per_100m_proposed",
+        "region_recall_at_k_proposed",
+    }  # fmt: skip
+    assert row["region_recall"] == 0.0
+    assert row["region_recall_proposed"] == scored(tiny_pair, honest).row["region_recall"] > 0.5
+
+
 def test_the_same_region_twice_counts_once(tiny_pair: Path, honest: ChangeReport) -> None:
     regions = honest.regions
     twice = replace(

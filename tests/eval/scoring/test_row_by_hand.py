@@ -201,11 +201,28 @@ def test_the_regions(case: CaseScore) -> None:
         expected = {
             "region": index, "score": 7.0 - index, "is_reported": index in (1, 2, 3, 4),
             "is_withdrawn": index in (0, 5), "outcome": outcomes[index], "x_m": x_m[index], "y_m": 0.5, "z_m": 0.5,
-            "found_changes": found[index], "v_sphere_m3": spheres[index], "v_oe_m3": NAN, "s_points": NAN,
-            "oe_points": NAN,
+            "found_changes": found[index], "found_changes_proposed": found[index], "v_sphere_m3": spheres[index],
+            "v_oe_m3": NAN, "s_points": NAN, "oe_points": NAN,
         }  # fmt: skip
         assert_equal(row, expected)
     assert len(case.regions) == 7
+
+
+def test_what_was_proposed_is_judged_where_it_was_proposed(report: ChangeReport, truth: GroundTruth) -> None:
+    # the second candidate was proposed 3.5 m aside of its change, the false one on the other change; the last two are
+    # neither reported nor withdrawn
+    proposed = report.regions.centres_map.copy()
+    proposed[1, 0], proposed[3, 0] = 5.5 + 3.5, 20.5
+    report = replace(report, regions=replace(report.regions, proposed_centres_map=proposed))
+    case = score_answer(Answer("ok", "", "mine", report, report.seconds, report.evidence), truth)
+    assert [row["found_changes"] for row in case.regions] == ["2", "1", "1", "", "3", "", ""]
+    assert [row["found_changes_proposed"] for row in case.regions] == ["2", "", "1", "2", "3", "", ""]
+    assert (case.row["region_recall"], case.row["region_precision"]) == (0.5, 0.5)
+    assert (case.row["region_recall_proposed"], case.row["region_precision_proposed"]) == (1.0, 0.5)
+    assert case.row["false_regions_per_100m_proposed"] == 4.0  # candidates 1 and 5
+    # the two best find one of two where they were proposed; without the withdrawn ones, and centred, one of two
+    assert (case.row["region_recall_at_k_proposed"], case.row["region_recall_at_k"]) == (0.5, 0.5)
+    assert case.changes[0]["best_region"] == 1
 
 
 def test_the_objects(case: CaseScore) -> None:

@@ -83,6 +83,19 @@ def test_what_was_withdrawn_is_no_candidate_but_was_proposed() -> None:
     assert recall_at(ranked_pairs(results(), lost, changes(), is_proposal=True), 10.0) == 3 / 4
 
 
+def test_proposals_count_where_they_were_proposed() -> None:
+    # the candidate at 9 was proposed beside the change 1, on nothing; the one at 7 finds it then
+    found = regions()
+    centred = found.assign(found_changes_proposed=found["found_changes"].mask(found["score"] == 9.0, ""))
+    assert recall_at(ranked_pairs(results(), centred, changes()), 0.05) == recall_at(by_hand(), 0.05)
+    proposals = ranked_pairs(results(), centred, changes(), is_proposal=True)
+    assert proposals.is_false.sum() == by_hand().is_false.sum() + 1
+    assert proposals.change_score[0] == 7.0
+    # tables of older runs lack the column
+    older = ranked_pairs(results(), found, changes(), is_proposal=True)
+    np.testing.assert_array_equal(older.change_score, by_hand().change_score)
+
+
 def test_a_later_candidate_on_a_found_change_counts_nothing_and_an_unobservable_one_is_not_false() -> None:
     ranked = by_hand()
     assert ranked.n_new.tolist() == [1, 0, 1, 0, 0, 0, 1]
