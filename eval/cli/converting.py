@@ -83,7 +83,7 @@ def _export(source: Path, out: Path, progress: RunProgress, *, with_truth: bool)
     if not with_truth:  # a profile of one's own is a path, which can tell the scenario
         told = {name: value for name, value in session.provenance.items() if name != "sensor_profile"}
         session = replace(session, provenance=told)
-    # LABEL is the change's id, 0 none; INSTANCE is as in sim.session.truth
+    # LABEL is the change's id, 0 none, 65535 for the -1 of mixed returns; INSTANCE is as in sim.session.truth
     labels = read_labels(session.path, session.n_chunks)
     fields = ({"LABEL": of.astype(np.uint16), "INSTANCE": instance.astype(np.int16)} for instance, of in labels)
     with made_parents(out):

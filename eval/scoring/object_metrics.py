@@ -16,6 +16,7 @@ from cdpipe.model.report import ChangedObject
 from eval.core.statistics import mean
 from eval.truth.ground_truth import SESSIONS, GroundTruth
 from eval.truth.scoring_points import CELL_M
+from sim.session.truth import MIXED
 
 Outcome = Literal["match", "false", "ignored"]
 _PHASES = tuple(itertools.product((0.0, 0.5), repeat=3))
@@ -32,7 +33,8 @@ class ObjectMatches:
         iou_voxel: (C,) likewise for 0.1 m voxels, mean over 8 grid phases.
         iou_box: (C,) likewise for axis-aligned boxes.
         is_excused: (O,) objects with more than half of their rows on changes outside of the main group (unobservable or
-            partial); these cannot be false.
+            partial), or with mixed rows only; these cannot be false.
+        n_cells: (O,) int64 rows of each object without mixed ones.
     """
 
     matched_object: Int64Array
@@ -41,6 +43,7 @@ class ObjectMatches:
     iou_voxel: Float64Array
     iou_box: Float64Array
     is_excused: BoolArray
+    n_cells: Int64Array
 
     @property
     def outcomes(self) -> tuple[Outcome, ...]:
@@ -89,6 +92,8 @@ def compute_box_iou(points_a: Float64Array, points_b: Float64Array, cell_m: floa
 def match_objects(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], truth: GroundTruth) -> ObjectMatches:
     """Match the objects of an answer to the observable changes of their session, by the largest sum of point IoU.
 
+    Rows of mixed returns are left out.
+
     Args:
         objects: The answer's O objects.
         rows: Per object, the rows of its session's scoring points.
@@ -98,12 +103,15 @@ def match_objects(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], 
     ids = np.array([change.id for change in changes], dtype=np.int64)
     by_id = np.argsort(ids)
     n_shared = np.zeros((len(changes), len(objects)), dtype=np.int64)
+    scored: list[Int64Array] = []
     for column, (item, of_object) in enumerate(zip(objects, rows, strict=True)):
         labels = truth.sessions[item.session].scoring_points.change[of_object]
+        scored.append(of_object[labels != MIXED])
         found, counts = np.unique(labels[np.isin(labels, ids)], return_counts=True)
         n_shared[by_id[np.searchsorted(ids, found, sorter=by_id)], column] = counts  # ids are unique in the pair
     n_cells = np.array([len(of_change) for of_change in truth.change_rows], dtype=np.int64)
-    n_rows = np.array([len(of_object) for of_object in rows], dtype=np.int64)
+    n_rows = np.array([len(of_object) for of_object in scored], dtype=np.int64)
+    is_all_mixed = np.array([len(of_object) > 0 for of_object in rows], dtype=np.bool_) & (n_rows == 0)
     iou = n_shared / np.maximum(n_cells[:, None] + n_rows - n_shared, 1)
 
     matched_object = np.full(len(changes), -1, dtype=np.int64)
@@ -116,13 +124,13 @@ def match_objects(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], 
             row = candidates[index]
             matched_object[row], matched_change[column] = column, row
             points = truth.sessions[session].scoring_points.points_odom
-            true, answered = (points[of].astype(np.float64) for of in (truth.change_rows[row], rows[column]))
+            true, answered = (points[of].astype(np.float64) for of in (truth.change_rows[row], scored[column]))
             ious["point"][row] = iou[row, column]
             ious["voxel"][row] = compute_voxel_iou(true, answered)
             ious["box"][row] = compute_box_iou(true, answered)
     is_main = truth.is_observable & ~truth.is_partial
-    is_excused = 2 * n_shared[~is_main].sum(axis=0) > n_rows
-    return ObjectMatches(matched_object, matched_change, ious["point"], ious["voxel"], ious["box"], is_excused)
+    is_excused = (2 * n_shared[~is_main].sum(axis=0) > n_rows) | is_all_mixed
+    return ObjectMatches(matched_object, matched_change, ious["point"], ious["voxel"], ious["box"], is_excused, n_rows)
 
 
 def judge_kinds(objects: Sequence[ChangedObject], matches: ObjectMatches, truth: GroundTruth) -> Float64Array:

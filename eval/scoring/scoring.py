@@ -37,7 +37,7 @@ from eval.scoring.object_sizes import SizeErrors, compute_size_errors, summarise
 from eval.scoring.region_metrics import RegionScores, score_regions, score_unanswered_regions
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
-METRICS_VERSION = 5
+METRICS_VERSION = 6
 _NAN = float("nan")
 Metric = Callable[[GroundTruth, Answer], Mapping[str, float]]
 """`metric(truth, answer)`: columns by name; NaN where undefined. `answer.report` is None where a method gave none."""
@@ -120,7 +120,7 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
         right = judge_kinds(report.objects, objects, truth)
         object_scores = summarise_objects(objects, right, truth)
         sizes = compute_size_errors(report.objects, objects, truth)
-        items = make_object_rows(report.objects, objects, [len(of_object) for of_object in rows], truth)
+        items = make_object_rows(report.objects, objects, truth)
     n_regions = int(regions.columns["n_regions"])
     found: dict[str, float] = {**regions.columns, **object_scores, **summarise_size_errors(sizes, truth)}
     row = {
@@ -231,7 +231,7 @@ def make_region_rows(report: ChangeReport | None, scored: RegionScores, truth: G
 
 
 def make_object_rows(
-    objects: tuple[ChangedObject, ...], matches: ObjectMatches, n_cells: list[int], truth: GroundTruth
+    objects: tuple[ChangedObject, ...], matches: ObjectMatches, truth: GroundTruth
 ) -> list[dict[str, Any]]:
     """Return a row of objects.csv for every answered object."""
     rows = []
@@ -247,7 +247,7 @@ def make_object_rows(
                 "region": item.region,
                 "score": float(item.score),
                 "n_returns": len(item.returns),
-                "n_cells": n_cells[index],
+                "n_cells": int(matches.n_cells[index]),
                 "matched_change": truth.pair.changes[matched].id if matched >= 0 else -1,
                 "iou_point": float(matches.iou_point[matched]) if matched >= 0 else 0.0,
                 "outcome": outcome,

@@ -2,7 +2,8 @@
 
 The truth of a change and the answer of a method are both subsets of these rows. An object at close range, with a
 hundred returns per cell, therefore weighs as much as a distant one. Cells are fixed in the session's own odometry, so
-that a wrong merge acts only through the answer.
+that a wrong merge acts only through the answer. A mixed return (`sim.session.truth`) is a row only in a cell that holds
+no other; such rows are left out of truth and answers.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ from cdpipe.io.readers import open_session
 from cdpipe.io.session import Session, chunk_path, read_session
 from cdpipe.model.types import PosedScan
 from eval.core.output import whole_file
-from sim.session.truth import Int16Array, read_labels
+from sim.session.truth import MIXED, Int16Array, read_labels
 
 CELL_M = 0.1
-_CACHE_VERSION = 3
+_CACHE_VERSION = 4
 _BATCH_RETURNS = 500_000
 _PENDING_ROWS = 4_000_000
 _CACHE = {
@@ -49,7 +50,7 @@ class ScoringPoints:
     Attributes:
         returns: (N,) int64 scan * n_pixels + pixel of each, rising.
         points_odom: (N, 3) float32 deskewed points, the session's odom frame, metres.
-        change: (N,) int16 id of the change each belongs to, 0 for none.
+        change: (N,) int16 id of the change each belongs to, 0 for none, `MIXED` for neither.
         instance: (N,) int16 what each hit: 0 walls and floor, n the n-th prop, -2 nothing (a false return).
         n_scans: Revolutions of the session.
         n_pixels: Pixels of a revolution.
@@ -116,7 +117,9 @@ def load_scoring_points(session: Path) -> ScoringPoints:
 
 
 def build_scoring_points(session: Session) -> ScoringPoints:
-    """Return the first return of each 0.1 m cell, in the order of scans and of row-major pixels.
+    """Return the first return of each 0.1 m cell that is not mixed, or else its first, in the order of measurement.
+
+    Scans come in their order, and the pixels of a scan row by row.
 
     Reads the session as a stream; memory grows by about 60 bytes per cell.
 
@@ -140,7 +143,7 @@ def build_scoring_points(session: Session) -> ScoringPoints:
 
 
 class ScoringPointsBuilder:
-    """Receives the scans of a session in order and keeps the first return of each cell."""
+    """Receives the scans of a session in order and keeps the first return of each cell, mixed ones last."""
 
     def __init__(self, name: str, height: int, width: int) -> None:
         self._name = name
@@ -164,7 +167,8 @@ class ScoringPointsBuilder:
         except ValueError as error:
             raise InputError(f"{self._name}: scan {scan.index}: {error}") from error
         # neighbours on a row mostly share a cell; only the first of them can be the first of the cell
-        is_entered = np.append(True, cells[1:] != cells[:-1])[: len(cells)]
+        is_mixed = change.ravel()[scan.pixels] == MIXED
+        is_entered = np.append(True, (cells[1:] != cells[:-1]) | (is_mixed[1:] != is_mixed[:-1]))[: len(cells)]
         pixels = scan.pixels[is_entered]
         self._batch.append(
             {
@@ -207,9 +211,11 @@ def _count(parts: Sequence[_Rows]) -> int:
 
 
 def _first_per_cell(parts: Sequence[_Rows]) -> _Rows:
-    """Keep the first row of each cell; `parts` are in the order of measurement."""
-    _, first = np.unique(np.concatenate([part["cells"] for part in parts]), return_index=True)
-    return {name: np.concatenate([part[name] for part in parts])[first] for name in parts[0]}
+    """Keep the first row of each cell, a mixed one if there is no other; `parts` are in the order of measurement."""
+    rows = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    mixed_last = np.argsort(rows["change"] == MIXED, kind="stable")
+    _, first = np.unique(rows["cells"][mixed_last], return_index=True)
+    return {name: values[mixed_last[first]] for name, values in rows.items()}
 
 
 def _fingerprint(session: Session) -> str:

@@ -32,7 +32,9 @@ class Echo:
         photons: float32 expected photons, 0 for a miss.
         cosine: float32 of the incidence on `geom`, 0 for a miss.
         true_range_m: float32 distance to `geom` along the ray that met it, infinite for a miss.
-        geom: int32 geom that reflected most of the light, -1 for a miss.
+        geom: int32 geom that the strongest ray met, -1 for a miss.
+        owner: int32 owner of the geoms that reflected most of the light; any owner for a miss.
+        owner_share: float32 share of the light that came from the geoms of `owner`; 1 for one ray per beam.
     """
 
     range_m: Float32Array
@@ -40,18 +42,28 @@ class Echo:
     cosine: Float32Array
     true_range_m: Float32Array
     geom: Int32Array
+    owner: Int32Array
+    owner_share: Float32Array
 
 
-def central_echo(caster: Caster, reflectivity: Float32Array, rays: Rays, beam_origin_m: float) -> Echo:
-    """Cast the middle of every beam at geoms of these reflectivities (G,)."""
+def central_echo(
+    caster: Caster, reflectivity: Float32Array, rays: Rays, beam_origin_m: float, owners: Int32Array
+) -> Echo:
+    """Cast the middle of every beam at geoms of these reflectivities and owners, both (G,)."""
     distance_m, geom, cosine = caster.cast_columns(rays.origins, rays.directions)
     distance_m += np.float32(beam_origin_m)
     photons = received_photons(reflectivity[geom] * cosine, distance_m)
-    return Echo(np.where(geom >= 0, distance_m, np.float32(0.0)), photons, cosine, distance_m, geom)
+    range_m = np.where(geom >= 0, distance_m, np.float32(0.0))
+    return Echo(range_m, photons, cosine, distance_m, geom, owners[geom], np.ones_like(range_m))
 
 
 def spread_echo(
-    caster: Caster, reflectivity: Float32Array, rays: Rays, beam_origin_m: float, sub_rays: Literal[7, 19]
+    caster: Caster,
+    reflectivity: Float32Array,
+    rays: Rays,
+    beam_origin_m: float,
+    owners: Int32Array,
+    sub_rays: Literal[7, 19],
 ) -> Echo:
     """Cast several rays over the width of every beam and blend their echoes.
 
@@ -59,28 +71,28 @@ def spread_echo(
     the photons. The strongest group is reported. Its geom is the one that the strongest ray of the group met.
     """
     shape = rays.directions.shape[:2]
-    n_pixels = shape[0] * shape[1]
-    ranges_m, photons, cosines = (np.empty((sub_rays, n_pixels), np.float32) for _ in range(3))
-    geoms = np.empty((sub_rays, n_pixels), np.int32)
-    centres = np.repeat(rays.origins, shape[1], axis=0)
-    directions = rays.directions.reshape(-1, 3)
-    right, up = _across(directions)
     places, weights = sub_ray_pattern(sub_rays)
-    for ray, ((x, y), weight) in enumerate(zip(places, weights, strict=True)):
-        aside = right * np.float32(x) + up * np.float32(y)
-        origins = centres + aside * np.float32(WAIST_M / 2)
-        aside *= np.float32(np.tan(DIVERGENCE_RAD / 2))
-        aside += directions
-        aside /= np.float32(np.sqrt(1.0 + (x * x + y * y) * np.tan(DIVERGENCE_RAD / 2) ** 2))
-        ranges_m[ray], geoms[ray], cosines[ray] = caster.cast(origins, aside)
-        ranges_m[ray] += np.float32(beam_origin_m)
+    # The rays of a beam are cast one after another: they meet the same triangles, which takes a quarter less time.
+    hits_m, hit_geoms, hit_cosines = caster.cast(*_beam_rays(rays, places))
+    ranges_m: Float32Array = np.ascontiguousarray(hits_m.reshape(-1, sub_rays).T) + np.float32(beam_origin_m)
+    geoms: Int32Array = np.ascontiguousarray(hit_geoms.reshape(-1, sub_rays).T)
+    cosines: Float32Array = np.ascontiguousarray(hit_cosines.reshape(-1, sub_rays).T)
+    photons = np.empty_like(ranges_m)
+    for ray, weight in enumerate(weights):
         power = reflectivity[geoms[ray]] * cosines[ray]
         photons[ray] = np.float32(weight) * received_photons(power, ranges_m[ray])
     range_m, strength, strongest = blend_echoes(ranges_m, photons)
-    pixels = np.arange(n_pixels)
-    parts = (cosines, ranges_m, geoms)
-    cosine, true_range_m, geom = (part[strongest, pixels].reshape(shape) for part in parts)
-    return Echo(range_m.reshape(shape), strength.reshape(shape), cosine, true_range_m, geom)
+    owner, owner_share = divide_light(owners[geoms], ranges_m, photons)
+    pixels = np.arange(len(strongest))
+    return Echo(
+        range_m.reshape(shape),
+        strength.reshape(shape),
+        cosines[strongest, pixels].reshape(shape),
+        ranges_m[strongest, pixels].reshape(shape),
+        geoms[strongest, pixels].reshape(shape),
+        owner.reshape(shape),
+        owner_share.reshape(shape),
+    )
 
 
 def sub_ray_pattern(sub_rays: int) -> tuple[Float64Array, Float64Array]:
@@ -135,10 +147,46 @@ def blend_echoes(ranges_m: Float32Array, photons: Float32Array) -> tuple[Float32
     return range_m, strength, strongest
 
 
+def divide_light(owners: Int32Array, ranges_m: Float32Array, photons: Float32Array) -> tuple[Int32Array, Float32Array]:
+    """Find whose surfaces reflected most of the light that each pixel reports.
+
+    Args:
+        owners: (n, N) owner of the surface that each ray met; any owner for a miss.
+        ranges_m: (n, N) distance of each ray's echo, infinite for a miss.
+        photons: (n, N) its photons, 0 for a miss.
+
+    Returns:
+        (N,) owner of the largest part of the strongest group's light, (N,) that part as a share; 1 where all is dark.
+    """
+    owner, share = owners[0].copy(), np.ones(owners.shape[1], np.float32)
+    shared = np.flatnonzero((owners != owner).any(axis=0))
+    light, _, order = _strongest_group_light(ranges_m[:, shared], photons[:, shared])
+    of_ray = np.take_along_axis(owners[:, shared], order, axis=0)
+    totals = np.stack([np.where(of_ray == each, light, np.float32(0.0)).sum(axis=0) for each in of_ray])
+    largest, pixels = totals.argmax(axis=0), np.arange(len(shared))
+    owner[shared] = of_ray[largest, pixels]
+    strength = light.sum(axis=0)
+    share[shared] = np.where(strength > 0, totals[largest, pixels] / np.maximum(strength, np.float32(1e-30)), 1.0)
+    return owner, share
+
+
 def _strongest_group(
     ranges_m: Float32Array, photons: Float32Array
 ) -> tuple[Float32Array, Float32Array, npt.NDArray[np.int64]]:
     """Blend pixels (n, M) whose echoes may lie in several groups; misses, far away and dark, make up the last one."""
+    light, reach_m, order = _strongest_group_light(ranges_m, photons)
+    strength = light.sum(axis=0)
+    range_m = (light * reach_m).sum(axis=0) / np.maximum(strength, np.float32(1e-30))
+    return range_m, strength, order[light.argmax(axis=0), np.arange(order.shape[1])]
+
+
+def _strongest_group_light(
+    ranges_m: Float32Array, photons: Float32Array
+) -> tuple[Float32Array, Float32Array, Int64Array]:
+    """Return the (n, M) light and range of each ray, by rising range, and which ray that is; no light of weaker groups.
+
+    Misses count as 1,000 km away.
+    """
     order = np.argsort(ranges_m, axis=0, kind="stable")
     reach_m = np.take_along_axis(np.where(np.isinf(ranges_m), np.float32(1e6), ranges_m), order, axis=0)
     light = np.take_along_axis(photons, order, axis=0)
@@ -148,10 +196,24 @@ def _strongest_group(
     totals = np.zeros_like(light)
     for place, row in zip(group, light, strict=True):
         totals[place, pixels] += row
-    light = np.where(group == totals.argmax(axis=0), light, np.float32(0.0))
-    strength = light.sum(axis=0)
-    range_m = (light * reach_m).sum(axis=0) / np.maximum(strength, np.float32(1e-30))
-    return range_m, strength, order[light.argmax(axis=0), pixels]
+    return np.where(group == totals.argmax(axis=0), light, np.float32(0.0)), reach_m, order
+
+
+def _beam_rays(rays: Rays, places: Float64Array) -> tuple[Float64Array, Float32Array]:
+    """Return the origins and directions of the rays at n places across every beam, both (W * H * n, 3)."""
+    directions = rays.directions.reshape(-1, 3)
+    centres = np.repeat(rays.origins, rays.directions.shape[1], axis=0)
+    right, up = _across(directions)
+    origins = np.empty((len(directions), len(places), 3))
+    ways = np.empty(origins.shape, np.float32)
+    for ray, (x, y) in enumerate(places):
+        aside = right * np.float32(x) + up * np.float32(y)
+        origins[:, ray] = centres + aside * np.float32(WAIST_M / 2)
+        aside *= np.float32(np.tan(DIVERGENCE_RAD / 2))
+        aside += directions
+        aside /= np.float32(np.sqrt(1.0 + (x * x + y * y) * np.tan(DIVERGENCE_RAD / 2) ** 2))
+        ways[:, ray] = aside
+    return origins.reshape(-1, 3), ways.reshape(-1, 3)
 
 
 def _across(directions: Float32Array) -> tuple[Float32Array, Float32Array]:

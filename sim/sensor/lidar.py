@@ -25,9 +25,10 @@ from sim.sensor.optics import (
 from sim.sensor.rays import Rays
 
 MISS, FALSE_RETURN = -1, -2
-# A blended echo farther than this from its reported surface is a point in mid-air: the pixel is mixed. It is the same
-# distance by which a return must be off the old surface to count as changed.
-MIXED_M = 0.1
+# A return belongs to an owner whose geoms reflected at least this share of its light; others are mixed. Surfaces that
+# blend are less than 1 m apart (`sim.sensor.footprint.PULSE_M`), so the rest of the light moves the return by less than
+# 0.1 m, the distance by which a return must be off the old surface to count as changed.
+LEAST_SHARE = 0.9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,8 +41,9 @@ class Scan:
         signal: uint16 photons.
         true_range_m: float32 distance from the spin axis's point to the surface along the beam, infinite for a miss.
         geom: int32 geom hit, `MISS` where nothing returned, `FALSE_RETURN` where nothing stands.
-        is_mixed: True for a return whose echo, before noise, is more than 0.1 m off the surface of `geom`, because it
-            blends two surfaces. Always False with one ray per beam.
+        owner: int32 owner of the geoms that reflected most of the light, 0 where no geom was hit.
+        is_mixed: True for a return of which less than 90 % of the light came from geoms of `owner`. Always False with
+            one ray per beam.
     """
 
     range_mm: npt.NDArray[np.uint32]
@@ -49,11 +51,19 @@ class Scan:
     signal: npt.NDArray[np.uint16]
     true_range_m: Float32Array
     geom: Int32Array
+    owner: Int32Array
     is_mixed: BoolArray
 
 
 def scan(
-    scene: Scene, sensor: SensorMetadata, settings: Sensor, rays: Rays, seed: int, session: str, number: int
+    scene: Scene,
+    sensor: SensorMetadata,
+    settings: Sensor,
+    rays: Rays,
+    seed: int,
+    session: str,
+    number: int,
+    owners: Int32Array | None = None,
 ) -> Scan:
     """Cast one revolution and apply the effects of the sensor.
 
@@ -67,11 +77,11 @@ def scan(
         seed: The scenario's seed.
         session: "before" or "after".
         number: Index of the revolution in its session.
+        owners: (G,) owner of each geom, between which mixed returns are told; by default the prop, `scene.instance`.
     """
-    if settings.sub_rays == 1:
-        echo = central_echo(scene.caster, scene.reflectivity, rays, sensor.beam_origin_m)
-    else:
-        echo = spread_echo(scene.caster, scene.reflectivity, rays, sensor.beam_origin_m, settings.sub_rays)
+    owners = scene.instance if owners is None else owners
+    surfaces = scene.caster, scene.reflectivity, rays, sensor.beam_origin_m, owners
+    echo = central_echo(*surfaces) if settings.sub_rays == 1 else spread_echo(*surfaces, settings.sub_rays)
     shape = echo.range_m.shape
     range_m, photons = echo.range_m, echo.photons
     if settings.range_noise:
@@ -95,5 +105,6 @@ def scan(
         signal=signal_channel(photons).T,
         true_range_m=echo.true_range_m.T,
         geom=geom.T,
-        is_mixed=((geom >= 0) & (np.abs(echo.range_m - echo.true_range_m) > MIXED_M)).T,
+        owner=np.where(geom >= 0, echo.owner, np.int32(0)).T,
+        is_mixed=((geom >= 0) & (echo.owner_share < LEAST_SHARE)).T,
     )

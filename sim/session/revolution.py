@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Scenario
 from sim.drive.trajectory import Trajectory
@@ -15,12 +15,12 @@ from sim.scene import Scene
 from sim.sensor.lidar import Scan, scan
 from sim.sensor.rays import Rays, revolution_rays
 from sim.session.labels import Tally, mark_belonging
-from sim.session.truth import Int16Array, SessionName
+from sim.session.truth import MIXED, Int16Array, SessionName
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """Returns of one revolution on a changed prop, mixed pixels left out.
+    """Returns of one revolution on a changed prop; in the session that holds the change without mixed ones.
 
     Attributes:
         row, column: (N,) pixels.
@@ -41,6 +41,7 @@ class Revolution:
     Attributes:
         range_mm, reflectivity, signal: (H, W) as in `ScanChunk`.
         instance: (H, W) int16 truth labels.
+        mixed: (N,) flat numbers of the pixels that blend a changed prop with something else.
         column_poses: (W, 7) as in `ScanChunk`.
         hits: Returns on changed props, by change id.
         ghost_rays: Number of rays that met each ghost, by change id.
@@ -50,6 +51,7 @@ class Revolution:
     reflectivity: npt.NDArray[np.uint8]
     signal: npt.NDArray[np.uint16]
     instance: Int16Array
+    mixed: Int64Array
     column_poses: Float32Array
     hits: dict[int, Hits]
     ghost_rays: dict[int, int]
@@ -61,12 +63,14 @@ class Drive:
 
     Attributes:
         labels: `instance` of each geom, int16; two entries -2 and -1 at the end serve the geom numbers -2 and -1.
+        owners: (G,) int32 `instance` of the geoms of props of which this session holds a change, 0 for all others.
     """
 
     name: SessionName
     scenario: Scenario
     scene: Scene
     labels: Int16Array
+    owners: Int32Array
     sensor: SensorMetadata
     trajectory: Trajectory
     tallies: tuple[Tally, ...]
@@ -83,22 +87,24 @@ def simulate_revolution(drive: Drive, number: int) -> Revolution:
         change = tally.change
         if change.session != drive.name:
             ghost_rays[change.id] = tally.ghost.count(rays, reach_m.T)
-        is_on_it = (instance == change.instance) & ~result.is_mixed
+        is_own = change.session == drive.name
+        is_on_it = (result.owner == change.instance) & ~result.is_mixed if is_own else instance == change.instance
         row, column = np.divmod(np.flatnonzero(is_on_it), drive.sensor.width)
         if len(row):
-            is_own = change.session == drive.name
             points_world = rays.points(row, column, reach_m[row, column])
             belongs = mark_belonging(tally, points_world) if is_own else np.ones(len(row), dtype=bool)
             hits[change.id] = Hits(row, column, _measure(drive, number, result, row, column), belongs)
     column_poses = drive.trajectory.sensor_T_column(slice(number, number + 1))[0]
-    return Revolution(result.range_mm, result.reflectivity, result.signal, instance, column_poses, hits, ghost_rays)
+    channels = result.range_mm, result.reflectivity, result.signal
+    return Revolution(*channels, instance, np.flatnonzero(result.is_mixed), column_poses, hits, ghost_rays)
 
 
 def cast_revolution(drive: Drive, number: int) -> tuple[Rays, Scan]:
     """Return the rays of one revolution and the scan that the sensor reports."""
     world_T_column = drive.trajectory.world_T_column(slice(number, number + 1))[0]
     rays = revolution_rays(drive.sensor, world_T_column)
-    return rays, scan(drive.scene, drive.sensor, drive.scenario.sensor, rays, drive.seed, drive.name, number)
+    settings = drive.scenario.sensor
+    return rays, scan(drive.scene, drive.sensor, settings, rays, drive.seed, drive.name, number, drive.owners)
 
 
 def true_reach_m(sensor: SensorMetadata, result: Scan) -> Float32Array:
@@ -107,8 +113,10 @@ def true_reach_m(sensor: SensorMetadata, result: Scan) -> Float32Array:
 
 
 def label_changes(drive: Drive, revolutions: list[Revolution]) -> Int16Array:
-    """Label every return of a chunk (s, H, W) with its change, and add to the tallies."""
+    """Label every return of a chunk (s, H, W) with its change, or `MIXED`, and add to the tallies."""
     labels = np.zeros((len(revolutions), *revolutions[0].instance.shape), dtype=np.int16)
+    for of_revolution, each in zip(labels, revolutions, strict=True):
+        of_revolution.flat[each.mixed] = MIXED
     for tally in drive.tallies:
         change_id = tally.change.id
         tally.n_ghost_rays += sum(each.ghost_rays.get(change_id, 0) for each in revolutions)

@@ -147,8 +147,10 @@ def plan_drives(scenario: Scenario, sensor: SensorMetadata, seed: int) -> list[D
     for name in SESSIONS:
         scene = world.before if name == "before" else world.after
         labels = np.append(scene.instance, [-2, -1]).astype(np.int16)
+        held = [tally.change.instance for tally in tallies if tally.change.session == name]
+        owners = np.where(np.isin(scene.instance, held), scene.instance, np.int32(0))
         trajectory = plan_trajectory(world, scenario, sensor, seed, name)
-        drives.append(Drive(name, scenario, scene, labels, sensor, trajectory, tallies, seed))
+        drives.append(Drive(name, scenario, scene, labels, owners, sensor, trajectory, tallies, seed))
     return drives
 
 

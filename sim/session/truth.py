@@ -6,11 +6,14 @@
     PAIR/after/truth/...             likewise
 
 `instance`: -1 no return, -2 a false return where nothing stands, 0 walls, floor and fixtures, n the n-th prop
-(1-based). `change`: 0 (always for a false return), or the id of the change the return belongs to. For a change of
-group "partial" (moved by less than its own length, or reshaped) only returns farther than 0.1 m from the other
-session's true surface belong to it. With several rays per beam a pixel may blend an object with its background.
-`instance` then names the surface that reflected most of the light. If the blended position is more than 0.1 m off that
-surface (without range noise), the pixel is a point in mid-air: its `change` is 0, and it is not counted.
+(1-based). `change`: 0 (always for a false return), the id of the change the return belongs to, or -1 for a mixed
+return. For a change of group "partial" (moved by less than its own length, or reshaped) only returns farther than 0.1 m
+from the other session's true surface belong to it.
+
+With several rays per beam a return may blend surfaces. `instance` is then that of the strongest ray. A return belongs
+to a changed prop of its session, or to all the rest, if at least 90 % of its light came from there. A return below that
+for every one of them is mixed: its `change` is -1, and it counts for nothing. Sessions simulated before metrics version
+6 hold no -1; there `change` is 0 for returns more than 0.1 m off the surface of `instance`.
 """
 
 from __future__ import annotations
@@ -37,6 +40,7 @@ Kind = Literal["added", "removed", "moved", "reshaped"]
 Group = Literal["full", "partial"]
 _Four = Field(min_length=4, max_length=4)
 _CHECKS = ConfigDict(extra="forbid", allow_inf_nan=False)
+MIXED = -1  # `change` of a return that belongs neither to a change nor to the rest
 _LABELS = {"instance": ArraySpec("s,H,W", "int16"), "change": ArraySpec("s,H,W", "int16")}
 _POSES = {"world_T_sensor": ArraySpec("S,4,4", "float64")}
 
@@ -63,8 +67,8 @@ class Change:
         why_not: The rule that failed, or "".
         mesh_volume_m3: Volume of a closed surface, None for props of several parts; of a reshaped prop the volume that
             was removed.
-        n_returns_other: Returns of the other session on the same prop if it stands in both (moved, reshaped), without
-            points in mid-air.
+        n_returns_other: Returns of the other session with the same `instance`, where the prop stands in both (moved,
+            reshaped).
         n_cells_other: Cells of 0.1 m that these fill, in that session's odom frame.
     """
 

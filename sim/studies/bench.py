@@ -57,8 +57,8 @@ class BenchSite:
 
     @cached_property
     def drawn(self) -> Scenario:
-        """The scenario with every distribution drawn."""
-        return load_scenario(self.scenario, self.seed)
+        """The scenario with every distribution drawn, beams without width."""
+        return load_scenario(self.scenario, self.seed, ["sensor.sub_rays=1"])
 
     @cached_property
     def sensor(self) -> SensorMetadata:

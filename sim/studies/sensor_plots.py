@@ -170,9 +170,9 @@ def _divergence(figure: Figure) -> None:
     for axes, depth_m in zip(figure.subplots(1, 2), (0.4, 3.0), strict=True):
         near_m = 8.0
         meshes = [_plate(near_m, -3.0, 0.0), _plate(near_m + depth_m, -3.0, 3.0)]
-        caster, share = Caster(meshes), np.full(2, 0.25, np.float32)
         rays = _fan(np.arange(-0.09, 0.0901, 0.0003))
-        every = {1: central_echo(caster, share, rays, 0.0), 19: spread_echo(caster, share, rays, 0.0, 19)}
+        seen = Caster(meshes), np.full(2, 0.25, np.float32), rays, 0.0, np.arange(2, dtype=np.int32)
+        every = {1: central_echo(*seen), 19: spread_echo(*seen, 19)}
         for (count, echo), colour, size in zip(every.items(), _COLOURS, (5, 2), strict=False):
             points = echo.range_m[..., None] * rays.directions
             axes.plot(points[:, 0, 1], points[:, 0, 0], ".", markersize=size, color=colour, label=f"{count} per beam")

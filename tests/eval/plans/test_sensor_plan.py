@@ -24,23 +24,24 @@ PLAN = load_plan("sensor")
 WORLDS = list_worlds(PLAN.scenarios)
 REFERENCE = WORLDS[0]
 OVER = {list_settings_over(world.label, REFERENCE.label) for world in WORLDS[1:]}
-SMALL = ("sensor.mode=512x10", "platform.scan_spacing_m=2.0", "after.end_m=9")
+PLAIN = load_scenario(REFERENCE.name, 0, REFERENCE.settings).sensor
+SMALL = ("sensor.mode=512x10", "sensor.sub_rays=7", "platform.scan_spacing_m=2.0", "after.end_m=9")
 
 
-def values(field: FieldInfo) -> list[str]:
-    """The values of a switch or of a choice, as settings write them, without the default."""
+def values(name: str, field: FieldInfo) -> list[str]:
+    """The values of a switch or of a choice, as settings write them, without that of the plan's first world."""
     options = ("true", "false") if field.annotation is bool else map(str, field.annotation.__args__)  # type: ignore[union-attr]
-    return [value for value in options if value != str(field.default).lower()]
+    return [value for value in options if value != str(getattr(PLAIN, name)).lower()]
 
 
 def test_every_effect_of_the_sensor_has_a_row_of_its_own() -> None:
     switches = [name for name, field in Sensor.model_fields.items() if field.annotation is bool]
     assert {"rolling_scan", "range_noise", "dropouts", "false_positives"} <= set(switches)
     for name in (*switches, "sub_rays", "range_step_mm"):
-        for value in values(Sensor.model_fields[name]):
+        for value in values(name, Sensor.model_fields[name]):
             assert f"sensor.{name}={value}" in OVER
-    assert ",".join(f"sensor.{name}=false" for name in switches if Sensor.model_fields[name].default) in OVER
-    assert {f"sensor.profile={name}" for name in profile_names() if name != Sensor().profile} <= OVER
+    assert ",".join(f"sensor.{name}=false" for name in switches if getattr(PLAIN, name)) in OVER
+    assert {f"sensor.profile={name}" for name in profile_names() if name != PLAIN.profile} <= OVER
     assert {"sensor.mode=512x10", "sensor.mode=2048x10"} <= OVER
 
 

@@ -13,10 +13,12 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import invert, make_pose, transform
 from cdpipe.io.answer import write_answer, write_failure
 from cdpipe.io.readers import open_session
+from cdpipe.io.session import read_session
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 from eval.core.domains import domain_of, is_change_in_distribution
 from eval.scoring.scoring import METRICS_VERSION, CaseScore, score_stored
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
+from sim.session.truth import MIXED, read_labels, write_labels
 
 ONES = (
     "region_recall",
@@ -34,7 +36,8 @@ ONES = (
     "kind_accuracy",
 )
 COLUMN_TEXT = """
-scenario family domain pair_kind seed variant preset status error metrics_version n_changes n_observable score_radius_m
+scenario family domain pair_kind seed variant preset status error metrics_version checkpoints n_changes n_observable
+score_radius_m
 region_recall region_precision region_recall_at_k region_auroc region_ap keyframe_coverage is_auroc_assumed
 false_regions_per_100m region_coverage
 n_regions n_true_regions n_false_regions n_duplicate_regions n_ignored_regions n_found_changes
@@ -113,6 +116,58 @@ def test_the_truth_as_answer_scores_exactly_one(tiny_pair: Path, tiny_merge: np.
     assert [row["outcome"] for row in case.objects] == ["match"] * 3
     assert [row["is_kind_right"] for row in case.changes] == [1.0] * 3
     assert [row["n_truth_cells"] for row in case.changes] == [row["n_cells"] for row in case.objects]
+
+
+def mix_columns(session: Path, columns: list[int]) -> None:
+    """Make all returns of some columns of a session mixed."""
+    for index, (instance, change) in enumerate(list(read_labels(session, read_session(session).n_chunks))):
+        is_mixed = instance >= 0
+        is_mixed[:, :, [column for column in range(is_mixed.shape[2]) if column not in columns]] = False
+        write_labels(session, index, instance, np.where(is_mixed, MIXED, change).astype(np.int16))
+
+
+def naming_also(report: ChangeReport, added: list[tuple[int, int]]) -> ChangeReport:
+    """Add returns to the first object of a report."""
+    first, *others = report.objects
+    returns = np.concatenate([first.returns, np.array(added, np.int32).reshape(-1, 2)])
+    return replace(report, objects=(replace(first, returns=returns), *others))
+
+
+def test_mixed_returns_in_an_answer_are_neither_right_nor_wrong(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
+    # Thing 1 is seen in columns 4 to 13 of scans 2 to 4. Its right rim and the wall beside it are mixed.
+    n_cells = len(load_ground_truth(tiny_pair).change_rows[0])
+    mix_columns(tiny_pair / "after", [12, 13, 14])
+    report = true_report(tiny_pair, tiny_merge)
+    assert n_cells > len(load_ground_truth(tiny_pair).change_rows[0]) > 0
+    mixed = [(scan, row * 64 + column) for scan in range(2, 5) for row in range(4) for column in (12, 13, 14)]
+    plain, with_tail = scored(tiny_pair, report), scored(tiny_pair, naming_also(report, mixed))
+    assert {name: plain.row[name] for name in ONES} == dict.fromkeys(ONES, 1.0)
+    np.testing.assert_equal(with_tail.row, plain.row)
+    np.testing.assert_equal(with_tail.changes, plain.changes)
+    assert [row["n_cells"] for row in with_tail.objects] == [row["n_cells"] for row in plain.objects]
+    # a middling answer gets no better by them: half of the thing, and as many returns of the wall
+    first = report.objects[0]
+    wall = [(scan, 2 * 64 + column) for scan in range(2, 5) for column in range(15, 20)]
+    half = replace(report, objects=(replace(first, returns=first.returns[::2]), *report.objects[1:]))
+    poor = scored(tiny_pair, naming_also(half, wall))
+    assert 0.0 < poor.changes[0]["iou_point"] < 0.6
+    np.testing.assert_equal(scored(tiny_pair, naming_also(half, wall + mixed)).row, poor.row)
+    # an ordinary return of the wall is wrong
+    assert scored(tiny_pair, naming_also(report, wall[:1])).row["object_iou_point"] < 1.0
+
+
+def test_an_object_of_mixed_returns_alone_is_no_false_object(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
+    mix_columns(tiny_pair / "after", [20, 21, 22])
+    report = true_report(tiny_pair, tiny_merge)
+    mixed = [(scan, row * 64 + column) for scan in range(14) for row in range(4) for column in (20, 21, 22)]
+    wall = [(5, 2 * 64 + 30)]
+    tail = replace(report.objects[0], returns=np.array(mixed, np.int32), region=-1, kind="added", partner=-1)
+    for returns, outcome, precision in ((mixed, "ignored", 1.0), (mixed + wall, "false", 0.75), (wall, "false", 0.75)):
+        objects = (*report.objects, replace(tail, returns=np.array(returns, np.int32)))
+        case = scored(tiny_pair, replace(report, objects=objects))
+        assert case.objects[3]["outcome"] == outcome
+        assert case.row["object_precision_50"] == precision
+        assert case.objects[3]["n_cells"] == (0 if returns == mixed else 1)
 
 
 def test_the_row_has_the_promised_columns_and_the_items_lead_back_to_it(

@@ -17,11 +17,11 @@ from cdpipe.model.types import PosedScan
 from eval.truth import scoring_points as module
 from eval.truth.ground_truth import load_ground_truth
 from eval.truth.scoring_points import ScoringPoints, ScoringPointsBuilder, build_scoring_points, load_scoring_points
-from sim.session.truth import read_labels, read_true_poses, write_labels, write_true_poses
+from sim.session.truth import MIXED, read_labels, read_true_poses, write_labels, write_true_poses
 
 
 def points_by_dictionary(session: Path) -> dict[tuple[int, ...], tuple[int, int, int, int, np.ndarray]]:
-    """First return of each cell in the order of scans and pixels: scan, pixel, change, instance, point."""
+    """Scan, pixel, change, instance and point of the first return of each cell, a mixed one if there is no other."""
     opened = read_session(session)
     labels = list(read_labels(session, opened.n_chunks))
     instance, change = (np.concatenate([chunk[part] for chunk in labels]) for part in (0, 1))
@@ -31,18 +31,29 @@ def points_by_dictionary(session: Path) -> dict[tuple[int, ...], tuple[int, int,
         for pixel, point in zip(scan.pixels.tolist(), points, strict=True):
             row, column = divmod(pixel, opened.sensor.width)
             labelled = (int(change[scan.index, row, column]), int(instance[scan.index, row, column]))
-            first.setdefault(tuple(np.floor(point / 0.1)), (scan.index, pixel, *labelled, point))
+            cell = tuple(np.floor(point / 0.1))
+            if cell not in first or (first[cell][2] == MIXED and labelled[0] != MIXED):
+                first[cell] = (scan.index, pixel, *labelled, point)
     return first
 
 
+def mix(session: Path, share: float, seed: int = 0) -> None:
+    """Make this share of a session's returns mixed."""
+    rng = np.random.default_rng(seed)
+    for index, (instance, change) in enumerate(list(read_labels(session, read_session(session).n_chunks))):
+        is_mixed = (instance >= 0) & (rng.random(instance.shape) < share)
+        write_labels(session, index, instance, np.where(is_mixed, MIXED, change).astype(np.int16))
+
+
 @pytest.mark.parametrize(("batch", "pending"), [(500_000, 4_000_000), (300, 10), (1, 1)])
-@pytest.mark.parametrize("name", ["before", "after"])
+@pytest.mark.parametrize(("name", "mixed"), [("before", 0.0), ("after", 0.0), ("after", 0.4)])
 def test_equals_a_dictionary_of_cells(
-    tiny_pair: Path, name: str, batch: int, pending: int, monkeypatch: pytest.MonkeyPatch
+    tiny_pair: Path, name: str, mixed: float, batch: int, pending: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_BATCH_RETURNS", batch)
     monkeypatch.setattr(module, "_PENDING_ROWS", pending)
     session = tiny_pair / name
+    mix(session, mixed)
     built = build_scoring_points(read_session(session))
     expected = sorted(points_by_dictionary(session).values(), key=lambda row: row[:2])
     every = np.arange(len(built))
@@ -51,7 +62,22 @@ def test_equals_a_dictionary_of_cells(
     assert built.change.tolist() == [row[2] for row in expected]
     assert built.instance.tolist() == [row[3] for row in expected]
     np.testing.assert_allclose(built.points_odom, [row[4] for row in expected], atol=1e-5)
-    assert set(built.change.tolist()) == ({0, 2} if name == "before" else {0, 1, 3})
+    assert set(built.change.tolist()) == ({0, 2} if name == "before" else {0, 1, 3}) | ({MIXED} if mixed else set())
+
+
+def test_a_mixed_return_is_a_row_only_where_its_cell_has_no_other() -> None:
+    builder = ScoringPointsBuilder("by hand", 1, 6)
+    x_m = np.array([0.01, 0.02, 0.03, 0.31, 0.32, 0.61])  # three cells
+    points = np.column_stack([x_m, np.zeros((6, 2))])
+    for index, change in enumerate(([-1, 5, -1, -1, -1, 0], [7, 7, 7, -1, 3, -1])):
+        scan = PosedScan(index, points, np.eye(4), np.zeros(6, np.int64), np.arange(6, dtype=np.int32))
+        builder.add(scan, np.zeros((1, 6), np.int16), np.array([change], np.int16))
+        if index == 0:
+            first = builder.finish(1)
+    assert (first.returns.tolist(), first.change.tolist()) == ([1, 3, 5], [5, MIXED, 0])
+    whole = builder.finish(2)
+    assert (whole.returns.tolist(), whole.change.tolist()) == ([1, 5, 10], [5, 0, 3])
+    assert whole.nearest_m.tolist() == pytest.approx([np.inf, np.inf, np.inf, 0.32, np.inf, 0.02, np.inf, 0.01])
 
 
 def test_rows_are_found_again_by_their_returns(tiny_pair: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array
 from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 from sim.sensor.footprint import (
@@ -16,6 +16,7 @@ from sim.sensor.footprint import (
     Echo,
     blend_echoes,
     central_echo,
+    divide_light,
     spread_echo,
     sub_ray_pattern,
 )
@@ -41,11 +42,16 @@ def fan() -> Rays:
 
 
 def one_ray(*meshes: Mesh) -> Echo:
-    return central_echo(Caster(meshes), np.full(len(meshes), 0.3, np.float32), fan(), 0.015)
+    return central_echo(Caster(meshes), np.full(len(meshes), 0.3, np.float32), fan(), 0.015, each_its_own(meshes))
 
 
 def many_rays(sub_rays: Literal[7, 19], *meshes: Mesh) -> Echo:
-    return spread_echo(Caster(meshes), np.full(len(meshes), 0.3, np.float32), fan(), 0.015, sub_rays)
+    reflectivity = np.full(len(meshes), 0.3, np.float32)
+    return spread_echo(Caster(meshes), reflectivity, fan(), 0.015, each_its_own(meshes), sub_rays)
+
+
+def each_its_own(meshes: tuple[Mesh, ...]) -> Int32Array:
+    return np.arange(len(meshes), dtype=np.int32)
 
 
 def step(depth_m: float) -> tuple[Mesh, Mesh]:
@@ -124,6 +130,12 @@ def test_at_a_step_of_a_decimetre_pixels_blend_as_the_light_divides(sub_rays: Li
     # A sub-ray within rounding of the edge may fall to either side.
     off = np.abs(range_m - (10.0 * near + 10.1 * far) / (near + far))
     assert np.sort(off)[: -len(sub_ray_pattern(sub_rays)[0])].max() < 1.5e-3
+    owner, share = echo.owner[:, 0], echo.owner_share[:, 0]
+    np.testing.assert_array_equal(share < 1.0, is_mixed)
+    off = np.abs(share - np.maximum(near, far) / (near + far))
+    assert np.sort(off)[: -len(sub_ray_pattern(sub_rays)[0])].max() < 1e-3
+    is_clear = np.abs(near - far) > 0.2 * np.maximum(near, far)
+    assert ((owner == 0) != (near > far))[is_clear].sum() <= 1
 
 
 def test_at_a_step_of_five_metres_the_stronger_surface_wins() -> None:
@@ -177,6 +189,7 @@ def test_a_scene_and_its_beams_tilted_together_give_the_same_echoes(sub_rays: Li
             np.full(2, 0.3, np.float32),
             Rays(np.zeros((400, 3)), (ways @ matrix.T)[:, None].astype(np.float32)),
             0.015,
+            np.arange(2, dtype=np.int32),
             sub_rays,
         )
         for matrix in (np.eye(3), turn)
@@ -227,3 +240,47 @@ def test_blending_equals_its_slow_twin() -> None:
     again = blend_echoes(ranges_m[order], photons[order])
     np.testing.assert_allclose(again[0], range_m, rtol=2e-6)
     np.testing.assert_array_equal(order[again[2]][several], strongest[several])
+
+
+def divided(*rays: tuple[int, float, float]) -> tuple[int, float]:
+    """Owner and share of one pixel whose rays have an owner, a range and photons each."""
+    owners, ranges_m, photons = (np.array(part)[:, None] for part in zip(*rays, strict=True))
+    owner, share = divide_light(owners.astype(np.int32), ranges_m.astype(np.float32), photons.astype(np.float32))
+    return int(owner[0]), float(share[0])
+
+
+def test_light_is_divided_among_its_owners_by_hand() -> None:
+    assert divided((0, 5.0, 40.0), (3, 5.3, 60.0)) == (3, pytest.approx(0.6))
+    assert divided((3, 5.3, 5.0), (0, 5.0, 95.0)) == (0, pytest.approx(0.95))
+    # the owner of most light need not have the strongest ray
+    assert divided((3, 5.0, 40.0), (0, 5.1, 30.0), (0, 5.2, 30.0)) == (0, pytest.approx(0.6))
+    assert divided((1, 5.0, 20.0), (2, 5.1, 30.0), (0, 5.2, 50.0)) == (0, pytest.approx(0.5))
+    assert divided((4, 5.0, 1.0), (4, 5.9, 1.0)) == (4, 1.0)
+    # the light of a weaker group is not reported; a miss has none; nor has an echo that is dark
+    assert divided((0, 5.0, 60.0), (3, 5.5, 5.0), (3, 9.0, 35.0)) == (0, pytest.approx(60 / 65))
+    assert divided((7, np.inf, 0.0), (3, 5.3, 2.0), (3, 5.3, 2.0)) == (3, 1.0)
+    assert divided((7, 5.0, 0.0), (3, 5.3, 0.0))[1] == 1.0
+    assert divided((7, np.inf, 0.0), (3, np.inf, 0.0))[1] == 1.0
+
+
+def test_dividing_light_equals_its_slow_twin() -> None:
+    rng = np.random.default_rng(3)
+    shape = (19, 300)
+    ranges_m: Float32Array = (rng.choice([4.0, 4.7, 5.3, 9.0], shape) + rng.random(shape)).astype(np.float32)
+    ranges_m[rng.random(shape) < 0.1] = np.inf
+    photons = np.where(np.isinf(ranges_m), 0.0, rng.random(shape) + 0.01).astype(np.float32)
+    owners = rng.integers(0, 3, shape).astype(np.int32)
+    owners[:, :50] = 2
+    owner, share = divide_light(owners, ranges_m, photons)
+    for pixel in range(shape[1]):
+        hits = sorted(zip(ranges_m[:, pixel], photons[:, pixel], owners[:, pixel], strict=True))
+        groups: list[list[tuple[float, float, int]]] = []
+        for hit in (each for each in hits if np.isfinite(each[0])):
+            if groups and hit[0] - groups[-1][-1][0] < PULSE_M:
+                groups[-1].append(hit)
+            else:
+                groups.append([hit])
+        best = max(groups, key=lambda group: sum(p for _, p, _ in group))
+        light = [sum(p for _, p, o in best if o == each) for each in range(3)]
+        assert share[pixel] == pytest.approx(max(light) / sum(light), rel=1e-5)
+        assert owner[pixel] == np.argmax(light)

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +20,7 @@ from sim.geometry.mesh import Mesh, box_mesh, move_mesh
 from sim.geometry.raycast import Caster
 from sim.scene import Scene, build_world
 from sim.sensor import lidar, optics
+from sim.sensor.footprint import Echo, spread_echo
 from sim.sensor.lidar import FALSE_RETURN, MISS, Scan, scan
 from sim.sensor.optics import detection_probability, range_sigma_m, received_photons
 from sim.sensor.rays import Rays, revolution_rays
@@ -273,35 +276,59 @@ def test_each_effect_draws_from_a_stream_of_its_own(sensor: SensorMetadata, monk
     assert len(set(asked)) == 3
 
 
-def test_a_pixel_is_mixed_when_its_echo_lies_off_what_it_is_said_to_hit(
+def test_a_pixel_is_mixed_when_no_owner_sent_nine_tenths_of_its_light(
     sensor: SensorMetadata, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # So much noise and so many dropouts that mixed pixels are told apart without either.
     monkeypatch.setattr(lidar, "range_sigma_m", lambda *_: np.float32(0.08))
     monkeypatch.setattr(lidar, "detection_probability", lambda _: np.float32(0.7))
+    echoes: list[Echo] = []
+
+    def listening(*given: Any) -> Echo:
+        echoes.append(spread_echo(*given))
+        return echoes[-1]
+
+    monkeypatch.setattr(lidar, "spread_echo", listening)
     behind = box_mesh((6.0, 6.0, 6.0))
-    walls = Mesh(behind.vertices, behind.faces[:, ::-1])
-    for depth_m, is_any in ((0.08, False), (0.7, True)):
-        # A post's face in front of the wall at +x.
-        post = move_mesh(box_mesh((0.05, 1.0, 1.5)), make_pose(translation=(5.95 - depth_m, 0.0, 0.0)))
-        shares: Float32Array = np.full(2, 0.5, np.float32)
-        meshes = (walls, post)
-        scene = Scene(meshes, Caster(meshes), np.array([0, 1], np.int32), shares, ("wall", "post"), ("rock", "wood"))
-        one = scan(scene, sensor, IDEAL, still(sensor), 0, "before", 0)
-        assert not one.is_mixed.any()
-        clean, noisy = (
-            scan(scene, sensor, settings.model_copy(update={"sub_rays": 7}), still(sensor), 0, "before", 0)
-            for settings in (IDEAL, Sensor())
-        )
-        off_m = np.abs(clean.range_mm / 1000.0 - clean.true_range_m)
-        is_sure = np.abs(off_m - 0.1) > 1e-3
-        np.testing.assert_array_equal(clean.is_mixed[is_sure], off_m[is_sure] > 0.1)
-        is_at_post = clean.is_mixed & (np.abs(sensor.directions[..., 1]) < 0.3) & (sensor.directions[..., 0] > 0)
-        assert (is_at_post.sum() > 10) == is_any
-        kept = noisy.geom >= 0
-        assert 0.6 < kept.mean() < 0.8
-        np.testing.assert_array_equal(noisy.is_mixed[kept], clean.is_mixed[kept])  # noise and dropouts do not make one
-        assert not noisy.is_mixed[~kept].any()
+    # A leaning post in front of the wall at +x, whose echoes blend.
+    lean = Rotation.from_euler("x", 20, degrees=True).as_matrix()
+    post = move_mesh(box_mesh((0.05, 1.0, 1.5)), make_pose(lean, (5.4, 0.0, 0.0)))
+    meshes = (Mesh(behind.vertices, behind.faces[:, ::-1]), post)
+    shares: Float32Array = np.full(2, 0.5, np.float32)
+    scene = Scene(meshes, Caster(meshes), np.array([0, 1], np.int32), shares, ("wall", "post"), ("rock", "wood"))
+    one = scan(scene, sensor, IDEAL, still(sensor), 0, "before", 0)
+    assert not one.is_mixed.any() and echoes == []
+    np.testing.assert_array_equal(one.owner, one.geom)
+    clean, noisy, unowned = (
+        scan(scene, sensor, settings.model_copy(update={"sub_rays": 7}), still(sensor), 0, "before", 0, owners)
+        for settings, owners in ((IDEAL, None), (Sensor(), None), (IDEAL, np.zeros(2, np.int32)))
+    )
+    share, owner = echoes[0].owner_share.T, echoes[0].owner.T
+    assert ((share > 0.5) & (share < 0.9)).sum() > 5 < ((share > 0.9) & (share < 1.0)).sum()
+    np.testing.assert_array_equal(clean.is_mixed, share < 0.9)
+    np.testing.assert_array_equal(clean.owner, owner)
+    assert {0, 1} == set(clean.owner[clean.is_mixed].tolist())
+    kept = noisy.geom >= 0
+    assert 0.6 < kept.mean() < 0.8
+    np.testing.assert_array_equal(noisy.is_mixed[kept], clean.is_mixed[kept])  # noise and dropouts do not make one
+    np.testing.assert_array_equal(noisy.owner[kept], clean.owner[kept])
+    assert not noisy.is_mixed[~kept].any() and not noisy.owner[~kept].any()
+    # where nobody owns either, the same returns are of one owner
+    assert not unowned.is_mixed.any() and not unowned.owner.any()
+    np.testing.assert_array_equal(unowned.range_mm, clean.range_mm)
+
+
+@pytest.mark.parametrize(("share", "is_mixed"), [(0.6, True), (0.899, True), (0.9, False), (0.95, False)])
+def test_sixty_to_forty_is_mixed_and_ninety_five_to_five_is_not(
+    share: float, is_mixed: bool, sensor: SensorMetadata, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def divided(*given: Any) -> Echo:
+        echo = spread_echo(*given)
+        return replace(echo, owner_share=np.full_like(echo.owner_share, share))
+
+    monkeypatch.setattr(lidar, "spread_echo", divided)
+    result = scan(room((4.0, 4.0, 4.0), 0.5), sensor, Sensor(sub_rays=7), still(sensor), 0, "before", 0)
+    np.testing.assert_array_equal(result.is_mixed, (result.geom >= 0) & is_mixed)
 
 
 @pytest.mark.parametrize("settings", [Sensor(), EVERYTHING], ids=["default", "everything"])
