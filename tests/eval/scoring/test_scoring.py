@@ -36,8 +36,7 @@ ONES = (
     "kind_accuracy",
 )
 COLUMN_TEXT = """
-scenario family domain pair_kind seed variant preset status error metrics_version checkpoints n_changes n_observable
-score_radius_m
+scenario family domain pair_kind seed variant preset status error metrics_version n_changes n_observable score_radius_m
 region_recall region_precision region_recall_at_k region_auroc region_ap keyframe_coverage is_auroc_assumed
 false_regions_per_100m region_coverage
 n_regions n_true_regions n_false_regions n_duplicate_regions n_ignored_regions n_found_changes
