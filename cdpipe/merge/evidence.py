@@ -84,7 +84,7 @@ def measure_fit(
     moved = transform(before_T_after, own)
     found, squared_m2 = fine.tree.batch_nearest_neighbor_search(moved)
     normals = fine.normals[found]
-    forward_m = _plane_distances(moved, fine.points[found], normals, np.asarray(squared_m2))
+    forward_m = plane_distances(moved, fine.points[found], normals, np.asarray(squared_m2))
     is_seen = np.isfinite(forward_m)
     jacobian = plane_jacobian(own[is_seen] - centre_after, normals[is_seen] @ before_T_after[:3, :3])
     information = jacobian.T @ jacobian
@@ -94,7 +94,7 @@ def measure_fit(
     theirs = transform(invert(before_T_after), before.points[chosen])
     found, squared_m2 = after.tree.batch_nearest_neighbor_search(theirs)
     turned = fine.normals[chosen] @ before_T_after[:3, :3]
-    backward_m = _plane_distances(theirs, after.points[found], turned, np.asarray(squared_m2))
+    backward_m = plane_distances(theirs, after.points[found], turned, np.asarray(squared_m2))
     return SurfaceFit(forward_m, backward_m, information)
 
 
@@ -130,9 +130,17 @@ def _explain_both_ways(evidence: Mapping[str, float]) -> str:
     )
 
 
-def _plane_distances(
+def plane_distances(
     points: Float64Array, nearest: Float64Array, normals: Float64Array, squared_m2: Float64Array
 ) -> Float64Array:
+    """Return the (N,) point-to-plane distances, metres; inf if the nearest point is over 0.5 m away.
+
+    Args:
+        points: (N, 3) points.
+        nearest: (N, 3) nearest point of the surface to each.
+        normals: (N, 3) their unit normals.
+        squared_m2: (N,) squared distances of both.
+    """
     distances = np.abs(np.einsum("ij,ij->i", points - nearest, normals))
     return np.where(squared_m2 < _COUNTERPART_M**2, distances, np.inf)
 

@@ -15,7 +15,7 @@ from time import perf_counter
 
 import numpy as np
 
-from cdpipe.core.geometry import Float64Array, Int64Array, invert, transform
+from cdpipe.core.geometry import Float64Array, Int64Array, invert, transform, travelled_m
 from cdpipe.merge.candidates import Candidate, find_candidates, find_closest_pair
 from cdpipe.merge.evidence import SurfaceFit, explain_refusal, measure_fit, sample_evenly
 from cdpipe.merge.global_registration import is_kiss_matcher_installed, register_globally
@@ -52,6 +52,9 @@ _MIN_PLACES, _GOOD_FIT = 3, 0.7
 _FINE_M, _FINE_REACHES_M, _ALL_SAMPLES = 0.2, (1.0, 0.5, 0.25, 0.25), 2000
 # Cosine of 15 degrees, the largest tilt between the two maps.
 _UPRIGHT = 0.966
+# Largest displacement of a place by which a checked refinement may change a known alignment: a constant, or a share of
+# the path, which is what odometry drifts.
+_KNOWN_M, _KNOWN_SHARE = 1.0, 0.01
 # Longest correspondences of the walk, metres: above the drift between two stops, below the width of a narrow drift.
 _FIRST_TRY_M, _CHECK_REACH_M = 1.0, 1.5
 
@@ -93,10 +96,10 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     if reason and config.fallback and not is_kiss_matcher_installed():
         reason += " (KISS-Matcher could not be asked: pip install 'tunnelcd[kiss]')"
     before_T_after, local = best.before_T_after, None
-    if not reason and config.refine == "local" and "both_ways_m" not in evidence:  # one place is one registration
+    if not reason and config.refine != "none" and "both_ways_m" not in evidence:  # one place is one registration
         refining = perf_counter()
         del maps  # the refinement indexes both maps anew: at no time are there two indices of one map
-        local, measured = refine(before.map, after.map, best.walk, config)
+        local, measured = refine(before.map, after.map, best.walk, before_T_after, config)
         evidence |= measured
         if local is not None:
             before_T_after = fit_rigid(local.anchors_odom, local.before_T_after)
@@ -110,7 +113,8 @@ def take_known_merge(
     """Return both maps with an alignment that the user knows; no gate is asked.
 
     Evidence: `is_known` is 1; the other measurements are those of a walk that starts at the known alignment. With
-    `config.refine` the alignment is refined along the path, and stays as it is where the refinement does not fit.
+    `config.refine` the alignment is refined along the path, and stays as it is where the refinement does not fit. A
+    checked refinement moves no place by more than 1 m or 1 % of the after path, if that is more.
 
     Args:
         before: The before session.
@@ -130,17 +134,22 @@ def take_known_merge(
     found = _judge(_Start(int(np.argmin(distances_m)), before_T_after, known), maps, config)
     evidence, local, refined = dict(found.evidence), None, before_T_after
     walked = perf_counter()
-    if config.refine == "local" and "both_ways_m" in evidence:
-        refined = before_T_after if explain_refusal(evidence, config) else found.before_T_after
-    elif config.refine == "local":
+    within_m = np.inf
+    if config.refine == "checked":
+        within_m = max(_KNOWN_M, _KNOWN_SHARE * float(travelled_m(after.map.odom_T_keyframe)[-1]))
+    if config.refine != "none" and "both_ways_m" in evidence:
+        place = maps[1].positions[found.walk.keyframes[0]]
+        is_near = motion_between(found.before_T_after, before_T_after, place)[0] <= within_m
+        refined = found.before_T_after if is_near and not explain_refusal(evidence, config) else before_T_after
+    elif config.refine != "none":
         del maps
-        local, measured = refine(before.map, after.map, found.walk, config)
+        local, measured = refine(before.map, after.map, found.walk, before_T_after, config, within_m)
         evidence |= measured
         refined = before_T_after if local is None else fit_rigid(local.anchors_odom, local.before_T_after)
     seconds = {
         "t_index_s": indexed - start,
         "t_merge_s": walked - indexed,
-        "t_refine_s": perf_counter() - walked if config.refine == "local" else 0.0,
+        "t_refine_s": perf_counter() - walked if config.refine != "none" else 0.0,
     }
     return replace(merged, before_T_after=refined, evidence=evidence, local=local, seconds=seconds)
 

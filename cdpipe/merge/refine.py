@@ -8,6 +8,9 @@ Distant points carry the odometry error at the time they were observed. If the t
 (the stretch), surfaces that were seen on approach are displaced along the path. The error of a registration is
 proportional to the stretch and follows from the sensor positions from which the points were seen. The pose graph
 estimates the stretch.
+
+With `merge.refine: checked` one fifth of the after points is held out, and the refined alignment holds where these
+points do not fit the rigid merge better (`cdpipe.merge.held_out`).
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform, travelled_m
 from cdpipe.merge.evidence import sample_evenly
+from cdpipe.merge.held_out import HELD_OUT_EVERY, choose_alignment
 from cdpipe.merge.pose_graph import solve_pose_graph
 from cdpipe.merge.registration import IndexedMap, plane_jacobian, solve_point_to_plane
 from cdpipe.merge.walk import Step, Walk, walk
@@ -28,9 +32,9 @@ _SPACING, _SPACING_M = 0.6, 4.0
 # Points seen from farther than this are left out: 2.5 wall distances, at least 6 m. The wall distance is the 20th
 # percentile of the shortest range of each map point.
 _SEEN_WITHIN, _WALL_PERCENTILE, _SEEN_WITHIN_M = 2.5, 20, 6.0
-# Radius of a sphere: 1.8 wall distances, at least 5 m. A smaller sphere holds too little of the walls. The voxel size
-# is proportional.
+# Radius of a sphere: 1.8 wall distances, at least 5 m. A smaller sphere holds too little of the walls.
 _RADIUS, _RADIUS_M = 1.8, 5.0
+# Voxel size of a sphere; with `refine: local` it grows with the radius.
 _VOXEL, _VOXEL_M = 0.06, 0.4
 _CORRESPONDENCE_M = 1.0
 # Standard deviation of a map point's distance to the surface.
@@ -46,21 +50,29 @@ _MIN_GOOD_SHARE = 0.5
 
 
 def refine(
-    before_map: PointMap, after_map: PointMap, found: Walk, config: MergeConfig
+    before_map: PointMap,
+    after_map: PointMap,
+    found: Walk,
+    rigid: Float64Array,
+    config: MergeConfig,
+    within_m: float = np.inf,
 ) -> tuple[PathAlignment | None, dict[str, float]]:
     """Return the alignment along the after path, and its evidence.
 
     Evidence: `n_refined` registrations, `refined_inlier_share` (their mean inlier share), `max_correction_m` (largest
-    displacement of an anchor by the refinement).
+    displacement of an anchor by the refinement). If it is checked, also that of `choose_alignment`.
 
     Args:
         before_map: The before map.
         after_map: The after map.
         found: The accepted walk.
+        rigid: (4, 4) `before_T_after` of the rigid merge.
         config: Settings of the merge.
+        within_m: The rigid merge holds at places that the refinement would move farther; used if it is checked.
 
     Returns:
-        The alignment at every after keyframe, or None if fewer than half of the registrations fit.
+        The alignment at every after keyframe, or None if fewer than half of the registrations fit, or if the rigid
+        merge fits better everywhere.
     """
     if not np.isfinite(found.fits).any():
         return None, {"n_refined": 0.0}
@@ -68,13 +80,16 @@ def refine(
     seen_within_m = min(max(_SEEN_WITHIN * wall_m, _SEEN_WITHIN_M), config.seen_within_m)
     closer = config.model_copy(update={"seen_within_m": seen_within_m})
     before = IndexedMap(before_map, closer, is_target=True, has_coarse_target=False)
-    after = IndexedMap(after_map, closer, is_target=False)
+    is_checked = config.refine == "checked"
+    is_held_out = is_checked & (np.arange(len(after_map.points)) % HELD_OUT_EVERY == 0)
+    after = IndexedMap(after_map, closer, is_target=False, is_held_out=is_held_out)
     path_m = travelled_m(after_map.odom_T_keyframe)
     radius_m = max(_RADIUS * wall_m, _RADIUS_M)
     keyframes, start = _choose_anchors(path_m, found, max(_SPACING * radius_m, _SPACING_M))
     coarse = PathAlignment(after.positions[found.keyframes], found.before_T_after)
     first = int(np.nanargmax(found.fits))
-    step = Step(radius_m, max(_VOXEL * radius_m, _VOXEL_M), _CORRESPONDENCE_M)
+    voxel_m = _VOXEL_M if is_checked else max(_VOXEL * radius_m, _VOXEL_M)
+    step = Step(radius_m, voxel_m, _CORRESPONDENCE_M)
     walked = walk(before, after, keyframes, start, found.before_T_after[first], step, config)
     is_good = walked.fits >= _MIN_FIT
     evidence = {"n_refined": float(np.count_nonzero(is_good))}
@@ -85,6 +100,16 @@ def refine(
     per_stretch = _per_stretch(before, after, walked, is_good, radius_m)
     graph = solve_pose_graph(positions, walked.before_T_after, information, per_stretch)
     local = graph.at(path_m[walked.keyframes], path_m, after.positions)
+    if is_checked:
+        held_out = after_map.points[is_held_out & (after_map.nearest_m <= seen_within_m)]
+        places = walked.keyframes[np.isfinite(walked.fits)]
+        chosen, judged = choose_alignment(
+            before, held_out, after_map.odom_T_keyframe, places, local, rigid, radius_m, within_m
+        )
+        evidence |= judged
+        if chosen is None:
+            return None, evidence
+        local = chosen
     alignment = PathAlignment(after.positions, local)
     moved_m = np.linalg.norm(alignment.to_map(positions) - coarse.to_map(positions), axis=1)
     return alignment, {

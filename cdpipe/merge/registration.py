@@ -11,7 +11,7 @@ import small_gicp
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import Float32Array, Float64Array, invert, make_pose, transform
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, invert, make_pose, transform
 from cdpipe.core.grid_index import GridIndex, column_keys
 from cdpipe.core.voxel import cell_keys
 from cdpipe.model.config import MergeConfig
@@ -52,7 +52,8 @@ class IndexedMap:
     """A map indexed for merging; a robot can do this while it maps.
 
     Only points that were seen from within `merge.seen_within_m` are used: distant points carry the odometry error at
-    the time they were observed. A target is thinned to `merge.target_voxel_m` (reports/merge/notes).
+    the time they were observed. A target is thinned to `merge.target_voxel_m` (reports/merge/notes). The (N,) points of
+    the map that are held out are left out.
 
     Attributes:
         map: The map.
@@ -65,10 +66,17 @@ class IndexedMap:
     """
 
     def __init__(
-        self, point_map: PointMap, config: MergeConfig, is_target: bool, has_coarse_target: bool = True
+        self,
+        point_map: PointMap,
+        config: MergeConfig,
+        is_target: bool,
+        has_coarse_target: bool = True,
+        is_held_out: BoolArray | None = None,
     ) -> None:
         self.map = point_map
         is_near = point_map.nearest_m <= config.seen_within_m
+        if is_held_out is not None:
+            is_near &= ~is_held_out
         near = point_map.points[is_near]
         seen_from = near if point_map.seen_from is None else point_map.seen_from[is_near]
         self.points, self.seen_from = _thin(near, seen_from, config.target_voxel_m) if is_target else (near, seen_from)

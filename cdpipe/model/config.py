@@ -92,7 +92,10 @@ class MergeConfig(Settings):
     accept_all: bool = Field(False, description="accept every alignment, as FRAME does")
     fallback: bool = Field(True, description="if nothing is accepted, try KISS-Matcher (extra `kiss`)")
     kiss_voxel_m: Cell = Field(0.6, description="cell of KISS-Matcher")
-    refine: Literal["none", "local"] = Field("local", description="align again every few metres along the overlap")
+    refine: Literal["none", "local", "checked"] = Field(
+        "local",
+        description="align again every few metres along the overlap; `checked`: unless held-out points fit worse",
+    )
 
 
 class QueryConfig(Settings):

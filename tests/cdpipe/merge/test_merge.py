@@ -230,6 +230,29 @@ def test_a_known_merge_is_taken_as_it_is_or_refined(
     assert set(refined.seconds) == {"t_index_s", "t_merge_s", "t_refine_s"}
 
 
+@pytest.mark.parametrize("refine", ["local", "checked"])
+def test_a_checked_refinement_moves_a_known_merge_by_a_metre_at_most(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array, refine: str
+) -> None:
+    config = CONFIG.model_copy(update={"refine": refine})
+    for off_m in (0.8, 1.2):
+        known = make_pose(translation=(0.0, off_m, 0.0)) @ true_before_T_after
+        merged = take_known_merge(tunnel_before, tunnel_after, known, config)
+        if refine == "local" or off_m < 1:
+            assert path_error_m(merged, true_before_T_after) < 0.03
+        else:
+            assert merged.local is None and merged.evidence["n_kept"] == 0
+            np.testing.assert_array_equal(merged.before_T_after, known)
+    # of one place as well
+    before, after = stand(30.0, 0, np.eye(4)), stand(30.6, 1, AFTER_ODOM_T_WORLD)
+    far = make_pose(translation=(0.0, 1.2, 0.0)) @ invert(AFTER_ODOM_T_WORLD)
+    merged = take_known_merge(before, after, far, config)
+    if refine == "checked":
+        np.testing.assert_array_equal(merged.before_T_after, far)
+    else:
+        assert path_error_m(merged, invert(AFTER_ODOM_T_WORLD)) < 0.02
+
+
 def test_no_gate_is_asked_about_a_known_merge(tunnel_before: MappedSession, other_tunnel: MappedSession) -> None:
     for far_m in (0.0, 1000.0):
         known = make_pose(translation=(0.0, far_m, 0.0))

@@ -6,22 +6,26 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import make_pose
+from cdpipe.core.geometry import Float64Array, make_pose
+from cdpipe.merge.held_out import choose_alignment
 from cdpipe.merge.merge import merge_maps
+from cdpipe.merge.pose_graph import PoseGraph, solve_pose_graph
 from cdpipe.merge.refine import _discount_normal_noise, refine
 from cdpipe.merge.registration import IndexedMap
-from cdpipe.merge.walk import Walk
+from cdpipe.merge.walk import Walk, walk
+from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import MergeConfig
 from cdpipe.model.types import MappedSession, PointMap
 
 
+@pytest.mark.parametrize("mode", ["local", "checked"])
 @pytest.mark.parametrize("scales", [(1.005, 0.995), (0.995, 1.005), (1.0, 1.0)])
 def test_maps_that_stretch_differently_are_aligned_where_the_robot_stood(
-    looking_ahead: Callable[[int, float], MappedSession], scales: tuple[float, float]
+    looking_ahead: Callable[[int, float], MappedSession], scales: tuple[float, float], mode: str
 ) -> None:
     # a sensor that looks ahead puts every face where the odometry stood some metres before it
     before, after = (looking_ahead(sample, scale) for sample, scale in enumerate(scales, 1))
-    merged = merge_maps(before, after, MergeConfig(fallback=False))
+    merged = merge_maps(before, after, MergeConfig(fallback=False, refine=mode))
     assert merged.is_accepted
     assert merged.local is not None
     path = after.map.odom_T_keyframe[:, :3, 3]
@@ -63,15 +67,58 @@ def wide_drift(sample: int) -> PointMap:
     )
 
 
-def test_the_walls_of_a_wide_drift_are_looked_at() -> None:
+def refine_wide_drift(mode: str, off_m: float) -> tuple[PathAlignment | None, dict[str, float], Float64Array]:
+    """Refine two samples of the wide drift from an alignment that is off along it; also return the after path."""
     before, after = (wide_drift(sample) for sample in (1, 2))
-    config = MergeConfig(fallback=False)
-    maps = IndexedMap(before, config, is_target=True), IndexedMap(after, config, is_target=False)
-    keyframes = np.array([10, 25, 40])
-    coarse = np.repeat(make_pose(translation=(0.15, 0, 0))[None], 3, axis=0)
-    found = Walk(keyframes, coarse, np.zeros((3, 6, 6)), np.ones(3), np.zeros(3))
-    alignment, evidence = refine(maps[0].map, maps[1].map, found, config)
+    rigid = make_pose(translation=(off_m, 0, 0))
+    found = Walk(
+        np.array([10, 25, 40]), np.repeat(rigid[None], 3, axis=0), np.zeros((3, 6, 6)), np.ones(3), np.zeros(3)
+    )
+    alignment, evidence = refine(before, after, found, rigid, MergeConfig(fallback=False, refine=mode))
+    return alignment, evidence, after.odom_T_keyframe[:, :3, 3]
+
+
+@pytest.mark.parametrize("mode", ["local", "checked"])
+def test_the_walls_of_a_wide_drift_are_looked_at(mode: str) -> None:
+    alignment, evidence, path = refine_wide_drift(mode, off_m=0.15)
     assert alignment is not None
     assert evidence["n_refined"] > 8
-    path = after.odom_T_keyframe[:, :3, 3]
     assert np.linalg.norm(alignment.to_map(path) - path, axis=1).max() < 0.01
+    if mode == "checked":
+        assert evidence["n_kept"] == evidence["n_judged"] == evidence["n_refined"]
+        assert evidence["refined_misfit"] < evidence["rigid_misfit"]
+    else:
+        assert "n_judged" not in evidence
+
+
+@pytest.mark.parametrize("mode", ["local", "checked"])
+def test_a_refinement_that_fits_worse_is_taken_back(monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
+    def solve_wrongly(positions: Float64Array, registered: Float64Array, *others: Float64Array) -> PoseGraph:
+        return solve_pose_graph(positions, make_pose(translation=(0.4, 0, 0)) @ registered, *others)
+
+    monkeypatch.setattr("cdpipe.merge.refine.solve_pose_graph", solve_wrongly)
+    alignment, evidence, path = refine_wide_drift(mode, off_m=0.02)
+    if mode == "checked":
+        assert alignment is None
+        assert evidence["n_kept"] == 0 and evidence["rigid_misfit"] < evidence["refined_misfit"]
+    else:
+        assert alignment is not None and np.linalg.norm(alignment.to_map(path) - path, axis=1).min() > 0.3
+
+
+def test_points_that_are_held_out_are_not_registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: dict[str, Float64Array] = {}
+
+    def note(before: IndexedMap, after: IndexedMap, *others: object) -> Walk:
+        seen["registered"] = after.points
+        return walk(before, after, *others)
+
+    def choose(before: IndexedMap, held_out: Float64Array, *others: object) -> tuple[Float64Array | None, dict]:
+        seen["judging"] = held_out
+        return choose_alignment(before, held_out, *others)
+
+    monkeypatch.setattr("cdpipe.merge.refine.walk", note)
+    monkeypatch.setattr("cdpipe.merge.refine.choose_alignment", choose)
+    refine_wide_drift("checked", off_m=0.02)
+    both = np.concatenate([seen["registered"], seen["judging"]])
+    assert len(np.unique(both, axis=0)) == len(both)
+    assert len(seen["judging"]) == pytest.approx(len(both) / 5, rel=0.02)
