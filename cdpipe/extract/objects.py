@@ -103,7 +103,8 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
                 shape=ObjectShape(*upright_box(points[number]), volume_m3),
             )
         )
-    return _link_moves(objects, points, is_part, surroundings)
+    is_cut_finely = all(group.returns is not None for group in groups)
+    return _link_moves(objects, points, is_part, surroundings, nearest_twins=is_cut_finely)
 
 
 def _link_moves(
@@ -111,6 +112,8 @@ def _link_moves(
     points: Mapping[int, Float64Array],
     is_part: Mapping[int, bool],
     surroundings: _Surroundings,
+    *,
+    nearest_twins: bool,
 ) -> tuple[ChangedObject, ...]:
     before = [number for number, item in enumerate(objects) if item.session == "before"]
     removed = [number for number in before if not (is_part[number] and is_heap(points[number]))]
@@ -120,7 +123,8 @@ def _link_moves(
     def around(pairs: Sequence[tuple[int, int]]) -> list[tuple[Float64Array, Float64Array]]:
         return surroundings.standing([np.concatenate([points[removed[r]], points[added[a]]]) for r, a in pairs])
 
-    for move in find_moves([points[n] for n in removed], [points[n] for n in added], may_go_far, around):
+    ends = [points[n] for n in removed], [points[n] for n in added]
+    for move in find_moves(*ends, may_go_far, around, nearest_twins=nearest_twins):
         start, end = removed[move.removed], added[move.added]
         for number, partner in ((start, end), (end, start)):
             objects[number] = replace(

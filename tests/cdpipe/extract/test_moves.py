@@ -186,8 +186,9 @@ def test_turning_the_map_turns_the_displacement() -> None:
 
 def test_among_very_many_the_right_one_is_tried() -> None:
     crate = box((1.0, 0.7, 0.6), "lrfb")
-    others = [shifted(box((1.0 + 0.02 * n, 0.7 - 0.02 * n, 0.6), "lrfb"), 3.0, 2.0 * n) for n in range(1, 12)]
-    (move,) = moves([crate], [*others, shifted(crate, 4.0)], [True])
+    longer = [box((1.0 + 0.02 * n, 0.7 - 0.02 * n, 0.6), "lrfb") for n in (5, 6, 7, 8, 9, 10) * 2]
+    others = [shifted(each, 3.0, 2.0 * n) for n, each in enumerate(longer)]  # nearer, and not equal
+    (move,) = moves([crate], [*others, shifted(crate, 14.0)], [True])
     assert move.added == len(others)
 
 
@@ -196,3 +197,65 @@ def test_a_few_points_are_nobody() -> None:
     assert moves([few], [shifted(few, 2.0)], [True]) == []
     assert moves([few[:1]], [chair()], [True]) == []
     assert moves([], [chair()], []) == moves([chair()], [], [True]) == []
+
+
+def seen(points: Float64Array, share: float, purpose: str) -> Float64Array:
+    """Some of the points, with noise."""
+    return noisy(points[stream(6, "seen", purpose).random(len(points)) < share], purpose, 0.005)
+
+
+def at(points: Float64Array, x: float, y: float, turn_rad: float) -> Float64Array:
+    return transform(yaw_pose(turn_rad, (x, y, 0.0)), points)
+
+
+def linked(found: Sequence[Move]) -> set[tuple[int, int]]:
+    return {(move.removed, move.added) for move in found}
+
+
+def test_of_equal_objects_each_moved_to_where_one_is_nearest_however_many_points_it_has() -> None:
+    # three barrels and a fourth went, each seen from afar before and from near after or the other way round
+    shares, places = ((1.0, 0.35), (0.35, 1.0), (0.9, 0.4)), (0.0, 40.0, 80.0)
+    removed = [seen(at(barrel(), x, 0, x), share, f"gone {x}") for x, (share, _) in zip(places, shares, strict=True)]
+    added = [
+        seen(at(barrel(), x + 3, 1, 1.0), share, f"come {x}") for x, (_, share) in zip(places, shares, strict=True)
+    ]
+    removed.append(seen(at(barrel(), 60.0, 0.0, 0.3), 1.0, "taken away"))
+    added.append(seen(at(barrel(), 120.0, 0.0, 0.3), 1.0, "put there"))
+    found = moves(removed, added, [True] * 4)
+    assert linked(found) == {(0, 0), (1, 1), (2, 2), (3, 3)}
+    # points alone give the barrels of many points to one another
+    nothing = np.zeros((0, 3))
+    by_points = find_moves(
+        removed, added, [True] * 4, lambda pairs: [(nothing, nothing)] * len(pairs), nearest_twins=False
+    )
+    assert linked(by_points) != linked(found)
+    # without the two that lie far apart, and with one of them
+    assert linked(moves(removed[:3], added[:3], [True] * 3)) == {(0, 0), (1, 1), (2, 2)}
+    assert linked(moves(removed, added[:3], [True] * 4)) == {(0, 0), (1, 1), (2, 2)}
+    assert linked(moves(removed[:3], added, [True] * 3)) == {(0, 0), (1, 1), (2, 2)}
+
+
+def test_the_whole_of_the_ways_counts_not_the_way_of_the_first() -> None:
+    # the removed crate at 0 is nearest to the added one at 4, which is the only one near the crate at 6
+    crate = box((1.0, 0.7, 0.6), "lrfb")
+    removed, added = [crate, shifted(crate, 8.0)], [shifted(crate, 4.5), shifted(crate, -5.0)]
+    assert linked(moves(removed, added, [True, True])) == {(0, 1), (1, 0)}
+
+
+def test_the_nearest_of_very_many_equal_ones_is_tried() -> None:
+    crate = box((1.0, 0.7, 0.6), "lrfb")
+    removed = [seen(shifted(crate, 10.0 * n), 0.8, f"gone {n}") for n in range(9)]
+    added = [seen(shifted(crate, 10.0 * n + 2.5), 0.8, f"come {n}") for n in range(9)]
+    assert linked(moves(removed, added, [True] * 9)) == {(n, n) for n in range(9)}
+
+
+def test_a_fragment_beside_the_place_is_no_twin_of_the_whole() -> None:
+    crate = box((1.0, 0.7, 0.6), "lrfb")
+    fragment = shifted(crate[crate[:, 0] > 0.7], 1.3)
+    found = moves([crate, fragment], [shifted(crate, 4.0)], [True, True])
+    assert linked(found) == {(0, 0)}
+
+
+def test_a_crate_a_fifth_larger_is_no_twin_though_it_is_nearer() -> None:
+    crate = box((1.0, 0.7, 0.6), "lrfb")
+    assert linked(moves([crate], [shifted(1.2 * crate, 2.0), shifted(crate, 9.0)], [True])) == {(0, 1)}
