@@ -14,6 +14,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.voxel import cell_keys
 from cdpipe.model.report import ChangedObject
 from eval.core.statistics import mean
+from eval.scoring.twins import is_kind_right, label_changes
 from eval.truth.ground_truth import SESSIONS, GroundTruth
 from eval.truth.scoring_points import CELL_M
 from sim.session.truth import MIXED
@@ -136,24 +137,17 @@ def match_objects(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], 
 def judge_kinds(objects: Sequence[ChangedObject], matches: ObjectMatches, truth: GroundTruth) -> Float64Array:
     """Return (C,) whether each matched change has the right kind: 1, 0, or NaN where nothing matched.
 
-    A moved change is right if its object has the kind moved and is linked with the object matched to the change's other
-    half. If that other half is not observable, the kind that one session alone shows is right as well: added in the
-    after session, removed in the before session.
+    Among twins, props that nothing tells apart, the labels that suit the answer best count (`eval.scoring.twins`).
     """
-    changes = truth.pair.changes
-    place = {change.id: index for index, change in enumerate(changes)}
-    right = np.full(len(changes), np.nan)
-    for index in np.flatnonzero(matches.matched_object >= 0):
-        change, item = changes[index], objects[matches.matched_object[index]]
-        is_right = item.kind == change.kind
-        if change.kind == "moved" and change.partner is not None:
-            other = place[change.partner]
-            if truth.is_observable[other]:
-                is_right = is_right and item.partner >= 0 and item.partner == matches.matched_object[other]
-            else:
-                is_right = is_right or item.kind == ("added" if change.session == "after" else "removed")
-        right[index] = float(is_right)
-    return right
+    matched_object = matches.matched_object
+    labels = label_changes(objects, matched_object, truth)
+    return np.array(
+        [
+            float(is_kind_right(objects, matched_object, truth, index, label)) if matched >= 0 else np.nan
+            for index, (matched, label) in enumerate(zip(matched_object, labels, strict=True))
+        ],
+        dtype=np.float64,
+    )
 
 
 def summarise_objects(matches: ObjectMatches, right: Float64Array, truth: GroundTruth) -> dict[str, float]:

@@ -12,6 +12,7 @@ from cdpipe.model.report import ChangedObject
 from eval.core.statistics import median
 from eval.scoring.object_metrics import ObjectMatches
 from eval.scoring.region_metrics import transform_to_map
+from eval.scoring.twins import Label, label_changes, list_drawn_labels
 from eval.truth.ground_truth import GroundTruth
 from sim.session.truth import Change
 
@@ -41,7 +42,7 @@ def compute_size_errors(objects: Sequence[ChangedObject], matches: ObjectMatches
     """
     changes = truth.pair.changes
     errors = SizeErrors(*(np.full(len(changes), np.nan) for _ in range(2)))
-    moves = find_true_displacements_map(truth)
+    moves = find_true_displacements_map(truth, label_changes(objects, matches.matched_object, truth))
     for index in np.flatnonzero(matches.matched_object >= 0):
         item = objects[matches.matched_object[index]]
         if item.displacement_map is not None:
@@ -52,12 +53,16 @@ def compute_size_errors(objects: Sequence[ChangedObject], matches: ObjectMatches
     return errors
 
 
-def find_true_displacements_map(truth: GroundTruth) -> Float64Array:
+def find_true_displacements_map(truth: GroundTruth, labels: Sequence[Label] | None = None) -> Float64Array:
     """Return the (C, 3) displacement of each moved object, map frame, metres; NaN for objects that did not move.
 
     A displacement joins the centres of the object's bounding box before and after the move. Each centre is transformed
     into the map frame by the true pose of the judged before scan nearest to it in the world. The drift of the before
     odometry between both places belongs to the map frame and is no error of the answer.
+
+    Args:
+        truth: The pair's truth, C changes.
+        labels: (C,) what happened to each change; None: what the scenario says.
     """
     changes = truth.pair.changes
     if not changes:
@@ -66,11 +71,10 @@ def find_true_displacements_map(truth: GroundTruth) -> Float64Array:
     heights_m = {prop["name"]: float(prop["size_m"][2]) for prop in props if prop.get("size_m")}
     middles_world = np.array([_find_middle_world(change, heights_m.get(change.name, 0.0)) for change in changes])
     places = transform_to_map(middles_world, truth.before)
-    at = {change.id: index for index, change in enumerate(changes)}
     moves = np.full((len(changes), 3), np.nan)
-    for index, change in enumerate(changes):
-        if change.kind == "moved" and change.partner in at:
-            ends = (at[change.partner], index) if change.session == "after" else (index, at[change.partner])
+    for index, (change, label) in enumerate(zip(changes, labels or list_drawn_labels(truth), strict=True)):
+        if label.other >= 0:
+            ends = (label.other, index) if change.session == "after" else (index, label.other)
             moves[index] = places[ends[1]] - places[ends[0]]
     return moves
 

@@ -37,7 +37,7 @@ from eval.scoring.object_sizes import SizeErrors, compute_size_errors, summarise
 from eval.scoring.region_metrics import RegionScores, score_regions, score_unanswered_regions
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
-METRICS_VERSION = 6
+METRICS_VERSION = 7
 _NAN = float("nan")
 Metric = Callable[[GroundTruth, Answer], Mapping[str, float]]
 """`metric(truth, answer)`: columns by name; NaN where undefined. `answer.report` is None where a method gave none."""

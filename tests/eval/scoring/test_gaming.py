@@ -141,6 +141,22 @@ def test_the_surest_object_alone_misses_all_other_changes(tiny_pair: Path, hones
     assert all(row[name] < whole[name] for name in figures)
 
 
+def test_linking_whatever_went_with_whatever_came_pays_among_twins_alone(
+    tiny_pair: Path, tiny_merge: np.ndarray
+) -> None:
+    # the tiny pair has a move and an object that came; the one that went is linked with the one that came
+    report = true_report(tiny_pair, tiny_merge)
+    truth = load_ground_truth(tiny_pair)
+    drawn = [change.kind for change in truth.pair.changes]
+    went, came = drawn.index("moved"), drawn.index("added")
+    items = [replace(item, kind="added", partner=-1) for item in report.objects]
+    for index, partner in ((went, came), (came, went)):
+        items[index] = replace(items[index], kind="moved", partner=partner)
+    linked = replace(report, objects=tuple(items))
+    assert scored(tiny_pair, report).row["kind_accuracy"] == 1.0
+    assert scored(tiny_pair, linked).row["kind_accuracy"] == 0.0
+
+
 def test_objects_without_regions_find_nothing(tiny_pair: Path, honest: ChangeReport) -> None:
     objects = tuple(replace(item, region=-1) for item in honest.objects)
     row = scored(tiny_pair, replace(without_objects_and_regions(honest), objects=objects)).row
