@@ -33,6 +33,7 @@ from cdpipe.extract.extract import extract_changes, make_report
 from cdpipe.io.known_merge import require_rigid
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.mapping import build_map, choose_keyframes
+from cdpipe.mapping.recorded_frames import regions_as_mapped, report_as_recorded
 from cdpipe.mapping.session_check import check_session, unit_hint
 from cdpipe.merge.merge import merge_maps, take_known_merge
 from cdpipe.methods.registry import load_method
@@ -267,12 +268,13 @@ def detect_changes(
         return Done(report, report.seconds)
 
     if propose is not None:
-        regions = Done(propose((described[0].keyframe_scans, described[1].keyframe_scans)), {"t_cd_s": 0.0})
+        recorded = propose((described[0].keyframe_scans, described[1].keyframe_scans))
+        regions = Done(regions_as_mapped(recorded, merged.before), {"t_cd_s": 0.0})
     elif method.propose is not None:
         regions = hooks.run("regions", config, query) if merge is None else hooks.time(query)
     done = hooks.time(answer)
     return replace(
-        done.value,
+        report_as_recorded(done.value, merged.before, merged.after),
         seconds={**done.seconds, **merged.seconds},
         evidence={**done.value.evidence, **_sizes(merged)},
         checkpoints=list_checkpoints(config),
@@ -294,6 +296,7 @@ def detect_merge(
         np.zeros((0, 3)), config.query.radius_m, none, np.zeros((0, 2), dtype=np.int64), none.astype(np.bool_), none
     )
     report = make_report(merged, (before.descriptors, after.descriptors), regions, (), {}, merged.seconds, config)
+    report = report_as_recorded(report, merged.before, merged.after)
     return replace(report, evidence={**merged.evidence, **_sizes(merged)}, checkpoints=list_checkpoints(config))
 
 

@@ -97,3 +97,14 @@ def travelled_m(poses: Float64Array) -> Float64Array:
     """Return the (N,) path length from the first of (N, 4, 4) poses to each of them, metres."""
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def plane_jacobian(offsets: Float64Array, normals: Float64Array) -> Float64Array:
+    """Return the (N, 6) derivative of each point's displacement along its normal by rotation, then translation.
+
+    Args:
+        offsets: (N, 3) points relative to the centre of rotation.
+        normals: (N, 3) normals in the same axes.
+    """
+    (x, y, z), (a, b, c) = offsets.T, normals.T
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=1)

@@ -6,6 +6,7 @@ Returns and range images go to a temporary file where they are large: eleven byt
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -15,6 +16,7 @@ from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array, invert, t
 from cdpipe.core.grid_index import column_keys
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.core.voxel import UniqueCells, cell_corners, cell_keys, max_coordinate_m
+from cdpipe.mapping.consistency import make_consistent
 from cdpipe.mapping.free_space import COLUMNS, ROWS, render_view
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PLACES, KeyframeViews, PointMap, PosedScan, ScanSource
@@ -43,12 +45,15 @@ def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_S
         InputError: A position is too large for this voxel size, or no return is within range.
     """
     _require_reachable(source, config)
+    recorded_T_sensor = None if config.consistency == "none" else source.odom_T_sensor
     keyframe_scans = choose_keyframes(source.odom_T_sensor, config.keyframe_spacing_m)
+    if config.consistency == "scan-to-map":
+        source = make_consistent(source)
     accumulator = _MapAccumulator(config, frozenset(keyframe_scans.tolist()))
     scans = iter(source.scans())
     while batch := list(islice(scans, batch_scans)):
         accumulator.add(batch)
-    return accumulator.finish(source, keyframe_scans)
+    return replace(accumulator.finish(source, keyframe_scans), recorded_T_sensor=recorded_T_sensor)
 
 
 def choose_keyframes(odom_T_sensor: Float64Array, spacing_m: float) -> Int64Array:

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.core.geometry import Float64Array, invert, transform
-from cdpipe.merge.registration import IndexedMap, plane_jacobian
+from cdpipe.core.geometry import Float64Array, invert, plane_jacobian, transform
+from cdpipe.merge.registration import IndexedMap
 from cdpipe.model.config import MergeConfig
 
 # Name of the evidence, and the setting of `merge` that is its lower limit.

@@ -17,11 +17,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform, travelled_m
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, plane_jacobian, transform, travelled_m
 from cdpipe.merge.evidence import sample_evenly
 from cdpipe.merge.held_out import HELD_OUT_EVERY, choose_alignment
 from cdpipe.merge.pose_graph import solve_pose_graph
-from cdpipe.merge.registration import IndexedMap, plane_jacobian, solve_point_to_plane
+from cdpipe.merge.registration import IndexedMap, solve_point_to_plane
 from cdpipe.merge.walk import Step, Walk, walk
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import MergeConfig

@@ -11,7 +11,7 @@ import small_gicp
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, invert, make_pose, transform
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, invert, make_pose, plane_jacobian, transform
 from cdpipe.core.grid_index import GridIndex, column_keys
 from cdpipe.core.voxel import cell_keys
 from cdpipe.model.config import MergeConfig
@@ -216,17 +216,6 @@ def align_to_planes(
         if np.abs(step).max() < _PLANE_CONVERGED:  # metres, radians
             break
     return pose @ make_pose(translation=-centre)
-
-
-def plane_jacobian(offsets: Float64Array, normals: Float64Array) -> Float64Array:
-    """Return the (N, 6) derivative of each point's displacement along its normal by rotation, then translation.
-
-    Args:
-        offsets: (N, 3) points relative to the centre of rotation.
-        normals: (N, 3) normals in the same axes.
-    """
-    (x, y, z), (a, b, c) = offsets.T, normals.T
-    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=1)
 
 
 def solve_point_to_plane(jacobian: Float64Array, distances_m: Float64Array, values_m: Float64Array) -> Float64Array:

@@ -107,6 +107,7 @@ class PointMap:
         return_offsets: (M, 3) uint8 position of each return in its cell, in 1/PLACES of `voxel_m` from the cell's lower
             corner; None if not stored.
         views: Range images of the keyframes; None if not stored.
+        recorded_T_sensor: (S, 4, 4) recorded pose of every scan, where `odom_T_sensor` was made consistent; else None.
     """
 
     points: Float64Array
@@ -120,6 +121,7 @@ class PointMap:
     seen_from: Float32Array | None = None
     return_offsets: UInt8Array | None = None
     views: KeyframeViews | None = None
+    recorded_T_sensor: Float64Array | None = None
 
     def __post_init__(self) -> None:
         n, m = len(self.points), len(self.return_points)
@@ -127,6 +129,9 @@ class PointMap:
         require_shapes(self, return_points=(m,), return_pixels=(m,), return_offsets=(m, 3))
         require_shapes(self, scan_offsets=(len(self.odom_T_sensor) + 1,))
         require_poses("odom_T_sensor", self.odom_T_sensor)
+        if self.recorded_T_sensor is not None:
+            require_shapes(self, recorded_T_sensor=self.odom_T_sensor.shape)
+            require_poses("recorded_T_sensor", self.recorded_T_sensor)
 
     def positions_of(self, returns: Int64Array) -> Float64Array:
         """Return the (N, 3) positions of (N,) returns, the session's odom frame, metres, to 1/PLACES of a cell.

@@ -69,7 +69,7 @@ def merged_by_truth(
         reason = f"by the truth no after keyframe has a before keyframe within {PAIR_RADIUS_M:g} m"
         return MergedMaps(before.map, after.map, np.eye(4), evidence, False, reason, None, NO_SECONDS)
     i = nearest[paired]
-    odom_T_i, odom_T_j = truth[0].odom_T_sensor[scans_i[i]], truth[1].odom_T_sensor[scans_j]
+    odom_T_i, odom_T_j = before.map.odom_T_sensor[scans_i[i]], after.map.odom_T_sensor[scans_j]
     map_T_j = odom_T_i @ invert(world_T_i[i]) @ world_T_j[paired]
     of_paired = _displaced(map_T_j, noise, seed) @ invert(odom_T_j[paired])
     _, taken = cKDTree(world_T_j[paired, :3, 3]).query(world_T_j[:, :3, 3])

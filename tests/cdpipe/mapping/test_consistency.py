@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.geometry import Float64Array, invert, make_pose, stream
+from cdpipe.mapping.consistency import make_consistent
+from cdpipe.mapping.mapping import build_map
+from cdpipe.model.config import MapConfig, load_config
+from tests.cdpipe.conftest import CloudScans, scanned
+
+JITTER_M, JITTER_RAD = 0.05, 0.005
+
+
+def jittered(source: CloudScans, seed: int, along_only: bool = False) -> CloudScans:
+    """The session with poses that err from scan to scan."""
+    rng = stream(seed, "jitter")
+    n = len(source.odom_T_sensor)
+    shifts = rng.normal(0, JITTER_M, (n, 3)) * ([1, 0, 0] if along_only else [1, 1, 1])
+    turns = Rotation.from_rotvec(rng.normal(0, 0.0 if along_only else JITTER_RAD, (n, 3))).as_matrix()
+    return replaced(source, source.odom_T_sensor @ make_pose(turns, shifts))
+
+
+def replaced(source: CloudScans, poses: Float64Array) -> CloudScans:
+    return CloudScans(source.name, poses, [source.scan(index).points_sensor for index in range(len(poses))])
+
+
+def steps_off_m(poses: Float64Array, true: Float64Array) -> Float64Array:
+    """(S - 1,) how far the step to each scan is off: local errors, not the slow drift."""
+    errors = invert(invert(true[:-1]) @ true[1:]) @ invert(poses[:-1]) @ poses[1:]
+    return np.asarray(np.linalg.norm(errors[:, :3, 3], axis=1))
+
+
+@pytest.fixture(scope="module")
+def tunnel() -> CloudScans:
+    whole = scanned("drive", make_pose(), 0, 1, [])
+    return replaced(whole, whole.odom_T_sensor[:40])
+
+
+def test_jitter_from_scan_to_scan_goes(tunnel: CloudScans) -> None:
+    noisy = jittered(tunnel, 0)
+    consistent = make_consistent(noisy)
+    before = np.median(steps_off_m(noisy.odom_T_sensor, tunnel.odom_T_sensor))
+    after = np.median(steps_off_m(consistent.odom_T_sensor, tunnel.odom_T_sensor))
+    assert before > 0.08 and after < 0.02
+    # scans keep their points, and the path stays near the recorded one
+    np.testing.assert_array_equal(consistent.scan(7).points_sensor, noisy.scan(7).points_sensor)
+    np.testing.assert_array_equal(consistent.scan(7).odom_T_sensor, consistent.odom_T_sensor[7])
+    scans = list(consistent.scans())
+    assert [scan.index for scan in scans] == list(range(len(noisy.odom_T_sensor)))
+    np.testing.assert_array_equal(scans[7].odom_T_sensor, consistent.odom_T_sensor[7])
+    assert np.abs(consistent.odom_T_sensor[:, :3, 3] - noisy.odom_T_sensor[:, :3, 3]).max() < 6 * JITTER_M
+
+
+def test_scans_that_agree_keep_their_recorded_poses(tunnel: CloudScans) -> None:
+    np.testing.assert_array_equal(make_consistent(tunnel).odom_T_sensor, tunnel.odom_T_sensor)
+
+
+def test_a_slow_drift_stays(tunnel: CloudScans) -> None:
+    # 2 % too long and 1 degree off over the tunnel: nothing within one session contradicts it
+    poses = tunnel.odom_T_sensor.copy()
+    poses[:, :3, 3] *= 1.02
+    n = len(poses)
+    turns = Rotation.from_rotvec(np.linspace(0, np.deg2rad(1.0), n)[:, None] * [0, 0, 1]).as_matrix()
+    drifting = replaced(tunnel, make_pose(turns, np.zeros((n, 3))) @ poses)
+    found = make_consistent(jittered(drifting, 1)).odom_T_sensor
+    assert np.linalg.norm((found - drifting.odom_T_sensor)[:, :3, 3], axis=1).max() < 6 * JITTER_M
+
+
+def test_a_tunnel_that_tells_no_place_along_keeps_the_odometry_along_it() -> None:
+    rng = stream(0, "smooth")
+    clouds, poses = [], []
+    for x_m in np.arange(0, 20, 0.5):
+        along, angle = rng.uniform(-10, 10, 4000), rng.uniform(0, 2 * np.pi, 4000)
+        walls = np.column_stack([along, 2.5 * np.cos(angle), 2.5 * np.sin(angle)])
+        clouds.append(walls + rng.normal(0, 0.01, walls.shape))
+        poses.append(make_pose(translation=(x_m, 0, 0)))
+    smooth = CloudScans("smooth", np.array(poses), clouds)
+    noisy = jittered(smooth, 2)
+    found = make_consistent(noisy).odom_T_sensor
+    across = np.linalg.norm(found[:, 1:3, 3] - found[:, 1:3, 3].mean(axis=0), axis=1)
+    assert np.median(across) < 0.015 < np.median(np.linalg.norm(noisy.odom_T_sensor[:, 1:3, 3], axis=1))
+    assert np.abs(found[:, 0, 3] - noisy.odom_T_sensor[:, 0, 3]).max() < 4 * JITTER_M
+
+
+@pytest.mark.parametrize("n_scans", [1, 2])
+def test_a_session_of_a_scan_or_two_is_mapped(tunnel: CloudScans, n_scans: int) -> None:
+    few = replaced(tunnel, tunnel.odom_T_sensor[:n_scans])
+    assert make_consistent(few).odom_T_sensor.shape == (n_scans, 4, 4)
+
+
+def test_a_map_knows_its_recorded_poses_and_keyframes(tunnel: CloudScans) -> None:
+    noisy = jittered(tunnel, 0)
+    plain, consistent = (build_map(noisy, MapConfig(consistency=each)) for each in ("none", "scan-to-map"))
+    assert plain.recorded_T_sensor is None and consistent.recorded_T_sensor is not None
+    np.testing.assert_array_equal(consistent.recorded_T_sensor, noisy.odom_T_sensor)
+    np.testing.assert_array_equal(consistent.keyframe_scans, plain.keyframe_scans)
+    assert len(consistent.points) < 0.9 * len(plain.points)  # walls are thinner
+    with pytest.raises(ValueError, match="recorded_T_sensor"):
+        replace(plain, recorded_T_sensor=noisy.odom_T_sensor[:-1])
+
+
+def test_presets_of_the_paper_map_with_the_recorded_poses() -> None:
+    assert load_config("tunnelcd").map.consistency == "scan-to-map"
+    for preset in ("paper", "paper-topn", "paper-paired", "scan-context", "solid", "frame"):
+        assert "consistency" not in load_config(preset).model_dump()["map"], preset
+    assert load_config("tunnelcd").model_dump()["map"]["consistency"] == "scan-to-map"
