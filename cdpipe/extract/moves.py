@@ -45,12 +45,12 @@ _FINE_STEPS_M = (0.15, 0.14, 0.13, 0.12, 0.11, 0.1, 0.08, 0.07, 0.06, 0.05)
 _MOST_POINTS, _MOST_COARSE_POINTS = 150, 50
 # Leaf size of the k-d trees; fastest for points near a surface.
 _LEAF_POINTS = 32
-# Penalty of the score per metre of displacement; decides between equally similar objects.
-_TIE_PER_M = 0.01
-# Twins, objects of equal shape within noise: least fit, as a share of the best fit of either object, and largest factor
-# between extents. In a world of equal barrels, crates and chairs (validation seed) the 24 pairs of equal props have at
-# least 0.82 and at most 1.1.
-_TWIN_FIT, _TWIN_FACTOR = 0.75, 1.13
+# Penalty of the score per metre of displacement, and the one with which twins (below) are told apart.
+_TIE_PER_M, _TWIN_TIE_PER_M = 0.01, 0.1
+# Twins, objects that may be of one shape: least likeness, and largest factor between extents. In worlds of equal
+# barrels, crates and chairs (validation seeds) pairs of equal props have a likeness of at least 0.79 and, where one was
+# seen in part, a factor of up to 1.36; the likeness of pairs of different kinds is below 0.68.
+_TWIN_LIKENESS, _TWIN_FACTOR = 0.77, 1.45
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,9 +78,9 @@ def find_moves(
 ) -> list[Move]:
     """Match removed with added objects by their surfaces, one to one, so that the total score is largest.
 
-    The score of a pair is its number of matching points, less for a longer way. How many points a session has of an
-    object says from where it was seen, not which object it is: pairs of twins, objects of equal shape within noise,
-    score alike, and their ways decide.
+    The score of a pair is its number of matching points, less for a longer way. The number of points of an object
+    depends on the place from which it was seen. So all pairs of a group of twins, objects that may be of one shape,
+    have the mean number, and fit and way decide between them.
 
     Args:
         removed: Points (P, 3) of each object of the before session, map frame, metres.
@@ -88,8 +88,8 @@ def find_moves(
         may_go_far: For each removed object, whether partners that are not neighbours are tried.
         around: Returns, for pairs (removed, added) of neighbours, the points (Q, 3) and (R, 3) above the ground that
             the before and the after session have around both objects; the objects' own points may be included.
-        nearest_twins: Whether pairs of twins score alike; otherwise the points of every pair count, as for objects cut
-            out by whole map points.
+        nearest_twins: Whether twins are told apart by fit and way; otherwise the points of every pair count, as for
+            objects cut out by whole map points.
     """
     gone, come = [_Cloud.of(points) for points in removed], [_Cloud.of(points) for points in added]
     boxes = np.array([_box_xy(end) for end in come]).reshape(-1, 2, 2)
@@ -105,9 +105,10 @@ def find_moves(
     matches = {pair: match for pair, match in found.items() if match is not None}
     if nearest_twins:
         matches = _equalise_twins(matches, gone, come)
+    tie_per_m = _TWIN_TIE_PER_M if nearest_twins else _TIE_PER_M
     gain = np.zeros((len(gone), len(come)))
     for pair, match in matches.items():
-        gain[pair] = match.gain
+        gain[pair] = match.points / (1.0 + tie_per_m * float(np.linalg.norm(match.shift_map[:2])))
     pairs = zip(*(each.tolist() for each in linear_sum_assignment(gain, maximize=True)), strict=True)
     return [Move(r, a, matches[r, a].shift_map) for r, a in pairs if (r, a) in matches]
 
@@ -118,46 +119,47 @@ class _Match:
 
     Attributes:
         points: Score of the pair without its way, in points.
-        fit: Likeness times the larger share of a surface on the other; 1 for identical objects. If an object was seen
-            sparsely in one session, its points still lie on the surface of the other.
+        likeness: 1 for identical objects.
+        share: The larger share of a surface on the other. If an object was seen sparsely in one session, its points
+            still lie on the surface of the other.
         shift_map: (3,) displacement, metres.
     """
 
     points: float
-    fit: float
+    likeness: float
+    share: float
     shift_map: Float64Array
 
     @property
-    def gain(self) -> float:
-        return self.points / (1.0 + _TIE_PER_M * float(np.linalg.norm(self.shift_map[:2])))
+    def fit(self) -> float:
+        return self.likeness * self.share
 
 
 def _equalise_twins(
     matches: Mapping[tuple[int, int], _Match], gone: Sequence[_Cloud], come: Sequence[_Cloud]
 ) -> dict[tuple[int, int], _Match]:
-    """Return the matches, every pair of twins with the mean score of its group.
+    """Return the matches; the points of pairs of twins are the mean of their group, more for a better fit.
 
-    A group is a connected component of the pairs whose objects are of equal shape within noise.
+    A group is a connected component of the pairs whose objects may be of one shape.
     """
-    fit = np.zeros((len(gone), len(come)))
-    for pair, match in matches.items():
-        fit[pair] = match.fit
-    best = np.maximum(fit.max(axis=1, initial=0.0)[:, None], fit.max(axis=0, initial=0.0))
     twins = [
         (r, a)
         for (r, a), match in matches.items()
-        if match.fit >= _TWIN_FIT * best[r, a]
+        if match.likeness >= _TWIN_LIKENESS
         and np.abs(gone[r].log_extents - come[a].log_extents).max() <= np.log(_TWIN_FACTOR)
     ]
     ends = np.array(twins, dtype=np.int64).reshape(-1, 2).T
     n_objects = len(gone) + len(come)
     edges = coo_matrix((np.ones(len(twins)), (ends[0], len(gone) + ends[1])), (n_objects, n_objects))
-    group = connected_components(edges, directed=False)[1]
-    scores: dict[int, list[float]] = {}
+    label = connected_components(edges, directed=False)[1]
+    groups: dict[int, list[tuple[int, int]]] = {}
     for r, a in twins:
-        scores.setdefault(int(group[r]), []).append(matches[r, a].points)
-    equal = {(r, a): replace(matches[r, a], points=float(np.mean(scores[int(group[r])]))) for r, a in twins}
-    return {**matches, **equal}
+        groups.setdefault(int(label[r]), []).append((r, a))
+    equal = dict(matches)
+    for pairs in groups.values():
+        points_per_fit = sum(matches[pair].points for pair in pairs) / sum(matches[pair].fit for pair in pairs)
+        equal |= {pair: replace(matches[pair], points=points_per_fit * matches[pair].fit) for pair in pairs}
+    return equal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,7 +246,7 @@ def _match_pair(start: _Cloud, end: _Cloud, least_share: float) -> _Match | None
     together = np.concatenate([start.points, transform(invert(end_T_start), end.points)])
     centre = upright_box(together)[0][:3, 3]
     shift = transform(end_T_start, centre[None])[0] - centre
-    return _Match(excess * min(len(start.points), len(end.points)), likeness * max(shares), shift)
+    return _Match(excess * min(len(start.points), len(end.points)), likeness, max(shares), shift)
 
 
 def _align(start: _Cloud, end: _Cloud) -> tuple[float, Float64Array]:
