@@ -1,15 +1,11 @@
 """The check of a refined alignment: points that the refinement did not use choose between it and the rigid merge.
 
 The misfit of a point is d^2 / (d^2 + (0.1 m)^2) of its distance d to the before surface, and 1 without a surface near.
-A place goes back to the rigid merge if the held-out points around it and its two neighbours have a lower mean misfit
-under it, by more than one standard error. Ties leave the refined alignment: in a smooth drift no point tells how far
-along the axis a place is, and the refinement knows it from the bends before and after. Between two places the share of
-the refined alignment changes linearly.
+A place keeps the refined alignment if the held-out points around it and its two neighbours have a lower misfit under it
+than under the rigid merge. Between two places the share of the refined alignment changes linearly.
 """
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,9 +21,6 @@ HELD_OUT_EVERY = 5
 _JUDGES, _MIN_JUDGES = 600, 50
 # Scale of the misfit: half the points of a good merge are within 1 cm, and changed objects must not decide.
 _MISFIT_M = 0.1
-# Standard errors by which the rigid merge has to be better. At 0, noise gives 17 % of the places of five good
-# refinements to the rigid merge, at 1 only 5 %; at 2, three of five bad refinements (real scans, large voxels) hold.
-_SIGMAS = 1.0
 
 
 def choose_alignment(
@@ -65,13 +58,15 @@ def choose_alignment(
     if not is_judged.any():
         return None, {"n_judged": 0.0, "n_kept": 0.0}
     places, points = places[is_judged], [each for each in points if len(each) >= _MIN_JUDGES]
-    misfits = [
-        np.stack([_measure_misfits(before, pose, own) for pose in (rigid, refined[place])])
-        for place, own in zip(places, points, strict=True)
-    ]
+    misfits = np.array(
+        [
+            [_measure_misfit(before, pose, own) for pose in (rigid, refined[place])]
+            for place, own in zip(places, points, strict=True)
+        ]
+    )
     moved_m = np.linalg.norm(transform_each(refined, positions) - transform(rigid, positions), axis=1)
-    is_kept = ~_is_rigid_better([each[0] - each[1] for each in misfits]) & (moved_m[places] <= within_m)
-    rigid_misfit, refined_misfit = np.mean([each.mean(axis=1) for each in misfits], axis=0).tolist()
+    is_kept = _is_refined_better(misfits) & (moved_m[places] <= within_m)
+    rigid_misfit, refined_misfit = misfits.mean(axis=0).tolist()
     evidence = {
         "n_judged": float(len(places)),
         "n_kept": float(np.count_nonzero(is_kept)),
@@ -83,19 +78,18 @@ def choose_alignment(
     return _blend(rigid, refined, np.interp(path_m, path_m[places], is_kept), positions), evidence
 
 
-def _measure_misfits(before: IndexedMap, before_T_after: Float64Array, own: Float64Array) -> Float64Array:
-    """Return the (N,) misfits of (N, 3) after points, in [0, 1]."""
+def _measure_misfit(before: IndexedMap, before_T_after: Float64Array, own: Float64Array) -> float:
+    """Return the mean misfit of (N, 3) after points, in [0, 1]."""
     surface, moved = before.target, transform(before_T_after, own)
     found, squared_m2 = surface.tree.batch_nearest_neighbor_search(moved)
     distances_m = plane_distances(moved, surface.points[found], surface.normals[found], np.asarray(squared_m2))
-    return np.asarray(1 - 1 / (1 + (distances_m / _MISFIT_M) ** 2))
+    return float(np.mean(1 - 1 / (1 + (distances_m / _MISFIT_M) ** 2)))
 
 
-def _is_rigid_better(gains: Sequence[Float64Array]) -> BoolArray:
-    """Return for A places whether the misfits, rigid minus refined, of the place and its neighbours are below zero."""
-    means, variances = (np.pad(each, 1) for each in ([g.mean() for g in gains], [g.var() / len(g) for g in gains]))
-    mean, variance = (each[:-2] + each[1:-1] + each[2:] for each in (means, variances))
-    return np.asarray(mean < -_SIGMAS * np.sqrt(variance))
+def _is_refined_better(misfits: Float64Array) -> BoolArray:
+    """Return for (A, 2) misfits, rigid and refined, whether the refined sum of a place and its neighbours is lower."""
+    gains = np.pad(misfits[:, 0] - misfits[:, 1], 1)
+    return np.asarray(gains[:-2] + gains[1:-1] + gains[2:] > 0)
 
 
 def _blend(rigid: Float64Array, refined: Float64Array, shares: Float64Array, positions: Float64Array) -> Float64Array:

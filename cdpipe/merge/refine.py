@@ -10,7 +10,7 @@ proportional to the stretch and follows from the sensor positions from which the
 estimates the stretch.
 
 With `merge.refine: checked` one fifth of the after points is held out, and the refined alignment holds where these
-points do not fit the rigid merge better (`cdpipe.merge.held_out`).
+points fit it better than the rigid merge (`cdpipe.merge.held_out`).
 """
 
 from __future__ import annotations
@@ -34,8 +34,10 @@ _SPACING, _SPACING_M = 0.6, 4.0
 _SEEN_WITHIN, _WALL_PERCENTILE, _SEEN_WITHIN_M = 2.5, 20, 6.0
 # Radius of a sphere: 1.8 wall distances, at least 5 m. A smaller sphere holds too little of the walls.
 _RADIUS, _RADIUS_M = 1.8, 5.0
-# Voxel size of a sphere; with `refine: local` it grows with the radius.
-_VOXEL, _VOXEL_M = 0.06, 0.4
+# Voxel size of a sphere: with `refine: local` a multiple of its radius and a minimum, else the voxel size of the map.
+# On 14 real and simulated pairs of known alignment 0.2 m lowers the error of 0.4 m by a third in the median and takes
+# 1.7 times as long.
+_VOXEL, _VOXEL_M, _CHECKED_VOXEL_M = 0.06, 0.4, 0.2
 _CORRESPONDENCE_M = 1.0
 # Standard deviation of a map point's distance to the surface.
 _POINT_M = 0.05
@@ -88,7 +90,7 @@ def refine(
     keyframes, start = _choose_anchors(path_m, found, max(_SPACING * radius_m, _SPACING_M))
     coarse = PathAlignment(after.positions[found.keyframes], found.before_T_after)
     first = int(np.nanargmax(found.fits))
-    voxel_m = _VOXEL_M if is_checked else max(_VOXEL * radius_m, _VOXEL_M)
+    voxel_m = _CHECKED_VOXEL_M if is_checked else max(_VOXEL * radius_m, _VOXEL_M)
     step = Step(radius_m, voxel_m, _CORRESPONDENCE_M)
     walked = walk(before, after, keyframes, start, found.before_T_after[first], step, config)
     is_good = walked.fits >= _MIN_FIT

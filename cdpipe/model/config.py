@@ -101,7 +101,7 @@ class MergeConfig(Settings):
     kiss_voxel_m: Cell = Field(0.6, description="cell of KISS-Matcher")
     refine: Literal["none", "local", "checked"] = Field(
         "local",
-        description="align again every few metres along the overlap; `checked`: unless held-out points fit worse",
+        description="align again every few metres along the overlap; `checked`: where held-out points then fit better",
     )
 
 

@@ -1,12 +1,18 @@
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, make_pose
+from cdpipe.io import open_session
+from cdpipe.io.ouster.captures import open_recording
+from cdpipe.io.ouster.recording import import_recording
+from cdpipe.mapping import build_map
 from cdpipe.merge.held_out import choose_alignment
 from cdpipe.merge.merge import merge_maps
 from cdpipe.merge.pose_graph import PoseGraph, solve_pose_graph
@@ -14,8 +20,9 @@ from cdpipe.merge.refine import _discount_normal_noise, refine
 from cdpipe.merge.registration import IndexedMap
 from cdpipe.merge.walk import Walk, walk
 from cdpipe.model.alignment import PathAlignment
-from cdpipe.model.config import MergeConfig
+from cdpipe.model.config import MapConfig, MergeConfig
 from cdpipe.model.types import MappedSession, PointMap
+from tests.cdpipe.conftest import CloudScans
 
 
 @pytest.mark.parametrize("mode", ["local", "checked"])
@@ -122,3 +129,26 @@ def test_points_that_are_held_out_are_not_registered(monkeypatch: pytest.MonkeyP
     both = np.concatenate([seen["registered"], seen["judging"]])
     assert len(np.unique(both, axis=0)) == len(both)
     assert len(seen["judging"]) == pytest.approx(len(both) / 5, rel=0.02)
+
+
+def test_sparse_scans_of_a_standing_sensor_are_not_pulled_apart(tmp_path: Path) -> None:
+    if "TUNNELCD_REAL_DATA" not in os.environ:
+        pytest.skip("TUNNELCD_REAL_DATA is unset: the real recording is not at hand")
+    pytest.importorskip("ouster.sdk")
+    recording = Path(os.environ["TUNNELCD_REAL_DATA"]) / "ouster" / "osf_fw_3.2_10scans.osf"
+    stamps_ns = np.concatenate([each.column_stamps_ns for each in open_recording(recording).revolutions()])
+    times_s = np.arange(stamps_ns.min() / 1e9 - 0.2, stamps_ns.max() / 1e9 + 0.2, 0.05)
+    (tmp_path / "standing.tum").write_text("".join(f"{time_s:.9f} 0 0 0 0 0 0 1\n" for time_s in times_s))
+    import_recording(recording, tmp_path / "standing", trajectory=tmp_path / "standing.tum")
+    scans = list(open_session(tmp_path / "standing").scans())
+    before, after = (
+        build_map(CloudScans("standing", np.repeat(np.eye(4)[None], 5, axis=0), clouds), MapConfig())
+        for clouds in ([scan.points_sensor for scan in scans[first::2]] for first in (0, 1))
+    )
+    found = Walk(np.zeros(1, np.int64), np.eye(4)[None], np.zeros((1, 6, 6)), np.ones(1), np.zeros(1))
+    off_m = {}
+    for mode in ("local", "checked"):
+        alignment, _ = refine(before, after, found, np.eye(4), MergeConfig(refine=mode))
+        off_m[mode] = 0.0 if alignment is None else float(np.linalg.norm(alignment.to_map(np.zeros((1, 3)))))
+    # 8 beams, walls 7 m away: voxels of 0.8 m lose the alignment that voxels of 0.2 m keep
+    assert off_m["checked"] < 0.006 < 0.01 < off_m["local"]
