@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array
-from cdpipe.core.voxel import cell_means
+from cdpipe.core.voxel import cell_keys, cell_means
 from cdpipe.extract.shape import ground_heights
 
 # Largest distance of a neighbour of the object, and to the other session for a point that stayed.
@@ -15,6 +15,9 @@ _STAYED_M = 0.15
 # Column width of the ground, and height above it that may be a foot or a rut.
 _GROUND_M = 0.8
 _ABOVE_GROUND_M = 0.15
+# The plane of the floor: column width, least vertical component of the normal (25 degrees; muck lies at 34 and more),
+# height above the plane from which a point is something on the floor, fewest points, and most rounds of the fit.
+_FLOOR_COLUMN_M, _FLOOR_UPWARD, _ON_FLOOR_M, _FEWEST_FLOOR, _FLOOR_ROUNDS = 0.4, 0.9, 0.1, 8, 10
 # Least vertical component of the normal: a muck slope is at most 53 degrees steep, a wall is steeper.
 _MIN_UPWARD = 0.6
 _NEIGHBOURS = 10
@@ -33,8 +36,8 @@ def is_part_of_remainder(taken_map: Float64Array, rest_map: Float64Array, other_
     """Return whether the surface of a removed object continued in an object that stayed.
 
     The seam is the set of the object's points with a neighbour that stayed, lies above the ground and is on a slope. A
-    whole object touches only the floor or a wall. The length of a seam grows with the square root of the number of
-    points, so the seam is compared with that.
+    whole object touches only the floor or a wall. Heights are measured from the plane of the floor, which may slope.
+    The length of a seam grows with the square root of the number of points, so the seam is compared with that.
 
     Args:
         taken_map: (P, 3) points of the object, map frame, metres.
@@ -46,7 +49,10 @@ def is_part_of_remainder(taken_map: Float64Array, rest_map: Float64Array, other_
     beside_m, _ = cKDTree(taken_map[:, :2]).query(rest_map[:, :2])
     beside = rest_map[beside_m < _BESIDE_M]
     stayed_m, _ = cKDTree(other_map).query(beside)
-    heights = beside[:, 2] - ground_heights(np.concatenate([rest_map, other_map]), beside, _GROUND_M)
+    surface = np.concatenate([rest_map, other_map])
+    floor = _fit_floor(surface)
+    beside_floor = _above_plane(beside, floor)
+    heights = beside_floor[:, 2] - ground_heights(_above_plane(surface, floor), beside_floor, _GROUND_M)
     rest = beside[(stayed_m < _STAYED_M) & (heights > _ABOVE_GROUND_M)]
     upward, is_known = _upward(rest, rest_map)
     rest = rest[is_known & (upward > _MIN_UPWARD)]
@@ -62,6 +68,33 @@ def is_heap(points_map: Float64Array) -> bool:
     upward, is_known = _upward(surface, surface)
     is_slope = (upward > _SLOPE[0]) & (upward < _SLOPE[1])
     return bool(is_known.any() and is_slope[is_known].mean() >= _LEAST_SLOPE)
+
+
+def _fit_floor(surface: Float64Array) -> Float64Array:
+    """Return the slope (2,) of the floor, its rise along x and y, from a (Q, 3) surface; zeros without enough floor.
+
+    A plane is fitted to the lowest points of columns that lie flat. Points above it are left out, and it is fitted
+    again.
+    """
+    lowest = surface[np.argsort(surface[:, 2], kind="stable")]
+    lowest = lowest[np.unique(cell_keys(lowest * (1.0, 1.0, 0.0), _FLOOR_COLUMN_M), return_index=True)[1]]
+    upward, is_known = _upward(lowest, surface)
+    floor = lowest[is_known & (upward > _FLOOR_UPWARD)]
+    for _ in range(_FLOOR_ROUNDS):
+        if len(floor) < _FEWEST_FLOOR:
+            return np.zeros(2)
+        design = np.column_stack([floor[:, :2] - floor[:, :2].mean(axis=0), np.ones(len(floor))])
+        plane = np.linalg.lstsq(design, floor[:, 2], rcond=None)[0]
+        is_floor = floor[:, 2] - design @ plane < _ON_FLOOR_M
+        if is_floor.all():
+            break
+        floor = floor[is_floor]
+    return np.asarray(plane[:2])
+
+
+def _above_plane(points: Float64Array, slope: Float64Array) -> Float64Array:
+    """Return (N, 3) points with their distances from a plane through the origin, of a slope (2,), as heights."""
+    return np.column_stack([points[:, :2], (points[:, 2] - points[:, :2] @ slope) / np.sqrt(1.0 + slope @ slope)])
 
 
 def _upward(places: Float64Array, surface: Float64Array) -> tuple[Float64Array, BoolArray]:
