@@ -28,7 +28,7 @@ from cdpipe.descriptors.describe import (
     save_descriptors,
     use_threads,
 )
-from cdpipe.descriptors.sphere import describe_map
+from cdpipe.descriptors.sphere import anchor_frames, describe_map
 from cdpipe.extract.extract import extract_changes, make_report
 from cdpipe.io.known_merge import require_rigid
 from cdpipe.io.readers import open_session
@@ -155,7 +155,8 @@ def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
     thin_map = build_map(source, config.map)
     descriptors = describe_scans(source, thin_map.keyframe_scans, config.descriptor)
     if config.query.compare == "sphere":
-        spheres = describe_map(thin_map, thin_map.odom_T_anchor, config.descriptor, config.sphere)
+        anchors = anchor_frames(thin_map, thin_map.keyframe_scans, config.sphere)
+        spheres = describe_map(thin_map, anchors, config.descriptor, config.sphere)
         descriptors = replace(descriptors, spheres=spheres)
     return MappedSession(thin_map, descriptors)
 
@@ -190,7 +191,8 @@ def map_pair(
         return describe_scans(sources[session], maps[session].keyframe_scans[chosen], config.descriptor)
 
     def surroundings(session: int, chosen: slice) -> Spheres:
-        return describe_map(maps[session], maps[session].odom_T_anchor[chosen], config.descriptor, config.sphere)
+        anchors = anchor_frames(maps[session], maps[session].keyframe_scans[chosen], config.sphere)
+        return describe_map(maps[session], anchors, config.descriptor, config.sphere)
 
     scans = hooks.run("descriptors", config, lambda: _describe_both("describe keyframes", keyframes, kept, hooks))
     (before, after), seconds = scans.value, dict(scans.seconds)

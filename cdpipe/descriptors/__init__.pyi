@@ -7,10 +7,11 @@ from .describe import (
     save_descriptors,
     use_threads,
 )
-from .sphere import describe_map, sphere_digest
+from .sphere import anchor_frames, describe_map, sphere_digest
 from .yaw import relative_yaws_rad
 
 __all__ = [
+    "anchor_frames",
     "checkpoint_digest",
     "describe_map",
     "describe_scan",

@@ -140,7 +140,8 @@ def load_descriptors(
 
 
 def _spheres_of(map_config: MapConfig, sphere: SphereConfig) -> str:
-    return f"{sphere_digest(sphere)} {FRAMES} {map_config.model_dump_json()}"
+    frames = f"{FRAMES} " if sphere.frames == "path" else ""
+    return f"{sphere_digest(sphere)} {frames}{map_config.model_dump_json()}"
 
 
 def checkpoint_digest(config: DescriptorConfig) -> str:

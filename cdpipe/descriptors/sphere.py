@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, invert
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, invert
 from cdpipe.core.grid_index import GridIndex
 from cdpipe.core.path_frames import path_frames
 from cdpipe.descriptors.sphere_image import render
@@ -33,6 +33,13 @@ _NEIGHBOUR_M = 2.5
 _SHIPPED = SphereConfig()
 
 
+def anchor_frames(point_map: PointMap, scans: Int64Array, sphere: SphereConfig = _SHIPPED) -> Float64Array:
+    """Return the (K, 4, 4) frames at K scans of a map in which its images are rendered, odom_T_anchor."""
+    if sphere.frames == "path":
+        return path_frames(point_map.odom_T_sensor, scans)
+    return point_map.odom_T_sensor[scans]
+
+
 def describe_map(
     thin_map: PointMap, map_T_anchor: Float64Array, config: DescriptorConfig, sphere: SphereConfig = _SHIPPED
 ) -> Spheres:
@@ -40,7 +47,7 @@ def describe_map(
 
     Args:
         thin_map: The map.
-        map_T_anchor: (K, 4, 4) frames by path and gravity in the map's frame (`PointMap.odom_T_anchor`).
+        map_T_anchor: (K, 4, 4) frames in the map's frame (`anchor_frames`).
         config: `precision` is used.
         sphere: The weights; E is 64 with the shipped ones.
 
@@ -68,7 +75,7 @@ def change_logits(
         merged: Both maps.
         before: Its `spheres` are compared.
         is_covered: (K,) whether the after session came near a keyframe; the others get NaN.
-        sphere: The weights with which the before map was described.
+        sphere: The frames and the weights with which the before map was described.
 
     Raises:
         ValueError: The before session has no sphere descriptors.
@@ -78,7 +85,7 @@ def change_logits(
         raise ValueError("the before session has no sphere descriptors: describe its map")
     network, _ = _network(sphere)
     logits = np.full((len(is_covered), SECTORS), np.nan)
-    map_T_anchor = path_frames(merged.before.odom_T_sensor, before.keyframe_scans[is_covered])
+    map_T_anchor = anchor_frames(merged.before, before.keyframe_scans[is_covered], sphere)
     positions_odom = merged.alignment.to_odom(map_T_anchor[:, :3, 3])
     after_T_anchor = np.asarray(invert(merged.alignment.at(positions_odom)) @ map_T_anchor)
     images = render(GridIndex(merged.after.points), after_T_anchor)

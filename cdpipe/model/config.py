@@ -68,10 +68,18 @@ class DescriptorConfig(_WithWeights):
     weights: str = Field("", description="`3deg`: file of weights that `tunnelcd train` wrote; empty: the shipped ones")
 
 
-class SphereConfig(_WithWeights):
-    """The sphere descriptor."""
+class SphereConfig(Settings):
+    """The sphere descriptor. A dump leaves out what has its default."""
 
+    frames: Literal["sensor", "path"] = Field(
+        "sensor", description="axes of its images: the sensor's; path and gravity"
+    )
     weights: str = Field("", description="file of weights that `tunnelcd train` wrote; empty: the shipped ones")
+
+    @model_serializer(mode="wrap")
+    def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields = type(self).model_fields
+        return {name: value for name, value in handler(self).items() if value != fields[name].default}
 
 
 class MergeConfig(Settings):

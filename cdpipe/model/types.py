@@ -18,7 +18,6 @@ from cdpipe.core.geometry import (
     require_poses,
     require_shapes,
 )
-from cdpipe.core.path_frames import path_frames
 from cdpipe.model.alignment import PathAlignment
 
 Kind = Literal["added", "removed", "moved", "reshaped"]
@@ -152,11 +151,6 @@ class PointMap:
     def odom_T_keyframe(self) -> Float64Array:
         """(K, 4, 4) pose of each keyframe."""
         return self.odom_T_sensor[self.keyframe_scans]
-
-    @property
-    def odom_T_anchor(self) -> Float64Array:
-        """(K, 4, 4) frame of each keyframe by path and gravity (`path_frames`); sphere images are rendered in it."""
-        return path_frames(self.odom_T_sensor, self.keyframe_scans)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

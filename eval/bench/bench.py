@@ -17,7 +17,7 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import suggest
-from cdpipe.descriptors.sphere import change_log_odds, describe_map
+from cdpipe.descriptors.sphere import anchor_frames, change_log_odds, describe_map
 from cdpipe.merge.merge import merge_maps
 from cdpipe.model.config import load_config
 from cdpipe.query.query import find_regions
@@ -175,12 +175,13 @@ def _sphere(site: MergeSite) -> Contest:
     """Time both halves of a comparison: describing the before map, and comparing the after map with it."""
     before, after = (session.mapped for session in site.sessions)
     merged = merge_maps(before, after, site.config.merge)
-    poses = before.map.odom_T_anchor
+    sphere = site.config.sphere
+    poses = anchor_frames(before.map, before.map.keyframe_scans, sphere)
     is_covered = np.ones(len(poses), np.bool_)
 
     def both() -> None:
-        spheres = describe_map(before.map, poses, site.config.descriptor)
-        change_log_odds(merged, replace(before.descriptors, spheres=spheres), is_covered)
+        spheres = describe_map(before.map, poses, site.config.descriptor, sphere)
+        change_log_odds(merged, replace(before.descriptors, spheres=spheres), is_covered, sphere)
 
     return against_limit([seconds / len(poses) for seconds in timed(both, site.repeats)], _SPHERE_LIMIT_S)
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cdpipe.core.path_frames import FRAMES
 from cdpipe.descriptors import checkpoint_digest, sphere_digest
 from cdpipe.merge.global_registration import is_kiss_matcher_installed
 from cdpipe.model.alignment import PathAlignment
@@ -44,7 +45,8 @@ def name_result(stage: Stage, config: PipelineConfig) -> str:
             }
         case "spheres":
             precision, weights = config.descriptor.precision, sphere_digest(config.sphere)
-            read = {"maps": name_result("maps", config), "precision": precision, "weights": weights}
+            frames = {"frames": FRAMES} if config.sphere.frames == "path" else {}
+            read = {"maps": name_result("maps", config), "precision": precision, "weights": weights, **frames}
         case "merge":
             read = {
                 "maps": name_result("maps", config),

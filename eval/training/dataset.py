@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, stream, transform, yaw_rad
 from cdpipe.core.grid_index import GridIndex
-from cdpipe.core.path_frames import FRAMES
+from cdpipe.core.path_frames import FRAMES, path_frames
 from cdpipe.descriptors import sphere_image
 from cdpipe.descriptors.range_image import range_image
 from cdpipe.descriptors.sphere_image import COLUMNS, CROP_M, HALF_LENGTH_M, REACH_M, ROWS, pixels, render
@@ -132,21 +132,23 @@ def _load_map_config() -> MapConfig:
 
 
 class _WatchedScans(WrappedScans):
-    """A source that shows every scan to a watcher while all scans are read, so that they are read only once."""
+    """A source that shows every scan to a watcher when all scans are read for the first time."""
 
     def __init__(self, source: ScanSource, watch: Callable[[PosedScan], None]) -> None:
         super().__init__(source)
-        self._watch = watch
+        self._watch: Callable[[PosedScan], None] | None = watch
 
     def scans(self) -> Iterator[PosedScan]:
         """Read all scans in order, each seen by the watcher first."""
+        watch, self._watch = self._watch, None
         for scan in super().scans():
-            self._watch(scan)
+            if watch is not None:
+                watch(scan)
             yield scan
 
 
 def _map_held(held: LabelledSession) -> _Mapped:
-    """Map a session, reading it once."""
+    """Map a session, and note what its scans hold while they are read."""
     config, session = _load_map_config(), held.session
     chosen = set(choose_keyframes(session.odom_T_sensor, config.keyframe_spacing_m).tolist())
     builder = ScoringPointsBuilder(str(session.path), session.sensor.height, session.sensor.width)
@@ -235,7 +237,7 @@ def displace_poses(map_T_anchor: Float64Array, shift_m: Float64Array, turn_rad: 
 def _render_images(
     before: _Mapped, after: _Mapped, after_map: Float64Array, truth: GroundTruth, recipe: Recipe, seed: int
 ) -> Arrays:
-    anchors = before.map.odom_T_anchor
+    anchors = path_frames(before.map.odom_T_sensor, before.map.keyframe_scans)
     draws = draw_merge_errors(recipe, seed)
     poses = [displace_poses(anchors, *error) for error in zip(draws["shift_m"], draws["turn_rad"], strict=True)]
     after_index = GridIndex(after_map)

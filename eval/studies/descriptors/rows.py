@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, require_poses
-from cdpipe.descriptors import checkpoint_digest, describe_map, describe_scan, relative_yaws_rad
+from cdpipe.descriptors import anchor_frames, checkpoint_digest, describe_map, describe_scan, relative_yaws_rad
 from cdpipe.mapping.mapping import build_map
 from cdpipe.merge.merge import merge_maps
 from cdpipe.model.config import DescriptorConfig, PipelineConfig, load_config
@@ -118,7 +118,7 @@ def measure_spheres(
         truth: The pair's truth.
         config: All settings; the precision is replaced.
     """
-    poses = merged.before.odom_T_anchor
+    poses = anchor_frames(merged.before, merged.before.keyframe_scans, config.sphere)
     world = truth.before.world_T_sensor[before.keyframe_scans, :3, 3]
     labels = label_keyframes(world, truth.centroids_world, truth.is_observable, truth.pair.score_radius_m)
     used = labels >= 0

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, transform, yaw_pose
-from cdpipe.descriptors.sphere import change_logits, dequantise, describe_map
+from cdpipe.descriptors.sphere import anchor_frames, change_logits, dequantise, describe_map
 from cdpipe.descriptors.sphere_image import (
     COLUMNS,
     HALF_LENGTH_M,
@@ -21,11 +21,12 @@ from cdpipe.descriptors.sphere_image import (
 )
 from cdpipe.descriptors.sphere_network import SECTORS, make_untrained_sphere_network
 from cdpipe.model.alignment import PathAlignment
-from cdpipe.model.config import DescriptorConfig, QueryConfig
+from cdpipe.model.config import DescriptorConfig, QueryConfig, SphereConfig
 from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap
 from cdpipe.query.query import find_regions
 
 N_KEYFRAMES = 24
+SENSOR, PATH = SphereConfig(), SphereConfig(frames="path")
 
 
 def test_pixels_by_hand() -> None:
@@ -100,9 +101,10 @@ def _map_of(points: Float64Array, odom_T_sensor: Float64Array) -> PointMap:
     )  # fmt: skip
 
 
-def _set_of(thin_map: PointMap, precision: str = "float32") -> DescriptorSet:
+def _set_of(thin_map: PointMap, precision: str = "float32", sphere: SphereConfig = SENSOR) -> DescriptorSet:
     n = len(thin_map.keyframe_scans)
-    spheres = describe_map(thin_map, thin_map.odom_T_anchor, DescriptorConfig(precision=precision))
+    anchors = anchor_frames(thin_map, thin_map.keyframe_scans, sphere)
+    spheres = describe_map(thin_map, anchors, DescriptorConfig(precision=precision))
     return DescriptorSet(np.ones((n, 1), np.float32), None, thin_map.keyframe_scans, "by hand", "", spheres)
 
 
@@ -195,8 +197,11 @@ def test_rolling_pitching_and_turning_the_sensor_changes_nothing(turn_deg: tuple
         level.before,
         odom_T_sensor=level.before.odom_T_sensor @ make_pose(turns.as_matrix(), np.zeros((N_KEYFRAMES, 3))),
     )
-    descriptors, of_level = _set_of(before), _set_of(level.before)
+    descriptors, of_level = _set_of(before, sphere=PATH), _set_of(level.before, sphere=PATH)
     np.testing.assert_allclose(dequantise(descriptors.spheres), dequantise(of_level.spheres), atol=1e-5)
     covered = np.ones(N_KEYFRAMES, np.bool_)
-    logits = change_logits(replace(level, before=before), descriptors, covered)
-    np.testing.assert_allclose(logits, change_logits(level, of_level, covered), atol=1e-3)
+    logits = change_logits(replace(level, before=before), descriptors, covered, PATH)
+    np.testing.assert_allclose(logits, change_logits(level, of_level, covered, PATH), atol=1e-3)
+    # on the sensor's own axes it is another image
+    on_its_axes = _set_of(before), _set_of(level.before)
+    assert np.abs(dequantise(on_its_axes[0].spheres) - dequantise(on_its_axes[1].spheres)).max() > 0.1

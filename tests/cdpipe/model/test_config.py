@@ -125,9 +125,9 @@ def test_a_preset_on_the_search_path_has_its_weights_beside_it(tmp_path: Path, m
     assert load_config("mine").sphere.weights == str(tmp_path / "presets" / "w.safetensors")
 
 
-def test_settings_without_weights_are_dumped_as_before_there_were_any() -> None:
-    dumped = load_config("tunnelcd").model_dump(mode="json")
+def test_settings_of_before_there_were_weights_and_frames_are_dumped_as_then() -> None:
+    dumped = load_config("frame").model_dump(mode="json")
     assert "sphere" not in dumped and "weights" not in dumped["descriptor"]
     dumped = load_config("tunnelcd", ["sphere.weights=a"]).model_dump(mode="json")
-    assert dumped["sphere"] == {"weights": "a"}
+    assert dumped["sphere"] == {"frames": "path", "weights": "a"}
     assert PipelineConfig.model_validate(dumped).sphere.weights == "a"

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import invert, transform, yaw_rad
+from cdpipe.core.path_frames import path_frames
 from cdpipe.descriptors.range_image import range_image
 from cdpipe.descriptors.sphere_image import COLUMNS, ROWS, pixels, sphere_image
 from cdpipe.mapping.mapping import build_map
@@ -109,7 +110,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_gives_others(shard: Shar
 def test_images_are_the_pipeline_s_maps_rendered_directly(shard: Shard, from_files: FromFiles) -> None:
     arrays, (_, maps, truth) = shard[0], from_files
     np.testing.assert_array_equal(arrays["before_odom_T_keyframe"], maps[0].odom_T_keyframe)
-    anchors = maps[0].odom_T_anchor
+    anchors = path_frames(maps[0].odom_T_sensor, maps[0].keyframe_scans)
     clouds = {"before": maps[0].points, "after": after_in_map(maps, truth)}
     for anchor, pose in enumerate(anchors):
         for name, cloud in clouds.items():
@@ -123,7 +124,7 @@ def test_a_draw_is_off_by_its_own_error(shard: Shard, from_files: FromFiles) -> 
     arrays, (_, maps, truth) = shard[0], from_files
     shift, turn = arrays["draw_shift_m"], arrays["draw_turn_rad"]
     assert (shift[0] == 0).all() and (turn[0] == 0).all() and (shift[1] != 0).all() and (turn[1] != 0).all()
-    anchors, cloud = maps[0].odom_T_anchor, after_in_map(maps, truth)
+    anchors, cloud = path_frames(maps[0].odom_T_sensor, maps[0].keyframe_scans), after_in_map(maps, truth)
     poses = displace_poses(anchors, shift[1], turn[1])
     for anchor in range(0, len(anchors), 5):
         here = anchors[anchor, :3, 3]
@@ -160,7 +161,7 @@ def test_pixel_labels_are_where_changed_returns_are(shard: Shard, from_files: Fr
                 changed.add(int(maps[1].return_points[place]))
     cloud = after_in_map(maps, truth)[sorted(changed)]
     assert len(cloud) > 20
-    for anchor, pose in enumerate(maps[0].odom_T_anchor):
+    for anchor, pose in enumerate(path_frames(maps[0].odom_T_sensor, maps[0].keyframe_scans)):
         pixel = pixels(transform(invert(pose), cloud))
         wanted = np.zeros(ROWS * COLUMNS, dtype=bool)
         wanted[pixel[pixel >= 0]] = True

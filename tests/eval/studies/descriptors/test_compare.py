@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cdpipe.descriptors import describe_map, describe_scans
+from cdpipe.descriptors import anchor_frames, describe_map, describe_scans
 from cdpipe.descriptors.sphere_network import make_untrained_sphere_network
 from cdpipe.descriptors.weights_file import numbered_checkpoint_bytes
 from cdpipe.mapping.mapping import build_map
@@ -54,7 +54,7 @@ def test_every_descriptor_has_its_row_and_its_price(tiny_pair: Path) -> None:
 def test_a_run_counts_eight_bits_as_eight_bits(tiny_pair: Path) -> None:
     config = load_config("tunnelcd", ["descriptor.precision=int8"])
     mapped = mapped_pair(tiny_pair)[0]
-    spheres = describe_map(mapped.map, mapped.map.odom_T_anchor, config.descriptor)
+    spheres = describe_map(mapped.map, mapped.map.odom_T_keyframe, config.descriptor)
     kept = kept_bytes(replace(mapped, descriptors=replace(mapped.descriptors, spheres=spheres)), config)
     assert kept["bytes_regions_before"] == (28 + 64) * len(mapped.map.keyframe_scans)
 
@@ -90,9 +90,10 @@ def test_the_auroc_of_spheres_against_every_pair_of_keyframes(tiny_pair: Path, t
     assert (labels == 0).any()
     for row in rows:
         kept = config.descriptor.model_copy(update={"precision": row["precision"]})
-        spheres = replace(before.descriptors, spheres=describe_map(before.map, before.map.odom_T_anchor, kept))
+        anchors = anchor_frames(before.map, before.map.keyframe_scans, config.sphere)
+        spheres = replace(before.descriptors, spheres=describe_map(before.map, anchors, kept))
         scores = np.nan_to_num(
-            find_regions(merged, spheres, after.descriptors, config.query).keyframe_scores, nan=-np.inf
+            find_regions(merged, spheres, after.descriptors, config.query, config.sphere).keyframe_scores, nan=-np.inf
         )
         against = scores[labels == 1][:, None] - scores[labels == 0][None]
         assert row["region_auroc"] == pytest.approx(np.mean(np.where(against == 0, 0.5, against > 0)))
