@@ -5,6 +5,7 @@ description: what the plan is for
 scenarios:                           # eval/plans/worlds.py tells more
   - paper/site1
   - {name: paper/site2, each: [sensor.range_noise=false, sensor.mode=512x10]}  # unchanged, and with each of these
+odometry: own                        # of all scenarios that do not say otherwise; [kiss-icp, own]: each with both
 wide: [paper/site2]                  # wide drifts: presets apply their section `wide` there
 seeds: "20000:20002"                 # B excluded, in quotes; or a list
 report: [regions, objects]           # tables and plots of regions, of objects, or of both (eval/tables)
@@ -30,7 +31,7 @@ import re
 from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, ValidationInfo, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from cdpipe.core.errors import InputError
@@ -41,7 +42,17 @@ from eval.plans.files import read_plan
 from eval.plans.parts import Grid, Label, NotEmpty, Variant
 from eval.plans.targets import PlanTargets, Targets
 from eval.plans.variants import Cell, Method, Until
-from eval.plans.worlds import OneOrMore, ScenarioItem, World, get_group, list_worlds, world_slug
+from eval.plans.worlds import (
+    OWN_ODOMETRY,
+    Odometries,
+    OneOrMore,
+    PlanOdometry,
+    ScenarioItem,
+    World,
+    get_group,
+    list_worlds,
+    world_slug,
+)
 
 _MOST_SEEDS = 100_000
 _AFTER_MERGE = ("query", "extract", "outlier", "cluster", "m3c2", "dufomap")
@@ -58,15 +69,18 @@ def _refuse(mistakes: list[InitErrorDetails]) -> None:
         raise ValidationError.from_exception_data("Plan", mistakes)
 
 
-def _find_repeated_worlds(items: Iterable[ScenarioItem]) -> Iterator[InitErrorDetails]:
+def _find_repeated_worlds(
+    items: Iterable[ScenarioItem], odometry: tuple[PlanOdometry, ...]
+) -> Iterator[InitErrorDetails]:
     """Yield the worlds that are listed twice, and those that would share a folder."""
     known: dict[object, str] = {}
     for place, item in enumerate(items):
-        for index, world in enumerate(list_worlds([item])):
+        for index, world in enumerate(list_worlds([item], odometry)):
             names = (world.label, (world.name, world.settings), world_slug(world.label).casefold())
             other = next((known[name] for name in names if name in known), None)
             if other is not None:
-                where = (place, "each", index - 1) if index else (place,)
+                of_each = index % (1 + len(item.each))
+                where = (place, "each", of_each - 1) if of_each else (place,)
                 is_same = other == world.label or known.get(names[1]) == other
                 rule = "is listed twice" if is_same else f"would share the folder of {other}: rename one"
                 yield _mistake(where, ",".join(world.own) or world.name, f"scenario {world.label} {rule}")
@@ -96,7 +110,7 @@ def _find_settings_past_the_end(plan: Plan) -> Iterator[InitErrorDetails]:
 
 
 def _find_unknown_worlds(plan: Plan) -> Iterator[InitErrorDetails]:
-    worlds = list_worlds(plan.scenarios)
+    worlds = plan.worlds
     labels = [world.label for world in worlds]
     for place, variant in enumerate(plan.variants):
         for index, name in enumerate(variant.scenarios):
@@ -120,7 +134,7 @@ def _find_unknown_worlds(plan: Plan) -> Iterator[InitErrorDetails]:
 def _find_repeated_variants(plan: Plan) -> Iterator[InitErrorDetails]:
     """Yield the variants that a world has twice, and those that would share a folder."""
     told = set()
-    for world in list_worlds(plan.scenarios):
+    for world in plan.worlds:
         names: dict[str, str] = {}
         for method in list_methods(plan, world):
             name, folder = method.variant, folded(method.variant)
@@ -180,6 +194,7 @@ class Plan(Settings):
 
     name: Annotated[str, Field(min_length=1)]
     description: str = ""
+    odometry: Odometries = (OWN_ODOMETRY,)
     scenarios: Annotated[tuple[ScenarioItem, ...], NotEmpty]
     wide: Annotated[tuple[Label, ...], OneOrMore] = ()
     seeds: Annotated[tuple[int, ...], BeforeValidator(parse_seeds)]
@@ -191,14 +206,19 @@ class Plan(Settings):
 
     @field_validator("scenarios")
     @classmethod
-    def _worlds_differ(cls, items: tuple[ScenarioItem, ...]) -> tuple[ScenarioItem, ...]:
-        _refuse(list(_find_repeated_worlds(items)))
+    def _worlds_differ(cls, items: tuple[ScenarioItem, ...], info: ValidationInfo) -> tuple[ScenarioItem, ...]:
+        _refuse(list(_find_repeated_worlds(items, info.data.get("odometry", (OWN_ODOMETRY,)))))
         return items
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Plan:
         _refuse([*_find_settings_past_the_end(self), *_find_unknown_worlds(self), *_find_repeated_variants(self)])
         return self
+
+    @property
+    def worlds(self) -> list[World]:
+        """The worlds, in order: every item with each odometry, as it is and with each of its settings."""
+        return list_worlds(self.scenarios, self.odometry)
 
 
 def load_plan(name_or_path: str) -> Plan:
@@ -240,7 +260,7 @@ def expand_cells(plan: Plan) -> list[Cell]:
     """
     found: list[Cell] = []
     mistakes: list[str] = []
-    for world in list_worlds(plan.scenarios):
+    for world in plan.worlds:
         methods = []
         for method in list_methods(plan, world):
             try:
@@ -261,7 +281,7 @@ def list_planned_cases(plan: Plan) -> set[tuple[str, int, str]]:
     """Return (scenario, seed, variant) of all cells."""
     return {
         (world.label, seed, method.variant)
-        for world in list_worlds(plan.scenarios)
+        for world in plan.worlds
         for method in list_methods(plan, world)
         for seed in plan.seeds[: world.n_seeds]
     }

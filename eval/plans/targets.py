@@ -25,6 +25,8 @@ class Target(Settings):
         name: What the target is called in tables.
         domain: In or out of the training distribution; all pairs where neither this nor a site is set.
         site: Over the pairs with changes of the families whose name ends so, e.g. site1; the column is of results.csv.
+        sensor: Over the pairs with this sensor, all domains together; the column is of results.csv.
+        less_sensor: A sensor whose value on the same pairs (family and seed) is subtracted; with `sensor`.
         at_least: The lower bound.
         at_most: The upper bound; exactly one of the two is set.
         method: Of which method, where it is not the one that the targets are about.
@@ -36,6 +38,8 @@ class Target(Settings):
     name: str
     domain: Literal["in", "out"] | None = None
     site: str = ""
+    sensor: str = ""
+    less_sensor: str = ""
     at_least: float | None = None
     at_most: float | None = None
     method: str = ""
@@ -46,8 +50,10 @@ class Target(Settings):
     def _is_complete(self) -> Target:
         if (self.at_least is None) == (self.at_most is None):
             raise ValueError("expected one of at_least and at_most")
-        if self.domain and self.site:
-            raise ValueError("expected one of domain and site")
+        if sum(map(bool, (self.domain, self.site, self.sensor))) > 1:
+            raise ValueError("expected one of domain, site and sensor")
+        if self.less_sensor and not self.sensor:
+            raise ValueError("less_sensor: for a target with a sensor")
         if self.less and not (self.domain and self.column.startswith(RATE_COLUMN)):
             raise ValueError(f"less: for a column {RATE_COLUMN}... of one domain")
         return self
@@ -67,6 +73,8 @@ class Targets(Settings):
 
     Attributes:
         method: The method that the plan is about; pages show its cases.
+        odometry: The odometry of both sessions that the figures are of; "" where the plan does not tell them apart.
+        sensor: The sensor profile that the figures are of; "" likewise.
         regions: Bounds on regions.
         objects: Bounds on objects.
         merge: By kind of pair, the share of the pairs that must do what the kind asks for
@@ -74,6 +82,8 @@ class Targets(Settings):
     """
 
     method: str = ""
+    odometry: str = ""
+    sensor: str = ""
     regions: tuple[Target, ...] = ()
     objects: tuple[Target, ...] = ()
     merge: dict[PairKind, Annotated[float, Field(gt=0, le=1)]] = Field(default_factory=dict)

@@ -9,11 +9,13 @@ scenarios:
       - [sensor.range_noise=false, sensor.dropouts=false]
     pair_kind: clean                 # kind of pair for the merge tables; fills the column of that name
     n_seeds: 6                       # only the first six of the plan's seeds
+    odometry: own                    # the odometry of both sessions: own, kiss-icp or random-walk, or a list of them
 
 These are four worlds: `paper/site1`, `narrow[platform.speed_mps=0.5]` and
 `narrow[platform.speed_mps=0.5][sensor.range_noise=false]`, and so on. The column `scenario` holds that name; `family`
 is the scenario's own. Settings of `each` have brackets of their own, so that the label alone determines the reference
-of a world in any plan.
+of a world in any plan. An odometry that is not the scenario's own has the first brackets: `narrow[odometry=kiss-icp]`,
+`narrow[odometry=kiss-icp][sensor.range_noise=false]`. An item without `odometry` has that of the plan.
 """
 
 from __future__ import annotations
@@ -80,6 +82,12 @@ def _make_list(value: Any) -> Any:
     return [value] if isinstance(value, str) else value
 
 
+def _require_distinct(names: tuple[str, ...]) -> tuple[str, ...]:
+    if len(set(names)) < len(names):
+        raise ValueError("expected each odometry once")
+    return names
+
+
 def _normalise_setting(setting: str) -> str:
     """Normalise the value as YAML reads it: `off` and `false ` give the same world as `false`."""
     key, equals, text = setting.partition("=")
@@ -98,6 +106,12 @@ def _require_fit_on_top(settings: tuple[str, ...], info: ValidationInfo) -> tupl
 
 
 PairKind = Literal["clean", "drift", "smooth", "disjoint"]
+PlanOdometry = Literal["own", "kiss-icp", "random-walk"]
+OWN_ODOMETRY: PlanOdometry = "own"
+_ODOMETRY = "odometry"  # stands for the settings of both sessions in a label
+Odometries = Annotated[
+    tuple[PlanOdometry, ...], BeforeValidator(_make_list), Field(min_length=1), AfterValidator(_require_distinct)
+]
 ScenarioName = Annotated[str, AfterValidator(require_known_scenario)]
 OneOrMore = BeforeValidator(_make_list)
 WorldSettings = Annotated[tuple[Annotated[str, AfterValidator(_normalise_setting)], ...], OneOrMore]
@@ -111,6 +125,7 @@ class ScenarioItem(Settings):
     each: Annotated[tuple[Annotated[WorldSettings, AfterValidator(_require_fit_on_top)], ...], OneOrMore] = ()
     pair_kind: PairKind | None = None
     n_seeds: Annotated[int, Field(ge=1)] | None = None
+    odometry: Odometries | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -142,6 +157,7 @@ class World:
         name: The scenario.
         common: Settings that its item applies to all of its worlds.
         own: Further settings of this world.
+        odometry: The odometry of both sessions, "own" for the scenario's.
         pair_kind: Kind of its pairs, "" if not given; no part of the label.
         n_seeds: Number of the plan's seeds used, the first ones; None for all.
     """
@@ -151,23 +167,32 @@ class World:
     own: tuple[str, ...] = ()
     pair_kind: str = ""
     n_seeds: int | None = None
+    odometry: PlanOdometry = OWN_ODOMETRY
 
     @property
     def settings(self) -> tuple[str, ...]:
         """All settings, in the order in which they are written over the scenario."""
-        return (*self.common, *self.own)
+        sessions = () if self.odometry == OWN_ODOMETRY else ("before", "after")
+        return (*(f"{name}.odometry.source={self.odometry}" for name in sessions), *self.common, *self.own)
 
     @property
     def label(self) -> str:
         """Its name in tables: the scenario, with its settings in brackets if it has any."""
-        return self.name + "".join(f"[{','.join(part)}]" for part in (self.common, self.own) if part)
+        odometry = () if self.odometry == OWN_ODOMETRY else (f"{_ODOMETRY}={self.odometry}",)
+        return self.name + "".join(f"[{','.join(part)}]" for part in (odometry, self.common, self.own) if part)
 
 
-def list_worlds(items: Iterable[ScenarioItem]) -> list[World]:
-    """Return the worlds that the items of a plan define, in order."""
+def list_worlds(items: Iterable[ScenarioItem], odometry: tuple[PlanOdometry, ...] = (OWN_ODOMETRY,)) -> list[World]:
+    """Return the worlds that the items of a plan define: every item with each odometry, in order.
+
+    Args:
+        items: The plan's scenarios.
+        odometry: What an item has that names no odometry.
+    """
     return [
-        World(item.name, item.set, own, item.pair_kind or "", item.n_seeds)
+        World(item.name, item.set, own, item.pair_kind or "", item.n_seeds, name)
         for item in items
+        for name in item.odometry or odometry
         for own in ((), *item.each)
     ]
 
@@ -209,6 +234,11 @@ def find_references(cases: Iterable[tuple[str, str, int]]) -> dict[tuple[str, st
         if (nearest := next(shared, None)) is not None:
             found[world, variant] = nearest
     return found
+
+
+def is_other_odometry(world: str, reference: str) -> bool:
+    """Tell whether a world is its reference with another odometry and nothing else: it repeats nothing."""
+    return re.fullmatch(rf"\[{_ODOMETRY}=[^\]]*\]", world.removeprefix(reference)) is not None
 
 
 def list_settings_over(world: str, reference: str) -> str:

@@ -43,6 +43,7 @@ from eval.report.tables import Cell, Table, results_table, to_csv, unchanged_tab
 from eval.running.run_data import (
     RunData,
     ends_at_merge,
+    figures_of_plan,
     first_seed,
     flag,
     named_variants,
@@ -84,7 +85,7 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
             holds a link or cannot be written.
     """
     require_no_links(run)
-    data = read_run(run)
+    data = figures_of_plan(read_run(run))
     check_versions(Side(data), Side(data))
     try:
         files = _draw(data, views)
@@ -191,7 +192,7 @@ def _sections(data: RunData, pareto: Sequence[Chart], views: Views) -> dict[str,
 def list_failures(data: RunData) -> list[str]:
     """Return one line for every pair and reason without an answer, naming the variants it met."""
     found: dict[tuple[str, int, str], list[str]] = {}
-    for row in data.results:
+    for row in data.every_result:
         status, error = text(row, "status"), text(row, "error")
         if status != "ok":
             reason = status.replace("_", " ") + (f": {error}" if error else "")
@@ -221,7 +222,7 @@ def describe_machine(provenance: Mapping[str, Any]) -> str:
 
 def describe_commits(data: RunData) -> str:
     """Return which commits made how many of the answers, "" where all are of one; cells are kept when code changes."""
-    counts = Counter(text(row, "commit") or "unknown" for row in data.results)
+    counts = Counter(text(row, "commit") or "unknown" for row in data.every_result)
     if len(counts) < 2:
         return ""
     named = ", ".join(f"{commit} ({n} {'row' if n == 1 else 'rows'})" for commit, n in counts.items())

@@ -13,6 +13,7 @@ import pandas as pd
 from cdpipe.core.geometry import Float64Array
 from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
 from eval.report.compared_columns import COMPARED, POOLED, figures_of, is_time
+from eval.report.merge.tables import name_kinds
 from eval.report.tables import Cell, Table, methods_table, written_interval
 from eval.running.run_data import (
     Row,
@@ -119,13 +120,15 @@ def _merge_headlines(merges: pd.DataFrame) -> Table:
     if len(merges) == 0:
         return Table((), ())
     own = merges[merges["family"] == ALL_FAMILIES]
+    own = own.assign(pair_kind=name_kinds(own))
     kinds = list(dict.fromkeys(own["pair_kind"]))
     rows: list[tuple[float, tuple[Cell, ...]]] = []
     for variant, group in own.groupby("variant", sort=False):
         by_kind = {str(row["pair_kind"]): row for row in records(group)}
         cells = [_share_cell(by_kind.get(kind, {})) for kind in kinds]
         counts = (group["n_wrong_accepted"].sum(), group["n_refused"].sum(), group["n_failed"].sum())
-        error_m = by_kind.get("clean", {}).get("median_merge_error_m", math.nan)
+        clean = next((row for kind, row in by_kind.items() if kind.startswith("clean")), {})
+        error_m = clean.get("median_merge_error_m", math.nan)
         head = (Cell(spaced(str(variant))), Cell(str(group["n_pairs"].sum())))
         tail = (*(Cell(str(n)) for n in counts), Cell(fine(error_m)))
         rank = -float(group["n_within_target"].sum() / group["n_pairs"].sum()) + 10 * is_told_the_truth(str(variant))
@@ -149,6 +152,12 @@ def _sentence(data: RunData, merges: pd.DataFrame) -> str:
     n_pairs, n_methods = len(results[PAIR].drop_duplicates()), results["variant"].nunique()
     parts = [] if covered.is_whole else [covered.sentence.removesuffix(".")]
     parts.append(f"{_counted(n_pairs, 'session pair')}, {_counted(n_methods, 'variant')}")
+    if data.others and data.condition is not None:
+        n_others = len({(row["scenario"], row["seed"]) for row in data.others})
+        parts.append(
+            f"figures are of the pairs with {data.condition.words}, those of {_counted(n_others, 'other pair')} stand "
+            "in tables beside them"
+        )
     bad = [row for row in data.results if text(row, "status") != "ok"]
     n_unmade = sum(is_unmade(row) for row in bad)
     if len(bad) > n_unmade:

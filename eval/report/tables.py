@@ -36,6 +36,7 @@ from eval.tables.columns import (
     significant,
     spaced,
 )
+from eval.tables.conditions import condition_of_row, told_apart
 from eval.tables.rows import ALL_DOMAINS, PAIR, is_told_the_truth, numbers, records
 
 
@@ -239,6 +240,27 @@ def methods_table(
             cells = (Cell(spaced(str(row["variant"]))), Cell(str(row["n_pairs"]), interval=failed))
             rows.append((group_name(str(domain), group), (*cells, *(column[index] for column in of_columns))))
     return Table(("method", "pairs", *(column.heading for column in columns)), tuple(rows), caption)
+
+
+def conditions_table(table: pd.DataFrame, columns: Sequence[Column], caption: str) -> Table:
+    """Return the rows of every method under each odometry and sensor, side by side; no row where a plan has but one.
+
+    Args:
+        table: As `methods_table` takes it, with the columns of `eval.tables.conditions`.
+        columns: The columns.
+        caption: What stands above the table.
+    """
+    rows: list[tuple[str, tuple[Cell, ...]]] = []
+    own = table[table["domain"] != ALL_DOMAINS] if told_apart(table) else table[:0]
+    for (domain, variant), group in own.groupby(["domain", "variant"], sort=False):
+        for row in records(group):
+            values = (
+                Cell(column.shown(float(row[column.key])), interval=interval_of_row(row, column.key, column.shown))
+                for column in columns
+            )
+            cells = (Cell(condition_of_row(row).words), Cell(str(row["n_pairs"])), *values)
+            rows.append((f"{spaced(str(variant))}, {domain_name(str(domain))}", cells))
+    return Table(("odometry, sensor", "pairs", *(column.heading for column in columns)), tuple(rows), caption)
 
 
 def group_name(domain: str, rows: Sequence[Mapping[str, Any]]) -> str:

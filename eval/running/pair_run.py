@@ -34,7 +34,7 @@ from eval.running.rescoring import cell_document
 from eval.running.runfolder import RunFolder, write_json
 from eval.running.stage_cache import open_cache
 from eval.running.stages import PairStages
-from eval.scoring.scoring import METRICS_VERSION, CaseScore, score_stored
+from eval.scoring.scoring import METRICS_VERSION, CaseScore, describe_recording, score_stored
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 from scenarios.library import load_scenario
@@ -294,4 +294,6 @@ def _unmade(pair: Pair, status: str, error: str) -> CaseScore:
     """Score a case without a world: there is no truth, so every score is undefined."""
     row = {"scenario": "", "family": pair.family, "pair_kind": "", "seed": pair.seed, "variant": "", "preset": ""}
     outcome = {"status": status, "error": error, "metrics_version": METRICS_VERSION}
-    return CaseScore(row={**row, **outcome, "domain": domain_of(pair.family)}, changes=[], regions=[], objects=[])
+    drawn = {} if pair.scenario is None else pair.scenario.model_dump(mode="json")
+    told = {"domain": domain_of(pair.family), **describe_recording(drawn)}
+    return CaseScore(row={**row, **outcome, **told}, changes=[], regions=[], objects=[])

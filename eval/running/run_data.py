@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,10 @@ from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
 from eval.core.tablefile import read_table, table_file
 from eval.plans.coverage import Coverage, measure_coverage
 from eval.plans.targets import read_targets
-from eval.plans.worlds import find_references
+from eval.plans.worlds import find_references, is_other_odometry
 from eval.running.runfolder import TEXT_COLUMNS, RunFolder, read_json
+from eval.tables.conditions import COLUMNS as CONDITION_COLUMNS
+from eval.tables.conditions import Condition, by_condition, of_condition
 from eval.tables.rows import records, with_domain
 
 Row = Mapping[str, Any]
@@ -30,7 +32,7 @@ LARGEST = 1e15
 # ends of bins and of intervals, of which the last bin has none
 _UNBOUNDED = ("low", "high")
 # columns of text of the derived tables
-_DERIVED_TEXTS = {"domain", "variant"}
+_DERIVED_TEXTS = {"domain", "variant", *CONDITION_COLUMNS}
 _MORE_TEXTS = {
     "regions_targets": ("target", "asked", "is_met"), "objects_targets": ("target", "asked", "is_met"),
     "regions_by_size": ("measure",), "objects_by_group": ("measure", "value"),
@@ -54,6 +56,8 @@ class RunData:
         provenance: Content of provenance.json, {} where there is none.
         missing: Files that a complete run folder holds and this one lacks, one sentence each.
         left_out: One sentence for each table with figures that are read as NaN: infinite, or larger than `LARGEST`.
+        others: Rows of results.csv that `figures_of_plan` took out.
+        condition: Of which pairs the rows of `results` are; None for all of them.
     """
 
     folder: RunFolder
@@ -63,6 +67,27 @@ class RunData:
     provenance: Mapping[str, Any]
     missing: tuple[str, ...]
     left_out: tuple[str, ...] = ()
+    others: tuple[Row, ...] = ()
+    condition: Condition | None = None
+
+    @property
+    def every_result(self) -> tuple[Row, ...]:
+        """All rows of results.csv."""
+        return (*self.results, *self.others)
+
+
+def figures_of_plan(data: RunData) -> RunData:
+    """Return the part of a run that the figures of its plan are of, by odometry and sensor (`by_condition`)."""
+    (condition, is_main), *others = by_condition(pd.DataFrame(list(data.results)), read_targets(data.provenance))
+    if not others:
+        return replace(data, condition=condition)
+    results = tuple(row for row, is_of in zip(data.results, is_main, strict=True) if is_of)
+    rest = tuple(row for row, is_of in zip(data.results, is_main, strict=True) if not is_of)
+    pairs = {(row["scenario"], row["seed"]) for row in results}
+    changes, regions = (
+        tuple(row for row in rows if (row["scenario"], row["seed"]) in pairs) for rows in (data.changes, data.regions)
+    )
+    return replace(data, results=results, changes=changes, regions=regions, others=rest, condition=condition)
 
 
 def read_run(run: Path) -> RunData:
@@ -114,7 +139,13 @@ def stored_table(data: RunData, name: str) -> pd.DataFrame:
             raise InputError(
                 f"{path}: column {column} lacks a count: `tunnelcd score {path.parent}` makes the table anew"
             )
-    return _without_unusable(frame)
+    frame = _without_unusable(frame)
+    return frame if data.condition is None else of_condition(frame, data.condition)
+
+
+def every_condition(data: RunData, name: str) -> pd.DataFrame:
+    """Return a derived table of the run folder as `stored_table` does, with the rows of every odometry and sensor."""
+    return stored_table(replace(data, condition=None), name)
 
 
 def plan_name(data: RunData) -> str:
@@ -143,7 +174,7 @@ def comparable(data: RunData) -> pd.DataFrame:
 
 def covered_by(data: RunData) -> Coverage:
     """Return how much of its plan a run holds."""
-    cases = ((str(row["scenario"]), int(row["seed"]), str(row["variant"])) for row in data.results)
+    cases = ((str(row["scenario"]), int(row["seed"]), str(row["variant"])) for row in data.every_result)
     return measure_coverage(data.provenance, cases)
 
 
@@ -211,8 +242,9 @@ def scenarios(data: RunData, *, unchanged: bool) -> list[str]:
 
 
 def repeats(data: RunData) -> dict[tuple[str, str], str]:
-    """Return the reference world of each (world, variant) that has one (`eval.plans.worlds`)."""
-    return find_references(_cases(data))
+    """Return the reference world of each (world, variant) that is another with a setting (`eval.plans.worlds`)."""
+    found = find_references(_cases(data))
+    return {case: other for case, other in found.items() if not is_other_odometry(case[0], other)}
 
 
 def is_unchanged(data: RunData, scenario: str) -> bool:

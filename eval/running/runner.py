@@ -24,7 +24,7 @@ from eval.core.progress import RunProgress, Silent
 from eval.core.provenance import describe_run, digest
 from eval.plans.plan import Plan, expand_cells
 from eval.plans.variants import Cell
-from eval.plans.worlds import list_worlds, world_slug
+from eval.plans.worlds import world_slug
 from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Todo, Tools, cell_key, is_finished, pair_lock
 from eval.running.run_workers import remove_traces, run_on_workers
 from eval.running.runfolder import RunFolder, current_results, write_json, write_tables
@@ -133,7 +133,7 @@ def _run_here(run: RunFolder, pairs: Sequence[Pair], made: Made, progress: RunPr
 
 def _pairs(run: RunFolder, plan: Plan, all_cells: Sequence[Cell], force: bool, tools: Tools) -> list[Pair]:
     variants = list(dict.fromkeys(cell.variant for cell in all_cells))
-    places = {world.label: (place, world) for place, world in enumerate(list_worlds(plan.scenarios))}
+    places = {world.label: (place, world) for place, world in enumerate(plan.worlds)}
     for label in places:
         if (row := run.any_row(world_slug(label))) is not None and row["scenario"] != label:
             raise InputError(

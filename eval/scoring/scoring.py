@@ -266,6 +266,26 @@ def read_figure(report: ChangeReport, name: str) -> Float64Array:
     return np.asarray(report.figures.get(name, np.full(len(report.regions.scores), np.nan)), dtype=np.float64)
 
 
+def describe_recording(scenario: Mapping[str, Any]) -> dict[str, str]:
+    """Return the columns that say how a pair was recorded: the odometry of either session and the sensor's profile.
+
+    Args:
+        scenario: The scenario as drawn, as the truth of a pair holds it; a part that is not there gives "".
+    """
+
+    def named(*path: str) -> str:
+        value: Any = scenario
+        for key in path:
+            value = value.get(key) if isinstance(value, Mapping) else None
+        return "" if value is None else str(value)
+
+    return {
+        "odometry_before": named("before", "odometry", "source"),
+        "odometry_after": named("after", "odometry", "source"),
+        "sensor_profile": named("sensor", "profile"),
+    }
+
+
 def _make_identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
     return {
         "scenario": truth.pair.family,
@@ -281,6 +301,7 @@ def _make_identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
         "n_changes": len(truth.pair.changes),
         "n_observable": truth.n_observable,
         "score_radius_m": truth.pair.score_radius_m,
+        **describe_recording(truth.pair.scenario),
         "checkpoints": ";".join(f"{name} {digest}" for name, digest in answer.checkpoints.items()),
     }
 

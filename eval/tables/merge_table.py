@@ -15,6 +15,7 @@ import pandas as pd
 from cdpipe.core.geometry import BoolArray
 from eval.core.statistics import wilson_interval
 from eval.plans.targets import Targets, is_oracle
+from eval.tables.conditions import ANY, odometry_of, told_apart
 from eval.tables.rows import numbers, texts
 
 RIGHT_M, RIGHT_DEG = 0.5, 2.0
@@ -24,6 +25,7 @@ ERRORS = (
     "merge_error_m", "merge_error_deg", "merge_error_along_m", "merge_error_m_p95", "merge_error_deg_p95",
 )  # fmt: skip
 TIMES = ("t_index_s", "t_merge_s", "t_refine_s")
+_NAMES = ("pair_kind", "odometry", "family", "variant")
 # what a refusal says of a place that can slide along the tunnel: the setting of the gate that it names
 DEGENERACY = "min_hessian_ratio"
 
@@ -81,31 +83,32 @@ def kinds(results: pd.DataFrame) -> np.ndarray[Any, np.dtype[np.object_]]:
 
 
 def merge_table(results: pd.DataFrame, targets: Targets) -> pd.DataFrame:
-    """Return one row for each kind of pair and variant, and the same for each family.
+    """Return one row for each kind of pair, odometry and variant, and the same for each family.
 
     Args:
         results: Rows as in results.csv.
         targets: What the plan of the run asks for.
 
     Returns:
-        `pair_kind`; `family`, "all" in the rows over all; `variant`; the counts `n_pairs`, `n_accepted`, `n_refused`,
-        `n_failed`, `n_within_target`; `share_within_target` of all pairs with its 95 % Wilson interval `low` to `high`;
-        `target_share`; `n_wrong_accepted`; `n_p95_over_half_m`, accepted pairs whose 95th percentile along the path is
-        over 0.5 m; `is_met`: the share reaches the target's and none is wrong and accepted (neither target nor verdict
-        for a merge by the truth); `n_named_degeneracy` of the refusals; `median_` and `p95_` over the accepted pairs of
-        each error, `n_` of them defined, and the median, 95th percentile and number of each time. Rows without a kind
-        are left out.
+        `pair_kind`; `odometry` of both sessions; `family`, "all" in the rows over all; `variant`; the counts `n_pairs`,
+        `n_accepted`, `n_refused`, `n_failed`, `n_within_target`; `share_within_target` of all pairs with its 95 %
+        Wilson interval `low` to `high`; `target_share`; `n_wrong_accepted`; `n_p95_over_half_m`, accepted pairs whose
+        95th percentile along the path is over 0.5 m; `is_met`: the share reaches the target's and none is wrong and
+        accepted (neither target nor verdict for a merge by the truth); `n_named_degeneracy` of the refusals; `median_`
+        and `p95_` over the accepted pairs of each error, `n_` of them defined, and the median, 95th percentile and
+        number of each time. Rows without a kind are left out.
     """
     kind = kinds(results)
     family = results["family" if "family" in results else "scenario"]
-    cases = results.assign(pair_kind=kind, family=family)[kind != ""]
+    odometry = odometry_of(results)
+    cases = results.assign(pair_kind=kind, family=family, odometry=np.where(odometry == "", ANY, odometry))[kind != ""]
     rows: list[dict[str, Any]] = []
-    for keys in (["pair_kind", "variant"], ["pair_kind", "family", "variant"]):
+    for keys in (["pair_kind", "odometry", "variant"], ["pair_kind", "odometry", "family", "variant"]):
         for values, group in cases.groupby(keys, sort=False):
             names = {"family": ALL_FAMILIES, **dict(zip(keys, values, strict=True))}
-            rows.append({**{key: names[key] for key in ("pair_kind", "family", "variant")}, **_counts(group, targets)})
+            rows.append({**{key: names[key] for key in _NAMES}, **_counts(group, targets)})
     if not rows:
-        return pd.DataFrame(columns=["pair_kind", "family", "variant", "n_pairs"])
+        return pd.DataFrame(columns=[*_NAMES, "n_pairs"])
     return pd.DataFrame(rows).sort_values("pair_kind", key=_kind_order, kind="stable", ignore_index=True)
 
 
@@ -122,7 +125,7 @@ def merge_overview(results: pd.DataFrame, targets: Targets, *, is_whole: bool = 
         return table
     shown = table[table["family"] == ALL_FAMILIES]
     names = {
-        "pair_kind": "pair_kind", "variant": "variant", "n_pairs": "n", "n_accepted": "accepted",
+        "pair_kind": "pair_kind", **told_apart(table), "variant": "variant", "n_pairs": "n", "n_accepted": "accepted",
         "n_refused": "refused", "n_failed": "failed", "share_within_target": "within", "low": "low", "high": "high",
         "target_share": "target", "is_met": "met", "n_wrong_accepted": "wrong_accepted",
         "n_p95_over_half_m": "p95_over_0.5m",

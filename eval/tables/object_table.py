@@ -17,6 +17,7 @@ from cdpipe.core.geometry import Float64Array
 from eval.core.statistics import median
 from eval.plans.targets import Targets
 from eval.scoring.object_sizes import PILE_KIND
+from eval.tables.conditions import by_condition, told_apart
 from eval.tables.groups import clustered_interval, main_changes, objects_by_group, pair_numbers
 from eval.tables.rows import by_domain, by_variant, means_with_intervals, numbers, of_cases, texts, with_domain
 from eval.tables.targets import judged_targets
@@ -42,29 +43,32 @@ def object_tables(
         is_whole: Whether all that was planned is in them; otherwise nothing is said to be met or not.
 
     Returns:
-        objects_table: a row for every domain and variant; objects_by_group: by kind of prop and size of hull;
-        objects_targets: what is asked, and what is found.
+        objects_table: a row for every condition (odometry and sensor, where the plan tells them apart), domain and
+        variant; objects_by_group: by kind of prop and size of hull; objects_targets: what is asked, and what is found.
     """
     rows: list[dict[str, Any]] = []
     groups: list[dict[str, Any]] = []
     changes_by_variant = by_variant(changes)
-    for domain, cases in by_domain(with_domain(results)):
-        for variant, own in cases.groupby("variant", sort=False):
-            names = {"domain": domain, "variant": str(variant)}
-            own_changes = of_cases(changes_by_variant.get(str(variant), changes[:0]), own)
-            rows.append({**names, **_counts(own, own_changes), **_means(own), **_over_changes(own_changes)})
-            groups += [{**names, **row} for row in objects_by_group(own_changes)]
+    conditions = by_condition(results, targets)
+    for condition, is_its in conditions:
+        for domain, cases in by_domain(with_domain(results[is_its])):
+            for variant, own in cases.groupby("variant", sort=False):
+                names = {"domain": domain, "variant": str(variant), **condition.columns}
+                own_changes = of_cases(changes_by_variant.get(str(variant), changes[:0]), own)
+                rows.append({**names, **_counts(own, own_changes), **_means(own), **_over_changes(own_changes)})
+                groups += [{**names, **row} for row in objects_by_group(own_changes)]
     table = pd.DataFrame(rows)
     return {
         "objects_table": table,
         "objects_by_group": pd.DataFrame(groups),
-        "objects_targets": judged_targets(targets.objects, targets.method, table, results, is_whole=is_whole),
+        "objects_targets": judged_targets(targets, "objects", table, results, is_whole=is_whole),
     }
 
 
 def object_overview(table: pd.DataFrame) -> pd.DataFrame:
     """Return the columns of objects_table.csv that a terminal has room for, intervals beside the values."""
     names = {
+        **told_apart(table),
         "domain": "domain", "variant": "variant", "n_pairs": "n", "n_failed": "failed", "n_changes": "changes",
         "object_iou_point": "iou", "iou_matched_median": "matched", "object_iou_voxel": "voxel",
         "object_f1_25": "f1@25", "object_f1_50": "f1@50", "kind_accuracy": "kind",

@@ -18,6 +18,7 @@ from cdpipe.core.geometry import Float64Array
 from eval.core.ranking import auroc
 from eval.core.statistics import interval_of, mean, median, wilson_interval
 from eval.plans.targets import Targets
+from eval.tables.conditions import by_condition, told_apart
 from eval.tables.groups import recall_by_size
 from eval.tables.region_curves import (
     RATES_PER_100M,
@@ -52,8 +53,9 @@ def region_tables(
         is_whole: Whether all that was planned is in them; otherwise nothing is said to be met or not.
 
     Returns:
-        regions_table: a row for every domain and variant; regions_targets: what is asked, and what is
-        found; regions_by_size: recall by size, returns and range of the change; roc, froc: the curves.
+        regions_table: a row for every condition (odometry and sensor, where the plan tells them apart), domain and
+        variant; regions_targets: what is asked, and what is found; regions_by_size: recall by size, returns and range
+        of the change; roc, froc: the curves.
     """
     results = with_domain(results)
     rows: list[dict[str, Any]] = []
@@ -61,14 +63,18 @@ def region_tables(
     curves: dict[str, list[pd.DataFrame]] = {"roc": [], "froc": []}
     ranked: dict[tuple[str, str], RankedPairs] = {}
     items_by_variant = {name: by_variant(items[name]) for name in ("regions", "changes", "keyframes")}
-    for domain, cases in by_domain(results):
+    conditions = by_condition(results, targets)
+    of_conditions = [(each, *part) for each, is_its in conditions for part in by_domain(results[is_its])]
+    for condition, domain, cases in of_conditions:
         for variant, own in cases.groupby("variant", sort=False):
-            names = {"domain": domain, "variant": str(variant)}
+            names = {"domain": domain, "variant": str(variant), **condition.columns}
             regions, changes, keyframes = (
                 of_cases(part.get(str(variant), items[name][:0]), own, _NEEDED)
                 for name, part in items_by_variant.items()
             )
-            each = ranked[domain, str(variant)] = ranked_pairs(own, regions, changes)
+            each = ranked_pairs(own, regions, changes)
+            if condition == conditions[0][0]:
+                ranked[domain, str(variant)] = each
             labelled = keyframes[keyframes["label"] >= 0]
             scores, positive = labelled["score"].to_numpy(dtype=np.float64), labelled["label"].to_numpy() == 1
             rows.append({**names, **_counts(own), "region_auroc_pooled": auroc(scores, positive), **_operating(each)})
@@ -80,7 +86,7 @@ def region_tables(
     table = pd.DataFrame(rows)
     return {
         "regions_table": table,
-        "regions_targets": judged_targets(targets.regions, targets.method, table, results, ranked, is_whole=is_whole),
+        "regions_targets": judged_targets(targets, "regions", table, results, ranked, is_whole=is_whole),
         "regions_by_size": pd.DataFrame(sizes),
         **{name: pd.concat(parts, ignore_index=True) for name, parts in curves.items()},
     }
@@ -89,6 +95,7 @@ def region_tables(
 def region_overview(table: pd.DataFrame) -> pd.DataFrame:
     """Return the columns of regions_table.csv that a terminal has room for."""
     names = {
+        **told_apart(table),
         "domain": "domain", "variant": "variant", "n_pairs": "n", "n_failed": "failed", "region_auroc": "auroc",
         "region_auroc_low": "low", "region_auroc_high": "high", "region_auroc_pooled": "pooled",
         "region_recall_at_k": "recall_at_k", "region_recall": "recall", "region_precision": "precision",

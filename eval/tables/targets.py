@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
 from eval.core.statistics import mean_with_interval, median
-from eval.plans.targets import RATE_COLUMN, Target
+from eval.plans.targets import RATE_COLUMN, Target, Targets
+from eval.tables.conditions import ANY, by_condition, odometry_of, of_condition
 from eval.tables.region_curves import RankedPairs, recall_difference
 from eval.tables.rows import numbers, records, texts
 
@@ -25,8 +26,8 @@ _ENDS = {"silent_share": ("silent_low", "silent_high")}
 
 
 def judged_targets(
-    targets: Sequence[Target],
-    method: str,
+    targets: Targets,
+    subject: Literal["regions", "objects"],
     table: pd.DataFrame,
     results: pd.DataFrame,
     ranked: Mapping[tuple[str, str], RankedPairs] | None = None,
@@ -36,24 +37,28 @@ def judged_targets(
     """Return what is asked and whether it is met; no row for a figure that is undefined.
 
     Args:
-        targets: What is asked.
-        method: The variant that the targets are about.
+        targets: What the plan asks for.
+        subject: Of which part of it.
         table: regions_table or objects_table.
-        results: Rows as in results.csv.
+        results: Rows as in results.csv; judged are those of the odometry and the sensor that the plan's figures are of.
         ranked: Candidates and changes of each domain and variant, for targets against a rival.
         is_whole: Whether all that was planned is in the tables; otherwise nothing is said to be met or not.
 
     Returns:
-        `target`, its name; `domain` (or site), `variant`, `value` with `low` and `high` where there is an interval,
-        `asked` ("at least 0.97"), `n` pairs (changes, where the figure is a median over changes), and `is_met`: None
-        where no verdict is passed.
+        `target`, its name; `domain` (or site, or sensor), `variant`, `value` with `low` and `high` where there is an
+        interval, `asked` ("at least 0.97"), `n` pairs (changes, where the figure is a median over changes), and
+        `is_met`: None where no verdict is passed.
     """
     rows = []
-    for target in targets:
-        variant = target.method or method
+    main, is_its = by_condition(results, targets)[0]
+    table, own = of_condition(table, main), results[is_its]
+    for target in getattr(targets, subject):
+        variant = target.method or targets.method
         found: dict[str, Any] | None
         if target.site:
-            found = _on_site(target, variant, results)
+            found = _on_site(target, variant, own)
+        elif target.sensor:
+            found = _with_sensor(target, variant, results, main.odometry)
         elif target.less:
             found = _against(target, variant, ranked or {})
         else:
@@ -102,6 +107,23 @@ def _on_site(target: Target, variant: str, results: pd.DataFrame) -> dict[str, A
     if target.column.startswith("t_"):
         value, low, high = median(values), math.nan, math.nan
     return {"domain": target.site, "value": value, "low": low, "high": high, "n": n}
+
+
+def _with_sensor(target: Target, variant: str, results: pd.DataFrame, odometry: str) -> dict[str, Any]:
+    """Return the mean over the pairs with a sensor, less that of another sensor over the same pairs where asked."""
+    is_its = (odometry_of(results) == odometry) | (odometry == ANY)
+    own = results[is_its & (results["variant"] == variant).to_numpy()]
+
+    def of_pairs(sensor: str) -> pd.Series[float]:
+        rows = own[texts(own, "sensor_profile") == sensor]
+        pairs = pd.MultiIndex.from_arrays([texts(rows, "family"), numbers(rows, "seed")])
+        return pd.Series(numbers(rows, target.column), index=pairs).groupby(level=[0, 1]).mean()
+
+    values = of_pairs(target.sensor)
+    if target.less_sensor:
+        values = (values - of_pairs(target.less_sensor)).dropna()
+    value, low, high, n = mean_with_interval(np.asarray(values, dtype=np.float64))
+    return {"domain": target.sensor, "value": value, "low": low, "high": high, "n": n}
 
 
 def is_unchanged_pair(results: pd.DataFrame) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

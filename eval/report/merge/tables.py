@@ -13,6 +13,7 @@ from cdpipe.merge.evidence import GATES
 from eval.plans.targets import is_oracle
 from eval.report.tables import Cell, Table
 from eval.tables.columns import EN_DASH, UNDEFINED, Column, fine, significant
+from eval.tables.conditions import told_apart
 from eval.tables.merge_table import ALL_FAMILIES, RIGHT_DEG, RIGHT_M, RULES, TIMES, kinds
 from eval.tables.rows import numbers, records, texts
 
@@ -55,15 +56,23 @@ def kinds_table(table: pd.DataFrame, *, is_whole: bool = True) -> Table:
     """
     own = table[table["family"] == ALL_FAMILIES]
     caption = "Kinds of pair: one row is one method; the group says what the kind asks for"
-    groups = {kind: f"{kind}: {RULES[kind]}" if kind in RULES else kind for kind in own["pair_kind"].unique()}
-    return _targets_table(own.replace({"pair_kind": groups}), "variant", caption, is_whole=is_whole)
+    rules = [f": {RULES[kind]}" if kind in RULES else "" for kind in own["pair_kind"]]
+    groups = [f"{kind}{rule}" for kind, rule in zip(name_kinds(own), rules, strict=True)]
+    return _targets_table(own.assign(pair_kind=groups), "variant", caption, is_whole=is_whole)
 
 
 def families_table(table: pd.DataFrame, name: str, *, is_whole: bool = True) -> Table:
     """Return the same for one variant, family by family."""
     own = table[(table["family"] != ALL_FAMILIES) & (table["variant"] == name)]
     caption = f"The same by family: {name}; all variants are in merge.csv"
-    return _targets_table(own, "family", caption, is_whole=is_whole)
+    return _targets_table(own.assign(pair_kind=name_kinds(own)), "family", caption, is_whole=is_whole)
+
+
+def name_kinds(table: pd.DataFrame) -> list[str]:
+    """Return (N,) the kind of pair of each row, with its odometry where the rows differ in it: "drift, kiss-icp"."""
+    if not told_apart(table):
+        return [str(kind) for kind in table["pair_kind"]]
+    return [f"{kind}, {odometry}" for kind, odometry in zip(table["pair_kind"], table["odometry"], strict=True)]
 
 
 def _targets_table(table: pd.DataFrame, first: str, caption: str, *, is_whole: bool) -> Table:

@@ -14,14 +14,20 @@ from eval.core.figures import picture_address
 from eval.report.objects.cases import object_cases, voxel_variants
 from eval.report.objects.tables import OBJECT_COLUMNS, OBJECT_COUNTS, WITHDRAWAL_COLUMNS, groups_table
 from eval.report.regions.charts import look_of
-from eval.report.tables import Picture, Section, methods_table, targets_table, with_rows
-from eval.running.run_data import RunData, off_grids, shown_variant, stored_table
+from eval.report.tables import Picture, Section, conditions_table, methods_table, targets_table, with_rows
+from eval.running.run_data import RunData, every_condition, off_grids, shown_variant, stored_table
 from eval.running.runfolder import reported
+from eval.tables.columns import select
 from eval.tables.groups import main_changes
 from eval.tables.rows import ALL_DOMAINS, numbers, with_domain
 
 _CAPTION = "Objects: one row is one method on the pairs in or out of the training distribution"
 _WITHDRAWAL_CAPTION = "Regions before and after those without an object are withdrawn: one row is one method"
+_CONDITIONS_CAPTION = "Objects by odometry and sensor: the first row of a method is what the other figures are of"
+_COMPARED = select(
+    OBJECT_COLUMNS, "object_iou_point", "iou_matched_median", "object_f1_50", "object_precision_50", "kind_accuracy",
+    "object_iou_point_partial",
+)  # fmt: skip
 _DOTS = Look("#a8a8a8", 0.0, marker="circle", size=3.0)
 _LEAST_M3, _MOST_M3 = 0.02, 60.0
 
@@ -39,6 +45,7 @@ def draw_objects(data: RunData) -> Section | None:
     tables = [
         methods_table(table, OBJECT_COLUMNS, rows, _CAPTION, counts=OBJECT_COUNTS),
         methods_table(table, WITHDRAWAL_COLUMNS, rows, _WITHDRAWAL_CAPTION),
+        conditions_table(off_grids(every_condition(data, "objects_table"), data), _COMPARED, _CONDITIONS_CAPTION),
         targets_table(stored_table(data, "objects_targets")),
         *(groups_table(groups, domain, main, voxel_variants(data, main)) for domain in domains),
     ]

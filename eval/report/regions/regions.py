@@ -7,10 +7,19 @@ import pandas as pd
 from eval.core.domains import domain_name
 from eval.plans.targets import read_targets
 from eval.report.regions.charts import draw_free_response, draw_roc, draw_sizes
-from eval.report.tables import Cell, Section, Table, interval_of_row, methods_table, targets_table, with_rows
-from eval.running.run_data import RunData, off_grids, shown_variant, stored_table
+from eval.report.tables import (
+    Cell,
+    Section,
+    Table,
+    conditions_table,
+    interval_of_row,
+    methods_table,
+    targets_table,
+    with_rows,
+)
+from eval.running.run_data import RunData, every_condition, off_grids, shown_variant, stored_table
 from eval.running.runfolder import reported
-from eval.tables.columns import Column, scaled, share, significant
+from eval.tables.columns import Column, scaled, select, share, significant
 from eval.tables.rows import records, with_domain
 
 _ms = scaled(1000.0)
@@ -48,6 +57,13 @@ _CURVES = ("roc", "froc", "regions_by_size")
 _CAPTION = "Regions: one row is one method on the pairs in or out of the training distribution"
 
 
+_CONDITIONS_CAPTION = "Regions by odometry and sensor: the first row of a method is what the other figures are of"
+_COMPARED = select(
+    REGION_COLUMNS, "region_auroc", "region_recall_at_k", "recall_at_0.1", "recall_at_0.5", "region_recall",
+    "region_precision", "false_regions_per_100m",
+)  # fmt: skip
+
+
 def draw_regions(data: RunData) -> Section | None:
     """Return tables and plots of the regions; None where the plan of the run does not ask for them."""
     if "regions" not in reported(data.provenance):
@@ -57,7 +73,10 @@ def draw_regions(data: RunData) -> Section | None:
     if len(table) == 0:
         return Section(missing=("regions_table.csv is not in the run folder: `tunnelcd score` makes it.",))
     methods = methods_table(table, REGION_COLUMNS, with_domain(data.results), _CAPTION)
-    tables = (methods, silence_table(table), targets_table(stored_table(data, "regions_targets")))
+    conditions = conditions_table(
+        off_grids(every_condition(data, "regions_table"), data), _COMPARED, _CONDITIONS_CAPTION
+    )
+    tables = (methods, conditions, silence_table(table), targets_table(stored_table(data, "regions_targets")))
     first = [main, *(target.less for target in read_targets(data.provenance).regions if target.less)]
     plots = (
         draw_roc(found["roc"], table, main), draw_free_response(found["froc"], table),

@@ -42,7 +42,7 @@ class EffectsOn:
 
 def draw_effects(data: RunData) -> list[EffectsOn]:
     """Return table and picture for every world that others repeat with something set otherwise."""
-    results = pd.DataFrame(list(data.results))
+    results = pd.DataFrame(list(data.every_result))
     known = [name for name in ("scenario", "seed", "variant", *(column.key for column in COLUMNS)) if name in results]
     found = effects(results[known]).groupby("reference", sort=False)
     return [_effects_on(data, str(reference), own) for reference, own in found]
@@ -110,7 +110,7 @@ def _lines(
 ) -> Iterator[tuple[str, tuple[Cell, ...]]]:
     """Yield the rows of the table: for each variant the world's own means, then every setting."""
     for variant, own in table.groupby("variant", sort=False):
-        plain = of(data.results, scenario=table["reference"].iloc[0], variant=variant)
+        plain = of(data.every_result, scenario=table["reference"].iloc[0], variant=variant)
         means = (Cell(column.shown(over_pairs(plain, column.key))) for column in columns)
         yield str(variant), (Cell("as it is: mean"), Cell(str(len(plain))), *means)
         for setting in settings:

@@ -130,7 +130,8 @@ def test_the_row(case: CaseScore) -> None:
     expected = {
         "scenario": "narrow", "family": "narrow", "pair_kind": "", "seed": 7, "variant": "mine", "preset": "mine",
         "status": "ok", "error": "", "metrics_version": METRICS_VERSION, "domain": "in", "n_changes": 3,
-        "n_observable": 2, "score_radius_m": 3.0, "checkpoints": "3deg ab;sphere cd",
+        "n_observable": 2, "score_radius_m": 3.0, "odometry_before": "", "odometry_after": "",
+        "sensor_profile": "", "checkpoints": "3deg ab;sphere cd",
         # one of two is found by what stands, both by what was proposed
         "region_recall": 0.5, "region_precision": 0.5, "false_regions_per_100m": 2.0,
         "region_recall_proposed": 1.0, "region_precision_proposed": 0.5, "false_regions_per_100m_proposed": 4.0,
@@ -273,7 +274,8 @@ def test_a_case_without_an_answer(truth: GroundTruth) -> None:
     known = {
         "scenario": "narrow", "family": "narrow", "pair_kind": "", "seed": 7, "variant": "mine", "preset": "mine",
         "status": "failed", "error": "too dark", "metrics_version": METRICS_VERSION, "domain": "in", "n_changes": 3,
-        "n_observable": 2, "score_radius_m": 3.0, "checkpoints": "",
+        "n_observable": 2, "score_radius_m": 3.0, "odometry_before": "", "odometry_after": "",
+        "sensor_profile": "", "checkpoints": "",
         "region_auroc": 0.5, "region_ap": 12 / (12 + n_far),
         "is_auroc_assumed": 1.0, "overlap_true": 1.0, "evidence_overlap": 0.5, "t_merge_s": 2.0, "t_descriptor_s": 8.0,
         "after_path_m": 50.0,
