@@ -11,6 +11,7 @@ import pandas as pd
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from eval.core.statistics import N_RESAMPLES, Statistic, interval_of, mean, median
+from eval.tables.conditions import told_apart
 from eval.tables.region_curves import RankedPairs, found_at
 from eval.tables.rows import PAIR, numbers, texts
 
@@ -114,6 +115,7 @@ def recall_by_size(ranked: RankedPairs, changes: pd.DataFrame) -> list[dict[str,
 def group_overview(groups: pd.DataFrame, variant: str) -> pd.DataFrame:
     """Return the columns of objects_by_group.csv that a terminal has room for, of one variant."""
     names = {
+        **told_apart(groups),
         "domain": "domain", "object": "object", "n_changes": "n", "n_pairs": "pairs", "iou_point": "iou",
         "iou_point_low": "low", "iou_point_high": "high", "iou_matched_median": "matched", "share_50": "iou>=0.5",
         "share_found": "found", "kind_accuracy": "kind", "displacement_error_m": "moved_m", "volume_error": "volume",

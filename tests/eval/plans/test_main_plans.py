@@ -33,9 +33,25 @@ def test_main_judges_at_the_radius_and_threshold_of_regions() -> None:
     assert {variant for _, variant in shared} >= {"tunnelcd", "paper", "voxel-diff", "random-regions"}
     assert all(ours[key] == theirs[key] for key in shared)
     for (scenario, _), config in ours.items():
-        assert config.query.radius_m == (10.0 if scenario == "regions/wide" else 4.5)
+        assert config.query.radius_m == (10.0 if scenario.partition("[")[0] == "regions/wide" else 4.5)
     for variant in ("kiss-matcher", "oracle-merge"):
         assert ours["regions/wide", variant].query == ours["regions/wide", "tunnelcd"].query
+
+
+def test_parts_takes_one_part_away_at_a_time() -> None:
+    found = expand_cells(load_plan("parts"))
+    assert {cell.variant for cell in found} == {
+        "tunnelcd", "tunnelcd[map.consistency=none]", "tunnelcd[merge.refine=local]",
+    }  # fmt: skip
+    ours = next(cell.config for cell in found if cell.variant == "tunnelcd")
+    # else a row would repeat the first
+    assert ours.map.consistency != "none" and ours.merge.refine != "local"
+    held = find_references((cell.scenario, cell.variant, cell.seed) for cell in found)
+    thin = {label for label, _ in held}
+    assert {list_settings_over(label, held[label, "tunnelcd"]) for label in thin} == {"sensor.sub_rays=1"}
+    plain = {f"regions/{name}[odometry=kiss-icp]" for name in ("narrow", "wide", "network")}
+    assert {cell.scenario for cell in found} - thin == plain
+    assert len({cell.seed for cell in found}) >= 6 and all(20000 <= cell.seed < 30000 for cell in found)
 
 
 def test_every_stress_is_held_against_the_same_pair_without_it() -> None:

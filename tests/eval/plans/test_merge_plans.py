@@ -12,7 +12,6 @@ from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.changes import change_plan
 from eval.plans.plan import expand_cells, load_plan
 from eval.plans.variants import Cell
-from eval.plans.worlds import list_worlds
 
 VALIDATION, TEST = range(10000, 20000), range(20000, 30000)
 HELD_OUT = ("cave", "site1", "site2")
@@ -20,7 +19,7 @@ HELD_OUT = ("cave", "site1", "site2")
 
 def pairs_by_kind(name: str) -> Counter[str]:
     plan = load_plan(name)
-    kinds = {world.label: world.pair_kind for world in list_worlds(plan.scenarios)}
+    kinds = {world.label: world.pair_kind for world in plan.worlds}
     return Counter(kinds[label] for label, _ in {(cell.scenario, cell.seed) for cell in expand_cells(plan)})
 
 
@@ -38,7 +37,14 @@ def test_merge_has_two_hundred_test_pairs_of_four_kinds_and_four_methods() -> No
     assert variants(found) == ["tunnelcd", "frame", "kiss-matcher", "oracle-merge"]
     assert {cell.until for cell in found} == {"merge"}
     assert {cell.seed for cell in found} <= set(TEST)
-    clean = {world.name for world in list_worlds(load_plan("merge").scenarios) if world.pair_kind == "clean"}
+    worlds = load_plan("merge").worlds
+    # only true odometry asks for an exact merge; all other kinds are asked with both odometries
+    assert {world.odometry for world in worlds if world.pair_kind == "clean"} == {"own"}
+    for kind in ("drift", "smooth", "disjoint"):
+        of_kind = [(world.name, world.odometry) for world in worlds if world.pair_kind == kind]
+        names = {name for name, _ in of_kind}
+        assert sorted(of_kind) == sorted((name, each) for name in names for each in ("own", "kiss-icp"))
+    clean = {world.name for world in worlds if world.pair_kind == "clean"}
     assert clean == {f"merge/{name}" for name in ("narrow", "wide", "network", *HELD_OUT)}
 
 
@@ -50,8 +56,8 @@ def test_thresholds_are_chosen_on_validation_pairs_of_the_same_kinds() -> None:
     assert {cell.seed for cell in found} <= set(VALIDATION)
     assert not any(name in cell.scenario for cell in found for name in HELD_OUT)
     assert variants(found) == ["tunnelcd[merge.accept_all=true]"]
-    of_merge = {world.name: world.pair_kind for world in list_worlds(load_plan("merge").scenarios)}
-    for world in list_worlds(load_plan("merge-gates").scenarios):
+    of_merge = {world.name: world.pair_kind for world in load_plan("merge").worlds}
+    for world in load_plan("merge-gates").worlds:
         assert of_merge[world.name] == world.pair_kind
 
 

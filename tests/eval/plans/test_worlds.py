@@ -8,7 +8,15 @@ from cdpipe.core.errors import InputError
 from eval.plans import worlds
 from eval.plans.changes import change_plan
 from eval.plans.plan import Plan, expand_cells, load_plan
-from eval.plans.worlds import World, find_references, list_settings_over, list_worlds, world_slug
+from eval.plans.worlds import (
+    World,
+    find_references,
+    is_other_odometry,
+    list_settings_over,
+    list_worlds,
+    world_slug,
+)
+from scenarios.library import load_scenario
 
 PLAN = """\
 name: worlds
@@ -103,6 +111,65 @@ def test_a_plan_is_dumped_as_it_is_written_and_read_back_the_same(tmp_path: Path
     assert change_plan(plan) == plan
     again = change_plan(plan, seeds="3:5", settings=["extract.voxel_m=0.1"])
     assert list_worlds(again.scenarios) == list_worlds(plan.scenarios)
+
+
+BOTH = """\
+name: both
+odometry: [kiss-icp, own]
+scenarios:
+  - smoke/unchanged
+  - {name: smoke/one_box, each: sensor.sub_rays=7, pair_kind: drift, n_seeds: 1}
+  - {name: smoke/one_box, odometry: kiss-icp, set: sensor.profile=os1-32-u0}
+seeds: [7, 8]
+variants: [{preset: tunnelcd, per_scenario: {smoke/one_box: [query.radius_m=5]}}]
+"""
+KISS = ("before.odometry.source=kiss-icp", "after.odometry.source=kiss-icp")
+
+
+def test_a_plan_gives_every_item_its_odometries_unless_the_item_has_its_own(tmp_path: Path) -> None:
+    plan = read(tmp_path, BOTH)
+    assert [(world.label, world.settings) for world in plan.worlds] == [
+        ("smoke/unchanged[odometry=kiss-icp]", KISS),
+        ("smoke/unchanged", ()),
+        ("smoke/one_box[odometry=kiss-icp]", KISS),
+        ("smoke/one_box[odometry=kiss-icp][sensor.sub_rays=7]", (*KISS, "sensor.sub_rays=7")),
+        ("smoke/one_box", ()),
+        ("smoke/one_box[sensor.sub_rays=7]", ("sensor.sub_rays=7",)),
+        ("smoke/one_box[odometry=kiss-icp][sensor.profile=os1-32-u0]", (*KISS, "sensor.profile=os1-32-u0")),
+    ]
+    assert [world.pair_kind for world in plan.worlds] == ["", "", *["drift"] * 4, ""]
+    drawn = load_scenario("smoke/one_box", 7, plan.worlds[2].settings)
+    assert drawn.before.odometry.source == drawn.after.odometry.source == "kiss-icp"
+    assert {cell.config.query.radius_m for cell in expand_cells(plan) if "one_box" in cell.scenario} == {5}
+    assert change_plan(plan, seeds="1:3").worlds == plan.worlds
+
+
+def test_pairs_with_another_odometry_are_held_against_the_same_pairs_and_repeat_nothing() -> None:
+    one, other = "n[odometry=kiss-icp]", "n[odometry=kiss-icp][sensor.sub_rays=7]"
+    held = find_references((label, "v", 0) for label in ("n", one, other))
+    assert held == {(one, "v"): "n", (other, "v"): one}
+    assert (is_other_odometry(one, "n"), is_other_odometry(other, one)) == (True, False)
+    assert not is_other_odometry(other, "n")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("odometry: [kiss-icp, own]", "odometry: kis-icp"),
+        ("odometry: [kiss-icp, own]", "odometry: [own, own]"),
+        ("odometry: [kiss-icp, own]", "odometry: []"),
+        ("  - smoke/unchanged", "  - {name: smoke/unchanged, odometry: walk}"),
+    ],
+)
+def test_mistakes_of_the_odometry(tmp_path: Path, text: str, words: str) -> None:
+    assert text in BOTH
+    (line,) = mistakes(tmp_path, BOTH.replace(text, words))
+    assert "odometry" in line and line.startswith("plan.yaml:")
+
+
+def test_a_world_that_two_odometries_make_twice_is_refused(tmp_path: Path) -> None:
+    (line,) = mistakes(tmp_path, BOTH.replace("seeds: [", "  - {name: smoke/unchanged, odometry: own}\nseeds: ["))
+    assert "smoke/unchanged is listed twice" in line
 
 
 def test_the_kind_of_a_pair_is_of_all_worlds_of_its_item_and_in_no_name(tmp_path: Path) -> None:

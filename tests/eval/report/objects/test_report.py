@@ -14,7 +14,7 @@ from eval.report.objects.report import draw_objects
 from eval.report.objects.tables import OBJECT_COLUMNS, OBJECT_COUNTS, WITHDRAWAL_COLUMNS
 from eval.report.page import write_page
 from eval.report.tables import methods_table
-from eval.running.run_data import RunData, read_run
+from eval.running.run_data import RunData, figures_of_plan, read_run
 from eval.running.runfolder import RunFolder, write_json
 from eval.tables.object_table import FILES, ORACLE_VARIANT, object_tables
 from eval.tables.rows import with_domain
@@ -133,6 +133,40 @@ def test_the_section_says_what_the_tables_say(run: Path) -> None:
     # methods, withdrawal, targets, and kinds and sizes of either domain
     assert [len(each.rows) for each in part.tables] == [12, 12, 2, 6, 6]
     assert len(part.plots) == 1
+
+
+def test_the_figures_are_those_of_one_odometry_and_the_other_stands_beside_them(run: Path, tmp_path: Path) -> None:
+    results, changes = made_up(6)
+    own = results.assign(odometry_before="drift", odometry_after="drift")
+    kiss = results.assign(odometry_before="kiss-icp", odometry_after="kiss-icp")
+    kiss = kiss.assign(object_iou_point=kiss["object_iou_point"] - 0.3)
+    of_kiss = {"scenario": results["scenario"] + "[odometry=kiss-icp]"}
+    every = pd.concat([own, kiss.assign(**of_kiss)], ignore_index=True)
+    both = pd.concat([changes, changes.assign(scenario=changes["scenario"] + "[odometry=kiss-icp]")], ignore_index=True)
+    targets = TARGETS.model_copy(update={"odometry": "kiss-icp"})
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name, table in {"results": every, "changes": both, **object_tables(every, both, targets)}.items():
+        table.to_csv(folder / f"{name}.csv", index=False)
+    plan = {"name": "made-up", "report": "objects", "targets": targets.model_dump()}
+    write_json(folder / "provenance.json", {"tool": "tunnelcd", "plan": plan, "machine": {}, "command": "tunnelcd run"})
+    data = figures_of_plan(read_run(folder))
+    assert (len(data.results), len(data.others)) == (len(kiss), len(own))
+    assert all(row["odometry_before"] == "kiss-icp" for row in data.results)
+    part, plain = draw_objects(data), draw_objects(figures_of_plan(read_run(run)))
+    assert part is not None and plain is not None
+    mean = kiss[(kiss["variant"] == "tunnelcd") & (kiss["family"] == "regions/narrow")]["object_iou_point"].mean()
+    assert part.tables[0].rows[0][1][2].text == f"{mean:.2f}"
+    beside = part.tables[2]
+    assert beside.headings[0] == "odometry, sensor"
+    rows = dict(beside.groups())["tunnelcd, in distribution"]
+    assert [(cells[0].text, cells[2].text) for cells in rows] == [
+        ("kiss-icp", f"{mean:.2f}"), ("drift", f"{mean + 0.3:.2f}"),
+    ]  # fmt: skip
+    # a run that tells nothing apart has no such table, and all of its tables are as before
+    assert [table.headings[0] for table in plain.tables[:3]] == ["method", "method", "target"]
+    page = write_page(folder, "none").read_text()
+    assert "figures are of the pairs with kiss-icp, those of 12 other pairs stand in tables beside them" in page
 
 
 def test_the_best_is_among_those_that_ask_no_truth(run: Path) -> None:
