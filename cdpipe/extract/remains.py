@@ -50,9 +50,10 @@ def is_part_of_remainder(taken_map: Float64Array, rest_map: Float64Array, other_
     beside = rest_map[beside_m < _BESIDE_M]
     stayed_m, _ = cKDTree(other_map).query(beside)
     surface = np.concatenate([rest_map, other_map])
-    floor = _fit_floor(surface)
-    beside_floor = _above_plane(beside, floor)
-    heights = beside_floor[:, 2] - ground_heights(_above_plane(surface, floor), beside_floor, _GROUND_M)
+    # the lower of both: on a ramp the plane's is right, where few points tell the plane the level one's
+    frames = [np.zeros(2), _fit_floor(surface)]
+    placed = [(_above_plane(beside, slope), _above_plane(surface, slope)) for slope in frames]
+    heights = np.min([of[:, 2] - ground_heights(on, of, _GROUND_M) for of, on in placed], axis=0)
     rest = beside[(stayed_m < _STAYED_M) & (heights > _ABOVE_GROUND_M)]
     upward, is_known = _upward(rest, rest_map)
     rest = rest[is_known & (upward > _MIN_UPWARD)]

@@ -47,8 +47,8 @@ def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_S
     _require_reachable(source, config)
     recorded_T_sensor = None if config.consistency == "none" else source.odom_T_sensor
     keyframe_scans = choose_keyframes(source.odom_T_sensor, config.keyframe_spacing_m)
-    if config.consistency == "scan-to-map":
-        source = make_consistent(source)
+    if config.consistency != "none":
+        source = make_consistent(source, has_loops=config.consistency == "graph")
     accumulator = _MapAccumulator(config, frozenset(keyframe_scans.tolist()))
     scans = iter(source.scans())
     while batch := list(islice(scans, batch_scans)):

@@ -49,8 +49,9 @@ class MapConfig(Settings):
     voxel_m: Cell = Field(0.2, description="cell of the thinned map")
     max_range_m: Positive = Field(60.0, description="returns beyond this range are not mapped")
     keyframe_spacing_m: Positive = Field(1.0, description="path between keyframes")
-    consistency: Literal["none", "scan-to-map"] = Field(
-        "none", description="map with the recorded poses, or register every scan once more with those around it"
+    consistency: Literal["none", "scan-to-map", "graph"] = Field(
+        "none",
+        description="map with the recorded poses; register every scan once more with those around it; close loops, too",
     )
 
     @model_serializer(mode="wrap")

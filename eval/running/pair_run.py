@@ -264,6 +264,7 @@ def _open(
 
 
 def _write_maps(path: Path, stages: PairStages) -> None:
+    """Write the points of both maps for the page, with the recorded poses: answers are in their frames."""
     try:
         before, after = stages.maps(MapConfig())
     except TunnelcdError:

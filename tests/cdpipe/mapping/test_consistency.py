@@ -104,7 +104,7 @@ def test_a_map_knows_its_recorded_poses_and_keyframes(tunnel: CloudScans) -> Non
 
 
 def test_presets_of_the_paper_map_with_the_recorded_poses() -> None:
-    assert load_config("tunnelcd").map.consistency == "scan-to-map"
+    assert load_config("tunnelcd").map.consistency == "graph"
     for preset in ("paper", "paper-topn", "paper-paired", "scan-context", "solid", "frame"):
         assert "consistency" not in load_config(preset).model_dump()["map"], preset
-    assert load_config("tunnelcd").model_dump()["map"]["consistency"] == "scan-to-map"
+    assert load_config("tunnelcd").model_dump()["map"]["consistency"] == "graph"

@@ -332,11 +332,12 @@ def test_stages_are_shared_by_the_settings_they_depend_on(tmp_path: Path, runner
     told = Told()
     coarse = 'set: ["map.voxel_m=0.3"]'
     # the two that share a map stand apart in the plan
-    # both presets merge alike
-    alike = 'set: ["merge.refine=local"]'
+    # both presets map and merge alike
+    alike = 'set: ["map.consistency=graph", "merge.refine=checked"]'
     variants = f"{{preset: voxel-diff}}, {{preset: voxel-diff, {coarse}}}, {{preset: random-regions, {alike}}}"
     run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, variants=variants), progress=told)
-    assert (told.stages.count("map before"), told.stages.count("map after")) == (2, 2)
+    # the page's maps, of the recorded poses as answers are; and those of each map setting
+    assert (told.stages.count("map before"), told.stages.count("map after")) == (3, 3)
     # another map has the same keyframes
     assert told.stages.count("describe keyframes") == 1
     # per map setting, and each of them again for the clock
@@ -344,7 +345,7 @@ def test_stages_are_shared_by_the_settings_they_depend_on(tmp_path: Path, runner
     assert table(run)["variant"].tolist() == [
         "voxel-diff",
         "voxel-diff[map.voxel_m=0.3]",
-        "random-regions[merge.refine=local]",
+        "random-regions[map.consistency=graph, merge.refine=checked]",
     ]
 
 
