@@ -345,7 +345,7 @@ def test_stages_are_shared_by_the_settings_they_depend_on(tmp_path: Path, runner
     assert table(run)["variant"].tolist() == [
         "voxel-diff",
         "voxel-diff[map.voxel_m=0.3]",
-        "random-regions[map.consistency=graph, merge.refine=checked]",
+        "random-regions[map.consistency=graph,merge.refine=checked]",
     ]
 
 
