@@ -80,6 +80,26 @@ def test_a_mixed_return_is_a_row_only_where_its_cell_has_no_other() -> None:
     assert whole.nearest_m.tolist() == pytest.approx([np.inf, np.inf, np.inf, 0.32, np.inf, 0.02, np.inf, 0.01])
 
 
+@pytest.mark.parametrize(
+    ("x_m", "change", "returns", "labels"),
+    [
+        ((0.01, 0.31, 0.02), (MIXED, 0, 5), [1, 2], [0, 5]),  # another cell lies between the two of one cell
+        ((0.01, 0.31, 0.32), (0, MIXED, 6), [0, 2], [0, 6]),  # a mixed one before another of its cell
+        ((0.01, 0.02, 0.03), (MIXED, MIXED, MIXED), [0], [MIXED]),
+        ((0.01, 0.02, 0.03), (4, MIXED, 5), [0], [4]),
+    ],
+)
+def test_the_first_return_of_a_cell_that_is_not_mixed_is_its_row(
+    x_m: tuple[float, ...], change: tuple[int, ...], returns: list[int], labels: list[int]
+) -> None:
+    builder = ScoringPointsBuilder("by hand", 1, 3)
+    points = np.column_stack([x_m, np.zeros((3, 2))])
+    scan = PosedScan(0, points, np.eye(4), np.zeros(3, np.int64), np.arange(3, dtype=np.int32))
+    builder.add(scan, np.zeros((1, 3), np.int16), np.array([change], np.int16))
+    found = builder.finish(1)
+    assert (found.returns.tolist(), found.change.tolist()) == (returns, labels)
+
+
 def test_rows_are_found_again_by_their_returns(tiny_pair: Path) -> None:
     built = load_scoring_points(tiny_pair / "after")
     chosen = np.array([0, 5, len(built) - 1])
