@@ -128,7 +128,7 @@ def make_shard(family: str, seed: int, recipe: Recipe) -> bytes:
 
 
 def _load_map_config() -> MapConfig:
-    """Return the map settings of `tunnelcd`, with the recorded poses: truth is labelled in their frame, scan by scan."""
+    """Return the map settings of `tunnelcd` with the recorded poses: the truth of a scan is in their frame."""
     return load_config("tunnelcd").map.model_copy(update={"consistency": "none"})
 
 
