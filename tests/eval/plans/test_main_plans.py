@@ -41,11 +41,13 @@ def test_main_judges_at_the_radius_and_threshold_of_regions() -> None:
 def test_parts_takes_one_part_away_at_a_time() -> None:
     found = expand_cells(load_plan("parts"))
     assert {cell.variant for cell in found} == {
-        "tunnelcd", "tunnelcd[map.consistency=none]", "tunnelcd[merge.refine=local]",
+        "tunnelcd", "tunnelcd[map.consistency=none]", "tunnelcd[map.consistency=scan-to-map]",
+        "tunnelcd[merge.refine=local]", "tunnelcd[sphere.frames=sensor]", "tunnelcd[extract.recentre=false]",
     }  # fmt: skip
     ours = next(cell.config for cell in found if cell.variant == "tunnelcd")
     # else a row would repeat the first
-    assert ours.map.consistency != "none" and ours.merge.refine != "local"
+    assert ours.map.consistency == "graph" and ours.merge.refine != "local"
+    assert ours.sphere.frames != "sensor" and ours.extract.recentre
     held = find_references((cell.scenario, cell.variant, cell.seed) for cell in found)
     thin = {label for label, _ in held}
     assert {list_settings_over(label, held[label, "tunnelcd"]) for label in thin} == {"sensor.sub_rays=1"}
