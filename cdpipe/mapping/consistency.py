@@ -6,7 +6,7 @@ scans within a few metres of path. The relative pose of the odometry to its neig
 the walls do not.
 
 1. From the middle of the session to both ends, each scan is registered with the scans before it (`_follow`).
-2. Sweeps register every scan with those on both sides (`_register_all`): first each with every second scan alone, never
+2. Sweeps register every scan with those on both sides (`_sweep`): first each with every second scan alone, never
    with itself, as a scan that is off would find itself; then with all, which ties even and odd scans together.
 3. Where the session comes through a place that it knows, the loop is closed (`cdpipe.mapping.loops`), and the scans of
    both passes are registered with one another.
@@ -22,7 +22,7 @@ import numpy as np
 from cdpipe.core.geometry import BoolArray, Float64Array, invert
 from cdpipe.mapping.loops import Loop, close_loops, find_loops
 from cdpipe.mapping.scan_registration import Registration, Samples, Target, register_scan
-from cdpipe.model.types import PosedScan, ScanSource
+from cdpipe.model.types import PosedScan, ScanSource, WrappedScans
 
 # A block of path is registered with one map: its scans, and those within this way before and after it.
 _BLOCK_M, _AROUND_M = 4.0, 6.0
@@ -36,16 +36,12 @@ _BY_HALVES = Registration(voxel_m=0.2, correspondence_m=0.5, robust_m=0.07, step
 _WITH_ALL = Registration(voxel_m=0.2, correspondence_m=0.5, robust_m=0.05, step_m=0.1, step_rad=0.01)
 
 
-class ConsistentScans(ScanSource):
+class ConsistentScans(WrappedScans):
     """A session with other poses than those that were recorded."""
 
     def __init__(self, source: ScanSource, odom_T_sensor: Float64Array) -> None:
-        self._source, self._poses = source, odom_T_sensor
-
-    @property
-    def name(self) -> str:
-        """Name of the session in messages."""
-        return self._source.name
+        super().__init__(source)
+        self._poses = odom_T_sensor
 
     @property
     def odom_T_sensor(self) -> Float64Array:
@@ -54,11 +50,11 @@ class ConsistentScans(ScanSource):
 
     def scan(self, index: int) -> PosedScan:
         """Read one scan."""
-        return replace(self._source.scan(index), odom_T_sensor=self._poses[index])
+        return replace(super().scan(index), odom_T_sensor=self._poses[index])
 
     def scans(self) -> Iterator[PosedScan]:
         """Read all scans in order."""
-        for scan in self._source.scans():
+        for scan in super().scans():
             yield replace(scan, odom_T_sensor=self._poses[scan.index])
 
 

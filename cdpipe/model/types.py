@@ -69,6 +69,31 @@ class ScanSource(Protocol):
         """Read all scans in order."""
 
 
+class WrappedScans(ScanSource):
+    """A source of scans that reads from another one; subclasses replace how scans are read."""
+
+    def __init__(self, source: ScanSource) -> None:
+        self._source = source
+
+    @property
+    def name(self) -> str:
+        """Name of the session in messages."""
+        return self._source.name
+
+    @property
+    def odom_T_sensor(self) -> Float64Array:
+        """(S, 4, 4) pose of each scan."""
+        return self._source.odom_T_sensor
+
+    def scan(self, index: int) -> PosedScan:
+        """Read one scan."""
+        return self._source.scan(index)
+
+    def scans(self) -> Iterator[PosedScan]:
+        """Read all scans in order."""
+        return self._source.scans()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeViews:
     """Range image of each keyframe: the space in front of the measured ranges is free.

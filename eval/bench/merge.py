@@ -30,8 +30,8 @@ from cdpipe.mapping.mapping import build_map
 from cdpipe.merge.global_registration import is_kiss_matcher_installed, register_globally
 from cdpipe.merge.merge import merge_maps
 from cdpipe.model.config import PipelineConfig, load_config
-from cdpipe.model.types import MappedSession, PosedScan, ScanSource, SessionName
-from eval.truth.adapters import WrappedScans, pipeline_input
+from cdpipe.model.types import MappedSession, PosedScan, ScanSource, SessionName, WrappedScans
+from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
 from sim.session.simulate import simulate_pair
 from sim.session.truth import read_true_poses

@@ -25,13 +25,13 @@ from cdpipe.descriptors.range_image import range_image
 from cdpipe.descriptors.sphere_image import COLUMNS, CROP_M, HALF_LENGTH_M, REACH_M, ROWS, pixels, render
 from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.model.config import MapConfig, load_config
-from cdpipe.model.types import DescriptorSet, MappedSession, PointMap, PosedScan, ScanSource
+from cdpipe.model.types import DescriptorSet, MappedSession, PointMap, PosedScan, ScanSource, WrappedScans
 from cdpipe.training.shard import CHANGE_KINDS, FORMAT_VERSION, encode_shard, split_of
 from eval.core.provenance import digest
 from eval.oracles.merge import OracleMerge, merged_by_truth
 from eval.scoring.merge_metrics import PAIR_RADIUS_M
 from eval.scoring.region_metrics import label_keyframes, transform_to_map
-from eval.truth.adapters import WrappedScans, held_input
+from eval.truth.adapters import held_input
 from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth, ground_truth
 from eval.truth.scoring_points import ScoringPointsBuilder
 from scenarios.library import load_scenario
