@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
+from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array, Int64Array
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Scenario
 from sim.drive.trajectory import Trajectory
@@ -19,31 +19,12 @@ from sim.session.truth import MIXED, Int16Array, SessionName
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hits:
-    """Returns of one revolution on a changed prop; in the session that holds the change without mixed ones.
-
-    Attributes:
-        row, column: (N,) pixels.
-        points_odom: (N, 3) places as the session measured them.
-        belongs: (N,) which of them belong to the change; all True in the session that does not hold it.
-    """
-
-    row: Int64Array
-    column: Int64Array
-    points_odom: Float64Array
-    belongs: BoolArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Revolution:
-    """One simulated revolution as it is written, and its contribution to each change.
+    """One simulated revolution with its truth; nothing in it depends on the session's own odometry.
 
     Attributes:
         range_mm, reflectivity, signal: (H, W) as in `ScanChunk`.
-        instance: (H, W) int16 truth labels.
-        mixed: (N,) flat numbers of the pixels that blend a changed prop with something else.
-        column_poses: (W, 7) as in `ScanChunk`.
-        hits: Returns on changed props, by change id.
+        instance, change: (H, W) int16 as in `sim.session.truth`.
         ghost_rays: Number of rays that met each ghost, by change id.
     """
 
@@ -51,9 +32,7 @@ class Revolution:
     reflectivity: npt.NDArray[np.uint8]
     signal: npt.NDArray[np.uint16]
     instance: Int16Array
-    mixed: Int64Array
-    column_poses: Float32Array
-    hits: dict[int, Hits]
+    change: Int16Array
     ghost_rays: dict[int, int]
 
 
@@ -81,22 +60,18 @@ def simulate_revolution(drive: Drive, number: int) -> Revolution:
     """Simulate one revolution. The result depends on its number alone, so revolutions may run in any thread."""
     rays, result = cast_revolution(drive, number)
     reach_m = true_reach_m(drive.sensor, result)
-    instance = drive.labels.take(result.geom, mode="wrap")
-    hits, ghost_rays = {}, {}
+    change = np.where(result.is_mixed, np.int16(MIXED), np.int16(0))
+    ghost_rays = {}
     for tally in drive.tallies:
-        change = tally.change
-        if change.session != drive.name:
-            ghost_rays[change.id] = tally.ghost.count(rays, reach_m.T)
-        is_own = change.session == drive.name
-        is_on_it = (result.owner == change.instance) & ~result.is_mixed if is_own else instance == change.instance
-        row, column = np.divmod(np.flatnonzero(is_on_it), drive.sensor.width)
+        if tally.change.session != drive.name:
+            ghost_rays[tally.change.id] = tally.ghost.count(rays, reach_m.T)
+            continue
+        row, column = np.nonzero((result.owner == tally.change.instance) & ~result.is_mixed)
         if len(row):
-            points_world = rays.points(row, column, reach_m[row, column])
-            belongs = mark_belonging(tally, points_world) if is_own else np.ones(len(row), dtype=bool)
-            hits[change.id] = Hits(row, column, _measure(drive, number, result, row, column), belongs)
-    column_poses = drive.trajectory.sensor_T_column(slice(number, number + 1))[0]
-    channels = result.range_mm, result.reflectivity, result.signal
-    return Revolution(*channels, instance, np.flatnonzero(result.is_mixed), column_poses, hits, ghost_rays)
+            belongs = mark_belonging(tally, rays.points(row, column, reach_m[row, column]))
+            change[row[belongs], column[belongs]] = tally.change.id
+    instance = drive.labels.take(result.geom, mode="wrap")
+    return Revolution(result.range_mm, result.reflectivity, result.signal, instance, change, ghost_rays)
 
 
 def cast_revolution(drive: Drive, number: int) -> tuple[Rays, Scan]:
@@ -112,30 +87,25 @@ def true_reach_m(sensor: SensorMetadata, result: Scan) -> Float32Array:
     return np.where(result.geom >= 0, result.true_range_m - np.float32(sensor.beam_origin_m), np.float32(0.0))
 
 
-def label_changes(drive: Drive, revolutions: list[Revolution]) -> Int16Array:
-    """Label every return of a chunk (s, H, W) with its change, or `MIXED`, and add to the tallies."""
-    labels = np.zeros((len(revolutions), *revolutions[0].instance.shape), dtype=np.int16)
-    for of_revolution, each in zip(labels, revolutions, strict=True):
-        of_revolution.flat[each.mixed] = MIXED
+def tally_revolution(drive: Drive, number: int, revolution: Revolution) -> None:
+    """Add a revolution to the tallies, its returns where the session measured them."""
     for tally in drive.tallies:
-        change_id = tally.change.id
-        tally.n_ghost_rays += sum(each.ghost_rays.get(change_id, 0) for each in revolutions)
-        for place, each in enumerate(revolutions):
-            hits = each.hits.get(change_id)
-            if hits is None:
-                continue
-            if tally.change.session != drive.name:
-                tally.other.add(hits.points_odom)
-                continue
-            tally.own.add(hits.points_odom[hits.belongs])
-            labels[place, hits.row[hits.belongs], hits.column[hits.belongs]] = change_id
-    return labels
+        change = tally.change
+        is_own = change.session == drive.name
+        tally.n_ghost_rays += revolution.ghost_rays.get(change.id, 0)
+        is_on_it = revolution.change == change.id if is_own else revolution.instance == change.instance
+        row, column = np.nonzero(is_on_it)
+        if len(row):
+            returns = tally.own if is_own else tally.other
+            returns.add(measured_points(drive, number, revolution.range_mm, row, column))
 
 
-def _measure(drive: Drive, number: int, result: Scan, row: Int64Array, column: Int64Array) -> Float64Array:
-    """Return the positions (N, 3) of some returns of a revolution as the session measured them, odom frame."""
-    sensor, trajectory = drive.sensor, drive.trajectory
-    reach = result.range_mm[row, column][:, None] / 1000.0 - sensor.beam_origin_m
+def measured_points(
+    drive: Drive, number: int, range_mm: npt.NDArray[np.uint32], row: Int64Array, column: Int64Array
+) -> Float64Array:
+    """Return where a session measured some returns of a revolution (H, W): their positions (N, 3), odom frame."""
+    sensor = drive.sensor
+    reach = range_mm[row, column][:, None] / 1000.0 - sensor.beam_origin_m
     points_sensor = sensor.origins[row, column] + reach * sensor.directions[row, column]
-    poses = trajectory.odom_T_column(number, column)
+    poses = drive.trajectory.odom_T_column(number, column)
     return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], points_sensor) + poses[:, :3, 3])

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import os
+import pickle
 import shutil
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
+from io import BytesIO
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryFile
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +32,7 @@ from sim.drive.odometry import register_scans, start_pose
 from sim.drive.trajectory import plan_trajectory
 from sim.scene import build_world
 from sim.session.labels import list_changes
-from sim.session.revolution import Drive, Revolution, cast_revolution, label_changes, simulate_revolution
+from sim.session.revolution import Drive, Revolution, simulate_revolution, tally_revolution
 from sim.session.truth import (
     SESSIONS,
     Int16Array,
@@ -102,7 +107,7 @@ def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progres
         partial.mkdir(parents=True)
         with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
             for drive in drives:
-                write_session(estimate_odometry(drive, pool, report), partial / drive.name, pool, report)
+                write_session(drive, partial / drive.name, pool, report)
         write_pair_truth(partial, collect_truth(scenario, seed, drives, files))
         partial.replace(home)
     except OSError as error:
@@ -154,27 +159,6 @@ def plan_drives(scenario: Scenario, sensor: SensorMetadata, seed: int) -> list[D
     return drives
 
 
-def estimate_odometry(drive: Drive, pool: Executor, report: Progress) -> Drive:
-    """Let KISS-ICP estimate the poses of a session that asks for it, from the scans that will be written."""
-    plan: SessionPlan = getattr(drive.scenario, drive.name)
-    if plan.odometry.source != "kiss-icp":
-        return drive
-    trajectory = drive.trajectory
-    start = start_pose(trajectory.true, float(trajectory.revolution_s[0]))
-    images = _range_images(drive, pool, report)
-    estimated = register_scans(images, drive.sensor, trajectory.revolution_s, trajectory.column_s, start, drive.name)
-    return replace(drive, trajectory=replace(trajectory, estimated=estimated))
-
-
-def _range_images(drive: Drive, pool: Executor, report: Progress) -> Iterator[npt.NDArray[np.uint32]]:
-    n_scans = drive.trajectory.n_scans
-    for start in range(0, n_scans, CHUNK_SCANS):
-        report(f"odometry {drive.name}", start, n_scans)
-        numbers = range(start, min(start + CHUNK_SCANS, n_scans))
-        yield from pool.map(lambda number: cast_revolution(drive, number)[1].range_mm, numbers)
-    report(f"odometry {drive.name}", n_scans, n_scans)
-
-
 def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) -> None:
     """Simulate one session with its truth into `folder`, the revolutions in the threads of `pool`.
 
@@ -184,12 +168,14 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
     n_scans = drive.trajectory.n_scans
     profile = drive.scenario.sensor.profile
     provenance = {"made_by": "tunnelcd simulate", "session": drive.name, "sensor_profile": profile}
-    report(drive.name, 0, n_scans)
     with (
         SessionWriter(folder, drive.sensor, CHUNK_SCANS, provenance) as writer,
-        closing(simulate_chunks(drive, pool)) as chunks,
+        TemporaryFile(dir=folder.parent) as spool,
+        closing(_simulate_revolutions(drive, pool)) as revolutions,
     ):
-        for index, (chunk, instance, change) in enumerate(chunks):
+        drive, kept = _estimate_odometry(drive, revolutions, spool, report)
+        report(drive.name, 0, n_scans)
+        for index, (chunk, instance, change) in enumerate(_fill_chunks(drive, kept)):
             writer.add(chunk)
             write_labels(writer.folder, index, instance, change)
             report(drive.name, index * CHUNK_SCANS + len(instance), n_scans)
@@ -197,36 +183,71 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
         writer.close(drive.trajectory.odom_T_sensor)
 
 
-def simulate_chunks(drive: Drive, pool: Executor) -> Generator[tuple[ScanChunk, Int16Array, Int16Array]]:
-    """Yield each chunk of a session with the (s, H, W) instance and change of its returns, and update the tallies."""
-    with closing(_simulate_ahead(drive, pool)) as chunks:
-        for index, revolutions in enumerate(chunks):
-            start = index * CHUNK_SCANS
-            chunk = ScanChunk(
-                np.stack([each.range_mm for each in revolutions]),
-                np.stack([each.reflectivity for each in revolutions]),
-                np.stack([each.signal for each in revolutions]),
-                drive.trajectory.column_stamps_ns(slice(start, start + len(revolutions))),
-                np.stack([each.column_poses for each in revolutions]),
-            )
-            yield chunk, np.stack([each.instance for each in revolutions]), label_changes(drive, revolutions)
-
-
-def _simulate_ahead(drive: Drive, pool: Executor) -> Generator[list[Revolution]]:
-    """Yield the revolutions of each chunk in order; the next chunk is simulated while the caller writes this one."""
-
-    def begun(start: int) -> list[Future[Revolution]]:
-        numbers = range(start, min(start + CHUNK_SCANS, drive.trajectory.n_scans))
-        return [pool.submit(simulate_revolution, drive, number) for number in numbers]
-
-    running, ahead = [], begun(0)
+def _simulate_revolutions(drive: Drive, pool: Executor) -> Generator[Revolution]:
+    """Yield the revolutions in order; as many as a chunk holds are simulated while the caller uses one."""
+    ahead: deque[Future[Revolution]] = deque()
     try:
-        for start in range(CHUNK_SCANS, drive.trajectory.n_scans + CHUNK_SCANS, CHUNK_SCANS):
-            running, ahead = ahead, begun(start)
-            yield [each.result() for each in running]
+        for number in range(drive.trajectory.n_scans):
+            ahead.append(pool.submit(simulate_revolution, drive, number))
+            if len(ahead) > CHUNK_SCANS:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()
     finally:
-        for each in (*running, *ahead):
+        for each in ahead:
             each.cancel()
+
+
+def _estimate_odometry(
+    drive: Drive, revolutions: Iterator[Revolution], spool: IO[bytes], report: Progress
+) -> tuple[Drive, Iterator[Revolution]]:
+    """Let KISS-ICP estimate the poses of a session that asks for it, from the scans that will be written.
+
+    Args:
+        drive: The session's drive.
+        revolutions: All its revolutions.
+        spool: An empty file, which holds the revolutions until the last pose is known.
+        report: Called with the stage "odometry before" or "odometry after".
+
+    Returns:
+        The drive with these poses, and all its revolutions.
+    """
+    plan: SessionPlan = getattr(drive.scenario, drive.name)
+    if plan.odometry.source != "kiss-icp":
+        return drive, revolutions
+    trajectory = drive.trajectory
+
+    def keep() -> Iterator[npt.NDArray[np.uint32]]:
+        for number, revolution in enumerate(revolutions):
+            if number % CHUNK_SCANS == 0:
+                report(f"odometry {drive.name}", number, trajectory.n_scans)
+            pickle.dump(revolution, spool, pickle.HIGHEST_PROTOCOL)
+            yield revolution.range_mm
+        report(f"odometry {drive.name}", trajectory.n_scans, trajectory.n_scans)
+
+    start = start_pose(trajectory.true, float(trajectory.revolution_s[0]))
+    estimated = register_scans(keep(), drive.sensor, trajectory.revolution_s, trajectory.column_s, start, drive.name)
+    spool.seek(0)
+    kept = (pickle.load(spool) for _ in range(trajectory.n_scans))
+    return replace(drive, trajectory=replace(trajectory, estimated=estimated)), kept
+
+
+def _fill_chunks(drive: Drive, revolutions: Iterator[Revolution]) -> Iterator[tuple[ScanChunk, Int16Array, Int16Array]]:
+    """Yield each chunk of a session with the (s, H, W) instance and change of its returns, and update the tallies."""
+    trajectory = drive.trajectory
+    for start in range(0, trajectory.n_scans, CHUNK_SCANS):
+        held = list(islice(revolutions, CHUNK_SCANS))
+        numbers = range(start, start + len(held))
+        for number, revolution in zip(numbers, held, strict=True):
+            tally_revolution(drive, number, revolution)
+        chunk = ScanChunk(
+            np.stack([each.range_mm for each in held]),
+            np.stack([each.reflectivity for each in held]),
+            np.stack([each.signal for each in held]),
+            trajectory.column_stamps_ns(slice(start, start + len(held))),
+            np.concatenate([trajectory.sensor_T_column(slice(number, number + 1)) for number in numbers]),
+        )
+        yield chunk, np.stack([each.instance for each in held]), np.stack([each.change for each in held])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -285,9 +306,9 @@ def simulate_in_memory(scenario: Scenario, seed: int, n_threads: int = 1) -> Hel
 
 
 def _hold_session(drive: Drive, pool: Executor) -> LabelledSession:
-    drive = estimate_odometry(drive, pool, _report_nothing)
-    with closing(simulate_chunks(drive, pool)) as chunks:
-        chunk, instance, change = zip(*chunks, strict=True)
+    with closing(_simulate_revolutions(drive, pool)) as revolutions:
+        drive, kept = _estimate_odometry(drive, revolutions, BytesIO(), _report_nothing)
+        chunk, instance, change = zip(*_fill_chunks(drive, kept), strict=True)
     session = HeldSession(
         Path(drive.name), drive.sensor, drive.trajectory.odom_T_sensor, CHUNK_SCANS, {"session": drive.name}, chunk
     )

@@ -13,18 +13,19 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, travelled_m
-from cdpipe.sensor.ouster import load_profile
+from cdpipe.io.session import read_session
 from scenarios.library import load_scenario
 from sim.drive.odometry import walk_sigma
-from sim.session.simulate import estimate_odometry, plan_drives
+from sim.session.simulate import simulate_pair
+from sim.session.truth import SESSIONS, read_true_poses
 
 DISTANCES_M = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # 0: from one revolution to the next
 AXES = ("along_m", "left_m", "up_m", "yaw_deg", "roll_deg", "pitch_deg")
@@ -44,13 +45,13 @@ def estimate_poses(name: str, seed: int, settings: Sequence[str] = ()) -> list[P
     """Return true and KISS-ICP's poses of both sessions of a pair.
 
     Raises:
-        InputError, ScenarioError: As `sim.session.simulate.simulate_in_memory`.
+        InputError, ScenarioError: As `sim.session.simulate.simulate_pair`.
     """
     scenario = load_scenario(name, seed, [*_SETTINGS, *settings])
-    drives = plan_drives(scenario, load_profile(scenario.sensor.profile, scenario.sensor.mode), seed)
-    with ThreadPoolExecutor(1) as pool:
-        done = [estimate_odometry(drive, pool, lambda *_: None).trajectory for drive in drives]
-    return [(each.world_T_sensor, each.odom_T_sensor) for each in done]
+    with TemporaryDirectory() as folder:
+        simulate_pair(scenario, seed, Path(folder) / "pair")
+        sessions = [Path(folder) / "pair" / name for name in SESSIONS]
+        return [(read_true_poses(each), read_session(each).odom_T_sensor) for each in sessions]
 
 
 def relative_errors(true: Float64Array, estimated: Float64Array, distance_m: float) -> Float64Array:

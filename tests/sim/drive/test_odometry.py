@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import importlib.util
+import tempfile
 from collections.abc import Callable
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +12,21 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import invert, make_pose, transform, travelled_m, yaw_rad
+from cdpipe.core.voxel import cell_keys
 from cdpipe.io.session import Session, read_session
 from cdpipe.mapping import odometry
 from cdpipe.mapping.odometry import deskew_at_constant_velocity
 from cdpipe.sensor.ouster import SensorMetadata
-from scenarios.schema import Odometry, Platform, Roughness, Scenario, SessionPlan, Tunnel
-from sim.drive.odometry import register_scans
+from scenarios.schema import Odometry, Platform, Prop, Roughness, Scenario, SessionPlan, Tunnel
+from sim.drive.odometry import register_scans, start_pose
 from sim.geometry.mesh import Mesh, box_mesh
 from sim.geometry.raycast import Caster
-from sim.session.simulate import simulate_pair
-from sim.session.truth import read_true_poses
+from sim.sensor.lidar import Scan
+from sim.sensor.rays import Rays
+from sim.session.labels import CELL_M
+from sim.session.revolution import Drive, cast_revolution, measured_points
+from sim.session.simulate import plan_drives, simulate_in_memory, simulate_pair
+from sim.session.truth import SESSIONS, read_labels, read_pair_truth, read_true_poses
 
 needs_kiss_icp = pytest.mark.skipif(
     importlib.util.find_spec("kiss_icp") is None, reason="needs the extra `odometry`: KISS-ICP"
@@ -27,12 +34,13 @@ needs_kiss_icp = pytest.mark.skipif(
 
 
 @pytest.fixture(scope="module")
-def scenario(make_scenario: Callable[..., Scenario]) -> Scenario:
-    """A rough drift of 20 m, one session estimated by KISS-ICP and one by drift."""
+def scenario(make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop]) -> Scenario:
+    """A rough drift of 20 m and a box that goes, one session estimated by KISS-ICP and one by drift."""
     rough = (Roughness(amplitude_m=0.15, length_m=1.5), Roughness(amplitude_m=0.05, length_m=0.6))
     tunnel: Tunnel = make_scenario().tunnel.model_copy(update={"roughness": rough})
     return make_scenario(
         tunnel=tunnel,
+        props=(make_prop("box", 0.6, change="removed"), make_prop("new", 0.35, change="added")),
         platform=Platform(scan_spacing_m=0.5, speed_mps=1.5, tilt_deg=1.0),
         before=SessionPlan(route=("a", "b"), start_m=2.0, end_m=2.0, odometry=Odometry(source="kiss-icp")),
         after=SessionPlan(route=("b", "a"), start_m=2.0, end_m=16.0),
@@ -97,6 +105,88 @@ def test_kiss_icp_gives_the_same_bytes_twice_and_leaves_scans_and_truth_alone(
     assert scans(first) == scans(true)
     assert read_true_poses(pair / "before").tobytes() == read_true_poses(tmp_path / "plain" / "before").tobytes()
     assert np.abs(first.odom_T_sensor - true.odom_T_sensor).max() > 1e-3
+
+
+@needs_kiss_icp
+def test_scans_are_cast_once_and_everything_that_is_measured_stands_where_kiss_icp_puts_it(
+    scenario: Scenario, sensor: SensorMetadata, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cast: list[tuple[str, int]] = []
+
+    def watch(drive: Drive, number: int) -> tuple[Rays, Scan]:
+        cast.append((drive.name, number))
+        return cast_revolution(drive, number)
+
+    monkeypatch.setattr("sim.session.revolution.cast_revolution", watch)
+    monkeypatch.setattr("sim.session.simulate.CHUNK_SCANS", 7)  # the last chunk holds fewer
+    simulate_pair(scenario, 5, tmp_path / "pair")
+    session = read_session(tmp_path / "pair" / "before")
+    drives = plan_drives(scenario, session.sensor, 5)
+    assert session.n_scans > 20 and session.n_scans % 7
+    assert sorted(cast) == sorted((each.name, number) for each in drives for number in range(each.trajectory.n_scans))
+    # register the written scans, then measure with these poses
+    drive, range_mm = drives[0], np.concatenate([chunk.range_mm for chunk in session.chunks()])
+    times = drive.trajectory.revolution_s, drive.trajectory.column_s
+    start = start_pose(drive.trajectory.true, times[0][0])
+    estimated = register_scans(range_mm, session.sensor, *times, start, "before")
+    drive = replace(drive, trajectory=replace(drive.trajectory, estimated=estimated))
+    np.testing.assert_array_equal(session.odom_T_sensor, drive.trajectory.odom_T_sensor)
+    column_poses = np.concatenate([chunk.column_poses for chunk in session.chunks()])
+    np.testing.assert_array_equal(column_poses, drive.trajectory.sensor_T_column(slice(None)))
+    instance, change = (np.concatenate(part) for part in zip(*read_labels(session.path, session.n_chunks), strict=True))
+    for wanted in read_pair_truth(tmp_path / "pair").changes:
+        is_own = wanted.session == "before"
+        is_on_it = change == wanted.id if is_own else instance == wanted.instance
+        assert is_own == is_on_it.any()
+        points = [
+            measured_points(drive, number, range_mm[number], *np.nonzero(on)) for number, on in enumerate(is_on_it)
+        ]
+        n_cells = len(np.unique(cell_keys(np.concatenate(points), CELL_M)))
+        assert (wanted.n_cells if is_own else wanted.n_cells_other) == n_cells
+
+
+@needs_kiss_icp
+def test_a_session_in_memory_has_the_poses_and_scans_of_the_one_on_disk(pair: Path, scenario: Scenario) -> None:
+    held = simulate_in_memory(scenario, 5)
+    assert held.truth.changes == read_pair_truth(pair).changes
+    for name in SESSIONS:
+        memory, disk = held.sessions[name].session, read_session(pair / name)
+        assert memory.odom_T_sensor.tobytes() == disk.odom_T_sensor.tobytes()
+        for one, other in zip(memory.chunks(), disk.chunks(), strict=True):
+            for field in fields(one):
+                np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
+
+
+@needs_kiss_icp
+def test_progress_tells_odometry_before_its_session(pair: Path, scenario: Scenario, tmp_path: Path) -> None:
+    told: list[tuple[str, int, int]] = []
+    simulate_pair(scenario, 5, tmp_path / "pair", lambda *step: told.append(step))
+    n_before, n_after = (read_session(pair / name).n_scans for name in SESSIONS)
+    stages = [("world", 1), ("odometry before", n_before), ("before", n_before), ("after", n_after)]
+    assert told == [step for stage, total in stages for step in ((stage, 0, total), (stage, total, total))]
+
+
+@needs_kiss_icp
+def test_an_interrupted_estimate_leaves_nothing(
+    scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    n_registered = 0
+
+    class Interrupted:
+        last_pose = np.eye(4)
+
+        def register_frame(self, *_: object) -> None:
+            nonlocal n_registered
+            n_registered += 1
+            if n_registered == 9:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(odometry, "_kiss_icp", Interrupted)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(KeyboardInterrupt):
+        simulate_pair(scenario, 5, tmp_path / "pair")
+    assert n_registered == 9
+    assert list(tmp_path.iterdir()) == []
 
 
 @needs_kiss_icp
