@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, make_pose, transform, yaw_pose
 from cdpipe.core.voxel import thin
+from cdpipe.extract.point_comparison import label_groups
 from cdpipe.extract.shape import upright_box
 
 # Far moves: least share of both surfaces within `_SAME_WITHIN_M` of the other, and largest factor between extents.
@@ -35,6 +36,10 @@ _BESIDE_SHARE, _EITHER_SHARE = 0.4, 0.2
 _LIKENESS = 0.62
 _LIKE_WITHIN_M = 0.1
 _MIN_POINTS = 4
+# Tails: a beam that meets an edge also returns from behind it. Groups of points this far from the others are left out
+# if they hold fewer of an object's points than this share. A registration starts from the centre of the box around
+# the rest.
+_TAIL_GAP_M, _TAIL_SHARE = 0.2, 0.05
 # Largest number of partners to try for one object; a registration takes about 20 ms.
 _MOST_TRIED = 6
 # Yaws of the coarse registration, how many of its results are registered finely, and the robust scales of each.
@@ -88,10 +93,11 @@ def find_moves(
         may_go_far: For each removed object, whether partners that are not neighbours are tried.
         around: Returns, for pairs (removed, added) of neighbours, the points (Q, 3) and (R, 3) above the ground that
             the before and the after session have around both objects; the objects' own points may be included.
-        nearest_twins: Whether twins are told apart by fit and way; otherwise the points of every pair count, as for
-            objects cut out by whole map points.
+        nearest_twins: Whether tails are left out and twins are told apart by fit and way; otherwise all points of
+            every pair count, as for objects cut out by whole map points.
     """
-    gone, come = [_Cloud.of(points) for points in removed], [_Cloud.of(points) for points in added]
+    kept = _without_tails if nearest_twins else np.asarray
+    gone, come = ([_Cloud.of(kept(points)) for points in objects] for objects in (removed, added))
     boxes = np.array([_box_xy(end) for end in come]).reshape(-1, 2, 2)
     extents = np.array([end.log_extents for end in come]).reshape(-1, 3)
     beside = [(r, a) for r, start in enumerate(gone) for a in _neighbours(start, come, boxes)]
@@ -184,6 +190,12 @@ class _Cloud:
         """Return a thinner cloud with a thinner target for the coarse registration."""
         whole = thin(self.whole, _LIKE_WITHIN_M)
         return replace(self, few=_thin_to(self.few, _MOST_COARSE_POINTS), whole=whole, tree=_tree(whole))
+
+
+def _without_tails(points: Float64Array) -> Float64Array:
+    """Return the (P, 3) points without the groups of a few points that lie apart."""
+    groups, sizes = label_groups(points, _TAIL_GAP_M)
+    return points[sizes[groups] >= _TAIL_SHARE * len(points)]
 
 
 def _thin_to(points: Float64Array, most: int) -> Float64Array:

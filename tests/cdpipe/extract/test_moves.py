@@ -76,6 +76,17 @@ def test_an_object_seen_from_two_sides_went_where_it_went() -> None:
     np.testing.assert_allclose(move.displacement_map, went, atol=0.05)
 
 
+def test_a_few_returns_behind_an_edge_do_not_hide_where_an_object_went() -> None:
+    # Eight returns 0.8 m behind it move the centre of the box around an object by 0.4 m, another way in either session.
+    size, pose = (0.81, 0.64, 0.52), yaw_pose(1.45, (-3.3, 0.1, 0.0))
+    whole, middle = box(size, "lf"), np.array([[0.4, 0.32, 0.26]])
+    tail = face((0.1, 1.4, 0.3), (0.7, 1.4, 0.3))[:8]
+    start = noisy(np.concatenate([whole, tail]), "a")
+    end = noisy(np.concatenate([transform(pose, whole), transform(pose, middle) + shifted(tail, -0.4, 0.1)]), "b")
+    (move,) = moves([start], [end], [True])
+    np.testing.assert_allclose(move.displacement_map, (transform(pose, middle) - middle)[0], atol=0.05)
+
+
 def test_a_chair_is_not_a_barrel_of_the_same_extents() -> None:
     far = yaw_pose(0.7, (5.0, 2.0, 0.0))
     assert moves([chair()], [transform(far, barrel())], [True]) == []
