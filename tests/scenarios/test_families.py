@@ -84,7 +84,8 @@ def test_every_family_is_valid(name: str, seeds: Sequence[int]) -> None:
     for seed in seeds:
         scenario = drawn(name, seed)
         assert scenario.description
-        assert all(abs(place.lateral) >= 0.5 for place in places(scenario))
+        flown_over = name.endswith("low")
+        assert flown_over or all(abs(place.lateral) >= 0.5 for place in places(scenario))
         section = scenario.tunnel.section
         assert scenario.tunnel.resolution_m <= min(section.width_m, section.height_m) / 8
         sources = {plan.odometry.source for plan in (scenario.before, scenario.after)}
