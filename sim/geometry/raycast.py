@@ -21,16 +21,18 @@ class Caster:
 
     Embree works in float32. Coordinates are relative to the centre of the scene, so that a mine of 400 m is resolved
     to 0.02 mm.
+
+    Attributes:
+        centre_m: (3,) float64 that centre, world frame, whole metres.
     """
 
     def __init__(self, meshes: Iterable[Mesh]) -> None:
         meshes = list(meshes)
         corners = np.concatenate([mesh.vertices for mesh in meshes])
-        self._centre_m = np.round((corners.min(axis=0) + corners.max(axis=0)) / 2)
+        self.centre_m = np.round((corners.min(axis=0) + corners.max(axis=0)) / 2)
         self._scene = EmbreeScene()
         self._geoms = [
-            TriangleMesh(self._scene, (mesh.vertices - self._centre_m).astype(np.float32), mesh.faces)
-            for mesh in meshes
+            TriangleMesh(self._scene, (mesh.vertices - self.centre_m).astype(np.float32), mesh.faces) for mesh in meshes
         ]
         # Embree builds the scene at its first use, which must not happen in two threads at once.
         self.cast(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))
@@ -46,39 +48,13 @@ class Caster:
             (N,) float32 distance, metres, infinite where nothing is hit; (N,) int32 number of the mesh hit, or -1;
             (N,) float32 absolute cosine between ray and surface normal, 0 for a miss.
         """
-        return self._first(*self._rays(origins, directions))
+        return self.cast_local(*self._rays(origins, directions))
 
-    def cast_columns(
-        self, origins: Float64Array, directions: Float32Array
+    def cast_local(
+        self, origins: Float32Array, directions: Float32Array
     ) -> tuple[Float32Array, Int32Array, Float32Array]:
-        """Cast a whole revolution; the results of `cast`, each (W, H).
-
-        Args:
-            origins: (W, 3) float64 point where all beams of a column start, world frame, metres.
-            directions: (W, H, 3) float32 unit vectors, contiguous.
-        """
-        width, height, _ = directions.shape
-        local = np.repeat((origins - self._centre_m).astype(np.float32), height, axis=0)
-        ranges_m, ids, cosines = self._first(local, directions.reshape(-1, 3))
-        return ranges_m.reshape(width, height), ids.reshape(width, height), cosines.reshape(width, height)
-
-    def hits(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Int32Array, Float32Array]:
-        """Return distances and mesh numbers as `cast` does, and the (N, 3) unit normals (0 for a miss)."""
-        answer = self._scene.run(*self._rays(origins, directions), output=1)
-        ids = answer["geomID"]
-        is_hit = ids >= 0
-        normals = answer["Ng"]
-        length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
-        normals = np.where(is_hit[:, None], normals / np.maximum(length, 1e-30)[:, None], 0.0)
-        return np.where(is_hit, answer["tfar"], np.float32(np.inf)), ids, normals.astype(np.float32)
-
-    def _rays(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Float32Array]:
-        """Return origins, from the centre of the scene, and directions, both (N, 3) contiguous."""
-        local, ways = np.broadcast_arrays(np.asarray(origins) - self._centre_m, directions)
-        return np.ascontiguousarray(local, np.float32), np.ascontiguousarray(ways, np.float32)
-
-    def _first(self, origins: Float32Array, directions: Float32Array) -> tuple[Float32Array, Int32Array, Float32Array]:
-        """First hits of rays (N, 3) that start at local points; written with few passes over memory for speed."""
+        """Return the results of `cast` for contiguous (N, 3) rays whose origins are given from `centre_m`."""
+        # Written with few passes over memory for speed.
         answer = self._scene.run(origins, directions, output=1)
         ranges_m, ids, normals = answer["tfar"], answer["geomID"], answer["Ng"]
         products = normals * directions
@@ -93,6 +69,35 @@ class Caster:
         cosines[is_miss] = 0.0
         ranges_m[is_miss] = np.inf
         return ranges_m, ids, cosines
+
+    def cast_columns(
+        self, origins: Float64Array, directions: Float32Array
+    ) -> tuple[Float32Array, Int32Array, Float32Array]:
+        """Cast a whole revolution; the results of `cast`, each (W, H).
+
+        Args:
+            origins: (W, 3) float64 point where all beams of a column start, world frame, metres.
+            directions: (W, H, 3) float32 unit vectors, contiguous.
+        """
+        width, height, _ = directions.shape
+        local = np.repeat((origins - self.centre_m).astype(np.float32), height, axis=0)
+        ranges_m, ids, cosines = self.cast_local(local, directions.reshape(-1, 3))
+        return ranges_m.reshape(width, height), ids.reshape(width, height), cosines.reshape(width, height)
+
+    def hits(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Int32Array, Float32Array]:
+        """Return distances and mesh numbers as `cast` does, and the (N, 3) unit normals (0 for a miss)."""
+        answer = self._scene.run(*self._rays(origins, directions), output=1)
+        ids = answer["geomID"]
+        is_hit = ids >= 0
+        normals = answer["Ng"]
+        length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
+        normals = np.where(is_hit[:, None], normals / np.maximum(length, 1e-30)[:, None], 0.0)
+        return np.where(is_hit, answer["tfar"], np.float32(np.inf)), ids, normals.astype(np.float32)
+
+    def _rays(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Float32Array]:
+        """Return origins, from the centre of the scene, and directions, both (N, 3) contiguous."""
+        local, ways = np.broadcast_arrays(np.asarray(origins) - self.centre_m, directions)
+        return np.ascontiguousarray(local, np.float32), np.ascontiguousarray(ways, np.float32)
 
 
 def _row_sums(rows: Float32Array) -> Float32Array:

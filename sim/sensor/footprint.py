@@ -73,7 +73,7 @@ def spread_echo(
     shape = rays.directions.shape[:2]
     places, weights = sub_ray_pattern(sub_rays)
     # The rays of a beam are cast one after another: they meet the same triangles, which takes a quarter less time.
-    hits_m, hit_geoms, hit_cosines = caster.cast(*_beam_rays(rays, places))
+    hits_m, hit_geoms, hit_cosines = caster.cast_local(*_beam_rays(rays, places, caster.centre_m))
     ranges_m: Float32Array = np.ascontiguousarray(hits_m.reshape(-1, sub_rays).T) + np.float32(beam_origin_m)
     geoms: Int32Array = np.ascontiguousarray(hit_geoms.reshape(-1, sub_rays).T)
     cosines: Float32Array = np.ascontiguousarray(hit_cosines.reshape(-1, sub_rays).T)
@@ -199,28 +199,28 @@ def _strongest_group_light(
     return np.where(group == totals.argmax(axis=0), light, np.float32(0.0)), reach_m, order
 
 
-def _beam_rays(rays: Rays, places: Float64Array) -> tuple[Float64Array, Float32Array]:
-    """Return the origins and directions of the rays at n places across every beam, both (W * H * n, 3)."""
-    directions = rays.directions.reshape(-1, 3)
-    centres = np.repeat(rays.origins, rays.directions.shape[1], axis=0)
+def _beam_rays(rays: Rays, places: Float64Array, centre_m: Float64Array) -> tuple[Float32Array, Float32Array]:
+    """Return the origins from a centre, and the directions, of the rays at n places across every beam.
+
+    Both are (W * H * n, 3). They are computed by component: numpy is slow on rows of three.
+    """
+    directions = np.ascontiguousarray(rays.directions.reshape(-1, 3).T)
+    beam_origins = np.repeat(rays.origins.T, rays.directions.shape[1], axis=1)
     right, up = _across(directions)
-    origins = np.empty((len(directions), len(places), 3))
-    ways = np.empty(origins.shape, np.float32)
-    for ray, (x, y) in enumerate(places):
-        aside = right * np.float32(x) + up * np.float32(y)
-        origins[:, ray] = centres + aside * np.float32(WAIST_M / 2)
-        aside *= np.float32(np.tan(DIVERGENCE_RAD / 2))
-        aside += directions
-        aside /= np.float32(np.sqrt(1.0 + (x * x + y * y) * np.tan(DIVERGENCE_RAD / 2) ** 2))
-        ways[:, ray] = aside
+    x, y = places.astype(np.float32).T[..., None]
+    slope = np.tan(DIVERGENCE_RAD / 2)
+    lengths = np.sqrt(1.0 + (places * places).sum(axis=1, keepdims=True) * slope**2).astype(np.float32)
+    origins, ways = np.empty((2, directions.shape[1], len(places), 3), np.float32)
+    for axis in range(3):
+        aside = right[axis] * x + up[axis] * y
+        origins[..., axis] = (beam_origins[axis] + aside * np.float32(WAIST_M / 2) - centre_m[axis]).T
+        ways[..., axis] = ((aside * np.float32(slope) + directions[axis]) / lengths).T
     return origins.reshape(-1, 3), ways.reshape(-1, 3)
 
 
 def _across(directions: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """Two unit vectors (N, 3) at right angles to each beam (N, 3) and to one another, the first one level."""
-    x, y, z = (directions[:, axis] for axis in range(3))
+    """Two unit vectors (3, N) at right angles to each beam (3, N) and to one another, the first one level."""
+    x, y, z = directions
     level = np.maximum(np.hypot(x, y), np.float32(1e-6))
-    right, up = np.empty_like(directions), np.empty_like(directions)
-    right[:, 0], right[:, 1], right[:, 2] = y / level, -x / level, 0.0
-    up[:, 0], up[:, 1], up[:, 2] = right[:, 1] * z, right[:, 0] * -z, level
-    return right, up
+    right = np.stack([y / level, -x / level, np.zeros_like(z)])
+    return right, np.stack([right[1] * z, right[0] * -z, level])
