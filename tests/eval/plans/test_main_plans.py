@@ -18,7 +18,10 @@ def test_main_runs_every_preset_and_the_bounds_on_the_pairs_of_regions() -> None
     assert variants == {*preset_names(), "oracle-merge", "oracle-merge+oracle-regions"} - {"frame"}
     pairs = Counter((cell.scenario, cell.seed) for cell in found if cell.variant == "paper")
     assert {scenario for scenario, _ in pairs} <= {cell.scenario for cell in expand_cells(load_plan("regions"))}
-    assert len(set(Counter(scenario for scenario, _ in pairs).values())) == 1  # each family counts alike
+    n_seeds = Counter(scenario for scenario, _ in pairs)
+    # each family counts alike, with KISS-ICP's poses and with its own drift
+    assert {n for scenario, n in n_seeds.items() if scenario.endswith("[odometry=kiss-icp]")} == {6}
+    assert {n for scenario, n in n_seeds.items() if "[" not in scenario} == {2}
     assert {scenario.split("/")[1] for scenario, _ in pairs} >= {"narrow", "wide", "network", "cave", "site1"}
     assert all(20000 <= cell.seed < 30000 for cell in found)
     assert load_plan("main").report == ("regions", "objects")
