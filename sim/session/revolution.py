@@ -67,9 +67,8 @@ def simulate_revolution(drive: Drive, number: int) -> Revolution:
             ghost_rays[tally.change.id] = tally.ghost.count(rays, reach_m.T)
             continue
         row, column = np.nonzero((result.owner == tally.change.instance) & ~result.is_mixed)
-        if len(row):
-            belongs = mark_belonging(tally, rays.points(row, column, reach_m[row, column]))
-            change[row[belongs], column[belongs]] = tally.change.id
+        belongs = mark_belonging(tally, rays.points(row, column, reach_m[row, column]))
+        change[row[belongs], column[belongs]] = tally.change.id
     instance = drive.labels.take(result.geom, mode="wrap")
     return Revolution(result.range_mm, result.reflectivity, result.signal, instance, change, ghost_rays)
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import tempfile
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -186,6 +187,19 @@ def test_an_interrupted_estimate_leaves_nothing(
     with pytest.raises(KeyboardInterrupt):
         simulate_pair(scenario, 5, tmp_path / "pair")
     assert n_registered == 9
+    assert list(tmp_path.iterdir()) == []
+
+
+@needs_kiss_icp
+def test_a_disk_too_full_to_keep_the_scans_is_told_in_one_line(
+    scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr("sim.session.simulate.pickle.dump", fail)
+    with pytest.raises(InputError, match="pair: cannot write there: No space left on device"):
+        simulate_pair(scenario, 5, tmp_path / "pair")
     assert list(tmp_path.iterdir()) == []
 
 
