@@ -17,6 +17,15 @@ from sim.sensor.rays import Rays, revolution_rays
 from sim.session.labels import Tally, mark_belonging
 from sim.session.truth import MIXED, Int16Array, SessionName
 
+# The arrays of a revolution, in the order of its attributes.
+CHANNELS = {
+    "range_mm": np.uint32,
+    "reflectivity": np.uint8,
+    "signal": np.uint16,
+    "instance": np.int16,
+    "change": np.int16,
+}
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Revolution:

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import os
-import pickle
 import shutil
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
-from io import BytesIO
 from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryFile
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +19,7 @@ import numpy.typing as npt
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.core.plugins import require_extra
+from cdpipe.core.spooled import SpooledArray
 from cdpipe.core.yamlfile import setting_lines
 from cdpipe.io.session import ScanChunk, Session, SessionWriter
 from cdpipe.sensor.ouster import SensorMetadata, load_profile
@@ -32,7 +30,7 @@ from sim.drive.odometry import register_scans, start_pose
 from sim.drive.trajectory import plan_trajectory
 from sim.scene import build_world
 from sim.session.labels import list_changes
-from sim.session.revolution import Drive, Revolution, simulate_revolution, tally_revolution
+from sim.session.revolution import CHANNELS, Drive, Revolution, simulate_revolution, tally_revolution
 from sim.session.truth import (
     SESSIONS,
     Int16Array,
@@ -45,6 +43,8 @@ from sim.session.truth import (
 
 CHUNK_SCANS = 64
 _THREADS = 2
+# Bytes of each channel of a session that are held in memory until KISS-ICP has its poses; more are in a temporary file.
+_HELD_BYTES = 1 << 25
 
 Progress = Callable[[str, int, int], None]
 
@@ -170,10 +170,9 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
     provenance = {"made_by": "tunnelcd simulate", "session": drive.name, "sensor_profile": profile}
     with (
         SessionWriter(folder, drive.sensor, CHUNK_SCANS, provenance) as writer,
-        TemporaryFile(dir=folder.parent) as spool,
         closing(_simulate_revolutions(drive, pool)) as revolutions,
     ):
-        drive, kept = _estimate_odometry(drive, revolutions, spool, report)
+        drive, kept = _estimate_odometry(drive, revolutions, report)
         report(drive.name, 0, n_scans)
         for index, (chunk, instance, change) in enumerate(_fill_chunks(drive, kept)):
             writer.add(chunk)
@@ -199,14 +198,15 @@ def _simulate_revolutions(drive: Drive, pool: Executor) -> Generator[Revolution]
 
 
 def _estimate_odometry(
-    drive: Drive, revolutions: Iterator[Revolution], spool: IO[bytes], report: Progress
+    drive: Drive, revolutions: Iterator[Revolution], report: Progress
 ) -> tuple[Drive, Iterator[Revolution]]:
     """Let KISS-ICP estimate the poses of a session that asks for it, from the scans that will be written.
+
+    Until the last pose is known the revolutions are kept in temporary files.
 
     Args:
         drive: The session's drive.
         revolutions: All its revolutions.
-        spool: An empty file, which holds the revolutions until the last pose is known.
         report: Called with the stage "odometry before" or "odometry after".
 
     Returns:
@@ -216,20 +216,24 @@ def _estimate_odometry(
     if plan.odometry.source != "kiss-icp":
         return drive, revolutions
     trajectory = drive.trajectory
+    shape = drive.sensor.height, drive.sensor.width
+    channels = {name: SpooledArray(dtype, shape, _HELD_BYTES) for name, dtype in CHANNELS.items()}
+    ghost_rays = []
 
     def keep() -> Iterator[npt.NDArray[np.uint32]]:
         for number, revolution in enumerate(revolutions):
             if number % CHUNK_SCANS == 0:
                 report(f"odometry {drive.name}", number, trajectory.n_scans)
-            pickle.dump(revolution, spool, pickle.HIGHEST_PROTOCOL)
+            for name, spooled in channels.items():
+                spooled.append(getattr(revolution, name))
+            ghost_rays.append(revolution.ghost_rays)
             yield revolution.range_mm
         report(f"odometry {drive.name}", trajectory.n_scans, trajectory.n_scans)
 
     start = start_pose(trajectory.true, float(trajectory.revolution_s[0]))
     estimated = register_scans(keep(), drive.sensor, trajectory.revolution_s, trajectory.column_s, start, drive.name)
-    spool.seek(0)
-    kept = (pickle.load(spool) for _ in range(trajectory.n_scans))
-    return replace(drive, trajectory=replace(trajectory, estimated=estimated)), kept
+    kept = zip(*(spooled.finish() for spooled in channels.values()), ghost_rays, strict=True)
+    return replace(drive, trajectory=replace(trajectory, estimated=estimated)), (Revolution(*each) for each in kept)
 
 
 def _fill_chunks(drive: Drive, revolutions: Iterator[Revolution]) -> Iterator[tuple[ScanChunk, Int16Array, Int16Array]]:
@@ -307,7 +311,7 @@ def simulate_in_memory(scenario: Scenario, seed: int, n_threads: int = 1) -> Hel
 
 def _hold_session(drive: Drive, pool: Executor) -> LabelledSession:
     with closing(_simulate_revolutions(drive, pool)) as revolutions:
-        drive, kept = _estimate_odometry(drive, revolutions, BytesIO(), _report_nothing)
+        drive, kept = _estimate_odometry(drive, revolutions, _report_nothing)
         chunk, instance, change = zip(*_fill_chunks(drive, kept), strict=True)
     session = HeldSession(
         Path(drive.name), drive.sensor, drive.trajectory.odom_T_sensor, CHUNK_SCANS, {"session": drive.name}, chunk

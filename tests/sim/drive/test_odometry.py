@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import tempfile
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -13,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import invert, make_pose, transform, travelled_m, yaw_rad
+from cdpipe.core.spooled import SpooledArray
 from cdpipe.core.voxel import cell_keys
 from cdpipe.io.session import Session, read_session
 from cdpipe.mapping import odometry
@@ -195,10 +195,10 @@ def test_a_disk_too_full_to_keep_the_scans_is_told_in_one_line(
     scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
-        raise OSError(28, os.strerror(28))
+        raise InputError("TMPDIR: cannot write there: No space left on device")
 
-    monkeypatch.setattr("sim.session.simulate.pickle.dump", fail)
-    with pytest.raises(InputError, match="pair: cannot write there: No space left on device"):
+    monkeypatch.setattr(SpooledArray, "append", fail)
+    with pytest.raises(InputError, match="TMPDIR: cannot write there: No space left on device"):
         simulate_pair(scenario, 5, tmp_path / "pair")
     assert list(tmp_path.iterdir()) == []
 
