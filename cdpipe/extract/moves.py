@@ -76,7 +76,6 @@ class Move:
 def find_moves(
     removed: Sequence[Float64Array],
     added: Sequence[Float64Array],
-    may_go_far: Sequence[bool],
     around: Callable[[Sequence[tuple[int, int]]], Sequence[tuple[Float64Array, Float64Array]]],
     *,
     nearest_twins: bool = True,
@@ -90,7 +89,6 @@ def find_moves(
     Args:
         removed: Points (P, 3) of each object of the before session, map frame, metres.
         added: The same of the after session.
-        may_go_far: For each removed object, whether partners that are not neighbours are tried.
         around: Returns, for pairs (removed, added) of neighbours, the points (Q, 3) and (R, 3) above the ground that
             the before and the after session have around both objects; the objects' own points may be included.
         nearest_twins: Whether tails are left out and twins are told apart by fit and way; otherwise all points of
@@ -105,7 +103,7 @@ def find_moves(
     for (r, a), (before, after) in zip(beside, around(beside), strict=True):
         found[r, a] = _match_pair(gone[r].with_rest(before), come[a].with_rest(after), _BESIDE_SHARE)
     for r, start in enumerate(gone):
-        for a in _partners_elsewhere(start, come, extents, nearest_twins) if may_go_far[r] else ():
+        for a in _partners_elsewhere(start, come, extents, nearest_twins):
             if (r, a) not in found:
                 found[r, a] = _match_pair(start, come[a], _SAME_SHARE)
     matches = {pair: match for pair, match in found.items() if match is not None}

@@ -57,7 +57,7 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
     """Return the objects of an answer, one for each group of map points, in the same order.
 
     A group of the after map is added, a group of the before map removed. A matching pair is moved
-    (`cdpipe.extract.moves`). A removed part of an object that remains is reshaped (`cdpipe.extract.remains`). The score
+    (`cdpipe.extract.moves`). A removed part of a heap that remains is reshaped (`cdpipe.extract.remains`). The score
     of an object is its number of map points. Shapes and moves are measured on the returns if the maps store them.
 
     Args:
@@ -89,7 +89,9 @@ def assemble_objects(merged: MergedMaps, groups: Sequence[PointGroup]) -> tuple[
         taken, _ = cell_means(group.points_map, voxel_m)  # the density of its surroundings
         # groups of whole map points leave the foot of an object behind, which would look like a remainder
         may_be_part = group.session == "before" and group.returns is not None
-        is_part[number] = may_be_part and is_part_of_remainder(taken, around["before"], other)
+        is_part[number] = (
+            may_be_part and is_part_of_remainder(taken, around["before"], other) and is_heap(points[number])
+        )
         column_m = voxel_m if point_map.return_offsets is None else voxel_m / 2
         volume_m3 = column_volume_m3(points[number], other, column_m, voxel_m)
         objects.append(
@@ -116,15 +118,14 @@ def _link_moves(
     nearest_twins: bool,
 ) -> tuple[ChangedObject, ...]:
     before = [number for number, item in enumerate(objects) if item.session == "before"]
-    removed = [number for number in before if not (is_part[number] and is_heap(points[number]))]
+    removed = [number for number in before if not is_part[number]]
     added = [number for number, item in enumerate(objects) if item.session == "after"]
-    may_go_far = [not is_part[number] for number in removed]
 
     def around(pairs: Sequence[tuple[int, int]]) -> list[tuple[Float64Array, Float64Array]]:
         return surroundings.standing([np.concatenate([points[removed[r]], points[added[a]]]) for r, a in pairs])
 
     ends = [points[n] for n in removed], [points[n] for n in added]
-    for move in find_moves(*ends, may_go_far, around, nearest_twins=nearest_twins):
+    for move in find_moves(*ends, around, nearest_twins=nearest_twins):
         start, end = removed[move.removed], added[move.added]
         for number, partner in ((start, end), (end, start)):
             objects[number] = replace(

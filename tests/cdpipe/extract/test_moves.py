@@ -50,17 +50,17 @@ def noisy(points: Float64Array, purpose: str, noise_m: float = 0.01) -> Float64A
     return points + noise
 
 
-def moves(removed: Sequence[Float64Array], added: Sequence[Float64Array], may_go_far: Sequence[bool]) -> list[Move]:
+def moves(removed: Sequence[Float64Array], added: Sequence[Float64Array]) -> list[Move]:
     """Moves where nothing but these objects was there."""
     nothing = np.zeros((0, 3))
-    return find_moves(removed, added, may_go_far, lambda pairs: [(nothing, nothing)] * len(pairs))
+    return find_moves(removed, added, lambda pairs: [(nothing, nothing)] * len(pairs))
 
 
 def test_what_was_turned_and_carried_off_is_one_object_and_where_it_went_is_told() -> None:
     size = (1.1, 0.7, 0.6)
     middle = np.array([[0.55, 0.35, 0.3]])
     whole, pose = box(size, "lrfb"), yaw_pose(1.2, (4.0, -3.0, 0.1))
-    (move,) = moves([noisy(whole, "a")], [noisy(transform(pose, whole), "b")], [True])
+    (move,) = moves([noisy(whole, "a")], [noisy(transform(pose, whole), "b")])
     assert (move.removed, move.added) == (0, 0)
     np.testing.assert_allclose(move.displacement_map, (transform(pose, middle) - middle)[0], atol=0.03)
 
@@ -72,7 +72,7 @@ def test_an_object_seen_from_two_sides_went_where_it_went() -> None:
     middle = np.array([[0.55, 0.35, 0.3]])
     went = (transform(pose, middle) - middle)[0]
     assert np.linalg.norm(end.mean(axis=0) - start.mean(axis=0) - went) > 0.15
-    (move,) = moves([start], [end], [True])
+    (move,) = moves([start], [end])
     np.testing.assert_allclose(move.displacement_map, went, atol=0.05)
 
 
@@ -83,40 +83,40 @@ def test_a_few_returns_behind_an_edge_do_not_hide_where_an_object_went() -> None
     tail = face((0.1, 1.4, 0.3), (0.7, 1.4, 0.3))[:8]
     start = noisy(np.concatenate([whole, tail]), "a")
     end = noisy(np.concatenate([transform(pose, whole), transform(pose, middle) + shifted(tail, -0.4, 0.1)]), "b")
-    (move,) = moves([start], [end], [True])
+    (move,) = moves([start], [end])
     np.testing.assert_allclose(move.displacement_map, (transform(pose, middle) - middle)[0], atol=0.05)
 
 
 def test_a_chair_is_not_a_barrel_of_the_same_extents() -> None:
     far = yaw_pose(0.7, (5.0, 2.0, 0.0))
-    assert moves([chair()], [transform(far, barrel())], [True]) == []
+    assert moves([chair()], [transform(far, barrel())]) == []
     # where both are, each finds its own, whatever the order and the distance
     further = yaw_pose(2.0, (12.0, 2.0, 0.0))
     added = [transform(far, barrel()), transform(further, chair())]
-    found = moves([chair(), barrel()], added, [True, True])
+    found = moves([chair(), barrel()], added)
     assert [(move.removed, move.added) for move in found] == [(0, 1), (1, 0)]
 
 
 @pytest.mark.parametrize("factor", [0.6, 1.7])
 def test_the_same_shape_in_another_size_is_another_object(factor: float) -> None:
     crate = box((1.0, 0.7, 0.6), "lrfb")
-    assert moves([crate], [shifted(crate * factor, 3.0)], [True]) == []
+    assert moves([crate], [shifted(crate * factor, 3.0)]) == []
 
 
 @pytest.mark.parametrize(("length_m", "is_same"), [(1.25, True), (1.7, False)])
 def test_a_longer_box_is_another_object_however_well_they_fit(length_m: float, is_same: bool) -> None:
     short, long = box((1.0, 0.6, 0.5), "lrfb"), box((length_m, 0.6, 0.5), "lrfb")
-    assert len(moves([short], [shifted(long, 5.0)], [True])) == is_same
+    assert len(moves([short], [shifted(long, 5.0)])) == is_same
 
 
 def test_one_object_moves_once_and_of_two_alike_the_nearer_is_it() -> None:
     few = chair()
     copies = [shifted(few, 9.0), noisy(shifted(few, 4.0), "a", 0.004)]  # the farther one fits a little better
     for nearer, both in ((1, copies), (0, copies[::-1])):
-        (move,) = moves([few], both, [True])
+        (move,) = moves([few], both)
         assert move.added == nearer
         np.testing.assert_allclose(move.displacement_map, [4, 0, 0], atol=0.03)
-        (move,) = moves(both, [few], [True, True])
+        (move,) = moves(both, [few])
         assert move.removed == nearer
 
 
@@ -124,7 +124,7 @@ def test_the_best_pairing_is_not_given_up_for_more_pairs() -> None:
     # the crate went to the crate; that leaves a removed box and an added one which are not alike enough
     crate, low = box((1.0, 0.7, 0.6), "lrfb"), box((1.05, 0.75, 0.45), "lrfb")
     barrel_there = transform(yaw_pose(0, (7.0, 0, 0)), barrel(0.42, 0.55))
-    found = moves([crate, low], [barrel_there, shifted(crate, 4.0, 1.0)], [True, True])
+    found = moves([crate, low], [barrel_there, shifted(crate, 4.0, 1.0)])
     assert (0, 1) in [(move.removed, move.added) for move in found]
 
 
@@ -134,7 +134,7 @@ def test_what_stuck_out_of_a_short_move_is_paired() -> None:
     start, end = box((0.9, 0.6, 0.5), "lrf"), shifted(box((0.9, 0.6, 0.5), "lrf"), 0.5)
     start = start[(start[:, 0] < 0.45) | (start[:, 0] > 0.899)]
     end = end[(end[:, 0] > 0.95) | (end[:, 0] < 0.501)]
-    (move,) = moves([start], [end], [False])
+    (move,) = moves([start], [end])
     np.testing.assert_allclose(move.displacement_map, [0.5, 0, 0], atol=0.1)
 
 
@@ -144,9 +144,9 @@ def test_strips_that_are_not_alike_are_one_object_with_what_seems_to_have_stayed
     start = noisy(box((1.2, 1.0, 1.5), "fr"), "a", 0.005)
     end = noisy(shifted(box((1.2, 1.0, 1.5), "fr"), 0.3), "b", 0.005)
     gone, come = start[start[:, 0] < 0.25], end[end[:, 0] > 1.25]
-    (alone,) = moves([gone], [come], [False])  # strip on strip
+    (alone,) = moves([gone], [come])  # strip on strip
     assert alone.displacement_map[0] > 1.0
-    (move,) = find_moves([gone], [come], [False], lambda pairs: [(start, end)] * len(pairs))
+    (move,) = find_moves([gone], [come], lambda pairs: [(start, end)] * len(pairs))
     np.testing.assert_allclose(move.displacement_map, [0.3, 0.0, 0.0], atol=0.05)
 
 
@@ -155,8 +155,8 @@ def test_neighbours_that_share_just_enough_points_but_are_hardly_alike_are_two_o
     rail = face((0, 0, 0), (1.0, 0, 0))
     post = np.concatenate([rail, face((0, 0, 0), (0, 0, 1.0))])
     corner = np.concatenate([rail, face((0, 0, 0), (0, 1.0, 0))])
-    assert moves([noisy(post, "a")], [noisy(shifted(corner, 0.3, 0.1), "b")], [False]) == []
-    assert len(moves([noisy(post, "a")], [noisy(shifted(post, 0.3, 0.1), "b")], [False])) == 1
+    assert moves([noisy(post, "a")], [noisy(shifted(corner, 0.3, 0.1), "b")]) == []
+    assert len(moves([noisy(post, "a")], [noisy(shifted(post, 0.3, 0.1), "b")])) == 1
 
 
 def test_what_lies_on_what_stands_around_is_not_what_was_put_beside_it() -> None:
@@ -165,7 +165,7 @@ def test_what_lies_on_what_stands_around_is_not_what_was_put_beside_it() -> None
     is_load = heap[:, 1] < 1.5
     put = shifted(chair(), 2.2, 1.0)
     around = (heap, np.concatenate([heap[~is_load], put]))
-    assert find_moves([heap[is_load]], [put], [True], lambda pairs: [around] * len(pairs)) == []
+    assert find_moves([heap[is_load]], [put], lambda pairs: [around] * len(pairs)) == []
 
 
 def test_only_neighbours_are_asked_what_stands_around_them() -> None:
@@ -176,22 +176,16 @@ def test_only_neighbours_are_asked_what_stands_around_them() -> None:
         asked.extend(pairs)
         return [(np.zeros((0, 3)), np.zeros((0, 3)))] * len(pairs)
 
-    find_moves([crate, shifted(crate, 30.0)], [shifted(crate, 2.0), shifted(crate, 9.0)], [True, True], around)
+    find_moves([crate, shifted(crate, 30.0)], [shifted(crate, 2.0), shifted(crate, 9.0)], around)
     assert asked == [(0, 0)]
-
-
-def test_what_was_only_part_of_something_has_not_gone_far() -> None:
-    crate = box((1.0, 0.7, 0.6), "lrfb")
-    assert moves([crate], [shifted(crate, 4.0)], [False]) == []
-    assert len(moves([crate], [shifted(crate, 0.8)], [False])) == 1
 
 
 def test_turning_the_map_turns_the_displacement() -> None:
     crate = noisy(box((1.1, 0.7, 0.6), "lf"), "a")
     there = noisy(transform(yaw_pose(0.9, (3.0, 2.0, 0.0)), box((1.1, 0.7, 0.6), "rf")), "b")
-    (move,) = moves([crate], [there], [True])
+    (move,) = moves([crate], [there])
     turn = yaw_pose(2.2, (100.0, -30.0, 4.0))
-    (turned,) = moves([transform(turn, crate)], [transform(turn, there)], [True])
+    (turned,) = moves([transform(turn, crate)], [transform(turn, there)])
     np.testing.assert_allclose(turned.displacement_map, turn[:3, :3] @ move.displacement_map, atol=0.02)
 
 
@@ -199,15 +193,15 @@ def test_among_very_many_the_right_one_is_tried() -> None:
     crate = box((1.0, 0.7, 0.6), "lrfb")
     longer = [box((1.0 + 0.02 * n, 0.7 - 0.02 * n, 0.6), "lrfb") for n in (5, 6, 7, 8, 9, 10) * 2]
     others = [shifted(each, 3.0, 1.0 * n) for n, each in enumerate(longer)]  # nearer, and not equal
-    (move,) = moves([crate], [*others, shifted(crate, 8.0)], [True])
+    (move,) = moves([crate], [*others, shifted(crate, 8.0)])
     assert move.added == len(others)
 
 
 def test_a_few_points_are_nobody() -> None:
     few = chair()[:3]
-    assert moves([few], [shifted(few, 2.0)], [True]) == []
-    assert moves([few[:1]], [chair()], [True]) == []
-    assert moves([], [chair()], []) == moves([chair()], [], [True]) == []
+    assert moves([few], [shifted(few, 2.0)]) == []
+    assert moves([few[:1]], [chair()]) == []
+    assert moves([], [chair()]) == moves([chair()], []) == []
 
 
 def seen(points: Float64Array, share: float, purpose: str) -> Float64Array:
@@ -232,18 +226,16 @@ def test_of_equal_objects_each_moved_to_where_one_is_nearest_however_many_points
     ]
     removed.append(seen(at(barrel(), 60.0, 0.0, 0.3), 1.0, "taken away"))
     added.append(seen(at(barrel(), 120.0, 0.0, 0.3), 1.0, "put there"))
-    found = moves(removed, added, [True] * 4)
+    found = moves(removed, added)
     assert linked(found) == {(0, 0), (1, 1), (2, 2), (3, 3)}
     # points alone give the barrels of many points to one another
     nothing = np.zeros((0, 3))
-    by_points = find_moves(
-        removed, added, [True] * 4, lambda pairs: [(nothing, nothing)] * len(pairs), nearest_twins=False
-    )
+    by_points = find_moves(removed, added, lambda pairs: [(nothing, nothing)] * len(pairs), nearest_twins=False)
     assert linked(by_points) != linked(found)
     # without the two that lie far apart, and with one of them
-    assert linked(moves(removed[:3], added[:3], [True] * 3)) == {(0, 0), (1, 1), (2, 2)}
-    assert linked(moves(removed, added[:3], [True] * 4)) == {(0, 0), (1, 1), (2, 2)}
-    assert linked(moves(removed[:3], added, [True] * 3)) == {(0, 0), (1, 1), (2, 2)}
+    assert linked(moves(removed[:3], added[:3])) == {(0, 0), (1, 1), (2, 2)}
+    assert linked(moves(removed, added[:3])) == {(0, 0), (1, 1), (2, 2)}
+    assert linked(moves(removed[:3], added)) == {(0, 0), (1, 1), (2, 2)}
 
 
 def test_equal_objects_seen_in_part_are_twins() -> None:
@@ -251,30 +243,30 @@ def test_equal_objects_seen_in_part_are_twins() -> None:
     upper = barrel()[barrel()[:, 2] > 0.3]
     removed = [seen(at(each, x, 0, x), 0.9, f"gone {x}") for each, x in ((barrel(), 0.0), (upper, 40.0))]
     added = [seen(at(each, x, 1, 1.0), 0.9, f"come {x}") for each, x in ((upper, 3.0), (barrel(), 43.0))]
-    assert linked(moves(removed, added, [True] * 2)) == {(0, 0), (1, 1)}
+    assert linked(moves(removed, added)) == {(0, 0), (1, 1)}
 
 
 def test_the_whole_of_the_ways_counts_not_the_way_of_the_first() -> None:
     # the removed crate at 0 is nearest to the added one at 4, which is the only one near the crate at 6
     crate = box((1.0, 0.7, 0.6), "lrfb")
     removed, added = [crate, shifted(crate, 8.0)], [shifted(crate, 4.5), shifted(crate, -5.0)]
-    assert linked(moves(removed, added, [True, True])) == {(0, 1), (1, 0)}
+    assert linked(moves(removed, added)) == {(0, 1), (1, 0)}
 
 
 def test_the_nearest_of_very_many_equal_ones_is_tried() -> None:
     crate = box((1.0, 0.7, 0.6), "lrfb")
     removed = [seen(shifted(crate, 10.0 * n), 0.8, f"gone {n}") for n in range(9)]
     added = [seen(shifted(crate, 10.0 * n + 2.5), 0.8, f"come {n}") for n in range(9)]
-    assert linked(moves(removed, added, [True] * 9)) == {(n, n) for n in range(9)}
+    assert linked(moves(removed, added)) == {(n, n) for n in range(9)}
 
 
 def test_a_fragment_beside_the_place_is_no_twin_of_the_whole() -> None:
     crate = box((1.0, 0.7, 0.6), "lrfb")
     fragment = shifted(crate[crate[:, 0] > 0.7], 1.3)
-    found = moves([crate, fragment], [shifted(crate, 4.0)], [True, True])
+    found = moves([crate, fragment], [shifted(crate, 4.0)])
     assert linked(found) == {(0, 0)}
 
 
 def test_a_crate_a_fifth_larger_is_no_twin_though_it_is_nearer() -> None:
     crate = box((1.0, 0.7, 0.6), "lrfb")
-    assert linked(moves([crate], [shifted(1.2 * crate, 2.0), shifted(crate, 9.0)], [True])) == {(0, 1)}
+    assert linked(moves([crate], [shifted(1.2 * crate, 2.0), shifted(crate, 9.0)])) == {(0, 1)}

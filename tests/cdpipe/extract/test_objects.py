@@ -205,13 +205,13 @@ def test_muck_put_beside_the_pile_it_was_taken_off_is_reshaped_and_added() -> No
     assert [(item.kind, item.partner) for item in objects] == [("reshaped", -1), ("added", -1)]
 
 
-@pytest.mark.parametrize(("in_pile", "kinds"), [(True, ["reshaped", "added"]), (False, ["moved", "moved"])])
-def test_what_was_part_of_a_pile_did_not_go_far(in_pile: bool, kinds: list[str]) -> None:
+@pytest.mark.parametrize("in_pile", [True, False])
+def test_a_crate_that_stood_in_a_pile_is_no_part_of_it(in_pile: bool) -> None:
     here = yaw_pose(0.1, (2.3, 1.7, 0.15) if in_pile else (2.3, -1.7, 0.0))
     pair = merge(np.concatenate([ground(PILE), crate(here)]), np.concatenate([ground(PILE), crate(HERE)]))
     shown = crate(here)[crate(here)[:, 2] > 0.1]
     objects = assemble_objects(pair, [group(pair, "before", shown), group(pair, "after", crate(HERE))])
-    assert [item.kind for item in objects] == kinds
+    assert [item.kind for item in objects] == ["moved", "moved"]
 
 
 def test_what_stands_around_two_places_is_what_rises_above_the_ground_there() -> None:
