@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.errors import InputWarning, MergeFailedError
-from cdpipe.core.geometry import Int64Array
+from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors.describe import (
     describe_scans,
@@ -40,12 +40,13 @@ from cdpipe.methods.registry import load_method
 from cdpipe.model.config import PipelineConfig, Site, load_config
 from cdpipe.model.report import ChangeRegions, ChangeReport
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, ScanSource, Spheres
+from cdpipe.query.drift_width import keyframe_radii
 
 T = TypeVar("T")
 Stage = Literal["maps", "descriptors", "spheres", "merge", "regions"]
 OnStage = Callable[[str, int, int], None]
 Merge = Callable[[MappedSession, MappedSession], MergedMaps]
-Propose = Callable[[tuple[Int64Array, Int64Array]], ChangeRegions]
+Propose = Callable[[tuple[Int64Array, Int64Array], Float64Array], ChangeRegions]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +95,8 @@ def detect(
         after: The later session.
         preset: Name of a preset, or the path of a .yaml file.
         settings: Settings that replace those of the preset, e.g. `{"query.radius_m": 6}`.
-        site: Section of the preset that applies: for narrow or for wide drifts.
+        site: Section of the preset that applies: for narrow or for wide drifts. A preset whose radius follows the width
+            of the drift, as that of `tunnelcd`, has no such section.
         hooks: Called around the stages.
         before_T_after: (4, 4) transform of the after session's odom frame into the before session's, if it is known:
             no place is searched and no gate is asked. It is still refined along the path where `merge.refine` says so.
@@ -243,7 +245,8 @@ def detect_changes(
         config: All settings; `method` names the method that compares the merged maps.
         hooks: Called around the stages.
         merge: Replaces the merge.
-        propose: Replaces the method: returns regions from the keyframe scans of both sessions.
+        propose: Replaces the method: returns regions from the keyframe scans of both sessions, and the radius of a
+            region at each before keyframe.
 
     Raises:
         MergeFailedError: The sessions could not be aligned with enough evidence; it contains the evidence.
@@ -270,7 +273,8 @@ def detect_changes(
         return Done(report, report.seconds)
 
     if propose is not None:
-        recorded = propose((described[0].keyframe_scans, described[1].keyframe_scans))
+        scans = described[0].keyframe_scans, described[1].keyframe_scans
+        recorded = propose(scans, keyframe_radii(merged.before, scans[0], config.query))
         regions = Done(regions_as_mapped(recorded, merged.before), {"t_cd_s": 0.0})
     elif method.propose is not None:
         regions = hooks.run("regions", config, query) if merge is None else hooks.time(query)
@@ -294,8 +298,9 @@ def detect_merge(
     """Stop after the merge: a report without regions and objects; as `detect_changes` otherwise."""
     merged = merge_mapped(before, after, config, hooks or Hooks(), merge)
     none = np.zeros(0)
+    radius_m = none if config.query.radius_m == "width" else config.query.radius_m
     regions = ChangeRegions(
-        np.zeros((0, 3)), config.query.radius_m, none, np.zeros((0, 2), dtype=np.int64), none.astype(np.bool_), none
+        np.zeros((0, 3)), radius_m, none, np.zeros((0, 2), dtype=np.int64), none.astype(np.bool_), none
     )
     report = make_report(merged, (before.descriptors, after.descriptors), regions, (), {}, merged.seconds, config)
     report = report_as_recorded(report, merged.before, merged.after)

@@ -53,6 +53,7 @@ def test_tables_hold_what_the_report_does(report: cdpipe.ChangeReport) -> None:
     assert len(objects) == len(report.objects) > 0
     assert objects["n_returns"].tolist() == [len(item.returns) for item in report.objects]
     assert len(regions) == report.regions.is_proposed.sum()
+    assert regions["radius_m"].tolist() == report.regions.radii_m[report.regions.is_proposed].tolist()
     with pytest.raises(ValueError, match="objects"):
         report.to_pandas("object")  # type: ignore[arg-type]
 

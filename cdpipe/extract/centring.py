@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float64Array
+from cdpipe.core.geometry import Float64Array
 from cdpipe.extract.objects import PointGroup
 from cdpipe.extract.surface_rule import BEYOND_M
 from cdpipe.model.report import ChangeRegions
@@ -22,8 +22,10 @@ def centre_regions(
 
     Regions are centred best first, and each object is used once: an object whose centroid lies in the sphere of a
     better, centred region justifies no other region. The new centre is that of the smallest ball around the centroids
-    of the other objects in the sphere, so it is no farther from the farthest of them than the proposed centre was. If
-    that ball is larger than the sphere, the objects with the fewest points are left out.
+    of the other objects in the sphere, so it is no farther from the farthest of them than the proposed centre was.
+    Objects whose centroids come into the sphere with it justify no other region either: the centre is that of the
+    smallest ball around them, too. If a ball is larger than the sphere, the objects with the fewest points are left
+    out.
 
     Of an object the part within 1.5 m of the sphere counts. Scores, order, radius and regions without objects stay as
     they are.
@@ -38,14 +40,22 @@ def centre_regions(
         reported region that reaches it.
     """
     centres, is_reported = regions.centres_map.copy(), regions.is_reported.copy()
-    centred: list[Float64Array] = []
-    for region in np.flatnonzero(regions.is_reported).tolist():
-        parts = _parts_within(groups, regions.centres_map[region], regions.radius_m)
-        own = [part for part in parts if not _is_within(part.mean(axis=0), centred, regions.radius_m)]
+    centred: list[int] = []
+    for region, radius_m in enumerate(regions.radii_m.tolist()):
+        if not regions.is_reported[region]:
+            continue
+        taken = centres[centred], regions.radii_m[centred]
+        parts = _parts_within(groups, regions.centres_map[region], radius_m)
+        own = [index for index, part in parts.items() if not _is_within(part.mean(axis=0), *taken)]
         if own:
-            own.sort(key=len, reverse=True)
-            centres[region] = _enclosing_centre(np.array([part.mean(axis=0) for part in own]), regions.radius_m)
-            centred.append(centres[region])
+            places = [parts[index].mean(axis=0) for index in own]
+            centre = _enclosing_centre(np.array(places), radius_m)
+            reached = _parts_within(groups, centre, radius_m)
+            more = [part.mean(axis=0) for index, part in reached.items() if index not in own]
+            here = centre[None], np.array([radius_m])
+            places += [place for place in more if _is_within(place, *here) and not _is_within(place, *taken)]
+            centres[region] = _enclosing_centre(np.array(places), radius_m)
+            centred.append(region)
         elif parts and withdraw:
             is_reported[region] = False
     moved = replace(
@@ -55,30 +65,32 @@ def centre_regions(
         is_withdrawn=regions.is_proposed & ~is_reported if withdraw else regions.is_withdrawn,
         proposed_centres_map=regions.centres_map,
     )
-    return moved, [_with_nearest_region(group, centres, is_reported, regions.radius_m) for group in groups]
+    return moved, [_with_nearest_region(group, moved) for group in groups]
 
 
-def _with_nearest_region(
-    group: PointGroup, centres: Float64Array, is_reported: BoolArray, radius_m: float
-) -> PointGroup:
-    """Return a group with the reported region nearest to its centroid, if the region reaches it."""
-    away_m = np.where(is_reported, np.linalg.norm(centres - group.points_map.mean(axis=0), axis=1), np.inf)
+def _with_nearest_region(group: PointGroup, regions: ChangeRegions) -> PointGroup:
+    """Return a group with the nearest of the reported regions that reach its centroid, if one does."""
+    away_m = np.linalg.norm(regions.centres_map - group.points_map.mean(axis=0), axis=1)
+    away_m[~regions.is_reported | (away_m > regions.radii_m + BEYOND_M)] = np.inf
     region = int(np.argmin(away_m))
-    return replace(group, region=region) if away_m[region] <= radius_m + BEYOND_M else group
+    return replace(group, region=region) if np.isfinite(away_m[region]) else group
 
 
-def _parts_within(groups: Sequence[PointGroup], centre: Float64Array, radius_m: float) -> list[Float64Array]:
-    """Return the points (P, 3) within `BEYOND_M` of a sphere of each object that has a point in the sphere."""
-    parts = []
-    for group in groups:
+def _parts_within(groups: Sequence[PointGroup], centre: Float64Array, radius_m: float) -> dict[int, Float64Array]:
+    """Return the points (P, 3) within `BEYOND_M` of a sphere of each object, by index, that has a point in the sphere.
+
+    The objects with the most points come first.
+    """
+    parts = {}
+    for index, group in enumerate(groups):
         away_m = np.linalg.norm(group.points_map - centre, axis=1)
         if away_m.min() <= radius_m:
-            parts.append(group.points_map[away_m <= radius_m + BEYOND_M])
-    return parts
+            parts[index] = group.points_map[away_m <= radius_m + BEYOND_M]
+    return dict(sorted(parts.items(), key=lambda item: -len(item[1])))
 
 
-def _is_within(place: Float64Array, centres: Sequence[Float64Array], radius_m: float) -> bool:
-    return any(np.linalg.norm(place - centre) <= radius_m for centre in centres)
+def _is_within(place: Float64Array, centres: Float64Array, radii_m: Float64Array) -> bool:
+    return bool((np.linalg.norm(place - centres, axis=1) <= radii_m).any())
 
 
 def _enclosing_centre(places: Float64Array, radius_m: float) -> Float64Array:

@@ -47,7 +47,7 @@ def cut_objects(merged: MergedMaps, regions: ChangeRegions, config: PipelineConf
     is_taken = {name: np.zeros(len(merged.map_of(name).points), np.bool_) for name in SESSIONS}
     groups: list[PointGroup] = []
     for region in np.flatnonzero(regions.is_reported).tolist():
-        spheres = crops.around(regions.centres_map[region], regions.radius_m)
+        spheres = crops.around(regions.centres_map[region], regions.radii_m[region])
         for session, other in DIRECTIONS:
             indices, points = spheres[session].inside
             others = spheres[other].points
@@ -69,7 +69,7 @@ def withdraw_empty_regions(
     if groups:
         tree = cKDTree(np.concatenate([group.points_map for group in groups]))
         gaps_m, _ = tree.query(regions.centres_map[is_empty])
-        is_empty[is_empty] = np.asarray(gaps_m) > regions.radius_m
+        is_empty[is_empty] = np.asarray(gaps_m) > regions.radii_m[is_empty]
     return replace(regions, is_reported=regions.is_reported & ~is_empty, is_withdrawn=is_empty)
 
 
@@ -91,7 +91,7 @@ def measure_regions(
     """
     figures = {name: np.full(len(regions.scores), np.nan) for name in FIGURES}
     for region in np.flatnonzero(regions.is_reported).tolist():
-        points = after_within(regions.centres_map[region], regions.radius_m)
+        points = after_within(regions.centres_map[region], regions.radii_m[region])
         added = [group for group in groups if group.session == "after" and group.region == region]
         figures["v_sphere_m3"][region] = hull_volume_m3(points)
         figures["v_oe_m3"][region] = sum(hull_volume_m3(group.points_map) for group in added)

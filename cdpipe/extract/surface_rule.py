@@ -83,7 +83,7 @@ def cut_by_surface(merged: MergedMaps, regions: ChangeRegions, config: ExtractCo
     found: list[_Candidates] = []
     agreements: dict[int, _Agreement] = {}
     for region in np.flatnonzero(regions.is_reported).tolist():
-        spheres = crops.around(regions.centres_map[region], regions.radius_m)
+        spheres = crops.around(regions.centres_map[region], regions.radii_m[region])
         if min(len(sphere.indices) for sphere in spheres.values()) == 0:
             continue
         agreements[region], of_region = _compare_region(merged, spheres, regions.centres_map[region], region, config)

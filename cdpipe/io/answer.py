@@ -1,10 +1,11 @@
 """The answer of a method on disk, written by `detect` or another program and read by `score`.
 
     answer.json   format, status, method, config, checkpoints (digest of each descriptor's weights), seconds, evidence,
-                  before_T_after, radius_m, objects (session, kind, region, score and partner of each; if known, shape:
-                  map_T_box (4, 4), box_m (3,) and volume_m3; for moved objects displacement_map (3,)); until: "merge"
-                  if the method was stopped after the merge
+                  before_T_after, radius_m of all regions (left out where each has its own), objects (session, kind,
+                  region, score and partner of each; if known, shape: map_T_box (4, 4), box_m (3,) and volume_m3; for
+                  moved objects displacement_map (3,)); until: "merge" if the method was stopped after the merge
     answer.npz    region_centres_map (R, 3), region_scores (R,), region_pairs (R, 2), region_is_reported (R,),
+                  region_radii_m (R,), where radii differ along the path (without radius_m),
                   region_is_withdrawn (R,), regions above the threshold without an object of their own (optional),
                   region_direction (R,) uint8, session of the queried keyframe, 0 before, 1 after (optional),
                   region_proposed_centres_map (R, 3), where regions were proposed that are now centred on their objects
@@ -25,6 +26,7 @@ so that a misspelt field does not pass as a missing one.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -97,7 +99,9 @@ def write_answer(folder: Path, method: str, report: ChangeReport, until: Until |
         **_join("object_points_map", np.zeros((0, 3)), [item.points_map for item in objects]),
         **{f"figure_{name}": values for name, values in report.figures.items()},
     }
+    has_own_radii = isinstance(regions.radius_m, np.ndarray)
     optional = {
+        "region_radii_m": regions.radii_m if has_own_radii else None,
         "region_is_withdrawn": regions.is_withdrawn,
         "region_direction": regions.direction,
         "region_proposed_centres_map": regions.proposed_centres_map,
@@ -110,7 +114,7 @@ def write_answer(folder: Path, method: str, report: ChangeReport, until: Until |
         "error": "",
         "method": method,
         "before_T_after": report.before_T_after.tolist(),
-        "radius_m": regions.radius_m,
+        **({} if has_own_radii else {"radius_m": regions.radius_m}),
         "seconds": dict(report.seconds),
         "evidence": dict(report.evidence),
         "config": dict(report.config),
@@ -176,6 +180,10 @@ def read_answer(folder: Path) -> Answer:
     file, n_objects = folder / "answer.npz", len(document.objects)
     arrays = read_npz(file, lambda types: check_array_types(file, types, n_objects))
     check_offsets(file, arrays, n_objects)
+    if math.isnan(document.radius_m) != ("region_radii_m" in arrays):
+        raise InputError(
+            f"{path}: radius_m: expected here for all regions, or array region_radii_m of answer.npz for each"
+        )
     try:
         report, points_odom = _report(document, arrays)
     except ValueError as error:
@@ -215,7 +223,7 @@ def _report(
     scores = arrays["region_scores"]
     regions = ChangeRegions(
         centres_map=arrays["region_centres_map"],
-        radius_m=document.radius_m,
+        radius_m=arrays.get("region_radii_m", document.radius_m),
         scores=scores,
         pairs=arrays.get("region_pairs", np.full((len(scores), 2), -1)),
         is_reported=arrays.get("region_is_reported", np.ones(len(scores), dtype=np.bool_)),

@@ -74,7 +74,7 @@ class AnswerPart(FailurePart):
     """answer.json of a case with an answer."""
 
     before_T_after: _Pose
-    radius_m: PositiveFloat
+    radius_m: PositiveFloat = float("nan")  # left out where answer.npz has that of each region
     objects: list[ObjectPart] = Field(default_factory=list)
 
 
@@ -82,7 +82,7 @@ class AnswerPart(FailurePart):
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     "region_centres_map": ("R", 3), "region_scores": ("R",), "region_pairs": ("R", 2), "region_is_reported": ("R",),
     "region_is_withdrawn": ("R",), "region_direction": ("R",), "keyframe_scores": ("Kb",),
-    "region_proposed_centres_map": ("R", 3),
+    "region_proposed_centres_map": ("R", 3), "region_radii_m": ("R",),
     "before_keyframe_scans": ("Kb",), "after_keyframe_scans": ("Ka",), "object_returns": ("M", 2),
     "object_return_offsets": ("O + 1",), "object_points_map": ("P", 3), "object_point_offsets": ("O + 1",),
     "object_points_odom": ("P", 3), "object_point_odom_offsets": ("O + 1",), "local_before_T_after": ("Ka", 4, 4),

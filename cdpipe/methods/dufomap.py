@@ -42,7 +42,7 @@ def dufomap(maps: PlacedMaps, session: SessionName, other: SessionName, config: 
         (N,) mask of the points of `session`.
     """
     points = maps.points[session]
-    compared = np.flatnonzero(is_within(points, maps.path[other], config.query.radius_m))
+    compared = np.flatnonzero(is_within(points, maps.path[other], config.query.fixed_radius_m))
     point_map, points_odom = maps.merged.map_of(other), maps.merged.to_odom(other, points[compared])
     settings = config.dufomap
     void_map = load_dufomap().dufomap(settings.voxel_m, settings.hit_inflation_m, _UNKNOWN_VOXELS, THREADS)

@@ -43,7 +43,7 @@ def m3c2(maps: PlacedMaps, session: SessionName, other: SessionName, config: Pip
     """
     py4dgeo = load_py4dgeo()
     points = maps.points[session]
-    core = np.flatnonzero(is_within(points, maps.path[other], config.query.radius_m))
+    core = np.flatnonzero(is_within(points, maps.path[other], config.query.fixed_radius_m))
     is_new = np.zeros(len(points), dtype=np.bool_)
     if len(core) == 0:
         return is_new

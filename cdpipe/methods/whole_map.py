@@ -75,7 +75,7 @@ class WholeMap:
         before_path, after_path = merged.keyframe_positions(before, after)
         clouds = {name: merged.to_map(name, merged.map_of(name).points) for name in SESSIONS}
         maps = PlacedMaps(merged, clouds, {"before": before_path, "after": after_path})
-        radius_m = config.query.radius_m
+        radius_m = config.query.fixed_radius_m
         groups: list[PointGroup] = []
         is_changed: dict[SessionName, BoolArray] = {}
         for session, other in DIRECTIONS:
@@ -94,7 +94,7 @@ class WholeMap:
         end = perf_counter()
         seconds = {"t_cd_s": compared - start, "t_oe_s": end - compared, "t_returns_s": end - grouped}
         marked = [(points, is_changed[session]) for session, points in maps.points.items()]
-        scores = marked_share(marked, before_path, radius_m)
+        scores = marked_share(marked, before_path, np.full(len(before_path), radius_m))
         scores[~is_within(before_path, after_path, config.query.max_pair_m)] = np.nan
         regions = replace(regions, keyframe_scores=scores)
         index = GridIndex(maps.points["after"])
@@ -120,7 +120,7 @@ def _in_reported_regions(
     if len(reported) == 0 or not groups:
         return []
     gaps_m, nearest = query_nearest(_centroids(groups), regions.centres_map[reported])
-    reach_m = config.query.suppression * config.query.radius_m
+    reach_m = config.query.suppression * config.query.fixed_radius_m
     min_points = config.query.threshold if config.query.n_regions is None else 0.0
     return [
         PointGroup(group.session, group.indices, group.points_map, int(reported[region]))

@@ -9,7 +9,15 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer
+from pydantic import (
+    Discriminator,
+    Field,
+    SerializerFunctionWrapHandler,
+    Tag,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.plugins import METHODS, PRESETS, entry_points, find_yaml
@@ -30,6 +38,11 @@ Cell = Annotated[float, Field(ge=0.01)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[float, Field(ge=0)]
+# A length, or the word; either kind of input breaks the rule of its own kind alone.
+LengthOrWidth = Annotated[
+    Annotated[Positive, Tag("length")] | Annotated[Literal["width"], Tag("word")],
+    Discriminator(lambda value: "word" if isinstance(value, str) else "length"),
+]
 Site = Literal["narrow", "wide"]
 WEIGHTS = ("descriptor.weights", "sphere.weights")
 """Settings that name a file; a relative path starts at the file that holds the setting."""
@@ -123,11 +136,27 @@ class QueryConfig(Settings):
     reading: Literal["nearest", "paired"] = Field(
         "nearest", description="A: nearest in descriptor space; B: the same place after alignment"
     )
-    radius_m: Positive = Field(4.5, description="radius of a region's sphere (paper: 4.5 and 10)")
-    threshold: float = Field(0.0, description="score from which a region is reported; calibrated on validation seeds")
+    radius_m: LengthOrWidth = Field(
+        4.5,
+        description="radius of a region's sphere (paper: 4.5 and 10), or `width`: 4.5 to 10 by the drift's width",
+    )
+    threshold: float = Field(
+        0.0, description="score from which a region is reported (`sphere`: log-odds); calibrated on validation seeds"
+    )
     n_regions: Count | None = Field(None, description="report this many regions instead of using the threshold")
     suppression: Positive = Field(1.0, description="candidates nearer than this many radii to a better one are dropped")
     max_pair_m: Positive = Field(5.0, description="keyframes farther apart are not the same place")
+
+    @property
+    def fixed_radius_m(self) -> float:
+        """The radius, where it is one number.
+
+        Raises:
+            ValueError: It follows the width of the drift.
+        """
+        if self.radius_m == "width":
+            raise ValueError("query.radius_m is width: it is no number")
+        return self.radius_m
 
 
 class ExtractConfig(Settings):
@@ -225,6 +254,15 @@ class PipelineConfig(Settings):
             raise ValueError(f"no such method (registered: {', '.join(known)}){hint}")
         return method
 
+    @model_validator(mode="after")
+    def _width_has_keyframes(self) -> PipelineConfig:
+        if self.query.radius_m == "width" and self.method != "descriptor":
+            raise ValueError(
+                f"query.radius_m = width is for method: descriptor, this one is {self.method}; expected a length in "
+                "metres, e.g. 4.5"
+            )
+        return self
+
     @model_serializer(mode="wrap")
     def _without_empty_groups(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         return {name: value for name, value in handler(self).items() if name not in ("options", "sphere") or value}
@@ -242,11 +280,11 @@ def load_config(
 
     Args:
         preset: Name of a preset, or the path of a .yaml file. Its settings are for narrow drifts; the section `wide`
-            has those that differ in wide drifts: the radius, and with it the threshold. Relative paths in it start at
-            that file.
+            has those that differ in wide drifts: the radius, and with it the threshold. Where the radius follows the
+            width of the drift, a preset needs no such section. Relative paths in it start at that file.
         settings: Replace those of the preset: `["query.radius_m=6"]`, `{"query.radius_m": 6}` or
             `{"query": {"radius_m": 6}}`. Relative paths start at the working folder.
-        site: Narrow or wide drifts.
+        site: Narrow or wide drifts; no matter for a preset whose radius follows the width.
 
     Raises:
         InputError: The preset is unknown or has no settings for the site, or keys or values are wrong. All mistakes for
@@ -264,12 +302,14 @@ def load_config(
             mistakes |= dict.fromkeys(str(error).splitlines())
     if mistakes:
         raise InputError("\n".join(mistakes))
-    if site not in found:
-        raise InputError(
-            f"{narrow.source}: wide: missing: this preset does not say what it needs in wide drifts; "
-            "expected e.g. wide: {query: {radius_m: 10, threshold: 0.5}}"
-        )
-    return found[site]
+    if site in found:
+        return found[site]
+    if found["narrow"].query.radius_m == "width" or _follows_width(narrow):
+        return found["narrow"]
+    raise InputError(
+        f"{narrow.source}: wide: missing: this preset does not say what it needs in wide drifts; "
+        "expected e.g. wide: {query: {radius_m: 10, threshold: 0.5}}"
+    )
 
 
 def settings_table() -> list[tuple[str, Any, str]]:
@@ -294,6 +334,12 @@ def _preset_document(preset: str) -> Document:
         raise InputError(f"preset {preset!r} is unknown{suggest(preset, presets)} (known: {', '.join(presets)})")
     document = read_yaml(Path(f"{preset}.yaml"), presets[preset].read_text(encoding="utf-8"))
     return _resolve_files(document, Path(str(presets[preset])).parent)
+
+
+def _follows_width(preset: Document) -> bool:
+    """Return whether the radius of a preset, before settings over it, follows the width of the drift."""
+    query = preset.value.get("query")
+    return isinstance(query, dict) and query.get("radius_m") == "width"
 
 
 def _resolve_files(document: Document, folder: Path) -> Document:

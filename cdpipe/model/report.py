@@ -21,7 +21,7 @@ class ChangeRegions:
 
     Attributes:
         centres_map: (R, 3) sphere centres, map frame, metres.
-        radius_m: Radius of all spheres.
+        radius_m: Radius of all spheres, metres; or (R,) float64 radius of each, where it follows the drift's width.
         scores: (R,) change score, falling; a larger score means a surer change.
         pairs: (R, 2) int64 before and after keyframe of each.
         is_reported: (R,) whether the region is in the answer: it passed the threshold (or the fixed number of regions)
@@ -36,7 +36,7 @@ class ChangeRegions:
     """
 
     centres_map: Float64Array
-    radius_m: float
+    radius_m: float | Float64Array
     scores: Float64Array
     pairs: Int64Array
     is_reported: BoolArray
@@ -50,10 +50,17 @@ class ChangeRegions:
         """(R,) whether the region passed the threshold (or the fixed number), withdrawn or not."""
         return self.is_reported if self.is_withdrawn is None else self.is_reported | self.is_withdrawn
 
+    @property
+    def radii_m(self) -> Float64Array:
+        """(R,) radius of each sphere, metres."""
+        return np.broadcast_to(np.asarray(self.radius_m, dtype=np.float64), len(self.scores))
+
     def __post_init__(self) -> None:
         n = len(self.scores)
         require_shapes(self, centres_map=(n, 3), pairs=(n, 2), is_reported=(n,), is_withdrawn=(n,), direction=(n,))
         require_shapes(self, proposed_centres_map=(n, 3))
+        if isinstance(self.radius_m, np.ndarray):
+            require_shapes(self, radius_m=(n,))
         if self.is_reported.dtype != np.bool_:
             raise ValueError(f"is_reported must be a boolean mask, got {self.is_reported.dtype}")
         if self.is_withdrawn is not None and (self.is_withdrawn & self.is_reported).any():
@@ -166,6 +173,7 @@ class ChangeReport:
         shown = np.flatnonzero(self.regions.is_proposed)
         columns = {"score": self.regions.scores, "is_withdrawn": ~self.regions.is_reported}
         columns |= {f"{axis}_m": self.regions.centres_map[:, k] for k, axis in enumerate(_AXES)} | dict(self.figures)
+        columns["radius_m"] = self.regions.radii_m
         return pd.DataFrame({"region": shown, **{name: values[shown] for name, values in columns.items()}})
 
 

@@ -14,15 +14,21 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.descriptors.sphere import change_log_odds, max_within_reach
+from cdpipe.descriptors.sphere import change_log_odds
 from cdpipe.model.config import QueryConfig, SphereConfig
 from cdpipe.model.report import ChangeRegions
 from cdpipe.model.types import DescriptorSet, MergedMaps, UInt8Array
 from cdpipe.query.difference import sphere_difference
+from cdpipe.query.drift_width import keyframe_radii, score_radii
 
 # Values of `ChangeRegions.direction`: the session whose keyframe is queried in the other session.
 BEFORE, AFTER = 0, 1
 _SHIPPED = SphereConfig()
+# Keyframe scores, in log-odds: what is surer than this (0.95) counts as this, so that a sure change some metres away is
+# not above a doubtful one here; and the fall per metre, which ranks keyframes near one change by their distance. Mean
+# AUROC and AP of 16 validation pairs (3 narrow, 7 caves, 6 wide): 0.999 and 0.994; without both 0.992 and 0.90.
+_SURE = 3.0
+_FALL_PER_M = 0.1
 
 
 def find_regions(
@@ -42,12 +48,16 @@ def find_regions(
         sphere: Weights of the sphere descriptors, if they are compared.
     """
     places = _Places(merged, before, after, config)
+    radii_b = keyframe_radii(merged.before, before.keyframe_scans, config)
     if config.compare == "scan":
-        return _score_by_scans(places, before, after, config)
+        radii_a = keyframe_radii(merged.after, after.keyframe_scans, config)
+        return _score_by_scans(places, before, after, config, radii_b, radii_a)
     if config.compare == "sphere":
-        return _score_by_spheres(places, change_log_odds(merged, before, places.is_covered_b, sphere), config)
+        local = change_log_odds(merged, before, places.is_covered_b, sphere)
+        score_m = score_radii(merged.before, before.keyframe_scans, config)
+        return _score_by_spheres(places, local, config, radii_b, score_m)
     scores = sphere_difference(merged, before, after, config)
-    return rank_regions(places.before, scores, places.pairs_b, scores, config, _from(BEFORE, scores))
+    return rank_regions(places.before, scores, places.pairs_b, scores, config, _from(BEFORE, scores), radii_b)
 
 
 class _Places:
@@ -65,7 +75,14 @@ class _Places:
         return np.column_stack([np.arange(len(self.near_a)), self.near_a])
 
 
-def _score_by_scans(places: _Places, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> ChangeRegions:
+def _score_by_scans(
+    places: _Places,
+    before: DescriptorSet,
+    after: DescriptorSet,
+    config: QueryConfig,
+    radii_b: Float64Array,
+    radii_a: Float64Array,
+) -> ChangeRegions:
     """Score every keyframe of both sessions by the descriptor distance to its partner.
 
     Every keyframe is a candidate at its own position. After keyframes are queried among the before descriptors and,
@@ -95,19 +112,33 @@ def _score_by_scans(places: _Places, before: DescriptorSet, after: DescriptorSet
         keyframe_scores=keyframe_scores,
         config=config,
         direction=np.concatenate([_from(AFTER, pairs_a[is_candidate_a]), _from(BEFORE, pairs_b[is_candidate_b])]),
+        radii_m=np.concatenate([radii_a[is_candidate_a], radii_b[is_candidate_b]]),
     )
 
 
-def _score_by_spheres(places: _Places, local: Float64Array, config: QueryConfig) -> ChangeRegions:
+def _score_by_spheres(
+    places: _Places, local: Float64Array, config: QueryConfig, radii_m: Float64Array, score_m: Float64Array
+) -> ChangeRegions:
     """Rank before keyframes by the (K,) log-odds of their own stretch.
 
-    A sphere descriptor covers 2 m of tunnel before and behind its keyframe. A keyframe score covers a region, so it is
-    the maximum of the log-odds within `radius_m`.
+    A sphere descriptor covers 2 m of tunnel before and behind its keyframe. The score of a keyframe covers its
+    surroundings: it is the largest of the log-odds, 3 at most, less 0.1 per metre of distance.
+
+    Args:
+        places: Positions of the keyframes.
+        local: (K,) log-odds.
+        config: Suppression distance, and threshold or number of regions.
+        radii_m: (K,) radius of a region at each keyframe.
+        score_m: (K,) radius of the surroundings that count for its score.
     """
     keyframe_scores = np.full(len(local), np.nan)
     covered = np.flatnonzero(places.is_covered_b)
-    keyframe_scores[covered] = max_within_reach(local[covered], places.before[covered], config.radius_m)
-    return rank_regions(places.before, local, places.pairs_b, keyframe_scores, config, _from(BEFORE, local))
+    tree = cKDTree(places.before[covered])
+    for keyframe in covered:
+        found = covered[tree.query_ball_point(places.before[keyframe], score_m[keyframe])]
+        away_m = np.linalg.norm(places.before[found] - places.before[keyframe], axis=1)
+        keyframe_scores[keyframe] = (np.minimum(local[found], _SURE) - _FALL_PER_M * away_m).max()
+    return rank_regions(places.before, local, places.pairs_b, keyframe_scores, config, _from(BEFORE, local), radii_m)
 
 
 def rank_regions(
@@ -117,8 +148,11 @@ def rank_regions(
     keyframe_scores: Float64Array,
     config: QueryConfig,
     direction: UInt8Array | None = None,
+    radii_m: Float64Array | None = None,
 ) -> ChangeRegions:
     """Sort candidates by score, suppress those near a better one, and mark the reported ones.
+
+    Of two candidates of different radius, that of the better one decides what is near.
 
     Args:
         centres_map: (N, 3) sphere centres, map frame, metres.
@@ -127,17 +161,20 @@ def rank_regions(
         keyframe_scores: (K,) copied into the result.
         config: Radius, suppression distance, and threshold or number of regions.
         direction: (N,) as in `ChangeRegions`; None if no keyframes are queried.
+        radii_m: (N,) radius of each candidate where `query.radius_m` is `width`; None if it is a number.
     """
+    if radii_m is None:
+        radii_m = np.full(len(scores), config.fixed_radius_m)
     order = np.argsort(-scores, kind="stable")
     order = order[~np.isnan(scores[order])]
-    kept = order[_suppress_neighbours(centres_map[order], config.suppression * config.radius_m)]
+    kept = order[_suppress_neighbours(centres_map[order], config.suppression * radii_m[order])]
     if config.n_regions is None:
         is_reported = scores[kept] >= config.threshold
     else:
         is_reported = np.arange(len(kept)) < config.n_regions
     return ChangeRegions(
         centres_map=centres_map[kept],
-        radius_m=config.radius_m,
+        radius_m=radii_m[kept] if config.radius_m == "width" else config.radius_m,
         scores=scores[kept],
         pairs=pairs[kept].astype(np.int64),
         is_reported=is_reported,
@@ -151,12 +188,12 @@ def _from(session: int, candidates: npt.NDArray[Any]) -> UInt8Array:
     return np.full(len(candidates), session, dtype=np.uint8)
 
 
-def _suppress_neighbours(centres: Float64Array, distance_m: float) -> BoolArray:
-    """Mark, from best to worst, every (N, 3) centre that is at least `distance_m` from all centres marked before."""
+def _suppress_neighbours(centres: Float64Array, distances_m: Float64Array) -> BoolArray:
+    """Mark, from best to worst, every (N, 3) centre that is at least their distance, (N,), from all marked before."""
     is_kept = np.ones(len(centres), dtype=np.bool_)
     for index, centre in enumerate(centres):
         if is_kept[index]:
-            is_kept[index + 1 :] &= np.linalg.norm(centres[index + 1 :] - centre, axis=1) >= distance_m
+            is_kept[index + 1 :] &= np.linalg.norm(centres[index + 1 :] - centre, axis=1) >= distances_m[index]
     return is_kept
 
 

@@ -14,7 +14,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="print no progress an
 Preset = Annotated[str, typer.Option("--preset", help="name of a preset, or a .yaml file")]
 KindOfSite = Annotated[
     Literal["narrow", "wide"],
-    typer.Option("--site", help="width of the drifts: which of the preset's settings apply"),
+    typer.Option("--site", help="width of the drifts, for presets with settings for each; `tunnelcd` measures it"),
 ]
 SetSettings = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="one setting; may be repeated")

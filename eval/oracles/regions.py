@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Int64Array
+from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.model.config import QueryConfig
 from cdpipe.model.report import ChangeRegions
 from cdpipe.query.query import query_nearest, rank_regions
@@ -17,7 +17,7 @@ from eval.truth.ground_truth import GroundTruth
 
 
 def regions_by_truth(
-    truth: GroundTruth, keyframe_scans: tuple[Int64Array, Int64Array], config: QueryConfig
+    truth: GroundTruth, keyframe_scans: tuple[Int64Array, Int64Array], radii_m: Float64Array, config: QueryConfig
 ) -> ChangeRegions:
     """Return a region around each observable change, except those that the region of a larger change suppresses.
 
@@ -28,7 +28,8 @@ def regions_by_truth(
     Args:
         truth: The pair's truth.
         keyframe_scans: Scans of the before and of the after keyframes, at least one of each.
-        config: `radius_m` and `suppression` are used.
+        radii_m: (Kb,) radius of a region at each before keyframe.
+        config: `suppression` is used.
 
     Returns:
         The regions, all reported with score 1. A before keyframe scores the less the farther its nearest change is.
@@ -47,6 +48,7 @@ def regions_by_truth(
         centres_map=transform_to_map(places_world, truth.before),
         scores=np.ones(len(chosen)),
         pairs=np.column_stack(nearest),
+        radii_m=radii_m[nearest[0]],
         keyframe_scores=np.where(np.isfinite(gaps_m), -gaps_m, np.nan),
         config=config.model_copy(update={"threshold": 1.0, "n_regions": None}),
     )

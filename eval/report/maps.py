@@ -52,10 +52,11 @@ class TruthMark:
 
 @dataclass(frozen=True, slots=True)
 class RegionMark:
-    """A reported region on the map: its centre in metres, and whether it finds a change (None: not scored)."""
+    """A reported region on the map: its centre and radius in metres, and whether it finds no change."""
 
     x_m: float
     y_m: float
+    radius_m: float
     is_false: bool
 
 
@@ -104,13 +105,12 @@ def distance_map(before: Points, after: Points) -> str:
     return data_address(figure)
 
 
-def region_map(points: Points, regions: Sequence[RegionMark], radius_m: float, truths: Sequence[TruthMark]) -> str:
+def region_map(points: Points, regions: Sequence[RegionMark], truths: Sequence[TruthMark]) -> str:
     """Draw reported regions as red circles over a grey map seen from above, and where the changes truly are.
 
     Args:
         points: (N, 3) map points, metres.
         regions: Reported regions; false ones are dashed.
-        radius_m: Their radius.
         truths: True positions; labels of neighbours are joined.
     """
     raster = Raster.around(points)
@@ -118,7 +118,7 @@ def region_map(points: Points, regions: Sequence[RegionMark], radius_m: float, t
     figure, axes = _map_axes(raster)
     axes.imshow(_on_white(_tinted(counts, "#9a9a9a"), counts > 0), extent=raster.extent, origin="lower")
     for region in regions:
-        circle = Circle((region.x_m, region.y_m), radius_m, fill=True, facecolor=(*to_rgb(RED), 0.18))
+        circle = Circle((region.x_m, region.y_m), region.radius_m, fill=True, facecolor=(*to_rgb(RED), 0.18))
         circle.set(edgecolor=RED, linewidth=1.5, linestyle=_DASHED if region.is_false else "solid")
         axes.add_patch(circle)
     for state, look in _TRUTH_LOOKS.items():

@@ -40,9 +40,10 @@ def plot(report: ChangeReport, pair: Path | str | None = None) -> Figure:
         changes = truth.centroids_world[truth.is_observable].reshape(-1, 3)
         axes.plot(*transform_to_map(changes, truth.before)[:, :2].T, "kx", markersize=10, label="true change")
     angle = np.linspace(0.0, 2 * np.pi, 100)
-    circle = report.regions.radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
-    for centre in report.regions.centres_map[report.regions.is_reported, :2]:
-        axes.plot(*(centre + circle).T, color="0.3", linewidth=0.8)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    for region in np.flatnonzero(report.regions.is_reported):
+        outline = report.regions.centres_map[region, :2] + report.regions.radii_m[region] * circle
+        axes.plot(*outline.T, color="0.3", linewidth=0.8)
     for kind, colour in CHANGE_RGB.items():
         points = [item.points_map[:, :2] for item in report.objects if item.kind == kind]
         if points:

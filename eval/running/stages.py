@@ -118,7 +118,7 @@ class PairStages(Hooks):
         Args:
             config: All settings.
             merge: What merges instead of the method.
-            propose: What proposes regions instead of the method, from the scans of the keyframes of both sessions.
+            propose: What proposes regions instead of the method, as in `detect_changes`.
             until: Last stage, None for the whole method.
 
         Raises:
@@ -172,7 +172,8 @@ def time_parts(compute: Callable[[], Done[T]], clock: Callable[[], float] = time
 def kept_bytes(before: MappedSession, config: PipelineConfig) -> dict[str, float]:
     """Return the bytes of the thinned before map, and of what a method keeps of that session to find regions.
 
-    Both as float32: x, y, z of every map point; for a descriptor one vector and one pose (7 numbers) per keyframe. Any
+    Both as float32: x, y, z of every map point; for a descriptor one vector and one pose (7 numbers) per keyframe, and
+    the width of the drift where the radius follows it. Any
     other method keeps the map; `dufomap` also keeps the returns of the scans that it casts. Random regions keep the
     poses alone.
     """
@@ -182,7 +183,8 @@ def kept_bytes(before: MappedSession, config: PipelineConfig) -> dict[str, float
     if config.method == "random-regions":
         kept = _POSE_BYTES * n_keyframes
     elif config.method == "descriptor" and vectors is not None:
-        kept = _POSE_BYTES * n_keyframes + float(vectors.nbytes)
+        width_bytes = 4.0 if config.query.radius_m == "width" else 0.0
+        kept = (_POSE_BYTES + width_bytes) * n_keyframes + float(vectors.nbytes)
     elif config.method == "dufomap":
         kept = map_bytes + 12.0 * float(np.diff(before.map.scan_offsets)[:: config.dufomap.every_scan].sum())
     else:

@@ -92,8 +92,9 @@ def _check_regions(regions: ChangeRegions, n_keyframes: int, n_scans: int) -> No
         _require_near("region_proposed_centres_map", regions.proposed_centres_map)
     _require_finite("region_scores", regions.scores)
     _require_scores("region_scores", regions.scores)
-    if not 0 < regions.radius_m <= FARTHEST_M:
-        raise ValueError(f"radius_m = {regions.radius_m}: expected a length in metres, up to {FARTHEST_M:g}")
+    for radius_m in np.ravel(regions.radius_m):
+        if not 0 < radius_m <= FARTHEST_M:
+            raise ValueError(f"radius_m = {radius_m}: expected a length in metres, up to {FARTHEST_M:g}")
     if np.isinf(regions.keyframe_scores).any():
         raise ValueError("keyframe_scores: a score is infinite: expected a number, or NaN where nothing was compared")
     _require_scores("keyframe_scores", regions.keyframe_scores)

@@ -104,7 +104,7 @@ def compute_recall_at_k(found: Sequence[tuple[int, ...]], is_observable: BoolArr
 
 
 def measure_covered_share(
-    positions_world: Float64Array, travelled_m: Float64Array, centres_world: Float64Array, radius_m: float
+    positions_world: Float64Array, travelled_m: Float64Array, centres_world: Float64Array, radii_m: Float64Array
 ) -> float:
     """Return the share of a path's length inside spheres; the middle of a step between scans decides for the step.
 
@@ -112,7 +112,7 @@ def measure_covered_share(
         positions_world: (S, 3) true positions along the path.
         travelled_m: (S,) path length up to each of them.
         centres_world: (R, 3) centres of the spheres.
-        radius_m: Their radius.
+        radii_m: (R,) radius of each.
 
     Returns:
         A share in [0, 1], 0 without spheres; NaN for a path without length.
@@ -120,10 +120,11 @@ def measure_covered_share(
     steps_m = np.diff(travelled_m)
     if steps_m.sum() == 0:
         return float("nan")
-    if len(centres_world) == 0:
-        return 0.0
-    distances, _ = cKDTree(centres_world).query((positions_world[1:] + positions_world[:-1]) / 2)
-    return float(steps_m[distances <= radius_m].sum() / steps_m.sum())
+    middles = cKDTree((positions_world[1:] + positions_world[:-1]) / 2)
+    is_inside = np.zeros(len(steps_m), dtype=np.bool_)
+    for centre, radius_m in zip(centres_world, radii_m, strict=True):
+        is_inside[middles.query_ball_point(centre, radius_m)] = True
+    return float(steps_m[is_inside].sum() / steps_m.sum())
 
 
 def label_keyframes(
@@ -185,7 +186,10 @@ def score_regions(report: ChangeReport, truth: GroundTruth, after_travelled_m: F
         "region_recall_at_k_proposed": compute_recall_at_k(proposed.found, truth.is_observable),
         **ranking,
         "region_coverage": measure_covered_share(
-            truth.after.world_T_sensor[:, :3, 3], after_travelled_m, centres[regions.is_reported], regions.radius_m
+            truth.after.world_T_sensor[:, :3, 3],
+            after_travelled_m,
+            centres[regions.is_reported],
+            regions.radii_m[regions.is_reported],
         ),
         "n_regions": int(np.count_nonzero(regions.is_reported)),
         "n_withdrawn": int(np.count_nonzero(is_withdrawn)),

@@ -159,7 +159,7 @@ def _regions(report: ChangeReport, rows: Sequence[Row]) -> Iterator[Line]:
     outcomes = {int(number(row, "region")): text(row, "outcome") for row in rows}
     for index in np.flatnonzero(report.regions.is_reported).tolist():
         word = "false" if outcomes.get(index) == "false" else "true"
-        circles = sphere_path(report.regions.centres_map[index], report.regions.radius_m)
+        circles = sphere_path(report.regions.centres_map[index], report.regions.radii_m[index])
         yield Line(f"regions/{word}/region {index}", circles, _REGION_RGB[word])
 
 

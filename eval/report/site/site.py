@@ -152,21 +152,28 @@ def region_picture(
         rows: The rows of `changes` and `regions` that the answer has in the tables of those names.
     """
     outcomes = {int(number(row, "region")): text(row, "outcome") for row in rows["regions"]}
+    radii_m = report.regions.radii_m.tolist()
     regions = [
-        RegionMark(float(x_m), float(y_m), outcomes.get(index) == "false")
+        RegionMark(float(x_m), float(y_m), radii_m[index], outcomes.get(index) == "false")
         for index, (x_m, y_m, _) in enumerate(report.regions.centres_map)
         if report.regions.is_reported[index]
     ]
     marks = [] if truth is None else truth_marks(truth, rows["changes"])
     states = [mark.state for mark in marks]
-    radius_m, n_false = report.regions.radius_m, sum(mark.is_false for mark in regions)
-    words = [f"{len(regions)} regions of {radius_m:g} m reported, {n_false} of them false."]
+    n_false = sum(mark.is_false for mark in regions)
+    words = [f"{len(regions)} regions{_name_radii(regions)} reported, {n_false} of them false."]
     if states and "not scored" not in states:
         n_observable = len(states) - states.count("unobservable")
         words.append(f"{states.count('found')} of {n_observable} observable changes found.")
     if states:
         words.append("Numbers are those of the changes below.")
-    return Picture(title, region_map(before, regions, radius_m, marks), " ".join(words))
+    return Picture(title, region_map(before, regions, marks), " ".join(words))
+
+
+def _name_radii(regions: Sequence[RegionMark]) -> str:
+    """Return the radius of regions, or the smallest and the largest, in words."""
+    radii = sorted({f"{mark.radius_m:.3g}" for mark in regions}, key=float)
+    return f" of {' to '.join(dict.fromkeys([radii[0], radii[-1]]))} m" if radii else ""
 
 
 def truth_marks(truth: GroundTruth, rows: Sequence[Row]) -> list[TruthMark]:

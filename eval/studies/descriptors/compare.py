@@ -38,7 +38,7 @@ from sim.session.simulate import simulate_pair
 
 _FAMILIES = ("narrow", "wide", "network")
 _SEEDS = "10300:10304"  # of the validation seeds
-_VERSION = 1  # of a row; raised when its figures change, so that stored rows are measured again
+_VERSION = 2  # of a row; raised when its figures change, so that stored rows are measured again
 
 
 def measure(

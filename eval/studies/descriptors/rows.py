@@ -49,8 +49,7 @@ def measure_pair(pair: Path, settings: Iterable[str] = ()) -> list[Row]:
         InputError: A session or its truth is missing or damaged.
     """
     truth = load_ground_truth(pair)
-    # what a region's size is belongs to the site, as in the plans
-    config = load_config("tunnelcd", [f"query.radius_m={truth.pair.score_radius_m}", *settings])
+    config = load_config("tunnelcd", settings)
     sources = {name: pipeline_input(pair, name) for name in SESSIONS}
     maps = {name: build_map(sources[name], config.map) for name in SESSIONS}
     weights = config.descriptor.weights

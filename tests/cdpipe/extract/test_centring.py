@@ -79,6 +79,28 @@ def test_a_region_whose_objects_are_in_better_ones_is_withdrawn_and_other_object
     assert kept.is_withdrawn is None
 
 
+def test_what_comes_into_the_sphere_with_its_new_centre_counts_for_the_centre() -> None:
+    # 4.9 m from the proposed centre, 3.9 m from the object at 1: the second region, proposed on it, has nothing else
+    found, assigned = centre_regions(regions((0, 0), (7, 0)), [group(1.0), group(4.9)])
+    np.testing.assert_allclose(found.centres_map[0], (2.95, 0, 0), atol=0.03)
+    assert found.is_reported.tolist() == [True, False]
+    assert [each.region for each in assigned] == [0, 0]
+    # a part of it in the sphere is not enough, for then it justifies a region of its own
+    found, _ = centre_regions(regions((0, 0), (7, 0)), [group(1.0), group(5.1)])
+    np.testing.assert_allclose(found.centres_map[:, 0], [1.0, 5.1], atol=1e-9)
+    assert found.is_reported.tolist() == [True, True]
+
+
+def test_every_region_has_its_own_reach() -> None:
+    proposed = replace(regions((0, 0), (8, 0)), radius_m=np.array([2.0, 5.0]))
+    found, assigned = centre_regions(proposed, [group(1.0), group(3.5)])
+    np.testing.assert_allclose(found.centres_map[:, 0], [1.0, 3.5], atol=1e-9)
+    # 3.5 is 2.5 m from the first centre, and inside the second sphere
+    assert [each.region for each in assigned] == [0, 1]
+    larger = replace(proposed, radius_m=np.array([5.0, 2.0]))
+    np.testing.assert_allclose(centre_regions(larger, [group(1.0), group(3.5)])[0].centres_map[0, 0], 2.25, atol=0.02)
+
+
 def test_an_object_out_of_reach_of_all_regions_keeps_its_region() -> None:
     found, assigned = centre_regions(regions((0, 0), (50, 0)), [group(1.0, region=0), group(60.0, region=1)])
     assert [each.region for each in assigned] == [0, 1]

@@ -49,6 +49,46 @@ def test_an_answer_survives_the_disk(tmp_path: Path) -> None:
     np.testing.assert_array_equal(answer.report.figures["v_oe_m3"], [0.3, np.nan])
 
 
+def test_a_radius_of_each_region_survives_the_disk_and_one_of_all_is_a_number_as_ever(tmp_path: Path) -> None:
+    report = _report()
+    own = replace(report, regions=replace(report.regions, radius_m=np.array([10.0, 4.5])))
+    none = replace(report, regions=_select_none(own.regions), figures={}, objects=())
+    for written in (own, none):
+        write_answer(tmp_path, "mine", written)
+        assert "radius_m" not in json.loads((tmp_path / "answer.json").read_text())
+        read = read_answer(tmp_path).report
+        assert read is not None
+        np.testing.assert_array_equal(read.regions.radius_m, written.regions.radius_m)
+    write_answer(tmp_path, "mine", report)
+    assert json.loads((tmp_path / "answer.json").read_text())["radius_m"] == 4.5
+    with np.load(tmp_path / "answer.npz") as arrays:
+        assert "region_radii_m" not in arrays
+    read = read_answer(tmp_path).report
+    assert read is not None
+    assert read.regions.radius_m == 4.5
+    assert read.regions.radii_m.tolist() == [4.5, 4.5]
+
+
+def _select_none(regions: ChangeRegions) -> ChangeRegions:
+    empty = np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 2), np.int64), np.zeros(0, np.bool_)
+    return ChangeRegions(*empty, regions.keyframe_scores)
+
+
+def test_an_answer_has_either_one_radius_or_that_of_each_region(tmp_path: Path) -> None:
+    report = _report()
+    write_answer(tmp_path, "mine", replace(report, regions=replace(report.regions, radius_m=np.array([10.0, 4.5]))))
+    document = json.loads((tmp_path / "answer.json").read_text())
+    (tmp_path / "answer.json").write_text(json.dumps({**document, "radius_m": 4.5}))
+    with pytest.raises(InputError, match=r"answer\.json: radius_m: .*or array region_radii_m"):
+        read_answer(tmp_path)
+    write_answer(tmp_path, "mine", report)
+    (tmp_path / "answer.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"answer\.json: radius_m: .*or array region_radii_m"):
+        read_answer(tmp_path)
+    with pytest.raises(ValueError, match=r"radius_m must be \(2\)"):
+        replace(report.regions, radius_m=np.array([4.5]))
+
+
 def test_a_local_merge_survives_the_disk_and_need_not_be_there(tmp_path: Path) -> None:
     local = np.stack([yaw_pose(0.1 * index, (index, 2.0, 3.0)) for index in range(2)])
     write_answer(tmp_path, "paper", replace(_report(), local_before_T_after=local))

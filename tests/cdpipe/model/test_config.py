@@ -5,6 +5,8 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.model.config import PipelineConfig, load_config, preset_names, settings_table
 
+WITHOUT_SITE = ("tunnelcd", "sphere-difference", "kiss-matcher", "frame")
+
 
 def test_every_shipped_preset_is_valid() -> None:
     named = {"paper", "paper-topn", "paper-paired", "voxel-diff", "c2c", "random-regions", "tunnelcd", "frame"}
@@ -16,6 +18,9 @@ def test_every_shipped_preset_is_valid() -> None:
 def test_every_shipped_preset_says_what_wide_drifts_need() -> None:
     for name in preset_names():
         narrow, wide = load_config(name), load_config(name, site="wide")
+        if name in WITHOUT_SITE:
+            assert narrow == wide and narrow.query.radius_m == "width"
+            continue
         assert (narrow.query.radius_m, wide.query.radius_m) == (4.5, 10.0)
         scored = narrow.query.n_regions is None
         has_own = wide.query.threshold != narrow.query.threshold
@@ -53,6 +58,33 @@ def test_a_preset_without_wide_drifts_is_refused_there(tmp_path: Path) -> None:
     assert load_config(str(preset)).query.radius_m == 3
     with pytest.raises(InputError, match=r"mine\.yaml: wide: .*wide: \{query: \{radius_m: 10"):
         load_config(str(preset), site="wide")
+
+
+def test_a_radius_that_follows_the_width_needs_no_site(tmp_path: Path) -> None:
+    preset = tmp_path / "mine.yaml"
+    preset.write_text("query: {radius_m: width, threshold: 0.5}\n")
+    assert load_config(str(preset)) == load_config(str(preset), site="wide")
+    fixed = load_config(str(preset), ["query.radius_m=6"], "wide").query
+    assert (fixed.radius_m, fixed.fixed_radius_m, fixed.threshold) == (6.0, 6.0, 0.5)
+    preset.write_text("query: {radius_m: 3}\n")
+    assert load_config(str(preset), ["query.radius_m=width"], "wide").query.radius_m == "width"
+    with pytest.raises(ValueError, match="width"):
+        _ = load_config("tunnelcd").query.fixed_radius_m
+
+
+@pytest.mark.parametrize("value", ["-1", "0", "widht", "[4]", "null"])
+def test_a_radius_is_a_length_or_the_word(value: str) -> None:
+    with pytest.raises(InputError) as caught:
+        load_config("tunnelcd", [f"query.radius_m={value}"])
+    (line,) = str(caught.value).splitlines()  # one rule, not one of each kind
+    assert line.startswith("--set: query.radius_m = ")
+    assert ('did you mean "width"' in line) == (value == "widht")
+
+
+def test_methods_without_keyframes_need_a_length() -> None:
+    for name in ("c2c", "voxel-diff", "random-regions"):
+        with pytest.raises(InputError, match=r"query.radius_m = width is for method: descriptor, this one is .*4\.5"):
+            load_config(name, ["query.radius_m=width"])
 
 
 def test_paper_preset_holds_the_published_settings() -> None:

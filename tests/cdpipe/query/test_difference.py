@@ -60,6 +60,13 @@ def test_only_what_the_other_session_came_near_to_counts() -> None:
     np.testing.assert_allclose(scored(before, after, paths, radius_m=6.5), [0, 1 / 3])
 
 
+def test_every_keyframe_has_a_sphere_of_its_own_radius() -> None:
+    # of the first cloud all is marked, of the second nothing: 2 of 3 points within 2 m of the origin, all within 1 m
+    clouds = [(line(0, 2), np.ones(2, np.bool_)), (line(1.5, 21), np.zeros(2, np.bool_))]
+    shares = marked_share(clouds, line(0, 0, 20), np.array([2.0, 1.0, 0.5]))
+    np.testing.assert_array_equal(shares, [2 / 3, 1, np.nan])
+
+
 def test_keyframes_that_cannot_be_scored_are_nan() -> None:
     # 10 was not visited again within 5 m; at 20 nothing stands
     scores = scored(line(0, 10), line(0, 10), (line(0, 10, 20), line(0, 4.9, 20)), radius_m=6.0)
@@ -115,5 +122,5 @@ def test_the_border_is_within() -> None:
     assert is_within(line(1.0, 1.5, 1.6), line(0.5), 1.0).tolist() == [True, True, False]
     assert is_within(line(1.0), line(), 1.0).tolist() == [False]
     assert is_within(line(), line(1.0), 1.0).shape == (0,)
-    share = marked_share([(line(0, 1, 2), np.array([True, False, True]))], line(0, 9), radius_m=1.0)
+    share = marked_share([(line(0, 1, 2), np.array([True, False, True]))], line(0, 9), np.ones(2))
     np.testing.assert_array_equal(share, [0.5, np.nan])

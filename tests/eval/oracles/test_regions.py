@@ -22,6 +22,7 @@ from tests.eval.changes import change
 
 N_SCANS = 40
 SCANS = (np.arange(0, N_SCANS, 4), np.arange(1, N_SCANS, 3))
+RADII_M = np.full(len(SCANS[0]), 4.5)
 
 
 def truth_of(places: list[tuple[float, float]], n_cells: list[int], is_observable: list[bool]) -> GroundTruth:
@@ -46,7 +47,7 @@ def truth_of(places: list[tuple[float, float]], n_cells: list[int], is_observabl
 
 def test_every_change_gets_a_region_that_finds_it_however_the_map_drifts() -> None:
     truth = truth_of([(3.2, 1.0), (17.9, -1.5), (33.0, 0.5)], [5, 9, 7], [True, True, True])
-    regions = regions_by_truth(truth, SCANS, QueryConfig(radius_m=4.5))
+    regions = regions_by_truth(truth, SCANS, RADII_M, QueryConfig(radius_m=4.5))
     # the largest first; the places are exact, for the scan that carries them there carries them back
     back = transform_to_world(regions.centres_map, truth.before)
     np.testing.assert_allclose(back, truth.centroids_world[[1, 2, 0]], atol=1e-9)
@@ -65,22 +66,30 @@ def test_every_change_gets_a_region_that_finds_it_however_the_map_drifts() -> No
 
 def test_what_nobody_could_see_gets_no_region_and_a_near_neighbour_of_a_larger_one_none_of_its_own() -> None:
     truth = truth_of([(5.0, 0.0), (8.0, 0.0), (20.0, 0.0), (30.0, 0.0)], [5, 9, 7, 3], [True, True, False, True])
-    regions = regions_by_truth(truth, SCANS, QueryConfig(radius_m=4.5))
+    regions = regions_by_truth(truth, SCANS, RADII_M, QueryConfig(radius_m=4.5))
     back = transform_to_world(regions.centres_map, truth.before)
     np.testing.assert_allclose(back[:, 0], [8.0, 30.0], atol=1e-9)
-    closer = regions_by_truth(truth, SCANS, QueryConfig(radius_m=4.5, suppression=0.5))
+    closer = regions_by_truth(truth, SCANS, RADII_M, QueryConfig(radius_m=4.5, suppression=0.5))
     assert len(closer.scores) == 3
 
 
 @pytest.mark.parametrize("settings", [{"threshold": 1e9}, {"n_regions": 1}])
 def test_no_threshold_stands_in_its_way(settings: dict[str, float]) -> None:
     truth = truth_of([(5.0, 0.0), (30.0, 0.0)], [5, 9], [True, True])
-    regions = regions_by_truth(truth, SCANS, QueryConfig(radius_m=4.5, **settings))
+    regions = regions_by_truth(truth, SCANS, RADII_M, QueryConfig(radius_m=4.5, **settings))
     assert regions.is_reported.tolist() == [True, True]
 
 
+def test_a_region_has_the_radius_of_its_before_keyframe() -> None:
+    truth = truth_of([(5.0, 0.0), (14.0, 0.0), (30.0, 0.0)], [9, 5, 7], [True, True, True])
+    radii_m = np.linspace(10.0, 4.5, len(SCANS[0]))  # keyframes 4 m apart
+    regions = regions_by_truth(truth, SCANS, radii_m, QueryConfig(radius_m="width"))
+    # the one at 5 m has 9.4 m, that of keyframe 1, and suppresses the one at 14 m
+    np.testing.assert_array_equal(regions.radii_m, radii_m[[1, 7]])
+
+
 def test_an_unchanged_pair_has_no_region() -> None:
-    regions = regions_by_truth(truth_of([], [], []), SCANS, QueryConfig())
+    regions = regions_by_truth(truth_of([], [], []), SCANS, RADII_M, QueryConfig())
     assert regions.centres_map.shape == (0, 3)
     assert regions.pairs.shape == (0, 2)
     assert np.isnan(regions.keyframe_scores).all()

@@ -176,15 +176,15 @@ def test_what_was_not_scored_has_no_chart() -> None:
 
 
 def test_a_setting_is_a_line_with_the_presets_own_value_in_its_place() -> None:
-    values = {"tunnelcd": 0.9, "tunnelcd[query.radius_m=3.0]": 0.4, "tunnelcd[query.radius_m=6.0]": 0.7}
+    values = {"paper": 0.9, "paper[query.radius_m=3.0]": 0.4, "paper[query.radius_m=6.0]": 0.7}
     rows = [
         {"scenario": "narrow", "seed": seed, "variant": name, "object_iou_point": value + 0.02 * seed}
         for name, value in values.items() for seed in (0, 1)
     ]  # fmt: skip
     # a pair that only one value was run on takes no part
-    rows.append({"scenario": "narrow", "seed": 5, "variant": "tunnelcd", "object_iou_point": 0.0})
+    rows.append({"scenario": "narrow", "seed": 5, "variant": "paper", "object_iou_point": 0.0})
     (factor,) = factors(run(rows))
-    assert (factor.preset, factor.key, factor.own) == ("tunnelcd", "query.radius_m", "4.5")
+    assert (factor.preset, factor.key, factor.own) == ("paper", "query.radius_m", "4.5")
     assert list(factor.points) == ["3.0", "4.5", "6.0"]
     (chart,) = draw_factors(run(rows))
     figure = accepted(chart.drawing)
@@ -193,6 +193,15 @@ def test_a_setting_is_a_line_with_the_presets_own_value_in_its_place() -> None:
     assert line.y == pytest.approx((0.41, 0.91, 0.71))
     assert (star.marker.symbol, star.x, star.y) == ("star", (1,), pytest.approx((0.91,)))
     assert "n = 2 session pairs" in chart.caption
+
+
+def test_a_value_may_be_a_word_among_numbers() -> None:
+    values = {"tunnelcd": 0.9, "tunnelcd[query.radius_m=10]": 0.4, "tunnelcd[query.radius_m=4.5]": 0.7}
+    rows = [{"scenario": "narrow", "seed": 0, "variant": name, "object_iou_point": v} for name, v in values.items()]
+    (factor,) = factors(run(rows))
+    assert (list(factor.points), factor.own) == (["4.5", "10", "width"], "width")
+    (chart,) = draw_factors(run(rows))
+    assert accepted(chart.drawing).layout.xaxis.ticktext == ("4.5", "10", "width")
 
 
 def test_a_lone_value_is_no_setting_to_draw() -> None:

@@ -137,8 +137,8 @@ def test_distances_colour_only_what_is_new() -> None:
 
 def test_regions_are_drawn_in_red_around_their_centres() -> None:
     points = np.concatenate([square(x, 0) for x in range(0, 20, 2)])
-    none = pixels(region_map(points, [], 2.0, []))
-    one = pixels(region_map(points, [RegionMark(5.0, 1.0, False)], 2.0, [TruthMark(5.0, 1.0, "1", "found")]))
+    none = pixels(region_map(points, [], []))
+    one = pixels(region_map(points, [RegionMark(5.0, 1.0, 2.0, False)], [TruthMark(5.0, 1.0, "1", "found")]))
     assert share_of(one, RED) > 2 * share_of(none, RED)
 
 

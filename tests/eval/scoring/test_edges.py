@@ -131,8 +131,8 @@ def test_the_middle_of_a_step_at_exactly_the_radius_is_covered() -> None:
     positions = np.column_stack([x_m, np.zeros(41), np.zeros(41)])
     sphere = np.array([(2.0, 0.0, 0.0)])
     # the middles at 1.875 and 2.125 m
-    assert measure_covered_share(positions, x_m, sphere, 0.125) == 2 / 40
-    assert measure_covered_share(positions, x_m, sphere, np.nextafter(0.125, 0.0)) == 0.0
+    assert measure_covered_share(positions, x_m, sphere, np.array([0.125])) == 2 / 40
+    assert measure_covered_share(positions, x_m, sphere, np.nextafter([0.125], 0.0)) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -109,7 +109,9 @@ def true_local(truth: GroundTruth) -> np.ndarray:
 
 def true_report(truth: GroundTruth) -> ChangeReport:
     scans = truth.before.judged_scans, truth.after.judged_scans
-    regions = regions_by_truth(truth, scans, QueryConfig(radius_m=RADIUS_M, suppression=1e-9))
+    regions = regions_by_truth(
+        truth, scans, np.full(len(scans[0]), RADIUS_M), QueryConfig(radius_m=RADIUS_M, suppression=1e-9)
+    )
     local = true_local(truth)
     return ChangeReport(
         local[0], {}, regions, objects_of(truth, truth.change_rows), {}, {}, scans, local_before_T_after=local

@@ -99,12 +99,13 @@ def test_coverage_by_hand() -> None:
     # 40 steps of a quarter metre along x; a sphere of 1 m at x = 2 holds the 8 steps between 1 and 3
     x = np.arange(41) * 0.25
     positions = on_line(*x)
-    assert measure_covered_share(positions, x, on_line(2.0), 1.0) == 8 / 40
+    assert measure_covered_share(positions, x, on_line(2.0), np.ones(1)) == 8 / 40
+    assert measure_covered_share(positions, x, on_line(2.0, 8.0), np.array([1.0, 0.5])) == 12 / 40
     # overlapping spheres count once
-    assert measure_covered_share(positions, x, on_line(2.0, 2.0), 1.0) == 8 / 40
-    assert measure_covered_share(positions, x, on_line(5.0), 100.0) == 1.0
-    assert measure_covered_share(positions, x, on_line(), 1.0) == 0.0
-    assert np.isnan(measure_covered_share(on_line(0.0), np.zeros(1), on_line(0.0), 1.0))
+    assert measure_covered_share(positions, x, on_line(2.0, 2.0), np.ones(2)) == 8 / 40
+    assert measure_covered_share(positions, x, on_line(5.0), np.array([100.0])) == 1.0
+    assert measure_covered_share(positions, x, on_line(), np.zeros(0)) == 0.0
+    assert np.isnan(measure_covered_share(on_line(0.0), np.zeros(1), on_line(0.0), np.ones(1)))
 
 
 def test_keyframe_labels_by_hand() -> None:

@@ -56,7 +56,7 @@ def test_a_run_counts_eight_bits_as_eight_bits(tiny_pair: Path) -> None:
     mapped = mapped_pair(tiny_pair)[0]
     spheres = describe_map(mapped.map, mapped.map.odom_T_keyframe, config.descriptor)
     kept = kept_bytes(replace(mapped, descriptors=replace(mapped.descriptors, spheres=spheres)), config)
-    assert kept["bytes_regions_before"] == (28 + 64) * len(mapped.map.keyframe_scans)
+    assert kept["bytes_regions_before"] == (28 + 64 + 4) * len(mapped.map.keyframe_scans)
 
 
 def test_places_are_those_of_describe_scans(tiny_pair: Path) -> None:
