@@ -1,5 +1,7 @@
 """Thresholds at which every method has the same false-alarm rate: 5 % of the unchanged validation pairs alarm.
 
+A preset with settings of its own for wide drifts has one threshold for each kind of site, any other preset has one.
+
 Run as `python -m eval.studies.calibrate RUN`, where RUN is the folder of `tunnelcd run calibrate`. The program prints
 these thresholds, and those at which every method has 0.1 false regions per 100 m. It writes both to RUN/thresholds.csv
 and, in the form of presets, to RUN/thresholds.yaml. Presets are changed by hand, so that none changes unnoticed.
@@ -7,6 +9,7 @@ and, in the form of presets, to RUN/thresholds.yaml. Presets are changed by hand
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +19,7 @@ import typer
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
+from cdpipe.model.config import load_config
 from eval.core.exits import run_program
 from eval.core.printing import echo
 from eval.core.tablefile import read_table as read_stored_table
@@ -57,9 +61,10 @@ def find_rate_threshold(
 def find_thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
     """Return one row per variant and kind of site, with its thresholds at either rate.
 
-    A threshold belongs to a kind of site, as the radius does: the same change scores differently in narrow and wide
-    drifts. Kinds of site differ in `score_radius_m`. Withdrawn candidates cannot alarm. The run must therefore use a
-    threshold below the one sought; no lower one is returned.
+    Where the radius belongs to a kind of site, so does the threshold: the same change scores differently in narrow and
+    wide drifts. Kinds of site differ in `score_radius_m`, which is NaN for a preset that tells none apart: its
+    threshold is of all pairs together. Withdrawn candidates cannot alarm. The run must therefore use a threshold below
+    the one sought; no lower one is returned.
 
     Returns:
         `threshold`, which at most 5 % of the pairs reach, with `n_pairs`, `n_alarms` of them and `n_unanswered` others;
@@ -72,11 +77,14 @@ def find_thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFram
     if len(changed):
         raise InputError(f"{', '.join(changed)}: has changes: calibration needs unchanged pairs")
     rows = []
-    for (variant, _), cases in results.groupby(["variant", "score_radius_m"], sort=False):
-        radius_m = float(cases["score_radius_m"].iloc[0])
+    kind = results["score_radius_m"].where(results["preset"].map(_tells_sites_apart))
+    for (variant, _), cases in results.groupby(["variant", kind], sort=False, dropna=False):
+        radius_m = float(kind[cases.index[0]])
         ok = cases[cases["status"] == "ok"]
         if len(ok) == 0:
-            raise InputError(f"{variant}, {radius_m:g} m: no pair has an answer: a threshold needs at least one")
+            raise InputError(
+                f"{variant}, {_name_kind(radius_m)}: no pair has an answer: a threshold needs at least one"
+            )
         stands = (regions["variant"] == variant) & ~regions["is_withdrawn"].astype(bool)
         lowest = _find_lowest_examined(regions[regions["variant"] == variant].merge(cases[["scenario", "seed"]]))
         if lowest is not None:
@@ -105,7 +113,7 @@ def find_thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFram
 
 
 def format_settings(table: pd.DataFrame) -> str:
-    """Return the thresholds in the YAML form of presets: by rate and variant, for narrow sites and under `wide`."""
+    """Return the thresholds in the YAML form of presets: by rate and variant, narrow or all sites, and `wide` ones."""
     lines = []
     rates = (
         ("threshold", f"at most {ALARM_SHARE:.0%} of the unchanged pairs alarm"),
@@ -115,7 +123,7 @@ def format_settings(table: pd.DataFrame) -> str:
         lines += [f"{column}:  # {meaning}"]
         for variant, own in table.sort_values("score_radius_m", kind="stable").groupby("variant", sort=False):
             first, *wider = zip(own["score_radius_m"], own[column], strict=True)
-            lines += [f"  {variant}:", f"    preset: {{query: {{threshold: {first[1]:g}}}}}  # {first[0]:g} m"]
+            lines += [f"  {variant}:", f"    preset: {{query: {{threshold: {first[1]:g}}}}}  # {_name_kind(first[0])}"]
             lines += [
                 f"    wide_{radius_m:g}m: {{query: {{radius_m: {radius_m:g}, threshold: {value:g}}}}}"
                 for radius_m, value in wider
@@ -146,6 +154,19 @@ def read_table(path: Path, plan: str) -> pd.DataFrame:
     if table.empty:
         raise InputError(f"{path}: has no rows: {expected}")
     return table
+
+
+@cache
+def _tells_sites_apart(preset: str) -> bool:
+    """Return whether a preset has other settings for wide drifts, as one of a file that is not at hand may have."""
+    try:
+        return load_config(preset) != load_config(preset, site="wide")
+    except InputError:
+        return True
+
+
+def _name_kind(score_radius_m: float) -> str:
+    return "all sites" if np.isnan(score_radius_m) else f"{score_radius_m:g} m"
 
 
 def _find_lowest_examined(regions: pd.DataFrame) -> float | None:

@@ -10,6 +10,7 @@ from eval.plans.worlds import find_references, list_settings_over
 from scenarios import load_scenario
 
 BASE = "stress/narrow"
+WITHOUT_SITE = ("tunnelcd", "sphere-difference", "kiss-matcher", "oracle-merge", "oracle-merge+oracle-regions")
 
 
 def test_main_runs_every_preset_and_the_bounds_on_the_pairs_of_regions() -> None:
@@ -35,8 +36,9 @@ def test_main_judges_at_the_radius_and_threshold_of_regions() -> None:
     shared = ours.keys() & theirs.keys()
     assert {variant for _, variant in shared} >= {"tunnelcd", "paper", "voxel-diff", "random-regions"}
     assert all(ours[key] == theirs[key] for key in shared)
-    for (scenario, _), config in ours.items():
-        assert config.query.radius_m == (10.0 if scenario.partition("[")[0] == "regions/wide" else 4.5)
+    for (scenario, variant), config in ours.items():
+        told = 10.0 if scenario.partition("[")[0] == "regions/wide" else 4.5
+        assert config.query.radius_m == ("width" if variant in WITHOUT_SITE else told)
     for variant in ("kiss-matcher", "oracle-merge"):
         assert ours["regions/wide", variant].query == ours["regions/wide", "tunnelcd"].query
 
@@ -46,11 +48,12 @@ def test_parts_takes_one_part_away_at_a_time() -> None:
     assert {cell.variant for cell in found} == {
         "tunnelcd", "tunnelcd[map.consistency=none]", "tunnelcd[map.consistency=scan-to-map]",
         "tunnelcd[merge.refine=local]", "tunnelcd[sphere.frames=sensor]", "tunnelcd[extract.recentre=false]",
+        "tunnelcd[query.radius_m=4.5]",
     }  # fmt: skip
     ours = next(cell.config for cell in found if cell.variant == "tunnelcd")
     # else a row would repeat the first
     assert ours.map.consistency == "graph" and ours.merge.refine != "local"
-    assert ours.sphere.frames != "sensor" and ours.extract.recentre
+    assert ours.sphere.frames != "sensor" and ours.extract.recentre and ours.query.radius_m == "width"
     held = find_references((cell.scenario, cell.variant, cell.seed) for cell in found)
     thin = {label for label, _ in held}
     assert {list_settings_over(label, held[label, "tunnelcd"]) for label in thin} == {"sensor.sub_rays=1"}

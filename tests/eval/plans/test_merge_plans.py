@@ -71,7 +71,7 @@ def test_noise_has_each_error_alone_for_both_methods() -> None:
     assert {each.index(max(each)) for each in errors} == {0, 1}
     assert {cell.until for cell in found} == {None}
     assert len({cell.seed for cell in found}) >= ENOUGH_PAIRS
-    assert {cell.config.query.radius_m for cell in found if cell.scenario == "wide"} == {10}
+    assert {cell.config.query.radius_m for cell in found if cell.scenario == "wide"} == {10, "width"}
 
 
 LIMITED = """\

@@ -106,9 +106,10 @@ def test_thresholds_are_set_on_twenty_validation_pairs_of_each_trained_family() 
 def test_every_method_runs_on_the_seeds_that_are_its(name: str, seeds: range, others: set[str]) -> None:
     found = expand_cells(load_plan(name))
     assert {cell.seed for cell in found} <= set(seeds)
-    assert {cell.variant for cell in found} == {*METHODS, *others}
+    assert {cell.preset for cell in found} == {*METHODS, *others}
     for cell in found:
-        assert cell.config.query.radius_m == (10.0 if scenario_of(cell.scenario) in WIDE else 4.5)
+        told = 10.0 if scenario_of(cell.scenario) in WIDE else 4.5
+        assert cell.config.query.radius_m == ("width" if cell.preset in ("tunnelcd", "sphere-difference") else told)
 
 
 def test_the_two_plans_of_test_pairs_judge_at_the_same_thresholds() -> None:

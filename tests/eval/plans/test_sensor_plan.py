@@ -66,7 +66,7 @@ def test_no_threshold_hides_an_effect() -> None:
     assert len({cell.scenario for cell in found}) == len(WORLDS)
     for cell in found:
         assert {cell.config.query.n_regions} == as_in_tune
-        assert cell.config.query.radius_m == 4.5
+        assert cell.config.query.radius_m == ("width" if cell.preset == "tunnelcd" else 4.5)
     variants = {cell.config.method: cell.config for cell in found}
     assert set(variants) == {"descriptor", "voxel-diff"}
     assert variants["voxel-diff"].extract == load_config("voxel-diff").extract

@@ -41,13 +41,13 @@ def test_half_a_kilometre_allows_five_tenths_of_a_false_region_and_so_none() -> 
     assert find_rate_threshold(np.zeros(0), 0.0) == 0.0
 
 
-def _results(n_changes: int = 0) -> pd.DataFrame:
+def _results(n_changes: int = 0, preset: str = "c2c") -> pd.DataFrame:
     rows = [
-        (scenario, seed, "m", "ok" if seed else "merge_refused", n_changes, radius_m, 1000.0)
+        (scenario, seed, "m", preset, "ok" if seed else "merge_refused", n_changes, radius_m, 1000.0)
         for scenario, radius_m in (("null/a", 4.5), ("null/b", 4.5), ("null/c", 10.0))
         for seed in range(4)
     ]
-    columns = ["scenario", "seed", "variant", "status", "n_changes", "score_radius_m", "after_path_m"]
+    columns = ["scenario", "seed", "variant", "preset", "status", "n_changes", "score_radius_m", "after_path_m"]
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -66,6 +66,22 @@ def test_a_table_by_hand() -> None:
     assert narrow["threshold"] == pytest.approx(6.001)
     assert (narrow["threshold_at_rate"], narrow["n_false"], narrow["km"]) == (0.0, 4, 6.0)
     assert (wide["score_radius_m"], wide["threshold"], wide["km"]) == (10.0, pytest.approx(200.1), 3.0)
+
+
+def test_a_preset_that_tells_no_sites_apart_has_one_threshold_of_all_pairs() -> None:
+    table = find_thresholds(_results(preset="tunnelcd"), _regions())
+    (one,) = table.to_dict("records")
+    # 12 pairs, 3 refused; of the nine answered none may alarm, the best score is 200. 9 km allow nine false regions
+    assert np.isnan(one["score_radius_m"])
+    assert (one["n_pairs"], one["n_unanswered"], one["km"]) == (9, 3, 9.0)
+    assert one["threshold"] == pytest.approx(200.1)
+    lines = format_settings(table).splitlines()
+    assert lines[2] == "    preset: {query: {threshold: 200.1}}  # all sites"
+    assert not any("wide" in line for line in lines)
+    # a preset of a file that is not at hand may tell them apart
+    assert len(find_thresholds(_results(preset="mine"), _regions())) == 2
+    with pytest.raises(InputError, match="m, all sites: no pair has an answer"):
+        find_thresholds(_results(preset="tunnelcd").assign(status="failed"), _regions())
 
 
 def test_what_was_withdrawn_cannot_alarm() -> None:
