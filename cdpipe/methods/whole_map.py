@@ -94,7 +94,7 @@ class WholeMap:
         end = perf_counter()
         seconds = {"t_cd_s": compared - start, "t_oe_s": end - compared, "t_returns_s": end - grouped}
         marked = [(points, is_changed[session]) for session, points in maps.points.items()]
-        scores = marked_share(marked, before_path, np.full(len(before_path), radius_m))
+        scores = marked_share(marked, before_path, radius_m)
         scores[~is_within(before_path, after_path, config.query.max_pair_m)] = np.nan
         regions = replace(regions, keyframe_scores=scores)
         index = GridIndex(maps.points["after"])

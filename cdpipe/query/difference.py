@@ -14,7 +14,7 @@ from cdpipe.core.grid_index import GridIndex
 from cdpipe.extract.point_comparison import is_within
 from cdpipe.model.config import QueryConfig
 from cdpipe.model.types import DescriptorSet, MergedMaps
-from cdpipe.query.drift_width import keyframe_radii
+from cdpipe.query.drift_width import LEAST_RADIUS_M
 
 # 1.5 voxels of a map with 0.2 m voxels; below it, gaps between points count as changes.
 NEW_BEYOND_M = 0.3
@@ -25,8 +25,9 @@ def sphere_difference(
 ) -> Float64Array:
     """Score every before keyframe by the share of points around it that are over 0.3 m from the other map.
 
-    The share is over the points of both maps within the radius of the keyframe, and within the radius of a keyframe of
-    the other session. Beyond that the other session saw too little to compare.
+    The share is over the points of both maps within `radius_m` of the keyframe and within `radius_m` of a keyframe of
+    the other session. Beyond that the other session saw too little to compare. Where the radius of a region follows the
+    width of the drift, 4.5 m take its place, so that the same change has the same score everywhere.
 
     Args:
         merged: Both maps.
@@ -37,45 +38,36 @@ def sphere_difference(
     Returns:
         (Kb,) shares in [0, 1]; NaN for a keyframe without an after keyframe within `max_pair_m` or without points.
     """
+    radius_m = LEAST_RADIUS_M if config.radius_m == "width" else config.radius_m
     before_path, after_path = merged.keyframe_positions(before, after)
-    radii_m = keyframe_radii(merged.before, before.keyframe_scans, config)
-    after_radii_m = keyframe_radii(merged.after, after.keyframe_scans, config)
-    seen_before = merged.before.points[_is_in_any_sphere(merged.before.points, after_path, after_radii_m)]
+    seen_before = merged.before.points[is_within(merged.before.points, after_path, radius_m)]
     after_points = merged.alignment.to_map(merged.after.points)
     # after points far from every before keyframe are in no sphere, so they need no distance
-    seen_after = after_points[_is_in_any_sphere(after_points, before_path, radii_m)]
+    seen_after = after_points[is_within(after_points, before_path, radius_m)]
     # distances are to the full other map: a point at the edge of the shared part has neighbours beyond the edge
     clouds = [
         (seen_before, ~is_within(seen_before, after_points, NEW_BEYOND_M)),
         (seen_after, ~is_within(seen_after, merged.before.points, NEW_BEYOND_M)),
     ]
-    scores = marked_share(clouds, before_path, radii_m)
+    scores = marked_share(clouds, before_path, radius_m)
     scores[~is_within(before_path, after_path, config.max_pair_m)] = np.nan
     return scores
 
 
-def _is_in_any_sphere(points: Float64Array, centres: Float64Array, radii_m: Float64Array) -> BoolArray:
-    """Mark the (N, 3) points in any of the spheres around (K, 3) centres, each with its radius, border included."""
-    is_inside, index = np.zeros(len(points), dtype=np.bool_), GridIndex(points)
-    for centre, radius_m in zip(centres, radii_m, strict=True):
-        is_inside[index.crop(centre, radius_m)] = True
-    return is_inside
-
-
 def marked_share(
-    clouds: Sequence[tuple[Float64Array, BoolArray]], centres: Float64Array, radii_m: Float64Array
+    clouds: Sequence[tuple[Float64Array, BoolArray]], centres: Float64Array, radius_m: float
 ) -> Float64Array:
     """Return the (K,) share of marked points in each sphere, all clouds together; NaN for an empty sphere.
 
     Args:
         clouds: For each cloud its points (N, 3), metres, and the mask (N,) of the marked ones; one frame.
         centres: (K, 3) sphere centres, same frame, metres.
-        radii_m: (K,) radius of each sphere, metres, border included.
+        radius_m: Sphere radius, border included.
     """
     n_marked, n_all = np.zeros(len(centres)), np.zeros(len(centres))
     for points, is_marked in clouds:
         index = GridIndex(points)
-        for row, (centre, radius_m) in enumerate(zip(centres, radii_m, strict=True)):
+        for row, centre in enumerate(centres):
             inside = index.crop(centre, radius_m)
             n_all[row] += len(inside)
             n_marked[row] += np.count_nonzero(is_marked[inside])

@@ -27,7 +27,8 @@ _SMOOTHED_M = 8.0
 # Radii of the paper: 4.5 m in narrow drifts (site 1) and 10 m in drifts 10 m wide (site 2). They apply up to the first
 # width and from the second one on; between them the radius grows linearly. Validation tunnels of `narrow` and `network`
 # measure 4 to 6.6 m, of `cave` 6.5 to 11 m, of `wide` 8 to 12.6 m.
-_RADII_M = (4.5, 10.0)
+LEAST_RADIUS_M = 4.5
+_RADII_M = (LEAST_RADIUS_M, 10.0)
 # Regions: a sphere of 4.5 m holds a drift 8 m wide from wall to wall, and of 16 validation pairs none has a duplicate.
 _REGION_WIDTHS_M = (8.0, 10.5)
 # Scores of keyframes: between what `narrow` and `wide` measure.

@@ -28,7 +28,7 @@ def point_map(points_map: Float64Array, path_map: Float64Array, odom_T_map: Floa
 
 
 def scored(
-    before: Float64Array, after: Float64Array, paths: tuple[Float64Array, Float64Array], **settings: float
+    before: Float64Array, after: Float64Array, paths: tuple[Float64Array, Float64Array], **settings: float | str
 ) -> Float64Array:
     """Scores of the before keyframes; everything is given in the map frame."""
     maps = point_map(before, paths[0], np.eye(4)), point_map(after, paths[1], invert(BEFORE_T_AFTER))
@@ -60,11 +60,13 @@ def test_only_what_the_other_session_came_near_to_counts() -> None:
     np.testing.assert_allclose(scored(before, after, paths, radius_m=6.5), [0, 1 / 3])
 
 
-def test_every_keyframe_has_a_sphere_of_its_own_radius() -> None:
-    # of the first cloud all is marked, of the second nothing: 2 of 3 points within 2 m of the origin, all within 1 m
-    clouds = [(line(0, 2), np.ones(2, np.bool_)), (line(1.5, 21), np.zeros(2, np.bool_))]
-    shares = marked_share(clouds, line(0, 0, 20), np.array([2.0, 1.0, 0.5]))
-    np.testing.assert_array_equal(shares, [2 / 3, 1, np.nan])
+def test_the_same_change_has_the_same_score_however_wide_the_drift_is() -> None:
+    paths = line(0, 10), line(0, 10)
+    before, after = line(1, 2, 4.6, 10.0), line(1, 3, 4.6, 10.31)
+    for wall_m in (2.0, 8.0):  # 4 m and 16 m wide; the walls are out of reach, or the same in both sessions
+        walls = np.concatenate([line(*np.arange(-5, 15, 0.2), y=side_m) for side_m in (-wall_m, wall_m)])
+        pair = np.concatenate([before, walls]), np.concatenate([after, walls])
+        np.testing.assert_array_equal(scored(*pair, paths, radius_m="width"), scored(*pair, paths, radius_m=4.5))
 
 
 def test_keyframes_that_cannot_be_scored_are_nan() -> None:
@@ -122,5 +124,5 @@ def test_the_border_is_within() -> None:
     assert is_within(line(1.0, 1.5, 1.6), line(0.5), 1.0).tolist() == [True, True, False]
     assert is_within(line(1.0), line(), 1.0).tolist() == [False]
     assert is_within(line(), line(1.0), 1.0).shape == (0,)
-    share = marked_share([(line(0, 1, 2), np.array([True, False, True]))], line(0, 9), np.ones(2))
+    share = marked_share([(line(0, 1, 2), np.array([True, False, True]))], line(0, 9), radius_m=1.0)
     np.testing.assert_array_equal(share, [0.5, np.nan])

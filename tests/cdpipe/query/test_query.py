@@ -206,3 +206,14 @@ def test_scores_of_spheres_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     # but one has nothing surer than -1 within 4.5 m; the last was not visited again
     np.testing.assert_allclose(found.keyframe_scores, [2.8, 3.0, 2.8, 2.6, -1.0, np.nan])
     assert found.scores.max() == 8.0
+
+
+def test_scores_of_the_sphere_difference_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = session([(0, 0, 0), (2, 0, 0), (4, 0, 0), (10, 0, 0)], [[1, 0]] * 4)
+    monkeypatch.setattr("cdpipe.query.query.sphere_difference", lambda *_: np.array([0.1, 0.5, np.nan, 0.2]))
+    merged = MergedMaps(before[0], before[0], make_pose(), {}, True)
+    # without a map the drift counts as narrow, and the surroundings reach 4.5 m; 3 % less per metre
+    follows = find_regions(merged, before[1], before[1], QueryConfig(compare="difference", radius_m="width"))
+    np.testing.assert_allclose(follows.keyframe_scores, [0.5 * 0.94, 0.5, 0.5 * 0.94, 0.2])
+    fixed = find_regions(merged, before[1], before[1], QueryConfig(compare="difference", radius_m=4.5))
+    np.testing.assert_array_equal(fixed.keyframe_scores, [0.1, 0.5, np.nan, 0.2])
