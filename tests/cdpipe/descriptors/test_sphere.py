@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, transform, yaw_pose
-from cdpipe.descriptors.sphere import anchor_frames, change_logits, dequantise, describe_map
+from cdpipe.descriptors.sphere import anchor_frames, change_log_odds, change_logits, dequantise, describe_map
 from cdpipe.descriptors.sphere_image import (
     COLUMNS,
     HALF_LENGTH_M,
@@ -149,10 +149,12 @@ def test_regions_of_spheres_and_the_reach_of_their_scores() -> None:
     assert regions.pairs[0].tolist() == [round(regions.centres_map[0, 0])] * 2
     assert not regions.direction.any()  # it is always the before keyframe that is looked up
     best = int(regions.pairs[0, 0])
-    # the score of the block reaches 4 m, and falls on the way
-    falls = regions.keyframe_scores[best - 4 : best + 5]
-    np.testing.assert_allclose(falls, min(regions.scores[0], 3.0) - 0.1 * np.abs(np.arange(-4, 5)), atol=1e-9)
-    assert regions.keyframe_scores[[best - 5, best + 5]].max() < falls.min()
+    # a score reaches 4 m, and falls on the way; keyframes are a metre apart
+    local = np.minimum(change_log_odds(merged, before, np.ones(N_KEYFRAMES, np.bool_)), 3.0)
+    away_m = np.abs(np.arange(N_KEYFRAMES)[:, None] - np.arange(N_KEYFRAMES))
+    reached = np.where(away_m <= 4, local - 0.1 * away_m, -np.inf).max(axis=1)
+    np.testing.assert_allclose(regions.keyframe_scores, reached, atol=1e-9)
+    assert regions.keyframe_scores[best] == min(regions.scores[0], 3.0) == reached.max()
 
 
 def test_keyframes_the_after_session_never_came_near_have_no_score() -> None:
