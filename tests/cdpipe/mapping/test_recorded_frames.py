@@ -107,5 +107,5 @@ def test_answers_of_the_pipeline_are_in_the_recorded_frames(
     )
     # regions that are told in the recorded frame find the same objects
     proposed = replace(expected.regions, is_withdrawn=None)
-    given = detect_changes(before, after, CONFIG, propose=lambda scans: proposed)
+    given = detect_changes(before, after, CONFIG, propose=lambda scans, radii_m: proposed)
     assert {item.kind for item in given.objects} == {item.kind for item in report.objects}
