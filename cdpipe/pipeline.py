@@ -138,7 +138,7 @@ def describe(
     config = load_config(preset, settings)
     list_checkpoints(config)  # report bad weights before the mapping
     use_threads(THREADS)
-    source = open_session(Path(session))
+    source = open_session(session)
     if config.query.compare == "sphere":
         descriptors = map_session(source, config).descriptors
     else:
@@ -350,7 +350,7 @@ def _open(session: Path | str | ScanSource, config: PipelineConfig) -> tuple[Sca
     """Return an opened session, and the descriptors stored in its folder."""
     if not isinstance(session, Path | str):
         return session, None
-    source = open_session(Path(session))
+    source = open_session(session)
     return source, load_descriptors(Path(session), config.descriptor, source.odom_T_sensor, config.map, config.sphere)
 
 

@@ -29,7 +29,7 @@ def report(pair: Path) -> cdpipe.ChangeReport:
 
 
 def test_paths_and_opened_sessions_give_the_same(pair: Path, report: cdpipe.ChangeReport) -> None:
-    before, after = (cdpipe.open_session(pair / name) for name in ("before", "after"))
+    before, after = cdpipe.open_session(pair / "before"), cdpipe.open_session(str(pair / "after"))
     again = cdpipe.detect(before, after, settings=["query.n_regions=2", "extract.min_cells=20"])
     np.testing.assert_array_equal(again.regions.centres_map, report.regions.centres_map)
     assert [item.returns.tobytes() for item in again.objects] == [item.returns.tobytes() for item in report.objects]
@@ -62,6 +62,7 @@ def test_a_saved_report_scores_like_the_one_in_memory(pair: Path, report: cdpipe
     cdpipe.save_report(report, tmp_path / "answer", "mine")
     stored, held = score(tmp_path / "answer", pair), score(report, pair)
     assert held["object_iou_point"] > 0.5
+    assert cdpipe.read_answer(str(tmp_path / "answer")).method == "mine"
     for row in (stored, held):
         del row["variant"], row["preset"]
     np.testing.assert_equal(stored, held)

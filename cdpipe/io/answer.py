@@ -83,8 +83,9 @@ class Answer:
     checkpoints: Mapping[str, str] = field(default_factory=dict)
 
 
-def write_answer(folder: Path, method: str, report: ChangeReport, until: Until | None = None) -> None:
+def write_answer(folder: Path | str, method: str, report: ChangeReport, until: Until | None = None) -> None:
     """Write an answer into `folder`, which may exist; answer.json is written last and marks it complete."""
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     regions, objects = report.regions, report.objects
     arrays = {
@@ -165,12 +166,13 @@ def write_failure(
     _write_json(folder, document, until)
 
 
-def read_answer(folder: Path) -> Answer:
+def read_answer(folder: Path | str) -> Answer:
     """Read an answer.
 
     Raises:
         InputError: It is missing, damaged or inconsistent; the text names the file and the field.
     """
+    folder = Path(folder)
     path = folder / "answer.json"
     value = read_json(path, "expected an answer written by `tunnelcd detect` or by another method")
     document = check_document(path, value)

@@ -28,7 +28,7 @@ _NUMBERS = re.compile(r"(\d+)")
 _STANDING = 0.1
 
 
-def open_session(path: Path) -> ScanSource:
+def open_session(path: str | Path) -> ScanSource:
     """Open a folder of scans.
 
     Args:
@@ -41,6 +41,7 @@ def open_session(path: Path) -> ScanSource:
         InputError: The folder is missing or holds neither, or its trajectory does not fit its scans. Mistakes inside a
             single scan are raised when it is read.
     """
+    path = Path(path)
     if path.suffix.lower() in RECORDING_SUFFIXES and not path.is_dir():
         raise InputError(
             f"{path}: a sensor's own recording: turn it into a session first, `tunnelcd convert {path} FOLDER`, and "
