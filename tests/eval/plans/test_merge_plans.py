@@ -40,6 +40,7 @@ def test_merge_has_two_hundred_test_pairs_of_four_kinds_and_four_methods() -> No
     worlds = load_plan("merge").worlds
     # only true odometry asks for an exact merge; all other kinds are asked with both odometries
     assert {world.odometry for world in worlds if world.pair_kind == "clean"} == {"own"}
+    assert sum(world.n_seeds for world in worlds if world.odometry == "kiss-icp" and world.n_seeds) >= 100
     for kind in ("drift", "smooth", "disjoint"):
         of_kind = [(world.name, world.odometry) for world in worlds if world.pair_kind == kind]
         names = {name for name, _ in of_kind}

@@ -73,13 +73,20 @@ def test_objects_has_pairs_of_every_sensor_profile_and_asks_for_the_same_of_each
             assert found[world.label, "tunnelcd"] == f"{world.name}[odometry=kiss-icp]"
 
 
-def test_regions_has_a_hundred_test_pairs_in_and_out_of_distribution() -> None:
+def test_regions_has_sixty_test_pairs_in_and_out_of_distribution() -> None:
     counts = Counter(scenario for scenario, _ in pairs("regions"))
     assert all(name.startswith("regions/") for name in counts)
-    assert counts.total() >= 100
-    assert sum(n for name, n in counts.items() if name.endswith(KISS_ICP)) >= 80
+    assert counts.total() >= 60
+    assert sum(n for name, n in counts.items() if name.endswith(KISS_ICP)) >= 48
     assert {domain_of(scenario_of(name)) for name in counts if name.endswith(KISS_ICP)} == {"in", "out"}
     assert load_plan("regions").report == ("regions",)
+
+
+def test_pairs_that_plans_share_are_simulated_and_mapped_once_in_a_common_folder() -> None:
+    shared = pairs("regions")
+    assert pairs("main") < shared
+    assert {(name, seed) for name, seed in pairs("objects") if "sensor.profile" not in name} < shared
+    assert {(name, seed) for name, seed in pairs("parts") if "sensor.sub_rays" not in name} < shared
 
 
 def test_null_drives_five_kilometres_where_nothing_changed() -> None:
