@@ -42,6 +42,10 @@ _SEED_FACTOR = 2.5
 _MAX_BORDER = 5.0
 # Largest distance of an object's foot, which no ray can pass, from its cells in free space.
 _FOOT_M = 0.3
+# Solid parts of a group that are farther apart are objects of their own. Mixed returns are one or two to a cell, and
+# a surface near the sensor has ten; both are looked at within 0.2 m.
+_APART_M = 0.3
+_FULL_RETURNS, _DENSE_M = 3, 0.2
 # Least number of scans with a grazing ray through a cell.
 _MIN_SCANS_PAST = 3
 # Least size of a low object: 0.25 m^2 in cells of 0.05 m.
@@ -152,13 +156,22 @@ def compare_site(points: Float64Array, reference: Float64Array) -> Site:
     return Site(means, cell_of_return, distances_m(means, Surface(surface_points), _PLANE_M))
 
 
+def measure_noise_m(site: Site, region_noise_m: float) -> float:
+    """Return the noise at a site: the median distance of the cells on the other session's surface.
+
+    The noise of the region, where other walls and sparser points may raise it, is the largest that is returned.
+    """
+    near_m = site.distance_m[site.distance_m < _COARSE_M]
+    return min(region_noise_m, float(np.median(near_m))) if len(near_m) else region_noise_m
+
+
 def grow_objects(site: Site, free_space_votes: Int64Array, noise_m: float, config: ExtractConfig) -> list[Int64Array]:
     """Return the cells of each object of a site.
 
     Connected cells form an object if they stand off the surface by more than the noise and were seen through, if at
     least `min_cells` of them are clear of the surface, and if on average `min_views` keyframes saw through them. The
     foot of an object is too close to floor and wall for a ray to pass behind it; cells near the object that stand off
-    the surface are added to it.
+    the surface are added to it. A group of several solid parts is several objects (`split_group`).
 
     Args:
         site: The cells.
@@ -171,8 +184,39 @@ def grow_objects(site: Site, free_space_votes: Int64Array, noise_m: float, confi
     labels, sizes = label_groups(site.points[core], _LINK_M)
     n_views = np.bincount(labels, free_space_votes[core], len(sizes))
     is_seen = n_views >= config.min_views * sizes
-    kept = np.flatnonzero(is_seen & (_count_clear(site, core, labels, noise_m, config) >= config.min_cells))
-    return _attach_feet(site, core, labels, kept, foot)
+    clear_m = seed_threshold_m(noise_m, config)
+    n_clear = np.bincount(labels[site.distance_m[core] > clear_m], minlength=len(sizes))
+    is_object = is_seen & (n_clear >= config.min_cells)
+    return _split_objects(site, core[is_object[labels]], foot, clear_m, config.min_cells)
+
+
+def split_group(points: Float64Array, n_returns: Int64Array, is_clear: BoolArray, min_cells: int) -> Int64Array:
+    """Return the (N,) part of each cell of a connected group: all 0, or two parts and more that are objects apart.
+
+    A beam that meets two surfaces returns from between them. Such returns link an object with what stands behind it,
+    but seldom fall into the same cell. A cell is solid if it and most cells around it hold three returns or more. If
+    solid cells hold most returns, and lie in places `_APART_M` from one another, each with enough clear cells, every
+    cell belongs to the nearest place.
+
+    Args:
+        points: (N, 3) cells, metres.
+        n_returns: (N,) returns in each cell.
+        is_clear: (N,) whether a cell is clear of the other session's surface.
+        min_cells: Fewest clear cells of a part.
+    """
+    is_full = n_returns >= _FULL_RETURNS
+    pairs = cKDTree(points).query_pairs(_DENSE_M, output_type="ndarray")
+    one, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    n_full = is_full + np.bincount(one, is_full[other], len(points))
+    solid = np.flatnonzero(is_full & (2 * n_full > 1 + np.bincount(one, minlength=len(points))))
+    labels, sizes = label_groups(points[solid], _APART_M)
+    n_clear = np.bincount(labels[is_clear[solid]], minlength=len(sizes))
+    in_part = np.isin(labels, np.flatnonzero(n_clear >= min_cells))
+    parts, part_of_solid = np.unique(labels[in_part], return_inverse=True)
+    if len(parts) < 2 or 2 * n_returns[solid].sum() < n_returns.sum():
+        return np.zeros(len(points), dtype=np.int64)
+    nearest = cKDTree(points[solid[in_part]]).query(points)[1]
+    return np.asarray(part_of_solid[nearest], dtype=np.int64)
 
 
 def unassigned_cells(site: Site, taken: list[Int64Array], noise_m: float, config: ExtractConfig) -> Int64Array:
@@ -184,31 +228,42 @@ def unassigned_cells(site: Site, taken: list[Int64Array], noise_m: float, config
     return left if is_enough else left[:0]
 
 
-def grow_low_objects(
+def add_low_objects(
     site: Site, left: Int64Array, n_past: Int64Array, taken: list[Int64Array], noise_m: float, config: ExtractConfig
 ) -> list[Int64Array]:
-    """Return the cells of each low object, which grazing rays reveal and range images do not.
+    """Return the cells of each object of a site: those found so far, and what grazing rays reveal besides.
 
-    Grazing rays also pass through a surface that is slightly displaced, but there only some cells are clear of the
-    surface; of a low object at least half are.
+    Range images do not show free space above a low object. Grazing rays also pass through a surface that is slightly
+    displaced, but there only some cells are clear of the surface; of a low object at least half are. A group that
+    touches an object found so far is a part of it.
 
     Args:
         site: The cells.
         left: (L,) cells of the site to consider, from `unassigned_cells`.
         n_past: (L,) scans of the other session with a grazing ray through each cell.
-        taken: Cells of the objects found so far; a group that touches one belongs to it and is dropped.
+        taken: Cells of the objects found so far.
         noise_m: Median distance of the two surfaces in the region, metres.
         config: Thresholds.
     """
+    clear_m = seed_threshold_m(noise_m, config)
     is_passed = n_past >= _MIN_SCANS_PAST
     core, foot = left[is_passed], left[~is_passed]
     labels, sizes = label_groups(site.points[core], _LINK_M)
-    n_clear = _count_clear(site, core, labels, noise_m, config)
+    n_clear = np.bincount(labels[site.distance_m[core] > clear_m], minlength=len(sizes))
     is_whole = (n_clear >= _MIN_LOW_CELLS) & (2 * n_clear >= sizes)
-    if any(len(each) for each in taken):
-        near = cKDTree(site.points[np.concatenate(taken)]).query(site.points[core], distance_upper_bound=_FOOT_M)[0]
-        is_whole &= np.bincount(labels, np.isfinite(near), len(sizes)) == 0
-    return _attach_feet(site, core, labels, np.flatnonzero(is_whole), foot)
+    objects = list(taken)
+    if taken:
+        of_cell = np.repeat(np.arange(len(taken)), [len(each) for each in taken])
+        tree = cKDTree(site.points[np.concatenate(taken)])
+        gaps_m, nearest = tree.query(site.points[core], distance_upper_bound=_FOOT_M)
+        for label in np.flatnonzero(is_whole).tolist():
+            members = np.flatnonzero(labels == label)
+            closest = members[np.argmin(gaps_m[members])]
+            if np.isfinite(gaps_m[closest]):
+                touched = of_cell[nearest[closest]]
+                objects[touched] = np.concatenate([objects[touched], core[members]])
+                is_whole[label] = False
+    return objects + _split_objects(site, core[is_whole[labels]], foot, clear_m, _MIN_LOW_CELLS)
 
 
 def border_threshold_m(noise_m: float, config: ExtractConfig) -> float:
@@ -221,19 +276,30 @@ def seed_threshold_m(noise_m: float, config: ExtractConfig) -> float:
     return max(config.seed_m, _SEED_FACTOR * border_threshold_m(noise_m, config))
 
 
-def _count_clear(site: Site, core: Int64Array, labels: Int64Array, noise_m: float, config: ExtractConfig) -> Int64Array:
-    is_clear = site.distance_m[core] > seed_threshold_m(noise_m, config)
-    return np.bincount(labels[is_clear], minlength=int(labels.max(initial=-1)) + 1)
+def _split_objects(site: Site, core: Int64Array, foot: Int64Array, clear_m: float, min_cells: int) -> list[Int64Array]:
+    """Return the cells of each object: its core, its foot, and what is nearest to it of the other foot cells.
 
+    Core cells that foot cells join are of one object: what hides a place from the other session cuts no object in two.
 
-def _attach_feet(
-    site: Site, core: Int64Array, labels: Int64Array, kept: Int64Array, foot: Int64Array
-) -> list[Int64Array]:
-    """Return the cells of the kept groups of the core, each with the foot cells nearest to it."""
-    if len(kept) == 0:
+    Args:
+        site: The cells.
+        core: (C,) cells of objects that were seen through.
+        foot: (F,) other cells that stand off the surface; those near a core are a part of its object.
+        clear_m: Distance from the other session's surface above which a cell is clear of it.
+        min_cells: Fewest clear cells of an object.
+    """
+    if len(core) == 0:
         return []
-    is_kept = np.isin(labels, kept)
-    core, labels = core[is_kept], labels[is_kept]
-    _, nearest = cKDTree(site.points[core]).query(site.points[foot], distance_upper_bound=_FOOT_M)
-    of_foot = np.append(labels, -1)[nearest]
-    return [np.concatenate([core[labels == label], foot[of_foot == label]]) for label in kept]
+    gap_m = cKDTree(site.points[core]).query(site.points[foot], distance_upper_bound=_FOOT_M)[0]
+    cells = np.concatenate([core, foot[np.isfinite(gap_m)]])
+    labels, sizes = label_groups(site.points[cells], _LINK_M)
+    has_core = np.bincount(labels[: len(core)], minlength=len(sizes)) > 0
+    n_returns = np.bincount(site.cell_of_return, minlength=len(site.points))
+    objects = []
+    for label in np.flatnonzero(has_core).tolist():
+        own = cells[labels == label]
+        part = split_group(site.points[own], n_returns[own], site.distance_m[own] > clear_m, min_cells)
+        objects += [own[part == each] for each in range(part.max() + 1)]
+    rest, of_object = cells[~has_core[labels]], np.repeat(np.arange(len(objects)), [len(each) for each in objects])
+    nearest = of_object[cKDTree(site.points[np.concatenate(objects)]).query(site.points[rest])[1]]
+    return [np.concatenate([each, rest[nearest == index]]) for index, each in enumerate(objects)]

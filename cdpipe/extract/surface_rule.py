@@ -23,11 +23,12 @@ from cdpipe.extract.surface import (
     SURFACE_CELL_M,
     PlaneTable,
     Site,
+    add_low_objects,
     compare_site,
     find_candidates,
     find_nearest,
-    grow_low_objects,
     grow_objects,
+    measure_noise_m,
     unassigned_cells,
 )
 from cdpipe.mapping.free_space import REACH_M, count_through_and_hit, free_space_votes, grazing_ray_count
@@ -184,7 +185,8 @@ def _cut_sites(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) ->
         compared = compare_site(points[site.session], points[other])
         n_views = _free_space_votes(compared.points, merged, other, correction)
         rays = partial(collect_rays, merged, other, returns[other], points[other], correction)
-        for cells in find_object_cells(compared, n_views, rays, site.agreement.noise_m, config):
+        noise_m = measure_noise_m(compared, site.agreement.noise_m)
+        for cells in find_object_cells(compared, n_views, rays, noise_m, config):
             is_member = np.zeros(len(compared.points), dtype=np.bool_)
             is_member[cells] = True
             of_object = is_member[compared.cell_of_return]
@@ -240,9 +242,7 @@ def find_object_cells(
     left = unassigned_cells(site, objects, noise_m, config)
     if len(left) == 0:
         return objects
-    return objects + grow_low_objects(
-        site, left, grazing_ray_count(site.points[left], *rays()), objects, noise_m, config
-    )
+    return add_low_objects(site, left, grazing_ray_count(site.points[left], *rays()), objects, noise_m, config)
 
 
 def _free_space_votes(

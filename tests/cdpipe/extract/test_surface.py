@@ -9,11 +9,12 @@ from cdpipe.extract.point_comparison import label_groups
 from cdpipe.extract.surface import (
     PlaneTable,
     Site,
+    add_low_objects,
     compare_site,
     distances_m,
     find_candidates,
-    grow_low_objects,
     grow_objects,
+    measure_noise_m,
     unassigned_cells,
 )
 from cdpipe.merge.registration import Surface
@@ -233,6 +234,39 @@ def test_two_boxes_half_a_metre_apart_are_two_and_touching_ones_are_one() -> Non
     assert set(found_one.tolist()) == set(np.flatnonzero(site.points[:, 2] > 0.04).tolist())
 
 
+@pytest.mark.parametrize(
+    ("gap_m", "n_box", "n_bridge", "n_objects"),
+    [
+        (0.5, 3, 2, 2),
+        (0.5, 3, 3, 1),  # what joins them is solid
+        (0.5, 2, 2, 1),  # seen from too far away to tell
+        (0.25, 3, 2, 1),  # near enough to be parts of one
+    ],
+)
+def test_boxes_that_single_returns_join_are_two(gap_m: float, n_box: int, n_bridge: int, n_objects: int) -> None:
+    bridge = lattice((0.8, 0.3, 0.4), (0.8 + gap_m, 0.3, 0.4), 0.05)[1:-1]
+    boxes = np.concatenate([BOX, OTHER + np.array([gap_m - 0.5, 0.0, 0.0])])
+    cells = on_floor(boxes, bridge)
+    n_returns = np.repeat([n_box, n_bridge, 3], [len(boxes), len(bridge), len(cells.points) - len(boxes) - len(bridge)])
+    site = Site(cells.points, np.repeat(np.arange(len(cells.points)), n_returns), cells.distance_m)
+    found = grow_objects(site, is_above(site, 0.21), 0.0, CONFIG)
+    assert len(found) == n_objects
+    # nothing is lost, and every cell of the bridge is part of the nearer box
+    assert sorted(np.concatenate(found).tolist()) == np.flatnonzero(site.points[:, 2] > 0.04).tolist()
+    if n_objects == 2:
+        assert site.points[found[0], 0].max() <= 0.8 + gap_m / 2 + 1e-9
+        assert site.points[found[1], 0].min() >= 0.8 + gap_m / 2 - 1e-9
+
+
+def test_noise_is_that_of_the_surfaces_at_the_site_and_that_of_the_region_at_most() -> None:
+    # three cells on the surface, 1, 2 and 6 cm off, and an object
+    site = Site(np.zeros((6, 3)), np.arange(6), np.array([0.01, 0.02, 0.06, 0.5, 0.6, 0.7]))
+    assert measure_noise_m(site, 0.05) == 0.02
+    assert measure_noise_m(site, 0.015) == 0.015
+    alone = Site(np.zeros((2, 3)), np.arange(2), np.array([0.5, np.inf]))
+    assert measure_noise_m(alone, 0.05) == 0.05
+
+
 SLAB = lattice((0, 0, 0.05), (1.15, 0.95, 0.15), 0.05)
 
 
@@ -242,26 +276,38 @@ def test_a_low_object_is_what_scans_passed_and_most_of_it_clear() -> None:
     assert sorted(left.tolist()) == np.flatnonzero(site.points[:, 2] > 0.04).tolist()
     height_m = site.points[left, 2]
     # passed above 0.12 m all is clear, and the rest is its foot
-    (found,) = grow_low_objects(site, left, np.where(height_m > 0.12, 3, 2), [], 0.0, CONFIG)
+    (found,) = add_low_objects(site, left, np.where(height_m > 0.12, 3, 2), [], 0.0, CONFIG)
     assert sorted(found.tolist()) == sorted(left.tolist())
-    assert grow_low_objects(site, left, np.full(len(left), 2), [], 0.0, CONFIG) == []
+    assert add_low_objects(site, left, np.full(len(left), 2), [], 0.0, CONFIG) == []
     # a third of what was passed is clear: so it is with a surface that is a little off
-    assert grow_low_objects(site, left, np.full(len(left), 3), [], 0.0, CONFIG) == []
+    assert add_low_objects(site, left, np.full(len(left), 3), [], 0.0, CONFIG) == []
     # half is enough
-    assert len(grow_low_objects(site, left, np.where(height_m > 0.07, 3, 0), [], 0.0, CONFIG)) == 1
+    assert len(add_low_objects(site, left, np.where(height_m > 0.07, 3, 0), [], 0.0, CONFIG)) == 1
     # noise raises what counts as clear
     assert len(unassigned_cells(site, [], 0.02, CONFIG)) == 0
 
 
-def test_what_touches_an_object_is_no_low_one() -> None:
-    for gap_m, n_found in ((0.2, 0), (0.5, 1)):
+def test_what_touches_an_object_is_a_part_of_it_and_no_low_one() -> None:
+    for gap_m, n_new in ((0.2, 0), (0.5, 1)):
         site = on_floor(BOX, SLAB + np.array([0.8 + gap_m, 0.0, 0.0]))
         taken = grow_objects(site, np.where((site.points[:, 2] > 0.21) & (site.points[:, 0] < 0.9), 3, 0), 0.0, CONFIG)
         assert len(taken) == 1
         left = unassigned_cells(site, taken, 0.0, CONFIG)
         assert not set(left.tolist()) & set(taken[0].tolist())
         n_past = np.where(site.points[left, 2] > 0.12, 3, 0)
-        assert len(grow_low_objects(site, left, n_past, taken, 0.0, CONFIG)) == n_found
+        found = add_low_objects(site, left, n_past, taken, 0.0, CONFIG)
+        assert len(found) == 1 + n_new
+        passed = set(left[n_past == 3].tolist())
+        assert passed <= set(found[-1].tolist())
+        assert set(taken[0].tolist()) <= set(found[0].tolist())
+
+
+def test_what_hides_the_middle_of_an_object_does_not_cut_it_in_two() -> None:
+    site = on_floor(skin((0, 0, 0), (1.6, 0.6, 0.7)))
+    # a strip 0.5 m wide that no keyframe of the other session saw through
+    is_hidden = np.abs(site.points[:, 0] - 0.8) < 0.25
+    (found,) = grow_objects(site, np.where(is_hidden, 0, is_above(site, 0.21)), 0.0, CONFIG)
+    assert sorted(found.tolist()) == np.flatnonzero(site.points[:, 2] > 0.04).tolist()
 
 
 def test_nothing_stands_off() -> None:
