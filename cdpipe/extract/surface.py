@@ -255,7 +255,7 @@ def add_low_objects(
     if taken:
         of_cell = np.repeat(np.arange(len(taken)), [len(each) for each in taken])
         tree = cKDTree(site.points[np.concatenate(taken)])
-        gaps_m, nearest = tree.query(site.points[core], distance_upper_bound=_FOOT_M)
+        gaps_m, nearest = map(np.asarray, tree.query(site.points[core], distance_upper_bound=_FOOT_M))
         for label in np.flatnonzero(is_whole).tolist():
             members = np.flatnonzero(labels == label)
             closest = members[np.argmin(gaps_m[members])]

@@ -15,7 +15,7 @@ import numpy as np
 
 from cdpipe.core.names import visible
 from eval.core.charts import BAR_SHARE, BLACK, GRID_COLOUR, HEAT_COLOURS, Axis, Drawing, Heat, Series
-from eval.core.figures import picture, png
+from eval.core.figures import picture, picture_address, png
 
 _FONT = "system-ui, -apple-system, Segoe UI, Roboto, Helvetica Neue, DejaVu Sans, sans-serif"
 _COLUMN_GAP, _ROW_GAP_PX, _ABOVE_PX, _BELOW_PX = 0.09, 84, 34, 56
@@ -48,6 +48,11 @@ class Chart:
     def png(self) -> bytes:
         """The chart as a PNG file for papers."""
         return png(picture(self.drawing))
+
+    @property
+    def address(self) -> str:
+        """The chart as a picture, a data address."""
+        return picture_address(self.drawing)
 
     @property
     def height_px(self) -> int:

@@ -65,7 +65,7 @@ POINT_COLOURS = (
 )  # fmt: skip
 
 
-def write_page(run: Path, views: Views = "chosen") -> Path:
+def write_page(run: Path, views: Views = "chosen", *, is_slim: bool = False) -> Path:
     """Write `index.html` and the tables table1, table2 (.csv, .tex), results.tex and summary.tex into a run folder.
 
     Further files: regions_table.tex and objects_table.tex where the tables exist, pareto.csv and its pictures where
@@ -76,6 +76,7 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
         run: The folder; results.csv must be there, anything else may be missing.
         views: Which pairs get a 3-D view, a file of its own below `views/` that the page links to; "none" for a page
             that is to stand without them.
+        is_slim: Whether charts are pictures and pictures are compressed: a fifth of the bytes.
 
     Returns:
         Path of the page.
@@ -88,7 +89,7 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
     data = figures_of_plan(read_run(run))
     check_versions(Side(data), Side(data))
     try:
-        files = _draw(data, views)
+        files = _draw(data, views, is_slim=is_slim)
     except KeyError as error:
         raise InputError(
             f"{run}: a table lacks column {error}: `tunnelcd score {run}` makes the tables anew"
@@ -98,7 +99,7 @@ def write_page(run: Path, views: Views = "chosen") -> Path:
     return run / "index.html"
 
 
-def _draw(data: RunData, views: Views) -> dict[str, str | bytes]:
+def _draw(data: RunData, views: Views, *, is_slim: bool) -> dict[str, str | bytes]:
     """Return every file of a page by its name."""
     merges = merge_table(pd.DataFrame(list(data.results)), read_targets(data.provenance))
     content = _about(data, merges)
@@ -113,6 +114,9 @@ def _draw(data: RunData, views: Views) -> dict[str, str | bytes]:
         files["results.tex"] = to_latex(content["results"])
         for name in ("table1", "table2"):
             files |= {f"{name}.csv": to_csv(content[name]), f"{name}.tex": to_latex(content[name])}
+    content["is_slim"] = is_slim
+    if is_slim:
+        content["plotly"] = ""
     content["missing"] = list(dict.fromkeys([*data.left_out, *content["missing"], *content["merge"].missing]))
     files["index.html"] = render_page("page.html", content)
     files |= {f"{chart.name}.png": chart.png for chart in content["charts"] if chart.has_png}

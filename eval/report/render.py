@@ -11,6 +11,7 @@ import jinja2
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import visible
+from eval.core.figures import compress_address
 from eval.core.output import whole_file
 
 _FILES = ("page.html", "comparison.html", "parts.html", "page.css", "charts.js")
@@ -27,6 +28,7 @@ def render_page(template: str, content: Mapping[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["compress"] = compress_address
     return environment.get_template(template).render(content)
 
 

@@ -372,6 +372,21 @@ def test_a_page_without_a_chart_holds_no_script(run: Path) -> None:
     assert "<script" not in write_page(run).read_text()
 
 
+def test_a_slim_page_has_the_same_tables_and_every_chart_as_a_picture(run: Path, page: Path) -> None:
+    shown = without_scripts(page.read_text())
+    copy = write_page(run, "none", is_slim=True)
+    slim = copy.read_text()
+    assert "<script" not in slim
+    assert len(slim) < len(page.read_text()) / 5
+    sources = re.findall(r'src="([^"]*)"', slim)
+    n_charts, n_pictures = shown.count('class="chart"'), shown.count("src=")
+    assert n_charts > 0
+    assert len(sources) == n_charts + n_pictures
+    for source in sources:
+        assert base64.b64decode(source.removeprefix("data:image/webp;base64,"), validate=True)[8:12] == b"WEBP"
+    assert tables_of(copy) == tables_of(page)
+
+
 def test_the_first_pair_can_be_seen_in_3d_and_a_page_without_views_links_to_none(run: Path) -> None:
     page = write_page(run)
     file = run / "views" / "paper__site1" / "7.html"
