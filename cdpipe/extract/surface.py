@@ -204,12 +204,14 @@ def split_group(points: Float64Array, n_returns: Int64Array, is_clear: BoolArray
         is_clear: (N,) whether a cell is clear of the other session's surface.
         min_cells: Fewest clear cells of a part.
     """
-    is_full = n_returns >= _FULL_RETURNS
-    pairs = cKDTree(points).query_pairs(_DENSE_M, output_type="ndarray")
-    one, other = np.concatenate([pairs, pairs[:, ::-1]]).T
-    n_full = is_full + np.bincount(one, is_full[other], len(points))
-    solid = np.flatnonzero(is_full & (2 * n_full > 1 + np.bincount(one, minlength=len(points))))
-    labels, sizes = label_groups(points[solid], _APART_M)
+    full = np.flatnonzero(n_returns >= _FULL_RETURNS)
+    n_full, n_near = (
+        cKDTree(each).query_ball_point(points[full], _DENSE_M, return_length=True) for each in (points[full], points)
+    )
+    solid = full[2 * n_full > n_near]
+    means, cell_of_solid = cell_means(points[solid], SURFACE_CELL_M)
+    labels, sizes = label_groups(means, _APART_M)
+    labels = labels[cell_of_solid]
     n_clear = np.bincount(labels[is_clear[solid]], minlength=len(sizes))
     in_part = np.isin(labels, np.flatnonzero(n_clear >= min_cells))
     parts, part_of_solid = np.unique(labels[in_part], return_inverse=True)
