@@ -1,8 +1,9 @@
 """Moved objects: match a removed with an added object if their surfaces can be registered.
 
 The two sessions see an object from different sides, so centres and edges do not agree; surfaces do. A removed object is
-registered with an added one by yaw and translation. The share of both surfaces that then coincides decides whether they
-are one object; the registration gives the displacement.
+registered with an added one by yaw and translation, and where that fails by any rotation, because an object may lie
+where it stood. The share of both surfaces that then coincides decides whether they are one object; the registration
+gives the displacement.
 
 If an object moved by less than its own length, only two strips of it were extracted, and these need not be similar. The
 overlap of both poses appears unchanged and is part of the surroundings. Neighbouring objects are therefore registered
@@ -15,10 +16,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, make_pose, transform, yaw_pose
 from cdpipe.core.voxel import thin
@@ -35,6 +38,8 @@ _BESIDE_M = 1.5
 _BESIDE_SHARE, _EITHER_SHARE = 0.4, 0.2
 _LIKENESS = 0.62
 _LIKE_WITHIN_M = 0.1
+# Tipped objects, which may turn in any way: least mean share and least likeness.
+_TIPPED_SHARE, _TIPPED_LIKENESS = 0.65, 0.77
 _MIN_POINTS = 4
 # Tails: a beam that meets an edge also returns from behind it. Groups of points this far from the others are left out
 # if they hold fewer of an object's points than this share. A registration starts from the centre of the box around
@@ -44,6 +49,10 @@ _TAIL_GAP_M, _TAIL_SHARE = 0.2, 0.05
 _MOST_TRIED = 6
 # Yaws of the coarse registration, how many of its results are registered finely, and the robust scales of each.
 _HEADINGS = 16
+# Rotations of the registration of tipped objects: those that map principal axes on one another, and each 30 degrees
+# to either side, as objects that are seen in part have other axes.
+_CUBE = Rotation.create_group("O").as_matrix()
+_BESIDES = Rotation.from_euler("z", [[-30], [0], [30]], degrees=True).as_matrix()
 _REFINED = 3
 _COARSE_STEPS_M = (0.3, 0.25, 0.2)
 _FINE_STEPS_M = (0.15, 0.14, 0.13, 0.12, 0.11, 0.1, 0.08, 0.07, 0.06, 0.05)
@@ -56,6 +65,10 @@ _TIE_PER_M, _TWIN_TIE_PER_M = 0.01, 0.1
 # barrels, crates and chairs (validation seeds) pairs of equal props have a likeness of at least 0.79 and, where one was
 # seen in part, a factor of up to 1.36; the likeness of pairs of different kinds is below 0.68.
 _TWIN_LIKENESS, _TWIN_FACTOR = 0.77, 1.45
+
+
+# The (4, 4) pose that fits sources (N, 3) to goals (N, 3) with weights (N,).
+Fit = Callable[[Float64Array, Float64Array, Float64Array], Float64Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,8 +104,8 @@ def find_moves(
         added: The same of the after session.
         around: Returns, for pairs (removed, added) of neighbours, the points (Q, 3) and (R, 3) above the ground that
             the before and the after session have around both objects; the objects' own points may be included.
-        nearest_twins: Whether tails are left out and twins are told apart by fit and way; otherwise all points of
-            every pair count, as for objects cut out by whole map points.
+        nearest_twins: Whether tails are left out, twins are told apart by fit and way, and an object may have been
+            tipped on its way; otherwise all points of every pair count, as for objects cut out by whole map points.
     """
     kept = _without_tails if nearest_twins else np.asarray
     gone, come = ([_Cloud.of(kept(points)) for points in objects] for objects in (removed, added))
@@ -106,6 +119,8 @@ def find_moves(
         for a in _partners_elsewhere(start, come, extents, nearest_twins):
             if (r, a) not in found:
                 found[r, a] = _match_pair(start, come[a], _SAME_SHARE)
+                if found[r, a] is None and nearest_twins:  # strips of neighbours would fit in some way
+                    found[r, a] = _match_tipped(start, come[a])
     matches = {pair: match for pair, match in found.items() if match is not None}
     if nearest_twins:
         matches = _equalise_twins(matches, gone, come)
@@ -248,10 +263,22 @@ def _match_pair(start: _Cloud, end: _Cloud, least_share: float) -> _Match | None
     """
     if min(len(start.points), len(end.points)) < _MIN_POINTS:
         return None
-    likeness, end_T_start = _align(start, end)
+    return _judge(start, end, *_align(start, end), least_share, _LIKENESS)
+
+
+def _match_tipped(start: _Cloud, end: _Cloud) -> _Match | None:
+    """Return the match of a pair of which one object may lie where the other stands, None if it is none."""
+    if min(len(start.points), len(end.points)) < _MIN_POINTS:
+        return None
+    return _judge(start, end, *_align_freely(start, end), _TIPPED_SHARE, _TIPPED_LIKENESS)
+
+
+def _judge(
+    start: _Cloud, end: _Cloud, likeness: float, end_T_start: Float64Array, least_share: float, least_likeness: float
+) -> _Match | None:
     shares = _shares(start, end, end_T_start)
     excess = likeness * (sum(shares) / 2 - least_share)  # the likeness decides between pairs with a full share
-    if excess <= 0.0 or min(shares) < _EITHER_SHARE or likeness < _LIKENESS:
+    if excess <= 0.0 or min(shares) < _EITHER_SHARE or likeness < least_likeness:
         return None
     together = np.concatenate([start.points, transform(invert(end_T_start), end.points)])
     centre = upright_box(together)[0][:3, 3]
@@ -266,32 +293,56 @@ def _align(start: _Cloud, end: _Cloud) -> tuple[float, Float64Array]:
     their surroundings.
     """
     middles = {(_middle(start.points), _middle(end.points)), (_middle(start.whole), _middle(end.whole))}
+    turns = [yaw_pose(float(yaw_rad))[:3, :3] for yaw_rad in np.arange(_HEADINGS) * (2 * np.pi / _HEADINGS)]
+    guesses = [_turn_about(turn, *ends) for turn in turns for ends in sorted(middles)]
+    return _register(start, end, guesses, _upright_fit)
+
+
+def _align_freely(start: _Cloud, end: _Cloud) -> tuple[float, Float64Array]:
+    """Return the best likeness and its (4, 4) end_T_start, any rotation; the search starts from principal axes."""
+    start_axes, end_axes = _principal_axes(start.points), _principal_axes(end.points)
+    turns = [end_axes @ beside @ turn @ start_axes.T for turn in _CUBE for beside in _BESIDES]
+    middles = start.points.mean(axis=0), end.points.mean(axis=0)
+    return _register(start, end, [_turn_about(turn, *middles) for turn in turns], _rigid_fit)
+
+
+def _turn_about(turn: Float64Array, start_middle: ArrayLike, end_middle: ArrayLike) -> Float64Array:
+    """Return the (4, 4) pose of a (3, 3) rotation that moves one middle to the other."""
+    return make_pose(turn, np.subtract(end_middle, turn @ np.asarray(start_middle)))
+
+
+def _principal_axes(points: Float64Array) -> Float64Array:
+    """Return the (3, 3) right-handed axes of the covariance of (P, 3) points, one a column, the shortest first."""
+    axes = np.linalg.eigh(np.cov(points.T))[1]
+    return np.asarray(axes * (1.0, 1.0, np.sign(np.linalg.det(axes))))
+
+
+def _register(start: _Cloud, end: _Cloud, guesses: Sequence[Float64Array], fit: Fit) -> tuple[float, Float64Array]:
+    """Return the best likeness and its (4, 4) end_T_start by ICP from several guesses, coarse, then the best finely."""
     coarse_start, coarse_end = start.coarse(), end.coarse()
     coarse = []
-    for yaw_rad in np.arange(_HEADINGS) * (2 * np.pi / _HEADINGS):
-        turn = yaw_pose(float(yaw_rad))
-        for start_middle, end_middle in sorted(middles):
-            guess = make_pose(turn[:3, :3], np.subtract(end_middle, transform(turn, np.array([start_middle]))[0]))
-            for scale_m in _COARSE_STEPS_M:
-                guess = _step(coarse_start, coarse_end, guess, scale_m)
-            coarse.append((_likeness(coarse_start, coarse_end, guess), guess))
+    for guess in guesses:
+        pose = guess
+        for scale_m in _COARSE_STEPS_M:
+            pose = _step(coarse_start, coarse_end, pose, scale_m, fit)
+        coarse.append((_likeness(coarse_start, coarse_end, pose), pose))
     coarse.sort(key=lambda item: -item[0])
     fine = []
     for _, guess in coarse[:_REFINED]:
         pose = guess
         for scale_m in _FINE_STEPS_M:
-            pose = _step(start, end, pose, scale_m)
+            pose = _step(start, end, pose, scale_m, fit)
         fine.append((_likeness(start, end, pose), pose))
     return max(fine, key=lambda item: item[0])
 
 
-def _step(start: _Cloud, end: _Cloud, end_T_start: Float64Array, scale_m: float) -> Float64Array:
+def _step(start: _Cloud, end: _Cloud, end_T_start: Float64Array, scale_m: float, fit: Fit) -> Float64Array:
     """Do one ICP step, both directions, with robust weights of the given scale; return the new (4, 4) end_T_start."""
     (far_m, in_end), (far_back_m, in_start) = _nearest(start.few, end.few, start, end, end_T_start)
     weights = np.concatenate([_weights(far_m, scale_m) / len(start.few), _weights(far_back_m, scale_m) / len(end.few)])
     sources = np.concatenate([start.few, start.whole[in_start]])
     goals = np.concatenate([end.whole[in_end], end.few])
-    return _upright_fit(sources, goals, weights)
+    return fit(sources, goals, weights)
 
 
 def _weights(distances_m: Float64Array, scale_m: float) -> Float64Array:
@@ -306,6 +357,15 @@ def _upright_fit(sources: Float64Array, goals: Float64Array, weights: Float64Arr
     yaw_rad = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return make_pose(turn, goal - turn @ source)
+
+
+def _rigid_fit(sources: Float64Array, goals: Float64Array, weights: Float64Array) -> Float64Array:
+    """Return the (4, 4) pose of the weighted least-squares fit of sources to goals, (N, 3) (Kabsch 1976)."""
+    shares = weights / weights.sum()
+    source, goal = shares @ sources, shares @ goals
+    u, _, v = np.linalg.svd((goals - goal).T @ ((sources - source) * shares[:, None]))
+    turn = (u * (1.0, 1.0, np.sign(np.linalg.det(u @ v)))) @ v
     return make_pose(turn, goal - turn @ source)
 
 

@@ -2,8 +2,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import Float64Array, stream, transform, yaw_pose
+from cdpipe.core.geometry import Float64Array, make_pose, stream, transform, yaw_pose
 from cdpipe.extract.moves import Move, find_moves
 
 STEP_M = 0.06
@@ -74,6 +75,25 @@ def test_an_object_seen_from_two_sides_went_where_it_went() -> None:
     assert np.linalg.norm(end.mean(axis=0) - start.mean(axis=0) - went) > 0.15
     (move,) = moves([start], [end])
     np.testing.assert_allclose(move.displacement_map, went, atol=0.05)
+
+
+@pytest.mark.parametrize("tilt_deg", [90, 135])
+def test_a_chair_that_lies_where_it_went_is_the_one_that_stood(tilt_deg: float) -> None:
+    turn = Rotation.from_euler("xz", [tilt_deg, 70], degrees=True).as_matrix()
+    pose, middle = make_pose(turn, np.array([5.0, 3.0, 0.4])), np.array([[0.25, 0.25, 0.475]])
+    (move,) = moves([noisy(chair(), "a")], [noisy(transform(pose, chair()), "b")])
+    # the displacement is that of the box around it, which is larger where it lies askew
+    np.testing.assert_allclose(move.displacement_map, (transform(pose, middle) - middle)[0], atol=0.1)
+    # what was cut out by whole map points is too sparse to be turned any way
+    nothing = np.zeros((0, 3))
+    ends = [noisy(chair(), "a")], [noisy(transform(pose, chair()), "b")]
+    assert find_moves(*ends, lambda pairs: [(nothing, nothing)] * len(pairs), nearest_twins=False) == []
+
+
+def test_a_lying_barrel_is_no_chair() -> None:
+    pose = make_pose(Rotation.from_euler("x", 90, degrees=True).as_matrix(), np.array([5.0, 3.0, 0.4]))
+    assert moves([chair()], [transform(pose, barrel())]) == []
+    assert len(moves([barrel()], [transform(pose, barrel())])) == 1
 
 
 def test_a_few_returns_behind_an_edge_do_not_hide_where_an_object_went() -> None:
