@@ -145,5 +145,5 @@ def test_the_table_of_results_is_made_of_committed_rows() -> None:
             *objects.loc[row, ["object_iou_point", "object_f1_50"]],
         ]
         # what a method costs was measured on the pairs that the figures are of
-        time = f"{cost.loc[row[1:], 'cost_value']:.1f}" if row[0] == "kiss-icp" else "–"
+        time = f"{cost.loc[row[1:], 'cost_value']:.1f}" if row[0] == "kiss-icp" else "-"
         assert shown == [*(f"{figure:.2f}" for figure in figures), time], row

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,10 +50,6 @@ _TAIL_GAP_M, _TAIL_SHARE = 0.2, 0.05
 _MOST_TRIED = 6
 # Yaws of the coarse registration, how many of its results are registered finely, and the robust scales of each.
 _HEADINGS = 16
-# Rotations of the registration of tipped objects: those that map principal axes on one another, and each 30 degrees
-# to either side, as objects that are seen in part have other axes.
-_CUBE = Rotation.create_group("O").as_matrix()
-_BESIDES = Rotation.from_euler("z", [[-30], [0], [30]], degrees=True).as_matrix()
 _REFINED = 3
 _COARSE_STEPS_M = (0.3, 0.25, 0.2)
 _FINE_STEPS_M = (0.15, 0.14, 0.13, 0.12, 0.11, 0.1, 0.08, 0.07, 0.06, 0.05)
@@ -301,9 +298,20 @@ def _align(start: _Cloud, end: _Cloud) -> tuple[float, Float64Array]:
 def _align_freely(start: _Cloud, end: _Cloud) -> tuple[float, Float64Array]:
     """Return the best likeness and its (4, 4) end_T_start, any rotation; the search starts from principal axes."""
     start_axes, end_axes = _principal_axes(start.points), _principal_axes(end.points)
-    turns = [end_axes @ beside @ turn @ start_axes.T for turn in _CUBE for beside in _BESIDES]
+    turns = [end_axes @ turn @ start_axes.T for turn in _turns_of_axes()]
     middles = start.points.mean(axis=0), end.points.mean(axis=0)
     return _register(start, end, [_turn_about(turn, *middles) for turn in turns], _rigid_fit)
+
+
+@cache
+def _turns_of_axes() -> Float64Array:
+    """Return the (72, 3, 3) rotations from principal axes to principal axes from which a free registration starts.
+
+    They are those that map axes on one another, and each 30 degrees to either side, as an object that is seen in part
+    has other axes.
+    """
+    beside = Rotation.from_euler("z", [[-30], [0], [30]], degrees=True).as_matrix()
+    return np.asarray([turn @ each for each in Rotation.create_group("O").as_matrix() for turn in beside])
 
 
 def _turn_about(turn: Float64Array, start_middle: ArrayLike, end_middle: ArrayLike) -> Float64Array:

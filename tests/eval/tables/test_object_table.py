@@ -192,9 +192,8 @@ def test_clustered_intervals_equal_plain_resampling(statistic: str) -> None:
     assert np.isnan(clustered_interval(np.zeros(0), np.zeros(0, dtype=np.int64), statistic)).all()
 
 
-def test_the_plan_of_objects_shares_no_pair_with_that_of_regions_and_varies_the_rule_alone() -> None:
+def test_the_plan_of_objects_varies_the_rule_alone() -> None:
     found = expand_cells(load_plan("objects"))
-    assert not {cell.seed for cell in found} & {cell.seed for cell in expand_cells(load_plan("regions"))}
     assert {cell.seed for cell in found} <= set(TEST)
     of_site = {cell.variant: cell for cell in found if cell.scenario == "regions/site2"}
     ours = of_site["tunnelcd"]
