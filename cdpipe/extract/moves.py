@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,7 +39,7 @@ _BESIDE_SHARE, _EITHER_SHARE = 0.4, 0.2
 _LIKENESS = 0.62
 _LIKE_WITHIN_M = 0.1
 # Tipped objects, which may turn in any way: least mean share and least likeness.
-_TIPPED_SHARE, _TIPPED_LIKENESS = 0.65, 0.77
+_TIPPED_SHARE, _TIPPED_LIKENESS = 0.65, 0.72
 _MIN_POINTS = 4
 # Tails: a beam that meets an edge also returns from behind it. Groups of points this far from the others are left out
 # if they hold fewer of an object's points than this share. A registration starts from the centre of the box around
@@ -298,20 +297,9 @@ def _align(start: _Cloud, end: _Cloud) -> tuple[float, Float64Array]:
 def _align_freely(start: _Cloud, end: _Cloud) -> tuple[float, Float64Array]:
     """Return the best likeness and its (4, 4) end_T_start, any rotation; the search starts from principal axes."""
     start_axes, end_axes = _principal_axes(start.points), _principal_axes(end.points)
-    turns = [end_axes @ turn @ start_axes.T for turn in _turns_of_axes()]
+    turns = [end_axes @ turn @ start_axes.T for turn in Rotation.create_group("O").as_matrix()]
     middles = start.points.mean(axis=0), end.points.mean(axis=0)
     return _register(start, end, [_turn_about(turn, *middles) for turn in turns], _rigid_fit)
-
-
-@cache
-def _turns_of_axes() -> Float64Array:
-    """Return the (72, 3, 3) rotations from principal axes to principal axes from which a free registration starts.
-
-    They are those that map axes on one another, and each 30 degrees to either side, as an object that is seen in part
-    has other axes.
-    """
-    beside = Rotation.from_euler("z", [[-30], [0], [30]], degrees=True).as_matrix()
-    return np.asarray([turn @ each for each in Rotation.create_group("O").as_matrix() for turn in beside])
 
 
 def _turn_about(turn: Float64Array, start_middle: ArrayLike, end_middle: ArrayLike) -> Float64Array:

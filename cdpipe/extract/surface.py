@@ -46,8 +46,6 @@ _FOOT_M = 0.3
 # a surface near the sensor has ten; both are looked at within 0.2 m.
 _APART_M = 0.3
 _FULL_RETURNS, _DENSE_M = 3, 0.2
-# Least share of the returns of a group in its solid cells: seat and back of a chair are solid parts with half of them.
-_SOLID_SHARE = 2 / 3
 # Least number of scans with a grazing ray through a cell.
 _MIN_SCANS_PAST = 3
 # Least size of a low object: 0.25 m^2 in cells of 0.05 m.
@@ -197,8 +195,8 @@ def split_group(points: Float64Array, n_returns: Int64Array, is_clear: BoolArray
 
     A beam that meets two surfaces returns from between them. Such returns link an object with what stands behind it,
     but seldom fall into the same cell. A cell is solid if it and most cells around it hold three returns or more. If
-    solid cells hold two thirds of the returns, and lie in places `_APART_M` from one another, each with enough clear
-    cells, every cell belongs to the nearest place.
+    solid cells lie in places `_APART_M` from one another, each with enough clear cells, every cell belongs to the
+    nearest place.
 
     Args:
         points: (N, 3) cells, metres.
@@ -217,7 +215,7 @@ def split_group(points: Float64Array, n_returns: Int64Array, is_clear: BoolArray
     n_clear = np.bincount(labels[is_clear[solid]], minlength=len(sizes))
     in_part = np.isin(labels, np.flatnonzero(n_clear >= min_cells))
     parts, part_of_solid = np.unique(labels[in_part], return_inverse=True)
-    if len(parts) < 2 or n_returns[solid].sum() < _SOLID_SHARE * n_returns.sum():
+    if len(parts) < 2:
         return np.zeros(len(points), dtype=np.int64)
     nearest = cKDTree(points[solid[in_part]]).query(points)[1]
     return np.asarray(part_of_solid[nearest], dtype=np.int64)
