@@ -8,14 +8,14 @@ the walls do not.
 1. From the middle of the session to both ends, each scan is registered with the scans before it (`_follow`).
 2. Sweeps register every scan with those on both sides (`_sweep`): first each with every second scan alone, never
    with itself, as a scan that is off would find itself; then with all, which ties even and odd scans together.
-3. Where the session comes through a place that it knows, the loop is closed (`cdpipe.mapping.loops`), and the scans of
+3. A scan that no pose lays on the walls is bent: the sensor was shaken within the revolution. Its points are left out.
+4. Where the session comes through a place that it knows, the loop is closed (`cdpipe.mapping.loops`), and the scans of
    both passes are registered with one another.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -31,17 +31,19 @@ _BEHIND_M, _RENEWED_M = 10.0, 1.0
 # Scans agree already if a sweep moves nine of ten by no more than this: 0.4 to 0.6 cm at constant drift, 4 cm with
 # KISS-ICP (validation tunnels of `narrow` and `wide`).
 _AGREE_M = 0.015
+# A scan is bent if so many of its points are off the walls, and so many times as many as of the scans around it.
+_BENT_SHARE, _BENT_FACTOR = 0.05, 3.0
 _FOLLOWING = Registration(voxel_m=0.3, correspondence_m=1.0, robust_m=0.2, step_m=0.2, step_rad=0.02)
 _BY_HALVES = Registration(voxel_m=0.2, correspondence_m=0.5, robust_m=0.07, step_m=0.1, step_rad=0.01)
 _WITH_ALL = Registration(voxel_m=0.2, correspondence_m=0.5, robust_m=0.05, step_m=0.1, step_rad=0.01)
 
 
 class ConsistentScans(WrappedScans):
-    """A session with other poses than those that were recorded."""
+    """A session with other poses than those that were recorded, and without the points of (S,) bent scans."""
 
-    def __init__(self, source: ScanSource, odom_T_sensor: Float64Array) -> None:
+    def __init__(self, source: ScanSource, odom_T_sensor: Float64Array, is_bent: BoolArray) -> None:
         super().__init__(source)
-        self._poses = odom_T_sensor
+        self._poses, self._is_bent = odom_T_sensor, is_bent
 
     @property
     def odom_T_sensor(self) -> Float64Array:
@@ -50,12 +52,18 @@ class ConsistentScans(WrappedScans):
 
     def scan(self, index: int) -> PosedScan:
         """Read one scan."""
-        return replace(super().scan(index), odom_T_sensor=self._poses[index])
+        return self._corrected(super().scan(index))
 
     def scans(self) -> Iterator[PosedScan]:
         """Read all scans in order."""
         for scan in super().scans():
-            yield replace(scan, odom_T_sensor=self._poses[scan.index])
+            yield self._corrected(scan)
+
+    def _corrected(self, scan: PosedScan) -> PosedScan:
+        n = 0 if self._is_bent[scan.index] else len(scan.points_sensor)
+        return PosedScan(
+            scan.index, scan.points_sensor[:n], self._poses[scan.index], scan.stamps_ns[:n], scan.pixels[:n]
+        )
 
 
 def make_consistent(source: ScanSource, *, has_loops: bool = False) -> ConsistentScans:
@@ -71,15 +79,24 @@ def make_consistent(source: ScanSource, *, has_loops: bool = False) -> Consisten
         InputError: A scan cannot be read.
     """
     scans, poses = Samples(source), source.odom_T_sensor
-    moved_m = np.linalg.norm((_sweep(scans, poses, _WITH_ALL) - poses)[:, :3, 3], axis=1)
+    is_bent = np.zeros(len(poses), dtype=np.bool_)
+    moved_m = np.linalg.norm((_sweep(scans, poses, _WITH_ALL)[0] - poses)[:, :3, 3], axis=1)
     if np.percentile(moved_m, 90) > _AGREE_M:
         poses = _follow(scans, _FOLLOWING)
-        poses = _sweep(scans, poses, _BY_HALVES, by_halves=True)
-        poses = _sweep(scans, poses, _WITH_ALL)
+        poses, off_share = _sweep(scans, poses, _BY_HALVES, by_halves=True)
+        is_bent = _find_bent(scans.path_m, off_share)
+        poses, _ = _sweep(scans, poses, _WITH_ALL)
     loops = find_loops(scans, poses) if has_loops else ()
     if loops:
-        poses = _sweep(scans, close_loops(scans.path_m, poses, loops), _WITH_ALL, loops=loops)
-    return ConsistentScans(source, poses)
+        poses, _ = _sweep(scans, close_loops(scans.path_m, poses, loops), _WITH_ALL, loops=loops)
+    return ConsistentScans(source, poses, is_bent)
+
+
+def _find_bent(path_m: Float64Array, off_share: Float64Array) -> BoolArray:
+    """Return which scans are bent, by (S,) path and (S,) shares of points off the walls."""
+    first, end = (np.searchsorted(path_m, path_m + way_m) for way_m in (-_AROUND_M, _AROUND_M))
+    usual = [np.median(off_share[a:b]) for a, b in zip(first, np.maximum(end, first + 1), strict=True)]
+    return np.asarray(off_share > np.maximum(_BENT_SHARE, _BENT_FACTOR * np.array(usual)))
 
 
 def _follow(scans: Samples, settings: Registration) -> Float64Array:
@@ -96,7 +113,7 @@ def _follow(scans: Samples, settings: Registration) -> Float64Array:
                 near = behind[np.abs(path_m[behind] - path_m[index]) <= _BEHIND_M]
                 made_m = path_m[index]
                 target = Target(scans, found, near if len(near) else behind[-1:], guess[:3, 3], settings.voxel_m)
-            found[index] = register_scan(scans.of_scan(index), guess, [guess], target, settings)
+            found[index], _ = register_scan(scans.of_scan(index), guess, [guess], target, settings)
     return found
 
 
@@ -107,8 +124,10 @@ def _sweep(
     *,
     by_halves: bool = False,
     loops: tuple[Loop, ...] = (),
-) -> Float64Array:
-    """Return the (S, 4, 4) poses after one sweep; all scans of a block are registered with the poses before it.
+) -> tuple[Float64Array, Float64Array]:
+    """Return the (S, 4, 4) poses after one sweep, and the (S,) share of each scan's points that are off the walls.
+
+    All scans of a block are registered with the poses before it.
 
     Args:
         scans: The scans.
@@ -117,7 +136,7 @@ def _sweep(
         by_halves: Whether a scan is compared with every second scan alone.
         loops: Closed loops: scans of both passes are registered with one another.
     """
-    found = poses.copy()
+    found, off_share = poses.copy(), np.zeros(len(poses))
     steps = invert(scans.recorded[:-1]) @ scans.recorded[1:]
     blocks = np.floor(scans.path_m / _BLOCK_M)
     for block in np.unique(blocks):
@@ -133,8 +152,10 @@ def _sweep(
             predicted = [poses[index - 1] @ steps[index - 1]] if index else []
             predicted += [poses[index + 1] @ invert(steps[index])] if index + 1 < len(poses) else []
             target = first if index % 2 == 0 else second
-            found[index] = register_scan(scans.of_scan(index), poses[index], predicted, target, settings)
-    return found
+            found[index], off_share[index] = register_scan(
+                scans.of_scan(index), poses[index], predicted, target, settings
+            )
+    return found, off_share
 
 
 def _is_near(path_m: Float64Array, first: int, last: int, loops: tuple[Loop, ...]) -> BoolArray:

@@ -26,6 +26,8 @@ _STEPS, _CONVERGED = 4, 2e-4
 # to 0.011; rough drifts 0.012 to 0.33). Nothing counts up to this share, and all from twice as much.
 _NOISE_SHARE = 0.006
 _MIN_PAIRS = 50
+# A point at this distance from the planes of a map is not on its walls.
+_OFF_WALLS_M = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,12 +120,15 @@ def register_scan(
     predicted: Sequence[Float64Array],
     target: Target,
     settings: Registration,
-) -> Float64Array:
-    """Return the (4, 4) pose of a scan by Gauss-Newton on its distances to planes and on the odometry.
+) -> tuple[Float64Array, float]:
+    """Return the (4, 4) pose of a scan, and the share of its points that it leaves 0.1 m and more off the walls.
+
+    It is found by Gauss-Newton on the distances to planes and on the odometry.
 
     Args:
         points: (N, 3) points, sensor frame, metres.
-        guess: (4, 4) first pose, odom frame; it is the answer where too few points have a counterpart.
+        guess: (4, 4) first pose, odom frame; it is the answer, with a share of 0, where too few points have a
+            counterpart.
         predicted: (4, 4) poses that the odometry predicts from neighbours.
         target: The map.
         settings: Of the registration.
@@ -134,7 +139,7 @@ def register_scan(
     for _ in range(_STEPS):
         chosen, distances_m, normals = target.planes(transform(pose, points), settings.correspondence_m)
         if len(chosen) < _MIN_PAIRS:
-            return guess
+            return guess, 0.0
         jacobian = plane_jacobian(points.take(chosen, axis=0), normals @ pose[:3, :3])
         weighted = jacobian / (_POINT_M * (1 + (distances_m / settings.robust_m) ** 2))[:, None] ** 2
         told = _discount_normal_noise(weighted.T @ jacobian)
@@ -150,7 +155,7 @@ def register_scan(
         pose = pose @ make_pose(Rotation.from_rotvec(step[:3]).as_matrix(), step[3:])
         if np.abs(step).max() < _CONVERGED:
             break
-    return invert(shift) @ pose
+    return invert(shift) @ pose, float(np.mean(np.abs(distances_m) > _OFF_WALLS_M))
 
 
 def _discount_normal_noise(hessian: Float64Array) -> Float64Array:

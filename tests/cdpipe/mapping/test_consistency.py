@@ -59,6 +59,30 @@ def test_scans_that_agree_keep_their_recorded_poses(tunnel: CloudScans) -> None:
     np.testing.assert_array_equal(make_consistent(tunnel).odom_T_sensor, tunnel.odom_T_sensor)
 
 
+def test_a_scan_that_was_shaken_within_its_revolution_adds_no_points(tunnel: CloudScans) -> None:
+    noisy = jittered(tunnel, 0)
+    clouds = [noisy.scan(index).points_sensor for index in range(len(noisy.odom_T_sensor))]
+    of_turn = np.arctan2(clouds[20][:, 1], clouds[20][:, 0]) / np.pi
+    shaken = Rotation.from_rotvec(np.deg2rad(6.0) * np.outer(of_turn, [0, 1, 0])).apply(clouds[20])
+    clouds[20] = shaken
+    consistent = make_consistent(CloudScans(noisy.name, noisy.odom_T_sensor, clouds))
+    sizes = [len(scan.points_sensor) for scan in consistent.scans()]
+    assert sizes == [0 if index == 20 else len(cloud) for index, cloud in enumerate(clouds)]
+    assert len(consistent.scan(20).points_sensor) == len(consistent.scan(20).pixels) == 0
+    point_map = build_map(CloudScans(noisy.name, noisy.odom_T_sensor, clouds), MapConfig(consistency="scan-to-map"))
+    assert 20 not in point_map.scans_of(np.arange(len(point_map.return_points)))
+
+
+def test_scans_of_a_place_with_loose_walls_are_kept(tunnel: CloudScans) -> None:
+    noisy, rng = jittered(tunnel, 0), stream(0, "loose")
+    clouds = [noisy.scan(index).points_sensor for index in range(len(noisy.odom_T_sensor))]
+    for cloud in clouds:  # a tenth of all returns is of something that moves
+        loose = rng.random(len(cloud)) < 0.1
+        cloud[loose] *= rng.uniform(0.8, 0.95, (np.count_nonzero(loose), 1))
+    scans = make_consistent(CloudScans(noisy.name, noisy.odom_T_sensor, clouds)).scans()
+    assert all(len(scan.points_sensor) for scan in scans)
+
+
 def test_a_slow_drift_stays(tunnel: CloudScans) -> None:
     # 2 % too long and 1 degree off over the tunnel: nothing within one session contradicts it
     poses = tunnel.odom_T_sensor.copy()
