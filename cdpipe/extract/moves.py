@@ -202,9 +202,10 @@ class _Cloud:
 
 
 def _without_tails(points: Float64Array) -> Float64Array:
-    """Return the (P, 3) points without the groups of a few points that lie apart."""
+    """Return the (P, 3) points without the groups of a few points that lie apart; all where there is nothing else."""
     groups, sizes = label_groups(points, _TAIL_GAP_M)
-    return points[sizes[groups] >= _TAIL_SHARE * len(points)]
+    is_body = sizes[groups] >= _TAIL_SHARE * len(points)
+    return points[is_body] if is_body.any() else points
 
 
 def _thin_to(points: Float64Array, most: int) -> Float64Array:

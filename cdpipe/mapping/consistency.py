@@ -78,8 +78,11 @@ def make_consistent(source: ScanSource, *, has_loops: bool = False) -> Consisten
     Raises:
         InputError: A scan cannot be read.
     """
-    scans, poses = Samples(source), source.odom_T_sensor
+    poses = source.odom_T_sensor
     is_bent = np.zeros(len(poses), dtype=np.bool_)
+    if len(poses) == 1:
+        return ConsistentScans(source, poses, is_bent)
+    scans = Samples(source)
     moved_m = np.linalg.norm((_sweep(scans, poses, _WITH_ALL)[0] - poses)[:, :3, 3], axis=1)
     if np.percentile(moved_m, 90) > _AGREE_M:
         poses = _follow(scans, _FOLLOWING)

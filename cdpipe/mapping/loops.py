@@ -17,7 +17,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, make_pose, transform
-from cdpipe.mapping.scan_registration import Registration, Samples, Target, register_scan
+from cdpipe.mapping.scan_registration import MIN_PAIRS, Registration, Samples, Target, register_scan, spread
 
 # Places are this far apart along the path; those closer than the second are no two passes.
 _SPACING_M, _APART_M = 4.0, 25.0
@@ -126,8 +126,8 @@ class _Place:
     def __init__(self, scans: Samples, poses: Float64Array, scan: int) -> None:
         way_m = np.abs(scans.path_m - scans.path_m[scan])
         scan_T_others = invert(poses[scan]) @ poses
-        around = np.flatnonzero(way_m <= _AROUND_M).tolist()
-        points = np.concatenate([transform(scan_T_others[k], scans.of_scan(k)) for k in around])
+        around = spread(np.flatnonzero(way_m <= _AROUND_M))
+        points = np.concatenate([transform(scan_T_others[k], scans.of_scan(k)) for k in around.tolist()])
         self.points = points[np.einsum("ij,ij->i", points, points) < (2 * _AROUND_M) ** 2]
         self.target = Target(scans, scan_T_others, np.flatnonzero(way_m <= _TARGET_M), np.zeros(3), _FINE.voxel_m)
 
@@ -139,7 +139,7 @@ class _Place:
         for settings in registrations:
             pose, _ = register_scan(self.points, pose, [pose], other.target, settings)
         found, distances_m, _ = other.target.planes(transform(pose, self.points), _COUNTERPART_M)
-        if 2 * len(found) < len(self.points):
+        if len(found) < max(MIN_PAIRS, len(self.points) / 2):
             return pose, 0.0
         return pose, float(np.mean(np.abs(distances_m) <= _INLIER_M))
 

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, invert, transform_each
+from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
 from cdpipe.model.types import PointMap
 
@@ -51,16 +52,34 @@ def regions_as_mapped(regions: ChangeRegions, before: PointMap) -> ChangeRegions
     """Return regions in the frame of a before map from those in the frame of its recorded odometry."""
     if before.recorded_T_sensor is None:
         return regions
-    recorded_T_keyframe, map_T_keyframe = before.recorded_T_sensor[before.keyframe_scans], before.odom_T_keyframe
-    return _move_regions(regions, _transforms_at(regions.centres_map, recorded_T_keyframe, map_T_keyframe))
+    map_T_recorded = _transforms_at(regions.centres_map, _recorded_T_keyframe(before), before.odom_T_keyframe)
+    return _move_regions(regions, map_T_recorded)
+
+
+def merge_as_mapped(before_T_after: Float64Array, before: PointMap, after: PointMap) -> PathAlignment:
+    """Return the alignment of two maps that moves what an after keyframe saw as a (4, 4) merge of recorded frames does.
+
+    It is the merge itself where neither map has other poses than those that were recorded.
+    """
+    if all(np.array_equal(_recorded_T_keyframe(each), each.odom_T_keyframe) for each in (before, after)):
+        return PathAlignment.rigid(before_T_after)
+    recorded_T_keyframe, odom_T_keyframe = before_T_after @ _recorded_T_keyframe(after), after.odom_T_keyframe
+    map_T_recorded = _transforms_at(recorded_T_keyframe[:, :3, 3], _recorded_T_keyframe(before), before.odom_T_keyframe)
+    return PathAlignment(odom_T_keyframe[:, :3, 3], map_T_recorded @ recorded_T_keyframe @ invert(odom_T_keyframe))
 
 
 def recorded_T_map(point_map: PointMap, places_odom: Float64Array) -> Float64Array:
     """Return the (N, 4, 4) transforms from a map's frame into that of its recorded odometry at (N, 3) places."""
     if point_map.recorded_T_sensor is None:
         return np.repeat(np.eye(4)[None], len(places_odom), axis=0)
-    recorded_T_keyframe = point_map.recorded_T_sensor[point_map.keyframe_scans]
-    return _transforms_at(places_odom, point_map.odom_T_keyframe, recorded_T_keyframe)
+    return _transforms_at(places_odom, point_map.odom_T_keyframe, _recorded_T_keyframe(point_map))
+
+
+def _recorded_T_keyframe(point_map: PointMap) -> Float64Array:
+    """Return the (K, 4, 4) recorded pose of each keyframe."""
+    if point_map.recorded_T_sensor is None:
+        return point_map.odom_T_keyframe
+    return point_map.recorded_T_sensor[point_map.keyframe_scans]
 
 
 def _transforms_at(places: Float64Array, src_T_keyframe: Float64Array, dst_T_keyframe: Float64Array) -> Float64Array:

@@ -21,11 +21,13 @@ _MAP_CELL_M, _SCAN_CELL_M = 0.2, 0.6
 _NEIGHBOURS = 10
 # Standard deviation of a point's distance to its plane, and its correlation with its neighbours is in here, too.
 _POINT_M = 0.05
+# A sensor that stands sees one place in all its scans; more of them tell nothing new and take 1 MB each.
+_MOST_SCANS = 200
 _STEPS, _CONVERGED = 4, 2e-4
 # Noise of the normals alone makes information along a smooth drift, a small share of that across it (validation: 0.002
 # to 0.011; rough drifts 0.012 to 0.33). Nothing counts up to this share, and all from twice as much.
 _NOISE_SHARE = 0.006
-_MIN_PAIRS = 50
+MIN_PAIRS = 50
 # A point at this distance from the planes of a map is not on its walls.
 _OFF_WALLS_M = 0.1
 
@@ -79,13 +81,19 @@ class Samples:
         return self._points[kind][start:end].astype(np.float64)
 
 
+def spread(scans: Int64Array) -> Int64Array:
+    """Return (N,) scans, or 200 of them from the first to the last."""
+    n = len(scans)
+    return scans if n <= _MOST_SCANS else scans[np.linspace(0, n - 1, _MOST_SCANS).astype(np.int64)]
+
+
 def _first_per_cell(points: Float64Array, cell_m: float) -> Float64Array:
     _, first = np.unique(cell_keys(points, cell_m), return_index=True)
     return points[np.sort(first)]
 
 
 class Target:
-    """The map of some scans about a (3,) centre, with a plane at every point.
+    """The map of some scans, 200 of them at most, about a (3,) centre, with a plane at every point.
 
     Attributes:
         centre: (3,) its origin in the odom frame: rotations are found about it.
@@ -96,6 +104,7 @@ class Target:
     ) -> None:
         self.centre = centre
         self._voxel_m = voxel_m
+        chosen = spread(chosen)
         cloud = np.concatenate([transform(poses[index], scans.of_map(index)) for index in chosen]) - centre
         thinned, self._tree = small_gicp.preprocess_points(cloud, voxel_m, _NEIGHBOURS, num_threads=1)
         self._points = np.ascontiguousarray(thinned.points()[:, :3])
@@ -129,7 +138,7 @@ def register_scan(
         points: (N, 3) points, sensor frame, metres.
         guess: (4, 4) first pose, odom frame; it is the answer, with a share of 0, where too few points have a
             counterpart.
-        predicted: (4, 4) poses that the odometry predicts from neighbours.
+        predicted: (4, 4) poses that the odometry predicts from neighbours, one at least.
         target: The map.
         settings: Of the registration.
     """
@@ -138,7 +147,7 @@ def register_scan(
     information = np.repeat([1 / settings.step_rad**2, 1 / settings.step_m**2], 3) / max(len(priors), 1)
     for _ in range(_STEPS):
         chosen, distances_m, normals = target.planes(transform(pose, points), settings.correspondence_m)
-        if len(chosen) < _MIN_PAIRS:
+        if len(chosen) < MIN_PAIRS:
             return guess, 0.0
         jacobian = plane_jacobian(points.take(chosen, axis=0), normals @ pose[:3, :3])
         weighted = jacobian / (_POINT_M * (1 + (distances_m / settings.robust_m) ** 2))[:, None] ** 2

@@ -16,6 +16,7 @@ from time import perf_counter
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, transform, travelled_m
+from cdpipe.mapping.recorded_frames import merge_as_mapped
 from cdpipe.merge.candidates import Candidate, find_candidates, find_closest_pair
 from cdpipe.merge.evidence import SurfaceFit, explain_refusal, measure_fit, sample_evenly
 from cdpipe.merge.global_registration import is_kiss_matcher_installed, register_globally
@@ -119,20 +120,24 @@ def take_known_merge(
     Args:
         before: The before session.
         after: The after session.
-        before_T_after: (4, 4) the known alignment.
+        before_T_after: (4, 4) the known alignment, between the frames of the recorded odometries.
         config: Settings of the merge.
     """
     start = perf_counter()
     seconds = {"t_index_s": 0.0, "t_merge_s": 0.0, "t_refine_s": 0.0}
     known = {"n_hypotheses": 0.0, "is_known": 1.0}
-    merged = MergedMaps(before.map, after.map, before_T_after, known, True, seconds=seconds)
+    by_user = merge_as_mapped(before_T_after, before.map, after.map)
+    known_local = None if by_user.is_rigid else by_user
+    if known_local is not None:
+        before_T_after = fit_rigid(by_user.anchors_odom, by_user.before_T_after)
+    merged = MergedMaps(before.map, after.map, before_T_after, known, True, local=known_local, seconds=seconds)
     if not _have_points(before, after, config):
         return merged
     maps = (IndexedMap(before.map, config, is_target=True), IndexedMap(after.map, config, is_target=False))
     indexed = perf_counter()
     distances_m, _ = maps[0].path.query(transform(before_T_after, maps[1].positions))
     found = _judge(_Start(int(np.argmin(distances_m)), before_T_after, known), maps, config)
-    evidence, local, refined = dict(found.evidence), None, before_T_after
+    evidence, local, refined = dict(found.evidence), known_local, before_T_after
     walked = perf_counter()
     within_m = np.inf
     if config.refine == "checked":
@@ -140,12 +145,14 @@ def take_known_merge(
     if config.refine != "none" and "both_ways_m" in evidence:
         place = maps[1].positions[found.walk.keyframes[0]]
         is_near = motion_between(found.before_T_after, before_T_after, place)[0] <= within_m
-        refined = found.before_T_after if is_near and not explain_refusal(evidence, config) else before_T_after
+        if is_near and not explain_refusal(evidence, config):
+            local, refined = None, found.before_T_after
     elif config.refine != "none":
         del maps
-        local, measured = refine(before.map, after.map, found.walk, before_T_after, config, within_m)
+        fitted, measured = refine(before.map, after.map, found.walk, before_T_after, config, within_m)
         evidence |= measured
-        refined = before_T_after if local is None else fit_rigid(local.anchors_odom, local.before_T_after)
+        if fitted is not None:
+            local, refined = fitted, fit_rigid(fitted.anchors_odom, fitted.before_T_after)
     seconds = {
         "t_index_s": indexed - start,
         "t_merge_s": walked - indexed,

@@ -57,6 +57,13 @@ def moves(removed: Sequence[Float64Array], added: Sequence[Float64Array]) -> lis
     return find_moves(removed, added, lambda pairs: [(nothing, nothing)] * len(pairs))
 
 
+def test_an_object_of_points_that_all_lie_apart_is_no_error() -> None:
+    loose = 5.0 * face((0, 0, 0), (0.3, 0.3, 0))
+    assert len(loose) > 20  # 0.3 m apart
+    for other in (loose, box((0.8, 0.6, 0.5), "lf")):
+        moves([loose], [shifted(other, 30)])
+
+
 def test_what_was_turned_and_carried_off_is_one_object_and_where_it_went_is_told() -> None:
     size = (1.1, 0.7, 0.6)
     middle = np.array([[0.55, 0.35, 0.3]])

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream
 from cdpipe.mapping.consistency import make_consistent
 from cdpipe.mapping.mapping import build_map
+from cdpipe.mapping.scan_registration import spread
 from cdpipe.model.config import MapConfig, load_config
 from tests.cdpipe.conftest import CloudScans, scanned
 
@@ -108,6 +109,25 @@ def test_a_tunnel_that_tells_no_place_along_keeps_the_odometry_along_it() -> Non
     across = np.linalg.norm(found[:, 1:3, 3] - found[:, 1:3, 3].mean(axis=0), axis=1)
     assert np.median(across) < 0.015 < np.median(np.linalg.norm(noisy.odom_T_sensor[:, 1:3, 3], axis=1))
     assert np.abs(found[:, 0, 3] - noisy.odom_T_sensor[:, 0, 3]).max() < 4 * JITTER_M
+
+
+def test_one_scan_of_a_smooth_drift_keeps_its_pose() -> None:
+    rng = stream(1, "alone")
+    angle, along, radius_m = (
+        rng.uniform(0, 2 * np.pi, 20_000),
+        rng.uniform(-12, 12, 20_000),
+        rng.normal(3, 0.02, 20_000),
+    )
+    walls = np.column_stack([along, radius_m * np.cos(angle), radius_m * np.sin(angle)])
+    alone = CloudScans("alone", make_pose(np.eye(3)[None], np.ones((1, 3))), [walls])
+    np.testing.assert_array_equal(make_consistent(alone).odom_T_sensor, alone.odom_T_sensor)
+
+
+def test_the_map_of_a_sensor_that_stands_has_no_more_than_200_scans() -> None:
+    assert spread(np.arange(7, 207)).tolist() == list(range(7, 207))
+    chosen = spread(np.arange(0, 10_000, 2))
+    assert len(np.unique(chosen)) == 200 and (chosen[0], chosen[-1]) == (0, 9998)
+    assert np.isin(chosen % 2, 0).all()  # halves stay apart
 
 
 @pytest.mark.parametrize("n_scans", [1, 2])

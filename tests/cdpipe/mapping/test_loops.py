@@ -95,6 +95,24 @@ def test_drifts_beside_one_another_are_no_loop(rough: CloudScans) -> None:
     assert find_loops(Samples(source), source.odom_T_sensor) == ()
 
 
+def test_a_hall_without_a_point_near_the_path_closes_nothing() -> None:
+    rng = stream(0, "hall")
+    along, across = rng.uniform(-20, 60, (4, 60_000)), rng.uniform(-9.5, 9.5, (4, 60_000))
+    out = 9.5 + 0.15 * np.sin(3 * along) * np.sin(4 * across)
+    sides = [(along[0], out[0], across[0]), (along[1], -out[1], across[1])]
+    sides += [(along[2], across[2], out[2]), (along[3], across[3], -out[3])]
+    walls = np.concatenate([np.column_stack(side) for side in sides])
+    x_m = np.concatenate([np.arange(0.0, 30.0), np.arange(30.0, 0.0, -1.0)])
+    true = make_pose(np.repeat(np.eye(3)[None], 60, axis=0), np.column_stack([x_m, 0 * x_m, 0 * x_m]))
+    clouds = []
+    for pose in true:
+        seen = np.flatnonzero(np.linalg.norm(walls - pose[:3, 3], axis=1) < 18)
+        clouds.append(transform(invert(pose), walls[rng.choice(seen, 4000, replace=False)]))
+    off = true.copy()
+    off[:, 1, 3] = np.linspace(0, 1.5, 60)
+    assert find_loops(Samples(CloudScans("hall", off, clouds)), off) == ()
+
+
 def test_the_pose_graph_shares_an_error_out_over_the_round() -> None:
     # a square, driven once; at its end the odometry is off by a known motion
     true = [yaw_pose(0.0)]

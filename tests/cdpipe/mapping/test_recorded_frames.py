@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform
-from cdpipe.mapping.recorded_frames import regions_as_mapped, report_as_recorded
+from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, travelled_m
+from cdpipe.mapping.recorded_frames import merge_as_mapped, regions_as_mapped, report_as_recorded
+from cdpipe.merge.merge import take_known_merge
 from cdpipe.model.config import ExtractConfig, MergeConfig, PipelineConfig, QueryConfig
 from cdpipe.model.report import ChangeReport
-from cdpipe.model.types import MappedSession, PointMap
+from cdpipe.model.types import MappedSession, MergedMaps, PointMap
 from cdpipe.pipeline import detect_changes, detect_merge
 
 CONFIG = PipelineConfig(
@@ -64,6 +65,37 @@ def test_what_a_scan_saw_at_a_keyframe_has_its_place_in_the_recorded_frame(
         recorded = transform(told.local_before_T_after[k], transform(after.recorded_T_sensor[scan], sensor_points))
         again = transform(invert(before.recorded_T_sensor[scans[nearest]]), recorded)
         np.testing.assert_allclose(again, seen, atol=1e-9)
+
+
+@pytest.mark.parametrize("refine", ["none", "checked"])
+def test_a_known_merge_is_one_of_the_recorded_frames(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array, refine: str
+) -> None:
+    def late(session: MappedSession, lost_m: float) -> MappedSession:
+        """The session as if its odometry had lost metres over the first part of the path."""
+        poses = session.map.odom_T_sensor
+        lost = np.exp(-travelled_m(poses) / 30.0)[:, None] * [0.0, lost_m, 0.0]
+        recorded = poses.copy()
+        recorded[:, :3, 3] += lost
+        return replace(session, map=replace(session.map, recorded_T_sensor=recorded))
+
+    before, after = late(tunnel_before, 1.0), late(tunnel_after, 0.0)
+    known = merge_as_mapped(true_before_T_after, before.map, after.map)
+    assert not known.is_rigid
+    config = CONFIG.model_copy(update={"merge": MergeConfig(voxel_m=0.25, refine=refine)})
+
+    def merge(one: MappedSession, other: MappedSession) -> MergedMaps:
+        return take_known_merge(one, other, true_before_T_after, config.merge)
+
+    told = detect_merge(before, after, config, merge=merge)
+    if refine == "none":  # the answer is in recorded frames, and has the merge that was given
+        assert told.local_before_T_after is not None
+        np.testing.assert_allclose(
+            told.local_before_T_after, np.broadcast_to(true_before_T_after, told.local_before_T_after.shape), atol=0.05
+        )
+    # equal poses are no other frame
+    same = replace(tunnel_after.map, recorded_T_sensor=tunnel_after.map.odom_T_sensor)
+    assert merge_as_mapped(true_before_T_after, tunnel_before.map, same).is_rigid
 
 
 def local_of(report: ChangeReport, keyframe: int) -> Float64Array:
