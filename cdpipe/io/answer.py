@@ -42,6 +42,7 @@ from cdpipe.core.geometry import Float64Array
 from cdpipe.io.answer_parts import (
     FORMAT,
     FORMAT_VERSION,
+    MAX_ERROR,
     OFFSETS,
     AnswerPart,
     ShapePart,
@@ -157,10 +158,10 @@ def write_failure(
     seconds: Mapping[str, float] | None = None,
     checkpoints: Mapping[str, str] | None = None,
 ) -> None:
-    """Write the record of a case without an answer, with the seconds measured until then."""
+    """Write the record of a case without an answer, with 10,000 letters of its error and the seconds until then."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "answer.npz").unlink(missing_ok=True)
-    document: dict[str, Any] = {"status": status, "error": error, "method": method}
+    document: dict[str, Any] = {"status": status, "error": error[:MAX_ERROR], "method": method}
     document |= {"seconds": dict(seconds or {}), "evidence": dict(evidence)}
     document |= {"config": dict(config), "checkpoints": dict(checkpoints or {})}
     _write_json(folder, document, until)
@@ -180,7 +181,8 @@ def read_answer(folder: Path | str) -> Answer:
         failed = document.status, document.error, document.method, None, document.seconds, document.evidence
         return Answer(*failed, until=document.until, checkpoints=document.checkpoints)
     file, n_objects = folder / "answer.npz", len(document.objects)
-    arrays = read_npz(file, lambda types: check_array_types(file, types, n_objects))
+    stored = read_npz(file, lambda types: check_array_types(file, types, n_objects))
+    arrays = {name: _computable(array) for name, array in stored.items()}
     check_offsets(file, arrays, n_objects)
     if math.isnan(document.radius_m) != ("region_radii_m" in arrays):
         raise InputError(
@@ -192,6 +194,11 @@ def read_answer(folder: Path | str) -> Answer:
         raise InputError(f"{file}: arrays that do not go together: {error}") from error
     measured = report.seconds, report.evidence
     return Answer("ok", "", document.method, report, *measured, points_odom, document.until, report.checkpoints)
+
+
+def _computable(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return an array; floating-point numbers that linear algebra does not take, of 16 or 128 bits, as 64 bits."""
+    return array.astype(np.float64) if array.dtype.kind == "f" and array.dtype.itemsize not in (4, 8) else array
 
 
 def _report(

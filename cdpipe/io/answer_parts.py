@@ -20,6 +20,10 @@ FORMAT_VERSION: Literal[1] = 1
 Until = Literal["merge"]
 
 Failure = Literal["failed", "merge_refused", "worker_died"]
+# Texts go into every table and page: a settings text of a variant has some hundred letters, a traceback some thousand.
+MAX_ERROR = 10_000
+_Name = Annotated[str, Field(max_length=1_000)]
+_Figures = Annotated[dict[_Name, float], Field(max_length=1_000)]
 _Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 _Four = Field(min_length=4, max_length=4)
 _Pose = Annotated[list[Annotated[list[float], _Four]], _Four]
@@ -57,13 +61,13 @@ class FailurePart(_Part):
     format: Literal["tunnelcd-answer"]
     format_version: Literal[1]
     status: Literal["ok", Failure]
-    method: str
+    method: _Name
     until: Until | None = None
-    error: str = ""
-    seconds: dict[str, float] = Field(default_factory=dict)
-    evidence: dict[str, float] = Field(default_factory=dict)
+    error: str = Field("", max_length=MAX_ERROR)
+    seconds: _Figures = Field(default_factory=dict)
+    evidence: _Figures = Field(default_factory=dict)
     config: dict[str, Any] = Field(default_factory=dict)
-    checkpoints: dict[str, str] = Field(default_factory=dict)
+    checkpoints: dict[_Name, _Name] = Field(default_factory=dict, max_length=100)
     # fields of an answer are allowed and ignored
     before_T_after: Any = None
     radius_m: Any = None

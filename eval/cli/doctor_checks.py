@@ -174,7 +174,8 @@ def cluster() -> str:
 
     settings = {"processes": False, "n_workers": 1, "threads_per_worker": 1, "silence_logs": 50}
     # any free port: another program may hold Dask's own
-    with Client(**settings, dashboard_address="127.0.0.1:0") as client:
+    ports = {"dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127.0.0.1:0"}
+    with Client(**settings, **ports) as client:
         found = client.submit(sum, (2, 3)).result(timeout=5)
     _require(found == 5, f"a worker made {found} of 2 + 3")
     return "a worker computes"

@@ -7,9 +7,12 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from cdpipe.core.errors import InputError
+from cdpipe.core.files import parse_json
+from cdpipe.core.names import require_table_name, visible
 from eval.core.progress import RunProgress, Silent
 from eval.core.provenance import FORMAT_VERSION
-from eval.running.runfolder import IDENTITY, ITEM_TABLES, RunFolder, write_json, write_tables
+from eval.running.runfolder import IDENTITY, ITEM_TABLES, RunFolder, json_text, write_json, write_tables
 from eval.scoring.scoring import CaseScore, score_stored
 from eval.truth.ground_truth import load_ground_truth
 
@@ -25,11 +28,21 @@ def cell_document(score: CaseScore, identity: Mapping[str, Any], key: str, place
         identity: scenario, seed, variant, preset, pair_kind and commit; they replace the answer's own names.
         key: Digest of everything that the cell depends on.
         place: Position of its rows in the tables: scenario, variant.
+
+    Raises:
+        InputError: It is larger than what is read again.
     """
     names = {name: identity[name] for name in IDENTITY}
     items = {table: [{**names, **item} for item in getattr(score, table)] for table in ITEM_TABLES}
     head = {"format_version": FORMAT_VERSION, "key": key, "order": list(place)}
-    return {**head, "row": {**score.row, **identity}, **items}
+    document = {**head, "row": {**score.row, **identity}, **items}
+    try:
+        parse_json(json_text(document))
+    except ValueError as error:
+        told = ", ".join(f"{len(rows)} {table}" for table, rows in items.items() if rows)
+        case = "{scenario} {seed} {variant}".format(**identity)
+        raise InputError(f"{case}: its scores are {error} ({told}): answer with fewer regions or objects") from error
+    return document
 
 
 def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
@@ -42,7 +55,7 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
         How many answers were scored.
 
     Raises:
-        InputError: An answer is damaged, or its pair has no truth.
+        InputError: An answer is damaged, its pair has no truth, or a table would read its name as something else.
     """
     progress = progress or Silent()
     folders = sorted(file.parent for file in run.path.glob("answers/*/*/*/answer.json"))
@@ -54,6 +67,7 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
             path = run.path / "cells" / slug / seed / f"{folder.name}.json"
             stored = run.read_cell(path)
             if stored is None:
+                _require_readable_name(folder)
                 identity = foreign_identity(run, slug, seed, folder.name)
                 key, place = NO_KEY, LAST
             else:
@@ -80,3 +94,10 @@ def foreign_identity(run: RunFolder, slug: str, seed: str, name: str) -> dict[st
     world = {"scenario": row["scenario"], "pair_kind": row.get("pair_kind", "")}
     who = {"seed": int(seed), "variant": name, "preset": name, "commit": None, "is_contended": False}
     return {**world, **who}
+
+
+def _require_readable_name(answer: Path) -> None:
+    try:
+        require_table_name(answer.name)
+    except ValueError as error:
+        raise InputError(f"{answer.parent}: the answer {visible(answer.name)}: {error}") from error

@@ -290,7 +290,12 @@ def _require_format(path: Path, document: Mapping[str, Any]) -> None:
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write JSON that appears whole or not at all; numpy scalars become plain numbers."""
     with whole_file(path) as partial:
-        partial.write_text(json.dumps(document, indent=1, default=_plain))
+        partial.write_text(json_text(document))
+
+
+def json_text(document: Mapping[str, Any]) -> str:
+    """Return what `write_json` writes."""
+    return json.dumps(document, indent=1, default=_plain)
 
 
 def _items(table: str, cells: Sequence[Mapping[str, Any]]) -> pd.DataFrame:

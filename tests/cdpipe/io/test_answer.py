@@ -207,6 +207,22 @@ def test_a_failure_replaces_an_older_answer(tmp_path: Path) -> None:
     assert not (tmp_path / "answer.npz").exists()
 
 
+def test_of_a_long_error_the_beginning_is_kept(tmp_path: Path) -> None:
+    write_failure(tmp_path, "paper", "failed", "e" * 50_000, {}, {})
+    assert read_answer(tmp_path).error == "e" * 10_000
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.longdouble])
+def test_numbers_of_any_width_are_read(tmp_path: Path, dtype: type) -> None:
+    local = np.stack([yaw_pose(0.5 * index, (index, 2.0, 3.0)) for index in range(2)])
+    write_answer(tmp_path, "paper", replace(_report(), local_before_T_after=local))
+    arrays = dict(np.load(tmp_path / "answer.npz"))
+    np.savez(tmp_path / "answer.npz", **{**arrays, "local_before_T_after": local.astype(dtype)})
+    read = read_answer(tmp_path).report
+    assert read is not None and read.local_before_T_after is not None
+    np.testing.assert_allclose(read.local_before_T_after, local, atol=1e-3)
+
+
 def test_a_foreign_answer_may_name_points(tmp_path: Path) -> None:
     write_answer(tmp_path, "other", _report())
     arrays = dict(np.load(tmp_path / "answer.npz"))

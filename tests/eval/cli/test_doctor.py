@@ -206,6 +206,24 @@ def test_a_cluster_starts_where_the_port_of_its_dashboard_is_taken() -> None:
         assert doctor_checks.cluster() == "a worker computes"
 
 
+@pytest.mark.skipif(not Path("/proc/self/net/tcp").exists(), reason="reads the sockets of Linux")
+def test_the_cluster_that_is_tried_listens_on_this_machine_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
+    found: list[str] = []
+
+    class Watched(distributed.Client):  # type: ignore[misc,name-defined]
+        def submit(self, *args: Any, **settings: Any) -> Any:
+            own = {str(each.readlink()) for each in Path("/proc/self/fd").iterdir() if each.is_symlink()}
+            for table in ("tcp", "tcp6"):
+                rows = [line.split() for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]]
+                found.extend(row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in own)
+            return super().submit(*args, **settings)
+
+    monkeypatch.setattr(distributed, "Client", Watched)
+    doctor_checks.cluster()
+    assert found and all(address.startswith("0100007F:") for address in found)
+
+
 def test_wrong_answers_of_packages_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     class Caster:
         def __init__(self, meshes: object) -> None:

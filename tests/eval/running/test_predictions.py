@@ -259,6 +259,9 @@ def shifted(parts: dict[str, Any]) -> None:
         (True, lambda d: d.update(radius_m="4.5"), "answer.json: radius_m = '4.5': "),
         (True, lambda d: d.update(radius_m=None), "answer.json: radius_m = None: "),
         (True, lambda d: d.update(radius_m=float("inf")), "radius_m = inf: expected a length"),
+        (True, lambda d: d.update(method="m" * 1001), "answer.json: method"),
+        (True, lambda d: d.update(evidence={f"e{k}": 1.0 for k in range(1001)}), "answer.json: evidence"),
+        (True, lambda d: d.update(checkpoints={"sphere": "0" * 5_000_000}), "answer.json: checkpoints.sphere"),
         (True, lambda d: d.update(seconds=None), "answer.json: seconds = None: "),
         (True, lambda d: d.update(evidence=[1.0]), "answer.json: evidence = [1.0]: "),
         (
@@ -313,7 +316,7 @@ def test_every_mistake_is_one_line_with_its_file(
     change(document if of_document else arrays)
     folder = write_prediction(tiny_pair.parent / "theirs", document, arrays)
     code, out, err = command("score", tiny_pair, folder)
-    assert (code, out) == (2, "") and words in err
+    assert (code, out) == (2, "") and words in err and len(err) < 2000
     assert all(line.startswith(f"error: {folder}") for line in err.splitlines())
 
 
@@ -385,6 +388,34 @@ def test_what_no_method_may_be_called(
         write_prediction(tmp_path / f"mine/tiny/pair/{seed}", *good)
     code, _, err = command("score", run.path, "--predictions", tmp_path / "mine", "--as", name)
     assert code == 2 and err.startswith("error: --as ") and err.count("\n") == 1 and "\x1b" not in err
+
+
+def test_an_answer_of_too_many_regions_is_refused_and_loses_no_row(
+    tmp_path: Path, run: RunFolder, command: Command, good: tuple[dict[str, Any], dict[str, Any]]
+) -> None:
+    document, arrays = good
+    many = 60_000
+    centres = np.repeat(arrays["region_centres_map"][:1], many, axis=0)
+    answers = [arrays, {**arrays, "region_centres_map": centres, "region_scores": np.zeros(many)}]
+    for seed, each in zip(SEEDS, answers, strict=True):
+        write_prediction(tmp_path / f"mine/tiny/pair/{seed}", document, each)
+    code, _, err = command("score", run.path, "--predictions", tmp_path / "mine", "--as", "many", "--quiet")
+    assert code == 2 and err.count("\n") == 1 and "tiny/pair 4 many: " in err and "60000 regions" in err
+    assert not (run.path / "answers").exists() and not (run.path / "results.csv").exists()
+    assert [path.stem for path in run.path.glob("cells/*/*/*")] == ["ours", "ours"]
+    # nor by the way of the answers of a run
+    write_prediction(run.answer("tiny/pair", SEEDS[1], "many"), document, answers[1])
+    code, _, err = command("score", run.path, "--quiet")
+    assert code == 2 and "60000 regions" in err and not (run.path / "results.csv").exists()
+
+
+@pytest.mark.parametrize("name", ["NA", "1e5", "evil\x1b[31m"])
+def test_an_answer_that_was_put_into_the_run_has_a_name_that_tables_hold(
+    run: RunFolder, command: Command, good: tuple[dict[str, Any], dict[str, Any]], name: str
+) -> None:
+    write_prediction(run.path / "answers/tiny__pair" / str(SEEDS[0]) / name, *good)
+    code, _, err = command("score", run.path, "--quiet")
+    assert code == 2 and err.count("\n") == 1 and "expected" in err and "\x1b" not in err
 
 
 def test_an_answer_that_was_never_scored_is_not_replaced(
