@@ -14,7 +14,7 @@ from eval.plans.files import read_plan
 from eval.plans.variants import ORACLE_MERGE
 from eval.plans.worlds import PairKind
 
-RATE_COLUMN = "recall_at_"
+RATE_COLUMN, PROPOSED = "recall_at_", "_proposed"
 
 
 class Target(Settings):
@@ -30,7 +30,7 @@ class Target(Settings):
         at_least: The lower bound.
         at_most: The upper bound; exactly one of the two is set.
         method: Of which method, where it is not the one that the targets are about.
-        less: A rival whose value is subtracted first; for the columns `recall_at_...`.
+        less: A rival whose value is subtracted first; for the columns `recall_at_...` and `recall_at_..._proposed`.
         least_km: No verdict where the unchanged pairs are shorter than this together.
     """
 

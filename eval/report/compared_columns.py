@@ -11,6 +11,7 @@ from cdpipe.core.geometry import Float64Array
 from eval.tables.columns import RESULT_COLUMNS, Column, select, share, significant
 from eval.tables.merge_table import RULES, is_within_target, kinds
 from eval.tables.rows import numbers, with_domain
+from eval.tables.targets import is_unchanged_pair
 
 POOLED = "recall_at_0.1"
 POOLED_RATE_PER_100M = 0.1
@@ -28,8 +29,8 @@ COMPARED = (
            "Changes of all pairs together found at the lowest threshold with at most 0.1 false regions per 100 m, set "
            "anew in every draw of pairs.", "Undefined without regions.csv and changes.csv."),
     *select(RESULT_COLUMNS, "region_auroc", "false_regions_per_100m"),
-    Column("is_alarm", "alarm where nothing changed", "low", share,
-           "Share of the unchanged pairs with a reported region.", "Undefined for changed and refused pairs."),
+    Column("is_alarm", "alarm or no answer where nothing changed", "low", share,
+           "Share of the unchanged pairs with a reported region, or without an answer where refusing is never right."),
     *select(RESULT_COLUMNS, "object_iou_point"),
     Column("object_iou_voxel", "object voxel IoU", "high", share, "The same with 0.1 m voxels, mean over 8 grids."),
     *select(RESULT_COLUMNS, "object_f1_50", "kind_accuracy", "merge_error_m", "merge_error_deg"),
@@ -63,7 +64,12 @@ def figures_of(results: pd.DataFrame) -> pd.DataFrame:
         "is_within_target": within,
     }
     stored = [column.key for column in COMPARED if column.key not in (*columns, POOLED) and column.key in results]
-    return pd.DataFrame({**columns, **{key: _as_numbers(results, key) for key in stored}})
+    figures = {**columns, **{key: _as_numbers(results, key) for key in stored}}
+    if (
+        "is_alarm" in stored and "is_unchanged_pair" in results
+    ):  # who refuses the pairs on which he would cry wolf is not silent
+        figures["is_alarm"] = np.where(is_unchanged_pair(results) & (answered == 0), 1.0, figures["is_alarm"])
+    return pd.DataFrame(figures)
 
 
 def is_time(key: str) -> bool:

@@ -153,7 +153,8 @@ def best(values: Sequence[float], column: Column, n_used: Sequence[int] | None =
         values: One for each row.
         column: Which direction wins, and how values are written.
         n_used: Over how many pairs each is. One over fewer than six takes no part where another is over more: a method
-            that hardly ever answers is not the best of those that do.
+            that hardly ever answers is not the best of those that do. Nobody is best where the best value is over
+            fewer pairs than another: a method would only have to leave out the hard ones.
     """
     counts = n_used or [0] * len(values)
     enough = min(ENOUGH_PAIRS, max(counts, default=0))
@@ -165,7 +166,8 @@ def best(values: Sequence[float], column: Column, n_used: Sequence[int] | None =
     if column.better is None or len(set(known)) < 2:
         return [False] * len(values)
     winner = max(known) if column.better == "high" else min(known)
-    return [word != UNDEFINED and float(word) == winner for word in written]
+    is_winner = [word != UNDEFINED and float(word) == winner for word in written]
+    return [is_best and n == max(counts) for is_best, n in zip(is_winner, counts, strict=True)]
 
 
 def used_pairs(cases: pd.DataFrame, variants: Sequence[str], key: str) -> list[tuple[int, int]]:

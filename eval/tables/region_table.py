@@ -61,7 +61,7 @@ def region_tables(
     rows: list[dict[str, Any]] = []
     sizes: list[dict[str, Any]] = []
     curves: dict[str, list[pd.DataFrame]] = {"roc": [], "froc": []}
-    ranked: dict[tuple[str, str], RankedPairs] = {}
+    ranked: dict[tuple[str, str, bool], RankedPairs] = {}
     items_by_variant = {name: by_variant(items[name]) for name in ("regions", "changes", "keyframes")}
     conditions = by_condition(results, targets)
     of_conditions = [(each, *part) for each, is_its in conditions for part in by_domain(results[is_its])]
@@ -73,12 +73,13 @@ def region_tables(
                 for name, part in items_by_variant.items()
             )
             each = ranked_pairs(own, regions, changes)
+            proposed = ranked_pairs(own, regions, changes, is_proposal=True)
             if condition == conditions[0][0]:
-                ranked[domain, str(variant)] = each
+                ranked |= {(domain, str(variant), False): each, (domain, str(variant), True): proposed}
             labelled = keyframes[keyframes["label"] >= 0]
             scores, positive = labelled["score"].to_numpy(dtype=np.float64), labelled["label"].to_numpy() == 1
             rows.append({**names, **_counts(own), "region_auroc_pooled": auroc(scores, positive), **_operating(each)})
-            rows[-1] |= _proposed(ranked_pairs(own, regions, changes, is_proposal=True))
+            rows[-1] |= _proposed(proposed)
             sizes += [{**names, **row} for row in recall_by_size(each, changes)]
             roc, froc = roc_curve(scores, positive), free_response(each)
             curves["roc"].append(_curve(names, roc, ("false_positive_rate", "true_positive_rate")))

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from eval.core.statistics import mean_with_interval, median
-from eval.plans.targets import RATE_COLUMN, Target, Targets
+from eval.plans.targets import PROPOSED, RATE_COLUMN, Target, Targets
 from eval.tables.conditions import ANY, by_condition, odometry_of, of_condition
 from eval.tables.region_curves import RankedPairs, recall_difference
 from eval.tables.rows import numbers, records, texts
@@ -30,7 +30,7 @@ def judged_targets(
     subject: Literal["regions", "objects"],
     table: pd.DataFrame,
     results: pd.DataFrame,
-    ranked: Mapping[tuple[str, str], RankedPairs] | None = None,
+    ranked: Mapping[tuple[str, str, bool], RankedPairs] | None = None,
     *,
     is_whole: bool = True,
 ) -> pd.DataFrame:
@@ -41,7 +41,8 @@ def judged_targets(
         subject: Of which part of it.
         table: regions_table or objects_table.
         results: Rows as in results.csv; judged are those of the odometry and the sensor that the plan's figures are of.
-        ranked: Candidates and changes of each domain and variant, for targets against a rival.
+        ranked: Candidates and changes of each domain and variant, for targets against a rival; as reported (False), and
+            as proposed (True).
         is_whole: Whether all that was planned is in the tables; otherwise nothing is said to be met or not.
 
     Returns:
@@ -85,12 +86,15 @@ def _of_table(target: Target, variant: str, table: pd.DataFrame) -> dict[str, An
     }  # fmt: skip
 
 
-def _against(target: Target, variant: str, ranked: Mapping[tuple[str, str], RankedPairs]) -> dict[str, Any] | None:
+def _against(
+    target: Target, variant: str, ranked: Mapping[tuple[str, str, bool], RankedPairs]
+) -> dict[str, Any] | None:
     """Return the recall of a variant at a rate of false regions less that of a rival, with its paired interval."""
-    ours, theirs = (ranked.get((str(target.domain), name)) for name in (variant, target.less))
+    is_proposal = target.column.endswith(PROPOSED)
+    ours, theirs = (ranked.get((str(target.domain), name, is_proposal)) for name in (variant, target.less))
     if ours is None or theirs is None:
         return None
-    rate = float(target.column.removeprefix(RATE_COLUMN))
+    rate = float(target.column.removeprefix(RATE_COLUMN).removesuffix(PROPOSED))
     difference, low, high = recall_difference(theirs, ours, rate)
     return {"domain": target.domain, "value": difference, "low": low, "high": high, "n": len(ours.pairs)}
 

@@ -148,6 +148,14 @@ def test_a_refusal_counts_as_no_answer_but_where_it_can_be_right() -> None:
     assert figures["is_within_target"][2] == 1.0
 
 
+def test_refusing_the_unchanged_pairs_on_which_it_would_cry_wolf_counts_as_crying() -> None:
+    unchanged = {"is_unchanged_pair": True, "scenario": "null/narrow", "pair_kind": "clean"}
+    rows = [row(1, **unchanged, is_alarm=False), row(2, **unchanged, is_alarm=NAN, status="merge_refused")]
+    rows += [row(3, is_unchanged_pair=False, is_alarm=NAN, status="merge_refused")]
+    rows += [row(4, **{**unchanged, "pair_kind": "smooth"}, is_alarm=NAN, status="merge_refused")]  # rightly so
+    assert figures_of(pd.DataFrame(rows))["is_alarm"].tolist() == pytest.approx([0, 1, NAN, NAN], nan_ok=True)
+
+
 def test_truth_values_read_back_as_texts_are_numbers() -> None:
     figures = figures_of(pd.DataFrame([row(1, is_alarm="True"), row(2, is_alarm="False"), row(3, is_alarm=NAN)]))
     np.testing.assert_array_equal(figures["is_alarm"], [1.0, 0.0, NAN])

@@ -22,6 +22,7 @@ TARGETS = Targets(
         Target(column="region_auroc", name="AUROC", domain="in", at_least=0.9),
         Target(column="region_recall_at_k", name="recall", domain="out", at_least=0.5),
         Target(column="recall_at_0.1", name="less c2c", less="c2c", domain="in", at_least=0),
+        Target(column="recall_at_0.1_proposed", name="proposals less c2c", less="c2c", domain="in", at_least=0),
         Target(column="silent_share", name="silent", at_least=0.95, least_km=5),
         Target(column="false_regions_per_100m_unchanged", name="false", at_most=0.1, least_km=5),
         Target(column="bytes_ratio", name="bytes", site="site1", at_least=10),
@@ -177,6 +178,27 @@ def test_a_rival_that_finds_more_makes_the_target_missed() -> None:
     ]
     target = the_target(tables(swapped, regions=regions)["regions_targets"], str(target["target"]), "in")
     assert (target["value"], target["is_met"]) == (-1.0, False)
+
+
+def test_proposals_are_held_against_a_rival_before_any_is_withdrawn() -> None:
+    ours = [changed("narrow", seed) for seed in range(4)]
+    theirs = [{**row, "variant": "c2c"} for row in ours]
+    ranks = [
+        ("tunnelcd", 3.0, "", True),
+        ("tunnelcd", 2.0, "", True),
+        ("tunnelcd", 1.0, "1", False),
+        ("c2c", 1.0, "1", False),
+    ]
+    regions = [
+        {"scenario": "narrow", "seed": s, "variant": name, "score": score, "found_changes": found, "is_withdrawn": gone}
+        for s in range(4)
+        for name, score, found, gone in ranks
+    ]
+    found = tables([*ours, *theirs], regions=regions)["regions_targets"]
+    # two false candidates rank first, and were withdrawn
+    assert the_target(found, "less c2c", "in")["value"] == 0.0
+    target = the_target(found, "proposals less c2c", "in")
+    assert (target["value"], target["is_met"], target["n"]) == (-1.0, False, 4)
 
 
 def test_silence_is_judged_over_five_kilometres_and_more() -> None:
