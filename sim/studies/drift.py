@@ -20,6 +20,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, invert, make_pose, travelled_m
 from cdpipe.io.session import read_session
 from scenarios.library import load_scenario
@@ -212,8 +213,11 @@ def _tilt_deg(poses: Float64Array, heading_rad: Float64Array | float) -> Poses:
 
 
 def _read_csv(path: Path) -> Float64Array:
-    rows = np.loadtxt(path, delimiter=",", ndmin=2)
-    return make_pose(Rotation.from_quat(rows[:, 3:7]).as_matrix(), rows[:, :3])
+    try:
+        rows = np.loadtxt(path, delimiter=",", ndmin=2)
+        return make_pose(Rotation.from_quat(rows[:, 3:7]).as_matrix(), rows[:, :3])
+    except (OSError, ValueError, IndexError) as error:
+        raise InputError(f"{path}: {error}: expected lines of x, y, z and a quaternion, separated by commas") from error
 
 
 def _report(name: str, sessions: Sequence[Poses]) -> str:
@@ -245,4 +249,8 @@ def main(words: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    try:
+        main(sys.argv[1:])
+    except InputError as mistake:
+        sys.stderr.write(f"error: {mistake}{os.linesep}")
+        sys.exit(2)

@@ -20,11 +20,12 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from cdpipe.core.geometry import invert
+from cdpipe.core.geometry import invert, make_pose, yaw_pose
 from cdpipe.core.plugins import SEARCH_PATH
 from cdpipe.core.yamlfile import apply_settings, read_yaml, setting_lines
 from cdpipe.descriptors.describe import load_descriptors, save_descriptors
 from cdpipe.io.answer import read_answer
+from cdpipe.io.known_merge import read_known_merge
 from cdpipe.io.ply import read_ply_points
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
@@ -422,6 +423,18 @@ def _read_studies(folder: Path) -> None:
     read_table(folder / "rows.csv", "main")
 
 
+def _merges(folder: Path) -> None:
+    known = make_pose(yaw_pose(0.3)[:3, :3], (1.0, -2.0, 0.5))
+    np.savetxt(folder / "known.txt", known)
+    (folder / "known.json").write_text(json.dumps(known.tolist()))
+    (folder / "answer.json").write_text(json.dumps({"format": "tunnelcd-answer", "before_T_after": known.tolist()}))
+
+
+def _read_merges(folder: Path) -> None:
+    for path in sorted(folder.iterdir()):
+        read_known_merge(path)
+
+
 def _osf(folder: Path) -> None:
     from tests.cdpipe import recordings  # noqa: PLC0415 - only where the vendor's SDK is installed
 
@@ -489,7 +502,8 @@ READERS: tuple[Reader, ...] = (
     Reader("sensor metadata", _metadata, _read_metadata, ("*.json",), 1.5),
     Reader("truth of a pair", _truth, _read_truth, _TRUTH, 0.7, lines=True),
     Reader("answer", _answer, read_answer, ("answer.json", "answer.npz"), 4.0, lines=True),
-    Reader("answer, scored", _scored, _read_scored, ("answer/*",), 0.7, lines=True),
+    Reader("answer, scored", _scored, _read_scored, ("answer/*",), 1.5, lines=True),
+    Reader("known merge", _merges, _read_merges, ("*",), 0.7, lines=True),
     Reader("preset", _copy(*_PRESETS), _read_presets, ("*.yaml",), 2.0, lines=True),
     Reader("plan", _copy(*_PLANS), _read_plans, ("*.yaml",), 0.3, lines=True),
     Reader("scenario", _copy(*_FAMILIES), _read_families, ("*.yaml",), 0.4, lines=True),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, make_pose
 from cdpipe.core.motion import make_motion
 from scenarios.schema import GAITS, Odometry
@@ -149,3 +150,10 @@ def test_the_gait_of_a_hand_and_the_drift_of_its_family_are_those_of_real_walks(
     gaits = [measure_gait(walk) for walk in walks]
     for key, value in GAITS["handheld"].items():
         assert min(gait[key] for gait in gaits) * 0.85 < value < max(gait[key] for gait in gaits) * 1.15, key
+
+
+@pytest.mark.parametrize("text", ["1,2\n", "x,y\n", "1,2,3,0,0,0,0\n"])
+def test_rollouts_that_are_none_are_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "none.csv").write_text(text)
+    with pytest.raises(InputError, match=r"none\.csv: .*: expected lines of x, y, z and a quaternion"):
+        main(["walk", str(tmp_path)])
