@@ -61,7 +61,7 @@ def means_by_method(results: pd.DataFrame, columns: Sequence[Column]) -> pd.Data
     """Return the mean of each column over the pairs of each method, of times the median.
 
     Args:
-        results: Rows of results.csv with their `domain`.
+        results: Rows of results.csv, or their figures (`figures_of`), with their `domain`.
         columns: The columns.
 
     Returns:
@@ -72,9 +72,18 @@ def means_by_method(results: pd.DataFrame, columns: Sequence[Column]) -> pd.Data
         for variant, own in cases.groupby("variant", sort=False):
             row: dict[str, Any] = {"domain": domain, "variant": str(variant), "n_pairs": len(own)}
             for column in columns:
-                row |= _mean(numbers(own, column.key), column.key)
+                row |= _mean(_stated(own, column.key), column.key)
             rows.append(row)
     return pd.DataFrame(rows)
+
+
+def _stated(own: pd.DataFrame, key: str) -> Float64Array:
+    """Return a column; of a cost nothing if an answer leaves it out: else a method would state it where it is small."""
+    values = numbers(own, key)
+    is_cost = key.startswith(("t_total", "bytes_"))  # seconds per region are undefined where no region is proposed
+    is_answered = own["status"] == "ok" if "status" in own else own["is_answered"] == 1
+    is_left_out = np.isnan(values) & is_answered.to_numpy(dtype=bool)
+    return np.full(len(values), np.nan) if is_cost and is_left_out.any() else values
 
 
 def is_unmade(row: Row) -> bool:

@@ -12,9 +12,11 @@ from cdpipe.core.errors import InputError
 from eval.report.compared_columns import COMPARED, figures_of
 from eval.report.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare, paired_differences, verdict
 from eval.report.page import write_page
+from eval.report.summary import means_by_method
 from eval.running.run_data import read_run
 from eval.running.sides import cautions, is_one_machine, only_in, read_side, short_names, why_no_times
 from eval.scoring.scoring import METRICS_VERSION
+from eval.tables.columns import select
 from eval.tables.region_curves import ranked_pairs, recall_at
 
 NAN = float("nan")
@@ -154,6 +156,15 @@ def test_refusing_the_unchanged_pairs_on_which_it_would_cry_wolf_counts_as_cryin
     rows += [row(3, is_unchanged_pair=False, is_alarm=NAN, status="merge_refused")]
     rows += [row(4, **{**unchanged, "pair_kind": "smooth"}, is_alarm=NAN, status="merge_refused")]  # rightly so
     assert figures_of(pd.DataFrame(rows))["is_alarm"].tolist() == pytest.approx([0, 1, NAN, NAN], nan_ok=True)
+
+
+def test_a_cost_that_is_stated_where_it_is_small_has_no_mean() -> None:
+    rows = [row(seed, t_total_s=1.0, bytes_regions_before=1000.0) for seed in (1, 2)]
+    partly = [row(1, t_total_s=1.0, bytes_regions_before=NAN), row(2, t_total_s=NAN, bytes_regions_before=1000.0)]
+    refused = row(3, t_total_s=NAN, bytes_regions_before=NAN, status="merge_refused")
+    for own, cost in (([*rows, refused], (1.0, 1000.0)), ([*partly, refused], (NAN, NAN))):
+        found = means_by_method(figures_of(pd.DataFrame(own)), select(COMPARED, "t_total_s", "bytes_regions_before"))
+        assert found[["t_total_s", "bytes_regions_before"]].to_numpy()[0].tolist() == pytest.approx(cost, nan_ok=True)
 
 
 def test_truth_values_read_back_as_texts_are_numbers() -> None:
