@@ -211,7 +211,7 @@ def test_the_cluster_that_is_tried_listens_on_this_machine_alone(monkeypatch: py
     distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
     found: list[str] = []
 
-    class Watched(distributed.Client):  # type: ignore[misc,name-defined]
+    class Watched(distributed.Client):
         def submit(self, *args: Any, **settings: Any) -> Any:
             own = {str(each.readlink()) for each in Path("/proc/self/fd").iterdir() if each.is_symlink()}
             for table in ("tcp", "tcp6"):
