@@ -279,7 +279,7 @@ def test_the_phase_of_an_answers_thinning_changes_no_score(seed: int, phase: flo
     unnamed = tuple(replace(item, returns=np.zeros((0, 2), np.int32)) for item in report.objects)
     bare = replace(report, objects=unnamed)
     answers = [Answer("ok", "", "", bare, {}, {}, points_odom=tuple(points)) for points in (whole, thinned)]
-    names = ("object_iou_point", "object_f1_50")
+    names = [name for name in SHARES if name.startswith(("object", "kind"))]
     scores = [numbers(score_answer(answer, truth).row, names) for answer in answers]
     assert scores[0] == pytest.approx(scores[1], nan_ok=True, abs=0.1)
 
