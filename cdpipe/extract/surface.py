@@ -48,8 +48,10 @@ _APART_M = 0.3
 _FULL_RETURNS, _DENSE_M = 3, 0.2
 # Least number of scans with a grazing ray through a cell.
 _MIN_SCANS_PAST = 3
-# Least size of a low object: 0.25 m^2 in cells of 0.05 m.
+# Least size of a low object: 0.25 m^2 in cells of 0.05 m. As so many cells must agree, one of them may be nearer to the
+# surface than a seed of other objects: as far as a candidate, or this many times the noise.
 _MIN_LOW_CELLS = 100
+_LOW_FACTOR = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,12 +228,12 @@ def unassigned_cells(site: Site, taken: list[Int64Array], noise_m: float, config
     is_left = site.distance_m > border_threshold_m(noise_m, config)
     is_left[np.concatenate([*taken, np.zeros(0, dtype=np.int64)])] = False
     left = np.flatnonzero(is_left)
-    is_enough = np.count_nonzero(site.distance_m[left] > seed_threshold_m(noise_m, config)) >= _MIN_LOW_CELLS
+    is_enough = np.count_nonzero(site.distance_m[left] > low_threshold_m(noise_m)) >= _MIN_LOW_CELLS
     return left if is_enough else left[:0]
 
 
 def add_low_objects(
-    site: Site, left: Int64Array, n_past: Int64Array, taken: list[Int64Array], noise_m: float, config: ExtractConfig
+    site: Site, left: Int64Array, n_past: Int64Array, taken: list[Int64Array], noise_m: float
 ) -> list[Int64Array]:
     """Return the cells of each object of a site: those found so far, and what grazing rays reveal besides.
 
@@ -245,9 +247,8 @@ def add_low_objects(
         n_past: (L,) scans of the other session with a grazing ray through each cell.
         taken: Cells of the objects found so far.
         noise_m: Median distance of the two surfaces in the region, metres.
-        config: Thresholds.
     """
-    clear_m = seed_threshold_m(noise_m, config)
+    clear_m = low_threshold_m(noise_m)
     is_passed = n_past >= _MIN_SCANS_PAST
     core, foot = left[is_passed], left[~is_passed]
     labels, sizes = label_groups(site.points[core], _LINK_M)
@@ -276,6 +277,11 @@ def border_threshold_m(noise_m: float, config: ExtractConfig) -> float:
 def seed_threshold_m(noise_m: float, config: ExtractConfig) -> float:
     """Return the distance from the surface above which a cell is clear of it, metres."""
     return max(config.seed_m, _SEED_FACTOR * border_threshold_m(noise_m, config))
+
+
+def low_threshold_m(noise_m: float) -> float:
+    """Return the distance from the surface above which a cell of a low object is clear of it, metres."""
+    return max(_COARSE_M, _LOW_FACTOR * noise_m)
 
 
 def _split_objects(site: Site, core: Int64Array, foot: Int64Array, clear_m: float, min_cells: int) -> list[Int64Array]:

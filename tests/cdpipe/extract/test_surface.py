@@ -276,15 +276,27 @@ def test_a_low_object_is_what_scans_passed_and_most_of_it_clear() -> None:
     assert sorted(left.tolist()) == np.flatnonzero(site.points[:, 2] > 0.04).tolist()
     height_m = site.points[left, 2]
     # passed above 0.12 m all is clear, and the rest is its foot
-    (found,) = add_low_objects(site, left, np.where(height_m > 0.12, 3, 2), [], 0.0, CONFIG)
+    (found,) = add_low_objects(site, left, np.where(height_m > 0.12, 3, 2), [], 0.0)
     assert sorted(found.tolist()) == sorted(left.tolist())
-    assert add_low_objects(site, left, np.full(len(left), 2), [], 0.0, CONFIG) == []
-    # a third of what was passed is clear: so it is with a surface that is a little off
-    assert add_low_objects(site, left, np.full(len(left), 3), [], 0.0, CONFIG) == []
-    # half is enough
-    assert len(add_low_objects(site, left, np.where(height_m > 0.07, 3, 0), [], 0.0, CONFIG)) == 1
+    assert add_low_objects(site, left, np.full(len(left), 2), [], 0.0) == []
+    # two thirds of what was passed are clear, or half with a noise of 1.5 cm, which asks for 12 cm
+    assert len(add_low_objects(site, left, np.full(len(left), 3), [], 0.0)) == 1
+    noisy = unassigned_cells(site, [], 0.015, CONFIG)
+    assert sorted(noisy.tolist()) == np.flatnonzero(site.points[:, 2] > 0.09).tolist()
+    assert len(add_low_objects(site, noisy, np.full(len(noisy), 3), [], 0.015)) == 1
+    # a third is clear: so it is with a surface that is a little off
+    assert add_low_objects(site, left, np.full(len(left), 3), [], 0.015) == []
     # noise raises what counts as clear
     assert len(unassigned_cells(site, [], 0.02, CONFIG)) == 0
+
+
+@pytest.mark.parametrize(("height_m", "n_objects"), [(0.1, 1), (0.05, 0)])
+def test_a_low_object_need_not_reach_the_seed_of_others(height_m: float, n_objects: int) -> None:
+    site = on_floor(lattice((0, 0, height_m), (1.15, 0.95, height_m), 0.05))
+    left = unassigned_cells(site, [], 0.0, CONFIG)
+    assert len(left) == (480 if n_objects else 0)
+    if n_objects:
+        assert len(add_low_objects(site, left, np.full(len(left), 3), [], 0.0)) == n_objects
 
 
 def test_what_touches_an_object_is_a_part_of_it_and_no_low_one() -> None:
@@ -295,7 +307,7 @@ def test_what_touches_an_object_is_a_part_of_it_and_no_low_one() -> None:
         left = unassigned_cells(site, taken, 0.0, CONFIG)
         assert not set(left.tolist()) & set(taken[0].tolist())
         n_past = np.where(site.points[left, 2] > 0.12, 3, 0)
-        found = add_low_objects(site, left, n_past, taken, 0.0, CONFIG)
+        found = add_low_objects(site, left, n_past, taken, 0.0)
         assert len(found) == 1 + n_new
         passed = set(left[n_past == 3].tolist())
         assert passed <= set(found[-1].tolist())
