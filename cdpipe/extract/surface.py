@@ -48,10 +48,11 @@ _APART_M = 0.3
 _FULL_RETURNS, _DENSE_M = 3, 0.2
 # Least number of scans with a grazing ray through a cell.
 _MIN_SCANS_PAST = 3
-# Least size of a low object: 0.25 m^2 in cells of 0.05 m. As so many cells must agree, one of them may be nearer to the
-# surface than a seed of other objects: as far as a candidate, or this many times the noise.
+# Least size of a low object: 0.25 m^2 in cells of 0.05 m. As so many cells must agree, those on a floor may be nearer
+# to it than seeds of other objects: as far as candidates, or this many times the noise.
 _MIN_LOW_CELLS = 100
 _LOW_FACTOR = 8.0
+_LEVEL = np.cos(np.deg2rad(30.0))  # of the normals of a floor; muck lies at 34 degrees and more
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,25 +63,28 @@ class Site:
         points: (N, 3) mean of the returns of each occupied cell, map frame, metres.
         cell_of_return: (M,) cell of each return.
         distance_m: (N,) distance of each cell to the other session's surface, metres; inf without a surface.
+        is_on_floor: (N,) whether the surface nearest to it is a floor below it.
     """
 
     points: Float64Array
     cell_of_return: Int64Array
     distance_m: Float64Array
+    is_on_floor: BoolArray
 
 
-def distances_m(points: Float64Array, surface: Surface, plane_m: float) -> Float64Array:
-    """Return the (N,) distances of (N, 3) points to a surface, metres.
+def distances_m(points: Float64Array, surface: Surface, plane_m: float) -> tuple[Float64Array, BoolArray]:
+    """Return the (N,) distances of (N, 3) points to a surface, metres, and whether they are above a floor.
 
     It is the point-to-plane distance if the nearest surface point is within `plane_m` or the point is near-coplanar;
     otherwise it is the distance to the nearest surface point.
     """
     chosen, nearest_m = find_nearest(points, surface)
-    offsets = points - surface.points.take(chosen, axis=0)
-    along = np.einsum("ij,ij->i", offsets, surface.normals.take(chosen, axis=0))
+    offsets, normals = points - surface.points.take(chosen, axis=0), surface.normals.take(chosen, axis=0)
+    along = np.einsum("ij,ij->i", offsets, normals)
     off_plane_m = np.abs(along)
     is_on_plane = (nearest_m < plane_m) | (off_plane_m < _GRAZING * nearest_m)
-    return np.asarray(np.where(is_on_plane, off_plane_m, nearest_m))
+    is_on_floor = (np.abs(normals[:, 2]) > _LEVEL) & (along * normals[:, 2] > 0)
+    return np.asarray(np.where(is_on_plane, off_plane_m, nearest_m)), is_on_floor
 
 
 def find_nearest(points: Float64Array, surface: Surface) -> tuple[Int64Array, Float64Array]:
@@ -126,7 +130,7 @@ def find_candidates(points: Float64Array, table: PlaneTable) -> tuple[Int64Array
     """
     distance_m = table.distances_m(points)
     doubtful = np.flatnonzero(distance_m > _COARSE_M)
-    distance_m[doubtful] = distances_m(points.take(doubtful, axis=0), table.surface, _COARSE_PLANE_M)
+    distance_m[doubtful], _ = distances_m(points.take(doubtful, axis=0), table.surface, _COARSE_PLANE_M)
     standing = np.flatnonzero(distance_m > _COARSE_M)
     return standing[_are_three_together(points[standing])], float(np.median(distance_m))
 
@@ -150,12 +154,13 @@ def _are_three_together(points: Float64Array) -> BoolArray:
 def compare_site(points: Float64Array, reference: Float64Array) -> Site:
     """Compare the (M, 3) returns around a site with the (R, 3) returns of the other session, map frame, metres."""
     means, cell_of_return = cell_means(points, CELL_M)
+    unknown = np.zeros(len(means), dtype=np.bool_)
     if len(reference) == 0:
-        return Site(means, cell_of_return, np.full(len(means), np.inf))
+        return Site(means, cell_of_return, np.full(len(means), np.inf), unknown)
     surface_points, _ = cell_means(reference, SURFACE_CELL_M)
     if len(surface_points) < _MIN_SURFACE:
-        return Site(means, cell_of_return, np.asarray(cKDTree(surface_points).query(means)[0]))
-    return Site(means, cell_of_return, distances_m(means, Surface(surface_points), _PLANE_M))
+        return Site(means, cell_of_return, np.asarray(cKDTree(surface_points).query(means)[0]), unknown)
+    return Site(means, cell_of_return, *distances_m(means, Surface(surface_points), _PLANE_M))
 
 
 def measure_noise_m(site: Site, region_noise_m: float) -> float:
@@ -186,10 +191,10 @@ def grow_objects(site: Site, free_space_votes: Int64Array, noise_m: float, confi
     labels, sizes = label_groups(site.points[core], _LINK_M)
     n_views = np.bincount(labels, free_space_votes[core], len(sizes))
     is_seen = n_views >= config.min_views * sizes
-    clear_m = seed_threshold_m(noise_m, config)
-    n_clear = np.bincount(labels[site.distance_m[core] > clear_m], minlength=len(sizes))
+    is_clear = site.distance_m > seed_threshold_m(noise_m, config)
+    n_clear = np.bincount(labels[is_clear[core]], minlength=len(sizes))
     is_object = is_seen & (n_clear >= config.min_cells)
-    return _split_objects(site, core[is_object[labels]], foot, clear_m, config.min_cells)
+    return _split_objects(site, core[is_object[labels]], foot, is_clear, config.min_cells)
 
 
 def split_group(points: Float64Array, n_returns: Int64Array, is_clear: BoolArray, min_cells: int) -> Int64Array:
@@ -228,12 +233,12 @@ def unassigned_cells(site: Site, taken: list[Int64Array], noise_m: float, config
     is_left = site.distance_m > border_threshold_m(noise_m, config)
     is_left[np.concatenate([*taken, np.zeros(0, dtype=np.int64)])] = False
     left = np.flatnonzero(is_left)
-    is_enough = np.count_nonzero(site.distance_m[left] > low_threshold_m(noise_m)) >= _MIN_LOW_CELLS
+    is_enough = np.count_nonzero(_is_clear_if_low(site, noise_m, config)[left]) >= _MIN_LOW_CELLS
     return left if is_enough else left[:0]
 
 
 def add_low_objects(
-    site: Site, left: Int64Array, n_past: Int64Array, taken: list[Int64Array], noise_m: float
+    site: Site, left: Int64Array, n_past: Int64Array, taken: list[Int64Array], noise_m: float, config: ExtractConfig
 ) -> list[Int64Array]:
     """Return the cells of each object of a site: those found so far, and what grazing rays reveal besides.
 
@@ -247,12 +252,13 @@ def add_low_objects(
         n_past: (L,) scans of the other session with a grazing ray through each cell.
         taken: Cells of the objects found so far.
         noise_m: Median distance of the two surfaces in the region, metres.
+        config: Thresholds.
     """
-    clear_m = low_threshold_m(noise_m)
+    is_clear = _is_clear_if_low(site, noise_m, config)
     is_passed = n_past >= _MIN_SCANS_PAST
     core, foot = left[is_passed], left[~is_passed]
     labels, sizes = label_groups(site.points[core], _LINK_M)
-    n_clear = np.bincount(labels[site.distance_m[core] > clear_m], minlength=len(sizes))
+    n_clear = np.bincount(labels[is_clear[core]], minlength=len(sizes))
     is_whole = (n_clear >= _MIN_LOW_CELLS) & (2 * n_clear >= sizes)
     objects = list(taken)
     if taken:
@@ -266,7 +272,7 @@ def add_low_objects(
                 touched = of_cell[nearest[closest]]
                 objects[touched] = np.concatenate([objects[touched], core[members]])
                 is_whole[label] = False
-    return objects + _split_objects(site, core[is_whole[labels]], foot, clear_m, _MIN_LOW_CELLS)
+    return objects + _split_objects(site, core[is_whole[labels]], foot, is_clear, _MIN_LOW_CELLS)
 
 
 def border_threshold_m(noise_m: float, config: ExtractConfig) -> float:
@@ -279,12 +285,18 @@ def seed_threshold_m(noise_m: float, config: ExtractConfig) -> float:
     return max(config.seed_m, _SEED_FACTOR * border_threshold_m(noise_m, config))
 
 
-def low_threshold_m(noise_m: float) -> float:
-    """Return the distance from the surface above which a cell of a low object is clear of it, metres."""
-    return max(_COARSE_M, _LOW_FACTOR * noise_m)
+def _is_clear_if_low(site: Site, noise_m: float, config: ExtractConfig) -> BoolArray:
+    """Mark the (N,) cells that are clear of the surface, if they are of a low object.
+
+    Thin things lie on the floor; a wall that stands off by so little is one that odometry bent.
+    """
+    low_m, seed_m = max(_COARSE_M, _LOW_FACTOR * noise_m), seed_threshold_m(noise_m, config)
+    return np.asarray(site.distance_m > np.where(site.is_on_floor, low_m, seed_m))
 
 
-def _split_objects(site: Site, core: Int64Array, foot: Int64Array, clear_m: float, min_cells: int) -> list[Int64Array]:
+def _split_objects(
+    site: Site, core: Int64Array, foot: Int64Array, is_clear: BoolArray, min_cells: int
+) -> list[Int64Array]:
     """Return the cells of each object: its core, its foot, and what is nearest to it of the other foot cells.
 
     Core cells that foot cells join are of one object: what hides a place from the other session cuts no object in two.
@@ -293,7 +305,7 @@ def _split_objects(site: Site, core: Int64Array, foot: Int64Array, clear_m: floa
         site: The cells.
         core: (C,) cells of objects that were seen through.
         foot: (F,) other cells that stand off the surface; those near a core are a part of its object.
-        clear_m: Distance from the other session's surface above which a cell is clear of it.
+        is_clear: (N,) whether each cell of the site is clear of the other session's surface.
         min_cells: Fewest clear cells of an object.
     """
     if len(core) == 0:
@@ -306,7 +318,7 @@ def _split_objects(site: Site, core: Int64Array, foot: Int64Array, clear_m: floa
     objects = []
     for label in np.flatnonzero(has_core).tolist():
         own = cells[labels == label]
-        part = split_group(site.points[own], n_returns[own], site.distance_m[own] > clear_m, min_cells)
+        part = split_group(site.points[own], n_returns[own], is_clear[own], min_cells)
         objects += [own[part == each] for each in range(part.max() + 1)]
     rest, of_object = cells[~has_core[labels]], np.repeat(np.arange(len(objects)), [len(each) for each in objects])
     nearest = of_object[cKDTree(site.points[np.concatenate(objects)]).query(site.points[rest])[1]]

@@ -242,7 +242,7 @@ def find_object_cells(
     left = unassigned_cells(site, objects, noise_m, config)
     if len(left) == 0:
         return objects
-    return add_low_objects(site, left, grazing_ray_count(site.points[left], *rays()), objects, noise_m)
+    return add_low_objects(site, left, grazing_ray_count(site.points[left], *rays()), objects, noise_m, config)
 
 
 def _free_space_votes(
