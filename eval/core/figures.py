@@ -33,7 +33,7 @@ from eval.core.charts import (
 
 DPI = 130
 _SLIM_SCALE, _WEBP_QUALITY = 0.75, 30
-_WIDTH_IN, _PX_PER_IN, _LEGEND_CHARACTERS = 9.0, 88.0, 145
+_WIDTH_IN, _PX_PER_IN, _LEGEND_CHARACTERS, _LEGEND_LINE_IN = 9.0, 88.0, 145, 0.17
 _DASHES: dict[Dash, Any] = {"solid": "solid", "dash": (0, (5, 2)), "dot": (0, (1, 1.5)), "dashdot": "dashdot"}
 _MARKERS = dict(zip(("", *SYMBOLS), ("", "o", "s", "D", "^", "v", "p", "*", "h", "X"), strict=True))
 
@@ -80,16 +80,17 @@ def picture_address(drawing: Drawing) -> str:
 def picture(drawing: Drawing) -> Figure:
     """Return a chart as a matplotlib figure, 9 inches wide."""
     n_rows = len(drawing.rows)
-    figure = blank_figure(_WIDTH_IN, 0.5 + n_rows * drawing.row_px / _PX_PER_IN)
+    handles = [_legend_entry(name, series) for name, series in drawing.legend.items()]
+    n_across = max(1, min(len(handles), 5, _LEGEND_CHARACTERS // (8 + max(map(len, drawing.legend), default=0))))
+    above_in = 0.5 + _LEGEND_LINE_IN * -(-len(handles) // n_across)
+    figure = blank_figure(_WIDTH_IN, above_in + n_rows * drawing.row_px / _PX_PER_IN)
     for row, panels in zip(figure.subplots(n_rows, drawing.n_columns, squeeze=False), drawing.rows, strict=True):
         for axes, panel in zip_longest(row, panels):
             if panel is None:
                 axes.set_axis_off()
             else:
                 _draw_panel(axes, panel)
-    handles = [_legend_entry(name, series) for name, series in drawing.legend.items()]
     if handles:
-        n_across = max(1, min(len(handles), 5, _LEGEND_CHARACTERS // (8 + max(map(len, drawing.legend)))))
         figure.legend(handles=handles, loc="outside upper center", ncols=n_across, fontsize=8, frameon=False)
     return figure
 

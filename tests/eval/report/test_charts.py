@@ -146,6 +146,21 @@ def test_a_logarithmic_axis_is_marked_at_one_and_three() -> None:
     assert log_span([]) == pytest.approx((1 / 1.5, 1.5))
 
 
+@pytest.mark.parametrize("n_names", [1, 12])
+def test_a_legend_of_long_names_takes_no_room_from_the_panels(n_names: int) -> None:
+    names = [
+        f"tunnelcd[extract.method=voxel,extract.voxel_m=0.{number:02d},cluster.min_points=32]"
+        for number in range(n_names)
+    ]
+    series = [Series([0.0, 1.0], [0.0, 1.0], look_of(name, names), name) for name in names]
+    figure = picture(Drawing([[Panel(SHARE, SHARE, series)]], 200))
+    figure.draw_without_rendering()
+    (axes,), (legend,) = figure.axes, figure.legends
+    panel = axes.get_window_extent()
+    assert panel.y1 <= legend.get_window_extent().y0
+    assert panel.height / figure.dpi > 0.7 * 200 / 88  # 200 px at 88 px an inch, less what axis and margins take
+
+
 def test_false_regions_without_end_stay_inside_the_picture() -> None:
     figure = accepted(free_response().drawing)
     line = next(trace for trace in figure.data if trace.xaxis == "x2" and trace.name)
