@@ -20,7 +20,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 import traceback
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -155,13 +154,18 @@ class _Process:
 
     def receive(self, wait_s: float) -> Message | None:
         """Return the next message, or None after the last one of the request."""
-        killer = threading.Timer(wait_s, self._process.kill)
+        is_late = threading.Event()
+
+        def kill() -> None:
+            is_late.set()
+            self._process.kill()
+
+        killer = threading.Timer(wait_s, kill)
         killer.start()
-        started_s = time.monotonic()
         try:
             return self._receive()
         except EOFError as error:
-            raise self._ended(has_time=time.monotonic() < started_s + wait_s) from error
+            raise self._ended(has_time=not is_late.is_set()) from error
         finally:
             killer.cancel()
 
