@@ -1,7 +1,8 @@
 """The training loop of all descriptors: seeded, resumable, with early stopping on the validation tunnels.
 
-A task provides the network, the losses of a step and the scores. Every random draw depends on (seed, step) alone, so a
-resumed run gives the same weights as an uninterrupted one.
+A task provides the network, the losses of a step and the scores. What is scored and kept is the exponential moving
+average of the weights, because the last steps alone fit the last batches. Every random draw depends on (seed, step)
+alone, so a resumed run gives the same weights as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from cdpipe.core.files import ArraySpec, parse_json, read_tensors, require_forma
 from cdpipe.descriptors.weights_file import list_tensors
 
 FORMAT = "tunnelcd-training"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 1 held no averaged weights
 _STATE = "state.safetensors"
 _REMEDY = "remove it to train from the start"
 _WARM_UP = 0.1
@@ -40,6 +41,7 @@ class FitConfig:
         learning_rate: Peak learning rate.
         validate_every: Steps between two validations.
         patience: Number of validations without a new best score after which training stops.
+        averaging: Share of the earlier average in that of a step; less in the first steps, (1 + step) / (10 + step).
     """
 
     seed: int = 0
@@ -47,6 +49,7 @@ class FitConfig:
     learning_rate: float = 2e-3
     validate_every: int = 250
     patience: int = 6
+    averaging: float = 0.999
 
 
 class Task(Protocol):
@@ -102,7 +105,7 @@ def fit(
     on_step: Callable[[int, Mapping[str, float]], None],
     on_validation: Callable[[Progress], None],
 ) -> list[Progress]:
-    """Train a task's network; afterwards it has the weights of the best validation.
+    """Train a task's network; afterwards it has the averaged weights of the best validation.
 
     Args:
         task: Network, losses, scores.
@@ -121,7 +124,7 @@ def fit(
     network = task.network
     optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=1e-3)
     identity = json.dumps({"run": identity, **asdict(config)}, sort_keys=True)
-    history, best = _restore(folder / _STATE, network, optimiser, identity)
+    history, average, best = _restore(folder / _STATE, network, optimiser, identity)
     for done in history:
         on_validation(done)
     sums: dict[str, float] = {}
@@ -137,6 +140,9 @@ def fit(
         torch.stack(list(losses.values())).sum().backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
+        keep = min(config.averaging, (1 + step) / (10 + step))
+        for name, weights in network.named_parameters():
+            average[name].lerp_(weights.detach(), 1.0 - keep)
         numbers = {name: loss.item() for name, loss in losses.items()}
         sums = {name: sums.get(name, 0.0) + value for name, value in numbers.items()}
         on_step(step + 1, numbers)
@@ -144,15 +150,18 @@ def fit(
             continue
         n_steps = step + 1 - (history[-1].step if history else 0)
         network.eval()
+        last = _copy(network.state_dict())
+        network.load_state_dict(average)
         scores = task.scores()
+        network.load_state_dict(last)
         first = next(iter(scores.values()))
         is_best = all(first > next(iter(done.scores.values())) for done in history)
         means = {name: value / n_steps for name, value in sums.items()}
         history.append(Progress(step + 1, means, scores, is_best, perf_counter() - began))
         sums = {}
         if is_best:
-            best = {name: tensor.clone() for name, tensor in network.state_dict().items()}
-        _save(folder / _STATE, network, optimiser, best, history, identity)
+            best = _copy(average)
+        _save(folder / _STATE, {"last": last, "average": average, "best": best}, optimiser, history, identity)
         on_validation(history[-1])
     network.load_state_dict(best)
     network.eval()
@@ -161,15 +170,13 @@ def fit(
 
 def _save(
     path: Path,
-    network: nn.Module,
+    weights: Mapping[str, Mapping[str, Tensor]],
     optimiser: torch.optim.Optimizer,
-    best: Mapping[str, Tensor],
     history: list[Progress],
     identity: str,
 ) -> None:
     """Write the state that the next step depends on, as safetensors, so that nothing is unpickled."""
-    tensors = {f"last.{name}": tensor for name, tensor in network.state_dict().items()}
-    tensors |= {f"best.{name}": tensor for name, tensor in best.items()}
+    tensors = {f"{part}.{name}": tensor for part, of_part in weights.items() for name, tensor in of_part.items()}
     for index, state in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{index}.{name}": tensor for name, tensor in state.items()}
     document = {"format": FORMAT, "format_version": FORMAT_VERSION, "identity": identity}
@@ -187,16 +194,16 @@ def _save(
 
 def _restore(
     path: Path, network: nn.Module, optimiser: torch.optim.Optimizer, identity: str
-) -> tuple[list[Progress], dict[str, Tensor]]:
-    """Load a state into network and optimiser; return the validations so far and the best weights."""
+) -> tuple[list[Progress], dict[str, Tensor], dict[str, Tensor]]:
+    """Load a state into network and optimiser; return the validations so far, the averaged and the best weights."""
     if not path.is_file():
-        return [], {name: tensor.clone() for name, tensor in network.state_dict().items()}
+        return [], _copy(network.state_dict()), _copy(network.state_dict())
     try:
         _, metadata = read_tensors(path, lambda types: None, (), remedy=_REMEDY)
         about = parse_json(metadata["about"])
         # the first states carry no number; they hold the same as those of format 1
         found = about.get("format", FORMAT), about.get("format_version", 1)
-        require_format(path, found, FORMAT, FORMAT_VERSION, _REMEDY)
+        require_format(path, found, FORMAT, FORMAT_VERSION, _REMEDY, oldest=FORMAT_VERSION)
         if about["identity"] != identity:
             raise InputError(f"{path}: of a run on other data or with other settings: name another --out")
         history = TypeAdapter(list[Progress]).validate_python(about["history"])
@@ -208,21 +215,25 @@ def _restore(
             index, _, name = key.partition(".")
             states.setdefault(int(index), {})[name] = tensor
         optimiser.load_state_dict({**optimiser.state_dict(), "state": states})
-        return history, _below("best.", tensors)
+        return history, _below("average.", tensors), _below("best.", tensors)
     except (AttributeError, KeyError, ValueError, TypeError, RuntimeError) as error:
         told = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: damaged ({told}): {_REMEDY}") from error
 
 
 def _list_state(network: nn.Module) -> dict[str, ArraySpec]:
-    """Return what the state of a training run holds: two sets of weights, and AdamW's moments of each parameter."""
+    """Return what the state of a training run holds: three sets of weights, and AdamW's moments of each parameter."""
     weights = {name: replace(spec, is_finite=False) for name, spec in list_tensors(network.state_dict()).items()}
-    state = {f"{part}.{name}": spec for part in ("last", "best") for name, spec in weights.items()}
+    state = {f"{part}.{name}": spec for part in ("last", "average", "best") for name, spec in weights.items()}
     for index, parameter in enumerate(network.parameters()):
         moments = {"step": torch.zeros(()), "exp_avg": parameter, "exp_avg_sq": parameter}
         parts = list_tensors({f"optimiser.{index}.{name}": tensor for name, tensor in moments.items()})
         state |= {name: replace(spec, is_optional=True, is_finite=False) for name, spec in parts.items()}
     return state
+
+
+def _copy(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: tensor.clone() for name, tensor in tensors.items()}
 
 
 def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -97,3 +97,15 @@ def test_the_rate_rises_and_falls() -> None:
     rates = [learning_rate(step, config) for step in range(100)]
     assert max(rates) == pytest.approx(1.0) and rates.index(max(rates)) == 10
     assert rates[0] < 0.1 and rates[-1] < 0.001
+
+
+def test_the_average_of_the_weights_is_scored_and_kept(tmp_path: Path) -> None:
+    task, weights = _Line(), []
+    config = FitConfig(steps=30, learning_rate=0.1, validate_every=30, averaging=0.7)
+    fit(task, config, tmp_path, "a", lambda *_: weights.append(task.network.weight.item()), _nothing)
+    average = 0.0
+    for step, weight in enumerate(weights):
+        keep = min(0.7, (1 + step) / (10 + step))
+        average = keep * average + (1 - keep) * weight
+    assert task.network.weight.item() == pytest.approx(average, rel=1e-5)
+    assert average != pytest.approx(weights[-1], rel=1e-3)
