@@ -11,6 +11,7 @@ A place that the other session did not observe is unknown and no change.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -46,6 +47,9 @@ _FOOT_M = 0.3
 # a surface near the sensor has ten; both are looked at within 0.2 m.
 _APART_M = 0.3
 _FULL_RETURNS, _DENSE_M = 3, 0.2
+# Where two parts meet, cells within `_SEAM_M` of the other part hold mixed returns: fewer to a cell than the parts do,
+# this share at most. A surface that the sensor sampled thinly has no such seam.
+_SEAM_M, _SEAM_SHARE = 0.1, 0.75
 # Least number of scans with a grazing ray through a cell.
 _MIN_SCANS_PAST = 3
 # Least size of a low object: 0.25 m^2 in cells of 0.05 m. As so many cells must agree, those on a floor may be nearer
@@ -203,7 +207,7 @@ def split_group(points: Float64Array, n_returns: Int64Array, is_clear: BoolArray
     A beam that meets two surfaces returns from between them. Such returns link an object with what stands behind it,
     but seldom fall into the same cell. A cell is solid if it and most cells around it hold three returns or more. If
     solid cells lie in places `_APART_M` from one another, each with enough clear cells, every cell belongs to the
-    nearest place.
+    nearest place. Places are of one part if the cells between them hold as many returns as the others.
 
     Args:
         points: (N, 3) cells, metres.
@@ -225,7 +229,23 @@ def split_group(points: Float64Array, n_returns: Int64Array, is_clear: BoolArray
     if len(parts) < 2:
         return np.zeros(len(points), dtype=np.int64)
     nearest = cKDTree(points[solid[in_part]]).query(points)[1]
-    return np.asarray(part_of_solid[nearest], dtype=np.int64)
+    part = np.asarray(part_of_solid[nearest], dtype=np.int64)
+    for one, other in combinations(range(len(parts)), 2):
+        if not _is_seam_thin(points, n_returns, part == one, part == other):
+            part[part == one] = other
+    return np.unique(part, return_inverse=True)[1].astype(np.int64)
+
+
+def _is_seam_thin(points: Float64Array, n_returns: Int64Array, is_one: BoolArray, is_other: BoolArray) -> bool:
+    """Return whether the cells where two parts meet hold fewer returns than those of the parts do."""
+    seam = [np.zeros(0, dtype=np.int64)]
+    for own, there in ((is_one, is_other), (is_other, is_one)):
+        gap_m = cKDTree(points[there]).query(points[own], distance_upper_bound=_SEAM_M)[0]
+        seam.append(n_returns[own][np.isfinite(gap_m)])
+    at_seam = np.concatenate(seam)
+    if len(at_seam) == 0:
+        return True
+    return bool(at_seam.mean() <= _SEAM_SHARE * min(n_returns[is_one].mean(), n_returns[is_other].mean()))
 
 
 def unassigned_cells(site: Site, taken: list[Int64Array], noise_m: float, config: ExtractConfig) -> Int64Array:

@@ -46,10 +46,9 @@ _MAX_SHIFT_M = 0.4
 _MIN_TELLING = 2
 # Height above the surface below which a range image cannot show free space.
 _LOW_M = 0.3
-# Ratio of seen-through to hit by its own session above which a surface is a double caused by drift.
-_DOUBLED = 3.0
-# Distance within which a keyframe reliably observes a place.
-_NEAR_M = REACH_M / 2
+# Ratio of seen-through to hit by its own session above which a surface is a double caused by drift, and above which it
+# is one if it was mostly seen from afar.
+_DOUBLED, _DOUBLED_AFAR = 3.0, 0.4
 _UNKNOWN_VIEWS = np.int64(1 << 20)
 
 
@@ -204,26 +203,21 @@ def _cut_sites(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) ->
 def _is_out_of_place(point_map: PointMap, returns: Int64Array) -> bool:
     """Return whether returns are misplaced by odometry drift, according to free space of their own session.
 
-    A wall that is seen twice, after drift or from far away, can be doubled in the map. Returns count as misplaced if
-
-    - keyframes of their own session saw through them over three times as often as they hit them, or
-    - most of them, weighted by path length, were seen from over 15 m although keyframes observed the place from near.
+    A wall that is seen twice, after drift or from far away, can be doubled in the map. Its own session then sees
+    through it too: over `_DOUBLED` times as often as keyframes hit it, or over `_DOUBLED_AFAR` times if most of the
+    returns, weighted by path length, were seen from over 15 m.
     """
     if point_map.views is None:
         return False
     points = point_map.positions_of(returns)
     places, _ = cell_means(points, CELL_M)
-    n_through, n_hit = count_through_and_hit(places, point_map.views)
-    if n_through.sum() > _DOUBLED * n_hit.sum():
-        return True
+    n_through, n_hit = (counts.sum() for counts in count_through_and_hit(places, point_map.views))
     scans = point_map.scans_of(returns)
-    ranges_m = np.linalg.norm(points - point_map.odom_T_sensor[scans, :3, 3], axis=1)
+    is_far = np.linalg.norm(points - point_map.odom_T_sensor[scans, :3, 3], axis=1) > REACH_M
     # weighted by path length, because the scans of a robot at rest are redundant
     way_m = np.diff(travelled_m(point_map.odom_T_sensor), prepend=0.0)[scans]
-    if way_m[ranges_m > REACH_M].sum() <= way_m[ranges_m <= REACH_M].sum():
-        return False
-    n_looked = sum(count_through_and_hit(places, point_map.views, within_m=_NEAR_M))
-    return bool(np.mean(n_looked > 0) > 0.5)
+    is_afar = way_m[is_far].sum() > way_m[~is_far].sum()
+    return bool(n_through > (_DOUBLED_AFAR if is_afar else _DOUBLED) * n_hit)
 
 
 def find_object_cells(

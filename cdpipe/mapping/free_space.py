@@ -51,12 +51,10 @@ def free_space_votes(points_odom: Float64Array, views: KeyframeViews) -> Int64Ar
     return n_through - n_hit
 
 
-def count_through_and_hit(
-    points_odom: Float64Array, views: KeyframeViews, within_m: float = REACH_M
-) -> tuple[Int64Array, Int64Array]:
+def count_through_and_hit(points_odom: Float64Array, views: KeyframeViews) -> tuple[Int64Array, Int64Array]:
     """Return the (N,) number of keyframes that saw through each place, and the (N,) number that hit it.
 
-    Arguments as of `free_space_votes`; keyframes farther than `within_m` from a place are ignored.
+    Arguments as of `free_space_votes`; keyframes farther than 15 m from a place are ignored.
     """
     n_through, n_hit = np.zeros((2, len(points_odom)), dtype=np.int64)
     if len(points_odom) == 0 or len(views.ranges_m) == 0:
@@ -65,9 +63,9 @@ def count_through_and_hit(
     spread_m = float(np.linalg.norm(points_odom - centre, axis=1).max())
     rotations, shifts = views.sensor_T_odom[:, :3, :3], views.sensor_T_odom[:, :3, 3]
     distances_m = np.linalg.norm(rotations @ centre + shifts, axis=1)
-    for keyframe in np.flatnonzero(distances_m <= within_m + spread_m):
+    for keyframe in np.flatnonzero(distances_m <= REACH_M + spread_m):
         pixel, ranges_m = _pixels(points_odom @ rotations[keyframe].T + shifts[keyframe])
-        in_view = np.flatnonzero((pixel >= 0) & (ranges_m >= _NEAREST_M) & (ranges_m <= within_m))
+        in_view = np.flatnonzero((pixel >= 0) & (ranges_m >= _NEAREST_M) & (ranges_m <= REACH_M))
         first_m, is_hit = _look_up(views.ranges_m[keyframe], pixel[in_view], ranges_m[in_view])
         n_through[in_view] += np.isfinite(first_m) & (first_m > ranges_m[in_view] + _MARGIN_M)
         n_hit[in_view] += is_hit

@@ -18,6 +18,7 @@ from cdpipe.extract.surface import (
     find_candidates,
     grow_objects,
     measure_noise_m,
+    split_group,
     unassigned_cells,
 )
 from cdpipe.merge.registration import Surface
@@ -264,6 +265,15 @@ def test_boxes_that_single_returns_join_are_two(gap_m: float, n_box: int, n_brid
     if n_objects == 2:
         assert site.points[found[0], 0].max() <= 0.8 + gap_m / 2 + 1e-9
         assert site.points[found[1], 0].min() >= 0.8 + gap_m / 2 - 1e-9
+
+
+@pytest.mark.parametrize(("n_between", "n_parts"), [(1, 2), (2, 1)])
+def test_a_surface_that_is_sampled_thinly_between_two_dense_patches_is_one(n_between: int, n_parts: int) -> None:
+    sheet = lattice((0, 0, 0), (2.0, 1.0, 0), 0.05)
+    n_returns = np.where((sheet[:, 0] < 0.32) | (sheet[:, 0] > 1.68), 3, 2)
+    n_returns[np.abs(sheet[:, 0] - 1.0) < 0.12] = n_between
+    part = split_group(sheet, n_returns, np.ones(len(sheet), dtype=np.bool_), 30)
+    assert part.max() + 1 == n_parts
 
 
 def test_noise_is_that_of_the_surfaces_at_the_site_and_that_of_the_region_at_most() -> None:

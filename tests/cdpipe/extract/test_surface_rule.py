@@ -145,13 +145,11 @@ def in_the_hall(path: Sequence[tuple[float, float, float]], n_off: int = 0, off_
 def test_what_only_scans_from_afar_show_is_no_change_where_the_session_came_near(
     session: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        cdpipe.extract.surface_rule, "_DOUBLED", np.inf
-    )  # that the session saw through it would tell as well
+    monkeypatch.setattr(cdpipe.extract.surface_rule, "_DOUBLED", np.inf)  # as from near
     right = in_the_hall((*DOWN_THE_HALL, *PATH))
     off = in_the_hall((*DOWN_THE_HALL, *PATH), len(DOWN_THE_HALL), -1.2)
     assert both_ways(session, off, right) == []
-    monkeypatch.setattr(cdpipe.extract.surface_rule, "_NEAR_M", 0.0)  # as if it had never come near
+    monkeypatch.setattr(cdpipe.extract.surface_rule, "_DOUBLED_AFAR", np.inf)
     hanging = both_ways(session, off, right)[0]  # the locker again, in front of itself
     assert hanging.points_map[:, 1].max() < 1.5
 
@@ -162,6 +160,7 @@ def test_what_only_scans_from_afar_show_is_no_change_where_the_session_came_near
         tuple((x, 0.0, 1.5) for x in np.arange(13.8, 36.0, 0.7).tolist()),  # it came no nearer than 12 m
         # it waited before it came
         (*((18.0, 0.0, 1.5),) * 100, *((x, 0.0, 1.5) for x in np.arange(18.0, 8.0, -0.7).tolist())),
+        ((8.0, 0.0, 1.5), *DOWN_THE_HALL),  # one scan from near shows it too
     ],
 )
 def test_a_thing_seen_mostly_from_afar_is_a_change_all_the_same(path: Sequence[tuple[float, float, float]]) -> None:
