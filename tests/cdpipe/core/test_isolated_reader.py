@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -96,6 +97,22 @@ def test_too_long_is_one_line(
     monkeypatch.setattr(isolated_reader, "_WAIT_FACTOR", wait_factor)
     with pytest.raises(InputError, match=r"x\.osf: the library took too long to read it: "):
         read(function)
+
+
+def test_a_reader_killed_before_its_answer_is_awaited_took_too_long(
+    read: Callable[..., list[isolated_reader.Message]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Early(threading.Timer):
+        """A timer that has fired when `start` returns, as on a machine that is busy just then."""
+
+        def start(self) -> None:
+            super().start()
+            self.join()
+
+    monkeypatch.setattr(isolated_reader.threading, "Timer", Early)
+    monkeypatch.setattr(isolated_reader, "_WAIT_FACTOR", 0.001)
+    with pytest.raises(InputError, match=r"x\.osf: the library took too long to read it: "):
+        read("wait")
 
 
 def test_a_bug_stays_a_traceback(read: Callable[..., list[isolated_reader.Message]]) -> None:
