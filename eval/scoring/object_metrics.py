@@ -145,8 +145,7 @@ def judge_kinds(objects: Sequence[ChangedObject], matches: ObjectMatches, truth:
         [
             float(is_kind_right(objects, matched_object, truth, index, label)) if matched >= 0 else np.nan
             for index, (matched, label) in enumerate(zip(matched_object, labels, strict=True))
-        ],
-        dtype=np.float64,
+        ]
     )
 
 

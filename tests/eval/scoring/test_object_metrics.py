@@ -19,7 +19,7 @@ from eval.scoring.object_metrics import (
 )
 from eval.truth.ground_truth import GroundTruth, SessionTruth
 from eval.truth.scoring_points import ScoringPoints
-from sim.session.truth import Change, PairTruth
+from sim.session.truth import MIXED, Change, PairTruth
 from tests.eval.changes import change
 
 N_CELLS = 40
@@ -350,3 +350,14 @@ def test_an_object_of_wall_that_touches_an_unobservable_change_is_false() -> Non
     columns, outcomes = columns_of(truth, [thing(), thing()], [span(5, 15), span(29, 40)])
     assert outcomes == ("match", "false")
     assert (columns["object_precision_50"], columns["n_ignored_objects"]) == (0.5, 0)
+
+
+@pytest.mark.parametrize(
+    ("rows", "is_excused"),
+    [(span(4, 5), True), (span(4, 6), True), (span(4, 7), False), (span(0, 0), False)],
+)
+def test_an_object_of_mixed_returns_alone_counts_neither_for_nor_against(rows: np.ndarray, is_excused: bool) -> None:
+    truth = ground_truth([change(1)], after=[1, 1, 1, 1, MIXED, MIXED] + [0] * (N_CELLS - 6))
+    matches = match_objects([thing(), thing()], [span(0, 4), rows], truth)
+    assert matches.is_excused.tolist() == [False, is_excused]
+    assert matches.iou_point.tolist() == [1.0]
