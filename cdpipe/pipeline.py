@@ -1,8 +1,8 @@
 """The pipeline: map, describe, merge, query, extract. This module alone defines the order of the stages.
 
 `detect` takes two sessions, `detect_changes` two mapped sessions. `Hooks` are called around every stage: the command
-line reports progress with them, a benchmark caches and times results. `PipelineConfig.method` names the method that
-compares the merged maps.
+line reports progress with them, a benchmark caches and times results. `regions.source` names what finds the regions
+in the merged maps.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.recorded_frames import regions_as_mapped, report_as_recorded
 from cdpipe.mapping.session_check import check_session, unit_hint
 from cdpipe.merge.merge import merge_maps, take_known_merge
-from cdpipe.methods.registry import load_method
+from cdpipe.methods.registry import load_source
 from cdpipe.model.config import PipelineConfig, Site, load_config
 from cdpipe.model.report import ChangeRegions, ChangeReport
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, ScanSource, Spheres
@@ -108,7 +108,7 @@ def detect(
     """
     known = None if before_T_after is None else require_rigid(before_T_after)
     config = load_config(preset, settings, site)
-    load_method(config.method)  # report a missing extra, or bad weights, before the mapping
+    load_source(config)  # report a missing extra, or bad weights, before the mapping
     list_checkpoints(config)
     use_threads(THREADS)
     hooks = hooks or Hooks()
@@ -139,7 +139,7 @@ def describe(
     list_checkpoints(config)  # report bad weights before the mapping
     use_threads(THREADS)
     source = open_session(session)
-    if config.query.compare == "sphere":
+    if config.regions.source == "sphere":
         descriptors = map_session(source, config).descriptors
     else:
         chosen = choose_keyframes(source.odom_T_sensor, config.map.keyframe_spacing_m)
@@ -156,7 +156,7 @@ def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
     check_session(source, config.map)
     thin_map = build_map(source, config.map)
     descriptors = describe_scans(source, thin_map.keyframe_scans, config.descriptor)
-    if config.query.compare == "sphere":
+    if config.regions.source == "sphere":
         anchors = anchor_frames(thin_map, thin_map.keyframe_scans, config.sphere)
         spheres = describe_map(thin_map, anchors, config.descriptor, config.sphere)
         descriptors = replace(descriptors, spheres=spheres)
@@ -198,7 +198,7 @@ def map_pair(
 
     scans = hooks.run("descriptors", config, lambda: _describe_both("describe keyframes", keyframes, kept, hooks))
     (before, after), seconds = scans.value, dict(scans.seconds)
-    if config.query.compare == "sphere":
+    if config.regions.source == "sphere":
         known: list[Spheres | None] = [None if each is None else each.spheres for each in kept]
         spheres: Done[tuple[Spheres, Spheres]] = hooks.run(
             "spheres", config, lambda: _describe_both("describe spheres", surroundings, known, hooks)
@@ -242,18 +242,19 @@ def detect_changes(
     Args:
         before: The earlier session.
         after: The later session.
-        config: All settings; `method` names the method that compares the merged maps.
+        config: All settings; `regions.source` names what finds the regions.
         hooks: Called around the stages.
         merge: Replaces the merge.
-        propose: Replaces the method: returns regions from the keyframe scans of both sessions, and the radius of a
+        propose: Replaces the source: returns regions from the keyframe scans of both sessions, and the radius of a
             region at each before keyframe.
 
     Raises:
         MergeFailedError: The sessions could not be aligned with enough evidence; it contains the evidence.
+        InputError: The source of regions cannot be loaded, or does not go with the extraction.
     """
     hooks = hooks or Hooks()
+    method = load_source(config)
     merged = merge_mapped(before, after, config, hooks, merge)
-    method = load_method(config.method)
     described = before.descriptors, after.descriptors
     regions: Done[ChangeRegions] | None = None
 

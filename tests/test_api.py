@@ -36,11 +36,11 @@ def test_paths_and_opened_sessions_give_the_same(pair: Path, report: cdpipe.Chan
     assert again.config == report.config
 
 
-def test_mapped_sessions_are_compared_by_the_method_of_the_settings(pair: Path) -> None:
+def test_mapped_sessions_are_compared_by_the_source_of_the_settings(pair: Path) -> None:
     config = cdpipe.load_config("c2c", {"query.threshold": 5})
     mapped = [cdpipe.map_session(cdpipe.open_session(pair / name), config) for name in ("before", "after")]
     by_method = cdpipe.detect_changes(*mapped, config)
-    assert by_method.config["method"] == "c2c"
+    assert by_method.config["regions"]["source"] == "c2c"
     # a whole-map method scores a region by its number of points
     assert len(by_method.regions.scores) > 0
     assert (by_method.regions.scores % 1 == 0).all()

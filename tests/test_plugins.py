@@ -40,7 +40,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         done = subprocess.run([*pip, site, root / name], check=False, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
     (root / "path" / "presets").mkdir(parents=True)
-    (root / "path" / "presets" / "from_folder.yaml").write_text("method: c2c\nquery: {threshold: 20}\n")
+    (root / "path" / "presets" / "from_folder.yaml").write_text(
+        "regions: {source: c2c}\nextract: {method: clusters}\nquery: {threshold: 20}\n"
+    )
     (root / "path" / "plans").mkdir()
     (root / "path" / "plans" / "plugged.yaml").write_text(PLAN)
     python_path = os.pathsep.join([str(ROOT), str(site)])
@@ -74,9 +76,9 @@ def test_plugins_run_in_a_plan_and_are_scored(installed: dict[str, str]) -> None
 
 def test_a_method_that_nobody_registered_is_refused_by_name(installed: dict[str, str], tmp_path: Path) -> None:
     preset = tmp_path / "own.yaml"
-    preset.write_text("method: highr\n")
+    preset.write_text("regions: {source: highr}\n")
     done = tunnelcd(installed, "detect", "a", "b", "--preset", str(preset), "--out", str(tmp_path / "out"))
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
-    assert "own.yaml:1: method" in line
+    assert "own.yaml:1: regions.source" in line
     assert "higher" in line

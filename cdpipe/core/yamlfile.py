@@ -11,7 +11,7 @@ from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -26,7 +26,13 @@ _MAX_LISTED = 50_000  # pydantic's list of all mistakes takes a kilobyte for eac
 
 
 class Settings(BaseModel):
-    """Base of every model read from YAML: frozen; unknown keys, NaN and infinity are mistakes."""
+    """Base of every model read from YAML: frozen; unknown keys, NaN and infinity are mistakes.
+
+    Attributes:
+        renamed: What replaced a former key, by its name ("query.compare").
+    """
+
+    renamed: ClassVar[Mapping[str, str]] = {}
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -196,6 +202,9 @@ def _near_key(model: type[BaseModel], key: Key, where: str) -> str:
 
     A file names its group on a line of its own; an option needs the group in the suggestion.
     """
+    renamed = model.renamed.get(".".join(map(str, key))) if issubclass(model, Settings) else None
+    if renamed:
+        return f"; it is {renamed}"
     last = str(key[-1])
     groups = [name for name, field in model.model_fields.items() if isinstance(field.annotation, type)]
     grouped = [f'"{group}.{last}"' for group in groups if last in _fields_at(model, (group,))]

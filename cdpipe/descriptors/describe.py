@@ -160,7 +160,7 @@ def list_checkpoints(config: PipelineConfig) -> dict[str, str]:
         InputError: A file of weights cannot be used.
     """
     found = {config.descriptor.method: checkpoint_digest(config.descriptor)}
-    return found | ({"sphere": sphere_digest(config.sphere)} if config.query.compare == "sphere" else {})
+    return found | ({"sphere": sphere_digest(config.sphere)} if config.regions.source == "sphere" else {})
 
 
 def use_threads(n_threads: int) -> None:

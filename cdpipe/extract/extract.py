@@ -1,8 +1,9 @@
 """Object extraction: cut the changed objects out of the reported regions, in both directions.
 
 Points that only the after map has are added, points that only the before map has are removed. `extract.method` chooses
-the comparison: the paper's point-to-voxel comparison (`voxel`), the distance to the nearest point (`nearest`), or the
-distance to the surface together with free space (`surface`, `cdpipe.extract.surface_rule`).
+the comparison: the paper's point-to-voxel comparison (`voxel`), the distance to the nearest point (`nearest`), the
+distance to the surface together with free space (`surface`, `cdpipe.extract.surface_rule`), or what the source of the
+regions cut out itself (`clusters`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from cdpipe.core.geometry import Float64Array
 from cdpipe.extract.centring import centre_regions
+from cdpipe.extract.clusters import take_clusters
 from cdpipe.extract.crops import DIRECTIONS, SESSIONS, Crops
 from cdpipe.extract.objects import PointGroup, assemble_objects
 from cdpipe.extract.point_comparison import cluster_inliers, is_within, new_points_mask
@@ -38,6 +40,8 @@ def cut_objects(merged: MergedMaps, regions: ChangeRegions, config: PipelineConf
         regions: Candidates; only the reported ones are used.
         config: `extract` is used, and for `voxel` and `nearest` also `outlier` and `cluster`.
     """
+    if config.extract.method == "clusters":
+        return take_clusters(merged, regions, config.query)
     if config.extract.method == "surface":
         return cut_by_surface(merged, regions, config.extract)
     is_voxel, extract = config.extract.method == "voxel", config.extract
@@ -62,8 +66,11 @@ def cut_objects(merged: MergedMaps, regions: ChangeRegions, config: PipelineConf
 def withdraw_empty_regions(
     regions: ChangeRegions, groups: Sequence[PointGroup], config: PipelineConfig
 ) -> ChangeRegions:
-    """Withdraw the reported regions whose sphere holds no extracted point, if `extract.withdraw` is set."""
-    if not config.extract.withdraw:
+    """Withdraw the reported regions whose sphere holds no extracted point, if `extract.withdraw` is set.
+
+    With `extract.method: clusters` none is: a region is a cluster, and a large one may lie around its own sphere.
+    """
+    if not config.extract.withdraw or config.extract.method == "clusters":
         return regions
     is_empty = regions.is_reported.copy()
     if groups:
@@ -126,6 +133,7 @@ def extract_changes(
     end = perf_counter()
     seconds = {"t_cd_s": t_cd_s, "t_oe_s": end - start, "t_returns_s": end - grouped}
     crops = Crops(merged, margin_m=0.0)
+    regions = replace(regions, clusters=None)
     figures = measure_regions(regions, groups, lambda centre, radius_m: crops.crop("after", centre, radius_m)[1])
     return make_report(merged, described, regions, objects, figures, seconds, config)
 

@@ -1,4 +1,4 @@
-"""Regions by descriptors, as in the paper and in `tunnelcd`; `query.compare` names the descriptors."""
+"""Regions at keyframes: by descriptors, as in the paper and in `tunnelcd`, by points, or at every one of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from cdpipe.query.query import find_regions
 
 
 class DescriptorQuery:
-    """A registered method: the inverted query of the paper (section III), or the comparison of spheres."""
+    """Registered as `scan`, the inverted query of the paper (section III), and as `sphere`."""
 
     uses_descriptors = True
 
@@ -17,4 +17,10 @@ class DescriptorQuery:
         self, merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig
     ) -> ChangeRegions:
         """Return the candidate regions, ranked by the descriptors of the keyframes."""
-        return find_regions(merged, before, after, config.query, config.sphere)
+        return find_regions(merged, before, after, config)
+
+
+class KeyframeQuery(DescriptorQuery):
+    """Registered as `sphere-difference` and `every-keyframe`, which read no descriptors."""
+
+    uses_descriptors = False

@@ -16,7 +16,6 @@ import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array
 from cdpipe.core.threads import THREADS
-from cdpipe.extract.point_comparison import is_within
 from cdpipe.methods.whole_map import PlacedMaps, WholeMap
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.types import SessionName
@@ -42,7 +41,7 @@ def dufomap(maps: PlacedMaps, session: SessionName, other: SessionName, config: 
         (N,) mask of the points of `session`.
     """
     points = maps.points[session]
-    compared = np.flatnonzero(is_within(points, maps.path[other], config.query.fixed_radius_m))
+    compared = np.flatnonzero(maps.is_compared(session, other))
     point_map, points_odom = maps.merged.map_of(other), maps.merged.to_odom(other, points[compared])
     settings = config.dufomap
     void_map = load_dufomap().dufomap(settings.voxel_m, settings.hit_inflation_m, _UNKNOWN_VOXELS, THREADS)

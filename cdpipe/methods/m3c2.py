@@ -18,7 +18,6 @@ import numpy as np
 
 from cdpipe.core.geometry import BoolArray
 from cdpipe.core.threads import THREADS
-from cdpipe.extract.point_comparison import is_within
 from cdpipe.methods.whole_map import PlacedMaps, WholeMap
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.types import SessionName
@@ -43,7 +42,7 @@ def m3c2(maps: PlacedMaps, session: SessionName, other: SessionName, config: Pip
     """
     py4dgeo = load_py4dgeo()
     points = maps.points[session]
-    core = np.flatnonzero(is_within(points, maps.path[other], config.query.fixed_radius_m))
+    core = np.flatnonzero(maps.is_compared(session, other))
     is_new = np.zeros(len(points), dtype=np.bool_)
     if len(core) == 0:
         return is_new

@@ -8,11 +8,12 @@ from cdpipe.core.geometry import stream
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.report import ChangeRegions
 from cdpipe.model.types import DescriptorSet, MergedMaps
+from cdpipe.query.drift_width import keyframe_radii
 from cdpipe.query.query import query_nearest, rank_regions
 
 
 class RandomRegions:
-    """A registered method that draws regions at random; the pipeline extracts the objects."""
+    """A registered source that draws regions at random."""
 
     def propose(
         self, merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig
@@ -27,4 +28,5 @@ class RandomRegions:
         scores = stream(config.seed, "random-regions", sizes).random(len(gaps_m))
         scores[gaps_m > config.query.max_pair_m] = np.nan
         pairs = np.column_stack([np.arange(len(scores)), partners])
-        return rank_regions(before_path, scores, pairs, scores, config.query)
+        radii_m = keyframe_radii(merged.before, before.keyframe_scans, config.query)
+        return rank_regions(before_path, scores, pairs, scores, config.query, radii_m=radii_m)

@@ -1,14 +1,14 @@
-"""The methods by name: entry points of the group `tunnelcd.methods`, for ours as for those of other packages.
+"""The sources of regions by name: entry points of the group `tunnelcd.methods`, ours and those of other packages.
 
-A registered method is one of
+A registered source is one of
 
-- a function `(merged, before, after, config) -> ChangeReport`;
-- a class or object with `detect`, called like that function;
-- a class or object with `propose`, called in the same way, that returns `ChangeRegions`: the pipeline extracts the
-  objects.
+- a class or object with `propose(merged, before, after, config)`, which returns `ChangeRegions`: `extract.method` cuts
+  out the objects;
+- a function with these arguments that returns a whole `ChangeReport`, objects included;
+- a class or object with `detect`, called like that function.
 
 A class is created once per process, without arguments. `uses_descriptors = True` on any of them adds the time of the
-descriptors to the method's time.
+descriptors to the method's time. `has_clusters = True` says that the regions hold `Clusters`.
 """
 
 from __future__ import annotations
@@ -38,26 +38,47 @@ class Method:
         detect: Finds regions and objects.
         propose: Finds regions only.
         uses_descriptors: Whether it reads the descriptors of the keyframes.
+        has_clusters: Whether it cuts out clusters of its own, for `extract.method: clusters`.
     """
 
     detect: Detect | None
     propose: Propose | None
     uses_descriptors: bool
+    has_clusters: bool
+
+
+def load_source(config: PipelineConfig) -> Method:
+    """Return the source of regions that the settings name.
+
+    Raises:
+        InputError: It cannot be loaded (`load_method`), or the extraction needs clusters that it does not have.
+    """
+    method = load_method(config.regions.source)
+    if config.extract.method == "clusters" and method.detect is None and not method.has_clusters:
+        raise InputError(
+            f"extract.method = clusters: regions.source = {config.regions.source} cuts out nothing itself: expected "
+            "surface, voxel or nearest"
+        )
+    return method
 
 
 def load_method(name: str) -> Method:
-    """Return a registered method.
+    """Return what is registered under a name.
 
     Raises:
         InputError: No method has this name, it cannot be imported, its extra is not installed, or it is of none of the
             three kinds.
     """
     if name in _WITH_EXTRAS:
-        require_extra(name, f"method {name}")
+        require_extra(name, f"regions.source = {name}")
     found: Any = load_entry_point(METHODS, name)
     made = found() if isinstance(found, type) else found
     propose = getattr(made, "propose", None)
     detect = None if propose is not None else getattr(made, "detect", made)
     if not callable(propose or detect):
         raise InputError(f"{METHODS}: {name!r}: expected a function, or a class with `detect` or `propose`")
-    return Method(detect, propose, bool(getattr(made, "uses_descriptors", False)))
+    return Method(
+        detect,
+        propose,
+        *(bool(getattr(made, mark, False)) for mark in ("uses_descriptors", "has_clusters")),
+    )

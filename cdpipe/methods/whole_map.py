@@ -1,28 +1,27 @@
-"""Whole-map methods: the points that are new in either map are filtered and clustered; each cluster is an object.
+"""Whole-map comparisons as sources of regions: what is new in either map is filtered and clustered.
 
-The methods differ only in their `NewMask`, which decides whether a point is new. Regions, objects, scores and times are
-computed in the same way for all of them.
+Each cluster is a region. The sources differ only in their `NewMask`, which decides whether a point is new. Regions,
+clusters and scores are computed in the same way for all of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from time import perf_counter
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import BoolArray, Float64Array
-from cdpipe.core.grid_index import GridIndex
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.extract.clusters import cluster_centroids, cluster_groups
 from cdpipe.extract.crops import DIRECTIONS, SESSIONS
-from cdpipe.extract.extract import make_report, measure_regions
-from cdpipe.extract.objects import PointGroup, assemble_objects
 from cdpipe.extract.point_comparison import cluster_inliers, is_within
 from cdpipe.model.config import PipelineConfig
-from cdpipe.model.report import ChangeRegions, ChangeReport
+from cdpipe.model.report import ChangeRegions, Clusters
 from cdpipe.model.types import DescriptorSet, MergedMaps, SessionName
 from cdpipe.query.difference import marked_share
-from cdpipe.query.query import query_nearest, rank_regions
+from cdpipe.query.drift_width import LEAST_RADIUS_M, keyframe_radii
+from cdpipe.query.query import query_nearest, rank_regions, score_keyframes_by_share
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,11 +32,24 @@ class PlacedMaps:
         merged: The merged maps, with the returns and poses of every scan, each session in its own odom frame.
         points: (N, 3) float64 map points of each session, map frame, metres.
         path: (K, 3) float64 position of the sensor at each keyframe, map frame, metres.
+        radii_m: (K,) float64 radius of a region at each keyframe, metres.
     """
 
     merged: MergedMaps
     points: dict[SessionName, Float64Array]
     path: dict[SessionName, Float64Array]
+    radii_m: dict[SessionName, Float64Array]
+
+    def is_compared(self, session: SessionName, other: SessionName) -> BoolArray:
+        """Mark the (N,) map points of `session` that lie within a region's radius of the path of `other`."""
+        radii_m = self.radii_m[other]
+        if len(radii_m) == 0:
+            return np.zeros(len(self.points[session]), dtype=np.bool_)
+        # the bound of the search excludes the border, so it is slightly larger
+        gaps_m, nearest = cKDTree(self.path[other]).query(
+            self.points[session], distance_upper_bound=radii_m.max() * (1 + 1e-6)
+        )
+        return np.asarray(gaps_m <= np.append(radii_m, -1.0)[nearest])
 
 
 NewMask = Callable[[PlacedMaps, SessionName, SessionName, PipelineConfig], BoolArray]
@@ -45,24 +57,26 @@ NewMask = Callable[[PlacedMaps, SessionName, SessionName, PipelineConfig], BoolA
 
 
 class WholeMap:
-    """A registered method that compares both maps at once; decorates a `NewMask`.
+    """A registered source of regions that compares both maps at once; decorates a `NewMask`.
 
-    Only points within `query.radius_m` of the other session's path are compared; beyond that the other session saw too
-    little for an empty place to be evidence. A region is the centroid of a cluster, its score is the cluster's number
-    of map points, and `query.threshold` is in points. A cluster that is suppressed by a larger one is an object of that
-    one's region. The score of a keyframe is the share of new points among the points of both maps within
-    `query.radius_m`.
+    Only points within a region's radius of the other session's path are compared; beyond that the other session saw
+    too little for an empty place to be evidence. A region is the centroid of a cluster, its score is the cluster's
+    number of map points, and `query.threshold` is in points. With `extract.method: clusters` the clusters are the
+    objects; one that is suppressed by a larger one is an object of that one's region. The score of a keyframe is the
+    share of new points among the points of both maps within `query.radius_m` (`width`: 4.5 m).
 
     Attributes:
         new_mask: Decides which points are new.
     """
 
+    has_clusters = True
+
     def __init__(self, new_mask: NewMask) -> None:
         self.new_mask = new_mask
 
-    def detect(
+    def propose(
         self, merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig
-    ) -> ChangeReport:
+    ) -> ChangeRegions:
         """Compare, filter and cluster.
 
         Args:
@@ -71,63 +85,50 @@ class WholeMap:
             after: Gives those of the after session.
             config: `outlier`, `cluster` and `query` are used, and whatever `new_mask` uses.
         """
-        start = perf_counter()
-        before_path, after_path = merged.keyframe_positions(before, after)
-        clouds = {name: merged.to_map(name, merged.map_of(name).points) for name in SESSIONS}
-        maps = PlacedMaps(merged, clouds, {"before": before_path, "after": after_path})
-        radius_m = config.query.fixed_radius_m
-        groups: list[PointGroup] = []
+        maps = _place(merged, before, after, config)
+        found: list[Int64Array] = []
+        is_after: list[bool] = []
         is_changed: dict[SessionName, BoolArray] = {}
         for session, other in DIRECTIONS:
             points = maps.points[session]
-            new = np.flatnonzero(self.new_mask(maps, session, other, config))
-            new = new[is_within(points[new], maps.path[other], radius_m)]
-            found = cluster_inliers(points, new, config)
-            groups += [PointGroup(session, indices, points[indices], -1) for indices in found]
+            new = np.flatnonzero(self.new_mask(maps, session, other, config) & maps.is_compared(session, other))
+            of_session = cluster_inliers(points, new, config)
+            found += of_session
+            is_after += [session == "after"] * len(of_session)
             is_changed[session] = np.zeros(len(points), dtype=np.bool_)
-            is_changed[session][np.concatenate([np.zeros(0, dtype=np.int64), *found])] = True
-        regions = _cluster_regions(groups, maps, config)
-        compared = perf_counter()
-        answered = _in_reported_regions(groups, regions, config)
-        grouped = perf_counter()
-        objects = assemble_objects(merged, answered)
-        end = perf_counter()
-        seconds = {"t_cd_s": compared - start, "t_oe_s": end - compared, "t_returns_s": end - grouped}
+            is_changed[session][np.concatenate([np.zeros(0, dtype=np.int64), *of_session])] = True
+        clusters = Clusters(
+            is_after=np.array(is_after, dtype=np.bool_),
+            points=np.concatenate([np.zeros(0, dtype=np.int64), *found]),
+            starts=np.cumsum([0, *map(len, found)], dtype=np.int64),
+        )
         marked = [(points, is_changed[session]) for session, points in maps.points.items()]
-        scores = marked_share(marked, before_path, radius_m)
-        scores[~is_within(before_path, after_path, config.query.max_pair_m)] = np.nan
-        regions = replace(regions, keyframe_scores=scores)
-        index = GridIndex(maps.points["after"])
-        figures = measure_regions(regions, answered, index.points_within)
-        return make_report(merged, (before, after), regions, objects, figures, seconds, config)
+        radius_m = LEAST_RADIUS_M if config.query.radius_m == "width" else config.query.radius_m
+        shares = marked_share(marked, maps.path["before"], radius_m)
+        shares[~is_within(maps.path["before"], maps.path["after"], config.query.max_pair_m)] = np.nan
+        keyframe_scores = score_keyframes_by_share(shares, merged, before, after, config.query)
+        return replace(_rank_clusters(clusters, maps, keyframe_scores, config), clusters=clusters)
 
 
-def _cluster_regions(groups: Sequence[PointGroup], maps: PlacedMaps, config: PipelineConfig) -> ChangeRegions:
-    centres = _centroids(groups)
-    pairs = np.column_stack(
-        [query_nearest(centres, maps.path["before"])[1], query_nearest(centres, maps.path["after"])[1]]
-    )
-    scores = np.array([len(group.indices) for group in groups], dtype=np.float64)
-    no_scores = np.full(len(maps.path["before"]), np.nan)
-    return rank_regions(centres, scores, pairs, no_scores, config.query)
-
-
-def _in_reported_regions(
-    groups: Sequence[PointGroup], regions: ChangeRegions, config: PipelineConfig
-) -> list[PointGroup]:
-    """Return the clusters of the reported regions: their own, and those they suppressed that pass the threshold."""
-    reported = np.flatnonzero(regions.is_reported)
-    if len(reported) == 0 or not groups:
-        return []
-    gaps_m, nearest = query_nearest(_centroids(groups), regions.centres_map[reported])
-    reach_m = config.query.suppression * config.query.fixed_radius_m
-    min_points = config.query.threshold if config.query.n_regions is None else 0.0
-    return [
-        PointGroup(group.session, group.indices, group.points_map, int(reported[region]))
-        for group, gap_m, region in zip(groups, gaps_m, nearest, strict=True)
-        if gap_m < reach_m and len(group.indices) >= min_points
+def _place(merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig) -> PlacedMaps:
+    paths = merged.keyframe_positions(before, after)
+    radii_m = [
+        keyframe_radii(merged.map_of(name), described.keyframe_scans, config.query)
+        for name, described in zip(SESSIONS, (before, after), strict=True)
     ]
+    points = {name: merged.to_map(name, merged.map_of(name).points) for name in SESSIONS}
+    return PlacedMaps(
+        merged, points, dict(zip(SESSIONS, paths, strict=True)), dict(zip(SESSIONS, radii_m, strict=True))
+    )
 
 
-def _centroids(groups: Sequence[PointGroup]) -> Float64Array:
-    return np.array([group.points_map.mean(axis=0) for group in groups], dtype=np.float64).reshape(-1, 3)
+def _rank_clusters(
+    clusters: Clusters, maps: PlacedMaps, keyframe_scores: Float64Array, config: PipelineConfig
+) -> ChangeRegions:
+    groups = cluster_groups(clusters, maps.points)
+    centres = cluster_centroids(groups)
+    nearest = {name: query_nearest(centres, maps.path[name])[1] for name in SESSIONS}
+    scores = np.array([len(group.indices) for group in groups], dtype=np.float64)
+    pairs = np.column_stack([nearest["before"], nearest["after"]])
+    radii_m = maps.radii_m["before"][nearest["before"]] if len(maps.radii_m["before"]) else np.zeros(len(scores))
+    return rank_regions(centres, scores, pairs, keyframe_scores, config.query, radii_m=radii_m)

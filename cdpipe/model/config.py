@@ -7,7 +7,7 @@ from dataclasses import replace
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     Discriminator,
@@ -127,14 +127,37 @@ class MergeConfig(Settings):
     )
 
 
-class QueryConfig(Settings):
-    """From descriptors to changed regions: inverted query, threshold, suppression."""
+# Sources that score keyframes; they read nothing but descriptors, maps and `query`, and cut out nothing.
+SOURCES_AT_KEYFRAMES = ("scan", "sphere", "sphere-difference", "every-keyframe", "random-regions")
 
-    compare: Literal["scan", "sphere", "difference"] = Field(
-        "scan", description="scan descriptors; sphere descriptors; or the points of both maps, without learning"
+
+class RegionsConfig(Settings):
+    """Where regions come from."""
+
+    source: str = Field(
+        "scan",
+        description=(
+            "`scan`: the paper's query of scan descriptors; `sphere`: sphere descriptors; `sphere-difference`, "
+            "`every-keyframe`, `random-regions`; `voxel-diff`, `c2c`, `m3c2`, `dufomap`: clusters of a whole-map "
+            "comparison; or a plugin's, by its registered name"
+        ),
     )
+
+    @field_validator("source")
+    @classmethod
+    def _is_registered(cls, source: str) -> str:
+        known = entry_points(METHODS)
+        if source not in known:
+            hint = suggest(source, known) or ": install the package that has it"
+            raise ValueError(f"no such source (registered: {', '.join(known)}){hint}")
+        return source
+
+
+class QueryConfig(Settings):
+    """From scored places to changed regions: reading, radius, threshold, suppression."""
+
     reading: Literal["nearest", "paired"] = Field(
-        "nearest", description="A: nearest in descriptor space; B: the same place after alignment"
+        "nearest", description="`scan`: A: nearest in descriptor space; B: the same place after alignment"
     )
     radius_m: LengthOrWidth = Field(
         4.5,
@@ -147,26 +170,19 @@ class QueryConfig(Settings):
     suppression: Positive = Field(1.0, description="candidates nearer than this many radii to a better one are dropped")
     max_pair_m: Positive = Field(5.0, description="keyframes farther apart are not the same place")
 
-    @property
-    def fixed_radius_m(self) -> float:
-        """The radius, where it is one number.
-
-        Raises:
-            ValueError: It follows the width of the drift.
-        """
-        if self.radius_m == "width":
-            raise ValueError("query.radius_m is width: it is no number")
-        return self.radius_m
-
 
 class ExtractConfig(Settings):
-    """Object extraction: the paper's point-to-voxel comparison, distances, or surfaces.
+    """Object extraction: the paper's point-to-voxel comparison, distances, surfaces, or what the source cut out.
 
     A dump leaves out `recentre` where it is true, so that the answers of other rules do not name it.
     """
 
-    method: Literal["surface", "voxel", "nearest"] = Field(
-        "surface", description="distance from the other session's surface; the paper's voxels; or the nearest point's"
+    method: Literal["surface", "voxel", "nearest", "clusters"] = Field(
+        "surface",
+        description=(
+            "distance from the other session's surface; the paper's voxels; the nearest point's; or the clusters of a "
+            "source that compares whole maps"
+        ),
     )
     withdraw: bool = Field(True, description="withdraw regions in which no object is found")
     recentre: bool = Field(True, description="`surface`: centre each reported region on its objects")
@@ -224,17 +240,22 @@ class DufomapConfig(Settings):
 
 
 class PipelineConfig(Settings):
-    """All settings of one method."""
+    """All settings of one method: where regions come from, how objects are cut out of them, and all before that."""
 
-    method: str = Field(
-        "descriptor",
-        description="the paper's pipeline, a whole-map rival, a control, or a plugin's; by registered name",
-    )
+    renamed: ClassVar[Mapping[str, str]] = {
+        "method": (
+            "regions.source now: scan or sphere for descriptor; voxel-diff, c2c, m3c2 and dufomap go with "
+            "extract.method = clusters"
+        ),
+        "query.compare": "regions.source now: sphere-difference for difference",
+    }
+
     seed: Annotated[int, Field(ge=0)] = Field(0, description="for methods that draw at random")
     map: MapConfig = MapConfig()
     descriptor: DescriptorConfig = DescriptorConfig()
     sphere: SphereConfig = SphereConfig()
     merge: MergeConfig = MergeConfig()
+    regions: RegionsConfig = RegionsConfig()
     query: QueryConfig = QueryConfig()
     extract: ExtractConfig = ExtractConfig()
     outlier: OutlierConfig = OutlierConfig()
@@ -245,21 +266,12 @@ class PipelineConfig(Settings):
         {}, description="settings of a plugin's method, by its own names"
     )
 
-    @field_validator("method")
-    @classmethod
-    def _is_registered(cls, method: str) -> str:
-        known = entry_points(METHODS)
-        if method not in known:
-            hint = suggest(method, known) or ": install the package that has it"
-            raise ValueError(f"no such method (registered: {', '.join(known)}){hint}")
-        return method
-
     @model_validator(mode="after")
-    def _width_has_keyframes(self) -> PipelineConfig:
-        if self.query.radius_m == "width" and self.method != "descriptor":
+    def _has_clusters(self) -> PipelineConfig:
+        if self.extract.method == "clusters" and self.regions.source in SOURCES_AT_KEYFRAMES:
             raise ValueError(
-                f"query.radius_m = width is for method: descriptor, this one is {self.method}; expected a length in "
-                "metres, e.g. 4.5"
+                f"extract.method = clusters: regions.source = {self.regions.source} cuts out nothing itself: expected "
+                "surface, voxel or nearest"
             )
         return self
 

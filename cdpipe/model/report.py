@@ -16,6 +16,24 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Clusters:
+    """Groups of new map points that a source of regions cut out itself; C of them, N points in all.
+
+    Attributes:
+        is_after: (C,) whether the points are of the after map.
+        points: (N,) int64 indices of map points, cluster by cluster.
+        starts: (C + 1,) int64 first of the N points of each cluster, and N.
+    """
+
+    is_after: BoolArray
+    points: Int64Array
+    starts: Int64Array
+
+    def __post_init__(self) -> None:
+        require_shapes(self, is_after=(len(self.starts) - 1,), points=(int(self.starts[-1]),))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ChangeRegions:
     """Every candidate sphere, best first, and the score of every before keyframe.
 
@@ -33,6 +51,8 @@ class ChangeRegions:
             centre is the position of that keyframe. None for methods that query no keyframes.
         proposed_centres_map: (R, 3) centres at which the regions were proposed, before the reported ones were centred
             on their objects; None if no region was centred.
+        clusters: What the source itself cut out, for `extract.method: clusters`; None of a source that finds places
+            alone, and in an answer.
     """
 
     centres_map: Float64Array
@@ -44,6 +64,7 @@ class ChangeRegions:
     is_withdrawn: BoolArray | None = None
     direction: UInt8Array | None = None
     proposed_centres_map: Float64Array | None = None
+    clusters: Clusters | None = None
 
     @property
     def is_proposed(self) -> BoolArray:

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.descriptors.sphere import change_log_odds
-from cdpipe.model.config import QueryConfig, SphereConfig
+from cdpipe.model.config import PipelineConfig, QueryConfig
 from cdpipe.model.report import ChangeRegions
 from cdpipe.model.types import DescriptorSet, MergedMaps, UInt8Array
 from cdpipe.query.difference import sphere_difference
@@ -24,7 +24,6 @@ from cdpipe.query.drift_width import keyframe_radii, score_radii
 
 # Values of `ChangeRegions.direction`: the session whose keyframe is queried in the other session.
 BEFORE, AFTER = 0, 1
-_SHIPPED = SphereConfig()
 # Keyframe scores, in log-odds: what is surer than this (0.95) counts as this, so that a sure change some metres away is
 # not above a doubtful one here; and the fall per metre, which ranks keyframes near one change by their distance. Mean
 # AUROC and AP of 16 validation pairs (3 narrow, 7 caves, 6 wide): 0.999 and 0.994; without both 0.992 and 0.90.
@@ -35,40 +34,58 @@ _SHARE_FALL_PER_M = 0.03
 
 
 def find_regions(
-    merged: MergedMaps,
-    before: DescriptorSet,
-    after: DescriptorSet,
-    config: QueryConfig,
-    sphere: SphereConfig = _SHIPPED,
+    merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: PipelineConfig
 ) -> ChangeRegions:
-    """Score the keyframes by the comparison that `query.compare` names, and rank them as regions.
+    """Score the keyframes as `regions.source` says, and rank them as regions.
 
     Args:
-        merged: Both maps and their alignment; `scan` uses only the poses.
+        merged: Both maps and their alignment; with a fixed radius, `scan` and `every-keyframe` use only the poses.
         before: Descriptors of the before session; `pairs[:, 0]` indexes its keyframes.
         after: Descriptors of the after session; `pairs[:, 1]` indexes its keyframes.
-        config: Comparison, reading, radius, threshold, suppression.
-        sphere: Weights of the sphere descriptors, if they are compared.
+        config: `regions.source`: scan, sphere, sphere-difference or every-keyframe; `query`; for sphere its weights.
     """
-    places = _Places(merged, before, after, config)
-    radii_b = keyframe_radii(merged.before, before.keyframe_scans, config)
-    if config.compare == "scan":
-        radii_a = keyframe_radii(merged.after, after.keyframe_scans, config)
-        return _score_by_scans(places, before, after, config, radii_b, radii_a)
-    score_m = score_radii(merged.before, before.keyframe_scans, config)
-    if config.compare == "sphere":
-        # a sphere descriptor covers 2 m of tunnel before and behind its keyframe
-        scores = change_log_odds(merged, before, places.is_covered_b, sphere)
-        keyframe_scores = _score_surroundings(
-            places, score_m, lambda near, away_m: np.minimum(scores[near], _SURE) - _FALL_PER_M * away_m
-        )
-    else:
-        scores = keyframe_scores = sphere_difference(merged, before, after, config)
-        if config.radius_m == "width":
+    query = config.query
+    places = _Places(merged, before, after, query)
+    radii_b = keyframe_radii(merged.before, before.keyframe_scans, query)
+    match config.regions.source:
+        case "scan":
+            radii_a = keyframe_radii(merged.after, after.keyframe_scans, query)
+            return _score_by_scans(places, before, after, query, radii_b, radii_a)
+        case "sphere":
+            # a sphere descriptor covers 2 m of tunnel before and behind its keyframe
+            scores = change_log_odds(merged, before, places.is_covered_b, config.sphere)
             keyframe_scores = _score_surroundings(
-                places, score_m, lambda near, away_m: scores[near] * (1.0 - _SHARE_FALL_PER_M * away_m)
+                places,
+                score_radii(merged.before, before.keyframe_scans, query),
+                lambda near, away_m: np.minimum(scores[near], _SURE) - _FALL_PER_M * away_m,
             )
-    return rank_regions(places.before, scores, places.pairs_b, keyframe_scores, config, _from(BEFORE, scores), radii_b)
+        case "sphere-difference":
+            scores = sphere_difference(merged, before, after, query)
+            keyframe_scores = score_keyframes_by_share(scores, merged, before, after, query)
+        case "every-keyframe":
+            scores = keyframe_scores = np.where(places.is_covered_b, 0.0, np.nan)
+        case other:
+            raise ValueError(f"{other} is no source of regions at keyframes")
+    return rank_regions(
+        places.before, scores, places.pairs_b, keyframe_scores, query, _from(BEFORE, scores), radii_m=radii_b
+    )
+
+
+def score_keyframes_by_share(
+    shares: Float64Array, merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig
+) -> Float64Array:
+    """Return the (K,) scores of the before keyframes from the (K,) shares of new points around them.
+
+    A share counts where it was measured; where the radius follows the width of the drift, also for the keyframes
+    around, less 3 % per metre.
+    """
+    if config.radius_m != "width":
+        return shares
+    return _score_surroundings(
+        _Places(merged, before, after, config),
+        score_radii(merged.before, before.keyframe_scans, config),
+        lambda near, away_m: shares[near] * (1.0 - _SHARE_FALL_PER_M * away_m),
+    )
 
 
 class _Places:
@@ -154,7 +171,8 @@ def rank_regions(
     keyframe_scores: Float64Array,
     config: QueryConfig,
     direction: UInt8Array | None = None,
-    radii_m: Float64Array | None = None,
+    *,
+    radii_m: Float64Array,
 ) -> ChangeRegions:
     """Sort candidates by score, suppress those near a better one, and mark the reported ones.
 
@@ -167,10 +185,8 @@ def rank_regions(
         keyframe_scores: (K,) copied into the result.
         config: Radius, suppression distance, and threshold or number of regions.
         direction: (N,) as in `ChangeRegions`; None if no keyframes are queried.
-        radii_m: (N,) radius of each candidate where `query.radius_m` is `width`; None if it is a number.
+        radii_m: (N,) radius of each candidate.
     """
-    if radii_m is None:
-        radii_m = np.full(len(scores), config.fixed_radius_m)
     order = np.argsort(-scores, kind="stable")
     order = order[~np.isnan(scores[order])]
     kept = order[_suppress_neighbours(centres_map[order], config.suppression * radii_m[order])]

@@ -190,7 +190,7 @@ def _query(site: MergeSite) -> Contest:
     """Time the paper's query per region, as its Table I does."""
     before, after = (session.mapped for session in site.sessions)
     merged = merge_maps(before, after, site.config.merge)
-    config = load_config("paper-topn", [f"query.n_regions={_N_REGIONS}"]).query
+    config = load_config("paper-topn", [f"query.n_regions={_N_REGIONS}"])
     seconds = timed(lambda: find_regions(merged, before.descriptors, after.descriptors, config), site.repeats)
     per_region_s = [each / _N_REGIONS for each in seconds]
     return against_limit(per_region_s, _QUERY_LIMITS_S.get(site.size, _QUERY_LIMITS_S["60k"]))

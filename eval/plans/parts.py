@@ -29,7 +29,7 @@ _OF_TRUE_REGIONS = ("query.radius_m", "query.suppression")
 
 def has_effect_on_true_regions(setting: str) -> bool:
     """Return whether a setting has an effect on a variant with regions from the truth."""
-    return get_group(setting) != "query" or get_key(setting) in _OF_TRUE_REGIONS
+    return get_group(setting) not in ("query", "regions") or get_key(setting) in _OF_TRUE_REGIONS
 
 
 def get_key(setting: str) -> str:

@@ -65,8 +65,11 @@ class Method:
             InputError: The settings contradict each other or the preset.
         """
         config = load_config(self.preset, [*self.named, *self.silent], self.site)
-        if self.oracle_regions and config.method != "descriptor":
-            raise InputError(f"{self.variant}: oracle_regions is for method: descriptor, this one is {config.method}")
+        if self.oracle_regions and config.extract.method == "clusters":
+            raise InputError(
+                f"{self.variant}: oracle_regions: extract.method = clusters takes those of regions.source: expected "
+                "surface, voxel or nearest"
+            )
         return config
 
     def cell(self, world: World, seed: int, config: PipelineConfig, until: Until | None) -> Cell:

@@ -227,7 +227,7 @@ def cell_key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mappi
             # the digests name the weights, wherever their files lie
             "config": cell.config.model_dump(mode="json", exclude={"descriptor": {"weights"}, "sphere": {"weights"}}),
             "checkpoint": checkpoint_digest(cell.config.descriptor),
-            **({"sphere": sphere_digest(cell.config.sphere)} if cell.config.query.compare == "sphere" else {}),
+            **({"sphere": sphere_digest(cell.config.sphere)} if cell.config.regions.source == "sphere" else {}),
             "oracle": None if cell.oracle is None else cell.oracle.model_dump(mode="json"),
             **({"oracle_regions": True} if cell.oracle_regions else {}),
             "until": cell.until,

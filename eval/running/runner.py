@@ -17,7 +17,7 @@ from typing import Any
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.descriptors import list_checkpoints
-from cdpipe.methods.registry import load_method
+from cdpipe.methods.registry import load_source
 from eval.core.cluster import HERE, Where, connected, require_usable
 from eval.core.output import remove
 from eval.core.progress import RunProgress, Silent
@@ -175,12 +175,17 @@ def _limited(pairs: Sequence[Pair], limit: int | None) -> list[Pair]:
 
 def _require_extras(pairs: Sequence[Pair]) -> None:
     """Refuse to begin where methods need packages that are not installed; name all of them at once."""
-    mistakes = []
-    for method in dict.fromkeys(each.cell.config.method for pair in pairs for each in pair.todo):
+    mistakes: dict[str, None] = {}
+    cells = {each.cell.variant: each.cell for pair in pairs for each in pair.todo}
+    for cell in cells.values():
         try:
-            load_method(method)
+            if load_source(cell.config).detect is not None and cell.oracle_regions:
+                raise InputError(
+                    f"{cell.variant}: regions.source = {cell.config.regions.source} finds regions and objects at once: "
+                    "regions from the truth need a source with `propose`"
+                )
         except InputError as error:
-            mistakes.append(str(error))
+            mistakes[str(error)] = None
     if mistakes:
         raise InputError("\n".join(mistakes))
 

@@ -17,14 +17,15 @@ from cdpipe.core.path_frames import FRAMES
 from cdpipe.descriptors import checkpoint_digest, sphere_digest
 from cdpipe.merge.global_registration import is_kiss_matcher_installed
 from cdpipe.model.alignment import PathAlignment
-from cdpipe.model.config import PipelineConfig
-from cdpipe.model.report import ChangeRegions
+from cdpipe.model.config import SOURCES_AT_KEYFRAMES, PipelineConfig
+from cdpipe.model.report import ChangeRegions, Clusters
 from cdpipe.model.types import DescriptorSet, KeyframeViews, MergedMaps, PointMap
 from cdpipe.pipeline import Stage
 from eval.core.provenance import digest
 from eval.running.stage_cache import Arrays
 from eval.truth.ground_truth import SESSIONS
 
+_WHOLE_MAP_SOURCES = ("voxel-diff", "c2c", "m3c2", "dufomap")
 _PIXELS = tuple(f"{session}.return_pixels" for session in SESSIONS)
 
 
@@ -57,11 +58,24 @@ def name_result(stage: Stage, config: PipelineConfig) -> str:
         case "regions":
             read = {
                 "merge": name_result("merge", config),
-                "spheres": name_result("spheres", config) if config.query.compare == "sphere" else None,
-                "method": [config.method, config.seed, config.options],
+                "spheres": name_result("spheres", config) if config.regions.source == "sphere" else None,
+                "source": [config.regions.source, config.seed],
                 "settings": config.query.model_dump(mode="json"),
+                "own": {} if config.regions.source in SOURCES_AT_KEYFRAMES else _settings_of_clusters(config),
             }
     return f"{stage}-{digest(read)}"
+
+
+def is_kept(stage: Stage, config: PipelineConfig) -> bool:
+    """Return whether a result may be kept: the code of a plugin can change without a trace in its name."""
+    return stage != "regions" or config.regions.source in (*SOURCES_AT_KEYFRAMES, *_WHOLE_MAP_SOURCES)
+
+
+def _settings_of_clusters(config: PipelineConfig) -> dict[str, Any]:
+    """Return what a source that compares whole maps may read besides."""
+    found = config.model_dump(mode="json", include={"outlier", "cluster", "m3c2", "dufomap"})
+    how = {"method", "withdraw", "recentre"}  # objects are cut out of the regions
+    return found | {"extract": config.extract.model_dump(mode="json", exclude=how)}
 
 
 def pack(stage: Stage, value: Any) -> Arrays:
@@ -97,7 +111,8 @@ def unpack(stage: Stage, arrays: Arrays, maps: Sequence[PointMap] = ()) -> Any:
             before, after = maps
             return MergedMaps(before, after, **_plain(arrays), evidence=evidence, local=alignment)
         case "regions":
-            return ChangeRegions(**_plain(arrays))
+            clusters = _part(arrays, "clusters")
+            return ChangeRegions(**_plain(arrays), clusters=Clusters(**_plain(clusters)) if clusters else None)
 
 
 def _map_from(arrays: Arrays) -> PointMap:

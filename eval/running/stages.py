@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from cdpipe.methods.registry import load_method
+from cdpipe.methods.registry import load_source
 from cdpipe.model.config import MapConfig, PipelineConfig
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import MappedSession, PointMap, ScanSource
@@ -38,7 +38,7 @@ from cdpipe.pipeline import (
 )
 from eval.plans.variants import Until
 from eval.running.stage_cache import Kept, StageCache
-from eval.running.stage_results import name_result, pack, unpack
+from eval.running.stage_results import is_kept, name_result, pack, unpack
 
 REPEAT_BELOW_S = 1.0
 REPEATS = 3
@@ -87,6 +87,8 @@ class PairStages(Hooks):
         if stage == "maps":
             maps: Any = self._find_maps(name, compute)
             return Done(maps)
+        if not is_kept(stage, config):
+            return self.time(compute)
         kept = self._cache.find(name)
         if kept is None:
             done = compute() if stage in _OF_DESCRIPTORS else self.time(compute)
@@ -133,7 +135,7 @@ class PairStages(Hooks):
         else:
             report = detect_changes(*mapped.value, config, self, merge=merge, propose=propose)
             report = replace(report, evidence={**report.evidence, **kept_bytes(mapped.value[0], config)})
-            is_described = propose is None and load_method(config.method).uses_descriptors
+            is_described = propose is None and load_source(config).uses_descriptors
         return replace(report, seconds={**report.seconds, **self._of_descriptors(mapped.seconds, is_described)})
 
     def _of_descriptors(self, seconds: Mapping[str, float], is_described: bool) -> Mapping[str, float]:
@@ -172,20 +174,20 @@ def time_parts(compute: Callable[[], Done[T]], clock: Callable[[], float] = time
 def kept_bytes(before: MappedSession, config: PipelineConfig) -> dict[str, float]:
     """Return the bytes of the thinned before map, and of what a method keeps of that session to find regions.
 
-    Both as float32: x, y, z of every map point; for a descriptor one vector and one pose (7 numbers) per keyframe, and
-    the width of the drift where the radius follows it. Any
-    other method keeps the map; `dufomap` also keeps the returns of the scans that it casts. Random regions keep the
-    poses alone.
+    All as float32: x, y, z of every map point; for a descriptor one vector and one pose (7 numbers) per keyframe, and
+    the width of the drift where the radius follows it. Random regions and every keyframe need no vector. Any other
+    source keeps the map; `dufomap` also keeps the returns of the scans that it casts.
     """
     map_bytes = 12.0 * len(before.map.points)
-    vectors = {"scan": before.descriptors.q, "sphere": before.descriptors.spheres}.get(config.query.compare)
+    source = config.regions.source
+    vectors = {"scan": before.descriptors.q, "sphere": before.descriptors.spheres}.get(source)
     n_keyframes = len(before.map.keyframe_scans)
-    if config.method == "random-regions":
-        kept = _POSE_BYTES * n_keyframes
-    elif config.method == "descriptor" and vectors is not None:
-        width_bytes = 4.0 if config.query.radius_m == "width" else 0.0
-        kept = (_POSE_BYTES + width_bytes) * n_keyframes + float(vectors.nbytes)
-    elif config.method == "dufomap":
+    pose_bytes = _POSE_BYTES + (4.0 if config.query.radius_m == "width" else 0.0)
+    if source in ("random-regions", "every-keyframe"):
+        kept = pose_bytes * n_keyframes
+    elif vectors is not None:
+        kept = pose_bytes * n_keyframes + float(vectors.nbytes)
+    elif source == "dufomap":
         kept = map_bytes + 12.0 * float(np.diff(before.map.scan_offsets)[:: config.dufomap.every_scan].sum())
     else:
         kept = map_bytes

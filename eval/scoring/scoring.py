@@ -66,14 +66,18 @@ class CaseScore:
 def score(answer: ChangeReport | Path | str, pair: Path | str) -> dict[str, Any]:
     """Score a report, or the folder of a stored answer, against a simulated pair: one row of results.csv.
 
+    A report is called as its config says under `method`, or else by its source of regions.
+
     Raises:
         InputError: The pair has no truth, a file is damaged, or the answer cannot be an answer to this pair.
     """
     truth = load_ground_truth(Path(pair))
     if not isinstance(answer, ChangeReport):
         return score_stored(truth, Path(answer)).row
-    method, measured = str(answer.config.get("method", "")), (answer.seconds, answer.evidence)
-    whole = Answer("ok", "", method, answer, *measured, checkpoints=answer.checkpoints)
+    config: dict[str, Any] = dict(answer.config)
+    method = config.get("method", config.get("regions", {}).get("source", ""))
+    measured = answer.seconds, answer.evidence
+    whole = Answer("ok", "", str(method), answer, *measured, checkpoints=answer.checkpoints)
     check_answer(whole, truth, Path("report"))
     return score_answer(whole, truth).row
 

@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import pandas as pd
 import typer
 
+from cdpipe.core.errors import InputError
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import checkpoint_digest, list_checkpoints, sphere_digest, use_threads
 from cdpipe.model.config import load_config
@@ -64,7 +65,12 @@ def measure(
         ScenarioError: A world cannot be drawn or built.
         InputError: `out` cannot be written, or a setting is wrong.
     """
-    list_checkpoints(load_config("tunnelcd", settings))
+    config = load_config("tunnelcd", settings)
+    if config.regions.source != "sphere":
+        raise InputError(
+            f"--set: regions.source = {config.regions.source}: expected sphere, which is what is measured here"
+        )
+    list_checkpoints(config)
     make_writable(out)
     use_threads(THREADS)
     todo = [(family, seed, load_scenario(family, seed)) for seed in seeds for family in families]
@@ -103,7 +109,9 @@ def _key(scenario: Scenario, seed: int, settings: Sequence[str]) -> str:
             "scenario": scenario.model_dump(mode="json"),
             "files": file_digests(scenario),
             "seed": seed,
-            "config": config.model_dump(mode="json", include={"map", "descriptor", "merge", "query"}, exclude=unused),
+            "config": config.model_dump(
+                mode="json", include={"map", "descriptor", "merge", "regions", "query"}, exclude=unused
+            ),
             "checkpoints": [
                 checkpoint_digest(config.descriptor.model_copy(update={"method": method})) for method in METHODS
             ],

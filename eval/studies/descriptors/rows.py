@@ -128,7 +128,7 @@ def measure_spheres(
         of_precision = config.descriptor.model_copy(update={"precision": precision})
         spheres = describe_map(merged.before, poses, of_precision, config.sphere)
         described = replace(before, spheres=spheres)
-        scores = find_regions(merged, described, after, config.query, config.sphere).keyframe_scores
+        scores = find_regions(merged, described, after, config).keyframe_scores
         seconds = thread_time() - start
         rows.append(
             {

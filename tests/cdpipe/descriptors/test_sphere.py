@@ -21,7 +21,7 @@ from cdpipe.descriptors.sphere_image import (
 )
 from cdpipe.descriptors.sphere_network import SECTORS, make_untrained_sphere_network
 from cdpipe.model.alignment import PathAlignment
-from cdpipe.model.config import DescriptorConfig, QueryConfig, SphereConfig
+from cdpipe.model.config import DescriptorConfig, SphereConfig, load_config
 from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap
 from cdpipe.query.query import find_regions
 
@@ -143,8 +143,7 @@ def test_eight_bits_say_about_the_same() -> None:
 def test_regions_of_spheres_and_the_reach_of_their_scores() -> None:
     merged = _merged(12.0, make_pose())
     before, after = _set_of(merged.before), _set_of(merged.after)
-    config = QueryConfig(compare="sphere", radius_m=4.0)
-    regions = find_regions(merged, before, after, config)
+    regions = find_regions(merged, before, after, load_config("tunnelcd", ["query.radius_m=4"]))
     assert abs(regions.centres_map[0, 0] - 12) <= 1
     assert regions.pairs[0].tolist() == [round(regions.centres_map[0, 0])] * 2
     assert not regions.direction.any()  # it is always the before keyframe that is looked up
@@ -161,7 +160,7 @@ def test_keyframes_the_after_session_never_came_near_have_no_score() -> None:
     merged = _merged(None, make_pose())
     before, after = _set_of(merged.before), _set_of(merged.after)
     short = replace(after, q=after.q[:8], keyframe_scans=after.keyframe_scans[:8], spheres=None)
-    regions = find_regions(merged, before, short, QueryConfig(compare="sphere", max_pair_m=2.0))
+    regions = find_regions(merged, before, short, load_config("tunnelcd", ["query.max_pair_m=2"]))
     assert np.isfinite(regions.keyframe_scores[:10]).all() and np.isnan(regions.keyframe_scores[10:]).all()
     assert regions.centres_map[:, 0].max() <= 9
 

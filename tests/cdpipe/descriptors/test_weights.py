@@ -17,7 +17,7 @@ from cdpipe.descriptors import checkpoint_digest, describe_map, describe_scan, l
 from cdpipe.descriptors.network import make_untrained_network
 from cdpipe.descriptors.sphere_network import SphereSize, make_untrained_sphere_network
 from cdpipe.descriptors.weights_file import digest, numbered_checkpoint_bytes
-from cdpipe.model.config import DescriptorConfig, PipelineConfig, QueryConfig, SphereConfig
+from cdpipe.model.config import DescriptorConfig, PipelineConfig, RegionsConfig, SphereConfig
 from cdpipe.model.types import PointMap, PosedScan
 
 Digest = Callable[[str], str]
@@ -79,7 +79,7 @@ def test_a_file_that_changes_is_read_anew(tmp_path: Path) -> None:
 
 
 def test_checkpoints_are_those_that_a_method_uses(tmp_path: Path) -> None:
-    shipped = PipelineConfig(query=QueryConfig(compare="sphere"))
+    shipped = PipelineConfig(regions=RegionsConfig(source="sphere"))
     assert list_checkpoints(shipped) == {"3deg": checkpoint_digest(DescriptorConfig()), "sphere": sphere_digest()}
     mine = SphereConfig(weights=write(tmp_path / "mine.safetensors", make_untrained_sphere_network(1)))
     assert list_checkpoints(shipped.model_copy(update={"sphere": mine}))["sphere"] == sphere_digest(mine)

@@ -117,21 +117,33 @@ def plane(z_m: float) -> Float64Array:
     return np.column_stack([x.ravel(), y.ravel(), z_m + roughness_m])
 
 
-def placed(before: Float64Array, after: Float64Array, path: Float64Array, maps: MergedMaps) -> PlacedMaps:
-    return PlacedMaps(maps, {"before": before, "after": after}, {"before": path, "after": path})
+def placed(
+    before: Float64Array, after: Float64Array, path: Float64Array, maps: MergedMaps, radius_m: float = 9.0
+) -> PlacedMaps:
+    radii_m = np.full(len(path), radius_m)
+    return PlacedMaps(
+        maps, {"before": before, "after": after}, {"before": path, "after": path}, {"before": radii_m, "after": radii_m}
+    )
 
 
 @needs("m3c2")
 def test_m3c2_of_a_plane_that_rose_by_hand(empty: PointMap) -> None:
     turn = yaw_pose(0.4, (1.0, 2.0, 3.0))
     turn[:3, :3] = turn[:3, :3] @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    settings = ("query.radius_m=9", "m3c2.depth_m=1.5", "extract.distance_m=0.3")
+    settings = ("m3c2.depth_m=1.5", "extract.distance_m=0.3")
 
-    def share(session: SessionName, rose_m: float, seen_from_m: float, moved_by: Float64Array, *more: str) -> float:
+    def share(
+        session: SessionName,
+        rose_m: float,
+        seen_from_m: float,
+        moved_by: Float64Array,
+        *more: str,
+        radius_m: float = 9.0,
+    ) -> float:
         before, after, path = (
             transform(moved_by, cloud) for cloud in (plane(0.0), plane(rose_m), np.array([[0.0, 0.0, seen_from_m]]))
         )
-        maps = placed(before, after, path, merged(empty, empty, np.eye(4)))
+        maps = placed(before, after, path, merged(empty, empty, np.eye(4)), radius_m)
         other: SessionName = "before" if session == "after" else "after"
         return float(m3c2.new_mask(maps, session, other, load_config("m3c2", [*settings, *more])).mean())
 
@@ -146,7 +158,7 @@ def test_m3c2_of_a_plane_that_rose_by_hand(empty: PointMap) -> None:
         # beyond the cylinder there is nothing to measure a distance to
         assert share("after", 1.6, 3.0, moved_by) == 0.0
     # points that nobody passed near are not asked about
-    assert share("after", 0.31, 2.0, np.eye(4), "query.radius_m=1.5") == 0.0
+    assert share("after", 0.31, 2.0, np.eye(4), radius_m=1.5) == 0.0
 
 
 @needs("m3c2")
@@ -177,17 +189,18 @@ def test_dufomap_by_hand(empty: PointMap) -> None:
     """The room ends at x = 5: void in front of that wall, but not behind it, nor within the inflation of its hits."""
     x_m = np.array([0.0, 3.0, 4.45, 4.95, 5.3, 5.9])
     asked = np.column_stack([x_m, np.zeros(len(x_m)), np.full(len(x_m), 1.5)])
-    maps = placed(asked, asked, np.zeros((1, 3)), merged(empty, empty, np.eye(4)))
+    sessions = merged(empty, empty, np.eye(4))
+    maps, short = (placed(asked, asked, np.zeros((1, 3)), sessions, radius_m) for radius_m in (9.0, 1.0))
     directions: tuple[tuple[SessionName, SessionName], ...] = (("after", "before"), ("before", "after"))
 
-    def is_void(session: SessionName, other: SessionName, *settings: str) -> list[bool]:
-        given = ("query.radius_m=9", "dufomap.voxel_m=0.1", "dufomap.hit_inflation_m=0.2", *settings)
+    def is_void(session: SessionName, other: SessionName, *settings: str, maps: PlacedMaps = maps) -> list[bool]:
+        given = ("dufomap.voxel_m=0.1", "dufomap.hit_inflation_m=0.2", *settings)
         return dufomap.new_mask(maps, session, other, load_config("dufomap", given)).tolist()
 
     for session, other in directions:
         assert is_void(session, other) == [True, True, True, False, False, False]
     assert is_void("after", "before", "dufomap.hit_inflation_m=1") == [True, True, False, False, False, False]
-    assert not any(is_void("after", "before", "query.radius_m=1"))
+    assert not any(is_void("after", "before", maps=short))
 
 
 @needs("dufomap")

@@ -223,10 +223,10 @@ def test_random_regions_stay_where_the_after_session_came() -> None:
     assert regions.centres_map[:, 0].max() <= 11.5
 
 
-def test_every_preset_has_its_method() -> None:
-    assert {load_config(name).method for name in preset_names()} <= entry_points(METHODS).keys()
-    assert load_method("voxel-diff").detect == voxel_diff.detect
-    assert load_method("c2c").detect == c2c.detect
+def test_every_preset_has_its_source() -> None:
+    assert {load_config(name).regions.source for name in preset_names()} <= entry_points(METHODS).keys()
+    assert load_method("voxel-diff").propose == voxel_diff.propose
+    assert load_method("c2c").propose == c2c.propose
 
 
 def test_figures_are_of_the_after_map() -> None:
@@ -243,8 +243,8 @@ def test_figures_are_of_the_after_map() -> None:
     assert report.figures["v_oe_m3"][0] == pytest.approx(0.4**3)
 
 
-def test_a_mask_of_ones_own_makes_a_method() -> None:
-    """A whole-map method is a mask."""
+def test_a_mask_of_ones_own_makes_a_source() -> None:
+    """A whole-map comparison is a mask."""
 
     def higher_mask(maps: PlacedMaps, session: SessionName, other: SessionName, config: PipelineConfig) -> BoolArray:
         points, others = maps.points[session], maps.points[other]
@@ -259,7 +259,18 @@ def test_a_mask_of_ones_own_makes_a_method() -> None:
     def in_the_middle(maps: PlacedMaps, session: SessionName, other: SessionName, config: PipelineConfig) -> BoolArray:
         return higher_mask(maps, session, other, config) & (np.abs(maps.points[session][:, 1]) < 1.5)
 
-    report = in_the_middle.detect(merged, descriptors(merged.before), descriptors(merged.after), config)
-    assert report.regions.scores.tolist() == [64.0]
-    (item,) = report.objects
-    assert (item.session, item.kind) == ("after", "added")
+    regions = in_the_middle.propose(merged, descriptors(merged.before), descriptors(merged.after), config)
+    assert regions.scores.tolist() == [64.0]
+    assert regions.clusters is not None
+    assert regions.clusters.is_after.tolist() == [True]
+
+
+def test_points_are_compared_within_the_radius_of_the_others_nearest_keyframe() -> None:
+    path = np.array([[0.0, 0, 0], [10, 0, 0]])
+    points = np.array([[0.0, 4.5, 0], [0, 4.6, 0], [10, 9.9, 0], [10, 10.1, 0], [4.9, 4.6, 0], [5.1, 4.6, 0]])
+    radii_m = np.array([4.5, 10.0])
+    maps = PlacedMaps(pair([], []), {"before": path, "after": points}, {"before": path, "after": path},
+                      {"before": radii_m, "after": radii_m})  # fmt: skip
+    assert maps.is_compared("after", "before").tolist() == [True, False, True, False, False, True]
+    nowhere = replace(maps, path={"before": path[:0], "after": path}, radii_m={"before": radii_m[:0], "after": radii_m})
+    assert not nowhere.is_compared("after", "before").any()

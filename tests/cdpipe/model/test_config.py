@@ -5,7 +5,7 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.model.config import PipelineConfig, load_config, preset_names, settings_table
 
-WITHOUT_SITE = ("tunnelcd", "sphere-difference", "kiss-matcher", "frame")
+WITHOUT_SITE = ("tunnelcd", "every-keyframe", "sphere-difference", "kiss-matcher", "frame")
 
 
 def test_every_shipped_preset_is_valid() -> None:
@@ -65,11 +65,9 @@ def test_a_radius_that_follows_the_width_needs_no_site(tmp_path: Path) -> None:
     preset.write_text("query: {radius_m: width, threshold: 0.5}\n")
     assert load_config(str(preset)) == load_config(str(preset), site="wide")
     fixed = load_config(str(preset), ["query.radius_m=6"], "wide").query
-    assert (fixed.radius_m, fixed.fixed_radius_m, fixed.threshold) == (6.0, 6.0, 0.5)
+    assert (fixed.radius_m, fixed.threshold) == (6.0, 0.5)
     preset.write_text("query: {radius_m: 3}\n")
     assert load_config(str(preset), ["query.radius_m=width"], "wide").query.radius_m == "width"
-    with pytest.raises(ValueError, match="width"):
-        _ = load_config("tunnelcd").query.fixed_radius_m
 
 
 @pytest.mark.parametrize("value", ["-1", "0", "widht", "[4]", "null"])
@@ -81,10 +79,20 @@ def test_a_radius_is_a_length_or_the_word(value: str) -> None:
     assert ('did you mean "width"' in line) == (value == "widht")
 
 
-def test_methods_without_keyframes_need_a_length() -> None:
-    for name in ("c2c", "voxel-diff", "random-regions"):
-        with pytest.raises(InputError, match=r"query.radius_m = width is for method: descriptor, this one is .*4\.5"):
-            load_config(name, ["query.radius_m=width"])
+@pytest.mark.parametrize("key", ["method=c2c", "query.compare=sphere"])
+def test_former_keys_name_those_that_replaced_them(key: str) -> None:
+    former = key.partition("=")[0]
+    with pytest.raises(InputError, match=rf"^--set: {former} = .*: unknown key; it is regions.source now: "):
+        load_config("tunnelcd", [key])
+
+
+@pytest.mark.parametrize("preset", ["tunnelcd", "paper", "every-keyframe", "sphere-difference", "random-regions"])
+def test_clusters_need_a_source_that_compares_whole_maps(preset: str) -> None:
+    with pytest.raises(InputError, match=r"extract\.method = clusters: regions\.source = .* surface, voxel or"):
+        load_config(preset, ["extract.method=clusters"])
+    for rule in ("surface", "voxel", "nearest"):
+        assert load_config(preset, [f"extract.method={rule}"]).extract.method == rule
+        assert load_config("c2c", [f"extract.method={rule}"]).extract.method == rule
 
 
 def test_paper_preset_holds_the_published_settings() -> None:

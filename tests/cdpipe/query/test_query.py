@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, yaw_pose
-from cdpipe.model.config import QueryConfig
+from cdpipe.model.config import PipelineConfig, QueryConfig, RegionsConfig
 from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap
 from cdpipe.query.query import find_regions, rank_regions
 
@@ -29,6 +29,10 @@ def session(positions: list[tuple[float, float, float]], q: list[list[float]]) -
     return point_map, DescriptorSet(vectors, None, scans, "by hand", "")
 
 
+def by(source: str, **settings: object) -> PipelineConfig:
+    return PipelineConfig(regions=RegionsConfig(source=source), query=QueryConfig.model_validate(settings))
+
+
 def find(
     before: tuple[PointMap, DescriptorSet],
     after: tuple[PointMap, DescriptorSet],
@@ -37,7 +41,7 @@ def find(
 ) -> dict[tuple[float, ...], tuple[float, tuple[int, int]]]:
     """Score and pair of every candidate, by its centre."""
     merged = MergedMaps(before[0], after[0], make_pose() if before_T_after is None else before_T_after, {}, True)
-    regions = find_regions(merged, before[1], after[1], QueryConfig(suppression=1e-9, **settings))
+    regions = find_regions(merged, before[1], after[1], by("scan", suppression=1e-9, **settings))
     return {
         tuple(np.round(centre, 6).tolist()): (pytest.approx(score, abs=1e-6), (int(pair[0]), int(pair[1])))
         for centre, score, pair in zip(regions.centres_map, regions.scores, regions.pairs, strict=True)
@@ -76,7 +80,7 @@ def test_reading_b_by_hand() -> None:
 def test_the_direction_says_whose_keyframe_was_looked_up() -> None:
     merged = MergedMaps(BEFORE[0], AFTER[0], make_pose(), {}, True)
     for reading in ("nearest", "paired"):
-        regions = find_regions(merged, BEFORE[1], AFTER[1], QueryConfig(reading=reading, suppression=1e-9))
+        regions = find_regions(merged, BEFORE[1], AFTER[1], by("scan", reading=reading, suppression=1e-9))
         # before keyframes stand at y = 0, after keyframes at y = 1; the centre is where the asking one stands
         np.testing.assert_array_equal(regions.direction, regions.centres_map[:, 1])
         own = np.where(regions.direction == 0, regions.pairs[:, 0], regions.pairs[:, 1])
@@ -93,6 +97,7 @@ def test_a_direction_is_dropped_and_ordered_with_its_candidate() -> None:
         np.zeros(0),
         QueryConfig(radius_m=4.0),
         np.array([1, 1, 0], np.uint8),
+        radii_m=np.full(3, 4.0),
     )
     assert regions.direction.tolist() == [0, 1]
 
@@ -110,10 +115,10 @@ def test_scores_of_before_keyframes_by_hand() -> None:
     before = session([(0, 0, 0), (10, 0, 0), (40, 0, 0)], [[1, 0], [1, 0], [1, 0]])
     after = session([(0, 1, 0), (10, 1, 0), (10, 4, 0)], [[1, 0], [0.6, 0.8], [-1, 0]])
     merged = MergedMaps(before[0], after[0], make_pose(), {}, True)
-    paired = find_regions(merged, before[1], after[1], QueryConfig(reading="paired"))
+    paired = find_regions(merged, before[1], after[1], by("scan", reading="paired"))
     # own scores: 0, |(1, 0) - (0.6, 0.8)|; heard from after keyframe 2: 2; the third place was not visited again
     np.testing.assert_allclose(paired.keyframe_scores, [0, 2, np.nan], atol=1e-6)
-    nearest = find_regions(merged, before[1], after[1], QueryConfig(reading="nearest"))
+    nearest = find_regions(merged, before[1], after[1], by("scan", reading="nearest"))
     # reading A: every before keyframe finds (1, 0) again; after keyframe 2 is |(-1, 0) - (1, 0)| from all
     np.testing.assert_allclose(nearest.keyframe_scores, [0, 2, np.nan], atol=1e-6)
 
@@ -142,7 +147,8 @@ def test_a_session_without_keyframes() -> None:
 def ranked(xs: list[float], scores: list[float], **settings: object) -> tuple[list[float], list[bool]]:
     centres = np.array([[x, 0.0, 0.0] for x in xs]).reshape(-1, 3)
     pairs = np.zeros((len(xs), 2), np.int64)
-    regions = rank_regions(centres, np.array(scores), pairs, np.zeros(0), QueryConfig(radius_m=4.0, **settings))
+    config, radii_m = QueryConfig(radius_m=4.0, **settings), np.full(len(xs), 4.0)
+    regions = rank_regions(centres, np.array(scores), pairs, np.zeros(0), config, radii_m=radii_m)
     return regions.centres_map[:, 0].tolist(), regions.is_reported.tolist()
 
 
@@ -163,8 +169,6 @@ def test_the_radius_of_the_better_one_decides_what_is_near() -> None:
 
     assert kept([2, 1]) == ([0], [10])
     assert kept([1, 2]) == ([6, 0], [4.5, 10])
-    with pytest.raises(ValueError, match="width"):
-        rank_regions(np.zeros((1, 3)), np.ones(1), np.zeros((1, 2)), np.zeros(0), QueryConfig(radius_m="width"))
 
 
 def test_threshold_or_number() -> None:
@@ -179,8 +183,8 @@ def test_of_equal_scores_the_first_comes_first() -> None:
     assert ranked([0, 10, 20], [1, 1, 1])[0] == [0, 10, 20]
 
 
-@pytest.mark.parametrize("compare", ["scan", "difference"])
-def test_regions_have_the_radius_of_their_own_keyframe_where_it_follows_the_width(compare: str) -> None:
+@pytest.mark.parametrize("source", ["scan", "sphere-difference"])
+def test_regions_have_the_radius_of_their_own_keyframe_where_it_follows_the_width(source: str) -> None:
     def in_drift(session: tuple[PointMap, DescriptorSet], width_m: float) -> tuple[PointMap, DescriptorSet]:
         x, y, z = np.meshgrid(np.arange(-3.0, 24.0, 0.2), [-width_m / 2, width_m / 2], np.arange(-1.0, 1.0, 0.2))
         points = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
@@ -188,11 +192,11 @@ def test_regions_have_the_radius_of_their_own_keyframe_where_it_follows_the_widt
 
     before, after = in_drift(BEFORE, 5.0), in_drift(AFTER, 14.0)
     merged = MergedMaps(before[0], after[0], make_pose(), {}, True)
-    found = find_regions(merged, before[1], after[1], QueryConfig(compare=compare, radius_m="width", suppression=1e-9))
+    found = find_regions(merged, before[1], after[1], by(source, radius_m="width", suppression=1e-9))
     # before keyframes are in a drift 5 m wide, after keyframes in one 14 m wide
-    assert len(found.radii_m) == (6 if compare == "scan" else 3)
+    assert len(found.radii_m) == (6 if source == "scan" else 3)
     np.testing.assert_array_equal(found.radii_m, np.where(found.direction == 0, 4.5, 10.0))
-    fixed = find_regions(merged, before[1], after[1], QueryConfig(compare=compare, radius_m=4.5, suppression=1e-9))
+    fixed = find_regions(merged, before[1], after[1], by(source, radius_m=4.5, suppression=1e-9))
     assert fixed.radius_m == 4.5
 
 
@@ -201,7 +205,7 @@ def test_scores_of_spheres_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     local = np.array([-5.0, 8.0, -6.0, -6.5, -1.0, np.nan])
     monkeypatch.setattr("cdpipe.query.query.change_log_odds", lambda *_: local)
     merged = MergedMaps(before[0], AFTER[0], make_pose(), {}, True)
-    found = find_regions(merged, before[1], AFTER[1], QueryConfig(compare="sphere", radius_m=4.5, max_pair_m=6.0))
+    found = find_regions(merged, before[1], AFTER[1], by("sphere", radius_m=4.5, max_pair_m=6.0))
     # 8 counts as 3, less 0.1 per metre: 3 at its keyframe, 2.8 at both neighbours and 2.6 two keyframes on; the last
     # but one has nothing surer than -1 within 4.5 m; the last was not visited again
     np.testing.assert_allclose(found.keyframe_scores, [2.8, 3.0, 2.8, 2.6, -1.0, np.nan])
@@ -213,7 +217,7 @@ def test_scores_of_the_sphere_difference_by_hand(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("cdpipe.query.query.sphere_difference", lambda *_: np.array([0.1, 0.5, np.nan, 0.2]))
     merged = MergedMaps(before[0], before[0], make_pose(), {}, True)
     # without a map the drift counts as narrow, and the surroundings reach 4.5 m; 3 % less per metre
-    follows = find_regions(merged, before[1], before[1], QueryConfig(compare="difference", radius_m="width"))
+    follows = find_regions(merged, before[1], before[1], by("sphere-difference", radius_m="width"))
     np.testing.assert_allclose(follows.keyframe_scores, [0.5 * 0.94, 0.5, 0.5 * 0.94, 0.2])
-    fixed = find_regions(merged, before[1], before[1], QueryConfig(compare="difference", radius_m=4.5))
+    fixed = find_regions(merged, before[1], before[1], by("sphere-difference", radius_m=4.5))
     np.testing.assert_array_equal(fixed.keyframe_scores, [0.1, 0.5, np.nan, 0.2])

@@ -21,7 +21,7 @@ def test_a_missing_extra_is_named_before_anything_is_mapped(
     folders = (tiny_pair / "before", tiny_pair / "after", "--preset", method, "--out", tmp_path / "out")
     code, out, err = command("detect", *folders)
     assert code == 2
-    assert f"method {method} needs a package more: pip install 'tunnelcd[{method}]'" in err
+    assert f"regions.source = {method} needs a package more: pip install 'tunnelcd[{method}]'" in err
     assert not (tmp_path / "out").exists()
     assert out == ""
     for name in entry_points(METHODS).keys() - PACKAGES.keys():

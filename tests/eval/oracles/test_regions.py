@@ -140,6 +140,7 @@ def test_a_plan_is_written_as_it_was_read(tmp_path: Path) -> None:
             "{preset: tunnelcd, oracle_regions: true, set: [query.threshold=1]}",
             "this variant's regions are the truth's",
         ),
+        ("{preset: tunnelcd, oracle_regions: true, set: [regions.source=scan]}", "regions.source=scan"),
         ("{preset: tunnelcd, oracle_regions: true, per_scenario: {narrow: [query.n_regions=3]}}", "query.n_regions=3"),
         ("{preset: tunnelcd, oracle_regions: true, oracle_merge: {}, set: [merge.voxel_m=1]}", "merged by the truth"),
     ],
@@ -149,9 +150,9 @@ def test_settings_that_nothing_reads_are_refused(tmp_path: Path, variant: str, r
         plan_of(tmp_path, PLAN.replace("{preset: tunnelcd, oracle_regions: true}", variant))
 
 
-def test_a_method_without_regions_of_its_own_takes_none_from_the_truth(tmp_path: Path) -> None:
+def test_clusters_of_a_source_take_no_regions_from_the_truth(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, PLAN.replace("tunnelcd, oracle_regions", "c2c, oracle_regions"))
-    with pytest.raises(InputError, match=r"oracle_regions .*c2c"):
+    with pytest.raises(InputError, match=r"c2c.*oracle_regions: extract.method = clusters"):
         expand_cells(plan)
 
 

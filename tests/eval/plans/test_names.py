@@ -17,7 +17,7 @@ PLAN = "name: hostile\nscenarios: [{worlds}]\nseeds: [10600]\nvariants: [{varian
 def write_plan(folder: Path, presets: tuple[str, ...], worlds: str = "smoke/one_box") -> Path:
     for name in presets:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text("method: voxel-diff\n")
+        (folder / name).write_text("regions: {source: voxel-diff}\n")
     path = folder / "plan.yaml"
     variants = ", ".join(f'{{preset: "{folder / name}"}}' for name in presets)
     path.write_text(PLAN.format(worlds=worlds, variants=variants))

@@ -105,7 +105,7 @@ def test_grid_points_get_their_values(tmp_path: Path) -> None:
     config = {c.variant: c.config for c in expand_cells(read(tmp_path))}[
         "tunnelcd[extract.voxel_m=0.3,query.radius_m=3]"
     ]
-    assert (config.extract.voxel_m, config.query.radius_m, config.query.compare) == (0.3, 3.0, "sphere")
+    assert (config.extract.voxel_m, config.query.radius_m, config.regions.source) == (0.3, 3.0, "sphere")
 
 
 def test_all_mistakes_of_a_plan_at_once_with_lines(tmp_path: Path) -> None:

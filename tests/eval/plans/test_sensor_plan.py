@@ -67,8 +67,8 @@ def test_no_threshold_hides_an_effect() -> None:
     for cell in found:
         assert {cell.config.query.n_regions} == as_in_tune
         assert cell.config.query.radius_m == ("width" if cell.preset == "tunnelcd" else 4.5)
-    variants = {cell.config.method: cell.config for cell in found}
-    assert set(variants) == {"descriptor", "voxel-diff"}
+    variants = {cell.config.regions.source: cell.config for cell in found}
+    assert set(variants) == {"sphere", "voxel-diff"}
     assert variants["voxel-diff"].extract == load_config("voxel-diff").extract
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from cdpipe.core.errors import InputError
+from cdpipe.methods.registry import Method
 from eval.cli.tools import check_file
 from eval.core import cluster
 from eval.core.cluster import Where, exposure, require_reachable
@@ -43,13 +44,29 @@ def test_missing_extras_are_named_all_at_once_before_anything_is_made(
     code, out, err = command("run", tmp_path / "plan.yaml", "--out", tmp_path / "run")
     assert (code, out) == (2, "")
     assert err.splitlines() == [
-        f"error: method {name} needs a package more: pip install 'tunnelcd[{name}]'" for name in ("m3c2", "dufomap")
+        f"error: regions.source = {name} needs a package more: pip install 'tunnelcd[{name}]'"
+        for name in ("m3c2", "dufomap")
     ]
     assert not (tmp_path / "run").exists()
     # the first cell alone needs neither, and a list of cells needs nothing
     with pytest.raises(AssertionError, match="nothing must be made"):
         command("run", tmp_path / "plan.yaml", "--out", tmp_path / "run", "--limit", 1)
     assert command("run", tmp_path / "plan.yaml", "--out", tmp_path / "list", "--dry-run")[0] == 0
+
+
+def test_regions_from_the_truth_need_a_source_that_does_not_cut_out_itself(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = Method(detect=forbidden, propose=None, uses_descriptors=False, has_clusters=False)
+    monkeypatch.setattr(runner, "load_source", lambda config: whole)
+    plan_of(tmp_path, "{preset: tunnelcd}, {preset: tunnelcd, oracle_regions: true}")
+    code, _, err = command("run", tmp_path / "plan.yaml", "--out", tmp_path / "run")
+    (line,) = err.splitlines()
+    assert (code, line.startswith("error: oracle-regions: regions.source = sphere finds regions and objects at")) == (
+        2,
+        True,
+    )
+    assert not (tmp_path / "run").exists()
 
 
 class Noted(Silent):

@@ -216,11 +216,11 @@ def test_limit_and_then_the_rest(tmp_path: Path, runner: Runner) -> None:
 
 def test_a_changed_setting_redoes_its_cells_only(tmp_path: Path, runner: Runner) -> None:
     preset = tmp_path / "own.yaml"
-    preset.write_text("method: voxel-diff\n")
+    preset.write_text("regions: {source: voxel-diff}\nextract: {method: clusters}\n")
     plan = plan_of(tmp_path, variants=f"{{preset: {preset}}}, {{preset: random-regions}}")
     run, _ = runner.run(tmp_path / "run", plan)
     assert table(run)["preset"].tolist() == ["own", "random-regions"]
-    preset.write_text("method: voxel-diff\nquery: {threshold: 1000000}\n")
+    preset.write_text("regions: {source: voxel-diff}\nextract: {method: clusters}\nquery: {threshold: 1000000}\n")
     assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(1, 1, 0)
     assert table(run).set_index("variant").loc["own", "n_regions"] == 0
     assert runner.families() == [ONE_BOX]

@@ -19,7 +19,7 @@ from cdpipe.descriptors.sphere_network import make_untrained_sphere_network
 from cdpipe.descriptors.weights_file import numbered_checkpoint_bytes
 from cdpipe.methods import descriptor
 from cdpipe.model.alignment import PathAlignment
-from cdpipe.model.config import PipelineConfig, load_config
+from cdpipe.model.config import PipelineConfig, RegionsConfig, load_config
 from cdpipe.model.report import ChangeRegions
 from cdpipe.model.types import DescriptorSet, KeyframeViews, MergedMaps, PointMap
 from cdpipe.pipeline import Stage
@@ -29,7 +29,7 @@ from eval.running.pair_run import Tools
 from eval.running.runfolder import RunFolder, start_run_folder
 from eval.running.runner import run_plan
 from eval.running.stage_cache import Kept, StageCache, open_cache
-from eval.running.stage_results import name_result, pack, unpack
+from eval.running.stage_results import is_kept, name_result, pack, unpack
 from eval.running.stages import PairStages
 from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
@@ -407,3 +407,32 @@ def test_files_of_weights_are_told_apart_by_what_they_hold(tmp_path: Path) -> No
         one, other, moved = name(stage, key, 1, "a"), name(stage, key, 2, "a"), name(stage, key, 1, "b")
         assert one == moved != other
         assert name_result(stage, config_of("tunnelcd")) not in (one, other)
+
+
+@pytest.mark.parametrize(
+    ("preset", "setting", "is_read"),
+    [
+        ("m3c2", "extract.distance_m=0.2", True),
+        ("m3c2", "m3c2.normal_m=2", True),
+        ("dufomap", "dufomap.every_scan=2", True),
+        ("voxel-diff", "extract.voxel_m=0.4", True),
+        ("voxel-diff", "outlier.sigmas=3", True),
+        ("c2c", "cluster.min_points=9", True),
+        ("c2c", "extract.method=voxel", False),
+        ("c2c", "extract.withdraw=false", False),
+        ("c2c", "regions.source=m3c2", True),
+        ("tunnelcd", "extract.voxel_m=0.4", False),
+        ("tunnelcd", "regions.source=every-keyframe", True),
+    ],
+)
+def test_regions_are_named_by_what_their_source_reads(preset: str, setting: str, is_read: bool) -> None:
+    names = {name_result("regions", load_config(preset, settings)) for settings in ((), (setting,))}
+    assert len(names) == 1 + is_read
+
+
+def test_regions_of_plugins_are_not_kept() -> None:
+    config = load_config("c2c")
+    assert is_kept("regions", config)
+    of_others = config.model_copy(update={"regions": RegionsConfig.model_construct(source="higher")})
+    assert not is_kept("regions", of_others)
+    assert is_kept("merge", of_others)

@@ -18,7 +18,7 @@ from eval.scoring import scoring
 from eval.scoring.answer_check import MAX_AMOUNT, check_answer
 from eval.scoring.judged_places import carry_merge, carry_scores, find_nearest_keyframes
 from eval.scoring.merge_metrics import EVIDENCE
-from eval.scoring.region_metrics import score_regions
+from eval.scoring.region_metrics import score_regions, score_unanswered_regions
 from eval.scoring.scoring import METRICS_VERSION, CaseScore, score, score_answer
 from eval.truth.ground_truth import GroundTruth, SessionTruth, ground_truth
 from eval.truth.scoring_points import ScoringPoints
@@ -50,6 +50,12 @@ def session(cube_x_m: float, change_id: int, nearest_m: tuple[float, ...]) -> Se
     return SessionTruth(POSES, POSES, points)
 
 
+SCENARIO = {
+    "props": [], "before": {"odometry": {"source": "kiss-icp"}}, "after": {"odometry": {"source": "drift"}},
+    "sensor": {"profile": "os1-32"},
+}  # fmt: skip
+
+
 @pytest.fixture(name="truth")
 def truth_fixture() -> GroundTruth:
     """A box that came at x = 5 to 6, a pile that went at x = 20 to 21, and one that nobody could see at x = 49."""
@@ -59,7 +65,7 @@ def truth_fixture() -> GroundTruth:
         change(3, "after", "added", is_observable=False, world_T_object=make_pose(translation=(49, 0, 0)).tolist()),
     )
     sessions = {"before": session(20.0, 2, (np.inf, np.inf, 3.5)), "after": session(5.0, 1, (np.inf, 2.5))}
-    return ground_truth(PairTruth("narrow", 7, 3.0, changes, {"props": []}), sessions)
+    return ground_truth(PairTruth("narrow", 7, 3.0, changes, SCENARIO), sessions)
 
 
 def pixels(first: int, end: int) -> np.ndarray:
@@ -130,8 +136,8 @@ def test_the_row(case: CaseScore) -> None:
     expected = {
         "scenario": "narrow", "family": "narrow", "pair_kind": "", "seed": 7, "variant": "mine", "preset": "mine",
         "status": "ok", "error": "", "metrics_version": METRICS_VERSION, "domain": "in", "n_changes": 3,
-        "n_observable": 2, "score_radius_m": 3.0, "odometry_before": "", "odometry_after": "",
-        "sensor_profile": "", "checkpoints": "3deg ab;sphere cd",
+        "n_observable": 2, "score_radius_m": 3.0, "odometry_before": "kiss-icp",
+        "odometry_after": "drift", "sensor_profile": "os1-32", "checkpoints": "3deg ab;sphere cd",
         # one of two is found by what stands, both by what was proposed
         "region_recall": 0.5, "region_precision": 0.5, "false_regions_per_100m": 2.0,
         "region_recall_proposed": 1.0, "region_precision_proposed": 0.5, "false_regions_per_100m_proposed": 4.0,
@@ -274,8 +280,8 @@ def test_a_case_without_an_answer(truth: GroundTruth) -> None:
     known = {
         "scenario": "narrow", "family": "narrow", "pair_kind": "", "seed": 7, "variant": "mine", "preset": "mine",
         "status": "failed", "error": "too dark", "metrics_version": METRICS_VERSION, "domain": "in", "n_changes": 3,
-        "n_observable": 2, "score_radius_m": 3.0, "odometry_before": "", "odometry_after": "",
-        "sensor_profile": "", "checkpoints": "",
+        "n_observable": 2, "score_radius_m": 3.0, "odometry_before": "kiss-icp",
+        "odometry_after": "drift", "sensor_profile": "os1-32", "checkpoints": "",
         "region_auroc": 0.5, "region_ap": 12 / (12 + n_far),
         "is_auroc_assumed": 1.0, "overlap_true": 1.0, "evidence_overlap": 0.5, "t_merge_s": 2.0, "t_descriptor_s": 8.0,
         "after_path_m": 50.0,
@@ -286,6 +292,8 @@ def test_a_case_without_an_answer(truth: GroundTruth) -> None:
     })  # fmt: skip
     assert len(known) + sum(value != value for value in case.row.values()) == len(case.row)
     assert (case.regions, case.objects) == ([], [])
+    for found in (score_unanswered_regions(truth).matches, score_unanswered_regions(truth).proposed):
+        assert (found.outcomes, found.best_region.tolist()) == ((), [-1, -1, -1])
     for row in case.changes:
         assert (row["is_found"], row["best_region"], row["matched_object"], row["matched_kind"]) == (False, -1, -1, "")
     assert np.isnan([row[name] for row in case.changes for name in ("is_kind_right", "volume_error_share")]).all()
@@ -402,12 +410,14 @@ def test_metrics_of_others_add_columns(
 
 
 def test_a_report_in_memory_scores_like_the_stored_one(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
-    report = replace(true_report(tiny_pair, tiny_merge), config={"method": "ours"})
+    report = replace(true_report(tiny_pair, tiny_merge), config={"method": "ours"}, checkpoints={"3deg": "ab"})
     stored = scored(tiny_pair, report).row
     row = score(report, str(tiny_pair))
     assert (row["variant"], row["preset"]) == ("ours", "ours")
     np.testing.assert_equal(row, {**stored, "variant": "ours", "preset": "ours"})
     np.testing.assert_equal(score(str(tiny_pair.parent / "answer"), tiny_pair), stored)
+    assert row["checkpoints"] == "3deg ab"
+    assert score(replace(report, config={"regions": {"source": "sphere"}}), tiny_pair)["variant"] == "sphere"
     unnamed = score(replace(report, config={}), tiny_pair)
     assert (unnamed["variant"], unnamed["status"], unnamed["error"]) == ("", "ok", "")
     assert (unnamed["t_merge_s"], unnamed["map_points_before"]) == (1.0, 123.0)
@@ -430,7 +440,7 @@ def test_the_first_region_may_find_several_changes(report: ChangeReport, truth: 
     answer = Answer("ok", "", "mine", replace(report, regions=one, objects=(), figures=figures), {}, {})
     case = score_answer(answer, near)
     assert [(row["is_found"], row["best_region"]) for row in case.changes] == [(True, 0)] * 3
-    assert case.regions[0]["found_changes"] == "1;2;3"
+    assert case.regions[0]["found_changes"] == case.regions[0]["found_changes_proposed"] == "1;2;3"
     assert (type(case.row["s_points"]), case.row["s_points"]) == (float, 3.0)
     assert scoring.read_figure(answer.report, "s_points").dtype == np.float64
 
@@ -445,3 +455,10 @@ def test_a_figure_at_the_limit_is_taken_and_one_above_is_refused(report: ChangeR
         answer = Answer("ok", "", "mine", replace(report, figures={"s_points": np.full(7, value)}), {}, {})
         with pytest.raises(InputError, match="figure_s_points: expected") if is_refused else nullcontext():
             check_answer(answer, truth, Path("answer"))
+
+
+@pytest.mark.parametrize(
+    "scenario", [{}, {"before": None, "after": {"odometry": "kiss-icp"}, "sensor": {"profile": None}}]
+)
+def test_a_part_of_a_scenario_that_is_not_there_has_no_name(scenario: dict[str, Any]) -> None:
+    assert set(scoring.describe_recording(scenario).values()) == {""}

@@ -249,13 +249,14 @@ FIXED = "query.radius_m=4.5"
 @pytest.mark.parametrize(
     ("settings", "per_keyframe", "per_point"),
     [
-        (["query.compare=scan", FIXED], 4 * 32 + 28, 0),
-        (["query.compare=sphere", FIXED], 4 * 64 + 28, 0),
-        (["query.compare=sphere"], 4 * 64 + 28 + 4, 0),  # and the width of the drift
-        (["query.compare=difference"], 0, 12),
-        (["method=voxel-diff", FIXED], 0, 12),
-        (["method=c2c", FIXED], 0, 12),
-        (["method=random-regions", FIXED], 28, 0),
+        (["regions.source=scan", FIXED], 4 * 32 + 28, 0),
+        (["regions.source=sphere", FIXED], 4 * 64 + 28, 0),
+        (["regions.source=sphere"], 4 * 64 + 28 + 4, 0),  # and the width of the drift
+        (["regions.source=sphere-difference"], 0, 12),
+        (["regions.source=voxel-diff"], 0, 12),
+        (["regions.source=c2c"], 0, 12),
+        (["regions.source=random-regions", FIXED], 28, 0),
+        (["regions.source=every-keyframe"], 28 + 4, 0),
     ],
 )
 def test_bytes_kept_by_hand(settings: list[str], per_keyframe: int, per_point: int) -> None:

@@ -92,9 +92,7 @@ def test_the_auroc_of_spheres_against_every_pair_of_keyframes(tiny_pair: Path, t
         kept = config.descriptor.model_copy(update={"precision": row["precision"]})
         anchors = anchor_frames(before.map, before.map.keyframe_scans, config.sphere)
         spheres = replace(before.descriptors, spheres=describe_map(before.map, anchors, kept))
-        scores = np.nan_to_num(
-            find_regions(merged, spheres, after.descriptors, config.query, config.sphere).keyframe_scores, nan=-np.inf
-        )
+        scores = np.nan_to_num(find_regions(merged, spheres, after.descriptors, config).keyframe_scores, nan=-np.inf)
         against = scores[labels == 1][:, None] - scores[labels == 0][None]
         assert row["region_auroc"] == pytest.approx(np.mean(np.where(against == 0, 0.5, against > 0)))
         assert (row["n_positive"], row["n_negative"]) == ((labels == 1).sum(), (labels == 0).sum())
@@ -195,6 +193,10 @@ def test_what_was_measured_is_kept_and_what_was_simulated_is_not(tmp_path: Path,
     [
         (["smoke/one_bax", "--out", "OUT"], 'scenario "smoke/one_bax": unknown; did you mean "smoke/one_box"'),
         (["smoke/one_box", "--seeds", "4:3", "--out", "OUT"], "--seeds 4:3: "),
+        (
+            ["smoke/one_box", "--seeds", "4", "--out", "OUT", "--set", "regions.source=scan"],
+            "--set: regions.source = scan: expected sphere",
+        ),
     ],
 )
 def test_mistakes_are_one_line(arguments: list[str], words: str, tmp_path: Path) -> None:
