@@ -191,7 +191,7 @@ def test_a_bent_alignment_is_followed_keyframe_by_keyframe() -> None:
 def test_rolling_pitching_and_turning_the_sensor_changes_nothing(turn_deg: tuple[int, ...] | None) -> None:
     level = _merged(12.0, make_pose())
     turns = (
-        Rotation.random(N_KEYFRAMES, rng=0)
+        Rotation.random(N_KEYFRAMES, random_state=0)
         if turn_deg is None
         else Rotation.from_euler("ZYX", np.tile(turn_deg, (N_KEYFRAMES, 1)), degrees=True)
     )
