@@ -34,6 +34,10 @@ def run_command(
     plan: Annotated[str, typer.Argument(help="name from `list`, or a .yaml file")],
     out: RunOut,
     seeds: Annotated[str | None, typer.Option(metavar="A:B", help="replaces the plan's seeds; B excluded")] = None,
+    split: Annotated[
+        Literal["dev", "sealed"],
+        typer.Option(help="`sealed`: other seeds, drawn from the name of this version; nobody can have tuned on them"),
+    ] = "dev",
     preset: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME", help="run this preset in place of the plan's variants; may be repeated"),
@@ -55,7 +59,9 @@ def run_command(
     from eval.plans.changes import change_plan
     from eval.plans.plan import load_plan
 
-    chosen = change_plan(load_plan(plan), seeds=seeds, presets=preset or (), settings=settings or (), grid=grid or ())
+    chosen = change_plan(
+        load_plan(plan), seeds=seeds, split=split, presets=preset or (), settings=settings or (), grid=grid or ()
+    )
     where = Where(workers, scheduler)
     require_usable(where)
     if dry_run:

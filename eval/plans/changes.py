@@ -1,4 +1,4 @@
-"""Changes of a plan by the options --seeds, --preset, --set and --grid."""
+"""Changes of a plan by the options --seeds, --split, --preset, --set and --grid."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from cdpipe.core.files import parse_yaml_value
 from cdpipe.core.yamlfile import Document, validate
 from eval.plans.parts import get_key, has_effect_on_true_regions, require_valid_setting, require_valid_settings
 from eval.plans.plan import Plan, parse_seeds
+from eval.plans.splits import SplitName, seal_seeds, version_name
 from eval.plans.worlds import get_group
 
 
@@ -19,15 +20,17 @@ def change_plan(
     plan: Plan,
     *,
     seeds: str | None = None,
+    split: SplitName = "dev",
     presets: Sequence[str] = (),
     settings: Sequence[str] = (),
     grid: Sequence[str] = (),
 ) -> Plan:
-    """Return the plan with the options --seeds, --preset, --set and --grid applied.
+    """Return the plan with the options --seeds, --split, --preset, --set and --grid applied.
 
     Args:
         plan: The plan.
         seeds: "A:B", replaces the plan's seeds.
+        split: `sealed` replaces each seed of the plan, a seed of `dev`, by a sealed one.
         presets: Names or files, replace the plan's variants, its own grids and its targets. A variant that is a preset
             alone keeps what the plan sets for it by scenario.
         settings: `key=value`, written over every variant and every grid point.
@@ -43,6 +46,12 @@ def change_plan(
     document = plan.model_dump(mode="json")
     if seeds is not None:
         document["seeds"] = parse_seeds(seeds)
+    if split == "sealed":
+        version = version_name()
+        try:
+            document |= {"seeds": seal_seeds(document["seeds"], version), "split": f"sealed by {version}"}
+        except ValueError as error:
+            raise InputError(f"--split sealed: plan {plan.name}: {error}") from error
     if presets:
         document |= {"variants": [_find_variant(document["variants"], name) for name in presets]}
         document |= {"grid": [], "targets": {}}

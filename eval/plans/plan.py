@@ -31,7 +31,16 @@ import re
 from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from cdpipe.core.errors import InputError
@@ -190,7 +199,11 @@ def _list_subjects(value: Any) -> Any:
 
 
 class Plan(Settings):
-    """A plan; `expand_cells` expands it."""
+    """A plan; `expand_cells` expands it.
+
+    `split` is what `--split` wrote: "sealed", and the version that the seeds were drawn from; "" for the seeds of the
+    file, and then a dump leaves it out.
+    """
 
     name: Annotated[str, Field(min_length=1)]
     description: str = ""
@@ -198,6 +211,7 @@ class Plan(Settings):
     scenarios: Annotated[tuple[ScenarioItem, ...], NotEmpty]
     wide: Annotated[tuple[Label, ...], OneOrMore] = ()
     seeds: Annotated[tuple[int, ...], BeforeValidator(parse_seeds)]
+    split: str = ""
     until: Until | None = None
     report: Annotated[tuple[Literal["regions", "objects"], ...], BeforeValidator(_list_subjects)] = ()
     targets: PlanTargets = Targets()
@@ -214,6 +228,10 @@ class Plan(Settings):
     def _parts_fit(self) -> Plan:
         _refuse([*_find_settings_past_the_end(self), *_find_unknown_worlds(self), *_find_repeated_variants(self)])
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_split(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {name: value for name, value in handler(self).items() if name != "split" or value}
 
     @property
     def worlds(self) -> list[World]:

@@ -67,10 +67,11 @@ def run_plan(
 
     Raises:
         InputError: A setting is wrong, a method's extra is missing, the folder cannot be written or holds another
-            world or variant where one of the plan belongs, or the cluster cannot be used.
+            world or variant where one of the plan belongs, or cells of another split, or the cluster cannot be used.
     """
     progress, tools = progress or Silent(), tools or TOOLS
     require_usable(where)
+    _require_one_split(run, plan)
     all_cells = expand_cells(plan)
     provenance = _provenance(plan, all_cells, command, tools)
     pairs = _pairs(run, plan, all_cells, force, tools)
@@ -110,6 +111,7 @@ def list_cells(plan: Plan, path: Path, *, force: bool = False, limit: int | None
     run = RunFolder(path)
     if path.is_dir() and any(path.iterdir()):
         run.provenance()
+        _require_one_split(run, plan)
     elif path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file: name a folder to run in")
     all_cells = expand_cells(plan)
@@ -171,6 +173,14 @@ def _limited(pairs: Sequence[Pair], limit: int | None) -> list[Pair]:
         if todo:
             chosen.append(replace(pair, todo=todo))
     return chosen
+
+
+def _require_one_split(run: RunFolder, plan: Plan) -> None:
+    """Refuse a folder with cells of another split: its tables would mix seeds that were looked at with sealed ones."""
+    earlier = dict(run.stored_provenance().get("plan") or {})
+    if earlier and earlier.get("split", "") != plan.split:
+        told = [split or "as plans name them" for split in (str(earlier.get("split", "")), plan.split)]
+        raise InputError(f"{run.path}: its seeds are {told[0]}, these are {told[1]}: name another folder")
 
 
 def _require_extras(pairs: Sequence[Pair]) -> None:

@@ -10,7 +10,9 @@ from cdpipe.core.path_frames import path_frames
 
 def poses_at(positions: Float64Array, seed: int | None = None) -> Float64Array:
     """Poses at (S, 3) positions, level and ahead along x, or rolled, pitched and turned at random."""
-    rotations = Rotation.identity(len(positions)) if seed is None else Rotation.random(len(positions), random_state=seed)
+    rotations = (
+        Rotation.identity(len(positions)) if seed is None else Rotation.random(len(positions), random_state=seed)
+    )
     return make_pose(rotations.as_matrix(), positions)
 
 

@@ -1,0 +1,74 @@
+"""Splits of the test seeds: `dev`, which may be looked at, and `sealed`, which nobody can have tuned on.
+
+`eval/splits.yaml` holds their ranges and how often their scores have been looked at. A sealed seed is drawn from the
+name of the version that is released. Each seed of `dev` has one, so plans that share pairs share the sealed ones, too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+import eval
+from cdpipe.core.yamlfile import Settings, read_yaml, validate
+
+SplitName = Literal["dev", "sealed"]
+
+
+class Split(Settings):
+    """A range of seeds, `end` excluded, and every look at scores of it."""
+
+    first: Annotated[int, Field(ge=0)]
+    end: Annotated[int, Field(ge=1)]
+    looks: tuple[str, ...] = ()
+
+
+class Splits(Settings):
+    """Both splits of the test seeds."""
+
+    dev: Split
+    sealed: Split
+
+
+def load_splits() -> Splits:
+    """Return the splits of the test seeds."""
+    return validate(Splits, read_yaml(Path(eval.__path__[0]) / "splits.yaml"))
+
+
+def version_name() -> str:
+    """Return the name of the version that runs, from which sealed seeds are drawn."""
+    return f"tunnelcd {metadata.version('tunnelcd')}"
+
+
+def seal_seeds(seeds: Sequence[int], version: str) -> tuple[int, ...]:
+    """Return the sealed seed of each seed of `dev`.
+
+    Draw number i is SHA-256 of "<version> <i>", as a number, modulo the size of the range; a number that was drawn
+    before is passed over. The n-th seed of `dev` gets the n-th number.
+
+    Args:
+        seeds: Seeds of `dev`.
+        version: Name of a version, `version_name`.
+
+    Raises:
+        ValueError: One of them is no seed of `dev`.
+    """
+    dev, sealed = load_splits().dev, load_splits().sealed
+    strange = [seed for seed in seeds if not dev.first <= seed < dev.end]
+    if strange:
+        raise ValueError(
+            f"seed {strange[0]} is of no split: expected a plan of test seeds, {dev.first} to {dev.end - 1}"
+        )
+    drawn: dict[int, None] = {}
+    number = 0
+    while len(drawn) < dev.end - dev.first:
+        hashed = int.from_bytes(hashlib.sha256(f"{version} {number}".encode()).digest(), "big")
+        drawn[sealed.first + hashed % (sealed.end - sealed.first)] = None
+        number += 1
+    in_order = list(drawn)
+    return tuple(in_order[seed - dev.first] for seed in seeds)
