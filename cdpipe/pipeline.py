@@ -36,7 +36,7 @@ from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.recorded_frames import regions_as_mapped, report_as_recorded
 from cdpipe.mapping.session_check import check_session, unit_hint
 from cdpipe.merge.merge import merge_maps, take_known_merge
-from cdpipe.methods.registry import load_source
+from cdpipe.methods.registry import list_extras, load_source
 from cdpipe.model.config import PipelineConfig, Site, load_config
 from cdpipe.model.report import ChangeRegions, ChangeReport
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, ScanSource, Spheres
@@ -285,6 +285,7 @@ def detect_changes(
         seconds={**done.seconds, **merged.seconds},
         evidence={**done.value.evidence, **_sizes(merged)},
         checkpoints=list_checkpoints(config),
+        extras=list_extras(config, merged.evidence, proposes=propose is None),
     )
 
 
@@ -305,7 +306,12 @@ def detect_merge(
     )
     report = make_report(merged, (before.descriptors, after.descriptors), regions, (), {}, merged.seconds, config)
     report = report_as_recorded(report, merged.before, merged.after)
-    return replace(report, evidence={**merged.evidence, **_sizes(merged)}, checkpoints=list_checkpoints(config))
+    return replace(
+        report,
+        evidence={**merged.evidence, **_sizes(merged)},
+        checkpoints=list_checkpoints(config),
+        extras=list_extras(config, merged.evidence, proposes=False),
+    )
 
 
 def merge_mapped(

@@ -18,6 +18,7 @@ METHODS = "tunnelcd.methods"
 METRICS = "tunnelcd.metrics"
 PRESETS = "tunnelcd.presets"
 SEARCH_PATH = "TUNNELCD_PATH"
+ABSENT = "absent"
 # Optional dependency of pyproject.toml -> the module that it installs.
 _EXTRAS = {"m3c2": "py4dgeo", "dufomap": "dufomap", "kiss": "kiss_matcher", "odometry": "kiss_icp", "ouster": "ouster"}
 
@@ -25,6 +26,14 @@ _EXTRAS = {"m3c2": "py4dgeo", "dufomap": "dufomap", "kiss": "kiss_matcher", "odo
 def has_extra(name: str) -> bool:
     """Return whether an extra of `_EXTRAS` is installed."""
     return find_spec(_EXTRAS[name]) is not None
+
+
+def extra_version(package: str) -> str:
+    """Return the version of an optional package, `ABSENT` where it is not installed."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return ABSENT
 
 
 def require_extra(name: str, asked_by: str) -> None:

@@ -1,7 +1,8 @@
 """The answer of a method on disk, written by `detect` or another program and read by `score`.
 
-    answer.json   format, status, method, config, checkpoints (digest of each descriptor's weights), seconds, evidence,
-                  before_T_after, radius_m of all regions (left out where each has its own), objects (session, kind,
+    answer.json   format, status, method, config, checkpoints (digest of each descriptor's weights), extras (version of
+                  each optional package that it depends on, left out without one), seconds, evidence, before_T_after,
+                  radius_m of all regions (left out where each has its own), objects (session, kind,
                   region, score and partner of each; if known, shape: map_T_box (4, 4), box_m (3,) and volume_m3; for
                   moved objects displacement_map (3,)); until: "merge" if the method was stopped after the merge
     answer.npz    region_centres_map (R, 3), region_scores (R,), region_pairs (R, 2), region_is_reported (R,),
@@ -71,6 +72,7 @@ class Answer:
         points_odom: For each object the (P, 3) odom points of a foreign answer without returns; None otherwise.
         until: Last stage of a method that was stopped on purpose; None if it ran to its end.
         checkpoints: Digest of the weights of each descriptor that was used, by its name.
+        extras: Version of each optional package that it depends on, "absent" if one was wanted in vain.
     """
 
     status: str
@@ -82,6 +84,7 @@ class Answer:
     points_odom: tuple[Float64Array, ...] | None = None
     until: Until | None = None
     checkpoints: Mapping[str, str] = field(default_factory=dict)
+    extras: Mapping[str, str] = field(default_factory=dict)
 
 
 def write_answer(folder: Path | str, method: str, report: ChangeReport, until: Until | None = None) -> None:
@@ -121,6 +124,7 @@ def write_answer(folder: Path | str, method: str, report: ChangeReport, until: U
         "evidence": dict(report.evidence),
         "config": dict(report.config),
         "checkpoints": dict(report.checkpoints),
+        **({"extras": dict(report.extras)} if report.extras else {}),
         "objects": [_object_document(item) for item in objects],
     }
     _write_json(folder, document, until)
@@ -157,6 +161,7 @@ def write_failure(
     until: Until | None = None,
     seconds: Mapping[str, float] | None = None,
     checkpoints: Mapping[str, str] | None = None,
+    extras: Mapping[str, str] | None = None,
 ) -> None:
     """Write the record of a case without an answer, with 10,000 letters of its error and the seconds until then."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -164,6 +169,7 @@ def write_failure(
     document: dict[str, Any] = {"status": status, "error": error[:MAX_ERROR], "method": method}
     document |= {"seconds": dict(seconds or {}), "evidence": dict(evidence)}
     document |= {"config": dict(config), "checkpoints": dict(checkpoints or {})}
+    document |= {"extras": dict(extras)} if extras else {}
     _write_json(folder, document, until)
 
 
@@ -179,7 +185,7 @@ def read_answer(folder: Path | str) -> Answer:
     document = check_document(path, value)
     if not isinstance(document, AnswerPart):
         failed = document.status, document.error, document.method, None, document.seconds, document.evidence
-        return Answer(*failed, until=document.until, checkpoints=document.checkpoints)
+        return Answer(*failed, until=document.until, checkpoints=document.checkpoints, extras=document.extras)
     file, n_objects = folder / "answer.npz", len(document.objects)
     stored = read_npz(file, lambda types: check_array_types(file, types, n_objects))
     arrays = {name: _computable(array) for name, array in stored.items()}
@@ -193,7 +199,8 @@ def read_answer(folder: Path | str) -> Answer:
     except ValueError as error:
         raise InputError(f"{file}: arrays that do not go together: {error}") from error
     measured = report.seconds, report.evidence
-    return Answer("ok", "", document.method, report, *measured, points_odom, document.until, report.checkpoints)
+    used = report.checkpoints, report.extras
+    return Answer("ok", "", document.method, report, *measured, points_odom, document.until, *used)
 
 
 def _computable(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -253,6 +260,7 @@ def _report(
         config=document.config,
         local_before_T_after=arrays.get("local_before_T_after"),
         checkpoints=document.checkpoints,
+        extras=document.extras,
     )
     return report, points_odom
 

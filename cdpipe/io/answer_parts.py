@@ -68,6 +68,7 @@ class FailurePart(_Part):
     evidence: _Figures = Field(default_factory=dict)
     config: dict[str, Any] = Field(default_factory=dict)
     checkpoints: dict[_Name, _Name] = Field(default_factory=dict, max_length=100)
+    extras: dict[_Name, _Name] = Field(default_factory=dict, max_length=100)
     # fields of an answer are allowed and ignored
     before_T_after: Any = None
     radius_m: Any = None

@@ -76,7 +76,8 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     points within `inlier_m` of the other surface, and median distance, around the start), `hessian_ratio` (smallest to
     largest eigenvalue of the translation's Hessian, whole path), `agreement` (mean inlier share along the path),
     `distinctness` (residual of the best rival alignment divided by this one's; 10 without a rival),
-    `descriptor_distance`, `n_hypotheses` walked, `is_fallback`.
+    `descriptor_distance`, `n_hypotheses` walked, `is_fallback`, and `kiss_matcher`: 1 if KISS-Matcher was asked, 0 if
+    it was wanted and is not installed.
 
     Returns:
         The best hypothesis with the reason of a refusal; the identity if nothing could be registered.
@@ -87,8 +88,10 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     start = perf_counter()
     maps = (IndexedMap(before.map, config, is_target=True), IndexedMap(after.map, config, is_target=False))
     indexed = perf_counter()
-    best, n_hypotheses = _find_hypothesis(before, after, maps, config)
+    best, n_hypotheses, asks_kiss_matcher = _find_hypothesis(before, after, maps, config)
     evidence: dict[str, float] = {"n_hypotheses": float(n_hypotheses)}
+    if asks_kiss_matcher:
+        evidence["kiss_matcher"] = float(is_kiss_matcher_installed())
     seconds = {"t_index_s": indexed - start, "t_merge_s": perf_counter() - indexed, "t_refine_s": 0.0}
     if best is None:
         return MergedMaps(before.map, after.map, np.eye(4), evidence, False, _TOO_FEW, seconds=seconds)
@@ -169,10 +172,11 @@ def _have_points(before: MappedSession, after: MappedSession, config: MergeConfi
 
 def _find_hypothesis(
     before: MappedSession, after: MappedSession, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
-) -> tuple[_Hypothesis | None, int]:
-    """Return the accepted hypothesis, or else the best one, and the number of hypotheses that were walked."""
+) -> tuple[_Hypothesis | None, int, bool]:
+    """Return the accepted hypothesis or else the best one, how many were walked, and if KISS-Matcher was wanted."""
     if config.method == "frame":
-        return _choose_hypothesis(_start_by_frame(find_closest_pair(before, after), maps, config), maps, config)
+        starts = _start_by_frame(find_closest_pair(before, after), maps, config)
+        return *_choose_hypothesis(starts, maps, config), False
     best: _Hypothesis | None = None
     n_tried = 0
     if config.method == "voting":
@@ -180,11 +184,11 @@ def _find_hypothesis(
         best, n_tried = _choose_hypothesis(starts, maps, config)
         is_accepted = best is not None and not explain_refusal(best.evidence, config)
         if is_accepted or not (config.fallback and is_kiss_matcher_installed()):
-            return best, n_tried
+            return best, n_tried, config.fallback and not is_accepted
     other, n_other = _choose_hypothesis(_start_by_kiss_matcher(maps, config), maps, config)
     if other is not None and (best is None or not explain_refusal(other.evidence, config)):
         best = other
-    return best, n_tried + n_other
+    return best, n_tried + n_other, True
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,12 +13,12 @@ descriptors to the method's time. `has_clusters = True` says that the regions ho
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.plugins import METHODS, load_entry_point, require_extra
+from cdpipe.core.plugins import ABSENT, METHODS, extra_version, load_entry_point, require_extra
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.report import ChangeRegions, ChangeReport
 from cdpipe.model.types import DescriptorSet, MergedMaps
@@ -27,7 +27,8 @@ Detect = Callable[[MergedMaps, DescriptorSet, DescriptorSet, PipelineConfig], Ch
 Propose = Callable[[MergedMaps, DescriptorSet, DescriptorSet, PipelineConfig], ChangeRegions]
 
 # Methods of ours that need an extra of the same name (`cdpipe.core.plugins`).
-_WITH_EXTRAS = ("m3c2", "dufomap")
+# Sources that need an extra of their name, and its package.
+PACKAGES = {"m3c2": "py4dgeo", "dufomap": "dufomap"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +63,21 @@ def load_source(config: PipelineConfig) -> Method:
     return method
 
 
+def list_extras(config: PipelineConfig, evidence: Mapping[str, float], *, proposes: bool = True) -> dict[str, str]:
+    """Return the version of every optional package that an answer depends on, by the package's name.
+
+    Args:
+        config: All settings.
+        evidence: That of the merge, which says whether KISS-Matcher was asked; "absent" where it was wanted in vain.
+        proposes: Whether the source of the settings proposed the regions.
+    """
+    found = {}
+    if "kiss_matcher" in evidence:
+        found["kiss-matcher"] = extra_version("kiss-matcher") if evidence["kiss_matcher"] else ABSENT
+    package = PACKAGES.get(config.regions.source)
+    return {**found, package: extra_version(package)} if proposes and package else found
+
+
 def load_method(name: str) -> Method:
     """Return what is registered under a name.
 
@@ -69,7 +85,7 @@ def load_method(name: str) -> Method:
         InputError: No method has this name, it cannot be imported, its extra is not installed, or it is of none of the
             three kinds.
     """
-    if name in _WITH_EXTRAS:
+    if name in PACKAGES:
         require_extra(name, f"regions.source = {name}")
     found: Any = load_entry_point(METHODS, name)
     made = found() if isinstance(found, type) else found

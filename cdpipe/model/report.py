@@ -158,6 +158,7 @@ class ChangeReport:
         local_before_T_after: (Ka, 4, 4) refined alignment at each after keyframe; None if `before_T_after` holds
             everywhere.
         checkpoints: Digest of the weights of each descriptor that was used, by its name.
+        extras: Version of each optional package that the answer depends on; "absent" if it was wanted in vain.
     """
 
     before_T_after: Float64Array
@@ -170,6 +171,7 @@ class ChangeReport:
     config: Mapping[str, object] = field(default_factory=dict)
     local_before_T_after: Float64Array | None = None
     checkpoints: Mapping[str, str] = field(default_factory=dict)
+    extras: Mapping[str, str] = field(default_factory=dict)
 
     def to_pandas(self, table: Literal["objects", "regions"] = "objects") -> pd.DataFrame:
         """Return the objects or the reported regions as a table; positions in the map frame, metres.

@@ -11,17 +11,18 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from cdpipe.core.plugins import extra_version
 from cdpipe.core.threads import THREAD_VARIABLES
 
 TOOL = "tunnelcd"
 FORMAT_VERSION = 1
 _PACKAGES = (
     "tunnelcd", "numpy", "scipy", "pandas", "torch", "mujoco", "embreex", "trimesh", "small_gicp", "kiss-matcher",
-    "py4dgeo", "dufomap", "scikit-image", "pydantic", "matplotlib", "plotly", "distributed",
+    "py4dgeo", "dufomap", "kiss-icp", "ouster-sdk", "viser", "scikit-image", "pydantic", "matplotlib", "plotly",
+    "distributed",
 )  # fmt: skip
 
 
@@ -44,13 +45,7 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that results depend on; "absent" where not installed."""
-    found = {"python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "absent"
-    return found
+    return {"python": platform.python_version(), **{name: extra_version(name) for name in _PACKAGES}}
 
 
 def describe_run(

@@ -18,7 +18,8 @@ ENOUGH_PAIRS = 6
 _NORMAL_95 = 1.959963984540054
 IDENTITY_COLUMNS = (
     "scenario", "family", "domain", "pair_kind", "seed", "variant", "preset", "status", "error", "metrics_version",
-    "score_radius_m", "odometry_before", "odometry_after", "sensor_profile", "checkpoints", "commit", "is_contended",
+    "score_radius_m", "odometry_before", "odometry_after", "sensor_profile", "checkpoints", "extras", "commit",
+    "is_contended",
 )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from cdpipe.core.errors import InputError
 from eval.core.statistics import ENOUGH_PAIRS, paired_difference
 from eval.report.compared_columns import COMPARED, POOLED, POOLED_RATE_PER_100M, figures_of, is_time
 from eval.running.run_data import RunData
-from eval.running.sides import Side, check_versions, matched_variants
+from eval.running.sides import Side, check_extras, check_versions, matched_variants
 from eval.tables.region_curves import RankedPairs, ranked_pairs, recall_at, recall_difference
 from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers
 
@@ -56,6 +56,8 @@ def compare(a: Side, b: Side, *, times_count: bool = True, seed: int = 0) -> pd.
         InputError: The sides share no session pair, or their metrics versions differ.
     """
     check_versions(a, b)
+    check_extras(a)
+    check_extras(b)
     figures = [figures_of(side.results) for side in (a, b)]
     rows: list[dict[str, Any]] = []
     for variants in matched_variants(a, b):

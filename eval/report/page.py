@@ -55,7 +55,7 @@ from eval.running.run_data import (
     text,
 )
 from eval.running.runfolder import read_json
-from eval.running.sides import Side, check_versions, is_contended
+from eval.running.sides import Side, check_extras, check_versions, is_contended
 from eval.tables.columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
 from eval.tables.merge_table import merge_table
 
@@ -88,6 +88,7 @@ def write_page(run: Path, views: Views = "chosen", *, is_slim: bool = False) -> 
     require_no_links(run)
     data = figures_of_plan(read_run(run))
     check_versions(Side(data), Side(data))
+    check_extras(Side(data))
     try:
         files = _draw(data, views, is_slim=is_slim)
     except KeyError as error:

@@ -17,10 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from cdpipe.core.errors import InputError, MergeFailedError, ScenarioError, TunnelcdError
+from cdpipe.core.plugins import extra_version
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import checkpoint_digest, list_checkpoints, sphere_digest, use_threads
 from cdpipe.io.answer import write_answer, write_failure
-from cdpipe.merge.global_registration import is_kiss_matcher_installed
+from cdpipe.methods.registry import PACKAGES, list_extras
 from cdpipe.model.config import MapConfig
 from cdpipe.pipeline import OnStage
 from eval.core.domains import domain_of
@@ -218,7 +219,9 @@ def cell_key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mappi
     """Return the digest of everything that a cell depends on, the metrics version apart."""
     merge = cell.config.merge
     asks_kiss_matcher = merge.method == "kiss-matcher" or (merge.method == "voting" and merge.fallback)
-    is_missed = cell.oracle is None and asks_kiss_matcher and not is_kiss_matcher_installed()
+    extras = ["kiss-matcher"] if cell.oracle is None and asks_kiss_matcher else []
+    if cell.config.regions.source in PACKAGES:
+        extras.append(PACKAGES[cell.config.regions.source])
     return digest(
         {
             "scenario": None if scenario is None else scenario.model_dump(mode="json"),
@@ -232,8 +235,8 @@ def cell_key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mappi
             **({"oracle_regions": True} if cell.oracle_regions else {}),
             "until": cell.until,
             "pair_kind": pair_kind,
-            # a cell made without the extra runs again once it is installed
-            **({"kiss_matcher": "absent"} if is_missed else {}),
+            # a cell that may depend on an extra runs again with another version of it, or without it
+            "extras": {name: extra_version(name) for name in extras},
         }
     )
 
@@ -283,10 +286,11 @@ def _answer(stages: PairStages, cell: Cell, truth: GroundTruth, folder: Path) ->
         report = stages.answer(cell.config, merge, propose, cell.until)
     except MergeFailedError as error:
         measured = error.evidence, settings, cell.until, error.seconds
-        write_failure(folder, cell.variant, "merge_refused", str(error), *measured, list_checkpoints(cell.config))
+        used = list_checkpoints(cell.config), list_extras(cell.config, error.evidence, proposes=False)
+        write_failure(folder, cell.variant, "merge_refused", str(error), *measured, *used)
     except TunnelcdError as error:
-        used = list_checkpoints(cell.config)
-        write_failure(folder, cell.variant, "failed", str(error), {}, settings, cell.until, checkpoints=used)
+        weights = list_checkpoints(cell.config)
+        write_failure(folder, cell.variant, "failed", str(error), {}, settings, cell.until, checkpoints=weights)
     else:
         write_answer(folder, cell.variant, report, cell.until)
 

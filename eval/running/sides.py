@@ -76,6 +76,26 @@ def check_versions(a: Side, b: Side) -> None:
     raise InputError(f"{told}: their columns do not mean the same: {ways}")
 
 
+def check_extras(side: Side) -> None:
+    """Refuse a run in which an optional package answered for some rows of a method and not, or otherwise, for others.
+
+    Raises:
+        InputError: Rows of one variant depend on two versions of a package, or on one that some of them lacked.
+    """
+    found: dict[tuple[str, str], set[str]] = {}
+    for row in side.data.results:
+        told = row.get("extras")  # rows of older runs and of other programs do not say
+        for used in filter(None, told.split(";") if isinstance(told, str) else ()):
+            name, _, version = used.partition(" ")
+            found.setdefault((str(row["variant"]), name), set()).add(version)
+    for (variant, name), versions in found.items():
+        if len(versions) > 1:
+            raise InputError(
+                f"{side.path}: rows of {variant} are of {name} {' and '.join(sorted(versions))}: run its plan again "
+                "with one of them"
+            )
+
+
 def matched_variants(a: Side, b: Side) -> list[tuple[str, str]]:
     """Return pairs of variants (of A, of B) to compare; a variant that a side names is compared with all others."""
     names = [list(dict.fromkeys(str(row["variant"]) for row in side.data.results)) for side in (a, b)]

@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.path_frames import FRAMES
+from cdpipe.core.plugins import extra_version
 from cdpipe.descriptors import checkpoint_digest, sphere_digest
-from cdpipe.merge.global_registration import is_kiss_matcher_installed
+from cdpipe.methods.registry import PACKAGES
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import SOURCES_AT_KEYFRAMES, PipelineConfig
 from cdpipe.model.report import ChangeRegions, Clusters
@@ -53,7 +54,7 @@ def name_result(stage: Stage, config: PipelineConfig) -> str:
                 "maps": name_result("maps", config),
                 "descriptors": name_result("descriptors", config),
                 "settings": config.merge.model_dump(mode="json"),
-                "has_kiss_matcher": is_kiss_matcher_installed(),
+                "kiss_matcher": extra_version("kiss-matcher"),
             }
         case "regions":
             read = {
@@ -75,6 +76,8 @@ def _settings_of_clusters(config: PipelineConfig) -> dict[str, Any]:
     """Return what a source that compares whole maps may read besides."""
     found = config.model_dump(mode="json", include={"outlier", "cluster", "m3c2", "dufomap"})
     how = {"method", "withdraw", "recentre"}  # objects are cut out of the regions
+    package = PACKAGES.get(config.regions.source)
+    found |= {"package": extra_version(package)} if package else {}
     return found | {"extract": config.extract.model_dump(mode="json", exclude=how)}
 
 

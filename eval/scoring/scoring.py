@@ -77,7 +77,7 @@ def score(answer: ChangeReport | Path | str, pair: Path | str) -> dict[str, Any]
     config: dict[str, Any] = dict(answer.config)
     method = config.get("method", config.get("regions", {}).get("source", ""))
     measured = answer.seconds, answer.evidence
-    whole = Answer("ok", "", str(method), answer, *measured, checkpoints=answer.checkpoints)
+    whole = Answer("ok", "", str(method), answer, *measured, checkpoints=answer.checkpoints, extras=answer.extras)
     check_answer(whole, truth, Path("report"))
     return score_answer(whole, truth).row
 
@@ -307,6 +307,7 @@ def _make_identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
         "score_radius_m": truth.pair.score_radius_m,
         **describe_recording(truth.pair.scenario),
         "checkpoints": ";".join(f"{name} {digest}" for name, digest in answer.checkpoints.items()),
+        "extras": ";".join(f"{name} {version}" for name, version in answer.extras.items()),
     }
 
 

@@ -34,6 +34,7 @@ def _report() -> ChangeReport:
         keyframe_scans=(np.array([0, 4, 8]), np.array([0, 5])),
         config={"method": "descriptor"},
         checkpoints={"3deg": "ab", "sphere": "cd"},
+        extras={"kiss-matcher": "1.0.1"},
     )
 
 
@@ -43,6 +44,7 @@ def test_an_answer_survives_the_disk(tmp_path: Path) -> None:
     assert (answer.status, answer.method, answer.seconds) == ("ok", "paper", {"t_cd_s": 0.25})
     assert answer.report is not None
     assert answer.checkpoints == answer.report.checkpoints == {"3deg": "ab", "sphere": "cd"}
+    assert answer.extras == answer.report.extras == {"kiss-matcher": "1.0.1"}
     assert [len(item.returns) for item in answer.report.objects] == [3, 0, 2]
     np.testing.assert_array_equal(answer.report.objects[2].points_map, np.full((2, 3), 2.0))
     np.testing.assert_array_equal(answer.report.regions.keyframe_scores, [0.9, np.nan, 0.1])

@@ -115,7 +115,10 @@ def test_what_is_refused_is_left_to_kiss_matcher(
     assert not merge_maps(tunnel_before, lost, CONFIG).is_accepted
     merged = merge_maps(tunnel_before, lost, MergeConfig())
     assert merged.is_accepted
-    assert merged.evidence["is_fallback"] == 1
+    assert (merged.evidence["is_fallback"], merged.evidence["kiss_matcher"]) == (1, 1)
+    # who is not asked leaves no trace
+    assert "kiss_matcher" not in merge_maps(tunnel_before, tunnel_after, MergeConfig()).evidence
+    assert "kiss_matcher" not in merge_maps(tunnel_before, lost, CONFIG).evidence
     assert path_error_m(merged, true_before_T_after) < 0.02
 
 
@@ -126,6 +129,7 @@ def test_without_the_extra_the_refusal_says_what_was_not_tried(
     merged = merge_maps(tunnel_before, other_tunnel, MergeConfig())
     assert not merged.is_accepted
     assert "pip install 'tunnelcd[kiss]'" in merged.reason
+    assert merged.evidence["kiss_matcher"] == 0
 
 
 def test_moving_both_sessions_moves_the_answer(

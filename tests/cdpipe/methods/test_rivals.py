@@ -9,7 +9,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array, transform, yaw_pose
 from cdpipe.core.plugins import METHODS, entry_points
 from cdpipe.methods.c2c import c2c
 from cdpipe.methods.random_regions import RandomRegions
-from cdpipe.methods.registry import load_method
+from cdpipe.methods.registry import list_extras, load_method
 from cdpipe.methods.voxel_diff import voxel_diff
 from cdpipe.methods.whole_map import PlacedMaps, WholeMap
 from cdpipe.model.config import PipelineConfig, load_config, preset_names
@@ -227,6 +227,17 @@ def test_every_preset_has_its_source() -> None:
     assert {load_config(name).regions.source for name in preset_names()} <= entry_points(METHODS).keys()
     assert load_method("voxel-diff").propose == voxel_diff.propose
     assert load_method("c2c").propose == c2c.propose
+
+
+def test_an_answer_names_the_optional_packages_that_it_depends_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cdpipe.methods.registry.extra_version", lambda name: f"{name} 1")
+    ours, m3c2 = load_config("tunnelcd"), load_config("m3c2")
+    assert list_extras(ours, {}) == {}
+    assert list_extras(ours, {"kiss_matcher": 1.0}) == {"kiss-matcher": "kiss-matcher 1"}
+    assert list_extras(ours, {"kiss_matcher": 0.0}) == {"kiss-matcher": "absent"}
+    assert list_extras(m3c2, {}) == {"py4dgeo": "py4dgeo 1"}
+    assert list_extras(m3c2, {}, proposes=False) == {}
+    assert list(list_extras(load_config("dufomap"), {"kiss_matcher": 1.0})) == ["kiss-matcher", "dufomap"]
 
 
 def test_figures_are_of_the_after_map() -> None:

@@ -235,6 +235,17 @@ def test_other_metrics_versions_are_refused_in_one_line_that_says_how_to_mend(wr
         compared(unknown, new)
 
 
+def test_rows_with_and_without_an_extra_are_not_mixed(write: Write) -> None:
+    fine = write("fine", [row(1, extras="kiss-matcher 1.0;py4dgeo 1"), row(2, extras=""), row(3)])
+    mixed = write("mixed", [row(1, extras="py4dgeo 1;kiss-matcher 1.0"), row(2, extras="kiss-matcher absent"), row(3)])
+    compared(fine, fine)
+    for sides in ((fine, mixed), (mixed, fine)):
+        with pytest.raises(
+            InputError, match=f"^{mixed}: rows of tunnelcd are of kiss-matcher 1.0 and absent: run its plan"
+        ):
+            compared(*sides)
+
+
 def test_runs_that_share_nothing_and_rows_that_stand_twice_are_refused(write: Write) -> None:
     a, b = write("a", [row(1)]), write("b", [row(2)])
     with pytest.raises(InputError, match="share no session pair and variant"):

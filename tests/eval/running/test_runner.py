@@ -735,13 +735,15 @@ def test_a_world_that_cannot_be_made_keeps_its_kind(tmp_path: Path, runner: Runn
     assert set(results["pair_kind"]) == {"clean"}
 
 
-def test_cells_made_without_kiss_matcher_are_made_again_once_it_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    def keys(*, is_installed: bool) -> dict[str, str]:
-        monkeypatch.setattr(pair_run, "is_kiss_matcher_installed", lambda: is_installed)
+def test_cells_are_made_again_with_another_version_of_an_extra_that_they_may_ask(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def keys(version: str) -> dict[str, str]:
+        monkeypatch.setattr(pair_run, "extra_version", lambda name: version)
         found = expand_cells(load_plan("merge"))[:4]
         return {cell.variant: pair_run.cell_key(cell, "clean", None, {}) for cell in found}
 
-    there, missing = keys(is_installed=True), keys(is_installed=False)
+    there, missing = keys("1.0"), keys("absent")
     changed = {variant: there[variant] != missing[variant] for variant in there}
     assert changed == {"tunnelcd": True, "frame": False, "kiss-matcher": True, "oracle-merge": False}
 

@@ -137,7 +137,7 @@ def test_the_row(case: CaseScore) -> None:
         "scenario": "narrow", "family": "narrow", "pair_kind": "", "seed": 7, "variant": "mine", "preset": "mine",
         "status": "ok", "error": "", "metrics_version": METRICS_VERSION, "domain": "in", "n_changes": 3,
         "n_observable": 2, "score_radius_m": 3.0, "odometry_before": "kiss-icp",
-        "odometry_after": "drift", "sensor_profile": "os1-32", "checkpoints": "3deg ab;sphere cd",
+        "odometry_after": "drift", "sensor_profile": "os1-32", "checkpoints": "3deg ab;sphere cd", "extras": "",
         # one of two is found by what stands, both by what was proposed
         "region_recall": 0.5, "region_precision": 0.5, "false_regions_per_100m": 2.0,
         "region_recall_proposed": 1.0, "region_precision_proposed": 0.5, "false_regions_per_100m_proposed": 4.0,
@@ -281,7 +281,7 @@ def test_a_case_without_an_answer(truth: GroundTruth) -> None:
         "scenario": "narrow", "family": "narrow", "pair_kind": "", "seed": 7, "variant": "mine", "preset": "mine",
         "status": "failed", "error": "too dark", "metrics_version": METRICS_VERSION, "domain": "in", "n_changes": 3,
         "n_observable": 2, "score_radius_m": 3.0, "odometry_before": "kiss-icp",
-        "odometry_after": "drift", "sensor_profile": "os1-32", "checkpoints": "",
+        "odometry_after": "drift", "sensor_profile": "os1-32", "checkpoints": "", "extras": "",
         "region_auroc": 0.5, "region_ap": 12 / (12 + n_far),
         "is_auroc_assumed": 1.0, "overlap_true": 1.0, "evidence_overlap": 0.5, "t_merge_s": 2.0, "t_descriptor_s": 8.0,
         "after_path_m": 50.0,
@@ -411,12 +411,13 @@ def test_metrics_of_others_add_columns(
 
 def test_a_report_in_memory_scores_like_the_stored_one(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
     report = replace(true_report(tiny_pair, tiny_merge), config={"method": "ours"}, checkpoints={"3deg": "ab"})
+    report = replace(report, extras={"kiss-matcher": "1.0", "py4dgeo": "absent"})
     stored = scored(tiny_pair, report).row
     row = score(report, str(tiny_pair))
     assert (row["variant"], row["preset"]) == ("ours", "ours")
     np.testing.assert_equal(row, {**stored, "variant": "ours", "preset": "ours"})
     np.testing.assert_equal(score(str(tiny_pair.parent / "answer"), tiny_pair), stored)
-    assert row["checkpoints"] == "3deg ab"
+    assert (row["checkpoints"], row["extras"]) == ("3deg ab", "kiss-matcher 1.0;py4dgeo absent")
     assert score(replace(report, config={"regions": {"source": "sphere"}}), tiny_pair)["variant"] == "sphere"
     unnamed = score(replace(report, config={}), tiny_pair)
     assert (unnamed["variant"], unnamed["status"], unnamed["error"]) == ("", "ok", "")

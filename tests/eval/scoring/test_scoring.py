@@ -50,7 +50,7 @@ evidence_distinctness evidence_refined_inlier_share evidence_max_correction_m t_
 t_descriptor_s t_descriptor_per_keyframe_s t_cd_s t_cd_per_region_s t_oe_s t_oe_per_region_s t_returns_s
 t_total_s t_total_with_merge_s t_total_paper_s v_sphere_m3 v_oe_m3 s_points oe_points
 map_points_before map_points_after bytes_map_before bytes_regions_before
-n_keyframes_before n_keyframes_after after_path_m is_unchanged_pair is_alarm checkpoints
+n_keyframes_before n_keyframes_after after_path_m is_unchanged_pair is_alarm checkpoints extras
 odometry_before odometry_after sensor_profile
 """
 COLUMNS = COLUMN_TEXT.split()
