@@ -26,8 +26,7 @@ from cdpipe.model.types import DescriptorSet, MergedMaps
 Detect = Callable[[MergedMaps, DescriptorSet, DescriptorSet, PipelineConfig], ChangeReport]
 Propose = Callable[[MergedMaps, DescriptorSet, DescriptorSet, PipelineConfig], ChangeRegions]
 
-# Methods of ours that need an extra of the same name (`cdpipe.core.plugins`).
-# Sources that need an extra of their name, and its package.
+# Sources of ours that need the extra of the same name (`cdpipe.core.plugins`), and its package.
 PACKAGES = {"m3c2": "py4dgeo", "dufomap": "dufomap"}
 
 

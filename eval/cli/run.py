@@ -36,7 +36,7 @@ def run_command(
     seeds: Annotated[str | None, typer.Option(metavar="A:B", help="replaces the plan's seeds; B excluded")] = None,
     split: Annotated[
         Literal["dev", "sealed"],
-        typer.Option(help="`sealed`: other seeds, drawn from the name of this version; nobody can have tuned on them"),
+        typer.Option(help="`sealed`: other seeds, drawn from the name of this version"),
     ] = "dev",
     preset: Annotated[
         list[str] | None,

@@ -21,9 +21,10 @@ TOOL = "tunnelcd"
 FORMAT_VERSION = 1
 _PACKAGES = (
     "tunnelcd", "numpy", "scipy", "pandas", "torch", "mujoco", "embreex", "trimesh", "small_gicp", "kiss-matcher",
-    "py4dgeo", "dufomap", "kiss-icp", "ouster-sdk", "viser", "scikit-image", "pydantic", "matplotlib", "plotly",
-    "distributed",
+    "py4dgeo", "dufomap", "kiss-icp", "scikit-image", "pydantic", "matplotlib", "plotly", "distributed",
 )  # fmt: skip
+# No result depends on these extras.
+_OTHER_PACKAGES = ("ouster-sdk", "viser")
 
 
 def digest(value: Any) -> str:
@@ -77,7 +78,7 @@ def describe_run(
         "seeds": list(plan["seeds"]),
         "config_digests": {name: digest(config) for name, config in configs.items()},
         "checkpoints": dict(checkpoints),
-        "versions": versions(),
+        "versions": {**versions(), **{name: extra_version(name) for name in _OTHER_PACKAGES}},
         "git_commit": commit,
         "machine": machine(),
     }

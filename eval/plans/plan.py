@@ -245,7 +245,10 @@ def load_plan(name_or_path: str) -> Plan:
     Raises:
         InputError: It is unknown or has mistakes (one line each).
     """
-    return validate(Plan, read_plan(name_or_path))
+    document = read_plan(name_or_path)
+    if isinstance(document.value, dict) and "split" in document.value:
+        raise InputError(f"{document.where(('split',))}: split: leave it out, and run the plan with --split sealed")
+    return validate(Plan, document)
 
 
 def list_methods(plan: Plan, world: World) -> list[Method]:

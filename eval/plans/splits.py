@@ -1,4 +1,4 @@
-"""Splits of the test seeds: `dev`, which may be looked at, and `sealed`, which nobody can have tuned on.
+"""Splits of the test seeds: `dev`, which may be looked at, and `sealed`, which has not been.
 
 `eval/splits.yaml` holds their ranges and how often their scores have been looked at. A sealed seed is drawn from the
 name of the version that is released. Each seed of `dev` has one, so plans that share pairs share the sealed ones, too.
@@ -62,7 +62,7 @@ def seal_seeds(seeds: Sequence[int], version: str) -> tuple[int, ...]:
     strange = [seed for seed in seeds if not dev.first <= seed < dev.end]
     if strange:
         raise ValueError(
-            f"seed {strange[0]} is of no split: expected a plan of test seeds, {dev.first} to {dev.end - 1}"
+            f"seed {strange[0]} has no sealed one: expected a plan of test seeds from {dev.first} to {dev.end - 1}"
         )
     drawn: dict[int, None] = {}
     number = 0

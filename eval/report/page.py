@@ -128,7 +128,7 @@ def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
     """Return what every page shows: the run, its summary and its merges, and nothing of regions and objects."""
     return {
         "plan": plan_name(data),
-        "split": str(dict(data.provenance.get("plan") or {}).get("split") or ""),
+        "split": str(plan.get("split", "")) if isinstance(plan := data.provenance.get("plan"), Mapping) else "",
         "machine": describe_machine(data.provenance),
         "command": str(data.provenance.get("command") or "unknown"),
         "finished": str(data.provenance.get("finished") or "unknown"),

@@ -220,7 +220,7 @@ def cell_key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mappi
     merge = cell.config.merge
     asks_kiss_matcher = merge.method == "kiss-matcher" or (merge.method == "voting" and merge.fallback)
     extras = ["kiss-matcher"] if cell.oracle is None and asks_kiss_matcher else []
-    if cell.config.regions.source in PACKAGES:
+    if cell.config.regions.source in PACKAGES and cell.until is None and not cell.oracle_regions:
         extras.append(PACKAGES[cell.config.regions.source])
     return digest(
         {
@@ -236,7 +236,7 @@ def cell_key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mappi
             "until": cell.until,
             "pair_kind": pair_kind,
             # a cell that may depend on an extra runs again with another version of it, or without it
-            "extras": {name: extra_version(name) for name in extras},
+            **({"extras": {name: extra_version(name) for name in extras}} if extras else {}),
         }
     )
 

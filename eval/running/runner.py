@@ -177,10 +177,11 @@ def _limited(pairs: Sequence[Pair], limit: int | None) -> list[Pair]:
 
 def _require_one_split(run: RunFolder, plan: Plan) -> None:
     """Refuse a folder with cells of another split: its tables would mix seeds that were looked at with sealed ones."""
-    earlier = dict(run.stored_provenance().get("plan") or {})
-    if earlier and earlier.get("split", "") != plan.split:
+    earlier = run.stored_provenance().get("plan")
+    if isinstance(earlier, Mapping) and earlier.get("split", "") != plan.split:
         told = [split or "as plans name them" for split in (str(earlier.get("split", "")), plan.split)]
-        raise InputError(f"{run.path}: its seeds are {told[0]}, these are {told[1]}: name another folder")
+        way = "give --split sealed, or name another folder" if not plan.split else "name another folder"
+        raise InputError(f"{run.path}: its seeds are {told[0]}, these are {told[1]}: {way}")
 
 
 def _require_extras(pairs: Sequence[Pair]) -> None:

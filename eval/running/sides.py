@@ -83,7 +83,8 @@ def check_extras(side: Side) -> None:
         InputError: Rows of one variant depend on two versions of a package, or on one that some of them lacked.
     """
     found: dict[tuple[str, str], set[str]] = {}
-    for row in side.data.results:
+    rows = (row for row in side.data.results if side.variant in ("", row["variant"]))
+    for row in rows:
         told = row.get("extras")  # rows of older runs and of other programs do not say
         for used in filter(None, told.split(";") if isinstance(told, str) else ()):
             name, _, version = used.partition(" ")
@@ -91,8 +92,8 @@ def check_extras(side: Side) -> None:
     for (variant, name), versions in found.items():
         if len(versions) > 1:
             raise InputError(
-                f"{side.path}: rows of {variant} are of {name} {' and '.join(sorted(versions))}: run its plan again "
-                "with one of them"
+                f"{side.path}: rows of {variant} are of {name} {' and '.join(sorted(versions))}: make them "
+                "all with one of them"
             )
 
 

@@ -65,9 +65,16 @@ def test_pairs_that_plans_share_stay_shared() -> None:
     assert not {seed for _, seed in pairs("null")} & {seed for _, seed in pairs("regions")}
 
 
+def test_no_plan_file_calls_its_seeds_sealed(tmp_path: Path) -> None:
+    file = tmp_path / "tiny.yaml"
+    file.write_text("name: tiny\nscenarios: [smoke/one_box]\nseeds: [1]\nvariants: [{preset: paper}]\nsplit: sealed\n")
+    with pytest.raises(InputError, match=r"tiny\.yaml:5: split: .*--split sealed"):
+        load_plan(str(file))
+
+
 def test_validation_seeds_have_no_sealed_ones() -> None:
     with pytest.raises(
-        InputError, match=r"^--split sealed: plan calibrate: seed 10100 is of no split: expected .*20999"
+        InputError, match=r"^--split sealed: plan calibrate: seed 10100 has no sealed one: expected .*20999"
     ):
         change_plan(load_plan("calibrate"), split="sealed")
 
@@ -87,5 +94,7 @@ def test_the_run_records_its_split(tmp_path: Path, command: Command) -> None:
         code, _, err = command("run", file, "--out", tmp_path / "run", *options)
         (line,) = err.splitlines()
         assert code == 2
-        assert f"its seeds are sealed by {version_name()}, these are as plans name them: name another folder" in line
+        assert (
+            f"its seeds are sealed by {version_name()}, these are as plans name them: give --split sealed, or" in line
+        )
     assert pd.read_csv(tmp_path / "run" / "results.csv")["seed"].tolist() == [seed]

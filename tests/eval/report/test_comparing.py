@@ -241,7 +241,7 @@ def test_rows_with_and_without_an_extra_are_not_mixed(write: Write) -> None:
     compared(fine, fine)
     for sides in ((fine, mixed), (mixed, fine)):
         with pytest.raises(
-            InputError, match=f"^{mixed}: rows of tunnelcd are of kiss-matcher 1.0 and absent: run its plan"
+            InputError, match=f"^{mixed}: rows of tunnelcd are of kiss-matcher 1.0 and absent: make them all"
         ):
             compared(*sides)
 
