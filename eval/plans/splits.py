@@ -14,7 +14,6 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-import eval
 from cdpipe.core.yamlfile import Settings, read_yaml, validate
 
 SplitName = Literal["dev", "sealed"]
@@ -37,7 +36,7 @@ class Splits(Settings):
 
 def load_splits() -> Splits:
     """Return the splits of the test seeds."""
-    return validate(Splits, read_yaml(Path(eval.__path__[0]) / "splits.yaml"))
+    return validate(Splits, read_yaml(Path(__file__).parents[1] / "splits.yaml"))
 
 
 def version_name() -> str:

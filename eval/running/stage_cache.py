@@ -9,6 +9,7 @@ not at all; a damaged one is ignored.
 from __future__ import annotations
 
 import hashlib
+import os
 import zipfile
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -155,5 +156,10 @@ def _is_maps(name: str) -> bool:
 
 
 def _maps_bytes(folder: Path) -> int:
-    """Return how many bytes the maps of all pairs beside one take."""
-    return sum(path.stat().st_size for path in folder.parents[2].glob(f"*/*/*/{MAPS}-*.npz"))
+    """Return how many bytes the maps of all pairs beside one take; another process may remove some meanwhile."""
+    total = 0
+    for place, _, names in os.walk(folder.parents[2]):
+        for name in filter(_is_maps, names):
+            with suppress(FileNotFoundError):
+                total += Path(place, name).stat().st_size
+    return total

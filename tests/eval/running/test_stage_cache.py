@@ -287,6 +287,7 @@ def some_map(draw: np.random.Generator, **options: Any) -> PointMap:
 
 
 def test_results_come_back_as_they_went(tmp_path: Path) -> None:
+    folder = tmp_path / "world" / "0" / "root"
     draw = np.random.default_rng(0)
     views = KeyframeViews(draw.random((2, 4, 6)).astype(np.float16), np.stack([np.eye(4)] * 2))
     full = some_map(
@@ -313,7 +314,7 @@ def test_results_come_back_as_they_went(tmp_path: Path) -> None:
             np.ones((2, 3)), np.array([10.0, 4.5]), np.ones(2), np.ones((2, 2), int), np.ones(2, bool), np.ones(1)
         ),
     ]
-    StageCache(tmp_path).keep("maps-0", Kept(pack("maps", maps), {"t_merge_s": 2.0}, True))
+    StageCache(folder).keep("maps-0", Kept(pack("maps", maps), {"t_merge_s": 2.0}, True))
     given = {
         "descriptors": pack("descriptors", described),
         "spheres": pack("spheres", spheres),
@@ -321,8 +322,8 @@ def test_results_come_back_as_they_went(tmp_path: Path) -> None:
         **{f"regions-{i}": pack("regions", each) for i, each in enumerate(regions)},
     }
     for name, arrays in given.items():
-        StageCache(tmp_path).keep(name, Kept(arrays))
-    later = StageCache(tmp_path)
+        StageCache(folder).keep(name, Kept(arrays))
+    later = StageCache(folder)
     found = later.find("maps-0")
     assert found is not None
     assert (found.seconds, found.is_contended) == ({"t_merge_s": 2.0}, True)
@@ -377,6 +378,15 @@ def test_a_run_stores_maps_up_to_a_limit(tmp_path: Path, monkeypatch: pytest.Mon
         assert cache.find("maps-0") is None or cache.find("maps-0") is not cache.find("maps-0")
     assert sorted(path.parts[-3] for path in tmp_path.rglob("maps-*")) == ["0", "1"]
     assert len(list(tmp_path.rglob("merge-*"))) == 4
+
+
+def test_maps_that_another_process_removes_meanwhile_do_not_count(tmp_path: Path) -> None:
+    beside = tmp_path / "world" / "0" / "root"
+    beside.mkdir(parents=True)
+    (beside / "maps-0.npz").symlink_to("removed")
+    cache = StageCache(tmp_path / "world" / "1" / "root")
+    cache.keep("maps-0", Kept({"points": np.zeros((2, 3))}))
+    assert cache.find("maps-0") is not None
 
 
 def test_weights_are_part_of_what_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
