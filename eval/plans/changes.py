@@ -31,8 +31,8 @@ def change_plan(
         plan: The plan.
         seeds: "A:B", replaces the plan's seeds.
         split: `sealed` replaces each seed of the plan, a seed of `dev`, by a sealed one.
-        presets: Names or files, replace the plan's variants, its own grids and its targets. A variant that is a preset
-            alone keeps what the plan sets for it by scenario.
+        presets: Names or files, replace the plan's variants, its own grids, thresholds and targets. A variant that is
+            a preset alone keeps what the plan sets for it by scenario.
         settings: `key=value`, written over every variant and every grid point.
         grid: `key=v1,v2`; every variant runs at every combination. The plan's own grids stay. Variants merged by the
             truth get neither settings nor grids of `merge`; variants with regions from the truth get none of `query`
@@ -54,7 +54,12 @@ def change_plan(
             raise InputError(f"--split sealed: plan {plan.name}: {error}") from error
     if presets:
         document |= {"variants": [_find_variant(document["variants"], name) for name in presets]}
-        document |= {"grid": [], "targets": {}}
+        document |= {"grid": [], "targets": {}, "thresholds": {}}
+    if document.get("thresholds") and (settings or grid):
+        raise InputError(
+            f"{'--set' if settings else '--grid'}: plan {plan.name} holds a threshold for each of its methods, which "
+            "other settings make wrong: copy the plan, and change it there"
+        )
     overridden = {get_key(setting) for setting in (*settings, *itertools.chain(*axes))}
     document["variants"] = [
         {

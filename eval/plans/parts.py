@@ -23,6 +23,8 @@ from eval.oracles.merge import OracleMerge
 from eval.plans.worlds import OneOrMore, format_setting, get_group, raise_as_value_error, require_known_label
 from scenarios.schema import Scenario
 
+# a source that goes with every `extract.method`
+_WITH_EVERY_RULE = "voxel-diff"
 # settings of the query that regions from the truth still use
 _OF_TRUE_REGIONS = ("query.radius_m", "query.suppression")
 
@@ -48,7 +50,8 @@ def require_valid_setting(setting: str) -> str:
             "belongs to the world, not to the method: set it in the plan, under scenarios, "
             f'e.g. {{name: narrow, set: ["{setting}"]}}'
         )
-    raise_as_value_error(lambda: validate(PipelineConfig, apply_settings(Document("", {}), [setting])))
+    base = Document("", {"regions": {"source": _WITH_EVERY_RULE}})
+    raise_as_value_error(lambda: validate(PipelineConfig, apply_settings(base, [setting])))
     return setting
 
 
@@ -123,6 +126,15 @@ class Variant(Settings):
                 raise ValueError(f"{setting} does nothing: this variant's regions are the truth's; leave it out")
         return self
 
+    def keep_effective(self, settings: Iterable[str]) -> tuple[str, ...]:
+        """Return those of some settings that the parts from the truth leave an effect."""
+        return tuple(
+            setting
+            for setting in settings
+            if not (self.oracle_merge is not None and get_group(setting) == "merge")
+            and (not self.oracle_regions or has_effect_on_true_regions(setting))
+        )
+
     @property
     def every_setting(self) -> tuple[str, ...]:
         """All settings over the preset, in any scenario."""
@@ -138,14 +150,41 @@ class Variant(Settings):
 
 
 class Grid(Settings):
-    """Every combination of values of some settings over one preset."""
+    """Every combination of values of some settings, and of some lists of settings, over one preset or several.
 
-    variant: PresetName
-    scenarios: Annotated[tuple[Label, ...], NotEmpty]
-    keys: Annotated[dict[str, Values], NotEmpty, AfterValidator(_require_valid_keys)]
+    A grid without `scenarios` runs in all worlds of its plan.
+    """
+
+    variant: Annotated[tuple[PresetName, ...], OneOrMore, NotEmpty]
+    scenarios: Annotated[tuple[Label, ...], OneOrMore] = ()
+    keys: Annotated[dict[str, Values], AfterValidator(_require_valid_keys)] = Field(default_factory=dict)
+    each: Annotated[tuple[MethodSettings, ...], OneOrMore] = ()
+
+    @model_validator(mode="after")
+    def _varies(self) -> Grid:
+        if not self.keys and not self.each:
+            raise ValueError("expected keys, each or both: at least one is needed")
+        return self
+
+    @property
+    def name(self) -> str:
+        """Its presets."""
+        return ", ".join(self.variant)
 
     @property
     def points(self) -> list[tuple[str, ...]]:
-        """The settings of every combination."""
-        axes = [[format_setting(key, value) for value in values] for key, values in self.keys.items()]
-        return list(itertools.product(*axes))
+        """The settings of every combination: those of `each` first."""
+        axes = [[(format_setting(key, value),) for value in values] for key, values in self.keys.items()]
+        return [tuple(itertools.chain(*point)) for point in itertools.product(self.each or ((),), *axes)]
+
+    @property
+    def every_setting(self) -> tuple[str, ...]:
+        """Every setting of any combination."""
+        return tuple(dict.fromkeys(itertools.chain(*self.points)))
+
+    @model_serializer(mode="wrap")
+    def _as_written(self, handler: SerializerFunctionWrapHandler) -> Any:
+        document = handler(self)
+        presets = document["variant"]
+        document["variant"] = presets[0] if len(presets) == 1 else presets
+        return {key: value for key, value in document.items() if value or key == "keys"}

@@ -11,6 +11,8 @@ seeds: "20000:20002"                 # B excluded, in quotes; or a list
 report: [regions, objects]           # tables and plots of regions, of objects, or of both (eval/tables)
 targets: main                        # what is asked: those of another plan, or of its own (eval/plans/targets.py)
 until: null                          # merge: stop after the merge; only the columns of the merge are filled
+set: [merge.refine=none]             # every method has these, below its own settings; part of no name
+thresholds: {"paper[extract.voxel_m=0.4]": 1.1}  # query.threshold of a variant or grid point; part of no name
 variants:
   - preset: paper                    # a shipped preset or the path of a .yaml file
     set: ["extract.voxel_m=0.4"]     # part of the variant's name
@@ -20,15 +22,17 @@ variants:
     oracle_regions: true                                 # a region around each change (eval/oracles/regions.py)
     scenarios: [paper/site1]                             # only in these worlds; in all worlds if left out
 grid:
-  - variant: tunnelcd                # a preset
-    scenarios: [paper/site1]         # some of the plan's worlds, e.g. paper/site2[sensor.mode=512x10]
+  - variant: tunnelcd                # a preset, or a list of presets
+    scenarios: [paper/site1]         # some of the plan's worlds, e.g. paper/site2[sensor.mode=512x10]; all if left out
     keys: {extract.voxel_m: [0.2, 0.4], query.radius_m: [3, 4.5]}
+    each: [[extract.method=surface], [extract.method=voxel, cluster.min_points=32]]  # lists of settings
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -48,7 +52,7 @@ from cdpipe.core.names import folded
 from cdpipe.core.yamlfile import Settings, suggest, validate
 from cdpipe.model.config import Site
 from eval.plans.files import read_plan
-from eval.plans.parts import Grid, Label, NotEmpty, Variant
+from eval.plans.parts import Grid, Label, MethodSettings, NotEmpty, Variant, get_key
 from eval.plans.targets import PlanTargets, Targets
 from eval.plans.variants import Cell, Method, Until
 from eval.plans.worlds import (
@@ -64,6 +68,7 @@ from eval.plans.worlds import (
 )
 
 _MOST_SEEDS = 100_000
+_MAY_BE_LEFT_OUT = ("split", "set", "thresholds")
 _AFTER_MERGE = ("query", "extract", "outlier", "cluster", "m3c2", "dufomap")
 
 
@@ -107,15 +112,21 @@ def _find_settings_past_the_end(plan: Plan) -> Iterator[InitErrorDetails]:
     if plan.wide:
         yield _mistake(("wide",), ", ".join(plan.wide), rule.format("wide"))
     for place, variant in enumerate(plan.variants):
-        for setting in variant.every_setting:
-            if get_group(setting) in _AFTER_MERGE:
-                yield _mistake(("variants", place), variant.preset, rule.format(f"{setting} of {variant.preset}"))
+        for setting in filter(_acts_after_merge, variant.every_setting):
+            yield _mistake(("variants", place), variant.preset, rule.format(f"{setting} of {variant.preset}"))
         if variant.oracle_regions:
             yield _mistake(("variants", place, "oracle_regions"), "true", rule.format("oracle_regions"))
     for place, grid in enumerate(plan.grid):
-        for key in grid.keys:
-            if get_group(key) in _AFTER_MERGE:
-                yield _mistake(("grid", place, "keys", key), key, rule.format(f"{key} of the grid of {grid.variant}"))
+        for key in dict.fromkeys(get_key(setting) for setting in grid.every_setting if _acts_after_merge(setting)):
+            yield _mistake(("grid", place, "keys", key), key, rule.format(f"{key} of the grid of {grid.name}"))
+    for setting in filter(_acts_after_merge, plan.set):
+        yield _mistake(("set",), setting, rule.format(setting))
+    if plan.thresholds:
+        yield _mistake(("thresholds",), ", ".join(plan.thresholds), rule.format("thresholds"))
+
+
+def _acts_after_merge(setting: str) -> bool:
+    return get_group(setting) in _AFTER_MERGE
 
 
 def _find_unknown_worlds(plan: Plan) -> Iterator[InitErrorDetails]:
@@ -133,7 +144,7 @@ def _find_unknown_worlds(plan: Plan) -> Iterator[InitErrorDetails]:
         who = f"per_scenario of {variant.preset}"
         asked += [(("variants", place, "per_scenario", name), who, name) for name in variant.per_scenario]
     for place, grid in enumerate(plan.grid):
-        who = f"the grid of {grid.variant}"
+        who = f"the grid of {grid.name}"
         asked += [(("grid", place, "scenarios", index), who, name) for index, name in enumerate(grid.scenarios)]
     for where, who, name in asked:
         if name not in known:
@@ -155,6 +166,18 @@ def _find_repeated_variants(plan: Plan) -> Iterator[InitErrorDetails]:
                 )
                 yield _mistake(("variants",), name, f"variant {name} {twice if names[folder] == name else shared}")
             names.setdefault(folder, name)
+
+
+def _find_unknown_thresholds(plan: Plan) -> Iterator[InitErrorDetails]:
+    """Yield the names under `thresholds` that no variant and no grid point has."""
+    if not plan.thresholds:
+        return
+    every = [method for world in plan.worlds for method in list_methods(plan, world)]
+    known = {method.variant for method in every if not method.oracle_regions}
+    for name, threshold in plan.thresholds.items():
+        if name not in known:
+            rule = f"no variant or grid point with a threshold is called {name}{suggest(name, known)}"
+            yield _mistake(("thresholds", name), str(threshold), rule)
 
 
 def parse_seeds(value: Any) -> tuple[int, ...]:
@@ -213,6 +236,8 @@ class Plan(Settings):
     seeds: Annotated[tuple[int, ...], BeforeValidator(parse_seeds)]
     split: str = ""
     until: Until | None = None
+    set: MethodSettings = ()
+    thresholds: dict[str, float] = Field(default_factory=dict)
     report: Annotated[tuple[Literal["regions", "objects"], ...], BeforeValidator(_list_subjects)] = ()
     targets: PlanTargets = Targets()
     variants: Annotated[tuple[Variant, ...], NotEmpty]
@@ -227,11 +252,12 @@ class Plan(Settings):
     @model_validator(mode="after")
     def _parts_fit(self) -> Plan:
         _refuse([*_find_settings_past_the_end(self), *_find_unknown_worlds(self), *_find_repeated_variants(self)])
+        _refuse(list(_find_unknown_thresholds(self)))
         return self
 
     @model_serializer(mode="wrap")
-    def _without_split(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {name: value for name, value in handler(self).items() if name != "split" or value}
+    def _as_written(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {name: value for name, value in handler(self).items() if name not in _MAY_BE_LEFT_OUT or value}
 
     @property
     def worlds(self) -> list[World]:
@@ -260,6 +286,7 @@ def list_methods(plan: Plan, world: World) -> list[Method]:
             preset=variant.preset,
             named=variant.set,
             silent=tuple(setting for place in places for setting in variant.per_scenario.get(place, ())),
+            shared=variant.keep_effective(plan.set),
             site=site,
             oracle=variant.oracle_merge,
             oracle_regions=variant.oracle_regions,
@@ -268,9 +295,17 @@ def list_methods(plan: Plan, world: World) -> list[Method]:
         if not variant.scenarios or world.label in variant.scenarios
     ]
     for grid in plan.grid:
-        if not places.keys().isdisjoint(grid.scenarios):
-            methods += [Method(grid.variant, point, site=site) for point in grid.points]
-    return methods
+        if not grid.scenarios or not places.keys().isdisjoint(grid.scenarios):
+            methods += [
+                Method(preset, point, shared=plan.set, site=site) for preset in grid.variant for point in grid.points
+            ]
+    return [_with_threshold(method, plan.thresholds.get(method.variant)) for method in methods]
+
+
+def _with_threshold(method: Method, threshold: float | None) -> Method:
+    if threshold is None:
+        return method
+    return replace(method, silent=(*method.silent, f"query.threshold={threshold!r}"))
 
 
 def expand_cells(plan: Plan) -> list[Cell]:

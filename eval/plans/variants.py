@@ -44,11 +44,22 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """A variant or a grid point in one world: settings in its name, and settings of the site."""
+    """A variant or a grid point in one world.
+
+    Attributes:
+        preset: The preset.
+        named: Settings in its name.
+        silent: Settings of the site, and its threshold; over those of the name.
+        shared: Settings of all methods of the plan; under those of the name.
+        site: Section of the preset that applies.
+        oracle: The oracle that merges instead of the method, or None.
+        oracle_regions: Whether the regions come from the truth.
+    """
 
     preset: str
     named: tuple[str, ...]
     silent: tuple[str, ...] = ()
+    shared: tuple[str, ...] = ()
     site: Site = "narrow"
     oracle: OracleMerge | None = None
     oracle_regions: bool = False
@@ -64,7 +75,7 @@ class Method:
         Raises:
             InputError: The settings contradict each other or the preset.
         """
-        config = load_config(self.preset, [*self.named, *self.silent], self.site)
+        config = load_config(self.preset, [*self.shared, *self.named, *self.silent], self.site)
         if self.oracle_regions and config.extract.method == "clusters":
             raise InputError(
                 f"{self.variant}: oracle_regions: extract.method = clusters takes those of regions.source: expected "

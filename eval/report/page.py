@@ -33,6 +33,7 @@ from eval.report.regions.regions import REGION_COLUMNS, draw_regions
 from eval.report.render import render_page, write_file
 from eval.report.scenarios import draw_scenarios
 from eval.report.settings.effects import draw_effects
+from eval.report.settings.factorial import draw_factorial, factorial_table
 from eval.report.settings.factors import draw_factors
 from eval.report.settings.grids import PQ_COLUMN, draw_grids
 from eval.report.site.site import draw_site
@@ -111,7 +112,10 @@ def _draw(data: RunData, views: Views, *, is_slim: bool) -> dict[str, str | byte
         points = pareto_table(data)
         if len(points):
             files["pareto.csv"] = points.to_csv(index=False)
-        content |= _sections(data, draw_pareto(points, is_contended=is_contended(data)), views)
+        crossed = factorial_table(data)
+        if len(crossed):
+            files["factorial.csv"] = crossed.to_csv(index=False)
+        content |= _sections(data, draw_pareto(points, is_contended=is_contended(data)), draw_factorial(crossed), views)
         files["results.tex"] = to_latex(content["results"])
         for name in ("table1", "table2"):
             files |= {f"{name}.csv": to_csv(content[name]), f"{name}.tex": to_latex(content[name])}
@@ -148,7 +152,7 @@ def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def _sections(data: RunData, pareto: Sequence[Chart], views: Views) -> dict[str, Any]:
+def _sections(data: RunData, pareto: Sequence[Chart], factorial: Sequence[Chart], views: Views) -> dict[str, Any]:
     """Return what a page shows of regions, objects and times; `missing` lists what could not be shown of them."""
     regions, objects, unchanged = draw_regions(data), draw_objects(data), unchanged_table(data)
     worlds, variant = scenarios(data, unchanged=False), shown_variant(data)
@@ -163,8 +167,8 @@ def _sections(data: RunData, pareto: Sequence[Chart], views: Views) -> dict[str,
     missing += [] if worlds else ["No scenario with changes was run."]
     if objects is None:
         missing += [] if n_unchanged else ["No unchanged pair was run, so false alarms are not measured."]
-        missing += [] if grids else ["No grid of two settings was run."]
-    charts = [*(regions.plots if regions is not None else ()), *pareto, *by_scenario, *grids, *factors]
+        missing += [] if grids or factorial else ["No grid of two settings was run."]
+    charts = [*(regions.plots if regions is not None else ()), *pareto, *factorial, *by_scenario, *grids, *factors]
     return {
         "regions": regions,
         "objects": objects,
@@ -175,6 +179,7 @@ def _sections(data: RunData, pareto: Sequence[Chart], views: Views) -> dict[str,
         "enough_pairs": ENOUGH_PAIRS,
         "table1": time_table(data),
         "table2": volume_table(data),
+        "factorial": factorial,
         "grids": grids,
         "factors": factors,
         "by_scenario": by_scenario,

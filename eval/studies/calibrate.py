@@ -1,10 +1,12 @@
 """Thresholds at which every method has the same false-alarm rate: 5 % of the unchanged validation pairs alarm.
 
-A preset with settings of its own for wide drifts has one threshold for each kind of site, any other preset has one.
+A preset with settings of its own for wide drifts has one threshold for each kind of site where the plan names wide
+drifts; any other preset, and any variant of a plan without `wide`, has one.
 
 Run as `python -m eval.studies.calibrate RUN`, where RUN is the folder of `tunnelcd run calibrate`. The program prints
 these thresholds, and those at which every method has 0.1 false regions per 100 m. It writes both to RUN/thresholds.csv
-and, in the form of presets, to RUN/thresholds.yaml. Presets are changed by hand, so that none changes unnoticed.
+and, in the form of presets and of plans (`thresholds`), to RUN/thresholds.yaml. Presets and plans are changed by hand,
+so that none changes unnoticed.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ from eval.core.exits import run_program
 from eval.core.printing import echo
 from eval.core.tablefile import read_table as read_stored_table
 from eval.core.tablefile import table_file
+from eval.plans.coverage import read_stored_plan
+from eval.running.runfolder import read_json
 
 ALARM_SHARE = 0.05
 FALSE_PER_100M = 0.1
@@ -58,13 +62,18 @@ def find_rate_threshold(
     return _round_above(scores, int(false_per_100m * path_m / 100.0 + 1e-9), lowest)
 
 
-def find_thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
+def find_thresholds(results: pd.DataFrame, regions: pd.DataFrame, *, has_wide: bool = True) -> pd.DataFrame:
     """Return one row per variant and kind of site, with its thresholds at either rate.
 
     Where the radius belongs to a kind of site, so does the threshold: the same change scores differently in narrow and
     wide drifts. Kinds of site differ in `score_radius_m`, which is NaN for a preset that tells none apart: its
     threshold is of all pairs together. Withdrawn candidates cannot alarm. The run must therefore use a threshold below
     the one sought; no lower one is returned.
+
+    Args:
+        results: Rows of results.csv.
+        regions: Rows of regions.csv.
+        has_wide: Whether the plan of the run names wide drifts, for which presets may have settings of their own.
 
     Returns:
         `threshold`, which at most 5 % of the pairs reach, with `n_pairs`, `n_alarms` of them and `n_unanswered` others;
@@ -77,7 +86,7 @@ def find_thresholds(results: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFram
     if len(changed):
         raise InputError(f"{', '.join(changed)}: has changes: calibration needs unchanged pairs")
     rows = []
-    kind = results["score_radius_m"].where(results["preset"].map(_tells_sites_apart))
+    kind = results["score_radius_m"].where(results["preset"].map(_tells_sites_apart) & has_wide)
     for (variant, _), cases in results.groupby(["variant", kind], sort=False, dropna=False):
         radius_m = float(kind[cases.index[0]])
         ok = cases[cases["status"] == "ok"]
@@ -131,11 +140,22 @@ def format_settings(table: pd.DataFrame) -> str:
     return "\n".join([*lines, ""])
 
 
+def format_plan(table: pd.DataFrame) -> str:
+    """Return the thresholds of variants with settings as a plan has them: at most 5 % of the unchanged pairs alarm."""
+    own = table[table["variant"].str.contains("[", regex=False) & table["score_radius_m"].isna()]
+    if len(own) == 0:
+        return ""
+    lines = [f'  "{name}": {value:g}' for name, value in zip(own["variant"], own["threshold"], strict=True)]
+    return "\n".join(["thresholds:  # of a plan", *lines, ""])
+
+
 def main(run: Annotated[Path, typer.Argument(help="folder of `tunnelcd run calibrate`")]) -> None:
     """Print and write the thresholds of a calibration run."""
-    table = find_thresholds(read_table(run / "results.csv", "calibrate"), read_table(run / "regions.csv", "calibrate"))
+    results, regions = (read_table(run / f"{name}.csv", "calibrate") for name in ("results", "regions"))
+    plan = read_stored_plan(read_json(run / "provenance.json"))
+    table = find_thresholds(results, regions, has_wide=plan is None or len(plan.wide) > 0)
     table.to_csv(run / "thresholds.csv", index=False)
-    settings = format_settings(table)
+    settings = format_settings(table) + format_plan(table)
     (run / "thresholds.yaml").write_text(settings, encoding="utf-8")
     echo(*table.to_string(index=False).split("\n"), "", *settings.split("\n"))
 

@@ -284,9 +284,71 @@ def test_the_example_of_the_documentation_is_a_plan(tmp_path: Path) -> None:
     plan = read(tmp_path, textwrap.dedent(documentation.partition("\n\n")[2]))
     assert set(Plan.model_fields) - {"split"} == plan.model_fields_set  # that is for --split to write
     assert plan.seeds == (20000, 20001)
-    # of each seed: one variant on both sites and on two more worlds of one, another and four grid points on the other
-    assert len(expand_cells(plan)) == 2 * ((2 + 2) + 1 + 4)
+    # of each seed: one variant on both sites and on two more worlds of one, another and eight grid points on the other
+    assert len(expand_cells(plan)) == 2 * ((2 + 2) + 1 + 8)
     assert {cell.variant for cell in expand_cells(plan) if cell.preset == "paper"} == {"paper[extract.voxel_m=0.4]"}
+
+
+CROSSED = """\
+name: crossed
+scenarios: [smoke/one_box, smoke/unchanged]
+seeds: [7]
+set: [merge.refine=checked, query.radius_m=6, extract.voxel_m=0.8]
+thresholds: {"paper[extract.method=surface]": 0.25, tunnelcd: -1}
+variants:
+  - {preset: tunnelcd, set: []}
+  - {preset: tunnelcd, oracle_merge: {}, oracle_regions: true}
+grid:
+  - variant: [paper, voxel-diff]
+    each: [extract.method=surface, [extract.method=voxel, extract.voxel_m=0.3]]
+"""
+
+
+def test_presets_crossed_with_lists_of_settings(tmp_path: Path) -> None:
+    cells = expand_cells(read(tmp_path, CROSSED))
+    found = {cell.variant: cell.config for cell in cells}
+    assert len(cells) == 2 * len(found)  # a grid without scenarios runs in all worlds
+    assert list(found) == [
+        "tunnelcd",
+        "oracle-merge+oracle-regions",
+        "paper[extract.method=surface]",
+        "paper[extract.method=voxel,extract.voxel_m=0.3]",
+        "voxel-diff[extract.method=surface]",
+        "voxel-diff[extract.method=voxel,extract.voxel_m=0.3]",
+    ]
+    # settings of the plan go over the preset's, and under the variant's own
+    assert {config.query.radius_m for config in found.values()} == {6.0}
+    assert [config.extract.voxel_m for config in found.values()] == [0.8, 0.8, 0.8, 0.3, 0.8, 0.3]
+    assert found["paper[extract.method=surface]"].merge.refine == "checked"
+    # a threshold belongs to its own method alone
+    assert found["paper[extract.method=surface]"].query.threshold == 0.25
+    assert found["tunnelcd"].query.threshold == -1
+    assert found["voxel-diff[extract.method=surface]"].query.threshold == load_config("voxel-diff").query.threshold
+    # the truth needs no merge
+    assert found["oracle-merge+oracle-regions"].merge.refine == load_config("tunnelcd").merge.refine
+
+
+def test_thresholds_belong_to_methods_that_the_plan_runs_as_they_are(tmp_path: Path) -> None:
+    (line,) = mistakes(tmp_path, CROSSED.replace('"paper[extract.method=surface]": 0.25', '"papr": 1'))
+    assert line.startswith("plan.yaml:5: thresholds.papr = '1.0': ") and "is called papr" in line
+    (line,) = mistakes(tmp_path, CROSSED.replace("tunnelcd: -1", "oracle-merge+oracle-regions: 1"))
+    assert "is called oracle-merge+oracle-regions" in line
+    for options in ({"settings": ["map.voxel_m=0.3"]}, {"grid": ["map.voxel_m=0.1,0.2"]}):
+        with pytest.raises(InputError, match=r"plan crossed holds a threshold for each of its methods"):
+            change_plan(read(tmp_path, CROSSED), **options)  # type: ignore[arg-type]
+    changed = change_plan(read(tmp_path, CROSSED), presets=["c2c"])
+    assert {cell.variant for cell in expand_cells(changed)} == {"c2c"}
+
+
+def test_a_plan_that_was_written_down_is_the_same_plan(tmp_path: Path) -> None:
+    plan = read(tmp_path, CROSSED)
+    assert Plan.model_validate(plan.model_dump(mode="json")) == plan
+    assert expand_cells(Plan.model_validate(plan.model_dump(mode="json")))[2].config == expand_cells(plan)[2].config
+
+
+def test_a_grid_of_nothing_is_refused(tmp_path: Path) -> None:
+    (line,) = mistakes(tmp_path, CROSSED[: CROSSED.index("    each:")])
+    assert line.startswith("plan.yaml:10: grid.0") and "expected keys, each or both" in line
 
 
 ORACLES = """\

@@ -7,7 +7,7 @@ import yaml
 
 from cdpipe.core.errors import InputError
 from cdpipe.model.config import load_config
-from eval.studies.calibrate import find_alarm_threshold, find_rate_threshold, find_thresholds, format_settings
+from eval.studies.calibrate import find_alarm_threshold, find_rate_threshold, find_thresholds, format_plan, format_settings
 
 
 def test_five_per_cent_of_forty_pairs_alarm() -> None:
@@ -55,6 +55,16 @@ def _regions() -> pd.DataFrame:
     found = [("null/a", 1, 5.0), ("null/a", 1, 4.0), ("null/a", 2, 3.0), ("null/b", 3, 6.0), ("null/c", 1, 200.0)]
     rows = [(scenario, seed, "m", score, score >= 4.0, False) for scenario, seed, score in found]
     return pd.DataFrame(rows, columns=["scenario", "seed", "variant", "score", "is_reported", "is_withdrawn"])
+
+
+def test_a_plan_that_names_no_wide_drifts_has_one_threshold_for_a_variant() -> None:
+    table = find_thresholds(_results(), _regions(), has_wide=False)
+    assert len(table) == 1
+    assert np.isnan(table["score_radius_m"]).all()
+    assert int(table["n_pairs"][0]) == 9  # of all three kinds of worlds
+    assert format_plan(table) == ""  # a preset holds its own threshold
+    named = format_plan(table.assign(variant="c2c[extract.method=surface]", threshold=200.1))
+    assert yaml.safe_load(named) == {"thresholds": {"c2c[extract.method=surface]": 200.1}}
 
 
 def test_a_table_by_hand() -> None:
