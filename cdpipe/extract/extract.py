@@ -27,6 +27,8 @@ from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
 from cdpipe.model.types import DescriptorSet, MergedMaps
 
 FIGURES = ("v_sphere_m3", "v_oe_m3", "s_points", "oe_points")
+# Points of the before map in the sphere of a candidate as it was proposed: who looks at it has to be sent these.
+ASKED_POINTS = "asked_points"
 
 
 def cut_objects(merged: MergedMaps, regions: ChangeRegions, config: PipelineConfig) -> list[PointGroup]:
@@ -107,6 +109,13 @@ def measure_regions(
     return figures
 
 
+def count_asked_points(regions: ChangeRegions, crops: Crops) -> Float64Array:
+    """Return (R,) the points of the before map in the sphere of each candidate as it was proposed."""
+    centres = regions.centres_map if regions.proposed_centres_map is None else regions.proposed_centres_map
+    spheres = zip(centres, regions.radii_m, strict=True)
+    return np.array([len(crops.crop("before", centre, radius_m)[0]) for centre, radius_m in spheres], dtype=np.float64)
+
+
 def extract_changes(
     merged: MergedMaps,
     regions: ChangeRegions,
@@ -135,6 +144,7 @@ def extract_changes(
     crops = Crops(merged, margin_m=0.0)
     regions = replace(regions, clusters=None)
     figures = measure_regions(regions, groups, lambda centre, radius_m: crops.crop("after", centre, radius_m)[1])
+    figures[ASKED_POINTS] = count_asked_points(regions, crops)
     return make_report(merged, described, regions, objects, figures, seconds, config)
 
 

@@ -152,7 +152,8 @@ class ChangeReport:
         regions: All candidates.
         objects: Objects extracted from the reported regions.
         seconds: Wall-clock seconds per stage (`t_merge_s`, `t_cd_s`, `t_oe_s`, `t_descriptor_s`).
-        figures: (R,) value of each row of the paper's Table II per region, by column name; NaN if not reported.
+        figures: (R,) value of each row of the paper's Table II per region, by column name, NaN if not reported; and
+            `asked_points`, the before map's points in the sphere of each candidate as it was proposed.
         keyframe_scans: Scans of the before and of the after keyframes that `regions.pairs` indexes.
         config: The effective settings.
         local_before_T_after: (Ka, 4, 4) refined alignment at each after keyframe; None if `before_T_after` holds

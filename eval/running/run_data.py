@@ -35,7 +35,7 @@ _UNBOUNDED = ("low", "high")
 _DERIVED_TEXTS = {"domain", "variant", *CONDITION_COLUMNS}
 _MORE_TEXTS = {
     "regions_targets": ("target", "asked", "is_met"), "objects_targets": ("target", "asked", "is_met"),
-    "regions_by_size": ("measure",), "objects_by_group": ("measure", "value"),
+    "regions_by_size": ("measure",), "budgets": ("site", "price"), "objects_by_group": ("measure", "value"),
 }  # fmt: skip
 _COUNT = re.compile(r"n(_|$)")
 _NUMBER = re.compile(r"[-+.\deE]+")

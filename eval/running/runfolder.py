@@ -9,7 +9,7 @@ stages/<world>/<seed>/                        what the pipeline's stages gave (e
 cells/<world>/<seed>/<variant>.json           a finished cell: key, order, row, items
 results.csv changes.csv regions.csv objects.csv keyframes.csv summary.csv
 merge.csv                                     where pairs have a kind (eval.tables.merge_table)
-regions_table.csv regions_targets.csv regions_by_size.csv roc.csv froc.csv
+regions_table.csv regions_targets.csv regions_by_size.csv budgets.csv roc.csv froc.csv
                                               where the plan says `report: regions` (eval.tables.region_table)
 objects_table.csv objects_by_group.csv objects_targets.csv
                                               where it says `report: objects` (eval.tables.object_table)

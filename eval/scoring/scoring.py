@@ -17,7 +17,7 @@ import numpy as np
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, travelled_m
 from cdpipe.core.plugins import METRICS, entry_points, load_entry_point
-from cdpipe.extract.extract import FIGURES, hull_volume_m3
+from cdpipe.extract.extract import ASKED_POINTS, FIGURES, hull_volume_m3
 from cdpipe.io.answer import Answer, read_answer
 from cdpipe.model.report import ChangedObject, ChangeReport
 from eval.core.domains import domain_of, is_change_in_distribution
@@ -215,7 +215,7 @@ def make_region_rows(report: ChangeReport | None, scored: RegionScores, truth: G
         return []
     regions = report.regions
     is_withdrawn = regions.is_proposed & ~regions.is_reported
-    figures = {name: read_figure(report, name) for name in FIGURES}
+    figures = {name: read_figure(report, name) for name in (*FIGURES, ASKED_POINTS)}
     return [
         {
             "region": index,

@@ -18,6 +18,7 @@ from cdpipe.core.geometry import Float64Array
 from eval.core.ranking import auroc
 from eval.core.statistics import interval_of, mean, median, wilson_interval
 from eval.plans.targets import Targets
+from eval.tables.budgets import budget_rows
 from eval.tables.conditions import by_condition, told_apart
 from eval.tables.groups import recall_by_size
 from eval.tables.region_curves import (
@@ -32,7 +33,7 @@ from eval.tables.region_curves import (
 from eval.tables.rows import by_domain, by_variant, means_with_intervals, numbers, of_cases, with_domain
 from eval.tables.targets import is_unchanged_pair, judged_targets
 
-FILES = ("regions_table", "regions_targets", "regions_by_size", "roc", "froc")
+FILES = ("regions_table", "regions_targets", "regions_by_size", "budgets", "roc", "froc")
 _MEANS = (
     "region_auroc", "region_recall_at_k", "region_recall_at_k_proposed", "region_recall", "region_recall_proposed",
     "region_precision",
@@ -55,11 +56,13 @@ def region_tables(
     Returns:
         regions_table: a row for every condition (odometry and sensor, where the plan tells them apart), domain and
         variant; regions_targets: what is asked, and what is found; regions_by_size: recall by size, returns and range
-        of the change; roc, froc: the curves.
+        of the change; budgets: recall by what is looked at, sent or waited for, for each domain and kind of site; roc,
+        froc: the curves.
     """
     results = with_domain(results)
     rows: list[dict[str, Any]] = []
     sizes: list[dict[str, Any]] = []
+    budgets: list[dict[str, Any]] = []
     curves: dict[str, list[pd.DataFrame]] = {"roc": [], "froc": []}
     ranked: dict[tuple[str, str, bool], RankedPairs] = {}
     items_by_variant = {name: by_variant(items[name]) for name in ("regions", "changes", "keyframes")}
@@ -81,6 +84,7 @@ def region_tables(
             rows.append({**names, **_counts(own), "region_auroc_pooled": auroc(scores, positive), **_operating(each)})
             rows[-1] |= _proposed(proposed)
             sizes += [{**names, **row} for row in recall_by_size(each, changes)]
+            budgets += [{**names, **row} for row in _budgets_by_site(own, regions, changes)]
             roc, froc = roc_curve(scores, positive), free_response(each)
             curves["roc"].append(_curve(names, roc, ("false_positive_rate", "true_positive_rate")))
             curves["froc"].append(_curve(names, froc, ("false_regions_per_100m", "recall")))
@@ -89,6 +93,7 @@ def region_tables(
         "regions_table": table,
         "regions_targets": judged_targets(targets, "regions", table, results, ranked, is_whole=is_whole),
         "regions_by_size": pd.DataFrame(sizes),
+        "budgets": pd.DataFrame(budgets),
         **{name: pd.concat(parts, ignore_index=True) for name, parts in curves.items()},
     }
 
@@ -105,6 +110,18 @@ def region_overview(table: pd.DataFrame) -> pd.DataFrame:
         "bytes_ratio": "bytes 1/", "t_descriptor_per_keyframe_s": "t_desc/kf", "t_cd_per_region_s": "t_cd/region",
     }  # fmt: skip
     return table[list(names)].rename(columns=names)
+
+
+def _budgets_by_site(own: pd.DataFrame, regions: pd.DataFrame, changes: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the budgets of a variant at all sites together, and at each kind of site: families of one last name."""
+    kinds = own["family"].astype(str).str.rpartition("/")[2] if "family" in own else own["scenario"].astype(str)
+    parts = [("all", own)] + [(str(kind), part) for kind, part in own.groupby(kinds, sort=False)]
+    rows = []
+    for site, part in parts:
+        its = of_cases(regions, part, _NEEDED), of_cases(changes, part, _NEEDED)
+        proposed = ranked_pairs(part, *its, is_proposal=True)
+        rows += [{"site": site, **row} for row in budget_rows(proposed, part, its[0])]
+    return rows
 
 
 def _curve(names: Mapping[str, str], points: tuple[Any, Any], columns: tuple[str, str]) -> pd.DataFrame:

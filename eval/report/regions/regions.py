@@ -6,6 +6,7 @@ import pandas as pd
 
 from eval.core.domains import domain_name
 from eval.plans.targets import read_targets
+from eval.report.regions.budgets import budget_areas, draw_budgets
 from eval.report.regions.charts import draw_free_response, draw_roc, draw_sizes
 from eval.report.tables import (
     Cell,
@@ -53,7 +54,7 @@ REGION_COLUMNS = (
     Column("t_cd_per_region_s", "t_cd / region [ms]", None, _ms, "Median.",
            "Undefined where no region was reported."),
 )  # fmt: skip
-_CURVES = ("roc", "froc", "regions_by_size")
+_CURVES = ("roc", "froc", "regions_by_size", "budgets")
 _CAPTION = "Regions: one row is one method on the pairs in or out of the training distribution"
 
 
@@ -76,11 +77,14 @@ def draw_regions(data: RunData) -> Section | None:
     conditions = conditions_table(
         off_grids(every_condition(data, "regions_table"), data), _COMPARED, _CONDITIONS_CAPTION
     )
-    tables = (methods, conditions, silence_table(table), targets_table(stored_table(data, "regions_targets")))
+    tables = (
+        methods, conditions, silence_table(table), targets_table(stored_table(data, "regions_targets")),
+        budget_areas(found["budgets"]),
+    )  # fmt: skip
     first = [main, *(target.less for target in read_targets(data.provenance).regions if target.less)]
     plots = (
         draw_roc(found["roc"], table, main), draw_free_response(found["froc"], table),
-        draw_sizes(found["regions_by_size"], table, first),
+        draw_budgets(found["budgets"]), draw_sizes(found["regions_by_size"], table, first),
     )  # fmt: skip
     return Section(with_rows(tables), tuple(each for each in plots if each is not None))
 

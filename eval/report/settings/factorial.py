@@ -113,6 +113,6 @@ def _panel(column: Column, table: Float64Array, sources: list[str], rules: list[
     low, high = (0.0, 1.0) if column.key in SHARES else (float(np.nanmin(table)), float(np.nanmax(table)))
     texts = [[column.shown(value) for value in row] for row in table]
     x = Axis("extraction", (-0.5, len(rules) - 0.5), ticks=named_ticks(rules))
-    y = Axis("source", (-0.5, len(sources) - 0.5), ticks=named_ticks(sources))
+    y = Axis("source", (len(sources) - 0.5, -0.5), ticks=named_ticks(sources))  # the first on top
     hover = f"{plotly_text(column.heading)}: %{{text}}<extra></extra>"
     return Panel(x, y, [], column.heading, Heat(table, texts, low, high, hover))

@@ -8,7 +8,13 @@ import pytest
 import cdpipe.extract.objects
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.extract.crops import Crops
-from cdpipe.extract.extract import cut_objects, hull_volume_m3, measure_regions, withdraw_empty_regions
+from cdpipe.extract.extract import (
+    count_asked_points,
+    cut_objects,
+    hull_volume_m3,
+    measure_regions,
+    withdraw_empty_regions,
+)
 from cdpipe.extract.objects import PointGroup, assemble_objects
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import ClusterConfig, ExtractConfig, OutlierConfig, PipelineConfig
@@ -106,6 +112,20 @@ def test_a_removed_box_is_cut_out_of_the_before_map() -> None:
     objects, figures = extract_objects(merged([FLOOR, BOX], [FLOOR]), regions([(0, 0, 0.5)]), CONFIG)
     assert summary(objects) == [("before", "removed", 0, 640, -1)]
     assert figures["s_points"][0] < len(FLOOR)
+
+
+def test_who_looks_at_a_candidate_asks_for_the_before_points_of_its_proposed_sphere() -> None:
+    pair = merged([FLOOR, BOX], [FLOOR, PLATE])
+    # reported or not; the second was centred on what it holds after it had been proposed beside the map
+    candidates = regions([(0.0, 0.0, 0.05), (1.5, 1.4, 0.8), (-3.0, 0.0, 0.8)], radius_m=1.0, n_reported=1)
+    proposed = candidates.centres_map.copy()
+    proposed[1] = (20.0, 0.0, 0.0)
+    candidates = replace(candidates, proposed_centres_map=proposed, radius_m=np.array([1.0, 1.0, 0.9]))
+    asked = count_asked_points(candidates, Crops(pair, 0.0))
+    before = np.concatenate([FLOOR, BOX])
+    assert asked[0] == np.count_nonzero(np.linalg.norm(before - proposed[0], axis=1) <= 1.0) > 0
+    assert asked[1] == 0
+    assert asked[2] == np.count_nonzero(np.linalg.norm(before - proposed[2], axis=1) <= 0.9) > 0
 
 
 def test_moved_partners_name_each_other() -> None:

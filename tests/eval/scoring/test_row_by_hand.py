@@ -102,7 +102,8 @@ def report_fixture() -> ChangeReport:
         objects=(crate, half, wall),
         seconds={"t_index_s": 1.0, "t_merge_s": 2.0, "t_refine_s": 4.0, "t_descriptor_s": 8.0, "t_cd_s": 16.0,
                  "t_oe_s": 32.0, "t_returns_s": 64.0},
-        figures={"v_sphere_m3": np.array([9.0, 1.0, 2.0, 3.0, 4.0, 9.0, 9.0]), "s_points": np.full(7, NAN)},
+        figures={"v_sphere_m3": np.array([9.0, 1.0, 2.0, 3.0, 4.0, 9.0, 9.0]), "s_points": np.full(7, NAN),
+                 "asked_points": np.arange(7.0)},
         keyframe_scans=(np.arange(51), np.arange(0, 51, 2)),
     )  # fmt: skip
 
@@ -209,7 +210,7 @@ def test_the_regions(case: CaseScore) -> None:
             "region": index, "score": 7.0 - index, "is_reported": index in (1, 2, 3, 4),
             "is_withdrawn": index in (0, 5), "outcome": outcomes[index], "x_m": x_m[index], "y_m": 0.5, "z_m": 0.5,
             "found_changes": found[index], "found_changes_proposed": found[index], "v_sphere_m3": spheres[index],
-            "v_oe_m3": NAN, "s_points": NAN, "oe_points": NAN,
+            "v_oe_m3": NAN, "s_points": NAN, "oe_points": NAN, "asked_points": float(index),
         }  # fmt: skip
         assert_equal(row, expected)
     assert len(case.regions) == 7

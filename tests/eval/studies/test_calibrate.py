@@ -7,7 +7,13 @@ import yaml
 
 from cdpipe.core.errors import InputError
 from cdpipe.model.config import load_config
-from eval.studies.calibrate import find_alarm_threshold, find_rate_threshold, find_thresholds, format_plan, format_settings
+from eval.studies.calibrate import (
+    find_alarm_threshold,
+    find_rate_threshold,
+    find_thresholds,
+    format_plan,
+    format_settings,
+)
 
 
 def test_five_per_cent_of_forty_pairs_alarm() -> None:

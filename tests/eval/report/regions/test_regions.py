@@ -11,6 +11,7 @@ import pytest
 
 from eval.plans.targets import Target, Targets
 from eval.report.page import write_page
+from eval.report.regions.budgets import budget_areas, shown_budgets
 from eval.report.regions.regions import draw_regions
 from eval.report.summary import draw_summary
 from eval.running.run_data import read_run
@@ -49,7 +50,8 @@ def made_up(
                     items["regions"] += [
                         {**names, "region": place, "score": scores[i], "is_reported": scores[i] > 1.5,
                          "is_withdrawn": False,
-                         "outcome": "true" if is_hit[i] else "false", "found_changes": str(i + 1) if is_hit[i] else ""}
+                         "outcome": "true" if is_hit[i] else "false", "found_changes": str(i + 1) if is_hit[i] else "",
+                         "asked_points": 1000.0}
                         for place, i in enumerate(order)
                     ]  # fmt: skip
                     items["keyframes"] += [
@@ -70,7 +72,8 @@ def made_up(
                      "region_recall": float(np.mean(found)), "region_precision": np.nan,
                      "n_false_regions": int((scores[2:] > 1.5).sum()), "n_found_changes": sum(found),
                      "bytes_map_before": 1.2e6, "bytes_regions_before": 4e4 if variant == "tunnelcd" else 1.2e6,
-                     "t_descriptor_per_keyframe_s": 0.011, "t_cd_per_region_s": 0.02, "is_unchanged_pair": False,
+                     "t_descriptor_per_keyframe_s": 0.011, "t_cd_per_region_s": 0.02, "t_cd_s": 0.1, "t_oe_s": 0.8,
+                     "t_oe_per_region_s": 0.4, "n_regions": 2, "n_withdrawn": 0, "is_unchanged_pair": False,
                      "is_alarm": np.nan, "merge_error_m": 0.01, "merge_error_deg": 0.01}
                 )  # fmt: skip
     return pd.DataFrame(rows), {name: pd.DataFrame(each) for name, each in items.items()}
@@ -125,9 +128,31 @@ def test_tables_and_plots_are_on_the_page_before_anything_else(run: Path) -> Non
     assert text.index('id="regions"') < text.index('id="results"')
     part = draw_regions(read_run(run))
     assert part is not None
-    assert [len(table.rows) for table in part.tables] == [3 * len(METHODS), 2]
-    assert len(part.plots) == 3
+    assert [len(table.rows) for table in part.tables] == [3 * len(METHODS), 2, 2 * len(METHODS)]
+    assert [plot.name for plot in part.plots] == ["roc", "free_response", "budgets", "recall_by_size"]
     assert not part.missing
+
+
+def test_the_areas_below_the_budgets_stand_best_first(run: Path) -> None:
+    table = budget_areas(pd.read_csv(run / "budgets.csv"))
+    rows = [(group, cells) for group, cells in table.rows if group == "in distribution"]
+    # a tenth of the map's bytes buys something of a method that keeps a thirtieth of them, and nothing of the others
+    assert rows[0][1][0].text == "tunnelcd"
+    assert rows[0][1][3].is_best and float(rows[0][1][3].text) > 0
+    assert {cells[3].text for _, cells in rows[1:]} == {"0.00"}
+    # by what is looked at, the rival with better scores leads
+    assert [cells[0].text for _, cells in rows if cells[1].is_best] == ["c2c"]
+
+
+def test_of_sources_crossed_with_rules_one_variant_stands_for_each(run: Path) -> None:
+    budgets = pd.read_csv(run / "budgets.csv")
+    names = {"c2c": "c2c[extract.method=surface]", "tunnelcd": "tunnelcd[extract.method=surface]"}
+    crossed = budgets.replace({"variant": {**names, "paper": "c2c[extract.method=voxel]"}})
+    shown = shown_budgets(crossed)
+    assert dict(shown["variant"].value_counts()) == dict.fromkeys(names, len(shown) // 2)
+    assert set(shown_budgets(budgets)["variant"]) == {*METHODS}
+    unknown = budgets.assign(area=np.nan, recall=np.nan)
+    assert not any(cell.is_best for _, cells in budget_areas(unknown).rows for cell in cells)
 
 
 def test_what_is_missed_is_bold_and_what_is_met_is_not(run: Path) -> None:

@@ -16,7 +16,8 @@ SURFACE, VOXEL = "[extract.method=surface]", "[extract.method=voxel,extract.voxe
 def rows_of(variant: str, recall: float, n_false: int, status: str = "ok") -> list[dict[str, object]]:
     return [
         {
-            "scenario": scenario, "family": scenario, "seed": seed, "variant": variant, "preset": variant.split("[")[0],
+            "scenario": scenario, "family": scenario, "seed": seed, "variant": variant,
+            "preset": variant.partition("[")[0],
             "status": status if seed == 0 else "ok", "region_recall": recall if status == "ok" or seed else 0.0,
             "region_recall_at_k": recall, "object_f1_50": recall / 2, "object_iou_point": recall / 4, "object_pq": 0.0,
             "n_observable": 2, "n_false_regions": n_false, "after_path_m": 100.0 * (1 + seed),

@@ -1,0 +1,111 @@
+"""What proposals save: the changes found against what looking for them costs.
+
+A method lets somebody look at its candidates, best first. Each look has a price, and there are three of them:
+
+- `spheres`: looks per 100 m of the after path;
+- `seconds`: seconds after the merge per 100 m of that path: the query, and the extraction of a region for each look;
+- `bytes`: what one robot sends the other, as a share of the bytes of the before map: what the method keeps of the
+  before session (descriptors, or the map itself), and the points of the before map in each sphere that is looked at.
+
+A change is found at the price of the first look whose sphere, as it was proposed, finds it. It costs infinitely much
+where no candidate does, and where the pair has no answer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cdpipe.core.geometry import Float64Array
+from cdpipe.extract.extract import ASKED_POINTS
+from eval.tables.groups import clustered_interval
+from eval.tables.region_curves import RankedPairs
+from eval.tables.rows import PAIR, numbers
+
+# The budgets at which recall is stated; areas run from no budget to the last one.
+BUDGETS: Mapping[str, tuple[float, ...]] = MappingProxyType({
+    "spheres": (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0),
+    "seconds": (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0),
+    "bytes": (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.2, 0.5, 1.0, 2.0),
+})  # fmt: skip
+# the share of the map's bytes up to which the area is taken
+_AREA_ENDS = {"spheres": 12.0, "seconds": 10.0, "bytes": 0.1}
+BYTES_PER_POINT = 12
+
+
+def budget_rows(ranked: RankedPairs, results: pd.DataFrame, regions: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the recall of one variant at each budget; no row without an observable change.
+
+    Args:
+        ranked: Its candidates as proposed (`is_proposal`), and its changes.
+        results: Its rows of results.csv.
+        regions: Its rows of regions.csv, candidates of a pair best first.
+
+    Returns:
+        `price`, `budget`, `recall` with its 95 % interval over pairs, and `area`, the mean recall from no budget to 12
+        spheres or 10 s per 100 m, or 10 % of the map's bytes, with its interval. They are NaN where an answer does not
+        state what the price needs.
+    """
+    prices = price_changes(ranked, results, regions)
+    rows = []
+    for price, budgets in BUDGETS.items():
+        costs = prices[price]
+        area = _mean_over_changes(np.clip(1.0 - costs / _AREA_ENDS[price], 0.0, 1.0), ranked)
+        for budget in budgets:
+            found = np.where(np.isnan(costs), np.nan, costs <= budget)
+            recall = _mean_over_changes(found, ranked)
+            names = {"price": price, "budget": budget, "n_changes": len(costs)}
+            rows.append({**names, **_named("recall", recall), **_named("area", area)})
+    return rows if len(ranked.change_pair) else []
+
+
+def price_changes(ranked: RankedPairs, results: pd.DataFrame, regions: pd.DataFrame) -> dict[str, Float64Array]:
+    """Return (C,) what each change costs, by price: infinite where it is not found, NaN where it is not known."""
+    cases = results.assign(look_s=_seconds_per_look(results)).set_index(PAIR)
+    path, query_s, look_s, kept, whole = (
+        dict(zip(cases.index, numbers(cases, name), strict=True))
+        for name in ("after_path_m", "t_cd_s", "look_s", "bytes_regions_before", "bytes_map_before")
+    )
+    asked = _asked_bytes(regions)
+    prices = {name: np.full(len(ranked.change_pair), np.inf) for name in BUDGETS}
+    for change in np.flatnonzero(np.isfinite(ranked.change_score)).tolist():
+        pair, n_looks = ranked.pairs[ranked.change_pair[change]], int(ranked.change_rank[change]) + 1
+        # who has the whole map asks for nothing
+        sent = kept[pair] + (0.0 if kept[pair] >= whole[pair] else float(asked[pair][n_looks - 1]))
+        prices["spheres"][change] = 100.0 * n_looks / path[pair]
+        prices["seconds"][change] = 100.0 * (query_s[pair] + n_looks * look_s[pair]) / path[pair]
+        prices["bytes"][change] = sent / whole[pair]
+    return prices
+
+
+def _asked_bytes(regions: pd.DataFrame) -> dict[tuple[str, int], Float64Array]:
+    """Return the bytes of all spheres up to each candidate of a pair, best first."""
+    asked = {}
+    for _, own in regions.groupby(PAIR, sort=False):
+        points = numbers(own.sort_values("score", ascending=False, kind="stable"), ASKED_POINTS)
+        asked[str(own["scenario"].iloc[0]), int(own["seed"].iloc[0])] = BYTES_PER_POINT * np.cumsum(points)
+    return asked
+
+
+def _seconds_per_look(results: pd.DataFrame) -> Float64Array:
+    """Return the seconds of one extraction in each pair; those of all pairs where a pair proposed no region."""
+    whole_s, per_region_s = numbers(results, "t_oe_s"), numbers(results, "t_oe_per_region_s")
+    n_proposed = np.nansum(numbers(results, "n_regions") + numbers(results, "n_withdrawn"))
+    pooled_s = np.nansum(whole_s) / n_proposed if n_proposed else math.nan
+    return np.where(np.isnan(per_region_s) & ~np.isnan(whole_s), pooled_s, per_region_s)
+
+
+def _mean_over_changes(values: Float64Array, ranked: RankedPairs) -> tuple[float, float, float]:
+    """Return the mean over all changes and its interval; NaN where one has no value: else a pair would be left out."""
+    if len(values) == 0 or np.isnan(values).any():
+        return math.nan, math.nan, math.nan
+    return float(values.mean()), *clustered_interval(values.astype(np.float64), ranked.change_pair)
+
+
+def _named(name: str, values: tuple[float, float, float]) -> dict[str, float]:
+    return dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
