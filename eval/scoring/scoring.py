@@ -34,6 +34,7 @@ from eval.scoring.object_metrics import (
     summarise_objects,
 )
 from eval.scoring.object_sizes import SizeErrors, compute_size_errors, summarise_size_errors
+from eval.scoring.point_metrics import score_points
 from eval.scoring.region_metrics import RegionScores, score_regions, score_unanswered_regions
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
@@ -114,6 +115,7 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
     if report is None or answer.until == "merge":
         regions = score_unanswered_regions(truth)
         objects, object_scores = score_unanswered_objects(truth)
+        object_scores |= score_points((), (), truth)
         right = np.full(len(truth.pair.changes), np.nan)
         sizes = SizeErrors(right, right)
         items: list[dict[str, Any]] = []
@@ -122,7 +124,7 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
         rows = find_answer_rows(answer, truth)
         objects = match_objects(report.objects, rows, truth)
         right = judge_kinds(report.objects, objects, truth)
-        object_scores = summarise_objects(objects, right, truth)
+        object_scores = {**summarise_objects(objects, right, truth), **score_points(report.objects, rows, truth)}
         sizes = compute_size_errors(report.objects, objects, truth)
         items = make_object_rows(report.objects, objects, truth)
     n_regions = int(regions.columns["n_regions"])

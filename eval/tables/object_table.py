@@ -26,7 +26,8 @@ FILES = ("objects_table", "objects_by_group", "objects_targets")
 ORACLE_VARIANT = "oracle-merge+oracle-regions"
 _MEANS = (
     "object_iou_point", "object_iou_voxel", "object_iou_box", "object_f1_25", "object_f1_50", "object_precision_50",
-    "object_pq", "kind_accuracy", "object_iou_point_partial", "region_recall_proposed", "region_recall",
+    "object_pq", "kind_accuracy", "object_iou_point_partial", "static_accuracy", "dynamic_accuracy",
+    "associated_accuracy", "region_recall_proposed", "region_recall",
 )  # fmt: skip
 _RATES = ("false_regions_per_100m_proposed", "false_regions_per_100m")
 

@@ -40,6 +40,9 @@ OBJECT_COLUMNS = (
            "Undefined where no volume was answered."),
     Column("object_iou_point_partial", "short moves, reshaped: IoU", "high", share,
            "Point IoU of the group `partial`, which is in no other column but kind and displacement."),
+    Column("associated_accuracy", "AA", "high", share,
+           "Associated accuracy of DynamicMap_Benchmark: the root of the share of unchanged points that no object "
+           "holds times the share of changed points that one holds; mean over pairs."),
 )  # fmt: skip
 OBJECT_COUNTS = {
     "iou_matched_median": "n_matched", "displacement_error_m": "n_displacements",

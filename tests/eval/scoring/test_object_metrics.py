@@ -17,6 +17,7 @@ from eval.scoring.object_metrics import (
     score_unanswered_objects,
     summarise_objects,
 )
+from eval.scoring.point_metrics import score_points
 from eval.truth.ground_truth import GroundTruth, SessionTruth
 from eval.truth.scoring_points import ScoringPoints
 from sim.session.truth import MIXED, Change, PairTruth
@@ -97,6 +98,21 @@ def test_every_column_by_hand() -> None:
     assert columns["object_pq"] == pytest.approx((7 / 13) / 2.5)
     assert columns["kind_accuracy"] == 0.5
     assert (columns["n_objects"], columns["n_matched"], columns["n_ignored_objects"]) == (3, 2, 0)
+
+
+def test_static_dynamic_and_associated_accuracy_by_hand() -> None:
+    # as above, with a mixed return and a change that nobody could see: both are neither static nor dynamic
+    labels = [0] * 5 + [1] * 10 + [0] * 5 + [2] * 10 + [MIXED] + [3] * 3 + [0] * 6
+    truth = ground_truth([change(1), change(2), change(3, is_observable=False)], after=labels)
+    objects = [thing(), thing(kind="moved"), thing(), thing("before")]
+    found = score_points(objects, [span(8, 18), span(20, 23), span(29, 40), span(0, 4)], truth)
+    # of 16 static points after and 40 before, 3 + 6 + 4 are called changed; of 20 dynamic ones 7 + 3 + 1 are
+    assert found["static_accuracy"] == 43 / 56
+    assert found["dynamic_accuracy"] == 11 / 20
+    assert found["associated_accuracy"] == pytest.approx((43 / 56 * 11 / 20) ** 0.5)
+    unchanged = score_points([thing()], [span(0, 20)], ground_truth([]))
+    assert unchanged["static_accuracy"] == 60 / 80
+    assert np.isnan([unchanged["dynamic_accuracy"], unchanged["associated_accuracy"]]).all()
 
 
 def test_an_empty_answer_scores_zero() -> None:

@@ -27,7 +27,7 @@ SHARES = (
     "region_recall", "region_precision", "region_recall_at_k", "region_recall_proposed", "region_precision_proposed",
     "region_recall_at_k_proposed", "region_auroc", "region_ap", "object_iou_point", "object_iou_voxel",
     "object_iou_box", "object_f1_25", "object_f1_50", "object_precision_50", "object_pq", "kind_accuracy",
-    "object_iou_point_partial",
+    "object_iou_point_partial", "dynamic_accuracy", "associated_accuracy",
 )  # fmt: skip
 # boxes and voxels lie along the axes of odom, so a turn moves them
 ALONG_AXES = ("object_iou_voxel", "object_iou_box")

@@ -153,7 +153,9 @@ def test_the_row(case: CaseScore) -> None:
         "object_iou_point": 0.75, "object_iou_voxel": 0.75, "object_iou_box": (1 + 0.1 / 1.1) / 2,
         "object_f1_25": 2 / 2.5, "object_f1_50": 2 / 2.5, "object_precision_50": 2 / 3, "object_pq": 1.5 / 2.5,
         "kind_accuracy": 0.5, "n_objects": 3, "n_matched": 2, "n_ignored_objects": 0, "n_partial": 0,
-        "object_iou_point_partial": NAN, "displacement_error_m": NAN, "pile_volume_error": 0.25,
+        # 4 of 8 points of walls are called changed; 8 of the crate's and 4 of the heap's 16 are
+        "object_iou_point_partial": NAN, "static_accuracy": 0.5, "dynamic_accuracy": 0.75,
+        "associated_accuracy": (0.5 * 0.75) ** 0.5, "displacement_error_m": NAN, "pile_volume_error": 0.25,
         "merge_error_m": 0.5, "merge_error_m_p95": 0.5, "merge_error_deg": 0.0, "merge_error_deg_p95": 0.0,
         "merge_error_along_m": 0.3, "merge_error_along_m_p95": 0.3, "n_merge_pairs": 51, "overlap_true": 1.0,
         **{f"evidence_{name}": 0.75 if name == "overlap" else NAN for name in EVIDENCE},
@@ -270,7 +272,7 @@ def test_a_case_without_an_answer(truth: GroundTruth) -> None:
         "region_recall", "region_recall_at_k", "region_precision", "region_recall_proposed",
         "region_recall_at_k_proposed", "region_precision_proposed", "object_iou_point", "object_iou_voxel",
         "object_iou_box", "object_f1_25", "object_f1_50", "object_precision_50", "object_pq", "kind_accuracy",
-        "keyframe_coverage",
+        "keyframe_coverage", "dynamic_accuracy", "associated_accuracy",
     ]  # fmt: skip
     counts = [
         "n_regions", "n_withdrawn", "n_true_regions", "n_false_regions", "n_duplicate_regions", "n_ignored_regions",
@@ -285,7 +287,7 @@ def test_a_case_without_an_answer(truth: GroundTruth) -> None:
         "odometry_after": "drift", "sensor_profile": "os1-32", "checkpoints": "", "extras": "",
         "region_auroc": 0.5, "region_ap": 12 / (12 + n_far),
         "is_auroc_assumed": 1.0, "overlap_true": 1.0, "evidence_overlap": 0.5, "t_merge_s": 2.0, "t_descriptor_s": 8.0,
-        "after_path_m": 50.0,
+        "after_path_m": 50.0, "static_accuracy": 1.0,
         "is_unchanged_pair": False, **dict.fromkeys(zeros, 0.0), **dict.fromkeys(counts, 0),
     }  # fmt: skip
     assert_equal({name: value for name, value in case.row.items() if value == value}, {

@@ -33,6 +33,9 @@ ONES = (
     "object_f1_50",
     "object_precision_50",
     "object_pq",
+    "static_accuracy",
+    "dynamic_accuracy",
+    "associated_accuracy",
     "kind_accuracy",
 )
 COLUMN_TEXT = """
@@ -42,7 +45,8 @@ false_regions_per_100m region_coverage
 n_regions n_true_regions n_false_regions n_duplicate_regions n_ignored_regions n_found_changes
 object_iou_point object_iou_voxel object_iou_box object_f1_25 object_f1_50 object_precision_50 object_pq kind_accuracy
 region_recall_proposed region_recall_at_k_proposed region_precision_proposed false_regions_per_100m_proposed n_withdrawn
-n_objects n_matched n_ignored_objects n_partial object_iou_point_partial displacement_error_m pile_volume_error
+n_objects n_matched n_ignored_objects n_partial object_iou_point_partial
+static_accuracy dynamic_accuracy associated_accuracy displacement_error_m pile_volume_error
 merge_error_m merge_error_deg merge_error_along_m merge_error_m_p95 merge_error_deg_p95 merge_error_along_m_p95
 n_merge_pairs overlap_true evidence_overlap evidence_inlier_share evidence_residual_m evidence_hessian_ratio
 evidence_agreement evidence_descriptor_distance evidence_n_hypotheses evidence_is_fallback evidence_n_refined
@@ -317,7 +321,7 @@ def without_objects_and_regions(report: ChangeReport) -> ChangeReport:
 
 def test_an_empty_answer_scores_zero(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
     row = scored(tiny_pair, without_objects_and_regions(true_report(tiny_pair, tiny_merge))).row
-    zeros = [name for name in ONES if name not in ("region_auroc", "region_ap")]
+    zeros = [name for name in ONES if name not in ("region_auroc", "region_ap", "static_accuracy")]
     assert {name: row[name] for name in zeros} == dict.fromkeys(zeros, 0.0)
     assert (row["region_auroc"], row["region_coverage"]) == (0.5, 0.0)
     assert np.isnan(row["t_cd_per_region_s"])
@@ -427,7 +431,8 @@ def test_an_unchanged_pair(write_tiny_pair: Callable[..., Path], tiny_merge: np.
     assert silent["is_unchanged_pair"] is True
     assert silent["is_alarm"] is False
     assert silent["false_regions_per_100m"] == 0.0
-    assert np.isnan([silent[name] for name in ONES]).all()
+    assert np.isnan([silent[name] for name in ONES if name != "static_accuracy"]).all()
+    assert silent["static_accuracy"] == 1.0
     regions = replace(
         report.regions,
         centres_map=np.zeros((1, 3)),

@@ -1,0 +1,53 @@
+"""Scores of single points as DynamicMap_Benchmark (Zhang et al., ITSC 2023) has them, so that its users can compare.
+
+There a method divides the points of a map into static and dynamic ones. Here dynamic is what belongs to a change.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from cdpipe.core.geometry import Int64Array
+from cdpipe.model.report import ChangedObject
+from eval.truth.ground_truth import SESSIONS, GroundTruth
+
+
+def score_points(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], truth: GroundTruth) -> dict[str, float]:
+    """Return the static, the dynamic and the associated accuracy over the scoring points of both sessions together.
+
+    Static are the points of no change, dynamic those of the observable changes of the main group. Mixed returns and
+    the points of all other changes are left out.
+
+    Args:
+        objects: The answer's objects; of none, every point is called static.
+        rows: Per object, the rows of its session's scoring points.
+        truth: The pair's truth.
+
+    Returns:
+        `static_accuracy`, the share of the static points that no object holds; `dynamic_accuracy`, the share of the
+        dynamic points that an object holds, NaN where nothing changed; `associated_accuracy`, the root of their
+        product.
+    """
+    is_main = truth.is_observable & ~truth.is_partial
+    n_right, n_points = np.zeros(2), np.zeros(2)
+    for session in SESSIONS:
+        labels = truth.sessions[session].scoring_points.change
+        is_answered = np.zeros(len(labels), dtype=np.bool_)
+        for item, of_object in zip(objects, rows, strict=True):
+            is_answered[of_object if item.session == session else []] = True
+        of_session = [change.id for change, is_its in zip(truth.pair.changes, is_main, strict=True)
+                      if is_its and change.session == session]  # fmt: skip
+        is_static, is_dynamic = labels == 0, np.isin(labels, of_session)
+        n_points += (np.count_nonzero(is_static), np.count_nonzero(is_dynamic))
+        n_right += (np.count_nonzero(is_static & ~is_answered), np.count_nonzero(is_dynamic & is_answered))
+    static, dynamic = (
+        right / n if n else math.nan for right, n in zip(n_right.tolist(), n_points.tolist(), strict=True)
+    )
+    return {
+        "static_accuracy": static,
+        "dynamic_accuracy": dynamic,
+        "associated_accuracy": math.sqrt(static * dynamic),
+    }
