@@ -94,7 +94,7 @@ def _draw_scenario(document: Document, seed: int) -> tuple[Scenario | None, list
 
 def _freeze(scenario: Scenario) -> Scenario:
     """Return the scenario without its changes: the world stays as in the before session."""
-    stay = {"change": "none", "to": None, "shift": None, "loaded_share": None}
+    stay = {"change": "none", "to": None, "shift": None, "loaded_share": None}  # what ages, ages
     props = tuple(prop.model_copy(update=stay) for prop in scenario.props if prop.change != "added")
     return scenario.model_copy(update={"props": props})
 
@@ -104,7 +104,7 @@ def _turn_over(scenario: Scenario, turnover: float, seed: int) -> Scenario:
     props: list[Prop] = []
     for prop in scenario.props:
         number = stream(seed, "turnover", prop.name).random()
-        is_turned = prop.change == "none" and number < turnover
+        is_turned = prop.change == "none" and prop.aged is None and number < turnover
         update = {"change": "added" if number < turnover / 2 else "removed"} if is_turned else {}
         props.append(prop.model_copy(update=update))
     return scenario.model_copy(update={"props": tuple(props)})

@@ -220,8 +220,38 @@ class Shift(Settings):
     turn_deg: Finite = 0.0
 
 
-class Prop(Settings):
+class Lean(Settings):
+    """Settings that leave keys added later out of their dump while these have their defaults.
+
+    So the truth of an older scenario keeps its bytes.
+    """
+
+    _LATER: ClassVar[frozenset[str]] = frozenset()
+
+    @model_serializer(mode="wrap")
+    def _leave_out(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields = type(self).model_fields
+        dumped: dict[str, Any] = handler(self)
+        return {key: value for key, value in dumped.items() if key not in self._LATER or value != fields[key].default}
+
+
+class Aged(Settings):
+    """What time did to a prop that nobody touched: in the after session it stands a little otherwise; no change.
+
+    The pose of the before session is displaced as a whole; nothing settles again.
+    """
+
+    shift_m: Annotated[float, Field(ge=0, le=0.2)] = 0.0
+    heading_deg: Finite = 0.0  # direction of the shift, against the x axis of the world
+    turn_deg: Annotated[float, Field(ge=-20, le=20)] = 0.0
+    lean_deg: Annotated[float, Field(ge=-20, le=20)] = 0.0  # about the prop's own x axis
+    sag_m: Annotated[float, Field(ge=0, le=0.2)] = 0.0  # into the floor
+
+
+class Prop(Lean):
     """An object on the floor. What happens to it between the sessions is its `change`."""
+
+    _LATER: ClassVar[frozenset[str]] = frozenset({"aged"})
 
     name: str
     kind: str  # a PropKind, or the name of a prop on the search path, which has a mesh
@@ -231,6 +261,7 @@ class Prop(Settings):
     change: Literal["none", "added", "removed", "moved", "reshaped"] = "none"
     to: Place | None = None  # where a moved prop stands in the after session
     shift: Shift | None = None  # or how far from its first place
+    aged: Aged | None = None  # of a prop that stays: how it stands in the after session
     loaded_share: Annotated[float, Field(gt=0, lt=1)] | None = None  # of a reshaped pile's volume, taken away
     repose_deg: Annotated[float, Field(ge=30, le=45)] = 37.0  # flanks of a pile; blasted rock has 34 to 40
     fragment_m: Annotated[float, Field(ge=0.02, le=2.0)] = 0.25  # characteristic size of a pile's fragments
@@ -253,6 +284,8 @@ class Prop(Settings):
             raise ValueError(f"prop {self.name!r}: change: moved goes with a place `to` or a `shift`, not both")
         if (self.change == "reshaped") != (self.loaded_share is not None):
             raise ValueError(f"prop {self.name!r}: change: reshaped and loaded_share go together")
+        if self.aged is not None and self.change != "none":
+            raise ValueError(f"prop {self.name!r}: aged: only of a prop that stays (change: none)")
         if self.change == "reshaped" and self.kind != "muck_pile":
             raise ValueError(f"prop {self.name!r}: only a muck_pile can be reshaped")
         if self.kind in ("muck_pile", "railing") and "tipped" in (self.place.posture, self.to and self.to.posture):
@@ -282,21 +315,6 @@ class Sensor(Settings):
         if self.min_range_m >= self.max_range_m:
             raise ValueError(f"sensor.min_range_m = {self.min_range_m:g} leaves nothing below max_range_m")
         return self
-
-
-class Lean(Settings):
-    """Settings that leave keys added later out of their dump while these have their defaults.
-
-    So the truth of an older scenario keeps its bytes.
-    """
-
-    _LATER: ClassVar[frozenset[str]] = frozenset()
-
-    @model_serializer(mode="wrap")
-    def _leave_out(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        fields = type(self).model_fields
-        dumped: dict[str, Any] = handler(self)
-        return {key: value for key, value in dumped.items() if key not in self._LATER or value != fields[key].default}
 
 
 class Gait(Settings):

@@ -124,8 +124,10 @@ def setting_lines(settings: Iterable[str] | Mapping[str, Any]) -> list[str]:
 def apply_settings(document: Document, settings: Iterable[str]) -> Document:
     """Return the document with `a.b=value` settings applied; values are YAML scalars or lists.
 
+    An item of a list goes by its `name`: `props.barrel.size_m=[1, 1, 1]`.
+
     Raises:
-        InputError: A setting has no "=" or is not YAML.
+        InputError: A setting has no "=", is not YAML, or names an item that its list lacks.
     """
     value = deepcopy(document.value)
     origins = dict(document.origins)
@@ -138,18 +140,34 @@ def apply_settings(document: Document, settings: Iterable[str]) -> Document:
         except YamlError as error:
             raise InputError(f"--set {setting}: the value is not YAML") from error
         *parents, last = name.split(".")
-        place = value
-        for depth, parent in enumerate(parents, 1):
-            if parent not in place:
-                origins[tuple(parents[:depth])] = "--set"
-            place = place.setdefault(parent, {})
-            if not isinstance(place, dict):
-                raise InputError(f"--set {setting}: {parent} is a value, not a group of settings")
+        place: Any = value
+        written: Key = ()
+        for parent in parents:
+            is_new = isinstance(place, dict) and parent not in place
+            key, place = _step_into(place, parent, setting)
+            written = (*written, key)
+            origins |= {written: "--set"} if is_new else {}
+        if not isinstance(place, dict):
+            raise InputError(f"--set {setting}: {parents[-1]} is a list: name an item and one of its keys")
         place[last] = parsed
-        written = (*parents, last)
+        written = (*written, last)
         origins = {key: where for key, where in origins.items() if key[: len(written)] != written}
         origins[written] = "--set"
     return replace(document, value=value, origins=origins)
+
+
+def _step_into(place: Any, name: str, setting: str) -> tuple[str | int, Any]:
+    """Return the key of a group of settings, or of a named item of a list, and what stands there; groups are made."""
+    if isinstance(place, list):
+        names = [item.get("name") if isinstance(item, dict) else None for item in place]
+        if name not in names:
+            known = [each for each in names if isinstance(each, str)]
+            raise InputError(f"--set {setting}: no item of the list is called {name}{suggest(name, known)}")
+        return names.index(name), place[names.index(name)]
+    found = place.setdefault(name, {})
+    if not isinstance(found, dict | list):
+        raise InputError(f"--set {setting}: {name} is a value, not a group of settings")
+    return name, found
 
 
 def split_section(document: Document, name: str) -> tuple[Document, Document | None]:

@@ -26,6 +26,8 @@ grid:
     scenarios: [paper/site1]         # some of the plan's worlds, e.g. paper/site2[sensor.mode=512x10]; all if left out
     keys: {extract.voxel_m: [0.2, 0.4], query.radius_m: [3, 4.5]}
     each: [[extract.method=surface], [extract.method=voxel, cluster.min_points=32]]  # lists of settings
+axes:                                # eval/plans/axes.py: the first scenario, made harder in steps
+  - {name: columns, steps: [{value: 1024}, {value: 512, set: sensor.mode=512x10}]}
 """
 
 from __future__ import annotations
@@ -51,6 +53,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.names import folded
 from cdpipe.core.yamlfile import Settings, suggest, validate
 from cdpipe.model.config import Site
+from eval.plans.axes import Axis, harder_item, method_steps
 from eval.plans.files import read_plan
 from eval.plans.parts import Grid, Label, MethodSettings, NotEmpty, Variant, get_key
 from eval.plans.targets import PlanTargets, Targets
@@ -64,11 +67,12 @@ from eval.plans.worlds import (
     World,
     get_group,
     list_worlds,
+    require_draws,
     world_slug,
 )
 
 _MOST_SEEDS = 100_000
-_MAY_BE_LEFT_OUT = ("split", "set", "thresholds")
+_MAY_BE_LEFT_OUT = ("split", "set", "thresholds", "axes")
 _AFTER_MERGE = ("query", "extract", "outlier", "cluster", "m3c2", "dufomap")
 
 
@@ -180,6 +184,20 @@ def _find_unknown_thresholds(plan: Plan) -> Iterator[InitErrorDetails]:
             yield _mistake(("thresholds", name), str(threshold), rule)
 
 
+def _find_misfit_steps(plan: Plan) -> Iterator[InitErrorDetails]:
+    """Yield the steps of axes that do not fit the first scenario, and axes of one name."""
+    names = [axis.name for axis in plan.axes]
+    for place, axis in enumerate(plan.axes):
+        if axis.name in names[:place]:
+            yield _mistake(("axes", place, "name"), axis.name, f"axis {axis.name!r} stands twice")
+        for index, step in enumerate(axis.steps):
+            try:
+                if step.set:
+                    require_draws(plan.base.name, (*plan.base.settings, *step.set))
+            except ValueError as error:
+                yield _mistake(("axes", place, "steps", index, "set"), ",".join(step.set), str(error))
+
+
 def parse_seeds(value: Any) -> tuple[int, ...]:
     """Return the seeds of "A:B" (B excluded), of "A", or of a list of non-negative numbers.
 
@@ -242,6 +260,7 @@ class Plan(Settings):
     targets: PlanTargets = Targets()
     variants: Annotated[tuple[Variant, ...], NotEmpty]
     grid: tuple[Grid, ...] = ()
+    axes: tuple[Axis, ...] = ()
 
     @field_validator("scenarios")
     @classmethod
@@ -253,6 +272,7 @@ class Plan(Settings):
     def _parts_fit(self) -> Plan:
         _refuse([*_find_settings_past_the_end(self), *_find_unknown_worlds(self), *_find_repeated_variants(self)])
         _refuse(list(_find_unknown_thresholds(self)))
+        _refuse(list(_find_misfit_steps(self)))
         return self
 
     @model_serializer(mode="wrap")
@@ -261,8 +281,14 @@ class Plan(Settings):
 
     @property
     def worlds(self) -> list[World]:
-        """The worlds, in order: every item with each odometry, as it is and with each of its settings."""
-        return list_worlds(self.scenarios, self.odometry)
+        """The worlds, in order: every item with each odometry, as it is, with each of its settings, and by the axes."""
+        first, *others = self.scenarios
+        return list_worlds([harder_item(first, self.axes), *others], self.odometry)
+
+    @property
+    def base(self) -> World:
+        """The world that the axes make harder: the first one."""
+        return self.worlds[0]
 
 
 def load_plan(name_or_path: str) -> Plan:
@@ -299,6 +325,10 @@ def list_methods(plan: Plan, world: World) -> list[Method]:
             methods += [
                 Method(preset, point, shared=plan.set, site=site) for preset in grid.variant for point in grid.points
             ]
+    if world.label == plan.base.label:
+        methods += [
+            replace(method, named=(*method.named, *step)) for step in method_steps(plan.axes) for method in [*methods]
+        ]
     return [_with_threshold(method, plan.thresholds.get(method.variant)) for method in methods]
 
 

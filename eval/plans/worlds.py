@@ -101,7 +101,7 @@ def _require_fit_on_top(settings: tuple[str, ...], info: ValidationInfo) -> tupl
     if not settings:
         raise ValueError("an empty list sets nothing: leave it out")
     if "name" in info.data:
-        _require_draws(info.data["name"], (*info.data.get("set", ()), *settings))
+        require_draws(info.data["name"], (*info.data.get("set", ()), *settings))
     return settings
 
 
@@ -140,7 +140,7 @@ class ScenarioItem(Settings):
     @classmethod
     def _set_fits(cls, settings: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
         if settings and "name" in info.data:
-            _require_draws(info.data["name"], settings)
+            require_draws(info.data["name"], settings)
         return settings
 
     @model_serializer(mode="wrap")
@@ -252,8 +252,12 @@ def _shorten(label: str) -> Iterator[str]:
         yield from (label[:place] for place in range(len(label) - 1, 0, -1) if label[place] == "[")
 
 
-def _require_draws(name: str, settings: tuple[str, ...]) -> None:
-    """Raise ValueError for settings that do not fit a scenario, for any seed."""
+def require_draws(name: str, settings: tuple[str, ...]) -> None:
+    """Check that settings fit a scenario.
+
+    Raises:
+        ValueError: They do not, for some seed, or belong to the method.
+    """
     of_method = [setting for setting in settings if get_group(setting) in PipelineConfig.model_fields]
     lines = [f"{setting} belongs to the method, not to the world: set it under variants" for setting in of_method]
     try:

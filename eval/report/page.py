@@ -23,6 +23,7 @@ from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.targets import read_targets
 from eval.report.charts import Chart, plotly_script
 from eval.report.cost import draw_pareto, pareto_table
+from eval.report.hardness import draw_hardness
 from eval.report.latex import latex_tables, to_latex
 from eval.report.merge.merge import draw_merge
 from eval.report.merge.tables import MERGE_COLUMNS
@@ -109,13 +110,21 @@ def _draw(data: RunData, views: Views, *, is_slim: bool) -> dict[str, str | byte
     if len(merges):
         files["merge.csv"] = merges.to_csv(index=False)
     if not ends_at_merge(data):
+        hardness = draw_hardness(data)
+        if hardness is not None:
+            files |= {**hardness.files, "breaking_points.tex": to_latex(hardness.table)}
         points = pareto_table(data)
         if len(points):
             files["pareto.csv"] = points.to_csv(index=False)
         crossed = factorial_table(data)
         if len(crossed):
             files["factorial.csv"] = crossed.to_csv(index=False)
-        content |= _sections(data, draw_pareto(points, is_contended=is_contended(data)), draw_factorial(crossed), views)
+        drawn = {
+            "hardness": () if hardness is None else hardness.plots,
+            "pareto": draw_pareto(points, is_contended=is_contended(data)),
+            "factorial": draw_factorial(crossed),
+        }
+        content |= _sections(data, drawn, views) | {"hardness": hardness}
         files["results.tex"] = to_latex(content["results"])
         for name in ("table1", "table2"):
             files |= {f"{name}.csv": to_csv(content[name]), f"{name}.tex": to_latex(content[name])}
@@ -143,6 +152,7 @@ def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
         "summary": draw_summary(data, merges),
         "merge": draw_merge(data),
         "ends_at_merge": ends_at_merge(data),
+        "hardness": None,
         "columns": MERGE_COLUMNS,
         "views": None,
         "charts": (),
@@ -152,8 +162,14 @@ def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def _sections(data: RunData, pareto: Sequence[Chart], factorial: Sequence[Chart], views: Views) -> dict[str, Any]:
-    """Return what a page shows of regions, objects and times; `missing` lists what could not be shown of them."""
+def _sections(data: RunData, drawn: Mapping[str, Sequence[Chart]], views: Views) -> dict[str, Any]:
+    """Return what a page shows of regions, objects and times; `missing` lists what could not be shown of them.
+
+    Args:
+        data: The run.
+        drawn: Charts that are drawn already: of what is hard, of cost, of sources crossed with extractions.
+        views: Which pairs get a 3-D view.
+    """
     regions, objects, unchanged = draw_regions(data), draw_objects(data), unchanged_table(data)
     worlds, variant = scenarios(data, unchanged=False), shown_variant(data)
     # a run about objects alone shows its best and worst in their own section, and no maps
@@ -167,8 +183,11 @@ def _sections(data: RunData, pareto: Sequence[Chart], factorial: Sequence[Chart]
     missing += [] if worlds else ["No scenario with changes was run."]
     if objects is None:
         missing += [] if n_unchanged else ["No unchanged pair was run, so false alarms are not measured."]
-        missing += [] if grids or factorial else ["No grid of two settings was run."]
-    charts = [*(regions.plots if regions is not None else ()), *pareto, *factorial, *by_scenario, *grids, *factors]
+        missing += [] if grids or drawn["factorial"] else ["No grid of two settings was run."]
+    of_regions = () if regions is None else regions.plots
+    charts = [
+        *drawn["hardness"], *of_regions, *drawn["pareto"], *drawn["factorial"], *by_scenario, *grids, *factors,
+    ]  # fmt: skip
     return {
         "regions": regions,
         "objects": objects,
@@ -179,11 +198,11 @@ def _sections(data: RunData, pareto: Sequence[Chart], factorial: Sequence[Chart]
         "enough_pairs": ENOUGH_PAIRS,
         "table1": time_table(data),
         "table2": volume_table(data),
-        "factorial": factorial,
+        "factorial": drawn["factorial"],
         "grids": grids,
         "factors": factors,
         "by_scenario": by_scenario,
-        "pareto": pareto,
+        "pareto": drawn["pareto"],
         "views": links,
         "worst": draw_worst(data, variant, worst) if is_mapped else [],
         "worst_variant": variant,

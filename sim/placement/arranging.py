@@ -7,9 +7,10 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import ScenarioError
-from cdpipe.core.geometry import Float64Array, stream
+from cdpipe.core.geometry import Float64Array, make_pose, stream
 from scenarios.schema import Place, Prop, Scenario
 from sim.placement.fitting import Spot, place_prop
 from sim.placement.lanes import Lane, build_lanes
@@ -98,7 +99,19 @@ def place_props(scenario: Scenario, centreline: Centreline, around: Surroundings
             stretches = (anywhere,) if job.place.area is None else areas[job.place.area]
             found[job.key] = _find_place(job, stretches, board)
             board.add(found[job.key])
-    return [item for job in jobs for item in found[job.key]]
+    return [aged for job in jobs for item in found[job.key] for aged in age(item)]
+
+
+def age(item: Standing) -> list[Standing]:
+    """Return a prop at rest; one that ages, as it stands in either session."""
+    aged = item.prop.aged
+    if aged is None:
+        return [item]
+    turned = make_pose(Rotation.from_euler("ZX", [aged.turn_deg, aged.lean_deg], degrees=True).as_matrix())
+    pose = item.world_T_object @ turned
+    heading = np.deg2rad(aged.heading_deg)
+    pose[:3, 3] += (aged.shift_m * np.cos(heading), aged.shift_m * np.sin(heading), -aged.sag_m)
+    return [replace(item, sessions=_BEFORE), replace(item, sessions=_AFTER, world_T_object=pose)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

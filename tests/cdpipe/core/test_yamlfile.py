@@ -53,6 +53,18 @@ def test_settings_are_written_over_the_file() -> None:
     assert document.value == {"name": "a", "spare": {"radius_m": 1}}
 
 
+def test_an_item_of_a_list_goes_by_its_name() -> None:
+    text = "props:\n  - {name: crate, size: {x: 1}}\n  - {name: barrel}\n"
+    changed = apply_settings(read_yaml(Path("a.yaml"), text), ["props.barrel.size.x=2", "props.crate.size.x=3"])
+    assert changed.value == {"props": [{"name": "crate", "size": {"x": 3}}, {"name": "barrel", "size": {"x": 2}}]}
+    assert changed.where(("props", 0, "size", "x")) == changed.where(("props", 1, "size")) == "--set"
+    assert changed.where(("props", 0, "name")) == "a.yaml:2"
+    with pytest.raises(InputError, match=r'no item of the list is called barel; did you mean "barrel"\?'):
+        apply_settings(changed, ["props.barel.size.x=2"])
+    with pytest.raises(InputError, match="props is a list: name an item and one of its keys"):
+        apply_settings(changed, ["props.barrel=2"])
+
+
 @pytest.mark.parametrize(
     ("setting", "message"),
     [("name", "expected key=value"), ("name.first=1", "name is a value"), ("name=[1", "not YAML")],

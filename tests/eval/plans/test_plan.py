@@ -284,8 +284,9 @@ def test_the_example_of_the_documentation_is_a_plan(tmp_path: Path) -> None:
     plan = read(tmp_path, textwrap.dedent(documentation.partition("\n\n")[2]))
     assert set(Plan.model_fields) - {"split"} == plan.model_fields_set  # that is for --split to write
     assert plan.seeds == (20000, 20001)
-    # of each seed: one variant on both sites and on two more worlds of one, another and eight grid points on the other
-    assert len(expand_cells(plan)) == 2 * ((2 + 2) + 1 + 8)
+    # of each seed: one variant on both sites and on two more worlds of one, another and eight grid points on the other;
+    # the variant and the grid points in the world of an axis
+    assert len(expand_cells(plan)) == 2 * ((2 + 2) + 1 + 8 + (1 + 8))
     assert {cell.variant for cell in expand_cells(plan) if cell.preset == "paper"} == {"paper[extract.voxel_m=0.4]"}
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from cdpipe.core.geometry import make_pose
 from cdpipe.sensor.ouster import SensorMetadata
-from scenarios.schema import Drift, Place, Platform, Prop, Scenario, Section, Sensor, SessionPlan, Shift, Tunnel
+from scenarios.schema import Aged, Drift, Place, Platform, Prop, Scenario, Section, Sensor, SessionPlan, Shift, Tunnel
 from sim.geometry.mesh import Mesh, box_mesh, move_mesh, point_triangle_distance
 from sim.geometry.raycast import Caster
 from sim.scene import World, build_world
@@ -122,6 +122,26 @@ def test_a_moved_prop_is_two_linked_changes_and_a_short_move_is_partial(
         (5, "near", "moved", "after", 4, "partial", 3),
         (6, "gone", "removed", "before", None, "full", 4),
     ]
+
+
+def test_a_prop_that_aged_stands_a_little_otherwise_and_has_not_changed(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop]
+) -> None:
+    aged = Aged(shift_m=0.05, heading_deg=90.0, turn_deg=3.0, lean_deg=2.0, sag_m=0.01)
+    old, gone = make_prop("old", 0.3, aged=aged), make_prop("gone", 0.7, change="removed")
+    scenario = make_scenario(props=(old, gone))
+    world = build_world(scenario, 0)
+    assert [tally.change.name for tally in list_changes(scenario, world)] == ["gone"]
+    before, after = (item for item in world.standing if item.prop.name == "old")
+    assert (before.sessions, after.sessions) == ({"before"}, {"after"})
+    np.testing.assert_allclose(after.world_T_object[:3, 3] - before.world_T_object[:3, 3], [0, 0.05, -0.01], atol=1e-9)
+    turned = before.world_T_object[:3, :3].T @ after.world_T_object[:3, :3]
+    np.testing.assert_allclose(np.rad2deg(np.arccos((np.trace(turned) - 1) / 2)), np.hypot(3.0, 2.0), atol=0.01)
+    # in the before session it stands where it would stand for ever, and either scene holds it
+    (still,) = (item for item in build_world(make_scenario(props=(make_prop("old", 0.3), gone)), 0).standing
+                if item.prop.name == "old")  # fmt: skip
+    np.testing.assert_array_equal(before.world_T_object, still.world_T_object)
+    assert all((scene.instance == 1).any() for scene in (world.before, world.after))
 
 
 def test_of_a_short_move_only_what_is_off_the_old_surface_counts(

@@ -1,0 +1,117 @@
+"""What breaks whom, and where: the first section of the page of a plan with axes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from eval.core.charts import Axis, Drawing, Look, Panel, Series, named_ticks
+from eval.plans.coverage import read_stored_plan
+from eval.report.charts import Chart
+from eval.report.regions.charts import look_of
+from eval.report.tables import Cell, Table
+from eval.running.run_data import RunData
+from eval.tables.columns import UNDEFINED, share, spaced
+from eval.tables.hardness import BROKEN_BELOW, breaking_points, hardness_table
+from eval.tables.rows import records
+
+_N_ACROSS = 4
+_HOLDS = "holds"
+
+
+@dataclass(frozen=True, slots=True)
+class Hardness:
+    """The section: a sentence for each method, the table of breaking points, the slopes, and both tables as files."""
+
+    sentences: tuple[str, ...]
+    table: Table
+    plots: tuple[Chart, ...]
+    files: Mapping[str, str]
+
+
+def draw_hardness(data: RunData) -> Hardness | None:
+    """Return the section; None where the plan of the run has no axes, or is not valid any more."""
+    plan = read_stored_plan(data.provenance)
+    if plan is None or not plan.axes:
+        return None
+    results, regions, changes = (pd.DataFrame(list(rows)) for rows in (data.results, data.regions, data.changes))
+    steps = hardness_table(results, regions, changes, plan)
+    points = breaking_points(steps)
+    files = {"hard.csv": steps.to_csv(index=False), "breaking_points.csv": points.to_csv(index=False)}
+    return Hardness(_sentences(points), _table(points), (_slopes(steps),), files)
+
+
+def _ranked(points: pd.DataFrame) -> list[str]:
+    """Return the methods, those that hold on most axes first."""
+    holds = points.assign(holds=points["step"] == 0).groupby("variant", sort=False)["holds"].sum()
+    return [str(name) for name in holds.sort_values(ascending=False, kind="stable").index]
+
+
+def _sentences(points: pd.DataFrame) -> tuple[str, ...]:
+    found = []
+    for variant in _ranked(points):
+        own = records(points[(points["variant"] == variant) & points["is_measured"]])
+        broken = [f"{row['axis']} ({_at(row)})" for row in own if row["step"]]
+        n_held = len(own) - len(broken)
+        told = f"breaks at {', '.join(broken)}" if broken else "breaks nowhere"
+        found.append(f"{spaced(variant)} holds on {n_held} of {len(own)} axes and {told}.")
+    return tuple(found)
+
+
+def _at(row: Mapping[str, Any]) -> str:
+    value = row["value"]
+    number = f"{value:g}" if isinstance(value, int | float) else str(value)
+    return f"{number} {row['unit']}".strip()
+
+
+def _table(points: pd.DataFrame) -> Table:
+    """Return a row for each method, best first, and a column for each axis."""
+    axes = list(dict.fromkeys(points["axis"].astype(str)))
+    cell = {(row["variant"], row["axis"]): row for row in records(points)}
+    rows = [("", (Cell(spaced(name)), *(_cell(cell[name, axis]) for axis in axes))) for name in _ranked(points)]
+    caption = (
+        "Breaking points: the first step at which a method finds fewer than half of the changes at 0.1 false regions "
+        "per 100 m; below it the recall there, or that of the hardest step"
+    )
+    return Table(("method", *axes), tuple(rows), caption)
+
+
+def _cell(row: Mapping[str, Any]) -> Cell:
+    if not row["is_measured"]:
+        return Cell(UNDEFINED)
+    holds = row["step"] == 0
+    return Cell(_HOLDS if holds else _at(row), holds, interval=share(row["recall"]))
+
+
+def _slopes(steps: pd.DataFrame) -> Chart:
+    """Return recall against the steps of each axis: a panel for each, a line for each method."""
+    names = [str(name) for name in dict.fromkeys(steps["variant"])]
+    panels: list[Panel] = []
+    for axis, own in steps.groupby("axis", sort=False):
+        values = own.drop_duplicates("step")
+        ticks = [_at({"value": value, "unit": ""}) for value in values["value"]]
+        lines = [_line(own[own["variant"] == name], name, names, place) for place, name in enumerate(names)]
+        limit = Series([-0.4, len(ticks) - 0.6], [BROKEN_BELOW] * 2, Look("#c4c4c4", 0.8))
+        title = f"{axis}{f' [{unit}]' if (unit := str(values['unit'].iloc[0])) else ''}"
+        x_axis = Axis(title, (-0.4, len(ticks) - 0.6), ticks=named_ticks(ticks))
+        y_axis = Axis("recall" if len(panels) % _N_ACROSS == 0 else "", (-0.03, 1.05))
+        panels.append(Panel(x_axis, y_axis, [limit, *lines]))
+    rows = [panels[start : start + _N_ACROSS] for start in range(0, len(panels), _N_ACROSS)]
+    n_pairs = int(steps["n_pairs"].max()) if len(steps) else 0
+    caption = (
+        f"Recall at 0.1 false regions per 100 m over n = {n_pairs} pairs a step, easiest step on the left; a pair "
+        "without an answer finds nothing. The grey line is one half. hard.csv has the 95 % intervals."
+    )
+    return Chart("hard", "What breaks whom, and where", Drawing(rows, 210), caption, has_png=True)
+
+
+def _line(own: pd.DataFrame, name: str, names: list[str], place: int) -> Series:
+    look = look_of(name, names)
+    # side by side, so that equal values do not hide each other
+    x = own["step"].to_numpy(dtype=np.float64) - 1 + 0.05 * (place - (len(names) - 1) / 2)
+    shown = Look(look.colour, look.width, look.dash, "circle", 3.0)
+    return Series(x, own["recall_at_0.1"], shown, name, hover="recall %{y:.2f}")

@@ -1,0 +1,136 @@
+"""Where methods break, worked out by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from eval.core.figures import picture
+from eval.plans.plan import Plan, load_plan
+from eval.report.hardness import draw_hardness
+from eval.report.page import write_page
+from eval.running.run_data import read_run
+from eval.running.runfolder import write_json
+from eval.tables.hardness import breaking_points, hardness_table
+
+PLAN = """\
+name: harder
+scenarios: [smoke/one_box]
+seeds: "7:9"
+variants: [{preset: tunnelcd}, {preset: c2c}]
+axes:
+  - name: height
+    unit: m
+    steps: [{value: 1.2, set: before.height_m=1.2}, {value: 0.8}, {value: 0.5, set: before.height_m=0.5}]
+  - name: keyframes
+    steps: [{value: 1}, {value: 4, method: map.keyframe_spacing_m=4}]
+"""
+BASE = "smoke/one_box"
+TALL, LOW, SPACED = f"{BASE}[before.height_m=1.2]", f"{BASE}[before.height_m=0.5]", "[map.keyframe_spacing_m=4]"
+
+
+@pytest.fixture(name="plan")
+def plan_fixture(tmp_path: Path) -> Plan:
+    (tmp_path / "plan.yaml").write_text(PLAN)
+    return load_plan(str(tmp_path / "plan.yaml"))
+
+
+def tables(found: dict[tuple[str, str], tuple[str, str]]) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """Two pairs of two changes by world and variant: which changes their candidates find, "x" for a refused pair."""
+    results, regions, changes = [], [], []
+    for (world, variant), of_pairs in found.items():
+        for seed, ids in zip((7, 8), of_pairs, strict=True):
+            names = {"scenario": world, "seed": seed, "variant": variant}
+            status = "merge_refused" if ids == "x" else "ok"
+            results.append({**names, "family": BASE, "status": status, "n_observable": 2, "score_radius_m": 4.5,
+                            "after_path_m": 100.0, "region_auroc": 0.5, "object_iou_point": 0.25, "object_f1_50": 0.5,
+                            "is_unchanged_pair": False, "metrics_version": 7})  # fmt: skip
+            for place, change in enumerate(ids if ids != "x" else ""):
+                regions.append({**names, "score": 9.0 - place, "found_changes": change, "is_withdrawn": False})
+            truth = {"is_observable": True, "n_truth_cells": 9, "is_found": False}
+            changes += [{**names, "id": number, **truth} for number in (1, 2)]
+    return pd.DataFrame(results), pd.DataFrame(regions), pd.DataFrame(changes)
+
+
+EVERY = {
+    (TALL, "tunnelcd"): ("12", "12"), (BASE, "tunnelcd"): ("12", "1"), (LOW, "tunnelcd"): ("1", "1"),
+    (TALL, "c2c"): ("12", "12"), (BASE, "c2c"): ("1", "x"), (LOW, "c2c"): ("12", "12"),
+    (BASE, f"tunnelcd{SPACED}"): ("x", "x"), (BASE, f"c2c{SPACED}"): ("12", "12"),
+}  # fmt: skip
+
+
+def test_recall_at_every_step(plan: Plan) -> None:
+    table = hardness_table(*tables(EVERY), plan).set_index(["axis", "variant", "step"]).sort_index()
+    assert table.loc[("height", "tunnelcd"), "recall_at_0.1"].tolist() == [1.0, 0.75, 0.5]
+    # one of two in the pair that was answered, none in the other: a refused pair is not left out
+    assert table.loc[("height", "c2c"), "recall_at_0.1"].tolist() == [1.0, 0.25, 1.0]
+    assert table.loc[("height", "c2c"), "n_failed"].tolist() == [0, 1, 0]
+    assert table.loc[("keyframes", "tunnelcd"), "recall_at_0.1"].tolist() == [0.75, 0.0]
+    assert table.loc[("keyframes", "c2c"), "value"].tolist() == [1, 4]
+    assert table["n_pairs"].tolist() == [2] * 10
+    low, high = table.loc[("height", "tunnelcd", 2), ["recall_at_0.1_low", "recall_at_0.1_high"]]
+    assert (low, high) == (0.5, 1.0)
+
+
+def test_a_false_region_is_paid_for(plan: Plan) -> None:
+    # what finds nothing comes first, and 200 m allow none
+    found = hardness_table(*tables(EVERY | {(TALL, "c2c"): ("", "12")}), plan)
+    results, regions, changes = tables(EVERY)
+    worse = regions.copy()
+    worse.loc[
+        (worse["scenario"] == TALL) & (worse["variant"] == "c2c") & (worse["found_changes"] == "1"), "found_changes"
+    ] = ""
+    false_first = hardness_table(results, worse, changes, plan)
+    assert found.loc[found["variant"].eq("c2c") & found["scenario"].eq(TALL), "recall_at_0.1"].tolist() == [0.5]
+    assert false_first.loc[
+        false_first["variant"].eq("c2c") & false_first["scenario"].eq(TALL), "recall_at_0.1"
+    ].tolist() == [0.0]
+
+
+def test_breaking_points(plan: Plan) -> None:
+    points = breaking_points(hardness_table(*tables(EVERY), plan)).set_index(["axis", "variant"])
+    # one half is not below one half
+    assert points.loc[("height", "tunnelcd"), ["step", "value", "recall"]].tolist() == [0, "", 0.5]
+    # broken at the second step, whatever comes after
+    assert points.loc[("height", "c2c"), ["step", "value", "recall"]].tolist() == [2, 0.8, 0.25]
+    assert points.loc[("keyframes", "tunnelcd"), ["step", "value", "recall"]].tolist() == [2, 4, 0.0]
+    assert points["is_measured"].all()
+
+
+def test_a_step_that_was_not_run_gives_no_verdict(plan: Plan) -> None:
+    some = {case: found for case, found in EVERY.items() if case != (BASE, "c2c")}
+    points = breaking_points(hardness_table(*tables(some), plan)).set_index(["axis", "variant"])
+    assert not points.loc[("height", "c2c"), "is_measured"]
+    assert points.loc[("height", "tunnelcd"), "is_measured"]
+
+
+def test_the_page_says_first_what_breaks_whom(tmp_path: Path, plan: Plan) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    for name, table in zip(("results", "regions", "changes"), tables(EVERY), strict=True):
+        table.to_csv(run / f"{name}.csv", index=False)
+    write_json(run / "provenance.json", {"tool": "tunnelcd", "plan": plan.model_dump(mode="json"), "machine": {}})
+    section = draw_hardness(read_run(run))
+    assert section is not None
+    # what breaks in the scenario as it is breaks on every axis that passes it
+    assert section.sentences == (
+        "tunnelcd holds on 1 of 2 axes and breaks at keyframes (4).",
+        "c2c holds on 0 of 2 axes and breaks at height (0.8 m), keyframes (1).",
+    )
+    cells = [[(cell.text, cell.interval) for cell in cells] for _, cells in section.table.rows]
+    assert cells[0] == [("tunnelcd", ""), ("holds", "0.50"), ("4", "0.00")]
+    assert cells[1] == [("c2c", ""), ("0.8 m", "0.25"), ("1", "0.25")]
+    assert picture(section.plots[0].drawing)
+    page = write_page(run).read_text()
+    assert page.index('id="hardness"') < page.index('id="results"')
+    assert "c2c holds on 0 of 2 axes" in page
+    assert len(pd.read_csv(run / "hard.csv")) == 10 and len(pd.read_csv(run / "breaking_points.csv")) == 4
+    assert (run / "hard.png").stat().st_size > 1000 and r"\textbf" in (run / "breaking_points.tex").read_text()
+
+
+def test_a_plan_without_axes_has_no_such_section(tmp_path: Path) -> None:
+    results = tables({(BASE, "c2c"): ("1", "2")})[0]
+    results.to_csv(tmp_path / "results.csv", index=False)
+    assert draw_hardness(read_run(tmp_path)) is None
