@@ -94,7 +94,7 @@ def _draw_scenario(document: Document, seed: int) -> tuple[Scenario | None, list
 
 def _freeze(scenario: Scenario) -> Scenario:
     """Return the scenario without its changes: the world stays as in the before session."""
-    stay = {"change": "none", "to": None, "shift": None, "loaded_share": None}  # what ages, ages
+    stay = {"change": "none", "to": None, "shift": None, "loaded_share": None}  # age is no change
     props = tuple(prop.model_copy(update=stay) for prop in scenario.props if prop.change != "added")
     return scenario.model_copy(update={"props": props})
 

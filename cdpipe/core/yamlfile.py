@@ -162,7 +162,8 @@ def _step_into(place: Any, name: str, setting: str) -> tuple[str | int, Any]:
         names = [item.get("name") if isinstance(item, dict) else None for item in place]
         if name not in names:
             known = [each for each in names if isinstance(each, str)]
-            raise InputError(f"--set {setting}: no item of the list is called {name}{suggest(name, known)}")
+            told = suggest(name, known) or f": expected one of {', '.join(known) or 'no name: its items have none'}"
+            raise InputError(f"--set {setting}: no item of the list is called {name!r}{told}")
         return names.index(name), place[names.index(name)]
     found = place.setdefault(name, {})
     if not isinstance(found, dict | list):

@@ -49,6 +49,9 @@ class Axis(Settings):
         values = [step.value for step in self.steps]
         if len(set(values)) < len(values):
             raise ValueError(f"axis {self.name!r}: expected every value once")
+        made = [(step.set, step.method) for step in self.steps]
+        if len(set(made)) < len(made):
+            raise ValueError(f"axis {self.name!r}: two steps set the same: expected settings of its own for each")
         return self
 
 

@@ -72,6 +72,9 @@ def change_plan(
     ]
     for each in document["grid"]:
         each["keys"].update({get_key(setting): [parse_yaml_value(setting.partition("=")[2])] for setting in settings})
+        if "each" in each:
+            kept = dict.fromkeys(tuple(_drop_settings(listed, overridden)) for listed in each["each"])
+            each["each"] = [list(listed) for listed in kept]
     return validate(Plan, Document(f"plan {plan.name} with the settings of the command line", document))
 
 

@@ -164,6 +164,8 @@ class Grid(Settings):
     def _varies(self) -> Grid:
         if not self.keys and not self.each:
             raise ValueError("expected keys, each or both: at least one is needed")
+        if twice := self.keys.keys() & set(map(get_key, itertools.chain(*self.each))):
+            raise ValueError(f"{min(twice)} stands in keys and in each: leave one of them out")
         return self
 
     @property

@@ -16,7 +16,7 @@ thresholds: {"paper[extract.voxel_m=0.4]": 1.1}  # query.threshold of a variant 
 variants:
   - preset: paper                    # a shipped preset or the path of a .yaml file
     set: ["extract.voxel_m=0.4"]     # part of the variant's name
-    per_scenario: {paper/site2: ["query.threshold=1"]}   # belongs to the site and not to the variant's name
+    per_scenario: {paper/site2: ["query.radius_m=10"]}  # belongs to the site and not to the variant's name
   - preset: tunnelcd
     oracle_merge: {noise_m: 0.1, noise_deg: 0.2}         # merged by the truth (eval/oracles/merge.py); {}: no noise
     oracle_regions: true                                 # a region around each change (eval/oracles/regions.py)
@@ -33,7 +33,7 @@ axes:                                # eval/plans/axes.py: the first scenario, m
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -72,6 +72,7 @@ from eval.plans.worlds import (
 )
 
 _MOST_SEEDS = 100_000
+_NO_THRESHOLDS: Mapping[str, Any] = {"thresholds": {}}
 _MAY_BE_LEFT_OUT = ("split", "set", "thresholds", "axes")
 _AFTER_MERGE = ("query", "extract", "outlier", "cluster", "m3c2", "dufomap")
 
@@ -176,21 +177,34 @@ def _find_unknown_thresholds(plan: Plan) -> Iterator[InitErrorDetails]:
     """Yield the names under `thresholds` that no variant and no grid point has."""
     if not plan.thresholds:
         return
-    every = [method for world in plan.worlds for method in list_methods(plan, world)]
+    every = [method for world in plan.worlds for method in list_methods(plan.model_copy(update=_NO_THRESHOLDS), world)]
     known = {method.variant for method in every if not method.oracle_regions}
+    has_own = {method.variant for method in every if "query.threshold" in map(get_key, (*method.named, *method.silent))}
     for name, threshold in plan.thresholds.items():
-        if name not in known:
+        if name in has_own:
+            rule = f"{name} has a threshold of its own: leave one of them out"
+            yield _mistake(("thresholds", name), str(threshold), rule)
+        elif name not in known:
             rule = f"no variant or grid point with a threshold is called {name}{suggest(name, known)}"
             yield _mistake(("thresholds", name), str(threshold), rule)
 
 
 def _find_misfit_steps(plan: Plan) -> Iterator[InitErrorDetails]:
-    """Yield the steps of axes that do not fit the first scenario, and axes of one name."""
+    """Yield the steps of axes that do not fit the first scenario, axes of one name, and axes that tell nothing."""
     names = [axis.name for axis in plan.axes]
+    if plan.axes and plan.until == "merge":
+        yield _mistake(("axes",), ", ".join(names), "axes ask for regions, and the plan ends at the merge")
+    if plan.axes and len(plan.scenarios[0].odometry or plan.odometry) > 1:
+        yield _mistake(("axes",), ", ".join(names), "expected one odometry of the first scenario, which the axes vary")
     for place, axis in enumerate(plan.axes):
         if axis.name in names[:place]:
             yield _mistake(("axes", place, "name"), axis.name, f"axis {axis.name!r} stands twice")
         for index, step in enumerate(axis.steps):
+            if idle := [
+                each for variant in plan.variants for each in step.method if not variant.keep_effective([each])
+            ]:
+                rule = f"{idle[0]} does nothing to a variant of this plan, which takes that part from the truth"
+                yield _mistake(("axes", place, "steps", index, "method"), idle[0], rule)
             try:
                 if step.set:
                     require_draws(plan.base.name, (*plan.base.settings, *step.set))
@@ -270,9 +284,9 @@ class Plan(Settings):
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Plan:
+        _refuse(list(_find_misfit_steps(self)))
         _refuse([*_find_settings_past_the_end(self), *_find_unknown_worlds(self), *_find_repeated_variants(self)])
         _refuse(list(_find_unknown_thresholds(self)))
-        _refuse(list(_find_misfit_steps(self)))
         return self
 
     @model_serializer(mode="wrap")
@@ -326,10 +340,14 @@ def list_methods(plan: Plan, world: World) -> list[Method]:
                 Method(preset, point, shared=plan.set, site=site) for preset in grid.variant for point in grid.points
             ]
     if world.label == plan.base.label:
-        methods += [
-            replace(method, named=(*method.named, *step)) for step in method_steps(plan.axes) for method in [*methods]
-        ]
+        methods += [with_step(method, step) for step in method_steps(plan.axes) for method in [*methods]]
     return [_with_threshold(method, plan.thresholds.get(method.variant)) for method in methods]
+
+
+def with_step(method: Method, step: tuple[str, ...]) -> Method:
+    """Return a method with the settings of a step of an axis, over those of its own name."""
+    keys = set(map(get_key, step))
+    return replace(method, named=(*(each for each in method.named if get_key(each) not in keys), *step))
 
 
 def _with_threshold(method: Method, threshold: float | None) -> Method:

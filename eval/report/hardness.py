@@ -10,13 +10,12 @@ import numpy as np
 import pandas as pd
 
 from eval.core.charts import Axis, Drawing, Look, Panel, Series, named_ticks
-from eval.plans.coverage import read_stored_plan
 from eval.report.charts import Chart
 from eval.report.regions.charts import look_of
 from eval.report.tables import Cell, Table
-from eval.running.run_data import RunData
+from eval.running.run_data import RunData, stored_table
 from eval.tables.columns import UNDEFINED, share, spaced
-from eval.tables.hardness import BROKEN_BELOW, breaking_points, hardness_table
+from eval.tables.hardness import BROKEN_BELOW
 from eval.tables.rows import records
 
 _N_ACROSS = 4
@@ -25,24 +24,25 @@ _HOLDS = "holds"
 
 @dataclass(frozen=True, slots=True)
 class Hardness:
-    """The section: a sentence for each method, the table of breaking points, the slopes, and both tables as files."""
+    """The section: a sentence for each method, the table of breaking points, and the slopes."""
 
     sentences: tuple[str, ...]
     table: Table
     plots: tuple[Chart, ...]
-    files: Mapping[str, str]
 
 
 def draw_hardness(data: RunData) -> Hardness | None:
-    """Return the section; None where the plan of the run has no axes, or is not valid any more."""
-    plan = read_stored_plan(data.provenance)
-    if plan is None or not plan.axes:
+    """Return the section; None where the run has no hard.csv, as its plan has no axes."""
+    steps, points = stored_table(data, "hard"), stored_table(data, "breaking_points")
+    if len(steps) == 0 or len(points) == 0:
         return None
-    results, regions, changes = (pd.DataFrame(list(rows)) for rows in (data.results, data.regions, data.changes))
-    steps = hardness_table(results, regions, changes, plan)
-    points = breaking_points(steps)
-    files = {"hard.csv": steps.to_csv(index=False), "breaking_points.csv": points.to_csv(index=False)}
-    return Hardness(_sentences(points), _table(points), (_slopes(steps),), files)
+    steps, points = (_with_texts(table) for table in (steps, points))
+    return Hardness(_sentences(points), _table(points), (_slopes(steps),))
+
+
+def _with_texts(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table with "" where a unit or a value is empty."""
+    return table.astype({"unit": object, "value": object}).fillna({"unit": "", "value": ""})
 
 
 def _ranked(points: pd.DataFrame) -> list[str]:
@@ -58,7 +58,8 @@ def _sentences(points: pd.DataFrame) -> tuple[str, ...]:
         broken = [f"{row['axis']} ({_at(row)})" for row in own if row["step"]]
         n_held = len(own) - len(broken)
         told = f"breaks at {', '.join(broken)}" if broken else "breaks nowhere"
-        found.append(f"{spaced(variant)} holds on {n_held} of {len(own)} axes and {told}.")
+        axes = f"holds on {n_held} of {len(own)} axes and {told}" if own else "was not run at every step of any axis"
+        found.append(f"{spaced(variant)} {axes}.")
     return tuple(found)
 
 
@@ -101,10 +102,10 @@ def _slopes(steps: pd.DataFrame) -> Chart:
         y_axis = Axis("recall" if len(panels) % _N_ACROSS == 0 else "", (-0.03, 1.05))
         panels.append(Panel(x_axis, y_axis, [limit, *lines]))
     rows = [panels[start : start + _N_ACROSS] for start in range(0, len(panels), _N_ACROSS)]
-    n_pairs = int(steps["n_pairs"].max()) if len(steps) else 0
+    n_pairs = int(steps["n_judged"].max())
     caption = (
-        f"Recall at 0.1 false regions per 100 m over n = {n_pairs} pairs a step, easiest step on the left; a pair "
-        "without an answer finds nothing. The grey line is one half. hard.csv has the 95 % intervals."
+        f"Recall at 0.1 false regions per 100 m over up to n = {n_pairs} pairs a step, easiest step on the left; a "
+        "pair without an answer finds nothing. The grey line is one half. hard.csv has the 95 % intervals."
     )
     return Chart("hard", "What breaks whom, and where", Drawing(rows, 210), caption, has_png=True)
 

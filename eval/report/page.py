@@ -112,7 +112,7 @@ def _draw(data: RunData, views: Views, *, is_slim: bool) -> dict[str, str | byte
     if not ends_at_merge(data):
         hardness = draw_hardness(data)
         if hardness is not None:
-            files |= {**hardness.files, "breaking_points.tex": to_latex(hardness.table)}
+            files["breaking_points.tex"] = to_latex(hardness.table)
         points = pareto_table(data)
         if len(points):
             files["pareto.csv"] = points.to_csv(index=False)

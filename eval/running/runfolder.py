@@ -11,6 +11,7 @@ results.csv changes.csv regions.csv objects.csv keyframes.csv summary.csv
 merge.csv                                     where pairs have a kind (eval.tables.merge_table)
 regions_table.csv regions_targets.csv regions_by_size.csv budgets.csv roc.csv froc.csv
                                               where the plan says `report: regions` (eval.tables.region_table)
+hard.csv breaking_points.csv                  where its plan has axes (eval.tables.hardness)
 objects_table.csv objects_by_group.csv objects_targets.csv
                                               where it says `report: objects` (eval.tables.object_table)
 effects.csv                                   where a world was run with and without a setting (eval.tables.effects)
@@ -37,10 +38,12 @@ from eval.core.output import make_writable, remove, require_no_links, whole_file
 from eval.core.provenance import FORMAT_VERSION, TOOL
 from eval.core.statistics import summarise
 from eval.core.tablefile import read_table
-from eval.plans.coverage import measure_coverage
+from eval.plans.coverage import measure_coverage, read_stored_plan
 from eval.plans.targets import read_targets
 from eval.plans.worlds import world_slug
 from eval.tables.effects import effects
+from eval.tables.hardness import FILES as HARD_FILES
+from eval.tables.hardness import breaking_points, hardness_table
 from eval.tables.merge_table import merge_table
 from eval.tables.object_table import FILES as OBJECT_FILES
 from eval.tables.object_table import object_tables
@@ -253,7 +256,7 @@ def _report_tables(
     run: RunFolder, results: pd.DataFrame, items: Mapping[str, pd.DataFrame]
 ) -> Mapping[str, pd.DataFrame]:
     """Return the tables that the plan asks for, and empty ones for those that it does not."""
-    tables = {name: pd.DataFrame() for name in (*REGION_FILES, *OBJECT_FILES)}
+    tables = {name: pd.DataFrame() for name in (*REGION_FILES, *OBJECT_FILES, *HARD_FILES)}
     provenance = run.stored_provenance()
     subjects, targets = reported(provenance), read_targets(provenance)
     if not subjects or "region_auroc" not in results:
@@ -262,6 +265,10 @@ def _report_tables(
     is_whole = measure_coverage(provenance, cases).is_whole
     if "regions" in subjects:
         tables |= region_tables(results, items, targets, is_whole=is_whole)
+    plan = read_stored_plan(provenance)
+    if plan is not None and plan.axes:
+        steps = hardness_table(results, items["regions"], items["changes"], plan)
+        tables |= dict(zip(HARD_FILES, (steps, breaking_points(steps)), strict=True))
     if "objects" in subjects:
         tables |= object_tables(results, items["changes"], targets, is_whole=is_whole)
     return tables

@@ -51,3 +51,9 @@ def score_points(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], t
         "dynamic_accuracy": dynamic,
         "associated_accuracy": math.sqrt(static * dynamic),
     }
+
+
+def score_unanswered_points(truth: GroundTruth) -> dict[str, float]:
+    """Return the scores of a case without an answer: 0; NaN where nothing changed and none is asked."""
+    empty = score_points((), (), truth)
+    return {name: math.nan if math.isnan(value) else 0.0 for name, value in empty.items()}

@@ -34,7 +34,7 @@ from eval.scoring.object_metrics import (
     summarise_objects,
 )
 from eval.scoring.object_sizes import SizeErrors, compute_size_errors, summarise_size_errors
-from eval.scoring.point_metrics import score_points
+from eval.scoring.point_metrics import score_points, score_unanswered_points
 from eval.scoring.region_metrics import RegionScores, score_regions, score_unanswered_regions
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
@@ -115,7 +115,7 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
     if report is None or answer.until == "merge":
         regions = score_unanswered_regions(truth)
         objects, object_scores = score_unanswered_objects(truth)
-        object_scores |= score_points((), (), truth)
+        object_scores |= score_unanswered_points(truth)
         right = np.full(len(truth.pair.changes), np.nan)
         sizes = SizeErrors(right, right)
         items: list[dict[str, Any]] = []

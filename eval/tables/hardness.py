@@ -7,7 +7,6 @@ A method breaks at the first step at which it finds fewer than half of the chang
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,13 +14,15 @@ import pandas as pd
 
 from eval.core.statistics import interval_of, mean
 from eval.plans.axes import Step, world_of_step
-from eval.plans.plan import Plan, list_methods
+from eval.plans.plan import Plan, list_methods, with_step
 from eval.tables.region_curves import ranked_pairs, recall_at, resampled_recalls
 from eval.tables.rows import numbers
 
+FILES = ("hard", "breaking_points")
 RATE_PER_100M = 0.1
 BROKEN_BELOW = 0.5
 _RECALL = f"recall_at_{RATE_PER_100M:g}"
+_COUNTS = ("n_pairs", "n_judged", "n_failed", "n_observable")
 _MEANS = ("region_auroc", "object_iou_point", "object_f1_50")
 
 
@@ -35,9 +36,10 @@ def hardness_table(results: pd.DataFrame, regions: pd.DataFrame, changes: pd.Dat
         plan: Says which rows are of which step.
 
     Returns:
-        `axis`, `unit`, `step` (1 is the easiest), `value`, `variant`, `scenario`; `n_pairs`, `n_failed`; recall at 0.1
+        `axis`, `unit`, `step` (1 is the easiest), `value`, `variant`, `scenario`; `n_planned` pairs, `n_pairs` that
+        were run, `n_judged` of these with a world, `n_failed` without an answer, `n_observable` changes; recall at 0.1
         false regions per 100 m with its 95 % interval over pairs, and means over pairs of AUROC, IoU and F1. Numbers
-        are NaN where no pair was run.
+        are NaN where no pair was run, or where nobody could see a change.
     """
     rows: list[dict[str, Any]] = []
     tables = results, regions, changes
@@ -48,7 +50,9 @@ def hardness_table(results: pd.DataFrame, regions: pd.DataFrame, changes: pd.Dat
             names = {"axis": axis.name, "unit": axis.unit, "step": number, "value": step.value}
             for variant, run in zip(_variants_of_step(plan, Step(value=0)), _variants_of_step(plan, step), strict=True):
                 own = [found.get((world, run), table[:0]) for found, table in zip(of_case, tables, strict=True)]
-                rows.append({**names, "variant": variant, "scenario": world, **_measure(*own)})
+                n_planned = len(plan.seeds[: plan.base.n_seeds])
+                told = {"variant": variant, "scenario": world, "n_planned": n_planned}
+                rows.append({**names, **told, **_measure(*own)})
     return pd.DataFrame(rows)
 
 
@@ -61,14 +65,16 @@ def breaking_points(table: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         `step` and `value` of the first step with a recall below one half, 0 and "" where it holds; `recall`, the
-        recall there, and that of the last step where it holds; `is_measured`, whether all steps before were run.
+        recall there, and that of the last step where it holds; `is_measured`, whether every planned pair of all steps
+        up to that one was run, and there was a change to find at each.
     """
     rows = []
-    for (axis, variant), own in table.groupby(["axis", "variant"], sort=False):
+    for (axis, variant), own in table.groupby(["axis", "variant"], sort=False) if len(table) else ():
         recall = own[_RECALL].to_numpy(dtype=np.float64)
         broken = np.flatnonzero(~(recall >= BROKEN_BELOW))
         place = int(broken[0]) if len(broken) else len(own) - 1
-        is_measured = not np.isnan(recall[: place + 1]).any()
+        is_run = (own["n_pairs"] >= own["n_planned"]).to_numpy() & ~np.isnan(recall)
+        is_measured = bool(is_run[: place + 1].all())
         holds = len(broken) == 0
         at = own.iloc[place]
         rows.append(
@@ -84,18 +90,20 @@ def _variants_of_step(plan: Plan, step: Step) -> list[str]:
     """Return the name of every method of the base world with the method's settings of a step."""
     alone = plan.model_copy(update={"axes": ()})
     methods = list_methods(alone, plan.base)
-    return [replace(method, named=(*method.named, *step.method)).variant for method in methods]
+    return [with_step(method, step.method).variant for method in methods]
 
 
 def _measure(results: pd.DataFrame, regions: pd.DataFrame, changes: pd.DataFrame) -> dict[str, float]:
     if len(results) == 0:
-        return {"n_pairs": 0, "n_failed": 0, **dict.fromkeys((_RECALL, *_MEANS), math.nan)}
+        return {**dict.fromkeys(_COUNTS, 0), **dict.fromkeys((_RECALL, *_MEANS), math.nan)}
     ranked = ranked_pairs(results, regions, changes)
     is_enough = np.count_nonzero(ranked.n_observable) > 1
     low, high = interval_of(resampled_recalls(ranked, RATE_PER_100M)) if is_enough else (math.nan, math.nan)
     return {
         "n_pairs": len(results),
+        "n_judged": len(ranked.pairs),
         "n_failed": int((results["status"] != "ok").sum()),
+        "n_observable": int(ranked.n_observable.sum()),
         _RECALL: recall_at(ranked, RATE_PER_100M),
         f"{_RECALL}_low": low,
         f"{_RECALL}_high": high,

@@ -211,7 +211,9 @@ def _prop_surfaces(item: Standing) -> Iterator[Surface]:
         yield Surface(f"changes/{change}/{name}{_where(item)}", whole, CHANGE_RGB[change])
         return
     for material, meshes in parts.items():
-        yield Surface(f"props/{name}/{material}", join_meshes(meshes), _rgb(material_colour(name, material)))
+        yield Surface(
+            f"props/{name}{_where(item)}/{material}", join_meshes(meshes), _rgb(material_colour(name, material))
+        )
 
 
 def _label(item: Standing) -> Label:
@@ -222,8 +224,9 @@ def _label(item: Standing) -> Label:
 
 
 def _where(item: Standing) -> str:
-    """Return the session in brackets for the two places of a moved prop and the two shapes of a reshaped one."""
-    return f" ({min(item.sessions)})" if item.prop.change in ("moved", "reshaped") else ""
+    """Return the session in brackets for the two places of a moved or aged prop and the shapes of a reshaped one."""
+    is_twice = item.prop.change in ("moved", "reshaped") or item.prop.aged is not None
+    return f" ({min(item.sessions)})" if is_twice else ""
 
 
 def _scenario_of(pair: Path, truth: PairTruth) -> Scenario:

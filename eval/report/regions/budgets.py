@@ -13,10 +13,10 @@ from eval.core.charts import Axis, Drawing, Look, Panel, Series, log_span
 from eval.core.domains import domain_name
 from eval.report.charts import Chart
 from eval.report.regions.charts import look_of
-from eval.report.tables import Cell, Table, interval_of_row
+from eval.report.tables import Cell, Table, best_rows, interval_of_row
 from eval.running.run_data import split_variant
-from eval.tables.columns import share, spaced
-from eval.tables.rows import ALL_DOMAINS, records
+from eval.tables.columns import Column, share, spaced
+from eval.tables.rows import ALL_DOMAINS, is_told_the_truth, records
 
 _PRICES = {
     "spheres": "spheres looked at per 100 m",
@@ -24,6 +24,7 @@ _PRICES = {
     "bytes": "bytes sent, share of the before map",
 }
 _AREAS = {"spheres": "up to 12 spheres / 100 m", "seconds": "up to 10 s / 100 m", "bytes": "up to 10 % of the map"}
+_AREA = Column("area", "area", "high", share)
 _ALL_SITES = "all"
 _RULE, _SHOWN_RULE = "extract.method", "surface"
 
@@ -71,16 +72,17 @@ def draw_budgets(budgets: pd.DataFrame) -> Chart | None:
 
 
 def budget_areas(budgets: pd.DataFrame) -> Table:
-    """Return the areas below the curves of `draw_budgets`: a row for each method, best first by bytes."""
+    """Return the areas below the curves of `draw_budgets`: a row for each method, best first by bytes, oracles last."""
     shown = shown_budgets(budgets)
     rows = []
     for domain, own in _domains(shown):
         firsts = own.drop_duplicates(["variant", "price"])
         of_variant = {str(name): part for name, part in firsts.groupby("variant", sort=False)}
         areas = {name: dict(zip(part["price"], records(part), strict=True)) for name, part in of_variant.items()}
-        best = {price: firsts.loc[firsts["price"] == price, "area"].max() for price in _PRICES}
-        for name, row in sorted(areas.items(), key=lambda item: -np.nan_to_num(item[1]["bytes"]["area"])):
-            cells = [_area_cell(row[price], best[price]) for price in _PRICES]
+        names = sorted(areas, key=lambda name: (is_told_the_truth(name), -np.nan_to_num(areas[name]["bytes"]["area"])))
+        marks = {price: best_rows([areas[name][price] for name in names], _AREA, [1] * len(names)) for price in _PRICES}
+        for place, name in enumerate(names):
+            cells = [_area_cell(areas[name][price], is_best=marks[price][place]) for price in _PRICES]
             rows.append((domain_name(domain), (Cell(spaced(name)), *cells)))
     caption = "What proposals save: mean recall from no budget to the one in the heading; interval: 95 % over pairs"
     return Table(("method", *_AREAS.values()), tuple(rows), caption)
@@ -90,10 +92,8 @@ def _dotted(name: str, names: list[str]) -> Look:
     return replace(look_of(name, names), marker="circle", size=3.0)
 
 
-def _area_cell(row: Mapping[str, Any], best: float) -> Cell:
-    text = share(row["area"])
-    is_best = not np.isnan(row["area"]) and text == share(best)
-    return Cell(text, is_best, interval=interval_of_row(row, "area", share))
+def _area_cell(row: Mapping[str, Any], *, is_best: bool) -> Cell:
+    return Cell(share(row["area"]), is_best, interval=interval_of_row(row, "area", share))
 
 
 def _domains(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:

@@ -16,7 +16,7 @@ from eval.report.charts import Chart, plotly_text
 from eval.report.settings.grids import N_ACROSS, PQ_COLUMN, SHARES
 from eval.running.run_data import RunData, split_variant
 from eval.tables.columns import RESULT_COLUMNS, Column, significant
-from eval.tables.rows import by_domain, is_told_the_truth, means_with_intervals, numbers, with_domain
+from eval.tables.rows import by_domain, means_with_intervals, numbers, with_domain
 
 _RULE, _SOURCE = "extract.method", "source"
 _MEANS = ("region_recall", "object_f1_50", "object_iou_point", "object_pq", "kind_accuracy")
@@ -37,18 +37,18 @@ class Combination:
 
 
 def list_combinations(data: RunData) -> list[Combination]:
-    """Return the combinations of a run: none unless two sources at least were run with two rules at least."""
+    """Return the combinations of a run: none unless two sources at least were run with two rules each, each once."""
     found = []
     for variant in dict.fromkeys(str(row["variant"]) for row in data.results):
         preset, settings = split_variant(variant)
         if _RULE in settings:
-            source = "truth" if is_told_the_truth(variant) else preset
-            found.append(Combination(variant, source, settings[_RULE]))
+            found.append(Combination(variant, preset, settings[_RULE]))
     rules: dict[str, set[str]] = {}
     for each in found:
         rules.setdefault(each.source, set()).add(each.rule)
     crossed = [source for source, own in rules.items() if len(own) > 1]
-    return found if len(crossed) > 1 else []
+    is_once = len({(each.source, each.rule) for each in found}) == len(found)
+    return found if len(crossed) > 1 and is_once else []
 
 
 def factorial_table(data: RunData) -> pd.DataFrame:
@@ -101,8 +101,7 @@ def _measure(own: pd.DataFrame) -> dict[str, float]:
 
 def _drawing(own: pd.DataFrame) -> Drawing:
     sources, rules = (list(dict.fromkeys(own[name])) for name in (_SOURCE, "extraction"))
-    of_cell = own.drop_duplicates([_SOURCE, "extraction"]).set_index([_SOURCE, "extraction"])
-    every = of_cell.reindex(pd.MultiIndex.from_product([sources, rules]))
+    every = own.set_index([_SOURCE, "extraction"]).reindex(pd.MultiIndex.from_product([sources, rules]))
     values = {key: numbers(every, key).reshape(len(sources), len(rules)) for key in _SHOWN}
     panels = [_panel(_COLUMNS[key], table, sources, rules) for key, table in values.items() if np.isfinite(table).any()]
     rows = [panels[start : start + N_ACROSS] for start in range(0, len(panels), N_ACROSS)]

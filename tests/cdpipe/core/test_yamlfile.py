@@ -59,7 +59,7 @@ def test_an_item_of_a_list_goes_by_its_name() -> None:
     assert changed.value == {"props": [{"name": "crate", "size": {"x": 3}}, {"name": "barrel", "size": {"x": 2}}]}
     assert changed.where(("props", 0, "size", "x")) == changed.where(("props", 1, "size")) == "--set"
     assert changed.where(("props", 0, "name")) == "a.yaml:2"
-    with pytest.raises(InputError, match=r'no item of the list is called barel; did you mean "barrel"\?'):
+    with pytest.raises(InputError, match=r"called 'barel'; did you mean \"barrel\"\?"):
         apply_settings(changed, ["props.barel.size.x=2"])
     with pytest.raises(InputError, match="props is a list: name an item and one of its keys"):
         apply_settings(changed, ["props.barrel=2"])

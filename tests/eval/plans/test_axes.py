@@ -74,6 +74,29 @@ def test_mistakes_have_a_line(tmp_path: Path, old: str, new: str, line: int, wor
     assert f"plan.yaml:{line}: " in told, told
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("{value: 0.8}", "{value: 0.8}\n      - {value: 0.7}", "two steps set the same"),
+        ("name: harder", "name: harder\nuntil: merge", "the plan ends at the merge"),
+        ("name: harder", "name: harder\nodometry: [own, kiss-icp]", "one odometry"),
+        ("{preset: c2c}]", "{preset: c2c, oracle_merge: {}}]", "merge.refine=none does nothing to a variant"),
+    ],
+)
+def test_axes_that_tell_nothing_are_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
+    text = PLAN.replace("map.keyframe_spacing_m=4", "merge.refine=none")
+    with pytest.raises(InputError, match=words):
+        read(tmp_path, text.replace(old, new))
+
+
+def test_a_step_replaces_a_setting_of_a_variant(tmp_path: Path) -> None:
+    text = PLAN.replace("{preset: c2c}", "{preset: c2c, set: map.keyframe_spacing_m=2}")
+    names = {cell.variant: cell.config.map.keyframe_spacing_m for cell in expand_cells(read(tmp_path, text))}
+    assert names["c2c[map.keyframe_spacing_m=4]"] == 4
+    assert names["c2c[map.keyframe_spacing_m=2]"] == 2
+    assert not any(name.count("keyframe") > 1 for name in names)
+
+
 def test_plan_hard_asks_for_twelve_axes_with_five_steps_but_one() -> None:
     plan = load_plan("hard")
     assert [len(axis.steps) for axis in plan.axes] == [5, 5, 5, 5, 5, 2, 5, 5, 5, 5, 5, 5]

@@ -334,11 +334,25 @@ def test_thresholds_belong_to_methods_that_the_plan_runs_as_they_are(tmp_path: P
     assert line.startswith("plan.yaml:5: thresholds.papr = '1.0': ") and "is called papr" in line
     (line,) = mistakes(tmp_path, CROSSED.replace("tunnelcd: -1", "oracle-merge+oracle-regions: 1"))
     assert "is called oracle-merge+oracle-regions" in line
+    own = CROSSED.replace("set: []", "set: query.threshold=5").replace(
+        "tunnelcd: -1", '"tunnelcd[query.threshold=5]": 3'
+    )
+    (line,) = mistakes(tmp_path, own)
+    assert "tunnelcd[query.threshold=5] has a threshold of its own" in line
     for options in ({"settings": ["map.voxel_m=0.3"]}, {"grid": ["map.voxel_m=0.1,0.2"]}):
         with pytest.raises(InputError, match=r"plan crossed holds a threshold for each of its methods"):
             change_plan(read(tmp_path, CROSSED), **options)  # type: ignore[arg-type]
     changed = change_plan(read(tmp_path, CROSSED), presets=["c2c"])
     assert {cell.variant for cell in expand_cells(changed)} == {"c2c"}
+
+
+def test_settings_of_the_command_line_replace_those_of_each(tmp_path: Path) -> None:
+    text = CROSSED.replace('thresholds: {"paper[extract.method=surface]": 0.25, tunnelcd: -1}\n', "")
+    cells = expand_cells(change_plan(read(tmp_path, text), settings=["extract.method=nearest"]))
+    of_grid = [cell.variant for cell in cells if cell.preset == "paper" and cell.scenario == "smoke/unchanged"]
+    assert of_grid == ["paper[extract.method=nearest]", "paper[extract.voxel_m=0.3,extract.method=nearest]"]
+    (line,) = mistakes(tmp_path, text + "    keys: {extract.voxel_m: [0.2]}\n")
+    assert "extract.voxel_m stands in keys and in each" in line
 
 
 def test_a_plan_that_was_written_down_is_the_same_plan(tmp_path: Path) -> None:

@@ -272,7 +272,7 @@ def test_a_case_without_an_answer(truth: GroundTruth) -> None:
         "region_recall", "region_recall_at_k", "region_precision", "region_recall_proposed",
         "region_recall_at_k_proposed", "region_precision_proposed", "object_iou_point", "object_iou_voxel",
         "object_iou_box", "object_f1_25", "object_f1_50", "object_precision_50", "object_pq", "kind_accuracy",
-        "keyframe_coverage", "dynamic_accuracy", "associated_accuracy",
+        "keyframe_coverage", "static_accuracy", "dynamic_accuracy", "associated_accuracy",
     ]  # fmt: skip
     counts = [
         "n_regions", "n_withdrawn", "n_true_regions", "n_false_regions", "n_duplicate_regions", "n_ignored_regions",
@@ -287,7 +287,7 @@ def test_a_case_without_an_answer(truth: GroundTruth) -> None:
         "odometry_after": "drift", "sensor_profile": "os1-32", "checkpoints": "", "extras": "",
         "region_auroc": 0.5, "region_ap": 12 / (12 + n_far),
         "is_auroc_assumed": 1.0, "overlap_true": 1.0, "evidence_overlap": 0.5, "t_merge_s": 2.0, "t_descriptor_s": 8.0,
-        "after_path_m": 50.0, "static_accuracy": 1.0,
+        "after_path_m": 50.0,
         "is_unchanged_pair": False, **dict.fromkeys(zeros, 0.0), **dict.fromkeys(counts, 0),
     }  # fmt: skip
     assert_equal({name: value for name, value in case.row.items() if value == value}, {

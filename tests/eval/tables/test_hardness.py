@@ -106,12 +106,21 @@ def test_a_step_that_was_not_run_gives_no_verdict(plan: Plan) -> None:
     assert points.loc[("height", "tunnelcd"), "is_measured"]
 
 
+def write_run(folder: Path, plan: Plan, found: dict[tuple[str, str], tuple[str, str]]) -> Path:
+    folder.mkdir()
+    every = tables(found)
+    steps = hardness_table(*every, plan)
+    points = breaking_points(steps)
+    names = ("results", "regions", "changes", "hard", "breaking_points")
+    for name, table in zip(names, (*every, steps, points), strict=True):
+        if len(table):
+            table.to_csv(folder / f"{name}.csv", index=False)
+    write_json(folder / "provenance.json", {"tool": "tunnelcd", "plan": plan.model_dump(mode="json"), "machine": {}})
+    return folder
+
+
 def test_the_page_says_first_what_breaks_whom(tmp_path: Path, plan: Plan) -> None:
-    run = tmp_path / "run"
-    run.mkdir()
-    for name, table in zip(("results", "regions", "changes"), tables(EVERY), strict=True):
-        table.to_csv(run / f"{name}.csv", index=False)
-    write_json(run / "provenance.json", {"tool": "tunnelcd", "plan": plan.model_dump(mode="json"), "machine": {}})
+    run = write_run(tmp_path / "run", plan, EVERY)
     section = draw_hardness(read_run(run))
     assert section is not None
     # what breaks in the scenario as it is breaks on every axis that passes it
@@ -126,11 +135,49 @@ def test_the_page_says_first_what_breaks_whom(tmp_path: Path, plan: Plan) -> Non
     page = write_page(run).read_text()
     assert page.index('id="hardness"') < page.index('id="results"')
     assert "c2c holds on 0 of 2 axes" in page
-    assert len(pd.read_csv(run / "hard.csv")) == 10 and len(pd.read_csv(run / "breaking_points.csv")) == 4
     assert (run / "hard.png").stat().st_size > 1000 and r"\textbf" in (run / "breaking_points.tex").read_text()
 
 
-def test_a_plan_without_axes_has_no_such_section(tmp_path: Path) -> None:
-    results = tables({(BASE, "c2c"): ("1", "2")})[0]
-    results.to_csv(tmp_path / "results.csv", index=False)
-    assert draw_hardness(read_run(tmp_path)) is None
+def test_the_page_needs_no_lists_of_regions_and_changes(tmp_path: Path, plan: Plan) -> None:
+    run = write_run(tmp_path / "run", plan, EVERY)
+    for name in ("regions", "changes"):
+        (run / f"{name}.csv").unlink()
+    assert "c2c holds on 0 of 2 axes" in write_page(run).read_text()
+
+
+def test_pairs_that_are_missing_give_no_verdict(tmp_path: Path, plan: Plan) -> None:
+    every = tables(EVERY)
+    is_left_out = [(each["scenario"] == BASE) & (each["variant"] == "c2c") & (each["seed"] == 8) for each in every]
+    some = [each[~mask] for each, mask in zip(every, is_left_out, strict=True)]
+    points = breaking_points(hardness_table(some[0], some[1], some[2], plan)).set_index(["axis", "variant"])
+    assert points["is_measured"].to_dict() == {
+        ("height", "tunnelcd"): True, ("height", "c2c"): False,
+        ("keyframes", "tunnelcd"): True, ("keyframes", "c2c"): False,
+    }  # fmt: skip
+    run = write_run(tmp_path / "run", plan, {case: found for case, found in EVERY.items() if case[1] != "c2c"})
+    section = draw_hardness(read_run(run))
+    assert section is not None
+    assert "c2c was not run at every step of any axis." in section.sentences
+
+
+def test_a_step_without_a_change_to_find_gives_no_verdict(plan: Plan) -> None:
+    results, regions, changes = tables(EVERY)
+    is_low = (results["scenario"] == LOW) & (results["variant"] == "c2c")
+    results.loc[is_low, "n_observable"] = 0
+    changes = changes[~((changes["scenario"] == LOW) & (changes["variant"] == "c2c"))]
+    results.loc[(results["scenario"] == BASE) & (results["seed"] == 8), "n_observable"] = float("nan")  # no world
+    changes = changes[~((changes["scenario"] == BASE) & (changes["seed"] == 8))]
+    regions = regions[~((regions["scenario"] == BASE) & (regions["seed"] == 8))]
+    table = hardness_table(results, regions, changes, plan)
+    of_c2c = table[(table["axis"] == "height") & (table["variant"] == "c2c")]
+    assert of_c2c["n_observable"].tolist() == [4, 2, 0]
+    assert of_c2c[["n_pairs", "n_judged"]].to_numpy().tolist() == [[2, 2], [2, 1], [2, 2]]
+    points = breaking_points(table).set_index(["axis", "variant"])
+    # broken at the second step is broken; that nobody could see a change at the third one is no failure
+    assert not points.loc[("height", "c2c"), "is_measured"] or points.loc[("height", "c2c"), "step"] == 2
+
+
+def test_a_plan_without_axes_has_no_such_section(tmp_path: Path, plan: Plan) -> None:
+    run = write_run(tmp_path / "run", plan.model_copy(update={"axes": ()}), EVERY)
+    assert draw_hardness(read_run(run)) is None
+    assert '<h2 id="hardness">' not in write_page(run).read_text()

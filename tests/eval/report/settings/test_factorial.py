@@ -49,7 +49,8 @@ def data(tmp_path: Path) -> RunData:
 def test_table_by_hand(data: RunData) -> None:
     table = factorial_table(data)
     assert list(dict.fromkeys(zip(table["source"], table["extraction"], strict=True))) == [
-        ("truth", "surface"), ("truth", "voxel"), ("c2c", "surface"), ("c2c", "voxel"), ("c2c", "clusters"),
+        ("oracle-regions", "surface"), ("oracle-regions", "voxel"), ("c2c", "surface"), ("c2c", "voxel"),
+        ("c2c", "clusters"),
     ]  # fmt: skip
     assert set(table["domain"]) == {"in", "out", "all"}
     whole = table[table["domain"] == "all"].set_index(["source", "extraction"])
@@ -75,6 +76,16 @@ def test_the_page_shows_the_combinations(data: RunData) -> None:
     # truth has no clusters of its own: an empty cell
     assert [list(row) for row in first.heat.texts] == [["1.00", "0.80", "\u2013"], ["0.60", "0.20", "0.50"]]
     assert picture(charts[0].drawing)
+
+
+def test_combinations_that_would_share_a_cell_are_not_crossed(tmp_path: Path) -> None:
+    twice = "c2c[extract.method=voxel,extract.voxel_m=0.4]"
+    data = run_of(
+        tmp_path,
+        *(rows_of(f"{name}{rule}", 0.6, 3) for name in ("c2c", "m3c2") for rule in (SURFACE, VOXEL)),
+        rows_of(twice, 0.9, 0),
+    )
+    assert len(factorial_table(data)) == 0
 
 
 def test_one_source_with_several_extractions_is_no_factorial(tmp_path: Path) -> None:
