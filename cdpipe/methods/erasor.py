@@ -93,6 +93,8 @@ def ground_mask(points: Float64Array, columns: Int64Array) -> BoolArray:
         points: (N, 3) points, z up, metres.
         columns: (N,) column of each point.
     """
+    if len(points) == 0:
+        return np.zeros(0, dtype=np.bool_)
     _, columns, counts = np.unique(columns, return_inverse=True, return_counts=True)
     by_height = np.lexsort((points[:, 2], columns))
     ranks = np.arange(len(points)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -100,9 +102,7 @@ def ground_mask(points: Float64Array, columns: Int64Array) -> BoolArray:
     base_m = np.bincount(columns[lowest], points[lowest, 2]) / np.bincount(columns[lowest])
     is_ground = points[:, 2] < base_m[columns] + _SEED_M
     for _ in range(_N_PLANES):
-        centres, normals = _fit_planes(points[is_ground], columns[is_ground], len(counts))
-        above_m = np.einsum("ij,ij->i", points - centres[columns], normals[columns])
-        is_ground = above_m < _GROUND_M
+        is_ground = points[:, 2] - _plane_heights(points, columns, is_ground) < _GROUND_M
     return is_ground
 
 
@@ -130,15 +130,21 @@ def _columns(points: Float64Array, settings: ErasorConfig) -> _Columns:
     return _Columns(columns, counts, np.where(counts > 0, tops_m - bottoms_m, 0.0), tops_m)
 
 
-def _fit_planes(points: Float64Array, columns: Int64Array, n_columns: int) -> tuple[Float64Array, Float64Array]:
-    """Return the (C, 3) centre and the (C, 3) upward unit normal of the points of each column."""
-    counts = np.maximum(np.bincount(columns, minlength=n_columns), 1)
-    centres = np.column_stack([np.bincount(columns, axis, n_columns) for axis in points.T]) / counts[:, None]
-    off = points - centres[columns]
-    products = np.einsum("ni,nj->nij", off, off).reshape(-1, 9)
-    spreads = np.column_stack([np.bincount(columns, product, n_columns) for product in products.T])
-    normals = np.linalg.eigh(spreads.reshape(-1, 3, 3))[1][:, :, 0]
-    return centres, np.where(normals[:, 2:] < 0, -normals, normals)
+def _plane_heights(points: Float64Array, columns: Int64Array, is_ground: BoolArray) -> Float64Array:
+    """Return the (N,) height at each point of the plane z = a x + b y + c that fits the ground of its column best.
+
+    The authors take the smallest principal axis of the ground as normal. It lies across a column that is narrower than
+    its objects are high.
+    """
+    ground, column_of = points[is_ground], columns[is_ground]
+    counts = np.maximum(np.bincount(column_of, minlength=columns.max() + 1), 1)
+    centres = np.column_stack([np.bincount(column_of, axis, len(counts)) for axis in ground.T]) / counts[:, None]
+    off = ground - centres[column_of]
+    products = [np.bincount(column_of, off[:, i] * off[:, j], len(counts)) for i in (0, 1) for j in (0, 1, 2)]
+    sums = np.stack(products, axis=1).reshape(-1, 2, 3)
+    slopes = np.einsum("cij,cj->ci", np.linalg.pinv(sums[:, :, :2], hermitian=True), sums[:, :, 2])
+    aside = points[:, :2] - centres[columns, :2]
+    return np.asarray(centres[columns, 2] + np.einsum("ni,ni->n", aside, slopes[columns]))
 
 
 def _floor_heights(positions: Float64Array, points: Float64Array) -> Float64Array:
