@@ -20,7 +20,10 @@ PRESETS = "tunnelcd.presets"
 SEARCH_PATH = "TUNNELCD_PATH"
 ABSENT = "absent"
 # Optional dependency of pyproject.toml -> the module that it installs.
-_EXTRAS = {"m3c2": "py4dgeo", "dufomap": "dufomap", "kiss": "kiss_matcher", "odometry": "kiss_icp", "ouster": "ouster"}
+_EXTRAS = {
+    "m3c2": "py4dgeo", "dufomap": "dufomap", "octomap": "pyoctomap", "kiss": "kiss_matcher", "odometry": "kiss_icp",
+    "ouster": "ouster",
+}  # fmt: skip
 
 
 def has_extra(name: str) -> bool:

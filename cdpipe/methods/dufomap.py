@@ -40,15 +40,12 @@ def dufomap(maps: PlacedMaps, session: SessionName, other: SessionName, config: 
     Returns:
         (N,) mask of the points of `session`.
     """
-    points = maps.points[session]
-    compared = np.flatnonzero(maps.is_compared(session, other))
-    point_map, points_odom = maps.merged.map_of(other), maps.merged.to_odom(other, points[compared])
+    compared, points_odom = maps.compared_in_odom(session, other)
     settings = config.dufomap
     void_map = load_dufomap().dufomap(settings.voxel_m, settings.hit_inflation_m, _UNKNOWN_VOXELS, THREADS)
-    for scan in range(0, len(point_map.odom_T_sensor), settings.every_scan):
-        returns = np.arange(*point_map.scan_offsets[scan : scan + 2])
-        void_map.run(point_map.positions_of(returns), _origin_pose(point_map.odom_T_sensor[scan, :3, 3]), False)
-    is_void = np.zeros(len(points), dtype=np.bool_)
+    for odom_T_sensor, returns_odom in maps.scans(other, settings.every_scan):
+        void_map.run(returns_odom, _origin_pose(odom_T_sensor[:3, 3]), False)
+    is_void = np.zeros(len(maps.points[session]), dtype=np.bool_)
     is_void[compared] = void_map.segment(points_odom, _origin_pose(np.zeros(3)), False)
     return is_void
 

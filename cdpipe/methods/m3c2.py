@@ -12,14 +12,15 @@ from __future__ import annotations
 
 import logging
 import os
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.threads import THREADS
 from cdpipe.methods.whole_map import PlacedMaps, WholeMap
-from cdpipe.model.config import PipelineConfig
+from cdpipe.model.config import M3C2Config, PipelineConfig
 from cdpipe.model.types import SessionName
 from cdpipe.query.query import query_nearest
 
@@ -40,27 +41,61 @@ def m3c2(maps: PlacedMaps, session: SessionName, other: SessionName, config: Pip
     Returns:
         (N,) mask of the points of `session`.
     """
+    found = measure_distances(maps, session, other, config.m3c2)
+    is_new = np.zeros(len(maps.points[session]), dtype=np.bool_)
+    # NaN where there is no distance, and where the points are too few to tell its error
+    is_new[found.core] = found.behind_m > np.fmax(found.levels_m, config.extract.distance_m)
+    return is_new
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Distances:
+    """What M3C2 measured at some map points of a session, its core points.
+
+    Attributes:
+        core: (C,) index of each among the session's map points.
+        behind_m: (C,) how far the other map's surface lies behind the own one, seen from the session's path, metres;
+            NaN where a cylinder holds no point.
+        levels_m: (C,) 95 % level of detection by the roughness of both surfaces, metres; may be NaN.
+        normals: (C, 3) unit normals; their sign means nothing.
+        n_own: (C,) points of the own map in the cylinder.
+        n_other: (C,) points of the other map in it.
+    """
+
+    core: Int64Array
+    behind_m: Float64Array
+    levels_m: Float64Array
+    normals: Float64Array
+    n_own: Int64Array
+    n_other: Int64Array
+
+
+def measure_distances(maps: PlacedMaps, session: SessionName, other: SessionName, settings: M3C2Config) -> Distances:
+    """Measure the distances of the compared map points of `session` to `other` along their normals."""
     py4dgeo = load_py4dgeo()
     points = maps.points[session]
     core = np.flatnonzero(maps.is_compared(session, other))
-    is_new = np.zeros(len(points), dtype=np.bool_)
     if len(core) == 0:
-        return is_new
+        none, no_counts = np.zeros(0), np.zeros(0, dtype=np.int64)
+        return Distances(core, none, none, np.zeros((0, 3)), no_counts, no_counts)
     algorithm = py4dgeo.M3C2(
         epochs=(py4dgeo.Epoch(points), py4dgeo.Epoch(maps.points[other])),
         corepoints=points[core],
-        normal_radii=[config.m3c2.normal_m],
-        cyl_radius=config.m3c2.cylinder_m,
-        max_distance=config.m3c2.depth_m,
+        normal_radii=[settings.normal_m],
+        cyl_radius=settings.cylinder_m,
+        max_distance=settings.depth_m,
     )
     distances_m, uncertainties = algorithm.run()
+    normals = algorithm.directions()
     seen_from = maps.path[session][query_nearest(points[core], maps.path[session])[1]]
-    is_towards_path = np.einsum("ij,ij->i", algorithm.directions(), seen_from - points[core]) > 0
-    behind_m = np.where(is_towards_path, -distances_m, distances_m)
-    # NaN where there is no distance, and where the points are too few to tell its error
-    limits_m = np.fmax(uncertainties["lodetection"], config.extract.distance_m)
-    is_new[core] = behind_m > limits_m
-    return is_new
+    is_towards_path = np.einsum("ij,ij->i", normals, seen_from - points[core]) > 0
+    return Distances(
+        core,
+        np.where(is_towards_path, -distances_m, distances_m),
+        uncertainties["lodetection"],
+        normals,
+        *(uncertainties[f"num_samples{epoch}"].astype(np.int64) for epoch in (1, 2)),
+    )
 
 
 def load_py4dgeo() -> Any:

@@ -26,8 +26,9 @@ from cdpipe.model.types import DescriptorSet, MergedMaps
 Detect = Callable[[MergedMaps, DescriptorSet, DescriptorSet, PipelineConfig], ChangeReport]
 Propose = Callable[[MergedMaps, DescriptorSet, DescriptorSet, PipelineConfig], ChangeRegions]
 
-# Sources of ours that need the extra of the same name (`cdpipe.core.plugins`), and its package.
-PACKAGES = {"m3c2": "py4dgeo", "dufomap": "dufomap"}
+# Sources of ours that need an extra (`cdpipe.core.plugins`), of the same name but for `_EXTRAS`, and its package.
+PACKAGES = {"m3c2": "py4dgeo", "m3c2-ep": "py4dgeo", "dufomap": "dufomap", "octomap": "pyoctomap"}
+_EXTRAS = {"m3c2-ep": "m3c2"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +86,7 @@ def load_method(name: str) -> Method:
             three kinds.
     """
     if name in PACKAGES:
-        require_extra(name, f"regions.source = {name}")
+        require_extra(_EXTRAS.get(name, name), f"regions.source = {name}")
     found: Any = load_entry_point(METHODS, name)
     made = found() if isinstance(found, type) else found
     propose = getattr(made, "propose", None)

@@ -6,7 +6,7 @@ clusters and scores are computed in the same way for all of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,6 +50,18 @@ class PlacedMaps:
             self.points[session], distance_upper_bound=radii_m.max() * (1 + 1e-6)
         )
         return np.asarray(gaps_m <= np.append(radii_m, -1.0)[nearest])
+
+    def compared_in_odom(self, session: SessionName, other: SessionName) -> tuple[Int64Array, Float64Array]:
+        """Return the (C,) compared map points of `session` and their (C, 3) positions in the odom frame of `other`."""
+        compared = np.flatnonzero(self.is_compared(session, other))
+        return compared, self.merged.to_odom(other, self.points[session][compared])
+
+    def scans(self, session: SessionName, every_scan: int) -> Iterator[tuple[Float64Array, Float64Array]]:
+        """Return the (4, 4) odom_T_sensor and the (R, 3) returns, odom frame, of every n-th scan of a session."""
+        point_map = self.merged.map_of(session)
+        for scan in range(0, len(point_map.odom_T_sensor), every_scan):
+            returns = np.arange(*point_map.scan_offsets[scan : scan + 2])
+            yield point_map.odom_T_sensor[scan], point_map.positions_of(returns)
 
 
 NewMask = Callable[[PlacedMaps, SessionName, SessionName, PipelineConfig], BoolArray]

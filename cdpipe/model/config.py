@@ -127,6 +127,8 @@ class MergeConfig(Settings):
     )
 
 
+# Settings that only the source of this name reads; a dump of another leaves them out where they are the defaults.
+_OF_ONE_SOURCE = ("removert", "octomap", "m3c2_ep", "erasor")
 # Sources that score keyframes; they read nothing but descriptors, maps and `query`, and cut out nothing.
 SOURCES_AT_KEYFRAMES = ("scan", "sphere", "sphere-difference", "every-keyframe", "random-regions")
 
@@ -138,8 +140,8 @@ class RegionsConfig(Settings):
         "scan",
         description=(
             "`scan`: the paper's query of scan descriptors; `sphere`: sphere descriptors; `sphere-difference`, "
-            "`every-keyframe`, `random-regions`; `voxel-diff`, `c2c`, `m3c2`, `dufomap`: clusters of a whole-map "
-            "comparison; or a plugin's, by its registered name"
+            "`every-keyframe`, `random-regions`; `voxel-diff`, `c2c`, `m3c2`, `m3c2-ep`, `dufomap`, `octomap`, "
+            "`removert`, `erasor`: clusters of a whole-map comparison; or a plugin's, by its registered name"
         ),
     )
 
@@ -226,9 +228,9 @@ class ClusterConfig(Settings):
 class M3C2Config(Settings):
     """Distances along normals (M3C2)."""
 
-    normal_m: Positive = Field(1.0, description="`m3c2`: radius within which a point's normal is estimated")
-    cylinder_m: Positive = Field(0.25, description="`m3c2`: radius of the cylinder along the normal")
-    depth_m: Positive = Field(1.5, description="`m3c2`: length of the cylinder to either side")
+    normal_m: Positive = Field(1.0, description="`m3c2`, `m3c2-ep`: radius within which a point's normal is estimated")
+    cylinder_m: Positive = Field(0.25, description="`m3c2`, `m3c2-ep`: radius of the cylinder along the normal")
+    depth_m: Positive = Field(1.5, description="`m3c2`, `m3c2-ep`: length of the cylinder to either side")
 
 
 class DufomapConfig(Settings):
@@ -237,6 +239,43 @@ class DufomapConfig(Settings):
     voxel_m: Cell = Field(0.1, description="`dufomap`: voxel of the void map")
     hit_inflation_m: NonNegative = Field(0.2, description="`dufomap`: not void within this distance of a return (d_s)")
     every_scan: Count = Field(1, description="`dufomap`: the rays of every n-th scan are cast")
+
+
+class RemovertConfig(Settings):
+    """Range images that see through what is not there (Removert)."""
+
+    pixel_deg: Annotated[float, Field(ge=0.1, le=10)] = Field(
+        1.4, description="`removert`: pixel of the fine range image; that of the coarse one is 2.5 times as wide"
+    )
+    margin: Share = Field(
+        0.05, description="`removert`: a scan sees through a point if it is farther by this share of the point's range"
+    )
+    every_scan: Count = Field(1, description="`removert`: every n-th scan is compared")
+
+
+class OctomapConfig(Settings):
+    """Probability that a voxel is occupied (OctoMap)."""
+
+    voxel_m: Cell = Field(0.1, description="`octomap`: voxel of the occupancy map")
+    free_below: Share = Field(0.5, description="`octomap`: a voxel is free if its probability is lower")
+    every_scan: Count = Field(1, description="`octomap`: the rays of every n-th scan are cast")
+
+
+class M3C2EPConfig(Settings):
+    """Standard deviations from which M3C2-EP propagates its level of detection."""
+
+    range_m: Positive = Field(0.02, description="`m3c2-ep`: standard deviation of a range")
+    angle_deg: Positive = Field(0.1, description="`m3c2-ep`: standard deviation of the angles of a return")
+    alignment_m: NonNegative = Field(0.02, description="`m3c2-ep`: standard deviation of the alignment, each axis")
+
+
+class ErasorConfig(Settings):
+    """Heights of columns around the sensor (ERASOR)."""
+
+    max_range_m: Positive = Field(80.0, description="`erasor`: radius of the 20 rings of columns")
+    max_height_m: Positive = Field(3.0, description="`erasor`: points higher above the floor are not used")
+    scan_ratio: Share = Field(0.2, description="`erasor`: a column is flat if it is lower than this share of the map's")
+    every_scan: Count = Field(1, description="`erasor`: every n-th scan is compared")
 
 
 class PipelineConfig(Settings):
@@ -262,6 +301,10 @@ class PipelineConfig(Settings):
     cluster: ClusterConfig = ClusterConfig()
     m3c2: M3C2Config = M3C2Config()
     dufomap: DufomapConfig = DufomapConfig()
+    removert: RemovertConfig = RemovertConfig()
+    octomap: OctomapConfig = OctomapConfig()
+    m3c2_ep: M3C2EPConfig = M3C2EPConfig()
+    erasor: ErasorConfig = ErasorConfig()
     options: dict[str, bool | int | float | str] = Field(
         {}, description="settings of a plugin's method, by its own names"
     )
@@ -277,7 +320,10 @@ class PipelineConfig(Settings):
 
     @model_serializer(mode="wrap")
     def _without_empty_groups(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {name: value for name, value in handler(self).items() if name not in ("options", "sphere") or value}
+        own, fields = self.regions.source.replace("-", "_"), type(self).model_fields
+        of_others = [name for name in _OF_ONE_SOURCE if name != own and getattr(self, name) == fields[name].default]
+        found = {name: value for name, value in handler(self).items() if name not in of_others}
+        return {name: value for name, value in found.items() if name not in ("options", "sphere") or value}
 
 
 def preset_names() -> list[str]:

@@ -150,6 +150,19 @@ def void() -> str:
     return "tells air from wall"
 
 
+def free_space() -> str:
+    """Tell a voxel that a ray passed from the voxel where it ended (pyoctomap)."""
+    import numpy as np
+
+    from cdpipe.methods.octomap import load_pyoctomap
+
+    tree = load_pyoctomap().OcTree(0.1)
+    tree.insertPointCloud(np.array([[2.05, 0.05, 0.05]]), np.array([0.05, 0.05, 0.05]))
+    labels = tree.getLabels(np.array([[1.05, 0.05, 0.05], [2.05, 0.05, 0.05]])).tolist()
+    _require(labels == [0, 1], f"a passed voxel and one that was hit have the labels {labels}")
+    return "tells a free voxel from an occupied one"
+
+
 def sdk() -> str:
     """Let the vendor's SDK load (ouster-sdk)."""
     from cdpipe.io.ouster.sdk import require_sdk
@@ -194,6 +207,7 @@ OF_EXTRA: dict[str, Callable[[], str]] = {
     "kiss": coarse_merge,
     "m3c2": surface_distance,
     "dufomap": void,
+    "octomap": free_space,
     "cluster": cluster,
 }
 

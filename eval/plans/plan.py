@@ -74,7 +74,9 @@ from eval.plans.worlds import (
 _MOST_SEEDS = 100_000
 _NO_THRESHOLDS: Mapping[str, Any] = {"thresholds": {}}
 _MAY_BE_LEFT_OUT = ("split", "set", "thresholds", "axes")
-_AFTER_MERGE = ("query", "extract", "outlier", "cluster", "m3c2", "dufomap")
+_AFTER_MERGE = (
+    "query", "extract", "outlier", "cluster", "m3c2", "dufomap", "removert", "octomap", "m3c2_ep", "erasor",
+)  # fmt: skip
 
 
 def _mistake(where: tuple[str | int, ...], written: str, rule: str) -> InitErrorDetails:

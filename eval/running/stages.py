@@ -43,6 +43,8 @@ from eval.running.stage_results import is_kept, name_result, pack, unpack
 REPEAT_BELOW_S = 1.0
 REPEATS = 3
 _POSE_BYTES = 28.0
+# Sources that compare the other map to single scans; their section of the settings says to which.
+_SCAN_READERS = ("dufomap", "octomap", "removert", "erasor")
 # These stages warm up by themselves and run once; they do not count for a method that uses no descriptors.
 _OF_DESCRIPTORS = ("descriptors", "spheres")
 
@@ -176,7 +178,7 @@ def kept_bytes(before: MappedSession, config: PipelineConfig) -> dict[str, float
 
     All as float32: x, y, z of every map point; for a descriptor one vector and one pose (7 numbers) per keyframe, and
     the width of the drift where the radius follows it. Random regions and every keyframe need no vector. Any other
-    source keeps the map; `dufomap` also keeps the returns of the scans that it casts.
+    source keeps the map; those that read single scans also keep the returns of these.
     """
     map_bytes = 12.0 * len(before.map.points)
     source = config.regions.source
@@ -187,8 +189,9 @@ def kept_bytes(before: MappedSession, config: PipelineConfig) -> dict[str, float
         kept = pose_bytes * n_keyframes
     elif vectors is not None:
         kept = pose_bytes * n_keyframes + float(vectors.nbytes)
-    elif source == "dufomap":
-        kept = map_bytes + 12.0 * float(np.diff(before.map.scan_offsets)[:: config.dufomap.every_scan].sum())
+    elif source in _SCAN_READERS:
+        every_scan = getattr(config, source).every_scan
+        kept = map_bytes + 12.0 * float(np.diff(before.map.scan_offsets)[::every_scan].sum())
     else:
         kept = map_bytes
     return {"bytes_map_before": map_bytes, "bytes_regions_before": kept}

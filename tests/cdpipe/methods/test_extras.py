@@ -1,4 +1,4 @@
-"""The rivals that need an extra, in a room of known boxes."""
+"""The rivals that ask for normals, rays or range images, in a room of known boxes; some need an extra."""
 
 import importlib.util
 import logging
@@ -9,9 +9,11 @@ import pytest
 
 from cdpipe.core.geometry import Float64Array, stream, transform, yaw_pose
 from cdpipe.methods.dufomap import dufomap
-from cdpipe.methods.m3c2 import m3c2
+from cdpipe.methods.m3c2 import Distances, m3c2
+from cdpipe.methods.m3c2_ep import detection_levels, m3c2_ep
+from cdpipe.methods.octomap import octomap
 from cdpipe.methods.whole_map import PlacedMaps
-from cdpipe.model.config import load_config
+from cdpipe.model.config import M3C2EPConfig, load_config
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, SessionName
 from cdpipe.pipeline import detect_changes
@@ -19,7 +21,9 @@ from eval.running.stages import kept_bytes
 from tests.cdpipe.rooms import Box, RoomScans
 
 Command = Callable[..., tuple[int, str, str]]
-PACKAGES = {"m3c2": "py4dgeo", "dufomap": "dufomap"}
+PACKAGES = {"m3c2": "py4dgeo", "m3c2-ep": "py4dgeo", "dufomap": "dufomap", "octomap": "pyoctomap"}
+# The room has seven scans, fewer than the presets leave out.
+SETTINGS_OF = {"octomap": ("octomap.every_scan=1",), "removert": ("removert.every_scan=1",)}
 
 
 def needs(method: str) -> pytest.MarkDecorator:
@@ -27,7 +31,7 @@ def needs(method: str) -> pytest.MarkDecorator:
     return pytest.mark.skipif(is_missing, reason=f"needs the extra `{method}`: {PACKAGES[method]}")
 
 
-both = pytest.mark.parametrize("method", [pytest.param(name, marks=needs(name)) for name in PACKAGES])
+every = pytest.mark.parametrize("method", ["removert", *(pytest.param(name, marks=needs(name)) for name in PACKAGES)])
 
 CRATE: Box = ((1.0, 1.2, 0.0), (1.8, 2.2, 0.9))
 ODOM_T_ROOM = yaw_pose(0.7, (3.0, -2.0, 0.5))
@@ -59,7 +63,7 @@ def merged(before: PointMap, after: PointMap, before_T_after: Float64Array) -> M
 
 
 def answer(method: str, maps: MergedMaps, settings: Sequence[str] = ()) -> ChangeReport:
-    config = load_config(method, [*SETTINGS, *settings])
+    config = load_config(method, [*SETTINGS, *SETTINGS_OF.get(method, ()), *settings])
     mapped = [MappedSession(each, descriptors(each)) for each in (maps.before, maps.after)]
     return detect_changes(*mapped, config, merge=lambda before, after: maps)
 
@@ -68,7 +72,7 @@ def returns_of(report: ChangeReport) -> set[tuple[int, int]]:
     return {(int(scan), int(pixel)) for item in report.objects for scan, pixel in item.returns}
 
 
-@both
+@every
 def test_an_added_crate_is_found_and_a_removed_one_too(
     method: str, empty: PointMap, crated: PointMap, crated_scans: RoomScans
 ) -> None:
@@ -89,7 +93,7 @@ def test_an_added_crate_is_found_and_a_removed_one_too(
         np.testing.assert_allclose(centre, np.mean(CRATE, axis=0), atol=0.35)
 
 
-@both
+@every
 def test_nothing_changed(method: str, empty: PointMap) -> None:
     again = RoomScans([], 2, odom_T_room=ODOM_T_ROOM).mapped()
     report = answer(method, merged(empty, again, np.linalg.inv(ODOM_T_ROOM)))
@@ -98,7 +102,7 @@ def test_nothing_changed(method: str, empty: PointMap) -> None:
     assert report.regions.keyframe_scores.tolist() == [0.0] * len(report.keyframe_scans[0])
 
 
-@both
+@every
 def test_where_the_odometry_started_matters_little(method: str, empty: PointMap, crated: PointMap) -> None:
     # maps are thinned, and rays cast, in cells of the session's own odom frame: not the same to the bit
     elsewhere = yaw_pose(-1.1, (50.0, 7.0, -3.0))
@@ -108,6 +112,12 @@ def test_where_the_odometry_started_matters_little(method: str, empty: PointMap,
     np.testing.assert_allclose(first.regions.centres_map, second.regions.centres_map, atol=0.15)
     one, other = returns_of(first), returns_of(second)
     assert len(one & other) / len(one | other) > 0.7
+
+
+@every
+def test_where_the_other_session_did_not_come_nothing_is_new(method: str, empty: PointMap, crated: PointMap) -> None:
+    report = answer(method, merged(empty, crated, yaw_pose(0.0, (500.0, 0.0, 0.0))))
+    assert (len(report.regions.scores), report.objects) == (0, ())
 
 
 def plane(z_m: float) -> Float64Array:
@@ -209,10 +219,67 @@ def test_dufomap_says_nothing(empty: PointMap, capfd: pytest.CaptureFixture[str]
     assert capfd.readouterr() == ("", "")
 
 
-def test_dufomap_keeps_the_map_and_the_returns_whose_rays_it_casts(empty: PointMap) -> None:
-    kept = kept_bytes(MappedSession(empty, descriptors(empty)), load_config("dufomap", ["dufomap.every_scan=5"]))
+@pytest.mark.parametrize("method", ["dufomap", "octomap", "removert", "erasor"])
+def test_a_rival_keeps_the_map_and_the_returns_of_the_scans_that_it_reads(method: str, empty: PointMap) -> None:
+    kept = kept_bytes(MappedSession(empty, descriptors(empty)), load_config(method, [f"{method}.every_scan=5"]))
     n_cast = sum(int(np.diff(empty.scan_offsets)[scan]) for scan in range(0, len(empty.odom_T_sensor), 5))
     assert kept == {
         "bytes_map_before": 12.0 * len(empty.points),
         "bytes_regions_before": 12.0 * (len(empty.points) + n_cast),
     }
+
+
+@needs("octomap")
+def test_octomap_by_hand(empty: PointMap) -> None:
+    """The room ends at x = 5: free in front of that wall, occupied at it, and unknown behind it."""
+    x_m = np.array([0.55, 3.05, 4.55, 5.0, 5.55])
+    points = np.column_stack([x_m, np.full(len(x_m), 0.05), np.full(len(x_m), 1.55)])
+    sessions = merged(empty, empty, np.eye(4))
+    maps, short = (placed(points, points, np.zeros((1, 3)), sessions, radius_m) for radius_m in (9.0, 1.0))
+
+    def is_free(session: SessionName, other: SessionName, maps: PlacedMaps = maps) -> list[bool]:
+        config = load_config("octomap", ["octomap.voxel_m=0.1", "octomap.free_below=0.3", "octomap.every_scan=1"])
+        return octomap.new_mask(maps, session, other, config).tolist()
+
+    assert is_free("after", "before") == is_free("before", "after") == [True, True, True, False, False]
+    assert not any(is_free("after", "before", maps=short))
+
+
+@needs("octomap")
+@pytest.mark.parametrize(("n_scans", "free_below", "is_free"), [(2, 0.3, False), (3, 0.3, True), (2, 0.31, True)])
+def test_octomap_counts_misses(n_scans: int, free_below: float, is_free: bool) -> None:
+    # odds of (0.4 / 0.6) ** 2 = 0.44 are a probability of 0.308, those of the third power one of 0.229
+    scanned = RoomScans([], 1, path=[(0.02, 0.02, 1.52)] * n_scans).mapped()
+    points = np.array([[3.05, 0.05, 1.55]])
+    maps = placed(points, points, np.zeros((1, 3)), merged(scanned, scanned, np.eye(4)))
+    config = load_config("octomap", ["octomap.voxel_m=0.1", f"octomap.free_below={free_below}", "octomap.every_scan=1"])
+    assert octomap.new_mask(maps, "after", "before", config).tolist() == [is_free]
+
+
+@needs("m3c2-ep")
+@pytest.mark.parametrize(("rose_m", "share"), [(0.13, 0.0), (0.15, 1.0)])
+def test_m3c2_ep_of_a_plane_that_rose_by_hand(rose_m: float, share: float, empty: PointMap) -> None:
+    # with exact ranges and angles the level is sqrt(7.815) = 2.796 standard deviations of the alignment: 0.140 m
+    settings = ("m3c2_ep.alignment_m=0.05", "m3c2_ep.range_m=1e-6", "m3c2_ep.angle_deg=1e-6", "m3c2.cylinder_m=0.5")
+    maps = placed(plane(0.0), plane(rose_m), np.array([[0.0, 0.0, 2.0]]), merged(empty, empty, np.eye(4)))
+    config = load_config("m3c2-ep", settings)
+    # corners of the planes have too few points
+    is_inner = np.abs(plane(0.0)[:, :2]).max(axis=1) < 2.0
+    assert m3c2_ep.new_mask(maps, "after", "before", config)[is_inner].mean() == share
+    assert m3c2_ep.new_mask(maps, "before", "after", config).mean() == 0.0
+
+
+def test_levels_of_detection_by_hand() -> None:
+    """Points 3 m below one path and 2 m above the other: along the normal ranges err, across it angles do."""
+    normals = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    n_own, n_other, unused = np.array([9, 9, 4]), np.array([6, 6, 9]), np.zeros(3)
+    found = Distances(np.arange(3), unused, unused, normals, n_own, n_other)
+    settings = M3C2EPConfig(range_m=0.06, angle_deg=np.rad2deg(0.01), alignment_m=0.0)
+    paths = np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -2.0]])
+    levels_m = detection_levels(np.zeros((3, 3)), *paths, found, settings)
+    along_m2, across_m2 = 0.06**2 / 9 + 0.06**2 / 6, 0.03**2 / 9 + 0.02**2 / 6
+    expected_m = np.sqrt(7.815 * np.array([along_m2, across_m2, np.nan]))
+    np.testing.assert_allclose(levels_m, expected_m, rtol=1e-6)
+    # the error of the alignment is added, and no average reduces it
+    aligned = detection_levels(np.zeros((3, 3)), *paths, found, settings.model_copy(update={"alignment_m": 0.05}))
+    np.testing.assert_allclose(aligned**2 - levels_m**2, 7.815 * 0.05**2 * np.array([1, 1, np.nan]), rtol=1e-6)

@@ -9,10 +9,10 @@ from cdpipe.core.plugins import METHODS, entry_points
 from cdpipe.methods.registry import load_method
 
 Command = Callable[..., tuple[int, str, str]]
-PACKAGES = {"m3c2": "py4dgeo", "dufomap": "dufomap"}
+EXTRAS = {"m3c2": "m3c2", "m3c2-ep": "m3c2", "dufomap": "dufomap", "octomap": "octomap"}
 
 
-@pytest.mark.parametrize("method", PACKAGES)
+@pytest.mark.parametrize("method", EXTRAS)
 def test_a_missing_extra_is_named_before_anything_is_mapped(
     method: str, tiny_pair: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -21,10 +21,10 @@ def test_a_missing_extra_is_named_before_anything_is_mapped(
     folders = (tiny_pair / "before", tiny_pair / "after", "--preset", method, "--out", tmp_path / "out")
     code, out, err = command("detect", *folders)
     assert code == 2
-    assert f"regions.source = {method} needs a package more: pip install 'tunnelcd[{method}]'" in err
+    assert f"regions.source = {method} needs a package more: pip install 'tunnelcd[{EXTRAS[method]}]'" in err
     assert not (tmp_path / "out").exists()
     assert out == ""
-    for name in entry_points(METHODS).keys() - PACKAGES.keys():
+    for name in entry_points(METHODS).keys() - EXTRAS.keys():
         load_method(name)
-    with pytest.raises(InputError, match=rf"pip install 'tunnelcd\[{method}\]'"):
+    with pytest.raises(InputError, match=rf"pip install 'tunnelcd\[{EXTRAS[method]}\]'"):
         load_method(method)
