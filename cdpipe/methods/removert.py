@@ -1,8 +1,8 @@
 """Removert (Kim, Kim 2020): what the other session's range images see through, at two resolutions.
 
 Removert removes moving objects from a map. It projects a scan and the map around it into range images. A map point is
-removed if it is the nearest of its pixel and the scan measured farther there; then it is reverted if coarser images do
-not confirm it. For two sessions, the scans of one are compared to the map points of the other, in both directions.
+removed if it is the nearest of its pixel and the scan measured farther there. It is reverted if coarser images do not
+confirm it. For two sessions, the scans of one are compared to the map points of the other, in both directions.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ SPACING_M = 0.2
 SENSOR = (0.0, 0.0, 1.0)
 ROOF_M = 2.6
 PUBLISHED = ErasorConfig()
+AS_PUBLISHED = ("erasor.max_range_m=80", "erasor.max_height_m=3")
 
 
 def grid(low: Sequence[float], high: Sequence[float]) -> Float64Array:
@@ -111,7 +112,7 @@ def test_two_sessions_with_and_without_the_box(room: Float64Array, is_found: boo
         points = {name: merged.to_map(name, merged.map_of(name).points) for name in (session, other)}
         path, radii_m = np.array([SENSOR]), np.array([9.0])
         maps = PlacedMaps(merged, points, {session: path, other: path}, {session: radii_m, other: radii_m})
-        found = erasor.new_mask(maps, session, other, load_config("erasor"))
+        found = erasor.new_mask(maps, session, other, load_config("erasor", AS_PUBLISHED))
         assert found[: len(BOX)].mean() == pytest.approx(float(is_found), abs=0.05)
         assert not found[len(BOX) :].any()
 
@@ -128,4 +129,4 @@ def test_far_from_the_other_session_nothing_is_new() -> None:
         dict.fromkeys(names, radii_m),
     )
     for session, other in (names, names[::-1]):
-        assert not erasor.new_mask(maps, session, other, load_config("erasor")).any()
+        assert not erasor.new_mask(maps, session, other, load_config("erasor", AS_PUBLISHED)).any()

@@ -238,6 +238,9 @@ def test_an_answer_names_the_optional_packages_that_it_depends_on(monkeypatch: p
     assert list_extras(m3c2, {}) == {"py4dgeo": "py4dgeo 1"}
     assert list_extras(m3c2, {}, proposes=False) == {}
     assert list(list_extras(load_config("dufomap"), {"kiss_matcher": 1.0})) == ["kiss-matcher", "dufomap"]
+    assert list_extras(load_config("m3c2-ep"), {}) == {"py4dgeo": "py4dgeo 1"}
+    assert list_extras(load_config("octomap"), {}) == {"pyoctomap": "pyoctomap 1"}
+    assert list_extras(load_config("removert"), {}) == list_extras(load_config("erasor"), {}) == {}
 
 
 def test_figures_are_of_the_after_map() -> None:

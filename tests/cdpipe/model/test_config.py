@@ -171,3 +171,17 @@ def test_settings_of_before_there_were_weights_and_frames_are_dumped_as_then() -
     dumped = load_config("tunnelcd", ["sphere.weights=a"]).model_dump(mode="json")
     assert dumped["sphere"] == {"frames": "path", "weights": "a"}
     assert PipelineConfig.model_validate(dumped).sphere.weights == "a"
+
+
+def test_a_dump_names_the_settings_of_one_rival_only_where_they_count() -> None:
+    own = {"removert", "octomap", "m3c2_ep", "erasor"}
+
+    def named(preset: str, *settings: str) -> set[str]:
+        return own & load_config(preset, settings).model_dump().keys()
+
+    assert named("tunnelcd") == named("dufomap") == set()
+    assert (named("m3c2-ep"), named("erasor")) == ({"m3c2_ep"}, {"erasor"})
+    assert named("erasor", "removert.margin=0.3") == {"erasor", "removert"}
+    for preset in ("tunnelcd", "erasor"):
+        config = load_config(preset, ["removert.margin=0.3"])
+        assert PipelineConfig.model_validate(config.model_dump()) == config
