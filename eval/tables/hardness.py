@@ -65,25 +65,33 @@ def breaking_points(table: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         `step` and `value` of the first step with a recall below one half, 0 and "" where it holds; `recall`, the
-        recall there, and that of the last step where it holds; `is_measured`, whether every planned pair of all steps
-        up to that one was run, and there was a change to find at each.
+        recall there with its 95 % interval, and that of the last step where it holds; `n_judged`, the pairs of that
+        step, and `n_failed`, those of them without an answer; `is_measured`, whether every planned pair of all steps up
+        to that one was run and has a world, and there was a change to find at each.
     """
     rows = []
     for (axis, variant), own in table.groupby(["axis", "variant"], sort=False) if len(table) else ():
         recall = own[_RECALL].to_numpy(dtype=np.float64)
         broken = np.flatnonzero(~(recall >= BROKEN_BELOW))
         place = int(broken[0]) if len(broken) else len(own) - 1
-        is_run = (own["n_pairs"] >= own["n_planned"]).to_numpy() & ~np.isnan(recall)
+        is_run = (own["n_judged"] >= own["n_planned"]).to_numpy() & ~np.isnan(recall)
         is_measured = bool(is_run[: place + 1].all())
         holds = len(broken) == 0
         at = own.iloc[place]
         rows.append(
             {
                 "axis": axis, "unit": at["unit"], "variant": variant, "step": 0 if holds else int(at["step"]),
-                "value": "" if holds else at["value"], "recall": float(recall[place]), "is_measured": is_measured,
+                "value": "" if holds else at["value"], "recall": float(recall[place]), **_spread(at),
+                "is_measured": is_measured,
             }
         )  # fmt: skip
     return pd.DataFrame(rows)
+
+
+def _spread(at: pd.Series[Any]) -> dict[str, float]:
+    """Return the interval of the recall of a row of `hardness_table`, and the pairs that it is of."""
+    ends = {f"recall_{end}": float(at.get(f"{_RECALL}_{end}", math.nan)) for end in ("low", "high")}
+    return {**ends, "n_judged": int(at["n_judged"]), "n_failed": int(at["n_failed"])}
 
 
 def _variants_of_step(plan: Plan, step: Step) -> list[str]:

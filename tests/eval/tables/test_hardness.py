@@ -96,6 +96,9 @@ def test_breaking_points(plan: Plan) -> None:
     # broken at the second step, whatever comes after
     assert points.loc[("height", "c2c"), ["step", "value", "recall"]].tolist() == [2, 0.8, 0.25]
     assert points.loc[("keyframes", "tunnelcd"), ["step", "value", "recall"]].tolist() == [2, 4, 0.0]
+    # the answered pair has one half, the refused one nothing: two pairs, of which one failed
+    spread = ["recall_low", "recall_high", "n_judged", "n_failed"]
+    assert points.loc[("height", "c2c"), spread].tolist() == [0.0, 0.5, 2, 1]
     assert points["is_measured"].all()
 
 
@@ -173,8 +176,9 @@ def test_a_step_without_a_change_to_find_gives_no_verdict(plan: Plan) -> None:
     assert of_c2c["n_observable"].tolist() == [4, 2, 0]
     assert of_c2c[["n_pairs", "n_judged"]].to_numpy().tolist() == [[2, 2], [2, 1], [2, 2]]
     points = breaking_points(table).set_index(["axis", "variant"])
-    # broken at the second step is broken; that nobody could see a change at the third one is no failure
-    assert not points.loc[("height", "c2c"), "is_measured"] or points.loc[("height", "c2c"), "step"] == 2
+    # a pair whose world could not be built is no pair, and at the third step nobody could see a change
+    assert points["is_measured"].to_dict() == dict.fromkeys(points.index, False)
+    assert points.loc[("height", "tunnelcd"), "n_judged"] == 2  # at the last step; the second one lacks a pair
 
 
 def test_a_plan_without_axes_has_no_such_section(tmp_path: Path, plan: Plan) -> None:
