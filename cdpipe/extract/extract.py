@@ -59,7 +59,7 @@ def cut_objects(merged: MergedMaps, regions: ChangeRegions, config: PipelineConf
             others = spheres[other].points
             is_old = ~new_points_mask(points, others, extract) if is_voxel else is_within(points, others, reach_m)
             new = np.flatnonzero(~is_old & ~is_taken[session][indices])
-            for members in cluster_inliers(points, new, config):
+            for members in cluster_inliers(points, new, config.outlier, config.cluster):
                 groups.append(PointGroup(session, indices[members], points[members], region))
                 is_taken[session][indices[members]] = True
     return groups

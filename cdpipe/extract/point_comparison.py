@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.voxel import cell_keys
-from cdpipe.model.config import ClusterConfig, ExtractConfig, OutlierConfig, PipelineConfig
+from cdpipe.model.config import ClusterConfig, ExtractConfig, OutlierConfig
 
 _MAX_DENSE_CELLS = 1 << 22
 
@@ -88,16 +88,19 @@ def label_clusters(points: Float64Array, config: ClusterConfig) -> Int64Array:
     return labels[groups]
 
 
-def cluster_inliers(points: Float64Array, new: Int64Array, config: PipelineConfig) -> list[Int64Array]:
+def cluster_inliers(
+    points: Float64Array, new: Int64Array, outlier: OutlierConfig, cluster: ClusterConfig
+) -> list[Int64Array]:
     """Return the indices into (N, 3) points of each cluster of the new ones, without outliers, largest cluster first.
 
     Args:
         points: (N, 3) points, metres.
         new: (M,) indices of the new points.
-        config: `outlier` and `cluster` are used.
+        outlier: Of the outlier removal.
+        cluster: Of the clusters.
     """
-    new = new[inlier_mask(points[new], config.outlier)]
-    labels = label_clusters(points[new], config.cluster)
+    new = new[inlier_mask(points[new], outlier)]
+    labels = label_clusters(points[new], cluster)
     return [new[labels == label] for label in range(labels.max(initial=-1) + 1)]
 
 

@@ -11,8 +11,8 @@ from cdpipe.model.types import SessionName
 
 @WholeMap
 def c2c(maps: PlacedMaps, session: SessionName, other: SessionName, config: PipelineConfig) -> BoolArray:
-    """Mark the map points of `session` farther than `extract.distance_m` from every point of `other`.
+    """Mark the map points of `session` farther than `c2c.distance_m` from every point of `other`.
 
     CloudCompare and others measure this distance to the nearest point.
     """
-    return ~is_within(maps.points[session], maps.points[other], config.extract.distance_m)
+    return ~is_within(maps.points[session], maps.points[other], config.c2c.distance_m)

@@ -2,7 +2,7 @@
 
 The normal at a map point is that of the plane through its own map around it. The distance is that between the mean
 points of both maps within a cylinder along the normal. A point is new if the distance is larger than its 95 % level of
-detection and than `extract.distance_m`, and if the other map's surface lies behind the point, seen from the session's
+detection and than `m3c2.distance_m`, and if the other map's surface lies behind the point, seen from the session's
 own path: a crate stands in front of the floor, and the floor under it is hidden, not removed.
 """
 
@@ -35,8 +35,8 @@ def m3c2(maps: PlacedMaps, session: SessionName, other: SessionName, config: Pip
         maps: Both maps.
         session: The session whose points are marked.
         other: The session they are compared to.
-        config: `m3c2`, `extract.distance_m` and `query.radius_m` are used. Points farther than that from the other path
-            are not compared, so they are not measured.
+        config: `m3c2` and `query.radius_m` are used. Points farther than that from the other path are not compared, so
+            they are not measured.
 
     Returns:
         (N,) mask of the points of `session`.
@@ -44,7 +44,7 @@ def m3c2(maps: PlacedMaps, session: SessionName, other: SessionName, config: Pip
     found = measure_distances(maps, session, other, config.m3c2)
     is_new = np.zeros(len(maps.points[session]), dtype=np.bool_)
     # NaN where there is no distance, and where the points are too few to tell its error
-    is_new[found.core] = found.behind_m > np.fmax(found.levels_m, config.extract.distance_m)
+    is_new[found.core] = found.behind_m > np.fmax(found.levels_m, config.m3c2.distance_m)
     return is_new
 
 

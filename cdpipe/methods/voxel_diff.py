@@ -5,11 +5,11 @@ from __future__ import annotations
 from cdpipe.core.geometry import BoolArray
 from cdpipe.extract.point_comparison import new_points_mask
 from cdpipe.methods.whole_map import PlacedMaps, WholeMap
-from cdpipe.model.config import PipelineConfig
+from cdpipe.model.config import ExtractConfig, PipelineConfig
 from cdpipe.model.types import SessionName
 
 
 @WholeMap
 def voxel_diff(maps: PlacedMaps, session: SessionName, other: SessionName, config: PipelineConfig) -> BoolArray:
-    """Mark the map points of `session` in a voxel (`extract.voxel_m`) that is empty in `other`."""
-    return new_points_mask(maps.points[session], maps.points[other], config.extract)
+    """Mark the map points of `session` in a voxel (`voxel_diff.voxel_m`) that is empty in `other`."""
+    return new_points_mask(maps.points[session], maps.points[other], ExtractConfig(voxel_m=config.voxel_diff.voxel_m))

@@ -16,7 +16,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.extract.clusters import cluster_centroids, cluster_groups
 from cdpipe.extract.crops import DIRECTIONS, SESSIONS
 from cdpipe.extract.point_comparison import cluster_inliers, is_within
-from cdpipe.model.config import PipelineConfig
+from cdpipe.model.config import ClusterConfig, PipelineConfig
 from cdpipe.model.report import ChangeRegions, Clusters
 from cdpipe.model.types import DescriptorSet, MergedMaps, SessionName
 from cdpipe.query.difference import marked_share
@@ -95,16 +95,18 @@ class WholeMap:
             merged: Both maps, in one frame.
             before: Gives the keyframe scans of the before session.
             after: Gives those of the after session.
-            config: `outlier`, `cluster` and `query` are used, and whatever `new_mask` uses.
+            config: `outlier`, `cluster.radius_m`, `regions.min_points` and `query` are used, and whatever `new_mask`
+                uses.
         """
         maps = _place(merged, before, after, config)
+        clusters_of = ClusterConfig(radius_m=config.cluster.radius_m, min_points=config.regions.min_points)
         found: list[Int64Array] = []
         is_after: list[bool] = []
         is_changed: dict[SessionName, BoolArray] = {}
         for session, other in DIRECTIONS:
             points = maps.points[session]
             new = np.flatnonzero(self.new_mask(maps, session, other, config) & maps.is_compared(session, other))
-            of_session = cluster_inliers(points, new, config)
+            of_session = cluster_inliers(points, new, config.outlier, clusters_of)
             found += of_session
             is_after += [session == "after"] * len(of_session)
             is_changed[session] = np.zeros(len(points), dtype=np.bool_)

@@ -48,16 +48,21 @@ WEIGHTS = ("descriptor.weights", "sphere.weights")
 """Settings that name a file; a relative path starts at the file that holds the setting."""
 
 
-class _WithWeights(Settings):
-    """Settings with a file of weights, which a dump leaves out where there is none."""
+class _Grown(Settings):
+    """Settings that grew: a dump leaves out the newer ones where they have their defaults, as older answers do."""
+
+    newer: ClassVar[tuple[str, ...]] = ()
 
     @model_serializer(mode="wrap")
-    def _without_empty_weights(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {name: value for name, value in handler(self).items() if name != "weights" or value}
+    def _without_newer_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        defaults = {name: type(self).model_fields[name].default for name in self.newer}
+        return {name: value for name, value in handler(self).items() if name not in defaults or value != defaults[name]}
 
 
-class MapConfig(Settings):
+class MapConfig(_Grown):
     """From scans to a thinned map and keyframes."""
+
+    newer: ClassVar[tuple[str, ...]] = ("consistency",)
 
     voxel_m: Cell = Field(0.2, description="cell of the thinned map")
     max_range_m: Positive = Field(60.0, description="returns beyond this range are not mapped")
@@ -67,13 +72,11 @@ class MapConfig(Settings):
         description="map with the recorded poses; register every scan once more with those around it; close loops, too",
     )
 
-    @model_serializer(mode="wrap")
-    def _without_none(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {name: value for name, value in handler(self).items() if name != "consistency" or value != "none"}
 
-
-class DescriptorConfig(_WithWeights):
+class DescriptorConfig(_Grown):
     """The descriptor of every keyframe, computed while mapping."""
+
+    newer: ClassVar[tuple[str, ...]] = ("weights",)
 
     method: Literal["3deg", "untrained", "scan-context", "solid"] = Field(
         "3deg", description="trained weights, the same network untrained, or one made by hand"
@@ -82,18 +85,15 @@ class DescriptorConfig(_WithWeights):
     weights: str = Field("", description="`3deg`: file of weights that `tunnelcd train` wrote; empty: the shipped ones")
 
 
-class SphereConfig(Settings):
-    """The sphere descriptor. A dump leaves out what has its default."""
+class SphereConfig(_Grown):
+    """The sphere descriptor."""
+
+    newer: ClassVar[tuple[str, ...]] = ("frames", "weights")
 
     frames: Literal["sensor", "path"] = Field(
         "sensor", description="axes of its images: the sensor's; path and gravity"
     )
     weights: str = Field("", description="file of weights that `tunnelcd train` wrote; empty: the shipped ones")
-
-    @model_serializer(mode="wrap")
-    def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        fields = type(self).model_fields
-        return {name: value for name, value in handler(self).items() if value != fields[name].default}
 
 
 class MergeConfig(Settings):
@@ -128,13 +128,15 @@ class MergeConfig(Settings):
 
 
 # Settings that only the source of this name reads; a dump of another leaves them out where they are the defaults.
-_OF_ONE_SOURCE = ("removert", "octomap", "m3c2_ep", "erasor")
+_OF_ONE_SOURCE = ("voxel_diff", "c2c", "removert", "octomap", "m3c2_ep", "erasor")
 # Sources that score keyframes; they read nothing but descriptors, maps and `query`, and cut out nothing.
 SOURCES_AT_KEYFRAMES = ("scan", "sphere", "sphere-difference", "every-keyframe", "random-regions")
 
 
-class RegionsConfig(Settings):
+class RegionsConfig(_Grown):
     """Where regions come from."""
+
+    newer: ClassVar[tuple[str, ...]] = ("min_points",)
 
     source: str = Field(
         "scan",
@@ -144,6 +146,8 @@ class RegionsConfig(Settings):
             "`removert`, `erasor`: clusters of a whole-map comparison; or a plugin's, by its registered name"
         ),
     )
+
+    min_points: Count = Field(16, description="smaller clusters of a whole-map comparison are no region")
 
     @field_validator("source")
     @classmethod
@@ -173,11 +177,10 @@ class QueryConfig(Settings):
     max_pair_m: Positive = Field(5.0, description="keyframes farther apart are not the same place")
 
 
-class ExtractConfig(Settings):
-    """Object extraction: the paper's point-to-voxel comparison, distances, surfaces, or what the source cut out.
+class ExtractConfig(_Grown):
+    """Object extraction: the paper's point-to-voxel comparison, distances, surfaces, or what the source cut out."""
 
-    A dump leaves out `recentre` where it is true, so that the answers of other rules do not name it.
-    """
+    newer: ClassVar[tuple[str, ...]] = ("recentre",)
 
     method: Literal["surface", "voxel", "nearest", "clusters"] = Field(
         "surface",
@@ -191,9 +194,7 @@ class ExtractConfig(Settings):
     voxel_m: Cell = Field(0.65, description="`voxel`: size (paper: 0.65)")
     min_points: Count = Field(1, description="`voxel`: points that make a voxel occupied")
     origin_m: float = Field(0.0, ge=-1000, le=1000, description="`voxel`: offset of the grid along every axis")
-    distance_m: Positive = Field(
-        0.3, description="`nearest`, `c2c`, `m3c2`: a point farther than this from the other cloud is new"
-    )
+    distance_m: Positive = Field(0.3, description="`nearest`: a point farther than this from the other cloud is new")
     realign: bool = Field(True, description="`surface`: align each sphere once more before comparing")
     seed_m: Positive = Field(0.12, description="`surface`: an object has cells at least this far from the surface")
     border_m: Positive = Field(
@@ -205,10 +206,6 @@ class ExtractConfig(Settings):
     min_views: Positive = Field(
         2.5, description="`surface`: least mean number of keyframes that saw through a cell, minus those that hit it"
     )
-
-    @model_serializer(mode="wrap")
-    def _without_recentre(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {name: value for name, value in handler(self).items() if name != "recentre" or not value}
 
 
 class OutlierConfig(Settings):
@@ -222,12 +219,29 @@ class ClusterConfig(Settings):
     """From new points to objects."""
 
     radius_m: Positive = Field(0.5, description="points nearer than this are one object")
-    min_points: Count = Field(16, description="smaller clusters are dropped")
+    min_points: Count = Field(16, description="`voxel`, `nearest`: smaller clusters are dropped")
 
 
-class M3C2Config(Settings):
+class VoxelDiffConfig(Settings):
+    """Voxels of the whole maps."""
+
+    voxel_m: Cell = Field(0.5, description="`voxel-diff`: size")
+
+
+class C2CConfig(Settings):
+    """Distances to the nearest point (C2C)."""
+
+    distance_m: Positive = Field(0.2, description="`c2c`: a point farther than this from the other map is new")
+
+
+class M3C2Config(_Grown):
     """Distances along normals (M3C2)."""
 
+    newer: ClassVar[tuple[str, ...]] = ("distance_m",)
+
+    distance_m: Positive = Field(
+        0.1, description="`m3c2`: a surface that moved farther than this along its normal is new"
+    )
     normal_m: Positive = Field(1.0, description="`m3c2`, `m3c2-ep`: radius within which a point's normal is estimated")
     cylinder_m: Positive = Field(0.25, description="`m3c2`, `m3c2-ep`: radius of the cylinder along the normal")
     depth_m: Positive = Field(1.5, description="`m3c2`, `m3c2-ep`: length of the cylinder to either side")
@@ -299,6 +313,8 @@ class PipelineConfig(Settings):
     extract: ExtractConfig = ExtractConfig()
     outlier: OutlierConfig = OutlierConfig()
     cluster: ClusterConfig = ClusterConfig()
+    voxel_diff: VoxelDiffConfig = VoxelDiffConfig()
+    c2c: C2CConfig = C2CConfig()
     m3c2: M3C2Config = M3C2Config()
     dufomap: DufomapConfig = DufomapConfig()
     removert: RemovertConfig = RemovertConfig()

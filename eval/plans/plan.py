@@ -75,7 +75,8 @@ _MOST_SEEDS = 100_000
 _NO_THRESHOLDS: Mapping[str, Any] = {"thresholds": {}}
 _MAY_BE_LEFT_OUT = ("split", "set", "thresholds", "axes")
 _AFTER_MERGE = (
-    "query", "extract", "outlier", "cluster", "m3c2", "dufomap", "removert", "octomap", "m3c2_ep", "erasor",
+    "query", "extract", "outlier", "cluster",
+    "voxel_diff", "c2c", "m3c2", "dufomap", "removert", "octomap", "m3c2_ep", "erasor",
 )  # fmt: skip
 
 

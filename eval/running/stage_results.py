@@ -27,8 +27,10 @@ from eval.running.stage_cache import Arrays
 from eval.truth.ground_truth import SESSIONS
 
 _WHOLE_MAP_SOURCES = ("voxel-diff", "c2c", "m3c2", "m3c2-ep", "dufomap", "octomap", "removert", "erasor")
-# The settings that they read besides those of the query and of the extraction.
-_OF_WHOLE_MAPS = {"outlier", "cluster", "m3c2", "dufomap", "removert", "octomap", "m3c2_ep", "erasor"}
+# The settings that they read besides those of the query.
+_OF_WHOLE_MAPS = {
+    "outlier", "voxel_diff", "c2c", "m3c2", "dufomap", "removert", "octomap", "m3c2_ep", "erasor",
+}  # fmt: skip
 _PIXELS = tuple(f"{session}.return_pixels" for session in SESSIONS)
 
 
@@ -77,10 +79,10 @@ def is_kept(stage: Stage, config: PipelineConfig) -> bool:
 def _settings_of_clusters(config: PipelineConfig) -> dict[str, Any]:
     """Return what a source that compares whole maps may read besides."""
     found = config.model_dump(mode="json", include=_OF_WHOLE_MAPS)
-    how = {"method", "withdraw", "recentre"}  # objects are cut out of the regions
+    clusters = [config.cluster.radius_m, config.regions.min_points]
     package = PACKAGES.get(config.regions.source)
     found |= {"package": extra_version(package)} if package else {}
-    return found | {"extract": config.extract.model_dump(mode="json", exclude=how)}
+    return found | {"clusters": clusters}
 
 
 def pack(stage: Stage, value: Any) -> Arrays:

@@ -140,7 +140,7 @@ def placed(
 def test_m3c2_of_a_plane_that_rose_by_hand(empty: PointMap) -> None:
     turn = yaw_pose(0.4, (1.0, 2.0, 3.0))
     turn[:3, :3] = turn[:3, :3] @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    settings = ("m3c2.depth_m=1.5", "extract.distance_m=0.3")
+    settings = ("m3c2.depth_m=1.5", "m3c2.distance_m=0.3")
 
     def share(
         session: SessionName,
@@ -160,7 +160,7 @@ def test_m3c2_of_a_plane_that_rose_by_hand(empty: PointMap) -> None:
     for moved_by in (np.eye(4), turn):
         assert share("after", 0.29, 2.0, moved_by) == 0.0
         assert share("after", 0.31, 2.0, moved_by) == 1.0
-        assert share("after", 0.31, 2.0, moved_by, "extract.distance_m=0.32") == 0.0
+        assert share("after", 0.31, 2.0, moved_by, "m3c2.distance_m=0.32") == 0.0
         # the plane that was there before is hidden by the one that came, unless one looks from below
         assert share("before", 0.31, 2.0, moved_by) == 0.0
         assert share("before", 0.31, -2.0, moved_by) == 1.0

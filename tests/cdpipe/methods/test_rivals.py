@@ -89,20 +89,20 @@ def test_one_added_crate_by_hand() -> None:
 def test_c2c_by_hand() -> None:
     # hovering in the middle of the corridor all 64 points are new; lowered to 0.2 m above the floor's points, the lower
     # layer of 16 is not; that it is nearer than a voxel to the floor takes more away from `voxel-diff`
-    settings = ("query.threshold=0", "outlier.sigmas=10", "cluster.min_points=16")
+    settings = ("query.threshold=0", "outlier.sigmas=10", "regions.min_points=16")
     hovering, low = crate(20.0), crate(20.0) - (0.0, 0.0, 1.0)
     assert low[:, 2].min() == pytest.approx(0.3)
     for box, distance_m, n_new in ((hovering, 0.3, 64), (low, 0.3, 48), (low, 0.19, 64), (low, 0.5, 32)):
-        report = answer(pair([], [box]), load_config("c2c", [*settings, f"extract.distance_m={distance_m}"]))
+        report = answer(pair([], [box]), load_config("c2c", [*settings, f"c2c.distance_m={distance_m}"]))
         assert report.regions.scores.tolist() == [n_new]
         (item,) = report.objects
         assert (item.session, item.kind, len(item.returns)) == ("after", "added", n_new)
-    by_voxel = answer(pair([], [low]), load_config("voxel-diff", [*settings, "extract.voxel_m=0.65"]))
+    by_voxel = answer(pair([], [low]), load_config("voxel-diff", [*settings, "voxel_diff.voxel_m=0.65"]))
     assert by_voxel.regions.scores.max(initial=0) < 48
 
 
 def test_c2c_measures_in_both_directions_and_at_any_place() -> None:
-    settings = ("query.threshold=0", "outlier.sigmas=10", "cluster.min_points=16")
+    settings = ("query.threshold=0", "outlier.sigmas=10", "regions.min_points=16")
     merged = pair([crate(10.0)], [crate(30.0)])
     objects = answer(merged, load_config("c2c", settings)).objects
     assert {(item.session, item.kind, item.partner) for item in objects} == {
@@ -142,7 +142,7 @@ def test_keyframe_score_is_the_changed_share_around_it() -> None:
 def test_threshold_is_in_points_and_a_near_cluster_joins_the_larger_one() -> None:
     small, large = crate(23.0, 0.6), crate(20.0)  # 27 and 64 points, centroids 3 m apart
     far = crate(35.0, 0.6)
-    small_too = ("outlier.sigmas=10", "cluster.min_points=16")
+    small_too = ("outlier.sigmas=10", "regions.min_points=16")
     merged = pair([], [small, large, far])
     loose = answer(merged, load_config("voxel-diff", [*small_too, "query.threshold=0", "query.radius_m=4.5"]))
     assert loose.regions.scores.tolist() == [64.0, 27.0]
@@ -246,7 +246,7 @@ def test_an_answer_names_the_optional_packages_that_it_depends_on(monkeypatch: p
 def test_figures_are_of_the_after_map() -> None:
     # a crate went and a smaller one came 2 m beside it: one region holds both, the table only what came
     config = load_config(
-        "voxel-diff", ["outlier.sigmas=10", "cluster.min_points=16", "query.n_regions=1", "query.radius_m=4.5"]
+        "voxel-diff", ["outlier.sigmas=10", "regions.min_points=16", "query.n_regions=1", "query.radius_m=4.5"]
     )
     report = answer(pair([crate(20.0)], [crate(22.0, 0.6)]), config)
     assert sorted((item.session, len(item.returns), item.region) for item in report.objects) == [
@@ -267,7 +267,7 @@ def test_a_mask_of_ones_own_makes_a_source() -> None:
 
     merged = pair([], [crate(20.0)])
     # beside the walls the nearest point of the other map may be any of a column: only what stands in the middle counts
-    config = load_config("voxel-diff", ["query.threshold=0", "outlier.sigmas=10", "cluster.min_points=33"])
+    config = load_config("voxel-diff", ["query.threshold=0", "outlier.sigmas=10", "regions.min_points=33"])
 
     @WholeMap
     def in_the_middle(maps: PlacedMaps, session: SessionName, other: SessionName, config: PipelineConfig) -> BoolArray:

@@ -33,7 +33,7 @@ Result = tuple[int, str, str]
 Command = Callable[..., Result]
 SMALL = ("--set", "sensor.mode=512x10", "--set", "platform.scan_spacing_m=1.0")
 # finds the box with so few returns, which the preset is not tuned for
-FINE = ("--preset", "voxel-diff", "--set", "cluster.min_points=8", "--set", "query.threshold=0")
+FINE = ("--preset", "voxel-diff", "--set", "regions.min_points=8", "--set", "query.threshold=0")
 
 
 @pytest.fixture(scope="module")

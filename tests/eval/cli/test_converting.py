@@ -90,7 +90,7 @@ def test_a_pair_there_and_back_gives_the_same_answer(pair: Path, tmp_path: Path,
             np.testing.assert_allclose(one.points_sensor, other.points_sensor, atol=1e-5)
             np.testing.assert_array_equal(one.pixels, other.pixels)
             np.testing.assert_array_equal(one.stamps_ns, other.stamps_ns)
-    methods = ("--preset", "voxel-diff", "--set", "query.threshold=0", "--set", "cluster.min_points=8", "--quiet")
+    methods = ("--preset", "voxel-diff", "--set", "query.threshold=0", "--set", "regions.min_points=8", "--quiet")
     for source, out in ((pair, "one"), (tmp_path / "back", "other")):
         assert command("detect", source / "before", source / "after", "--out", tmp_path / out, *methods)[0] == 0
     one, other = (

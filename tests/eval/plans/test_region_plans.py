@@ -104,9 +104,9 @@ def test_null_drives_five_kilometres_where_nothing_changed() -> None:
 
 def test_thresholds_are_set_on_twenty_validation_pairs_of_each_trained_family() -> None:
     assert Counter(scenario for scenario, _ in pairs("calibrate")) == dict.fromkeys(
-        ("null/narrow", "null/network", "null/wide"), 20
+        (f"{family}{KISS_ICP}" for family in ("null/narrow", "null/network", "null/wide")), 20
     )
-    assert {domain_of(scenario) for scenario, _ in pairs("calibrate")} == {"in"}
+    assert {domain_of(scenario_of(name)) for name, _ in pairs("calibrate")} == {"in"}
 
 
 @pytest.mark.parametrize(

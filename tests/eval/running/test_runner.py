@@ -132,7 +132,7 @@ def test_smoke_plan_end_to_end(smoke: RunFolder) -> None:
 
 def test_the_box_is_found(tmp_path: Path, runner: Runner) -> None:
     # the preset is tuned and calibrated for four times as many returns
-    found = '{preset: voxel-diff, set: ["cluster.min_points=8", "query.threshold=0"]}'
+    found = '{preset: voxel-diff, set: ["regions.min_points=8", "query.threshold=0"]}'
     run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, variants=found))
     assert table(run)["region_recall"].tolist() == [1.0]
 

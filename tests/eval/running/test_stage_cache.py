@@ -422,7 +422,7 @@ def test_files_of_weights_are_told_apart_by_what_they_hold(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("preset", "setting", "is_read"),
     [
-        ("m3c2", "extract.distance_m=0.2", True),
+        ("m3c2", "m3c2.distance_m=0.2", True),
         ("m3c2", "m3c2.normal_m=2", True),
         ("dufomap", "dufomap.every_scan=2", True),
         ("removert", "removert.margin=0.07", True),
@@ -430,9 +430,14 @@ def test_files_of_weights_are_told_apart_by_what_they_hold(tmp_path: Path) -> No
         ("m3c2-ep", "m3c2_ep.range_m=0.1", True),
         ("m3c2-ep", "m3c2.normal_m=2.2", True),
         ("erasor", "erasor.scan_ratio=0.3", True),
-        ("voxel-diff", "extract.voxel_m=0.4", True),
+        ("voxel-diff", "voxel_diff.voxel_m=0.4", True),
         ("voxel-diff", "outlier.sigmas=3", True),
-        ("c2c", "cluster.min_points=9", True),
+        ("c2c", "c2c.distance_m=0.4", True),
+        ("c2c", "regions.min_points=9", True),
+        ("c2c", "cluster.radius_m=0.4", True),
+        # the rules read these, so all rules have the same regions
+        ("c2c", "cluster.min_points=9", False),
+        ("voxel-diff", "extract.voxel_m=0.4", False),
         ("c2c", "extract.method=voxel", False),
         ("c2c", "extract.withdraw=false", False),
         ("c2c", "regions.source=m3c2", True),
