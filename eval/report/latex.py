@@ -64,12 +64,13 @@ def latex_tables(data: RunData) -> dict[str, str]:
 
 
 def to_latex(table: Table) -> str:
-    """Return a table of the page as a LaTeX tabular, best values in bold, the group as the first column."""
+    """Return a table of the page as a LaTeX tabular, best values in bold, the group, if there is one, in front."""
+    has_groups = any(group for group, _ in table.rows)
     lines = [
-        [_escaped(group), *(_marked(cell.text, "bold" if cell.is_best else "") for cell in cells)]
+        [_escaped(group)] * has_groups + [_marked(cell.text, "bold" if cell.is_best else "") for cell in cells]
         for group, cells in table.rows
     ]
-    return _typeset(["scenario", *table.headings], lines)
+    return _typeset(["scenario"] * has_groups + list(table.headings), lines, n_names=1 + has_groups)
 
 
 def _float(
@@ -99,10 +100,15 @@ def _float(
     return _typeset(headings, lines, caption=_escaped(caption), label=f"tab:{name}")
 
 
-def _typeset(headings: Sequence[str], lines: Sequence[Sequence[str]], caption: str = "", label: str = "") -> str:
-    """Return lines of LaTeX cells as pandas typesets them: a tabular, or a wide float where there is a caption."""
+def _typeset(
+    headings: Sequence[str], lines: Sequence[Sequence[str]], caption: str = "", label: str = "", *, n_names: int = 2
+) -> str:
+    """Return lines of LaTeX cells as pandas typesets them: a tabular, or a wide float where there is a caption.
+
+    The first `n_names` columns are names, all others values.
+    """
     frame = pd.DataFrame(lines, columns=[_stacked(heading) for heading in headings])
-    formats = "ll" + "r" * (len(headings) - 2)
+    formats = "l" * n_names + "r" * (len(headings) - n_names)
     source = str(
         frame.to_latex(index=False, escape=False, column_format=formats, caption=caption or None, label=label or None)
     )

@@ -138,7 +138,9 @@ def test_the_page_says_first_what_breaks_whom(tmp_path: Path, plan: Plan) -> Non
     page = write_page(run).read_text()
     assert page.index('id="hardness"') < page.index('id="results"')
     assert "c2c holds on 0 of 2 axes" in page
-    assert (run / "hard.png").stat().st_size > 1000 and r"\textbf" in (run / "breaking_points.tex").read_text()
+    latex = (run / "breaking_points.tex").read_text()
+    assert (run / "hard.png").stat().st_size > 1000 and r"\textbf" in latex
+    assert r"\begin{tabular}{lrr}" in latex and "scenario" not in latex  # nothing is grouped
 
 
 def test_the_page_needs_no_lists_of_regions_and_changes(tmp_path: Path, plan: Plan) -> None:
