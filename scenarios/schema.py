@@ -452,8 +452,33 @@ class Odometry(Lean):
         return self
 
 
-class SessionPlan(Settings):
+class Mist(Settings):
+    """Droplets of water, everywhere alike."""
+
+    visibility_m: Annotated[float, Field(ge=5, le=2000)]  # meteorological optical range: 5 % of the contrast is left
+
+
+class Dust(Settings):
+    """Mineral dust, denser near the floor, in swathes that drift."""
+
+    mg_per_m3: Annotated[float, Field(gt=0, le=5000)]  # mean at the floor
+    scale_height_m: Positive = 2.0  # height above the floor at which 37 % are left
+    patch_m: Annotated[float, Field(ge=2, le=40)] = 4.0  # correlation length of the swathes
+    contrast: Annotated[float, Field(ge=0, le=1.5)] = 0.7  # standard deviation of the logarithm of the density
+    drift_mps: NotNegative = 0.3  # speed of the air
+
+
+class Air(Settings):
+    """What is in the air of one session; the truth labels its returns."""
+
+    mist: Mist | None = None
+    dust: Dust | None = None
+
+
+class SessionPlan(Lean):
     """One drive through the tunnel: along a route, or on a recorded trajectory."""
+
+    _LATER: ClassVar[frozenset[str]] = frozenset({"air"})
 
     route: tuple[str, ...] = ()
     trajectory: str | None = None  # TUM file of world_T_sensor, instead of a route; from the scenario's file
@@ -463,6 +488,7 @@ class SessionPlan(Settings):
     height_m: Positive | None = None  # instead of platform.sensor_height_m
     speed_mps: Positive | None = None  # instead of platform.speed_mps
     odometry: Odometry = Odometry()
+    air: Air | None = None  # mist and dust; left out: clear
 
     @model_validator(mode="after")
     def _route_or_trajectory(self) -> SessionPlan:

@@ -11,6 +11,7 @@ from cdpipe.core.geometry import BoolArray, Float32Array, Int32Array, stream
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Sensor
 from sim.scene import Scene
+from sim.sensor.air import AirVolume, cross_air
 from sim.sensor.footprint import central_echo, spread_echo
 from sim.sensor.optics import (
     FALSE_PHOTONS,
@@ -40,7 +41,8 @@ class Scan:
         reflectivity: uint8, percent of a perfect diffuse reflector up to 100.
         signal: uint16 photons.
         true_range_m: float32 distance from the spin axis's point to the surface along the beam, infinite for a miss.
-        geom: int32 geom hit, `MISS` where nothing returned, `FALSE_RETURN` where nothing stands.
+        geom: int32 geom hit, `MISS` where nothing returned, `FALSE_RETURN` where nothing stands,
+            `sim.sensor.air.AIR` for mist and dust.
         owner: int32 owner of the geoms that reflected most of the light, 0 where no geom was hit.
         is_mixed: True for a return of which less than 90 % of the light came from geoms of `owner`. Always False with
             one ray per beam.
@@ -64,6 +66,7 @@ def scan(
     session: str,
     number: int,
     owners: Int32Array | None = None,
+    air: AirVolume | None = None,
 ) -> Scan:
     """Cast one revolution and apply the effects of the sensor.
 
@@ -78,17 +81,20 @@ def scan(
         session: "before" or "after".
         number: Index of the revolution in its session.
         owners: (G,) owner of each geom, between which mixed returns are told; by default the prop, `scene.instance`.
+        air: Mist and dust around the sensor; None where the air is clear.
     """
     owners = scene.instance if owners is None else owners
     surfaces = scene.caster, scene.reflectivity, rays, sensor.beam_origin_m, owners
     echo = central_echo(*surfaces) if settings.sub_rays == 1 else spread_echo(*surfaces, settings.sub_rays)
+    if air is not None:
+        echo = cross_air(echo, rays, sensor.beam_origin_m, air, stream(seed, session, "air-returns", str(number)))
     shape = echo.range_m.shape
     range_m, photons = echo.range_m, echo.photons
     if settings.range_noise:
         noise = stream(seed, session, "range-noise", str(number)).standard_normal(shape, dtype=np.float32)
         noise *= range_sigma_m(range_m, photons, echo.cosine)
         range_m = range_m + noise
-    is_return = (echo.geom >= 0) & (range_m >= settings.min_range_m) & (range_m <= settings.max_range_m)
+    is_return = (echo.geom != MISS) & (range_m >= settings.min_range_m) & (range_m <= settings.max_range_m)
     if settings.dropouts:
         draw = stream(seed, session, "dropouts", str(number)).random(shape, dtype=np.float32)
         is_return &= draw < detection_probability(photons)

@@ -9,9 +9,10 @@ import numpy.typing as npt
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array, Int64Array
 from cdpipe.sensor.ouster import SensorMetadata
-from scenarios.schema import Scenario
+from scenarios.schema import Scenario, SessionPlan
 from sim.drive.trajectory import Trajectory
 from sim.scene import Scene
+from sim.sensor.air import AirVolume, air_around
 from sim.sensor.lidar import Scan, scan
 from sim.sensor.rays import Rays, revolution_rays
 from sim.session.labels import Tally, mark_belonging
@@ -50,7 +51,7 @@ class Drive:
     """Everything that stays the same while one session is simulated.
 
     Attributes:
-        labels: `instance` of each geom, int16; two entries -2 and -1 at the end serve the geom numbers -2 and -1.
+        labels: `instance` of each geom, int16; entries -3, -2 and -1 at the end serve the geom numbers -3 to -1.
         owners: (G,) int32 `instance` of the geoms of props of which this session holds a change, 0 for all others.
     """
 
@@ -86,8 +87,19 @@ def cast_revolution(drive: Drive, number: int) -> tuple[Rays, Scan]:
     """Return the rays of one revolution and the scan that the sensor reports."""
     world_T_column = drive.trajectory.world_T_column(slice(number, number + 1))[0]
     rays = revolution_rays(drive.sensor, world_T_column)
-    settings = drive.scenario.sensor
-    return rays, scan(drive.scene, drive.sensor, settings, rays, drive.seed, drive.name, number, drive.owners)
+    settings, air = drive.scenario.sensor, find_air(drive, number)
+    return rays, scan(drive.scene, drive.sensor, settings, rays, drive.seed, drive.name, number, drive.owners, air)
+
+
+def find_air(drive: Drive, number: int) -> AirVolume | None:
+    """Return the mist and dust around the sensor during a revolution; None where the air is clear."""
+    plan: SessionPlan = getattr(drive.scenario, drive.name)
+    if plan.air is None:
+        return None
+    time_s = drive.trajectory.revolution_s[number : number + 1]
+    position_m = drive.trajectory.true.sample(time_s)[0][0]
+    floor_z_m = position_m[2] - (plan.height_m or drive.scenario.platform.sensor_height_m)
+    return air_around(plan.air, position_m, float(floor_z_m), float(time_s[0]), drive.seed, drive.name)
 
 
 def true_reach_m(sensor: SensorMetadata, result: Scan) -> Float32Array:

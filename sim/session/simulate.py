@@ -151,7 +151,7 @@ def plan_drives(scenario: Scenario, sensor: SensorMetadata, seed: int) -> list[D
     drives = []
     for name in SESSIONS:
         scene = world.before if name == "before" else world.after
-        labels = np.append(scene.instance, [-2, -1]).astype(np.int16)
+        labels = np.append(scene.instance, [-3, -2, -1]).astype(np.int16)
         held = [tally.change.instance for tally in tallies if tally.change.session == name]
         owners = np.where(np.isin(scene.instance, held), scene.instance, np.int32(0))
         trajectory = plan_trajectory(world, scenario, sensor, seed, name)

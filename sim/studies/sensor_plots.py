@@ -20,6 +20,7 @@ from scenarios.schema import Sensor
 from sim.geometry.mesh import Mesh, box_mesh
 from sim.geometry.raycast import Caster
 from sim.scene import Scene
+from sim.sensor.air import AIR, AirVolume
 from sim.sensor.footprint import central_echo, spread_echo
 from sim.sensor.lidar import FALSE_RETURN, Scan, scan
 from sim.sensor.optics import (
@@ -227,15 +228,39 @@ def _steps(figure: Figure) -> None:
     right.set(xlabel="column", ylabel="range (m)", title="Walls 0.25 m to either side", ylim=(0.2, 1.0))
 
 
+def _air(figure: Figure) -> None:
+    left, right = figure.subplots(1, 2)
+    sensor = load_profile("os1-32-nominal", "1024x10")
+    scene = _room((30.0, 2.5, 2.0))
+    clear = _still_scan(scene, sensor, _IDEAL, 0)
+    for visibility_m, colour in zip((12.0, 30.0, 60.0), _COLOURS, strict=False):
+        misty = [_still_scan(scene, sensor, _IDEAL, n, AirVolume(np.log(20) / visibility_m)) for n in range(4)]
+        is_wall = (misty[0].geom >= 0) & (clear.signal >= 20)
+        reach_m = (clear.true_range_m - sensor.beam_origin_m)[is_wall]
+        left.plot(reach_m[::7], (misty[0].signal / clear.signal.clip(1))[is_wall][::7], ".", markersize=2, color=colour)
+        line_m = np.linspace(0.0, 20.0, 100)
+        left.plot(line_m, np.exp(-2 * np.log(20) / visibility_m * line_m), color=colour, label=f"{visibility_m:g} m")
+        ranges_m = np.concatenate([each.range_mm[each.geom == AIR] / 1000.0 for each in misty])
+        share = len(ranges_m) / (4 * sensor.height * sensor.width)
+        label = f"{visibility_m:g} m: {100 * share:.0f} % of the beams"
+        right.hist(ranges_m, bins=40, range=(0.0, 20.0), histtype="step", color=colour, label=label)
+    left.set(xlabel="way to the wall (m)", ylabel="share of the photons", title="Lines: Beer-Lambert; dots: simulated")
+    left.legend(fontsize=8, title="visibility", title_fontsize=8)
+    right.set(xlabel="range (m)", ylabel="returns per 0.5 m", title="Returns of the mist in a 5 m drift", yscale="log")
+    right.legend(fontsize=8)
+
+
 def _facing_share(sensor: SensorMetadata, settings: Sensor, share: float, wall_m: float) -> float:
     """Return the share of beams within 5 degrees of the normal of a wall that have a return."""
     result = _still_scan(_room((wall_m, 150.0, 150.0), share), sensor, settings, int(wall_m))
     return float((result.range_mm > 0)[np.abs(sensor.directions[..., 0]) > np.cos(np.deg2rad(5.0))].mean())
 
 
-def _still_scan(scene: Scene, sensor: SensorMetadata, settings: Sensor, number: int) -> Scan:
+def _still_scan(
+    scene: Scene, sensor: SensorMetadata, settings: Sensor, number: int, air: AirVolume | None = None
+) -> Scan:
     rays = revolution_rays(sensor, np.tile(make_pose(), (sensor.width, 1, 1)))
-    return scan(scene, sensor, settings, rays, SEED, "before", number)
+    return scan(scene, sensor, settings, rays, SEED, "before", number, air=air)
 
 
 def _room(half_m: tuple[float, float, float], reflectivity: float = 0.25) -> Scene:
@@ -267,6 +292,7 @@ _PLOTS: dict[str, Callable[[Figure], None]] = {
     "divergence": _divergence,
     "false_returns": _false_returns,
     "steps": _steps,
+    "air": _air,
 }
 
 if __name__ == "__main__":

@@ -11,11 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float32Array, Float64Array
 from cdpipe.io.session import ScanChunk, Session
+from sim.sensor.air import AIR
 from sim.session.truth import read_labels
 
 Rgb = tuple[int, int, int]
 MAX_POINTS = 300_000
 _ROCK_RGB = (150, 150, 150)
+_AIR_RGB = (140, 200, 240)  # returns of mist and dust
 # after Okabe and Ito, which the colour-blind can tell apart
 CHANGE_RGB: dict[str, Rgb] = {
     "added": (0, 158, 115),
@@ -82,12 +84,13 @@ def session_cloud(
     if kinds is None:
         return Cloud(name, cloud, {"height": by_height})
     by_change = np.tile(np.array(_ROCK_RGB, np.uint8), (len(cloud), 1))
-    change = np.concatenate(changes)
+    change, instance = np.concatenate(changes), np.concatenate(instances)
+    by_change[instance == AIR] = _AIR_RGB
     for number, kind in kinds.items():
         by_change[change == number] = CHANGE_RGB[kind]
     colours = {
         "change": by_change,
-        "instance": _by_instance(np.concatenate(instances).astype(np.int64)),
+        "instance": _by_instance(instance.astype(np.int64)),
         "session": np.tile(np.array(own, np.uint8), (len(cloud), 1)),
         "height": by_height,
     }
@@ -107,10 +110,11 @@ def _place_returns(session: Session, chunk: ScanChunk, frame_T_sensor: Float64Ar
 
 
 def _by_instance(instance: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
-    """Colour the walls grey and each prop by its number; steps of the golden angle keep neighbours distinct."""
+    """Colour the walls grey, the air blue and each prop by its number, neighbours apart by the golden angle."""
     hue = 2 * np.pi * np.modf(instance * 0.618034)[0]
     wheel = 140 + 100 * np.cos(hue[:, None] + np.array([0.0, 2.1, 4.2]))
-    return np.where((instance > 0)[:, None], wheel, _ROCK_RGB).astype(np.uint8)
+    colours = np.where((instance > 0)[:, None], wheel, _ROCK_RGB)
+    return np.where((instance == AIR)[:, None], _AIR_RGB, colours).astype(np.uint8)
 
 
 def _by_height(points: Float32Array) -> npt.NDArray[np.uint8]:

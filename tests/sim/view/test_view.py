@@ -21,7 +21,7 @@ from eval.cli.world import load_view
 from scenarios.schema import MeshFile, Place, Prop, Scenario, Shift, Tunnel
 from sim.geometry.mesh import Mesh
 from sim.scene import build_world
-from sim.session.simulate import simulate_pair
+from sim.session.simulate import simulate, simulate_pair
 from sim.session.truth import read_pair_truth, read_true_poses
 from sim.view import view as view_module
 from sim.view import viewer
@@ -142,6 +142,16 @@ def test_a_pair_s_returns_are_thinned_placed_and_coloured_by_truth(pair: Path) -
     assert len(points) > 50
     assert (points > box.min(axis=0) - 0.1).all()
     assert (points < box.max(axis=0) + 0.1).all()
+
+
+def test_returns_of_mist_are_light_blue(tmp_path: Path) -> None:
+    settings = ["after.air.mist.visibility_m=12", "platform.scan_spacing_m=3"]
+    simulate("smoke/one_box", 1, tmp_path / "pair", settings)
+    before, after = view_pair(tmp_path / "pair").clouds
+    blue = (140, 200, 240)
+    for quantity in ("change", "instance"):
+        assert 0.01 < (after.colours[quantity] == blue).all(axis=1).mean() < 0.9
+        assert not (before.colours[quantity] == blue).all(axis=1).any()
 
 
 def test_a_session_is_placed_as_the_pipeline_places_it(pair: Path) -> None:

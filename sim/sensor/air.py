@@ -1,0 +1,158 @@
+"""Mist and dust: what the air takes from a beam on its way, and what it sends back itself.
+
+Extinction alpha (1/m) dims a surface at range R by exp(-2 integral of alpha), Beer and Lambert there and back. A slice
+of air of depth dR sends back as much light as a surface of reflectivity pi beta dR in its place, beta = alpha / lidar
+ratio. So both go through the sensor's own photon budget (`sim.sensor.optics.received_photons`), overlap included.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cdpipe.core.geometry import Float32Array, Float64Array, stream
+from scenarios.schema import Air, Dust
+from sim.geometry.noise import smooth_noise
+from sim.sensor.footprint import PULSE_M, Echo
+from sim.sensor.optics import received_photons
+from sim.sensor.rays import Rays
+
+AIR = -3  # number of the geom of a return from the air
+# Koschmieder: at the meteorological optical range 5 % of the contrast is left, so alpha = ln(20) / range.
+CONTRAST_LEFT = 0.05
+# Extinction over backscatter, sr. Water droplets at 905 nm: O'Connor, Illingworth and Hogan 2004. Mineral dust at
+# 532 nm: Tesche and others 2009; at the sensor's 865 nm unverified.
+MIST_RATIO_SR, DUST_RATIO_SR = 18.8, 55.0
+# Extinction of dust, 3 Q / (4 density r): Mie's efficiency Q is 2 for grains much larger than the wavelength (here 18
+# times around the grain), quartz has 2,650 kg/m3, the effective radius of 2.5 um is that of respirable dust: ours.
+DUST_M2_PER_MG = 3 * 2.0 / (4 * 2650.0 * 2.5e-6) * 1e-6
+# The receiver adds up what comes back within one pulse (`PULSE_M`); air farther than this is too weak to be reported.
+REACH_M = 20.0
+LEAST_PHOTONS = 1.0
+# Around the sensor dust has swathes on a lattice; farther off it has its mean.
+_LATTICE_M, _LATTICE_REACH_M, _LATTICE_HEIGHT_M = 1.0, 40.0, 8.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AirVolume:
+    """The air around the sensor during one revolution.
+
+    Attributes:
+        mist_per_m: Extinction of the mist.
+        dust: What the dust is like, None without any.
+        floor_z_m: Height of the floor below the sensor, world frame, metres.
+        corner_m: (3,) first point of the lattice, world frame, metres.
+        swathes: (X, Y, Z) float32 density of the dust over its mean on the lattice.
+    """
+
+    mist_per_m: float
+    dust: Dust | None = None
+    floor_z_m: float = 0.0
+    corner_m: Float64Array | None = None
+    swathes: Float32Array | None = None
+
+    def extinction(self, points: Float32Array) -> tuple[Float32Array, Float32Array]:
+        """Return the extinction (1/m) and the backscatter (1/(m sr)) at (3, N) points, world frame, metres."""
+        mist = np.full(points.shape[1], self.mist_per_m, np.float32)
+        if self.dust is None or self.swathes is None or self.corner_m is None:
+            return mist, mist / np.float32(MIST_RATIO_SR)
+        dust = self._swathe(points)
+        dust *= np.float32(DUST_M2_PER_MG * self.dust.mg_per_m3)
+        heights_m = np.maximum(points[2] - np.float32(self.floor_z_m), np.float32(0.0))
+        dust *= np.exp(heights_m / np.float32(-self.dust.scale_height_m))
+        return mist + dust, mist / np.float32(MIST_RATIO_SR) + dust / np.float32(DUST_RATIO_SR)
+
+    def _swathe(self, points: Float32Array) -> Float32Array:
+        """Return the density over its mean at the nearest place of the lattice, 1 beyond it."""
+        assert self.swathes is not None and self.corner_m is not None
+        index = np.rint((points - self.corner_m[:, None].astype(np.float32)) / np.float32(_LATTICE_M)).astype(np.int32)
+        is_off = np.zeros(points.shape[1], np.bool_)
+        for axis, count in enumerate(self.swathes.shape):
+            is_off |= (index[axis] < 0) | (index[axis] >= count)
+            np.clip(index[axis], 0, count - 1, out=index[axis])
+        found = self.swathes[index[0], index[1], index[2]]
+        found[is_off] = 1.0
+        return np.asarray(found)
+
+
+def air_around(air: Air, sensor_m: Float64Array, floor_z_m: float, time_s: float, seed: int, session: str) -> AirVolume:
+    """Return the air around a sensor at a (3,) position, world frame, at a time of its session.
+
+    Swathes are log-normal about their mean and drift along a level heading that the seed draws.
+    """
+    mist_per_m = -np.log(CONTRAST_LEFT) / air.mist.visibility_m if air.mist is not None else 0.0
+    dust = air.dust
+    if dust is None:
+        return AirVolume(mist_per_m)
+    generator = stream(seed, session, "air")
+    key, heading_rad = int(generator.integers(1 << 62)), float(generator.uniform(0.0, 2 * np.pi))
+    drifted_m = dust.drift_mps * time_s * np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
+    half_m = np.array([_LATTICE_REACH_M, _LATTICE_REACH_M, _LATTICE_HEIGHT_M])
+    corner_m = np.floor((sensor_m - half_m) / _LATTICE_M) * _LATTICE_M
+    axes = [start + np.arange(0.0, 2 * half + 1e-9, _LATTICE_M) for start, half in zip(corner_m, half_m, strict=True)]
+    moved = (axes[0] - drifted_m[0], axes[1] - drifted_m[1], axes[2])
+    swathes = np.exp(dust.contrast * smooth_noise(moved, dust.patch_m, key) - dust.contrast**2 / 2)
+    return AirVolume(mist_per_m, dust, floor_z_m, corner_m, swathes.astype(np.float32))
+
+
+def cross_air(echo: Echo, rays: Rays, beam_origin_m: float, air: AirVolume, generator: np.random.Generator) -> Echo:
+    """Return the echo of a revolution through the air: surfaces dimmed, and the air where it is the stronger.
+
+    The light of each metre of air is counted with the noise of its photons (square root transform); the metre with the
+    highest count is the air's echo, somewhere within it. That the strongest metre wins is ours, unverified.
+
+    Args:
+        echo: The surfaces' echo through clear air.
+        rays: The revolution's rays.
+        beam_origin_m: Distance of their origins from the spin axis.
+        air: The air.
+        generator: Draws as many numbers for every pixel, whatever it meets.
+    """
+    n_pixels = echo.range_m.size
+    reach_m = np.where(echo.geom >= 0, echo.range_m - np.float32(beam_origin_m), np.float32(REACH_M)).ravel()
+    depth, best, best_m = (np.zeros(n_pixels, np.float32) for _ in range(3))
+    within = generator.random(n_pixels, dtype=np.float32)
+    ways = rays.directions.reshape(-1, 3).T
+    origins = np.repeat(rays.origins.T, rays.directions.shape[1], axis=1).astype(np.float32)
+    for number in range(int(np.ceil(reach_m.max(initial=0.0) / PULSE_M))):
+        start_m = np.float32(number * PULSE_M)
+        on_way = np.flatnonzero(reach_m > start_m)
+        length_m = np.minimum(reach_m[on_way] - start_m, np.float32(PULSE_M))
+        middle_m = start_m + length_m * np.float32(0.5)
+        alpha, beta = air.extinction(origins[:, on_way] + ways[:, on_way] * middle_m)
+        half = alpha * length_m * np.float32(0.5)
+        depth[on_way] += half
+        if start_m < REACH_M:
+            noise = generator.standard_normal(n_pixels, dtype=np.float32)[on_way]
+            power = np.float32(np.pi) * beta * length_m * np.exp(-2 * depth[on_way])
+            counted = _count(received_photons(power, middle_m + np.float32(beam_origin_m)), noise)
+            is_better = counted > best[on_way]
+            better = on_way[is_better]
+            best[better], best_m[better] = counted[is_better], start_m + within[better] * length_m[is_better]
+        depth[on_way] += half
+    return _strongest(echo, depth, best, best_m + np.float32(beam_origin_m))
+
+
+def _count(photons: Float32Array, noise: Float32Array) -> Float32Array:
+    """Return (N,) numbers of photons of (N,) expectations: the square root of a Poisson number has deviation 1/2."""
+    root = np.maximum(np.sqrt(photons) + noise / 2, np.float32(0.0))
+    return np.asarray(
+        np.where(photons > 0, np.maximum(root * root - np.float32(0.25), np.float32(0.0)), np.float32(0.0))
+    )
+
+
+def _strongest(echo: Echo, depth: Float32Array, counted: Float32Array, air_m: Float32Array) -> Echo:
+    """Return the stronger of the dimmed surface and the air, for (N,) optical depths, photons and ranges of the air."""
+    shape = echo.range_m.shape
+    photons = echo.photons * np.exp(-2 * depth).reshape(shape)
+    light, range_m = counted.reshape(shape), air_m.reshape(shape)
+    is_air = (light > photons) & (light >= LEAST_PHOTONS)
+    return replace(
+        echo,
+        range_m=np.where(is_air, range_m, echo.range_m),
+        photons=np.where(is_air, light, photons),
+        cosine=np.where(is_air, np.float32(1.0), echo.cosine),
+        true_range_m=np.where(is_air, np.float32(np.inf), echo.true_range_m),
+        geom=np.where(is_air, np.int32(AIR), echo.geom),
+    )
