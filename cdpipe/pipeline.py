@@ -32,6 +32,7 @@ from cdpipe.descriptors.sphere import anchor_frames, describe_map
 from cdpipe.extract.extract import extract_changes, make_report
 from cdpipe.io.known_merge import require_rigid
 from cdpipe.io.readers import open_session
+from cdpipe.mapping.airborne import clear
 from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.recorded_frames import regions_as_mapped, report_as_recorded
 from cdpipe.mapping.session_check import check_session, unit_hint
@@ -143,7 +144,7 @@ def describe(
         descriptors = map_session(source, config).descriptors
     else:
         chosen = choose_keyframes(source.odom_T_sensor, config.map.keyframe_spacing_m)
-        descriptors = describe_scans(source, chosen, config.descriptor)
+        descriptors = describe_scans(clear(source, config.map), chosen, config.descriptor)
     return descriptors, save_descriptors(Path(session), descriptors, source.odom_T_sensor, config.map, config.sphere)
 
 
@@ -154,6 +155,7 @@ def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
         InputError: The session or one of its scans cannot be used; the message names it and a remedy.
     """
     check_session(source, config.map)
+    source = clear(source, config.map)
     thin_map = build_map(source, config.map)
     descriptors = describe_scans(source, thin_map.keyframe_scans, config.descriptor)
     if config.regions.source == "sphere":
@@ -190,7 +192,9 @@ def map_pair(
     ]
 
     def keyframes(session: int, chosen: slice) -> DescriptorSet:
-        return describe_scans(sources[session], maps[session].keyframe_scans[chosen], config.descriptor)
+        return describe_scans(
+            clear(sources[session], config.map), maps[session].keyframe_scans[chosen], config.descriptor
+        )
 
     def surroundings(session: int, chosen: slice) -> Spheres:
         anchors = anchor_frames(maps[session], maps[session].keyframe_scans[chosen], config.sphere)
@@ -222,7 +226,7 @@ def map_sources(sources: Sequence[ScanSource], config: PipelineConfig, hooks: Ho
         maps = []
         for name, source in zip(("before", "after"), sources, strict=True):
             hooks.on_stage(f"map {name}", 0, 1)
-            maps.append(build_map(source, config.map))
+            maps.append(build_map(clear(source, config.map), config.map))
         return Done((maps[0], maps[1]))
 
     return hooks.run("maps", config, compute).value

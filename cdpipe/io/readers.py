@@ -91,6 +91,7 @@ class RecordedScans:
             odom_T_sensor=self.odom_T_sensor[index],
             stamps_ns=stamps[is_hit],
             pixels=np.flatnonzero(is_hit).astype(np.int32),
+            signal=self._chunk.signal[row][is_hit] if self._chunk.signal[row].any() else None,
         )
 
     def scans(self) -> Iterator[PosedScan]:

@@ -62,7 +62,7 @@ class _Grown(Settings):
 class MapConfig(_Grown):
     """From scans to a thinned map and keyframes."""
 
-    newer: ClassVar[tuple[str, ...]] = ("consistency",)
+    newer: ClassVar[tuple[str, ...]] = ("consistency", "airborne")
 
     voxel_m: Cell = Field(0.2, description="cell of the thinned map")
     max_range_m: Positive = Field(60.0, description="returns beyond this range are not mapped")
@@ -70,6 +70,9 @@ class MapConfig(_Grown):
     consistency: Literal["none", "scan-to-map", "graph"] = Field(
         "none",
         description="map with the recorded poses; register every scan once more with those around it; close loops, too",
+    )
+    airborne: Literal["keep", "drop"] = Field(
+        "keep", description="returns of mist and dust; dropped where they are over 1 in 100 of a scan"
     )
 
 

@@ -38,6 +38,7 @@ class PosedScan:
         odom_T_sensor: (4, 4) float64 pose that maps sensor points into the session's odom frame.
         stamps_ns: (N,) int64 time of each return since the start of the session.
         pixels: (N,) int32 origin of each return: row * W + column, or the row of its file.
+        signal: (N,) uint16 photons of each return, None where the sensor does not tell.
     """
 
     index: int
@@ -45,10 +46,13 @@ class PosedScan:
     odom_T_sensor: Float64Array
     stamps_ns: Int64Array
     pixels: Int32Array
+    signal: npt.NDArray[np.uint16] | None = None
 
     def __post_init__(self) -> None:
         n = len(self.points_sensor)
         require_shapes(self, points_sensor=(None, 3), odom_T_sensor=(4, 4), stamps_ns=(n,), pixels=(n,))
+        if self.signal is not None:
+            require_shapes(self, signal=(n,))
 
 
 class ScanSource(Protocol):

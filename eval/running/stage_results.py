@@ -48,6 +48,7 @@ def name_result(stage: Stage, config: PipelineConfig) -> str:
                 "keyframe_spacing_m": config.map.keyframe_spacing_m,
                 "method": config.descriptor.method,
                 "weights": checkpoint_digest(config.descriptor),
+                **({"airborne": "drop"} if config.map.airborne == "drop" else {}),
             }
         case "spheres":
             precision, weights = config.descriptor.precision, sphere_digest(config.sphere)

@@ -1,0 +1,105 @@
+"""Returns of mist and dust: told by their weakness, and by neighbours that do not lie on one surface with them.
+
+A surface within a few metres sends back tens of photons, the air in front of it a handful; and the places from which
+air returns are scattered along the beams, while neighbouring beams meet a surface at ranges that agree or follow a
+line. Published filters for snow use either: intensity (LIOR, Park and others 2020) and local density (DROR, Charron and
+others 2018).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cdpipe.core.geometry import BoolArray, Float64Array
+from cdpipe.model.config import MapConfig
+from cdpipe.model.types import PosedScan, ScanSource, WrappedScans
+
+# Simulated validation worlds (10001 of six families). A scan is dusty by the first rule: it holds for 0.4 % of a clear
+# scan at most, for 94 % and more of the returns of mist and dust. In a dusty scan the second rule drops what it can: in
+# mist with 12, 20 and 40 m of visibility 0.8, 0.01 and 0.00 % of what is left are returns of the mist, and 9, 6 and 4 %
+# of the surfaces are lost.
+_FARTHEST_M = 20.0
+_NEAR_M, _NEAR_PHOTONS = 3.0, 10
+_DUSTY_SHARE = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class _Rule:
+    """A return is airborne if it is weak and fewer than two of its four neighbours agree with its range."""
+
+    weak_photons: int
+    agree_m: float
+    agree_share: float
+    may_lie_between: bool  # whether it may instead lie on the line between the next two
+
+
+_IN_ANY_AIR = _Rule(16, 0.1, 0.02, may_lie_between=True)
+_IN_DUST = _Rule(24, 0.05, 0.01, may_lie_between=False)
+
+
+class ClearScans(WrappedScans):
+    """A session without the returns of mist and dust; a scan of clear air is as recorded."""
+
+    def scan(self, index: int) -> PosedScan:
+        """Read one scan."""
+        return drop_airborne(super().scan(index))
+
+    def scans(self) -> Iterator[PosedScan]:
+        """Read all scans in order."""
+        return map(drop_airborne, super().scans())
+
+
+def clear(source: ScanSource, config: MapConfig) -> ScanSource:
+    """Return a session as its map shall have it, `map.airborne`."""
+    return ClearScans(source) if config.airborne == "drop" else source
+
+
+def drop_airborne(scan: PosedScan) -> PosedScan:
+    """Return a scan without the returns of mist and dust, if it is dusty; else the scan.
+
+    It is dusty if more than one return in a hundred looks airborne. Without the sensor's signal nobody can tell.
+    """
+    if scan.signal is None or np.count_nonzero(_mark(scan, scan.signal, _IN_ANY_AIR)) <= _DUSTY_SHARE * len(scan.pixels):
+        return scan
+    kept = ~_mark(scan, scan.signal, _IN_DUST)
+    if not kept.any():
+        return scan
+    return PosedScan(
+        scan.index,
+        scan.points_sensor[kept],
+        scan.odom_T_sensor,
+        scan.stamps_ns[kept],
+        scan.pixels[kept],
+        scan.signal[kept],
+    )
+
+
+def _mark(scan: PosedScan, signal: npt.NDArray[np.uint16], rule: _Rule) -> BoolArray:
+    """Mark the (N,) returns within 20 m that look airborne by a rule, and those too dark for a surface within 3 m."""
+    squared_m2 = np.einsum("ij,ij->i", scan.points_sensor, scan.points_sensor)
+    is_marked: BoolArray = (signal < rule.weak_photons) & (squared_m2 < _FARTHEST_M**2)
+    weak = np.flatnonzero(is_marked)
+    ranges_m = np.sqrt(squared_m2)
+    is_dark = (ranges_m[weak] < _NEAR_M) & (signal[weak] < _NEAR_PHOTONS)
+    is_marked[weak] = is_dark | ~_is_on_surface(scan.pixels, ranges_m, weak, rule)
+    return is_marked
+
+
+def _is_on_surface(
+    pixels: npt.NDArray[np.int32], ranges_m: Float64Array, chosen: npt.NDArray[np.int64], rule: _Rule
+) -> BoolArray:
+    """Tell which (C,) chosen returns lie on one surface with the two beams on either side in their row."""
+    image = np.full(int(pixels.max(initial=0)) + 5, np.nan)
+    image[pixels + 2] = ranges_m
+    own, at = ranges_m[chosen], pixels[chosen] + 2
+    tolerance_m = rule.agree_m + rule.agree_share * own
+    around = {step: image[at + step] for step in (-2, -1, 1, 2)}
+    agreeing = np.stack([np.abs(other - own) < tolerance_m for other in around.values()])
+    is_on: BoolArray = agreeing.sum(axis=0) >= 2
+    if rule.may_lie_between:
+        is_on |= np.abs(around[-1] + around[1] - 2 * own) < tolerance_m
+    return is_on

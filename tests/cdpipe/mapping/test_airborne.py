@@ -1,0 +1,153 @@
+"""Returns of mist and dust are dropped, and clear air changes nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cdpipe
+from cdpipe.core.geometry import Float64Array, Int32Array
+from cdpipe.io.readers import open_session
+from cdpipe.io.session import read_session
+from cdpipe.mapping.airborne import ClearScans, clear, drop_airborne
+from cdpipe.mapping.mapping import build_map
+from cdpipe.model.config import MapConfig, load_config
+from cdpipe.model.types import PosedScan
+from scenarios import load_scenario
+from sim.sensor.air import AIR
+from sim.session.simulate import simulate_pair
+from sim.session.truth import read_labels
+
+WIDTH = 100
+
+
+def scan_of(ranges_m: Float64Array, signal: Int32Array) -> PosedScan:
+    """One row of beams over a sixth of a turn; a range of 0 is a miss."""
+    azimuth = np.linspace(0.0, np.pi / 3, WIDTH)
+    points = ranges_m[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros(WIDTH)])
+    is_hit = ranges_m > 0
+    pixels = (WIDTH + np.flatnonzero(is_hit)).astype(np.int32)
+    stamps_ns = np.arange(is_hit.sum(), dtype=np.int64)
+    return PosedScan(0, points[is_hit], np.eye(4), stamps_ns, pixels, signal[is_hit].astype(np.uint16))
+
+
+def wall(signal: int = 60) -> tuple[Float64Array, Int32Array]:
+    return np.linspace(4.0, 9.0, WIDTH), np.full(WIDTH, signal, np.int32)
+
+
+def dropped(scan: PosedScan) -> list[int]:
+    return sorted(set((scan.pixels - WIDTH).tolist()) - set((drop_airborne(scan).pixels - WIDTH).tolist()))
+
+
+MIST = [10, 20, 50, 51, 80, 90]
+
+
+def in_mist(ranges_m: Float64Array, signal: Int32Array) -> tuple[Float64Array, Int32Array]:
+    """Six weak returns in front of the wall: enough for a dusty scan."""
+    ranges_m[MIST], signal[MIST] = (2.2, 1.2, 4.0, 3.1, 6.0, 3.9), 7
+    return ranges_m, signal
+
+
+def test_weak_returns_in_front_of_a_wall_are_dropped() -> None:
+    scan = scan_of(*in_mist(*wall()))
+    left = drop_airborne(scan)
+    assert dropped(scan) == MIST
+    assert left.signal is not None and len(left.points_sensor) == len(left.stamps_ns) == len(left.signal) == 94
+    kept = np.isin(scan.pixels, left.pixels)
+    assert (left.points_sensor == scan.points_sensor[kept]).all() and (left.stamps_ns == scan.stamps_ns[kept]).all()
+
+
+def test_strong_returns_and_surfaces_stay() -> None:
+    ranges_m, signal = in_mist(*wall())
+    ranges_m[30], signal[30] = 2.0, 40  # a lone wire that shines
+    ranges_m[60:64], signal[60:64] = 4.0, 9  # a dark post, four beams wide
+    assert dropped(scan_of(ranges_m, signal)) == MIST
+    # a dark wall: its ranges agree; but around the mist fewer neighbours are left
+    ranges_m, signal = in_mist(wall()[0], np.full(WIDTH, 12, np.int32))
+    lost = dropped(scan_of(ranges_m, signal))
+    assert set(MIST) <= set(lost) and len(lost) <= 2 * len(MIST)
+
+
+def test_what_is_near_and_nearly_black_is_mist_though_it_looks_like_a_surface() -> None:
+    ranges_m, signal = in_mist(*wall())
+    ranges_m[60:70], signal[60:70] = 1.5, 8
+    assert dropped(scan_of(ranges_m, signal)) == sorted([*MIST, *range(60, 70)])
+    signal[60:70] = 12
+    assert dropped(scan_of(ranges_m, signal)) == MIST
+    dark = scan_of(np.full(WIDTH, 1.5), np.full(WIDTH, 8))
+    assert drop_airborne(dark) is dark  # nothing would be left
+
+
+def test_only_a_dusty_scan_loses_returns() -> None:
+    ranges_m, signal = wall()
+    ranges_m[20], signal[20] = 1.2, 7
+    one = scan_of(ranges_m, signal)
+    assert drop_airborne(one) is one  # one in a hundred, as in clear air
+    ranges_m[40], signal[40] = 1.9, 7
+    assert dropped(scan_of(ranges_m, signal)) == [20, 40]
+    # a dark wall that runs away from beam to beam is no dust: its ranges follow a line
+    steep = scan_of(np.linspace(3.0, 19.0, WIDTH) ** 1.05, np.full(WIDTH, 12))
+    assert drop_airborne(steep) is steep
+
+
+def test_a_sensor_that_tells_no_signal_keeps_everything() -> None:
+    scan = replace(scan_of(*in_mist(*wall())), signal=None)
+    assert drop_airborne(scan) is scan
+
+
+@cache
+def misty_pair(folder: Path) -> Path:
+    settings = ["after.air.mist.visibility_m=20"]
+    simulate_pair(load_scenario("smoke/one_box", 3, settings), 3, folder / "pair")
+    return folder / "pair"
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return misty_pair(tmp_path_factory.mktemp("misty"))
+
+
+def test_nearly_all_returns_of_simulated_mist_are_dropped_and_few_of_surfaces(pair: Path) -> None:
+    session = read_session(pair / "after")
+    truth = np.concatenate([instance for instance, _ in read_labels(session.path, session.n_chunks)])
+    source, cleared = open_session(pair / "after"), ClearScans(open_session(pair / "after"))
+    seen = np.concatenate([truth[scan.index].ravel()[scan.pixels] for scan in source.scans()])
+    left = np.concatenate([truth[scan.index].ravel()[scan.pixels] for scan in cleared.scans()])
+    assert (seen == AIR).mean() > 0.05
+    assert (left == AIR).sum() < 0.01 * (seen == AIR).sum()
+    assert (left >= 0).sum() > 0.9 * (seen >= 0).sum()
+
+
+def test_clear_scans_are_as_recorded(pair: Path) -> None:
+    source = open_session(pair / "before")
+    for one, other in zip(source.scans(), ClearScans(open_session(pair / "before")).scans(), strict=True):
+        assert (one.pixels == other.pixels).all()
+    assert clear(source, MapConfig()) is source
+
+
+def test_the_map_of_a_misty_session_holds_its_surfaces(pair: Path) -> None:
+    before = build_map(open_session(pair / "before"), MapConfig()).points
+    cells = {tuple(each) for each in np.floor(before / 0.6).astype(int).tolist()}
+
+    def n_off(airborne: str) -> int:
+        """Count map points in cells of 0.6 m that the clear session left empty."""
+        config = MapConfig.model_validate({"airborne": airborne})
+        points = build_map(clear(open_session(pair / "after"), config), config).points
+        return sum(tuple(each) not in cells for each in np.floor(points / 0.6).astype(int).tolist())
+
+    assert n_off("drop") < 0.25 * n_off("keep")
+
+
+def test_the_pipeline_sees_through_the_mist(pair: Path) -> None:
+    report = cdpipe.detect(pair / "before", pair / "after")
+    assert [item.kind for item in report.objects] == ["added"]
+
+
+def test_presets_of_the_paper_map_what_was_recorded() -> None:
+    assert load_config("paper").map.airborne == load_config("paper-paired").map.airborne == "keep"
+    assert load_config("tunnelcd").map.airborne == load_config("c2c").map.airborne == "drop"
+    assert "airborne" not in load_config("paper").model_dump(mode="json")["map"]
