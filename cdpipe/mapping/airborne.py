@@ -63,7 +63,9 @@ def drop_airborne(scan: PosedScan) -> PosedScan:
 
     It is dusty if more than one return in a hundred looks airborne. Without the sensor's signal nobody can tell.
     """
-    if scan.signal is None or np.count_nonzero(_mark(scan, scan.signal, _IN_ANY_AIR)) <= _DUSTY_SHARE * len(scan.pixels):
+    if scan.signal is None:
+        return scan
+    if np.count_nonzero(_mark(scan, scan.signal, _IN_ANY_AIR)) <= _DUSTY_SHARE * len(scan.pixels):
         return scan
     kept = ~_mark(scan, scan.signal, _IN_DUST)
     if not kept.any():
