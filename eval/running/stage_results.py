@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from cdpipe.core.path_frames import FRAMES
 from cdpipe.core.plugins import extra_version
-from cdpipe.descriptors import checkpoint_digest, sphere_digest
+from cdpipe.descriptors import checkpoint_digest, range_net_digest, sphere_digest
 from cdpipe.methods.registry import PACKAGES
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import SOURCES_AT_KEYFRAMES, PipelineConfig
@@ -26,9 +26,9 @@ from eval.core.provenance import digest
 from eval.running.stage_cache import Arrays
 from eval.truth.ground_truth import SESSIONS
 
-_WHOLE_MAP_SOURCES = ("voxel-diff", "c2c", "m3c2", "m3c2-ep", "dufomap", "octomap", "removert", "erasor")
+_WHOLE_MAP_SOURCES = ("voxel-diff", "c2c", "m3c2", "m3c2-ep", "dufomap", "octomap", "removert", "erasor", "range-net")
 # The settings that they read besides those of the query and of the extraction.
-_OF_WHOLE_MAPS = {"outlier", "cluster", "m3c2", "dufomap", "removert", "octomap", "m3c2_ep", "erasor"}
+_OF_WHOLE_MAPS = {"outlier", "cluster", "m3c2", "dufomap", "removert", "octomap", "m3c2_ep", "erasor", "range_net"}
 _PIXELS = tuple(f"{session}.return_pixels" for session in SESSIONS)
 
 
@@ -77,6 +77,8 @@ def is_kept(stage: Stage, config: PipelineConfig) -> bool:
 def _settings_of_clusters(config: PipelineConfig) -> dict[str, Any]:
     """Return what a source that compares whole maps may read besides."""
     found = config.model_dump(mode="json", include=_OF_WHOLE_MAPS)
+    if config.regions.source == "range-net":  # the digest names the weights, wherever their file lies
+        found["range_net"] |= {"weights": range_net_digest(config.range_net)}
     how = {"method", "withdraw", "recentre"}  # objects are cut out of the regions
     package = PACKAGES.get(config.regions.source)
     found |= {"package": extra_version(package)} if package else {}
