@@ -23,6 +23,7 @@ from cdpipe.descriptors.network import (
     load_trained_network,
     make_untrained_network,
 )
+from cdpipe.descriptors.point_changes import range_net_digest
 from cdpipe.descriptors.range_image import range_image
 from cdpipe.descriptors.sphere import sphere_digest
 from cdpipe.descriptors.weights_file import checkpoint_bytes, digest, read_weights
@@ -154,13 +155,18 @@ def checkpoint_digest(config: DescriptorConfig) -> str:
 
 
 def list_checkpoints(config: PipelineConfig) -> dict[str, str]:
-    """Return the digests of the weights that a method uses: by its scan descriptor, and by `sphere` if it compares so.
+    """Return the digests of the weights that a method uses: by its scan descriptor, and by a source with a network.
 
     Raises:
         InputError: A file of weights cannot be used.
     """
-    found = {config.descriptor.method: checkpoint_digest(config.descriptor)}
-    return found | ({"sphere": sphere_digest(config.sphere)} if config.regions.source == "sphere" else {})
+    found: dict[str, str] = {config.descriptor.method: checkpoint_digest(config.descriptor)}
+    match config.regions.source:
+        case "sphere":
+            found["sphere"] = sphere_digest(config.sphere)
+        case "range-net":
+            found["range-net"] = range_net_digest(config.range_net)
+    return found
 
 
 def use_threads(n_threads: int) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, invert
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array
 from cdpipe.core.grid_index import GridIndex
 from cdpipe.core.path_frames import path_frames
 from cdpipe.descriptors.sphere_image import render
@@ -86,9 +86,7 @@ def change_logits(
     network, _ = _network(sphere)
     logits = np.full((len(is_covered), SECTORS), np.nan)
     map_T_anchor = anchor_frames(merged.before, before.keyframe_scans[is_covered], sphere)
-    positions_odom = merged.alignment.to_odom(map_T_anchor[:, :3, 3])
-    after_T_anchor = np.asarray(invert(merged.alignment.at(positions_odom)) @ map_T_anchor)
-    images = render(GridIndex(merged.after.points), after_T_anchor)
+    images = render(GridIndex(merged.after.points), merged.move_poses("before", "after", map_T_anchor))
     spheres = dequantise(before.spheres[is_covered])
     with torch.inference_mode():
         batches = (torch.split(torch.from_numpy(array), _BATCH) for array in (spheres, images))

@@ -44,7 +44,7 @@ LengthOrWidth = Annotated[
     Discriminator(lambda value: "word" if isinstance(value, str) else "length"),
 ]
 Site = Literal["narrow", "wide"]
-WEIGHTS = ("descriptor.weights", "sphere.weights")
+WEIGHTS = ("descriptor.weights", "sphere.weights", "range_net.weights")
 """Settings that name a file; a relative path starts at the file that holds the setting."""
 
 
@@ -131,7 +131,7 @@ class MergeConfig(Settings):
 
 
 # Settings that only the source of this name reads; a dump of another leaves them out where they are the defaults.
-_OF_ONE_SOURCE = ("voxel_diff", "c2c", "removert", "octomap", "m3c2_ep", "erasor")
+_OF_ONE_SOURCE = ("voxel_diff", "c2c", "removert", "octomap", "m3c2_ep", "erasor", "range_net")
 # Sources that score keyframes; they read nothing but descriptors, maps and `query`, and cut out nothing.
 SOURCES_AT_KEYFRAMES = ("scan", "sphere", "sphere-difference", "every-keyframe", "random-regions")
 
@@ -146,7 +146,8 @@ class RegionsConfig(_Grown):
         description=(
             "`scan`: the paper's query of scan descriptors; `sphere`: sphere descriptors; `sphere-difference`, "
             "`every-keyframe`, `random-regions`; `voxel-diff`, `c2c`, `m3c2`, `m3c2-ep`, `dufomap`, `octomap`, "
-            "`removert`, `erasor`: clusters of a whole-map comparison; or a plugin's, by its registered name"
+            "`removert`, `erasor`, `range-net`: clusters of a whole-map comparison; or a plugin's, by its registered "
+            "name"
         ),
     )
 
@@ -295,6 +296,22 @@ class ErasorConfig(Settings):
     every_scan: Count = Field(1, description="`erasor`: every n-th scan is compared")
 
 
+class RangeNetConfig(_Grown):
+    """A network that compares range images of both maps."""
+
+    newer: ClassVar[tuple[str, ...]] = ("weights",)
+
+    threshold: Annotated[float, Field(gt=0, le=1)] = Field(
+        0.5, description="`range-net`: a point is new from this mean probability of a change"
+    )
+    depth_m: Positive = Field(
+        0.3, description="`range-net`: an image shows the points no farther than this behind the nearest of their pixel"
+    )
+    weights: str = Field(
+        "", description="`range-net`: file of weights that `tunnelcd train` wrote; empty: the shipped ones"
+    )
+
+
 class PipelineConfig(Settings):
     """All settings of one method: where regions come from, how objects are cut out of them, and all before that."""
 
@@ -324,6 +341,7 @@ class PipelineConfig(Settings):
     octomap: OctomapConfig = OctomapConfig()
     m3c2_ep: M3C2EPConfig = M3C2EPConfig()
     erasor: ErasorConfig = ErasorConfig()
+    range_net: RangeNetConfig = RangeNetConfig()
     options: dict[str, bool | int | float | str] = Field(
         {}, description="settings of a plugin's method, by its own names"
     )

@@ -15,6 +15,7 @@ from cdpipe.core.geometry import (
     Int8Array,
     Int32Array,
     Int64Array,
+    invert,
     require_poses,
     require_shapes,
 )
@@ -270,6 +271,15 @@ class MergedMaps:
     def to_odom(self, session: SessionName, points_map: Float64Array) -> Float64Array:
         """Return (N, 3) points of the map frame in a session's odom frame, metres."""
         return points_map if session == "before" else self.alignment.to_odom(points_map)
+
+    def move_poses(self, source: SessionName, target: SessionName, odom_T_here: Float64Array) -> Float64Array:
+        """Return (K, 4, 4) poses in the odom frame of session `source` in that of `target`, as it holds at each."""
+        if source == target:
+            return odom_T_here
+        if source == "after":
+            return np.asarray(self.alignment.at(odom_T_here[:, :3, 3]) @ odom_T_here)
+        positions_after = self.alignment.to_odom(odom_T_here[:, :3, 3])
+        return np.asarray(invert(self.alignment.at(positions_after)) @ odom_T_here)
 
     def keyframe_positions(self, before: DescriptorSet, after: DescriptorSet) -> tuple[Float64Array, Float64Array]:
         """Return the (Kb, 3) before and (Ka, 3) after positions of the described keyframes, map frame, metres."""

@@ -1,3 +1,4 @@
+from .change_training import ChangeTask
 from .data import ChangePairs, TunnelShard, open_dataset, read_place_data, stacked
 from .fit import FitConfig
 from .scan_training import PlaceTask
@@ -6,6 +7,7 @@ from .sphere_training import SphereTask, read_sphere_data
 
 __all__ = [
     "ChangePairs",
+    "ChangeTask",
     "FitConfig",
     "PlaceTask",
     "SphereTask",

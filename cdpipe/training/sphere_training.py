@@ -33,14 +33,14 @@ _MIN_PIXELS = 3
 _POSITIVE_WEIGHT = 3.0
 _PLACE_WEIGHT = 0.5
 _PASTED_SHARE = 0.25
-_PASTED_SHIFT_ROWS = 3
+PASTED_SHIFT_ROWS = 3
 # A pasted pixel counts as changed if it is this much in front of the surface; it is pasted from _IN_FRONT_M on.
 _STANDS_OUT_M = 0.15
 _IN_FRONT_M = 0.05
 # Largest logarithm of the scale factor, and largest share of missing pixels.
 _LOG_SCALE = float(np.log(1.6))
 _MAX_MISSING = 0.3
-_CHANGED, _UNCOUNTED = 1, 2
+CHANGED, UNCOUNTED = 1, 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +93,7 @@ def read_sphere_data(tunnels: Sequence[TunnelShard]) -> SphereData:
         if not isinstance(radius_m, int | float) or not 0 < radius_m < np.inf:
             raise InputError(f"{tunnel.path}: damaged: score_radius_m = {radius_m!r:.40}: make the dataset again")
         marks = np.zeros(256, np.uint8)
-        marks[arrays["change_ids"]] = np.where(arrays["change_is_observable"], _CHANGED, _UNCOUNTED)
+        marks[arrays["change_ids"]] = np.where(arrays["change_is_observable"], CHANGED, UNCOUNTED)
         parts["before_m"].append(arrays["before_images"][covered])
         parts["after_m"].append(np.moveaxis(arrays["after_images"], 0, 1)[covered])
         parts["before_marks"].append(marks[arrays["before_labels"][covered]])
@@ -123,8 +123,8 @@ def sector_targets(before_marks: Tensor, after_marks: Tensor) -> Tensor:
     A sector is changed if at least three pixels of the keyframe's own rows, both images together, have an observable
     change. It is ignored if it has fewer, or only unobservable changes.
     """
-    changed = _per_sector((before_marks == _CHANGED).float() + (after_marks == _CHANGED).float())
-    uncounted = _per_sector((before_marks == _UNCOUNTED).float() + (after_marks == _UNCOUNTED).float())
+    changed = _per_sector((before_marks == CHANGED).float() + (after_marks == CHANGED).float())
+    uncounted = _per_sector((before_marks == UNCOUNTED).float() + (after_marks == UNCOUNTED).float())
     is_changed, is_untouched = changed >= _MIN_PIXELS, changed + uncounted == 0
     return torch.where(is_changed, 1.0, torch.where(is_untouched, 0.0, -1.0))
 
@@ -137,8 +137,7 @@ class SphereTask:
         targets = sector_targets(training.before_marks, training.after_marks[:, 0])
         self._changed = torch.nonzero((targets == 1).any(dim=1))[:, 0].numpy()
         self._unchanged = torch.nonzero((targets == 0).all(dim=1))[:, 0].numpy()
-        stands_there = (training.after_marks[:, 0, _OWN_ROWS] == _CHANGED).flatten(1).sum(dim=1)
-        self._donors = torch.nonzero(stands_there >= _MIN_PIXELS)[:, 0].numpy()
+        self._donors = find_donors(training)
         if not len(self._donors) or not len(self._unchanged):
             raise InputError("training needs keyframes with an object added and keyframes without: make more tunnels")
 
@@ -165,9 +164,10 @@ class SphereTask:
         targets = sector_targets(data.before_marks[chosen], data.after_marks[chosen, errors])
         pasted = slice(half, half + int(_PASTED_SHARE * BATCH))
         donors = draw.choice(self._donors, pasted.stop - pasted.start)
-        shifts = draw.integers(-_PASTED_SHIFT_ROWS, _PASTED_SHIFT_ROWS, len(donors), endpoint=True)
-        after[pasted], targets[pasted] = _paste(after[pasted], data, donors, shifts)
-        before, after = _augment(before, after, draw)
+        shifts = draw.integers(-PASTED_SHIFT_ROWS, PASTED_SHIFT_ROWS, len(donors), endpoint=True)
+        after[pasted], marks = paste_objects(after[pasted], data, donors, shifts)
+        targets[pasted] = sector_targets(torch.zeros_like(marks), marks)
+        before, after = augment(before, after, draw)
         if draw.random() < 0.5:
             before, after = after, before
         if draw.random() < 0.5:  # reversed heading
@@ -261,7 +261,13 @@ def pool_within_reach(scores: Float64Array, data: SphereData) -> Float64Array:
     return best
 
 
-def _augment(before: Tensor, after: Tensor, draw: np.random.Generator) -> tuple[Tensor, Tensor]:
+def find_donors(data: SphereData) -> Int64Array:
+    """Return the keyframes in whose own rows an object was added, for `paste_objects`."""
+    stands_there = (data.after_marks[:, 0, _OWN_ROWS] == CHANGED).flatten(1).sum(dim=1)
+    return np.asarray(torch.nonzero(stands_there >= _MIN_PIXELS)[:, 0].numpy())
+
+
+def augment(before: Tensor, after: Tensor, draw: np.random.Generator) -> tuple[Tensor, Tensor]:
     """Return the images with a random scale for both and random missing pixels for each.
 
     A scaled pixel beyond the renderer's reach becomes empty.
@@ -276,16 +282,26 @@ def _augment(before: Tensor, after: Tensor, draw: np.random.Generator) -> tuple[
     return seen[0], seen[1]
 
 
-def _paste(after: Tensor, data: SphereData, donors: Int64Array, shifts: Int64Array) -> tuple[Tensor, Tensor]:
-    """Paste the added objects of the donors, shifted by rows, into images; return the images and their targets."""
+def paste_objects(after: Tensor, data: SphereData, donors: Int64Array, shifts: Int64Array) -> tuple[Tensor, Tensor]:
+    """Paste the added objects of the donors, shifted by rows, into images.
+
+    Args:
+        after: (B, ROWS, COLUMNS) images, metres.
+        data: Holds the donors.
+        donors: (B,) keyframes whose objects are pasted (`find_donors`).
+        shifts: (B,) rows by which they are shifted.
+
+    Returns:
+        The images and (B, ROWS, COLUMNS) uint8 marks of what was pasted: 0 nothing, 1 an object that stands out from
+        the surface, 2 one that hardly does.
+    """
     images = torch.stack([torch.roll(data.after_m[k, 0], int(s), 0) for k, s in zip(donors, shifts, strict=True)])
     marks = torch.stack([torch.roll(data.after_marks[k, 0], int(s), 0) for k, s in zip(donors, shifts, strict=True)])
-    is_object = marks == _CHANGED
+    is_object = marks == CHANGED
     is_put = is_object & ((after == 0) | (images < after - _IN_FRONT_M))
     stands_out = is_object & (after > 0) & (images < after - _STANDS_OUT_M)
-    changed, touched = _per_sector(stands_out.float()), _per_sector(is_put.float())
-    targets = torch.where(changed >= _MIN_PIXELS, 1.0, torch.where(touched == 0, 0.0, -1.0))
-    return torch.where(is_put, images, after), targets
+    marks = torch.zeros_like(marks).masked_fill(is_put, UNCOUNTED).masked_fill(stands_out, CHANGED)
+    return torch.where(is_put, images, after), marks
 
 
 def _per_sector(pixels: Tensor) -> Tensor:

@@ -45,11 +45,17 @@ def weights() -> str:
     """Load the shipped networks, and hold their digests against their model cards (torch, safetensors)."""
     import torch
 
+    from cdpipe.descriptors.change_network import load_trained_change_network
     from cdpipe.descriptors.network import load_trained_network
     from cdpipe.descriptors.sphere_network import load_trained_sphere_network
 
     told = []
-    for name, load in (("3deg", load_trained_network), ("sphere", load_trained_sphere_network)):
+    shipped: tuple[tuple[str, Callable[[], tuple[torch.nn.Module, str]]], ...] = (
+        ("3deg", load_trained_network),
+        ("sphere", load_trained_sphere_network),
+        ("range-net", load_trained_change_network),
+    )
+    for name, load in shipped:
         network, digest = load()
         card = json.loads((resources.files("cdpipe") / "descriptors" / "weights" / f"{name}.json").read_text())
         _require(digest == card["checkpoint"], f"{name}.safetensors is {digest}, its model card {card['checkpoint']}")

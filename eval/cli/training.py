@@ -51,7 +51,7 @@ def dataset(
 def train(
     data: Annotated[Path, typer.Argument(metavar="DIR", help="made by `tunnelcd dataset`, tunnels of both splits")],
     out: Annotated[Path, typer.Option("--out", help="folder for checkpoint, model card and curves")],
-    descriptor: Annotated[str, typer.Option(help="sphere or 3deg")] = "sphere",
+    descriptor: Annotated[str, typer.Option(help="sphere, 3deg, or the network of range-net")] = "sphere",
     steps: Annotated[int, typer.Option(min=1, help="largest number of training steps")] = 4000,
     seed: Annotated[int, typer.Option(min=0, help="seed of the initial weights and of every draw")] = 0,
     threads: Annotated[int, typer.Option(min=1, help="number of torch's threads; another gives other weights")] = 2,

@@ -76,7 +76,7 @@ _NO_THRESHOLDS: Mapping[str, Any] = {"thresholds": {}}
 _MAY_BE_LEFT_OUT = ("split", "set", "thresholds", "axes")
 _AFTER_MERGE = (
     "query", "extract", "outlier", "cluster",
-    "voxel_diff", "c2c", "m3c2", "dufomap", "removert", "octomap", "m3c2_ep", "erasor",
+    "voxel_diff", "c2c", "m3c2", "dufomap", "removert", "octomap", "m3c2_ep", "erasor", "range_net",
 )  # fmt: skip
 
 

@@ -19,10 +19,10 @@ import numpy as np
 from cdpipe.core.errors import InputError, MergeFailedError, ScenarioError, TunnelcdError
 from cdpipe.core.plugins import extra_version
 from cdpipe.core.threads import THREADS
-from cdpipe.descriptors import checkpoint_digest, list_checkpoints, sphere_digest, use_threads
+from cdpipe.descriptors import checkpoint_digest, list_checkpoints, use_threads
 from cdpipe.io.answer import write_answer, write_failure
 from cdpipe.methods.registry import PACKAGES, list_extras
-from cdpipe.model.config import MapConfig
+from cdpipe.model.config import WEIGHTS, MapConfig
 from cdpipe.pipeline import OnStage
 from eval.core.domains import domain_of
 from eval.core.output import remove, whole_file
@@ -44,6 +44,8 @@ from sim.session.simulate import simulate_pair
 
 if sys.platform != "win32":
     import fcntl
+
+_WEIGHTS = {setting.partition(".")[0]: {"weights"} for setting in WEIGHTS}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,15 +224,16 @@ def cell_key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mappi
     extras = ["kiss-matcher"] if cell.oracle is None and asks_kiss_matcher else []
     if cell.config.regions.source in PACKAGES and cell.until is None and not cell.oracle_regions:
         extras.append(PACKAGES[cell.config.regions.source])
+    weights = list_checkpoints(cell.config)
     return digest(
         {
             "scenario": None if scenario is None else scenario.model_dump(mode="json"),
             "files": dict(files),
             "seed": cell.seed,
             # the digests name the weights, wherever their files lie
-            "config": cell.config.model_dump(mode="json", exclude={"descriptor": {"weights"}, "sphere": {"weights"}}),
+            "config": cell.config.model_dump(mode="json", exclude=_WEIGHTS),
             "checkpoint": checkpoint_digest(cell.config.descriptor),
-            **({"sphere": sphere_digest(cell.config.sphere)} if cell.config.regions.source == "sphere" else {}),
+            **{name: found for name, found in weights.items() if name == cell.config.regions.source},
             "oracle": None if cell.oracle is None else cell.oracle.model_dump(mode="json"),
             **({"oracle_regions": True} if cell.oracle_regions else {}),
             "until": cell.until,

@@ -239,7 +239,11 @@ def _provenance(plan: Plan, all_cells: Sequence[Cell], command: Sequence[str], t
     configs = {f"{cell.scenario} {cell.variant}": cell.config.model_dump(mode="json") for cell in all_cells}
     checkpoints: dict[str, str] = {}
     for cell in all_cells:
-        files = {"sphere": cell.config.sphere.weights, cell.config.descriptor.method: cell.config.descriptor.weights}
+        files = {
+            "sphere": cell.config.sphere.weights,
+            "range-net": cell.config.range_net.weights,
+            cell.config.descriptor.method: cell.config.descriptor.weights,
+        }
         for name, digest_of_weights in list_checkpoints(cell.config).items():
             checkpoints[f"{name} {files[name]}".strip()] = digest_of_weights
     return describe_run(plan.model_dump(mode="json"), configs, checkpoints, command, tools.commit(), tools.now())

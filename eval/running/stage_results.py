@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from cdpipe.core.path_frames import FRAMES
 from cdpipe.core.plugins import extra_version
-from cdpipe.descriptors import checkpoint_digest, sphere_digest
+from cdpipe.descriptors import checkpoint_digest, range_net_digest, sphere_digest
 from cdpipe.methods.registry import PACKAGES
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import SOURCES_AT_KEYFRAMES, PipelineConfig
@@ -26,10 +26,10 @@ from eval.core.provenance import digest
 from eval.running.stage_cache import Arrays
 from eval.truth.ground_truth import SESSIONS
 
-_WHOLE_MAP_SOURCES = ("voxel-diff", "c2c", "m3c2", "m3c2-ep", "dufomap", "octomap", "removert", "erasor")
+_WHOLE_MAP_SOURCES = ("voxel-diff", "c2c", "m3c2", "m3c2-ep", "dufomap", "octomap", "removert", "erasor", "range-net")
 # The settings that they read besides those of the query.
 _OF_WHOLE_MAPS = {
-    "outlier", "voxel_diff", "c2c", "m3c2", "dufomap", "removert", "octomap", "m3c2_ep", "erasor",
+    "outlier", "voxel_diff", "c2c", "m3c2", "dufomap", "removert", "octomap", "m3c2_ep", "erasor", "range_net",
 }  # fmt: skip
 _PIXELS = tuple(f"{session}.return_pixels" for session in SESSIONS)
 
@@ -81,6 +81,8 @@ def _settings_of_clusters(config: PipelineConfig) -> dict[str, Any]:
     """Return what a source that compares whole maps may read besides."""
     found = config.model_dump(mode="json", include=_OF_WHOLE_MAPS)
     clusters = [config.cluster.radius_m, config.regions.min_points]
+    if config.regions.source == "range-net":  # the digest names the weights, wherever their file lies
+        found["range_net"] |= {"weights": range_net_digest(config.range_net)}
     package = PACKAGES.get(config.regions.source)
     found |= {"package": extra_version(package)} if package else {}
     return found | {"clusters": clusters}

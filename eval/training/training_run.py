@@ -13,9 +13,11 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.descriptors import use_threads
+from cdpipe.descriptors.change_network import make_untrained_change_network
 from cdpipe.descriptors.network import make_untrained_network
 from cdpipe.descriptors.sphere_network import SphereNetwork, make_untrained_sphere_network
 from cdpipe.descriptors.weights_file import digest, numbered_checkpoint_bytes
+from cdpipe.training.change_training import ChangeTask
 from cdpipe.training.data import TunnelShard, open_dataset, read_place_data
 from cdpipe.training.fit import FitConfig, Progress, Task, fit
 from cdpipe.training.scan_training import PlaceTask
@@ -29,6 +31,7 @@ from eval.core.provenance import git_commit
 SOURCES = {
     "sphere": "what the map around a keyframe looks like, 64 numbers (cdpipe.descriptors.sphere_network)",
     "3deg": "re-implementation of 3DEG, arXiv 2210.07285 (cdpipe.descriptors.network)",
+    "range-net": "which pixels of two range images have changed (cdpipe.descriptors.change_network)",
 }
 
 
@@ -135,6 +138,9 @@ def _make_task(name: str, training: Sequence[TunnelShard], validation: Sequence[
     if name == "sphere":
         network = make_untrained_sphere_network(seed)
         return SphereTask(network, read_sphere_data(training), read_sphere_data(validation), seed)
+    if name == "range-net":
+        pixels = read_sphere_data(training), read_sphere_data(validation)
+        return ChangeTask(make_untrained_change_network(seed), *pixels, seed)
     return PlaceTask(make_untrained_network(seed), read_place_data(training), read_place_data(validation), seed)
 
 

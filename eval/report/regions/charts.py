@@ -44,6 +44,7 @@ _LOOKS = {
     "octomap": Look(_WINE, 1.6, "dash"),
     "removert": Look(_WINE, 1.6, "dashdot"),
     "erasor": Look(_GREY, 1.6, "dash"),
+    "range-net": Look(_SKY, 1.6),
     "scan-context": Look(_PURPLE, 1.2),
     "solid": Look(_PURPLE, 1.2, "dash"),
     "untrained": Look(_SKY, 1.2),

@@ -1,4 +1,4 @@
-"""Weights of one's own: `descriptor.weights` and `sphere.weights` name files."""
+"""Weights of one's own: `descriptor.weights`, `sphere.weights` and `range_net.weights` name files."""
 
 from __future__ import annotations
 
@@ -13,11 +13,19 @@ from torch import nn
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import make_pose
-from cdpipe.descriptors import checkpoint_digest, describe_map, describe_scan, list_checkpoints, sphere_digest
+from cdpipe.descriptors import (
+    checkpoint_digest,
+    describe_map,
+    describe_scan,
+    list_checkpoints,
+    range_net_digest,
+    sphere_digest,
+)
+from cdpipe.descriptors.change_network import make_untrained_change_network
 from cdpipe.descriptors.network import make_untrained_network
 from cdpipe.descriptors.sphere_network import SphereSize, make_untrained_sphere_network
 from cdpipe.descriptors.weights_file import digest, numbered_checkpoint_bytes
-from cdpipe.model.config import DescriptorConfig, PipelineConfig, RegionsConfig, SphereConfig
+from cdpipe.model.config import DescriptorConfig, PipelineConfig, RangeNetConfig, RegionsConfig, SphereConfig
 from cdpipe.model.types import PointMap, PosedScan
 
 Digest = Callable[[str], str]
@@ -29,6 +37,10 @@ def digest_of_scans(path: str) -> str:
 
 def digest_of_spheres(path: str) -> str:
     return sphere_digest(SphereConfig(weights=path))
+
+
+def digest_of_range_net(path: str) -> str:
+    return range_net_digest(RangeNetConfig(weights=path))
 
 
 def write(path: Path, network: nn.Module) -> str:
@@ -83,18 +95,26 @@ def test_checkpoints_are_those_that_a_method_uses(tmp_path: Path) -> None:
     assert list_checkpoints(shipped) == {"3deg": checkpoint_digest(DescriptorConfig()), "sphere": sphere_digest()}
     mine = SphereConfig(weights=write(tmp_path / "mine.safetensors", make_untrained_sphere_network(1)))
     assert list_checkpoints(shipped.model_copy(update={"sphere": mine}))["sphere"] == sphere_digest(mine)
+    network = make_untrained_change_network(1)
+    rival = RangeNetConfig(weights=write(tmp_path / "rival.safetensors", network))
+    found = list_checkpoints(PipelineConfig(regions=RegionsConfig(source="range-net"), range_net=rival))
+    assert found["range-net"] == digest(numbered_checkpoint_bytes(network)) and "sphere" not in found
     # the paper compares scans; a hand-made descriptor has no file
     assert list(list_checkpoints(PipelineConfig(sphere=mine))) == ["3deg"]
     by_hand = PipelineConfig(descriptor=DescriptorConfig(method="solid", weights="none.safetensors"))
     assert list_checkpoints(by_hand)["solid"].startswith("version")
 
 
-@pytest.mark.parametrize("find", [digest_of_scans, digest_of_spheres])
+@pytest.mark.parametrize("find", [digest_of_scans, digest_of_spheres, digest_of_range_net])
 def test_files_that_hold_no_such_weights_are_one_line(tmp_path: Path, find: Digest) -> None:
     path = tmp_path / "mine.safetensors"
-    networks = {digest_of_scans: make_untrained_network(), digest_of_spheres: make_untrained_sphere_network()}
+    networks = {
+        digest_of_scans: make_untrained_network(),
+        digest_of_spheres: make_untrained_sphere_network(),
+        digest_of_range_net: make_untrained_change_network(),
+    }
     own = networks.pop(find)
-    (other,) = networks.values()
+    other = next(iter(networks.values()))
     tensors = {name: tensor.clone() for name, tensor in own.state_dict().items()}
     first = next(name for name in tensors if name.endswith("conv.weight"))
 

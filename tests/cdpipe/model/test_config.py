@@ -174,13 +174,14 @@ def test_settings_of_before_there_were_weights_and_frames_are_dumped_as_then() -
 
 
 def test_a_dump_names_the_settings_of_one_rival_only_where_they_count() -> None:
-    own = {"removert", "octomap", "m3c2_ep", "erasor"}
+    own = {"removert", "octomap", "m3c2_ep", "erasor", "range_net"}
 
     def named(preset: str, *settings: str) -> set[str]:
         return own & load_config(preset, settings).model_dump().keys()
 
     assert named("tunnelcd") == named("dufomap") == set()
     assert (named("m3c2-ep"), named("erasor")) == ({"m3c2_ep"}, {"erasor"})
+    assert named("range-net") == {"range_net"}
     assert named("erasor", "removert.margin=0.3") == {"erasor", "removert"}
     for preset in ("tunnelcd", "erasor"):
         config = load_config(preset, ["removert.margin=0.3"])

@@ -22,7 +22,7 @@ METHODS = (
     "paper", "paper-paired", "untrained", "scan-context", "solid", "sphere-difference", "voxel-diff", "c2c", "tunnelcd",
     "m3c2", "dufomap",
 )  # fmt: skip
-VISIBILITY = {"removert", "octomap", "m3c2-ep", "erasor"}
+VISIBILITY = {"removert", "octomap", "m3c2-ep", "erasor", "range-net"}
 WIDE = ("regions/wide", "regions/low", "regions/site2", "null/wide")
 KISS_ICP = "[odometry=kiss-icp]"
 

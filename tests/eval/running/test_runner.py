@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from torch import nn
 
 from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.descriptors.change_network import make_untrained_change_network
 from cdpipe.descriptors.sphere_network import make_untrained_sphere_network
 from cdpipe.descriptors.weights_file import numbered_checkpoint_bytes
 from cdpipe.io.answer import read_answer
@@ -748,16 +750,24 @@ def test_cells_are_made_again_with_another_version_of_an_extra_that_they_may_ask
     assert changed == {"tunnelcd": True, "frame": False, "kiss-matcher": True, "oracle-merge": False}
 
 
-def test_a_cell_and_the_provenance_name_weights_by_what_the_file_holds(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("preset", "make"),
+    [("tunnelcd", make_untrained_sphere_network), ("range-net", make_untrained_change_network)],
+)
+def test_a_cell_and_the_provenance_name_weights_by_what_the_file_holds(
+    tmp_path: Path, preset: str, make: Callable[[int], nn.Module]
+) -> None:
+    name, group = ("sphere", "sphere") if preset == "tunnelcd" else ("range-net", "range_net")
+
     def keyed(file: str, seed: int) -> tuple[str, Any]:
-        (tmp_path / file).write_bytes(numbered_checkpoint_bytes(make_untrained_sphere_network(seed)))
-        plan = change_plan(load_plan("smoke"), presets=["tunnelcd"], settings=[f"sphere.weights={tmp_path / file}"])
+        (tmp_path / file).write_bytes(numbered_checkpoint_bytes(make(seed)))
+        plan = change_plan(load_plan("smoke"), presets=[preset], settings=[f"{group}.weights={tmp_path / file}"])
         cell = expand_cells(plan)[0]
         return pair_run.cell_key(cell, "", None, {}), _provenance(plan, [cell], [], Tools())["checkpoints"]
 
     (one, used), (moved, _), (other, _) = keyed("a", 1), keyed("b", 1), keyed("a", 2)
     assert one == moved != other
-    assert list(used) == ["3deg", f"sphere {tmp_path / 'a'}"] and len(set(used.values())) == 2
+    assert list(used) == ["3deg", f"{name} {tmp_path / 'a'}"] and len(set(used.values())) == 2
 
 
 def test_tables_that_are_there_are_put_together_again_only_where_something_may_have_changed(

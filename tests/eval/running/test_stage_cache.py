@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from torch import nn
 
 from cdpipe import pipeline
 from cdpipe.core.errors import MergeFailedError
+from cdpipe.descriptors.change_network import make_untrained_change_network
 from cdpipe.descriptors.network import make_untrained_network
 from cdpipe.descriptors.sphere_network import make_untrained_sphere_network
 from cdpipe.descriptors.weights_file import numbered_checkpoint_bytes
@@ -405,18 +407,30 @@ def test_weights_are_part_of_what_is_read(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_files_of_weights_are_told_apart_by_what_they_hold(tmp_path: Path) -> None:
-    def name(stage: Stage, key: str, seed: int, file: str) -> str:
-        network = make_untrained_network(seed) if key == "descriptor" else make_untrained_sphere_network(seed)
-        (tmp_path / file).write_bytes(numbered_checkpoint_bytes(network))
-        return name_result(stage, config_of("tunnelcd", f"{key}.weights={tmp_path / file}"))
+    make: dict[str, Callable[[int], nn.Module]] = {
+        "descriptor": make_untrained_network,
+        "sphere": make_untrained_sphere_network,
+        "range_net": make_untrained_change_network,
+    }
 
-    read: dict[Stage, str] = {
-        "descriptors": "descriptor", "merge": "descriptor", "spheres": "sphere", "regions": "sphere",
-    }  # fmt: skip
-    for stage, key in read.items():
+    def name(stage: Stage, key: str, seed: int, file: str) -> str:
+        (tmp_path / file).write_bytes(numbered_checkpoint_bytes(make[key](seed)))
+        return name_result(stage, config_of(preset_of(key), f"{key}.weights={tmp_path / file}"))
+
+    def preset_of(key: str) -> str:
+        return "range-net" if key == "range_net" else "tunnelcd"
+
+    read: tuple[tuple[Stage, str], ...] = (
+        ("descriptors", "descriptor"),
+        ("merge", "descriptor"),
+        ("spheres", "sphere"),
+        ("regions", "sphere"),
+        ("regions", "range_net"),
+    )
+    for stage, key in read:
         one, other, moved = name(stage, key, 1, "a"), name(stage, key, 2, "a"), name(stage, key, 1, "b")
         assert one == moved != other
-        assert name_result(stage, config_of("tunnelcd")) not in (one, other)
+        assert name_result(stage, config_of(preset_of(key))) not in (one, other)
 
 
 @pytest.mark.parametrize(
@@ -431,6 +445,8 @@ def test_files_of_weights_are_told_apart_by_what_they_hold(tmp_path: Path) -> No
         ("m3c2-ep", "m3c2.normal_m=2.2", True),
         ("erasor", "erasor.scan_ratio=0.3", True),
         ("voxel-diff", "voxel_diff.voxel_m=0.4", True),
+        ("range-net", "range_net.threshold=0.6", True),
+        ("range-net", "range_net.depth_m=0.4", True),
         ("voxel-diff", "outlier.sigmas=3", True),
         ("c2c", "c2c.distance_m=0.4", True),
         ("c2c", "regions.min_points=9", True),

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+import torch
 
 from cdpipe.descriptors.sphere_network import load_sphere_network
 from cdpipe.descriptors.weights_file import digest
@@ -115,6 +116,37 @@ def test_the_place_descriptor_is_trained_by_the_same_command(data: Path, tmp_pat
     assert command("train", data, "--out", out, *arguments)[0] == 0
     card = json.loads((out / "3deg.json").read_text())
     assert set(card["validation"]["trained"]) == {"recall_at_1", "yaw_error_deg", "yaw_flip_share"}
+
+
+def test_a_network_for_the_rival_is_trained_by_the_same_command_and_used_at_once(
+    data: Path, tmp_path: Path, command: Command, simulated_once: Callable[[Scenario, int], Path]
+) -> None:
+    options = ("--descriptor", "range-net", "--steps", "2", "--threads", "1", "--quiet")
+    assert command("train", data, "--out", tmp_path / "trained", *options)[0] == 0
+    card = json.loads((tmp_path / "trained" / "range-net.json").read_text())
+    names = {"average_precision", "average_precision_change_head", "visibility_accuracy"}
+    assert set(card["validation"]["trained"]) == set(card["validation"]["untrained"]) == names
+    pair, checkpoint = simulated_once(load_scenario("smoke/one_box", 20000), 20000), tmp_path / "trained" / "range-net"
+    found = []
+    usual = torch.get_num_threads()
+    try:
+        for threads, out in ((1, "one"), (2, "two")):
+            torch.set_num_threads(threads)
+            settings = ("--set", f"range_net.weights={checkpoint}.safetensors", "--set", "range_net.threshold=0.4")
+            arguments = ("--preset", "range-net", *settings, "--out", tmp_path / out, "--quiet")
+            assert command("detect", pair / "before", pair / "after", *arguments)[0] == 0
+            answer = read_answer(tmp_path / out)
+            assert answer.checkpoints["range-net"] == card["checkpoint"]
+            assert answer.report is not None
+            found.append(answer.report.regions)
+    finally:
+        torch.set_num_threads(usual)
+    # a session is compared on one thread, whatever torch was told before
+    assert found[0].scores.tolist() == found[1].scores.tolist()
+    assert found[0].keyframe_scores.tobytes() == found[1].keyframe_scores.tobytes()
+    wrong = ("--set", f"range_net.weights={tmp_path / 'none.safetensors'}", "--out", tmp_path / "wrong", "--quiet")
+    code, _, err = command("detect", pair / "before", pair / "after", "--preset", "range-net", *wrong)
+    assert code == 2 and "none.safetensors: missing" in err and len(err.strip().splitlines()) == 1
 
 
 def test_mistakes_are_one_line(data: Path, tmp_path: Path, command: Command) -> None:
