@@ -9,13 +9,19 @@ from typing import Literal
 Domain = Literal["in", "out"]
 TRAINED_FAMILIES = frozenset({"narrow", "wide", "network"})
 TRAINED_KINDS = frozenset({"box", "crate", "chair", "barrel", "cone", "pallet", "rock", "vehicle", "muck_pile"})
+# Groups of variations that nothing was trained or tuned on: sessions in which something moves.
+UNSEEN_GROUPS = frozenset({"dynamic"})
 _NAMES = {"in": "in distribution", "out": "out of distribution", "all": "all pairs"}
 
 
 @cache
 def domain_of(family: str) -> Domain:
-    """Return "in" for the trained families and their shipped variations (`unchanged/wide`), "out" for all others."""
-    is_trained = family.rpartition("/")[2] in TRAINED_FAMILIES
+    """Return "in" for the trained families and their shipped variations (`unchanged/wide`), "out" for all others.
+
+    Variations in which something moves (`dynamic/wide`) are out: no network and no threshold has seen any.
+    """
+    group, _, name = family.rpartition("/")
+    is_trained = name in TRAINED_FAMILIES and group not in UNSEEN_GROUPS
     return "in" if is_trained and (resources.files("scenarios") / "families" / f"{family}.yaml").is_file() else "out"
 
 

@@ -21,6 +21,7 @@ from sim.placement.stations import Stations, draw_areas, way
 from sim.scene import World
 
 _TRIES = 80  # places that the seed draws, as for a prop
+_SHORTER = (1.0, 0.5, 0.25)  # shares of its length that a drawn stretch has, each for so many places
 _STARTS = 8  # times at which it may start, at each place
 _PROP_GAP_M = 0.1
 _ALONG_M = 0.25  # between the places at which a mover is checked against props, and four times that against rock
@@ -88,7 +89,7 @@ def _plan(mover: Mover, instance: int, site: _Site, seed: int) -> MovingBody:
 
 
 def _draw_stands(mover: Mover, site: _Site, seed: int, generator: np.random.Generator) -> Iterator[Stand]:
-    """Yield the stretch that a mover's path names; or, up to 80 times, one that the seed draws."""
+    """Yield the stretch that a mover's path names; or those that the seed draws, shorter ones after 80 and 160."""
     path = mover.path
     if path.between is not None and path.fractions is not None:
         is_fixed = path.lateral is not None
@@ -98,9 +99,10 @@ def _draw_stands(mover: Mover, site: _Site, seed: int, generator: np.random.Gene
     stations = way(site.scenario, site.world.centreline)
     if path.area is not None:
         stations = draw_areas(site.scenario, site.world.centreline, seed)[path.area][1]
-    for place in (generator.random(_TRIES) * len(stations)).astype(int).tolist():
-        stand = _stretch_at(stations, place, path.length_m)
-        yield stand if generator.random() < 0.5 else Stand(stand.edge, stand.end, stand.start)
+    for share in _SHORTER:
+        for place in (generator.random(_TRIES) * len(stations)).astype(int).tolist():
+            stand = _stretch_at(stations, place, share * path.length_m)
+            yield stand if generator.random() < 0.5 else Stand(stand.edge, stand.end, stand.start)
 
 
 def _stretch_at(stations: Stations, place: int, length_m: float) -> Stand:
