@@ -141,3 +141,6 @@ def _undrawable(scenario: Scenario) -> Iterator[Mistake]:
         for name, place in (("place", prop.place), ("to", prop.to)):
             if place is not None and place.between is None and place.at is None and place.area is None:
                 yield ("props", index, name), f"a place anywhere {needs}: give at, or between and fraction"
+    for index, mover in enumerate(scenario.movers):
+        if mover.path.between is None and mover.path.area is None:
+            yield ("movers", index, "path"), f"a path anywhere {needs}: give between and fractions"

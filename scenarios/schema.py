@@ -232,7 +232,8 @@ class Lean(Settings):
     def _leave_out(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         fields = type(self).model_fields
         dumped: dict[str, Any] = handler(self)
-        return {key: value for key, value in dumped.items() if key not in self._LATER or value != fields[key].default}
+        is_later = {key: key in self._LATER and getattr(self, key) == fields[key].default for key in dumped}
+        return {key: value for key, value in dumped.items() if not is_later[key]}
 
 
 class Aged(Settings):
@@ -501,8 +502,72 @@ class SessionPlan(Lean):
         return self
 
 
-class Scenario(Settings):
-    """A world, what changes in it, and the two drives."""
+class Stretch(Settings):
+    """Where a mover goes to and fro: between two nodes, in an area, or (neither) anywhere on the way of the drives.
+
+    In the last two cases the seed draws a stretch of `length_m`, and draws again until nothing is in its way.
+    """
+
+    between: tuple[str, str] | None = None
+    fractions: tuple[Share, Share] | None = None  # of the way between the two nodes: where it starts and turns round
+    area: str | None = None
+    length_m: Positive = 8.0  # of a stretch that the seed draws
+    lateral: SignedShare | None = None  # -1 right wall, +1 left wall, of the width the mover leaves free; None: drawn
+
+    @model_validator(mode="after")
+    def _one_way_to_say_where(self) -> Stretch:
+        if (self.between is None) != (self.fractions is None):
+            raise ValueError("between and fractions go together")
+        if self.between is not None and self.area is not None:
+            raise ValueError("give between or area, not both")
+        return self
+
+
+# What each kind of mover is like where its keys are left out; a kind has these keys and no other of them.
+USUAL_MOVERS: dict[str, dict[str, Any]] = {
+    "person": {"speed_mps": 1.3, "pause_s": 2.0, "height_m": 1.75},
+    "forklift": {"speed_mps": 2.0, "pause_s": 4.0, "size_m": (3.4, 1.15, 2.1)},
+    "loader": {"speed_mps": 2.0, "pause_s": 6.0, "size_m": (8.6, 2.2, 2.2)},
+    "curtain": {"width_m": 1.6, "swing_deg": 10.0},
+}
+
+
+class Mover(Settings):
+    """Something that moves while a session is recorded; never a change. sim/movers/MOVERS.md has every kind."""
+
+    name: str
+    kind: Literal["person", "forklift", "loader", "curtain"]
+    sessions: Literal["both", "before", "after"] = "both"
+    path: Stretch = Stretch()
+    speed_mps: NotNegative | None = None  # 0: it stays at the start of its stretch; a curtain has none
+    pause_s: NotNegative | None = None  # at either end; a person turns round meanwhile, a machine lifts or lowers
+    height_m: Annotated[float, Field(ge=1.2, le=2.2)] | None = None  # of a person
+    size_m: tuple[Positive, Positive, Positive] | None = None  # of a machine: length, width, height
+    width_m: Positive | None = None  # of a curtain; it hangs from the roof down to the floor
+    swing_deg: Annotated[float, Field(ge=0, le=30)] | None = None  # amplitude of a curtain's lowest strip
+    reflectivity: Reflectivity | None = None  # of every part; left out: what each part is made of
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_in(cls, given: Any) -> Any:
+        if not isinstance(given, dict):
+            return given
+        said = {key: value for key, value in given.items() if value is not None}
+        return {**USUAL_MOVERS.get(str(given.get("kind")), {}), **said}
+
+    @model_validator(mode="after")
+    def _keys_of_its_kind(self) -> Mover:
+        known = {key for keys in USUAL_MOVERS.values() for key in keys}
+        said = sorted(key for key in known - USUAL_MOVERS[self.kind].keys() if getattr(self, key) is not None)
+        if said:
+            raise ValueError(f"mover {self.name!r}: a {self.kind} has no {', '.join(said)}: leave that out")
+        return self
+
+
+class Scenario(Lean):
+    """A world, what changes in it, what moves in it, and the two drives."""
+
+    _LATER: ClassVar[frozenset[str]] = frozenset({"movers"})
 
     family: str
     description: str = ""
@@ -510,6 +575,7 @@ class Scenario(Settings):
     tunnel: Tunnel
     areas: tuple[Area, ...] = ()
     props: tuple[Prop, ...] = ()
+    movers: tuple[Mover, ...] = ()
     sensor: Sensor = Sensor()
     platform: Platform = Platform()
     before: SessionPlan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 
 import mujoco
@@ -16,7 +17,37 @@ from sim.geometry.mesh import Mesh, box_mesh, cylinder_mesh, move_mesh
 _CYLINDER_SEGMENTS = 64
 
 
-class Caster:
+class RayCaster(ABC):
+    """What the rays of a sensor are cast at: a scene of numbered meshes.
+
+    Attributes:
+        centre_m: (3,) float64 centre of the scene, world frame, whole metres; rays in float32 start from it.
+    """
+
+    centre_m: Float64Array
+
+    @abstractmethod
+    def cast_local(
+        self, origins: Float32Array, directions: Float32Array
+    ) -> tuple[Float32Array, Int32Array, Float32Array]:
+        """Return the results of `Caster.cast` for contiguous (N, 3) rays whose origins are given from `centre_m`."""
+
+    def cast_columns(
+        self, origins: Float64Array, directions: Float32Array
+    ) -> tuple[Float32Array, Int32Array, Float32Array]:
+        """Cast a whole revolution; the results of `Caster.cast`, each (W, H).
+
+        Args:
+            origins: (W, 3) float64 point where all beams of a column start, world frame, metres.
+            directions: (W, H, 3) float32 unit vectors, contiguous.
+        """
+        width, height, _ = directions.shape
+        local = np.repeat((origins - self.centre_m).astype(np.float32), height, axis=0)
+        ranges_m, ids, cosines = self.cast_local(local, directions.reshape(-1, 3))
+        return ranges_m.reshape(width, height), ids.reshape(width, height), cosines.reshape(width, height)
+
+
+class Caster(RayCaster):
     """An Embree scene of one or more meshes, numbered in the order given.
 
     Embree works in float32. Coordinates are relative to the centre of the scene, so that a mine of 400 m is resolved
@@ -69,20 +100,6 @@ class Caster:
         cosines[is_miss] = 0.0
         ranges_m[is_miss] = np.inf
         return ranges_m, ids, cosines
-
-    def cast_columns(
-        self, origins: Float64Array, directions: Float32Array
-    ) -> tuple[Float32Array, Int32Array, Float32Array]:
-        """Cast a whole revolution; the results of `cast`, each (W, H).
-
-        Args:
-            origins: (W, 3) float64 point where all beams of a column start, world frame, metres.
-            directions: (W, H, 3) float32 unit vectors, contiguous.
-        """
-        width, height, _ = directions.shape
-        local = np.repeat((origins - self.centre_m).astype(np.float32), height, axis=0)
-        ranges_m, ids, cosines = self.cast_local(local, directions.reshape(-1, 3))
-        return ranges_m.reshape(width, height), ids.reshape(width, height), cosines.reshape(width, height)
 
     def hits(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Int32Array, Float32Array]:
         """Return distances and mesh numbers as `cast` does, and the (N, 3) unit normals (0 for a miss)."""

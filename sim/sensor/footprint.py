@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array, Int64Array
-from sim.geometry.raycast import Caster
+from sim.geometry.raycast import RayCaster
 from sim.sensor.optics import received_photons
 from sim.sensor.rays import Rays
 
@@ -47,7 +47,7 @@ class Echo:
 
 
 def central_echo(
-    caster: Caster, reflectivity: Float32Array, rays: Rays, beam_origin_m: float, owners: Int32Array
+    caster: RayCaster, reflectivity: Float32Array, rays: Rays, beam_origin_m: float, owners: Int32Array
 ) -> Echo:
     """Cast the middle of every beam at geoms of these reflectivities and owners, both (G,)."""
     distance_m, geom, cosine = caster.cast_columns(rays.origins, rays.directions)
@@ -58,7 +58,7 @@ def central_echo(
 
 
 def spread_echo(
-    caster: Caster,
+    caster: RayCaster,
     reflectivity: Float32Array,
     rays: Rays,
     beam_origin_m: float,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +11,7 @@ import numpy.typing as npt
 from cdpipe.core.geometry import BoolArray, Float32Array, Int32Array, stream
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Sensor
-from sim.scene import Scene
+from sim.geometry.raycast import RayCaster
 from sim.sensor.air import AirVolume, cross_air
 from sim.sensor.footprint import central_echo, spread_echo
 from sim.sensor.optics import (
@@ -57,8 +58,24 @@ class Scan:
     is_mixed: BoolArray
 
 
+class Surfaces(Protocol):
+    """What a sensor looks at, such as `sim.scene.Scene`: a ray caster, instance and reflectivity (G,) of its geoms."""
+
+    @property
+    def caster(self) -> RayCaster:
+        """Ray caster over the geoms."""
+
+    @property
+    def instance(self) -> Int32Array:
+        """(G,) number of the object that each geom belongs to, 0 for rock and fixtures."""
+
+    @property
+    def reflectivity(self) -> Float32Array:
+        """(G,) share of the light that each geom reflects."""
+
+
 def scan(
-    scene: Scene,
+    scene: Surfaces,
     sensor: SensorMetadata,
     settings: Sensor,
     rays: Rays,

@@ -11,6 +11,7 @@ from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array, Int64Ar
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Scenario, SessionPlan
 from sim.drive.trajectory import Trajectory
+from sim.movers.casting import MovingScene
 from sim.scene import Scene
 from sim.sensor.air import AirVolume, air_around
 from sim.sensor.lidar import Scan, scan
@@ -36,6 +37,8 @@ class Revolution:
         range_mm, reflectivity, signal: (H, W) as in `ScanChunk`.
         instance, change: (H, W) int16 as in `sim.session.truth`.
         ghost_rays: Number of rays that met each ghost, by change id.
+        sightings: (M, 4) of each mover the number of its returns, and their mean true position, world frame (NaN where
+            it has none).
     """
 
     range_mm: npt.NDArray[np.uint32]
@@ -44,6 +47,7 @@ class Revolution:
     instance: Int16Array
     change: Int16Array
     ghost_rays: dict[int, int]
+    sightings: Float64Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +57,8 @@ class Drive:
     Attributes:
         labels: `instance` of each geom, int16; entries -3, -2 and -1 at the end serve the geom numbers -3 to -1.
         owners: (G,) int32 `instance` of the geoms of props of which this session holds a change, 0 for all others.
+        moving: The scene with the session's movers, whose geoms come last in `labels` and `owners`.
+        sightings: (M, S, 4) what each revolution saw of each mover so far, as in `Revolution`.
     """
 
     name: SessionName
@@ -64,6 +70,8 @@ class Drive:
     trajectory: Trajectory
     tallies: tuple[Tally, ...]
     seed: int
+    moving: MovingScene
+    sightings: Float64Array
 
 
 def simulate_revolution(drive: Drive, number: int) -> Revolution:
@@ -80,7 +88,19 @@ def simulate_revolution(drive: Drive, number: int) -> Revolution:
         belongs = mark_belonging(tally, rays.points(row, column, reach_m[row, column]))
         change[row[belongs], column[belongs]] = tally.change.id
     instance = drive.labels.take(result.geom, mode="wrap")
-    return Revolution(result.range_mm, result.reflectivity, result.signal, instance, change, ghost_rays)
+    sightings = see_movers(drive, rays, instance, reach_m)
+    return Revolution(result.range_mm, result.reflectivity, result.signal, instance, change, ghost_rays, sightings)
+
+
+def see_movers(drive: Drive, rays: Rays, instance: Int16Array, reach_m: Float32Array) -> Float64Array:
+    """Return what a revolution saw of each mover, (M, 4) as in `Revolution`, from instance and reach (H, W)."""
+    sightings = np.full((len(drive.moving.movers), 4), np.nan)
+    for number, mover in enumerate(drive.moving.movers):
+        row, column = np.nonzero(instance == mover.instance)
+        sightings[number, 0] = len(row)
+        if len(row):
+            sightings[number, 1:] = rays.points(row, column, reach_m[row, column]).mean(axis=0)
+    return sightings
 
 
 def cast_revolution(drive: Drive, number: int) -> tuple[Rays, Scan]:
@@ -88,7 +108,8 @@ def cast_revolution(drive: Drive, number: int) -> tuple[Rays, Scan]:
     world_T_column = drive.trajectory.world_T_column(slice(number, number + 1))[0]
     rays = revolution_rays(drive.sensor, world_T_column)
     settings, air = drive.scenario.sensor, find_air(drive, number)
-    return rays, scan(drive.scene, drive.sensor, settings, rays, drive.seed, drive.name, number, drive.owners, air)
+    surfaces = drive.moving.pose(drive.trajectory.revolution_s[number] + drive.trajectory.column_s)
+    return rays, scan(surfaces, drive.sensor, settings, rays, drive.seed, drive.name, number, drive.owners, air)
 
 
 def find_air(drive: Drive, number: int) -> AirVolume | None:
@@ -108,7 +129,9 @@ def true_reach_m(sensor: SensorMetadata, result: Scan) -> Float32Array:
 
 
 def tally_revolution(drive: Drive, number: int, revolution: Revolution) -> None:
-    """Add a revolution to the tallies, its returns where the session measured them."""
+    """Add a revolution to the tallies, its returns where the session measured them, and to what was seen of movers."""
+    if drive.moving.movers:
+        drive.sightings[:, number] = revolution.sightings
     for tally in drive.tallies:
         change = tally.change
         is_own = change.session == drive.name

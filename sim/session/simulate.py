@@ -28,15 +28,20 @@ from scenarios.references import file_digests
 from scenarios.schema import Scenario, SessionPlan
 from sim.drive.odometry import register_scans, start_pose
 from sim.drive.trajectory import plan_trajectory
+from sim.movers.casting import MovingScene
+from sim.movers.planning import plan_movers
 from sim.scene import build_world
 from sim.session.labels import list_changes
 from sim.session.revolution import CHANNELS, Drive, Revolution, simulate_revolution, tally_revolution
 from sim.session.truth import (
     SESSIONS,
     Int16Array,
+    MoverTrack,
+    MoverTruth,
     PairTruth,
     SessionName,
     write_labels,
+    write_mover_track,
     write_pair_truth,
     write_true_poses,
 )
@@ -120,7 +125,27 @@ def collect_truth(scenario: Scenario, seed: int, drives: Sequence[Drive], files:
     """Return the truth of a pair after both sessions were simulated."""
     changes = tuple(tally.finished() for tally in drives[0].tallies)
     drawn = scenario.model_dump(mode="json")
-    return PairTruth(scenario.family, seed, scenario.score_radius_m, changes, drawn, dict(files))
+    movers = tuple(mover for drive in drives for mover in _list_movers(drive))
+    return PairTruth(scenario.family, seed, scenario.score_radius_m, changes, drawn, dict(files), movers)
+
+
+def _list_movers(drive: Drive) -> Iterator[MoverTruth]:
+    """Yield the truth of every mover of a session that was simulated."""
+    time_s = drive.trajectory.revolution_s
+    for mover, sightings in zip(drive.moving.movers, drive.sightings, strict=True):
+        course = mover.course
+        share = float((course.moment(time_s).activity > 0).mean()) if course.is_moving else 0.0
+        n_returns = int(sightings[:, 0].sum())
+        name, kind = mover.mover.name, mover.mover.kind
+        yield MoverTruth(name, kind, mover.instance, drive.name, course.length_m, share, n_returns)
+
+
+def track_movers(drive: Drive) -> MoverTrack | None:
+    """Return where the movers of a session that was simulated were, and what was seen of them; None without movers."""
+    if not drive.moving.movers:
+        return None
+    poses = np.stack([mover.world_T_root(drive.trajectory.revolution_s) for mover in drive.moving.movers])
+    return MoverTrack(poses, drive.sightings[..., 0].astype(np.int32), drive.sightings[..., 1:])
 
 
 def _report_nothing(stage: str, done: int, total: int) -> None:
@@ -144,18 +169,20 @@ def plan_drives(scenario: Scenario, sensor: SensorMetadata, seed: int) -> list[D
 
     Raises:
         InputError: A trajectory cannot be read.
-        ScenarioError: The world contradicts itself.
+        ScenarioError: The world contradicts itself, or a mover finds no way.
     """
     world = build_world(scenario, seed)
     tallies = tuple(list_changes(scenario, world))
     drives = []
     for name in SESSIONS:
         scene = world.before if name == "before" else world.after
-        labels = np.append(scene.instance, [-3, -2, -1]).astype(np.int16)
-        held = [tally.change.instance for tally in tallies if tally.change.session == name]
-        owners = np.where(np.isin(scene.instance, held), scene.instance, np.int32(0))
         trajectory = plan_trajectory(world, scenario, sensor, seed, name)
-        drives.append(Drive(name, scenario, scene, labels, owners, sensor, trajectory, tallies, seed))
+        moving = MovingScene(scene, plan_movers(world, scenario, trajectory.true, seed, name))
+        labels = np.append(moving.instance, [-3, -2, -1]).astype(np.int16)
+        held = [tally.change.instance for tally in tallies if tally.change.session == name]
+        owners = np.where(np.isin(moving.instance, held), moving.instance, np.int32(0))
+        seen = np.zeros((len(moving.movers), trajectory.n_scans, 4))
+        drives.append(Drive(name, scenario, scene, labels, owners, sensor, trajectory, tallies, seed, moving, seen))
     return drives
 
 
@@ -179,6 +206,8 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
             write_labels(writer.folder, index, instance, change)
             report(drive.name, index * CHUNK_SCANS + len(instance), n_scans)
         write_true_poses(writer.folder, drive.trajectory.world_T_sensor)
+        if (track := track_movers(drive)) is not None:
+            write_mover_track(writer.folder, track)
         writer.close(drive.trajectory.odom_T_sensor)
 
 
@@ -218,7 +247,7 @@ def _estimate_odometry(
     trajectory = drive.trajectory
     shape = drive.sensor.height, drive.sensor.width
     channels = {name: SpooledArray(dtype, shape, _HELD_BYTES) for name, dtype in CHANNELS.items()}
-    ghost_rays = []
+    ghost_rays, sightings = [], []
 
     def keep() -> Iterator[npt.NDArray[np.uint32]]:
         for number, revolution in enumerate(revolutions):
@@ -227,12 +256,13 @@ def _estimate_odometry(
             for name, spooled in channels.items():
                 spooled.append(getattr(revolution, name))
             ghost_rays.append(revolution.ghost_rays)
+            sightings.append(revolution.sightings)
             yield revolution.range_mm
         report(f"odometry {drive.name}", trajectory.n_scans, trajectory.n_scans)
 
     start = start_pose(trajectory.true, float(trajectory.revolution_s[0]))
     estimated = register_scans(keep(), drive.sensor, trajectory.revolution_s, trajectory.column_s, start, drive.name)
-    kept = zip(*(spooled.finish() for spooled in channels.values()), ghost_rays, strict=True)
+    kept = zip(*(spooled.finish() for spooled in channels.values()), ghost_rays, sightings, strict=True)
     return replace(drive, trajectory=replace(trajectory, estimated=estimated)), (Revolution(*each) for each in kept)
 
 

@@ -1,14 +1,16 @@
 """The truth of a simulated pair, stored apart from the sessions so that they can be handed out without it.
 
-    PAIR/truth/changes.json          the changes, the scenario as drawn, family, seed
+    PAIR/truth/changes.json          the changes, the movers, the scenario as drawn, family, seed
     PAIR/before/truth/poses.npz      world_T_sensor (S, 4, 4) float64, at the middle column of each revolution
     PAIR/before/truth/00000.npz      per chunk: instance (s, H, W) int16, change (s, H, W) int16
+    PAIR/before/truth/movers.npz     only with movers: see `MoverTrack`
     PAIR/after/truth/...             likewise
 
 `instance`: -1 no return, -2 a false return where nothing stands, -3 a return from mist or dust, 0 walls, floor and
-fixtures, n the n-th prop (1-based). `change`: 0 (always for a false return and for one from the air), the id of the
-change the return belongs to, or -1 for a mixed return. For a change of group "partial" (moved by less than its own
-length, or reshaped) only returns farther than 0.1 m from the other session's true surface belong to it.
+fixtures, n the n-th prop (1-based), n_props + k the k-th mover of the scenario (1-based). `change`: 0 (always for a
+false return, for one from the air and for a mover), the id of the change the return belongs to, or -1 for a mixed
+return. For a change of group "partial" (moved by less than its own length, or reshaped) only returns farther than 0.1 m
+from the other session's true surface belong to it.
 
 With several rays per beam a return may blend surfaces. `instance` is then that of the strongest ray. A return belongs
 to a changed prop of its session, or to all the rest, if at least 90 % of its light came from there. A return below that
@@ -31,7 +33,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_json, read_npz
-from cdpipe.core.geometry import FARTHEST_M, Float64Array
+from cdpipe.core.geometry import FARTHEST_M, Float64Array, Int32Array
 
 Int16Array = npt.NDArray[np.int16]
 SessionName = Literal["before", "after"]
@@ -43,6 +45,11 @@ _CHECKS = ConfigDict(extra="forbid", allow_inf_nan=False)
 MIXED = -1  # `change` of a return that belongs neither to a change nor to the rest
 _LABELS = {"instance": ArraySpec("s,H,W", "int16"), "change": ArraySpec("s,H,W", "int16")}
 _POSES = {"world_T_sensor": ArraySpec("S,4,4", "float64")}
+_TRACK = {
+    "world_T_mover": ArraySpec("M,S,4,4", "float64"),
+    "n_returns": ArraySpec("M,S", "int32"),
+    "seen_world": ArraySpec("M,S,3", "float64", is_finite=False),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +100,47 @@ class Change:
     n_cells_other: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class MoverTruth:
+    """Something that moved during one session. It is no change.
+
+    Attributes:
+        name: The mover's name.
+        kind: What it is, e.g. "person".
+        instance: Value of its returns in `instance`; the same in both sessions.
+        session: The session; a mover of both has one entry for each.
+        stretch_m: Length of the line that it goes to and fro on, 0 for one that stays.
+        moving_share: Share of the session's revolutions in which it is on its way.
+        n_returns: Number of returns with its instance.
+    """
+
+    __pydantic_config__ = _CHECKS
+    name: str
+    kind: str
+    instance: int
+    session: SessionName
+    stretch_m: float
+    moving_share: float
+    n_returns: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MoverTrack:
+    """Where the M movers of a session were, at the middle column of each of its S revolutions.
+
+    Movers are in the order of their entries in `PairTruth.movers`.
+
+    Attributes:
+        world_T_mover: (M, S, 4, 4) pose of each mover's root, on the floor below it; of a curtain its upper edge.
+        n_returns: (M, S) int32 number of its returns.
+        seen_world: (M, S, 3) mean of their true positions, NaN where there are none.
+    """
+
+    world_T_mover: Float64Array
+    n_returns: Int32Array
+    seen_world: Float64Array
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PairTruth:
     """Everything known about a pair, beside the per-return labels.
@@ -104,6 +152,7 @@ class PairTruth:
         changes: All changes, observable or not.
         scenario: The scenario as drawn.
         files: SHA-256 of every file that the scenario names, by its path as seen from the working folder.
+        movers: What moved in either session, before first; the file has the key only where there are some.
     """
 
     __pydantic_config__ = _CHECKS
@@ -113,12 +162,16 @@ class PairTruth:
     changes: tuple[Change, ...]
     scenario: dict[str, Any]
     files: dict[str, str] = field(default_factory=dict)
+    movers: tuple[MoverTruth, ...] = ()
 
 
 def write_pair_truth(pair: Path, truth: PairTruth) -> None:
     """Write `PAIR/truth/changes.json`."""
     (pair / "truth").mkdir(parents=True, exist_ok=True)
-    (pair / "truth" / "changes.json").write_text(json.dumps(asdict(truth), indent=1))
+    document = asdict(truth)
+    if not truth.movers:
+        del document["movers"]  # the truth of an older scenario keeps its bytes
+    (pair / "truth" / "changes.json").write_text(json.dumps(document, indent=1))
 
 
 def read_pair_truth(pair: str | Path) -> PairTruth:
@@ -168,6 +221,22 @@ def read_true_poses(session: Path) -> Float64Array:
     if (np.abs(world_T_sensor) > FARTHEST_M).any():
         raise InputError(f"{path}: damaged: a pose is farther than {FARTHEST_M:g} m from the origin")
     return world_T_sensor
+
+
+def write_mover_track(session: Path, track: MoverTrack) -> None:
+    """Write where the movers of one session were."""
+    (session / "truth").mkdir(exist_ok=True)
+    np.savez(session / "truth" / "movers.npz", allow_pickle=False, **{name: getattr(track, name) for name in _TRACK})
+
+
+def read_mover_track(session: Path) -> MoverTrack | None:
+    """Read where the movers of one session were; None where none moved.
+
+    Raises:
+        InputError: The file is damaged.
+    """
+    path = session / "truth" / "movers.npz"
+    return MoverTrack(**read_npz(path, _TRACK)) if path.is_file() else None
 
 
 def read_labels(session: Path, n_chunks: int) -> Iterator[tuple[Int16Array, Int16Array]]:

@@ -415,7 +415,7 @@ def test_files_of_weights_are_told_apart_by_what_they_hold(tmp_path: Path) -> No
 
     def name(stage: Stage, key: str, seed: int, file: str) -> str:
         (tmp_path / file).write_bytes(numbered_checkpoint_bytes(make[key](seed)))
-        return name_result(stage, config_of(preset_of(key), f"{key}.weights={tmp_path / file}"))
+        return name_result(stage, load_config(preset_of(key), [f"{key}.weights={tmp_path / file}"]))
 
     def preset_of(key: str) -> str:
         return "range-net" if key == "range_net" else "tunnelcd"
@@ -430,7 +430,7 @@ def test_files_of_weights_are_told_apart_by_what_they_hold(tmp_path: Path) -> No
     for stage, key in read:
         one, other, moved = name(stage, key, 1, "a"), name(stage, key, 2, "a"), name(stage, key, 1, "b")
         assert one == moved != other
-        assert name_result(stage, config_of(preset_of(key))) not in (one, other)
+        assert name_result(stage, load_config(preset_of(key))) not in (one, other)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import transform
+from cdpipe.sensor.ouster import SensorMetadata
+from scenarios.schema import Mover, Prop, Scenario, Section, SessionPlan, Tunnel
+from sim.drive.trajectory import plan_trajectory
+from sim.movers.mover import MovingBody
+from sim.movers.planning import plan_movers
+from sim.placement.placing import floor_heights
+from sim.scene import World, build_world
+
+SEED = 5
+Settings = dict[str, Any]
+Plan = Callable[[Sequence[Settings], str], tuple[MovingBody, ...]]
+WALKER: Settings = {"name": "walker", "kind": "person", "path": {"between": ("a", "b"), "fractions": (0.3, 0.6)}}
+
+
+@pytest.fixture(scope="module", name="scenario")
+def scenario_fixture(make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop]) -> Scenario:
+    plain = make_scenario()
+    tunnel = plain.tunnel.model_copy(update={"section": Section(width_m=5.0, height_m=3.2)})
+    return make_scenario(tunnel=tunnel, props=(make_prop("box", 0.4, 0.9),))
+
+
+@pytest.fixture(scope="module", name="world")
+def world_fixture(scenario: Scenario) -> World:
+    return build_world(scenario, SEED)
+
+
+@pytest.fixture(scope="module", name="plan")
+def plan_fixture(scenario: Scenario, world: World, sensor: SensorMetadata) -> Plan:
+    robots = {name: plan_trajectory(world, scenario, sensor, SEED, name).true for name in ("before", "after")}
+
+    def plan(movers: Sequence[Settings], session: str) -> tuple[MovingBody, ...]:
+        drawn = scenario.model_copy(update={"movers": tuple(Mover.model_validate(each) for each in movers)})
+        return plan_movers(world, drawn, robots[session], SEED, session)
+
+    plan.robots = robots  # type: ignore[attr-defined]
+    return plan
+
+
+KINDS = [
+    WALKER,
+    {"name": "stander", "kind": "person", "speed_mps": 0},
+    {"name": "truck", "kind": "forklift", "path": {"length_m": 5}},
+    {"name": "curtain", "kind": "curtain", "width_m": 0.9},
+]
+
+
+@pytest.mark.parametrize("session", ["before", "after"])
+def test_no_corner_of_a_mover_comes_near_the_sensor_or_into_the_rock(
+    plan: Plan, scenario: Scenario, world: World, session: str
+) -> None:
+    robot = plan.robots[session]  # type: ignore[attr-defined]
+    time_s = np.linspace(robot.time_s[0], robot.time_s[-1], 150)
+    sensor_m = robot.sample(time_s)[0]
+    movers = plan(KINDS, session)
+    assert [mover.instance for mover in movers] == [2, 3, 4, 5]
+    for mover in movers:
+        lowest_m = np.inf
+        for limb, poses in zip(mover.figure.limbs, mover.world_T_links(time_s), strict=True):
+            corners = np.concatenate([mesh.vertices for mesh in limb.meshes])
+            for pose, place in zip(poses, sensor_m, strict=True):
+                moved = transform(pose, corners)
+                level_m = np.linalg.norm(moved[:, :2] - place[:2], axis=1).min()
+                assert level_m > scenario.platform.clearance_m - 0.01, mover.mover.name
+                floor_m = floor_heights(world.fixed, moved + np.array([0.0, 0.0, 0.1]))
+                assert np.isfinite(floor_m).all()
+                lowest_m = min(lowest_m, float((moved[:, 2] - floor_m).min()))
+        if mover.mover.kind != "curtain":
+            assert -0.08 < lowest_m < 0.03, mover.mover.name  # feet and wheels are on the floor
+        else:
+            assert 0.1 < lowest_m < 0.5
+
+
+def test_a_walker_keeps_to_its_stretch(plan: Plan) -> None:
+    (walker,) = plan([WALKER], "before")
+    x = walker.world_T_root(np.linspace(0, 100, 500))[:, 0, 3]
+    assert x.min() == pytest.approx(6.0, abs=0.3)
+    assert x.max() == pytest.approx(12.0, abs=0.3)
+
+
+def test_another_mover_changes_no_draw_and_sessions_differ(plan: Plan) -> None:
+    alone = plan([KINDS[2]], "before")[0]
+    among = plan(KINDS, "before")[2]
+    np.testing.assert_array_equal(alone.course.points, among.course.points)
+    assert alone.course.offset_s == among.course.offset_s
+    later = plan([KINDS[2]], "after")[0]
+    assert alone.course.offset_s != later.course.offset_s
+    only = plan([WALKER | {"sessions": "after"}], "before")
+    assert only == ()
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        (
+            {"path": {"between": ("a", "b"), "fractions": (0.2, 0.8), "lateral": 0.0}},
+            r"before: mover 'walker' finds no way: it comes within 0.\d\d m of the sensor at .*and 0.5 m are needed",
+        ),
+        (
+            {"path": {"between": ("a", "b"), "fractions": (0.3, 0.6), "lateral": 0.95}},
+            "prop 'box' stands in its way",
+        ),
+        ({"kind": "forklift", "size_m": (3.0, 4.9, 2.0)}, r"the walls leave it \d.\d\d m, and it needs 4.9\d m"),
+    ],
+)
+def test_a_mover_without_a_way_is_refused_on_one_line(plan: Plan, settings: Settings, reason: str) -> None:
+    with pytest.raises(ScenarioError, match=reason) as refused:
+        plan([WALKER | settings], "before")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_mover_may_be_where_the_robot_is_not(make_scenario: Callable[..., Scenario], sensor: SensorMetadata) -> None:
+    """A loader fills the drift beyond the end of the drive."""
+    tunnel = Tunnel.model_validate(make_scenario().tunnel.model_dump() | {"nodes": {"a": (0, 0, 0), "b": (40, 0, 0)}})
+    short = SessionPlan(route=("a", "b"), start_m=2.0, end_m=22.0)
+    path = {"between": ("a", "b"), "fractions": (0.65, 0.8), "lateral": 0.0}
+    loader = Mover.model_validate({"name": "loader", "kind": "loader", "path": path, "size_m": (7.0, 1.9, 2.0)})
+    scenario = make_scenario(tunnel=tunnel, before=short, after=short, movers=(loader,))
+    world = build_world(scenario, SEED)
+    robot = plan_trajectory(world, scenario, sensor, SEED, "before").true
+    (placed,) = plan_movers(world, scenario, robot, SEED, "before")
+    assert placed.world_T_root(np.linspace(0, 60, 100))[:, 0, 3].min() > 25
+    closer = scenario.model_copy(update={"before": SessionPlan(route=("a", "b"), start_m=2.0, end_m=12.0)})
+    robot = plan_trajectory(world, closer, sensor, SEED, "before").true
+    with pytest.raises(ScenarioError, match="mover 'loader' finds no way: it comes within"):
+        plan_movers(world, closer, robot, SEED, "before")
