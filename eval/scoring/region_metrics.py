@@ -198,8 +198,32 @@ def score_regions(report: ChangeReport, truth: GroundTruth, after_travelled_m: F
         "n_duplicate_regions": matches.count("duplicate"),
         "n_ignored_regions": matches.count("ignored"),
         "n_found_changes": _count_found(matches, truth),
+        **_rate_movers(centres, matches, truth, path_m),
     }
     return RegionScores(columns, matches, proposed, scores, labels)
+
+
+def mark_near_movers(centres_world: Float64Array, seen_world: Float64Array, score_radius_m: float) -> BoolArray:
+    """Mark the centres (R, 3) within `score_radius_m` (inclusive) of a place (N, 3) where a mover gave returns."""
+    if len(seen_world) == 0:
+        return np.zeros(len(centres_world), dtype=np.bool_)
+    nearest_m, _ = cKDTree(seen_world).query(centres_world)
+    return np.asarray(nearest_m <= score_radius_m, dtype=np.bool_)
+
+
+def _rate_movers(
+    centres_world: Float64Array, matches: RegionMatches, truth: GroundTruth, path_m: float
+) -> dict[str, float]:
+    """Return the false regions on movers of either session, and their rate: NaN where no session saw a mover."""
+    seen_world = np.concatenate([session.seen_movers_world for session in truth.sessions.values()])
+    is_false = np.array([outcome == "false" for outcome in matches.outcomes], dtype=np.bool_)
+    is_near = mark_near_movers(centres_world, seen_world, truth.pair.score_radius_m)
+    n_near = int(np.count_nonzero(is_false & is_near))
+    is_defined = len(seen_world) > 0 and path_m > 0
+    return {
+        "false_regions_on_movers_per_100m": 100.0 * n_near / path_m if is_defined else float("nan"),
+        "n_false_regions_on_movers": n_near,
+    }
 
 
 def _rank_keyframes(
@@ -244,10 +268,13 @@ def score_unanswered_regions(truth: GroundTruth) -> RegionScores:
         "region_recall", "region_recall_at_k", "region_precision",
         "region_recall_proposed", "region_recall_at_k_proposed", "region_precision_proposed",
     )  # fmt: skip
-    rates = ("false_regions_per_100m", "false_regions_per_100m_proposed", "region_coverage")
+    rates = (
+        "false_regions_per_100m", "false_regions_per_100m_proposed", "region_coverage",
+        "false_regions_on_movers_per_100m",
+    )  # fmt: skip
     counts = (
         "n_regions", "n_withdrawn", "n_true_regions", "n_false_regions", "n_duplicate_regions", "n_ignored_regions",
-        "n_found_changes",
+        "n_found_changes", "n_false_regions_on_movers",
     )  # fmt: skip
     share = 0.0 if truth.n_observable else float("nan")
     scores, labels, ranking = _rank_keyframes(None, truth)

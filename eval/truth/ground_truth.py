@@ -22,7 +22,7 @@ from cdpipe.io.session import read_session
 from cdpipe.mapping.mapping import choose_keyframes
 from cdpipe.model.types import SessionName
 from eval.truth.scoring_points import ScoringPoints, load_scoring_points
-from sim.session.truth import PairTruth, read_pair_truth, read_true_poses
+from sim.session.truth import PairTruth, read_mover_track, read_pair_truth, read_true_poses
 
 SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
 JUDGED_SPACING_M = 1.0
@@ -36,6 +36,7 @@ class SessionTruth:
         odom_T_sensor: (S, 4, 4) poses of the robot's odometry.
         world_T_sensor: (S, 4, 4) true poses.
         scoring_points: Returns that objects are scored against.
+        seen_movers_world: (N, 3) mean true position of the returns on each mover in each revolution that has some.
         judged_scans: (J,) the first scan and one per metre of odometry. Keyframe scores and merges are judged there,
             whatever keyframes an answer names.
     """
@@ -43,12 +44,14 @@ class SessionTruth:
     odom_T_sensor: Float64Array
     world_T_sensor: Float64Array
     scoring_points: ScoringPoints
+    seen_movers_world: Float64Array = field(default_factory=lambda: np.zeros((0, 3)))
     judged_scans: Int64Array = field(init=False)
 
     def __post_init__(self) -> None:
         require_poses("odom_T_sensor", self.odom_T_sensor)
         require_poses("world_T_sensor", self.world_T_sensor)
         require_shape("world_T_sensor", self.world_T_sensor, self.odom_T_sensor.shape)
+        require_shape("seen_movers_world", self.seen_movers_world, (None, 3))
         object.__setattr__(self, "judged_scans", choose_keyframes(self.odom_T_sensor, JUDGED_SPACING_M))
 
     def to_world(self, points_odom: Float64Array, scans: Int64Array) -> Float64Array:
@@ -109,7 +112,9 @@ def load_ground_truth(pair: Path) -> GroundTruth:
     Raises:
         InputError: A session or a part of the truth is missing, damaged or of another session.
     """
-    return ground_truth(read_pair_truth(pair), {name: _load_session(pair / name) for name in SESSIONS})
+    truth = read_pair_truth(pair)
+    n_movers = {name: sum(mover.session == name for mover in truth.movers) for name in SESSIONS}
+    return ground_truth(truth, {name: _load_session(pair / name, n_movers[name]) for name in SESSIONS})
 
 
 def ground_truth(truth: PairTruth, sessions: Mapping[SessionName, SessionTruth]) -> GroundTruth:
@@ -137,9 +142,22 @@ def ground_truth(truth: PairTruth, sessions: Mapping[SessionName, SessionTruth])
     )
 
 
-def _load_session(path: Path) -> SessionTruth:
+def _load_session(path: Path, n_movers: int) -> SessionTruth:
     odom_T_sensor = read_session(path).odom_T_sensor
+    seen_world = _load_seen_movers(path, n_movers, len(odom_T_sensor))
     try:
-        return SessionTruth(odom_T_sensor, read_true_poses(path), load_scoring_points(path))
+        return SessionTruth(odom_T_sensor, read_true_poses(path), load_scoring_points(path), seen_world)
     except (KeyError, ValueError) as error:
         raise InputError(f"{path / 'truth'}: not the truth of this session: {error}") from error
+
+
+def _load_seen_movers(path: Path, n_movers: int, n_scans: int) -> Float64Array:
+    """Return where the movers of a session were seen (N, 3), as `SessionTruth.seen_movers_world`."""
+    track = read_mover_track(path)
+    found = (0, n_scans) if track is None else track.n_returns.shape
+    if found != (n_movers, n_scans):
+        raise InputError(
+            f"{path / 'truth' / 'movers.npz'}: not the truth of this session: it has {found[0]} movers and {found[1]} "
+            f"revolutions, expected {n_movers} and {n_scans}"
+        )
+    return np.zeros((0, 3)) if track is None else track.seen_world[track.n_returns > 0]

@@ -149,6 +149,7 @@ def test_the_row(case: CaseScore) -> None:
         "region_coverage": (4 + 4 + 3) / 50,
         "n_regions": 4, "n_withdrawn": 2, "n_true_regions": 1, "n_false_regions": 1, "n_duplicate_regions": 1,
         "n_ignored_regions": 1, "n_found_changes": 1,
+        "false_regions_on_movers_per_100m": NAN, "n_false_regions_on_movers": 0,
         # the crate whole, and half of the heap
         "object_iou_point": 0.75, "object_iou_voxel": 0.75, "object_iou_box": (1 + 0.1 / 1.1) / 2,
         "object_f1_25": 2 / 2.5, "object_f1_50": 2 / 2.5, "object_precision_50": 2 / 3, "object_pq": 1.5 / 2.5,
@@ -169,6 +170,35 @@ def test_the_row(case: CaseScore) -> None:
         "is_alarm": NAN,
     }  # fmt: skip
     assert_equal(case.row, expected)
+
+
+@pytest.mark.parametrize(
+    ("seen_before", "seen_after", "n_false", "rate"),
+    [
+        ([], [], 0, NAN),
+        ([(35.0, 3.5, 0.5)], [], 1, 2.0),  # 3 m from the false region at (35, 0.5, 0.5): the radius
+        ([], [(35.0, 3.51, 0.5)], 0, 0.0),
+        ([(5.5, 0.5, 0.5)], [(49.0, 0.5, 0.5), (28.0, 0.5, 0.5)], 0, 0.0),  # on true, ignored and withdrawn ones
+        ([(34.0, 0.5, 0.5)], [(36.0, 0.5, 0.5)], 1, 2.0),  # seen in both sessions, one region
+    ],
+)
+def test_false_regions_on_movers(
+    report: ChangeReport,
+    truth: GroundTruth,
+    seen_before: list[tuple[float, float, float]],
+    seen_after: list[tuple[float, float, float]],
+    n_false: int,
+    rate: float,
+) -> None:
+    seen = {"before": seen_before, "after": seen_after}
+    sessions = {
+        name: replace(of_session, seen_movers_world=np.array(seen[name], dtype=np.float64).reshape(-1, 3))
+        for name, of_session in truth.sessions.items()
+    }
+    columns = score_regions(report, replace(truth, sessions=sessions), np.arange(51.0)).columns
+    assert columns["n_false_regions_on_movers"] == n_false
+    assert columns["false_regions_on_movers_per_100m"] == pytest.approx(rate, nan_ok=True)
+    assert columns["n_false_regions"] == 1
 
 
 def test_the_changes(case: CaseScore) -> None:
@@ -276,7 +306,8 @@ def test_a_case_without_an_answer(truth: GroundTruth) -> None:
     ]  # fmt: skip
     counts = [
         "n_regions", "n_withdrawn", "n_true_regions", "n_false_regions", "n_duplicate_regions", "n_ignored_regions",
-        "n_found_changes", "n_objects", "n_matched", "n_ignored_objects", "n_partial", "n_merge_pairs",
+        "n_found_changes", "n_false_regions_on_movers", "n_objects", "n_matched", "n_ignored_objects", "n_partial",
+        "n_merge_pairs",
     ]  # fmt: skip
     # no place has a score: all tie
     n_far = sum(row["label"] == 0 for row in case.keyframes)
