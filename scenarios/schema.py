@@ -539,7 +539,7 @@ class Mover(Settings):
     kind: Literal["person", "forklift", "loader", "curtain"]
     sessions: Literal["both", "before", "after"] = "both"
     path: Stretch = Stretch()
-    speed_mps: NotNegative | None = None  # 0: it stays at the start of its stretch; a curtain has none
+    speed_mps: NotNegative | None = None  # 0: a person stands at the start of the stretch; a curtain has none
     pause_s: NotNegative | None = None  # at either end; a person turns round meanwhile, a machine lifts or lowers
     height_m: Annotated[float, Field(ge=1.2, le=2.2)] | None = None  # of a person
     size_m: tuple[Positive, Positive, Positive] | None = None  # of a machine: length, width, height
@@ -561,6 +561,8 @@ class Mover(Settings):
         said = sorted(key for key in known - USUAL_MOVERS[self.kind].keys() if getattr(self, key) is not None)
         if said:
             raise ValueError(f"mover {self.name!r}: a {self.kind} has no {', '.join(said)}: leave that out")
+        if self.speed_mps == 0 and self.kind != "person":
+            raise ValueError(f"mover {self.name!r}: a {self.kind} that never moves is a prop: give it a speed_mps")
         return self
 
 

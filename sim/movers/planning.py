@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from sim.placement.placing import grow_rectangle, rectangles_overlap, standing_b
 from sim.placement.stations import Stations, draw_areas, way
 from sim.scene import World
 
+SessionName = Literal["before", "after"]
+SESSIONS: tuple[SessionName, ...] = ("before", "after")
 _TRIES = 80  # places that the seed draws, as for a prop
 _SHORTER = (1.0, 0.5, 0.25)  # shares of its length that a drawn stretch has, each for so many places
 _STARTS = 8  # times at which it may start, at each place
@@ -38,54 +41,78 @@ class _Site:
 
     world: World
     scenario: Scenario
-    session: str
+    session: SessionName
     robot_s: Float64Array
     robot: Float64Array  # (N, 3) sensor at these times (N,)
 
 
-def plan_movers(world: World, scenario: Scenario, robot: Motion, seed: int, session: str) -> tuple[MovingBody, ...]:
-    """Return the movers of a session, in the scenario's order, each with its course.
+def plan_movers(
+    world: World, scenario: Scenario, robots: Mapping[SessionName, Motion], seed: int
+) -> dict[SessionName, tuple[MovingBody, ...]]:
+    """Return the movers of each session, in the scenario's order, each with its course.
 
     The seed draws what a mover leaves open: its stretch, its place across the drift, and when it starts. It draws again
     until the mover passes between the walls, touches no prop, and keeps `platform.clearance_m` from the sensor at all
-    times. The draws of one mover depend on no other mover. Movers may meet each other.
+    times. The draws of one mover depend on no other mover. Movers may meet each other. A curtain hangs at one place in
+    all of its sessions, because a curtain that hangs elsewhere is a change; all others have a course for each session.
 
     Args:
         world: The world.
         scenario: Its movers, and the platform's clearance.
-        robot: True movement of the sensor in this session.
+        robots: True movement of the sensor in each session.
         seed: Seed of the draws.
-        session: "before" or "after".
 
     Raises:
         ScenarioError: A mover finds no way.
     """
-    here = [(number, mover) for number, mover in enumerate(scenario.movers, 1) if mover.sessions in ("both", session)]
-    if not here:
-        return ()
+    sites = [_watch(world, scenario, session, robot) for session, robot in robots.items()] if scenario.movers else []
+    planned: dict[SessionName, list[MovingBody]] = {session: [] for session in robots}
+    for number, mover in enumerate(scenario.movers, start=len(scenario.props) + 1):
+        here = [site for site in sites if mover.sessions in ("both", site.session)]
+        for together in [here] if mover.kind == "curtain" and here else [[site] for site in here]:
+            for site, body in zip(together, _plan(mover, number, together, seed), strict=True):
+                planned[site.session].append(body)
+    return {session: tuple(bodies) for session, bodies in planned.items()}
+
+
+def _watch(world: World, scenario: Scenario, session: SessionName, robot: Motion) -> _Site:
     time_s = np.arange(robot.time_s[0], robot.time_s[-1] + _WATCH_S, _WATCH_S)
-    site = _Site(world, scenario, session, time_s, robot.sample(time_s)[0])
-    return tuple(_plan(mover, len(scenario.props) + number, site, seed) for number, mover in here)
+    return _Site(world, scenario, session, time_s, robot.sample(time_s)[0])
 
 
-def _plan(mover: Mover, instance: int, site: _Site, seed: int) -> MovingBody:
-    generator = stream(seed, site.session, "mover", mover.name)
+def _plan(mover: Mover, instance: int, sites: Sequence[_Site], seed: int) -> list[MovingBody]:
+    """Return a mover in one session, or in several at the same place.
+
+    Raises:
+        ScenarioError: It finds no way.
+    """
+    sessions = " and ".join(site.session for site in sites)
+    generator = stream(seed, sites[0].session if mover.kind != "curtain" else "pair", "mover", mover.name)
     figure = make_figure(build_body(mover), mover.reflectivity)
     refusal = "there is no stretch to be on"
-    for stand in _draw_stands(mover, site, seed, generator):
+    for stand in _draw_stands(mover, sites[0], seed, generator):
         lateral = float(generator.uniform(-1.0, 1.0)) if mover.path.lateral is None else mover.path.lateral
-        starts = generator.random(_STARTS)
+        starts = generator.random((len(SESSIONS), _STARTS))
         facing = float(generator.uniform(-np.pi, np.pi))
         try:
-            body = MovingBody(mover, instance, *_settle(mover, figure, stand, lateral, facing, site))
-            _refuse_contact(body, site)
-            return _start_clear(body, starts, site)
+            body = MovingBody(mover, instance, *_settle(mover, figure, stand, lateral, facing, sites[0]))
+            return [_fit(body, starts[SESSIONS.index(site.session)], site) for site in sites]
         except ScenarioError as error:
             refusal = str(error)
     raise ScenarioError(
-        f"{site.session}: mover {mover.name!r} finds no way: {refusal}: give it another path or lateral, or lower "
+        f"{sessions}: mover {mover.name!r} finds no way: {refusal}: give it another path or lateral, or lower "
         "platform.clearance_m"
     )
+
+
+def _fit(body: MovingBody, starts: Float64Array, site: _Site) -> MovingBody:
+    """Return a mover that touches nothing in a session and starts when it keeps clear of the robot.
+
+    Raises:
+        ScenarioError: It cannot.
+    """
+    _refuse_contact(body, site)
+    return _start_clear(body, starts, site)
 
 
 def _draw_stands(mover: Mover, site: _Site, seed: int, generator: np.random.Generator) -> Iterator[Stand]:

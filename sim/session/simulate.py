@@ -173,11 +173,12 @@ def plan_drives(scenario: Scenario, sensor: SensorMetadata, seed: int) -> list[D
     """
     world = build_world(scenario, seed)
     tallies = tuple(list_changes(scenario, world))
+    trajectories = {name: plan_trajectory(world, scenario, sensor, seed, name) for name in SESSIONS}
+    movers = plan_movers(world, scenario, {name: each.true for name, each in trajectories.items()}, seed)
     drives = []
-    for name in SESSIONS:
+    for name, trajectory in trajectories.items():
         scene = world.before if name == "before" else world.after
-        trajectory = plan_trajectory(world, scenario, sensor, seed, name)
-        moving = MovingScene(scene, plan_movers(world, scenario, trajectory.true, seed, name))
+        moving = MovingScene(scene, movers[name])
         labels = np.append(moving.instance, [-3, -2, -1]).astype(np.int16)
         held = [tally.change.instance for tally in tallies if tally.change.session == name]
         owners = np.where(np.isin(moving.instance, held), moving.instance, np.int32(0))

@@ -6,7 +6,7 @@ A name is a path. Its first word is the group that a viewer shows or hides as a 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,12 +19,14 @@ from cdpipe.core.geometry import Float64Array
 from cdpipe.io.session import is_session, read_session
 from cdpipe.sensor.ouster import load_profile
 from scenarios.schema import Scenario
-from sim.drive.trajectory import plan_trajectory
+from sim.drive.trajectory import Trajectory, plan_trajectory
 from sim.geometry.mesh import Mesh, drop_unused_vertices, join_meshes, move_mesh
+from sim.movers.mover import MovingBody
+from sim.movers.planning import plan_movers
 from sim.placement.placing import Standing, standing_box
 from sim.props.shapes import solid_mesh
 from sim.scene import World, build_world
-from sim.session.truth import SESSIONS, PairTruth, read_pair_truth, read_true_poses
+from sim.session.truth import SESSIONS, PairTruth, SessionName, read_pair_truth, read_true_poses
 from sim.view.picture import material_colour
 from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Rgb, session_cloud
 
@@ -61,13 +63,13 @@ class Label:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """The parts of a view.
+    """The parts of a view. Movers are shown where they are in the middle of their session.
 
     Attributes:
         title: Its heading.
         bands: The walls in bands of height above the floor, lowest first; each ends where the next begins.
-        surfaces: Fixtures, unchanged props and changed props.
-        lines: Paths of the sensor.
+        surfaces: Fixtures, unchanged props, changed props and movers.
+        lines: Paths of the sensor, and the stretches on which movers go to and fro.
         clouds: Returns of sessions.
         labels: Names of the props.
         eye, target: (3,) position of the camera, and the point it looks at.
@@ -100,15 +102,16 @@ def view_scenario(scenario: Scenario, seed: int) -> View:
         InputError: The sensor profile cannot be read.
     """
     world = build_world(scenario, seed)
-    sensor = load_profile(scenario.sensor.profile, scenario.sensor.mode)
-    lines, notes = [], []
-    for session in SESSIONS:
-        try:
-            poses = plan_trajectory(world, scenario, sensor, seed, session).world_T_sensor
-            lines.append(Line(f"paths/{session}", poses[:, :3, 3], SESSION_RGB[session]))
-        except ScenarioError as error:
-            notes.append(f"no path {session}: {error}")
-    return _world_view(f"{scenario.family}, seed {seed}", world, lines, (), tuple(notes))
+    drives, notes = _plan_drives(world, scenario, seed)
+    lines = [
+        Line(f"paths/{session}", drive.world_T_sensor[:, :3, 3], SESSION_RGB[session])
+        for session, drive in drives.items()
+    ]
+    try:
+        movers = _place_movers(world, scenario, drives, seed)
+    except ScenarioError as error:
+        movers, notes = [], [*notes, f"no movers: {error}"]
+    return _world_view(f"{scenario.family}, seed {seed}", world, lines, (), movers, tuple(notes))
 
 
 def view_pair(pair: Path) -> View:
@@ -118,14 +121,17 @@ def view_pair(pair: Path) -> View:
         InputError: The pair or its truth is missing, damaged, or of a version whose scenario cannot be built here.
     """
     truth = read_pair_truth(pair)
-    world = build_world(_scenario_of(pair, truth), truth.seed)
+    scenario = _scenario_of(pair, truth)
+    world = build_world(scenario, truth.seed)
     poses = {session: read_true_poses(pair / session) for session in SESSIONS}
     lines = [Line(f"paths/{session}", poses[session][:, :3, 3], SESSION_RGB[session]) for session in SESSIONS]
     kinds = {change.id: change.kind for change in truth.changes}
     clouds = tuple(
         session_cloud(f"returns/{session}", read_session(pair / session), poses[session], kinds) for session in SESSIONS
     )
-    return _world_view(f"{pair}: {truth.family}, seed {truth.seed}", world, lines, clouds, ())
+    drives = _plan_drives(world, scenario, truth.seed)[0] if scenario.movers else {}
+    movers = _place_movers(world, scenario, drives, truth.seed)
+    return _world_view(f"{pair}: {truth.family}, seed {truth.seed}", world, lines, clouds, movers, ())
 
 
 def view_session(folder: Path) -> View:
@@ -175,8 +181,63 @@ def wall_bands(wall: Mesh, floor_points: Float64Array, n_bands: int = _N_BANDS) 
     return tuple(bands)
 
 
+def _plan_drives(world: World, scenario: Scenario, seed: int) -> tuple[dict[SessionName, Trajectory], list[str]]:
+    """Return the drive of each session, and a note for one that cannot be driven."""
+    sensor = load_profile(scenario.sensor.profile, scenario.sensor.mode)
+    drives: dict[SessionName, Trajectory] = {}
+    notes = []
+    for session in SESSIONS:
+        try:
+            drives[session] = plan_trajectory(world, scenario, sensor, seed, session)
+        except ScenarioError as error:
+            notes.append(f"no path {session}: {error}")
+    return drives, notes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Placed:
+    """A mover of a session at one time of it."""
+
+    session: SessionName
+    time_s: float
+    body: MovingBody
+
+    @property
+    def name(self) -> str:
+        """The name of its group."""
+        return f"movers/{self.session}/{self.body.mover.name}"
+
+
+def _place_movers(
+    world: World, scenario: Scenario, drives: Mapping[SessionName, Trajectory], seed: int
+) -> list[_Placed]:
+    """Return the movers of each session that is driven, in the middle of its drive."""
+    planned = plan_movers(world, scenario, {name: drive.true for name, drive in drives.items()}, seed)
+    middles_s = {name: float(drive.revolution_s[drive.n_scans // 2]) for name, drive in drives.items()}
+    return [_Placed(name, middles_s[name], body) for name, bodies in planned.items() for body in bodies]
+
+
+def _mover_surfaces(placed: _Placed) -> Iterator[Surface]:
+    """Yield a mover by material."""
+    figure = placed.body.figure
+    poses = placed.body.world_T_links(np.array([placed.time_s]))[:, 0]
+    limbs = zip(figure.limbs, poses, strict=True)
+    meshes = [move_mesh(mesh, pose) for limb, pose in limbs for mesh in limb.meshes]
+    parts: dict[str, list[Mesh]] = {}
+    for material, mesh in zip(figure.materials, meshes, strict=True):
+        parts.setdefault(material, []).append(mesh)
+    for material, of_material in parts.items():
+        rgb = _rgb(material_colour(placed.body.mover.name, material))
+        yield Surface(f"{placed.name}/{material}", join_meshes(of_material), rgb)
+
+
 def _world_view(
-    title: str, world: World, lines: Sequence[Line], clouds: tuple[Cloud, ...], notes: tuple[str, ...]
+    title: str,
+    world: World,
+    lines: Sequence[Line],
+    clouds: tuple[Cloud, ...],
+    movers: Sequence[_Placed],
+    notes: tuple[str, ...],
 ) -> View:
     wall = world.before.meshes[0]
     floor = [line.points for line in world.centreline.drifts]
@@ -195,9 +256,14 @@ def _world_view(
         target = lines[0].points[len(lines[0].points) // 2] if lines else wall.vertices.mean(axis=0)
     labels = tuple(_label(item) for item in world.standing)
     eye = target + np.array([-6.0, -6.0, 8.0])
-    return View(
-        title, wall_bands(wall, floor_points), (*fixtures, *props), tuple(lines), clouds, labels, eye, target, notes
-    )
+    moving = [surface for placed in movers for surface in _mover_surfaces(placed)]
+    stretches = [
+        Line(f"{placed.name}/stretch", placed.body.course.points, SESSION_RGB[placed.session])
+        for placed in movers
+        if placed.body.course.is_moving
+    ]
+    surfaces, all_lines = (*fixtures, *props, *moving), (*lines, *stretches)
+    return View(title, wall_bands(wall, floor_points), surfaces, all_lines, clouds, labels, eye, target, notes)
 
 
 def _prop_surfaces(item: Standing) -> Iterator[Surface]:

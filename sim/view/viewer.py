@@ -184,11 +184,11 @@ def _add_switch(gui: Any, group: str, handle: Any) -> None:
 
 
 def _switched(handles: dict[str, Any]) -> list[str]:
-    """Return the groups with a switch: the outermost, and for fixtures, changes and paths the level below."""
+    """Return the groups with a switch: the outermost, and for fixtures, changes, movers and paths the level below."""
     inner = [name for name in handles if name.count("/") == 1]
-    split = ("fixtures", "changes", "paths", "returns")
+    split = ("fixtures", "changes", "movers", "paths", "returns")
     groups = [name for name in handles if "/" not in name and name not in split]
-    kinds = sorted(name for name in inner if name.startswith(("fixtures/", "changes/")))
+    kinds = sorted(name for name in inner if name.startswith(("fixtures/", "changes/", "movers/")))
     return [*groups, *kinds, *(name for name in inner if name.startswith("paths/"))]
 
 

@@ -49,6 +49,7 @@ def test_movers_are_repeated_and_drawn_as_props_are() -> None:
         ({"kind": "person", "width_m": 1}, "a person has no width_m: leave that out"),
         ({"kind": "curtain", "speed_mps": 1, "pause_s": 2}, "a curtain has no pause_s, speed_mps"),
         ({"kind": "loader", "height_m": 1.8}, "a loader has no height_m"),
+        ({"kind": "forklift", "speed_mps": 0}, "a forklift that never moves is a prop"),
         ({"kind": "person", "path": {"between": ["a", "b"]}}, "between and fractions go together"),
         ({"kind": "person", "path": {"between": ["a", "b"], "fractions": [0, 1], "area": "a"}}, "between or area"),
         ({"kind": "dragon"}, "person"),

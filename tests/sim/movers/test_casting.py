@@ -83,10 +83,10 @@ def test_a_scan_that_rolls_does_not_see_the_mover_as_it_is_at_one_time(
 def test_a_mover_that_stands_still_equals_a_prop_that_stands_there(
     kind: str, sensor: SensorMetadata, make_body: MakeBody, floor: Mesh
 ) -> None:
-    mover = make_body(kind, speed_mps=0)
+    mover = make_body(kind)
     rays, time_s = columns_of(sensor, 1.0)
     poses = mover.world_T_links(np.zeros(1))[:, 0]
-    # who stands moves a forearm; so all columns are those of one time
+    # all columns are those of one time
     moving = MovingCaster(Caster([floor]), 1, [mover], np.zeros_like(time_s))
     meshes = [
         move_mesh(mesh, pose) for limb, pose in zip(mover.figure.limbs, poses, strict=True) for mesh in limb.meshes

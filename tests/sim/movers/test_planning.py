@@ -12,7 +12,7 @@ from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Mover, Prop, Scenario, Section, SessionPlan, Tunnel
 from sim.drive.trajectory import plan_trajectory
 from sim.movers.mover import MovingBody
-from sim.movers.planning import plan_movers
+from sim.movers.planning import SESSIONS, plan_movers
 from sim.placement.placing import floor_heights
 from sim.scene import World, build_world
 
@@ -36,11 +36,11 @@ def world_fixture(scenario: Scenario) -> World:
 
 @pytest.fixture(scope="module", name="plan")
 def plan_fixture(scenario: Scenario, world: World, sensor: SensorMetadata) -> Plan:
-    robots = {name: plan_trajectory(world, scenario, sensor, SEED, name).true for name in ("before", "after")}
+    robots = {name: plan_trajectory(world, scenario, sensor, SEED, name).true for name in SESSIONS}
 
     def plan(movers: Sequence[Settings], session: str) -> tuple[MovingBody, ...]:
         drawn = scenario.model_copy(update={"movers": tuple(Mover.model_validate(each) for each in movers)})
-        return plan_movers(world, drawn, robots[session], SEED, session)
+        return plan_movers(world, drawn, robots, SEED)[session]
 
     plan.robots = robots  # type: ignore[attr-defined]
     return plan
@@ -98,6 +98,15 @@ def test_another_mover_changes_no_draw_and_sessions_differ(plan: Plan) -> None:
     assert only == ()
 
 
+def test_a_curtain_hangs_at_one_place_in_both_sessions_and_swings_on(plan: Plan) -> None:
+    before, after = (plan(KINDS, session)[3] for session in SESSIONS)
+    np.testing.assert_array_equal(before.course.points, after.course.points)
+    assert len(before.figure.limbs) == len(after.figure.limbs)
+    assert before.course.offset_s != after.course.offset_s
+    walkers = [plan(KINDS, session)[1] for session in SESSIONS]
+    assert np.linalg.norm(walkers[0].course.points - walkers[1].course.points) > 0.5  # people go where they like
+
+
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
@@ -127,9 +136,9 @@ def test_a_mover_may_be_where_the_robot_is_not(make_scenario: Callable[..., Scen
     scenario = make_scenario(tunnel=tunnel, before=short, after=short, movers=(loader,))
     world = build_world(scenario, SEED)
     robot = plan_trajectory(world, scenario, sensor, SEED, "before").true
-    (placed,) = plan_movers(world, scenario, robot, SEED, "before")
+    (placed,) = plan_movers(world, scenario, {"before": robot}, SEED)["before"]
     assert placed.world_T_root(np.linspace(0, 60, 100))[:, 0, 3].min() > 25
     closer = scenario.model_copy(update={"before": SessionPlan(route=("a", "b"), start_m=2.0, end_m=12.0)})
     robot = plan_trajectory(world, closer, sensor, SEED, "before").true
     with pytest.raises(ScenarioError, match="mover 'loader' finds no way: it comes within"):
-        plan_movers(world, closer, robot, SEED, "before")
+        plan_movers(world, closer, {"before": robot}, SEED)

@@ -18,11 +18,11 @@ from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
 from eval.cli.main import main
 from eval.cli.world import load_view
-from scenarios.schema import MeshFile, Place, Prop, Scenario, Shift, Tunnel
+from scenarios.schema import MeshFile, Mover, Place, Prop, Scenario, Shift, Tunnel
 from sim.geometry.mesh import Mesh
 from sim.scene import build_world
 from sim.session.simulate import simulate, simulate_pair
-from sim.session.truth import read_pair_truth, read_true_poses
+from sim.session.truth import read_mover_track, read_pair_truth, read_true_poses
 from sim.view import view as view_module
 from sim.view import viewer
 from sim.view.returns import CHANGE_RGB, session_cloud
@@ -87,6 +87,40 @@ def test_a_world_is_shown_with_walls_paths_and_changes_in_their_colours(shown: V
             box = parts["changes/removed/went"].mesh.vertices
             middle = (box.min(axis=0) + box.max(axis=0)) / 2
             np.testing.assert_allclose(middle, (item.world_T_object @ [0, 0, 0.35, 1])[:3], atol=0.02)
+
+
+def test_movers_are_shown_where_they_are_in_the_middle_of_each_session(
+    server: Any, make_scenario: Callable[..., Scenario], tmp_path: Path
+) -> None:
+    stretch = {"between": ("a", "b"), "fractions": (0.2, 0.6)}
+    movers = [
+        Mover.model_validate({"name": "walker", "kind": "person", "sessions": "after", "path": stretch}),
+        Mover.model_validate({"name": "guard", "kind": "person", "speed_mps": 0}),
+    ]
+    scenario = make_scenario(movers=tuple(movers))
+    shown = view_scenario(scenario, 3)
+    parts = named(shown)
+    groups = {name.rpartition("/")[0] for name in parts if name.startswith("movers/")}
+    assert groups == {"movers/before/guard", "movers/after/guard", "movers/after/walker"}
+    assert [name for name in parts if name.endswith("/stretch")] == ["movers/after/walker/stretch"]
+    simulate_pair(scenario, 3, tmp_path / "pair")
+    of_pair = named(view_pair(tmp_path / "pair"))
+    track = read_mover_track(tmp_path / "pair" / "after")
+    assert track is not None
+    middle = track.world_T_mover[0, len(track.n_returns[0]) // 2, :2, 3]
+    helmet = of_pair["movers/after/walker/plastic"].mesh.vertices
+    np.testing.assert_allclose(helmet[:, :2].mean(axis=0), middle, atol=0.2)
+    np.testing.assert_array_equal(helmet, parts["movers/after/walker/plastic"].mesh.vertices)
+    show(server, shown)
+    switches = list(server.gui._gui_input_handle_from_uuid.values())
+    assert {"movers/before", "movers/after"} <= {getattr(handle, "label", "") for handle in switches}
+
+
+def test_movers_that_find_no_way_are_a_note(make_scenario: Callable[..., Scenario]) -> None:
+    path = {"between": ("a", "b"), "fractions": (0.2, 0.6), "lateral": 0.0}
+    blocking = Mover.model_validate({"name": "walker", "kind": "person", "path": path})
+    (note,) = view_scenario(make_scenario(movers=(blocking,)), 3).notes
+    assert note.startswith("no movers: before: mover 'walker' finds no way")
 
 
 def test_bands_hold_every_face_of_the_walls_once_and_by_height(shown: View, scenario: Scenario) -> None:
