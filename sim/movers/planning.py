@@ -24,7 +24,7 @@ from sim.scene import World
 SessionName = Literal["before", "after"]
 SESSIONS: tuple[SessionName, ...] = ("before", "after")
 _TRIES = 80  # places that the seed draws, as for a prop
-_SHORTER = (1.0, 0.5, 0.25)  # shares of its length that a drawn stretch has, each for so many places
+_SHORTER = (1.0, 0.5, 0.25, 0.1)  # shares of its length that a drawn stretch has, each for so many places
 _STARTS = 8  # times at which it may start, at each place
 _PROP_GAP_M = 0.1
 _ALONG_M = 0.25  # between the places at which a mover is checked against props, and four times that against rock
@@ -116,7 +116,7 @@ def _fit(body: MovingBody, starts: Float64Array, site: _Site) -> MovingBody:
 
 
 def _draw_stands(mover: Mover, site: _Site, seed: int, generator: np.random.Generator) -> Iterator[Stand]:
-    """Yield the stretch that a mover's path names; or those that the seed draws, shorter ones after 80 and 160."""
+    """Yield the stretch that a mover's path names; or those that the seed draws, shorter ones after 80, 160 and 240."""
     path = mover.path
     if path.between is not None and path.fractions is not None:
         is_fixed = path.lateral is not None
