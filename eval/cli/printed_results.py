@@ -31,9 +31,8 @@ def print_results(folder: Path, quiet: bool) -> None:
     from eval.tables.merge_table import merge_overview
 
     results = pd.read_csv(folder / "results.csv")
-    results["n_failed"] = results["status"] != "ok"
     groups = results.groupby(["scenario", "variant"], sort=False)
-    counts = groups["n_failed"].agg(n="size", n_failed="sum")
+    counts = groups["status"].agg(n="size", n_failed=lambda status: (status != "ok").sum())
     # a run that ends at the merge has nothing in the columns of what comes later
     shown = [name for name in _SHOWN if name in results.columns and results[name].notna().any()]
     print_table("means over pairs", counts.join(groups[shown].mean()).reset_index())
