@@ -5,7 +5,7 @@ mutants that survive with `tests/mutants.yaml`, which says of each why no test c
 one row per file. It fails if a survivor is not listed, or if less than 92 % are dead.
 
     python tests/mutants.py               # everything anew
-    python tests/mutants.py --keep        # read the results that are there: after `mutmut run eval.core.ranking*`, say
+    python tests/mutants.py --keep        # read the results there are: after `mutmut run cdpipe.core.ranking*`, say
     python tests/mutants.py --out FILE    # write the table as Markdown, too
 """
 

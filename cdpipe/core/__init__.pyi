@@ -2,6 +2,7 @@ from .errors import InputError, MergeFailedError, ScenarioError, TunnelcdError
 from .geometry import invert, make_pose, stream, transform, yaw_pose
 from .grid_index import GridIndex
 from .motion import Motion, make_motion
+from .ranking import auroc, average_precision
 from .voxel import cell_keys, cell_means
 from .yamlfile import Document, Settings, read_yaml, validate
 
@@ -14,6 +15,8 @@ __all__ = [
     "ScenarioError",
     "Settings",
     "TunnelcdError",
+    "auroc",
+    "average_precision",
     "cell_keys",
     "cell_means",
     "invert",

@@ -130,10 +130,14 @@ class MergeConfig(Settings):
     )
 
 
-# Settings that only the source of this name reads; a dump of another leaves them out where they are the defaults.
-_OF_ONE_SOURCE = ("voxel_diff", "c2c", "removert", "octomap", "m3c2_ep", "erasor", "range_net")
 # Sources that score keyframes; they read nothing but descriptors, maps and `query`, and cut out nothing.
 SOURCES_AT_KEYFRAMES = ("scan", "sphere", "sphere-difference", "every-keyframe", "random-regions")
+WHOLE_MAP_SOURCES = ("voxel-diff", "c2c", "m3c2", "m3c2-ep", "dufomap", "octomap", "removert", "erasor", "range-net")
+"""Shipped sources that compare whole maps."""
+OF_WHOLE_MAPS = tuple(source.replace("-", "_") for source in WHOLE_MAP_SOURCES)
+"""The section of settings that each of them has. `m3c2-ep` reads that of `m3c2`, too."""
+# Every dump has held these two. One leaves the others out where they are the defaults, but for that of its own source.
+_IN_EVERY_DUMP = ("m3c2", "dufomap")
 
 
 class RegionsConfig(_Grown):
@@ -358,7 +362,8 @@ class PipelineConfig(Settings):
     @model_serializer(mode="wrap")
     def _without_empty_groups(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         own, fields = self.regions.source.replace("-", "_"), type(self).model_fields
-        of_others = [name for name in _OF_ONE_SOURCE if name != own and getattr(self, name) == fields[name].default]
+        idle = [name for name in OF_WHOLE_MAPS if name not in (own, *_IN_EVERY_DUMP)]
+        of_others = [name for name in idle if getattr(self, name) == fields[name].default]
         found = {name: value for name, value in handler(self).items() if name not in of_others}
         return {name: value for name, value in found.items() if name not in ("options", "sphere") or value}
 

@@ -17,7 +17,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import BoolArray, Float64Array, stream
+from cdpipe.core.geometry import stream
+from cdpipe.core.ranking import average_precision
 from cdpipe.descriptors.change_network import ChangeNetwork
 from cdpipe.descriptors.sphere_image import COLUMNS
 from cdpipe.training.sphere_training import (
@@ -148,19 +149,3 @@ def visible_mask(own_m: Tensor, other_m: Tensor, own_marks: Tensor) -> Tensor:
     """
     reaches = (other_m > 0) & (other_m >= own_m - _IN_FRONT_M)
     return reaches | (own_marks == CHANGED)
-
-
-def average_precision(scores: Float64Array, is_positive: BoolArray) -> float:
-    """Return the mean over the positives of the precision at their score; NaN without a positive.
-
-    Args:
-        scores: (N,) scores; equal ones count together.
-        is_positive: (N,) which are positive.
-    """
-    order = np.argsort(-scores, kind="stable")
-    ranked = scores[order]
-    ends = np.flatnonzero(np.append(ranked[1:] != ranked[:-1], True))
-    found = np.cumsum(is_positive[order])[ends]
-    if not len(found) or found[-1] == 0:
-        return float("nan")
-    return float(np.sum(np.diff(found, prepend=0) * found / (ends + 1)) / found[-1])

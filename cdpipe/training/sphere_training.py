@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
+from cdpipe.core.ranking import auroc
 from cdpipe.descriptors.sphere import average_neighbours, max_within_reach
 from cdpipe.descriptors.sphere_image import COLUMNS, REACH_M, ROWS
 from cdpipe.descriptors.sphere_network import SECTORS, SphereNetwork
@@ -184,15 +185,13 @@ class SphereTask:
         """
         data = self._validation
         pooled = pooled_scores(self.network, data, draw=min(1, data.n_draws - 1))
-        by_tunnel = [
-            _auroc(pooled[mask], data.labels[mask])
-            for mask in (data.tunnels == tunnel for tunnel in np.unique(data.tunnels))
-        ]
         used = data.labels >= 0
+        is_changed = data.labels == 1
+        of_tunnels = [used & (data.tunnels == tunnel) for tunnel in np.unique(data.tunnels)]
         return {
-            "log_likelihood": fit_platt(pooled[used], data.labels[used] == 1)[2],
-            "auroc": float(np.nanmean(by_tunnel)),
-            "auroc_pooled": _auroc(pooled, data.labels),
+            "log_likelihood": fit_platt(pooled[used], is_changed[used])[2],
+            "auroc": float(np.nanmean([auroc(pooled[mask], is_changed[mask]) for mask in of_tunnels])),
+            "auroc_pooled": auroc(pooled[used], is_changed[used]),
         }
 
     def finish(self) -> dict[str, float]:
@@ -307,13 +306,3 @@ def paste_objects(after: Tensor, data: SphereData, donors: Int64Array, shifts: I
 def _per_sector(pixels: Tensor) -> Tensor:
     own = pixels[..., _OWN_ROWS, :].sum(dim=-2)
     return own.reshape(*own.shape[:-1], SECTORS, COLUMNS // SECTORS).sum(dim=-1)
-
-
-def _auroc(scores: Float64Array, labels: Int64Array) -> float:
-    """Return the area under the ROC curve, ties count half; NaN if a class is missing."""
-    used: BoolArray = labels >= 0
-    positive, negative = np.sort(scores[used & (labels == 1)]), np.sort(scores[used & (labels == 0)])
-    if not len(positive) or not len(negative):
-        return float("nan")
-    below = np.searchsorted(negative, positive, "left") + np.searchsorted(negative, positive, "right")
-    return float(below.mean() / (2 * len(negative)))

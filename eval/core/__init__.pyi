@@ -4,7 +4,6 @@ from .exits import run_program
 from .output import make_writable, new_folder
 from .progress import RunProgress, Silent, shown_progress
 from .provenance import git_commit
-from .ranking import auroc, average_precision
 from .statistics import bootstrap_interval, mean_with_interval, summarise, wilson_interval
 
 __all__ = [
@@ -12,8 +11,6 @@ __all__ = [
     "RunProgress",
     "Silent",
     "Where",
-    "auroc",
-    "average_precision",
     "bootstrap_interval",
     "domain_of",
     "git_commit",

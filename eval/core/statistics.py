@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
-from eval.core.ranking import auroc, average_precision
+from cdpipe.core.ranking import auroc, average_precision
 
 Statistic = Literal["mean", "median"]
 N_RESAMPLES = 2000

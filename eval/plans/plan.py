@@ -52,7 +52,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import folded
 from cdpipe.core.yamlfile import Settings, suggest, validate
-from cdpipe.model.config import Site
+from cdpipe.model.config import OF_WHOLE_MAPS, Site
 from eval.plans.axes import Axis, harder_item, method_steps
 from eval.plans.files import read_plan
 from eval.plans.parts import Grid, Label, MethodSettings, NotEmpty, Variant, get_key
@@ -74,10 +74,7 @@ from eval.plans.worlds import (
 _MOST_SEEDS = 100_000
 _NO_THRESHOLDS: Mapping[str, Any] = {"thresholds": {}}
 _MAY_BE_LEFT_OUT = ("split", "set", "thresholds", "axes")
-_AFTER_MERGE = (
-    "query", "extract", "outlier", "cluster",
-    "voxel_diff", "c2c", "m3c2", "dufomap", "removert", "octomap", "m3c2_ep", "erasor", "range_net",
-)  # fmt: skip
+_AFTER_MERGE = ("query", "extract", "outlier", "cluster", *OF_WHOLE_MAPS)
 
 
 def _mistake(where: tuple[str | int, ...], written: str, rule: str) -> InitErrorDetails:

@@ -18,7 +18,7 @@ from cdpipe.core.plugins import extra_version
 from cdpipe.descriptors import checkpoint_digest, range_net_digest, sphere_digest
 from cdpipe.methods.registry import PACKAGES
 from cdpipe.model.alignment import PathAlignment
-from cdpipe.model.config import SOURCES_AT_KEYFRAMES, PipelineConfig
+from cdpipe.model.config import OF_WHOLE_MAPS, SOURCES_AT_KEYFRAMES, WHOLE_MAP_SOURCES, PipelineConfig
 from cdpipe.model.report import ChangeRegions, Clusters
 from cdpipe.model.types import DescriptorSet, KeyframeViews, MergedMaps, PointMap
 from cdpipe.pipeline import Stage
@@ -26,11 +26,6 @@ from eval.core.provenance import digest
 from eval.running.stage_cache import Arrays
 from eval.truth.ground_truth import SESSIONS
 
-_WHOLE_MAP_SOURCES = ("voxel-diff", "c2c", "m3c2", "m3c2-ep", "dufomap", "octomap", "removert", "erasor", "range-net")
-# The settings that they read besides those of the query.
-_OF_WHOLE_MAPS = {
-    "outlier", "voxel_diff", "c2c", "m3c2", "dufomap", "removert", "octomap", "m3c2_ep", "erasor", "range_net",
-}  # fmt: skip
 _PIXELS = tuple(f"{session}.return_pixels" for session in SESSIONS)
 
 
@@ -74,12 +69,12 @@ def name_result(stage: Stage, config: PipelineConfig) -> str:
 
 def is_kept(stage: Stage, config: PipelineConfig) -> bool:
     """Return whether a result may be kept: the code of a plugin can change without a trace in its name."""
-    return stage != "regions" or config.regions.source in (*SOURCES_AT_KEYFRAMES, *_WHOLE_MAP_SOURCES)
+    return stage != "regions" or config.regions.source in (*SOURCES_AT_KEYFRAMES, *WHOLE_MAP_SOURCES)
 
 
 def _settings_of_clusters(config: PipelineConfig) -> dict[str, Any]:
     """Return what a source that compares whole maps may read besides."""
-    found = config.model_dump(mode="json", include=_OF_WHOLE_MAPS)
+    found = config.model_dump(mode="json", include={"outlier", *OF_WHOLE_MAPS})
     clusters = [config.cluster.radius_m, config.regions.min_points]
     if config.regions.source == "range-net":  # the digest names the weights, wherever their file lies
         found["range_net"] |= {"weights": range_net_digest(config.range_net)}

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform_each
+from cdpipe.core.ranking import auroc, average_precision
 from cdpipe.model.report import ChangeReport
-from eval.core.ranking import auroc, average_precision
 from eval.scoring.judged_places import carry_scores
 from eval.truth.ground_truth import GroundTruth, SessionTruth
 

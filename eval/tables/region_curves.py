@@ -20,7 +20,7 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
-from eval.core.ranking import comparable, last_of_ties
+from cdpipe.core.ranking import comparable, last_of_ties
 from eval.core.statistics import N_RESAMPLES, interval_of
 from eval.tables.rows import PAIR
 

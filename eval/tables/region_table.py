@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
-from eval.core.ranking import auroc
+from cdpipe.core.ranking import auroc
 from eval.core.statistics import interval_of, mean, median, wilson_interval
 from eval.plans.targets import Targets
 from eval.tables.budgets import budget_rows

@@ -160,10 +160,8 @@ def _settle(
         return make_figure(build_body(mover, hang_m), mover.reflectivity), stay(point, float(path.yaw_rad[0]), 0.0)
     height_m = float(extent.high[2])
     path = lay_line(stand, lateral, half_m, height_m, centreline, fixed)
-    if is_staying:
-        sway_rad = _SWAY_RAD if mover.kind == "person" else 0.0
-        yaw_rad = float(path.yaw_rad[0]) + (facing if mover.kind == "person" else 0.0)
-        return figure, stay(path.points[0], yaw_rad, 0.0, sway_rad)
+    if is_staying:  # a person: no machine stays
+        return figure, stay(path.points[0], float(path.yaw_rad[0]) + facing, 0.0, _SWAY_RAD)
     assert mover.speed_mps is not None and mover.pause_s is not None
     if mover.kind == "person":
         return figure, walk_along(path, mover.speed_mps, mover.pause_s)
@@ -218,11 +216,9 @@ def _measure_depth(body: MovingBody, site: _Site) -> float:
         of_limb = np.concatenate([mesh.vertices for mesh in limb.meshes])
         corners += [transform(pose, of_limb[:: max(1, len(of_limb) // 64)]) for pose in poses]
     points = np.concatenate(corners)
-    floor_m = float(course.points[:, 2].min())
     if body.mover.kind != "curtain":
         nearest = np.linalg.norm(points[:, None, :2] - course.points[None, ::5, :2], axis=2).argmin(axis=1)
-        floor_m = course.points[::5][nearest, 2] + _FOOT_M
-        points = points[points[:, 2] > floor_m]
+        points = points[points[:, 2] > course.points[::5][nearest, 2] + _FOOT_M]
     return float(find_way_out(points, site.world.fixed)[0].max(initial=0.0))
 
 

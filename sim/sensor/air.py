@@ -35,57 +35,70 @@ _LATTICE_M, _LATTICE_REACH_M, _LATTICE_HEIGHT_M = 1.0, 40.0, 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AirVolume:
-    """The air around the sensor during one revolution.
+class DustCloud:
+    """The dust around the sensor during one revolution.
 
     Attributes:
-        mist_per_m: Extinction of the mist.
-        dust: What the dust is like, None without any.
+        dust: What it is like.
         floor_z_m: Height of the floor below the sensor, world frame, metres.
         corner_m: (3,) first point of the lattice, world frame, metres.
-        swathes: (X, Y, Z) float32 density of the dust over its mean on the lattice.
+        swathes: (X, Y, Z) float32 density over its mean on the lattice.
     """
 
-    mist_per_m: float
-    dust: Dust | None = None
-    floor_z_m: float = 0.0
-    corner_m: Float64Array | None = None
-    swathes: Float32Array | None = None
+    dust: Dust
+    floor_z_m: float
+    corner_m: Float64Array
+    swathes: Float32Array
 
-    def extinction(self, points: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """Return the extinction (1/m) and the backscatter (1/(m sr)) at (3, N) points, world frame, metres."""
-        mist = np.full(points.shape[1], self.mist_per_m, np.float32)
-        if self.dust is None or self.swathes is None or self.corner_m is None:
-            return mist, mist / np.float32(MIST_RATIO_SR)
-        dust = self._swathe(points)
-        dust *= np.float32(DUST_M2_PER_MG * self.dust.mg_per_m3)
-        heights_m = np.maximum(points[2] - np.float32(self.floor_z_m), np.float32(0.0))
-        dust *= np.exp(heights_m / np.float32(-self.dust.scale_height_m))
-        return mist + dust, mist / np.float32(MIST_RATIO_SR) + dust / np.float32(DUST_RATIO_SR)
-
-    def _swathe(self, points: Float32Array) -> Float32Array:
-        """Return the density over its mean at the nearest place of the lattice, 1 beyond it."""
-        assert self.swathes is not None and self.corner_m is not None
+    def extinction(self, points: Float32Array) -> Float32Array:
+        """Return the extinction (N,), 1/m, at (3, N) points, world frame, metres; of the mean beyond the lattice."""
         index = np.rint((points - self.corner_m[:, None].astype(np.float32)) / np.float32(_LATTICE_M)).astype(np.int32)
         is_off = np.zeros(points.shape[1], np.bool_)
         for axis, count in enumerate(self.swathes.shape):
             is_off |= (index[axis] < 0) | (index[axis] >= count)
             np.clip(index[axis], 0, count - 1, out=index[axis])
-        found = self.swathes[index[0], index[1], index[2]]
-        found[is_off] = 1.0
-        return np.asarray(found)
+        density: Float32Array = self.swathes[index[0], index[1], index[2]]
+        density[is_off] = 1.0
+        density *= np.float32(DUST_M2_PER_MG * self.dust.mg_per_m3)
+        heights_m = np.maximum(points[2] - np.float32(self.floor_z_m), np.float32(0.0))
+        density *= np.exp(heights_m / np.float32(-self.dust.scale_height_m))
+        return density
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AirVolume:
+    """The air around the sensor during one revolution.
+
+    Attributes:
+        mist_per_m: Extinction of the mist.
+        dust: The dust, None without any.
+    """
+
+    mist_per_m: float
+    dust: DustCloud | None = None
+
+    def extinction(self, points: Float32Array) -> tuple[Float32Array, Float32Array]:
+        """Return the extinction (1/m) and the backscatter (1/(m sr)) at (3, N) points, world frame, metres."""
+        mist = np.full(points.shape[1], self.mist_per_m, np.float32)
+        from_mist = mist / np.float32(MIST_RATIO_SR)
+        if self.dust is None:
+            return mist, from_mist
+        dust = self.dust.extinction(points)
+        return mist + dust, from_mist + dust / np.float32(DUST_RATIO_SR)
 
 
 def air_around(air: Air, sensor_m: Float64Array, floor_z_m: float, time_s: float, seed: int, session: str) -> AirVolume:
-    """Return the air around a sensor at a (3,) position, world frame, at a time of its session.
-
-    Swathes are log-normal about their mean and drift along a level heading that the seed draws.
-    """
+    """Return the air around a sensor at a (3,) position, world frame, at a time of its session."""
     mist_per_m = -np.log(CONTRAST_LEFT) / air.mist.visibility_m if air.mist is not None else 0.0
-    dust = air.dust
-    if dust is None:
+    if air.dust is None:
         return AirVolume(mist_per_m)
-    generator = stream(seed, session, "air")
+    return AirVolume(mist_per_m, _dust_around(air.dust, sensor_m, floor_z_m, time_s, stream(seed, session, "air")))
+
+
+def _dust_around(
+    dust: Dust, sensor_m: Float64Array, floor_z_m: float, time_s: float, generator: np.random.Generator
+) -> DustCloud:
+    """Return dust in swathes that are log-normal about their mean and drift along a drawn level heading."""
     key, heading_rad = int(generator.integers(1 << 62)), float(generator.uniform(0.0, 2 * np.pi))
     drifted_m = dust.drift_mps * time_s * np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
     half_m = np.array([_LATTICE_REACH_M, _LATTICE_REACH_M, _LATTICE_HEIGHT_M])
@@ -93,7 +106,7 @@ def air_around(air: Air, sensor_m: Float64Array, floor_z_m: float, time_s: float
     axes = [start + np.arange(0.0, 2 * half + 1e-9, _LATTICE_M) for start, half in zip(corner_m, half_m, strict=True)]
     moved = (axes[0] - drifted_m[0], axes[1] - drifted_m[1], axes[2])
     swathes = np.exp(dust.contrast * smooth_noise(moved, dust.patch_m, key) - dust.contrast**2 / 2)
-    return AirVolume(mist_per_m, dust, floor_z_m, corner_m, swathes.astype(np.float32))
+    return DustCloud(dust, floor_z_m, corner_m, swathes.astype(np.float32))
 
 
 def cross_air(echo: Echo, rays: Rays, beam_origin_m: float, air: AirVolume, generator: np.random.Generator) -> Echo:

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
+from cdpipe.core.ranking import auroc
 from cdpipe.descriptors import use_threads
 from cdpipe.descriptors.sphere_network import (
     SphereNetwork,
@@ -39,7 +40,6 @@ from cdpipe.training.sphere_training import SphereData, SphereTask, local_scores
 from eval.core.exits import run_program
 from eval.core.figures import picture, png
 from eval.core.output import make_writable, whole_file
-from eval.core.ranking import auroc
 from eval.core.statistics import mean
 from eval.core.tablefile import read_table
 from eval.studies.descriptors.curve_plots import curves_chart

@@ -17,13 +17,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, require_poses
+from cdpipe.core.ranking import auroc
 from cdpipe.descriptors import anchor_frames, checkpoint_digest, describe_map, describe_scan, relative_yaws_rad
 from cdpipe.mapping.mapping import build_map
 from cdpipe.merge.merge import merge_maps
 from cdpipe.model.config import DescriptorConfig, PipelineConfig, load_config
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, ScanSource
 from cdpipe.query.query import find_regions
-from eval.core.ranking import auroc
 from eval.core.statistics import mean, median
 from eval.scoring.region_metrics import label_keyframes
 from eval.truth.adapters import pipeline_input

@@ -5,10 +5,11 @@ import pytest
 import torch
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.ranking import average_precision
 from cdpipe.descriptors.change_network import make_untrained_change_network
 from cdpipe.descriptors.sphere_image import COLUMNS, REACH_M, ROWS
 from cdpipe.training import sphere_training
-from cdpipe.training.change_training import BATCH, ChangeTask, average_precision, visible_mask
+from cdpipe.training.change_training import BATCH, ChangeTask, visible_mask
 from cdpipe.training.sphere_training import SphereData
 
 WALL_M, BLOCK_M = 3.0, 2.0
@@ -45,15 +46,6 @@ def test_visible_is_what_the_other_session_looked_at_or_through() -> None:
     # what the truth calls observable was seen, and what it does not is as the images say
     assert visible_mask(own, other, nothing + 1).all()
     assert visible_mask(own, other, nothing + 2).tolist() == [[[True, True, True, False, False]]]
-
-
-def test_average_precision_by_hand() -> None:
-    # ranked: + - + -; precision 1 at the first, 2/3 at the second
-    scores = np.array([0.1, 0.9, 0.5, 0.7])
-    assert average_precision(scores, np.array([False, True, True, False])) == pytest.approx((1 + 2 / 3) / 2)
-    # of equal scores no order counts: two of four
-    assert average_precision(np.zeros(4), np.array([True, False, False, True])) == pytest.approx(0.5)
-    assert np.isnan(average_precision(scores, np.zeros(4, dtype=np.bool_)))
 
 
 @pytest.mark.usefixtures("as_simulated")

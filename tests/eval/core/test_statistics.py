@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from cdpipe.core.geometry import stream
-from eval.core.ranking import auroc
+from cdpipe.core.ranking import auroc
 from eval.core.statistics import bootstrap_interval, summarise
 
 NAN = float("nan")

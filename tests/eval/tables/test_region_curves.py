@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError
-from eval.core.ranking import auroc
+from cdpipe.core.ranking import auroc
 from eval.core.statistics import interval_of
 from eval.tables import region_curves
 from eval.tables.groups import clustered_interval, recall_by_size

@@ -8,17 +8,18 @@ import pytest
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import transform
+from cdpipe.core.motion import Motion
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Mover, Prop, Scenario, Section, SessionPlan, Tunnel
 from sim.drive.trajectory import plan_trajectory
 from sim.movers.mover import MovingBody
-from sim.movers.planning import SESSIONS, plan_movers
+from sim.movers.planning import SESSIONS, SessionName, plan_movers
 from sim.placement.placing import floor_heights
 from sim.scene import World, build_world
 
 SEED = 5
 Settings = dict[str, Any]
-Plan = Callable[[Sequence[Settings], str], tuple[MovingBody, ...]]
+Plan = Callable[[Sequence[Settings], SessionName], tuple[MovingBody, ...]]
 WALKER: Settings = {"name": "walker", "kind": "person", "path": {"between": ("a", "b"), "fractions": (0.3, 0.6)}}
 
 
@@ -34,15 +35,17 @@ def world_fixture(scenario: Scenario) -> World:
     return build_world(scenario, SEED)
 
 
-@pytest.fixture(scope="module", name="plan")
-def plan_fixture(scenario: Scenario, world: World, sensor: SensorMetadata) -> Plan:
-    robots = {name: plan_trajectory(world, scenario, sensor, SEED, name).true for name in SESSIONS}
+@pytest.fixture(scope="module")
+def robots(scenario: Scenario, world: World, sensor: SensorMetadata) -> dict[SessionName, Motion]:
+    return {name: plan_trajectory(world, scenario, sensor, SEED, name).true for name in SESSIONS}
 
-    def plan(movers: Sequence[Settings], session: str) -> tuple[MovingBody, ...]:
+
+@pytest.fixture(scope="module", name="plan")
+def plan_fixture(scenario: Scenario, world: World, robots: dict[SessionName, Motion]) -> Plan:
+    def plan(movers: Sequence[Settings], session: SessionName) -> tuple[MovingBody, ...]:
         drawn = scenario.model_copy(update={"movers": tuple(Mover.model_validate(each) for each in movers)})
         return plan_movers(world, drawn, robots, SEED)[session]
 
-    plan.robots = robots  # type: ignore[attr-defined]
     return plan
 
 
@@ -56,9 +59,9 @@ KINDS = [
 
 @pytest.mark.parametrize("session", ["before", "after"])
 def test_no_corner_of_a_mover_comes_near_the_sensor_or_into_the_rock(
-    plan: Plan, scenario: Scenario, world: World, session: str
+    plan: Plan, scenario: Scenario, world: World, robots: dict[SessionName, Motion], session: SessionName
 ) -> None:
-    robot = plan.robots[session]  # type: ignore[attr-defined]
+    robot = robots[session]
     time_s = np.linspace(robot.time_s[0], robot.time_s[-1], 150)
     sensor_m = robot.sample(time_s)[0]
     movers = plan(KINDS, session)

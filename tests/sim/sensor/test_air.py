@@ -136,9 +136,9 @@ def test_the_air_hides_no_more_than_it_must(sensor: SensorMetadata) -> None:
 def test_swathes_keep_the_mean_and_drift_with_the_air() -> None:
     dust = Dust(mg_per_m3=100, contrast=0.8, patch_m=3, drift_mps=1.0)
     volume = dusty(dust)
-    assert volume.swathes is not None
-    logs = np.log(volume.swathes.astype(np.float64))
-    assert logs.std() == pytest.approx(0.8, rel=0.15) and volume.swathes.mean() == pytest.approx(1.0, abs=0.2)
+    assert volume.dust is not None
+    swathes = volume.dust.swathes.astype(np.float64)
+    assert np.log(swathes).std() == pytest.approx(0.8, rel=0.15) and swathes.mean() == pytest.approx(1.0, abs=0.2)
     # the lattice follows the sensor, the swathes do not
     aside = dusty(dust, at=(5.0, -3.0, 0.0))
     points = np.random.default_rng(0).uniform(-6, 6, (3, 200)).astype(np.float32)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import stream
-from eval.core.ranking import auroc, average_precision, last_of_ties
+from cdpipe.core.ranking import auroc, average_precision, last_of_ties
 
 
 def auroc_by_pairs(scores: np.ndarray, is_positive: np.ndarray) -> float:
