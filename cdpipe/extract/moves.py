@@ -24,8 +24,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, make_pose, transform, yaw_pose
+from cdpipe.core.groups import label_groups
 from cdpipe.core.voxel import thin
-from cdpipe.extract.point_comparison import label_groups
 from cdpipe.extract.shape import upright_box
 
 # Far moves: least share of both surfaces within `_SAME_WITHIN_M` of the other, and largest factor between extents.

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.groups import label_groups
 from cdpipe.core.voxel import cell_means
-from cdpipe.extract.point_comparison import label_groups
 from cdpipe.merge.registration import Surface
 from cdpipe.model.config import ExtractConfig
 

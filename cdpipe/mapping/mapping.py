@@ -18,6 +18,7 @@ from cdpipe.core.spooled import SpooledArray
 from cdpipe.core.voxel import UniqueCells, cell_corners, cell_keys, max_coordinate_m
 from cdpipe.mapping.consistency import make_consistent
 from cdpipe.mapping.free_space import COLUMNS, ROWS, render_view
+from cdpipe.mapping.movers import drop_movers
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PLACES, KeyframeViews, PointMap, PosedScan, ScanSource
 
@@ -38,7 +39,7 @@ def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_S
 
     Args:
         source: The session, read once in order.
-        config: Voxel size, longest range, keyframe spacing.
+        config: Voxel size, longest range, keyframe spacing, and what is made consistent and left out.
         batch_scans: Scans held in memory at a time.
 
     Raises:
@@ -53,7 +54,8 @@ def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_S
     scans = iter(source.scans())
     while batch := list(islice(scans, batch_scans)):
         accumulator.add(batch)
-    return replace(accumulator.finish(source, keyframe_scans), recorded_T_sensor=recorded_T_sensor)
+    point_map = replace(accumulator.finish(source, keyframe_scans), recorded_T_sensor=recorded_T_sensor)
+    return drop_movers(point_map) if config.movers == "drop" else point_map
 
 
 def choose_keyframes(odom_T_sensor: Float64Array, spacing_m: float) -> Int64Array:

@@ -62,7 +62,7 @@ class _Grown(Settings):
 class MapConfig(_Grown):
     """From scans to a thinned map and keyframes."""
 
-    newer: ClassVar[tuple[str, ...]] = ("consistency", "airborne")
+    newer: ClassVar[tuple[str, ...]] = ("consistency", "airborne", "movers")
 
     voxel_m: Cell = Field(0.2, description="cell of the thinned map")
     max_range_m: Positive = Field(60.0, description="returns beyond this range are not mapped")
@@ -73,6 +73,9 @@ class MapConfig(_Grown):
     )
     airborne: Literal["keep", "drop"] = Field(
         "keep", description="returns of mist and dust; dropped where they are over 1 in 100 of a scan"
+    )
+    movers: Literal["keep", "drop"] = Field(
+        "keep", description="what moved while the session was recorded: what the session itself saw through as well"
     )
 
 

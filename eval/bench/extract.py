@@ -20,11 +20,12 @@ from time import thread_time
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array, Int64Array, transform
+from cdpipe.core.groups import label_groups
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import use_threads
 from cdpipe.extract.crops import Crops, Sphere
 from cdpipe.extract.objects import ReturnPool
-from cdpipe.extract.point_comparison import inlier_mask, label_groups, new_points_mask
+from cdpipe.extract.point_comparison import inlier_mask, new_points_mask
 from cdpipe.extract.surface import RIM_M, SITE_M, PlaneTable, compare_site, find_candidates
 from cdpipe.extract.surface_rule import BEYOND_M, collect_rays, find_object_cells, realign
 from cdpipe.mapping.free_space import free_space_votes
