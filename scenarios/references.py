@@ -13,7 +13,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import Key
 from cdpipe.sensor.ouster import load_profile
 from scenarios.dangling import Mistake, items_at, mapping_at
-from scenarios.schema import Furniture, Scenario, SessionPlan, Tunnel
+from scenarios.schema import Furniture, Platform, Scenario, Sensor, SessionPlan, Tunnel
 
 
 def file_keys(tree: Any) -> list[tuple[Key, str]]:
@@ -29,8 +29,11 @@ def file_keys(tree: Any) -> list[tuple[Key, str]]:
         ((session, "odometry", "file"), mapping_at(mapping_at(tree, session), "odometry").get("file"))
         for session in ("before", "after")
     ]
-    profile = mapping_at(tree, "sensor").get("profile")
-    files += [(("sensor", "profile"), profile)] if str(profile).endswith(".json") else []  # else a shipped one's name
+    owners: dict[Key, Any] = {(): tree, **{(name,): mapping_at(tree, name) for name in ("before", "after")}}
+    for owner, holder in owners.items():
+        profile = mapping_at(holder, "sensor").get("profile")
+        # else a shipped one's name
+        files += [((*owner, "sensor", "profile"), profile)] if str(profile).endswith(".json") else []
     return [(key, name) for key, name in files if isinstance(name, str)]
 
 
@@ -72,7 +75,7 @@ def _start_mistakes(scenario: Scenario) -> Iterator[Mistake]:
         if plan.trajectory is not None:
             continue
         left_m = route_length_m(scenario.tunnel, plan)
-        if left_m < scenario.platform.scan_spacing_m:
+        if left_m < scenario.of(name).platform.scan_spacing_m:
             whole_m = left_m + plan.start_m + plan.end_m
             yield (name, "start_m"), f"start_m and end_m leave nothing of the route, which is {whole_m:.1f} m"
 
@@ -83,26 +86,31 @@ def _room_mistakes(scenario: Scenario) -> Iterator[Mistake]:
         return
     sections = [drift.section or scenario.tunnel.section for drift in drifts]
     width_m = min(section.width_m for section in sections)
-    if width_m <= 2 * scenario.platform.clearance_m:
-        yield ("platform", "clearance_m"), f"leaves the platform no room in a drift {width_m:.1f} m wide"
     roof_m = min(section.height_m for section in sections)
     for name, plan in (("before", scenario.before), ("after", scenario.after)):
-        if plan.trajectory is None and (plan.height_m or scenario.platform.sensor_height_m) >= roof_m:
-            key: Key = (name, "height_m") if plan.height_m else ("platform", "sensor_height_m")
+        platform: Platform = plan.platform or scenario.platform
+        owner: Key = (name, "platform") if plan.platform else ("platform",)
+        if (name == "before" or plan.platform) and width_m <= 2 * platform.clearance_m:
+            yield (*owner, "clearance_m"), f"leaves the platform no room in a drift {width_m:.1f} m wide"
+        if plan.trajectory is None and (plan.height_m or platform.sensor_height_m) >= roof_m:
+            key: Key = (name, "height_m") if plan.height_m else (*owner, "sensor_height_m")
             yield key, f"the sensor would be above the roof of a drift {roof_m:.1f} m high"
 
 
 def _sensor_mistakes(scenario: Scenario) -> Iterator[Mistake]:
-    sensor = scenario.sensor
-    if sensor.profile.endswith(".json") and not Path(sensor.profile).is_file():
-        return  # already reported as a missing file
-    key: Key = ("sensor", "profile")
-    try:
-        load_profile(sensor.profile)
-        key = ("sensor", "mode")
-        load_profile(sensor.profile, sensor.mode)
-    except InputError as error:
-        yield key, str(error)
+    owners: dict[Key, Sensor | None] = {
+        (): scenario.sensor, ("before",): scenario.before.sensor, ("after",): scenario.after.sensor
+    }  # fmt: skip
+    for owner, sensor in owners.items():
+        if sensor is None or (sensor.profile.endswith(".json") and not Path(sensor.profile).is_file()):
+            continue  # a missing file is reported already
+        key: Key = (*owner, "sensor", "profile")
+        try:
+            load_profile(sensor.profile)
+            key = (*owner, "sensor", "mode")
+            load_profile(sensor.profile, sensor.mode)
+        except InputError as error:
+            yield key, str(error)
 
 
 def _foreign_mistakes(scenario: Scenario) -> Iterator[Mistake]:

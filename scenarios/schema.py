@@ -479,7 +479,7 @@ class Air(Settings):
 class SessionPlan(Lean):
     """One drive through the tunnel: along a route, or on a recorded trajectory."""
 
-    _LATER: ClassVar[frozenset[str]] = frozenset({"air"})
+    _LATER: ClassVar[frozenset[str]] = frozenset({"air", "sensor", "platform"})
 
     route: tuple[str, ...] = ()
     trajectory: str | None = None  # TUM file of world_T_sensor, instead of a route; from the scenario's file
@@ -490,6 +490,8 @@ class SessionPlan(Lean):
     speed_mps: Positive | None = None  # instead of platform.speed_mps
     odometry: Odometry = Odometry()
     air: Air | None = None  # mist and dust; left out: clear
+    sensor: Sensor | None = None  # of this session alone; keys left out are those of the scenario's sensor
+    platform: Platform | None = None  # likewise
 
     @model_validator(mode="after")
     def _route_or_trajectory(self) -> SessionPlan:
@@ -566,6 +568,20 @@ class Mover(Settings):
         return self
 
 
+def _fill_in(scenario: dict[Any, Any], plan: Any) -> Any:
+    """Return the plain tree of a session with the keys that its own sensor and platform leave out."""
+    if not isinstance(plan, dict):
+        return plan
+    filled = dict(plan)
+    for part in ("sensor", "platform"):
+        usual, own = scenario.get(part), plan.get(part)
+        if isinstance(usual, dict) and isinstance(own, dict):
+            # another kind of platform has another gait
+            left_out = {"gait"} if own.get("kind", usual.get("kind")) != usual.get("kind") else set()
+            filled[part] = {key: value for key, value in usual.items() if key not in left_out} | own
+    return filled
+
+
 class Scenario(Lean):
     """A world, what changes in it, what moves in it, and the two drives."""
 
@@ -582,6 +598,20 @@ class Scenario(Lean):
     platform: Platform = Platform()
     before: SessionPlan
     after: SessionPlan
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_in_sessions(cls, given: Any) -> Any:
+        """Give each session's own sensor and platform the keys that it leaves out."""
+        if not isinstance(given, dict):
+            return given
+        return {**given, **{name: _fill_in(given, given[name]) for name in ("before", "after") if name in given}}
+
+    def of(self, session: str) -> Scenario:
+        """Return the scenario as one session has it: with the sensor and the platform of this session."""
+        plan: SessionPlan = getattr(self, session)
+        own = {"sensor": plan.sensor or self.sensor, "platform": plan.platform or self.platform}
+        return self if plan.sensor is None and plan.platform is None else self.model_copy(update=own)
 
     @model_validator(mode="after")
     def _references_hold(self) -> Scenario:

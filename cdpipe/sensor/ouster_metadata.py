@@ -16,7 +16,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 
 METADATA_FILE = "expected the metadata .json of an Ouster sensor"
-MODES = ("512x10", "512x20", "1024x10", "1024x20", "2048x10")
+MODES = ("512x10", "512x20", "1024x10", "1024x20", "2048x10", "4096x5")
 
 _SECTIONS = ("sensor_info", "config_params", "beam_intrinsics", "lidar_intrinsics", "imu_intrinsics")
 # Default distance of the beam origin from the spin axis by product line, as in the vendor's SDK 1.0.1.
@@ -71,7 +71,7 @@ def parse_fields(document: Mapping[str, Any], source: str, mode: str | None = No
 
 
 def require_mode(mode: str, source: str) -> None:
-    """Raise `InputError` unless a mode is one of an OS1-32."""
+    """Raise `InputError` unless a mode is one of the sensor's."""
     if mode not in MODES:
         raise InputError(f"{source}: lidar_mode = {mode!r}: expected one of {', '.join(MODES)}")
 

@@ -275,6 +275,8 @@ def read_figure(report: ChangeReport, name: str) -> Float64Array:
 def describe_recording(scenario: Mapping[str, Any]) -> dict[str, str]:
     """Return the columns that say how a pair was recorded: the odometry of either session and the sensor's profile.
 
+    Where each session has a sensor of its own, both are named: `os0-128 then os1-32-nominal`.
+
     Args:
         scenario: The scenario as drawn, as the truth of a pair holds it; a part that is not there gives "".
     """
@@ -285,10 +287,12 @@ def describe_recording(scenario: Mapping[str, Any]) -> dict[str, str]:
             value = value.get(key) if isinstance(value, Mapping) else None
         return "" if value is None else str(value)
 
+    usual = named("sensor", "profile")
+    before, after = (named(session, "sensor", "profile") or usual for session in ("before", "after"))
     return {
         "odometry_before": named("before", "odometry", "source"),
         "odometry_after": named("after", "odometry", "source"),
-        "sensor_profile": named("sensor", "profile"),
+        "sensor_profile": before if before == after else f"{before} then {after}",
     }
 
 

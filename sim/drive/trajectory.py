@@ -10,7 +10,7 @@ import numpy as np
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
 from cdpipe.core.motion import Motion, rotation_matrices
-from cdpipe.sensor.ouster import SensorMetadata
+from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.schema import Platform, Scenario, SessionPlan
 from sim.drive.obstacles import check_clearance
 from sim.drive.odometry import drift_motion, read_odometry, walk_motion
@@ -99,6 +99,16 @@ def _from(start: Float64Array, end: Float64Array) -> Float64Array:
     return np.asarray(np.where(turn[..., 3:] < 0, -turn, turn))
 
 
+def load_sensor(scenario: Scenario, session: str) -> SensorMetadata:
+    """Return the sensor of one session.
+
+    Raises:
+        InputError: Its profile cannot be read.
+    """
+    settings = scenario.of(session).sensor
+    return load_profile(settings.profile, settings.mode)
+
+
 def plan_trajectory(world: World, scenario: Scenario, sensor: SensorMetadata, seed: int, session: str) -> Trajectory:
     """Return the drive of one session.
 
@@ -108,6 +118,7 @@ def plan_trajectory(world: World, scenario: Scenario, sensor: SensorMetadata, se
         InputError: The trajectory or the odometry file cannot be read.
         ScenarioError: The route leaves no room, the trajectory leaves the tunnel, or revolutions are too far apart.
     """
+    scenario = scenario.of(session)
     plan: SessionPlan = getattr(scenario, session)
     scene = world.before if session == "before" else world.after
     if plan.trajectory is not None:

@@ -87,9 +87,9 @@ def build_lanes(scenario: Scenario, centreline: Centreline, fixed: Caster) -> tu
     lanes = []
     for session, plan in (("before", scenario.before), ("after", scenario.after)):
         if plan.trajectory is None:
-            lanes.append(_route_lane(scenario, session, plan, centreline, fixed))
+            lanes.append(_route_lane(scenario.of(session), session, plan, centreline, fixed))
         else:
-            lanes.append(_recorded_lane(scenario, session, Path(plan.trajectory)))
+            lanes.append(_recorded_lane(scenario.of(session), session, Path(plan.trajectory)))
     return tuple(lanes)
 
 

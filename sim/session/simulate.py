@@ -22,12 +22,12 @@ from cdpipe.core.plugins import require_extra
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.core.yamlfile import setting_lines
 from cdpipe.io.session import ScanChunk, Session, SessionWriter
-from cdpipe.sensor.ouster import SensorMetadata, load_profile
+from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario, SessionPlan
 from sim.drive.odometry import register_scans, start_pose
-from sim.drive.trajectory import plan_trajectory
+from sim.drive.trajectory import load_sensor, plan_trajectory
 from sim.movers.casting import MovingScene
 from sim.movers.planning import plan_movers
 from sim.scene import build_world
@@ -157,23 +157,28 @@ def _plan(scenario: Scenario, seed: int, report: Progress) -> tuple[list[Drive],
     if "kiss-icp" in (scenario.before.odometry.source, scenario.after.odometry.source):
         require_extra("odometry", "odometry.source = kiss-icp")
     files = file_digests(scenario)
-    sensor = load_profile(scenario.sensor.profile, scenario.sensor.mode)
     report("world", 0, 1)
-    drives = plan_drives(scenario, sensor, seed)
+    drives = plan_drives(scenario, seed)
     report("world", 1, 1)
     return drives, files
 
 
-def plan_drives(scenario: Scenario, sensor: SensorMetadata, seed: int) -> list[Drive]:
+def plan_drives(scenario: Scenario, seed: int, sensor: SensorMetadata | None = None) -> list[Drive]:
     """Build the world and plan both sessions; only the parts of the world that they need stay in memory.
+
+    Args:
+        scenario: The scenario as drawn.
+        seed: Draws everything the scenario leaves open.
+        sensor: The sensor of both sessions in place of the scenario's.
 
     Raises:
         InputError: A trajectory cannot be read.
         ScenarioError: The world contradicts itself, or a mover finds no way.
     """
+    sensors = {name: sensor or load_sensor(scenario, name) for name in SESSIONS}
     world = build_world(scenario, seed)
     tallies = tuple(list_changes(scenario, world))
-    trajectories = {name: plan_trajectory(world, scenario, sensor, seed, name) for name in SESSIONS}
+    trajectories = {name: plan_trajectory(world, scenario, sensors[name], seed, name) for name in SESSIONS}
     movers = plan_movers(world, scenario, {name: each.true for name, each in trajectories.items()}, seed)
     drives = []
     for name, trajectory in trajectories.items():
@@ -183,7 +188,8 @@ def plan_drives(scenario: Scenario, sensor: SensorMetadata, seed: int) -> list[D
         held = [tally.change.instance for tally in tallies if tally.change.session == name]
         owners = np.where(np.isin(moving.instance, held), moving.instance, np.int32(0))
         seen = np.zeros((len(moving.movers), trajectory.n_scans, 4))
-        drives.append(Drive(name, scenario, scene, labels, owners, sensor, trajectory, tallies, seed, moving, seen))
+        own = scenario.of(name)
+        drives.append(Drive(name, own, scene, labels, owners, sensors[name], trajectory, tallies, seed, moving, seen))
     return drives
 
 

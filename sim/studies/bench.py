@@ -69,7 +69,7 @@ class BenchSite:
     def planned(self) -> tuple[Drive, float]:
         """The first drive, and how many seconds world and drives took."""
         start = time.perf_counter()
-        drive = plan_drives(self.drawn, self.sensor, self.seed)[0]
+        drive = plan_drives(self.drawn, self.seed, self.sensor)[0]
         return drive, time.perf_counter() - start
 
     @property

@@ -16,9 +16,8 @@ from pydantic import TypeAdapter
 from cdpipe.core.errors import InputError, TunnelcdError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.core.isolation import ProcessDiedError, run_isolated
-from cdpipe.sensor.ouster import load_profile
 from scenarios.library import load_scenario
-from sim.drive.trajectory import plan_trajectory
+from sim.drive.trajectory import load_sensor, plan_trajectory
 from sim.geometry.raycast import Caster
 from sim.placement.contact import interpenetration_m
 from sim.placement.placing import standing_middle
@@ -142,8 +141,10 @@ def survey_seed(family: str, seed: int) -> WorldFigures:
     scenario = load_scenario(family, seed)
     start_s = time.process_time()
     world = build_world(scenario, seed)
-    sensor = load_profile(scenario.sensor.profile, scenario.sensor.mode)
-    before, after = (plan_trajectory(world, scenario, sensor, seed, name).true.points for name in ("before", "after"))
+    before, after = (
+        plan_trajectory(world, scenario, load_sensor(scenario, name), seed, name).true.points
+        for name in ("before", "after")
+    )
     build_s = time.process_time() - start_s
     changes = {tally.change.name: tally.change for tally in list_changes(scenario, world)}
     kinds = [change.kind for change in changes.values()]

@@ -17,9 +17,8 @@ from scipy.spatial import cKDTree
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.io.session import is_session, read_session
-from cdpipe.sensor.ouster import load_profile
 from scenarios.schema import Scenario
-from sim.drive.trajectory import Trajectory, plan_trajectory
+from sim.drive.trajectory import Trajectory, load_sensor, plan_trajectory
 from sim.geometry.mesh import Mesh, drop_unused_vertices, join_meshes, move_mesh
 from sim.movers.mover import MovingBody
 from sim.movers.planning import plan_movers
@@ -183,12 +182,11 @@ def wall_bands(wall: Mesh, floor_points: Float64Array, n_bands: int = _N_BANDS) 
 
 def _plan_drives(world: World, scenario: Scenario, seed: int) -> tuple[dict[SessionName, Trajectory], list[str]]:
     """Return the drive of each session, and a note for one that cannot be driven."""
-    sensor = load_profile(scenario.sensor.profile, scenario.sensor.mode)
     drives: dict[SessionName, Trajectory] = {}
     notes = []
     for session in SESSIONS:
         try:
-            drives[session] = plan_trajectory(world, scenario, sensor, seed, session)
+            drives[session] = plan_trajectory(world, scenario, load_sensor(scenario, session), seed, session)
         except ScenarioError as error:
             notes.append(f"no path {session}: {error}")
     return drives, notes

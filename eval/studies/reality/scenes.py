@@ -62,7 +62,7 @@ def plan_drive(family: str, seed: int, sensor: SensorMetadata, profile: str) -> 
         ScenarioError: The world cannot be built.
     """
     settings = [f"sensor.profile={profile}", f"sensor.mode={sensor.mode}"]
-    return plan_drives(load_scenario(family, seed, settings), sensor, seed)[0]
+    return plan_drives(load_scenario(family, seed, settings), seed, sensor)[0]
 
 
 def change_effects(drive: Drive, settings: Sensor) -> Drive:

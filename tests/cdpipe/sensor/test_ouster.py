@@ -1,4 +1,5 @@
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -39,12 +40,16 @@ def test_positive_azimuth_offset_turns_the_beam_clockwise() -> None:
 
 
 def test_shipped_profiles_are_complete_and_survive_a_round_trip() -> None:
-    assert profile_names() == ["os1-32-g", "os1-32-gen1", "os1-32-nominal", "os1-32-u0"]
+    assert profile_names() == [
+        "os0-128-nominal", "os0-32-nominal", "os1-128-nominal", "os1-32-g", "os1-32-gen1", "os1-32-nominal",
+        "os1-32-u0", "os1-64-nominal", "puck-16",
+    ]  # fmt: skip
     for name in profile_names():
         sensor = load_profile(name)
         again = parse_metadata(json.loads(json.dumps(sensor.to_json())), name)
-        assert (sensor.height, sensor.width, sensor.rate_hz) == (32, 1024, 10.0)
-        np.testing.assert_allclose(again.project(np.ones((32, 1024))), sensor.project(np.ones((32, 1024))), atol=1e-15)
+        assert (sensor.height, sensor.width, sensor.rate_hz) == (int(re.findall(r"-(\d+)", name)[0]), 1024, 10.0)
+        ranges_m = np.ones((sensor.height, 1024))
+        np.testing.assert_allclose(again.project(ranges_m), sensor.project(ranges_m), atol=1e-15)
 
 
 def test_another_mode_changes_columns_and_stamps() -> None:
@@ -99,7 +104,8 @@ def test_first_generation_lists_64_beams_and_leaves_32_at_zero() -> None:
 def test_the_shift_of_a_row_follows_the_columns(mode: str) -> None:
     sensor = load_profile("os1-32-g", mode)
     columns = int(mode.split("x", maxsplit=1)[0])
-    assert sensor.pixel_shift[8] == 24 * columns // 1024
+    # its eighth beam is 8.51 deg off the smallest azimuth: 24.2 of 1024 columns, 96.8 of 4096
+    assert sensor.pixel_shift[8] == {512: 12, 1024: 24, 2048: 48, 4096: 97}[columns]
 
 
 def other(**change: object) -> dict[str, object]:
@@ -202,5 +208,7 @@ def test_unknown_profile_lists_the_known_ones() -> None:
 
 
 def test_modes_out_of_the_list_are_refused() -> None:
-    with pytest.raises(InputError, match=r"'4096x5': expected one of 512x10, 512x20, 1024x10, 1024x20, 2048x10"):
-        load_profile("os1-32-u0", "4096x5")
+    with pytest.raises(
+        InputError, match=r"'4096x10': expected one of 512x10, 512x20, 1024x10, 1024x20, 2048x10, 4096x5"
+    ):
+        load_profile("os1-32-u0", "4096x10")

@@ -59,10 +59,10 @@ def test_every_pair_is_made_with_both_odometries_and_the_figures_are_those_of_ki
         assert {scenario.before.odometry.source, scenario.after.odometry.source} == {source}
 
 
-def test_objects_has_pairs_of_every_sensor_profile_and_asks_for_the_same_of_each() -> None:
+def test_objects_has_pairs_of_every_profile_of_an_os1_32_and_asks_for_the_same_of_each() -> None:
     plan = load_plan("objects")
     nominal = plan.targets.sensor
-    others = {name for name in profile_names() if name != nominal}
+    others = {name for name in profile_names() if name.startswith("os1-32") and name != nominal}
     profiles = {load_scenario(world.name, plan.seeds[0], world.settings).sensor.profile for world in plan.worlds}
     assert profiles == {nominal, *others}
     asked = {(each.sensor, each.less_sensor, each.at_least) for each in plan.targets.objects if each.sensor}

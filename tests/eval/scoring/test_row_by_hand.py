@@ -497,3 +497,15 @@ def test_a_figure_at_the_limit_is_taken_and_one_above_is_refused(report: ChangeR
 )
 def test_a_part_of_a_scenario_that_is_not_there_has_no_name(scenario: dict[str, Any]) -> None:
     assert set(scoring.describe_recording(scenario).values()) == {""}
+
+
+@pytest.mark.parametrize(
+    ("own", "named"),
+    [
+        ({}, "os1"),
+        ({"after": {"sensor": {"profile": "os0"}}}, "os1 then os0"),
+        ({"before": {"sensor": {"profile": "os0"}}, "after": {"sensor": {"profile": "os0"}}}, "os0"),
+    ],
+)
+def test_the_profile_names_both_sensors_where_they_differ(own: dict[str, Any], named: str) -> None:
+    assert scoring.describe_recording({"sensor": {"profile": "os1"}, **own})["sensor_profile"] == named

@@ -122,7 +122,7 @@ def test_scans_are_cast_once_and_everything_that_is_measured_stands_where_kiss_i
     monkeypatch.setattr("sim.session.simulate.CHUNK_SCANS", 7)  # the last chunk holds fewer
     simulate_pair(scenario, 5, tmp_path / "pair")
     session = read_session(tmp_path / "pair" / "before")
-    drives = plan_drives(scenario, session.sensor, 5)
+    drives = plan_drives(scenario, 5, session.sensor)
     assert session.n_scans > 20 and session.n_scans % 7
     assert sorted(cast) == sorted((each.name, number) for each in drives for number in range(each.trajectory.n_scans))
     # register the written scans, then measure with these poses

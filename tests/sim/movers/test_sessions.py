@@ -90,7 +90,7 @@ def test_truth_lists_every_mover_and_where_it_was_seen(scenario: Scenario, pair:
 
 def test_returns_on_a_mover_lie_on_it_at_their_own_time(scenario: Scenario, sensor: SensorMetadata) -> None:
     ideal = Sensor(mode="512x10", range_noise=False, dropouts=False, false_positives=False)
-    after = plan_drives(scenario.model_copy(update={"sensor": ideal}), sensor, SEED)[1]
+    after = plan_drives(scenario.model_copy(update={"sensor": ideal}), SEED, sensor)[1]
     trajectory, truck = after.trajectory, after.moving.movers[1]
     n_seen = 0
     for number in range(trajectory.n_scans):

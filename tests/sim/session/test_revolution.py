@@ -44,7 +44,7 @@ def partial_changes(make_scenario: Callable[..., Scenario], make_prop: Callable[
 
 @pytest.fixture(scope="module")
 def drives(partial_changes: Scenario, sensor: SensorMetadata) -> list[Drive]:
-    return [with_sensor(drive, IDEAL) for drive in plan_drives(partial_changes, sensor, 3)]
+    return [with_sensor(drive, IDEAL) for drive in plan_drives(partial_changes, 3, sensor)]
 
 
 def with_sensor(drive: Drive, settings: Sensor) -> Drive:

@@ -251,7 +251,7 @@ def test_no_case_of_novelty_is_the_same_as_another() -> None:
 
 def test_a_drive_with_an_effect_off_is_the_drive_of_a_scenario_that_says_so(drive: Drive) -> None:
     said = ["sensor.profile=os1-32-g", "sensor.rolling_scan=false", "sensor.false_positives=false"]
-    told = plan_drives(load_scenario("smoke/one_box", 0, said), SENSOR, 0)[0]
+    told = plan_drives(load_scenario("smoke/one_box", 0, said), 0, SENSOR)[0]
     default = drive.scenario.sensor
     off = change_effects(drive, default.model_copy(update={"rolling_scan": False, "false_positives": False}))
     rolls = change_effects(drive, default.model_copy(update={"false_positives": False}))
