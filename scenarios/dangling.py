@@ -60,7 +60,7 @@ def _edges_named(tree: Any) -> list[tuple[Key, list[str]]]:
 
 
 def _repeated_names(tree: Any) -> Iterator[Mistake]:
-    for kind in ("area", "prop", "mover"):
+    for kind in ("area", "prop", "mover", "puddle"):
         names = [item.get("name") if isinstance(item, dict) else None for item in items_at(tree, f"{kind}s")]
         for index, name in enumerate(names):
             if isinstance(name, str) and name in names[:index]:
@@ -76,11 +76,13 @@ def _area_mistakes(tree: Any) -> Iterator[Mistake]:
 
 
 def _places(tree: Any) -> Iterator[tuple[Key, dict[str, Any]]]:
-    """Yield both places of every prop and the path of every mover, empty where there is none."""
+    """Yield both places of every prop, the path of every mover, the place of every puddle; empty where there is none."""
     for index, prop in enumerate(items_at(tree, "props")):
         yield from ((("props", index, name), mapping_at(prop, name)) for name in ("place", "to"))
     for index, mover in enumerate(items_at(tree, "movers")):
         yield ("movers", index, "path"), mapping_at(mover, "path")
+    for index, puddle in enumerate(items_at(tree, "puddles")):
+        yield ("puddles", index, "place"), mapping_at(puddle, "place")
 
 
 def _no_drift(pair: list[str], nodes: list[str]) -> str:

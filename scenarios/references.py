@@ -152,3 +152,6 @@ def _undrawable(scenario: Scenario) -> Iterator[Mistake]:
     for index, mover in enumerate(scenario.movers):
         if mover.path.between is None and mover.path.area is None:
             yield ("movers", index, "path"), f"a path anywhere {needs}: give between and fractions"
+    for index, puddle in enumerate(scenario.puddles):
+        if puddle.place.between is None and puddle.place.area is None:
+            yield ("puddles", index, "place"), f"a place anywhere {needs}: give between and fraction"

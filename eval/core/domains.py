@@ -9,8 +9,9 @@ from typing import Literal
 Domain = Literal["in", "out"]
 TRAINED_FAMILIES = frozenset({"narrow", "wide", "network"})
 TRAINED_KINDS = frozenset({"box", "crate", "chair", "barrel", "cone", "pallet", "rock", "vehicle", "muck_pile"})
-# Groups of variations that nothing was trained or tuned on: dusty air, and sessions in which something moves.
-_UNSEEN_GROUPS = frozenset({"dust", "dynamic"})
+# Groups of variations that no network was trained on and no threshold chosen on: dusty air, sessions in which something
+# moves, two sensors, puddles.
+_UNSEEN_GROUPS = frozenset({"dust", "dynamic", "cross", "water"})
 _NAMES = {"in": "in distribution", "out": "out of distribution", "all": "all pairs"}
 
 
@@ -18,7 +19,7 @@ _NAMES = {"in": "in distribution", "out": "out of distribution", "all": "all pai
 def domain_of(family: str) -> Domain:
     """Return "in" for the trained families and their shipped variations (`unchanged/wide`), "out" for all others.
 
-    Variations with dust or movers (`dust/wide`) are out: no network and no threshold has seen any.
+    Variations with dust, movers, two sensors or puddles (`dust/wide`) are out: no network or threshold has seen any.
     """
     group, _, name = family.rpartition("/")
     is_trained = name in TRAINED_FAMILIES and group not in _UNSEEN_GROUPS

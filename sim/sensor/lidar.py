@@ -25,6 +25,7 @@ from sim.sensor.optics import (
     signal_channel,
 )
 from sim.sensor.rays import Rays
+from sim.sensor.water import Water, cross_water
 
 MISS, FALSE_RETURN = -1, -2
 # A return belongs to an owner whose geoms reflected at least this share of its light; others are mixed. Surfaces that
@@ -43,7 +44,7 @@ class Scan:
         signal: uint16 photons.
         true_range_m: float32 distance from the spin axis's point to the surface along the beam, infinite for a miss.
         geom: int32 geom hit, `MISS` where nothing returned, `FALSE_RETURN` where nothing stands,
-            `sim.sensor.air.AIR` for mist and dust.
+            `sim.sensor.air.AIR` for mist and dust, `sim.sensor.water.MIRRORED` for what water mirrors.
         owner: int32 owner of the geoms that reflected most of the light, 0 where no geom was hit.
         is_mixed: True for a return of which less than 90 % of the light came from geoms of `owner`. Always False with
             one ray per beam.
@@ -84,6 +85,7 @@ def scan(
     number: int,
     owners: Int32Array | None = None,
     air: AirVolume | None = None,
+    water: Water | None = None,
 ) -> Scan:
     """Cast one revolution and apply the effects of the sensor.
 
@@ -99,10 +101,13 @@ def scan(
         number: Index of the revolution in its session.
         owners: (G,) owner of each geom, between which mixed returns are told; by default the prop, `scene.instance`.
         air: Mist and dust around the sensor; None where the air is clear.
+        water: Puddles; None where there are none.
     """
     owners = scene.instance if owners is None else owners
     surfaces = scene.caster, scene.reflectivity, rays, sensor.beam_origin_m, owners
     echo = central_echo(*surfaces) if settings.sub_rays == 1 else spread_echo(*surfaces, settings.sub_rays)
+    if water is not None:
+        echo = cross_water(echo, rays, sensor.beam_origin_m, water)
     if air is not None:
         echo = cross_air(echo, rays, sensor.beam_origin_m, air, stream(seed, session, "air-returns", str(number)))
     shape = echo.range_m.shape

@@ -16,6 +16,7 @@ from sim.scene import Scene
 from sim.sensor.air import AirVolume, air_around
 from sim.sensor.lidar import Scan, scan
 from sim.sensor.rays import Rays, revolution_rays
+from sim.sensor.water import Water
 from sim.session.labels import Tally, mark_belonging
 from sim.session.truth import MIXED, Int16Array, SessionName
 
@@ -55,10 +56,11 @@ class Drive:
     """Everything that stays the same while one session is simulated.
 
     Attributes:
-        labels: `instance` of each geom, int16; entries -3, -2 and -1 at the end serve the geom numbers -3 to -1.
+        labels: `instance` of each geom, int16; entries -4 to -1 at the end serve the geom numbers -4 to -1.
         owners: (G,) int32 `instance` of the geoms of props of which this session holds a change, 0 for all others.
         moving: The scene with the session's movers, whose geoms come last in `labels` and `owners`.
         sightings: (M, S, 4) what each revolution saw of each mover so far, as in `Revolution`.
+        water: The session's puddles; None without any.
     """
 
     name: SessionName
@@ -72,6 +74,7 @@ class Drive:
     seed: int
     moving: MovingScene
     sightings: Float64Array
+    water: Water | None = None
 
 
 def simulate_revolution(drive: Drive, number: int) -> Revolution:
@@ -109,7 +112,8 @@ def cast_revolution(drive: Drive, number: int) -> tuple[Rays, Scan]:
     rays = revolution_rays(drive.sensor, world_T_column)
     settings, air = drive.scenario.sensor, find_air(drive, number)
     surfaces = drive.moving.pose(drive.trajectory.revolution_s[number] + drive.trajectory.column_s)
-    return rays, scan(surfaces, drive.sensor, settings, rays, drive.seed, drive.name, number, drive.owners, air)
+    told = drive.seed, drive.name, number, drive.owners, air, drive.water
+    return rays, scan(surfaces, drive.sensor, settings, rays, *told)
 
 
 def find_air(drive: Drive, number: int) -> AirVolume | None:
