@@ -76,7 +76,7 @@ def _area_mistakes(tree: Any) -> Iterator[Mistake]:
 
 
 def _places(tree: Any) -> Iterator[tuple[Key, dict[str, Any]]]:
-    """Yield both places of every prop, the path of every mover, the place of every puddle; empty where there is none."""
+    """Yield both places of every prop, the path of every mover, the place of every puddle; empty where none is."""
     for index, prop in enumerate(items_at(tree, "props")):
         yield from ((("props", index, name), mapping_at(prop, name)) for name in ("place", "to"))
     for index, mover in enumerate(items_at(tree, "movers")):

@@ -12,12 +12,14 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.geometry import Float32Array, Float64Array
 from cdpipe.io.session import ScanChunk, Session
 from sim.sensor.air import AIR
+from sim.sensor.water import MIRRORED
 from sim.session.truth import read_labels
 
 Rgb = tuple[int, int, int]
 MAX_POINTS = 300_000
 _ROCK_RGB = (150, 150, 150)
-_AIR_RGB = (140, 200, 240)  # returns of mist and dust
+_AIR_RGB = (140, 200, 240)  # returns of mist and dust, and of what water mirrors
+_NOT_THERE = (AIR, MIRRORED)
 # after Okabe and Ito, which the colour-blind can tell apart
 CHANGE_RGB: dict[str, Rgb] = {
     "added": (0, 158, 115),
@@ -85,7 +87,7 @@ def session_cloud(
         return Cloud(name, cloud, {"height": by_height})
     by_change = np.tile(np.array(_ROCK_RGB, np.uint8), (len(cloud), 1))
     change, instance = np.concatenate(changes), np.concatenate(instances)
-    by_change[instance == AIR] = _AIR_RGB
+    by_change[np.isin(instance, _NOT_THERE)] = _AIR_RGB
     for number, kind in kinds.items():
         by_change[change == number] = CHANGE_RGB[kind]
     colours = {
@@ -114,7 +116,7 @@ def _by_instance(instance: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
     hue = 2 * np.pi * np.modf(instance * 0.618034)[0]
     wheel = 140 + 100 * np.cos(hue[:, None] + np.array([0.0, 2.1, 4.2]))
     colours = np.where((instance > 0)[:, None], wheel, _ROCK_RGB)
-    return np.where((instance == AIR)[:, None], _AIR_RGB, colours).astype(np.uint8)
+    return np.where(np.isin(instance, _NOT_THERE)[:, None], _AIR_RGB, colours).astype(np.uint8)
 
 
 def _by_height(points: Float32Array) -> npt.NDArray[np.uint8]:

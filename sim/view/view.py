@@ -23,6 +23,7 @@ from sim.geometry.mesh import Mesh, drop_unused_vertices, join_meshes, move_mesh
 from sim.movers.mover import MovingBody
 from sim.movers.planning import plan_movers
 from sim.placement.placing import Standing, standing_box
+from sim.placement.puddles import lay_puddles
 from sim.props.shapes import solid_mesh
 from sim.scene import World, build_world
 from sim.session.truth import SESSIONS, PairTruth, SessionName, read_pair_truth, read_true_poses
@@ -30,6 +31,8 @@ from sim.view.picture import material_colour
 from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Rgb, session_cloud
 
 _N_BANDS = 10
+_WATER_RGB: Rgb = (70, 120, 170)
+_SHEET_CORNERS = 48
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +70,7 @@ class View:
     Attributes:
         title: Its heading.
         bands: The walls in bands of height above the floor, lowest first; each ends where the next begins.
-        surfaces: Fixtures, unchanged props, changed props and movers.
+        surfaces: Fixtures, unchanged props, changed props, movers and puddles.
         lines: Paths of the sensor, and the stretches on which movers go to and fro.
         clouds: Returns of sessions.
         labels: Names of the props.
@@ -110,7 +113,8 @@ def view_scenario(scenario: Scenario, seed: int) -> View:
         movers = _place_movers(world, scenario, drives, seed)
     except ScenarioError as error:
         movers, notes = [], [*notes, f"no movers: {error}"]
-    return _world_view(f"{scenario.family}, seed {seed}", world, lines, (), movers, tuple(notes))
+    puddles = _puddle_surfaces(world, scenario, seed)
+    return _world_view(f"{scenario.family}, seed {seed}", world, lines, (), movers, puddles, tuple(notes))
 
 
 def view_pair(pair: Path) -> View:
@@ -130,7 +134,8 @@ def view_pair(pair: Path) -> View:
     )
     drives = _plan_drives(world, scenario, truth.seed)[0] if scenario.movers else {}
     movers = _place_movers(world, scenario, drives, truth.seed)
-    return _world_view(f"{pair}: {truth.family}, seed {truth.seed}", world, lines, clouds, movers, ())
+    puddles = _puddle_surfaces(world, scenario, truth.seed)
+    return _world_view(f"{pair}: {truth.family}, seed {truth.seed}", world, lines, clouds, movers, puddles, ())
 
 
 def view_session(folder: Path) -> View:
@@ -235,6 +240,7 @@ def _world_view(
     lines: Sequence[Line],
     clouds: tuple[Cloud, ...],
     movers: Sequence[_Placed],
+    puddles: Sequence[Surface],
     notes: tuple[str, ...],
 ) -> View:
     wall = world.before.meshes[0]
@@ -260,8 +266,31 @@ def _world_view(
         for placed in movers
         if placed.body.course.is_moving
     ]
-    surfaces, all_lines = (*fixtures, *props, *moving), (*lines, *stretches)
+    surfaces, all_lines = (*fixtures, *props, *moving, *puddles), (*lines, *stretches)
     return View(title, wall_bands(wall, floor_points), surfaces, all_lines, clouds, labels, eye, target, notes)
+
+
+def _puddle_surfaces(world: World, scenario: Scenario, seed: int) -> list[Surface]:
+    """Return the sheet of water of every puddle; one that only one session has is named after it.
+
+    Raises:
+        ScenarioError: There is no floor under a puddle.
+    """
+    sheets = {}
+    for session in SESSIONS:
+        for puddle, pool in zip(
+            [each for each in scenario.puddles if each.sessions in ("both", session)],
+            lay_puddles(scenario, world.centreline, world.walls, session, seed),
+            strict=True,
+        ):
+            where = "" if puddle.sessions == "both" else f" ({puddle.sessions})"
+            turn = np.linspace(0.0, 2 * np.pi, _SHEET_CORNERS, endpoint=False)
+            rim = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(_SHEET_CORNERS)])
+            corners = np.arange(_SHEET_CORNERS)
+            faces = np.column_stack([np.zeros_like(corners), 1 + corners, 1 + np.roll(corners, -1)])
+            mesh = Mesh(np.concatenate([[pool.centre], pool.centre + pool.radius_m * rim]), faces.astype(np.int32))
+            sheets[f"puddles/{pool.name}{where}"] = mesh
+    return [Surface(name, mesh, _WATER_RGB) for name, mesh in sheets.items()]
 
 
 def _prop_surfaces(item: Standing) -> Iterator[Surface]:

@@ -30,6 +30,7 @@ from sim.sensor.water import (
 )
 from sim.session.simulate import simulate_pair
 from sim.session.truth import read_labels
+from sim.view.view import view_scenario
 
 HALF_M = np.array([12.0, 12.0, 2.0])
 DEPTH_M = 0.04
@@ -192,3 +193,12 @@ def test_a_session_without_puddles_keeps_its_bytes_and_ghosts_are_no_change(tmp_
 def test_a_wrong_puddle_is_named(puddle: str, rule: str) -> None:
     with pytest.raises(ScenarioError, match=rule):
         load_scenario("smoke/unchanged", 3, [f"puddles=[{puddle}]"])
+
+
+def test_the_view_shows_every_puddle_once_and_whose_it_is() -> None:
+    view = view_scenario(load_scenario("smoke/unchanged", 3, with_puddles()), 3)
+    sheets = {part.name: part.mesh for part in view.surfaces if part.name.startswith("puddles/")}
+    assert set(sheets) == {"puddles/both", "puddles/new (after)"}
+    for mesh in sheets.values():
+        normals = np.cross(*(mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, 0]] for k in (1, 2)))
+        assert (normals[:, 2] > 0).all()  # seen from above
