@@ -294,22 +294,30 @@ class Prop(Lean):
         return self
 
 
-class Sensor(Settings):
+class Sensor(Lean):
     """The LiDAR: an Ouster profile (shipped name or metadata .json), its mode, and which effects are on.
 
     Every effect is a switch, so its influence on a result can be measured. sim/sensor/SENSOR.md names the constants.
     """
+
+    _LATER: ClassVar[frozenset[str]] = frozenset({"returns"})
 
     profile: str = "os1-32-nominal"
     mode: Annotated[str, Field(pattern=r"^\d+x\d+$")] = "1024x10"
     rolling_scan: bool = True  # a pose per column; off: the sensor stands still during each revolution
     range_noise: bool = True  # by range and by the strength of the return
     dropouts: bool = True  # weak returns are lost: reflectivity, incidence, range
+    returns: Literal["strongest", "last", "dual"] = "strongest"  # of the echoes of a beam; dual: the two strongest
     sub_rays: Literal[1, 7, 19] = 1  # rays over each beam's width; 1: no divergence, no mixed pixels at edges
     false_positives: bool = True  # returns where nothing is
     range_step_mm: Literal[1, 8] = 1  # 8: the vendor's low-bandwidth packets
     max_range_m: Annotated[float, Field(gt=0, le=524)] = 120.0  # the vendor's range field: 19 bits of millimetres
     min_range_m: NotNegative = 0.3
+
+    @property
+    def n_returns(self) -> int:
+        """How many returns of a beam are recorded at most."""
+        return 2 if self.returns == "dual" else 1
 
     @model_validator(mode="after")
     def _sees_something(self) -> Sensor:

@@ -92,6 +92,7 @@ class RecordedScans:
             stamps_ns=stamps[is_hit],
             pixels=np.flatnonzero(is_hit).astype(np.int32),
             signal=self._chunk.signal[row][is_hit] if self._chunk.signal[row].any() else None,
+            second_from=is_hit.size // 2 if self._session.n_returns == 2 else None,
         )
 
     def scans(self) -> Iterator[PosedScan]:

@@ -2,9 +2,11 @@
 
     session.json        format, sensor metadata (Ouster keys), frames, units, provenance
     odometry.npz        odom_T_sensor (S, 4, 4) float64: pose of each revolution at its middle column
-    chunks/00000.npz    range_mm (s, H, W) uint32 (0 = no return), reflectivity (s, H, W) uint8,
-                        signal (s, H, W) uint16 photons, column_stamps_ns (s, W) int64, column_poses (s, W, 7) float32
+    chunks/00000.npz    range_mm (s, R, W) uint32 (0 = no return), reflectivity (s, R, W) uint8,
+                        signal (s, R, W) uint16 photons, column_stamps_ns (s, W) int64, column_poses (s, W, 7) float32
 
+R is the number of beams H. A session with two returns of each beam says `"returns": 2` in session.json; there R is 2 H,
+and row H + h holds the second return of beam h.
 `column_poses` hold `sensor_T_column`: translation (m) and quaternion (x, y, z, w) of each column in the frame of its
 revolution, from the session's own odometry. A session is written under a temporary name and renamed when complete.
 """
@@ -18,7 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -32,10 +34,13 @@ from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
 
 FORMAT = "tunnelcd-session"
 FORMAT_VERSION = 2
+CHUNK_SCANS = 64
+# Of one file: below the 128 MiB that the reader of npz accepts; bytes of a pixel and of a column of a chunk.
+_CHUNK_BYTES, _PIXEL_BYTES, _COLUMN_BYTES = 120 << 20, 7, 36
 _CHUNK = {
-    "range_mm": ArraySpec("s,H,W", "uint32"),
-    "reflectivity": ArraySpec("s,H,W", "uint8"),
-    "signal": ArraySpec("s,H,W", "uint16"),
+    "range_mm": ArraySpec("s,R,W", "uint32"),
+    "reflectivity": ArraySpec("s,R,W", "uint8"),
+    "signal": ArraySpec("s,R,W", "uint16"),
     "column_stamps_ns": ArraySpec("s,W", "int64"),
     "column_poses": ArraySpec("s,W,7", "float32", is_finite=False),  # checked when read, by scan and column
 }
@@ -49,9 +54,9 @@ class ScanChunk:
     """A run of consecutive revolutions.
 
     Attributes:
-        range_mm: (s, H, W) uint32 staggered ranges, millimetres, 0 where nothing returned.
-        reflectivity: (s, H, W) uint8, calibrated; values up to 100 are percent of a perfect diffuse reflector.
-        signal: (s, H, W) uint16 photons of the return, the sensor's signal channel; 0 if unknown.
+        range_mm: (s, R, W) uint32 staggered ranges, millimetres, 0 where nothing returned.
+        reflectivity: (s, R, W) uint8, calibrated; values up to 100 are percent of a perfect diffuse reflector.
+        signal: (s, R, W) uint16 photons of the return, the sensor's signal channel; 0 if unknown.
         column_stamps_ns: (s, W) int64 time of each column since the start of the session.
         column_poses: (s, W, 7) float32 `sensor_T_column` as x, y, z, qx, qy, qz, qw.
     """
@@ -79,6 +84,7 @@ class Session:
         chunk_scans: Revolutions per chunk; the last chunk may hold fewer.
         provenance: How it was made, as stored.
         format_version: Number of the format that its files are in.
+        n_returns: Returns of each beam, 1 or 2.
     """
 
     path: Path
@@ -87,6 +93,12 @@ class Session:
     chunk_scans: int
     provenance: dict[str, Any]
     format_version: int = field(default=FORMAT_VERSION, kw_only=True)
+    n_returns: int = field(default=1, kw_only=True)
+
+    @property
+    def rows(self) -> int:
+        """Rows R of a revolution: the beams, then the second return of each where there are two."""
+        return self.sensor.height * self.n_returns
 
     @property
     def n_scans(self) -> int:
@@ -105,7 +117,7 @@ class Session:
             InputError: The file is missing or does not hold what the format promises.
         """
         n_scans = min(self.chunk_scans, self.n_scans - index * self.chunk_scans)
-        lengths = {"s": n_scans, "H": self.sensor.height, "W": self.sensor.width}
+        lengths = {"s": n_scans, "R": self.rows, "W": self.sensor.width}
         arrays = read_npz(chunk_path(self.path, index), _CHUNKS[self.format_version], lengths=lengths)
         if "signal" not in arrays:
             arrays["signal"] = np.zeros(arrays["range_mm"].shape, dtype=np.uint16)
@@ -122,7 +134,9 @@ class SessionWriter:
     It is a context manager; an exception inside removes the unfinished folder.
     """
 
-    def __init__(self, path: Path, sensor: SensorMetadata, chunk_scans: int, provenance: dict[str, Any]) -> None:
+    def __init__(
+        self, path: Path, sensor: SensorMetadata, chunk_scans: int, provenance: dict[str, Any], n_returns: int = 1
+    ) -> None:
         if path.exists():
             raise InputError(f"{path} exists already: name a new folder or remove it")
         self._path = path
@@ -130,6 +144,7 @@ class SessionWriter:
         self._sensor = sensor
         self._chunk_scans = chunk_scans
         self._provenance = provenance
+        self._n_returns = n_returns
         self._n_chunks = 0
 
     def __enter__(self) -> SessionWriter:
@@ -175,6 +190,7 @@ class SessionWriter:
             "format_version": FORMAT_VERSION,
             "n_scans": len(odom_T_sensor),
             "chunk_scans": self._chunk_scans,
+            **({"returns": self._n_returns} if self._n_returns > 1 else {}),
             "units": {"range": "mm", "length": "m", "time": "ns", "angle": "rad"},
             "frames": {"odom": "the session's own, x forward, z up", "sensor": "Ouster sensor frame"},
             "sensor": self._sensor.to_json(),
@@ -200,6 +216,7 @@ class _Header(Settings):
 
     n_scans: int
     chunk_scans: Annotated[int, Field(ge=1)]
+    returns: Literal[1, 2] = 1
     sensor: dict[str, Any]
     provenance: dict[str, Any]
 
@@ -250,7 +267,20 @@ def read_session(path: Path) -> Session:
     except ValueError as error:
         raise InputError(f"{path / 'odometry.npz'}: {error}: correct the pose, or remove the scan") from error
     sensor = parse_metadata(header.sensor, str(source))
-    return Session(path, sensor, poses, header.chunk_scans, header.provenance, format_version=version)
+    return Session(
+        path,
+        sensor,
+        poses,
+        header.chunk_scans,
+        header.provenance,
+        format_version=version,
+        n_returns=header.returns,
+    )
+
+
+def fit_chunk(rows: int, width: int, most: int = CHUNK_SCANS) -> int:
+    """Return how many revolutions of (R, W) pixels a chunk holds: `most`, or as many as readers accept in a file."""
+    return max(1, min(most, _CHUNK_BYTES // (rows * width * _PIXEL_BYTES + width * _COLUMN_BYTES)))
 
 
 def chunk_path(folder: Path, index: int) -> Path:

@@ -77,6 +77,7 @@ def drop_airborne(scan: PosedScan) -> PosedScan:
         scan.stamps_ns[kept],
         scan.pixels[kept],
         scan.signal[kept],
+        scan.second_from,
     )
 
 
@@ -87,21 +88,24 @@ def _mark(scan: PosedScan, signal: npt.NDArray[np.uint16], rule: _Rule) -> BoolA
     weak = np.flatnonzero(is_marked)
     ranges_m = np.sqrt(squared_m2)
     is_dark = (ranges_m[weak] < _NEAR_M) & (signal[weak] < _NEAR_PHOTONS)
-    is_marked[weak] = is_dark | ~_is_on_surface(scan.pixels, ranges_m, weak, rule)
+    is_marked[weak] = is_dark | ~_is_on_surface(scan, ranges_m, weak, rule)
     return is_marked
 
 
-def _is_on_surface(
-    pixels: npt.NDArray[np.int32], ranges_m: Float64Array, chosen: npt.NDArray[np.int64], rule: _Rule
-) -> BoolArray:
-    """Tell which (C,) chosen returns lie on one surface with the two beams on either side in their row."""
-    image = np.full(int(pixels.max(initial=0)) + 5, np.nan)
-    image[pixels + 2] = ranges_m
-    own, at = ranges_m[chosen], pixels[chosen] + 2
+def _is_on_surface(scan: PosedScan, ranges_m: Float64Array, chosen: npt.NDArray[np.int64], rule: _Rule) -> BoolArray:
+    """Tell which (C,) chosen returns lie on one surface with the two beams on either side in their row.
+
+    Of a beam with two returns either one may agree.
+    """
+    n_beams = scan.second_from or int(scan.pixels.max(initial=0)) + 1
+    images = np.full((1 if scan.second_from is None else 2, n_beams + 4), np.nan)
+    number, beam = np.divmod(scan.pixels, n_beams)
+    images[number, beam + 2] = ranges_m
+    own, at = ranges_m[chosen], beam[chosen] + 2
     tolerance_m = rule.agree_m + rule.agree_share * own
-    around = {step: image[at + step] for step in (-2, -1, 1, 2)}
-    agreeing = np.stack([np.abs(other - own) < tolerance_m for other in around.values()])
+    around = {step: images[:, at + step] for step in (-2, -1, 1, 2)}
+    agreeing = np.stack([(np.abs(other - own) < tolerance_m).any(axis=0) for other in around.values()])
     is_on: BoolArray = agreeing.sum(axis=0) >= 2
     if rule.may_lie_between:
-        is_on |= np.abs(around[-1] + around[1] - 2 * own) < tolerance_m
+        is_on |= (np.abs(around[-1][:, None] + around[1][None] - 2 * own) < tolerance_m).any(axis=(0, 1))
     return is_on

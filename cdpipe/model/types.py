@@ -40,6 +40,7 @@ class PosedScan:
         stamps_ns: (N,) int64 time of each return since the start of the session.
         pixels: (N,) int32 origin of each return: row * W + column, or the row of its file.
         signal: (N,) uint16 photons of each return, None where the sensor does not tell.
+        second_from: Pixels from this one on are second returns of the beams from pixel 0 on; None: one return a beam.
     """
 
     index: int
@@ -48,6 +49,7 @@ class PosedScan:
     stamps_ns: Int64Array
     pixels: Int32Array
     signal: npt.NDArray[np.uint16] | None = None
+    second_from: int | None = None
 
     def __post_init__(self) -> None:
         n = len(self.points_sensor)

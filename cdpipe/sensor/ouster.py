@@ -88,17 +88,23 @@ class SensorMetadata:
         return np.array(np.broadcast_to(in_sensor, (self.height, self.width, 3)), dtype=np.float64)
 
     def project(self, ranges_m: Float64Array) -> Float64Array:
-        """Return the (..., H, W, 3) points of staggered ranges (..., H, W), sensor frame, metres.
+        """Return the (..., R, W, 3) points of staggered ranges (..., R, W), sensor frame, metres.
 
         Each column is in the sensor frame at its own time; deskewing is a separate step. The point of a miss, range 0,
-        is undefined.
+        is undefined. R is H, or 2 H where the second returns of all beams follow the first ones.
 
         Raises:
-            ValueError: The last two axes are not (H, W).
+            ValueError: The last two axes are not (H, W) or (2 H, W).
         """
-        if ranges_m.shape[-2:] != (self.height, self.width):
-            raise ValueError(f"ranges_m must be (..., {self.height}, {self.width}), got {ranges_m.shape}")
-        return np.asarray(self.origins + (ranges_m[..., None] - self.beam_origin_m) * self.directions, dtype=np.float64)
+        rows = ranges_m.shape[-2] if ranges_m.ndim > 1 else 0
+        if rows not in (self.height, 2 * self.height) or ranges_m.shape[-1] != self.width:
+            raise ValueError(
+                f"ranges_m must be (..., {self.height} or {2 * self.height}, {self.width}), got {ranges_m.shape}"
+            )
+        origins, directions = self.origins, self.directions
+        if rows != self.height:
+            origins, directions = np.concatenate([origins, origins]), np.concatenate([directions, directions])
+        return np.asarray(origins + (ranges_m[..., None] - self.beam_origin_m) * directions, dtype=np.float64)
 
     def column_offsets_ns(self) -> Float64Array:
         """Return the (W,) time of each column after the start of its revolution, nanoseconds."""

@@ -129,7 +129,7 @@ def copy_session(source: Path, target: Path, name: str) -> None:
     """
     session = read_session(source)
     provenance = {"made_by": "tunnelcd export", "session": name}
-    with SessionWriter(target, session.sensor, session.chunk_scans, provenance) as writer:
+    with SessionWriter(target, session.sensor, session.chunk_scans, provenance, session.n_returns) as writer:
         for chunk in session.chunks():
             writer.add(chunk)
         writer.close(session.odom_T_sensor)

@@ -128,8 +128,11 @@ def make_shard(family: str, seed: int, recipe: Recipe) -> bytes:
 
 
 def _load_map_config() -> MapConfig:
-    """Return the map settings of `tunnelcd` with the recorded poses: the truth of a scan is in their frame."""
-    return load_config("tunnelcd").map.model_copy(update={"consistency": "none"})
+    """Return the map settings of `tunnelcd` with the recorded poses: the truth of a scan is in their frame.
+
+    Movers stay: where walls stand twice, they would look like movers.
+    """
+    return load_config("tunnelcd").map.model_copy(update={"consistency": "none", "movers": "keep"})
 
 
 class _WatchedScans(WrappedScans):
@@ -152,7 +155,7 @@ def _map_held(held: LabelledSession) -> _Mapped:
     """Map a session, and note what its scans hold while they are read."""
     config, session = _load_map_config(), held.session
     chosen = set(choose_keyframes(session.odom_T_sensor, config.keyframe_spacing_m).tolist())
-    builder = ScoringPointsBuilder(str(session.path), session.sensor.height, session.sensor.width)
+    builder = ScoringPointsBuilder(str(session.path), session.rows, session.sensor.width)
     ranges_m, stamps_ns = [], []
 
     def watch(scan: PosedScan) -> None:

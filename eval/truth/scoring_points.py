@@ -127,7 +127,7 @@ def build_scoring_points(session: Session) -> ScoringPoints:
     Raises:
         InputError: The session or its truth is missing or damaged.
     """
-    shape = session.sensor.height, session.sensor.width
+    shape = session.rows, session.sensor.width
     builder = ScoringPointsBuilder(str(session.path), *shape)
     scans = open_session(session.path).scans()
     for index, (instance, change) in enumerate(read_labels(session.path, session.n_chunks)):
@@ -238,7 +238,7 @@ def _read_cache(path: Path, fingerprint: str, session: Session) -> ScoringPoints
         arrays = read_npz(path, _CACHE)
         if str(arrays.pop("fingerprint")) != fingerprint:
             return None
-        n_pixels = session.sensor.height * session.sensor.width
+        n_pixels = session.rows * session.sensor.width
         returns = arrays["returns"]
         is_within = (returns >= 0) & (returns < session.n_scans * n_pixels)
         if not is_within.all() or (np.diff(returns) <= 0).any():

@@ -14,7 +14,7 @@ import numpy as np
 from cdpipe.core.geometry import Float32Array, Float64Array, stream
 from scenarios.schema import Air, Dust
 from sim.geometry.noise import smooth_noise
-from sim.sensor.footprint import PULSE_M, Echo
+from sim.sensor.footprint import PULSE_M, Echo, choose_echo, no_echo
 from sim.sensor.optics import received_photons
 from sim.sensor.rays import Rays
 
@@ -109,8 +109,10 @@ def _dust_around(
     return DustCloud(dust, floor_z_m, corner_m, swathes.astype(np.float32))
 
 
-def cross_air(echo: Echo, rays: Rays, beam_origin_m: float, air: AirVolume, generator: np.random.Generator) -> Echo:
-    """Return the echo of a revolution through the air: surfaces dimmed, and the air where it is the stronger.
+def cross_air(
+    echo: Echo, rays: Rays, beam_origin_m: float, air: AirVolume, generator: np.random.Generator
+) -> tuple[Echo, Echo]:
+    """Return the stronger and the weaker echo of a revolution through the air: of dimmed surfaces and of the air.
 
     The light of each metre of air is counted with the noise of its photons (square root transform); the metre with the
     highest count is the air's echo, somewhere within it. That the strongest metre wins is ours, unverified.
@@ -123,7 +125,7 @@ def cross_air(echo: Echo, rays: Rays, beam_origin_m: float, air: AirVolume, gene
         generator: Draws as many numbers for every pixel, whatever it meets.
     """
     n_pixels = echo.range_m.size
-    reach_m = np.where(echo.geom >= 0, echo.range_m - np.float32(beam_origin_m), np.float32(REACH_M)).ravel()
+    reach_m = np.where(echo.geom != -1, echo.range_m - np.float32(beam_origin_m), np.float32(REACH_M)).ravel()
     depth, best, best_m = (np.zeros(n_pixels, np.float32) for _ in range(3))
     within = generator.random(n_pixels, dtype=np.float32)
     ways = rays.directions.reshape(-1, 3).T
@@ -144,7 +146,22 @@ def cross_air(echo: Echo, rays: Rays, beam_origin_m: float, air: AirVolume, gene
             better = on_way[is_better]
             best[better], best_m[better] = counted[is_better], start_m + within[better] * length_m[is_better]
         depth[on_way] += half
-    return _strongest(echo, depth, best, best_m + np.float32(beam_origin_m))
+    return _rank(echo, depth, best, best_m + np.float32(beam_origin_m))
+
+
+def dim_echo(echo: Echo, rays: Rays, beam_origin_m: float, air: AirVolume) -> Echo:
+    """Return an echo as it comes through the air, which sends nothing back itself."""
+    reach_m = np.where(echo.geom != -1, echo.range_m - np.float32(beam_origin_m), np.float32(0.0)).ravel()
+    depth = np.zeros(len(reach_m), np.float32)
+    ways = rays.directions.reshape(-1, 3).T
+    origins = np.repeat(rays.origins.T, rays.directions.shape[1], axis=1).astype(np.float32)
+    for number in range(int(np.ceil(reach_m.max(initial=0.0) / PULSE_M))):
+        start_m = np.float32(number * PULSE_M)
+        on_way = np.flatnonzero(reach_m > start_m)
+        length_m = np.minimum(reach_m[on_way] - start_m, np.float32(PULSE_M))
+        middle_m = start_m + length_m * np.float32(0.5)
+        depth[on_way] += air.extinction(origins[:, on_way] + ways[:, on_way] * middle_m)[0] * length_m
+    return replace(echo, photons=echo.photons * np.exp(-2 * depth).reshape(echo.range_m.shape))
 
 
 def _count(photons: Float32Array, noise: Float32Array) -> Float32Array:
@@ -155,17 +172,26 @@ def _count(photons: Float32Array, noise: Float32Array) -> Float32Array:
     )
 
 
-def _strongest(echo: Echo, depth: Float32Array, counted: Float32Array, air_m: Float32Array) -> Echo:
-    """Return the stronger of the dimmed surface and the air, for (N,) optical depths, photons and ranges of the air."""
+def _rank(echo: Echo, depth: Float32Array, counted: Float32Array, air_m: Float32Array) -> tuple[Echo, Echo]:
+    """Return the stronger and the weaker of the dimmed surface and the air.
+
+    Args:
+        echo: The surface's echo, not dimmed.
+        depth: (N,) optical depth of the air before it.
+        counted: (N,) photons of the air; fewer than one are none.
+        air_m: (N,) range of the air's echo, metres.
+    """
     shape = echo.range_m.shape
-    photons = echo.photons * np.exp(-2 * depth).reshape(shape)
-    light, range_m = counted.reshape(shape), air_m.reshape(shape)
-    is_air = (light > photons) & (light >= LEAST_PHOTONS)
-    return replace(
-        echo,
-        range_m=np.where(is_air, range_m, echo.range_m),
-        photons=np.where(is_air, light, photons),
-        cosine=np.where(is_air, np.float32(1.0), echo.cosine),
-        true_range_m=np.where(is_air, np.float32(np.inf), echo.true_range_m),
-        geom=np.where(is_air, np.int32(AIR), echo.geom),
+    surface = replace(echo, photons=echo.photons * np.exp(-2 * depth).reshape(shape))
+    light = counted.reshape(shape)
+    light = np.where(light >= LEAST_PHOTONS, light, np.float32(0.0))
+    is_there = light > 0
+    air = replace(
+        no_echo(echo),
+        range_m=np.where(is_there, air_m.reshape(shape), np.float32(0.0)),
+        photons=light,
+        cosine=is_there.astype(np.float32),
+        geom=np.where(is_there, np.int32(AIR), np.int32(-1)),
     )
+    is_air = light > surface.photons
+    return choose_echo(is_air, air, surface), choose_echo(is_air, surface, air)

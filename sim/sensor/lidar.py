@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
@@ -12,8 +12,18 @@ from cdpipe.core.geometry import BoolArray, Float32Array, Int32Array, stream
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Sensor
 from sim.geometry.raycast import RayCaster
-from sim.sensor.air import AirVolume, cross_air
-from sim.sensor.footprint import central_echo, spread_echo
+from sim.sensor.air import AirVolume, cross_air, dim_echo
+from sim.sensor.footprint import (
+    PULSE_M,
+    Echo,
+    blend_beams,
+    cast_beams,
+    central_echo,
+    drop_strongest,
+    no_echo,
+    spread_echo,
+    stronger_echo,
+)
 from sim.sensor.optics import (
     FALSE_PHOTONS,
     apparent_reflectivity,
@@ -37,6 +47,8 @@ LEAST_SHARE = 0.9
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
     """One revolution as the sensor reports it, with the truth of each return. All arrays (H, W), staggered.
+
+    With two returns they are (2 H, W): the second return of row h is in row H + h.
 
     Attributes:
         range_mm: uint32, 0 where nothing returned.
@@ -104,35 +116,107 @@ def scan(
         water: Puddles; None where there are none.
     """
     owners = scene.instance if owners is None else owners
-    surfaces = scene.caster, scene.reflectivity, rays, sensor.beam_origin_m, owners
-    echo = central_echo(*surfaces) if settings.sub_rays == 1 else spread_echo(*surfaces, settings.sub_rays)
+    has_second = settings.returns != "strongest"
+    surfaces = scene.caster, scene.reflectivity, rays, sensor.beam_origin_m
+    second: Echo | None = None
+    if settings.sub_rays == 1:
+        echo = central_echo(*surfaces, owners)
+        second = no_echo(echo) if has_second else None
+    elif has_second:
+        hits = cast_beams(*surfaces, settings.sub_rays)
+        echo, second = (blend_beams(each, owners, rays.directions.shape[:2]) for each in (hits, drop_strongest(hits)))
+    else:
+        echo = spread_echo(*surfaces, owners, settings.sub_rays)
     if water is not None:
-        echo = cross_water(echo, rays, sensor.beam_origin_m, water)
+        echo, other = cross_water(echo, rays, sensor.beam_origin_m, water)
+        second = None if second is None else stronger_echo(second, other)
     if air is not None:
-        echo = cross_air(echo, rays, sensor.beam_origin_m, air, stream(seed, session, "air-returns", str(number)))
+        returns = stream(seed, session, "air-returns", str(number))
+        if second is not None:
+            second = dim_echo(second, rays, sensor.beam_origin_m, air)
+        echo, other = cross_air(echo, rays, sensor.beam_origin_m, air, returns)
+        second = None if second is None else stronger_echo(second, other)
+    parts = [_measure(echo, settings, (seed, session, ""), number)]
+    if second is not None:
+        parts = _arrange(parts[0], _measure(second, settings, (seed, session, "second-"), number))
+    if settings.returns == "last":
+        is_later = (parts[1].geom != MISS) & (parts[1].range_m > parts[0].range_m)
+        parts = [_choose(is_later, parts[1], parts[0])]
+    if settings.false_positives:
+        generator = stream(seed, session, "false-positives", str(number))
+        first = parts[0]
+        pixels, places_m = false_returns(generator, first.geom.size, settings.min_range_m, settings.max_range_m)
+        first.geom.flat[pixels], first.range_m.flat[pixels], first.photons.flat[pixels] = (
+            FALSE_RETURN, places_m, FALSE_PHOTONS
+        )  # fmt: skip
+    geom, range_m, photons, true_range_m, owner, share = (
+        np.concatenate([getattr(part, name).T for part in parts]) for name in _MEASURED
+    )
+    return Scan(
+        range_mm=range_channel(range_m, settings.range_step_mm),
+        reflectivity=reflectivity_channel(apparent_reflectivity(photons, range_m)),
+        signal=signal_channel(photons),
+        true_range_m=true_range_m,
+        geom=geom,
+        owner=np.where(geom >= 0, owner, np.int32(0)),
+        is_mixed=(geom >= 0) & (share < LEAST_SHARE),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Return:
+    """What the receiver makes of an echo. All arrays (W, H); attributes as of `Scan` and `Echo`, metres and photons."""
+
+    geom: Int32Array
+    range_m: Float32Array
+    photons: Float32Array
+    true_range_m: Float32Array
+    owner: Int32Array
+    owner_share: Float32Array
+
+
+_MEASURED = tuple(field.name for field in fields(_Return))
+
+
+def _measure(echo: Echo, settings: Sensor, purpose: tuple[int, str, str], number: int) -> _Return:
+    """Return an echo with range noise, without what is out of range or too weak.
+
+    Args:
+        echo: The echo.
+        settings: Which effects are on.
+        purpose: Seed, session, and what precedes the names of the streams.
+        number: Index of the revolution.
+    """
+    seed, session, prefix = purpose
     shape = echo.range_m.shape
     range_m, photons = echo.range_m, echo.photons
     if settings.range_noise:
-        noise = stream(seed, session, "range-noise", str(number)).standard_normal(shape, dtype=np.float32)
+        noise = stream(seed, session, f"{prefix}range-noise", str(number)).standard_normal(shape, dtype=np.float32)
         noise *= range_sigma_m(range_m, photons, echo.cosine)
         range_m = range_m + noise
     is_return = (echo.geom != MISS) & (range_m >= settings.min_range_m) & (range_m <= settings.max_range_m)
     if settings.dropouts:
-        draw = stream(seed, session, "dropouts", str(number)).random(shape, dtype=np.float32)
+        draw = stream(seed, session, f"{prefix}dropouts", str(number)).random(shape, dtype=np.float32)
         is_return &= draw < detection_probability(photons)
-    geom = np.where(is_return, echo.geom, np.int32(MISS))
-    range_m, photons = np.where(is_return, range_m, np.float32(0.0)), np.where(is_return, photons, np.float32(0.0))
-    if settings.false_positives:
-        generator = stream(seed, session, "false-positives", str(number))
-        pixels, places_m = false_returns(generator, geom.size, settings.min_range_m, settings.max_range_m)
-        geom.flat[pixels], range_m.flat[pixels], photons.flat[pixels] = FALSE_RETURN, places_m, FALSE_PHOTONS
-    range_mm = range_channel(range_m, settings.range_step_mm)
-    return Scan(
-        range_mm=range_mm.T,
-        reflectivity=reflectivity_channel(apparent_reflectivity(photons, range_m)).T,
-        signal=signal_channel(photons).T,
-        true_range_m=echo.true_range_m.T,
-        geom=geom.T,
-        owner=np.where(geom >= 0, echo.owner, np.int32(0)).T,
-        is_mixed=((geom >= 0) & (echo.owner_share < LEAST_SHARE)).T,
+    return _Return(
+        geom=np.where(is_return, echo.geom, np.int32(MISS)),
+        range_m=np.where(is_return, range_m, np.float32(0.0)),
+        photons=np.where(is_return, photons, np.float32(0.0)),
+        true_range_m=echo.true_range_m,
+        owner=echo.owner,
+        owner_share=echo.owner_share,
     )
+
+
+def _arrange(first: _Return, second: _Return) -> list[_Return]:
+    """Return both returns of every pixel: a lone one is the first, and two within one pulse are the first alone."""
+    is_lone = (first.geom == MISS) & (second.geom != MISS)
+    first, second = _choose(is_lone, second, first), _choose(is_lone, first, second)
+    is_close = (second.geom != MISS) & (np.abs(second.range_m - first.range_m) < PULSE_M)
+    none = _Return(np.full_like(second.geom, MISS), *(np.zeros_like(getattr(second, name)) for name in _MEASURED[1:]))
+    return [first, _choose(is_close, none, second)]
+
+
+def _choose(mask: BoolArray, chosen: _Return, other: _Return) -> _Return:
+    """Return one return where a mask (W, H) is true, and another elsewhere."""
+    return _Return(*(np.where(mask, getattr(chosen, name), getattr(other, name)) for name in _MEASURED))

@@ -10,15 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.core.geometry import Float32Array
+from cdpipe.core.geometry import Float32Array, Int64Array
 from sim.geometry.raycast import Caster
 from sim.placement.puddles import Pool
-from sim.sensor.footprint import Echo
+from sim.sensor.footprint import Echo, choose_echo, no_echo
 from sim.sensor.optics import received_photons
 from sim.sensor.rays import Rays
 
@@ -28,7 +27,6 @@ WATER_INDEX = 1.33
 # Absorption of pure water at 865 nm, 1/m: Kou, Labrie and Chylek 1993, cited from memory. Mud is not modelled.
 WATER_ABSORPTION_PER_M = 4.6
 _OFF_SURFACE_M = 1e-3
-_T = TypeVar("_T", np.float32, np.int32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,55 +52,60 @@ def mirrored_share(cosine: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]
     return np.asarray((across * across + along * along) / 2)
 
 
-def cross_water(echo: Echo, rays: Rays, beam_origin_m: float, water: Water) -> Echo:
-    """Return the echo of a revolution where the middles of its beams meet water before anything else.
+def cross_water(echo: Echo, rays: Rays, beam_origin_m: float, water: Water) -> tuple[Echo, Echo]:
+    """Return the stronger and the weaker echo of a revolution where beams meet water before anything else.
 
     Args:
         echo: The echo as if there were no water.
-        rays: The revolution's rays.
+        rays: The revolution's rays; the middle of a beam decides for the whole beam.
         beam_origin_m: Distance of their origins from the spin axis.
         water: The pools, and what they mirror.
+
+    Returns:
+        The stronger echo; and the other one of the beams that meet water, nothing for all other beams.
     """
-    shape, height = echo.range_m.shape, rays.directions.shape[1]
-    ways = rays.directions.reshape(-1, 3)
+    height = rays.directions.shape[1]
     reach_m = np.where(echo.geom >= 0, echo.range_m - np.float32(beam_origin_m), np.float32(np.inf)).ravel()
     surface_m = _meet(rays, reach_m, water.pools)
     wet = np.flatnonzero(surface_m < reach_m)
     if not len(wet):
-        return echo
-    way, start_m = ways[wet].astype(np.float64), surface_m[wet].astype(np.float64)
+        return echo, no_echo(echo)
+    way, start_m = rays.directions.reshape(-1, 3)[wet].astype(np.float64), surface_m[wet].astype(np.float64)
     cosine = np.abs(way[:, 2])
     share = mirrored_share(cosine)
     # through the water to the floor and back
-    depth_m = np.where(np.isfinite(reach_m[wet]), reach_m[wet] - start_m, 0.0) * cosine
+    is_floor = np.isfinite(reach_m[wet])
+    depth_m = np.where(is_floor, reach_m[wet] - start_m, 0.0) * cosine
     path_m = depth_m / np.sqrt(1.0 - (1.0 - cosine**2) / WATER_INDEX**2)
     passed = (1.0 - share) ** 2 * np.exp(-2.0 * WATER_ABSORPTION_PER_M * path_m)
-    floor_m = start_m + WATER_INDEX * path_m + beam_origin_m
-    floor_light = echo.photons.ravel()[wet] * passed
+    seems_m = np.where(is_floor, start_m + WATER_INDEX * path_m + beam_origin_m, 0.0)
+    floor = _replace(echo, wet, range_m=seems_m, photons=echo.photons.ravel()[wet] * passed)
     # by way of the surface to what it mirrors and back
     points = rays.origins[wet // height] + start_m[:, None] * way
     points[:, 2] += _OFF_SURFACE_M
-    mirrored_m, geom, facing = water.caster.cast(points, way * (1.0, 1.0, -1.0))
+    beyond_m, geom, facing = water.caster.cast(points, way * (1.0, 1.0, -1.0))
     is_met = geom >= 0
-    total_m = np.where(is_met, start_m + np.where(is_met, mirrored_m, 0.0) + beam_origin_m, 0.0).astype(np.float32)
+    total_m = np.where(is_met, start_m + np.where(is_met, beyond_m, 0.0) + beam_origin_m, 0.0).astype(np.float32)
     power = np.where(is_met, water.reflectivity[geom] * facing * share**2, 0.0).astype(np.float32)
-    mirror_light = np.where(is_met, received_photons(power, np.maximum(total_m, np.float32(1e-3))), 0.0)
-    is_mirrored = mirror_light > floor_light
-
-    def with_wet(channel: npt.NDArray[_T], mirrored: npt.ArrayLike, floor: npt.ArrayLike) -> npt.NDArray[_T]:
-        flat = channel.ravel().copy()
-        flat[wet] = np.where(is_mirrored, mirrored, floor)
-        return flat.reshape(shape)
-
-    is_floor = echo.geom.ravel()[wet] >= 0
-    return replace(
-        echo,
-        range_m=with_wet(echo.range_m, total_m, np.where(is_floor, floor_m, 0.0)),
-        photons=with_wet(echo.photons, mirror_light, floor_light),
-        cosine=with_wet(echo.cosine, facing, echo.cosine.ravel()[wet]),
-        true_range_m=with_wet(echo.true_range_m, np.inf, echo.true_range_m.ravel()[wet]),
-        geom=with_wet(echo.geom, MIRRORED, echo.geom.ravel()[wet]),
+    light = np.where(is_met, received_photons(power, np.maximum(total_m, np.float32(beam_origin_m))), 0.0)
+    ghost = _replace(
+        no_echo(echo), wet, range_m=total_m, photons=light, cosine=facing, geom=np.where(is_met, MIRRORED, -1)
     )
+    is_ghost = ghost.photons > floor.photons
+    is_wet = np.zeros(echo.range_m.size, dtype=np.bool_)
+    is_wet[wet] = True
+    other = choose_echo(is_ghost, floor, ghost)
+    return choose_echo(is_ghost, ghost, floor), choose_echo(is_wet.reshape(is_ghost.shape), other, no_echo(echo))
+
+
+def _replace(echo: Echo, wet: Int64Array, **values: npt.ArrayLike) -> Echo:
+    """Return an echo with other values (M,) in some of its pixels, given by their flat numbers (M,)."""
+    changed = {}
+    for name, own in values.items():
+        channel = getattr(echo, name).ravel().copy()
+        channel[wet] = own
+        changed[name] = channel.reshape(echo.range_m.shape)
+    return replace(echo, **changed)
 
 
 def _meet(rays: Rays, reach_m: Float32Array, pools: Sequence[Pool]) -> Float32Array:

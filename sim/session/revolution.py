@@ -35,8 +35,8 @@ class Revolution:
     """One simulated revolution with its truth; nothing in it depends on the session's own odometry.
 
     Attributes:
-        range_mm, reflectivity, signal: (H, W) as in `ScanChunk`.
-        instance, change: (H, W) int16 as in `sim.session.truth`.
+        range_mm, reflectivity, signal: (R, W) as in `ScanChunk`.
+        instance, change: (R, W) int16 as in `sim.session.truth`.
         ghost_rays: Number of rays that met each ghost, by change id.
         sightings: (M, 4) of each mover the number of its returns, and their mean true position, world frame (NaN where
             it has none).
@@ -82,13 +82,14 @@ def simulate_revolution(drive: Drive, number: int) -> Revolution:
     rays, result = cast_revolution(drive, number)
     reach_m = true_reach_m(drive.sensor, result)
     change = np.where(result.is_mixed, np.int16(MIXED), np.int16(0))
-    ghost_rays = {}
+    height, ghost_rays = drive.sensor.height, {}
+    farthest_m = reach_m.reshape(-1, height, reach_m.shape[1]).max(axis=0)  # a beam went on to its last return
     for tally in drive.tallies:
         if tally.change.session != drive.name:
-            ghost_rays[tally.change.id] = tally.ghost.count(rays, reach_m.T)
+            ghost_rays[tally.change.id] = tally.ghost.count(rays, farthest_m.T)
             continue
         row, column = np.nonzero((result.owner == tally.change.instance) & ~result.is_mixed)
-        belongs = mark_belonging(tally, rays.points(row, column, reach_m[row, column]))
+        belongs = mark_belonging(tally, rays.points(row % height, column, reach_m[row, column]))
         change[row[belongs], column[belongs]] = tally.change.id
     instance = drive.labels.take(result.geom, mode="wrap")
     sightings = see_movers(drive, rays, instance, reach_m)
@@ -96,13 +97,14 @@ def simulate_revolution(drive: Drive, number: int) -> Revolution:
 
 
 def see_movers(drive: Drive, rays: Rays, instance: Int16Array, reach_m: Float32Array) -> Float64Array:
-    """Return what a revolution saw of each mover, (M, 4) as in `Revolution`, from instance and reach (H, W)."""
+    """Return what a revolution saw of each mover, (M, 4) as in `Revolution`, from instance and reach (R, W)."""
     sightings = np.full((len(drive.moving.movers), 4), np.nan)
     for number, mover in enumerate(drive.moving.movers):
         row, column = np.nonzero(instance == mover.instance)
         sightings[number, 0] = len(row)
         if len(row):
-            sightings[number, 1:] = rays.points(row, column, reach_m[row, column]).mean(axis=0)
+            places = rays.points(row % drive.sensor.height, column, reach_m[row, column])
+            sightings[number, 1:] = places.mean(axis=0)
     return sightings
 
 
@@ -128,7 +130,7 @@ def find_air(drive: Drive, number: int) -> AirVolume | None:
 
 
 def true_reach_m(sensor: SensorMetadata, result: Scan) -> Float32Array:
-    """Return the length (H, W) float32 of each ray from its origin to its hit, metres, 0 without a true return."""
+    """Return the length (R, W) float32 of each ray from its origin to its hit, metres, 0 without a true return."""
     return np.where(result.geom >= 0, result.true_range_m - np.float32(sensor.beam_origin_m), np.float32(0.0))
 
 
@@ -150,9 +152,9 @@ def tally_revolution(drive: Drive, number: int, revolution: Revolution) -> None:
 def measured_points(
     drive: Drive, number: int, range_mm: npt.NDArray[np.uint32], row: Int64Array, column: Int64Array
 ) -> Float64Array:
-    """Return where a session measured some returns of a revolution (H, W): their positions (N, 3), odom frame."""
-    sensor = drive.sensor
+    """Return where a session measured some returns of a revolution (R, W): their positions (N, 3), odom frame."""
+    sensor, beam = drive.sensor, row % drive.sensor.height
     reach = range_mm[row, column][:, None] / 1000.0 - sensor.beam_origin_m
-    points_sensor = sensor.origins[row, column] + reach * sensor.directions[row, column]
+    points_sensor = sensor.origins[beam, column] + reach * sensor.directions[beam, column]
     poses = drive.trajectory.odom_T_column(number, column)
     return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], points_sensor) + poses[:, :3, 3])

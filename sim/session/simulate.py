@@ -21,7 +21,7 @@ from cdpipe.core.geometry import Float64Array
 from cdpipe.core.plugins import require_extra
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.core.yamlfile import setting_lines
-from cdpipe.io.session import ScanChunk, Session, SessionWriter
+from cdpipe.io.session import CHUNK_SCANS, ScanChunk, Session, SessionWriter, fit_chunk
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
@@ -48,7 +48,6 @@ from sim.session.truth import (
     write_true_poses,
 )
 
-CHUNK_SCANS = 64
 _THREADS = 2
 # Bytes of each channel of a session that are held in memory until KISS-ICP has its poses; more are in a temporary file.
 _HELD_BYTES = 1 << 25
@@ -208,7 +207,7 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
     profile = drive.scenario.sensor.profile
     provenance = {"made_by": "tunnelcd simulate", "session": drive.name, "sensor_profile": profile}
     with (
-        SessionWriter(folder, drive.sensor, CHUNK_SCANS, provenance) as writer,
+        SessionWriter(folder, drive.sensor, _chunk_scans(drive), provenance, drive.scenario.sensor.n_returns) as writer,
         closing(_simulate_revolutions(drive, pool)) as revolutions,
     ):
         drive, kept = _estimate_odometry(drive, revolutions, report)
@@ -216,7 +215,7 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
         for index, (chunk, instance, change) in enumerate(_fill_chunks(drive, kept)):
             writer.add(chunk)
             write_labels(writer.folder, index, instance, change)
-            report(drive.name, index * CHUNK_SCANS + len(instance), n_scans)
+            report(drive.name, index * _chunk_scans(drive) + len(instance), n_scans)
         write_true_poses(writer.folder, drive.trajectory.world_T_sensor)
         if (track := track_movers(drive)) is not None:
             write_mover_track(writer.folder, track)
@@ -257,7 +256,7 @@ def _estimate_odometry(
     if plan.odometry.source != "kiss-icp":
         return drive, revolutions
     trajectory = drive.trajectory
-    shape = drive.sensor.height, drive.sensor.width
+    shape = drive.sensor.height * drive.scenario.sensor.n_returns, drive.sensor.width
     channels = {name: SpooledArray(dtype, shape, _HELD_BYTES) for name, dtype in CHANNELS.items()}
     ghost_rays, sightings = [], []
 
@@ -278,11 +277,15 @@ def _estimate_odometry(
     return replace(drive, trajectory=replace(trajectory, estimated=estimated)), (Revolution(*each) for each in kept)
 
 
+def _chunk_scans(drive: Drive) -> int:
+    return fit_chunk(drive.sensor.height * drive.scenario.sensor.n_returns, drive.sensor.width, CHUNK_SCANS)
+
+
 def _fill_chunks(drive: Drive, revolutions: Iterator[Revolution]) -> Iterator[tuple[ScanChunk, Int16Array, Int16Array]]:
-    """Yield each chunk of a session with the (s, H, W) instance and change of its returns, and update the tallies."""
+    """Yield each chunk of a session with the (s, R, W) instance and change of its returns, and update the tallies."""
     trajectory = drive.trajectory
-    for start in range(0, trajectory.n_scans, CHUNK_SCANS):
-        held = list(islice(revolutions, CHUNK_SCANS))
+    for start in range(0, trajectory.n_scans, _chunk_scans(drive)):
+        held = list(islice(revolutions, _chunk_scans(drive)))
         numbers = range(start, start + len(held))
         for number, revolution in zip(numbers, held, strict=True):
             tally_revolution(drive, number, revolution)
@@ -314,8 +317,8 @@ class LabelledSession:
     Attributes:
         session: What the robot recorded.
         world_T_sensor: (S, 4, 4) true poses.
-        instance: (S, H, W) int16 as in `sim.session.truth`.
-        change: (S, H, W) int16 as in `sim.session.truth`.
+        instance: (S, R, W) int16 as in `sim.session.truth`.
+        change: (S, R, W) int16 as in `sim.session.truth`.
     """
 
     session: Session
@@ -356,6 +359,12 @@ def _hold_session(drive: Drive, pool: Executor) -> LabelledSession:
         drive, kept = _estimate_odometry(drive, revolutions, _report_nothing)
         chunk, instance, change = zip(*_fill_chunks(drive, kept), strict=True)
     session = HeldSession(
-        Path(drive.name), drive.sensor, drive.trajectory.odom_T_sensor, CHUNK_SCANS, {"session": drive.name}, chunk
+        Path(drive.name),
+        drive.sensor,
+        drive.trajectory.odom_T_sensor,
+        _chunk_scans(drive),
+        {"session": drive.name},
+        chunk,
+        n_returns=drive.scenario.sensor.n_returns,
     )
     return LabelledSession(session, drive.trajectory.world_T_sensor, np.concatenate(instance), np.concatenate(change))

@@ -2,7 +2,7 @@
 
     PAIR/truth/changes.json          the changes, the movers, the scenario as drawn, family, seed
     PAIR/before/truth/poses.npz      world_T_sensor (S, 4, 4) float64, at the middle column of each revolution
-    PAIR/before/truth/00000.npz      per chunk: instance (s, H, W) int16, change (s, H, W) int16
+    PAIR/before/truth/00000.npz      per chunk: instance (s, R, W) int16, change (s, R, W) int16, R as in the session
     PAIR/before/truth/movers.npz     only with movers: see `MoverTrack`
     PAIR/after/truth/...             likewise
 
@@ -199,7 +199,7 @@ def _reader() -> TypeAdapter[PairTruth]:
 
 
 def write_labels(session: Path, index: int, instance: Int16Array, change: Int16Array) -> None:
-    """Write the labels of one chunk, both (s, H, W)."""
+    """Write the labels of one chunk, both (s, R, W)."""
     (session / "truth").mkdir(exist_ok=True)
     np.savez(session / "truth" / f"{index:05d}.npz", allow_pickle=False, instance=instance, change=change)
 
@@ -240,7 +240,7 @@ def read_mover_track(session: Path) -> MoverTrack | None:
 
 
 def read_labels(session: Path, n_chunks: int) -> Iterator[tuple[Int16Array, Int16Array]]:
-    """Yield (instance, change) of every chunk, each (s, H, W) int16."""
+    """Yield (instance, change) of every chunk, each (s, R, W) int16."""
     for index in range(n_chunks):
         arrays = read_npz(session / "truth" / f"{index:05d}.npz", _LABELS)
         yield arrays["instance"], arrays["change"]

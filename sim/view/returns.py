@@ -68,7 +68,7 @@ def session_cloud(
     Raises:
         InputError: A chunk, or its truth, is missing or damaged.
     """
-    stride = max(1, -(-session.n_scans * session.sensor.height * session.sensor.width // max_points))
+    stride = max(1, -(-session.n_scans * session.rows * session.sensor.width // max_points))
     labels = None if kinds is None else read_labels(session.path, session.n_chunks)
     points, instances, changes = [], [], []
     for number, chunk in enumerate(session.chunks()):

@@ -19,6 +19,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.isolated_reader import Arrays, IsolatedReader
 from cdpipe.core.plugins import require_extra
 from cdpipe.io.ouster.integrity import check_osf_integrity, check_pcap_integrity
+from cdpipe.io.ouster.sdk import SECOND
 from cdpipe.io.readers import RECORDING_SUFFIXES
 from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
 from cdpipe.sensor.ouster_metadata import METADATA_FILE, require_mode
@@ -37,10 +38,10 @@ class Revolution:
     """One revolution of a recording.
 
     Attributes:
-        range_mm: (H, W) uint32 staggered range of the first (strongest) return, millimetres; 0 for a miss or a missing
-            column.
-        reflectivity: (H, W) uint8.
-        signal: (H, W) uint16 photons; 0 if the recording has no such channel.
+        range_mm: (R, W) uint32 staggered range, millimetres; 0 for a miss or a missing column. R is H, or 2 H where the
+            second returns of all beams follow the first (strongest) ones.
+        reflectivity: (R, W) uint8.
+        signal: (R, W) uint16 photons; 0 if the recording has no such channel.
         column_stamps_ns: (W,) int64 sensor clock; interpolated for missing columns.
         is_valid: (W,) whether the column arrived.
         odom_T_column: (W, 4, 4) sensor poses of the recording; undefined for missing columns.
@@ -213,10 +214,11 @@ def _decode(arrays: Arrays, sensor: SensorMetadata, sensor_to_body: Float64Array
 
 
 def _channel(arrays: Arrays, name: str, is_valid: BoolArray, most: int) -> npt.NDArray[Any]:
-    """Return a channel (H, W), clipped to `most`; zero in missing columns and for a missing channel."""
-    if name not in arrays:
-        return np.zeros(arrays["RANGE"].shape, np.uint8)
-    return np.where(is_valid, np.minimum(arrays[name], most), 0)
+    """Return a channel (R, W), clipped to `most`; zero in missing columns and for a missing channel."""
+    suffixes = ("", SECOND) if "RANGE" + SECOND in arrays else ("",)
+    missing = np.zeros(arrays["RANGE"].shape, np.uint32)
+    parts = [arrays.get(name + suffix, missing) for suffix in suffixes]
+    return np.concatenate([np.where(is_valid, np.minimum(part, most), 0) for part in parts])
 
 
 def _stamps_ns(stamps_ns: Int64Array, is_valid: BoolArray, sensor: SensorMetadata, where: str) -> Int64Array:

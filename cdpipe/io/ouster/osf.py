@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import make_pose
 from cdpipe.io.ouster.captures import Progress
-from cdpipe.io.ouster.sdk import one_line, require_sdk
+from cdpipe.io.ouster.sdk import SECOND, one_line, require_sdk
 from cdpipe.io.session import ScanChunk, Session
 
 _CHANNELS = {"RANGE": "range_mm", "REFLECTIVITY": "reflectivity", "SIGNAL": "signal"}
@@ -40,7 +40,8 @@ def write_osf(
     Args:
         session: The session.
         path: The new file.
-        fields: For each chunk, further fields (s, H, W) by name; default: none.
+        fields: For each chunk, further fields (s, R, W) by name; default: none. With two returns, those of the second
+            ones have a 2 after the name.
         on_progress: Called with the stage, the number of finished revolutions and their total.
 
     Raises:
@@ -116,7 +117,9 @@ def sensor_info(session: Session) -> Any:
         info = core.SensorInfo(json.dumps(document))
     except (RuntimeError, ValueError) as error:
         raise InputError(f"{session.path}: the vendor's SDK does not take its sensor: {one_line(error)}") from error
-    info.format.udp_profile_lidar = core.UDPProfileLidar.RNG19_RFL8_SIG16_NIR16
+    profile = core.UDPProfileLidar
+    one, two = profile.RNG19_RFL8_SIG16_NIR16, profile.RNG19_RFL8_SIG16_NIR16_DUAL
+    info.format.udp_profile_lidar = one if session.n_returns == 1 else two
     info.user_data = json.dumps({"tunnelcd": session.provenance})
     return info
 
@@ -132,8 +135,14 @@ def _check_fields(session: Session, chunk: ScanChunk, fields: Fields) -> None:
 
 def _frame(core: Any, info: Any, session: Session, chunk: ScanChunk, fields: Fields, row: int, number: int) -> Any:
     """Return one revolution as the SDK's `LidarFrame`."""
-    arrays = {name: getattr(chunk, own)[row] for name, own in _CHANNELS.items()}
-    arrays |= {name: values[row] for name, values in fields.items()}
+    whole = {name: getattr(chunk, own)[row] for name, own in _CHANNELS.items()}
+    whole |= {name: values[row] for name, values in fields.items()}
+    parts = [np.split(values, session.n_returns) for values in whole.values()]
+    arrays = {
+        name + suffix: part
+        for number, suffix in enumerate(("", SECOND)[: session.n_returns])
+        for name, part in zip(whole, (own[number] for own in parts), strict=True)
+    }
     frame = core.LidarFrame(info, [core.FieldType(name, values.dtype) for name, values in arrays.items()])
     for name, values in arrays.items():
         frame.field(name)[:] = values

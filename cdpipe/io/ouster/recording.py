@@ -25,11 +25,10 @@ from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Arr
 from cdpipe.core.motion import Motion, make_motion
 from cdpipe.core.plugins import require_extra
 from cdpipe.io.ouster.captures import Progress, Recording, Revolution, open_recording
-from cdpipe.io.session import ScanChunk, SessionWriter
+from cdpipe.io.session import ScanChunk, SessionWriter, fit_chunk
 from cdpipe.io.tum import motion_along
 from cdpipe.mapping.odometry import estimate_motion
 
-CHUNK_SCANS = 64
 KISS_ICP = "kiss-icp"
 _OWN_POSE_TOLERANCE = 1e-9
 
@@ -60,6 +59,7 @@ class _Times:
     last_ns: Int64Array
     has_own_pose: BoolArray
     n_left_out: int
+    n_returns: int
 
 
 def import_recording(
@@ -101,24 +101,29 @@ def import_recording(
         "sensor_clock_start_ns": int(times.first_ns[0]),
         "revolutions_left_out": times.n_left_out,
     }
-    with SessionWriter(out, recording.sensor, CHUNK_SCANS, provenance) as writer:
-        writer.close(_write(writer, recording, times, motion, report))
+    chunk_scans = fit_chunk(recording.sensor.height * times.n_returns, recording.sensor.width)
+    with SessionWriter(out, recording.sensor, chunk_scans, provenance, times.n_returns) as writer:
+        writer.close(_write(writer, chunk_scans, recording, times, motion, report))
     sensor = f"{recording.sensor.product}, {recording.sensor.mode}"
     return Imported(len(times.first_ns), poses, sensor, times.n_left_out)
 
 
 def _read_times(recording: Recording, report: Progress) -> _Times:
-    stamps_ns, has_own_pose = [], []
+    stamps_ns, has_own_pose, rows = [], [], set()
     left_out: list[int] = []
     middle = recording.sensor.width // 2
     for number, revolution in enumerate(recording.revolutions(left_out.append)):
         report("look through", number, recording.n_guessed)
         stamps_ns.append(revolution.column_stamps_ns[[0, middle, -1]])
+        rows.add(len(revolution.range_mm))
         off = np.abs(revolution.odom_T_column[revolution.is_valid] - recording.sensor_to_body)
         has_own_pose.append(off.max() > _OWN_POSE_TOLERANCE)
     report("look through", len(stamps_ns), len(stamps_ns))
+    if len(rows) > 1:
+        raise InputError(f"{recording.path}: some revolutions have two returns of each beam and some one: cut it there")
     first_ns, middle_ns, last_ns = np.array(stamps_ns).T
-    return _Times(first_ns, middle_ns, last_ns, np.array(has_own_pose), len(left_out))
+    n_returns = rows.pop() // recording.sensor.height
+    return _Times(first_ns, middle_ns, last_ns, np.array(has_own_pose), len(left_out), n_returns)
 
 
 def _choose_motion(
@@ -160,13 +165,18 @@ def _range_images(recording: Recording, n_scans: int, report: Progress) -> Itera
 
 
 def _write(
-    writer: SessionWriter, recording: Recording, times: _Times, motion: Motion | None, report: Progress
+    writer: SessionWriter,
+    chunk_scans: int,
+    recording: Recording,
+    times: _Times,
+    motion: Motion | None,
+    report: Progress,
 ) -> Float64Array:
-    """Write all chunks; return the (S, 4, 4) pose of each revolution at its middle column."""
+    """Write all chunks, of so many revolutions; return the (S, 4, 4) pose of each revolution at its middle column."""
     start_ns, n_scans = int(times.first_ns[0]), len(times.first_ns)
     odom_T_sensor: list[Float64Array] = []
     revolutions = recording.revolutions()
-    while batch := list(islice(revolutions, CHUNK_SCANS)):
+    while batch := list(islice(revolutions, chunk_scans)):
         column_poses = []
         for revolution in batch:
             stamps_s = (revolution.column_stamps_ns - start_ns) / 1e9

@@ -20,6 +20,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.isolated_reader import Message
 
 CHANNELS = ("RANGE", "REFLECTIVITY", "SIGNAL")
+SECOND = "2"  # ends the name of a channel of second returns
 # Exceptions of the SDK for a faulty file; C++ exceptions arrive as any of these.
 _SDK_ERRORS = (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError)
 
@@ -85,9 +86,9 @@ def describe_pcap(path: str, metadata: str) -> Iterator[Message]:
 def read_frames(path: str, metadata: str | None) -> Iterator[Message]:
     """Yield each revolution of a recording, and at the end a message without arrays.
 
-    The arrays of a revolution are its channels (H, W) among `CHANNELS`, `status` and `timestamp` (W,), and
-    `body_to_world` (W, 4, 4); `fields` names all channels of the file. The last message has the number of revolutions
-    that an OSF states, or the number of packets of a PCAP that look like another Ouster's.
+    The arrays of a revolution are its channels (H, W) among `CHANNELS` and those of second returns, `status` and
+    `timestamp` (W,), and `body_to_world` (W, 4, 4); `fields` names all channels of the file. The last message has the
+    number of revolutions that an OSF states, or the number of packets of a PCAP that look like another Ouster's.
     """
     require_sdk()
     from ouster.sdk import osf, pcap
@@ -110,7 +111,8 @@ def read_frames(path: str, metadata: str | None) -> Iterator[Message]:
 
 
 def _arrays(frame: Any) -> dict[str, Any]:
-    arrays = {name: frame.field(name) for name in CHANNELS if frame.has_field(name)}
+    names = [*CHANNELS, *(name + SECOND for name in CHANNELS)]
+    arrays = {name: frame.field(name) for name in names if frame.has_field(name)}
     arrays |= {"status": frame.status, "timestamp": frame.timestamp}
     return arrays | {"body_to_world": np.asarray(frame.body_to_world, dtype=np.float64)}
 

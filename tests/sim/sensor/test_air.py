@@ -39,7 +39,7 @@ def still(sensor: SensorMetadata, place: tuple[float, float, float] = (0.0, 0.0,
 def echoes(sensor: SensorMetadata, air: AirVolume, scene: Scene, seed: int = 1) -> tuple[Echo, Echo]:
     rays = still(sensor)
     clear = central_echo(scene.caster, scene.reflectivity, rays, sensor.beam_origin_m, scene.instance)
-    return clear, cross_air(clear, rays, sensor.beam_origin_m, air, stream(seed, "air-returns"))
+    return clear, cross_air(clear, rays, sensor.beam_origin_m, air, stream(seed, "air-returns"))[0]
 
 
 def dusty(dust: Dust, at: tuple[float, float, float] = (0.0, 0.0, 0.0), time_s: float = 0.0) -> AirVolume:
@@ -87,7 +87,7 @@ def test_the_air_sends_back_what_its_backscatter_says(
     rays = still(sensor)
     clear = central_echo(black.caster, black.reflectivity, rays, sensor.beam_origin_m, black.instance)
     level = np.abs(rays.directions[..., 2]) < 0.05  # 20 m of air before a wall
-    counts = [cross_air(clear, rays, sensor.beam_origin_m, volume, stream(seed, "air-returns")) for seed in range(3)]
+    counts = [cross_air(clear, rays, sensor.beam_origin_m, volume, stream(seed, "air-returns"))[0] for seed in range(3)]
     middle_m = np.arange(20) + 0.5
     power = np.pi * 0.06 / ratio_sr * np.exp(-2 * 0.06 * middle_m)
     expected = received_photons(power.astype(np.float32), (middle_m + sensor.beam_origin_m).astype(np.float32))

@@ -52,7 +52,7 @@ def still(sensor: SensorMetadata) -> Rays:
 def echoes(sensor: SensorMetadata, *pools: Pool) -> tuple[Rays, Echo, Echo]:
     scene, rays = room(), still(sensor)
     dry = central_echo(scene.caster, scene.reflectivity, rays, sensor.beam_origin_m, scene.instance)
-    return rays, dry, cross_water(dry, rays, sensor.beam_origin_m, Water(pools, scene.caster, scene.reflectivity))
+    return rays, dry, cross_water(dry, rays, sensor.beam_origin_m, Water(pools, scene.caster, scene.reflectivity))[0]
 
 
 def lake(radius_m: float = 30.0) -> Pool:
