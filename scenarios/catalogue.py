@@ -7,6 +7,7 @@ folder, without `.yaml`.
 from __future__ import annotations
 
 import os
+from functools import cache
 from pathlib import Path
 
 from cdpipe.core.errors import ScenarioError
@@ -16,6 +17,8 @@ from cdpipe.core.yamlfile import read_yaml, validate
 from scenarios.schema import PROP_KINDS, PropFile
 
 FAMILIES = Path(__file__).parent / "families"
+# Groups of families of which each is another one, seed by seed, but for one effect of a mine.
+EFFECT_GROUPS = frozenset({"cross", "dust", "dynamic", "water"})
 
 
 def scenario_names() -> list[str]:
@@ -35,6 +38,18 @@ def family_files() -> dict[str, Path]:
         ScenarioError: A file on the search path has the name of another scenario.
     """
     return _found("scenario", {}, (FAMILIES, *search_folders("families")))
+
+
+@cache
+def clean_family(name: str) -> str | None:
+    """Return the shipped family that a family is, seed by seed, but for one effect of a mine; None for any other.
+
+    `dust/narrow` is `narrow` in dusty air, `water/null` is `unchanged/narrow` with puddles.
+    """
+    if name.partition("/")[0] not in EFFECT_GROUPS or name not in family_files():
+        return None
+    base = read_yaml(family_files()[name]).value.get("extends")
+    return base if base in family_files() else None
 
 
 def prop_files() -> dict[str, Path]:

@@ -6,12 +6,11 @@ from functools import cache
 from importlib import resources
 from typing import Literal
 
+from scenarios.catalogue import EFFECT_GROUPS
+
 Domain = Literal["in", "out"]
 TRAINED_FAMILIES = frozenset({"narrow", "wide", "network"})
 TRAINED_KINDS = frozenset({"box", "crate", "chair", "barrel", "cone", "pallet", "rock", "vehicle", "muck_pile"})
-# Groups of variations that no network was trained on and no threshold chosen on: dusty air, sessions in which something
-# moves, two sensors, puddles.
-_UNSEEN_GROUPS = frozenset({"dust", "dynamic", "cross", "water"})
 _NAMES = {"in": "in distribution", "out": "out of distribution", "all": "all pairs"}
 
 
@@ -22,7 +21,7 @@ def domain_of(family: str) -> Domain:
     Variations with dust, movers, two sensors or puddles (`dust/wide`) are out: no network or threshold has seen any.
     """
     group, _, name = family.rpartition("/")
-    is_trained = name in TRAINED_FAMILIES and group not in _UNSEEN_GROUPS
+    is_trained = name in TRAINED_FAMILIES and group not in EFFECT_GROUPS
     return "in" if is_trained and (resources.files("scenarios") / "families" / f"{family}.yaml").is_file() else "out"
 
 

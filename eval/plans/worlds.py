@@ -43,6 +43,7 @@ from cdpipe.core.names import path_part
 from cdpipe.core.yamlfile import Settings, suggest
 from cdpipe.model.config import PipelineConfig
 from scenarios import check_scenario, scenario_names
+from scenarios.catalogue import clean_family
 
 
 def require_known_scenario(name: str) -> str:
@@ -213,7 +214,7 @@ def world_slug(label: str) -> str:
     return path_part(label.replace("/", "__"))
 
 
-def find_references(cases: Iterable[tuple[str, str, int]]) -> dict[tuple[str, str], str]:
+def find_references(cases: Iterable[tuple[str, str, int]], *, has_families: bool = False) -> dict[tuple[str, str], str]:
     """Return the reference of each world, for each variant that ran in both.
 
     The reference is the world whose label lacks the fewest brackets at the end: `narrow[a=1]` for `narrow[a=1][b=2]`,
@@ -221,6 +222,8 @@ def find_references(cases: Iterable[tuple[str, str, int]]) -> dict[tuple[str, st
 
     Args:
         cases: World, variant and seed of each row of a run.
+        has_families: Whether a world without such a reference may have that of another family: `narrow` for
+            `dust/narrow` (`scenarios.catalogue.clean_family`).
 
     Returns:
         The reference by (world, variant); no entry where no such world shares a seed.
@@ -230,7 +233,8 @@ def find_references(cases: Iterable[tuple[str, str, int]]) -> dict[tuple[str, st
         seeds.setdefault((world, variant), set()).add(seed)
     found: dict[tuple[str, str], str] = {}
     for (world, variant), own in seeds.items():
-        shared = (other for other in _shorten(world) if not own.isdisjoint(seeds.get((other, variant), ())))
+        others = (*_shorten(world), *(_clean(world) if has_families else ()))
+        shared = (other for other in others if not own.isdisjoint(seeds.get((other, variant), ())))
         if (nearest := next(shared, None)) is not None:
             found[world, variant] = nearest
     return found
@@ -242,7 +246,12 @@ def is_other_odometry(world: str, reference: str) -> bool:
 
 
 def list_settings_over(world: str, reference: str) -> str:
-    """Return the settings of a world beyond its reference: "a=1,b=2" for `narrow[a=1][b=2]` over `narrow`."""
+    """Return the settings of a world beyond its reference: "a=1,b=2" for `narrow[a=1][b=2]` over `narrow`.
+
+    Where the reference is of another family, that is the world's own: "dust/narrow" over `narrow`.
+    """
+    if not world.startswith(f"{reference}["):
+        return world.partition("[")[0]
     return world[len(reference) + 1 : -1].replace("][", ",")
 
 
@@ -250,6 +259,13 @@ def _shorten(label: str) -> Iterator[str]:
     """Yield the part of a label before each bracket, longest first; not every part is a world."""
     if label.endswith("]"):
         yield from (label[:place] for place in range(len(label) - 1, 0, -1) if label[place] == "[")
+
+
+def _clean(label: str) -> Iterator[str]:
+    """Yield the label of the same world without the effect that its family is about."""
+    name, bracket, settings = label.partition("[")
+    if (base := clean_family(name)) is not None:
+        yield base + bracket + settings
 
 
 def require_draws(name: str, settings: tuple[str, ...]) -> None:

@@ -1,7 +1,8 @@
 """What a setting of the world does to a method: the same seeds with it and without it, and the mean of the differences.
 
-A world `narrow[sensor.range_noise=false]` is compared with `narrow` in the same folder (`find_references`). A seed
-draws the same tunnel, the same changes and the same drives in both, so each pair is its own control.
+A world `narrow[sensor.range_noise=false]` is compared with `narrow` in the same folder, and so is `dust/narrow`
+(`find_references`). A seed draws the same tunnel, the same changes and the same drives in both, so each pair is its own
+control.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ def effects(results: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
     figures = results[metrics].apply(pd.to_numeric, errors="coerce").set_index(results["seed"])
     cases = dict(list(figures.groupby([results["scenario"].to_numpy(), results["variant"].to_numpy()])))
     rows: list[dict[str, Any]] = []
-    for (world, variant), reference in find_references(zip(*(results[name] for name in KEYS), strict=True)).items():
+    found = find_references(zip(*(results[name] for name in KEYS), strict=True), has_families=True)
+    for (world, variant), reference in found.items():
         changed, plain = cases[world, variant].align(cases[reference, variant], join="inner", axis=0)
         names = {"reference": reference, "settings": list_settings_over(world, reference), "variant": variant}
         rows += [

@@ -7,7 +7,8 @@ from collections import Counter
 from cdpipe.model.config import preset_names
 from eval.plans.plan import expand_cells, load_plan
 from eval.plans.worlds import find_references, list_settings_over
-from scenarios import load_scenario
+from scenarios import load_scenario, scenario_names
+from scenarios.catalogue import EFFECT_GROUPS
 
 BASE = "stress/narrow"
 WITHOUT_SITE = ("tunnelcd", "sphere-difference", "kiss-matcher", "oracle-merge", "oracle-merge+oracle-regions")
@@ -89,3 +90,19 @@ def test_the_base_of_the_stresses_is_the_easiest_drive_through_the_tunnels_of_na
         for session in (base.before, base.after):
             assert (session.lateral, session.start_m, session.end_m) == (0.0, 3.0, 3.0)
             assert (session.odometry.translation_percent, session.odometry.yaw_deg_per_100m) == (0.0, 0.0)
+
+
+def test_mine_has_ten_pairs_of_every_family_with_an_effect_beside_their_clean_twins() -> None:
+    plan = load_plan("mine")
+    found = expand_cells(plan)
+    worlds = {cell.scenario for cell in found}
+    effects = {name for name in scenario_names() if name.partition("/")[0] in EFFECT_GROUPS}
+    assert worlds == effects | {"narrow", "wide", "unchanged/narrow"}
+    held = find_references((cell.scenario, cell.variant, cell.seed) for cell in found)
+    assert held == {}  # so tables of regions and objects have a row for each
+    held = find_references(((cell.scenario, cell.variant, cell.seed) for cell in found), has_families=True)
+    assert {world for world, _ in held} == effects
+    assert len(plan.seeds) == 10 and all(20000 <= seed < 30000 for seed in plan.seeds)
+    radii = {cell.scenario: cell.config.query.radius_m for cell in found if cell.variant == "m3c2"}
+    assert {world for world, radius_m in radii.items() if radius_m == 10} == {"wide", "dynamic/wide", "dust/wide"}
+    assert {"tunnelcd[map.movers=keep]", "tunnelcd[map.airborne=keep]"} < {cell.variant for cell in found}

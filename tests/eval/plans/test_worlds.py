@@ -224,7 +224,7 @@ variants: [{preset: papr, set: query.n_region=3}]
         4: ["12", "expected a scenario's name, or {name"],
         5: ['did you mean "sensor.range_noise"?', "300x10", "query.radius_m=3 belongs to the method", "under variants"],
         8: [": sensor.sub_rays = 8: input should be 1, 7 or 19"],
-        9: ["'os1-32-q0' is unknown: name one of os1-32-g"],
+        9: ["'os1-32-q0' is unknown: name one of os0-128-nominal"],
         10: ["an empty list sets nothing"],
         11: ["sett", 'did you mean "set"?'],
         12: [": tunnel: expected key=value"],
@@ -358,3 +358,26 @@ def test_the_example_of_the_documentation_is_as_it_says(tmp_path: Path) -> None:
     labels = [world.label for world in list_worlds(plan.scenarios)]
     assert len(labels) == 4
     assert all(label in documentation for label in labels[:3])
+
+
+def test_a_family_with_an_effect_is_held_against_the_clean_one_only_where_asked() -> None:
+    cases = [
+        *((world, "v", 7) for world in ("narrow", "unchanged/narrow", "dust/narrow", "water/null", "regions/narrow")),
+        ("dust/wide", "v", 7),
+        ("cross/narrow[odometry=kiss-icp]", "v", 7),
+        ("narrow[odometry=kiss-icp]", "v", 7),
+        ("dust/narrow[a=1]", "v", 7),
+    ]
+    assert find_references(cases, has_families=True) == {
+        ("dust/narrow", "v"): "narrow",
+        ("water/null", "v"): "unchanged/narrow",
+        ("cross/narrow[odometry=kiss-icp]", "v"): "narrow[odometry=kiss-icp]",
+        ("narrow[odometry=kiss-icp]", "v"): "narrow",
+        ("dust/narrow[a=1]", "v"): "dust/narrow",
+    }
+    assert find_references(cases) == {
+        ("narrow[odometry=kiss-icp]", "v"): "narrow",
+        ("dust/narrow[a=1]", "v"): "dust/narrow",
+    }
+    assert list_settings_over("dust/narrow", "narrow") == "dust/narrow"
+    assert list_settings_over("cross/narrow[b=1]", "narrow[b=1]") == "cross/narrow"
