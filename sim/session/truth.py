@@ -241,6 +241,14 @@ def read_mover_track(session: Path) -> MoverTrack | None:
 
 def read_labels(session: Path, n_chunks: int) -> Iterator[tuple[Int16Array, Int16Array]]:
     """Yield (instance, change) of every chunk, each (s, R, W) int16."""
-    for index in range(n_chunks):
-        arrays = read_npz(session / "truth" / f"{index:05d}.npz", _LABELS)
-        yield arrays["instance"], arrays["change"]
+    return (read_chunk_labels(session, index) for index in range(n_chunks))
+
+
+def read_chunk_labels(session: Path, index: int) -> tuple[Int16Array, Int16Array]:
+    """Read (instance, change) of one chunk, each (s, R, W) int16.
+
+    Raises:
+        InputError: The file is missing or damaged.
+    """
+    arrays = read_npz(session / "truth" / f"{index:05d}.npz", _LABELS)
+    return arrays["instance"], arrays["change"]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,7 @@ from cdpipe.core.geometry import Float32Array, Float64Array
 from cdpipe.io.session import ScanChunk, Session
 from sim.sensor.air import AIR
 from sim.sensor.water import MIRRORED
-from sim.session.truth import read_labels
+from sim.session.truth import read_chunk_labels, read_labels
 
 Rgb = tuple[int, int, int]
 MAX_POINTS = 300_000
@@ -85,11 +86,8 @@ def session_cloud(
     by_height = _by_height(cloud)
     if kinds is None:
         return Cloud(name, cloud, {"height": by_height})
-    by_change = np.tile(np.array(_ROCK_RGB, np.uint8), (len(cloud), 1))
     change, instance = np.concatenate(changes), np.concatenate(instances)
-    by_change[np.isin(instance, _NOT_THERE)] = _AIR_RGB
-    for number, kind in kinds.items():
-        by_change[change == number] = CHANGE_RGB[kind]
+    by_change = _by_change(change, instance, kinds)
     colours = {
         "change": by_change,
         "instance": _by_instance(instance.astype(np.int64)),
@@ -97,6 +95,58 @@ def session_cloud(
         "height": by_height,
     }
     return Cloud(name, cloud, colours)
+
+
+class Revolutions:
+    """The returns of a session, one revolution at a time: the first ones, and the second ones where it has two."""
+
+    def __init__(
+        self, name: str, session: Session, frame_T_sensor: Float64Array, kinds: Mapping[int, str] | None
+    ) -> None:
+        """Take what `session_cloud` takes; nothing is read yet."""
+        self._name, self._session, self._poses, self._kinds = name, session, frame_T_sensor, kinds
+
+    def at(self, share: float) -> tuple[Cloud, ...]:
+        """Return the returns at a share of the drive.
+
+        Raises:
+            InputError: A chunk, or its truth, is missing or damaged.
+        """
+        session = self._session
+        scan = min(int(share * session.n_scans), session.n_scans - 1)
+        number, row = divmod(scan, session.chunk_scans)
+        chunk, labels = _read_chunk(session, number, has_truth=self._kinds is not None)
+        one = ScanChunk(*(getattr(chunk, each.name)[row : row + 1] for each in fields(ScanChunk)))
+        placed = _place_returns(session, one, self._poses[scan : scan + 1])[0].reshape(session.n_returns, -1, 3)
+        is_hit = one.range_mm.reshape(session.n_returns, -1) > 0
+        clouds = []
+        for order, (points, hit) in enumerate(zip(placed, is_hit, strict=True)):
+            name = f"{self._name} second" if order else self._name
+            colours = _by_height(points[hit].astype(np.float32))
+            if labels is not None and self._kinds is not None:
+                instance, change = (part[row].reshape(session.n_returns, -1)[order][hit] for part in labels)
+                colours = _by_change(change, instance, self._kinds)
+            clouds.append(Cloud(name, points[hit].astype(np.float32), {"change": colours}, 0.05))
+        return tuple(clouds)
+
+
+@lru_cache(maxsize=4)
+def _read_chunk(
+    session: Session, number: int, *, has_truth: bool
+) -> tuple[ScanChunk, tuple[npt.NDArray[np.int16], npt.NDArray[np.int16]] | None]:
+    """Return a chunk of a session, and its labels (s, R, W)."""
+    return session.chunk(number), read_chunk_labels(session.path, number) if has_truth else None
+
+
+def _by_change(
+    change: npt.NDArray[np.int16], instance: npt.NDArray[np.int16], kinds: Mapping[int, str]
+) -> npt.NDArray[np.uint8]:
+    """Colour the rock grey, changes by their kind, and what comes by way of air or water blue."""
+    colours = np.tile(np.array(_ROCK_RGB, np.uint8), (len(change), 1))
+    colours[np.isin(instance, _NOT_THERE)] = _AIR_RGB
+    for number, kind in kinds.items():
+        colours[change == number] = CHANGE_RGB[kind]
+    return colours
 
 
 def _place_returns(session: Session, chunk: ScanChunk, frame_T_sensor: Float64Array) -> Float64Array:

@@ -6,8 +6,8 @@ A name is a path. Its first word is the group that a viewer shows or hides as a 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from cdpipe.core.geometry import Float64Array
 from cdpipe.io.session import is_session, read_session
 from scenarios.schema import Scenario
 from sim.drive.trajectory import Trajectory, load_sensor, plan_trajectory
-from sim.geometry.mesh import Mesh, drop_unused_vertices, join_meshes, move_mesh
+from sim.geometry.mesh import Mesh, cylinder_mesh, drop_unused_vertices, join_meshes, move_mesh
 from sim.movers.mover import MovingBody
 from sim.movers.planning import plan_movers
 from sim.placement.placing import Standing, standing_box
@@ -28,7 +28,7 @@ from sim.props.shapes import solid_mesh
 from sim.scene import World, build_world
 from sim.session.truth import SESSIONS, PairTruth, SessionName, read_pair_truth, read_true_poses
 from sim.view.picture import material_colour
-from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Rgb, session_cloud
+from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Revolutions, Rgb, session_cloud
 
 _N_BANDS = 10
 _WATER_RGB: Rgb = (70, 120, 170)
@@ -63,6 +63,9 @@ class Label:
     text: str
 
 
+Play = Callable[[float], tuple[tuple[Surface, ...], tuple[Cloud, ...]]]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
     """The parts of a view. Movers are shown where they are in the middle of their session.
@@ -76,6 +79,8 @@ class View:
         labels: Names of the props.
         eye, target: (3,) position of the camera, and the point it looks at.
         notes: Parts that could not be shown, with the reason.
+        play: Returns what is elsewhere at another share of the drives, 0 to 1: the surfaces of movers and of sensors,
+            and the returns of one revolution; None where nothing is driven.
     """
 
     title: str
@@ -87,6 +92,7 @@ class View:
     eye: Float64Array
     target: Float64Array
     notes: tuple[str, ...] = ()
+    play: Play | None = None
 
 
 def is_pair(path: Path) -> bool:
@@ -114,7 +120,9 @@ def view_scenario(scenario: Scenario, seed: int) -> View:
     except ScenarioError as error:
         movers, notes = [], [*notes, f"no movers: {error}"]
     puddles = _puddle_surfaces(world, scenario, seed)
-    return _world_view(f"{scenario.family}, seed {seed}", world, lines, (), movers, puddles, tuple(notes))
+    view = _world_view(f"{scenario.family}, seed {seed}", world, lines, (), movers, puddles, tuple(notes))
+    poses = [(session, drive.world_T_sensor) for session, drive in drives.items()]
+    return replace(view, play=_player(poses, movers, drives, ())) if drives else view
 
 
 def view_pair(pair: Path) -> View:
@@ -135,7 +143,12 @@ def view_pair(pair: Path) -> View:
     drives = _plan_drives(world, scenario, truth.seed)[0] if scenario.movers else {}
     movers = _place_movers(world, scenario, drives, truth.seed)
     puddles = _puddle_surfaces(world, scenario, truth.seed)
-    return _world_view(f"{pair}: {truth.family}, seed {truth.seed}", world, lines, clouds, movers, puddles, ())
+    view = _world_view(f"{pair}: {truth.family}, seed {truth.seed}", world, lines, clouds, movers, puddles, ())
+    revolutions = [
+        Revolutions(f"revolution/{session}", read_session(pair / session), poses[session], kinds)
+        for session in SESSIONS
+    ]
+    return replace(view, play=_player(poses.items(), movers, drives, revolutions))
 
 
 def view_session(folder: Path) -> View:
@@ -150,7 +163,39 @@ def view_session(folder: Path) -> View:
     middle = poses[len(poses) // 2, :3, 3]
     line = Line("paths/session", poses[:, :3, 3], SESSION_RGB["after"])
     eye = middle + np.array([-8.0, -8.0, 10.0])
-    return View(str(folder), (), (), (line,), (cloud,), (), eye, middle)
+    play = _player([("session", poses)], (), {}, [Revolutions("revolution/session", session, poses, None)])
+    return View(str(folder), (), (), (line,), (cloud,), (), eye, middle, play=play)
+
+
+def _player(
+    poses: Iterable[tuple[str, Float64Array]],
+    movers: Sequence[_Placed],
+    drives: Mapping[SessionName, Trajectory],
+    revolutions: Sequence[Revolutions],
+) -> Play:
+    """Return what shows movers, sensors and returns at a share of the drives.
+
+    Args:
+        poses: Name of each session, and the (S, 4, 4) poses of its sensor.
+        movers: The movers.
+        drives: The drive of every session that has movers.
+        revolutions: The returns of each session.
+    """
+    paths = tuple(poses)
+
+    def play(share: float) -> tuple[tuple[Surface, ...], tuple[Cloud, ...]]:
+        surfaces = []
+        for session, world_T_sensor in paths:
+            here = world_T_sensor[min(int(share * len(world_T_sensor)), len(world_T_sensor) - 1)]
+            rgb = SESSION_RGB.get(session, SESSION_RGB["after"])
+            surfaces.append(Surface(f"sensor/{session}", move_mesh(cylinder_mesh(0.06, 0.06, 24), here), rgb))
+        for placed in movers:
+            time_s = drives[placed.session].revolution_s
+            now = replace(placed, time_s=float(time_s[min(int(share * len(time_s)), len(time_s) - 1)]))
+            surfaces += _mover_surfaces(now)
+        return tuple(surfaces), tuple(cloud for each in revolutions for cloud in each.at(share))
+
+    return play
 
 
 def view_folder(folder: Path) -> View:

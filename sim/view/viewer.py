@@ -5,7 +5,10 @@ from __future__ import annotations
 import contextlib
 import html
 import io
+import threading
+import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -14,9 +17,11 @@ import numpy as np
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import visible
 from sim.view.returns import CHANGE_RGB, SESSION_RGB
-from sim.view.view import View
+from sim.view.view import Play, View
 
 _MISSING = "the viewer needs viser: pip install 'tunnelcd[view]'"
+# Of the player: the share of the drives at first, the step, and the pause after a step.
+_START, _STEP, _PAUSE_S = 0.5, 0.002, 0.1
 _SIDES = {"from inside only": "front", "from both sides": "double"}
 
 
@@ -57,8 +62,18 @@ def running_server(port: int, host: str = "localhost") -> Iterator[Any]:
 
 def show(server: Any, view: View) -> None:
     """Put a view into a server's scene, with the switches beside it."""
-    groups = _add_nodes(server, view)
-    _add_switches(server, view, groups)
+    if view.play is not None:
+        surfaces, clouds = view.play(_START)
+        known = {surface.name for surface in view.surfaces}
+        view = replace(
+            view,
+            surfaces=(*view.surfaces, *(surface for surface in surfaces if surface.name not in known)),
+            clouds=(*view.clouds, *(replace(cloud, is_shown=False) for cloud in clouds)),
+        )
+    handles = _add_nodes(server, view)
+    _add_switches(server, view, handles)
+    if view.play is not None:
+        _add_player(server.gui, view.play, handles)
 
 
 def write_html(view: View, file: Path, legend: str = "") -> None:
@@ -150,9 +165,33 @@ def _add_switches(server: Any, view: View, handles: dict[str, Any]) -> None:
 
         def recolour(_event: Any) -> None:
             for cloud in view.clouds:
+                if choice.value not in cloud.colours:
+                    continue
                 handles[cloud.name].colors = cloud.colours[choice.value]
 
         choice.on_update(recolour)
+
+
+def _add_player(gui: Any, play: Play, handles: dict[str, Any]) -> None:
+    """Add a slider for the share of both drives, and a switch that moves it; what is elsewhere then is placed anew."""
+    share = gui.add_slider("share of the drives", min=0.0, max=1.0, step=_STEP, initial_value=_START)
+    running = gui.add_checkbox("play", initial_value=False)
+
+    def move(_event: Any) -> None:
+        surfaces, clouds = play(share.value)
+        for surface in surfaces:
+            handles[surface.name].vertices = surface.mesh.vertices.astype(np.float32)
+        for cloud in clouds:
+            handles[cloud.name].points = cloud.points
+            handles[cloud.name].colors = next(iter(cloud.colours.values()))
+
+    def run(_event: Any) -> None:
+        while running.value:
+            share.value = 0.0 if share.value >= 1.0 else min(share.value + _STEP, 1.0)
+            time.sleep(_PAUSE_S)
+
+    share.on_update(move)
+    running.on_update(lambda event: threading.Thread(target=run, args=(event,), daemon=True).start())
 
 
 def _add_wall_switches(gui: Any, view: View, handles: dict[str, Any]) -> None:
@@ -186,7 +225,7 @@ def _add_switch(gui: Any, group: str, handle: Any) -> None:
 def _switched(handles: dict[str, Any]) -> list[str]:
     """Return the groups with a switch: the outermost, and for fixtures, changes, movers and paths the level below."""
     inner = [name for name in handles if name.count("/") == 1]
-    split = ("fixtures", "changes", "movers", "paths", "returns")
+    split = ("fixtures", "changes", "movers", "paths", "returns", "revolution")
     groups = [name for name in handles if "/" not in name and name not in split]
     kinds = sorted(name for name in inner if name.startswith(("fixtures/", "changes/", "movers/")))
     return [*groups, *kinds, *(name for name in inner if name.startswith("paths/"))]

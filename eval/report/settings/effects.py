@@ -16,7 +16,7 @@ from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.worlds import get_group
 from eval.report.tables import Cell, Picture, Table
 from eval.running.run_data import RunData, of, over_pairs
-from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, Column, count, select
+from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, Column, count, select, share
 from eval.tables.effects import effects
 from eval.tables.rows import records
 
@@ -24,6 +24,7 @@ COLUMNS = (
     Column("n_observable", "observable changes", None, count),
     *select(RESULT_COLUMNS, "region_recall", "region_recall_at_k", "region_auroc", "false_regions_per_100m",
             "object_iou_point", "object_f1_50", "merge_error_m"),
+    Column("false_regions_on_movers_per_100m", "of these on movers", "low", share),
 )  # fmt: skip
 _DRAWN = ("region_recall_at_k", "object_iou_point", "object_f1_50")
 _MINUS = "\u2212"

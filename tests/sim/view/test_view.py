@@ -18,6 +18,7 @@ from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
 from eval.cli.main import main
 from eval.cli.world import load_view
+from scenarios import load_scenario
 from scenarios.schema import MeshFile, Mover, Place, Prop, Scenario, Shift, Tunnel
 from sim.geometry.mesh import Mesh
 from sim.scene import build_world
@@ -25,8 +26,8 @@ from sim.session.simulate import simulate, simulate_pair
 from sim.session.truth import read_mover_track, read_pair_truth, read_true_poses
 from sim.view import view as view_module
 from sim.view import viewer
-from sim.view.returns import CHANGE_RGB, session_cloud
-from sim.view.view import View, view_folder, view_pair, view_scenario, wall_bands
+from sim.view.returns import _AIR_RGB, CHANGE_RGB, session_cloud
+from sim.view.view import View, view_folder, view_pair, view_scenario, view_session, wall_bands
 from sim.view.viewer import require_viser, running_server, show, write_html
 
 viser = pytest.importorskip("viser", reason="the extra `view` is not installed")
@@ -112,8 +113,51 @@ def test_movers_are_shown_where_they_are_in_the_middle_of_each_session(
     np.testing.assert_allclose(helmet[:, :2].mean(axis=0), middle, atol=0.2)
     np.testing.assert_array_equal(helmet, parts["movers/after/walker/plastic"].mesh.vertices)
     show(server, shown)
-    switches = list(server.gui._gui_input_handle_from_uuid.values())
-    assert {"movers/before", "movers/after"} <= {getattr(handle, "label", "") for handle in switches}
+    switches = {handle.label: handle for handle in server.gui._gui_input_handle_from_uuid.values()}
+    assert {"movers/before", "movers/after"} <= switches.keys()
+    # at another time the walker and the sensor are elsewhere, and who stands is where he was
+    nodes = {name: server.scene.get_handle_by_name(f"/{name}") for name in (*parts, "sensor/after")}
+    was = {name: nodes[name].vertices.mean(axis=0) for name in (*groups_with(parts, "plastic"), "sensor/after")}
+    flip(switches["share of the drives"], 0.1)
+    moved_m = {name: float(np.linalg.norm(nodes[name].vertices.mean(axis=0) - was[name])) for name in was}
+    drive = view_module._plan_drives(build_world(scenario, 3), scenario, 3)[0]["after"]
+    sensor = nodes["sensor/after"].vertices.mean(axis=0)
+    np.testing.assert_allclose(sensor, drive.world_T_sensor[int(0.1 * drive.n_scans), :3, 3], atol=1e-4)
+    assert moved_m["sensor/after"] > 1
+    assert moved_m["movers/after/walker/plastic"] > 0.3 > 0.1 > moved_m["movers/before/guard/plastic"]
+
+
+def groups_with(parts: dict[str, Any], material: str) -> list[str]:
+    return [name for name in parts if name.startswith("movers/") and name.endswith(f"/{material}")]
+
+
+def test_the_player_shows_one_revolution_and_its_second_returns(server: Any, tmp_path: Path) -> None:
+    settings = ["sensor.returns=dual", "sensor.sub_rays=7", "after.air.mist.visibility_m=20", "sensor.mode=512x10",
+                "platform.scan_spacing_m=2"]  # fmt: skip
+    simulate_pair(load_scenario("smoke/one_box", 3, settings), 3, tmp_path / "pair")
+    view = view_pair(tmp_path / "pair")
+    assert view.play is not None
+    clouds = {cloud.name: cloud for cloud in view.play(0.4)[1]}
+    assert set(clouds) == {f"revolution/{name}{second}" for name in ("before", "after") for second in ("", " second")}
+    session = read_session(tmp_path / "pair" / "after")
+    scan = int(0.4 * session.n_scans)
+    first, second = np.split(session.chunk(0).range_mm[scan], 2)
+    assert len(clouds["revolution/after"].points) == (first > 0).sum()
+    assert len(clouds["revolution/after second"].points) == (second > 0).sum() > 100
+    air = (clouds["revolution/after second"].colours["change"] == _AIR_RGB).all(axis=1)
+    assert 0.3 < air.mean() < 1.0
+    show(server, view)
+    node = server.scene.get_handle_by_name("/revolution/after second")
+    assert not node.visible
+    switches = {handle.label: handle for handle in server.gui._gui_input_handle_from_uuid.values()}
+    flip(switches["revolution/after second"], True)
+    assert node.visible
+    flip(switches["share of the drives"], 0.4)
+    np.testing.assert_array_equal(node.points, clouds["revolution/after second"].points)
+    # a session alone has no truth, and is played in its own frame
+    alone = view_session(tmp_path / "pair" / "after")
+    assert alone.play is not None
+    assert {cloud.name for cloud in alone.play(1.0)[1]} == {"revolution/session", "revolution/session second"}
 
 
 def test_movers_that_find_no_way_are_a_note(make_scenario: Callable[..., Scenario]) -> None:
