@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from scenarios.schema import PROP_KINDS, Prop, Scenario, source_of
 
 CHECKED_SEEDS = range(8)
 SUFFIXES = (".yaml", ".yml")
+_ITEM = re.compile(r"\b[a-z_]+\.\d+\b")
 
 
 def load_scenario(name_or_path: str, seed: int, settings: Iterable[str] = ()) -> Scenario:
@@ -87,8 +88,10 @@ def _draw_scenario(document: Document, seed: int) -> tuple[Scenario | None, list
     try:
         scenario = validate(Scenario, replace(place, value=tree))
     except InputError as error:
-        return None, mistakes + _drop_repeated(str(error).splitlines(), drawn.broken, references)
+        mistakes += _drop_repeated(str(error).splitlines(), drawn.broken, references)
+        return None, _tell_copies_once(mistakes, drawn.origins)
     mistakes += [_format_mistake(place, key, rule) for key, rule in find_contradictions(scenario)]
+    mistakes = _tell_copies_once(mistakes, drawn.origins)
     return _freeze(scenario) if is_frozen else _turn_over(scenario, turnover, seed), mistakes
 
 
@@ -149,6 +152,17 @@ def _replace_at(value: Any, key: Key, new: str) -> Any:
     parts: Any = dict(value) if isinstance(value, dict) else list(value)
     parts[key[0]] = _replace_at(parts[key[0]], key[1:], new)
     return parts
+
+
+def _tell_copies_once(lines: list[str], origins: Mapping[Key, Key]) -> list[str]:
+    """Return the mistakes without those that a `repeat` repeats: what is wrong with all copies is told of the first."""
+    firsts: dict[Key, str] = {}
+    items = [key for key in origins if len(key) == 2 and isinstance(key[1], int)]
+    for place in sorted(items, key=lambda key: (str(key[0]), int(key[1]))):
+        firsts.setdefault(origins[place], join_key(place))
+    first_of = {join_key(place): firsts[source] for place, source in origins.items() if source in firsts}
+    told = [_ITEM.sub(lambda found: first_of.get(found[0], found[0]), line) for line in lines]
+    return list(dict.fromkeys(told))
 
 
 def _drop_repeated(lines: list[str], broken: set[Key], told: list[Mistake]) -> list[str]:

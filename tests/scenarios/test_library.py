@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -430,9 +431,7 @@ before:""",
         mistakes_of(written(tmp_path, text)),
         [
             ":23: props.4.size_m.0 = 0: ",
-            ":23: props.5.size_m.0 = 0: ",
             ":24: props.4.place.lateral = 3: ",
-            ":24: props.5.place.lateral = 3: ",
         ],
     )
 
@@ -521,3 +520,12 @@ def test_every_file_of_a_scenario_has_a_digest(tmp_path: Path) -> None:
     (tmp_path / "mine.stl").unlink()
     with pytest.raises(InputError, match=r"mine\.stl: cannot be read"):
         file_digests(scenario)
+
+
+def test_a_mistake_of_a_repeated_item_is_told_once() -> None:
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario("hard/drift", 20500, ["props.change.size=3", "props.clutter.aged={shift_m: 9}"])
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 2
+    assert lines[0] == '--set: props.0.size = 3: unknown key; did you mean "props.0.size_m"?'
+    assert re.match(r"--set: props\.8\.aged\.shift_m = 9: ", lines[1])
