@@ -50,6 +50,10 @@ class ConsistentScans(WrappedScans):
         """(S, 4, 4) consistent pose of each scan, odom frame."""
         return self._poses
 
+    def over(self, source: ScanSource) -> ConsistentScans:
+        """Return the scans of another source with these poses, and without the points of the same bent scans."""
+        return ConsistentScans(source, self._poses, self._is_bent)
+
     def scan(self, index: int) -> PosedScan:
         """Read one scan."""
         return self._corrected(super().scan(index))

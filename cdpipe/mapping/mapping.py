@@ -16,6 +16,7 @@ from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array, invert, t
 from cdpipe.core.grid_index import column_keys
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.core.voxel import UniqueCells, cell_corners, cell_keys, max_coordinate_m
+from cdpipe.mapping.airborne import ClearScans
 from cdpipe.mapping.consistency import make_consistent
 from cdpipe.mapping.free_space import COLUMNS, ROWS, render_view
 from cdpipe.mapping.movers import drop_movers
@@ -38,7 +39,8 @@ def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_S
     order does not depend on `batch_scans`.
 
     Args:
-        source: The session, read once in order.
+        source: The session, read in order: once as it is; before, where poses are made consistent; again, where
+            returns of mist or dust were left out (`ClearScans`).
         config: Voxel size, longest range, keyframe spacing, and what is made consistent and left out.
         batch_scans: Scans held in memory at a time.
 
@@ -48,14 +50,25 @@ def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_S
     _require_reachable(source, config)
     recorded_T_sensor = None if config.consistency == "none" else source.odom_T_sensor
     keyframe_scans = choose_keyframes(source.odom_T_sensor, config.keyframe_spacing_m)
+    cleared, consistent = source, None
     if config.consistency != "none":
-        source = make_consistent(source, has_loops=config.consistency == "graph")
+        source = consistent = make_consistent(source, has_loops=config.consistency == "graph")
+    point_map = _accumulate(source, keyframe_scans, config, batch_scans)
+    if isinstance(cleared, ClearScans) and cleared.has_dropped:
+        supported = cleared.supported_by(point_map)
+        source = supported if consistent is None else consistent.over(supported)
+        point_map = _accumulate(source, keyframe_scans, config, batch_scans)
+    point_map = replace(point_map, recorded_T_sensor=recorded_T_sensor)
+    return drop_movers(point_map) if config.movers == "drop" else point_map
+
+
+def _accumulate(source: ScanSource, keyframe_scans: Int64Array, config: MapConfig, batch_scans: int) -> PointMap:
+    """Return the map of all scans, read once in order."""
     accumulator = _MapAccumulator(config, frozenset(keyframe_scans.tolist()))
     scans = iter(source.scans())
     while batch := list(islice(scans, batch_scans)):
         accumulator.add(batch)
-    point_map = replace(accumulator.finish(source, keyframe_scans), recorded_T_sensor=recorded_T_sensor)
-    return drop_movers(point_map) if config.movers == "drop" else point_map
+    return accumulator.finish(source, keyframe_scans)
 
 
 def choose_keyframes(odom_T_sensor: Float64Array, spacing_m: float) -> Int64Array:

@@ -16,7 +16,7 @@ from cdpipe.io.session import read_session
 from cdpipe.mapping.airborne import ClearScans, clear, drop_airborne
 from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import MapConfig, load_config
-from cdpipe.model.types import PosedScan
+from cdpipe.model.types import PosedScan, WrappedScans
 from scenarios import load_scenario
 from sim.sensor.air import AIR
 from sim.session.simulate import simulate_pair
@@ -140,6 +140,33 @@ def test_the_map_of_a_misty_session_holds_its_surfaces(pair: Path) -> None:
         return sum(tuple(each) not in cells for each in np.floor(points / 0.6).astype(int).tolist())
 
     assert n_off("drop") < 0.25 * n_off("keep")
+
+
+def test_what_looks_airborne_on_a_surface_comes_back_and_the_air_does_not(pair: Path) -> None:
+    session = read_session(pair / "after")
+    truth = np.concatenate([instance for instance, _ in read_labels(session.path, session.n_chunks)])
+    config = MapConfig.model_validate({"airborne": "drop"})
+    cleared = ClearScans(open_session(pair / "after"))
+    without = build_map(ClearedOnce(cleared), config)
+    whole = build_map(ClearScans(open_session(pair / "after")), config)
+    seen, left = (
+        truth.reshape(len(truth), -1)[each.scans_of(np.arange(len(each.return_pixels))), each.return_pixels]
+        for each in (without, whole)
+    )
+    n_lost = sum((truth[scan.index].ravel()[scan.pixels] >= 0).sum() for scan in open_session(pair / "after").scans())
+    n_lost -= (seen >= 0).sum()
+    n_back = (left >= 0).sum() - (seen >= 0).sum()
+    assert n_back > 0.5 * n_lost > 0
+    n_air = (truth == AIR).sum()
+    assert (left == AIR).sum() - (seen == AIR).sum() < 0.1 * n_air
+    # the second pass moves no other return
+    assert set(
+        zip(without.return_pixels.tolist(), without.scans_of(np.arange(len(seen))).tolist(), strict=True)
+    ) <= set(zip(whole.return_pixels.tolist(), whole.scans_of(np.arange(len(left))).tolist(), strict=True))
+
+
+class ClearedOnce(WrappedScans):
+    """Scans without what looks airborne, of which the map does not know that they were cleared."""
 
 
 def test_the_pipeline_sees_through_the_mist(pair: Path) -> None:
