@@ -87,10 +87,12 @@ def _room_mistakes(scenario: Scenario) -> Iterator[Mistake]:
     sections = [drift.section or scenario.tunnel.section for drift in drifts]
     width_m = min(section.width_m for section in sections)
     roof_m = min(section.height_m for section in sections)
+    told: set[Key] = set()
     for name, plan in (("before", scenario.before), ("after", scenario.after)):
         platform: Platform = plan.platform or scenario.platform
         owner: Key = (name, "platform") if plan.platform else ("platform",)
-        if (name == "before" or plan.platform) and width_m <= 2 * platform.clearance_m:
+        if width_m <= 2 * platform.clearance_m and owner not in told:
+            told.add(owner)
             yield (*owner, "clearance_m"), f"leaves the platform no room in a drift {width_m:.1f} m wide"
         if plan.trajectory is None and (plan.height_m or platform.sensor_height_m) >= roof_m:
             key: Key = (name, "height_m") if plan.height_m else (*owner, "sensor_height_m")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, field_serializer, model_serializer, model_validator
 
 from cdpipe.core.yamlfile import Settings
 from scenarios.dangling import find_dangling
@@ -322,7 +322,7 @@ class Sensor(Lean):
     @model_validator(mode="after")
     def _sees_something(self) -> Sensor:
         if self.min_range_m >= self.max_range_m:
-            raise ValueError(f"sensor.min_range_m = {self.min_range_m:g} leaves nothing below max_range_m")
+            raise ValueError(f"min_range_m = {self.min_range_m:g} leaves nothing below max_range_m")
         return self
 
 
@@ -501,6 +501,14 @@ class SessionPlan(Lean):
     sensor: Sensor | None = None  # of this session alone; keys left out are those of the scenario's sensor
     platform: Platform | None = None  # likewise
 
+    @field_serializer("sensor", "platform")
+    def _dump_whole(self, part: Sensor | Platform | None) -> dict[str, Any] | None:
+        """Dump every key: one that was left out would be the scenario's when read again."""
+        if part is None:
+            return None
+        lean = part.model_dump(mode="json")
+        return {name: lean.get(name, getattr(part, name)) for name in type(part).model_fields}
+
     @model_validator(mode="after")
     def _route_or_trajectory(self) -> SessionPlan:
         if len(self.route) == 1 or bool(self.route) == (self.trajectory is not None):
@@ -614,9 +622,11 @@ def _fill_in(scenario: dict[Any, Any], plan: Any) -> Any:
     for part in ("sensor", "platform"):
         usual, own = scenario.get(part), plan.get(part)
         if isinstance(usual, dict) and isinstance(own, dict):
-            # another kind of platform has another gait
-            left_out = {"gait"} if own.get("kind", usual.get("kind")) != usual.get("kind") else set()
-            filled[part] = {key: value for key, value in usual.items() if key not in left_out} | own
+            filled[part] = usual | own
+            if own.get("kind", usual.get("kind")) != usual.get("kind"):  # another kind of platform has another gait
+                filled[part]["gait"] = own.get("gait")
+            elif isinstance(own.get("gait"), dict) and isinstance(usual.get("gait"), dict):
+                filled[part]["gait"] = usual["gait"] | own["gait"]
     return filled
 
 

@@ -41,7 +41,7 @@ class SpooledArray:
             self._file.flush()
         except OSError as error:
             raise InputError(
-                f"{tempfile.gettempdir()}: cannot write there: {error.strerror}: long sessions need about 11 bytes of "
+                f"{tempfile.gettempdir()}: cannot write there: {error.strerror}: long sessions need about 22 bytes of "
                 "temporary files for each return: make room, or name another folder in the variable TMPDIR"
             ) from error
 

@@ -16,6 +16,7 @@ the walls do not.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -65,8 +66,13 @@ class ConsistentScans(WrappedScans):
 
     def _corrected(self, scan: PosedScan) -> PosedScan:
         n = 0 if self._is_bent[scan.index] else len(scan.points_sensor)
-        return PosedScan(
-            scan.index, scan.points_sensor[:n], self._poses[scan.index], scan.stamps_ns[:n], scan.pixels[:n]
+        return replace(
+            scan,
+            points_sensor=scan.points_sensor[:n],
+            odom_T_sensor=self._poses[scan.index],
+            stamps_ns=scan.stamps_ns[:n],
+            pixels=scan.pixels[:n],
+            signal=None if scan.signal is None else scan.signal[:n],
         )
 
 

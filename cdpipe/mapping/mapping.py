@@ -1,6 +1,7 @@
-"""From scans to a voxel map in one pass; memory grows with the map.
+"""From scans to a voxel map in one pass, in two where returns of dust were left out; memory grows with the map.
 
-Returns and range images go to a temporary file where they are large: eleven bytes per return.
+Returns and range images go to a temporary file where they are large: eleven bytes per return, twice that while movers
+are taken out.
 """
 
 from __future__ import annotations
@@ -56,6 +57,7 @@ def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_S
     point_map = _accumulate(source, keyframe_scans, config, batch_scans)
     if isinstance(cleared, ClearScans) and cleared.has_dropped:
         supported = cleared.supported_by(point_map)
+        del point_map  # a second one is made
         source = supported if consistent is None else consistent.over(supported)
         point_map = _accumulate(source, keyframe_scans, config, batch_scans)
     point_map = replace(point_map, recorded_T_sensor=recorded_T_sensor)

@@ -22,8 +22,8 @@ from cdpipe.model.types import KeyframeViews, PointMap
 # Simulated validation tunnels (`dynamic/null` 10001, `dynamic/narrow` 10006; `narrow` 10020 and 10021 with KISS-ICP's
 # poses), map points of 0.2 m. A person who walks 4 to 12 m leaves 410 to 920 points of the stricter kind together, bars
 # of railings and legs of chairs 27 at most. So maps of sessions in which nothing moves stay as they are.
-_LEAST_POINTS = 60
-_LINK_M = 0.4
+_LEAST_POINTS, _OF_CELLS_M = 60, 0.2
+_LINK_CELLS = 2.0
 # The stricter kind was seen through by so many keyframes, and so many times as many as hit it; the other by more.
 _STRICT_THROUGH, _STRICT_FACTOR, _LEAST_THROUGH = 3, 2, 2
 # Points are held against the keyframes around their block.
@@ -42,26 +42,27 @@ def drop_movers(point_map: PointMap) -> PointMap:
     """
     if point_map.views is None:
         raise ValueError("views is None: movers are told by the range images of the keyframes")
-    is_kept = ~find_movers(point_map.points, point_map.views)
+    is_kept = ~find_movers(point_map.points, point_map.views, point_map.voxel_m)
     if is_kept.all() or not is_kept.any():
         return point_map
     return _keep(point_map, is_kept)
 
 
-def find_movers(points_odom: Float64Array, views: KeyframeViews) -> BoolArray:
+def find_movers(points_odom: Float64Array, views: KeyframeViews, voxel_m: float) -> BoolArray:
     """Mark the (N,) points of movers.
 
     Args:
         points_odom: (N, 3) points of a session's map, its odom frame, metres.
         views: Range images of its keyframes.
+        voxel_m: Cell of the map, metres: smaller cells hold a surface in more points.
     """
     n_through, n_hit = _count(points_odom, views)
     is_mover = (n_through >= _LEAST_THROUGH) & (n_through > n_hit)
     is_strict = is_mover & (n_through >= _STRICT_THROUGH) & (n_through > _STRICT_FACTOR * n_hit)
     found = np.flatnonzero(is_mover)
-    labels, sizes = label_groups(points_odom[found], _LINK_M)
+    labels, sizes = label_groups(points_odom[found], _LINK_CELLS * voxel_m)
     n_strict = np.bincount(labels, is_strict[found], len(sizes))
-    is_mover[found] = n_strict[labels] >= _LEAST_POINTS
+    is_mover[found] = n_strict[labels] >= _LEAST_POINTS * (_OF_CELLS_M / voxel_m) ** 2
     return is_mover
 
 

@@ -39,7 +39,7 @@ def estimate_motion(
     deskewing is off, because it assumes revolutions without gaps. A single revolution gives a motion at rest.
 
     Args:
-        range_images: For each revolution the staggered ranges (H, W), millimetres, 0 for a miss.
+        range_images: For each revolution the staggered ranges (R, W), millimetres, R as in a session, 0 for a miss.
         sensor: Beam table.
         revolution_s: (S,) time of each middle column.
         column_s: (W,) time of each column after the middle one.

@@ -19,6 +19,7 @@ from sim.sensor.footprint import (
     blend_beams,
     cast_beams,
     central_echo,
+    choose_echo,
     drop_strongest,
     no_echo,
     spread_echo,
@@ -35,7 +36,7 @@ from sim.sensor.optics import (
     signal_channel,
 )
 from sim.sensor.rays import Rays
-from sim.sensor.water import Water, cross_water
+from sim.sensor.water import Water, cross_water, look_through_water
 
 MISS, FALSE_RETURN = -1, -2
 # A return belongs to an owner whose geoms reflected at least this share of its light; others are mixed. Surfaces that
@@ -129,13 +130,17 @@ def scan(
         echo = spread_echo(*surfaces, owners, settings.sub_rays)
     if water is not None:
         echo, other = cross_water(echo, rays, sensor.beam_origin_m, water)
-        second = None if second is None else stronger_echo(second, other)
+        if second is not None:
+            second = stronger_echo(look_through_water(second, rays, sensor.beam_origin_m, water), other)
     if air is not None:
         returns = stream(seed, session, "air-returns", str(number))
         if second is not None:
             second = dim_echo(second, rays, sensor.beam_origin_m, air)
         echo, other = cross_air(echo, rays, sensor.beam_origin_m, air, returns)
         second = None if second is None else stronger_echo(second, other)
+    if second is not None:  # what was the stronger one may have been dimmed more
+        is_stronger = second.photons > echo.photons
+        echo, second = choose_echo(is_stronger, second, echo), choose_echo(is_stronger, echo, second)
     parts = [_measure(echo, settings, (seed, session, ""), number)]
     if second is not None:
         parts = _arrange(parts[0], _measure(second, settings, (seed, session, "second-"), number))
@@ -149,6 +154,8 @@ def scan(
         first.geom.flat[pixels], first.range_m.flat[pixels], first.photons.flat[pixels] = (
             FALSE_RETURN, places_m, FALSE_PHOTONS
         )  # fmt: skip
+        for later in parts[1:]:
+            later.geom.flat[pixels], later.range_m.flat[pixels], later.photons.flat[pixels] = MISS, 0.0, 0.0
     geom, range_m, photons, true_range_m, owner, share = (
         np.concatenate([getattr(part, name).T for part in parts]) for name in _MEASURED
     )
@@ -213,7 +220,10 @@ def _arrange(first: _Return, second: _Return) -> list[_Return]:
     is_lone = (first.geom == MISS) & (second.geom != MISS)
     first, second = _choose(is_lone, second, first), _choose(is_lone, first, second)
     is_close = (second.geom != MISS) & (np.abs(second.range_m - first.range_m) < PULSE_M)
-    none = _Return(np.full_like(second.geom, MISS), *(np.zeros_like(getattr(second, name)) for name in _MEASURED[1:]))
+    dark = np.zeros_like(second.range_m)
+    none = _Return(
+        np.full_like(second.geom, MISS), dark, dark, np.full_like(dark, np.inf), second.owner, np.ones_like(dark)
+    )
     return [first, _choose(is_close, none, second)]
 
 

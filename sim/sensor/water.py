@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.core.geometry import Float32Array, Int64Array
+from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
 from sim.geometry.raycast import Caster
 from sim.placement.puddles import Pool
 from sim.sensor.footprint import Echo, choose_echo, no_echo
@@ -64,24 +64,14 @@ def cross_water(echo: Echo, rays: Rays, beam_origin_m: float, water: Water) -> t
     Returns:
         The stronger echo; and the other one of the beams that meet water, nothing for all other beams.
     """
-    height = rays.directions.shape[1]
-    reach_m = np.where(echo.geom >= 0, echo.range_m - np.float32(beam_origin_m), np.float32(np.inf)).ravel()
-    surface_m = _meet(rays, reach_m, water.pools)
-    wet = np.flatnonzero(surface_m < reach_m)
+    wet, start_m = _find_wet(echo, rays, beam_origin_m, water)
     if not len(wet):
         return echo, no_echo(echo)
-    way, start_m = rays.directions.reshape(-1, 3)[wet].astype(np.float64), surface_m[wet].astype(np.float64)
-    cosine = np.abs(way[:, 2])
-    share = mirrored_share(cosine)
-    # through the water to the floor and back
-    is_floor = np.isfinite(reach_m[wet])
-    depth_m = np.where(is_floor, reach_m[wet] - start_m, 0.0) * cosine
-    path_m = depth_m / np.sqrt(1.0 - (1.0 - cosine**2) / WATER_INDEX**2)
-    passed = (1.0 - share) ** 2 * np.exp(-2.0 * WATER_ABSORPTION_PER_M * path_m)
-    seems_m = np.where(is_floor, start_m + WATER_INDEX * path_m + beam_origin_m, 0.0)
-    floor = _replace(echo, wet, range_m=seems_m, photons=echo.photons.ravel()[wet] * passed)
+    way = rays.directions.reshape(-1, 3)[wet].astype(np.float64)
+    floor = _look_down(echo, wet, start_m, np.abs(way[:, 2]), beam_origin_m)
     # by way of the surface to what it mirrors and back
-    points = rays.origins[wet // height] + start_m[:, None] * way
+    share = mirrored_share(np.abs(way[:, 2]))
+    points = rays.origins[wet // rays.directions.shape[1]] + start_m[:, None] * way
     points[:, 2] += _OFF_SURFACE_M
     beyond_m, geom, facing = water.caster.cast(points, way * (1.0, 1.0, -1.0))
     is_met = geom >= 0
@@ -96,6 +86,40 @@ def cross_water(echo: Echo, rays: Rays, beam_origin_m: float, water: Water) -> t
     is_wet[wet] = True
     other = choose_echo(is_ghost, floor, ghost)
     return choose_echo(is_ghost, ghost, floor), choose_echo(is_wet.reshape(is_ghost.shape), other, no_echo(echo))
+
+
+def look_through_water(echo: Echo, rays: Rays, beam_origin_m: float, water: Water) -> Echo:
+    """Return an echo as it comes through the water that its beams meet before it. Arguments as of `cross_water`."""
+    wet, start_m = _find_wet(echo, rays, beam_origin_m, water)
+    cosine = np.abs(rays.directions.reshape(-1, 3)[wet, 2].astype(np.float64))
+    return _look_down(echo, wet, start_m, cosine, beam_origin_m) if len(wet) else echo
+
+
+def _find_wet(echo: Echo, rays: Rays, beam_origin_m: float, water: Water) -> tuple[Int64Array, Float64Array]:
+    """Return the flat numbers (M,) of the beams that meet water before their echo, and the distance (M,) to it."""
+    reach_m = np.where(echo.geom >= 0, echo.range_m - np.float32(beam_origin_m), np.float32(np.inf)).ravel()
+    surface_m = _meet(rays, reach_m, water.pools)
+    wet = np.flatnonzero(surface_m < reach_m)
+    return wet, surface_m[wet].astype(np.float64)
+
+
+def _look_down(echo: Echo, wet: Int64Array, start_m: Float64Array, cosine: Float64Array, beam_origin_m: float) -> Echo:
+    """Return the echo of what lies under the water of (M,) beams, which is weaker and seems deeper.
+
+    Args:
+        echo: The echo as if there were no water.
+        wet: Flat numbers of the beams.
+        start_m: (M,) distance to the surface.
+        cosine: (M,) of the incidence on it.
+        beam_origin_m: Distance of the rays' origins from the spin axis.
+    """
+    is_floor = echo.geom.ravel()[wet] >= 0
+    reach_m = echo.range_m.ravel()[wet].astype(np.float64) - beam_origin_m
+    depth_m = np.where(is_floor, reach_m - start_m, 0.0) * cosine
+    path_m = depth_m / np.sqrt(1.0 - (1.0 - cosine**2) / WATER_INDEX**2)
+    passed = (1.0 - mirrored_share(cosine)) ** 2 * np.exp(-2.0 * WATER_ABSORPTION_PER_M * path_m)
+    seems_m = np.where(is_floor, start_m + WATER_INDEX * path_m + beam_origin_m, 0.0)
+    return _replace(echo, wet, range_m=seems_m, photons=echo.photons.ravel()[wet] * passed)
 
 
 def _replace(echo: Echo, wet: Int64Array, **values: npt.ArrayLike) -> Echo:

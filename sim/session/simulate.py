@@ -228,7 +228,7 @@ def _simulate_revolutions(drive: Drive, pool: Executor) -> Generator[Revolution]
     try:
         for number in range(drive.trajectory.n_scans):
             ahead.append(pool.submit(simulate_revolution, drive, number))
-            if len(ahead) > CHUNK_SCANS:
+            if len(ahead) > _chunk_scans(drive):
                 yield ahead.popleft().result()
         while ahead:
             yield ahead.popleft().result()

@@ -165,7 +165,7 @@ def _add_switches(server: Any, view: View, handles: dict[str, Any]) -> None:
 
         def recolour(_event: Any) -> None:
             for cloud in view.clouds:
-                if choice.value not in cloud.colours:
+                if cloud.name.startswith("revolution/"):  # it may be another one by now
                     continue
                 handles[cloud.name].colors = cloud.colours[choice.value]
 
@@ -185,13 +185,16 @@ def _add_player(gui: Any, play: Play, handles: dict[str, Any]) -> None:
             handles[cloud.name].points = cloud.points
             handles[cloud.name].colors = next(iter(cloud.colours.values()))
 
-    def run(_event: Any) -> None:
-        while running.value:
-            share.value = 0.0 if share.value >= 1.0 else min(share.value + _STEP, 1.0)
-            time.sleep(_PAUSE_S)
+    turn = threading.Lock()
+
+    def run() -> None:
+        with turn:  # one at a time, however often the switch is turned
+            while running.value:
+                share.value = 0.0 if share.value >= 1.0 else min(share.value + _STEP, 1.0)
+                time.sleep(_PAUSE_S)
 
     share.on_update(move)
-    running.on_update(lambda event: threading.Thread(target=run, args=(event,), daemon=True).start())
+    running.on_update(lambda _event: threading.Thread(target=run, daemon=True).start())
 
 
 def _add_wall_switches(gui: Any, view: View, handles: dict[str, Any]) -> None:

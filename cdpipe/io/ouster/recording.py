@@ -6,7 +6,7 @@ Sources of the poses:
 - a TUM file of `odom_T_sensor` with stamps of the sensor's clock, interpolated to every column;
 - `kiss-icp`: one pose per revolution at its middle column, interpolated; the odom frame is the first sensor frame.
 
-Only the first return of a beam is kept. A missing column has no returns and an interpolated stamp and pose.
+Both returns of a beam are kept. A missing column has no returns and an interpolated stamp and pose.
 """
 
 from __future__ import annotations

@@ -22,9 +22,9 @@ from eval.tables.rows import records
 
 COLUMNS = (
     Column("n_observable", "observable changes", None, count),
-    *select(RESULT_COLUMNS, "region_recall", "region_recall_at_k", "region_auroc", "false_regions_per_100m",
-            "object_iou_point", "object_f1_50", "merge_error_m"),
-    Column("false_regions_on_movers_per_100m", "of these on movers", "low", share),
+    *select(RESULT_COLUMNS, "region_recall", "region_recall_at_k", "region_auroc", "false_regions_per_100m"),
+    Column("n_false_regions_on_movers", "false regions on movers", "low", share),
+    *select(RESULT_COLUMNS, "object_iou_point", "object_f1_50", "merge_error_m"),
 )  # fmt: skip
 _DRAWN = ("region_recall_at_k", "object_iou_point", "object_f1_50")
 _MINUS = "\u2212"

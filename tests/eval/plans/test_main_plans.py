@@ -47,9 +47,9 @@ def test_main_judges_at_the_radius_and_threshold_of_regions() -> None:
 def test_parts_takes_one_part_away_at_a_time() -> None:
     found = expand_cells(load_plan("parts"))
     assert {cell.variant for cell in found} == {
-        "tunnelcd", "tunnelcd[map.consistency=none,map.movers=keep]", "tunnelcd[map.consistency=scan-to-map]",
-        "tunnelcd[merge.refine=local]", "tunnelcd[sphere.frames=sensor]", "tunnelcd[extract.recentre=false]",
-        "tunnelcd[query.radius_m=4.5]",
+        "tunnelcd", "tunnelcd[map.consistency=none,map.movers=keep]",
+        "tunnelcd[map.consistency=scan-to-map,map.movers=keep]", "tunnelcd[merge.refine=local]",
+        "tunnelcd[sphere.frames=sensor]", "tunnelcd[extract.recentre=false]", "tunnelcd[query.radius_m=4.5]",
     }  # fmt: skip
     ours = next(cell.config for cell in found if cell.variant == "tunnelcd")
     # else a row would repeat the first

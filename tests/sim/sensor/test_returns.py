@@ -95,8 +95,12 @@ def test_noise_and_dropouts_of_both_returns_are_drawn_apart_and_false_returns_ar
     assert (first[second != MISS] != MISS).all()
     assert (first == FALSE_RETURN).any() and not (second == FALSE_RETURN).any()
     clean = seen(sensor, "dual").range_mm[sensor.height :]
-    both = (clean > 0) & (second != MISS)
-    assert (clean[both] != dual.range_mm[sensor.height :][both]).any()
+    both = (clean > 0) & (second != MISS) & ~is_promoted & (first == seen(sensor, "dual").geom[: sensor.height])
+    errors = [
+        dual.range_mm[rows][both].astype(np.int64) - seen(sensor, "dual").range_mm[rows][both]
+        for rows in (slice(0, sensor.height), slice(sensor.height, None))
+    ]
+    assert both.sum() > 10 and np.abs(np.corrcoef(*errors)[0, 1]) < 0.9
 
 
 def test_mist_and_the_wall_behind_it_are_both_reported(sensor: SensorMetadata) -> None:
@@ -106,9 +110,15 @@ def test_mist_and_the_wall_behind_it_are_both_reported(sensor: SensorMetadata) -
     is_air = first == AIR
     assert is_air.mean() > 0.02
     assert (second[is_air] >= 0).mean() > 0.9
-    is_reported = strongest.geom != MISS
-    np.testing.assert_array_equal(first[is_reported], strongest.geom[is_reported])
+    # with one return the groups of a beam are ranked before the air dims them: an edge in a hundred is another
+    is_other = (strongest.geom != MISS) & (first != strongest.geom)
+    assert is_other.mean() < 0.01
+    assert (dual.signal[: sensor.height][is_other] >= strongest.signal[is_other]).all()
     assert (last.geom == AIR).sum() < 0.2 * is_air.sum()
+    # what was the stronger one is dimmed more than what is nearer: they are ranked as they arrive
+    for visibility_m in (10.0, 15.0, 20.0, 60.0):
+        signals = np.split(seen(sensor, "dual", air=AirVolume(np.log(20) / visibility_m)).signal, 2)
+        assert (signals[1] <= signals[0]).all()
     # the wall is as dim as without a second return, and the mist before it weaker
     is_wall = (first >= 0) & (second == AIR)
     assert (

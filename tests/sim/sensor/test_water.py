@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,8 @@ from sim.sensor.water import (
     cross_water,
     mirrored_share,
 )
-from sim.session.simulate import simulate_pair
+from sim.session.revolution import simulate_revolution
+from sim.session.simulate import plan_drives, simulate_pair
 from sim.session.truth import read_labels
 from sim.view.view import view_scenario
 
@@ -113,6 +115,9 @@ def test_a_flat_beam_reports_what_the_water_mirrors_where_its_mirror_image_is(se
     # no beam changes that meets something before the water
     is_changed = (wet.range_m != dry.range_m) | (wet.photons != dry.photons)
     assert (rays.directions[is_changed][:, 2] < 0).all()
+    to_wall_m = dry.range_m - sensor.beam_origin_m
+    to_water_m = LEVEL_M / np.where(rays.directions[..., 2] < 0, rays.directions[..., 2], -1e-9)
+    assert (to_wall_m[is_changed] > to_water_m[is_changed]).all()
     assert np.isinf(wet.true_range_m[column, row]).all()
 
 
@@ -127,7 +132,11 @@ def test_only_beams_inside_the_pool_change_and_ghosts_are_labelled(sensor: Senso
     water = Water([lake()], scene.caster, scene.reflectivity)
     seen = scan(scene, sensor, Sensor(false_positives=False), rays, 1, "after", 0, water=water)
     assert (seen.geom == MIRRORED).sum() > 100
-    assert not seen.is_mixed.any() and (seen.owner == 0).all()
+    both = scan(scene, sensor, Sensor(false_positives=False, returns="dual"), rays, 1, "after", 0, water=water)
+    first, second = np.split(both.geom, 2)
+    # a beam that meets water has the floor and the ghost, whichever is the stronger
+    assert ((first == 0) & (second == MIRRORED)).sum() > 100 < ((first == MIRRORED) & (second == 0)).sum()
+    assert (both.signal[sensor.height :] <= both.signal[: sensor.height]).all()
 
 
 PUDDLES = [
@@ -178,6 +187,25 @@ def test_a_session_without_puddles_keeps_its_bytes_and_ghosts_are_no_change(tmp_
     instance, change = (np.concatenate([part.ravel() for part in parts]) for parts in zip(*labels, strict=True))
     assert (instance == MIRRORED).sum() > 50
     assert (change == 0).all()
+
+
+def test_the_ghost_of_a_changed_prop_is_no_part_of_the_change(tmp_path: Path) -> None:
+    scenario = load_scenario("smoke/one_box", 3)
+    (box,) = [prop for prop in scenario.props if prop.change == "added"]
+    world = build_world(scenario, 3)
+    (place,) = [item.world_T_object[:3, 3] for item in world.standing if item.prop.name == box.name]
+    wet = scenario.model_copy(update={"sensor": scenario.sensor.model_copy(update={"mode": "1024x10"})})
+    drive = plan_drives(wet, 3)[1]
+    pool = Pool("p", place + np.array([0.0, 0.0, 0.02]), 3.0)
+    dry, water = (
+        [simulate_revolution(replace(drive, water=each), number) for number in range(0, drive.trajectory.n_scans, 4)]
+        for each in (None, Water((pool,), drive.scene.caster, drive.scene.reflectivity))
+    )
+    n_ghosts = sum((each.instance == MIRRORED).sum() for each in water)
+    assert n_ghosts > 100
+    for one, other in zip(dry, water, strict=True):
+        assert not other.change[other.instance == MIRRORED].any()
+        assert other.change.astype(bool).sum() <= one.change.astype(bool).sum()
 
 
 @pytest.mark.parametrize(
