@@ -47,6 +47,9 @@ _IN_ANY_AIR = _Rule(16, 0.1, 0.02, may_lie_between=True)
 _IN_DUST = _Rule(24, 0.05, 0.01, may_lie_between=False)
 
 
+LiesOnSurface = Callable[[PosedScan, npt.NDArray[np.int64]], BoolArray]
+
+
 class ClearScans(WrappedScans):
     """A session without the returns of mist and dust; a scan of clear air is as recorded.
 
@@ -54,8 +57,10 @@ class ClearScans(WrappedScans):
         has_dropped: Whether any scan that was read so far had such returns.
     """
 
-    def __init__(self, source: ScanSource) -> None:
+    def __init__(self, source: ScanSource, lies_on_surface: LiesOnSurface | None = None) -> None:
+        """Take a session, and what `drop_airborne` takes."""
         super().__init__(source)
+        self._lies_on_surface = lies_on_surface
         self.has_dropped = False
 
     def scan(self, index: int) -> PosedScan:
@@ -66,50 +71,37 @@ class ClearScans(WrappedScans):
         """Read all scans in order."""
         return map(self._cleared, super().scans())
 
-    def supported_by(self, point_map: PointMap) -> SupportedScans:
-        """Return the session with the returns that lie where its map, made without them, has a surface."""
-        return SupportedScans(self._source, point_map)
+    def supported_by(self, point_map: PointMap) -> ClearScans:
+        """Return the session with the returns that lie where its map, made without them, has a surface.
+
+        Small things a few metres away send back little more light than the air in front of them, and their neighbours
+        do not agree: many of their returns look airborne. But a few returns of a place are kept in other scans; air is
+        not met in one place again.
+        """
+        return ClearScans(self._source, _surface_of(point_map))
 
     def _cleared(self, scan: PosedScan) -> PosedScan:
-        cleared = drop_airborne(scan)
+        cleared = drop_airborne(scan, self._lies_on_surface)
         self.has_dropped |= cleared is not scan
         return cleared
 
 
-class SupportedScans(WrappedScans):
-    """A session without the returns of mist and dust but for those where its map has a surface.
+def _surface_of(point_map: PointMap) -> LiesOnSurface:
+    """Return what tells the returns in those cells of a map that hold three returns and more."""
+    n_returns = np.zeros(len(point_map.points), dtype=np.int64)
+    for start in range(0, len(point_map.return_points), _BLOCK_RETURNS):  # their file may not fit into memory
+        own = point_map.return_points[start : start + _BLOCK_RETURNS]
+        n_returns += np.bincount(own, minlength=len(n_returns))
+    poses, cell_m = point_map.odom_T_sensor, point_map.voxel_m
+    surface = np.unique(cell_keys(point_map.points[n_returns >= _SURFACE_RETURNS], cell_m))
 
-    Small things a few metres away send back little more light than the air in front of them, and their neighbours do
-    not agree: many of their returns look airborne. But a few returns of a place are kept in other scans; air is not
-    met in one place again.
-    """
+    def lies_on_surface(scan: PosedScan, chosen: npt.NDArray[np.int64]) -> BoolArray:
+        if not len(surface):
+            return np.zeros(len(chosen), dtype=np.bool_)
+        keys = cell_keys(transform(poses[scan.index], scan.points_sensor[chosen]), cell_m)
+        return np.asarray(surface[np.minimum(np.searchsorted(surface, keys), len(surface) - 1)] == keys)
 
-    def __init__(self, source: ScanSource, point_map: PointMap) -> None:
-        super().__init__(source)
-        n_returns = np.zeros(len(point_map.points), dtype=np.int64)
-        for start in range(0, len(point_map.return_points), _BLOCK_RETURNS):  # their file may not fit into memory
-            own = point_map.return_points[start : start + _BLOCK_RETURNS]
-            n_returns += np.bincount(own, minlength=len(n_returns))
-        surface = point_map.points[n_returns >= _SURFACE_RETURNS]
-        self._poses, self._cell_m = point_map.odom_T_sensor, point_map.voxel_m
-        self._keys = np.unique(cell_keys(surface, self._cell_m))
-
-    def scan(self, index: int) -> PosedScan:
-        """Read one scan."""
-        return self._cleared(super().scan(index))
-
-    def scans(self) -> Iterator[PosedScan]:
-        """Read all scans in order."""
-        return map(self._cleared, super().scans())
-
-    def _cleared(self, scan: PosedScan) -> PosedScan:
-        return drop_airborne(scan, self._lies_on_surface)
-
-    def _lies_on_surface(self, scan: PosedScan, chosen: npt.NDArray[np.int64]) -> BoolArray:
-        """Tell which (C,) chosen returns lie in a cell of the surface."""
-        keys = cell_keys(transform(self._poses[scan.index], scan.points_sensor[chosen]), self._cell_m)
-        places = np.minimum(np.searchsorted(self._keys, keys), max(len(self._keys) - 1, 0))
-        return self._keys[places] == keys if len(self._keys) else np.zeros(len(keys), dtype=np.bool_)
+    return lies_on_surface
 
 
 def clear(source: ScanSource, config: MapConfig) -> ScanSource:
@@ -117,9 +109,7 @@ def clear(source: ScanSource, config: MapConfig) -> ScanSource:
     return ClearScans(source) if config.airborne == "drop" else source
 
 
-def drop_airborne(
-    scan: PosedScan, lies_on_surface: Callable[[PosedScan, npt.NDArray[np.int64]], BoolArray] | None = None
-) -> PosedScan:
+def drop_airborne(scan: PosedScan, lies_on_surface: LiesOnSurface | None = None) -> PosedScan:
     """Return a scan without the returns of mist and dust, if it is dusty; else the scan.
 
     It is dusty if more than one return in a hundred looks airborne. Without the sensor's signal nobody can tell.

@@ -101,10 +101,9 @@ class SensorMetadata:
             raise ValueError(
                 f"ranges_m must be (..., {self.height} or {2 * self.height}, {self.width}), got {ranges_m.shape}"
             )
-        origins, directions = self.origins, self.directions
         if rows != self.height:
-            origins, directions = np.concatenate([origins, origins]), np.concatenate([directions, directions])
-        return np.asarray(origins + (ranges_m[..., None] - self.beam_origin_m) * directions, dtype=np.float64)
+            return np.concatenate([self.project(part) for part in np.split(ranges_m, 2, axis=-2)], axis=-3)
+        return np.asarray(self.origins + (ranges_m[..., None] - self.beam_origin_m) * self.directions, dtype=np.float64)
 
     def column_offsets_ns(self) -> Float64Array:
         """Return the (W,) time of each column after the start of its revolution, nanoseconds."""

@@ -23,14 +23,12 @@ class Pool:
     """A level disc of water, of which only the part above the floor is seen.
 
     Attributes:
-        name: Name of the puddle.
+        puddle: The puddle.
         centre: (3,) its middle at the level of the water, world frame, metres.
-        radius_m: Its radius.
     """
 
-    name: str
+    puddle: Puddle
     centre: Float64Array
-    radius_m: float
 
 
 def lay_puddles(scenario: Scenario, centreline: Centreline, walls: Caster, session: str, seed: int) -> tuple[Pool, ...]:
@@ -68,7 +66,7 @@ def _lay(puddle: Puddle, scenario: Scenario, centreline: Centreline, walls: Cast
     if not is_near.any():
         raise ScenarioError(f"puddle {puddle.name!r}: there is no floor {spot.where}: give it another place")
     middle[2] = float(floor_m[is_near].min()) + puddle.depth_m
-    return Pool(puddle.name, middle, puddle.radius_m)
+    return Pool(puddle, middle)
 
 
 def _find_spot(

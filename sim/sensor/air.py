@@ -7,11 +7,12 @@ ratio. So both go through the sensor's own photon budget (`sim.sensor.optics.rec
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cdpipe.core.geometry import Float32Array, Float64Array, stream
+from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, stream
 from scenarios.schema import Air, Dust
 from sim.geometry.noise import smooth_noise
 from sim.sensor.footprint import PULSE_M, Echo, choose_echo, no_echo
@@ -128,6 +129,44 @@ def cross_air(
     reach_m = np.where(echo.geom != -1, echo.range_m - np.float32(beam_origin_m), np.float32(REACH_M)).ravel()
     depth, best, best_m = (np.zeros(n_pixels, np.float32) for _ in range(3))
     within = generator.random(n_pixels, dtype=np.float32)
+    for step in _walk(reach_m, rays, air):
+        half = step.alpha * step.length_m * np.float32(0.5)
+        depth[step.on_way] += half
+        if step.start_m < REACH_M:
+            noise = generator.standard_normal(n_pixels, dtype=np.float32)[step.on_way]
+            power = np.float32(np.pi) * step.beta * step.length_m * np.exp(-2 * depth[step.on_way])
+            counted = _count(received_photons(power, step.middle_m + np.float32(beam_origin_m)), noise)
+            is_better = counted > best[step.on_way]
+            better = step.on_way[is_better]
+            best[better] = counted[is_better]
+            best_m[better] = step.start_m + within[better] * step.length_m[is_better]
+        depth[step.on_way] += half
+    return _rank(echo, depth, best, best_m + np.float32(beam_origin_m))
+
+
+def dim_echo(echo: Echo, rays: Rays, beam_origin_m: float, air: AirVolume) -> Echo:
+    """Return an echo as it comes through the air, which sends nothing back itself."""
+    reach_m = np.where(echo.geom != -1, echo.range_m - np.float32(beam_origin_m), np.float32(0.0)).ravel()
+    depth = np.zeros(len(reach_m), np.float32)
+    for step in _walk(reach_m, rays, air):
+        depth[step.on_way] += step.alpha * step.length_m
+    return replace(echo, photons=echo.photons * np.exp(-2 * depth).reshape(echo.range_m.shape))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Step:
+    """The air that the (M,) beams `on_way` cross between `start_m` and a pulse farther, or up to what they meet."""
+
+    start_m: np.float32
+    on_way: Int64Array
+    length_m: Float32Array
+    middle_m: Float32Array
+    alpha: Float32Array
+    beta: Float32Array
+
+
+def _walk(reach_m: Float32Array, rays: Rays, air: AirVolume) -> Iterator[_Step]:
+    """Yield the air along all beams, one pulse after the other, up to the reach (N,) of each."""
     ways = rays.directions.reshape(-1, 3).T
     origins = np.repeat(rays.origins.T, rays.directions.shape[1], axis=1).astype(np.float32)
     for number in range(int(np.ceil(reach_m.max(initial=0.0) / PULSE_M))):
@@ -136,32 +175,7 @@ def cross_air(
         length_m = np.minimum(reach_m[on_way] - start_m, np.float32(PULSE_M))
         middle_m = start_m + length_m * np.float32(0.5)
         alpha, beta = air.extinction(origins[:, on_way] + ways[:, on_way] * middle_m)
-        half = alpha * length_m * np.float32(0.5)
-        depth[on_way] += half
-        if start_m < REACH_M:
-            noise = generator.standard_normal(n_pixels, dtype=np.float32)[on_way]
-            power = np.float32(np.pi) * beta * length_m * np.exp(-2 * depth[on_way])
-            counted = _count(received_photons(power, middle_m + np.float32(beam_origin_m)), noise)
-            is_better = counted > best[on_way]
-            better = on_way[is_better]
-            best[better], best_m[better] = counted[is_better], start_m + within[better] * length_m[is_better]
-        depth[on_way] += half
-    return _rank(echo, depth, best, best_m + np.float32(beam_origin_m))
-
-
-def dim_echo(echo: Echo, rays: Rays, beam_origin_m: float, air: AirVolume) -> Echo:
-    """Return an echo as it comes through the air, which sends nothing back itself."""
-    reach_m = np.where(echo.geom != -1, echo.range_m - np.float32(beam_origin_m), np.float32(0.0)).ravel()
-    depth = np.zeros(len(reach_m), np.float32)
-    ways = rays.directions.reshape(-1, 3).T
-    origins = np.repeat(rays.origins.T, rays.directions.shape[1], axis=1).astype(np.float32)
-    for number in range(int(np.ceil(reach_m.max(initial=0.0) / PULSE_M))):
-        start_m = np.float32(number * PULSE_M)
-        on_way = np.flatnonzero(reach_m > start_m)
-        length_m = np.minimum(reach_m[on_way] - start_m, np.float32(PULSE_M))
-        middle_m = start_m + length_m * np.float32(0.5)
-        depth[on_way] += air.extinction(origins[:, on_way] + ways[:, on_way] * middle_m)[0] * length_m
-    return replace(echo, photons=echo.photons * np.exp(-2 * depth).reshape(echo.range_m.shape))
+        yield _Step(start_m, on_way, length_m, middle_m, alpha, beta)
 
 
 def _count(photons: Float32Array, noise: Float32Array) -> Float32Array:

@@ -144,6 +144,6 @@ def _meet(rays: Rays, reach_m: Float32Array, pools: Sequence[Pool]) -> Float32Ar
         may = np.flatnonzero((slope < 0).ravel() & (level_m.ravel() > 0) & (level_m.ravel() < surface_m))
         column = may // height
         off = rays.directions.reshape(-1, 3)[may, :2] * level_m.ravel()[may, None] - towards[column, :2]
-        inside = may[(off * off).sum(axis=1) <= pool.radius_m**2]
+        inside = may[(off * off).sum(axis=1) <= pool.puddle.radius_m**2]
         surface_m[inside] = level_m.ravel()[inside]
     return surface_m

@@ -321,20 +321,15 @@ def _puddle_surfaces(world: World, scenario: Scenario, seed: int) -> list[Surfac
     Raises:
         ScenarioError: There is no floor under a puddle.
     """
+    turn = np.linspace(0.0, 2 * np.pi, _SHEET_CORNERS, endpoint=False)
+    rim, corners = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(_SHEET_CORNERS)]), np.arange(_SHEET_CORNERS)
+    faces = np.column_stack([np.zeros_like(corners), 1 + corners, 1 + np.roll(corners, -1)]).astype(np.int32)
     sheets = {}
     for session in SESSIONS:
-        for puddle, pool in zip(
-            [each for each in scenario.puddles if each.sessions in ("both", session)],
-            lay_puddles(scenario, world.centreline, world.walls, session, seed),
-            strict=True,
-        ):
-            where = "" if puddle.sessions == "both" else f" ({puddle.sessions})"
-            turn = np.linspace(0.0, 2 * np.pi, _SHEET_CORNERS, endpoint=False)
-            rim = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(_SHEET_CORNERS)])
-            corners = np.arange(_SHEET_CORNERS)
-            faces = np.column_stack([np.zeros_like(corners), 1 + corners, 1 + np.roll(corners, -1)])
-            mesh = Mesh(np.concatenate([[pool.centre], pool.centre + pool.radius_m * rim]), faces.astype(np.int32))
-            sheets[f"puddles/{pool.name}{where}"] = mesh
+        for pool in lay_puddles(scenario, world.centreline, world.walls, session, seed):
+            where = "" if pool.puddle.sessions == "both" else f" ({session})"
+            outline = pool.centre + pool.puddle.radius_m * rim
+            sheets[f"puddles/{pool.puddle.name}{where}"] = Mesh(np.concatenate([[pool.centre], outline]), faces)
     return [Surface(name, mesh, _WATER_RGB) for name, mesh in sheets.items()]
 
 

@@ -12,7 +12,7 @@ from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios import load_scenario
-from scenarios.schema import Sensor
+from scenarios.schema import Puddle, Sensor
 from sim.geometry.mesh import Mesh, box_mesh
 from sim.geometry.raycast import Caster
 from sim.placement.puddles import Pool, lay_puddles
@@ -57,8 +57,10 @@ def echoes(sensor: SensorMetadata, *pools: Pool) -> tuple[Rays, Echo, Echo]:
     return rays, dry, cross_water(dry, rays, sensor.beam_origin_m, Water(pools, scene.caster, scene.reflectivity))[0]
 
 
-def lake(radius_m: float = 30.0) -> Pool:
-    return Pool("lake", np.array([0.0, 0.0, LEVEL_M]), radius_m)
+def lake() -> list[Pool]:
+    """Four puddles that cover the floor of the room."""
+    puddle, corners = Puddle(name="lake", radius_m=10), [(x, y, LEVEL_M) for x in (-7.0, 7.0) for y in (-7.0, 7.0)]
+    return [Pool(puddle, np.array(corner)) for corner in corners]
 
 
 def test_the_mirrored_share_is_fresnels() -> None:
@@ -78,7 +80,7 @@ def test_the_mirrored_share_is_fresnels() -> None:
 
 
 def test_the_floor_under_water_is_weak_and_seems_deeper(sensor: SensorMetadata) -> None:
-    rays, dry, wet = echoes(sensor, lake())
+    rays, dry, wet = echoes(sensor, *lake())
     steep = np.argwhere((wet.geom == 0) & (rays.directions[..., 2] < -0.3))
     assert len(steep) > 1000
     for column, row in steep[::199].tolist():
@@ -91,7 +93,7 @@ def test_the_floor_under_water_is_weak_and_seems_deeper(sensor: SensorMetadata) 
 
 
 def test_a_flat_beam_reports_what_the_water_mirrors_where_its_mirror_image_is(sensor: SensorMetadata) -> None:
-    rays, dry, wet = echoes(sensor, lake())
+    rays, dry, wet = echoes(sensor, *lake())
     ghosts = np.argwhere(wet.geom == MIRRORED)
     assert len(ghosts) > 300
     column, row = ghosts.T
@@ -122,14 +124,14 @@ def test_a_flat_beam_reports_what_the_water_mirrors_where_its_mirror_image_is(se
 
 
 def test_only_beams_inside_the_pool_change_and_ghosts_are_labelled(sensor: SensorMetadata) -> None:
-    pool = Pool("p", np.array([4.0, 1.0, LEVEL_M]), 1.0)
+    pool = Pool(Puddle(name="p", radius_m=1), np.array([4.0, 1.0, LEVEL_M]))
     rays, dry, wet = echoes(sensor, pool)
     column, row = np.nonzero(wet.photons != dry.photons)
     points = rays.points(row, column, (LEVEL_M / rays.directions[column, row, 2]).astype(np.float64))
     assert len(points) > 15
     assert (np.hypot(*(points[:, :2] - pool.centre[:2]).T) < 1.01).all()
     scene = room()
-    water = Water([lake()], scene.caster, scene.reflectivity)
+    water = Water(lake(), scene.caster, scene.reflectivity)
     seen = scan(scene, sensor, Sensor(false_positives=False), rays, 1, "after", 0, water=water)
     assert (seen.geom == MIRRORED).sum() > 100
     both = scan(scene, sensor, Sensor(false_positives=False, returns="dual"), rays, 1, "after", 0, water=water)
@@ -159,10 +161,10 @@ def test_a_puddle_covers_the_lowest_part_of_the_floor_around_it() -> None:
     scenario = load_scenario("smoke/unchanged", 3, with_puddles())
     world = build_world(scenario, 3)
     before, after = (lay_puddles(scenario, world.centreline, world.walls, name, 3) for name in ("before", "after"))
-    assert [pool.name for pool in before] == ["both"] and [pool.name for pool in after] == ["both", "new"]
+    assert [pool.puddle.name for pool in before] == ["both"] and [pool.puddle.name for pool in after] == ["both", "new"]
     assert np.array_equal(before[0].centre, after[0].centre)
     for pool in after:
-        above = pool.centre + np.column_stack([_disc(pool.radius_m), np.full(256, 0.5)])
+        above = pool.centre + np.column_stack([_disc(pool.puddle.radius_m), np.full(256, 0.5)])
         above_m, _, _ = world.walls.cast(above, (0.0, 0.0, -1.0))
         depths_m = above_m[np.isfinite(above_m)] - 0.5
         assert 0.03 < depths_m.max() < 0.055  # 0.05 m where the floor is lowest
@@ -196,7 +198,7 @@ def test_the_ghost_of_a_changed_prop_is_no_part_of_the_change(tmp_path: Path) ->
     (place,) = [item.world_T_object[:3, 3] for item in world.standing if item.prop.name == box.name]
     wet = scenario.model_copy(update={"sensor": scenario.sensor.model_copy(update={"mode": "1024x10"})})
     drive = plan_drives(wet, 3)[1]
-    pool = Pool("p", place + np.array([0.0, 0.0, 0.02]), 3.0)
+    pool = Pool(Puddle(name="p", radius_m=3), place + np.array([0.0, 0.0, 0.02]))
     dry, water = (
         [simulate_revolution(replace(drive, water=each), number) for number in range(0, drive.trajectory.n_scans, 4)]
         for each in (None, Water((pool,), drive.scene.caster, drive.scene.reflectivity))

@@ -174,3 +174,22 @@ def test_a_row_for_each_setting_and_a_mark_with_its_interval_for_each_variant() 
     assert ours.y[0] < theirs.y[0] < first.y.span[0]
     assert first.y.span[1] == 0.0
     assert picture(drawing).axes[0].get_ylim() == first.y.span
+
+
+def test_a_family_with_movers_shows_false_regions_on_them_beside_its_clean_twin(tmp_path: Path) -> None:
+    rows = [
+        {**row, "n_false_regions_on_movers": n, "false_regions_per_100m": 0.5 * n}
+        for world, numbers in (("unchanged/narrow", [0] * 6), ("dynamic/null", [2, 1, 1, 2, 1, 2]))
+        for row, n in zip(rows_of(world, "ours", [NAN] * 6, unchanged=True), numbers, strict=True)
+    ]
+    pd.DataFrame(rows).to_csv(tmp_path / "results.csv", index=False)
+    data = read_run(tmp_path)
+    (shown,) = draw_effects(data)
+    assert shown.reference == "unchanged/narrow"
+    at = shown.table.headings.index("false regions on movers")
+    assert shown.table.headings[at - 1] == "false regions / 100 m"
+    (_, plain), (_, moving) = shown.table.rows
+    assert moving[0].text == "dynamic/null"
+    assert (plain[at].text, moving[at].text, moving[at - 1].text) == ("0.00", "+1.50", "+0.75")
+    # tables of regions have a row for each of both
+    assert scenarios(data, unchanged=True) == ["unchanged/narrow", "dynamic/null"]
