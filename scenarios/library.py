@@ -21,6 +21,9 @@ from scenarios.schema import PROP_KINDS, Prop, Scenario, source_of
 
 CHECKED_SEEDS = range(8)
 SUFFIXES = (".yaml", ".yml")
+# A part of the scenario, or of a session, and what is wrong with it: value and rule.
+_OF_SCENARIO = re.compile(r": (sensor|platform)\.[\w.]+( = .*)")
+_OF_SESSION = re.compile(r": (?:before|after)\.(sensor|platform)( = .*)")
 _ITEM = re.compile(r"\b[a-z_]+\.\d+\b")
 
 
@@ -88,7 +91,7 @@ def _draw_scenario(document: Document, seed: int) -> tuple[Scenario | None, list
     try:
         scenario = validate(Scenario, replace(place, value=tree))
     except InputError as error:
-        mistakes += _drop_repeated(str(error).splitlines(), drawn.broken, references)
+        mistakes += _drop_inherited(_drop_repeated(str(error).splitlines(), drawn.broken, references))
         return None, _tell_copies_once(mistakes, drawn.origins)
     mistakes += [_format_mistake(place, key, rule) for key, rule in find_contradictions(scenario)]
     mistakes = _tell_copies_once(mistakes, drawn.origins)
@@ -163,6 +166,13 @@ def _tell_copies_once(lines: list[str], origins: Mapping[Key, Key]) -> list[str]
     first_of = {join_key(place): firsts[source] for place, source in origins.items() if source in firsts}
     told = [_ITEM.sub(lambda found: first_of.get(found[0], found[0]), line) for line in lines]
     return list(dict.fromkeys(told))
+
+
+def _drop_inherited(lines: list[str]) -> list[str]:
+    """Drop the mistakes of a session's own sensor or platform in keys that it has from the scenario's."""
+    of_scenario = {found[1] + found[2] for line in lines if (found := _OF_SCENARIO.search(line))}
+    inherited = ((line, _OF_SESSION.search(line)) for line in lines)
+    return [line for line, found in inherited if found is None or found[1] + found[2] not in of_scenario]
 
 
 def _drop_repeated(lines: list[str], broken: set[Key], told: list[Mistake]) -> list[str]:

@@ -101,6 +101,15 @@ def test_a_mistake_in_a_sessions_own_part_is_named_there(settings: list[str], ru
         assert ": sensor." not in line and ": platform." not in line
 
 
+def test_a_mistake_of_the_scenarios_part_is_not_told_again_of_the_session_that_has_it_from_there() -> None:
+    wrong = ["sensor.returns=both", "platform.track_m=-1"]
+    own = ["after.sensor.profile=os0-32-nominal", "before.platform.wheelbase_m=1", "after.sensor.min_range_m=-2"]
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario("smoke/one_box", 3, [*wrong, *own])
+    keys = [line.split(" = ")[0] for line in str(caught.value).splitlines()]
+    assert sorted(keys) == ["--set: after.sensor.min_range_m", "--set: platform.track_m", "--set: sensor.returns"]
+
+
 def test_the_file_of_a_sessions_own_profile_counts(tmp_path: Path) -> None:
     source = Path(cdpipe.__file__).parent / "sensor" / "profiles" / "os1-32-g.json"
     own = tmp_path / "own.json"
