@@ -153,21 +153,31 @@ def _drawing(own: pd.DataFrame, words: str) -> Drawing:
             x = Axis(title, log_span(points["x"], 4.0, 1.6), is_log=True)
             y = Axis("" if row else words, (-0.06, 1.12))
             line = Series(best["x"], best["quality_value"], _FRONT, style="steps")
-            series = [line, *(_series(point, names, title) for point in records(points))]
+            labels = _name_best(records(best), has_legend=len(names) <= _MAX_IN_LEGEND)
+            named = [(point, labels.get(str(point["variant"]), "")) for point in records(points)]
+            series = [line, *(_series(point, label, names, title) for point, label in named)]
             row.append(Panel(x, y, series, f"{domain_name(str(domain))}, {n_pairs} pairs"))
         rows.append(row)
     return Drawing(rows, 300)
 
 
-def _series(point: dict[str, Any], names: Sequence[str], title: str) -> Series:
-    """Return one method, with a legend where it has room; without one the front alone is named, beside its points."""
+def _name_best(best: Sequence[dict[str, Any]], *, has_legend: bool) -> dict[str, str]:
+    """Return the label of each method on the front; methods at one place share that of the first."""
+    places: dict[tuple[float, float], list[str]] = {}
+    for point in best:
+        # a name with settings is as long as the panel is wide; the legend has it
+        if not (has_legend and "[" in str(point["variant"])):
+            places.setdefault((point["x"], point["quality_value"]), []).append(str(point["variant"]))
+    return {together[0]: ", ".join(together) for together in places.values()}
+
+
+def _series(point: dict[str, Any], label: str, names: Sequence[str], title: str) -> Series:
+    """Return one method with its label, and with a legend where that has room; without one the front is black."""
     name, is_best = str(point["variant"]), bool(point["is_on_front"])
     has_legend, place = len(names) <= _MAX_IN_LEGEND, names.index(name)
     colour = look_of(name, names).colour if has_legend else BLACK if is_best else _GREY
     marker = SYMBOLS[place % len(SYMBOLS)] if has_legend else "circle"
     interval = f"95 %: {point['low']:.3f} to {point['high']:.3f}, n {point['n_quality']}"
-    # a name with settings is as long as the panel is wide; the legend has it
-    label = name if is_best and not (has_legend and "[" in name) else ""
     return Series(
         [point["x"]], [point["quality_value"]], Look(colour, 0.0, marker=marker, is_hollow=not point["competes"]),
         name if has_legend else "", low=[point["low"]], high=[point["high"]], labels=[label],

@@ -122,3 +122,10 @@ def test_the_picture_names_the_front(tmp_path: Path) -> None:
     assert "beside other work" not in front_text
     (busy,) = draw_pareto(pareto_table(run(tmp_path, methods)), is_contended=True)
     assert busy.caption.endswith("Times were measured beside other work.")
+
+
+def test_methods_at_one_place_share_a_label(tmp_path: Path) -> None:
+    methods = {"tunnelcd": (0.9, 3.0, 5.0), "paper": (0.3, 1.0, 2.0), "untrained": (0.3, 1.0, 2.0)}
+    (chart,) = draw_pareto(pareto_table(run(tmp_path, methods)))
+    labels = [text for trace in plotly_figure(chart.drawing)["data"] for text in trace.get("text", ()) if text]
+    assert labels == ["<b>tunnelcd</b>", "<b>paper, untrained</b>"] * 2
