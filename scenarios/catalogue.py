@@ -18,7 +18,7 @@ from scenarios.schema import PROP_KINDS, PropFile
 
 FAMILIES = Path(__file__).parent / "families"
 # Groups of families of which each is another one, seed by seed, but for one effect of a mine.
-EFFECT_GROUPS = frozenset({"cross", "dust", "dynamic", "water"})
+EFFECT_GROUPS = frozenset({"cross", "dust", "dynamic", "glare", "water"})
 
 
 def scenario_names() -> list[str]:

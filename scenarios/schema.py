@@ -27,6 +27,22 @@ PropKind = Literal[
 PROP_KINDS: tuple[str, ...] = get_args(PropKind)
 
 
+class Lean(Settings):
+    """Settings that leave keys added later out of their dump while these have their defaults.
+
+    So the truth of an older scenario keeps its bytes.
+    """
+
+    _LATER: ClassVar[frozenset[str]] = frozenset()
+
+    @model_serializer(mode="wrap")
+    def _leave_out(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields = type(self).model_fields
+        dumped: dict[str, Any] = handler(self)
+        is_later = {key: key in self._LATER and getattr(self, key) == fields[key].default for key in dumped}
+        return {key: value for key, value in dumped.items() if not is_later[key]}
+
+
 class Section(Settings):
     """Cross-section of a drift at its nominal size; in a foreign mesh about how wide and high its drifts are."""
 
@@ -128,14 +144,26 @@ class Screen(Settings):
     opening_m: Positive = 0.1
 
 
-class Furniture(Settings):
+class Markers(Settings):
+    """Plates of retroreflecting sheet, flat along one wall of every drift, as chainage is marked."""
+
+    every_m: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 10.0
+    size_m: Positive = 0.3
+    side: Side = "left"
+    height_share: Share = 0.3  # of the drift's height
+
+
+class Furniture(Lean):
     """What is fixed to the rock in both sessions and must never count as a change."""
+
+    _LATER: ClassVar[frozenset[str]] = frozenset({"markers"})
 
     pipes: tuple[Pipe, ...] = ()
     ducts: tuple[Duct, ...] = ()
     cable_trays: tuple[CableTray, ...] = ()
     bolts: Bolts | None = None
     screen: Screen | None = None
+    markers: Markers | None = None
 
 
 class MeshFile(Settings):
@@ -220,22 +248,6 @@ class Shift(Settings):
     turn_deg: Finite = 0.0
 
 
-class Lean(Settings):
-    """Settings that leave keys added later out of their dump while these have their defaults.
-
-    So the truth of an older scenario keeps its bytes.
-    """
-
-    _LATER: ClassVar[frozenset[str]] = frozenset()
-
-    @model_serializer(mode="wrap")
-    def _leave_out(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        fields = type(self).model_fields
-        dumped: dict[str, Any] = handler(self)
-        is_later = {key: key in self._LATER and getattr(self, key) == fields[key].default for key in dumped}
-        return {key: value for key, value in dumped.items() if not is_later[key]}
-
-
 class Aged(Settings):
     """What time did to a prop that nobody touched: in the after session it stands a little otherwise; no change.
 
@@ -300,7 +312,7 @@ class Sensor(Lean):
     Every effect is a switch, so its influence on a result can be measured. sim/sensor/SENSOR.md names the constants.
     """
 
-    _LATER: ClassVar[frozenset[str]] = frozenset({"returns"})
+    _LATER: ClassVar[frozenset[str]] = frozenset({"returns", "retroreflectors", "glass"})
 
     profile: str = "os1-32-nominal"
     mode: Annotated[str, Field(pattern=r"^\d+x\d+$")] = "1024x10"
@@ -310,6 +322,8 @@ class Sensor(Lean):
     returns: Literal["strongest", "last", "dual"] = "strongest"  # of the echoes of a beam; dual: the two strongest
     sub_rays: Literal[1, 7, 19] = 1  # rays over each beam's width; 1: no divergence, no mixed pixels at edges
     false_positives: bool = True  # returns where nothing is
+    retroreflectors: bool = False  # reflecting bands and plates are dazzling; off: they are white
+    glass: bool = False  # panes let light through and mirror it; off: they are dark walls
     range_step_mm: Literal[1, 8] = 1  # 8: the vendor's low-bandwidth packets
     max_range_m: Annotated[float, Field(gt=0, le=524)] = 120.0  # the vendor's range field: 19 bits of millimetres
     min_range_m: NotNegative = 0.3

@@ -52,7 +52,7 @@ class ScoringPoints:
         points_odom: (N, 3) float32 deskewed points, the session's odom frame, metres.
         change: (N,) int16 id of the change each belongs to, 0 for none, `MIXED` for neither.
         instance: (N,) int16 what each hit: 0 walls and floor, n the n-th prop, -2 nothing (a false return), -3 mist or
-            dust, -4 what a puddle mirrors.
+            dust, -4 what a puddle or a pane mirrors, -5 glare.
         n_scans: Revolutions of the session.
         n_pixels: Pixels of a revolution.
         nearest_m: (C + 1,) float32 shortest range of any return of each change, by its id; infinite where none is.

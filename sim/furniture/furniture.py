@@ -1,4 +1,4 @@
-"""The fixtures of both sessions: pipes, ducts, cable trays, rock bolts and wire mesh.
+"""The fixtures of both sessions: pipes, ducts, cable trays, markers, rock bolts and wire mesh.
 
 Rays measure the wall that the fixtures follow, so foreign meshes can have them too. Each item and material is one
 fixture over all drifts, which keeps the number of geoms small.
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from scenarios.schema import Furniture, Tunnel
 from sim.furniture.shell import measure_shell
 from sim.furniture.support import BOLT_LOWEST_SHARE, SCREEN_LOWEST_SHARE, bolt_mesh, bolt_pins, screen_mesh
-from sim.furniture.utilities import duct_meshes, pipe_meshes, tray_meshes, wall_plans
+from sim.furniture.utilities import duct_meshes, marker_mesh, pipe_meshes, tray_meshes, wall_plans
 from sim.geometry.mesh import Mesh, join_meshes
 from sim.geometry.raycast import Caster
 from sim.rock.axis import Axis, measure_axes
@@ -65,6 +65,8 @@ def _utilities(furniture: Furniture, axes: Sequence[Axis], seed: int) -> Iterato
         *steel, cables = tray_meshes(axes, tray, next(plans), name, seed)
         yield Fixture(name, "steel", join_meshes(steel))
         yield Fixture(f"cables-{number}", "rubber", cables)
+    if furniture.markers is not None:
+        yield Fixture("markers", "reflector", marker_mesh(axes, furniture.markers))
 
 
 def _support(furniture: Furniture, axes: Sequence[Axis], seed: int) -> Iterator[Fixture]:

@@ -1,4 +1,4 @@
-"""Pipes, ventilation ducts and cable trays along the walls and below the roof of every drift."""
+"""Pipes, ventilation ducts, cable trays and markers along the walls and below the roof of every drift."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cdpipe.core.geometry import Float64Array, stream
-from scenarios.schema import CableTray, Duct, Furniture, Pipe
+from cdpipe.core.geometry import Float64Array, make_pose, stream
+from scenarios.schema import CableTray, Duct, Furniture, Markers, Pipe
 from sim.furniture.wall_line import Cross, Line, WallPlan, roof_lines, stack_plans, wall_lines
-from sim.geometry.mesh import Mesh, join_meshes
+from sim.geometry.mesh import Mesh, box_mesh, join_meshes, move_mesh
 from sim.geometry.sweep import EMPTY, bars, circle, frames_along, sweep
 from sim.rock.axis import STATION_M, UP, Axis, wall_distances
 
@@ -18,6 +18,7 @@ _PIPE_STANDOFF_M = 0.08
 _DUCT_STANDOFF_M = 0.10
 _TRAY_STANDOFF_M = 0.05
 DUCT_LOWEST_M = 1.6
+_PLATE_STANDOFF_M, _PLATE_M = 0.03, 0.005
 _TRAY_HALF_HEIGHT_M = 0.05
 _SHEET_M = 0.006
 _COUPLING_M = 6.0
@@ -83,6 +84,21 @@ def tray_meshes(axes: Sequence[Axis], tray: CableTray, plan: WallPlan, name: str
             brackets.append(_wall_arms(axis, line, plan, every_m=1.5, width_m=0.04))
             cables.extend(_cables(path, tray.width_m, generator))
     return _join(trays), _join(brackets), _join(cables)
+
+
+def marker_mesh(axes: Sequence[Axis], markers: Markers) -> Mesh:
+    """Return plates flat along one wall of every drift, 5 mm thick, where the wall is at hand."""
+    half_m, side = markers.size_m / 2, 1.0 if markers.side == "left" else -1.0
+    plan = WallPlan(side, markers.height_share, Cross(_PLATE_M / 2, half_m, _PLATE_STANDOFF_M))
+    plates = []
+    for axis in axes:
+        for line in wall_lines(axis, plan):
+            left, up = frames_along(line.path)
+            for middle in range(2, len(line.path) - 2, round(markers.every_m / STATION_M)):
+                forward = np.cross(left[middle], up[middle])
+                pose = make_pose(np.column_stack([forward, left[middle], up[middle]]), line.path[middle])
+                plates.append(move_mesh(box_mesh((half_m, _PLATE_M / 2, half_m)), pose))
+    return _join(plates)
 
 
 def thin_path(path: Float64Array) -> Float64Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from sim.geometry.raycast import RayCaster
-from sim.sensor.optics import received_photons
+from sim.sensor.optics import received_photons, reflected_share
 from sim.sensor.rays import Rays
 
 # Width of the beam at half its brightness: 9.5 mm where it leaves the window, growing by 0.18 deg (data sheet of the
@@ -52,7 +52,7 @@ def central_echo(
     """Cast the middle of every beam at geoms of these reflectivities and owners, both (G,)."""
     distance_m, geom, cosine = caster.cast_columns(rays.origins, rays.directions)
     distance_m += np.float32(beam_origin_m)
-    photons = received_photons(reflectivity[geom] * cosine, distance_m)
+    photons = received_photons(reflected_share(reflectivity, geom, cosine), distance_m)
     range_m = np.where(geom >= 0, distance_m, np.float32(0.0))
     return Echo(range_m, photons, cosine, distance_m, geom, owners[geom], np.ones_like(range_m))
 
@@ -73,6 +73,16 @@ def stronger_echo(one: Echo, other: Echo) -> Echo:
 def choose_echo(mask: BoolArray, chosen: Echo, other: Echo) -> Echo:
     """Return one echo where a mask (W, H) is true, and another elsewhere."""
     return Echo(*(np.where(mask, getattr(chosen, each.name), getattr(other, each.name)) for each in fields(Echo)))
+
+
+def replace_pixels(echo: Echo, pixels: Int64Array, **values: npt.ArrayLike) -> Echo:
+    """Return an echo with other values (M,) in some of its pixels, given by their flat numbers (M,)."""
+    changed = {}
+    for name, own in values.items():
+        channel = getattr(echo, name).ravel().copy()
+        channel[pixels] = own
+        changed[name] = channel.reshape(echo.range_m.shape)
+    return replace(echo, **changed)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,7 +114,7 @@ def cast_beams(
     cosines: Float32Array = np.ascontiguousarray(hit_cosines.reshape(-1, sub_rays).T)
     photons = np.empty_like(ranges_m)
     for ray, weight in enumerate(weights):
-        power = reflectivity[geoms[ray]] * cosines[ray]
+        power = reflected_share(reflectivity, geoms[ray], cosines[ray])
         photons[ray] = np.float32(weight) * received_photons(power, ranges_m[ray])
     return BeamHits(ranges_m, photons, geoms, cosines)
 

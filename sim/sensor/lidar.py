@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Protocol
 
@@ -25,6 +26,8 @@ from sim.sensor.footprint import (
     spread_echo,
     stronger_echo,
 )
+from sim.sensor.glare import add_glare
+from sim.sensor.glass import Panes, cross_glass
 from sim.sensor.optics import (
     FALSE_PHOTONS,
     apparent_reflectivity,
@@ -57,7 +60,8 @@ class Scan:
         signal: uint16 photons.
         true_range_m: float32 distance from the spin axis's point to the surface along the beam, infinite for a miss.
         geom: int32 geom hit, `MISS` where nothing returned, `FALSE_RETURN` where nothing stands,
-            `sim.sensor.air.AIR` for mist and dust, `sim.sensor.water.MIRRORED` for what water mirrors.
+            `sim.sensor.air.AIR` for mist and dust, `sim.sensor.optics.MIRRORED` for what water or glass mirrors,
+            `sim.sensor.glare.GLARE` for stray light.
         owner: int32 owner of the geoms that reflected most of the light, 0 where no geom was hit.
         is_mixed: True for a return of which less than 90 % of the light came from geoms of `owner`. Always False with
             one ray per beam.
@@ -99,6 +103,7 @@ def scan(
     owners: Int32Array | None = None,
     air: AirVolume | None = None,
     water: Water | None = None,
+    panes: Panes | None = None,
 ) -> Scan:
     """Cast one revolution and apply the effects of the sensor.
 
@@ -115,23 +120,18 @@ def scan(
         owners: (G,) owner of each geom, between which mixed returns are told; by default the prop, `scene.instance`.
         air: Mist and dust around the sensor; None where the air is clear.
         water: Puddles; None where there are none.
+        panes: Panes of glass; None where glass is a wall.
     """
-    owners = scene.instance if owners is None else owners
-    has_second = settings.returns != "strongest"
-    surfaces = scene.caster, scene.reflectivity, rays, sensor.beam_origin_m
-    second: Echo | None = None
-    if settings.sub_rays == 1:
-        echo = central_echo(*surfaces, owners)
-        second = no_echo(echo) if has_second else None
-    elif has_second:
-        hits = cast_beams(*surfaces, settings.sub_rays)
-        echo, second = (blend_beams(each, owners, rays.directions.shape[:2]) for each in (hits, drop_strongest(hits)))
-    else:
-        echo = spread_echo(*surfaces, owners, settings.sub_rays)
+    reflectivity = scene.reflectivity if settings.retroreflectors else np.minimum(scene.reflectivity, np.float32(1.0))
+    surfaces = scene.caster, reflectivity, rays, sensor.beam_origin_m
+    echo, second = _see_surfaces(surfaces, scene.instance if owners is None else owners, settings)
     if water is not None:
         echo, other = cross_water(echo, rays, sensor.beam_origin_m, water)
         if second is not None:
             second = stronger_echo(look_through_water(second, rays, sensor.beam_origin_m, water), other)
+    if panes is not None:
+        echo, other = cross_glass(echo, rays, sensor.beam_origin_m, panes)
+        second = None if second is None else stronger_echo(second, other)
     if air is not None:
         returns = stream(seed, session, "air-returns", str(number))
         if second is not None:
@@ -141,6 +141,9 @@ def scan(
     if second is not None:  # what was the stronger one may have been dimmed more
         is_stronger = second.photons > echo.photons
         echo, second = choose_echo(is_stronger, second, echo), choose_echo(is_stronger, echo, second)
+    if settings.retroreflectors:
+        draw = stream(seed, session, "glare", str(number)).random(echo.range_m.shape, dtype=np.float32)
+        echo, second = add_glare(echo, second, rays, sensor, reflectivity > 1, draw)
     parts = [_measure(echo, settings, (seed, session, ""), number)]
     if second is not None:
         parts = _arrange(parts[0], _measure(second, settings, (seed, session, "second-"), number))
@@ -148,14 +151,7 @@ def scan(
         is_later = (parts[1].geom != MISS) & (parts[1].range_m > parts[0].range_m)
         parts = [_choose(is_later, parts[1], parts[0])]
     if settings.false_positives:
-        generator = stream(seed, session, "false-positives", str(number))
-        first = parts[0]
-        pixels, places_m = false_returns(generator, first.geom.size, settings.min_range_m, settings.max_range_m)
-        first.geom.flat[pixels], first.range_m.flat[pixels], first.photons.flat[pixels] = (
-            FALSE_RETURN, places_m, FALSE_PHOTONS
-        )  # fmt: skip
-        for later in parts[1:]:
-            later.geom.flat[pixels], later.range_m.flat[pixels], later.photons.flat[pixels] = MISS, 0.0, 0.0
+        _report_nothing_there(parts, settings, stream(seed, session, "false-positives", str(number)))
     geom, range_m, photons, true_range_m, owner, share = (
         np.concatenate([getattr(part, name).T for part in parts]) for name in _MEASURED
     )
@@ -168,6 +164,29 @@ def scan(
         owner=np.where(geom >= 0, owner, np.int32(0)),
         is_mixed=(geom >= 0) & (share < LEAST_SHARE),
     )
+
+
+def _see_surfaces(
+    surfaces: tuple[RayCaster, Float32Array, Rays, float], owners: Int32Array, settings: Sensor
+) -> tuple[Echo, Echo | None]:
+    """Return the first echo of a revolution from the surfaces, and the second one where the sensor may report it.
+
+    Args:
+        surfaces: Caster, reflectivity (G,), rays, and the distance of their origins from the spin axis.
+        owners: (G,) owner of each geom.
+        settings: Number of rays in a beam, and of returns.
+    """
+    has_second = settings.returns != "strongest"
+    if settings.sub_rays == 1:
+        echo = central_echo(*surfaces, owners)
+        return echo, no_echo(echo) if has_second else None
+    if not has_second:
+        return spread_echo(*surfaces, owners, settings.sub_rays), None
+    hits = cast_beams(*surfaces, settings.sub_rays)
+    first, second = (
+        blend_beams(each, owners, surfaces[2].directions.shape[:2]) for each in (hits, drop_strongest(hits))
+    )
+    return first, second
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -225,6 +244,17 @@ def _arrange(first: _Return, second: _Return) -> list[_Return]:
         np.full_like(second.geom, MISS), dark, dark, np.full_like(dark, np.inf), second.owner, np.ones_like(dark)
     )
     return [first, _choose(is_close, none, second)]
+
+
+def _report_nothing_there(parts: Sequence[_Return], settings: Sensor, generator: np.random.Generator) -> None:
+    """Let some pixels report a return where nothing is, and no second one, in place."""
+    first, *others = parts
+    pixels, places_m = false_returns(generator, first.geom.size, settings.min_range_m, settings.max_range_m)
+    first.geom.flat[pixels], first.range_m.flat[pixels], first.photons.flat[pixels] = (
+        FALSE_RETURN, places_m, FALSE_PHOTONS
+    )  # fmt: skip
+    for later in others:
+        later.geom.flat[pixels], later.range_m.flat[pixels], later.photons.flat[pixels] = MISS, 0.0, 0.0
 
 
 def _choose(mask: BoolArray, chosen: _Return, other: _Return) -> _Return:

@@ -12,8 +12,9 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.core.geometry import Float32Array, Int64Array
+from cdpipe.core.geometry import Float32Array, Int32Array, Int64Array
 
+MIRRORED = -4  # number of the geom of a return by way of a mirror, water or glass
 # Photons from a perfect diffuse reflector at 1 m, were the receiver as good there as it is far off. Measured: the
 # unit's signal times range squared over its own calibrated reflectivity, median beyond 20 m (0.80 to 1.16 of
 # it by beam).
@@ -39,17 +40,54 @@ SIGMA_ONE_PHOTON_M = 0.013
 BEAM_SIGMA_RAD = 0.00133
 LEAST_COSINE = 0.05
 # Above 100 % the reflectivity channel is logarithmic (the vendor's maintainers say so): counts for each doubling,
-# measured on about a hundred returns of 101 to 160; brighter ones bend off. Nothing in `sim.materials` is so bright.
+# measured on about a hundred returns of 101 to 160; brighter ones bend off.
 COUNTS_PER_DOUBLING = 1.0 / 0.06
+# What is left of a retroreflector's coefficient at an angle of entrance: EN ISO 20471, the least of new bands at 0.2
+# deg of observation (330, 290, 180, 65 cd/(lx m2)); that nothing is left at 60 deg is ours.
+RETRO_ENTRANCE_DEG, RETRO_LEFT = (5.0, 20.0, 30.0, 40.0, 60.0), (1.0, 290 / 330, 180 / 330, 65 / 330, 0.0)
 # Data sheet of the first generation: the false positive rate its ranges are stated for, at 100 klx of sunlight.
 FALSE_RETURN_RATE = 1e-4
+
+
+def reflected_share(reflectivity: Float32Array, geom: Int32Array, cosine: Float32Array) -> Float32Array:
+    """Return how much light surfaces send back, as a share of what a white diffuse one does at right angles.
+
+    Reflectivity times cosine (Lambert). A reflectivity above 1 is that of a retroreflector at right angles: the light
+    goes back to where it came from, at any angle of entrance up to some 30 deg, and the lit area grows with it.
+
+    Args:
+        reflectivity: (G,) of every geom.
+        geom: (...) geoms that were met; -1 for none.
+        cosine: (...) of the incidence, 0 where nothing was met.
+    """
+    share = reflectivity[geom] * cosine
+    if (reflectivity > 1).any():
+        retro = np.nonzero(reflectivity[geom] > 1)
+        facing = np.maximum(cosine[retro], np.float32(LEAST_COSINE))
+        left = np.interp(np.degrees(np.arccos(np.minimum(facing, 1.0))), RETRO_ENTRANCE_DEG, RETRO_LEFT)
+        share[retro] = np.where(cosine[retro] > 0, reflectivity[geom[retro]] * left / facing, 0.0)
+        share[retro] = np.maximum(share[retro], cosine[retro])  # the sheet itself is white
+    return np.asarray(share)
+
+
+def mirrored_share(cosine: npt.NDArray[np.floating], index: float) -> npt.NDArray[np.floating]:
+    """Return the share of unpolarised light that a smooth surface mirrors (Fresnel).
+
+    Args:
+        cosine: Of the incidence.
+        index: Refractive index behind the surface; that of air lies before it.
+    """
+    refracted = np.sqrt(1.0 - (1.0 - cosine * cosine) / index**2)
+    across = (cosine - index * refracted) / (cosine + index * refracted)
+    along = (index * cosine - refracted) / (index * cosine + refracted)
+    return np.asarray((across * across + along * along) / 2)
 
 
 def received_photons(power: Float32Array, range_m: Float32Array) -> Float32Array:
     """Return the expected photons of a return: 139,800 x power / R^2 x overlap(R), 0 for a miss at infinity.
 
     Args:
-        power: Reflectivity times the cosine of incidence (Lambert).
+        power: Share of light that the surface sends back, such as `reflected_share`.
         range_m: Distance, metres.
     """
     return np.asarray(power * _photons_of_white(range_m))

@@ -9,19 +9,17 @@ the surface as it is away from it. The stronger of the two echoes is reported.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
 from sim.geometry.raycast import Caster
 from sim.placement.puddles import Pool
-from sim.sensor.footprint import Echo, choose_echo, no_echo
-from sim.sensor.optics import received_photons
+from sim.sensor.footprint import Echo, choose_echo, no_echo, replace_pixels
+from sim.sensor.optics import MIRRORED, mirrored_share, received_photons
 from sim.sensor.rays import Rays
 
-MIRRORED = -4  # number of the geom of a return by way of water
 # Refractive index of water, near infrared.
 WATER_INDEX = 1.33
 # Absorption of pure water at 865 nm, 1/m: Kou, Labrie and Chylek 1993, cited from memory. Mud is not modelled.
@@ -44,14 +42,6 @@ class Water:
     reflectivity: Float32Array
 
 
-def mirrored_share(cosine: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    """Return the share of unpolarised light that water mirrors, by the cosine of the incidence (Fresnel)."""
-    refracted = np.sqrt(1.0 - (1.0 - cosine * cosine) / WATER_INDEX**2)
-    across = (cosine - WATER_INDEX * refracted) / (cosine + WATER_INDEX * refracted)
-    along = (WATER_INDEX * cosine - refracted) / (WATER_INDEX * cosine + refracted)
-    return np.asarray((across * across + along * along) / 2)
-
-
 def cross_water(echo: Echo, rays: Rays, beam_origin_m: float, water: Water) -> tuple[Echo, Echo]:
     """Return the stronger and the weaker echo of a revolution where beams meet water before anything else.
 
@@ -70,7 +60,7 @@ def cross_water(echo: Echo, rays: Rays, beam_origin_m: float, water: Water) -> t
     way = rays.directions.reshape(-1, 3)[wet].astype(np.float64)
     floor = _look_down(echo, wet, start_m, np.abs(way[:, 2]), beam_origin_m)
     # by way of the surface to what it mirrors and back
-    share = mirrored_share(np.abs(way[:, 2]))
+    share = mirrored_share(np.abs(way[:, 2]), WATER_INDEX)
     points = rays.origins[wet // rays.directions.shape[1]] + start_m[:, None] * way
     points[:, 2] += _OFF_SURFACE_M
     beyond_m, geom, facing = water.caster.cast(points, way * (1.0, 1.0, -1.0))
@@ -78,7 +68,7 @@ def cross_water(echo: Echo, rays: Rays, beam_origin_m: float, water: Water) -> t
     total_m = np.where(is_met, start_m + np.where(is_met, beyond_m, 0.0) + beam_origin_m, 0.0).astype(np.float32)
     power = np.where(is_met, water.reflectivity[geom] * facing * share**2, 0.0).astype(np.float32)
     light = np.where(is_met, received_photons(power, np.maximum(total_m, np.float32(beam_origin_m))), 0.0)
-    ghost = _replace(
+    ghost = replace_pixels(
         no_echo(echo), wet, range_m=total_m, photons=light, cosine=facing, geom=np.where(is_met, MIRRORED, -1)
     )
     is_ghost = ghost.photons > floor.photons
@@ -117,19 +107,9 @@ def _look_down(echo: Echo, wet: Int64Array, start_m: Float64Array, cosine: Float
     reach_m = echo.range_m.ravel()[wet].astype(np.float64) - beam_origin_m
     depth_m = np.where(is_floor, reach_m - start_m, 0.0) * cosine
     path_m = depth_m / np.sqrt(1.0 - (1.0 - cosine**2) / WATER_INDEX**2)
-    passed = (1.0 - mirrored_share(cosine)) ** 2 * np.exp(-2.0 * WATER_ABSORPTION_PER_M * path_m)
+    passed = (1.0 - mirrored_share(cosine, WATER_INDEX)) ** 2 * np.exp(-2.0 * WATER_ABSORPTION_PER_M * path_m)
     seems_m = np.where(is_floor, start_m + WATER_INDEX * path_m + beam_origin_m, 0.0)
-    return _replace(echo, wet, range_m=seems_m, photons=echo.photons.ravel()[wet] * passed)
-
-
-def _replace(echo: Echo, wet: Int64Array, **values: npt.ArrayLike) -> Echo:
-    """Return an echo with other values (M,) in some of its pixels, given by their flat numbers (M,)."""
-    changed = {}
-    for name, own in values.items():
-        channel = getattr(echo, name).ravel().copy()
-        channel[wet] = own
-        changed[name] = channel.reshape(echo.range_m.shape)
-    return replace(echo, **changed)
+    return replace_pixels(echo, wet, range_m=seems_m, photons=echo.photons.ravel()[wet] * passed)
 
 
 def _meet(rays: Rays, reach_m: Float32Array, pools: Sequence[Pool]) -> Float32Array:

@@ -14,6 +14,7 @@ from sim.drive.trajectory import Trajectory
 from sim.movers.casting import MovingScene
 from sim.scene import Scene
 from sim.sensor.air import AirVolume, air_around
+from sim.sensor.glass import Panes
 from sim.sensor.lidar import Scan, scan
 from sim.sensor.rays import Rays, revolution_rays
 from sim.sensor.water import Water
@@ -56,11 +57,12 @@ class Drive:
     """Everything that stays the same while one session is simulated.
 
     Attributes:
-        labels: `instance` of each geom, int16; entries -4 to -1 at the end serve the geom numbers -4 to -1.
+        labels: `instance` of each geom, int16; entries -5 to -1 at the end serve the geom numbers -5 to -1.
         owners: (G,) int32 `instance` of the geoms of props of which this session holds a change, 0 for all others.
         moving: The scene with the session's movers, whose geoms come last in `labels` and `owners`.
         sightings: (M, S, 4) what each revolution saw of each mover so far, as in `Revolution`.
         water: The session's puddles; None without any.
+        panes: The session's panes of glass; None where glass is a wall.
     """
 
     name: SessionName
@@ -75,6 +77,7 @@ class Drive:
     moving: MovingScene
     sightings: Float64Array
     water: Water | None = None
+    panes: Panes | None = None
 
 
 def simulate_revolution(drive: Drive, number: int) -> Revolution:
@@ -114,7 +117,7 @@ def cast_revolution(drive: Drive, number: int) -> tuple[Rays, Scan]:
     rays = revolution_rays(drive.sensor, world_T_column)
     settings, air = drive.scenario.sensor, find_air(drive, number)
     surfaces = drive.moving.pose(drive.trajectory.revolution_s[number] + drive.trajectory.column_s)
-    told = drive.seed, drive.name, number, drive.owners, air, drive.water
+    told = drive.seed, drive.name, number, drive.owners, air, drive.water, drive.panes
     return rays, scan(surfaces, drive.sensor, settings, rays, *told)
 
 

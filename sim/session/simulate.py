@@ -32,6 +32,7 @@ from sim.movers.casting import MovingScene
 from sim.movers.planning import plan_movers
 from sim.placement.puddles import lay_puddles
 from sim.scene import build_world
+from sim.sensor.glass import Panes
 from sim.sensor.water import Water
 from sim.session.labels import list_changes
 from sim.session.revolution import CHANNELS, Drive, Revolution, simulate_revolution, tally_revolution
@@ -185,15 +186,17 @@ def plan_drives(scenario: Scenario, seed: int, sensor: SensorMetadata | None = N
     for name, trajectory in trajectories.items():
         scene = world.before if name == "before" else world.after
         moving = MovingScene(scene, movers[name])
-        labels = np.append(moving.instance, [-4, -3, -2, -1]).astype(np.int16)
+        labels = np.append(moving.instance, [-5, -4, -3, -2, -1]).astype(np.int16)
         held = [tally.change.instance for tally in tallies if tally.change.session == name]
         owners = np.where(np.isin(moving.instance, held), moving.instance, np.int32(0))
         seen = np.zeros((len(moving.movers), trajectory.n_scans, 4))
         own, pools = scenario.of(name), lay_puddles(scenario, world.centreline, world.walls, name, seed)
-        water = Water(pools, scene.caster, scene.reflectivity) if pools else None
-        drives.append(
-            Drive(name, own, scene, labels, owners, sensors[name], trajectory, tallies, seed, moving, seen, water)
-        )
+        diffuse = np.minimum(scene.reflectivity, np.float32(1.0))
+        water = Water(pools, scene.caster, diffuse) if pools else None
+        is_glass = np.array(scene.materials) == "glass"
+        panes = Panes(scene.caster, diffuse, owners, is_glass) if own.sensor.glass and is_glass.any() else None
+        told = labels, owners, sensors[name], trajectory, tallies, seed, moving, seen, water, panes
+        drives.append(Drive(name, own, scene, *told))
     return drives
 
 

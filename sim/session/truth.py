@@ -6,11 +6,12 @@
     PAIR/before/truth/movers.npz     only with movers: see `MoverTrack`
     PAIR/after/truth/...             likewise
 
-`instance`: -1 no return, -2 a false return where nothing stands, -3 a return from mist or dust, -4 what a puddle
-mirrors, 0 walls, floor and fixtures, n the n-th prop (1-based), n_props + k the k-th mover of the scenario (1-based).
-`change`: 0 (always for a false return, for one from the air or by way of a mirror, and for a mover), the id of the
-change the return belongs to, or -1 for a mixed return. For a change of group "partial" (moved by less than its own
-length, or reshaped) only returns farther than 0.1 m from the other session's true surface belong to it.
+`instance`: -1 no return, -2 a false return where nothing stands, -3 a return from mist or dust, -4 what a puddle or a
+pane mirrors, -5 glare of a retroreflector, 0 walls, floor and fixtures, n the n-th prop (1-based), n_props + k the k-th
+mover of the scenario (1-based).
+`change`: 0 (always for an instance below 0 and for a mover), the id of the change that the return belongs to, or -1 for
+a mixed return. For a change of group "partial" (moved by less than its own length, or reshaped) only returns farther
+than 0.1 m from the other session's true surface belong to it.
 
 With several rays per beam a return may blend surfaces. `instance` is then that of the strongest ray. A return belongs
 to a changed prop of its session, or to all the rest, if at least 90 % of its light came from there. A return below that

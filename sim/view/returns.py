@@ -13,14 +13,15 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.geometry import Float32Array, Float64Array
 from cdpipe.io.session import ScanChunk, Session
 from sim.sensor.air import AIR
-from sim.sensor.water import MIRRORED
+from sim.sensor.glare import GLARE
+from sim.sensor.optics import MIRRORED
 from sim.session.truth import read_chunk_labels, read_labels
 
 Rgb = tuple[int, int, int]
 MAX_POINTS = 300_000
 _ROCK_RGB = (150, 150, 150)
-_AIR_RGB = (140, 200, 240)  # returns of mist and dust, and of what water mirrors
-_NOT_THERE = (AIR, MIRRORED)
+_AIR_RGB = (140, 200, 240)  # returns of mist and dust, of what water and glass mirror, and of glare
+_NOT_THERE = (AIR, MIRRORED, GLARE)
 # after Okabe and Ito, which the colour-blind can tell apart
 CHANGE_RGB: dict[str, Rgb] = {
     "added": (0, 158, 115),

@@ -11,6 +11,7 @@ from scenarios.schema import (
     Drift,
     Duct,
     Furniture,
+    Markers,
     Pipe,
     Roughness,
     Screen,
@@ -38,6 +39,7 @@ EVERYTHING = Furniture(
     cable_trays=(CableTray(side="right", height_share=0.6),),
     bolts=Bolts(),
     screen=Screen(share=0.5),
+    markers=Markers(every_m=5, size_m=0.3, side="right", height_share=0.3),
 )
 
 
@@ -110,7 +112,25 @@ def test_names_and_materials(network: Network) -> None:
         "cables-1": "rubber",
         "bolts": "steel",
         "screen": "steel",
+        "markers": "reflector",
     }
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_markers_hang_flat_on_their_wall_as_far_apart_as_they_say(side: str) -> None:
+    markers = Markers.model_validate({"every_m": 5, "size_m": 0.4, "side": side, "height_share": 0.5})
+    tunnel = straight(
+        Furniture(markers=markers), section=Section(shape="rectangle", width_m=4.0, height_m=3.0), resolution_m=0.1
+    )
+    mesh = furnished(tunnel)["markers"].mesh
+    plates = mesh.vertices.reshape(-1, 8, 3)
+    wall_y = 2.0 if side == "left" else -2.0
+    np.testing.assert_allclose(np.ptp(plates, axis=1), np.tile((0.4, 0.005, 0.4), (len(plates), 1)), atol=2e-3)
+    middles = plates.mean(axis=1)
+    np.testing.assert_allclose(np.diff(middles[:, 0]), 5.0, atol=0.01)
+    assert len(middles) == 5
+    np.testing.assert_allclose(middles[:, 1], wall_y - np.sign(wall_y) * 0.0325, atol=0.01)
+    np.testing.assert_allclose(middles[:, 2], 1.5, atol=0.01)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

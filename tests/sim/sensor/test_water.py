@@ -19,15 +19,13 @@ from sim.placement.puddles import Pool, lay_puddles
 from sim.scene import Scene, build_world
 from sim.sensor.footprint import Echo, central_echo
 from sim.sensor.lidar import scan
-from sim.sensor.optics import received_photons
+from sim.sensor.optics import MIRRORED, mirrored_share, received_photons
 from sim.sensor.rays import Rays, revolution_rays
 from sim.sensor.water import (
-    MIRRORED,
     WATER_ABSORPTION_PER_M,
     WATER_INDEX,
     Water,
     cross_water,
-    mirrored_share,
 )
 from sim.session.revolution import simulate_revolution
 from sim.session.simulate import plan_drives, simulate_pair
@@ -64,18 +62,19 @@ def lake() -> list[Pool]:
 
 
 def test_the_mirrored_share_is_fresnels() -> None:
-    assert mirrored_share(np.array(1.0)) == pytest.approx(((WATER_INDEX - 1) / (WATER_INDEX + 1)) ** 2)
-    assert mirrored_share(np.array(0.0)) == pytest.approx(1.0)
+    assert mirrored_share(np.array(1.0), WATER_INDEX) == pytest.approx(((WATER_INDEX - 1) / (WATER_INDEX + 1)) ** 2)
+    assert mirrored_share(np.array(0.0), WATER_INDEX) == pytest.approx(1.0)
     # at Brewster's angle light polarised in the plane of incidence is not mirrored, the rest by ((n^2 - 1)/(n^2 + 1))^2
     brewster = np.cos(np.arctan(WATER_INDEX))
-    assert mirrored_share(brewster) == pytest.approx(((WATER_INDEX**2 - 1) / (WATER_INDEX**2 + 1)) ** 2 / 2)
+    squared = WATER_INDEX**2
+    assert mirrored_share(brewster, WATER_INDEX) == pytest.approx(((squared - 1) / (squared + 1)) ** 2 / 2)
     # Fresnel's own form, by the angles of incidence and refraction
     incidence = np.deg2rad([5.0, 30.0, 60.0, 80.0, 89.0])
     refraction = np.arcsin(np.sin(incidence) / WATER_INDEX)
     off, both = incidence - refraction, incidence + refraction
     expected = ((np.sin(off) / np.sin(both)) ** 2 + (np.tan(off) / np.tan(both)) ** 2) / 2
-    assert mirrored_share(np.cos(incidence)) == pytest.approx(expected)
-    shares = mirrored_share(np.linspace(1.0, 0.0, 50))
+    assert mirrored_share(np.cos(incidence), WATER_INDEX) == pytest.approx(expected)
+    shares = mirrored_share(np.linspace(1.0, 0.0, 50), WATER_INDEX)
     assert (np.diff(shares[25:]) > 0).all()
 
 
@@ -86,7 +85,7 @@ def test_the_floor_under_water_is_weak_and_seems_deeper(sensor: SensorMetadata) 
     for column, row in steep[::199].tolist():
         cosine = -float(rays.directions[column, row, 2])
         path_m = DEPTH_M / np.sqrt(1 - (1 - cosine**2) / WATER_INDEX**2)
-        passed = (1 - mirrored_share(np.array(cosine))) ** 2 * np.exp(-2 * WATER_ABSORPTION_PER_M * path_m)
+        passed = (1 - mirrored_share(np.array(cosine), WATER_INDEX)) ** 2 * np.exp(-2 * WATER_ABSORPTION_PER_M * path_m)
         assert wet.photons[column, row] == pytest.approx(dry.photons[column, row] * passed, rel=1e-3)
         seems_m = dry.range_m[column, row] - DEPTH_M / cosine + WATER_INDEX * path_m
         assert wet.range_m[column, row] == pytest.approx(seems_m, abs=1e-4)
@@ -110,7 +109,7 @@ def test_a_flat_beam_reports_what_the_water_mirrors_where_its_mirror_image_is(se
     facing = np.where(np.abs(np.abs(mirrored[:, 0]) - HALF_M[0]) < 2e-3, np.abs(rays.directions[column, row, 0]), 0.0)
     on_x = facing > 0.5
     expected = received_photons(
-        (0.25 * facing * mirrored_share(cosine) ** 2).astype(np.float32), wet.range_m[column, row]
+        (0.25 * facing * mirrored_share(cosine, WATER_INDEX) ** 2).astype(np.float32), wet.range_m[column, row]
     )
     assert on_x.sum() > 30
     assert wet.photons[column, row][on_x] == pytest.approx(expected[on_x], rel=1e-3)
