@@ -594,8 +594,10 @@ class Puddle(Settings):
     depth_m: Annotated[float, Field(gt=0, le=0.5)] = 0.05  # above the lowest place of the floor within that
 
 
-class Mover(Settings):
+class Mover(Lean):
     """Something that moves while a session is recorded; never a change. sim/movers/MOVERS.md has every kind."""
+
+    _LATER: ClassVar[frozenset[str]] = frozenset({"dust_mg_per_m"})
 
     name: str
     kind: Literal["person", "forklift", "loader", "curtain"]
@@ -608,6 +610,7 @@ class Mover(Settings):
     width_m: Positive | None = None  # of a curtain; it hangs from the roof down to the floor
     swing_deg: Annotated[float, Field(ge=0, le=30)] | None = None  # amplitude of a curtain's lowest strip
     reflectivity: Reflectivity | None = None  # of every part; left out: what each part is made of
+    dust_mg_per_m: Annotated[float, Field(ge=0, le=10000)] | None = None  # that a machine raises on its way
 
     @model_validator(mode="before")
     @classmethod
@@ -623,6 +626,8 @@ class Mover(Settings):
         said = sorted(key for key in known - USUAL_MOVERS[self.kind].keys() if getattr(self, key) is not None)
         if said:
             raise ValueError(f"mover {self.name!r}: a {self.kind} has no {', '.join(said)}: leave that out")
+        if self.dust_mg_per_m is not None and self.kind not in ("forklift", "loader"):
+            raise ValueError(f"mover {self.name!r}: a {self.kind} raises no dust: leave dust_mg_per_m out")
         if self.speed_mps == 0 and self.kind != "person":
             raise ValueError(f"mover {self.name!r}: a {self.kind} that never moves is a prop: give it a speed_mps")
         return self

@@ -21,7 +21,7 @@ from cdpipe.model.config import PipelineConfig
 from cdpipe.model.types import SessionName
 
 # d_p, the authors' value: a voxel is void only if its neighbours were seen too. With 0, half of a tunnel is new.
-_UNKNOWN_VOXELS = 1
+UNKNOWN_VOXELS = 1
 
 
 @WholeMap
@@ -42,15 +42,15 @@ def dufomap(maps: PlacedMaps, session: SessionName, other: SessionName, config: 
     """
     compared, points_odom = maps.compared_in_odom(session, other)
     settings = config.dufomap
-    void_map = load_dufomap().dufomap(settings.voxel_m, settings.hit_inflation_m, _UNKNOWN_VOXELS, THREADS)
+    void_map = load_dufomap().dufomap(settings.voxel_m, settings.hit_inflation_m, UNKNOWN_VOXELS, THREADS)
     for odom_T_sensor, returns_odom in maps.scans(other, settings.every_scan):
-        void_map.run(returns_odom, _origin_pose(odom_T_sensor[:3, 3]), False)
+        void_map.run(returns_odom, origin_pose(odom_T_sensor[:3, 3]), False)
     is_void = np.zeros(len(maps.points[session]), dtype=np.bool_)
-    is_void[compared] = void_map.segment(points_odom, _origin_pose(np.zeros(3)), False)
+    is_void[compared] = void_map.segment(points_odom, origin_pose(np.zeros(3)), False)
     return is_void
 
 
-def _origin_pose(origin_odom: Float64Array) -> list[float]:
+def origin_pose(origin_odom: Float64Array) -> list[float]:
     """Return a position and the identity quaternion, as the package takes a pose; points are in the odom frame."""
     return [*origin_odom.tolist(), 1.0, 0.0, 0.0, 0.0]
 

@@ -1,10 +1,10 @@
-"""`tunnelcd convert`: a session becomes an OSF; an OSF or a PCAP becomes a session."""
+"""`tunnelcd convert`: a session becomes an OSF or a folder of PCD files; an OSF or a PCAP becomes a session."""
 
 # ruff: noqa: PLC0415 - heavy imports stand inside the functions, so that --help and completion are instant
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,10 +12,15 @@ from eval.cli.options import Quiet
 from eval.core.printing import say
 from eval.core.progress import RunProgress, shown_progress
 
+if TYPE_CHECKING:
+    from cdpipe.io.session import Session
+
+GT_CLOUD = "gt_cloud.pcd"
+
 
 def convert(
     source: Annotated[Path, typer.Argument(metavar="SRC", help="session folder; or a recording, .osf or .pcap")],
-    out: Annotated[Path, typer.Argument(metavar="DST", help="new .osf file; or new session folder")],
+    out: Annotated[Path, typer.Argument(metavar="DST", help="new .osf file or folder of .pcd files; or new session")],
     metadata: Annotated[
         Path | None,
         typer.Option(metavar="FILE.json", help="sensor of a .pcap; else the .json beside it", show_default=False),
@@ -28,11 +33,15 @@ def convert(
         str | None, typer.Option(metavar="kiss-icp", help="estimate the poses", show_default=False)
     ] = None,
     with_truth: Annotated[
-        bool, typer.Option("--with-truth/--without-truth", help="write the truth into the .osf as LABEL and INSTANCE")
+        bool, typer.Option("--with-truth/--without-truth", help="LABEL and INSTANCE in the .osf; gt_cloud.pcd")
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Convert a session to OSF for the vendor's SDK, or an OSF or PCAP recording of an Ouster to a session."""
+    """Convert a session to OSF for the vendor's SDK, or to PCD files; or an OSF or PCAP recording to a session.
+
+    A folder of PCD files has the layout of DynamicMap_Benchmark: pcd/000000.pcd and so on, the points in one frame, and
+    gt_cloud.pcd with the truth, where what moves has intensity 1.
+    """
     from cdpipe.core.errors import InputError
     from cdpipe.io.ouster.recording import import_recording
     from cdpipe.io.readers import RECORDING_SUFFIXES
@@ -63,23 +72,32 @@ def convert(
 
 
 def _export(source: Path, out: Path, progress: RunProgress, *, with_truth: bool) -> str:
-    from dataclasses import replace
-
-    import numpy as np
-
     from cdpipe.core.errors import InputError
-    from cdpipe.io.ouster.osf import write_osf
     from cdpipe.io.session import is_session, read_session
-    from eval.core.output import made_parents
-    from sim.session.truth import read_labels
 
-    if out.suffix.lower() != ".osf":
-        raise InputError(f"{out}: a session becomes an OSF: name a new file that ends in .osf")
+    if out.suffix.lower() not in ("", ".osf"):
+        raise InputError(f"{out}: a session becomes an OSF, a new file that ends in .osf, or a new folder of PCD files")
     if is_session(source / "before"):
         raise InputError(f"{source}: a pair of sessions: convert {source / 'before'} and {source / 'after'} one by one")
     session = read_session(source)
     if with_truth and not (source / "truth").is_dir():
         raise InputError(f"{source}: there is no truth in it: leave --with-truth out")
+    write, kept = (_write_osf, "with truth as fields LABEL and INSTANCE") if out.suffix else (
+        _write_pcds, f"and what moves is 1 in {GT_CLOUD}")  # fmt: skip
+    size = write(session, out, progress, with_truth=with_truth)
+    return f"{out}: {_revolutions(session.n_scans)}, {kept if with_truth else 'without truth'}, {size / 1e6:.1f} MB"
+
+
+def _write_osf(session: Session, out: Path, progress: RunProgress, *, with_truth: bool) -> int:
+    """Write a session as OSF; return its size in bytes."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from cdpipe.io.ouster.osf import write_osf
+    from eval.core.output import made_parents
+    from sim.session.truth import read_labels
+
     if not with_truth:  # a profile of one's own is a path, which can tell the scenario
         told = {name: value for name, value in session.provenance.items() if name != "sensor_profile"}
         session = replace(session, provenance=told)
@@ -88,8 +106,38 @@ def _export(source: Path, out: Path, progress: RunProgress, *, with_truth: bool)
     fields = ({"LABEL": of.astype(np.uint16), "INSTANCE": instance.astype(np.int16)} for instance, of in labels)
     with made_parents(out):
         write_osf(session, out, fields if with_truth else None, progress.stage)
-    also = "with truth as fields LABEL and INSTANCE" if with_truth else "without truth"
-    return f"{out}: {_revolutions(session.n_scans)}, {also}, {out.stat().st_size / 1e6:.1f} MB"
+    return out.stat().st_size
+
+
+def _write_pcds(session: Session, out: Path, progress: RunProgress, *, with_truth: bool) -> int:
+    """Write a session as PCD files, one a revolution, into a new folder; return their size in bytes.
+
+    The truth is one file of one return per 0.1 m cell: intensity 1 on what moves while the session is recorded, else 0.
+    """
+    from itertools import chain
+
+    import numpy as np
+
+    from cdpipe.core.geometry import transform
+    from cdpipe.io.pcd import write_pcd
+    from cdpipe.io.readers import open_session
+    from eval.core.output import new_folder
+    from eval.truth.scoring_points import build_scoring_points
+    from sim.session.truth import read_pair_truth
+
+    movers = [mover.instance for mover in read_pair_truth(session.path.parent).movers] if with_truth else None
+    counts = chain.from_iterable(chunk.reflectivity for chunk in session.chunks())
+    with new_folder(out) as folder:
+        (folder / "pcd").mkdir()
+        for scan, reflectivity in zip(open_session(session.path).scans(), counts, strict=True):
+            points_odom = transform(scan.odom_T_sensor, scan.points_sensor)
+            path = folder / "pcd" / f"{scan.index:06d}.pcd"
+            write_pcd(path, points_odom, reflectivity.ravel()[scan.pixels], scan.odom_T_sensor)
+            progress.stage("write", scan.index + 1, session.n_scans)
+        if movers is not None:
+            points = build_scoring_points(session)
+            write_pcd(folder / GT_CLOUD, points.points_odom.astype(np.float64), np.isin(points.instance, movers))
+        return sum(path.stat().st_size for path in folder.rglob("*.pcd"))
 
 
 def _revolutions(n: int) -> str:

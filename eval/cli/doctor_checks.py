@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from importlib import resources
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -169,6 +170,23 @@ def free_space() -> str:
     return "tells a free voxel from an occupied one"
 
 
+def point_file() -> str:
+    """Write a PCD file and read it again (pypcd4)."""
+    from tempfile import TemporaryDirectory
+
+    import numpy as np
+    from pypcd4.pypcd4 import PointCloud
+
+    from cdpipe.io.pcd import write_pcd
+
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "one.pcd")
+        write_pcd(path, np.array([[1.0, 2.0, 3.0]]), np.array([7]))
+        found = PointCloud.from_path(path).numpy().tolist()
+    _require(found == [[1.0, 2.0, 3.0, 7.0]], f"one point came back as {found}")
+    return "writes and reads a PCD file"
+
+
 def sdk() -> str:
     """Let the vendor's SDK load (ouster-sdk)."""
     from cdpipe.io.ouster.sdk import require_sdk
@@ -214,6 +232,7 @@ OF_EXTRA: dict[str, Callable[[], str]] = {
     "m3c2": surface_distance,
     "dufomap": void,
     "octomap": free_space,
+    "formats": point_file,
     "cluster": cluster,
 }
 

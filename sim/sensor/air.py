@@ -17,6 +17,7 @@ from scenarios.schema import Air, Dust
 from sim.geometry.noise import smooth_noise
 from sim.sensor.footprint import PULSE_M, Echo, choose_echo, no_echo
 from sim.sensor.optics import received_photons
+from sim.sensor.plumes import Puffs, fill_lattice
 from sim.sensor.rays import Rays
 
 AIR = -3  # number of the geom of a return from the air
@@ -40,16 +41,18 @@ class DustCloud:
     """The dust around the sensor during one revolution.
 
     Attributes:
-        dust: What it is like.
+        dust: What it is like where no vehicle raised it; None: there is none.
         floor_z_m: Height of the floor below the sensor, world frame, metres.
         corner_m: (3,) first point of the lattice, world frame, metres.
         swathes: (X, Y, Z) float32 density over its mean on the lattice.
+        raised: (X, Y, Z) float32 density of what vehicles raised, mg/m3; None: they raised none.
     """
 
-    dust: Dust
+    dust: Dust | None
     floor_z_m: float
     corner_m: Float64Array
     swathes: Float32Array
+    raised: Float32Array | None = None
 
     def extinction(self, points: Float32Array) -> Float32Array:
         """Return the extinction (N,), 1/m, at (3, N) points, world frame, metres; of the mean beyond the lattice."""
@@ -60,9 +63,15 @@ class DustCloud:
             np.clip(index[axis], 0, count - 1, out=index[axis])
         density: Float32Array = self.swathes[index[0], index[1], index[2]]
         density[is_off] = 1.0
-        density *= np.float32(DUST_M2_PER_MG * self.dust.mg_per_m3)
-        heights_m = np.maximum(points[2] - np.float32(self.floor_z_m), np.float32(0.0))
-        density *= np.exp(heights_m / np.float32(-self.dust.scale_height_m))
+        if self.dust is None:
+            density[:] = 0.0
+        else:
+            density *= np.float32(DUST_M2_PER_MG * self.dust.mg_per_m3)
+            heights_m = np.maximum(points[2] - np.float32(self.floor_z_m), np.float32(0.0))
+            density *= np.exp(heights_m / np.float32(-self.dust.scale_height_m))
+        if self.raised is not None:
+            raised = self.raised[index[0], index[1], index[2]]
+            density += np.float32(DUST_M2_PER_MG) * np.where(is_off, np.float32(0.0), raised)
         return density
 
 
@@ -88,26 +97,56 @@ class AirVolume:
         return mist + dust, from_mist + dust / np.float32(DUST_RATIO_SR)
 
 
-def air_around(air: Air, sensor_m: Float64Array, floor_z_m: float, time_s: float, seed: int, session: str) -> AirVolume:
-    """Return the air around a sensor at a (3,) position, world frame, at a time of its session."""
+def air_around(
+    air: Air,
+    sensor_m: Float64Array,
+    floor_z_m: float,
+    time_s: float,
+    seed: int,
+    session: str,
+    puffs: Puffs | None = None,
+) -> AirVolume:
+    """Return the air around a sensor at a (3,) position, world frame, at a time of its session.
+
+    Args:
+        air: Mist and dust of the session.
+        sensor_m: (3,) the position.
+        floor_z_m: Height of the floor below it.
+        time_s: The time.
+        seed: Of the scenario.
+        session: "before" or "after".
+        puffs: What vehicles have raised by then; it drifts with the session's dust, or stays in still air.
+    """
     mist_per_m = -np.log(CONTRAST_LEFT) / air.mist.visibility_m if air.mist is not None else 0.0
-    if air.dust is None:
+    if air.dust is None and puffs is None:
         return AirVolume(mist_per_m)
-    return AirVolume(mist_per_m, _dust_around(air.dust, sensor_m, floor_z_m, time_s, stream(seed, session, "air")))
+    return AirVolume(
+        mist_per_m, _dust_around(air.dust, puffs, sensor_m, floor_z_m, time_s, stream(seed, session, "air"))
+    )
 
 
 def _dust_around(
-    dust: Dust, sensor_m: Float64Array, floor_z_m: float, time_s: float, generator: np.random.Generator
+    dust: Dust | None,
+    puffs: Puffs | None,
+    sensor_m: Float64Array,
+    floor_z_m: float,
+    time_s: float,
+    generator: np.random.Generator,
 ) -> DustCloud:
-    """Return dust in swathes that are log-normal about their mean and drift along a drawn level heading."""
+    """Return dust in swathes that are log-normal about their mean and drift along a drawn level heading, and puffs."""
     key, heading_rad = int(generator.integers(1 << 62)), float(generator.uniform(0.0, 2 * np.pi))
-    drifted_m = dust.drift_mps * time_s * np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
+    heading = np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
     half_m = np.array([_LATTICE_REACH_M, _LATTICE_REACH_M, _LATTICE_HEIGHT_M])
     corner_m = np.floor((sensor_m - half_m) / _LATTICE_M) * _LATTICE_M
     axes = [start + np.arange(0.0, 2 * half + 1e-9, _LATTICE_M) for start, half in zip(corner_m, half_m, strict=True)]
+    speed_mps = 0.0 if dust is None else dust.drift_mps
+    raised = None if puffs is None else fill_lattice(puffs, speed_mps * heading, axes)
+    if dust is None:
+        return DustCloud(None, floor_z_m, corner_m, np.zeros([len(axis) for axis in axes], np.float32), raised)
+    drifted_m = speed_mps * time_s * heading
     moved = (axes[0] - drifted_m[0], axes[1] - drifted_m[1], axes[2])
     swathes = np.exp(dust.contrast * smooth_noise(moved, dust.patch_m, key) - dust.contrast**2 / 2)
-    return DustCloud(dust, floor_z_m, corner_m, swathes.astype(np.float32))
+    return DustCloud(dust, floor_z_m, corner_m, swathes.astype(np.float32), raised)
 
 
 def cross_air(

@@ -9,9 +9,10 @@ import numpy.typing as npt
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array, Int64Array
 from cdpipe.sensor.ouster import SensorMetadata
-from scenarios.schema import Scenario, SessionPlan
+from scenarios.schema import Air, Scenario, SessionPlan
 from sim.drive.trajectory import Trajectory
 from sim.movers.casting import MovingScene
+from sim.movers.trails import raise_dust
 from sim.scene import Scene
 from sim.sensor.air import AirVolume, air_around
 from sim.sensor.glass import Panes
@@ -124,12 +125,14 @@ def cast_revolution(drive: Drive, number: int) -> tuple[Rays, Scan]:
 def find_air(drive: Drive, number: int) -> AirVolume | None:
     """Return the mist and dust around the sensor during a revolution; None where the air is clear."""
     plan: SessionPlan = getattr(drive.scenario, drive.name)
-    if plan.air is None:
-        return None
     time_s = drive.trajectory.revolution_s[number : number + 1]
+    puffs = raise_dust(drive.moving.movers, float(time_s[0]))
+    if plan.air is None and puffs is None:
+        return None
     position_m = drive.trajectory.true.sample(time_s)[0][0]
     floor_z_m = position_m[2] - (plan.height_m or drive.scenario.platform.sensor_height_m)
-    return air_around(plan.air, position_m, float(floor_z_m), float(time_s[0]), drive.seed, drive.name)
+    told = position_m, float(floor_z_m), float(time_s[0]), drive.seed, drive.name, puffs
+    return air_around(plan.air or Air(), *told)
 
 
 def true_reach_m(sensor: SensorMetadata, result: Scan) -> Float32Array:

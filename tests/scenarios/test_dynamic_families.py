@@ -33,7 +33,20 @@ def test_a_dynamic_family_is_its_base_with_movers(name: str, base: str) -> None:
 
 def test_no_other_family_has_movers() -> None:
     for name in scenario_names():
-        assert bool(load_scenario(name, 1).movers) == name.startswith("dynamic/"), name
+        assert bool(load_scenario(name, 1).movers) == (name.startswith("dynamic/") or name == "dust/haul"), name
+
+
+def test_haul_is_wide_with_a_loader_that_raises_dust() -> None:
+    for seed in (1, 10001, 10002):
+        haul, wide = (load_scenario(name, seed).model_dump() for name in ("dust/haul", "wide"))
+        (loader,) = haul["movers"]
+        assert loader["kind"] == "loader" and 300 <= loader["dust_mg_per_m"] <= 3000
+        for tree in (haul, wide):
+            for key in ("family", "description", "movers"):
+                tree.pop(key, None)
+            for session in ("before", "after"):
+                tree[session].pop("air", None)
+        assert haul == wide
 
 
 def test_movers_are_repeated_and_drawn_as_props_are() -> None:

@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from cdpipe.core.geometry import transform
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import Session, SessionWriter, read_session
 from eval.cli import converting
 from eval.cli.main import main
-from sim.session.truth import read_labels
+from eval.truth.scoring_points import build_scoring_points
+from sim.session.truth import read_labels, read_pair_truth
 
 pytest.importorskip("ouster.sdk.core", reason="pip install 'tunnelcd[ouster]'")
 from ouster.sdk import osf
@@ -128,7 +131,7 @@ def test_names_and_options_that_do_not_go_together(pair: Path, tmp_path: Path, c
         ((pair / "truth" / "changes.json", tmp_path / "a"), "expected a session folder, or a recording (.osf, .pcap"),
         ((pair, tmp_path / "a.osf"), f"a pair of sessions: convert {before} and {pair / 'after'} one by one"),
         ((tmp_path, tmp_path / "a.osf"), "no session.json in it"),
-        ((before, tmp_path / "a"), "name a new file that ends in .osf"),
+        ((before, tmp_path / "a.bin"), "a new file that ends in .osf"),
         ((before, there), "there.osf exists already"),
         ((before, there / "a.osf"), "cannot write there"),
         ((before, tmp_path / "a.osf", "--odometry", "kiss-icp"), "leave --odometry out"),
@@ -160,3 +163,43 @@ def test_an_interrupt_leaves_nothing(
     assert command("convert", source, target, "--quiet") == (130, "", "interrupted; nothing was written\n")
     source.with_name("whole.osf").unlink(missing_ok=True)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_session_becomes_pcd_files_with_what_moves(tmp_path: Path, command: Command) -> None:
+    pypcd4 = pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
+    walker = "movers=[{name: walker, kind: person, path: {length_m: 6}, speed_mps: 1.2, sessions: after}]"
+    made = tmp_path / "made"
+    assert command("simulate", "smoke/unchanged", "--seed", "3", "--out", made, "--set", walker, *SMALL)[0] == 0
+    source, out = made / "after", tmp_path / "pcds"
+    code, said, _ = command("convert", source, out, "--with-truth")
+    assert code == 0
+    session = read_session(source)
+    assert said.startswith(f"{out}: {session.n_scans} revolutions, and what moves is 1 in gt_cloud.pcd, ")
+    assert sorted(path.name for path in out.iterdir()) == ["gt_cloud.pcd", "pcd"]
+    assert len(list((out / "pcd").iterdir())) == session.n_scans
+    reflectivity = next(session.chunks()).reflectivity
+    for scan in open_session(source).scans():
+        cloud = pypcd4.PointCloud.from_path(out / "pcd" / f"{scan.index:06d}.pcd")
+        assert cloud.fields == ("x", "y", "z", "intensity")
+        found = cloud.numpy()
+        wanted = transform(scan.odom_T_sensor, scan.points_sensor)
+        np.testing.assert_allclose(found[:, :3], wanted, atol=1e-5)
+        np.testing.assert_array_equal(found[:, 3], reflectivity[scan.index].ravel()[scan.pixels])
+        x, y, z, *turn = cloud.metadata.viewpoint
+        np.testing.assert_allclose((x, y, z), scan.odom_T_sensor[:3, 3], atol=1e-6)
+        rotation = Rotation.from_quat(np.roll(turn, -1)).as_matrix()
+        np.testing.assert_allclose(rotation, scan.odom_T_sensor[:3, :3], atol=1e-6)
+        if scan.index >= 3:
+            break
+    truth = pypcd4.PointCloud.from_path(out / "gt_cloud.pcd").numpy()
+    points = build_scoring_points(session)
+    np.testing.assert_array_equal(truth[:, :3], points.points_odom)
+    (mover,) = read_pair_truth(made).movers
+    np.testing.assert_array_equal(truth[:, 3], points.instance == mover.instance)
+    assert 30 < truth[:, 3].sum() < 0.1 * len(truth)
+    assert command("convert", source, tmp_path / "bare")[0] == 0
+    assert not (tmp_path / "bare" / "gt_cloud.pcd").exists()
+    refused(command("convert", source, out), "name a new or empty folder")
+    refused(
+        command("convert", source, tmp_path / "a.pcd"), "a new file that ends in .osf, or a new folder of PCD files"
+    )

@@ -105,6 +105,7 @@ def test_mine_has_ten_pairs_of_every_family_with_an_effect_beside_their_clean_tw
     assert len(plan.seeds) == 10 and all(20000 <= seed < 30000 for seed in plan.seeds)
     radii = {cell.scenario: cell.config.query.radius_m for cell in found if cell.variant == "m3c2"}
     assert {world for world, radius_m in radii.items() if radius_m == 10} == {
-        f"{effect}wide" for effect in ("", "dynamic/", "dust/", "glare/")
+        *(f"{effect}wide" for effect in ("", "dynamic/", "dust/", "glare/")),
+        "dust/haul",
     }
     assert {"tunnelcd[map.movers=keep]", "tunnelcd[map.airborne=keep]"} < {cell.variant for cell in found}
