@@ -1,8 +1,8 @@
 """What things are made of, and how much light of the LiDAR's 865 nm they send back.
 
 Shares of a perfect diffuse reflector. Typical figures for these materials in the near infrared; none is measured for
-the sensor modelled here, so all of them are unverified. What is above 1 is a retroreflector
-(`sim.sensor.optics.reflected_share`).
+the sensor modelled here, so all of them are unverified. The one far above 1 is a
+retroreflector (`sim.sensor.optics.reflected_share`).
 """
 
 from __future__ import annotations

@@ -30,7 +30,9 @@ from sim.sensor.glare import add_glare
 from sim.sensor.glass import Panes, cross_glass
 from sim.sensor.optics import (
     FALSE_PHOTONS,
+    RETRO_FROM,
     apparent_reflectivity,
+    as_white,
     detection_probability,
     false_returns,
     range_channel,
@@ -122,7 +124,7 @@ def scan(
         water: Puddles; None where there are none.
         panes: Panes of glass; None where glass is a wall.
     """
-    reflectivity = scene.reflectivity if settings.retroreflectors else np.minimum(scene.reflectivity, np.float32(1.0))
+    reflectivity = scene.reflectivity if settings.retroreflectors else as_white(scene.reflectivity)
     surfaces = scene.caster, reflectivity, rays, sensor.beam_origin_m
     echo, second = _see_surfaces(surfaces, scene.instance if owners is None else owners, settings)
     if water is not None:
@@ -143,7 +145,7 @@ def scan(
         echo, second = choose_echo(is_stronger, second, echo), choose_echo(is_stronger, echo, second)
     if settings.retroreflectors:
         draw = stream(seed, session, "glare", str(number)).random(echo.range_m.shape, dtype=np.float32)
-        echo, second = add_glare(echo, second, rays, sensor, reflectivity > 1, draw)
+        echo, second = add_glare(echo, second, rays, sensor, reflectivity >= RETRO_FROM, draw)
     parts = [_measure(echo, settings, (seed, session, ""), number)]
     if second is not None:
         parts = _arrange(parts[0], _measure(second, settings, (seed, session, "second-"), number))

@@ -42,6 +42,8 @@ LEAST_COSINE = 0.05
 # Above 100 % the reflectivity channel is logarithmic (the vendor's maintainers say so): counts for each doubling,
 # measured on about a hundred returns of 101 to 160; brighter ones bend off.
 COUNTS_PER_DOUBLING = 1.0 / 0.06
+# A reflectivity from this on is a retroreflector's: more than the highest count of the reflectivity channel stands for.
+RETRO_FROM = 700.0
 # What is left of a retroreflector's coefficient at an angle of entrance: EN ISO 20471, the least of new bands at 0.2
 # deg of observation (330, 290, 180, 65 cd/(lx m2)); that nothing is left at 60 deg is ours.
 RETRO_ENTRANCE_DEG, RETRO_LEFT = (5.0, 20.0, 30.0, 40.0, 60.0), (1.0, 290 / 330, 180 / 330, 65 / 330, 0.0)
@@ -52,7 +54,7 @@ FALSE_RETURN_RATE = 1e-4
 def reflected_share(reflectivity: Float32Array, geom: Int32Array, cosine: Float32Array) -> Float32Array:
     """Return how much light surfaces send back, as a share of what a white diffuse one does at right angles.
 
-    Reflectivity times cosine (Lambert). A reflectivity above 1 is that of a retroreflector at right angles: the light
+    Reflectivity times cosine (Lambert). One from `RETRO_FROM` on is that of a retroreflector at right angles: the light
     goes back to where it came from, at any angle of entrance up to some 30 deg, and the lit area grows with it.
 
     Args:
@@ -61,8 +63,8 @@ def reflected_share(reflectivity: Float32Array, geom: Int32Array, cosine: Float3
         cosine: (...) of the incidence, 0 where nothing was met.
     """
     share = reflectivity[geom] * cosine
-    if (reflectivity > 1).any():
-        retro = np.nonzero(reflectivity[geom] > 1)
+    if (reflectivity >= RETRO_FROM).any():
+        retro = np.nonzero(reflectivity[geom] >= RETRO_FROM)
         facing = np.maximum(cosine[retro], np.float32(LEAST_COSINE))
         left = np.interp(np.degrees(np.arccos(np.minimum(facing, 1.0))), RETRO_ENTRANCE_DEG, RETRO_LEFT)
         share[retro] = np.where(cosine[retro] > 0, reflectivity[geom[retro]] * left / facing, 0.0)
@@ -81,6 +83,11 @@ def mirrored_share(cosine: npt.NDArray[np.floating], index: float) -> npt.NDArra
     across = (cosine - index * refracted) / (cosine + index * refracted)
     along = (index * cosine - refracted) / (index * cosine + refracted)
     return np.asarray((across * across + along * along) / 2)
+
+
+def as_white(reflectivity: Float32Array) -> Float32Array:
+    """Return reflectivities (G,) in which retroreflectors are perfect diffuse reflectors."""
+    return np.where(reflectivity >= RETRO_FROM, np.float32(1.0), reflectivity)
 
 
 def received_photons(power: Float32Array, range_m: Float32Array) -> Float32Array:

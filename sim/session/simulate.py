@@ -33,6 +33,7 @@ from sim.movers.planning import plan_movers
 from sim.placement.puddles import lay_puddles
 from sim.scene import build_world
 from sim.sensor.glass import Panes
+from sim.sensor.optics import as_white
 from sim.sensor.water import Water
 from sim.session.labels import list_changes
 from sim.session.revolution import CHANNELS, Drive, Revolution, simulate_revolution, tally_revolution
@@ -191,7 +192,7 @@ def plan_drives(scenario: Scenario, seed: int, sensor: SensorMetadata | None = N
         owners = np.where(np.isin(moving.instance, held), moving.instance, np.int32(0))
         seen = np.zeros((len(moving.movers), trajectory.n_scans, 4))
         own, pools = scenario.of(name), lay_puddles(scenario, world.centreline, world.walls, name, seed)
-        diffuse = np.minimum(scene.reflectivity, np.float32(1.0))
+        diffuse = as_white(scene.reflectivity)
         water = Water(pools, scene.caster, diffuse) if pools else None
         is_glass = np.array(scene.materials) == "glass"
         panes = Panes(scene.caster, diffuse, owners, is_glass) if own.sensor.glass and is_glass.any() else None

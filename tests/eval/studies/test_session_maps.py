@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from cdpipe.io.readers import open_session
+from cdpipe.io.session import read_session
 from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import load_config
 from eval.studies.session_maps import find_dynamic, main, measure_accuracy
@@ -43,7 +44,8 @@ def test_a_point_is_dynamic_by_its_returns(pair: Path) -> None:
     assert found.sum() > 30
     # counted return by return
     wanted = np.zeros((len(found), 2), dtype=np.int64)
-    instances = np.concatenate([each for each, _ in read_labels(pair / "after", open_session(pair / "after").n_chunks)])
+    n_chunks = read_session(pair / "after").n_chunks
+    instances = np.concatenate([each for each, _ in read_labels(pair / "after", n_chunks)])
     for scan, instance in enumerate(instances):
         own = slice(*point_map.scan_offsets[scan : scan + 2])
         for point, pixel in zip(point_map.return_points[own], point_map.return_pixels[own], strict=True):

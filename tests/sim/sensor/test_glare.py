@@ -17,7 +17,7 @@ from sim.scene import Scene
 from sim.sensor.footprint import Echo, central_echo
 from sim.sensor.glare import GLARE, REACH_DEG, REPORTED_SHARE, STRAY_AT_1_DEG, add_glare
 from sim.sensor.lidar import Scan, scan
-from sim.sensor.optics import reflected_share
+from sim.sensor.optics import RETRO_FROM, reflected_share
 from sim.sensor.rays import Rays, revolution_rays
 from sim.session.simulate import plan_drives
 
@@ -45,7 +45,7 @@ def bare_echo(sensor: SensorMetadata, scene: Scene) -> Echo:
 def glaring(sensor: SensorMetadata, scene: Scene, draw: float) -> tuple[Echo, Echo]:
     clear = bare_echo(sensor, scene)
     draws = np.full(clear.range_m.shape, draw, np.float32)
-    return clear, add_glare(clear, None, still(sensor), sensor, scene.reflectivity > 1, draws)[0]
+    return clear, add_glare(clear, None, still(sensor), sensor, scene.reflectivity >= RETRO_FROM, draws)[0]
 
 
 @pytest.mark.parametrize(("entrance_deg", "coefficient"), [(5, 330), (20, 290), (30, 180), (40, 65)])
@@ -56,6 +56,12 @@ def test_a_retroreflector_sends_back_what_the_standard_asks_of_its_area(
     share = reflected_share(np.array([0.25, RETRO], np.float32), np.array([1], np.int32), cosine)
     # of white paper: a beam of fixed width lights 1 / cosine of its width, and the coefficient is by area
     assert share == pytest.approx(np.pi * coefficient / cosine, rel=1e-3)
+
+
+def test_bright_paint_is_lamberts() -> None:
+    cosine = np.array([1.0, 0.5], np.float32)
+    found = reflected_share(np.array([4.0], np.float32), np.zeros(2, np.int32), cosine)
+    assert found == pytest.approx([4.0, 2.0])
 
 
 def test_a_retroreflector_from_the_side_is_white_and_rock_is_lamberts() -> None:
@@ -98,7 +104,7 @@ def test_most_outshone_beams_report_nothing_and_a_covered_plate_does_no_harm(sen
     assert same is covered
     clear = bare_echo(sensor, hall(RETRO))
     draws = np.ones(clear.range_m.shape, np.float32)
-    *_, second = add_glare(clear, clear, still(sensor), sensor, hall(RETRO).reflectivity > 1, draws)
+    *_, second = add_glare(clear, clear, still(sensor), sensor, hall(RETRO).reflectivity >= RETRO_FROM, draws)
     assert second is not None
     assert not second.photons[is_outshone].any()
 
