@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from sim.geometry.raycast import Caster
@@ -114,43 +115,49 @@ def _look_through(echo: Echo, beams: _Beams, panes: Panes) -> Echo:
         geom[on_way], facing[on_way] = np.where(is_pane, -1, met), np.where(is_pane, np.float32(0.0), cosine)
         on_way = on_way[is_pane]
         passed[on_way] *= _pass_face(cosine[is_pane].astype(np.float64))
-    is_met = geom >= 0
-    range_m = np.where(is_met, beams.reach_m + np.where(is_met, gone_m, 0.0), 0.0).astype(np.float32)
-    share = reflected_share(panes.reflectivity, geom, facing) * np.square(passed).astype(np.float32)
-    return replace_pixels(
-        no_echo(echo),
-        beams.pixel,
-        range_m=range_m,
-        photons=_photons(share, range_m),
-        cosine=facing,
-        true_range_m=np.where(is_met, range_m, np.float32(np.inf)),
-        geom=geom,
-        owner=panes.owners[geom],
-    )
+    seen = _make_echo(echo, beams, panes, gone_m, geom, facing, passed)
+    reach_m = seen.range_m.ravel()[beams.pixel]
+    true_m = np.where(geom >= 0, reach_m, np.float32(np.inf))
+    return replace_pixels(seen, beams.pixel, true_range_m=true_m, geom=geom, owner=panes.owners[geom])
 
 
 def _look_back(echo: Echo, beams: _Beams, panes: Panes) -> Echo:
     """Return the echo of what the panes mirror."""
     turned = beams.way - 2.0 * (beams.way * beams.normal).sum(axis=1)[:, None] * beams.normal
     further_m, geom, facing = panes.caster.cast(beams.start + _BEYOND_M * turned, turned)
+    mirrored = np.asarray(mirrored_share(beams.cosine, GLASS_INDEX))
+    seen = _make_echo(echo, beams, panes, further_m, geom, facing, mirrored)
+    return replace_pixels(seen, beams.pixel, geom=np.where(geom >= 0, np.int32(MIRRORED), np.int32(-1)))
+
+
+def _make_echo(
+    echo: Echo,
+    beams: _Beams,
+    panes: Panes,
+    further_m: npt.NDArray[np.floating],
+    geom: Int32Array,
+    facing: Float32Array,
+    share: Float64Array,
+) -> Echo:
+    """Return the echo of what the beams meet beyond the panes, its geoms still to be named.
+
+    Args:
+        echo: Gives the shape.
+        beams: The N beams.
+        panes: The scene.
+        further_m: (N,) distance from the pane to what is met.
+        geom: (N,) what is met, -1 for nothing.
+        facing: (N,) cosine of the incidence on it.
+        share: (N,) share of the light that passes, or is mirrored, each way.
+    """
     is_met = geom >= 0
     range_m = np.where(is_met, beams.reach_m + np.where(is_met, further_m, 0.0), 0.0).astype(np.float32)
-    mirrored = np.square(mirrored_share(beams.cosine, GLASS_INDEX)).astype(np.float32)
-    share = reflected_share(panes.reflectivity, geom, facing) * mirrored
-    return replace_pixels(
-        no_echo(echo),
-        beams.pixel,
-        range_m=range_m,
-        photons=_photons(share, range_m),
-        cosine=facing,
-        geom=np.where(is_met, np.int32(MIRRORED), np.int32(-1)),
-    )
+    power = reflected_share(panes.reflectivity, geom, facing) * np.square(share).astype(np.float32)
+    light = received_photons(power, np.maximum(range_m, np.float32(1e-3)))
+    photons = np.where(power > 0, light, np.float32(0.0))
+    return replace_pixels(no_echo(echo), beams.pixel, range_m=range_m, photons=photons, cosine=facing)
 
 
 def _pass_face(cosine: Float64Array) -> Float64Array:
     """Return the share of light that passes one face of a pane, and half its glass."""
     return np.asarray((1.0 - mirrored_share(cosine, GLASS_INDEX)) * np.sqrt(1.0 - ABSORBED))
-
-
-def _photons(share: Float32Array, range_m: Float32Array) -> Float32Array:
-    return np.where(share > 0, received_photons(share, np.maximum(range_m, np.float32(1e-3))), np.float32(0.0))
