@@ -297,6 +297,8 @@ def describe_recording(scenario: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _make_identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
+    extras = [f"{name} {version}" for name, version in answer.extras.items()]
+    extras += sorted({session.made_poses for session in truth.sessions.values()} - {""})
     return {
         "scenario": truth.pair.family,
         "family": truth.pair.family,
@@ -313,7 +315,7 @@ def _make_identity(answer: Answer, truth: GroundTruth) -> dict[str, Any]:
         "score_radius_m": truth.pair.score_radius_m,
         **describe_recording(truth.pair.scenario),
         "checkpoints": ";".join(f"{name} {digest}" for name, digest in answer.checkpoints.items()),
-        "extras": ";".join(f"{name} {version}" for name, version in answer.extras.items()),
+        "extras": ";".join(extras),
     }
 
 

@@ -39,6 +39,7 @@ class SessionTruth:
         seen_movers_world: (N, 3) mean true position of the returns on each mover in each revolution that has some.
         judged_scans: (J,) the first scan and one per metre of odometry. Keyframe scores and merges are judged there,
             whatever keyframes an answer names.
+        made_poses: Package that estimated the poses, with its version; "" where it was none.
     """
 
     odom_T_sensor: Float64Array
@@ -46,6 +47,7 @@ class SessionTruth:
     scoring_points: ScoringPoints
     seen_movers_world: Float64Array = field(default_factory=lambda: np.zeros((0, 3)))
     judged_scans: Int64Array = field(init=False)
+    made_poses: str = ""
 
     def __post_init__(self) -> None:
         require_poses("odom_T_sensor", self.odom_T_sensor)
@@ -143,10 +145,12 @@ def ground_truth(truth: PairTruth, sessions: Mapping[SessionName, SessionTruth])
 
 
 def _load_session(path: Path, n_movers: int) -> SessionTruth:
-    odom_T_sensor = read_session(path).odom_T_sensor
+    session = read_session(path)
+    odom_T_sensor, made_poses = session.odom_T_sensor, str(session.provenance.get("odometry", ""))
     seen_world = _load_seen_movers(path, n_movers, len(odom_T_sensor))
     try:
-        return SessionTruth(odom_T_sensor, read_true_poses(path), load_scoring_points(path), seen_world)
+        points = load_scoring_points(path)
+        return SessionTruth(odom_T_sensor, read_true_poses(path), points, seen_world, made_poses=made_poses)
     except (KeyError, ValueError) as error:
         raise InputError(f"{path / 'truth'}: not the truth of this session: {error}") from error
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
-from cdpipe.core.plugins import require_extra
+from cdpipe.core.plugins import extra_version, require_extra
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.core.yamlfile import setting_lines
 from cdpipe.io.session import CHUNK_SCANS, ScanChunk, Session, SessionWriter, fit_chunk
@@ -210,6 +210,9 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
     n_scans = drive.trajectory.n_scans
     profile = drive.scenario.sensor.profile
     provenance = {"made_by": "tunnelcd simulate", "session": drive.name, "sensor_profile": profile}
+    plan: SessionPlan = getattr(drive.scenario, drive.name)
+    if plan.odometry.source == "kiss-icp":
+        provenance["odometry"] = f"kiss-icp {extra_version('kiss-icp')}"
     with (
         SessionWriter(folder, drive.sensor, _chunk_scans(drive), provenance, drive.scenario.sensor.n_returns) as writer,
         closing(_simulate_revolutions(drive, pool)) as revolutions,

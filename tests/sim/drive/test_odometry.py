@@ -4,6 +4,7 @@ import importlib.util
 import tempfile
 from collections.abc import Callable
 from dataclasses import fields, replace
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,13 @@ def test_kiss_icp_stays_near_the_truth_on_a_rough_drift(pair: Path) -> None:
     assert max(np.rad2deg(Rotation.from_matrix(each[:3, :3]).magnitude()) for each in error) < 3.0
     # It is an estimate, not the truth.
     assert np.linalg.norm(error[-1, :3, 3]) > 1e-3
+
+
+@needs_kiss_icp
+def test_a_session_says_which_package_made_its_poses(pair: Path) -> None:
+    told = f"kiss-icp {metadata.version('kiss-icp')}"
+    assert read_session(pair / "before").provenance["odometry"] == told
+    assert "odometry" not in read_session(pair / "after").provenance
 
 
 @needs_kiss_icp
