@@ -17,21 +17,28 @@ from matplotlib.figure import Figure
 from cdpipe.core.geometry import Float32Array, Float64Array, make_pose, yaw_pose
 from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.schema import Sensor
-from sim.geometry.mesh import Mesh, box_mesh
+from sim.geometry.mesh import Mesh, box_mesh, move_mesh
 from sim.geometry.raycast import Caster
+from sim.materials import REFLECTIVITY
 from sim.scene import Scene
 from sim.sensor.air import AIR, AirVolume
 from sim.sensor.footprint import central_echo, spread_echo
+from sim.sensor.glare import GLARE
+from sim.sensor.glass import ABSORBED, GLASS_INDEX, Panes
 from sim.sensor.lidar import FALSE_RETURN, Scan, scan
 from sim.sensor.optics import (
     FALSE_RETURN_RATE,
+    MIRRORED,
     PHOTONS_AT_1_M,
     detection_probability,
+    mirrored_share,
     range_sigma_m,
     received_photons,
+    reflected_share,
     reflectivity_channel,
 )
 from sim.sensor.rays import Rays, revolution_rays
+from sim.sensor.water import WATER_INDEX
 
 SEED = 7
 _IDEAL = Sensor(range_noise=False, dropouts=False, false_positives=False)
@@ -163,7 +170,7 @@ def _channels(figure: Figure) -> None:
     bright = _grid(0.01, 100.0)
     right.semilogx(100 * bright, reflectivity_channel(bright), color=_COLOURS[0])
     right.axvline(100.0, color="grey", linewidth=0.8, linestyle=":")
-    right.text(125.0, 20.0, "logarithmic; no simulated\nmaterial is so bright", fontsize=8, color="grey")
+    right.text(125.0, 20.0, "logarithmic; of our materials\nretroreflectors alone", fontsize=8, color="grey")
     right.set(xlabel="reflectivity x cosine (%)", ylabel="reflectivity channel", title="Calibrated reflectivity")
 
 
@@ -250,6 +257,69 @@ def _air(figure: Figure) -> None:
     right.legend(fontsize=8)
 
 
+def _mirrors(figure: Figure) -> None:
+    left, right = figure.subplots(1, 2)
+    angles_deg = np.linspace(0.0, 89.9, 300)
+    cosine = np.cos(np.deg2rad(angles_deg))
+    for (name, index), colour in zip({"water": WATER_INDEX, "glass": GLASS_INDEX}.items(), _COLOURS, strict=False):
+        left.plot(angles_deg, mirrored_share(cosine, index), color=colour, label=f"{name}, mirrored")
+    passed = (1.0 - mirrored_share(cosine, GLASS_INDEX)) ** 2 * (1.0 - ABSORBED)
+    left.plot(angles_deg, passed, "--", color=_COLOURS[1], label="pane, let through")
+    left.set(xlabel="incidence (deg)", ylabel="share of the light", title="Fresnel; each way")
+    left.legend(fontsize=8)
+    sensor, hall = load_profile("os1-32-nominal", "2048x10"), box_mesh((9.0, 6.0, 2.0))
+    pane = move_mesh(box_mesh((2.5, 0.003, 1.5)), yaw_pose(0.2, (3.5, 1.4, 0.0)))
+    meshes = Mesh(hall.vertices, hall.faces[:, ::-1]), pane
+    shares, owners = np.array([0.25, 0.05], np.float32), np.array([0, 1], np.int32)
+    scene = Scene(meshes, Caster(meshes), owners, shares, ("wall", "pane"), ("rock", "glass"))
+    panes, both = (
+        Panes(scene.caster, shares, owners, owners == 1),
+        Sensor(**(_IDEAL.model_dump() | {"returns": "dual"})),
+    )
+    rays = revolution_rays(sensor, np.tile(make_pose(), (sensor.width, 1, 1)))
+    result = scan(scene, sensor, both, rays, SEED, "before", 0, panes=panes)
+    points = sensor.project(result.range_mm / 1000.0)
+    level = np.tile(np.abs(sensor.altitude_deg) < 1.0, 2)[:, None] & (result.range_mm > 0)
+    for told, geom, colour in (("walls", 0, "grey"), ("pane", 1, _COLOURS[2]), ("mirrored", MIRRORED, _COLOURS[1])):
+        shown = points[level & (result.geom == geom)]
+        right.plot(shown[:, 0], shown[:, 1], ".", markersize=2, color=colour, label=told)
+    right.set(xlabel="x (m)", ylabel="y (m)", title="A pane of 5 m, both returns", aspect="equal")
+    right.legend(fontsize=7, loc="lower right", framealpha=1.0)
+
+
+def _glare(figure: Figure) -> None:
+    left, right = figure.subplots(1, 2)
+    angles_deg = np.linspace(0.0, 75.0, 300)
+    cosine, shares = (
+        np.cos(np.deg2rad(angles_deg)).astype(np.float32),
+        np.array([REFLECTIVITY["reflector"]], np.float32),
+    )
+    left.plot(
+        angles_deg, reflected_share(shares, np.zeros(300, np.int32), cosine), color=_COLOURS[1], label="reflector"
+    )
+    left.plot(angles_deg, cosine, color="grey", label="white")
+    left.set(xlabel="incidence (deg)", ylabel="light, of white at right angles", title="A retroreflector", yscale="log")
+    left.legend(fontsize=8)
+    sensor, hall, plate = (
+        load_profile("os1-32-nominal", "1024x10"),
+        box_mesh((12.0, 12.0, 4.0)),
+        box_mesh((0.01, 0.2, 0.2)),
+    )
+    meshes = Mesh(hall.vertices, hall.faces[:, ::-1]), Mesh(plate.vertices + np.array([6.0, 0.0, 0.0]), plate.faces)
+    reflectivity = np.array([0.25, REFLECTIVITY["reflector"]], np.float32)
+    scene = Scene(meshes, Caster(meshes), np.array([0, 1], np.int32), reflectivity, ("wall",), ("rock",))
+    result = _still_scan(scene, sensor, Sensor(**(_IDEAL.model_dump() | {"retroreflectors": True, "sub_rays": 7})), 0)
+    ways = sensor.directions
+    azimuth_deg, altitude_deg = np.rad2deg(np.arctan2(ways[..., 1], ways[..., 0])), np.rad2deg(np.arcsin(ways[..., 2]))
+    near = (np.abs(azimuth_deg) < 8.0) & (np.abs(altitude_deg) < 8.0)
+    kinds = (("wall", 0, "grey"), ("plate", 1, _COLOURS[1]), ("nothing", -1, _COLOURS[0]), ("glare", GLARE, "k"))
+    for told, geom, colour in kinds:
+        shown = near & (result.geom == geom)
+        right.plot(azimuth_deg[shown], altitude_deg[shown], ".", markersize=5, color=colour, label=told)
+    right.set(xlabel="azimuth (deg)", ylabel="altitude (deg)", title="Beams around a plate at 6 m")
+    right.legend(fontsize=8, loc="upper right", framealpha=1.0)
+
+
 def _facing_share(sensor: SensorMetadata, settings: Sensor, share: float, wall_m: float) -> float:
     """Return the share of beams within 5 degrees of the normal of a wall that have a return."""
     result = _still_scan(_room((wall_m, 150.0, 150.0), share), sensor, settings, int(wall_m))
@@ -293,6 +363,8 @@ _PLOTS: dict[str, Callable[[Figure], None]] = {
     "false_returns": _false_returns,
     "steps": _steps,
     "air": _air,
+    "mirrors": _mirrors,
+    "glare": _glare,
 }
 
 if __name__ == "__main__":
