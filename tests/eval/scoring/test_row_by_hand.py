@@ -446,13 +446,13 @@ def test_metrics_of_others_add_columns(
 
 
 def test_a_row_names_the_package_that_made_the_poses(tiny_pair: Path, tiny_merge: np.ndarray, tmp_path: Path) -> None:
-    shutil.copytree(tiny_pair, tmp_path / "pair")
-    path = tmp_path / "pair" / "after" / "session.json"
+    shutil.copytree(tiny_pair, tmp_path / "told")
+    path = tmp_path / "told" / "after" / "session.json"
     document = json.loads(path.read_text())
     document["provenance"]["odometry"] = "kiss-icp 9.9"
     path.write_text(json.dumps(document))
     report = replace(true_report(tiny_pair, tiny_merge), config={"method": "ours"}, extras={"py4dgeo": "1.0"})
-    assert score(report, tmp_path / "pair")["extras"] == "py4dgeo 1.0;kiss-icp 9.9"
+    assert score(report, tmp_path / "told")["extras"] == "py4dgeo 1.0;kiss-icp 9.9"
 
 
 def test_a_report_in_memory_scores_like_the_stored_one(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
