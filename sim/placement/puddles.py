@@ -9,12 +9,14 @@ import numpy as np
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, stream
 from scenarios.schema import Puddle, Scenario
+from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 from sim.placement.fitting import Spot
 from sim.placement.placing import PROBE_UP_M, floor_heights
 from sim.placement.stations import draw_areas, drawn_spots, spot_between, way
 from sim.rock.centreline import Centreline, left_of
 
+_SHEET_CORNERS = 48
 _PROBE_M = 0.1  # between the places at which the floor is measured
 
 
@@ -29,6 +31,13 @@ class Pool:
 
     puddle: Puddle
     centre: Float64Array
+
+    def sheet(self) -> Mesh:
+        """Return the whole disc as a surface, world frame, facing up."""
+        turn, corners = np.linspace(0.0, 2 * np.pi, _SHEET_CORNERS, endpoint=False), np.arange(_SHEET_CORNERS)
+        rim = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(_SHEET_CORNERS)])
+        faces = np.column_stack([np.zeros_like(corners), 1 + corners, 1 + np.roll(corners, -1)]).astype(np.int32)
+        return Mesh(np.concatenate([[self.centre], self.centre + self.puddle.radius_m * rim]), faces)
 
 
 def lay_puddles(scenario: Scenario, centreline: Centreline, walls: Caster, session: str, seed: int) -> tuple[Pool, ...]:

@@ -21,8 +21,11 @@ from cdpipe.core.geometry import Float64Array, stream, yaw_pose, yaw_rad
 from cdpipe.core.yamlfile import suggest
 from scenarios import load_scenario, scenario_names
 from scenarios.schema import Drift, Place, Prop, Roughness, Scenario, Section, SessionPlan, Tunnel
+from sim.geometry.mesh import move_mesh
+from sim.geometry.raycast import Caster
 from sim.placement.placing import Posture, Standing, standing_box, standing_middle
 from sim.scene import Scene, World, build_world
+from sim.session.simulate import plan_drives
 from sim.view.picture import render
 
 SEED = 20000
@@ -45,6 +48,7 @@ _DISTANCE_M = 2.0
 _EYE_M = 1.6
 _FRACTIONS = (0.5, 0.4, 0.6, 0.3)
 _QUALITY = 82
+_FIRST_GUEST = 20_000  # number of the first mover or puddle of a picture
 Pixels = npt.NDArray[np.uint8]
 
 
@@ -87,19 +91,59 @@ def draw_gallery(out: Path, only: Sequence[str] = ()) -> list[Path]:
 
 
 def family_picture(scenario: Scenario, seed: int) -> Pixels:
-    """Return a picture of a world in the after session, from the place that shows most of the changes."""
+    """Return a picture of a world in the after session, from the place that shows most of the changes.
+
+    With movers or puddles it shows most of these, movers where they are in the middle of the session.
+    """
     world = build_world(scenario, seed)
-    scene = world.after
+    if scenario.movers or scenario.puddles:
+        scene, places = _with_guests(scenario, seed)
+        return _best_view(world, scene, places, set(range(_FIRST_GUEST, _FIRST_GUEST + len(places))), nearest_m=5.0)
     changed = [item for item in world.standing if item.prop.change != "none" and "after" in item.sessions]
     # a little above a low prop, so that walls and roof come into the picture
     targets = [standing_middle(item) + np.array([0.0, 0.0, 0.6]) for item in changed or world.standing]
     numbers = {prop.name: number for number, prop in enumerate(scenario.props, start=1)}
-    wanted = {numbers[item.prop.name] for item in changed}
+    return _best_view(world, world.after, targets, {numbers[item.prop.name] for item in changed})
+
+
+def _with_guests(scenario: Scenario, seed: int) -> tuple[Scene, list[Float64Array]]:
+    """Return the after session's scene with its movers and puddles, and a place to look at of each, (3,).
+
+    Raises:
+        ScenarioError: A mover finds no way.
+    """
+    drive = plan_drives(scenario, seed)[1]
+    middle_s = drive.trajectory.revolution_s[[drive.trajectory.n_scans // 2]]
+    pools = drive.water.pools if drive.water is not None else ()
+    guests = [([pool.sheet()], ["water"], pool.centre) for pool in pools]
+    for body in drive.moving.movers:
+        poses = body.world_T_links(middle_s)[:, 0]
+        meshes = [
+            move_mesh(mesh, pose) for limb, pose in zip(body.figure.limbs, poses, strict=True) for mesh in limb.meshes
+        ]
+        place = body.world_T_root(middle_s)[0, :3, 3] + np.array([0.0, 0.0, 0.6])
+        guests.append((meshes, list(body.figure.materials), place))
+    scene = drive.scene
+    parts, materials, every, instance = list(scene.parts), list(scene.materials), list(scene.meshes), [scene.instance]
+    for number, (meshes, of_solids, _) in enumerate(guests):
+        every += meshes
+        materials += of_solids
+        parts += [f"guest-{number}"] * len(meshes)
+        instance.append(np.full(len(meshes), _FIRST_GUEST + number, np.int32))
+    shares = np.concatenate([scene.reflectivity, np.ones(len(every) - len(scene.meshes), np.float32)])
+    shown = Scene(tuple(every), Caster(every), np.concatenate(instance), shares, tuple(parts), tuple(materials))
+    return shown, [place for _, _, place in guests]
+
+
+def _best_view(
+    world: World, scene: Scene, targets: Sequence[Float64Array], wanted: set[int], nearest_m: float = 3.0
+) -> Pixels:
+    """Return a picture of a scene towards one of some places (3,), from where most of the wanted objects are seen."""
     stations = np.concatenate([line.points[::10] for line in world.centreline.drifts]) + np.array([0.0, 0.0, _EYE_M])
     views = [(stations[0], stations[1], -1.0)]
     for target in targets:
         distance_m = np.linalg.norm(stations - target, axis=1)
-        eyes = stations[(distance_m > 3.0) & (distance_m < 9.0)]
+        eyes = stations[(distance_m > nearest_m) & (distance_m < nearest_m + 6.0)]
         views += [(eye, target, _score(scene, eye, target, wanted)) for eye in eyes]
     eye, target, _ = max(views, key=lambda view: view[2])
     return render(scene, eye, target, *_FAMILY_PX, field_of_view_deg=78.0, samples=2)

@@ -21,6 +21,7 @@ COLOURS: dict[str, tuple[float, float, float]] = {
     "fabric": (0.80, 0.68, 0.30),
     "reflector": (0.95, 0.93, 0.88),
     "glass": (0.14, 0.19, 0.22),
+    "water": (0.10, 0.16, 0.22),
 }
 _PAINTS = ((0.80, 0.58, 0.10), (0.16, 0.36, 0.62), (0.20, 0.46, 0.28), (0.74, 0.34, 0.10), (0.42, 0.47, 0.52))
 _LAMP_M = (1.1, 0.8)  # right of the camera and above it

@@ -32,7 +32,6 @@ from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Revolutions, Rgb, s
 
 _N_BANDS = 10
 _WATER_RGB: Rgb = (70, 120, 170)
-_SHEET_CORNERS = 48
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -321,15 +320,11 @@ def _puddle_surfaces(world: World, scenario: Scenario, seed: int) -> list[Surfac
     Raises:
         ScenarioError: There is no floor under a puddle.
     """
-    turn = np.linspace(0.0, 2 * np.pi, _SHEET_CORNERS, endpoint=False)
-    rim, corners = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(_SHEET_CORNERS)]), np.arange(_SHEET_CORNERS)
-    faces = np.column_stack([np.zeros_like(corners), 1 + corners, 1 + np.roll(corners, -1)]).astype(np.int32)
     sheets = {}
     for session in SESSIONS:
         for pool in lay_puddles(scenario, world.centreline, world.walls, session, seed):
             where = "" if pool.puddle.sessions == "both" else f" ({session})"
-            outline = pool.centre + pool.puddle.radius_m * rim
-            sheets[f"puddles/{pool.puddle.name}{where}"] = Mesh(np.concatenate([[pool.centre], outline]), faces)
+            sheets[f"puddles/{pool.puddle.name}{where}"] = pool.sheet()
     return [Surface(name, mesh, _WATER_RGB) for name, mesh in sheets.items()]
 
 

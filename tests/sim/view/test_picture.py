@@ -9,6 +9,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from scenarios import load_scenario
 from scenarios.schema import Prop, Scenario
 from sim.materials import REFLECTIVITY
 from sim.scene import Scene, build_world
@@ -64,7 +65,7 @@ def test_more_samples_make_the_same_picture_smoother(boxed: Scenario) -> None:
 
 
 def test_every_material_has_a_colour_and_parts_are_drawn_in_theirs(boxed: Scenario) -> None:
-    assert COLOURS.keys() == REFLECTIVITY.keys()
+    assert COLOURS.keys() == {*REFLECTIVITY, "water"}  # a puddle is no geom
     scene = build_world(boxed, 0).after
     colours = part_colours(scene)
     assert colours.shape == (len(scene.meshes), 3)
@@ -104,3 +105,21 @@ def test_the_gallery_shows_a_family_and_a_prop_from_two_metres(
         ranges_m, geom, _ = scene.caster.cast(eye[None], ray[None])
         assert scene.instance[geom[0]] == 1
         assert 1.5 < ranges_m[0] < 2.9
+
+
+def test_a_picture_of_a_family_shows_its_movers_and_puddles() -> None:
+    walker = "movers=[{name: walker, kind: person, path: {length_m: 6}}]"
+    puddle = "puddles=[{name: p, place: {between: [start, bend], fraction: 0.5}, radius_m: 1}]"
+    scene, places = gallery._with_guests(load_scenario("smoke/unchanged", 3, [walker, puddle]), 3)
+    plain = build_world(load_scenario("smoke/unchanged", 3), 3).after
+    added = len(scene.meshes) - len(plain.meshes)
+    assert len(places) == 2 and added > 10
+    assert scene.parts[-added:] == ("guest-0", *["guest-1"] * (added - 1))
+    assert scene.materials[-added] == "water" and set(scene.materials[1 - added :]) > {"fabric", "reflector"}
+    # a ray down at the puddle meets it, one at the walker's chest meets the walker
+    down = scene.caster.cast(places[0][None] + (0.0, 0.0, 1.0), np.array([[0.0, 0.0, -1.0]]))[1]
+    assert scene.instance[down].tolist() == [gallery._FIRST_GUEST]
+    level = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.linspace(0, 2 * np.pi, 16, endpoint=False)])
+    chest = places[1] + (0.0, 0.0, 0.6)
+    met = scene.caster.cast(chest + 1.0 * level, -level)[1]
+    assert (scene.instance[met] == gallery._FIRST_GUEST + 1).mean() > 0.7
