@@ -14,9 +14,13 @@
                   keyframe_scores (Kb,), before_keyframe_scans (Kb,), after_keyframe_scans (Ka,),
                   object_returns (M, 2) int32 with object_return_offsets (O + 1,),
                   object_points_map (P, 3) with object_point_offsets (O + 1,), and figure_<name> (R,) each;
-                  local_before_T_after (Ka, 4, 4), local alignment at each after keyframe (optional)
+                  local_before_T_after (Ka, 4, 4), local alignment at each after keyframe (optional);
+                  surface_points_map (Q, 3), surface_normals_map (Q, 3), surface_displacement_m (Q,), surface_level_m
+                  (Q,) and surface_region (Q,), how far the rock moved (all or none of them): see `SurfaceField`;
+                  surface_regions of answer.json are its regions
 
-`seconds` holds t_index_s, t_merge_s, t_refine_s, t_descriptor_s, t_cd_s and t_oe_s as far as they were measured.
+`seconds` holds t_index_s, t_merge_s, t_refine_s, t_descriptor_s, t_cd_s, t_oe_s and t_surface_s as far as they were
+measured.
 
 A refused or failed case has an answer.json with status and error, and no answer.npz. An answer of another program may
 replace object_returns by object_points_odom with object_point_odom_offsets: points in the odom frame of the session
@@ -29,7 +33,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -45,6 +49,7 @@ from cdpipe.io.answer_parts import (
     FORMAT_VERSION,
     MAX_ERROR,
     OFFSETS,
+    SURFACE,
     AnswerPart,
     ShapePart,
     Until,
@@ -52,7 +57,14 @@ from cdpipe.io.answer_parts import (
     check_document,
     check_offsets,
 )
-from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
+from cdpipe.model.report import (
+    ChangedObject,
+    ChangeRegions,
+    ChangeReport,
+    ObjectShape,
+    SurfaceField,
+    SurfaceRegion,
+)
 
 # Fields of an object that answer.json holds as they are.
 _OBJECT_FIELDS = ("session", "kind", "region", "score", "partner")
@@ -113,6 +125,8 @@ def write_answer(folder: Path | str, method: str, report: ChangeReport, until: U
         "local_before_T_after": report.local_before_T_after,
     }
     arrays |= {name: array for name, array in optional.items() if array is not None}
+    if report.surface is not None:
+        arrays |= {name: getattr(report.surface, name.removeprefix("surface_")) for name in SURFACE}
     np.savez_compressed(folder / "answer.npz", allow_pickle=False, **arrays)
     document = {
         "status": "ok",
@@ -127,6 +141,8 @@ def write_answer(folder: Path | str, method: str, report: ChangeReport, until: U
         **({"extras": dict(report.extras)} if report.extras else {}),
         "objects": [_object_document(item) for item in objects],
     }
+    if report.surface is not None:
+        document["surface_regions"] = [_surface_document(item) for item in report.surface.regions]
     _write_json(folder, document, until)
 
 
@@ -261,8 +277,23 @@ def _report(
         local_before_T_after=arrays.get("local_before_T_after"),
         checkpoints=document.checkpoints,
         extras=document.extras,
+        surface=_surface(document, arrays),
     )
     return report, points_odom
+
+
+def _surface(document: AnswerPart, arrays: Mapping[str, npt.NDArray[Any]]) -> SurfaceField | None:
+    if "surface_points_map" not in arrays:
+        return None
+    regions = tuple(
+        SurfaceRegion(_numbers(part.centre_map), part.area_m2, part.volume_m3, part.mean_m, part.largest_m)
+        for part in document.surface_regions
+    )
+    return SurfaceField(**{name.removeprefix("surface_"): arrays[name] for name in SURFACE}, regions=regions)
+
+
+def _surface_document(item: SurfaceRegion) -> dict[str, Any]:
+    return {**asdict(item), "centre_map": item.centre_map.tolist()}
 
 
 def _object_document(item: ChangedObject) -> dict[str, Any]:

@@ -55,6 +55,16 @@ class ObjectPart(_Part):
     displacement_map: _Vector | None = None
 
 
+class SurfaceRegionPart(_Part):
+    """One region of rock that moved, came or went in answer.json; its points are in answer.npz."""
+
+    centre_map: _Vector
+    area_m2: float
+    volume_m3: float
+    mean_m: float
+    largest_m: float
+
+
 class FailurePart(_Part):
     """answer.json of a failed or refused case; the base of `AnswerPart`."""
 
@@ -73,6 +83,7 @@ class FailurePart(_Part):
     before_T_after: Any = None
     radius_m: Any = None
     objects: Any = None
+    surface_regions: Any = None
 
 
 class AnswerPart(FailurePart):
@@ -81,9 +92,11 @@ class AnswerPart(FailurePart):
     before_T_after: _Pose
     radius_m: PositiveFloat = float("nan")  # left out where answer.npz has that of each region
     objects: list[ObjectPart] = Field(default_factory=list)
+    surface_regions: list[SurfaceRegionPart] = Field(default_factory=list)
 
 
-# Arrays of answer.npz: R candidates, O objects, Kb before and Ka after keyframes, M returns, P points.
+# Arrays of answer.npz: R candidates, O objects, Kb before and Ka after keyframes, M returns, P points,
+# Q points of the surface.
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     "region_centres_map": ("R", 3), "region_scores": ("R",), "region_pairs": ("R", 2), "region_is_reported": ("R",),
     "region_is_withdrawn": ("R",), "region_direction": ("R",), "keyframe_scores": ("Kb",),
@@ -91,8 +104,11 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "before_keyframe_scans": ("Kb",), "after_keyframe_scans": ("Ka",), "object_returns": ("M", 2),
     "object_return_offsets": ("O + 1",), "object_points_map": ("P", 3), "object_point_offsets": ("O + 1",),
     "object_points_odom": ("P", 3), "object_point_odom_offsets": ("O + 1",), "local_before_T_after": ("Ka", 4, 4),
+    "surface_points_map": ("Q", 3), "surface_normals_map": ("Q", 3), "surface_displacement_m": ("Q",),
+    "surface_level_m": ("Q",), "surface_region": ("Q",),
 }  # fmt: skip
 _REQUIRED = ("region_centres_map", "region_scores")
+SURFACE = tuple(name for name in _SHAPES if name.startswith("surface_"))
 OFFSETS = {
     "object_returns": "object_return_offsets",
     "object_points_map": "object_point_offsets",
@@ -134,6 +150,7 @@ def check_array_types(path: Path, arrays: Mapping[str, ArrayType], n_objects: in
         elif array.ndim != len(shape) or array.shape[1:] != shape[1:]:
             mistakes.append(f"array {name} must be {_format_shape(shape)}, got {array.shape}")
     needed = [*_REQUIRED, *(OFFSETS[name] for name in OFFSETS if name in arrays)]
+    needed += SURFACE if any(name in arrays for name in SURFACE) else []
     mistakes += [
         f"array {name} is missing: expected {_format_shape(_SHAPES[name])}" for name in needed if name not in arrays
     ]

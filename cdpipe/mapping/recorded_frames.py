@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, invert, transform_each
 from cdpipe.model.alignment import PathAlignment
-from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
+from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, SurfaceField
 from cdpipe.model.types import PointMap
 
 
@@ -45,6 +45,7 @@ def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) 
         regions=_move_regions(report.regions, recorded_T_map(before, report.regions.centres_map)),
         objects=tuple(_move_objects(report.objects, before)),
         local_before_T_after=recorded @ map_T_keyframe @ invert(recorded_T_keyframe),
+        surface=None if report.surface is None else _move_surface(report.surface, before),
     )
 
 
@@ -90,6 +91,19 @@ def _transforms_at(places: Float64Array, src_T_keyframe: Float64Array, dst_T_key
 
 def _move_regions(regions: ChangeRegions, dst_T_src: Float64Array) -> ChangeRegions:
     return replace(regions, centres_map=transform_each(dst_T_src, regions.centres_map))
+
+
+def _move_surface(surface: SurfaceField, before: PointMap) -> SurfaceField:
+    """Return a field in the frame of the recorded odometry; each point moves with its nearest keyframe."""
+    centres = np.array([each.centre_map for each in surface.regions]).reshape(-1, 3)
+    moved = transform_each(recorded_T_map(before, centres), centres)
+    recorded = recorded_T_map(before, surface.points_map)
+    return replace(
+        surface,
+        points_map=transform_each(recorded, surface.points_map),
+        normals_map=np.einsum("nij,nj->ni", recorded[:, :3, :3], surface.normals_map),
+        regions=tuple(replace(each, centre_map=at) for each, at in zip(surface.regions, moved, strict=True)),
+    )
 
 
 def _move_objects(objects: tuple[ChangedObject, ...], before: PointMap) -> list[ChangedObject]:

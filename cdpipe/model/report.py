@@ -143,6 +143,58 @@ class ChangedObject:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SurfaceRegion:
+    """A connected part of the rock that moved, came or went.
+
+    Attributes:
+        centre_map: (3,) its middle, map frame, metres.
+        area_m2: Area of the before surface that it covers.
+        volume_m3: Displacement times area, summed: positive where rock came into the void.
+        mean_m: Mean displacement, weighted by area.
+        largest_m: Displacement of the largest magnitude, with its sign.
+    """
+
+    centre_map: Float64Array
+    area_m2: float
+    volume_m3: float
+    mean_m: float
+    largest_m: float
+
+    def __post_init__(self) -> None:
+        require_shapes(self, centre_map=(3,))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceField:
+    """How far the surface of the rock moved from before to after, at points of the before surface.
+
+    Attributes:
+        points_map: (Q, 3) points on the before surface, map frame, metres.
+        normals_map: (Q, 3) unit normal of the surface at each, into the void.
+        displacement_m: (Q,) displacement along the normal, positive into the void; NaN where it was not measured.
+        level_m: (Q,) 95 % level of detection, NaN if unknown: where rock did not move, 19 in 20 displacements are
+            smaller.
+        region: (Q,) int32 index of the point's region, -1 for none.
+        regions: The regions that moved.
+    """
+
+    points_map: Float64Array
+    normals_map: Float64Array
+    displacement_m: Float64Array
+    level_m: Float64Array
+    region: Int32Array
+    regions: tuple[SurfaceRegion, ...] = ()
+
+    def __post_init__(self) -> None:
+        n = len(self.displacement_m)
+        require_shapes(self, points_map=(n, 3), normals_map=(n, 3), level_m=(n,), region=(n,))
+        if not np.issubdtype(self.region.dtype, np.integer):
+            raise ValueError(f"region must be whole numbers, got {self.region.dtype}")
+        if (self.region < -1).any() or (self.region >= len(self.regions)).any():
+            raise ValueError(f"region must be -1 or the index of one of {len(self.regions)} regions")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ChangeReport:
     """The whole answer for one pair of sessions.
 
@@ -160,6 +212,7 @@ class ChangeReport:
             everywhere.
         checkpoints: Digest of the weights of each descriptor that was used, by its name.
         extras: Version of each optional package that the answer depends on; "absent" if it was wanted in vain.
+        surface: How far the rock moved; None where it was not asked for.
     """
 
     before_T_after: Float64Array
@@ -173,6 +226,7 @@ class ChangeReport:
     local_before_T_after: Float64Array | None = None
     checkpoints: Mapping[str, str] = field(default_factory=dict)
     extras: Mapping[str, str] = field(default_factory=dict)
+    surface: SurfaceField | None = None
 
     def to_pandas(self, table: Literal["objects", "regions"] = "objects") -> pd.DataFrame:
         """Return the objects or the reported regions as a table; positions in the map frame, metres.

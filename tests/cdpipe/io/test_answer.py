@@ -8,7 +8,14 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import yaw_pose
 from cdpipe.io.answer import read_answer, write_answer, write_failure
-from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
+from cdpipe.model.report import (
+    ChangedObject,
+    ChangeRegions,
+    ChangeReport,
+    ObjectShape,
+    SurfaceField,
+    SurfaceRegion,
+)
 
 
 def _report() -> ChangeReport:
@@ -69,6 +76,48 @@ def test_a_radius_of_each_region_survives_the_disk_and_one_of_all_is_a_number_as
     assert read is not None
     assert read.regions.radius_m == 4.5
     assert read.regions.radii_m.tolist() == [4.5, 4.5]
+
+
+def _surface() -> SurfaceField:
+    return SurfaceField(
+        points_map=np.arange(9.0).reshape(3, 3),
+        normals_map=np.tile([0.0, 0.0, 1.0], (3, 1)),
+        displacement_m=np.array([0.02, np.nan, -0.001]),
+        level_m=np.array([0.004, np.nan, 0.006]),
+        region=np.array([0, -1, -1], dtype=np.int32),
+        regions=(SurfaceRegion(np.array([0.0, 1, 2]), 0.25, 0.005, 0.02, 0.021),),
+    )
+
+
+def test_the_displacement_of_the_rock_survives_the_disk(tmp_path: Path) -> None:
+    surface = _surface()
+    write_answer(tmp_path, "mine", replace(_report(), surface=surface))
+    read = read_answer(tmp_path).report
+    assert read is not None
+    assert read.surface is not None
+    for name in ("points_map", "normals_map", "displacement_m", "level_m", "region"):
+        np.testing.assert_array_equal(getattr(read.surface, name), getattr(surface, name))
+    (region,) = read.surface.regions
+    np.testing.assert_array_equal(region.centre_map, [0.0, 1, 2])
+    assert (region.area_m2, region.volume_m3, region.mean_m, region.largest_m) == (0.25, 0.005, 0.02, 0.021)
+    write_answer(tmp_path, "mine", _report())
+    read = read_answer(tmp_path).report
+    assert read is not None
+    assert read.surface is None
+    assert "surface_regions" not in json.loads((tmp_path / "answer.json").read_text())
+
+
+def test_a_displacement_without_its_points_or_with_a_region_too_many_is_refused(tmp_path: Path) -> None:
+    write_answer(tmp_path, "mine", replace(_report(), surface=_surface()))
+    with np.load(tmp_path / "answer.npz") as stored:
+        arrays = dict(stored)
+    np.savez(tmp_path / "answer.npz", **{**arrays, "surface_region": np.array([1, -1, -1])})
+    with pytest.raises(InputError, match=r"region must be -1 or the index of one of 1 regions"):
+        read_answer(tmp_path)
+    del arrays["surface_level_m"]
+    np.savez(tmp_path / "answer.npz", **arrays)
+    with pytest.raises(InputError, match=r"array surface_level_m is missing: expected \(Q,\)"):
+        read_answer(tmp_path)
 
 
 def _select_none(regions: ChangeRegions) -> ChangeRegions:
