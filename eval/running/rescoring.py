@@ -12,7 +12,15 @@ from cdpipe.core.files import parse_json
 from cdpipe.core.names import require_table_name, visible
 from eval.core.progress import RunProgress, Silent
 from eval.core.provenance import FORMAT_VERSION
-from eval.running.runfolder import IDENTITY, ITEM_TABLES, RunFolder, json_text, write_json, write_tables
+from eval.running.runfolder import (
+    IDENTITY,
+    ITEM_TABLES,
+    SURFACE_TABLES,
+    RunFolder,
+    json_text,
+    write_json,
+    write_tables,
+)
 from eval.scoring.scoring import CaseScore, score_stored
 from eval.truth.ground_truth import load_ground_truth
 
@@ -34,6 +42,9 @@ def cell_document(score: CaseScore, identity: Mapping[str, Any], key: str, place
     """
     names = {name: identity[name] for name in IDENTITY}
     items = {table: [{**names, **item} for item in getattr(score, table)] for table in ITEM_TABLES}
+    items |= {
+        table: [{**names, **item} for item in rows] for table in SURFACE_TABLES if (rows := getattr(score, table))
+    }
     head = {"format_version": FORMAT_VERSION, "key": key, "order": list(place)}
     document = {**head, "row": {**score.row, **identity}, **items}
     try:

@@ -8,6 +8,7 @@ maps/<world>/<seed>.npz                       thinned maps for pictures
 stages/<world>/<seed>/                        what the pipeline's stages gave (eval.running.stage_cache); may be removed
 cells/<world>/<seed>/<variant>.json           a finished cell: key, order, row, items
 results.csv changes.csv regions.csv objects.csv keyframes.csv summary.csv
+surface_changes.csv surface_windows.csv       where rock moved, or an answer says so
 merge.csv                                     where pairs have a kind (eval.tables.merge_table)
 regions_table.csv regions_targets.csv regions_by_size.csv budgets.csv roc.csv froc.csv
                                               where the plan says `report: regions` (eval.tables.region_table)
@@ -59,6 +60,8 @@ TEXT_COLUMNS = {
 }  # fmt: skip
 _NAMED = {"scenario": str, "seed": int, "variant": str}
 ITEM_TABLES = ("changes", "regions", "objects", "keyframes")
+# tables of rock that moved: a cell has their rows, and a run their files, only where there are some
+SURFACE_TABLES = ("surface_changes", "surface_windows")
 _MAPS = {"before_points": ArraySpec("N,3", "float32"), "after_points": ArraySpec("M,3", "float32")}
 # what readers of an empty table may ask for
 _MINIMAL_COLUMNS = {"keyframes": ("keyframe", "score", "label")}
@@ -203,7 +206,9 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     for table, frame in items.items():
         _write_csv(run.path / f"{table}.csv", frame)
     _write_csv(run.path / "summary.csv", summarise(results, keyframes=items["keyframes"]))
+    surface_items = {table: _items(table, whole) for table in SURFACE_TABLES}
     tables = {
+        **surface_items,
         "effects": effects(results),
         "merge": merge_table(results, read_targets(run.stored_provenance())),
         **_report_tables(run, results, items),
@@ -306,7 +311,7 @@ def json_text(document: Mapping[str, Any]) -> str:
 
 
 def _items(table: str, cells: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    rows = [item for cell in cells for item in cell[table]]
+    rows = [item for cell in cells for item in cell.get(table, ())]
     return pd.DataFrame(rows) if rows else pd.DataFrame(columns=[*IDENTITY, *_MINIMAL_COLUMNS.get(table, ())])
 
 
@@ -324,6 +329,7 @@ def _plain(value: Any) -> Any:
 def _holds_rows(document: Mapping[str, Any]) -> bool:
     """Return whether a cell holds rows of numbers, and of texts where texts belong, and names its case in each."""
     tables = [[document["row"]], *(document[table] for table in ITEM_TABLES)]
+    tables += [document[table] for table in SURFACE_TABLES if table in document]
     if not all(isinstance(rows, list) and all(isinstance(row, dict) for row in rows) for rows in tables):
         return False
     is_plain = all(

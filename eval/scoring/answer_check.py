@@ -8,18 +8,20 @@ from pathlib import Path
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import FARTHEST_M, Float64Array, Int64Array, require_poses, require_shape
+from cdpipe.core.geometry import FARTHEST_M, BoolArray, Float64Array, Int64Array, require_poses, require_shape
 from cdpipe.core.yamlfile import suggest
 from cdpipe.io.answer import Answer
-from cdpipe.model.report import ChangedObject, ChangeRegions
+from cdpipe.model.report import ChangedObject, ChangeRegions, SurfaceField
 from cdpipe.model.types import SessionName
 from eval.scoring.answer_rows import POINT_RADIUS_M, find_rows_near_points
 from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth
 from eval.truth.scoring_points import ScoringPoints
 
-SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns"))
+SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns", "surface"))
 MAX_SECONDS = 1e8  # three years
+MAX_DISPLACEMENT_M = 5.0  # the truth knows none that is larger
 MAX_AMOUNT = 1e15  # of bytes, points, scores and every other figure; a page shows no larger one
+_UNIT_TOLERANCE = 1e-3  # of the length of a normal: arrays may come as float32
 _MANY = 100  # so many valid returns include the first return of some cell
 _ASIDE_M = 2.0  # largest gap between an object's points and its returns
 
@@ -53,6 +55,8 @@ def check_answer(answer: Answer, truth: GroundTruth, folder: Path) -> None:
             _check_returns(session, report.objects, truth.sessions[session])
             _check_points(session, report.objects, answer.points_odom, truth.sessions[session].scoring_points)
         _check_places(report.objects, truth.before.scoring_points)
+        if report.surface is not None:
+            _check_surface(report.surface)
     except ValueError as error:
         raise InputError(f"{folder}: not an answer to this pair: {error}") from error
 
@@ -226,6 +230,41 @@ def _check_points(
         raise ValueError(
             f"objects[{owner}] shares a point of object_points_odom with another object: one owner at most"
         )
+
+
+def _check_surface(surface: SurfaceField) -> None:
+    _require_near("surface_points_map", surface.points_map)
+    lengths = np.linalg.norm(surface.normals_map, axis=1)
+    is_unit = np.abs(lengths - 1.0) <= _UNIT_TOLERANCE
+    if not is_unit.all():
+        index = int(np.argmin(is_unit))
+        raise ValueError(f"surface_normals_map: entry {index} has length {lengths[index]:g}: expected a unit vector")
+    size_m, level_m = np.abs(surface.displacement_m), surface.level_m
+    _require_all(
+        "surface_displacement_m", np.isnan(size_m) | (size_m <= MAX_DISPLACEMENT_M), surface.displacement_m,
+        f"expected at most {MAX_DISPLACEMENT_M:g} m in size, NaN where it was not measured",
+    )  # fmt: skip
+    _require_all(
+        "surface_level_m", np.isnan(level_m) | ((level_m > 0) & (level_m <= MAX_DISPLACEMENT_M)), level_m,
+        f"expected a length in metres, up to {MAX_DISPLACEMENT_M:g}, NaN where it is unknown",
+    )  # fmt: skip
+    for index, region in enumerate(surface.regions):
+        where = f"surface_regions[{index}]"
+        _require_near(f"{where}.centre_map", region.centre_map[None])
+        if not 0 <= region.area_m2 <= MAX_AMOUNT:
+            raise ValueError(f"{where}.area_m2 = {region.area_m2}: expected 0 to {MAX_AMOUNT:g} m2")
+        if not abs(region.volume_m3) <= MAX_AMOUNT:
+            raise ValueError(f"{where}.volume_m3 = {region.volume_m3}: expected at most {MAX_AMOUNT:g} m3 in size")
+        for name, value in (("mean_m", region.mean_m), ("largest_m", region.largest_m)):
+            if not abs(value) <= MAX_DISPLACEMENT_M:
+                raise ValueError(f"{where}.{name} = {value}: expected at most {MAX_DISPLACEMENT_M:g} m in size")
+
+
+def _require_all(name: str, is_right: BoolArray, values: Float64Array, expected: str) -> None:
+    """Raise for the first of (N,) values that is not right."""
+    if not is_right.all():
+        index = int(np.argmin(is_right))
+        raise ValueError(f"{name}: entry {index} is {values[index]:g}: {expected}")
 
 
 def _require_near(name: str, places_m: Float64Array) -> None:

@@ -36,6 +36,7 @@ from eval.scoring.object_metrics import (
 from eval.scoring.object_sizes import SizeErrors, compute_size_errors, summarise_size_errors
 from eval.scoring.point_metrics import score_points, score_unanswered_points
 from eval.scoring.region_metrics import RegionScores, score_regions, score_unanswered_regions
+from eval.scoring.surface_metrics import score_surface
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
 METRICS_VERSION = 7
@@ -55,6 +56,8 @@ class CaseScore:
         objects: One dict per answered object.
         keyframes: One dict per judged place of the before session: keyframe (its number), scan, score (NaN where the
             answer states none), label (1, 0, or -1 for left out).
+        surface_changes: One dict per surface change of the truth.
+        surface_windows: One dict per window for detection limits.
     """
 
     row: dict[str, Any]
@@ -62,6 +65,8 @@ class CaseScore:
     regions: list[dict[str, Any]]
     objects: list[dict[str, Any]]
     keyframes: list[dict[str, Any]] = field(default_factory=list)
+    surface_changes: list[dict[str, Any]] = field(default_factory=list)
+    surface_windows: list[dict[str, Any]] = field(default_factory=list)
 
 
 def score(answer: ChangeReport | Path | str, pair: Path | str) -> dict[str, Any]:
@@ -127,6 +132,7 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
         object_scores = {**summarise_objects(objects, right, truth), **score_points(report.objects, rows, truth)}
         sizes = compute_size_errors(report.objects, objects, truth)
         items = make_object_rows(report.objects, objects, truth)
+    surface = score_surface(answer, truth, float(after_travelled_m[-1]))
     n_regions = int(regions.columns["n_regions"])
     found: dict[str, float] = {**regions.columns, **object_scores, **summarise_size_errors(sizes, truth)}
     row = {
@@ -136,6 +142,8 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
         **_list_times(answer, n_regions + int(regions.columns["n_withdrawn"])),
         **{name: mean(read_figure(report, name)[report.regions.is_reported]) if report else _NAN for name in FIGURES},
         **_list_sizes(answer, truth, n_regions, float(after_travelled_m[-1])),
+        **surface.columns,
+        "t_surface_s": float(answer.seconds.get("t_surface_s", _NAN)),
     }
     row |= compute_plugin_columns(truth, answer, row)
     if answer.until == "merge":
@@ -150,6 +158,8 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
             {"keyframe": index, "scan": int(scan), "score": float(score), "label": int(label)}
             for index, (scan, score, label) in enumerate(judged)
         ],
+        surface_changes=surface.changes,
+        surface_windows=surface.windows,
     )
 
 
@@ -332,7 +342,7 @@ def _list_times(answer: Answer, n_proposed: int) -> dict[str, float]:
 
     Withdrawn regions were compared and extracted as well, so times per region count them.
     """
-    index, merge, refine, descriptor, cd, oe, returns = (float(answer.seconds.get(name, _NAN)) for name in SECONDS)
+    index, merge, refine, descriptor, cd, oe, returns = (float(answer.seconds.get(name, _NAN)) for name in SECONDS[:-1])
     n_keyframes = 0 if answer.report is None else sum(len(scans) for scans in answer.report.keyframe_scans)
     return {
         "t_index_s": index,

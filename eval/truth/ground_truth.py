@@ -11,6 +11,7 @@ import numpy as np
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import (
     BoolArray,
+    Float32Array,
     Float64Array,
     Int64Array,
     invert,
@@ -18,14 +19,34 @@ from cdpipe.core.geometry import (
     require_shape,
     transform_each,
 )
-from cdpipe.io.session import read_session
+from cdpipe.io.session import Session, read_session
 from cdpipe.mapping.mapping import choose_keyframes
 from cdpipe.model.types import SessionName
 from eval.truth.scoring_points import ScoringPoints, load_scoring_points
-from sim.session.truth import PairTruth, read_mover_track, read_pair_truth, read_true_poses
+from sim.session.truth import (
+    Int16Array,
+    PairTruth,
+    read_chunk_surface,
+    read_mover_track,
+    read_pair_truth,
+    read_true_poses,
+)
 
 SESSIONS: tuple[SessionName, SessionName] = ("before", "after")
 JUDGED_SPACING_M = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceLabels:
+    """How far the rock moved at each of the N scoring points of a session.
+
+    Attributes:
+        displacement_m: (N,) float32 from before to after, positive into the void; NaN where a point is not on rock.
+        change: (N,) int16 id of the surface change that the point belongs to, 0 for none.
+    """
+
+    displacement_m: Float32Array
+    change: Int16Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +61,7 @@ class SessionTruth:
         judged_scans: (J,) the first scan and one per metre of odometry. Keyframe scores and merges are judged there,
             whatever keyframes an answer names.
         made_poses: Package that estimated the poses, with its version; "" where it was none.
+        surface: How far the rock moved at each scoring point; None where the pair has no surface changes.
     """
 
     odom_T_sensor: Float64Array
@@ -48,12 +70,16 @@ class SessionTruth:
     seen_movers_world: Float64Array = field(default_factory=lambda: np.zeros((0, 3)))
     judged_scans: Int64Array = field(init=False)
     made_poses: str = ""
+    surface: SurfaceLabels | None = None
 
     def __post_init__(self) -> None:
         require_poses("odom_T_sensor", self.odom_T_sensor)
         require_poses("world_T_sensor", self.world_T_sensor)
         require_shape("world_T_sensor", self.world_T_sensor, self.odom_T_sensor.shape)
         require_shape("seen_movers_world", self.seen_movers_world, (None, 3))
+        if self.surface is not None:
+            require_shape("surface.displacement_m", self.surface.displacement_m, (len(self.scoring_points),))
+            require_shape("surface.change", self.surface.change, (len(self.scoring_points),))
         object.__setattr__(self, "judged_scans", choose_keyframes(self.odom_T_sensor, JUDGED_SPACING_M))
 
     def to_world(self, points_odom: Float64Array, scans: Int64Array) -> Float64Array:
@@ -150,7 +176,8 @@ def _load_session(path: Path, n_movers: int) -> SessionTruth:
     seen_world = _load_seen_movers(path, n_movers, len(odom_T_sensor))
     try:
         points = load_scoring_points(path)
-        return SessionTruth(odom_T_sensor, read_true_poses(path), points, seen_world, made_poses=made_poses)
+        poses, surface = read_true_poses(path), _load_surface(session, points)
+        return SessionTruth(odom_T_sensor, poses, points, seen_world, made_poses=made_poses, surface=surface)
     except (KeyError, ValueError) as error:
         raise InputError(f"{path / 'truth'}: not the truth of this session: {error}") from error
 
@@ -165,3 +192,27 @@ def _load_seen_movers(path: Path, n_movers: int, n_scans: int) -> Float64Array:
             f"revolutions, expected {n_movers} and {n_scans}"
         )
     return np.zeros((0, 3)) if track is None else track.seen_world[track.n_returns > 0]
+
+
+def _load_surface(session: Session, points: ScoringPoints) -> SurfaceLabels | None:
+    """Return how far the rock moved at the scoring points of a session; None where it has no such truth.
+
+    Raises:
+        ValueError: The displacements are of a session with other scans.
+    """
+    scans, pixels = np.divmod(points.returns, points.n_pixels)
+    displacement_m = np.full(len(points), np.nan, dtype=np.float32)
+    change = np.zeros(len(points), dtype=np.int16)
+    for index in range(session.n_chunks):
+        labels = read_chunk_surface(session.path, index)
+        if labels is None:
+            return None
+        first = index * session.chunk_scans
+        n_scans = min(session.chunk_scans, session.n_scans - first)
+        rows = np.flatnonzero((scans >= first) & (scans < first + n_scans))
+        for each in labels:
+            require_shape(f"surface/{index:05d}.npz", each.reshape(len(each), -1), (n_scans, points.n_pixels))
+        displacement_m[rows], change[rows] = (
+            each.reshape(n_scans, -1)[scans[rows] - first, pixels[rows]] for each in labels
+        )
+    return SurfaceLabels(displacement_m, change)
