@@ -8,7 +8,7 @@ scenarios:                           # eval/plans/worlds.py tells more
 odometry: own                        # of all scenarios that do not say otherwise; [kiss-icp, own]: each with both
 wide: [paper/site2]                  # wide drifts: presets apply their section `wide` there
 seeds: "20000:20002"                 # B excluded, in quotes; or a list
-report: [regions, objects]           # tables and plots of regions, of objects, or of both (eval/tables)
+report: [regions, objects]           # tables and plots of these, or of `surface`, rock that moved (eval/tables)
 targets: main                        # what is asked: those of another plan, or of its own (eval/plans/targets.py)
 until: null                          # merge: stop after the merge; only the columns of the merge are filled
 set: [merge.refine=none]             # every method has these, below its own settings; part of no name
@@ -270,7 +270,7 @@ class Plan(Settings):
     until: Until | None = None
     set: MethodSettings = ()
     thresholds: dict[str, float] = Field(default_factory=dict)
-    report: Annotated[tuple[Literal["regions", "objects"], ...], BeforeValidator(_list_subjects)] = ()
+    report: Annotated[tuple[Literal["regions", "objects", "surface"], ...], BeforeValidator(_list_subjects)] = ()
     targets: PlanTargets = Targets()
     variants: Annotated[tuple[Variant, ...], NotEmpty]
     grid: tuple[Grid, ...] = ()

@@ -15,6 +15,7 @@ regions_table.csv regions_targets.csv regions_by_size.csv budgets.csv roc.csv fr
 hard.csv breaking_points.csv                  where its plan has axes (eval.tables.hardness)
 objects_table.csv objects_by_group.csv objects_targets.csv
                                               where it says `report: objects` (eval.tables.object_table)
+surface_table.csv detection_limits.csv        where it says `report: surface` (eval.tables.surface_table)
 effects.csv                                   where a world was run with and without a setting (eval.tables.effects)
 """
 
@@ -50,6 +51,8 @@ from eval.tables.object_table import FILES as OBJECT_FILES
 from eval.tables.object_table import object_tables
 from eval.tables.region_table import FILES as REGION_FILES
 from eval.tables.region_table import region_tables
+from eval.tables.surface_table import FILES as SURFACE_FILES
+from eval.tables.surface_table import surface_tables
 
 IDENTITY = ("scenario", "seed", "variant")
 # columns of text of results.csv and the item tables; every other one holds numbers or truth values
@@ -211,7 +214,7 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
         **surface_items,
         "effects": effects(results),
         "merge": merge_table(results, read_targets(run.stored_provenance())),
-        **_report_tables(run, results, items),
+        **_report_tables(run, results, {**items, **surface_items}),
     }
     for name, found in tables.items():
         if len(found):
@@ -237,6 +240,7 @@ def current_results(run: RunFolder, earlier: Mapping[str, Any], now: Mapping[str
         return None
     names = ["results", "summary", *ITEM_TABLES]
     names += [*(REGION_FILES if "regions" in subjects else ()), *(OBJECT_FILES if "objects" in subjects else ())]
+    names += SURFACE_FILES if "surface" in subjects else ()
     tables, cells = [run.path / f"{name}.csv" for name in names], [*run.path.glob("cells/*/*/*.json")]
     if not cells or not all(table.is_file() for table in tables):
         return None
@@ -251,7 +255,7 @@ def _lasting(provenance: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def reported(provenance: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return what the plan of a run asks a report of: "regions", "objects", both or nothing."""
+    """Return what the plan of a run asks a report of: "regions", "objects", "surface"; () for nothing."""
     plan = provenance.get("plan")
     subjects = (plan.get("report") or ()) if isinstance(plan, Mapping) else ()
     return tuple(subjects) if isinstance(subjects, list | tuple) else (str(subjects),)
@@ -261,7 +265,7 @@ def _report_tables(
     run: RunFolder, results: pd.DataFrame, items: Mapping[str, pd.DataFrame]
 ) -> Mapping[str, pd.DataFrame]:
     """Return the tables that the plan asks for, and empty ones for those that it does not."""
-    tables = {name: pd.DataFrame() for name in (*REGION_FILES, *OBJECT_FILES, *HARD_FILES)}
+    tables = {name: pd.DataFrame() for name in (*REGION_FILES, *OBJECT_FILES, *HARD_FILES, *SURFACE_FILES)}
     provenance = run.stored_provenance()
     subjects, targets = reported(provenance), read_targets(provenance)
     if not subjects or "region_auroc" not in results:
@@ -276,6 +280,8 @@ def _report_tables(
         tables |= dict(zip(HARD_FILES, (steps, breaking_points(steps)), strict=True))
     if "objects" in subjects:
         tables |= object_tables(results, items["changes"], targets, is_whole=is_whole)
+    if "surface" in subjects:
+        tables |= surface_tables(results, items["surface_windows"], targets)
     return tables
 
 

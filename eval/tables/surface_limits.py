@@ -1,0 +1,89 @@
+"""Detection limits of displacement fields: how large a displacement must be to be found, by the area that moved.
+
+Windows (`eval.scoring.surface_windows`) are means over discs. A method has one threshold for each area: 5 % of the
+null windows that it covers are beyond it.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cdpipe.core.geometry import Float64Array
+from eval.tables.groups import clustered_interval, pair_numbers
+from eval.tables.rows import numbers
+
+FALSE_SHARE = 0.05
+# a factor of sqrt 2 to either side of 5, 10, 20, 40, 80 and 160 mm; the last bin also holds all that is larger
+MAGNITUDES_M = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)
+EDGES_M = (*(round(float(each / np.sqrt(2)), 6) for each in MAGNITUDES_M), 5.0)
+_HALF = 0.5
+_COVERED = 0.5
+
+
+def detection_limits(windows: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return a row for each area and bin of magnitudes that holds a window of a change.
+
+    Args:
+        windows: Rows of surface_windows.csv of one variant.
+
+    Returns:
+        `area_m2`; `from_m` to `to_m`, the bin of |true_m|, and `magnitude_m`, the median in it; `threshold_m`, NaN
+        where the variant covers no null window, and `n_null_windows` that it covers; `n_windows`; `found_share` of
+        them with its 95 % bootstrap interval over session pairs; `limit_m`, the same in all rows of an area: the
+        smallest magnitude from which on at least half are found, between two bins by the logarithm of the magnitude;
+        NaN where half of the largest are not found.
+    """
+    rows: list[dict[str, Any]] = []
+    area_m2, is_null = numbers(windows, "area_m2"), windows["is_null"].astype(bool).to_numpy()
+    true_m, answered_m = numbers(windows, "true_m"), numbers(windows, "answered_m")
+    is_covered, pair = numbers(windows, "cover") >= _COVERED, pair_numbers(windows)
+    for area in np.unique(area_m2):
+        null_m = np.abs(answered_m[(area_m2 == area) & is_null & is_covered])
+        threshold_m = float(np.quantile(null_m, 1.0 - FALSE_SHARE)) if len(null_m) else float("nan")
+        is_found = (np.abs(answered_m) > threshold_m) & (np.sign(answered_m) == np.sign(true_m))
+        own: list[dict[str, Any]] = []
+        for low, high in pairwise(EDGES_M):
+            inside = (area_m2 == area) & ~is_null & (np.abs(true_m) >= low) & (np.abs(true_m) < high)
+            if not inside.any():
+                continue
+            found = is_found[inside].astype(np.float64)
+            found_low, found_high = clustered_interval(found, pair[inside])
+            own.append(
+                {
+                    "area_m2": float(area),
+                    "from_m": low,
+                    "to_m": high,
+                    "magnitude_m": float(np.median(np.abs(true_m[inside]))),
+                    "threshold_m": threshold_m,
+                    "n_null_windows": len(null_m),
+                    "n_windows": len(found),
+                    "found_share": float(found.mean()),
+                    "found_share_low": found_low,
+                    "found_share_high": found_high,
+                }
+            )
+        limit_m = interpolate_limit(*(np.array([row[name] for row in own]) for name in ("magnitude_m", "found_share")))
+        rows += [{**row, "limit_m": limit_m} for row in own]
+    return rows
+
+
+def interpolate_limit(magnitude_m: Float64Array, found_share: Float64Array) -> float:
+    """Return the smallest magnitude from which on at least half are found, by (B,) bins in rising order.
+
+    Between the last bin below one half and the next the share is taken as linear in the logarithm of the magnitude. If
+    all bins reach one half, it is that of the smallest: the limit lies there or below. NaN if the last bin does not.
+    """
+    is_half = found_share >= _HALF
+    if len(is_half) == 0 or not is_half[-1]:
+        return float("nan")
+    if is_half.all():
+        return float(magnitude_m[0])
+    last = int(np.flatnonzero(~is_half)[-1])
+    low, high = found_share[last], found_share[last + 1]
+    step = (_HALF - low) / (high - low)
+    logs = np.log(magnitude_m[last : last + 2])
+    return float(np.exp(logs[0] + step * (logs[1] - logs[0])))

@@ -1,0 +1,74 @@
+"""What a run says about rock that moved: a row for every method, and its detection limits.
+
+Means are over session pairs. A pair without an answer, or whose answer has no displacement field, counts as a field
+without a point.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from eval.core.statistics import median
+from eval.plans.targets import Targets
+from eval.scoring.surface_windows import AREAS_M2
+from eval.tables.conditions import by_condition
+from eval.tables.rows import by_domain, by_variant, means_with_intervals, numbers, of_cases, with_domain
+from eval.tables.surface_limits import detection_limits
+
+FILES = ("surface_table", "detection_limits")
+MEANS = (
+    "surface_cover", "surface_error_median_changed_m", "surface_error_p95_changed_m", "surface_bias_changed_m",
+    "surface_error_median_unchanged_m", "surface_error_p95_unchanged_m", "surface_bias_unchanged_m",
+    "surface_level_inside", "surface_level_median_m", "surface_recall", "surface_region_precision",
+    "surface_false_regions_per_100m", "surface_volume_error_share",
+)  # fmt: skip
+
+
+def surface_tables(results: pd.DataFrame, windows: pd.DataFrame, targets: Targets) -> dict[str, pd.DataFrame]:
+    """Return the tables of a run about rock that moved, by file name; empty ones where no pair asks for it.
+
+    Args:
+        results: Rows as in results.csv.
+        windows: Rows as in surface_windows.csv.
+        targets: What the plan of the run asks for.
+
+    Returns:
+        surface_table: a row for every condition (odometry and sensor, where the plan tells them apart), domain and
+        variant, with the detection limit of each area of windows; detection_limits: a row for each of them, area and
+        bin of magnitudes.
+    """
+    rows: list[dict[str, Any]] = []
+    limits: list[dict[str, Any]] = []
+    is_asked = ~np.isnan(numbers(results, "surface_cover"))
+    windows_by_variant = by_variant(windows)
+    for condition, is_its in by_condition(results, targets):
+        own_results = results[is_its & is_asked]
+        if len(own_results) == 0:
+            continue
+        for domain, cases in by_domain(with_domain(own_results)):
+            for variant, own in cases.groupby("variant", sort=False):
+                names = {"domain": domain, "variant": str(variant), **condition.columns}
+                own_windows = of_cases(windows_by_variant.get(str(variant), windows[:0]), own)
+                of_windows = detection_limits(own_windows) if len(own_windows) else []
+                limits += [{**names, **row} for row in of_windows]
+                by_area = {row["area_m2"]: row["limit_m"] for row in of_windows}
+                rows.append(
+                    {
+                        **names,
+                        "n_pairs": len(own),
+                        "n_failed": int((own["status"] != "ok").sum()),
+                        "n_surface_changes": int(np.nansum(numbers(own, "n_surface_changes"))),
+                        **means_with_intervals(own, MEANS),
+                        **{limit_column(area): by_area.get(area, float("nan")) for area in AREAS_M2},
+                        "t_surface_s": median(numbers(own, "t_surface_s")),
+                    }
+                )
+    return {"surface_table": pd.DataFrame(rows), "detection_limits": pd.DataFrame(limits)}
+
+
+def limit_column(area_m2: float) -> str:
+    """Return the column of surface_table.csv with the detection limit of windows of an area."""
+    return f"surface_limit_{area_m2:g}m2_m"

@@ -1,0 +1,108 @@
+"""Detection limits and the table of displacement fields, worked out by hand."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from eval.plans.targets import Targets
+from eval.tables.surface_limits import EDGES_M, detection_limits, interpolate_limit
+from eval.tables.surface_table import FILES, surface_tables
+
+NAN = float("nan")
+
+
+def window(true_m: float, answered_m: float, seed: int = 1, area_m2: float = 1.0, cover: float = 1.0) -> dict:
+    return {
+        "scenario": "surface/heave", "seed": seed, "variant": "ours", "area_m2": area_m2, "is_null": true_m == 0.0,
+        "true_m": true_m, "answered_m": answered_m, "cover": cover,
+    }  # fmt: skip
+
+
+def null_windows(n: int = 21) -> list[dict]:
+    """Answered 0 to 20 mm, so that the 95th percentile is 19 mm."""
+    return [window(0.0, 0.001 * k * (-1) ** k, seed=k) for k in range(n)]
+
+
+def test_limits_by_hand() -> None:
+    rows = null_windows()
+    rows += [window(0.02, value, seed) for seed, value in enumerate((0.0189, 0.0191, 0.018, -0.03))]
+    rows += [window(0.04, value, seed) for seed, value in enumerate((0.03, 0.03, 0.03, 0.0))]
+    low, high = detection_limits(pd.DataFrame(rows))
+    assert low["threshold_m"] == pytest.approx(0.019)
+    assert (low["n_null_windows"], low["n_windows"], high["n_windows"]) == (21, 4, 4)
+    # the fourth has the wrong sign
+    assert (low["found_share"], high["found_share"]) == (0.25, 0.75)
+    # a half lies midway between a quarter and three quarters
+    assert low["limit_m"] == high["limit_m"] == pytest.approx(np.sqrt(0.02 * 0.04))
+    assert 0.0 <= low["found_share_low"] <= 0.25 <= low["found_share_high"] <= 1.0
+
+
+def test_bins_hold_every_magnitude_from_the_least_edge_on_once() -> None:
+    values = np.geomspace(EDGES_M[0], 4.9, 200)
+    found = detection_limits(pd.DataFrame([*null_windows(), *(window(-value, -value) for value in values)]))
+    assert sum(row["n_windows"] for row in found) == 200
+    assert all(row["from_m"] <= row["magnitude_m"] < row["to_m"] for row in found)
+
+
+def test_areas_have_thresholds_of_their_own() -> None:
+    quiet = [{**row, "area_m2": 16.0, "answered_m": row["answered_m"] / 10} for row in null_windows()]
+    rows = [*null_windows(), *quiet, window(0.01, 0.01), window(0.01, 0.01, area_m2=16.0)]
+    small, large = detection_limits(pd.DataFrame(rows))
+    assert (small["found_share"], large["found_share"]) == (0.0, 1.0)
+    assert (small["limit_m"], large["limit_m"]) == pytest.approx((NAN, 0.01), nan_ok=True)
+
+
+def test_null_windows_that_are_not_covered_lower_no_threshold() -> None:
+    left_out = [window(0.0, 0.0, seed=k, cover=0.0) for k in range(500)]
+    rows = [*null_windows(), window(0.02, 0.0185)]
+    for each in (rows, [*rows, *left_out]):
+        (row,) = detection_limits(pd.DataFrame(each))
+        assert (row["threshold_m"], row["found_share"]) == (pytest.approx(0.019), 0.0)
+    (row,) = detection_limits(pd.DataFrame([*left_out, window(0.02, 0.5)]))
+    assert np.isnan(row["threshold_m"])
+    assert row["found_share"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("shares", "limit_m"),
+    [
+        ([1.0, 1.0, 1.0], 0.01),
+        ([0.0, 0.0, 0.4], NAN),
+        ([0.0, 0.5, 1.0], 0.02),
+        ([0.0, 1.0, 1.0], np.sqrt(0.01 * 0.02)),
+        ([1.0, 0.0, 1.0], np.sqrt(0.02 * 0.04)),  # found by chance below what is missed
+        ([], NAN),
+    ],
+)
+def test_where_half_are_found(shares: list[float], limit_m: float) -> None:
+    magnitudes = np.array([0.01, 0.02, 0.04])[: len(shares)]
+    assert interpolate_limit(magnitudes, np.array(shares)) == pytest.approx(limit_m, nan_ok=True)
+
+
+def case(seed: int, **columns: object) -> dict:
+    return {
+        "scenario": "surface/heave", "family": "surface/heave", "seed": seed, "variant": "ours", "status": "ok",
+        "surface_cover": 1.0, "surface_recall": 1.0, "n_surface_changes": 3, "t_surface_s": 2.0, **columns,
+    }  # fmt: skip
+
+
+def test_a_pair_without_an_answer_counts_and_a_pair_that_asks_nothing_does_not() -> None:
+    results = pd.DataFrame(
+        [
+            case(1),
+            case(2, status="merge_refused", surface_cover=0.0, surface_recall=0.0, t_surface_s=NAN),
+            case(3, scenario="narrow", family="narrow", surface_cover=NAN, surface_recall=NAN, n_surface_changes=NAN),
+        ]
+    )
+    windows = pd.DataFrame([*null_windows(), window(0.04, 0.03, seed=1)])
+    found = surface_tables(results, windows, Targets())
+    assert tuple(found) == FILES
+    (row,) = found["surface_table"].to_dict("records")
+    assert (row["domain"], row["n_pairs"], row["n_failed"], row["n_surface_changes"]) == ("out", 2, 1, 6)
+    assert (row["surface_cover"], row["surface_recall"], row["t_surface_s"]) == (0.5, 0.5, 2.0)
+    assert row["surface_recall_low"] <= 0.5 <= row["surface_recall_high"]
+    # of the windows only those of its pairs count: null ones of seeds 1 and 2
+    (limit,) = found["detection_limits"].to_dict("records")
+    assert (limit["n_null_windows"], row["surface_limit_1m2_m"]) == (2, 0.04)
+    nothing = surface_tables(results[2:], windows, Targets())
+    assert all(len(table) == 0 for table in nothing.values())
