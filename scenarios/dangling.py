@@ -71,9 +71,7 @@ def _repeated_names(tree: Any) -> Iterator[Mistake]:
 
 def _node_mistakes(tree: Any, nodes: list[str]) -> Iterator[Mistake]:
     uses = Counter(
-        node
-        for drift in items_at(mapping_at(tree, "tunnel"), "drifts")
-        for node in _names(items_at(drift, "nodes"))
+        node for drift in items_at(mapping_at(tree, "tunnel"), "drifts") for node in _names(items_at(drift, "nodes"))
     )
     ends = {node for drift in items_at(mapping_at(tree, "tunnel"), "drifts") for node in _ends(drift)}
     for index, change in enumerate(items_at(tree, "surface")):
@@ -98,7 +96,7 @@ def _area_mistakes(tree: Any) -> Iterator[Mistake]:
 
 
 def _places(tree: Any) -> Iterator[tuple[Key, dict[str, Any]]]:
-    """Yield both places of every prop, the path of every mover, the place of every puddle and surface change, empty where none is."""
+    """Yield the places of props, paths of movers, places of puddles and surface changes; empty where none is."""
     for index, prop in enumerate(items_at(tree, "props")):
         yield from ((("props", index, name), mapping_at(prop, name)) for name in ("place", "to"))
     for index, mover in enumerate(items_at(tree, "movers")):

@@ -55,7 +55,8 @@ def break_out(walls: TwinWalls, zone: Zone, change: SurfaceChange, seed: int) ->
         return Moved(walls, chosen, walls.before[chosen])
     places = walls.before[chosen]
     broken = sum(
-        share * np.clip(noise_at(places, length_m, key), -2, 2) for (share, length_m), key in zip(_BROKEN, keys, strict=True)
+        share * np.clip(noise_at(places, length_m, key), -2, 2)
+        for (share, length_m), key in zip(_BROKEN, keys, strict=True)
     )
     hollow = np.maximum(1.0 - 0.4 * (1.0 - np.clip(inside, 0, 1)) ** 2 + broken, _LEAST)
     depths_m = depth_m * np.clip(inside / _RIM, 0.0, 1.0) * hollow
@@ -121,7 +122,8 @@ def pile_up(walls: TwinWalls, heap: Heap, zone: Zone, change: SurfaceChange, vol
             return moved
         low_m, high_m = (peak_m, high_m) if held_m3 < volume_m3 else (low_m, peak_m)
     raise ScenarioError(
-        f"surface {change.name!r}: there is no room for {volume_m3:.2f} m3 of rubble {zone.where}: make the scar smaller"
+        f"surface {change.name!r}: there is no room for {volume_m3:.2f} m3 of rubble {zone.where}: "
+        "make the scar smaller"
     )
 
 

@@ -83,7 +83,7 @@ def _move_smoothly(walls: TwinWalls, zone: Zone, change: SurfaceChange, way: Flo
     near = vertices_near(walls, zone)
     weights = weight(zone.around(walls.before[near]))
     chosen, weights = near[weights > 0], weights[weights > 0]
-    ways = smooth_normals(walls, chosen, BODY_M) if way is None and len(chosen) else way
+    ways = way if way is not None else smooth_normals(walls, chosen, BODY_M) if len(chosen) else np.zeros(3)
     return Moved(walls, chosen, walls.before[chosen] + change.depth_m * weights[:, None] * ways)
 
 
@@ -97,8 +97,10 @@ def spray(walls: TwinWalls, zone: Zone, change: SurfaceChange, seed: int) -> Mov
         along_m = zone.length_m / 2 - np.abs(around.along_m)
         half_deg = (sector_deg[1] - sector_deg[0]) / 2
         over_m = np.deg2rad(half_deg) * (1.0 - np.abs(sector_offset(around.angle_deg, sector_deg))) * reach_m
-        wavy_m = _WAVY_M * np.clip(noise_at(places, _WAVY_LENGTH_M, edge_key), -2, 2)
-        return np.asarray(np.minimum(along_m, over_m if half_deg < 180 else np.inf) + wavy_m)
+        deep_m = np.minimum(along_m, over_m) if half_deg < 180 else along_m
+        close = np.flatnonzero(np.abs(deep_m) < 4 * _WAVY_M)  # elsewhere the edge is out of reach
+        deep_m[close] += _WAVY_M * np.clip(noise_at(places[close], _WAVY_LENGTH_M, edge_key), -2, 2)
+        return deep_m
 
     walls = refine_zone(
         walls, zone, lambda around, places: np.where(np.abs(inside_m(around, places) - 0.03) < 0.1, _FINEST_M, np.inf)

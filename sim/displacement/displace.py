@@ -55,12 +55,14 @@ class Displacement:
         patches: The changes, by number.
         label: (M,) int16 number of the change to which each face belongs, 0 for faces of which no corner moves by 1 mm.
         is_moved: (M,) faces of which any corner moves at all.
+        original: The before surface in the triangles that it had before any of them was cut.
     """
 
     walls: TwinWalls
     patches: tuple[Patch, ...]
     label: np.ndarray
     is_moved: BoolArray
+    original: Mesh
 
     def volume_m3(self, number: int) -> float:
         """Return the volume swept by one change, positive where rock came into the void."""
@@ -96,7 +98,8 @@ def displace(scenario: Scenario, centreline: Centreline, wall: Mesh, seed: int) 
     """
     if not scenario.surface:
         return None
-    walls, patches = twin_walls(wall), ()
+    walls = twin_walls(wall)
+    patches: tuple[Patch, ...] = ()
     # given places first, as with props, so that no drawn change takes one
     for change in sorted(scenario.surface, key=lambda each: each.place.between is None and each.place.node is None):
         walls, patches = _find_place(scenario, centreline, walls, patches, change, seed)
@@ -112,7 +115,7 @@ def displace(scenario: Scenario, centreline: Centreline, wall: Mesh, seed: int) 
     walls = replace(walls, owner=renumbered[walls.owner])
     moved_m = np.linalg.norm(walls.after - walls.before, axis=1)[walls.faces].max(axis=1)
     owner = walls.owner[walls.faces].max(axis=1)
-    return Displacement(walls, patches, np.where(moved_m > MOVED_M, owner, 0).astype(np.int16), moved_m > 0)
+    return Displacement(walls, patches, np.where(moved_m > MOVED_M, owner, 0).astype(np.int16), moved_m > 0, wall)
 
 
 def _find_place(
@@ -203,8 +206,8 @@ def _zones(scenario: Scenario, centreline: Centreline, change: SurfaceChange, se
         yield _at_end(scenario, centreline, change, place.node)
         return
     if change.kind == "face":
-        ends = [node for drift, line in zip(scenario.tunnel.drifts, centreline.drifts, strict=True)
-                for node, is_blind in zip((drift.nodes[0], drift.nodes[-1]), line.is_blind, strict=True) if is_blind]  # fmt: skip
+        pairs = zip(scenario.tunnel.drifts, centreline.drifts, strict=True)
+        ends = [drift.nodes[end] for drift, line in pairs for end in (0, -1) if line.is_blind[end]]
         for index in stream(seed, "surface", change.name, "place").permutation(len(ends)).tolist():
             yield _at_end(scenario, centreline, change, ends[index])
         return

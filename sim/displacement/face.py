@@ -83,7 +83,9 @@ def advance(walls: TwinWalls, zone: Zone, change: SurfaceChange, seed: int, tunn
     ):
         rough += sigma_m * np.clip(noise_at(places, length_m, key), -_LIMIT_SIGMA, _LIMIT_SIGMA)
     rough *= np.where(ways[:, 2] > _FLOOR_NORMAL, tunnel.floor.roughness, 1.0) * np.minimum(4.0 * share[chosen], 1.0)
-    before = TwinWalls(drawn.before, np.where((share > 0)[:, None], drawn.before, drawn.after), drawn.faces, drawn.owner)
+    before = TwinWalls(
+        drawn.before, np.where((share > 0)[:, None], drawn.before, drawn.after), drawn.faces, drawn.owner
+    )
     owner = np.where(share > 0, 0, before.owner)
     return Moved(TwinWalls(before.before, before.after, before.faces, owner), chosen, places + rough[:, None] * ways)
 

@@ -1,4 +1,4 @@
-"""What stands on rock that moved: furniture and stones follow it, props are carried along, scars and fill are kept free."""
+"""What stands on rock that moved: furniture and stones follow it, props are carried, scars and fill are kept free."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def follow(fixtures: Sequence[Fixture], displacement: Displacement) -> tuple[Fix
     done = []
     for fixture in fixtures:
         mesh = fixture.mesh
-        apart_m, nearest = tree.query(mesh.vertices, distance_upper_bound=_REACH_M)
+        apart_m, nearest = (np.asarray(each) for each in tree.query(mesh.vertices, distance_upper_bound=_REACH_M))
         found = np.isfinite(apart_m)
         moves = np.zeros_like(mesh.vertices)
         moves[found] = shift[near[nearest[found]]]
@@ -193,7 +193,7 @@ def _pieces(mesh: Mesh) -> tuple[Int64Array, Float64Array]:
 
 
 def _is_within(places: Float64Array, others: Float64Array, within_m: float) -> BoolArray:
-    is_in = ((places > others.min(axis=0) - within_m) & (places < others.max(axis=0) + within_m)).all(axis=1)
+    is_in: BoolArray = ((places > others.min(axis=0) - within_m) & (places < others.max(axis=0) + within_m)).all(axis=1)
     near = np.flatnonzero(is_in)
     apart_m, _ = cKDTree(others).query(places[near], distance_upper_bound=within_m)
     is_in[near] = np.isfinite(apart_m)

@@ -9,8 +9,8 @@ from cdpipe.core.geometry import Float64Array, Int64Array
 from sim.geometry.mesh import Mesh, split_triangles
 
 FARTHEST_M = 5.0  # a closest place beyond this says nothing of the same rock
-_PIECE_M = 0.15  # longest edge of the pieces that are looked up
-_FEW = 16
+_PIECE_M = 0.1  # longest edge of the pieces that are looked up
+_FEW = 8
 _TIE_M = 1e-9
 _BATCH = 4096
 
@@ -46,7 +46,7 @@ class SignedDistance:
             return signed
         for start in range(0, len(points), _BATCH):
             part = points[start : start + _BATCH]
-            apart_m, nearest = self._tree.query(part, k=few)
+            apart_m, nearest = (np.asarray(each) for each in self._tree.query(part, k=few))
             apart_m, nearest = apart_m.reshape(len(part), few), nearest.reshape(len(part), few)
             best_m = np.full(len(part), np.inf)
             signs = np.ones(len(part))
@@ -55,7 +55,9 @@ class SignedDistance:
             # a triangle farther down the list could only be nearer if its ball reached so far
             open_rows = np.flatnonzero((apart_m[:, -1] < best_m + self._largest_m) & (few < len(self._centres)))
             if len(open_rows):
-                lists = self._tree.query_ball_point(part[open_rows], np.minimum(best_m[open_rows], FARTHEST_M) + self._largest_m)
+                lists = self._tree.query_ball_point(
+                    part[open_rows], np.minimum(best_m[open_rows], FARTHEST_M) + self._largest_m
+                )
                 counts = np.fromiter((len(each) for each in lists), np.int64, len(lists))
                 found = np.concatenate([np.asarray(each, np.int64) for each in lists])
                 self._closest(part, np.repeat(open_rows, counts), found, best_m, signs)

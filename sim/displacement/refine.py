@@ -54,7 +54,7 @@ def refine(walls: TwinWalls, edge_m: Callable[[Float64Array], Float64Array]) -> 
 
     Args:
         walls: The walls.
-        edge_m: Gives the longest edge allowed at places (K, 3) of the before session, metres; infinite where any may be.
+        edge_m: Gives the longest edge (K,) allowed at places (K, 3) of the before session, metres; infinite for any.
     """
     for _ in range(_ROUNDS):
         near = np.flatnonzero(np.isfinite(edge_m(walls.before))[walls.faces].any(axis=1))
@@ -62,7 +62,10 @@ def refine(walls: TwinWalls, edge_m: Callable[[Float64Array], Float64Array]) -> 
         pairs = np.unique(np.sort(ends, axis=1), axis=0)
         middle = walls.before[pairs].mean(axis=1)
         longest_m = np.maximum(
-            *(np.linalg.norm(places[pairs[:, 1]] - places[pairs[:, 0]], axis=1) for places in (walls.before, walls.after))
+            *(
+                np.linalg.norm(places[pairs[:, 1]] - places[pairs[:, 0]], axis=1)
+                for places in (walls.before, walls.after)
+            )
         )
         pairs = pairs[longest_m > edge_m(middle)]
         if not len(pairs):

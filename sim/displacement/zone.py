@@ -24,7 +24,7 @@ class Around:
         along_m: Distance along the drift from the middle of a change.
         left_m: Distance to the left of the axis.
         up_m: Height above the floor of the centreline.
-        angle_deg: About the axis, half the drift's height above the floor: 0 the crown, 90 the left wall, +-180 the floor.
+        angle_deg: About the axis, half the drift's height up: 0 the crown, 90 the left wall, +-180 the floor.
         share: 1 on this drift's rock, fading to 0 on rock so far away that it belongs to another one.
     """
 

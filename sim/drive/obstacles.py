@@ -29,7 +29,7 @@ Span = tuple[Float64Array, Float64Array]  # lowest and highest forbidden offset,
 def find_obstacles(
     world: World, scenario: Scenario, session: str, line: Float64Array, headings: Float64Array, height_m: float
 ) -> list[tuple[str, Float64Array, Float64Array]]:
-    """Return for each prop and heap of rubble in the way what it is, and the offsets it forbids, (N,) to (N,), NaN where it is far."""
+    """Return what each prop and heap of rubble in the way is, and the offsets it forbids, (N,) to (N,), NaN if far."""
     clearance_m = scenario.platform.clearance_m
     found = []
     for item in world.standing:

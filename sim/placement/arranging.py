@@ -70,7 +70,9 @@ class _Board:
         for item in items:
             may_ride = item.posture == "upright" and item.shape.is_settled
             for place in self.around.barred:
-                if not (may_ride and place.may_be_carried) and rectangles_overlap(standing_corners(item), place.corners):
+                if not (may_ride and place.may_be_carried) and rectangles_overlap(
+                    standing_corners(item), place.corners
+                ):
                     return place.name
         return None
 

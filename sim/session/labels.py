@@ -133,7 +133,8 @@ def list_changes(scenario: Scenario, world: World) -> list[Tally]:
 
     A prop that stands in one session only was added or removed. A prop of the same shape was moved if any of its
     corners differs by more than one millimetre; a move is a removal and an addition, linked. A prop whose surface
-    differs was reshaped; its change is the removed part. A prop that aged, or that a heaving floor carries, has not changed.
+    differs was reshaped; its change is the removed part. A prop that aged, or that a
+    heaving floor carries, has not changed.
     """
     tallies: list[Tally] = []
     for instance, prop in enumerate(scenario.props, start=1):

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from sim.displacement.displace import MOVED_M, Displacement
 from sim.displacement.measure import FARTHEST_M, SignedDistance
-from sim.geometry.mesh import Mesh, split_triangles
+from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 from sim.scene import WALL_GEOM, World
 from sim.sensor.lidar import Scan
@@ -20,7 +18,7 @@ from sim.session.truth import Int16Array, SessionName, SurfaceChangeTruth
 _RISING = ("rubble", "fill")
 _SLACK_M = 0.05
 _SAME_M = 1e-3  # between the middle ray of a beam and the ray that gave the return
-_PIECE_M = 0.1
+_PIECE_M = 0.2
 
 
 class MovedRock:
@@ -34,16 +32,18 @@ class MovedRock:
         rising = [patch.number for patch in displacement.patches if patch.kind in _RISING]
         self._is_rising: BoolArray = np.isin(displacement.walls.owner[displacement.walls.faces].max(axis=1), rising)
         wall, far = own.meshes[WALL_GEOM], other.meshes[WALL_GEOM]
+        # the before surface is the same in its first triangles, which are fewer
+        looked_up = displacement.original if session == "after" else far
         self._boxes: list[tuple[Float64Array, Float64Array]] = []
-        chosen = np.zeros(len(wall.faces), dtype=bool)
+        chosen = np.zeros(len(looked_up.faces), dtype=bool)
         owner = displacement.walls.owner[displacement.walls.faces].max(axis=1)
         for patch in displacement.patches:
             moved = Mesh(wall.vertices, wall.faces[self._is_moved & (owner == patch.number)])
             corners = wall.vertices[moved.faces].reshape(-1, 3)
             self._boxes.append((corners.min(axis=0) - _SLACK_M, corners.max(axis=0) + _SLACK_M))
             shift_m = np.linalg.norm(wall.vertices[moved.faces] - far.vertices[moved.faces], axis=2).max(initial=0.0)
-            chosen |= _near_box(far, corners, min(float(shift_m), FARTHEST_M) + _SLACK_M)
-        self._index = SignedDistance(Mesh(far.vertices, far.faces[chosen]))
+            chosen |= _near_box(looked_up, corners, min(float(shift_m), FARTHEST_M) + _SLACK_M)
+        self._index = SignedDistance(Mesh(looked_up.vertices, looked_up.faces[chosen]))
 
     def measure(self, points: Float64Array, faces: Int64Array) -> Float64Array:
         """Return the displacement (N,) at places (N, 3) on faces (N,) of this session's walls, after minus before."""
@@ -120,25 +120,27 @@ def _near_box(mesh: Mesh, corners: Float64Array, within_m: float) -> BoolArray:
     """Mark the faces (M,) of which the box comes within a distance of the box of some places (N, 3)."""
     low, high = corners.min(axis=0) - within_m, corners.max(axis=0) + within_m
     is_below, is_above = mesh.vertices < low, mesh.vertices > high
-    return ~(is_below[mesh.faces].all(axis=1) | is_above[mesh.faces].all(axis=1)).any(axis=1)
+    return np.asarray(~(is_below[mesh.faces].all(axis=1) | is_above[mesh.faces].all(axis=1)).any(axis=1))
 
 
 def _cut(triangles: Float64Array, faces: Int64Array) -> tuple[Float64Array, Int64Array]:
-    """Return pieces (K, 3, 3) of triangles (N, 3, 3) of at most 0.1 m, and the face (K,) of each."""
-    pieces: list[Float64Array] = []
-    owners: list[Int64Array] = []
-    edges_m = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2).max(axis=1)
-    is_long = edges_m > _PIECE_M
-    pieces.append(triangles[~is_long])
-    owners.append(faces[~is_long])
-    for triangle, face in zip(triangles[is_long], faces[is_long], strict=True):
-        cut = split_triangles(triangle[None], _PIECE_M)
-        pieces.append(cut)
-        owners.append(np.full(len(cut), face))
+    """Return pieces (K, 3, 3) of triangles (N, 3, 3), cut at longest edges above 0.2 m, and the face (K,) of each."""
+    pieces, owners = [triangles[:0]], [faces[:0]]
+    while len(triangles):
+        lengths_m = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2)
+        is_long = lengths_m.max(axis=1) > _PIECE_M
+        pieces.append(triangles[~is_long])
+        owners.append(faces[~is_long])
+        triangles, faces, longest = triangles[is_long], faces[is_long], lengths_m[is_long].argmax(axis=1)
+        rows = np.arange(len(triangles))
+        a, b, c = (triangles[rows, (longest + turn) % 3] for turn in range(3))
+        middle = (a + b) / 2
+        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+        faces = np.concatenate([faces, faces])
     return np.concatenate(pieces), np.concatenate(owners)
 
 
-def _face_of(mesh: Mesh, faces: Int64Array, corners: Sequence[int] | Int64Array) -> Int64Array:
+def _face_of(mesh: Mesh, faces: Int64Array, corners: Int32Array) -> Int64Array:
     """Return a face (K,), of some faces, that has each of these corners (K,)."""
     of_corner = np.zeros(len(mesh.vertices), np.int64)
     for column in range(3):

@@ -309,8 +309,8 @@ def write_surface_labels(session: Path, index: int, displacement: Float32Array, 
     """Write displacement, metres, and surface change of one chunk, both (s, R, W)."""
     folder = session / "truth" / "surface"
     folder.mkdir(parents=True, exist_ok=True)
-    arrays = {"displacement": displacement, "surface_change": surface_change}
-    np.savez(folder / f"{index:05d}.npz", allow_pickle=False, **arrays)
+    path = folder / f"{index:05d}.npz"
+    np.savez(path, allow_pickle=False, displacement=displacement, surface_change=surface_change)
 
 
 def read_chunk_surface(session: Path, index: int) -> tuple[Float32Array, Int16Array] | None:
