@@ -41,6 +41,7 @@ from eval.report.site.site import draw_site
 from eval.report.site.views import Views, write_views
 from eval.report.site.worst import draw_worst, worst_rows
 from eval.report.summary import draw_summary
+from eval.report.surface.surface import SURFACE_COLUMNS, draw_surface
 from eval.report.tables import Cell, Table, results_table, to_csv, unchanged_table
 from eval.running.run_data import (
     RunData,
@@ -171,6 +172,7 @@ def _sections(data: RunData, drawn: Mapping[str, Sequence[Chart]], views: Views)
         views: Which pairs get a 3-D view.
     """
     regions, objects, unchanged = draw_regions(data), draw_objects(data), unchanged_table(data)
+    surface = draw_surface(data)
     worlds, variant = scenarios(data, unchanged=False), shown_variant(data)
     # a run about objects alone shows its best and worst in their own section, and no maps
     is_mapped = regions is not None or objects is None
@@ -179,18 +181,24 @@ def _sections(data: RunData, drawn: Mapping[str, Sequence[Chart]], views: Views)
     links = write_views(data, variant, [(str(row["scenario"]), int(row["seed"])) for row in worst], views)
     grids, factors, by_scenario = draw_grids(data), draw_factors(data), draw_scenarios(data)
     n_unchanged = len({(row["scenario"], row["seed"]) for row in data.results if flag(row, "is_unchanged_pair")})
-    missing = [*data.missing, *(line for part in (*sites, links, regions, objects) if part for line in part.missing)]
+    missing = [
+        *data.missing,
+        *(line for part in (*sites, links, regions, objects, surface) if part for line in part.missing),
+    ]
     missing += [] if worlds else ["No scenario with changes was run."]
     if objects is None:
         missing += [] if n_unchanged else ["No unchanged pair was run, so false alarms are not measured."]
         missing += [] if grids or drawn["factorial"] else ["No grid of two settings was run."]
     of_regions = () if regions is None else regions.plots
+    of_surface = () if surface is None else surface.plots
     charts = [
-        *drawn["hardness"], *of_regions, *drawn["pareto"], *drawn["factorial"], *by_scenario, *grids, *factors,
+        *drawn["hardness"], *of_regions, *of_surface, *drawn["pareto"], *drawn["factorial"], *by_scenario, *grids,
+        *factors,
     ]  # fmt: skip
     return {
         "regions": regions,
         "objects": objects,
+        "surface": surface,
         "results": results_table(data),
         "unchanged": unchanged,
         "n_unchanged": n_unchanged,
@@ -211,6 +219,7 @@ def _sections(data: RunData, drawn: Mapping[str, Sequence[Chart]], views: Views)
         "sites": sites,
         "columns": (
             *(() if regions is None else REGION_COLUMNS), *(() if objects is None else OBJECT_COLUMNS),
+            *(() if surface is None else SURFACE_COLUMNS),
             *RESULT_COLUMNS, *([PQ_COLUMN] if grids else []),
         ),
         "time_meanings": TIME_MEANINGS,

@@ -143,7 +143,6 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
         **{name: mean(read_figure(report, name)[report.regions.is_reported]) if report else _NAN for name in FIGURES},
         **_list_sizes(answer, truth, n_regions, float(after_travelled_m[-1])),
         **surface.columns,
-        "t_surface_s": float(answer.seconds.get("t_surface_s", _NAN)),
     }
     row |= compute_plugin_columns(truth, answer, row)
     if answer.until == "merge":

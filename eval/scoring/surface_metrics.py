@@ -40,7 +40,7 @@ _ERRORS = tuple(
 COLUMNS = (
     *_ERRORS, "surface_level_inside", "surface_level_median_m", "surface_recall", "surface_region_precision",
     "surface_false_regions_per_100m", "surface_volume_error_share", "n_surface_places", "n_surface_changes",
-    "n_surface_regions",
+    "n_surface_regions", "t_surface_s",
 )  # fmt: skip
 
 
@@ -68,7 +68,8 @@ def score_surface(answer: Answer, truth: GroundTruth, after_path_m: float) -> Su
     """Score the displacement field of an answer.
 
     A pair that asks for a field is scored as an empty field where the answer has none, or where there is no answer. On
-    any other pair an answer without a field has NaN in all columns and no rows.
+    any other pair an answer without a field has no columns and no rows, so that the tables of a run in which no rock moves
+    stay as they were; so has an answer that ends at the merge.
 
     Args:
         answer: The answer, checked.
@@ -77,7 +78,7 @@ def score_surface(answer: Answer, truth: GroundTruth, after_path_m: float) -> Su
     """
     surface = None if answer.report is None else answer.report.surface
     if answer.until is not None or (surface is None and not is_surface_pair(truth)):
-        return SurfaceScores(dict.fromkeys(COLUMNS, _NAN))
+        return SurfaceScores({})
     places = find_surface_places(truth)
     said = carry_surface(surface, places)
     changes = [_score_change(each, surface, said, places) for each in truth.pair.surface_changes]
@@ -99,6 +100,7 @@ def score_surface(answer: Answer, truth: GroundTruth, after_path_m: float) -> Su
         "n_surface_places": int(np.count_nonzero(places.is_judged)),
         "n_surface_changes": len(asked),
         "n_surface_regions": len(is_true),
+        "t_surface_s": float(answer.seconds.get("t_surface_s", _NAN)),
     }
     return SurfaceScores(columns, changes, list_windows(said, places))
 

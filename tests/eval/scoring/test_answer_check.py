@@ -55,6 +55,7 @@ def test_seconds(seconds: dict[str, float], told: str | None) -> None:
 def test_the_seconds_that_an_answer_may_state() -> None:
     assert SECONDS == (
         "t_index_s", "t_merge_s", "t_refine_s", "t_descriptor_s", "t_cd_s", "t_oe_s", "t_returns_s",
+        "t_surface_s",
     )  # fmt: skip
 
 

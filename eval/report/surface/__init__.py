@@ -1,0 +1,1 @@
+"""Rock that moved on the page: methods, detection limits, and unrolled maps of one pair."""
