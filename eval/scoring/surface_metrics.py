@@ -68,8 +68,8 @@ def score_surface(answer: Answer, truth: GroundTruth, after_path_m: float) -> Su
     """Score the displacement field of an answer.
 
     A pair that asks for a field is scored as an empty field where the answer has none, or where there is no answer. On
-    any other pair an answer without a field has no columns and no rows, so that the tables of a run in which no rock moves
-    stay as they were; so has an answer that ends at the merge.
+    any other pair an answer without a field has no columns and no rows, so that the tables of a run in which no rock
+    moves stay as they were. So has an answer that ends at the merge.
 
     Args:
         answer: The answer, checked.

@@ -101,6 +101,7 @@ def merge_table(results: pd.DataFrame, targets: Targets) -> pd.DataFrame:
     kind = kinds(results)
     family = results["family" if "family" in results else "scenario"]
     odometry = odometry_of(results)
+    results = results.copy()  # one block: pandas warns of a hundred columns in pieces
     cases = results.assign(pair_kind=kind, family=family, odometry=np.where(odometry == "", ANY, odometry))[kind != ""]
     rows: list[dict[str, Any]] = []
     for keys in (["pair_kind", "odometry", "variant"], ["pair_kind", "odometry", "family", "variant"]):

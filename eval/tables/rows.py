@@ -51,7 +51,7 @@ def is_told_the_truth(variant: str) -> bool:
 
 def with_domain(rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Return rows of results.csv as a table, with their `domain`."""
-    table = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows))
+    table = (rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows))).copy()  # in one block
     family = texts(table, "family" if "family" in table else "scenario")
     return table.assign(domain=[domain_of(name) for name in family])
 
