@@ -71,8 +71,7 @@ def test_walls_stay_closed_and_volumes_are_what_the_void_lost(
     assert total_m3 == pytest.approx(after_m3 - before_m3, rel=1e-9)
     signs = {patch.kind: np.sign(found.volume_m3(patch.number)) for patch in found.patches}
     assert all(sign == (-1 if kind in ("scar", "face") else 1) for kind, sign in signs.items())
-    before_m = np.linalg.norm(found.walls.before[found.walls.faces].mean(axis=1) - 0, axis=1)
-    assert (found.label[~found.is_moved] == 0).all() and len(before_m)
+    assert (found.label[~found.is_moved] == 0).all()
 
 
 def test_rubble_is_the_scar_times_its_swell(make_scenario: Callable[..., Scenario]) -> None:
@@ -228,7 +227,8 @@ def test_without_surface_changes_nothing_is_written(make_scenario: Callable[...,
 
 
 def test_a_foreign_mesh_is_deformed_the_same_way(make_scenario: Callable[..., Scenario], tmp_path: Path) -> None:
-    room = trimesh.creation.box(extents=(24.0, 4.0, 3.2)).subdivide_to_size(0.5)
+    # twelve triangles: none of their corners lies where the rock changes
+    room = trimesh.creation.box(extents=(24.0, 4.0, 3.2))
     room.apply_translation([10.0, 0.0, 1.6])
     room.invert()
     room.export(tmp_path / "hall.glb")
