@@ -6,6 +6,7 @@ values of the wrong type, which the schema reports.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
@@ -32,7 +33,7 @@ def find_dangling(tree: Any) -> list[Mistake]:
     of_edges = [(key, _no_drift(pair, nodes)) for key, pair in _edges_named(tree) if frozenset(pair) not in edges]
     if of_drifts:  # a misspelt drift joins nothing: only nodes that do not exist are worth a line of their own
         of_edges = [(key, rule) for key, rule in of_edges if not rule.startswith(_NO_DRIFT)]
-    return [*of_drifts, *of_edges, *_repeated_names(tree), *_area_mistakes(tree)]
+    return [*of_drifts, *of_edges, *_node_mistakes(tree, nodes), *_repeated_names(tree), *_area_mistakes(tree)]
 
 
 def _drift_mistakes(tunnel: Any, nodes: list[str]) -> Iterator[Mistake]:
@@ -60,11 +61,30 @@ def _edges_named(tree: Any) -> list[tuple[Key, list[str]]]:
 
 
 def _repeated_names(tree: Any) -> Iterator[Mistake]:
-    for kind in ("area", "prop", "mover", "puddle"):
-        names = [item.get("name") if isinstance(item, dict) else None for item in items_at(tree, f"{kind}s")]
+    keys = {"areas": "area", "props": "prop", "movers": "mover", "puddles": "puddle", "surface": "surface change"}
+    for key, kind in keys.items():
+        names = [item.get("name") if isinstance(item, dict) else None for item in items_at(tree, key)]
         for index, name in enumerate(names):
             if isinstance(name, str) and name in names[:index]:
-                yield (f"{kind}s", index, "name"), f"another {kind} has this name"
+                yield (key, index, "name"), f"another {kind} has this name"
+
+
+def _node_mistakes(tree: Any, nodes: list[str]) -> Iterator[Mistake]:
+    uses = Counter(
+        node for drift in items_at(mapping_at(tree, "tunnel"), "drifts") for node in _names(items_at(drift, "nodes"))
+    )
+    ends = {node for drift in items_at(mapping_at(tree, "tunnel"), "drifts") for node in _ends(drift)}
+    for index, change in enumerate(items_at(tree, "surface")):
+        node = mapping_at(change, "place").get("node")
+        if isinstance(node, str) and node not in nodes:
+            yield ("surface", index, "place", "node"), _unknown_node(node, nodes)
+        elif isinstance(node, str) and (uses[node] != 1 or node not in ends):
+            yield ("surface", index, "place", "node"), f"{node} is no blind end of a drift"
+
+
+def _ends(drift: Any) -> list[str]:
+    names = _names(items_at(drift, "nodes"))
+    return [names[0], names[-1]] if names else []
 
 
 def _area_mistakes(tree: Any) -> Iterator[Mistake]:
@@ -76,13 +96,15 @@ def _area_mistakes(tree: Any) -> Iterator[Mistake]:
 
 
 def _places(tree: Any) -> Iterator[tuple[Key, dict[str, Any]]]:
-    """Yield both places of every prop, the path of every mover, the place of every puddle; empty where none is."""
+    """Yield the places of props, paths of movers, places of puddles and surface changes; empty where none is."""
     for index, prop in enumerate(items_at(tree, "props")):
         yield from ((("props", index, name), mapping_at(prop, name)) for name in ("place", "to"))
     for index, mover in enumerate(items_at(tree, "movers")):
         yield ("movers", index, "path"), mapping_at(mover, "path")
     for index, puddle in enumerate(items_at(tree, "puddles")):
         yield ("puddles", index, "place"), mapping_at(puddle, "place")
+    for index, change in enumerate(items_at(tree, "surface")):
+        yield ("surface", index, "place"), mapping_at(change, "place")
 
 
 def _no_drift(pair: list[str], nodes: list[str]) -> str:

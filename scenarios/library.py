@@ -102,7 +102,7 @@ def _freeze(scenario: Scenario) -> Scenario:
     """Return the scenario without its changes: the world stays as in the before session."""
     stay = {"change": "none", "to": None, "shift": None, "loaded_share": None}  # age is no change
     props = tuple(prop.model_copy(update=stay) for prop in scenario.props if prop.change != "added")
-    return scenario.model_copy(update={"props": props})
+    return scenario.model_copy(update={"props": props, "surface": ()})
 
 
 def _turn_over(scenario: Scenario, turnover: float, seed: int) -> Scenario:

@@ -8,13 +8,23 @@ surfaces are kept. Their order is the order of the geoms in a single model of th
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
-from cdpipe.core.geometry import Float32Array, Int32Array
+from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array
 from scenarios.schema import Scenario
+from sim.displacement.displace import Displacement, displace
+from sim.displacement.follow import (
+    barred_places,
+    carry,
+    covered_outlines,
+    follow,
+    leave_out_broken,
+    raise_centreline,
+    rubble_points,
+)
 from sim.furniture.furniture import Fixture, furnish
 from sim.furniture.stones import strew_stones
 from sim.geometry.mesh import Mesh
@@ -28,6 +38,8 @@ from sim.rock.foreign import tunnel_mesh
 from sim.rock.tunnel import mesh_tunnel
 
 WALL = "wall"
+WALL_GEOM = 0
+_HEAP_M = 0.15  # rubble higher than this is driven round
 _STONE_FREE_M = 0.1  # round the footprint of every prop
 
 
@@ -63,6 +75,10 @@ class World:
         fixtures: Furniture and stones.
         standing: Every prop at each of its places, settled.
         before, after: The two scenes.
+        displacement: The walls of both sessions where rock changes; None where it does not.
+        changed: Drifts, tunnel, obstacles and furniture as they are in the after session where rock changes, in the
+            order centreline, walls, fixed, fixtures.
+        heaps: Name and places (N, 3) of the rubble of this session that a robot drives round.
     """
 
     centreline: Centreline
@@ -72,6 +88,17 @@ class World:
     standing: tuple[Standing, ...]
     before: Scene
     after: Scene
+    displacement: Displacement | None = None
+    changed: tuple[Centreline, Caster, Caster, tuple[Fixture, ...]] | None = None
+    heaps: tuple[tuple[str, Float64Array], ...] = ()
+
+    def of(self, session: str) -> World:
+        """Return the world as a session meets it: its floor, its rock, its furniture."""
+        if session == "before" or self.changed is None or self.displacement is None:
+            return self
+        centreline, walls, fixed, fixtures = self.changed
+        heaps = tuple(rubble_points(self.displacement, _HEAP_M))
+        return replace(self, centreline=centreline, walls=walls, fixed=fixed, fixtures=fixtures, heaps=heaps)
 
 
 def build_world(scenario: Scenario, seed: int) -> World:
@@ -83,14 +110,24 @@ def build_world(scenario: Scenario, seed: int) -> World:
     tunnel = scenario.tunnel
     centreline = build_centreline(tunnel, seed)
     wall = mesh_tunnel(tunnel, centreline, seed) if tunnel.mesh is None else tunnel_mesh(tunnel.mesh)
+    displacement = displace(scenario, centreline, wall, seed)
+    if displacement is not None:
+        wall = displacement.walls.mesh("before")
     walls = Caster([wall])
     furniture = furnish(tunnel, centreline, walls, seed)
+    if displacement is not None:
+        furniture = leave_out_broken(furniture, displacement)
     # Compiling takes the most memory, so it is done before the other ray casters exist.
     rock = [compile_mesh(mesh) for mesh in (wall, *(fixture.mesh for fixture in furniture))]
     hung = Caster([wall, *(fixture.mesh for fixture in furniture)]) if furniture else walls
     gap_m = WALL_GAP_M + (tunnel.resolution_m if tunnel.mesh is None else 0.0)
-    standing = place_props(scenario, centreline, Surroundings(walls, hung, gap_m), seed)
-    outlines = [grow_rectangle(standing_corners(item), _STONE_FREE_M) for item in standing]
+    around, outlines = Surroundings(walls, hung, gap_m), []
+    if displacement is not None:
+        level, _, hung_after = _change_rock(displacement, centreline, walls, furniture)[:3]
+        around = replace(around, barred=barred_places(displacement), after=(level, hung_after))
+        outlines = covered_outlines(displacement)
+    standing = place_props(scenario, centreline, around, seed)
+    outlines += [grow_rectangle(standing_corners(item), _STONE_FREE_M) for item in standing]
     stones = strew_stones(tunnel, centreline, walls, outlines, seed)
     if stones is None:
         fixtures, fixed = furniture, hung
@@ -98,8 +135,28 @@ def build_world(scenario: Scenario, seed: int) -> World:
         fixtures = (*furniture, stones)
         rock.append(compile_mesh(stones.mesh))
         fixed = Caster([wall, *(fixture.mesh for fixture in fixtures)])
-    scenes = [compile_scene(scenario, rock, fixtures, standing, session) for session in ("before", "after")]
-    return World(centreline, walls, fixed, fixtures, tuple(standing), scenes[0], scenes[1])
+    changed, rock_after = None, rock
+    if displacement is not None:
+        standing = carry(standing, displacement)
+        changed = _change_rock(displacement, centreline, walls, fixtures)
+        pairs = zip(fixtures, changed[3], rock[1:], strict=True)
+        rock_after = [compile_mesh(displacement.walls.mesh("after"))]
+        rock_after += [own if old is new else compile_mesh(new.mesh) for old, new, own in pairs]
+    before, after = (
+        compile_scene(scenario, own, fixtures, standing, session)
+        for own, session in ((rock, "before"), (rock_after, "after"))
+    )
+    return World(centreline, walls, fixed, fixtures, tuple(standing), before, after, displacement, changed)
+
+
+def _change_rock(
+    displacement: Displacement, centreline: Centreline, walls: Caster, fixtures: tuple[Fixture, ...]
+) -> tuple[Centreline, Caster, Caster, tuple[Fixture, ...]]:
+    """Return drifts, tunnel, obstacles and furniture as they are in the after session."""
+    wall, moved = displacement.walls.mesh("after"), follow(fixtures, displacement)
+    level = raise_centreline(centreline, walls, displacement)
+    bare = Caster([wall])
+    return level, bare, Caster([wall, *(fixture.mesh for fixture in moved)]) if moved else bare, moved
 
 
 def compile_scene(

@@ -29,7 +29,7 @@ Span = tuple[Float64Array, Float64Array]  # lowest and highest forbidden offset,
 def find_obstacles(
     world: World, scenario: Scenario, session: str, line: Float64Array, headings: Float64Array, height_m: float
 ) -> list[tuple[str, Float64Array, Float64Array]]:
-    """Return for each prop in the way its name and the offsets it forbids, (N,) to (N,), NaN where it is far."""
+    """Return what each prop and heap of rubble in the way is, and the offsets it forbids, (N,) to (N,), NaN if far."""
     clearance_m = scenario.platform.clearance_m
     found = []
     for item in world.standing:
@@ -44,8 +44,29 @@ def find_obstacles(
         high[near] = np.where(is_abreast, across + reach_m, -np.inf).max(axis=1)
         away = ~(low < high)
         low[away] = high[away] = np.nan
-        found.append((item.prop.name, low, high))
+        found.append((f"prop {item.prop.name!r}", low, high))
+    for name, places in world.heaps:
+        is_low = scenario.platform.kind == "quadrotor" and float(np.ptp(places[:, 2])) + AIR_BELOW_M < height_m
+        if len(places) and not is_low:
+            found.append((f"the rubble of surface {name!r}", *_keep_off(places[:, :2], line, headings, clearance_m)))
     return found
+
+
+def _keep_off(places: Float64Array, line: Float64Array, headings: Float64Array, clearance_m: float) -> Span:
+    """Return the offsets (N,) that places (K, 2) forbid to a line that keeps clear of them."""
+    low, high = np.full(len(line), np.nan), np.full(len(line), np.nan)
+    left = left_of(headings)
+    middle = places.mean(axis=0)
+    reach_m = float(np.linalg.norm(places - middle, axis=1).max()) + clearance_m + 10.0
+    for station in np.flatnonzero(np.linalg.norm(line[:, :2] - middle, axis=1) < reach_m).tolist():
+        away = places - line[station, :2]
+        along, across = away @ headings[station], away @ left[station]
+        is_abreast = np.abs(along) < clearance_m
+        if is_abreast.any():
+            reach = np.sqrt(clearance_m**2 - along[is_abreast] ** 2)
+            low[station] = (across[is_abreast] - reach).min()
+            high[station] = (across[is_abreast] + reach).max()
+    return low, high
 
 
 def sidestep(

@@ -138,7 +138,7 @@ def _plan_offsets(
         barred = sidestep(wanted, low, high, near_low, near_high)
         if barred is not None:
             raise ScenarioError(
-                f"{session}: prop {name!r} bars the way {barred * STEP_M:.1f} m along the route: "
+                f"{session}: {name} bars the way {barred * STEP_M:.1f} m along the route: "
                 "move it to a side, make it smaller, or lower platform.clearance_m"
             )
     stones = find_boulders(world, scenario, line, headings, float(width_m.max()))

@@ -118,7 +118,7 @@ def plan_trajectory(world: World, scenario: Scenario, sensor: SensorMetadata, se
         InputError: The trajectory or the odometry file cannot be read.
         ScenarioError: The route leaves no room, the trajectory leaves the tunnel, or revolutions are too far apart.
     """
-    scenario = scenario.of(session)
+    scenario, world = scenario.of(session), world.of(session)
     plan: SessionPlan = getattr(scenario, session)
     scene = world.before if session == "before" else world.after
     if plan.trajectory is not None:

@@ -111,6 +111,14 @@ class Caster(RayCaster):
         normals = np.where(is_hit[:, None], normals / np.maximum(length, 1e-30)[:, None], 0.0)
         return np.where(is_hit, answer["tfar"], np.float32(np.inf)), ids, normals.astype(np.float32)
 
+    def faces(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Int32Array, Int32Array]:
+        """Return distances and mesh numbers as `cast` does, and the (N,) number of the face hit in its mesh, or -1."""
+        answer = self._scene.run(*self._rays(origins, directions), output=1)
+        ids = answer["geomID"]
+        is_hit = ids >= 0
+        face = np.where(is_hit, answer["primID"], -1).astype(np.int32)
+        return np.where(is_hit, answer["tfar"], np.float32(np.inf)), ids, face
+
     def _rays(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Float32Array]:
         """Return origins, from the centre of the scene, and directions, both (N, 3) contiguous."""
         local, ways = np.broadcast_arrays(np.asarray(origins) - self.centre_m, directions)

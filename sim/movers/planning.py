@@ -77,7 +77,7 @@ def plan_movers(
 
 def _watch(world: World, scenario: Scenario, session: SessionName, robot: Motion) -> _Site:
     time_s = np.arange(robot.time_s[0], robot.time_s[-1] + _WATCH_S, _WATCH_S)
-    return _Site(world, scenario.of(session), session, time_s, robot.sample(time_s)[0])
+    return _Site(world.of(session), scenario.of(session), session, time_s, robot.sample(time_s)[0])
 
 
 def _plan(mover: Mover, instance: int, sites: Sequence[_Site], seed: int) -> list[MovingBody]:

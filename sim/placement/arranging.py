@@ -65,6 +65,17 @@ class _Board:
                     return other.prop.name, item.prop.name, max(shared)
         return None
 
+    def barred_by(self, items: Sequence[Standing]) -> str | None:
+        """Return the surface change in whose place one of the items would stand; None if there is none."""
+        for item in items:
+            may_ride = item.posture == "upright" and item.shape.is_settled
+            for place in self.around.barred:
+                if not (may_ride and place.may_be_carried) and rectangles_overlap(
+                    standing_corners(item), place.corners
+                ):
+                    return place.name
+        return None
+
     def is_passable(self, items: Sequence[Standing]) -> bool:
         return all(
             lane.is_open([*(each[number] for each in self.taken), lane.taken_by(item)])
@@ -84,7 +95,7 @@ def place_props(scenario: Scenario, centreline: Centreline, around: Surroundings
     Raises:
         ScenarioError: A prop does not fit, stands in another, does not come to rest, or finds no place.
     """
-    board = _Board(scenario, centreline, around, seed, build_lanes(scenario, centreline, around.fixed))
+    board = _Board(scenario, centreline, around, seed, build_lanes(scenario, centreline, around.fixed, around.after))
     areas = draw_areas(scenario, centreline, seed)
     anywhere = way(scenario, centreline)
     found: dict[tuple[str, bool], list[Standing]] = {}
@@ -177,6 +188,10 @@ def _refuse_overlap(items: Sequence[Standing], board: _Board) -> None:
             f"props {clash[0]!r} and {clash[1]!r} stand in one another in the {clash[2]} session: "
             "give one another fraction or lateral"
         )
+    if name := board.barred_by(items):
+        raise ScenarioError(
+            f"prop {items[0].prop.name!r} stands where surface {name!r} changes the rock: give one another place"
+        )
 
 
 def _find_place(job: _Job, stretches: Sequence[Stations], board: _Board) -> list[Standing]:
@@ -232,4 +247,6 @@ def _touching(items: Sequence[Standing], board: _Board) -> str:
 def _clash(items: Sequence[Standing], board: _Board) -> str:
     if clash := board.clash(items, _BETWEEN_M):
         return f"prop {clash[0]!r} stands there"
+    if name := board.barred_by(items):
+        return f"surface {name!r} changes the rock there"
     return "" if board.is_passable(items) else "the robot could not get by"

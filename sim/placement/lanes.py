@@ -78,8 +78,16 @@ class Lane:
         return True
 
 
-def build_lanes(scenario: Scenario, centreline: Centreline, fixed: Caster) -> tuple[Lane, ...]:
+def build_lanes(
+    scenario: Scenario, centreline: Centreline, fixed: Caster, after: tuple[Centreline, Caster] | None = None
+) -> tuple[Lane, ...]:
     """Return the lane of each session.
+
+    Args:
+        scenario: Its drives.
+        centreline: The drifts.
+        fixed: Rock and furniture.
+        after: Both as they are in the after session, where they differ.
 
     Raises:
         InputError: A recorded trajectory cannot be read.
@@ -87,7 +95,8 @@ def build_lanes(scenario: Scenario, centreline: Centreline, fixed: Caster) -> tu
     lanes = []
     for session, plan in (("before", scenario.before), ("after", scenario.after)):
         if plan.trajectory is None:
-            lanes.append(_route_lane(scenario.of(session), session, plan, centreline, fixed))
+            here = after if session == "after" and after is not None else (centreline, fixed)
+            lanes.append(_route_lane(scenario.of(session), session, plan, *here))
         else:
             lanes.append(_recorded_lane(scenario.of(session), session, Path(plan.trajectory)))
     return tuple(lanes)

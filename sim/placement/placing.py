@@ -12,6 +12,7 @@ from cdpipe.core.geometry import Float64Array, transform
 from scenarios.schema import Prop
 from sim.geometry.raycast import Caster
 from sim.props.shapes import Shape, footprint_corners, shape_mesh
+from sim.rock.centreline import Centreline
 
 Posture = Literal["upright", "tipped", "leaning"]
 
@@ -33,6 +34,7 @@ class Standing:
         world_T_object: (4, 4) pose; before settling with its lowest point about at floor level.
         posture: How it was put there.
         wall: (2,) unit direction of the wall it leans against or is banked up against, else None.
+        is_carried: Whether a floor that heaved moved it here; that is no change of the prop.
     """
 
     prop: Prop
@@ -41,6 +43,22 @@ class Standing:
     world_T_object: Float64Array
     posture: Posture = "upright"
     wall: Float64Array | None = None
+    is_carried: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Barred:
+    """A place where rock changes, and no prop stands.
+
+    Attributes:
+        name: The surface change.
+        corners: (4, 2) rectangle, world frame, metres.
+        may_be_carried: Whether an upright prop that settled there may stand on it and move with it.
+    """
+
+    name: str
+    corners: Float64Array
+    may_be_carried: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,11 +69,15 @@ class Surroundings:
         walls: The bare rock, whose floor carries them.
         fixed: Rock and furniture, from which they keep clear.
         gap_m: Distance between a prop and the side of the drift.
+        barred: Where rock changes and props stay away.
+        after: Centreline and `fixed` of the after session, where they differ.
     """
 
     walls: Caster
     fixed: Caster
     gap_m: float
+    barred: tuple[Barred, ...] = ()
+    after: tuple[Centreline, Caster] | None = None
 
 
 def floor_heights(walls: Caster, points: Float64Array) -> Float64Array:

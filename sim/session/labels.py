@@ -133,7 +133,8 @@ def list_changes(scenario: Scenario, world: World) -> list[Tally]:
 
     A prop that stands in one session only was added or removed. A prop of the same shape was moved if any of its
     corners differs by more than one millimetre; a move is a removal and an addition, linked. A prop whose surface
-    differs was reshaped; its change is the removed part. A prop that aged has not changed.
+    differs was reshaped; its change is the removed part. A prop that aged, or that a
+    heaving floor carries, has not changed.
     """
     tallies: list[Tally] = []
     for instance, prop in enumerate(scenario.props, start=1):
@@ -143,7 +144,8 @@ def list_changes(scenario: Scenario, world: World) -> list[Tally]:
             tallies.extend(_tally(len(tallies) + 1, instance, item, world, "full", None) for item in items)
             continue
         start, end = items
-        if prop.aged is not None or _is_same(start, end):
+        is_carried = end.is_carried and prop.change == "none"
+        if prop.aged is not None or is_carried or _is_same(start, end):
             continue
         if prop.loaded_share is not None:
             tallies.append(_tally_reshaped(len(tallies) + 1, instance, start, end, world))

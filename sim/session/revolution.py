@@ -20,7 +20,8 @@ from sim.sensor.lidar import Scan, scan
 from sim.sensor.rays import Rays, revolution_rays
 from sim.sensor.water import Water
 from sim.session.labels import Tally, mark_belonging
-from sim.session.truth import MIXED, Int16Array, SessionName
+from sim.session.surface import MovedRock
+from sim.session.truth import MIXED, Int16Array, SessionName, SurfaceChangeTruth
 
 # The arrays of a revolution, in the order of its attributes.
 CHANNELS = {
@@ -30,6 +31,8 @@ CHANNELS = {
     "instance": np.int16,
     "change": np.int16,
 }
+# Where rock changes, these as well.
+SURFACE_CHANNELS = {"displacement": np.float32, "surface_change": np.int16}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +45,7 @@ class Revolution:
         ghost_rays: Number of rays that met each ghost, by change id.
         sightings: (M, 4) of each mover the number of its returns, and their mean true position, world frame (NaN where
             it has none).
+        displacement, surface_change: (R, W) as in `sim.session.truth`; None where no rock changes.
     """
 
     range_mm: npt.NDArray[np.uint32]
@@ -51,6 +55,8 @@ class Revolution:
     change: Int16Array
     ghost_rays: dict[int, int]
     sightings: Float64Array
+    displacement: Float32Array | None = None
+    surface_change: Int16Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +70,8 @@ class Drive:
         sightings: (M, S, 4) what each revolution saw of each mover so far, as in `Revolution`.
         water: The session's puddles; None without any.
         panes: The session's panes of glass; None where glass is a wall.
+        rock: The session's walls where rock changes; None where it does not.
+        surface_changes: The changes of the pair's walls.
     """
 
     name: SessionName
@@ -79,6 +87,8 @@ class Drive:
     sightings: Float64Array
     water: Water | None = None
     panes: Panes | None = None
+    rock: MovedRock | None = None
+    surface_changes: tuple[SurfaceChangeTruth, ...] = ()
 
 
 def simulate_revolution(drive: Drive, number: int) -> Revolution:
@@ -97,7 +107,8 @@ def simulate_revolution(drive: Drive, number: int) -> Revolution:
         change[row[belongs], column[belongs]] = tally.change.id
     instance = drive.labels.take(result.geom, mode="wrap")
     sightings = see_movers(drive, rays, instance, reach_m)
-    return Revolution(result.range_mm, result.reflectivity, result.signal, instance, change, ghost_rays, sightings)
+    told = result.range_mm, result.reflectivity, result.signal, instance, change, ghost_rays, sightings
+    return Revolution(*told) if drive.rock is None else Revolution(*told, *drive.rock.mark(rays, result, reach_m))
 
 
 def see_movers(drive: Drive, rays: Rays, instance: Int16Array, reach_m: Float32Array) -> Float64Array:

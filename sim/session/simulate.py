@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import Float32Array, Float64Array
 from cdpipe.core.plugins import extra_version, require_extra
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.core.yamlfile import setting_lines
@@ -30,13 +30,14 @@ from sim.drive.odometry import register_scans, start_pose
 from sim.drive.trajectory import load_sensor, plan_trajectory
 from sim.movers.casting import MovingScene
 from sim.movers.planning import plan_movers
-from sim.placement.puddles import lay_puddles
-from sim.scene import build_world
+from sim.placement.puddles import Pool, lay_puddles
+from sim.scene import World, build_world
 from sim.sensor.glass import Panes
 from sim.sensor.optics import as_white
 from sim.sensor.water import Water
 from sim.session.labels import list_changes
-from sim.session.revolution import CHANNELS, Drive, Revolution, simulate_revolution, tally_revolution
+from sim.session.revolution import CHANNELS, SURFACE_CHANNELS, Drive, Revolution, simulate_revolution, tally_revolution
+from sim.session.surface import MovedRock, list_surface_changes
 from sim.session.truth import (
     SESSIONS,
     Int16Array,
@@ -44,9 +45,11 @@ from sim.session.truth import (
     MoverTruth,
     PairTruth,
     SessionName,
+    SurfaceChangeTruth,
     write_labels,
     write_mover_track,
     write_pair_truth,
+    write_surface_labels,
     write_true_poses,
 )
 
@@ -129,7 +132,8 @@ def collect_truth(scenario: Scenario, seed: int, drives: Sequence[Drive], files:
     changes = tuple(tally.finished() for tally in drives[0].tallies)
     drawn = scenario.model_dump(mode="json")
     movers = tuple(mover for drive in drives for mover in _list_movers(drive))
-    return PairTruth(scenario.family, seed, scenario.score_radius_m, changes, drawn, dict(files), movers)
+    told = scenario.family, seed, scenario.score_radius_m, changes, drawn, dict(files), movers
+    return PairTruth(*told, drives[0].surface_changes)
 
 
 def _list_movers(drive: Drive) -> Iterator[MoverTruth]:
@@ -183,6 +187,11 @@ def plan_drives(scenario: Scenario, seed: int, sensor: SensorMetadata | None = N
     tallies = tuple(list_changes(scenario, world))
     trajectories = {name: plan_trajectory(world, scenario, sensors[name], seed, name) for name in SESSIONS}
     movers = plan_movers(world, scenario, {name: each.true for name, each in trajectories.items()}, seed)
+    rocks: dict[SessionName, MovedRock] = {}
+    surface_changes: tuple[SurfaceChangeTruth, ...] = ()
+    if world.displacement is not None:
+        rocks = {name: MovedRock(world, world.displacement, name) for name in SESSIONS}
+        surface_changes = list_surface_changes(world, world.displacement, rocks["before"])
     drives = []
     for name, trajectory in trajectories.items():
         scene = world.before if name == "before" else world.after
@@ -191,14 +200,18 @@ def plan_drives(scenario: Scenario, seed: int, sensor: SensorMetadata | None = N
         held = [tally.change.instance for tally in tallies if tally.change.session == name]
         owners = np.where(np.isin(moving.instance, held), moving.instance, np.int32(0))
         seen = np.zeros((len(moving.movers), trajectory.n_scans, 4))
-        own, pools = scenario.of(name), lay_puddles(scenario, world.centreline, world.walls, name, seed)
+        own, pools = scenario.of(name), _lay_puddles(world, scenario, name, seed)
         diffuse = as_white(scene.reflectivity)
         water = Water(pools, scene.caster, diffuse) if pools else None
         is_glass = np.array(scene.materials) == "glass"
         panes = Panes(scene.caster, diffuse, owners, is_glass) if own.sensor.glass and is_glass.any() else None
         told = labels, owners, sensors[name], trajectory, tallies, seed, moving, seen, water, panes
-        drives.append(Drive(name, own, scene, *told))
+        drives.append(Drive(name, own, scene, *told, rocks.get(name), surface_changes))
     return drives
+
+
+def _lay_puddles(world: World, scenario: Scenario, name: SessionName, seed: int) -> tuple[Pool, ...]:
+    return lay_puddles(scenario, world.centreline, world.of(name).walls, name, seed)
 
 
 def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) -> None:
@@ -219,9 +232,11 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
     ):
         drive, kept = _estimate_odometry(drive, revolutions, report)
         report(drive.name, 0, n_scans)
-        for index, (chunk, instance, change) in enumerate(_fill_chunks(drive, kept)):
+        for index, (chunk, instance, change, surface) in enumerate(_fill_chunks(drive, kept)):
             writer.add(chunk)
             write_labels(writer.folder, index, instance, change)
+            if surface is not None:
+                write_surface_labels(writer.folder, index, *surface)
             report(drive.name, index * _chunk_scans(drive) + len(instance), n_scans)
         write_true_poses(writer.folder, drive.trajectory.world_T_sensor)
         if (track := track_movers(drive)) is not None:
@@ -264,7 +279,8 @@ def _estimate_odometry(
         return drive, revolutions
     trajectory = drive.trajectory
     shape = drive.sensor.height * drive.scenario.sensor.n_returns, drive.sensor.width
-    channels = {name: SpooledArray(dtype, shape, _HELD_BYTES) for name, dtype in CHANNELS.items()}
+    kinds = CHANNELS | (SURFACE_CHANNELS if drive.rock is not None else {})
+    channels = {name: SpooledArray(dtype, shape, _HELD_BYTES) for name, dtype in kinds.items()}
     ghost_rays, sightings = [], []
 
     def keep() -> Iterator[npt.NDArray[np.uint32]]:
@@ -280,16 +296,22 @@ def _estimate_odometry(
 
     start = start_pose(trajectory.true, float(trajectory.revolution_s[0]))
     estimated = register_scans(keep(), drive.sensor, trajectory.revolution_s, trajectory.column_s, start, drive.name)
-    kept = zip(*(spooled.finish() for spooled in channels.values()), ghost_rays, sightings, strict=True)
-    return replace(drive, trajectory=replace(trajectory, estimated=estimated)), (Revolution(*each) for each in kept)
+    stored = zip(*(spooled.finish() for spooled in channels.values()), ghost_rays, sightings, strict=True)
+    kept = (Revolution(**dict(zip((*channels, "ghost_rays", "sightings"), each, strict=True))) for each in stored)
+    return replace(drive, trajectory=replace(trajectory, estimated=estimated)), kept
 
 
 def _chunk_scans(drive: Drive) -> int:
     return fit_chunk(drive.sensor.height * drive.scenario.sensor.n_returns, drive.sensor.width, CHUNK_SCANS)
 
 
-def _fill_chunks(drive: Drive, revolutions: Iterator[Revolution]) -> Iterator[tuple[ScanChunk, Int16Array, Int16Array]]:
-    """Yield each chunk of a session with the (s, R, W) instance and change of its returns, and update the tallies."""
+def _fill_chunks(
+    drive: Drive, revolutions: Iterator[Revolution]
+) -> Iterator[tuple[ScanChunk, Int16Array, Int16Array, tuple[Float32Array, Int16Array] | None]]:
+    """Yield each chunk of a session with the truth of its returns, and update the tallies.
+
+    The truth is instance and change (s, R, W), and where rock changes displacement and surface change (s, R, W).
+    """
     trajectory = drive.trajectory
     for start in range(0, trajectory.n_scans, _chunk_scans(drive)):
         held = list(islice(revolutions, _chunk_scans(drive)))
@@ -303,7 +325,10 @@ def _fill_chunks(drive: Drive, revolutions: Iterator[Revolution]) -> Iterator[tu
             trajectory.column_stamps_ns(slice(start, start + len(held))),
             np.concatenate([trajectory.sensor_T_column(slice(number, number + 1)) for number in numbers]),
         )
-        yield chunk, np.stack([each.instance for each in held]), np.stack([each.change for each in held])
+        surface = [(each.displacement, each.surface_change) for each in held]
+        moved = [(metres, ids) for metres, ids in surface if metres is not None and ids is not None]
+        stacked = (np.stack([metres for metres, _ in moved]), np.stack([ids for _, ids in moved])) if moved else None
+        yield chunk, np.stack([each.instance for each in held]), np.stack([each.change for each in held]), stacked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -326,12 +351,16 @@ class LabelledSession:
         world_T_sensor: (S, 4, 4) true poses.
         instance: (S, R, W) int16 as in `sim.session.truth`.
         change: (S, R, W) int16 as in `sim.session.truth`.
+        displacement: (S, R, W) float32 metres, and
+        surface_change: (S, R, W) int16 as in `sim.session.truth`; None where no rock changes.
     """
 
     session: Session
     world_T_sensor: Float64Array
     instance: Int16Array
     change: Int16Array
+    displacement: Float32Array | None = None
+    surface_change: Int16Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -364,7 +393,7 @@ def simulate_in_memory(scenario: Scenario, seed: int, n_threads: int = 1) -> Hel
 def _hold_session(drive: Drive, pool: Executor) -> LabelledSession:
     with closing(_simulate_revolutions(drive, pool)) as revolutions:
         drive, kept = _estimate_odometry(drive, revolutions, _report_nothing)
-        chunk, instance, change = zip(*_fill_chunks(drive, kept), strict=True)
+        chunk, instance, change, surface = zip(*_fill_chunks(drive, kept), strict=True)
     session = HeldSession(
         Path(drive.name),
         drive.sensor,
@@ -374,4 +403,9 @@ def _hold_session(drive: Drive, pool: Executor) -> LabelledSession:
         chunk,
         n_returns=drive.scenario.sensor.n_returns,
     )
-    return LabelledSession(session, drive.trajectory.world_T_sensor, np.concatenate(instance), np.concatenate(change))
+    labels = drive.trajectory.world_T_sensor, np.concatenate(instance), np.concatenate(change)
+    moved = [each for each in surface if each is not None]
+    if not moved:
+        return LabelledSession(session, *labels)
+    displacement, surface_change = (np.concatenate([each[part] for each in moved]) for part in (0, 1))
+    return LabelledSession(session, *labels, displacement, surface_change)

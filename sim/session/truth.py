@@ -4,6 +4,8 @@
     PAIR/before/truth/poses.npz      world_T_sensor (S, 4, 4) float64, at the middle column of each revolution
     PAIR/before/truth/00000.npz      per chunk: instance (s, R, W) int16, change (s, R, W) int16, R as in the session
     PAIR/before/truth/movers.npz     only with movers: see `MoverTrack`
+    PAIR/before/truth/surface/00000.npz  per chunk, only where rock changes: displacement (s, R, W) float32, metres,
+                                     surface_change (s, R, W) int16
     PAIR/after/truth/...             likewise
 
 `instance`: -1 no return, -2 a false return where nothing stands, -3 a return from mist or dust, -4 what a puddle or a
@@ -12,6 +14,12 @@ mover of the scenario (1-based).
 `change`: 0 (always for an instance below 0 and for a mover), the id of the change that the return belongs to, or -1 for
 a mixed return. For a change of group "partial" (moved by less than its own length, or reshaped) only returns farther
 than 0.1 m from the other session's true surface belong to it.
+
+`displacement`: how far the walls moved from before to after, positive into the void. Of a return at the true place p it
+is the distance to the closest place on the walls of the other session, with the sign of the side on which p lies. NaN
+for returns that are not of the walls or mixed, where nothing is within 5 m, and, beside a surface change, for a return
+that came from beside the middle of its beam.
+`surface_change`: id of the surface change to which the place of the return belongs, 0 for none.
 
 With several rays per beam a return may blend surfaces. `instance` is then that of the strongest ray. A return belongs
 to a changed prop of its session, or to all the rest, if at least 90 % of its light came from there. A return below that
@@ -34,17 +42,22 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_json, read_npz
-from cdpipe.core.geometry import FARTHEST_M, Float64Array, Int32Array
+from cdpipe.core.geometry import FARTHEST_M, Float32Array, Float64Array, Int32Array
 
 Int16Array = npt.NDArray[np.int16]
 SessionName = Literal["before", "after"]
 SESSIONS: tuple[SessionName, ...] = ("before", "after")
 Kind = Literal["added", "removed", "moved", "reshaped"]
 Group = Literal["full", "partial"]
+SurfaceKind = Literal["convergence", "heave", "shotcrete", "scar", "rubble", "fill", "face"]
 _Four = Field(min_length=4, max_length=4)
 _CHECKS = ConfigDict(extra="forbid", allow_inf_nan=False)
 MIXED = -1  # `change` of a return that belongs neither to a change nor to the rest
 _LABELS = {"instance": ArraySpec("s,H,W", "int16"), "change": ArraySpec("s,H,W", "int16")}
+_SURFACE = {
+    "displacement": ArraySpec("s,H,W", "float32", is_finite=False),
+    "surface_change": ArraySpec("s,H,W", "int16"),
+}
 _POSES = {"world_T_sensor": ArraySpec("S,4,4", "float64")}
 _TRACK = {
     "world_T_mover": ArraySpec("M,S,4,4", "float64"),
@@ -102,6 +115,37 @@ class Change:
 
 
 @dataclass(frozen=True, slots=True)
+class SurfaceChangeTruth:
+    """Rock that moved, came or went between the sessions.
+
+    Signs are positive into the void. Area, largest and mean are those of the before surface, by the distance to the
+    closest place of the after surface.
+
+    Attributes:
+        id: 1-based, unique among the surface changes of the pair.
+        name: The name in the scenario; a scar and its rubble share it.
+        kind: What it is.
+        partner: Id of the rubble of a scar, of the scar of rubble, else None.
+        area_m2: Area of the before surface that moved more than 1 mm.
+        volume_m3: Volume of the space between the two surfaces.
+        largest_m: Displacement of largest magnitude.
+        mean_m: Displacement averaged over that area.
+        centre_world: [x, y, z] middle of the before surface that changed.
+    """
+
+    __pydantic_config__ = _CHECKS
+    id: Annotated[int, Field(ge=1, le=32767)]
+    name: str
+    kind: SurfaceKind
+    partner: int | None
+    area_m2: float
+    volume_m3: float
+    largest_m: float
+    mean_m: float
+    centre_world: Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
+@dataclass(frozen=True, slots=True)
 class MoverTruth:
     """Something that moved during one session. It is no change.
 
@@ -154,6 +198,7 @@ class PairTruth:
         scenario: The scenario as drawn.
         files: SHA-256 of every file that the scenario names, by its path as seen from the working folder.
         movers: What moved in either session, before first; the file has the key only where there are some.
+        surface_changes: Rock that moved, came or went; the file has the key only where there are some.
     """
 
     __pydantic_config__ = _CHECKS
@@ -164,14 +209,16 @@ class PairTruth:
     scenario: dict[str, Any]
     files: dict[str, str] = field(default_factory=dict)
     movers: tuple[MoverTruth, ...] = ()
+    surface_changes: tuple[SurfaceChangeTruth, ...] = ()
 
 
 def write_pair_truth(pair: Path, truth: PairTruth) -> None:
     """Write `PAIR/truth/changes.json`."""
     (pair / "truth").mkdir(parents=True, exist_ok=True)
     document = asdict(truth)
-    if not truth.movers:
-        del document["movers"]  # the truth of an older scenario keeps its bytes
+    for key in ("movers", "surface_changes"):
+        if not document[key]:
+            del document[key]  # the truth of an older scenario keeps its bytes
     (pair / "truth" / "changes.json").write_text(json.dumps(document, indent=1))
 
 
@@ -191,6 +238,9 @@ def read_pair_truth(pair: str | Path) -> PairTruth:
     for index, change in enumerate(truth.changes):
         if any(abs(value) > FARTHEST_M for row in change.world_T_object for value in row):
             raise InputError(f"{path}: damaged: changes.{index}: farther than {FARTHEST_M:g} m from the origin")
+    for index, rock in enumerate(truth.surface_changes):
+        if any(abs(value) > FARTHEST_M for value in rock.centre_world):
+            raise InputError(f"{path}: damaged: surface_changes.{index}: farther than {FARTHEST_M:g} m from the origin")
     return truth
 
 
@@ -253,3 +303,24 @@ def read_chunk_labels(session: Path, index: int) -> tuple[Int16Array, Int16Array
     """
     arrays = read_npz(session / "truth" / f"{index:05d}.npz", _LABELS)
     return arrays["instance"], arrays["change"]
+
+
+def write_surface_labels(session: Path, index: int, displacement: Float32Array, surface_change: Int16Array) -> None:
+    """Write displacement, metres, and surface change of one chunk, both (s, R, W)."""
+    folder = session / "truth" / "surface"
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{index:05d}.npz"
+    np.savez(path, allow_pickle=False, displacement=displacement, surface_change=surface_change)
+
+
+def read_chunk_surface(session: Path, index: int) -> tuple[Float32Array, Int16Array] | None:
+    """Read displacement (s, R, W) float32 and surface change (s, R, W) int16 of one chunk; None where no rock changes.
+
+    Raises:
+        InputError: The file is missing though the session has others, or it is damaged.
+    """
+    folder = session / "truth" / "surface"
+    if not folder.is_dir():
+        return None
+    arrays = read_npz(folder / f"{index:05d}.npz", _SURFACE)
+    return arrays["displacement"], arrays["surface_change"]
