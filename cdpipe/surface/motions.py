@@ -121,5 +121,4 @@ def _fit(
     signed_m = np.clip(along_m - jacobian @ motion, -3 * sigma_m, 3 * sigma_m)
     block_sigma_m = _TO_SIGMA * float(np.median(np.abs(np.bincount(block, signed_m) / counts)))
     per_block = hessian / max(float(weights.sum()), 1e-12) * len(counts)
-    covariance: Float64Array = np.linalg.inv(per_block) * block_sigma_m**2
-    return motion, covariance
+    return motion, np.asarray(np.linalg.inv(per_block) * block_sigma_m**2, dtype=np.float64)
