@@ -42,6 +42,7 @@ from cdpipe.model.config import PipelineConfig, Site, load_config
 from cdpipe.model.report import ChangeRegions, ChangeReport
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, ScanSource, Spheres
 from cdpipe.query.drift_width import keyframe_radii
+from cdpipe.surface.measure import measure_surface
 
 T = TypeVar("T")
 Stage = Literal["maps", "descriptors", "spheres", "merge", "regions"]
@@ -275,6 +276,10 @@ def detect_changes(
         else:
             assert method.detect is not None  # a method has `propose` or `detect`
             report = method.detect(merged, *described, config)
+        if config.surface.method != "none":
+            hooks.on_stage("surface", 0, 1)
+            surface, seconds = measure_surface(merged, report.objects, config)
+            report = replace(report, surface=surface, seconds={**report.seconds, "t_surface_s": seconds})
         return Done(report, report.seconds)
 
     if propose is not None:

@@ -16,8 +16,9 @@
                   object_points_map (P, 3) with object_point_offsets (O + 1,), and figure_<name> (R,) each;
                   local_before_T_after (Ka, 4, 4), local alignment at each after keyframe (optional);
                   surface_points_map (Q, 3), surface_normals_map (Q, 3), surface_displacement_m (Q,), surface_level_m
-                  (Q,) and surface_region (Q,), how far the rock moved (all or none of them): see `SurfaceField`;
-                  surface_regions of answer.json are its regions
+                  (Q,) and surface_region (Q,), how far the rock moved (all or none of them), surface_chainage_m (Q,)
+                  and surface_angle_deg (Q,) (optional): see `SurfaceField`; surface_regions of answer.json are its
+                  regions
 
 `seconds` holds t_index_s, t_merge_s, t_refine_s, t_descriptor_s, t_cd_s, t_oe_s and t_surface_s as far as they were
 measured.
@@ -50,6 +51,7 @@ from cdpipe.io.answer_parts import (
     MAX_ERROR,
     OFFSETS,
     SURFACE,
+    SURFACE_UNROLLED,
     AnswerPart,
     ShapePart,
     Until,
@@ -67,6 +69,7 @@ from cdpipe.model.report import (
 )
 
 # Fields of an object that answer.json holds as they are.
+_OF_SURFACE = (*SURFACE, *SURFACE_UNROLLED)
 _OBJECT_FIELDS = ("session", "kind", "region", "score", "partner")
 
 
@@ -126,7 +129,8 @@ def write_answer(folder: Path | str, method: str, report: ChangeReport, until: U
     }
     arrays |= {name: array for name, array in optional.items() if array is not None}
     if report.surface is not None:
-        arrays |= {name: getattr(report.surface, name.removeprefix("surface_")) for name in SURFACE}
+        of_surface = {name: getattr(report.surface, name.removeprefix("surface_")) for name in _OF_SURFACE}
+        arrays |= {name: array for name, array in of_surface.items() if array is not None}
     np.savez_compressed(folder / "answer.npz", allow_pickle=False, **arrays)
     document = {
         "status": "ok",
@@ -289,7 +293,8 @@ def _surface(document: AnswerPart, arrays: Mapping[str, npt.NDArray[Any]]) -> Su
         SurfaceRegion(_numbers(part.centre_map), part.area_m2, part.volume_m3, part.mean_m, part.largest_m)
         for part in document.surface_regions
     )
-    return SurfaceField(**{name.removeprefix("surface_"): arrays[name] for name in SURFACE}, regions=regions)
+    found = {name.removeprefix("surface_"): arrays[name] for name in _OF_SURFACE if name in arrays}
+    return SurfaceField(**found, regions=regions)
 
 
 def _surface_document(item: SurfaceRegion) -> dict[str, Any]:

@@ -105,10 +105,11 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "object_return_offsets": ("O + 1",), "object_points_map": ("P", 3), "object_point_offsets": ("O + 1",),
     "object_points_odom": ("P", 3), "object_point_odom_offsets": ("O + 1",), "local_before_T_after": ("Ka", 4, 4),
     "surface_points_map": ("Q", 3), "surface_normals_map": ("Q", 3), "surface_displacement_m": ("Q",),
-    "surface_level_m": ("Q",), "surface_region": ("Q",),
+    "surface_level_m": ("Q",), "surface_region": ("Q",), "surface_chainage_m": ("Q",), "surface_angle_deg": ("Q",),
 }  # fmt: skip
 _REQUIRED = ("region_centres_map", "region_scores")
-SURFACE = tuple(name for name in _SHAPES if name.startswith("surface_"))
+SURFACE_UNROLLED = ("surface_chainage_m", "surface_angle_deg")
+SURFACE = tuple(name for name in _SHAPES if name.startswith("surface_") and name not in SURFACE_UNROLLED)
 OFFSETS = {
     "object_returns": "object_return_offsets",
     "object_points_map": "object_point_offsets",
@@ -150,7 +151,7 @@ def check_array_types(path: Path, arrays: Mapping[str, ArrayType], n_objects: in
         elif array.ndim != len(shape) or array.shape[1:] != shape[1:]:
             mistakes.append(f"array {name} must be {_format_shape(shape)}, got {array.shape}")
     needed = [*_REQUIRED, *(OFFSETS[name] for name in OFFSETS if name in arrays)]
-    needed += SURFACE if any(name in arrays for name in SURFACE) else []
+    needed += SURFACE if any(name in arrays for name in (*SURFACE, *SURFACE_UNROLLED)) else []
     mistakes += [
         f"array {name} is missing: expected {_format_shape(_SHAPES[name])}" for name in needed if name not in arrays
     ]

@@ -319,6 +319,30 @@ class RangeNetConfig(_Grown):
     )
 
 
+class SurfaceConfig(_Grown):
+    """How far the rock moved."""
+
+    newer: ClassVar[tuple[str, ...]] = (
+        "method", "spacing_m", "normal_m", "radius_m", "window_m", "least_m", "least_area_m2",
+    )  # fmt: skip
+
+    method: Literal["none", "planes", "m3c2", "m3c2-ep", "c2c", "c2m", "unrolled"] = Field(
+        "none",
+        description=(
+            "displacement of the rock: not measured; by local planes; M3C2 and M3C2-EP; to the nearest point; to a "
+            "mesh; the difference of unrolled tunnels"
+        ),
+    )
+    spacing_m: Cell = Field(0.25, description="voxel of the before surface that has one place of measurement")
+    normal_m: Positive = Field(0.3, description="radius within which the normal and roughness of a place are estimated")
+    radius_m: Positive = Field(0.2, description="`planes`: radius of the spheres that both surfaces are averaged over")
+    window_m: Positive = Field(
+        8.0, description="`planes`: what most rock within this way along the path shares is the alignment's motion"
+    )
+    least_m: Positive = Field(0.005, description="a region of rock that moved has places that moved at least so far")
+    least_area_m2: Positive = Field(0.5, description="least area of a region of rock that moved")
+
+
 class PipelineConfig(Settings):
     """All settings of one method: where regions come from, how objects are cut out of them, and all before that."""
 
@@ -349,6 +373,7 @@ class PipelineConfig(Settings):
     m3c2_ep: M3C2EPConfig = M3C2EPConfig()
     erasor: ErasorConfig = ErasorConfig()
     range_net: RangeNetConfig = RangeNetConfig()
+    surface: SurfaceConfig = SurfaceConfig()
     options: dict[str, bool | int | float | str] = Field(
         {}, description="settings of a plugin's method, by its own names"
     )
@@ -368,7 +393,7 @@ class PipelineConfig(Settings):
         idle = [name for name in OF_WHOLE_MAPS if name not in (own, *_IN_EVERY_DUMP)]
         of_others = [name for name in idle if getattr(self, name) == fields[name].default]
         found = {name: value for name, value in handler(self).items() if name not in of_others}
-        return {name: value for name, value in found.items() if name not in ("options", "sphere") or value}
+        return {name: value for name, value in found.items() if name not in ("options", "sphere", "surface") or value}
 
 
 def preset_names() -> list[str]:

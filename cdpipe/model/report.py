@@ -176,6 +176,9 @@ class SurfaceField:
             smaller.
         region: (Q,) int32 index of the point's region, -1 for none.
         regions: The regions that moved.
+        chainage_m: (Q,) way along the before path, metres; None if not stated.
+        angle_deg: (Q,) angle about the path: 0 the crown of the roof, 90 the left wall, -90 the right wall, 180 the
+            floor; None if not stated.
     """
 
     points_map: Float64Array
@@ -184,10 +187,13 @@ class SurfaceField:
     level_m: Float64Array
     region: Int32Array
     regions: tuple[SurfaceRegion, ...] = ()
+    chainage_m: Float64Array | None = None
+    angle_deg: Float64Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.displacement_m)
         require_shapes(self, points_map=(n, 3), normals_map=(n, 3), level_m=(n,), region=(n,))
+        require_shapes(self, chainage_m=(n,), angle_deg=(n,))
         if not np.issubdtype(self.region.dtype, np.integer):
             raise ValueError(f"region must be whole numbers, got {self.region.dtype}")
         if (self.region < -1).any() or (self.region >= len(self.regions)).any():

@@ -11,6 +11,7 @@ from scenarios.catalogue import EFFECT_GROUPS
 Domain = Literal["in", "out"]
 TRAINED_FAMILIES = frozenset({"narrow", "wide", "network"})
 TRAINED_KINDS = frozenset({"box", "crate", "chair", "barrel", "cone", "pallet", "rock", "vehicle", "muck_pile"})
+SURFACE_OUT = frozenset({"wide", "cave"})
 _NAMES = {"in": "in distribution", "out": "out of distribution", "all": "all pairs"}
 
 
@@ -19,9 +20,12 @@ def domain_of(family: str) -> Domain:
     """Return "in" for the trained families and their shipped variations (`unchanged/wide`), "out" for all others.
 
     Variations with dust, movers, two sensors or puddles (`dust/wide`) are out: no network or threshold has seen any.
+    Families `surface/*` are in but for `surface/wide` and `surface/cave`, on which nothing is tuned.
     """
     group, _, name = family.rpartition("/")
     is_trained = name in TRAINED_FAMILIES and group not in EFFECT_GROUPS
+    if group == "surface":
+        is_trained = name not in SURFACE_OUT
     return "in" if is_trained and (resources.files("scenarios") / "families" / f"{family}.yaml").is_file() else "out"
 
 

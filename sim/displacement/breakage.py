@@ -29,6 +29,7 @@ _SQUEEZED = 1e-3
 _FOOT_SHARE = 0.12  # how much the outline of a heap wanders
 _FRAGMENT_M = (0.08, 0.35)
 _PER_M2 = 14.0
+_BESIDE_M = 0.22  # fragments lie where the flank would be at most so far below the floor
 _FILL_SLOPE = 1 / 3  # a ramp that a robot climbs
 _FILL_ROUGH = ((0.03, 1.2), (0.012, 0.25))  # standard deviation and correlation length, metres
 _FILL_EDGE_M = 0.12
@@ -105,16 +106,21 @@ def pile_up(walls: TwinWalls, heap: Heap, zone: Zone, change: SurfaceChange, vol
     near = np.flatnonzero(np.isfinite(edge_m(walls.before)))
     places = walls.before[near]
     off = places[:, :2] - heap.middle[:2]
-    wander = 1.0 + _FOOT_SHARE * np.clip(noise_at(places[:, :2], 0.9, outline_key), -2, 2)
-    fall_m = steep * np.linalg.norm(off, axis=1) * wander
+
+    def below_peak_m(off: Float64Array) -> Float64Array:
+        wander = 1.0 + _FOOT_SHARE * np.clip(noise_at(off + heap.middle[:2], 0.9, outline_key), -2, 2)
+        return np.asarray(steep * np.linalg.norm(off, axis=1) * wander)
+
+    fall_m = below_peak_m(off)
     bumps = _Fragments.draw(heap, generator)
+    bump_fall_m = below_peak_m(bumps.centres)
     faces = np.flatnonzero(np.isin(walls.faces, near).any(axis=1))
     low_m, high_m = 0.0, heap.reach_m
     moved = Moved(walls, near[:0], places[:0])
     for _ in range(_HALVINGS):
         peak_m = (low_m + high_m) / 2
         smooth = heap.middle[2] + peak_m - fall_m
-        level = np.maximum(smooth, bumps.tops(off, heap.middle[2], peak_m, steep))
+        level = np.maximum(smooth, bumps.tops(off, heap.middle[2], peak_m - bump_fall_m))
         is_under = level > places[:, 2]
         moved = Moved(walls, near[is_under], raise_to(places[is_under], level[is_under]))
         held_m3 = swept_volume_m3(walls.moved(moved.vertices, moved.places, 1), faces)
@@ -153,15 +159,14 @@ class _Fragments:
         slopes = steep[..., None] * np.stack([np.cos(facing), np.sin(facing)], axis=-1)
         return cls(np.column_stack([radius * np.cos(turn), radius * np.sin(turn)]), sizes_m, slopes)
 
-    def tops(self, off: Float64Array, floor_z: float, peak_m: float, steep: float) -> Float64Array:
+    def tops(self, off: Float64Array, floor_z: float, under_m: Float64Array) -> Float64Array:
         """Return the height (N,) of the highest fragment over places (N, 2) from the middle, -inf where there is none.
 
-        A fragment lies on the flank, or on the floor up to 0.3 m beside the foot.
+        A fragment lies on the flank, `under_m` (F,) above the floor, or on the floor beside the foot.
         """
         tops = np.full(len(off), -np.inf)
-        under_m = peak_m - steep * np.linalg.norm(self.centres, axis=1)
         for centre, size_m, slopes, flank_m in zip(self.centres, self.sizes_m, self.slopes, under_m, strict=True):
-            if flank_m < -0.3 * steep:
+            if flank_m < -_BESIDE_M:
                 continue
             near = np.flatnonzero((np.abs(off - centre) < size_m).all(axis=1))
             if len(near):

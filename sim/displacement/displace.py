@@ -14,7 +14,7 @@ from scenarios.schema import Scenario, SurfaceChange
 from sim.displacement.breakage import break_out, fill_up, pile_up, plan_heap
 from sim.displacement.deform import Moved, converge, heave, spray, vertices_near
 from sim.displacement.face import advance
-from sim.displacement.refine import TwinWalls, swept_volume_m3, twin_walls
+from sim.displacement.refine import TwinWalls, refine_ball, swept_volume_m3, twin_walls
 from sim.displacement.zone import Zone, sector_offset
 from sim.geometry.mesh import Mesh
 from sim.placement.fitting import Spot
@@ -24,6 +24,7 @@ from sim.rock.centreline import Centreline
 PatchKind = Literal["convergence", "heave", "shotcrete", "scar", "rubble", "fill", "face"]
 MOVED_M = 1e-3  # less is no change of the surface
 _STILL_M = 1e-7
+_COARSEST_M = 0.6  # longest edge where rock changes; those of marching cubes are shorter
 _APART_M = 0.3  # of rock that stays between two changes
 
 
@@ -147,6 +148,7 @@ def _make(
     scenario: Scenario, walls: TwinWalls, patches: tuple[Patch, ...], zone: Zone, change: SurfaceChange, seed: int
 ) -> tuple[TwinWalls, tuple[Patch, ...]]:
     number = len(patches) + 1
+    walls = refine_ball(walls, zone.middle, zone.reach_m, _COARSEST_M)
     if change.kind == "face":
         moved = advance(walls, zone, change, seed, scenario.tunnel)
     elif change.kind == "fill":

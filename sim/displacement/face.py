@@ -23,6 +23,7 @@ _SHELL_M = 1.0  # rock that must be left before the next drift
 _PLAIN = ((0.06, 0.8),)  # roughness of the new walls of a tunnel that has none: standard deviation, length, metres
 _LIMIT_SIGMA = 2.5
 _FLOOR_NORMAL = 0.6
+_OVERBREAK_SIGMA = 1.0  # by which the new walls lie outside the old section on average
 
 
 def advance(walls: TwinWalls, zone: Zone, change: SurfaceChange, seed: int, tunnel: Tunnel) -> Moved:
@@ -82,6 +83,8 @@ def advance(walls: TwinWalls, zone: Zone, change: SurfaceChange, seed: int, tunn
         octaves, stream(seed, "surface", change.name, "face").integers(2**63, size=len(octaves)).tolist(), strict=True
     ):
         rough += sigma_m * np.clip(noise_at(places, length_m, key), -_LIMIT_SIGMA, _LIMIT_SIGMA)
+    # Holes are drilled outwards: a new round never leaves rock inside the old section.
+    rough = np.minimum(rough - _OVERBREAK_SIGMA * float(np.hypot.reduce([sigma_m for sigma_m, _ in octaves])), 0.0)
     rough *= np.where(ways[:, 2] > _FLOOR_NORMAL, tunnel.floor.roughness, 1.0) * np.minimum(4.0 * share[chosen], 1.0)
     before = TwinWalls(
         drawn.before, np.where((share > 0)[:, None], drawn.before, drawn.after), drawn.faces, drawn.owner

@@ -74,6 +74,24 @@ def refine(walls: TwinWalls, edge_m: Callable[[Float64Array], Float64Array]) -> 
     return walls
 
 
+def refine_ball(walls: TwinWalls, middle: Float64Array, reach_m: float, edge_m: float) -> TwinWalls:
+    """Halve edges longer than `edge_m` of every face that may meet a ball, given by its middle (3,) and radius.
+
+    Large triangles of foreign meshes have no vertex in the place that changes.
+    """
+    for _ in range(_ROUNDS):
+        corners = walls.before[walls.faces]
+        centres = corners.mean(axis=1)
+        radii_m = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
+        near = np.flatnonzero(np.linalg.norm(centres - middle, axis=1) < reach_m + radii_m)
+        pairs = np.unique(np.sort(walls.faces[near][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+        pairs = pairs[_length(walls.before, pairs[:, 0], pairs[:, 1]) > edge_m]
+        if not len(pairs):
+            break
+        walls = _halve(walls, pairs)
+    return walls
+
+
 def swept_volume_m3(walls: TwinWalls, faces: Int64Array) -> float:
     """Return the volume between the two surfaces over some faces (K,), positive where rock came into the void.
 

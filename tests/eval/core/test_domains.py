@@ -10,6 +10,7 @@ from eval.core.domains import domain_of
     [
         ("narrow", "in"), ("regions/wide", "in"), ("null/network", "in"),
         ("cave", "out"), ("paper/site1", "out"), ("hard/drift", "out"), ("mine.yaml", "out"),
+        ("surface/convergence", "in"), ("surface/null", "in"), ("surface/wide", "out"), ("surface/cave", "out"),
         # the tunnels are trained ones, the air is not
         ("dust/narrow", "out"), ("dust/wide", "out"), ("dust/null", "out"),
     ],

@@ -1,0 +1,149 @@
+"""How far the rock moved between two merged sessions. This module alone defines the order of the steps.
+
+1. The near returns of each session are averaged in cells of 0.05 m (`cells`).
+2. Places on the before surface get a normal and a roughness (`places`).
+3. At each place the offset between both surfaces is measured along the normal (`offsets`).
+4. The rigid motions that most of the offsets share are the alignment's (`motions`). They are taken off the scans of the
+   after session, place by place of the sensor, and the offsets are measured again.
+5. The level of detection adds up the error of the means, the covariance of those motions, and the roughness.
+6. Neighbouring places beyond their level are regions (`regions`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.model.config import PipelineConfig
+from cdpipe.model.report import ChangedObject, SurfaceField
+from cdpipe.model.types import MergedMaps
+from cdpipe.surface.cells import NearReturns, SurfaceCells, make_cells, near_returns
+from cdpipe.surface.motions import PathMotions, fit_motions
+from cdpipe.surface.offsets import Offsets, measure_offsets
+from cdpipe.surface.places import SurfacePlaces, choose_places
+from cdpipe.surface.regions import group_regions
+from cdpipe.surface.unrolled import unroll
+
+# Rougher or less flat places (edges, pipes, bolts) do not tell the motion of the alignment.
+# Nor do places that moved farther than a merge is ever off.
+_FLAT, _SMOOTH_M, _NEAR_M = 0.25, 0.03, 0.1
+# Places left so many standard deviations off have moved, and tell nothing about the scans.
+_TO_SIGMA, _OUTLIER = 1.4826, 4.0
+# About so many returns of the after session tell the motions of its scans, each within that way of a place.
+_SAMPLE, _ON_PLACE_M, _SCAN_WINDOW_M = 400_000, 0.2, 4.0
+# 95 % of a normal distribution.
+_Z95 = 1.96
+# The variance of a mean from four folds is noisy: that of a place is the mean over its neighbours.
+_NEIGHBOURS = 24
+# Share of the roughness that both spheres do not share, as standard deviation, and the least error of a mean.
+_ROUGHNESS, _LEAST_M = 0.2, 0.0004
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """Q displacements with their levels of detection.
+
+    Attributes:
+        displacement_m: (Q,) displacement, positive into the void; NaN where it was not measured.
+        along_m: (Q,) the same along the normal of the before surface; of small displacements it is the same.
+        level_m: (Q,) 95 % level of detection, NaN if unknown.
+    """
+
+    displacement_m: Float64Array
+    along_m: Float64Array
+    level_m: Float64Array
+
+
+Method = Callable[[SurfaceCells, NearReturns, SurfacePlaces, Float64Array, PipelineConfig], Measured]
+"""`method(before, after, places, chainage_m, config)` measures the displacement at every place."""
+
+
+def measure_surface(
+    merged: MergedMaps, objects: tuple[ChangedObject, ...], config: PipelineConfig
+) -> tuple[SurfaceField, float]:
+    """Return the displacement of the rock and the seconds that it took.
+
+    Args:
+        merged: Both maps and their alignment.
+        objects: Objects that came or went, map frame.
+        config: `surface` is used, and the settings of the rival that it names.
+    """
+    start = time.perf_counter()
+    settings = config.surface
+    before, after = (near_returns(merged, name) for name in ("before", "after"))
+    cells = make_cells(before)
+    path = merged.before.odom_T_sensor
+    places = choose_places(cells, path[:, :3, 3], settings.spacing_m, settings.normal_m)
+    chainage_m, angle_deg, _ = unroll(places.points, path)
+    measured = load_method(settings.method)(cells, after, places, chainage_m, config)
+    region, regions = group_regions(
+        places, measured.along_m, measured.level_m, settings.spacing_m, settings.least_m, settings.least_area_m2
+    )
+    field = SurfaceField(
+        places.points, places.normals, measured.displacement_m, measured.level_m, region, regions, chainage_m, angle_deg
+    )
+    return field, time.perf_counter() - start
+
+
+def measure_planes(
+    before: SurfaceCells, after: NearReturns, places: SurfacePlaces, chainage_m: Float64Array, config: PipelineConfig
+) -> Measured:
+    """Measure the displacement by local planes, less what the alignment absorbed: our method."""
+    settings = config.surface
+    found = measure_offsets(before, make_cells(after), places, settings.radius_m)
+    told_m = _trust(places, found)
+    motions = fit_motions(places.points, places.normals, told_m, chainage_m, settings.window_m)
+    still = np.flatnonzero(_is_still(told_m - motions.along(places.points, places.normals, chainage_m)[0]))
+    after = after.without(_fit_scans(after, places, found.own_m, still))
+    found = measure_offsets(before, make_cells(after), places, settings.radius_m)
+    motions = fit_motions(places.points, places.normals, _trust(places, found), chainage_m, settings.window_m)
+    explained_m, alignment_m2 = motions.along(places.points, places.normals, chainage_m)
+    noise_m2 = _smooth_variance(places.points, found.variance_m2)
+    rough_m2 = (_ROUGHNESS * places.roughness_m) ** 2
+    level_m = _Z95 * np.sqrt(noise_m2 + alignment_m2 + rough_m2 + _LEAST_M**2)
+    return Measured(found.nearest_m - explained_m, found.along_m - explained_m, level_m)
+
+
+def _trust(places: SurfacePlaces, found: Offsets) -> Float64Array:
+    """Return the (Q,) offsets of flat places that tell the motion of the alignment, NaN elsewhere."""
+    is_told = (places.flatness < _FLAT) & (places.roughness_m < _SMOOTH_M) & (np.abs(found.along_m) < _NEAR_M)
+    return np.where(is_told, found.along_m, np.nan)
+
+
+def _is_still(rest_m: Float64Array) -> BoolArray:
+    """Mark the places at which the motions leave no more than their errors do."""
+    sigma_m = _TO_SIGMA * float(np.nanmedian(np.abs(rest_m))) if np.isfinite(rest_m).any() else 0.0
+    return np.asarray(np.abs(rest_m) <= _OUTLIER * sigma_m)
+
+
+def _fit_scans(after: NearReturns, places: SurfacePlaces, own_m: Float64Array, still: Int64Array) -> PathMotions:
+    """Return the motions of the after scans, by path position of the sensor, that lay their returns on still places."""
+    sample = np.arange(0, len(after.points), max(len(after.points) // _SAMPLE, 1))
+    points = after.points[sample]
+    if len(still) == 0:
+        return fit_motions(points[:0], points[:0], points[:0, 0], points[:0, 0], _SCAN_WINDOW_M)
+    found = cKDTree(places.points[still]).query(points, distance_upper_bound=_ON_PLACE_M)
+    on = np.flatnonzero(np.isfinite(found[0]))
+    place = still[np.asarray(found[1], dtype=np.int64)[on]]
+    normals = places.normals[place]
+    along_m = np.einsum("ij,ij->i", points[on] - places.points[place], normals) - own_m[place]
+    return fit_motions(points[on], normals, along_m, after.path_m[sample[on]], _SCAN_WINDOW_M)
+
+
+def load_method(name: str) -> Method:
+    """Return what measures the displacement: ours or a rival."""
+    return measure_planes
+
+
+def _smooth_variance(points: Float64Array, variance_m2: Float64Array) -> Float64Array:
+    """Return the (Q,) mean variance of each place and its neighbours that have one."""
+    known = np.flatnonzero(np.isfinite(variance_m2))
+    if len(known) == 0:
+        return np.full(len(points), np.nan)
+    index = cKDTree(points[known]).query(points, k=min(_NEIGHBOURS, len(known)))[1].reshape(len(points), -1)
+    return np.asarray(variance_m2[known][index].mean(axis=1))

@@ -1,0 +1,75 @@
+"""Regions of rock that moved: neighbouring places whose smoothed displacement is beyond its level of detection."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from cdpipe.core.geometry import Float64Array, Int32Array
+from cdpipe.core.groups import label_groups
+from cdpipe.model.report import SurfaceRegion
+from cdpipe.surface.places import SurfacePlaces
+
+# A place is judged with its neighbours, of which that many count as one: they err together.
+_SMOOTHED_M, _ALIKE = 0.6, 4.0
+_NEIGHBOURS = 24
+# Places of one region are no farther apart than this many spacings.
+_LINK = 1.8
+
+
+def group_regions(
+    places: SurfacePlaces,
+    along_m: Float64Array,
+    level_m: Float64Array,
+    spacing_m: float,
+    least_m: float,
+    least_area_m2: float,
+) -> tuple[Int32Array, tuple[SurfaceRegion, ...]]:
+    """Return the (Q,) region of each place, -1 for none, and the regions, largest volume first.
+
+    Args:
+        places: Where displacement was measured.
+        along_m: (Q,) displacement along the normal, NaN where there is none.
+        level_m: (Q,) its 95 % level of detection, NaN where unknown.
+        spacing_m: Edge of the voxels of the places.
+        least_m: Least displacement of a region's place, smoothed.
+        least_area_m2: Least area of a region.
+    """
+    region = np.full(len(along_m), -1, dtype=np.int32)
+    known = np.flatnonzero(np.isfinite(along_m) & (level_m > 0))
+    if len(known) == 0:
+        return region, ()
+    smoothed_m, smoothed_level_m = _smooth(places.points[known], along_m[known], level_m[known])
+    moved = known[np.abs(smoothed_m) > np.maximum(smoothed_level_m, least_m)]
+    signs = np.sign(smoothed_m[np.abs(smoothed_m) > np.maximum(smoothed_level_m, least_m)])
+    found: list[tuple[SurfaceRegion, np.ndarray]] = []
+    for sign in (1.0, -1.0):
+        own = moved[signs == sign]
+        labels, sizes = label_groups(places.points[own], _LINK * spacing_m)
+        for label in range(len(sizes)):
+            members = own[labels == label]
+            areas_m2 = places.areas_m2[members]
+            if areas_m2.sum() >= least_area_m2:
+                found.append((_describe(places.points[members], areas_m2, along_m[members]), members))
+    found.sort(key=lambda each: -abs(each[0].volume_m3))
+    for number, (_, members) in enumerate(found):
+        region[members] = number
+    return region, tuple(each for each, _ in found)
+
+
+def _smooth(points: Float64Array, along_m: Float64Array, level_m: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Return the (N,) mean displacement of each place and its neighbours, weighted by their levels, and its level."""
+    found = cKDTree(points).query(points, k=[*range(1, _NEIGHBOURS + 1)], distance_upper_bound=_SMOOTHED_M)
+    is_found = np.isfinite(np.asarray(found[0]))
+    index = np.where(is_found, np.asarray(found[1], dtype=np.int64), 0)
+    weights = is_found / level_m[index] ** 2
+    total = weights.sum(axis=1)
+    mean_m = (weights * along_m[index]).sum(axis=1) / total
+    # no better than the mean of independent groups of neighbours, nor worse than one place
+    return mean_m, np.sqrt(np.minimum(_ALIKE, is_found.sum(axis=1)) / total)
+
+
+def _describe(points: Float64Array, areas_m2: Float64Array, along_m: Float64Array) -> SurfaceRegion:
+    area_m2, volume_m3 = float(areas_m2.sum()), float(areas_m2 @ along_m)
+    centre = areas_m2 @ points / area_m2
+    return SurfaceRegion(centre, area_m2, volume_m3, volume_m3 / area_m2, float(along_m[np.argmax(np.abs(along_m))]))
