@@ -45,7 +45,8 @@ def require_valid_setting(setting: str) -> str:
     Raises:
         ValueError: There is no such key, the value is wrong, or the key belongs to the world.
     """
-    if get_group(setting) in Scenario.model_fields:
+    # `surface` is a list of the world and a section of the method
+    if get_group(setting) in Scenario.model_fields and get_group(setting) not in PipelineConfig.model_fields:
         raise ValueError(
             "belongs to the world, not to the method: set it in the plan, under scenarios, "
             f'e.g. {{name: narrow, set: ["{setting}"]}}'

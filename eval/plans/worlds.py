@@ -44,6 +44,7 @@ from cdpipe.core.yamlfile import Settings, suggest
 from cdpipe.model.config import PipelineConfig
 from scenarios import check_scenario, scenario_names
 from scenarios.catalogue import clean_family
+from scenarios.schema import Scenario
 
 
 def require_known_scenario(name: str) -> str:
@@ -274,7 +275,12 @@ def require_draws(name: str, settings: tuple[str, ...]) -> None:
     Raises:
         ValueError: They do not, for some seed, or belong to the method.
     """
-    of_method = [setting for setting in settings if get_group(setting) in PipelineConfig.model_fields]
+    # `surface` is a list of the world and a section of the method; a setting of the world may name either key
+    of_method = [
+        setting
+        for setting in settings
+        if get_group(setting) in PipelineConfig.model_fields and get_group(setting) not in Scenario.model_fields
+    ]
     lines = [f"{setting} belongs to the method, not to the world: set it under variants" for setting in of_method]
     try:
         check_scenario(name, [setting for setting in settings if setting not in of_method])

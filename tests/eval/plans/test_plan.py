@@ -9,10 +9,11 @@ from cdpipe.model.config import load_config
 from eval.plans import plan as plan_module
 from eval.plans.changes import change_plan
 from eval.plans.files import plan_names
+from eval.plans.parts import require_valid_setting
 from eval.plans.plan import Plan, expand_cells, list_planned_cases, load_plan, parse_seeds
 from eval.plans.targets import Targets
 from eval.plans.variants import name_variant
-from eval.plans.worlds import format_setting, world_slug
+from eval.plans.worlds import format_setting, require_draws, world_slug
 from eval.running.runfolder import reported
 
 PLAN = """\
@@ -542,3 +543,14 @@ grid:
     ]  # fmt: skip
     assert {config.descriptor.weights for config in configs} == {"d.safetensors"}
     assert expand_cells(plan)[1].config.descriptor.weights == "/b.safetensors"
+
+
+def test_surface_is_a_section_of_the_method_and_a_list_of_the_world() -> None:
+    plan = load_plan("surface")
+    assert {cell.config.surface.method for cell in expand_cells(plan)} == {
+        "planes", "m3c2", "m3c2-ep", "c2c", "c2m", "unrolled",
+    }  # fmt: skip
+    with pytest.raises(ValueError, match="surface"):
+        require_draws("narrow", ("surface.method=planes",))
+    with pytest.raises(ValueError, match="belongs to the world"):
+        require_valid_setting("tunnel.meander_m=1")
