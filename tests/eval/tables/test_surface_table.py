@@ -98,7 +98,7 @@ def test_a_pair_without_an_answer_counts_and_a_pair_that_asks_nothing_does_not()
     found = surface_tables(results, windows, Targets())
     assert tuple(found) == FILES
     (row,) = found["surface_table"].to_dict("records")
-    assert (row["domain"], row["n_pairs"], row["n_failed"], row["n_surface_changes"]) == ("out", 2, 1, 6)
+    assert (row["domain"], row["n_pairs"], row["n_failed"], row["n_surface_changes"]) == ("in", 2, 1, 6)
     assert (row["surface_cover"], row["surface_recall"], row["t_surface_s"]) == (0.5, 0.5, 2.0)
     assert row["surface_recall_low"] <= 0.5 <= row["surface_recall_high"]
     # of the windows only those of its pairs count: null ones of seeds 1 and 2
