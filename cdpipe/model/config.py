@@ -340,7 +340,7 @@ class SurfaceConfig(_Grown):
         8.0, description="`planes`: what most rock within this way along the path shares is the alignment's motion"
     )
     least_m: Positive = Field(0.005, description="a region of rock that moved has places that moved at least so far")
-    least_area_m2: Positive = Field(0.5, description="least area of a region of rock that moved")
+    least_area_m2: Positive = Field(0.75, description="least area of a region of rock that moved")
 
 
 class PipelineConfig(Settings):
