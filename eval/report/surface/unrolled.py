@@ -92,5 +92,7 @@ def draw_panels(
         axes.tick_params(labelsize=7)
         axes.set_title(plain_text(name), fontsize=8, loc="left", pad=2)
     axes_of_panels[-1].set_xlabel("chainage [m]", fontsize=8)
-    figure.colorbar(dots, ax=list(axes_of_panels), label="displacement into the void [mm]", shrink=0.7)
+    bar = figure.colorbar(dots, ax=list(axes_of_panels), shrink=0.9)
+    bar.set_label("displacement [mm]", fontsize=8)
+    bar.ax.tick_params(labelsize=7)
     return figure, bound_mm
