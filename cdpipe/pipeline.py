@@ -42,7 +42,7 @@ from cdpipe.model.config import PipelineConfig, Site, load_config
 from cdpipe.model.report import ChangeRegions, ChangeReport
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, ScanSource, Spheres
 from cdpipe.query.drift_width import keyframe_radii
-from cdpipe.surface.measure import measure_surface
+from cdpipe.surface.measure import measure_surface, require_method
 from cdpipe.surface.rock_or_object import leave_out_rock
 
 T = TypeVar("T")
@@ -111,7 +111,9 @@ def detect(
     """
     known = None if before_T_after is None else require_rigid(before_T_after)
     config = load_config(preset, settings, site)
-    load_source(config)  # report a missing extra, or bad weights, before the mapping
+    # report a missing extra, or bad weights, before the mapping
+    load_source(config)
+    require_method(config.surface.method)
     list_checkpoints(config)
     use_threads(THREADS)
     hooks = hooks or Hooks()
@@ -256,10 +258,12 @@ def detect_changes(
 
     Raises:
         MergeFailedError: The sessions could not be aligned with enough evidence; it contains the evidence.
-        InputError: The source of regions cannot be loaded, or does not go with the extraction.
+        InputError: The source of regions cannot be loaded, or does not go with the extraction; or the extra of
+            `surface.method` is not installed.
     """
     hooks = hooks or Hooks()
     method = load_source(config)
+    require_method(config.surface.method)
     merged = merge_mapped(before, after, config, hooks, merge)
     described = before.descriptors, after.descriptors
     regions: Done[ChangeRegions] | None = None
@@ -321,7 +325,7 @@ def detect_merge(
         report,
         evidence={**merged.evidence, **_sizes(merged)},
         checkpoints=list_checkpoints(config),
-        extras=list_extras(config, merged.evidence, proposes=False),
+        extras=list_extras(config, merged.evidence, proposes=False, measures=False),
     )
 
 

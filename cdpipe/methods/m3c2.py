@@ -41,28 +41,26 @@ def m3c2(maps: PlacedMaps, session: SessionName, other: SessionName, config: Pip
     Returns:
         (N,) mask of the points of `session`.
     """
-    found = measure_distances(maps, session, other, config.m3c2)
+    core, found = measure_distances(maps, session, other, config.m3c2)
     is_new = np.zeros(len(maps.points[session]), dtype=np.bool_)
     # NaN where there is no distance, and where the points are too few to tell its error
-    is_new[found.core] = found.behind_m > np.fmax(found.levels_m, config.m3c2.distance_m)
+    is_new[core] = found.behind_m > np.fmax(found.levels_m, config.m3c2.distance_m)
     return is_new
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Distances:
-    """What M3C2 measured at some map points of a session, its core points.
+    """What M3C2 measured at C core points of an own cloud.
 
     Attributes:
-        core: (C,) index of each among the session's map points.
-        behind_m: (C,) how far the other map's surface lies behind the own one, seen from the session's path, metres;
-            NaN where a cylinder holds no point.
+        behind_m: (C,) how far the other cloud's surface lies behind the own one, seen from the void, metres; NaN where
+            a cylinder holds no point.
         levels_m: (C,) 95 % level of detection by the roughness of both surfaces, metres; may be NaN.
         normals: (C, 3) unit normals; their sign means nothing.
-        n_own: (C,) points of the own map in the cylinder.
-        n_other: (C,) points of the other map in it.
+        n_own: (C,) points of the own cloud in the cylinder.
+        n_other: (C,) points of the other cloud in it.
     """
 
-    core: Int64Array
     behind_m: Float64Array
     levels_m: Float64Array
     normals: Float64Array
@@ -70,28 +68,51 @@ class Distances:
     n_other: Int64Array
 
 
-def measure_distances(maps: PlacedMaps, session: SessionName, other: SessionName, settings: M3C2Config) -> Distances:
-    """Measure the distances of the compared map points of `session` to `other` along their normals."""
-    py4dgeo = load_py4dgeo()
+def measure_distances(
+    maps: PlacedMaps, session: SessionName, other: SessionName, settings: M3C2Config
+) -> tuple[Int64Array, Distances]:
+    """Measure the distances of the compared map points of `session` to `other` along their normals.
+
+    Returns:
+        (C,) index of each core point among the session's map points, and what was measured there; the void is on the
+        side of the session's path.
+    """
     points = maps.points[session]
     core = np.flatnonzero(maps.is_compared(session, other))
-    if len(core) == 0:
-        none, no_counts = np.zeros(0), np.zeros(0, dtype=np.int64)
-        return Distances(core, none, none, np.zeros((0, 3)), no_counts, no_counts)
+    seen_from = maps.path[session][query_nearest(points[core], maps.path[session])[1]]
+    return core, compare_clouds(points[core], seen_from - points[core], points, maps.points[other], settings)
+
+
+def compare_clouds(
+    core_points: Float64Array, into_void: Float64Array, own: Float64Array, other: Float64Array, settings: M3C2Config
+) -> Distances:
+    """Measure the distances between two clouds along the normals of the own one, without an error of registration.
+
+    Args:
+        core_points: (C, 3) where to measure, metres.
+        into_void: (C, 3) directions, of any length, towards the void in front of the own cloud. They only say which of
+            its two directions a normal has.
+        own: (N, 3) cloud that normals are estimated in.
+        other: (M, 3) cloud, same frame.
+        settings: Radii of normals and cylinder, and half of its length.
+    """
+    n = len(core_points)
+    if min(n, len(own), len(other)) == 0:
+        unknown, no_counts = np.full(n, np.nan), np.zeros(n, dtype=np.int64)
+        return Distances(unknown, unknown, np.full((n, 3), np.nan), no_counts, no_counts)
+    py4dgeo = load_py4dgeo()
     algorithm = py4dgeo.M3C2(
-        epochs=(py4dgeo.Epoch(points), py4dgeo.Epoch(maps.points[other])),
-        corepoints=points[core],
+        epochs=(py4dgeo.Epoch(own), py4dgeo.Epoch(other)),
+        corepoints=core_points,
         normal_radii=[settings.normal_m],
         cyl_radius=settings.cylinder_m,
         max_distance=settings.depth_m,
     )
     distances_m, uncertainties = algorithm.run()
     normals = algorithm.directions()
-    seen_from = maps.path[session][query_nearest(points[core], maps.path[session])[1]]
-    is_towards_path = np.einsum("ij,ij->i", normals, seen_from - points[core]) > 0
+    is_into_void = np.einsum("ij,ij->i", normals, into_void) > 0
     return Distances(
-        core,
-        np.where(is_towards_path, -distances_m, distances_m),
+        np.where(is_into_void, -distances_m, distances_m),
         uncertainties["lodetection"],
         normals,
         *(uncertainties[f"num_samples{epoch}"].astype(np.int64) for epoch in (1, 2)),

@@ -35,11 +35,11 @@ def m3c2_ep(maps: PlacedMaps, session: SessionName, other: SessionName, config: 
     Returns:
         (N,) mask of the points of `session`.
     """
-    found = measure_distances(maps, session, other, config.m3c2)
+    core, found = measure_distances(maps, session, other, config.m3c2)
     points = maps.points[session]
-    levels_m = detection_levels(points[found.core], maps.path[session], maps.path[other], found, config.m3c2_ep)
+    levels_m = detection_levels(points[core], maps.path[session], maps.path[other], found, config.m3c2_ep)
     is_new = np.zeros(len(points), dtype=np.bool_)
-    is_new[found.core] = found.behind_m > levels_m
+    is_new[core] = found.behind_m > levels_m
     return is_new
 
 

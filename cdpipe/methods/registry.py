@@ -63,19 +63,24 @@ def load_source(config: PipelineConfig) -> Method:
     return method
 
 
-def list_extras(config: PipelineConfig, evidence: Mapping[str, float], *, proposes: bool = True) -> dict[str, str]:
+def list_extras(
+    config: PipelineConfig, evidence: Mapping[str, float], *, proposes: bool = True, measures: bool = True
+) -> dict[str, str]:
     """Return the version of every optional package that an answer depends on, by the package's name.
 
     Args:
         config: All settings.
         evidence: That of the merge, which says whether KISS-Matcher was asked; "absent" where it was wanted in vain.
         proposes: Whether the source of the settings proposed the regions.
+        measures: Whether the displacement of the rock was measured, if the settings say so.
     """
     found = {}
     if "kiss_matcher" in evidence:
         found["kiss-matcher"] = extra_version("kiss-matcher") if evidence["kiss_matcher"] else ABSENT
-    package = PACKAGES.get(config.regions.source)
-    return {**found, package: extra_version(package)} if proposes and package else found
+    # rivals of the displacement have the names of the sources that use the same package
+    names = [config.regions.source] * proposes + [config.surface.method] * measures
+    packages = dict.fromkeys(PACKAGES[name] for name in names if name in PACKAGES)
+    return {**found, **{package: extra_version(package) for package in packages}}
 
 
 def load_method(name: str) -> Method:

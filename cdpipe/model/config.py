@@ -323,7 +323,8 @@ class SurfaceConfig(_Grown):
     """How far the rock moved."""
 
     newer: ClassVar[tuple[str, ...]] = (
-        "method", "spacing_m", "normal_m", "radius_m", "window_m", "least_m", "least_area_m2",
+        "method", "spacing_m", "normal_m", "radius_m", "window_m", "reach_m", "mesh_m", "raster_m", "least_m",
+        "least_area_m2",
     )  # fmt: skip
 
     method: Literal["none", "planes", "m3c2", "m3c2-ep", "c2c", "c2m", "unrolled"] = Field(
@@ -339,6 +340,11 @@ class SurfaceConfig(_Grown):
     window_m: Positive = Field(
         8.0, description="`planes`: what most rock within this way along the path shares is the alignment's motion"
     )
+    reach_m: Positive = Field(
+        1.5, description="`c2c`, `c2m`, `unrolled`: a larger displacement is taken for another surface, not measured"
+    )
+    mesh_m: Cell = Field(0.15, description="`c2m`: the vertices of the mesh are the means of cells of this edge")
+    raster_m: Cell = Field(0.15, description="`unrolled`: edge of a cell of the raster of chainage and angle")
     least_m: Positive = Field(0.005, description="a region of rock that moved has places that moved at least so far")
     least_area_m2: Positive = Field(0.75, description="least area of a region of rock that moved")
 

@@ -40,11 +40,13 @@ class NearReturns:
         points: (N, 3) map frame, metres.
         path_m: (N,) path position of the sensor at each, metres.
         weights: (N,) inverse of the variance of each: noise of the range, width of the beam, drift.
+        map_T_sensor: (S, 4, 4) poses of the scans of the session.
     """
 
     points: Float64Array
     path_m: Float64Array
     weights: Float64Array
+    map_T_sensor: Float64Array
 
     def without(self, motions: PathMotions) -> NearReturns:
         """Return the returns with the motion of the scans taken off."""
@@ -63,11 +65,13 @@ class SurfaceCells:
         points: (C, 3) weighted mean of the returns of each cell, map frame, metres.
         fold_offsets: (C, N_FOLDS, 3) float32 mean of the returns of each fold, less the point; NaN without returns.
         tree: k-d tree of the points.
+        map_T_sensor: (S, 4, 4) poses of the scans of the session.
     """
 
     points: Float64Array
     fold_offsets: Float32Array
     tree: cKDTree
+    map_T_sensor: Float64Array
 
 
 def near_returns(merged: MergedMaps, session: SessionName) -> NearReturns:
@@ -85,7 +89,7 @@ def near_returns(merged: MergedMaps, session: SessionName) -> NearReturns:
         paths_m.append(np.full(len(near), path_m[scan]))
         variance_m2 = _RANGE_M**2 + (_BEAM_RAD**2 + _DRIFT**2) * range_m[near] ** 2
         weights.append(1.0 / variance_m2)
-    return NearReturns(np.concatenate(points), np.concatenate(paths_m), np.concatenate(weights))
+    return NearReturns(np.concatenate(points), np.concatenate(paths_m), np.concatenate(weights), map_T_odom @ poses)
 
 
 def make_cells(returns: NearReturns) -> SurfaceCells:
@@ -98,7 +102,8 @@ def make_cells(returns: NearReturns) -> SurfaceCells:
     of_folds = _means(returns, cell_of * N_FOLDS + folds, n * N_FOLDS).reshape(n, N_FOLDS, 3)
     is_kept = counts >= _LEAST_RETURNS
     kept = means[is_kept]
-    return SurfaceCells(kept, (of_folds[is_kept] - kept[:, None]).astype(np.float32), cKDTree(kept))
+    fold_offsets = (of_folds[is_kept] - kept[:, None]).astype(np.float32)
+    return SurfaceCells(kept, fold_offsets, cKDTree(kept), returns.map_T_sensor)
 
 
 def _means(returns: NearReturns, group: Int64Array, n: int) -> Float64Array:

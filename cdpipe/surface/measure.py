@@ -13,21 +13,27 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.plugins import require_extra
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.report import ChangedObject, SurfaceField
 from cdpipe.model.types import MergedMaps
 from cdpipe.surface.cells import NearReturns, SurfaceCells, make_cells, near_returns
+from cdpipe.surface.method import Z95, Measured, Method
 from cdpipe.surface.motions import PathMotions, fit_motions
 from cdpipe.surface.offsets import Offsets, measure_offsets
 from cdpipe.surface.places import SurfacePlaces, choose_places
 from cdpipe.surface.regions import group_regions
+from cdpipe.surface.rivals.c2c import measure_c2c
+from cdpipe.surface.rivals.c2m import measure_c2m
+from cdpipe.surface.rivals.m3c2 import measure_m3c2, measure_m3c2_ep
+from cdpipe.surface.rivals.unrolled import measure_unrolled
 from cdpipe.surface.rock_or_object import split_rock
 from cdpipe.surface.unrolled import unroll
 
@@ -41,31 +47,10 @@ _SAMPLE, _ON_PLACE_M, _SCAN_WINDOW_M = 400_000, 0.2, 4.0
 # Standard deviation of the tilt of scans that is left. It moves places by their distance from the path, which counts
 # where they are farther than the walls that the motions are fitted to, as beyond the ends of the path.
 _TILT_RAD, _CLOSE_M = 1e-3, 4.0
-# 95 % of a normal distribution.
-_Z95 = 1.96
 # The variance of a mean from four folds is noisy: that of a place is the mean over its neighbours.
 _NEIGHBOURS = 24
 # Share of the roughness that both spheres do not share, as standard deviation, and the least error of a mean.
 _ROUGHNESS, _LEAST_M = 0.18, 0.0004
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Measured:
-    """Q displacements with their levels of detection.
-
-    Attributes:
-        displacement_m: (Q,) displacement, positive into the void; NaN where it was not measured.
-        along_m: (Q,) the same along the normal of the before surface; of small displacements it is the same.
-        level_m: (Q,) 95 % level of detection, NaN if unknown.
-    """
-
-    displacement_m: Float64Array
-    along_m: Float64Array
-    level_m: Float64Array
-
-
-Method = Callable[[SurfaceCells, NearReturns, SurfacePlaces, Float64Array, PipelineConfig], Measured]
-"""`method(before, after, places, chainage_m, config)` measures the displacement at every place."""
 
 
 def measure_surface(
@@ -115,7 +100,7 @@ def measure_planes(
     noise_m2 = _smooth_variance(places.points, found.variance_m2)
     rough_m2 = (_ROUGHNESS * places.roughness_m) ** 2
     tilt_m2 = (_TILT_RAD * np.maximum(places.seen_from_m - _CLOSE_M, 0.0)) ** 2
-    level_m = _Z95 * np.sqrt(noise_m2 + alignment_m2 + rough_m2 + tilt_m2 + _LEAST_M**2)
+    level_m = Z95 * np.sqrt(noise_m2 + alignment_m2 + rough_m2 + tilt_m2 + _LEAST_M**2)
     return Measured(found.nearest_m - explained_m, found.along_m - explained_m, level_m)
 
 
@@ -145,9 +130,29 @@ def _fit_scans(after: NearReturns, places: SurfacePlaces, own_m: Float64Array, s
     return fit_motions(points[on], normals, along_m, after.path_m[sample[on]], _SCAN_WINDOW_M)
 
 
+# What `surface.method` names. A rival that needs an extra has the name of the extra beside it.
+_METHODS: Mapping[str, Method] = MappingProxyType({
+    "planes": measure_planes, "m3c2": measure_m3c2, "m3c2-ep": measure_m3c2_ep, "c2c": measure_c2c,
+    "c2m": measure_c2m, "unrolled": measure_unrolled,
+})  # fmt: skip
+_EXTRAS = MappingProxyType({"m3c2": "m3c2", "m3c2-ep": "m3c2"})
+
+
+def require_method(name: str) -> None:
+    """Raise `InputError` where `surface.method` names a rival whose extra is not installed."""
+    if name in _EXTRAS:
+        require_extra(_EXTRAS[name], f"surface.method = {name}")
+
+
 def load_method(name: str) -> Method:
-    """Return what measures the displacement: ours or a rival."""
-    return measure_planes
+    """Return what measures the displacement: ours or a rival.
+
+    Raises:
+        InputError: The extra of the rival is not installed.
+        KeyError: Nothing has this name. `none` measures nothing.
+    """
+    require_method(name)
+    return _METHODS[name]
 
 
 def _smooth_variance(points: Float64Array, variance_m2: Float64Array) -> Float64Array:

@@ -289,7 +289,8 @@ def _answer(stages: PairStages, cell: Cell, truth: GroundTruth, folder: Path) ->
         report = stages.answer(cell.config, merge, propose, cell.until)
     except MergeFailedError as error:
         measured = error.evidence, settings, cell.until, error.seconds
-        used = list_checkpoints(cell.config), list_extras(cell.config, error.evidence, proposes=False)
+        extras = list_extras(cell.config, error.evidence, proposes=False, measures=False)
+        used = list_checkpoints(cell.config), extras
         write_failure(folder, cell.variant, "merge_refused", str(error), *measured, *used)
     except TunnelcdError as error:
         weights = list_checkpoints(cell.config)

@@ -18,6 +18,7 @@ from typing import Any
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.descriptors import list_checkpoints
 from cdpipe.methods.registry import load_source
+from cdpipe.surface.measure import require_method
 from eval.core.cluster import HERE, Where, connected, require_usable
 from eval.core.output import remove
 from eval.core.progress import RunProgress, Silent
@@ -190,6 +191,7 @@ def _require_extras(pairs: Sequence[Pair]) -> None:
     cells = {each.cell.variant: each.cell for pair in pairs for each in pair.todo}
     for cell in cells.values():
         try:
+            require_method(cell.config.surface.method)
             if load_source(cell.config).detect is not None and cell.oracle_regions:
                 raise InputError(
                     f"{cell.variant}: regions.source = {cell.config.regions.source} finds regions and objects at once: "

@@ -279,7 +279,7 @@ def test_levels_of_detection_by_hand() -> None:
     """Points 3 m below one path and 2 m above the other: along the normal ranges err, across it angles do."""
     normals = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     n_own, n_other, unused = np.array([9, 9, 4]), np.array([6, 6, 9]), np.zeros(3)
-    found = Distances(np.arange(3), unused, unused, normals, n_own, n_other)
+    found = Distances(unused, unused, normals, n_own, n_other)
     settings = M3C2EPConfig(range_m=0.06, angle_deg=np.rad2deg(0.01), alignment_m=0.0)
     paths = np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -2.0]])
     levels_m = detection_levels(np.zeros((3, 3)), *paths, found, settings)
