@@ -248,7 +248,7 @@ class C2CConfig(Settings):
 class M3C2Config(_Grown):
     """Distances along normals (M3C2)."""
 
-    newer: ClassVar[tuple[str, ...]] = ("distance_m",)
+    newer: ClassVar[tuple[str, ...]] = ("distance_m", "registration_m")
 
     distance_m: Positive = Field(
         0.1, description="`m3c2`: a surface that moved farther than this along its normal is new"
@@ -256,6 +256,9 @@ class M3C2Config(_Grown):
     normal_m: Positive = Field(1.0, description="`m3c2`, `m3c2-ep`: radius within which a point's normal is estimated")
     cylinder_m: Positive = Field(0.25, description="`m3c2`, `m3c2-ep`: radius of the cylinder along the normal")
     depth_m: Positive = Field(1.5, description="`m3c2`, `m3c2-ep`: length of the cylinder to either side")
+    registration_m: NonNegative = Field(
+        0.0, description="`m3c2` as a surface method: error of the registration in the level of detection"
+    )
 
 
 class DufomapConfig(Settings):

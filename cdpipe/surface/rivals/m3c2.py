@@ -11,7 +11,7 @@ from cdpipe.methods.m3c2 import Distances, compare_clouds
 from cdpipe.methods.m3c2_ep import detection_levels
 from cdpipe.model.config import PipelineConfig
 from cdpipe.surface.cells import NearReturns, SurfaceCells, make_cells
-from cdpipe.surface.method import Measured
+from cdpipe.surface.method import Z95, Measured
 from cdpipe.surface.places import SurfacePlaces
 
 
@@ -20,11 +20,11 @@ def measure_m3c2(
 ) -> Measured:
     """Measure the displacement along the normals of M3C2; its level is that of the roughness of both surfaces.
 
-    The level is equation (1) of the paper with an error of registration of 0: 1.96 sqrt(s_1^2 / n_1 + s_2^2 / n_2).
+    The level is equation (1) of the paper: 1.96 (sqrt(s_1^2 / n_1 + s_2^2 / n_2) + `m3c2.registration_m`).
     It is NaN where a cylinder holds too few cells. Arguments as of `Method`; the section `m3c2` is used.
     """
     found = _compare(before, after, places, config)
-    return Measured(-found.behind_m, -found.behind_m, found.levels_m)
+    return Measured(-found.behind_m, -found.behind_m, found.levels_m + Z95 * config.m3c2.registration_m)
 
 
 def measure_m3c2_ep(
