@@ -1,9 +1,10 @@
 from .core.errors import InputError, MergeFailedError, TunnelcdError
-from .io.answer import read_answer, save_report, write_answer
+from .io.answer import read_answer, write_answer
 from .io.readers import open_session as open_session
+from .io.report_files import save_report
 from .methods.registry import load_method
 from .model.config import PipelineConfig, load_config, preset_names
-from .model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
+from .model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape, SurfaceField, SurfaceRegion
 from .model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, PosedScan, ScanSource
 from .pipeline import Hooks, describe, detect, detect_changes, map_session
 
@@ -22,6 +23,8 @@ __all__ = [
     "PointMap",
     "PosedScan",
     "ScanSource",
+    "SurfaceField",
+    "SurfaceRegion",
     "TunnelcdError",
     "describe",
     "detect",

@@ -43,6 +43,7 @@ from cdpipe.model.report import ChangeRegions, ChangeReport
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, ScanSource, Spheres
 from cdpipe.query.drift_width import keyframe_radii
 from cdpipe.surface.measure import measure_surface, require_method
+from cdpipe.surface.rock_or_object import leave_out_rock
 
 T = TypeVar("T")
 Stage = Literal["maps", "descriptors", "spheres", "merge", "regions"]
@@ -282,8 +283,9 @@ def detect_changes(
             report = method.detect(merged, *described, config)
         if config.surface.method != "none":
             hooks.on_stage("surface", 0, 1)
-            surface, seconds = measure_surface(merged, report.objects, config)
-            report = replace(report, surface=surface, seconds={**report.seconds, "t_surface_s": seconds})
+            surface, is_rock, seconds = measure_surface(merged, report.objects, config)
+            report = replace(leave_out_rock(report, is_rock), surface=surface)
+            report = replace(report, seconds={**report.seconds, "t_surface_s": seconds})
         return Done(report, report.seconds)
 
     if propose is not None:

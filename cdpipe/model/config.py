@@ -346,7 +346,7 @@ class SurfaceConfig(_Grown):
     mesh_m: Cell = Field(0.15, description="`c2m`: the vertices of the mesh are the means of cells of this edge")
     raster_m: Cell = Field(0.15, description="`unrolled`: edge of a cell of the raster of chainage and angle")
     least_m: Positive = Field(0.005, description="a region of rock that moved has places that moved at least so far")
-    least_area_m2: Positive = Field(0.5, description="least area of a region of rock that moved")
+    least_area_m2: Positive = Field(0.75, description="least area of a region of rock that moved")
 
 
 class PipelineConfig(Settings):

@@ -234,8 +234,8 @@ class ChangeReport:
     extras: Mapping[str, str] = field(default_factory=dict)
     surface: SurfaceField | None = None
 
-    def to_pandas(self, table: Literal["objects", "regions"] = "objects") -> pd.DataFrame:
-        """Return the objects or the reported regions as a table; positions in the map frame, metres.
+    def to_pandas(self, table: Literal["objects", "regions", "surface"] = "objects") -> pd.DataFrame:
+        """Return the objects, the reported regions or the rock as a table; positions in the map frame, metres.
 
         `objects`: one row per object: kind, centroid and corners of its points, centre, horizontal edges (the longer
         one is the length), height and yaw of its upright box, volume, and displacement if moved. Unknown values are
@@ -244,13 +244,19 @@ class ChangeReport:
         `regions`: one row per region that passed the threshold, best first. A withdrawn region contains no object, or
         none that a better region does not contain, and is not in the answer.
 
+        `surface`: one row per metre of chainage and sector of the section, 45 degrees each, in which places were
+        measured: their number, mean and largest displacement (positive into the void), the median of their 95 % levels
+        of detection, the share of places beyond it, and how many lie in regions that moved.
+
         Raises:
-            ValueError: There is no such table.
+            ValueError: There is no such table, or the answer has no displacement with its chainage and angle.
         """
         import pandas as pd  # noqa: PLC0415 - importing cdpipe must stay fast
 
-        if table not in ("objects", "regions"):
-            raise ValueError(f"table must be 'objects' or 'regions', got {table!r}")
+        if table not in ("objects", "regions", "surface"):
+            raise ValueError(f"table must be 'objects', 'regions' or 'surface', got {table!r}")
+        if table == "surface":
+            return _tabulate_surface(self.surface)
         if table == "objects":
             rows = [_object_row(index, item) for index, item in enumerate(self.objects)]
             return pd.DataFrame(rows, columns=_OBJECT_COLUMNS)
@@ -269,6 +275,36 @@ _OBJECT_COLUMNS = [
     *(f"box_{axis}_m" for axis in _AXES),
     *("box_length_m", "box_width_m", "box_height_m", "box_yaw_deg", "volume_m3"),
     *(f"displacement_{axis}_m" for axis in _AXES),
+]
+
+
+_SECTORS = ("crown", "left shoulder", "left wall", "left foot", "floor", "right foot", "right wall", "right shoulder")
+_SECTOR_DEG = 360 / len(_SECTORS)
+
+
+def _tabulate_surface(surface: SurfaceField | None) -> pd.DataFrame:
+    import pandas as pd  # noqa: PLC0415 - importing cdpipe must stay fast
+
+    if surface is None or surface.chainage_m is None or surface.angle_deg is None:
+        raise ValueError("surface: the answer has no displacement of the rock with chainage and angle")
+    known = np.flatnonzero(np.isfinite(surface.displacement_m))
+    values_m, levels_m = surface.displacement_m[known], surface.level_m[known]
+    sector = np.round(surface.angle_deg[known] / _SECTOR_DEG).astype(np.int64) % len(_SECTORS)
+    metre = np.floor(surface.chainage_m[known]).astype(np.int64)
+    cells, cell = np.unique(np.column_stack([metre, sector]), axis=0, return_inverse=True)
+    rows = []
+    for number, (start_m, which) in enumerate(cells.tolist()):
+        own = np.flatnonzero(cell.reshape(-1) == number)
+        largest = own[np.argmax(np.abs(values_m[own]))]
+        measured = values_m[own].mean(), values_m[largest], np.median(levels_m[own])
+        beyond, in_regions = (np.abs(values_m[own]) > levels_m[own]).mean(), (surface.region[known[own]] >= 0).sum()
+        rows.append((start_m, start_m + 1, _SECTORS[which], len(own), *measured, beyond, in_regions))
+    return pd.DataFrame(rows, columns=_SURFACE_COLUMNS)
+
+
+_SURFACE_COLUMNS = [
+    *("chainage_from_m", "chainage_to_m", "sector", "n_places", "mean_displacement_m", "largest_displacement_m"),
+    *("median_level_m", "share_beyond_level", "n_places_in_regions"),
 ]
 
 

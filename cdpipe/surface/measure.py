@@ -6,7 +6,8 @@
 4. The rigid motions that most of the offsets share are the alignment's (`motions`). They are taken off the scans of the
    after session, place by place of the sensor, and the offsets are measured again.
 5. The level of detection adds up the error of the means, the covariance of those motions, and the roughness.
-6. Neighbouring places beyond their level are regions (`regions`).
+6. Objects are told from rock (`rock_or_object`), and the displacement of objects is left out.
+7. Neighbouring places beyond their level are regions (`regions`).
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from cdpipe.surface.rivals.c2c import measure_c2c
 from cdpipe.surface.rivals.c2m import measure_c2m
 from cdpipe.surface.rivals.m3c2 import measure_m3c2, measure_m3c2_ep
 from cdpipe.surface.rivals.unrolled import measure_unrolled
+from cdpipe.surface.rock_or_object import split_rock
 from cdpipe.surface.unrolled import unroll
 
 # Rougher or less flat places (edges, pipes, bolts) do not tell the motion of the alignment.
@@ -42,16 +44,19 @@ _FLAT, _SMOOTH_M, _NEAR_M = 0.25, 0.03, 0.1
 _TO_SIGMA, _OUTLIER = 1.4826, 4.0
 # About so many returns of the after session tell the motions of its scans, each within that way of a place.
 _SAMPLE, _ON_PLACE_M, _SCAN_WINDOW_M = 400_000, 0.2, 4.0
+# Standard deviation of the tilt of scans that is left. It moves places by their distance from the path, which counts
+# where they are farther than the walls that the motions are fitted to, as beyond the ends of the path.
+_TILT_RAD, _CLOSE_M = 1e-3, 4.0
 # The variance of a mean from four folds is noisy: that of a place is the mean over its neighbours.
 _NEIGHBOURS = 24
 # Share of the roughness that both spheres do not share, as standard deviation, and the least error of a mean.
-_ROUGHNESS, _LEAST_M = 0.2, 0.0004
+_ROUGHNESS, _LEAST_M = 0.18, 0.0004
 
 
 def measure_surface(
     merged: MergedMaps, objects: tuple[ChangedObject, ...], config: PipelineConfig
-) -> tuple[SurfaceField, float]:
-    """Return the displacement of the rock and the seconds that it took.
+) -> tuple[SurfaceField, BoolArray, float]:
+    """Return the displacement of the rock, which of the (O,) objects are rock, and the seconds that it took.
 
     Args:
         merged: Both maps and their alignment.
@@ -66,13 +71,17 @@ def measure_surface(
     places = choose_places(cells, path[:, :3, 3], settings.spacing_m, settings.normal_m)
     chainage_m, angle_deg, _ = unroll(places.points, path)
     measured = load_method(settings.method)(cells, after, places, chainage_m, config)
+    is_rock, is_of_object = split_rock(objects, places, measured.along_m)
+    along_m, displacement_m = (
+        np.where(is_of_object, np.nan, values) for values in (measured.along_m, measured.displacement_m)
+    )
     region, regions = group_regions(
-        places, measured.along_m, measured.level_m, settings.spacing_m, settings.least_m, settings.least_area_m2
+        places, along_m, measured.level_m, settings.spacing_m, settings.least_m, settings.least_area_m2
     )
     field = SurfaceField(
-        places.points, places.normals, measured.displacement_m, measured.level_m, region, regions, chainage_m, angle_deg
+        places.points, places.normals, displacement_m, measured.level_m, region, regions, chainage_m, angle_deg
     )
-    return field, time.perf_counter() - start
+    return field, is_rock, time.perf_counter() - start
 
 
 def measure_planes(
@@ -90,7 +99,8 @@ def measure_planes(
     explained_m, alignment_m2 = motions.along(places.points, places.normals, chainage_m)
     noise_m2 = _smooth_variance(places.points, found.variance_m2)
     rough_m2 = (_ROUGHNESS * places.roughness_m) ** 2
-    level_m = Z95 * np.sqrt(noise_m2 + alignment_m2 + rough_m2 + _LEAST_M**2)
+    tilt_m2 = (_TILT_RAD * np.maximum(places.seen_from_m - _CLOSE_M, 0.0)) ** 2
+    level_m = Z95 * np.sqrt(noise_m2 + alignment_m2 + rough_m2 + tilt_m2 + _LEAST_M**2)
     return Measured(found.nearest_m - explained_m, found.along_m - explained_m, level_m)
 
 

@@ -14,6 +14,8 @@ from cdpipe.surface.cells import CELL_M, SurfaceCells
 _NEAREST = 80
 _LEAST_CELLS = 8
 _BLOCK = 1 << 14
+# Radius of the disc that tells the area of a place, in spacings: the area of a tube 5 m wide comes out 2 % too large.
+_DISC = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,6 +28,7 @@ class SurfacePlaces:
         roughness_m: (Q,) standard deviation of the cells around it, off their plane.
         flatness: (Q,) the same, over the smaller spread within the plane: 0 a plane, 1 no surface at all.
         areas_m2: (Q,) area of the surface that each place stands for.
+        seen_from_m: (Q,) distance of each from the path of the before session.
     """
 
     points: Float64Array
@@ -33,13 +36,13 @@ class SurfacePlaces:
     roughness_m: Float64Array
     flatness: Float64Array
     areas_m2: Float64Array
+    seen_from_m: Float64Array
 
 
 def choose_places(before: SurfaceCells, path: Float64Array, spacing_m: float, normal_m: float) -> SurfacePlaces:
     """Return the cell nearest to the mean of the cells of each voxel, where there are enough of them for a plane.
 
-    A voxel grid of edge h meets a plane of unit normal n in (|n_x| + |n_y| + |n_z|) / h^2 voxels per unit of area
-    (Crofton), so each place stands for h^2 / (|n_x| + |n_y| + |n_z|).
+    A place stands for the area of a disc about it over the number of places within.
 
     Args:
         before: Cells of the before session.
@@ -53,15 +56,18 @@ def choose_places(before: SurfaceCells, path: Float64Array, spacing_m: float, no
     parts = [_fit_planes(before, points[start : start + _BLOCK], normal_m) for start in range(0, len(points), _BLOCK)]
     if not parts:
         none = np.zeros(0)
-        return SurfacePlaces(np.zeros((0, 3)), np.zeros((0, 3)), none, none, none)
+        return SurfacePlaces(np.zeros((0, 3)), np.zeros((0, 3)), none, none, none, none)
     normals, spreads_m, counts = (np.concatenate(part) for part in zip(*parts, strict=True))
-    seen_from = path[cKDTree(path).query(points)[1]]
+    seen_from_m, nearest = cKDTree(path).query(points)
+    seen_from = path[nearest]
     normals *= np.where(np.einsum("ij,ij->i", normals, seen_from - points) < 0, -1.0, 1.0)[:, None]
     kept = np.flatnonzero(counts >= _LEAST_CELLS)
     normals, spreads_m = normals[kept], spreads_m[kept]
-    areas_m2 = spacing_m**2 / np.abs(normals).sum(axis=1)
+    points, radius_m = points[kept], _DISC * spacing_m
+    shares = cKDTree(points).query_ball_point(points, radius_m, return_length=True)
+    areas_m2 = np.pi * radius_m**2 / np.asarray(shares, dtype=np.float64)
     flatness = spreads_m[:, 0] / np.maximum(spreads_m[:, 1], CELL_M / 2)
-    return SurfacePlaces(points[kept], normals, spreads_m[:, 0], flatness, areas_m2)
+    return SurfacePlaces(points, normals, spreads_m[:, 0], flatness, areas_m2, np.asarray(seen_from_m)[kept])
 
 
 def _fit_planes(

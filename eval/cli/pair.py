@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from cdpipe.core.geometry import Float64Array
     from cdpipe.model.config import PipelineConfig
+    from cdpipe.model.report import SurfaceField
 
 
 def describe(
@@ -48,6 +49,9 @@ def detect(
         Path | None,
         typer.Option("--before-T-after", metavar="FILE", help="known merge, 4x4 as text or JSON", show_default=False),
     ] = None,
+    surface: Annotated[
+        bool, typer.Option("--surface", help="measure how far the rock moved, too (surface.method=planes)")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Find what changed between two sessions, simulated or recorded; needs no truth."""
@@ -56,15 +60,18 @@ def detect(
     from cdpipe.mapping.session_check import is_same_session
     from eval.core.output import new_folder
 
-    config = cdpipe.load_config(preset, settings or (), site)
+    settings = [*(["surface.method=planes"] if surface else []), *(settings or [])]
+    config = cdpipe.load_config(preset, settings, site)
     known = _read_known_merge(before_T_after, assume_aligned=assume_aligned)
     if is_same_session(cdpipe.open_session(before), cdpipe.open_session(after)):
         same = f"{before} and {after} are one and the same recording: nothing can have changed between them"
         echo(f"note: {same}", err=True)
     try:
         with shown_warnings(), new_folder(out) as partial, shown_progress(quiet) as progress:
-            report = cdpipe.detect(before, after, preset, settings or (), site, cdpipe.Hooks(progress.stage), known)
+            report = cdpipe.detect(before, after, preset, settings, site, cdpipe.Hooks(progress.stage), known)
             cdpipe.save_report(report, partial, preset)
+            if report.surface is not None:
+                _draw_surface(report.surface, partial / "surface.png")
     except MergeFailedError as error:
         if not quiet:
             print_table("merge: refused", _evidence_table(error.evidence, config))
@@ -84,8 +91,44 @@ def detect(
         )
     objects = report.to_pandas("objects")
     print_table("objects", objects[[name for name in objects.columns if not name.startswith(("min_", "max_", "box_"))]])
+    if report.surface is not None:
+        print_table("rock that moved, mm (positive: into the void)", _surface_table(report.surface))
     times = ", ".join(f"{name[2:-2]} {seconds:.3f} s" for name, seconds in report.seconds.items())
-    echo(f"{out}: answer.json, answer.npz, regions.csv, objects.csv, objects.ply ({times})")
+    more = "" if report.surface is None else ", surface.csv, surface.ply, surface.png"
+    echo(f"{out}: answer.json, answer.npz, regions.csv, objects.csv, objects.ply{more} ({times})")
+
+
+def _draw_surface(surface: SurfaceField, path: Path) -> None:
+    """Write the unrolled tunnel as a picture: chainage against angle, coloured by displacement."""
+    import numpy as np
+
+    from eval.core.figures import png
+    from eval.report.surface.unrolled import draw_panels
+
+    if surface.chainage_m is None or surface.angle_deg is None:
+        return
+    moved_m = np.abs(surface.displacement_m[surface.region >= 0])
+    panels = [("displacement of the rock", surface.displacement_m)]
+    figure, _ = draw_panels(panels, surface.chainage_m, surface.angle_deg, moved_m[np.isfinite(moved_m)])
+    path.write_bytes(png(figure))
+
+
+def _surface_table(surface: SurfaceField) -> pd.DataFrame:
+    import numpy as np
+    import pandas as pd
+
+    columns = ["region", "chainage_m", "angle_deg", "area_m2", "mean_mm", "largest_mm", "volume_m3"]
+    rows = []
+    for number, item in enumerate(surface.regions):
+        own = surface.region == number
+        places = [np.nan, np.nan]
+        if surface.chainage_m is not None and surface.angle_deg is not None:
+            turn = np.deg2rad(surface.angle_deg[own])
+            angle_deg = np.rad2deg(np.arctan2(np.sin(turn).mean(), np.cos(turn).mean()))
+            places = [float(np.median(surface.chainage_m[own])), float(angle_deg)]
+        sizes = item.area_m2, 1000 * item.mean_m, 1000 * item.largest_m, item.volume_m3
+        rows.append((number, *places, *sizes))
+    return pd.DataFrame(rows, columns=columns)
 
 
 def _read_known_merge(path: Path | None, *, assume_aligned: bool) -> Float64Array | None:

@@ -12,7 +12,8 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import yaw_pose
-from cdpipe.io.answer import Answer, save_report
+from cdpipe.io.answer import Answer
+from cdpipe.io.report_files import save_report
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 from eval.scoring.answer_check import check_answer
 from eval.truth.ground_truth import load_ground_truth

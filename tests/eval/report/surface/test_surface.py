@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import make_pose, yaw_pose
+from cdpipe.surface import unroll
 from eval.report.page import write_page
 from eval.report.surface.surface import draw_surface
-from eval.report.surface.unrolled import unroll
 from eval.running.rescoring import cell_document
 from eval.running.run_data import read_run
 from eval.running.runfolder import RunFolder, write_json, write_tables
@@ -75,7 +75,7 @@ def test_angles_turn_from_the_crown_to_the_left_wall(yaw_rad: float) -> None:
     wanted = {(0.0, 4.0): 0.0, (2.0, 2.0): 90.0, (-2.0, 2.0): -90.0, (0.0, 0.0): 180.0, (2.0, 4.0): 45.0}
     ring = [(x, y, z) for x in np.arange(2.25, 17) for y, z in wanted]
     points = np.array(ring) @ odom_T_world[:3, :3].T + odom_T_world[:3, 3]
-    chainage_m, angle_deg = unroll(points, path)
+    chainage_m, angle_deg, _ = unroll(points, path)
     np.testing.assert_allclose(chainage_m, [x for x, _, _ in ring], atol=1e-9)
     np.testing.assert_allclose(np.abs(angle_deg), [abs(wanted[y, z]) for _, y, z in ring], atol=1e-6)
     is_aside = np.array([y != 0 for _, y, _ in ring])
