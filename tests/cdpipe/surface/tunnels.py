@@ -42,7 +42,7 @@ def tunnel(sample: int, moved: Moved = nowhere, noise_m: float = NOISE_M, stretc
     path_m = np.clip(x_m + rng.uniform(-_SEEN_FROM_M, _SEEN_FROM_M, n), 0.0, LENGTH_M - 0.25)
     block = np.floor(x_m / 0.6) * 21 + np.floor((angle_deg + 180.0) / 360.0 * 21)
     _, errs_with = np.unique(np.floor(path_m) * 1000 + block, return_inverse=True)
-    noise = rng.normal(0.0, noise_m, n) + rng.normal(0.0, stretch_noise_m, errs_with.max() + 1)[errs_with]
+    noise = rng.normal(0.0, noise_m, n) + rng.normal(0.0, stretch_noise_m, int(errs_with.max()) + 1)[errs_with]
     radius_m = RADIUS_M - moved(x_m, angle_deg) + noise
     points = np.column_stack([x_m, radius_m * np.sin(np.deg2rad(angle_deg)), radius_m * np.cos(np.deg2rad(angle_deg))])
     return NearReturns(points, path_m, np.full(n, 1.0 / NOISE_M**2), PATH)
