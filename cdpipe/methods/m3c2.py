@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.threads import THREADS
@@ -23,6 +24,9 @@ from cdpipe.methods.whole_map import PlacedMaps, WholeMap
 from cdpipe.model.config import M3C2Config, PipelineConfig
 from cdpipe.model.types import SessionName
 from cdpipe.query.query import query_nearest
+
+# Core points move this share of the cylinder's half length along their normals.
+_OFF_SLABS = 1e-6
 
 
 @WholeMap
@@ -54,9 +58,9 @@ class Distances:
 
     Attributes:
         behind_m: (C,) how far the other cloud's surface lies behind the own one, seen from the void, metres; NaN where
-            a cylinder holds no point.
+            a cylinder holds no point of either, or too few points tell a normal.
         levels_m: (C,) 95 % level of detection by the roughness of both surfaces, metres; may be NaN.
-        normals: (C, 3) unit normals; their sign means nothing.
+        normals: (C, 3) unit normals, NaN where too few points tell one; their sign means nothing.
         n_own: (C,) points of the own cloud in the cylinder.
         n_other: (C,) points of the other cloud in it.
     """
@@ -101,21 +105,29 @@ def compare_clouds(
         unknown, no_counts = np.full(n, np.nan), np.zeros(n, dtype=np.int64)
         return Distances(unknown, unknown, np.full((n, 3), np.nan), no_counts, no_counts)
     py4dgeo = load_py4dgeo()
+    centre = core_points.mean(axis=0)  # far from its origin py4dgeo is off: some of its numbers are of single precision
+    epochs = py4dgeo.Epoch(own - centre), py4dgeo.Epoch(other - centre)
+    core_points = core_points - centre
+    normals = py4dgeo.M3C2(epochs=epochs, corepoints=core_points, normal_radii=[settings.normal_m]).directions()
+    # py4dgeo cuts its cylinder into slabs; a point on the plane between two counts once, twice or not at all. That
+    # plane often holds the core point itself, which is one of the own cloud.
     algorithm = py4dgeo.M3C2(
-        epochs=(py4dgeo.Epoch(own), py4dgeo.Epoch(other)),
-        corepoints=core_points,
-        normal_radii=[settings.normal_m],
+        epochs=epochs,
+        corepoints=core_points + _OFF_SLABS * settings.depth_m * normals,
+        corepoint_normals=normals,
         cyl_radius=settings.cylinder_m,
         max_distance=settings.depth_m,
     )
     distances_m, uncertainties = algorithm.run()
-    normals = algorithm.directions()
+    # fewer than three points tell no normal; py4dgeo returns zeros, or any normal to the line through two
+    third_m = np.asarray(cKDTree(own).query(core_points + centre, k=3)[0])[:, 2]
+    has_normal = third_m <= settings.normal_m
     is_into_void = np.einsum("ij,ij->i", normals, into_void) > 0
     return Distances(
-        np.where(is_into_void, -distances_m, distances_m),
-        uncertainties["lodetection"],
-        normals,
-        *(uncertainties[f"num_samples{epoch}"].astype(np.int64) for epoch in (1, 2)),
+        np.where(has_normal, np.where(is_into_void, -distances_m, distances_m), np.nan),
+        np.where(has_normal, uncertainties["lodetection"], np.nan),
+        np.where(has_normal[:, None], normals, np.nan),
+        *(np.where(has_normal, uncertainties[f"num_samples{epoch}"], 0).astype(np.int64) for epoch in (1, 2)),
     )
 
 

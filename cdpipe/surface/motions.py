@@ -16,7 +16,10 @@ from cdpipe.core.voxel import cell_keys
 
 _STEP_M = 2.0
 _LEAST_OFFSETS = 100
-_L1_ROUNDS, _ROUNDS = 4, 10
+_L1_ROUNDS, _ROUNDS = 10, 16
+# Residuals below this share of their scale weigh alike in the first rounds. Rock that moved, a quarter of the round and
+# more, enlarges the scale: with a share of 1 these rounds would be near to least squares, and half of it absorbed.
+_L1_SHARE = 0.1
 # Tukey's biweight: 95 % efficient for normal errors.
 _TUKEY = 4.685
 _TO_SIGMA = 1.4826
@@ -113,7 +116,7 @@ def _fit(
         residual_m = np.abs(along_m - jacobian @ motion)
         sigma_m = max(_TO_SIGMA * float(np.median(residual_m)), _LEAST_SIGMA_M)
         if number < _L1_ROUNDS:
-            weights = share / np.maximum(residual_m, sigma_m)
+            weights = share / np.maximum(residual_m, max(_L1_SHARE * sigma_m, _LEAST_SIGMA_M))
         else:
             weights = share * np.maximum(1 - (residual_m / (_TUKEY * sigma_m)) ** 2, 0.0) ** 2
     _, block = np.unique(cell_keys(points, _BLOCK_M), return_inverse=True)

@@ -93,9 +93,11 @@ def _triangulate(vertices: Float64Array, map_T_sensor: Float64Array, seam_m: flo
                             np.append(around_m, around_m[copied] + 2 * np.pi * median_m)])  # fmt: skip
     vertex_of = np.append(np.arange(len(vertices)), copied)
     try:
-        return np.asarray(vertex_of[Delaunay(flat).simplices], dtype=np.int64)
+        triangles = np.asarray(vertex_of[Delaunay(flat).simplices], dtype=np.int64)
     except QhullError:  # fewer than three vertices, or all on one line
         return np.zeros((0, 3), dtype=np.int64)
+    is_whole = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)  # not one of a vertex and its own copy
+    return np.asarray(triangles[is_whole])
 
 
 def find_closest(mesh: Mesh, points: Float64Array) -> tuple[Float64Array, Int64Array]:

@@ -36,7 +36,8 @@ def measure_unrolled(
 ) -> Measured:
     """Measure the mean radius of the before session less that of the after session, in the pixel of each place.
 
-    Radii are distances from the path of the before session, as of `unroll`. The level is 1.96 standard errors of the
+    Radii are distances from the axis of the drift, as of `unroll`: one axis for both sessions, that of all their cells
+    together, because an axis of each session would follow what moved. The level is 1.96 standard errors of the
     difference of both means, from the spread of the radii within the pixel. That spread is larger where the surface is
     oblique to the radius. Pixels with fewer than three cells of a session are not measured.
 
@@ -47,27 +48,25 @@ def measure_unrolled(
     if min(n, len(before.points), len(cells.points)) == 0:
         unknown = np.full(n, np.nan)
         return Measured(unknown, unknown, unknown)
-    raster_m, poses = config.surface.raster_m, before.map_T_sensor
-    unrolled_before, unrolled_after, unrolled_places = (
-        unroll(points, poses) for points in (before.points, cells.points, places.points)
-    )
+    raster_m = config.surface.raster_m
+    clouds = before.points, cells.points, places.points
+    chainages_m, angles_deg, radii_m = unroll(np.concatenate(clouds), before.map_T_sensor)
     # the height of a pixel is the raster's at the median radius; a whole number of them goes around
-    n_around = max(round(2 * np.pi * float(np.median(unrolled_before[2])) / raster_m), 1)
-    asked = _pixel_keys(unrolled_places, raster_m, n_around)
-    (own_m, own_m2), (other_m, other_m2) = (
-        _average(_pixel_keys(each, raster_m, n_around), each[2]).at(asked) for each in (unrolled_before, unrolled_after)
-    )
+    n_around = max(round(2 * np.pi * float(np.median(radii_m)) / raster_m), 1)
+    ends = np.cumsum([len(cloud) for cloud in clouds])[:-1]
+    own, other, asked = np.split(_pixel_keys(chainages_m, angles_deg, raster_m, n_around), ends)
+    own_radii_m, other_radii_m, _ = np.split(radii_m, ends)
+    own_m, own_m2 = _average(own, own_radii_m).at(asked)
+    other_m, other_m2 = _average(other, other_radii_m).at(asked)
     difference_m = own_m - other_m
     displacement_m = np.where(np.abs(difference_m) <= config.surface.reach_m, difference_m, np.nan)
     return Measured(displacement_m, displacement_m, Z95 * np.sqrt(own_m2 + other_m2))
 
 
-def _pixel_keys(
-    unrolled: tuple[Float64Array, Float64Array, Float64Array], raster_m: float, n_around: int
-) -> Int64Array:
-    """Return the (N,) key of the pixel of each point that is unrolled to chainage, angle and radius."""
-    along = np.floor(unrolled[0] / raster_m).astype(np.int64)
-    around = np.floor((unrolled[1] / 360.0 + 0.5) * n_around).astype(np.int64) % n_around
+def _pixel_keys(chainage_m: Float64Array, angle_deg: Float64Array, raster_m: float, n_around: int) -> Int64Array:
+    """Return the (N,) key of the pixel of each point; `n_around` pixels go around the drift."""
+    along = np.floor(chainage_m / raster_m).astype(np.int64)
+    around = np.floor((angle_deg / 360.0 + 0.5) * n_around).astype(np.int64) % n_around
     return np.asarray(along * n_around + around)
 
 

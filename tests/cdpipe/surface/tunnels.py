@@ -31,14 +31,20 @@ def left_wall(x_m: Float64Array, angle_deg: Float64Array) -> Float64Array:
     return np.where((np.abs(x_m - 6.0) < 1.5) & (np.abs(angle_deg - 90.0) < 30.0), 0.02, 0.0)
 
 
-def tunnel(sample: int, moved: Moved = nowhere, noise_m: float = NOISE_M) -> NearReturns:
-    """The returns of a session, spread at random; their scans are within 3 m along the path."""
+def tunnel(sample: int, moved: Moved = nowhere, noise_m: float = NOISE_M, stretch_noise_m: float = 0.0) -> NearReturns:
+    """The returns of a session, spread at random; their scans are within 3 m along the path.
+
+    Scans of a metre of path err together: on each block of rock, 0.6 m wide, by `stretch_noise_m` (one sigma).
+    """
     rng = stream(sample, "tunnel")
     n = int(2 * np.pi * RADIUS_M * LENGTH_M * _PER_M2)
     x_m, angle_deg = rng.uniform(0.0, LENGTH_M, n), rng.uniform(-180.0, 180.0, n)
-    radius_m = RADIUS_M - moved(x_m, angle_deg) + rng.normal(0.0, noise_m, n)
-    points = np.column_stack([x_m, radius_m * np.sin(np.deg2rad(angle_deg)), radius_m * np.cos(np.deg2rad(angle_deg))])
     path_m = np.clip(x_m + rng.uniform(-_SEEN_FROM_M, _SEEN_FROM_M, n), 0.0, LENGTH_M - 0.25)
+    block = np.floor(x_m / 0.6) * 21 + np.floor((angle_deg + 180.0) / 360.0 * 21)
+    _, errs_with = np.unique(np.floor(path_m) * 1000 + block, return_inverse=True)
+    noise = rng.normal(0.0, noise_m, n) + rng.normal(0.0, stretch_noise_m, int(errs_with.max()) + 1)[errs_with]
+    radius_m = RADIUS_M - moved(x_m, angle_deg) + noise
+    points = np.column_stack([x_m, radius_m * np.sin(np.deg2rad(angle_deg)), radius_m * np.cos(np.deg2rad(angle_deg))])
     return NearReturns(points, path_m, np.full(n, 1.0 / NOISE_M**2), PATH)
 
 

@@ -28,3 +28,16 @@ def test_a_missing_extra_is_named_before_anything_is_mapped(
         load_method(name)
     with pytest.raises(InputError, match=rf"pip install 'tunnelcd\[{EXTRAS[method]}\]'"):
         load_method(method)
+
+
+def test_a_missing_extra_of_a_rival_of_displacement_is_named_before_anything_is_mapped(
+    tiny_pair: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cdpipe.core.plugins.find_spec", lambda name: None)
+    monkeypatch.delattr(pipeline, "build_map")
+    given = ("--set", "surface.method=m3c2-ep", "--out", tmp_path / "out")
+    code, out, err = command("detect", tiny_pair / "before", tiny_pair / "after", *given)
+    assert code == 2
+    assert "surface.method = m3c2-ep needs a package more: pip install 'tunnelcd[m3c2]'" in err
+    assert not (tmp_path / "out").exists()
+    assert out == ""

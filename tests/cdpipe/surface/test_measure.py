@@ -1,0 +1,226 @@
+"""Our measure of displacement, on a smooth tunnel of which is known what moved."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cdpipe.core.geometry import Float64Array, make_pose, stream, transform
+from cdpipe.model.config import load_config
+from cdpipe.surface.cells import NearReturns, SurfaceCells
+from cdpipe.surface.measure import measure_planes
+from cdpipe.surface.method import Measured
+from cdpipe.surface.motions import PathMotions, fit_motions
+from cdpipe.surface.places import SurfacePlaces
+from cdpipe.surface.regions import group_regions
+from cdpipe.surface.unrolled import unroll
+from tests.cdpipe.surface.tunnels import (
+    LENGTH_M,
+    PATH,
+    RADIUS_M,
+    about_axis_deg,
+    is_inner,
+    left_wall,
+    surveyed,
+    true_displacement,
+    tunnel,
+)
+
+Survey = tuple[SurfaceCells, SurfacePlaces, Float64Array]
+
+
+@pytest.fixture(scope="module", name="survey")
+def survey_fixture() -> Survey:
+    return surveyed(tunnel(1))
+
+
+def measure(survey: Survey, after: NearReturns) -> Measured:
+    cells, places, chainage_m = survey
+    return measure_planes(cells, after, places, chainage_m, load_config("tunnelcd"))
+
+
+def test_a_patch_that_moved_is_measured_to_a_millimetre(survey: Survey) -> None:
+    found = measure(survey, tunnel(2, left_wall))
+    truth_m, inner = true_displacement(survey[1], left_wall), is_inner(survey[1])
+    for still in (True, False):
+        of_kind = inner & ((truth_m == 0) == still)
+        assert found.displacement_m[of_kind].mean() == pytest.approx(0.0 if still else 0.02, abs=1e-3)
+        assert np.abs(found.displacement_m - truth_m)[of_kind].max() < 0.004
+    assert (found.displacement_m > found.level_m)[inner & (truth_m > 0)].all()
+
+
+def test_rock_that_left_is_negative() -> None:
+    back = surveyed(tunnel(2, left_wall))
+    on = is_inner(back[1]) & (true_displacement(back[1], left_wall) > 0)
+    assert measure(back, tunnel(1)).displacement_m[on].mean() == pytest.approx(-0.02, abs=1e-3)
+
+
+def test_a_far_displacement_is_the_distance_to_the_new_surface(survey: Survey) -> None:
+    def slab(x_m: Float64Array, angle_deg: Float64Array) -> Float64Array:
+        return 30.0 * left_wall(x_m, angle_deg)
+
+    on = is_inner(survey[1]) & (true_displacement(survey[1], slab) > 0)
+    found = measure(survey, tunnel(2, slab))
+    # the nearest cell is half a cell off the foot of the perpendicular, and nearer than the surface by its noise
+    assert np.median(found.displacement_m[on]) == pytest.approx(0.6, abs=0.01)
+
+
+def test_the_level_holds_19_of_20_unchanged_places() -> None:
+    """Errors that the scans of a metre of path share: the folds tell them, and 95 % are below the level."""
+    survey = surveyed(tunnel(1, stretch_noise_m=0.0025))
+    found = measure(survey, tunnel(2, stretch_noise_m=0.0025))
+    inner = is_inner(survey[1])
+    held = np.abs(found.along_m[inner]) <= found.level_m[inner]
+    assert len(held) > 2000
+    assert 0.93 <= held.mean() <= 0.97
+
+
+def test_the_level_of_independent_noise_is_on_the_safe_side(survey: Survey) -> None:
+    """A smooth wall that is curved counts as rough, so more than 95 % are below the level."""
+    found = measure(survey, tunnel(3))
+    assert np.mean(np.abs(found.along_m) <= found.level_m) > 0.97
+    assert np.median(found.level_m) < 0.003
+
+
+def test_a_rigid_misalignment_is_absorbed(survey: Survey) -> None:
+    turn = np.deg2rad(0.1)
+    after = tunnel(2, left_wall)
+    # 5 mm across the tunnel, and 0.1 degrees about the vertical through its middle: another 10 mm at its ends
+    moved_by = make_pose(
+        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]], [0, 0.003, 0.004]
+    )
+    middle = np.array([6.0, 0.0, 0.0])
+    points = transform(moved_by, after.points - middle) + middle
+    found = measure(survey, replace(after, points=points))
+    truth_m, inner = true_displacement(survey[1], left_wall), is_inner(survey[1])
+    angle_deg, x_m = about_axis_deg(survey[1].points), survey[1].points[:, 0]
+    for sector in range(-180, 180, 45):
+        for end in (x_m < 3.0, x_m > 9.0):
+            of_sector = inner & end & (angle_deg >= sector) & (angle_deg < sector + 45)
+            assert found.displacement_m[of_sector].mean() == pytest.approx(0.0, abs=1e-3)
+    assert found.displacement_m[inner & (truth_m > 0)].mean() == pytest.approx(0.02, abs=1.5e-3)
+
+
+def test_a_change_of_a_third_of_the_round_is_not_absorbed(survey: Survey) -> None:
+    def third(x_m: Float64Array, angle_deg: Float64Array) -> Float64Array:
+        return np.where(np.abs(angle_deg - 90.0) < 60.0, 0.02, 0.0)
+
+    found = measure(survey, tunnel(2, third))
+    from_wall_deg = np.abs(about_axis_deg(survey[1].points) - 90.0)
+    inner = np.abs(survey[1].points[:, 0] - 6.0) < 5.5
+    assert found.displacement_m[inner & (from_wall_deg < 45.0)].mean() == pytest.approx(0.02, abs=1.5e-3)
+    assert found.displacement_m[inner & (from_wall_deg > 75.0)].mean() == pytest.approx(0.0, abs=1.5e-3)
+
+
+def wall_ring(x_m: float) -> Float64Array:
+    """Crown, left wall, right wall, floor, and the places between, at one chainage."""
+    angle = np.deg2rad([0.0, 90.0, -90.0, 180.0, 45.0, -45.0, 135.0, -135.0])
+    return np.column_stack([np.full(len(angle), x_m), RADIUS_M * np.sin(angle), RADIUS_M * np.cos(angle)])
+
+
+def test_angles_and_chainage_of_an_unrolled_tunnel() -> None:
+    chainage_m, angle_deg, radius_m = unroll(wall_ring(4.3), PATH)
+    np.testing.assert_allclose(chainage_m, 4.3, atol=1e-9)
+    np.testing.assert_allclose(np.abs(angle_deg[3]), 180.0, atol=1e-9)
+    expected_deg = [0.0, 90.0, -90.0, 45.0, -45.0, 135.0, -135.0]
+    np.testing.assert_allclose(np.delete(angle_deg, 3), expected_deg, atol=1e-9)
+    # about the axis of the drift, though the path is half a metre below it
+    np.testing.assert_allclose(radius_m, RADIUS_M, atol=1e-9)
+
+
+def test_a_reversed_path_counts_from_the_other_end_and_swaps_the_walls() -> None:
+    places = np.concatenate([wall_ring(x_m) for x_m in (2.3, 7.1)])
+    forth, back = unroll(places, PATH), unroll(places, PATH[::-1])
+    np.testing.assert_allclose(forth[0] + back[0], LENGTH_M - 0.25, atol=1e-9)
+    is_side = np.abs(np.abs(forth[1]) - 90.0) < 60.0
+    np.testing.assert_allclose(back[1][is_side], -forth[1][is_side], atol=1e-9)
+    np.testing.assert_allclose(forth[2], back[2], atol=1e-9)
+
+
+def test_a_path_that_comes_back_counts_on() -> None:
+    beside = make_pose(translation=np.array([0.0, -1.0, 0.0])) @ PATH[::-1]
+    there_and_back = np.concatenate([PATH, beside])
+    left, right = wall_ring(4.3)[1:3]
+    chainage_m, _, _ = unroll(np.array([left, right, *wall_ring(4.3)[[0, 3]]]), there_and_back)
+    # the left wall is nearer to the way there, the right wall to the way back, which is a metre longer
+    assert chainage_m[0] == pytest.approx(4.3, abs=1e-6)
+    assert chainage_m[1] == pytest.approx(2 * (LENGTH_M - 0.25) + 1.0 - 4.3, abs=1e-6)
+    assert unroll(np.zeros((0, 3)), PATH)[0].shape == (0,)
+
+
+def test_areas_and_volumes_of_regions(survey: Survey) -> None:
+    """3.6 m by 150 degrees came 40 mm, 3 m by 120 degrees on the other side went 30 mm."""
+    places = survey[1]
+    x_m, angle_deg = places.points[:, 0], about_axis_deg(places.points)
+    came_m = np.where((np.abs(x_m - 3.5) < 1.8) & (np.abs(angle_deg - 90.0) < 75.0), 0.04, 0.0)
+    went_m = np.where((np.abs(x_m - 8.5) < 1.5) & (np.abs(angle_deg + 90.0) < 60.0), -0.03, 0.0)
+    # one degree of the round is 35 mm wide
+    came_m2, went_m2 = 3.6 * 150 * np.deg2rad(RADIUS_M), 3.0 * 120 * np.deg2rad(RADIUS_M)
+    level_m = np.full(len(places.points), 1e-3)
+    region, regions = group_regions(places, came_m + went_m, level_m, 0.25, 0.005, 0.75)
+    assert len(regions) == 2
+    for number, (found, volume_m3) in enumerate(zip(regions, (came_m2 * 0.04, went_m2 * -0.03), strict=True)):
+        assert found.volume_m3 == pytest.approx(volume_m3, rel=0.05)
+        assert found.mean_m * found.area_m2 == pytest.approx(found.volume_m3)
+        assert places.areas_m2[region == number].sum() == pytest.approx(found.area_m2)
+    assert [found.largest_m for found in regions] == [0.04, -0.03]
+    # of a step, half is left at the edge once it is smoothed: with this least displacement a region ends there
+    for along_m, area_m2, x_of_centre_m in ((came_m, came_m2, 3.5), (went_m, went_m2, 8.5)):
+        _, (found,) = group_regions(places, along_m, level_m, 0.25, float(np.abs(along_m).max()) / 2, 0.75)
+        assert found.area_m2 == pytest.approx(area_m2, rel=0.05)
+        assert found.centre_map[0] == pytest.approx(x_of_centre_m, abs=0.1)
+
+
+def test_regions_below_the_level_or_too_small_are_none(survey: Survey) -> None:
+    places = survey[1]
+    along_m, level_m = true_displacement(places, left_wall), np.full(len(places.points), 1e-3)
+    assert group_regions(places, along_m, level_m, 0.25, 0.005, 0.75)[1]
+    assert group_regions(places, along_m, level_m * 100, 0.25, 0.005, 0.75)[1] == ()
+    assert group_regions(places, along_m, level_m, 0.25, 0.03, 0.75)[1] == ()
+    assert group_regions(places, along_m, level_m, 0.25, 0.005, 20.0)[1] == ()
+    region, regions = group_regions(places, along_m, level_m * np.nan, 0.25, 0.005, 0.75)
+    assert regions == ()
+    assert (region == -1).all()
+
+
+def test_the_places_cover_the_area_of_the_tunnel(survey: Survey) -> None:
+    inner = np.abs(survey[1].points[:, 0] - 6.0) < 5.0
+    assert survey[1].areas_m2[inner].sum() == pytest.approx(2 * np.pi * RADIUS_M * 10.0, rel=0.05)
+
+
+def test_motions_between_stations_by_hand() -> None:
+    """Station 0 m slides by 10 mm along y; that at 2 m turns by 1 mrad about z through (2, 0, 0)."""
+    motions = np.array([[0, 0, 0, 0, 0.01, 0], [0, 0, 1e-3, 0, 0, 0]], dtype=np.float64)
+    centres = np.array([[0.0, 0, 0], [2.0, 0, 0]])
+    of_path = PathMotions(0.0, centres, motions, np.tile(1e-6 * np.eye(6), (2, 1, 1)))
+    points = np.array([[5.0, 0, 0]] * 5)
+    path_m = np.array([0.0, 2.0, 1.0, -3.0, 9.0])
+    # 3 m from the centre of the second: 3 mm; half way between, half of each; beyond the ends, as at the ends
+    expected_m = [0.01, 0.003, 0.0065, 0.01, 0.003]
+    np.testing.assert_allclose(of_path.shifts(points, path_m)[:, 1], expected_m, atol=1e-12)
+    along_m, variance_m2 = of_path.along(points, np.tile([0.0, 1, 0], (5, 1)), path_m)
+    np.testing.assert_allclose(along_m, expected_m, atol=1e-12)
+    # the variance of the slide is 1e-6, that of the turn 1e-6 times the square of the lever
+    np.testing.assert_allclose(variance_m2[:3], [(1 + 25) * 1e-6, (1 + 9) * 1e-6, (26 + 10) / 2 * 1e-6], rtol=1e-9)
+
+
+def test_motions_are_found_again_with_a_third_of_outliers() -> None:
+    rng = stream(5, "motions")
+    angle = rng.uniform(-np.pi, np.pi, 3000)
+    normals = -np.column_stack([np.zeros(3000), np.sin(angle), np.cos(angle)])
+    points = np.column_stack([rng.uniform(0, 12, 3000), np.zeros(3000), np.zeros(3000)]) - RADIUS_M * normals
+    turn, slide = np.array([0.0, 1e-3, -2e-3]), np.array([0.0, 0.004, 0.003])
+    shift = np.cross(turn, points - [6.0, 0, 0]) + slide
+    clean_m = np.einsum("ij,ij->i", shift, normals)
+    along_m = clean_m + rng.normal(0, 5e-4, 3000) + np.where(np.abs(angle - 1.5) < np.pi / 3, 0.03, 0.0)
+    found = fit_motions(points, normals, along_m, points[:, 0], 8.0)
+    np.testing.assert_allclose(found.along(points, normals, points[:, 0])[0], clean_m, atol=5e-4)
+
+
+def test_too_few_offsets_tell_no_motion() -> None:
+    points, unknown = np.zeros((5, 3)), np.full(5, np.nan)
+    for along_m in (np.zeros(5), unknown):
+        found = fit_motions(points, np.tile([0.0, 0, 1], (5, 1)), along_m, np.zeros(5), 8.0)
+        moved_m, variance_m2 = found.along(points, np.tile([0.0, 0, 1], (5, 1)), np.zeros(5))
+        assert (moved_m == 0).all()
+        assert np.isnan(variance_m2).all()
