@@ -123,7 +123,11 @@ def build_world(scenario: Scenario, seed: int) -> World:
     gap_m = WALL_GAP_M + (tunnel.resolution_m if tunnel.mesh is None else 0.0)
     around, outlines = Surroundings(walls, hung, gap_m), []
     if displacement is not None:
-        level, _, hung_after = _change_rock(displacement, centreline, walls, furniture)[:3]
+        level, bare_after = (
+            raise_centreline(centreline, walls, displacement),
+            Caster([displacement.walls.mesh("after")]),
+        )
+        hung_after, _ = _follow_rock(displacement, bare_after, furniture)
         around = replace(around, barred=barred_places(displacement), after=(level, hung_after))
         outlines = covered_outlines(displacement)
     standing = place_props(scenario, centreline, around, seed)
@@ -138,7 +142,7 @@ def build_world(scenario: Scenario, seed: int) -> World:
     changed, rock_after = None, rock
     if displacement is not None:
         standing = carry(standing, displacement)
-        changed = _change_rock(displacement, centreline, walls, fixtures)
+        changed = level, bare_after, *_follow_rock(displacement, bare_after, fixtures)
         pairs = zip(fixtures, changed[3], rock[1:], strict=True)
         rock_after = [compile_mesh(displacement.walls.mesh("after"))]
         rock_after += [own if old is new else compile_mesh(new.mesh) for old, new, own in pairs]
@@ -149,14 +153,13 @@ def build_world(scenario: Scenario, seed: int) -> World:
     return World(centreline, walls, fixed, fixtures, tuple(standing), before, after, displacement, changed)
 
 
-def _change_rock(
-    displacement: Displacement, centreline: Centreline, walls: Caster, fixtures: tuple[Fixture, ...]
-) -> tuple[Centreline, Caster, Caster, tuple[Fixture, ...]]:
-    """Return drifts, tunnel, obstacles and furniture as they are in the after session."""
-    wall, moved = displacement.walls.mesh("after"), follow(fixtures, displacement)
-    level = raise_centreline(centreline, walls, displacement)
-    bare = Caster([wall])
-    return level, bare, Caster([wall, *(fixture.mesh for fixture in moved)]) if moved else bare, moved
+def _follow_rock(
+    displacement: Displacement, bare_after: Caster, fixtures: tuple[Fixture, ...]
+) -> tuple[Caster, tuple[Fixture, ...]]:
+    """Return obstacles and furniture as they are in the after session, given its bare tunnel."""
+    moved = follow(fixtures, displacement)
+    wall = displacement.walls.mesh("after")
+    return (Caster([wall, *(fixture.mesh for fixture in moved)]) if moved else bare_after), moved
 
 
 def compile_scene(

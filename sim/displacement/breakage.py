@@ -113,14 +113,14 @@ def pile_up(walls: TwinWalls, heap: Heap, zone: Zone, change: SurfaceChange, vol
 
     fall_m = below_peak_m(off)
     bumps = _Fragments.draw(heap, generator)
-    bump_fall_m = below_peak_m(bumps.centres)
+    bump_fall_m, covered = below_peak_m(bumps.centres), bumps.lie_over(off)
     faces = np.flatnonzero(np.isin(walls.faces, near).any(axis=1))
     low_m, high_m = 0.0, heap.reach_m
     moved = Moved(walls, near[:0], places[:0])
     for _ in range(_HALVINGS):
         peak_m = (low_m + high_m) / 2
         smooth = heap.middle[2] + peak_m - fall_m
-        level = np.maximum(smooth, bumps.tops(off, heap.middle[2], peak_m - bump_fall_m))
+        level = np.maximum(smooth, bumps.tops(covered, len(off), heap.middle[2], peak_m - bump_fall_m))
         is_under = level > places[:, 2]
         moved = Moved(walls, near[is_under], raise_to(places[is_under], level[is_under]))
         held_m3 = swept_volume_m3(walls.moved(moved.vertices, moved.places, 1), faces)
@@ -159,21 +159,35 @@ class _Fragments:
         slopes = steep[..., None] * np.stack([np.cos(facing), np.sin(facing)], axis=-1)
         return cls(np.column_stack([radius * np.cos(turn), radius * np.sin(turn)]), sizes_m, slopes)
 
-    def tops(self, off: Float64Array, floor_z: float, under_m: Float64Array) -> Float64Array:
-        """Return the height (N,) of the highest fragment over places (N, 2) from the middle, -inf where there is none.
+    def lie_over(self, off: Float64Array) -> list[tuple[Int64Array, Float64Array]]:
+        """Return which places (N, 2) from the middle each fragment covers, and how far below its tip it is there."""
+        x, y = np.ascontiguousarray(off.T)
+        covered = []
+        for (centre_x, centre_y), size_m, slopes in zip(self.centres, self.sizes_m, self.slopes, strict=True):
+            near = np.flatnonzero((np.abs(x - centre_x) < size_m) & (np.abs(y - centre_y) < size_m))
+            drop_m = ((off[near] - (centre_x, centre_y)) @ slopes.T).max(axis=1)
+            is_on = drop_m < 0.6 * size_m
+            covered.append((near[is_on], drop_m[is_on]))
+        return covered
+
+    def tops(
+        self, covered: list[tuple[Int64Array, Float64Array]], n_places: int, floor_z: float, under_m: Float64Array
+    ) -> Float64Array:
+        """Return the height (N,) of the highest fragment over each place, -inf where there is none.
 
         A fragment lies on the flank, `under_m` (F,) above the floor, or on the floor beside the foot.
+
+        Args:
+            covered: What `lie_over` found.
+            n_places: Number of places.
+            floor_z: Height of the floor.
+            under_m: (F,) height of the flank at each fragment.
         """
-        tops = np.full(len(off), -np.inf)
-        for centre, size_m, slopes, flank_m in zip(self.centres, self.sizes_m, self.slopes, under_m, strict=True):
-            if flank_m < -_BESIDE_M:
-                continue
-            near = np.flatnonzero((np.abs(off - centre) < size_m).all(axis=1))
-            if len(near):
-                drop_m = ((off[near] - centre) @ slopes.T).max(axis=1)
-                is_on = drop_m < 0.6 * size_m
+        tops = np.full(n_places, -np.inf)
+        for (places, drop_m), size_m, flank_m in zip(covered, self.sizes_m, under_m, strict=True):
+            if flank_m >= -_BESIDE_M:
                 height = floor_z + max(flank_m, 0.0) + 0.35 * size_m - drop_m
-                tops[near[is_on]] = np.maximum(tops[near[is_on]], height[is_on])
+                tops[places] = np.maximum(tops[places], height)
         return tops
 
 

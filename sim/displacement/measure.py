@@ -9,30 +9,37 @@ from cdpipe.core.geometry import Float64Array, Int64Array
 from sim.geometry.mesh import Mesh, split_triangles
 
 FARTHEST_M = 5.0  # a closest place beyond this says nothing of the same rock
-_PIECE_M = 0.1  # longest edge of the pieces that are looked up
-_FEW = 8
+_PIECE_M = 0.3  # longest edge of the pieces that are looked up
 _TIE_M = 1e-9
-_BATCH = 4096
+_BATCH = 2048
+_CHILDREN = 8
+_NOWHERE_M = 1e9  # where the boxes are that only fill up a node
 
 
 class SignedDistance:
     """An index of a surface, built once and shared by all threads.
+
+    A hierarchy of boxes with eight children each, in the order of a k-d tree over the centres of the triangles. The
+    search keeps the boxes that come as close as the triangle with the nearest centre does, level by level.
 
     Args:
         mesh: The surface; its faces look into the void.
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        self._triangles = split_triangles(mesh.vertices[mesh.faces], _PIECE_M)
-        a, b, c = (self._triangles[:, corner] for corner in range(3))
+        triangles = split_triangles(mesh.vertices[mesh.faces], _PIECE_M)
+        a, b, c = (triangles[:, corner] for corner in range(3))
         normals = np.cross(b - a, c - a)
         lengths = np.linalg.norm(normals, axis=1)
-        self._triangles, normals = self._triangles[lengths > 1e-14], normals[lengths > 1e-14]
-        self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        triangles, normals = triangles[lengths > 1e-14], normals[lengths > 1e-14]
+        self._tree = cKDTree(triangles.mean(axis=1))
+        order = np.asarray(self._tree.indices)
+        self._position = np.argsort(order)
+        self._triangles = triangles[order]
+        self._normals = normals[order] / np.linalg.norm(normals[order], axis=1, keepdims=True)
         self._centres = self._triangles.mean(axis=1)
         self._radii_m = np.linalg.norm(self._triangles - self._centres[:, None], axis=2).max(axis=1)
-        self._largest_m = float(self._radii_m.max(initial=0.0))
-        self._tree = cKDTree(self._centres)
+        self._levels = _box_levels(self._triangles)
 
     def measure(self, points: Float64Array) -> Float64Array:
         """Return the distance (N,) of points (N, 3) to the surface, positive in the void, NaN beyond 5 m.
@@ -41,48 +48,58 @@ class SignedDistance:
         is nearest to the way from the place to the point tells the side.
         """
         signed = np.full(len(points), np.nan)
-        few = min(_FEW, len(self._centres))
-        if not few:
+        if not len(self._triangles):
             return signed
         for start in range(0, len(points), _BATCH):
             part = points[start : start + _BATCH]
-            apart_m, nearest = (np.asarray(each) for each in self._tree.query(part, k=few))
-            apart_m, nearest = apart_m.reshape(len(part), few), nearest.reshape(len(part), few)
+            rows, which = self._candidates(part)
+            way = part[rows] - closest_places(part[rows], self._triangles[which])
+            distance_m = np.linalg.norm(way, axis=1)
             best_m = np.full(len(part), np.inf)
+            np.minimum.at(best_m, rows, distance_m)
+            is_tie = distance_m <= best_m[rows] + _TIE_M
+            rows, way, which = rows[is_tie], way[is_tie], which[is_tie]
+            facing = np.einsum("ij,ij->i", way, self._normals[which])
+            order = np.lexsort((np.abs(facing), rows))  # the steepest last
             signs = np.ones(len(part))
-            rows = np.repeat(np.arange(len(part)), few)
-            self._closest(part, rows, nearest.ravel(), best_m, signs)
-            # a triangle farther down the list could only be nearer if its ball reached so far
-            open_rows = np.flatnonzero((apart_m[:, -1] < best_m + self._largest_m) & (few < len(self._centres)))
-            if len(open_rows):
-                lists = self._tree.query_ball_point(
-                    part[open_rows], np.minimum(best_m[open_rows], FARTHEST_M) + self._largest_m
-                )
-                counts = np.fromiter((len(each) for each in lists), np.int64, len(lists))
-                found = np.concatenate([np.asarray(each, np.int64) for each in lists])
-                self._closest(part, np.repeat(open_rows, counts), found, best_m, signs)
+            signs[rows[order]] = np.where(facing[order] >= 0, 1.0, -1.0)
             signed[start : start + len(part)] = np.where(best_m <= FARTHEST_M, signs * best_m, np.nan)
         return signed
 
-    def _closest(
-        self, points: Float64Array, rows: Int64Array, which: Int64Array, best_m: Float64Array, signs: Float64Array
-    ) -> None:
-        """Improve the distance (N,) and side (N,) of points in place by candidate triangles: pairs (P,) of both."""
-        reach_m = np.linalg.norm(points[rows] - self._centres[which], axis=1) - self._radii_m[which]
-        bound_m = np.full(len(points), np.inf)
-        np.minimum.at(bound_m, rows, reach_m + 2 * self._radii_m[which])
-        is_hope = reach_m <= np.minimum(bound_m, best_m)[rows] + _TIE_M
-        rows, which = rows[is_hope], which[is_hope]
-        way = points[rows] - closest_places(points[rows], self._triangles[which])
-        distance_m = np.linalg.norm(way, axis=1)
-        nearest_m = best_m.copy()
-        np.minimum.at(nearest_m, rows, distance_m)
-        is_tie = distance_m <= nearest_m[rows] + _TIE_M
-        rows, way, which = rows[is_tie], way[is_tie], which[is_tie]
-        facing = np.einsum("ij,ij->i", way, self._normals[which])
-        order = np.lexsort((np.abs(facing), rows))  # the steepest last
-        signs[rows[order]] = np.where(facing[order] >= 0, 1.0, -1.0)
-        best_m[:] = nearest_m
+    def _candidates(self, points: Float64Array) -> tuple[Int64Array, Int64Array]:
+        """Return pairs (P,) of point and triangle: of every point (N, 3) all that may be the closest, within 5 m."""
+        nearest = self._position[np.asarray(self._tree.query(points)[1])]
+        upper_m = np.linalg.norm(points - closest_places(points, self._triangles[nearest]), axis=1)
+        bound = (np.minimum(upper_m, FARTHEST_M) + _TIE_M) ** 2 + _TIE_M
+        rows, which = np.arange(len(points)), np.zeros(len(points), np.int64)
+        for middles, halves in self._levels:
+            off = np.abs(points[rows, None] - middles[which]) - halves[which]
+            np.maximum(off, 0.0, out=off)
+            pair, child = np.nonzero(np.einsum("ijk,ijk->ij", off, off) <= bound[rows, None])
+            rows, which = rows[pair], which[pair] * _CHILDREN + child
+        # a triangle lies in its plane, and in a circle about its centre
+        way = points[rows] - self._centres[which]
+        above2 = np.einsum("ij,ij->i", way, self._normals[which]) ** 2
+        aside_m = np.sqrt(np.maximum(np.einsum("ij,ij->i", way, way) - above2, 0.0)) - self._radii_m[which]
+        is_hope = above2 + np.maximum(aside_m, 0.0) ** 2 <= bound[rows]
+        return rows[is_hope], which[is_hope]
+
+
+def _box_levels(triangles: Float64Array) -> list[tuple[Float64Array, Float64Array]]:
+    """Return middles and half sizes (K, 8, 3) of the boxes of each level: the children of its K nodes, largest first.
+
+    Child j of node i is node 8 i + j of the next level, and triangle 8 i + j after the last.
+    """
+    levels: list[tuple[Float64Array, Float64Array]] = []
+    low, high = triangles.min(axis=1), triangles.max(axis=1)
+    while not levels or len(low) > 1:
+        spare = np.zeros((-len(low) % _CHILDREN, 3))
+        middles = np.concatenate([(low + high) / 2, spare + _NOWHERE_M]).reshape(-1, _CHILDREN, 3)
+        halves = np.concatenate([(high - low) / 2, spare]).reshape(-1, _CHILDREN, 3)
+        levels.append((middles, halves))
+        low = np.concatenate([low, spare + np.inf]).reshape(-1, _CHILDREN, 3).min(axis=1)
+        high = np.concatenate([high, spare - np.inf]).reshape(-1, _CHILDREN, 3).max(axis=1)
+    return levels[::-1]
 
 
 def closest_places(points: Float64Array, triangles: Float64Array) -> Float64Array:

@@ -56,10 +56,14 @@ def refine(walls: TwinWalls, edge_m: Callable[[Float64Array], Float64Array]) -> 
         walls: The walls.
         edge_m: Gives the longest edge (K,) allowed at places (K, 3) of the before session, metres; infinite for any.
     """
+    is_finite, n_known = np.zeros(0, dtype=bool), 0
     for _ in range(_ROUNDS):
-        near = np.flatnonzero(np.isfinite(edge_m(walls.before))[walls.faces].any(axis=1))
-        ends = walls.faces[near][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-        pairs = np.unique(np.sort(ends, axis=1), axis=0)
+        is_finite = np.concatenate([is_finite, np.isfinite(edge_m(walls.before[n_known:]))])
+        # an edge that was short enough once stays so: only faces with a new vertex are looked at again
+        is_new = np.arange(len(walls.before)) >= n_known
+        n_known = len(walls.before)
+        near = np.flatnonzero(_has_any(is_finite, walls.faces) & _has_any(is_new, walls.faces))
+        pairs = _edges(walls.faces[near], n_known)
         middle = walls.before[pairs].mean(axis=1)
         longest_m = np.maximum(
             *(
@@ -84,7 +88,7 @@ def refine_ball(walls: TwinWalls, middle: Float64Array, reach_m: float, edge_m: 
         centres = corners.mean(axis=1)
         radii_m = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
         near = np.flatnonzero(np.linalg.norm(centres - middle, axis=1) < reach_m + radii_m)
-        pairs = np.unique(np.sort(walls.faces[near][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+        pairs = _edges(walls.faces[near], len(walls.before))
         pairs = pairs[_length(walls.before, pairs[:, 0], pairs[:, 1]) > edge_m]
         if not len(pairs):
             break
@@ -113,22 +117,48 @@ def _halve(walls: TwinWalls, pairs: Int64Array) -> TwinWalls:
     """Return the walls with a vertex in the middle of some edges (E, 2), the lower vertex first, sorted."""
     n = len(walls.before)
     keys = pairs[:, 0] * n + pairs[:, 1]
-    a, b = pairs.T
-    owner = np.where(walls.owner[a] == walls.owner[b], walls.owner[a], np.maximum(walls.owner[a], walls.owner[b]))
+    one, other = walls.owner[pairs.T]
+    owner = np.where(one == other, one, np.maximum(one, other))
     before, after = (np.concatenate([each, each[pairs].mean(axis=1)]) for each in (walls.before, walls.after))
-    ends = np.sort(walls.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    wanted = ends[:, 0] * n + ends[:, 1]
+    is_end = np.zeros(n, dtype=bool)
+    is_end[pairs] = True
+    a, b, c = walls.faces.T
+    is_touched = (is_end[a] & (is_end[b] | is_end[c])) | (is_end[b] & is_end[c])
+    touched = walls.faces[is_touched]
+    wanted = _edge_keys(touched, n)
     at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     middles = np.where(keys[at] == wanted, n + at, _NONE).reshape(-1, 3)
-    faces = _split(walls.faces, middles, before)
+    is_cut = (middles != _NONE).any(axis=1)
+    is_touched[is_touched] = is_cut
+    faces = np.concatenate([walls.faces[~is_touched], _split(touched[is_cut], middles[is_cut], before)])
     return TwinWalls(before, after, faces, np.concatenate([walls.owner, owner]))
 
 
+def _has_any(mask: BoolArray, faces: Int64Array) -> BoolArray:
+    """Mark the faces (M, 3) of which any vertex is marked in (N,)."""
+    a, b, c = faces.T
+    return np.asarray(mask[a] | mask[b] | mask[c])
+
+
+def _edges(faces: Int64Array, n_vertices: int) -> Int64Array:
+    """Return the edges (E, 2) of faces (M, 3), each once, the lower vertex first, sorted."""
+    return np.stack(np.divmod(np.unique(_edge_keys(faces, n_vertices)), n_vertices), axis=1)
+
+
+def _edge_keys(faces: Int64Array, n_vertices: int) -> Int64Array:
+    """Return a number (3 M,) for each edge ab, bc, ca of faces (M, 3) that orders edges by their lower vertex first."""
+    ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    return np.asarray(ends.min(axis=1) * n_vertices + ends.max(axis=1))
+
+
 def _split(faces: Int64Array, middles: Int64Array, places: Float64Array) -> Int64Array:
-    """Split faces (M, 3) at the middles (M, 3) of their edges ab, bc, ca, -1 where an edge stays whole."""
+    """Split faces (M, 3) at the middles (M, 3) of their edges ab, bc, ca, -1 where an edge stays whole.
+
+    Every face has one edge at least that is cut.
+    """
     is_cut = middles != _NONE
     count = is_cut.sum(axis=1)
-    done = [faces[count == 0]]
+    done = []
     # turned so that the first edge is the one that is cut, or the third the one that is not
     turn = np.where(count == 1, is_cut.argmax(axis=1), np.where(count == 2, (~is_cut).argmax(axis=1) + 1, 0))
     order = (np.arange(3) + turn[:, None]) % 3

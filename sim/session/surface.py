@@ -53,6 +53,14 @@ class MovedRock:
         moved_m[searched] = np.where(self._is_rising[faces[searched]], np.abs(found_m), self._turn * found_m)
         return moved_m
 
+    def _nearest_m(self, origins: Float64Array) -> Float32Array:
+        """Return the distance (W,) of places (W, 3) to the nearest of the boxes, a little less for rounding."""
+        nearest_m = np.full(len(origins), np.inf)
+        for low, high in self._boxes:
+            off = np.maximum(np.maximum(low - origins, origins - high), 0.0)
+            np.minimum(nearest_m, np.sqrt((off**2).sum(axis=1)), out=nearest_m)
+        return (nearest_m - _SAME_M).astype(np.float32)
+
     def mark(self, rays: Rays, result: Scan, reach_m: Float32Array) -> tuple[Float32Array, Int16Array]:
         """Return displacement and surface change (R, W) of the returns of a revolution.
 
@@ -65,7 +73,8 @@ class MovedRock:
         displacement = np.where(is_rock, np.float32(0.0), np.float32(np.nan))
         change = np.zeros(is_rock.shape, np.int16)
         height = rays.directions.shape[1]
-        row, column = np.nonzero(is_rock)
+        # most returns end before the nearest box
+        row, column = np.nonzero(is_rock & (reach_m > self._nearest_m(rays.origins)))
         points = rays.points(row % height, column, reach_m[row, column])
         is_near = np.zeros(len(row), dtype=bool)
         for low, high in self._boxes:
@@ -119,8 +128,12 @@ def list_surface_changes(world: World, displacement: Displacement, before: Moved
 def _near_box(mesh: Mesh, corners: Float64Array, within_m: float) -> BoolArray:
     """Mark the faces (M,) of which the box comes within a distance of the box of some places (N, 3)."""
     low, high = corners.min(axis=0) - within_m, corners.max(axis=0) + within_m
-    is_below, is_above = mesh.vertices < low, mesh.vertices > high
-    return np.asarray(~(is_below[mesh.faces].all(axis=1) | is_above[mesh.faces].all(axis=1)).any(axis=1))
+    a, b, c = mesh.faces.T
+    is_off = np.zeros(len(mesh.faces), dtype=bool)
+    for axis in range(3):
+        for is_beyond in (mesh.vertices[:, axis] < low[axis], mesh.vertices[:, axis] > high[axis]):
+            is_off |= is_beyond[a] & is_beyond[b] & is_beyond[c]
+    return ~is_off
 
 
 def _cut(triangles: Float64Array, faces: Int64Array) -> tuple[Float64Array, Int64Array]:

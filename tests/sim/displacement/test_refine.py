@@ -58,5 +58,28 @@ def test_signed_distance_agrees_with_every_triangle_and_with_the_side() -> None:
     np.testing.assert_array_equal(found_m > 0, is_inside)
 
 
+@pytest.mark.parametrize("cell_m", [0.12, 0.7])
+def test_the_search_finds_the_closest_of_all_triangles_near_and_far(cell_m: float) -> None:
+    generator = np.random.default_rng(11)
+    x, y = np.meshgrid(np.arange(-3.0, 3.0, cell_m), np.arange(-3.0, 3.0, cell_m), indexing="ij")
+    n_rows, n_columns = x.shape
+    heights = 100.0 + 0.02 * x**2 + 0.4 * cell_m * generator.normal(size=x.shape)
+    corner = (np.arange(n_rows - 1)[:, None] * n_columns + np.arange(n_columns - 1)).ravel()
+    faces = [[corner, corner + n_columns, corner + 1], [corner + 1, corner + n_columns, corner + n_columns + 1]]
+    mesh = Mesh(
+        np.stack([x, y, heights], axis=-1).reshape(-1, 3),
+        np.concatenate([np.stack(each, axis=1) for each in faces]).astype(np.int32),
+    )
+    above_m = generator.choice([-1, 1], 80) * 8 ** generator.uniform(-3, 1, 80)
+    points = np.column_stack([generator.uniform(-4, 4, (80, 2)), 100.0 + above_m])
+    triangles = mesh.vertices[mesh.faces]
+    copies = [np.tile(point, (len(triangles), 1)) for point in points]
+    every_m = np.array([np.linalg.norm(closest_places(each, triangles) - each, axis=1).min() for each in copies])
+    found_m = np.abs(SignedDistance(mesh).measure(points))
+    np.testing.assert_array_equal(np.isnan(found_m), every_m > 5.0)
+    assert 0 < (every_m > 5.0).sum() < 20
+    np.testing.assert_allclose(found_m[every_m <= 5.0], every_m[every_m <= 5.0], atol=1e-9)
+
+
 def test_nothing_within_five_metres_is_nan() -> None:
     assert np.isnan(SignedDistance(room()).measure(np.array([[9.0, 0.0, 0.0]]))).all()
