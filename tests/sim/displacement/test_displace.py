@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,14 @@ from pydantic import ValidationError
 
 from cdpipe.core.errors import ScenarioError
 from scenarios.schema import (
+    Bolts,
     Drift,
+    Furniture,
     MeshFile,
+    Odometry,
+    Pipe,
     Place,
+    Platform,
     Prop,
     Scenario,
     Section,
@@ -28,7 +34,7 @@ from sim.geometry.topology import closed_volume_m3, edges_of
 from sim.rock.centreline import build_centreline
 from sim.rock.tunnel import mesh_tunnel
 from sim.scene import build_world
-from sim.session.simulate import HeldPair, simulate_in_memory, simulate_pair
+from sim.session.simulate import HeldPair, plan_drives, simulate, simulate_in_memory, simulate_pair
 from sim.session.truth import SESSIONS, read_chunk_surface, read_pair_truth
 
 
@@ -204,6 +210,55 @@ def test_props_on_a_floor_that_heaved_move_with_it_and_are_no_change(
     assert simulate_in_memory(scenario, 0).truth.changes == ()
 
 
+@pytest.mark.parametrize("depth_m", [0.04, 0.1])
+def test_furniture_follows_rock_that_converges(make_scenario: Callable[..., Scenario], depth_m: float) -> None:
+    squeezed = change("convergence", depth_m=depth_m, length_m=8.0, sector_deg=(45, 135))
+    hung = Furniture(pipes=(Pipe(diameter_m=0.16, side="left", height_share=0.5),), bolts=Bolts(spacing_m=1.5))
+    tunnel = smooth()["tunnel"].model_copy(update={"furniture": hung})
+    world = build_world(make_scenario(**smooth(tunnel=tunnel, surface=(squeezed,))), 3)
+    assert world.changed is not None and len(world.fixtures) > 1
+    for old, new in zip(world.fixtures, world.changed[3], strict=True):
+        places, moves = old.mesh.vertices, new.mesh.vertices - old.mesh.vertices
+        # the left wall comes in by the full depth over the inner half of the 8 m, and not at all beside them
+        is_middle = (np.abs(places[:, 0] - 10.0) < 1.0) & (places[:, 1] > 1.5) & (np.abs(places[:, 2] - 1.6) < 0.7)
+        is_beside = (np.abs(places[:, 0] - 10.0) > 5.5) | (places[:, 1] < 0.5)
+        assert is_middle.any() and is_beside.any(), old.name
+        np.testing.assert_allclose(moves[is_middle], np.tile([0.0, -depth_m, 0.0], (is_middle.sum(), 1)), atol=2e-3)
+        assert (moves[is_beside] == 0).all()
+
+
+def test_rubble_that_leaves_no_lane_is_refused_in_one_line(make_scenario: Callable[..., Scenario]) -> None:
+    fallen = change("scar", depth_m=0.3, length_m=2.0, sector_deg=(20, 60))
+    narrow = smooth()["tunnel"].model_copy(update={"section": Section(shape="rectangle", width_m=2.2, height_m=3.2)})
+    scenario = make_scenario(**smooth(tunnel=narrow, surface=(fallen,)))
+    with pytest.raises(ScenarioError, match=r"^after: the rubble of surface 'scar' bars the way") as refused:
+        plan_drives(scenario, 0)
+    assert "\n" not in str(refused.value)
+    # the session before the fall has its lane
+    still = scenario.model_copy(update={"surface": ()})
+    assert [drive.name for drive in plan_drives(still, 0)] == list(SESSIONS)
+
+
+def test_kiss_icp_registers_a_session_in_which_rock_moved(make_scenario: Callable[..., Scenario]) -> None:
+    pytest.importorskip("kiss_icp")
+    dense = {
+        "platform": Platform(scan_spacing_m=0.5),
+        "before": SessionPlan(route=("a", "b"), start_m=2.0, end_m=10.0, odometry=Odometry(source="kiss-icp")),
+        "surface": (change("convergence", 0.35),),
+    }
+    scenario = make_scenario(**dense)
+    held = simulate_in_memory(scenario, 5)
+    plain = scenario.model_copy(update={"before": SessionPlan(route=("a", "b"), start_m=2.0, end_m=10.0)})
+    known = simulate_in_memory(plain, 5)
+    estimated, drifting = held.sessions["before"], known.sessions["before"]
+    assert np.abs(estimated.session.odom_T_sensor - drifting.session.odom_T_sensor).max() > 1e-3
+    # the truth does not depend on who estimates the poses
+    for name in ("displacement", "surface_change", "instance", "world_T_sensor"):
+        np.testing.assert_array_equal(getattr(estimated, name), getattr(drifting, name))
+    assert (np.asarray(estimated.surface_change) == 1).sum() > 100
+    assert held.truth.surface_changes == known.truth.surface_changes
+
+
 def test_two_threads_write_the_same_bytes(make_scenario: Callable[..., Scenario], tmp_path: Path) -> None:
     surface = (change("convergence", 0.3), change("scar", 0.7))
     scenario = make_scenario(surface=surface)
@@ -224,6 +279,20 @@ def test_without_surface_changes_nothing_is_written(make_scenario: Callable[...,
     simulate_pair(scenario, 5, tmp_path / "pair")
     assert read_chunk_surface(tmp_path / "pair" / "before", 0) is None
     assert "surface_changes" not in (tmp_path / "pair" / "truth" / "changes.json").read_text()
+
+
+def test_an_empty_list_of_surface_changes_gives_the_bytes_of_none(tmp_path: Path) -> None:
+    short = ["before.start_m=2", "before.end_m=22", "after.start_m=2", "after.end_m=22", "sensor.mode=512x10"]
+    folders = []
+    for name, more in (("none", []), ("empty", ["surface=[]"])):
+        simulate("smoke/one_box", 10001, tmp_path / name, short + more)
+        files = sorted(path for path in (tmp_path / name).rglob("*") if path.is_file())
+        folders.append({path.relative_to(tmp_path / name).as_posix(): path.read_bytes() for path in files})
+    assert folders[0] == folders[1]
+    assert not [name for name in folders[0] if "surface" in name]
+    document = json.loads(folders[0]["truth/changes.json"])
+    assert set(document) == {"family", "seed", "score_radius_m", "changes", "scenario", "files"}
+    assert "surface" not in document["scenario"]
 
 
 def test_a_foreign_mesh_is_deformed_the_same_way(make_scenario: Callable[..., Scenario], tmp_path: Path) -> None:
