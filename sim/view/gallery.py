@@ -21,12 +21,14 @@ from cdpipe.core.geometry import Float64Array, stream, yaw_pose, yaw_rad
 from cdpipe.core.yamlfile import suggest
 from scenarios import load_scenario, scenario_names
 from scenarios.schema import Drift, Place, Prop, Roughness, Scenario, Section, SessionPlan, Tunnel
+from sim.displacement.displace import Displacement
 from sim.geometry.mesh import move_mesh
 from sim.geometry.raycast import Caster
 from sim.placement.placing import Posture, Standing, standing_box, standing_middle
-from sim.scene import Scene, World, build_world
+from sim.scene import WALL_GEOM, Scene, World, build_world
 from sim.session.simulate import plan_drives
 from sim.view.picture import render
+from sim.view.rock import STEPS_M, face_tints
 
 SEED = 20000
 SIZES: dict[str, tuple[float, float, float]] = {
@@ -49,6 +51,11 @@ _EYE_M = 1.6
 _FRACTIONS = (0.5, 0.4, 0.6, 0.3)
 _QUALITY = 82
 _FIRST_GUEST = 20_000  # number of the first mover or puddle of a picture
+_DARKER = ", ".join(f"{100 * step_m:g}" for step_m in STEPS_M[1:])
+_ROCK_CAPTION = (
+    f"rock that moved: red into the void, blue into the rock, darker from {_DARKER} cm on; "
+    f"white less than {100 * STEPS_M[0]:g} cm"
+)
 Pixels = npt.NDArray[np.uint8]
 
 
@@ -84,26 +91,41 @@ def draw_gallery(out: Path, only: Sequence[str] = ()) -> list[Path]:
     written = []
     for name in [name for name in (*families, *SIZES) if not only or name in only]:
         is_prop = name in SIZES
-        pictures = prop_pictures(name) if is_prop else [(family_picture(load_scenario(name, SEED), SEED), "")]
+        pictures = prop_pictures(name) if is_prop else [_captioned(load_scenario(name, SEED), SEED)]
         written.append(out / f"{'prop' if is_prop else 'family'}-{name.replace('/', '-')}.jpg")
         _save(written[-1], pictures)
     return written
 
 
+def _captioned(scenario: Scenario, seed: int) -> tuple[Pixels, str]:
+    """Return the picture of a family, and what its colours mean where rock changed."""
+    return family_picture(scenario, seed), _ROCK_CAPTION if scenario.surface else ""
+
+
 def family_picture(scenario: Scenario, seed: int) -> Pixels:
     """Return a picture of a world in the after session, from the place that shows most of the changes.
 
-    With movers or puddles it shows most of these, movers where they are in the middle of the session.
+    With movers or puddles it shows most of these, movers where they are in the middle of the session. Rock that moved
+    is coloured by its displacement.
     """
     world = build_world(scenario, seed)
     if scenario.movers or scenario.puddles:
         scene, places = _with_guests(scenario, seed)
         return _best_view(world, scene, places, set(range(_FIRST_GUEST, _FIRST_GUEST + len(places))), nearest_m=5.0)
+    if world.displacement is not None:
+        return _best_view(world, world.after, _rock_places(world.displacement), set(), nearest_m=4.0)
     changed = [item for item in world.standing if item.prop.change != "none" and "after" in item.sessions]
     # a little above a low prop, so that walls and roof come into the picture
     targets = [standing_middle(item) + np.array([0.0, 0.0, 0.6]) for item in changed or world.standing]
     numbers = {prop.name: number for number, prop in enumerate(scenario.props, start=1)}
     return _best_view(world, world.after, targets, {numbers[item.prop.name] for item in changed})
+
+
+def _rock_places(displacement: Displacement) -> list[Float64Array]:
+    """Return the middle (3,) of each change of the after walls."""
+    walls = displacement.walls
+    faces = [walls.faces[displacement.label == patch.number] for patch in displacement.patches]
+    return [walls.after[each].mean(axis=(0, 1)) for each in faces]
 
 
 def _with_guests(scenario: Scenario, seed: int) -> tuple[Scene, list[Float64Array]]:
@@ -138,15 +160,23 @@ def _with_guests(scenario: Scenario, seed: int) -> tuple[Scene, list[Float64Arra
 def _best_view(
     world: World, scene: Scene, targets: Sequence[Float64Array], wanted: set[int], nearest_m: float = 3.0
 ) -> Pixels:
-    """Return a picture of a scene towards one of some places (3,), from where most of the wanted objects are seen."""
+    """Return a picture of a scene towards one of some places (3,), from where most of the wanted objects are seen.
+
+    Of rock that moved, every change is wanted, and coloured.
+    """
+    moved = world.displacement
+    label = None if moved is None else moved.label
+    tints = None if moved is None else face_tints(world)
+    if moved is not None:
+        wanted = wanted | {_FIRST_GUEST + patch.number for patch in moved.patches}
     stations = np.concatenate([line.points[::10] for line in world.centreline.drifts]) + np.array([0.0, 0.0, _EYE_M])
     views = [(stations[0], stations[1], -1.0)]
     for target in targets:
         distance_m = np.linalg.norm(stations - target, axis=1)
         eyes = stations[(distance_m > nearest_m) & (distance_m < nearest_m + 6.0)]
-        views += [(eye, target, _score(scene, eye, target, wanted)) for eye in eyes]
+        views += [(eye, target, _score(scene, eye, target, wanted, label)) for eye in eyes]
     eye, target, _ = max(views, key=lambda view: view[2])
-    return render(scene, eye, target, *_FAMILY_PX, field_of_view_deg=78.0, samples=2)
+    return render(scene, eye, target, *_FAMILY_PX, field_of_view_deg=78.0, samples=2, tints=tints)
 
 
 def prop_pictures(kind: str) -> list[tuple[Pixels, str]]:
@@ -222,8 +252,18 @@ def _close_up(world: World, scene: Scene, item: Standing) -> Pixels:
     return render(scene, eye, middle, *_SHEET_PX, field_of_view_deg=field_deg, samples=3)
 
 
-def _score(scene: Scene, eye: Float64Array, target: Float64Array, wanted: set[int]) -> float:
-    """Return the score of a view: the number of changed props in it, and the area they cover."""
+def _score(
+    scene: Scene, eye: Float64Array, target: Float64Array, wanted: set[int], label: npt.NDArray[np.int16] | None
+) -> float:
+    """Return the score of a view: the number of changed props and patches of rock in it, and the area they cover.
+
+    Args:
+        scene: The scene.
+        eye: (3,) the camera.
+        target: (3,) what it looks at.
+        wanted: Instances; of a patch of rock its number plus that of the first guest.
+        label: (M,) number of the patch that each face of the walls belongs to, 0 for none; None where no rock moved.
+    """
     forward = (target - eye) / np.linalg.norm(target - eye)
     side = np.cross(forward, (0.0, 0.0, 1.0))
     up = np.cross(side, forward)
@@ -234,6 +274,10 @@ def _score(scene: Scene, eye: Float64Array, target: Float64Array, wanted: set[in
     if np.isinf(ranges_m).any() or (ranges_m < 0.4).mean() > 0.02:
         return -1.0
     seen = scene.instance[geom]
+    if label is not None:
+        _, _, face = scene.caster.faces(eye, rays)
+        patch = np.where(geom == WALL_GEOM, label[np.where(geom == WALL_GEOM, face, 0)], 0)
+        seen = np.where(patch > 0, _FIRST_GUEST + patch, seen)
     sizes = [min(float((seen == number).mean()), 0.15) for number in wanted]
     return sum(1.0 + 20.0 * size for size in sizes if size > 0.003) + 0.1 * len(set(seen.tolist()))
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import Float32Array, Float64Array, stream
-from sim.scene import Scene
+from sim.scene import WALL_GEOM, Scene
 
 COLOURS: dict[str, tuple[float, float, float]] = {
     "rock": (0.50, 0.47, 0.43),
@@ -39,6 +39,7 @@ def render(
     height: int = 480,
     field_of_view_deg: float = 70.0,
     samples: int = 1,
+    tints: Float64Array | None = None,
 ) -> npt.NDArray[np.uint8]:
     """Return a picture (height, width, 3) of a scene.
 
@@ -50,6 +51,7 @@ def render(
         height: Pixels down.
         field_of_view_deg: Horizontal.
         samples: Rays across and down each pixel; more rays smooth edges and shadows.
+        tints: (M, 3) linear RGB colour of every face of the walls, NaN for the colour of rock; None for rock alone.
     """
     eye_m = np.asarray(eye, dtype=np.float64)
     forward, right, down = _axes(np.asarray(target, dtype=np.float64) - eye_m)
@@ -64,7 +66,7 @@ def render(
     colours = part_colours(scene)
     generator = stream(0, "picture")
     chunks = np.split(directions, range(_CHUNK, len(directions), _CHUNK))
-    light = np.concatenate([_shaded(scene, eye_m, lamp_m, chunk, colours, generator) for chunk in chunks])
+    light = np.concatenate([_shaded(scene, eye_m, lamp_m, chunk, colours, generator, tints) for chunk in chunks])
     pixels = light.reshape(height, samples, width, samples, 3).mean(axis=(1, 3))
     return np.asarray(np.clip(pixels, 0.0, 1.0) ** (1 / 2.2) * 255, dtype=np.uint8)
 
@@ -87,6 +89,7 @@ def _shaded(
     directions: Float64Array,
     colours: Float64Array,
     generator: np.random.Generator,
+    tints: Float64Array | None,
 ) -> Float64Array:
     """Return the linear light (N, 3) that the camera receives from each direction."""
     ranges_m, geom, normals = scene.caster.hits(eye_m, directions)
@@ -105,7 +108,13 @@ def _shaded(
     # a little more light from above than from below
     around = _openness(scene, points, facing, generator) * (0.8 + 0.2 * facing[:, 2])
     fog = 1.0 / (1.0 + (distance_m / 25.0) ** 2)
-    light[seen] = colours[geom[seen]] * (1.9 * lamp + 0.6 * around**1.4 * fog)[:, None]
+    own = colours[geom[seen]]
+    if tints is not None:
+        _, geom_again, face = scene.caster.faces(eye_m, directions[seen])
+        wall = np.flatnonzero(geom_again == WALL_GEOM)
+        tint = tints[face[wall]]
+        own[wall] = np.where(np.isfinite(tint), tint, own[wall])
+    light[seen] = own * (1.9 * lamp + 0.6 * around**1.4 * fog)[:, None]
     return light
 
 

@@ -25,13 +25,16 @@ from sim.movers.planning import plan_movers
 from sim.placement.placing import Standing, standing_box
 from sim.placement.puddles import lay_puddles
 from sim.props.shapes import solid_mesh
-from sim.scene import World, build_world
+from sim.scene import WALL_GEOM, World, build_world
 from sim.session.truth import SESSIONS, PairTruth, SessionName, read_pair_truth, read_true_poses
 from sim.view.picture import material_colour
 from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Revolutions, Rgb, session_cloud
+from sim.view.rock import ROCK_RGB, class_name, displacement_classes
 
 _N_BANDS = 10
 _WATER_RGB: Rgb = (70, 120, 170)
+# Groups of the rock that changes between the sessions.
+ROCK_BEFORE, ROCK_AFTER = "rock/before", "rock/after"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,8 +74,10 @@ class View:
 
     Attributes:
         title: Its heading.
-        bands: The walls in bands of height above the floor, lowest first; each ends where the next begins.
-        surfaces: Fixtures, unchanged props, changed props, movers and puddles.
+        bands: The walls in bands of height above the floor, lowest first; each ends where the next begins. Rock that
+            changes is not among them.
+        surfaces: Fixtures, unchanged props, changed props, movers, puddles, and rock that changes: as it was, and as
+            it is in the after session by class of displacement.
         lines: Paths of the sensor, and the stretches on which movers go to and fro.
         clouds: Returns of sessions.
         labels: Names of the props.
@@ -310,8 +315,28 @@ def _world_view(
         for placed in movers
         if placed.body.course.is_moving
     ]
-    surfaces, all_lines = (*fixtures, *props, *moving, *puddles), (*lines, *stretches)
+    rock = _rock_surfaces(world)
+    surfaces, all_lines = (*fixtures, *props, *moving, *puddles, *rock), (*lines, *stretches)
+    if world.displacement is not None:
+        wall = Mesh(wall.vertices, wall.faces[world.displacement.label == 0])
+        if not changed and len(rock) > 1:
+            target = rock[-1].mesh.vertices.mean(axis=0)
+            eye = target + np.array([-6.0, -6.0, 8.0])
     return View(title, wall_bands(wall, floor_points), surfaces, all_lines, clouds, labels, eye, target, notes)
+
+
+def _rock_surfaces(world: World) -> list[Surface]:
+    """Return the rock that changes as it was before, in the colour of rock, and as it is after, by its displacement."""
+    if world.displacement is None:
+        return []
+    before, after = world.before.meshes[WALL_GEOM], world.after.meshes[WALL_GEOM]
+    was = drop_unused_vertices(before.vertices, before.faces[world.displacement.label > 0])
+    surfaces = [Surface(ROCK_BEFORE + "/rock", was, _rgb(material_colour("wall", "rock")))]
+    classes = displacement_classes(world)
+    for number in np.unique(classes[classes >= 0]).tolist():
+        mesh = drop_unused_vertices(after.vertices, after.faces[classes == number])
+        surfaces.append(Surface(f"{ROCK_AFTER}/{class_name(number)}", mesh, ROCK_RGB[number]))
+    return surfaces
 
 
 def _puddle_surfaces(world: World, scenario: Scenario, seed: int) -> list[Surface]:

@@ -17,7 +17,7 @@ import numpy as np
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import visible
 from sim.view.returns import CHANGE_RGB, SESSION_RGB
-from sim.view.view import Play, View
+from sim.view.view import ROCK_AFTER, ROCK_BEFORE, Play, View
 
 _MISSING = "the viewer needs viser: pip install 'tunnelcd[view]'"
 # Of the player: the share of the drives at first, the step, and the pause after a step.
@@ -119,7 +119,7 @@ def _add_nodes(server: Any, view: View) -> dict[str, Any]:
     for surface in (*view.bands, *view.surfaces):
         mesh = surface.mesh
         # Walls are one-sided, so that the camera sees through the near wall from outside.
-        side = "front" if surface.name.startswith("walls/") else "double"
+        side = "front" if surface.name.startswith(("walls/", "rock/")) else "double"
         handles[surface.name] = scene.add_mesh_simple(
             f"/{surface.name}",
             mesh.vertices,
@@ -130,6 +130,8 @@ def _add_nodes(server: Any, view: View) -> dict[str, Any]:
             cast_shadow=False,
             receive_shadow=False,
         )
+    if ROCK_BEFORE in handles:
+        handles[ROCK_BEFORE].visible = False  # it lies in front of rock that fell out
     for line in view.lines:
         pairs = np.stack([line.points[:-1], line.points[1:]], axis=1).astype(np.float32)
         handles[line.name] = scene.add_line_segments(f"/{line.name}", pairs, line.rgb, thickness=0.06)
@@ -226,11 +228,11 @@ def _add_switch(gui: Any, group: str, handle: Any) -> None:
 
 
 def _switched(handles: dict[str, Any]) -> list[str]:
-    """Return the groups with a switch: the outermost, and for fixtures, changes, movers and paths the level below."""
+    """Return the groups with a switch: the outermost, and of those that have sessions or kinds the level below."""
     inner = [name for name in handles if name.count("/") == 1]
-    split = ("fixtures", "changes", "movers", "paths", "returns", "revolution")
+    split = ("fixtures", "changes", "movers", "rock", "paths", "returns", "revolution")
     groups = [name for name in handles if "/" not in name and name not in split]
-    kinds = sorted(name for name in inner if name.startswith(("fixtures/", "changes/", "movers/")))
+    kinds = sorted(name for name in inner if name.startswith(("fixtures/", "changes/", "movers/", "rock/")))
     return [*groups, *kinds, *(name for name in inner if name.startswith("paths/"))]
 
 
@@ -240,5 +242,8 @@ def _legend(view: View) -> str:
     sessions = [name for name in SESSION_RGB if any(line.name == f"paths/{name}" for line in view.lines)]
     colours = [(CHANGE_RGB[kind], kind) for kind in kinds] + [(SESSION_RGB[name], f"path {name}") for name in sessions]
     head = f"**{markdown_text(view.title)}**", " ".join(swatch.format(rgb, name) for rgb, name in colours)
-    lines = [*head, *map(markdown_text, view.notes)]
+    rock = [part for part in view.surfaces if part.name.startswith(f"{ROCK_AFTER}/")]
+    told = " ".join(swatch.format(part.rgb, PurePosixPath(part.name).name) for part in rock)
+    moved = f"rock moved, + into the void: {told}" if rock else ""
+    lines = [*head, moved, *map(markdown_text, view.notes)]
     return "\n\n".join(line for line in lines if line)

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from scenarios import load_scenario
-from scenarios.schema import Prop, Scenario
+from scenarios.schema import Prop, Scenario, SurfaceChange, SurfacePlace
 from sim.materials import REFLECTIVITY
 from sim.scene import Scene, build_world
 from sim.view import gallery
 from sim.view.picture import COLOURS, material_colour, part_colours, render
+from sim.view.rock import face_tints
 
 EYE, TARGET = (5.0, 0.0, 0.5), (8.0, 0.0, 0.3)
 
@@ -105,6 +106,32 @@ def test_the_gallery_shows_a_family_and_a_prop_from_two_metres(
         ranges_m, geom, _ = scene.caster.cast(eye[None], ray[None])
         assert scene.instance[geom[0]] == 1
         assert 1.5 < ranges_m[0] < 2.9
+
+
+def test_rock_that_came_in_is_red_and_rock_that_fell_out_blue_in_the_picture(
+    make_scenario: Callable[..., Scenario], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gallery, "_FAMILY_PX", (160, 100))
+    place = SurfacePlace(between=("a", "b"), fraction=0.6)
+    for kind, sign in (("convergence", 1), ("scar", -1)):
+        change = SurfaceChange(name=kind, kind=kind, depth_m=0.3, sector_deg=(-40, 40), place=place)
+        scenario = make_scenario(surface=(change,))
+        world = build_world(scenario, 0)
+        tints = face_tints(world)
+        (own, *_) = (patch.number for patch in world.displacement.patches)  # type: ignore[union-attr]
+        is_own = world.displacement.label == own  # type: ignore[union-attr]
+        assert np.isfinite(tints[is_own]).all()
+        assert np.isnan(tints[world.displacement.label == 0]).all()  # type: ignore[union-attr]
+        eye, roof = (8.0, 0.0, 1.0), (12.0, 0.0, 3.0)
+        plain, tinted = (render(world.after, eye, roof, 120, 90, tints=each).astype(int) for each in (None, tints))
+        is_tinted = (plain != tinted).any(axis=2)
+        redness = sign * (tinted[..., 0] - tinted[..., 2])[is_tinted]
+        assert is_tinted.sum() > 500 and (redness > 20).mean() > 0.5 and (redness > -20).all()
+        pixels, caption = gallery._captioned(scenario, 0)
+        # of a scar the picture shows the rubble, which is red
+        redness = pixels[..., 0].astype(int) - pixels[..., 2]
+        assert (redness > 60).mean() > 0.01 and "red into the void" in caption
+    assert gallery._captioned(make_scenario(), 0)[1] == ""
 
 
 def test_a_picture_of_a_family_shows_its_movers_and_puddles() -> None:

@@ -19,7 +19,7 @@ from cdpipe.io.session import read_session
 from eval.cli.main import main
 from eval.cli.world import load_view
 from scenarios import load_scenario
-from scenarios.schema import MeshFile, Mover, Place, Prop, Scenario, Shift, Tunnel
+from scenarios.schema import MeshFile, Mover, Place, Prop, Scenario, Shift, SurfaceChange, SurfacePlace, Tunnel
 from sim.geometry.mesh import Mesh
 from sim.scene import build_world
 from sim.session.simulate import simulate, simulate_pair
@@ -158,6 +158,44 @@ def test_the_player_shows_one_revolution_and_its_second_returns(server: Any, tmp
     alone = view_session(tmp_path / "pair" / "after")
     assert alone.play is not None
     assert {cloud.name for cloud in alone.play(1.0)[1]} == {"revolution/session", "revolution/session second"}
+
+
+def test_rock_that_moved_is_shown_by_its_displacement_and_switched(
+    server: Any, make_scenario: Callable[..., Scenario]
+) -> None:
+    surface = (
+        SurfaceChange(name="heaved", kind="heave", depth_m=0.1, place=SurfacePlace(between=("a", "b"), fraction=0.3)),
+        SurfaceChange(name="fell", kind="scar", depth_m=0.3, place=SurfacePlace(between=("a", "b"), fraction=0.7)),
+    )
+    scenario = make_scenario(surface=surface)
+    shown = view_scenario(scenario, 3)
+    parts = named(shown)
+    after = {name.rpartition("/")[2]: part for name, part in parts.items() if name.startswith("rock/after/")}
+    # the floor came up by 10 cm, the scar is 30 cm deep at most and its rubble higher than 20 cm
+    assert {"+5 to +20 cm", "-20 cm and more", "+20 cm and more", "less than 0.5 cm"} <= after.keys()
+    assert {part.rgb[0] > part.rgb[2] for name, part in after.items() if name.startswith("+")} == {True}
+    assert {part.rgb[0] < part.rgb[2] for name, part in after.items() if name.startswith("-")} == {True}
+    assert (np.abs(after["-20 cm and more"].mesh.vertices[:, 0] - 14.0) < 1.5).all()
+    assert np.abs(after["+5 to +20 cm"].mesh.vertices[:, 0] - 6.0).min() < 0.3
+    assert after["-20 cm and more"].mesh.vertices[:, 2].min() > 1.0  # it fell out of wall or roof
+    # each face of the walls is shown once, before and after
+    world = build_world(scenario, 3)
+    n_still = sum(len(band.mesh.faces) for band in shown.bands)
+    assert n_still + len(parts["rock/before/rock"].mesh.faces) == len(world.before.meshes[0].faces)
+    assert n_still + sum(len(part.mesh.faces) for part in after.values()) == len(world.after.meshes[0].faces)
+    legend = viewer._legend(shown)
+    assert all(f'rgb{part.rgb}">■</span> {name}' in legend for name, part in after.items())
+    show(server, shown)
+    switches = {handle.label: handle for handle in server.gui._gui_input_handle_from_uuid.values()}
+    for group, at_first in (("rock/before", False), ("rock/after", True)):
+        assert server.scene.get_handle_by_name(f"/{group}").visible is switches[group].value is at_first
+        flip(switches[group], not at_first)
+        assert server.scene.get_handle_by_name(f"/{group}").visible is not at_first
+
+
+def test_without_rock_that_moved_nothing_of_it_is_shown(shown: View) -> None:
+    assert not [name for name in named(shown) if name.startswith("rock")]
+    assert "rock" not in viewer._legend(shown)
 
 
 def test_movers_that_find_no_way_are_a_note(make_scenario: Callable[..., Scenario]) -> None:
