@@ -7,6 +7,7 @@ from the first to the second node of `between` (drawn places: as driven); of a s
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import Field, SerializerFunctionWrapHandler, field_serializer, model_serializer, model_validator
@@ -26,6 +27,22 @@ PropKind = Literal[
     "box", "crate", "chair", "trolley", "barrel", "cone", "railing", "pallet", "rock", "vehicle", "muck_pile", "mesh"
 ]
 PROP_KINDS: tuple[str, ...] = get_args(PropKind)
+
+
+def _with_usual(given: Any, usual: Mapping[str, Mapping[str, Any]]) -> Any:
+    """Return what is given of a thing of several kinds, with the usual values of the keys that its kind has."""
+    if not isinstance(given, dict):
+        return given
+    said = {key: value for key, value in given.items() if value is not None}
+    return {**usual.get(str(given.get("kind")), {}), **said}
+
+
+def _refuse_others(thing: Any, usual: Mapping[str, Mapping[str, Any]], what: str) -> None:
+    """Raise `ValueError` where a thing says a key that other kinds have and its own has not."""
+    known = {key for keys in usual.values() for key in keys}
+    said = sorted(key for key in known - usual[thing.kind].keys() if getattr(thing, key) is not None)
+    if said:
+        raise ValueError(f"{what}: a {thing.kind} has no {', '.join(said)}: leave that out")
 
 
 class Lean(Settings):
@@ -645,17 +662,11 @@ class SurfaceChange(Settings):
     @model_validator(mode="before")
     @classmethod
     def _fill_in(cls, given: Any) -> Any:
-        if not isinstance(given, dict):
-            return given
-        said = {key: value for key, value in given.items() if value is not None}
-        return {**USUAL_SURFACES.get(str(given.get("kind")), {}), **said}
+        return _with_usual(given, USUAL_SURFACES)
 
     @model_validator(mode="after")
     def _keys_of_its_kind(self) -> SurfaceChange:
-        known = {key for keys in USUAL_SURFACES.values() for key in keys}
-        said = sorted(key for key in known - USUAL_SURFACES[self.kind].keys() if getattr(self, key) is not None)
-        if said:
-            raise ValueError(f"surface {self.name!r}: a {self.kind} has no {', '.join(said)}: leave that out")
+        _refuse_others(self, USUAL_SURFACES, f"surface {self.name!r}")
         if self.sector_deg is not None and not 5 <= self.sector_deg[1] - self.sector_deg[0] <= 360:
             raise ValueError(f"surface {self.name!r}: sector_deg: from and to are 5 to 360 degrees apart, from first")
         if self.kind == "face" and (self.place.between or self.place.area):
@@ -686,17 +697,11 @@ class Mover(Lean):
     @model_validator(mode="before")
     @classmethod
     def _fill_in(cls, given: Any) -> Any:
-        if not isinstance(given, dict):
-            return given
-        said = {key: value for key, value in given.items() if value is not None}
-        return {**USUAL_MOVERS.get(str(given.get("kind")), {}), **said}
+        return _with_usual(given, USUAL_MOVERS)
 
     @model_validator(mode="after")
     def _keys_of_its_kind(self) -> Mover:
-        known = {key for keys in USUAL_MOVERS.values() for key in keys}
-        said = sorted(key for key in known - USUAL_MOVERS[self.kind].keys() if getattr(self, key) is not None)
-        if said:
-            raise ValueError(f"mover {self.name!r}: a {self.kind} has no {', '.join(said)}: leave that out")
+        _refuse_others(self, USUAL_MOVERS, f"mover {self.name!r}")
         if self.dust_mg_per_m is not None and self.kind not in ("forklift", "loader"):
             raise ValueError(f"mover {self.name!r}: a {self.kind} raises no dust: leave dust_mg_per_m out")
         if self.speed_mps == 0 and self.kind != "person":

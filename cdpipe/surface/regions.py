@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Float64Array, Int32Array
+from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array
 from cdpipe.core.groups import label_groups
 from cdpipe.model.report import SurfaceRegion
 from cdpipe.surface.places import SurfacePlaces
@@ -40,11 +40,9 @@ def group_regions(
     if len(known) == 0:
         return region, ()
     smoothed_m, smoothed_level_m = _smooth(places.points[known], along_m[known], level_m[known])
-    moved = known[np.abs(smoothed_m) > np.maximum(smoothed_level_m, least_m)]
-    signs = np.sign(smoothed_m[np.abs(smoothed_m) > np.maximum(smoothed_level_m, least_m)])
-    found: list[tuple[SurfaceRegion, np.ndarray]] = []
-    for sign in (1.0, -1.0):
-        own = moved[signs == sign]
+    beyond_m = np.maximum(smoothed_level_m, least_m)
+    found: list[tuple[SurfaceRegion, Int64Array]] = []
+    for own in (known[smoothed_m > beyond_m], known[smoothed_m < -beyond_m]):
         labels, sizes = label_groups(places.points[own], _LINK * spacing_m)
         for label in range(len(sizes)):
             members = own[labels == label]

@@ -81,7 +81,9 @@ def detect(
     verdict = "accepted" if known is None else "known, not judged"
     print_table(f"merge: {verdict}", _evidence_table(report.evidence, config))
     print_table("regions (map frame = the before session's odometry)", report.to_pandas("regions"))
-    if not report.regions.is_reported.any():
+    if report.regions.is_proposed.any() and not report.regions.is_reported.any():
+        echo("every region is withdrawn: none holds an object of its own", "")
+    elif not report.regions.is_reported.any():
         scores = report.regions.scores
         echo(
             f"nothing reaches query.threshold = {config.query.threshold:g}; "

@@ -115,14 +115,22 @@ def _from_trimesh(solid: trimesh.Trimesh) -> Mesh:
 
 def split_triangles(triangles: Float64Array, edge_m: float) -> Float64Array:
     """Halve triangles at their longest edge until none is longer than `edge_m`; the surface stays the same."""
-    done = []
+    return cut_triangles(triangles, edge_m)[0]
+
+
+def cut_triangles(triangles: Float64Array, edge_m: float) -> tuple[Float64Array, Int64Array]:
+    """Return the pieces (K, 3, 3) of `split_triangles`, and the triangle (K,) that each was a part of."""
+    owners = np.arange(len(triangles))
+    done, done_owners = [triangles[:0]], [owners[:0]]
     while len(triangles):
         lengths = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2)
         is_long = lengths.max(axis=1) > edge_m
         done.append(triangles[~is_long])
-        triangles, longest = triangles[is_long], np.argmax(lengths[is_long], axis=1)
+        done_owners.append(owners[~is_long])
+        triangles, owners, longest = triangles[is_long], owners[is_long], np.argmax(lengths[is_long], axis=1)
         rows = np.arange(len(triangles))
         a, b, c = (triangles[rows, (longest + shift) % 3] for shift in range(3))
         middle = (a + b) / 2
         triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-    return np.concatenate(done) if done else triangles
+        owners = np.concatenate([owners, owners])
+    return np.concatenate(done), np.concatenate(done_owners)

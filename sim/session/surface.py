@@ -7,7 +7,7 @@ import numpy as np
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from sim.displacement.displace import MOVED_M, Displacement
 from sim.displacement.measure import FARTHEST_M, SignedDistance
-from sim.geometry.mesh import Mesh
+from sim.geometry.mesh import Mesh, cut_triangles
 from sim.geometry.raycast import Caster
 from sim.scene import WALL_GEOM, World
 from sim.sensor.lidar import Scan
@@ -98,8 +98,8 @@ def list_surface_changes(world: World, displacement: Displacement, before: Moved
     found = []
     for patch in displacement.patches:
         faces = np.flatnonzero(displacement.label == patch.number)
-        pieces, owners = _cut(wall.vertices[wall.faces[faces]], faces)
-        moved_m = before.measure(pieces.mean(axis=1), owners)
+        pieces, owners = cut_triangles(wall.vertices[wall.faces[faces]], _PIECE_M)
+        moved_m = before.measure(pieces.mean(axis=1), faces[owners])
         area_m2 = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1) / 2
         corners = np.unique(wall.faces[faces])
         corner_face = _face_of(wall, faces, corners)
@@ -134,23 +134,6 @@ def _near_box(mesh: Mesh, corners: Float64Array, within_m: float) -> BoolArray:
         for is_beyond in (mesh.vertices[:, axis] < low[axis], mesh.vertices[:, axis] > high[axis]):
             is_off |= is_beyond[a] & is_beyond[b] & is_beyond[c]
     return ~is_off
-
-
-def _cut(triangles: Float64Array, faces: Int64Array) -> tuple[Float64Array, Int64Array]:
-    """Return pieces (K, 3, 3) of triangles (N, 3, 3), cut at longest edges above 0.2 m, and the face (K,) of each."""
-    pieces, owners = [triangles[:0]], [faces[:0]]
-    while len(triangles):
-        lengths_m = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2)
-        is_long = lengths_m.max(axis=1) > _PIECE_M
-        pieces.append(triangles[~is_long])
-        owners.append(faces[~is_long])
-        triangles, faces, longest = triangles[is_long], faces[is_long], lengths_m[is_long].argmax(axis=1)
-        rows = np.arange(len(triangles))
-        a, b, c = (triangles[rows, (longest + turn) % 3] for turn in range(3))
-        middle = (a + b) / 2
-        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-        faces = np.concatenate([faces, faces])
-    return np.concatenate(pieces), np.concatenate(owners)
 
 
 def _face_of(mesh: Mesh, faces: Int64Array, corners: Int32Array) -> Int64Array:

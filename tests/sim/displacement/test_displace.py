@@ -35,7 +35,7 @@ from sim.rock.centreline import build_centreline
 from sim.rock.tunnel import mesh_tunnel
 from sim.scene import build_world
 from sim.session.simulate import HeldPair, plan_drives, simulate, simulate_in_memory, simulate_pair
-from sim.session.truth import SESSIONS, read_chunk_surface, read_pair_truth
+from sim.session.truth import SESSIONS, SessionName, read_chunk_surface, read_pair_truth
 
 
 def at(fraction: float) -> SurfacePlace:
@@ -140,9 +140,9 @@ def heaved_fixture(make_scenario: Callable[..., Scenario]) -> HeldPair:
     return simulate_in_memory(make_scenario(**smooth(surface=(lift,))), 0)
 
 
-def true_points(pair: HeldPair, session: str) -> tuple[np.ndarray, np.ndarray]:
+def true_points(pair: HeldPair, session: SessionName) -> tuple[np.ndarray, np.ndarray]:
     """Return true places (N, 3) of the returns of a session without noise, and their displacement (N,)."""
-    labelled = pair.sessions[session]  # type: ignore[index]
+    labelled = pair.sessions[session]
     sensor = labelled.session.sensor
     points, moved = [], []
     for index in range(len(labelled.world_T_sensor)):
@@ -157,8 +157,10 @@ def true_points(pair: HeldPair, session: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("session", SESSIONS)
-def test_a_floor_that_rose_says_so_in_both_sessions_to_a_tenth_of_a_millimetre(heaved: HeldPair, session: str) -> None:
-    labelled = heaved.sessions[session]  # type: ignore[index]
+def test_a_floor_that_rose_says_so_in_both_sessions_to_a_tenth_of_a_millimetre(
+    heaved: HeldPair, session: SessionName
+) -> None:
+    labelled = heaved.sessions[session]
     assert labelled.displacement is not None and labelled.surface_change is not None
     moved_m = labelled.displacement[labelled.surface_change == 1]
     assert np.nanmin(moved_m) >= -1e-6
