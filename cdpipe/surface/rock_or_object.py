@@ -1,8 +1,8 @@
 """Which of the extracted objects are rock: an object is no change of the rock, and rock is no object.
 
 What came or went looks alike to the extraction. Two things tell them apart. Rock that fell was flush with the rock
-around it, and an object stood out of it. Rubble lies below the place that it fell from. And no object covers the floor
-as fill or a heave does.
+around it, and an object stood out of it. Rubble lies below the place that it fell from. And no object rises as gently
+over a wide floor as a heave or the ramp of fill does.
 """
 
 from __future__ import annotations
@@ -25,10 +25,13 @@ _AROUND_M, _STILL_M, _LEAST_AROUND = 0.7, 0.03, 5
 _FLUSH = 0.4
 _LEAST_DEPTH_M = 0.05
 # Rubble lies no farther than this from below the place that it fell from; that place has so many places at least.
-_BELOW_M, _LEAST_FALLEN = 2.0, 4
+_BELOW_M, _LEAST_FALLEN = 1.0, 4
 _HIGH_SHARE = 90
-# Floor that the largest vehicle covers.
-_WIDEST_M2 = 15.0
+# Floor that the largest vehicle covers. A heave may cover less: its displacement, over places this far apart, rises by
+# less than this per metre nearly everywhere. Muck lies at 0.7 and more, the side of an object is upright.
+_WIDEST_M2, _WIDE_M2 = 15.0, 3.0
+_APART_M, _GENTLE, _NEARLY = (0.2, 0.6), 0.5, 95
+_RAMP_M = 0.5
 
 
 def split_rock(
@@ -59,8 +62,8 @@ def split_rock(
     fallen = np.flatnonzero((along_m < -_LEAST_DEPTH_M) & ~is_of_object)
     for number, (item, own) in enumerate(zip(objects, members, strict=True)):
         if item.session == "after":
-            is_wide = places.areas_m2[own].sum() > _WIDEST_M2
-            is_rock[number] = is_wide or _is_below(item.points_map, places.points[fallen])
+            is_floor = _is_floor(places, along_m, own)
+            is_rock[number] = is_floor or _is_below(item.points_map, places.points[fallen])
             is_of_object[own] |= not is_rock[number]
     return is_rock, is_of_object
 
@@ -110,6 +113,19 @@ def _was_flush(places: SurfacePlaces, along_m: Float64Array, own: Int64Array, st
     offsets = places.points[own] - places.points[nearest]
     stood_out_m = np.einsum("ij,ij->i", offsets, places.normals[nearest])
     return float(np.percentile(stood_out_m, _HIGH_SHARE)) < _FLUSH * float(np.percentile(depths_m, _HIGH_SHARE))
+
+
+def _is_floor(places: SurfacePlaces, along_m: Float64Array, own: Int64Array) -> bool:
+    """Tell whether places are covered too widely, or too gently, for an object."""
+    area_m2 = float(places.areas_m2[own].sum())
+    if not _WIDE_M2 < area_m2 < _WIDEST_M2:
+        return area_m2 >= _WIDEST_M2
+    known = np.flatnonzero(np.isfinite(along_m))
+    near = known[np.isfinite(cKDTree(places.points[own]).query(places.points[known], distance_upper_bound=_RAMP_M)[0])]
+    one, other = cKDTree(places.points[near]).query_pairs(_APART_M[1], output_type="ndarray").T
+    apart_m = np.linalg.norm(places.points[near[one]] - places.points[near[other]], axis=1)
+    rise = np.abs(along_m[near[one]] - along_m[near[other]])[apart_m > _APART_M[0]] / apart_m[apart_m > _APART_M[0]]
+    return len(rise) > 0 and float(np.percentile(rise, _NEARLY)) < _GENTLE
 
 
 def _is_below(points: Float64Array, fallen: Float64Array) -> bool:

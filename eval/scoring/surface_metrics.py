@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray
 from cdpipe.io.answer import Answer
 from cdpipe.model.report import SurfaceField
 from eval.core.statistics import mean, median
@@ -146,7 +145,7 @@ def _score_change(
     n_core = int(np.count_nonzero(is_core))
     share = mean(is_claimed[is_core].astype(np.float64))
     is_observable = n_core >= MIN_CORE_PLACES
-    volume_m3 = 0.0 if surface is None else _answered_volume(surface, said, places, is_its & is_claimed, sign)
+    volume_m3 = 0.0 if surface is None else _answered_volume(surface, said, places, change.id, sign)
     return {
         "surface_change": change.id,
         "name": change.name,
@@ -170,15 +169,15 @@ def _score_change(
 
 
 def _answered_volume(
-    surface: SurfaceField, said: SurfaceAnswer, places: SurfacePlaces, is_its: BoolArray, sign: float
+    surface: SurfaceField, said: SurfaceAnswer, places: SurfacePlaces, change: int, sign: float
 ) -> float:
     """Return the summed volume of the regions of one sign that hold more places of this change than of any other."""
     total_m3 = 0.0
-    for region in np.unique(said.region[is_its]):
-        n_of_change = np.bincount(places.change[(said.region == region) & places.is_changed])
-        n_of_change[:1] = 0  # changed places of no change belong to nobody
-        n_its = int(np.count_nonzero(is_its & (said.region == region)))
+    is_held = places.is_judged & places.is_changed & (said.region >= 0)
+    for region in np.unique(said.region[is_held & (places.change == change)]):
+        n_of_change = np.bincount(places.change[is_held & (said.region == region)])
+        n_of_change[0] = 0  # changed places of no change belong to nobody
         volume_m3 = surface.regions[region].volume_m3
-        if n_its == n_of_change.max(initial=0) and np.sign(volume_m3) == sign:
+        if n_of_change[change] == n_of_change.max() and np.sign(volume_m3) == sign:
             total_m3 += volume_m3
     return total_m3

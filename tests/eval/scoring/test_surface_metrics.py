@@ -177,6 +177,18 @@ def test_every_figure_by_hand() -> None:
     assert one["area_m2"] == 64 * CELL_M2
 
 
+def test_the_volume_of_a_region_counts_where_single_places_in_it_have_the_wrong_sign_or_were_not_seen() -> None:
+    truth = wall_truth({1: (5, 1, 2, 2, -0.1), 2: (9, 1, 1, 1, -0.2)}, kinds={1: "scar", 2: "scar"})
+    field = true_field(truth)
+    (first, *_), displacement = np.flatnonzero(field.region == 0), field.displacement_m.copy()
+    displacement[first] = 0.002
+    one_region = np.where(field.region == 1, 0, field.region).astype(np.int32)  # holds both: it is the larger one's
+    for region, wanted in ((field.region, [-0.4, -0.2]), (one_region, [-0.4, 0.0])):
+        answer = replace(field, displacement_m=displacement, region=region)
+        volumes = [row["answered_volume_m3"] for row in score_field(truth, answer).surface_changes]
+        assert volumes == pytest.approx(wanted)
+
+
 def test_columns_are_those_that_are_listed() -> None:
     truth = wall_truth({1: (5, 1, 2, 2, -0.1)})
     assert set(surface_columns(score_field(truth, true_field(truth)))) == {*COLUMNS}
