@@ -17,7 +17,7 @@ from eval.running.run_data import RunData, every_condition, number, off_grids, s
 from eval.running.runfolder import reported
 from eval.scoring.surface_windows import AREAS_M2
 from eval.tables.columns import Column, scaled, select, share, significant
-from eval.tables.rows import ALL_DOMAINS, with_domain
+from eval.tables.rows import ALL_DOMAINS, is_told_the_truth, with_domain
 from eval.tables.surface_limits import EDGES_M, MAGNITUDES_M
 from eval.tables.surface_table import limit_column
 
@@ -88,11 +88,13 @@ def _domains(limits: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     if len(limits) == 0:
         return []
     found = [(str(domain), own) for domain, own in limits.groupby("domain", sort=False)]
-    return [(domain, own) for domain, own in found if domain != ALL_DOMAINS]
+    own_merge = [(domain, own) for domain, own in found if not own["variant"].map(is_told_the_truth).all()]
+    return [(domain, own) for domain, own in own_merge if domain != ALL_DOMAINS]
 
 
 def _limits_chart(limits: pd.DataFrame, domain: str) -> Chart:
     """Draw the found share over the magnitude of the displacement, a panel for each area and a line for each method."""
+    limits = limits[~limits["variant"].map(is_told_the_truth).astype(bool)]
     names = [str(name) for name in limits["variant"].unique()]
     panels = [
         _limits_panel(limits[limits["area_m2"] == area], area, names, is_first=index == 0)
@@ -102,7 +104,8 @@ def _limits_chart(limits: pd.DataFrame, domain: str) -> Chart:
     caption = (
         "Share of the windows that are found, over the size of their mean displacement. The threshold of each method "
         "and area lets 5 % of its null windows pass. Bars: 95 % interval, session pairs drawn. "
-        f"{domain_name(domain).capitalize()}, {n_windows} windows; detection_limits.csv has every point."
+        f"{domain_name(domain).capitalize()}, {n_windows} windows; detection_limits.csv has every point, and those of "
+        "methods that were told the merge."
     )
     return Chart(f"detection_limits_{domain}", f"Detection limits, {domain_name(domain)}", Drawing([panels], 325),
                  caption, has_png=True)  # fmt: skip
