@@ -36,6 +36,7 @@ from cdpipe.mapping.airborne import clear
 from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.recorded_frames import regions_as_mapped, report_as_recorded
 from cdpipe.mapping.session_check import check_session, unit_hint
+from cdpipe.merge.coverage import measure_coverage
 from cdpipe.merge.merge import merge_maps, take_known_merge
 from cdpipe.methods.registry import list_extras, load_source
 from cdpipe.model.config import PipelineConfig, Site, load_config
@@ -126,7 +127,8 @@ def detect(
         report = detect_changes(*mapped.value, config, hooks, merge=merge)
     except MergeFailedError as error:
         raise MergeFailedError(f"{before.name} and {after.name}: {error}", error.evidence, error.seconds) from error
-    return replace(report, seconds={**report.seconds, **mapped.seconds})
+    coverage = measure_coverage(report, before.odom_T_sensor, after.odom_T_sensor)
+    return replace(report, seconds={**report.seconds, **mapped.seconds}, coverage=coverage)
 
 
 def describe(
