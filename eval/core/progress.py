@@ -96,8 +96,8 @@ class Lines(RunProgress):
         self._write(line, self._pace(done, total))
 
     def stage(self, name: str, done: int, total: int) -> None:
-        """Write the name, once."""
-        self._write(f"  {name}")
+        """Write the name, once; a step of a stage, `stage: step`, is not told."""
+        self._write(f"  {name.partition(': ')[0]}")
 
     def note(self, text: str) -> None:
         """Write the line."""

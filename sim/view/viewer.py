@@ -161,7 +161,7 @@ def _add_switches(server: Any, view: View, handles: dict[str, Any]) -> None:
     for group in _switched(handles):
         _add_switch(gui, group, handles[group])
     for cloud in view.clouds:
-        if not cloud.name.startswith("changes/"):  # objects, which are shown by their kind
+        if not cloud.name.startswith(("changes/", "displacement/")):  # their group has one switch
             _add_switch(gui, cloud.name, handles[cloud.name])
     if view.clouds and len(view.clouds[0].colours) > 1:
         choice = gui.add_dropdown("returns by", tuple(view.clouds[0].colours))

@@ -23,6 +23,7 @@ _FILLED = 0.8
 # Cell of the points of objects and of rock; that of rock grows until no more points are left.
 _OBJECT_CELL_M, _ROCK_CELL_M, _LARGER, _MAX_ROCK = 0.03, 0.1, 1.25, 50_000
 _LARGEST = 65_535
+MOVED_ROCK, ELSEWHERE = "rock that moved", "displacement elsewhere"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,10 +98,10 @@ def _rock(surface: SurfaceField | None) -> Iterator[Layer]:
     cell_m = _ROCK_CELL_M
     while len(thin(surface.points_map[is_known], cell_m)) > _MAX_ROCK:
         cell_m *= _LARGER
-    for group, chosen in (("rock that moved", is_moved & is_known), ("displacement elsewhere", ~is_moved & is_known)):
+    for group, chosen in ((MOVED_ROCK, is_moved & is_known), (ELSEWHERE, ~is_moved & is_known)):
         for each in np.unique(number[chosen]).tolist():
             points = thin(surface.points_map[chosen & (number == each)], cell_m)
-            size_m, is_shown, name = max(cell_m, _ROCK_POINT_M), group == "rock that moved", class_name(each)
+            size_m, is_shown, name = max(cell_m, _ROCK_POINT_M), group == MOVED_ROCK, class_name(each)
             yield Layer(group, "points", points, ROCK_RGB[each], size_m, is_shown, f"rock {name}")
 
 

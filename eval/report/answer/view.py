@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from cdpipe.core.geometry import Float64Array
 from eval.report.answer.content import AnswerContent
-from eval.report.answer.layers import OBJECT_POINT_M, Layer, list_layers
+from eval.report.answer.layers import ELSEWHERE, MOVED_ROCK, OBJECT_POINT_M, Layer, list_layers
 from eval.report.answer.shapes import AFTER_RGB, BEFORE_RGB
 from eval.report.answer.tables import object_place
 from sim.geometry.mesh import Mesh, cylinder_mesh
@@ -20,12 +20,12 @@ from sim.view.view import Label, Line, Play, Surface, View
 
 _SENSOR_M = 0.12
 _ASIDE = np.array([-7.0, -7.0, 9.0])
-_GROUPS = {"rock that moved": "displacement", "displacement elsewhere": "displacement elsewhere"}
+_SHARE = 0.5  # of a point's edge on the page: here points are square
 
 
 def view_answer(content: AnswerContent) -> View:
     """Return the view of an answer; its slider moves both sensors along their paths."""
-    layers = list_layers(content)
+    layers = [layer for layer in list_layers(content) if layer.group != ELSEWHERE]
     clouds = [_cloud(each) for each in layers if each.kind == "points" and each.group not in CHANGE_RGB]
     labels, path, play = tuple(_labels(content)), content.paths[0], _play(content)
     target = labels[0].position if labels else path[len(path) // 2]
@@ -54,7 +54,7 @@ def _objects(content: AnswerContent) -> Iterator[Cloud]:
         if len(item.points_map):
             colours = _colours(CHANGE_RGB[item.kind], len(item.points_map))
             points = item.points_map.astype(np.float32)
-            yield Cloud(f"changes/{item.kind}/object {index}", points, colours, OBJECT_POINT_M)
+            yield Cloud(f"changes/{item.kind}/object {index}", points, colours, _SHARE * OBJECT_POINT_M)
 
 
 def _labels(content: AnswerContent) -> Iterator[Label]:
@@ -79,10 +79,9 @@ def _play(content: AnswerContent) -> Play:
 
 
 def _cloud(layer: Layer) -> Cloud:
-    first, _, rest = layer.group.partition(" ")
-    name = f"{first}/{rest}" if layer.group not in _GROUPS else f"{_GROUPS[layer.group]}/{layer.name}"
+    name = f"displacement/{layer.name}" if layer.group == MOVED_ROCK else layer.group.replace(" ", "/")
     points = layer.points.astype(np.float32)
-    return Cloud(name, points, _colours(layer.rgb, len(points)), layer.size_m, layer.is_shown)
+    return Cloud(name, points, _colours(layer.rgb, len(points)), _SHARE * layer.size_m, layer.is_shown)
 
 
 def _colours(rgb: Rgb, n: int) -> dict[str, npt.NDArray[np.uint8]]:
