@@ -7,6 +7,7 @@ terminal obeys none of it.
 # ruff: noqa: PLC0415 - heavy imports stand inside the functions, so that --help and completion are instant
 from __future__ import annotations
 
+import json
 import math
 import textwrap
 import warnings
@@ -55,6 +56,24 @@ def echo(*lines: str, err: bool = False) -> None:
     """Print lines to standard output, or to standard error."""
     for line in lines:
         typer.echo(visible(line), err=err)
+
+
+def echo_json(value: Any) -> None:
+    """Print a value as JSON for programs; what is undefined is null."""
+    typer.echo(json.dumps(_plain(value), indent=1, allow_nan=False))
+
+
+def _plain(value: Any) -> Any:
+    """Return JSON's own types."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "item"):  # a number of numpy
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if value is None or isinstance(value, bool | int | float) else str(value)
 
 
 def echo_wrapped(text: str, columns: int) -> None:

@@ -145,4 +145,6 @@ class _Rate(ProgressColumn):
         speed = task.finished_speed or task.speed
         if not speed:
             return Text("-/s")
+        if speed >= 10:
+            return Text(f"{speed:.0f}/s")
         return Text(f"{speed:.2g}/s" if speed >= 0.1 else f"{60 * speed:.2g}/min")
