@@ -33,14 +33,12 @@ def moved_m(item: ChangedObject, objects: tuple[ChangedObject, ...]) -> float:
 
     NaN if it has no partner, or the report does not hold the points.
     """
-    if item.displacement_map is not None:
-        return float(np.linalg.norm(item.displacement_map))
-    if not 0 <= item.partner < len(objects):
-        return float("nan")
-    both = item.points_map, objects[item.partner].points_map
-    if not all(len(points) for points in both):
-        return float("nan")
-    return float(np.linalg.norm(both[0].mean(axis=0) - both[1].mean(axis=0)))
+    both = [item, *([objects[item.partner]] if 0 <= item.partner < len(objects) else [])]
+    for each in both:
+        if each.displacement_map is not None:
+            return float(np.linalg.norm(each.displacement_map))
+    places = [each.points_map.mean(axis=0) for each in both if len(each.points_map)]
+    return float(np.linalg.norm(places[0] - places[1])) if len(places) == 2 else float("nan")
 
 
 def _tell_objects(report: ChangeReport) -> Iterator[str]:

@@ -10,7 +10,7 @@ import typer
 
 from eval.cli.options import AsJson, Quiet
 from eval.cli.printed_answer import LINE
-from eval.core.printing import MET, echo, echo_json, print_table
+from eval.core.printing import MET, echo, echo_json, line_width, print_table
 
 
 def bench(
@@ -69,7 +69,7 @@ def list_command(
         echo_json([{column: asdict(entry)[column] for column in columns} for entry in entries])
         return
     for entry in entries:
-        echo(*(describe_setting(entry, LINE) if what == "settings" else [describe_entry(entry, entries, LINE)]))
+        echo(*(describe_setting(entry, LINE) if what == "settings" else [describe_entry(entry, entries, line_width())]))
 
 
 _TITLES = {

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
+import sys
 import textwrap
 import warnings
 from collections.abc import Iterator
@@ -56,6 +58,11 @@ def echo(*lines: str, err: bool = False) -> None:
     """Print lines to standard output, or to standard error."""
     for line in lines:
         typer.echo(visible(line), err=err)
+
+
+def line_width() -> int:
+    """Return the columns of the terminal; where standard output is none, as many as any line needs."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else _ANY_WIDTH
 
 
 def echo_json(value: Any) -> None:
