@@ -82,4 +82,4 @@ def _size(edges_m: Float64Array) -> str:
 
 
 def _place(position: Float64Array) -> str:
-    return "-" if np.isnan(position).any() else " ".join(f"{each:.1f}" for each in position)
+    return "-" if np.isnan(position).any() else " ".join(f"{each:z.1f}" for each in position)
