@@ -22,7 +22,8 @@ from sim.session.revolution import (
     tally_revolution,
     true_reach_m,
 )
-from sim.session.simulate import plan_drives, simulate_pair
+from sim.session.planning import plan_drives
+from sim.session.simulate import simulate_pair
 from sim.session.truth import MIXED, read_labels, read_pair_truth
 
 IDEAL = Sensor(mode="512x10", range_noise=False, dropouts=False, false_positives=False)

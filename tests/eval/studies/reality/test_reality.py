@@ -57,7 +57,7 @@ from eval.studies.reality.tables import COLUMNS, arrange_by_source, format_markd
 from scenarios.library import load_scenario
 from scenarios.schema import Sensor
 from sim.session.revolution import Drive, cast_revolution
-from sim.session.simulate import plan_drives
+from sim.session.planning import plan_drives
 
 SENSOR = load_profile("os1-32-g", "1024x10")
 EVERYWHERE = np.ones((1, SENSOR.height, SENSOR.width), dtype=bool)
