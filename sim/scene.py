@@ -112,6 +112,7 @@ class Ground:
         fixtures: Furniture and stones.
         standing: Every prop at each of its places, settled on the floor before any rock changes.
         rock: The wall and the fixtures after compilation, in this order.
+        around: What the props were placed in: rock and furniture without stones.
         displacement: The walls of both sessions; None where no rock changes.
         after: Centreline and bare tunnel of the after session where rock changes.
     """
@@ -122,6 +123,7 @@ class Ground:
     fixtures: tuple[Fixture, ...]
     standing: tuple[Standing, ...]
     rock: tuple[Mesh, ...]
+    around: Surroundings
     displacement: Displacement | None = None
     after: tuple[Centreline, Caster] | None = None
 
@@ -185,7 +187,7 @@ def lay_ground(scenario: Scenario, seed: int) -> Ground:
         fixtures = (*furniture, stones)
         rock.append(compile_mesh(stones.mesh))
         fixed = Caster([wall, *(fixture.mesh for fixture in fixtures)])
-    return Ground(centreline, walls, fixed, fixtures, tuple(standing), tuple(rock), displacement, after)
+    return Ground(centreline, walls, fixed, fixtures, tuple(standing), tuple(rock), around, displacement, after)
 
 
 def follow_rock(

@@ -14,9 +14,7 @@ from sim.displacement.refine import TwinWalls
 CREEPING = ("convergence", "heave", "fill")  # kinds that may be half done; the others happen at once
 
 
-def displace_between(
-    whole: Displacement, start: Mapping[str, float], end: Mapping[str, float]
-) -> Displacement | None:
+def displace_between(whole: Displacement, start: Mapping[str, float], end: Mapping[str, float]) -> Displacement | None:
     """Return the walls of two states of a displacement, the first one as the before session.
 
     Every vertex lies on the straight way from its place before to its place after. The triangles are those of `whole`,

@@ -41,7 +41,7 @@ from sim.session.truth import (
     write_true_poses,
 )
 
-_THREADS = 2
+THREADS = 2
 # Bytes of each channel of a session that are held in memory until KISS-ICP has its poses; more are in a temporary file.
 _HELD_BYTES = 1 << 25
 
@@ -104,7 +104,7 @@ def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progres
     shutil.rmtree(partial, ignore_errors=True)
     try:
         partial.mkdir(parents=True)
-        with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+        with ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1)) as pool:
             for drive in drives:
                 write_session(drive, partial / drive.name, pool, report)
         write_pair_truth(partial, collect_truth(scenario, seed, drives, files))

@@ -15,8 +15,8 @@ from cdpipe.sensor.ouster import SensorMetadata
 from scenarios import load_scenario
 from scenarios.schema import Mover, Odometry, Platform, Prop, Scenario, Section, Sensor, SessionPlan
 from sim.session import simulate
-from sim.session.revolution import simulate_revolution
 from sim.session.planning import plan_drives
+from sim.session.revolution import simulate_revolution
 from sim.session.simulate import simulate_in_memory, simulate_pair
 from sim.session.truth import read_labels, read_mover_track, read_pair_truth, read_true_poses
 
