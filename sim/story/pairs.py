@@ -10,6 +10,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import require_plain_file
 from scenarios.references import file_digests
@@ -21,7 +23,7 @@ from sim.session.revolution import Drive
 from sim.session.simulate import THREADS, Progress, collect_truth, write_session
 from sim.session.truth import SESSIONS, PairTruth, write_pair_truth
 from sim.story.simulate import list_sessions_files, refuse_unsuited
-from sim.story.state import SessionState, Story, read_story
+from sim.story.state import SessionState, Story, find_mistakes, read_story
 from sim.story.world import build_session_world, pair_worlds, plan_session
 
 
@@ -116,6 +118,25 @@ def describe_pair(story: Story, states: tuple[SessionState, SessionState]) -> di
     """Return what the truth of a pair says of its story: enough to build its world again."""
     told = dict(zip(SESSIONS, (state.model_dump(mode="json") for state in states), strict=True))
     return {"n_sessions": len(story.sessions), **told, "scenario": story.scenario.model_dump(mode="json")}
+
+
+def rebuild_pair(truth: PairTruth) -> tuple[World, list[PlannedSession]]:
+    """Return the world of a pair of a story and its two planned sessions, before first, from what its truth says.
+
+    Raises:
+        InputError: The truth does not hold a story, or not one of this version.
+    """
+    story = truth.story or {}
+    try:
+        scenario = Scenario.model_validate(story.get("scenario"))
+        states = SessionState.model_validate(story.get("before")), SessionState.model_validate(story.get("after"))
+    except ValidationError as error:
+        raise InputError(f"the story is not one of this version ({error.errors()[0]['msg']})") from error
+    for state in states:
+        for mistake in find_mistakes(scenario, state):
+            raise InputError(f"the story does not fit its scenario: {state.name}: {mistake}")
+    _, world, planned = plan_pair(scenario, truth.seed, lay_ground(scenario, truth.seed), states)
+    return world, planned
 
 
 def _link_files(stored: Path, made: Path) -> None:

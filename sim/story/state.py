@@ -92,8 +92,13 @@ def read_story(folder: Path) -> Story:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise InputError(f"{path}: damaged: {where}: {first['msg']}: {_EXPECTED}") from error
-    for mistake in _find_mistakes(story):
-        raise InputError(f"{path}: damaged: {mistake}: {_EXPECTED}")
+    for number, state in enumerate(story.sessions, start=1):
+        if state.name != name_session(number):
+            raise InputError(
+                f"{path}: damaged: sessions.{number - 1}.name: expected {name_session(number)}: {_EXPECTED}"
+            )
+        for mistake in find_mistakes(story.scenario, state):
+            raise InputError(f"{path}: damaged: sessions.{number - 1}.{mistake}: {_EXPECTED}")
     return story
 
 
@@ -102,24 +107,20 @@ def dump_story(story: Story) -> dict[str, Any]:
     return {"format": FORMAT, "format_version": FORMAT_VERSION, **story.model_dump(mode="json")}
 
 
-def _find_mistakes(story: Story) -> Iterator[str]:
-    """Yield what contradicts the scenario in the states of a story."""
-    props, surface = {prop.name: prop for prop in changing_props(story.scenario)}, story.scenario.surface
-    for number, state in enumerate(story.sessions, start=1):
-        if state.name != name_session(number):
-            yield f"sessions.{number - 1}.name = {state.name}: expected {name_session(number)}"
-        if state.places.keys() != props.keys():
-            yield f"sessions.{number - 1}.places: expected the props that change: {', '.join(props) or 'none'}"
+def find_mistakes(scenario: Scenario, state: SessionState) -> Iterator[str]:
+    """Yield what contradicts the scenario in the state of a session."""
+    props = {prop.name: prop for prop in changing_props(scenario)}
+    kinds = {change.name: change.kind for change in scenario.surface}
+    for key, found, wanted in (("places", state.places, props), ("shares", state.shares, kinds)):
+        if found.keys() != wanted.keys():
+            yield f"{key}: expected {', '.join(wanted) or 'nothing'}"
             return
-        if state.shares.keys() != {change.name for change in surface}:
-            yield f"sessions.{number - 1}.shares: expected the surface changes of the scenario"
-            return
-        for name, where in state.places.items():
-            if where not in possible_places(props[name]):
-                yield f"sessions.{number - 1}.places.{name} = {where}: its change is {props[name].change}"
-        for change in surface:
-            if change.kind not in CREEPING and state.shares[change.name] not in (0.0, 1.0):
-                yield f"sessions.{number - 1}.shares.{change.name}: a {change.kind} happens at once: expected 0 or 1"
+    for name, where in state.places.items():
+        if where not in possible_places(props[name]):
+            yield f"places.{name} = {where}: its change is {props[name].change}"
+    for name, share in state.shares.items():
+        if kinds[name] not in CREEPING and share not in (0.0, 1.0):
+            yield f"shares.{name} = {share:g}: a {kinds[name]} happens at once: expected 0 or 1"
 
 
 def possible_places(prop: Prop) -> tuple[Where, ...]:

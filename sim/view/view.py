@@ -27,6 +27,7 @@ from sim.placement.puddles import lay_puddles
 from sim.props.shapes import solid_mesh
 from sim.scene import WALL_GEOM, World, build_world
 from sim.session.truth import SESSIONS, PairTruth, SessionName, read_pair_truth, read_true_poses
+from sim.story.pairs import rebuild_pair
 from sim.view.picture import material_colour
 from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Revolutions, Rgb, session_cloud
 from sim.view.rock import ROCK_RGB, class_name, displacement_classes
@@ -136,23 +137,48 @@ def view_pair(pair: Path) -> View:
         InputError: The pair or its truth is missing, damaged, or of a version whose scenario cannot be built here.
     """
     truth = read_pair_truth(pair)
-    scenario = _scenario_of(pair, truth)
-    world = build_world(scenario, truth.seed)
+    build = _build_pair if truth.story is None else _build_story_pair
+    world, drives, movers, puddles = build(pair, truth)
     poses = {session: read_true_poses(pair / session) for session in SESSIONS}
     lines = [Line(f"paths/{session}", poses[session][:, :3, 3], SESSION_RGB[session]) for session in SESSIONS]
     kinds = {change.id: change.kind for change in truth.changes}
     clouds = tuple(
         session_cloud(f"returns/{session}", read_session(pair / session), poses[session], kinds) for session in SESSIONS
     )
-    drives = _plan_drives(world, scenario, truth.seed)[0] if scenario.movers else {}
-    movers = _place_movers(world, scenario, drives, truth.seed)
-    puddles = _puddle_surfaces(world, scenario, truth.seed)
     view = _world_view(f"{pair}: {truth.family}, seed {truth.seed}", world, lines, clouds, movers, puddles, ())
     revolutions = [
         Revolutions(f"revolution/{session}", read_session(pair / session), poses[session], kinds)
         for session in SESSIONS
     ]
     return replace(view, play=_player(poses.items(), movers, drives, revolutions))
+
+
+_Built = tuple[World, dict[SessionName, Trajectory], list["_Placed"], list[Surface]]
+
+
+def _build_pair(pair: Path, truth: PairTruth) -> _Built:
+    """Return the world of a pair; where it has movers also its drives and these; and its puddles."""
+    scenario = _scenario_of(pair, truth)
+    world = build_world(scenario, truth.seed)
+    drives = _plan_drives(world, scenario, truth.seed)[0] if scenario.movers else {}
+    movers = _place_movers(world, scenario, drives, truth.seed)
+    return world, drives, movers, _puddle_surfaces(world, scenario, truth.seed)
+
+
+def _build_story_pair(pair: Path, truth: PairTruth) -> _Built:
+    """Return the same of two sessions of a story."""
+    try:
+        world, planned = rebuild_pair(truth)
+    except InputError as error:
+        raise InputError(f"{pair / 'truth' / 'changes.json'}: {error}: view its sessions one by one") from error
+    drives = {name: session.trajectory for name, session in zip(SESSIONS, planned, strict=True)}
+    placed = [
+        _Placed(name, _middle_s(drives[name]), body)
+        for name, session in zip(SESSIONS, planned, strict=True)
+        for body in session.movers
+    ]
+    sheets = {pool.puddle.name: pool.sheet() for session in planned for pool in session.pools}
+    return world, drives, placed, [Surface(f"puddles/{name}", mesh, _WATER_RGB) for name, mesh in sheets.items()]
 
 
 def view_session(folder: Path) -> View:
@@ -265,8 +291,11 @@ def _place_movers(
 ) -> list[_Placed]:
     """Return the movers of each session that is driven, in the middle of its drive."""
     planned = plan_movers(world, scenario, {name: drive.true for name, drive in drives.items()}, seed)
-    middles_s = {name: float(drive.revolution_s[drive.n_scans // 2]) for name, drive in drives.items()}
-    return [_Placed(name, middles_s[name], body) for name, bodies in planned.items() for body in bodies]
+    return [_Placed(name, _middle_s(drives[name]), body) for name, bodies in planned.items() for body in bodies]
+
+
+def _middle_s(drive: Trajectory) -> float:
+    return float(drive.revolution_s[drive.n_scans // 2])
 
 
 def _mover_surfaces(placed: _Placed) -> Iterator[Surface]:
