@@ -61,7 +61,9 @@ def story_command(
     with shown_warnings(), shown_progress(quiet, rate="sessions") as progress:
         comparisons = run_comparisons(story, out, method, progress, with_truth=with_truth)
     moved = write_story_page(story, out, method, comparisons, given)
-    if not quiet:
+    if moved.empty:
+        say(quiet, "no region of rock moved in any session")
+    elif not quiet:
         print_table("displacement since session 1, mm, and 95 % level of detection", moved)
     echo(f"page: {out / 'index.html'}")
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import cdpipe
 from cdpipe.core.errors import InputError, MergeFailedError
-from cdpipe.core.files import read_json
+from cdpipe.core.files import read_bytes, read_json
 from cdpipe.io.answer import Answer, read_answer, write_failure
 from cdpipe.io.session import is_session
 from cdpipe.model.config import PipelineConfig, Site
@@ -166,7 +166,7 @@ def _digest_session(session: Path) -> str:
     """Return a digest of a session's poses and description, which differ between any two sessions."""
     found = hashlib.sha256()
     for name in ("session.json", "odometry.npz"):
-        found.update((session / name).read_bytes())
+        found.update(read_bytes(session / name))
     return found.hexdigest()[:16]
 
 
