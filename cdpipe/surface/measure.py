@@ -47,7 +47,7 @@ _TO_SIGMA, _OUTLIER = 1.4826, 4.0
 _SAMPLE, _ON_PLACE_M, _SCAN_WINDOW_M = 400_000, 0.2, 4.0
 # Standard deviation of the tilt of scans that is left. It moves places by their distance from the path, which counts
 # where they are farther than the walls that the motions are fitted to, as beyond the ends of the path.
-_TILT_RAD, _CLOSE_M = 1e-3, 4.0
+_TILT_RAD, _CLOSE_M = 2e-3, 4.0
 # The variance of a mean from four folds is noisy: that of a place is the mean over its neighbours.
 _NEIGHBOURS = 24
 # Share of the roughness that both spheres do not share, as standard deviation, and the least error of a mean.
@@ -77,8 +77,9 @@ def measure_surface(
         np.where(is_of_object, np.nan, values) for values in (measured.along_m, measured.displacement_m)
     )
     region, regions = group_regions(
-        places, along_m, measured.level_m, settings.spacing_m, settings.least_m, settings.least_area_m2
-    )
+        places, along_m, measured.level_m, settings.spacing_m, settings.least_m, settings.least_area_m2,
+        shared_m=measured.shared_m,
+    )  # fmt: skip
     if any(is_hollow(each) for each in regions):
         regions = measure_hollows(regions, region, cells, places, measured.after or make_cells(after))
     field = SurfaceField(
@@ -103,8 +104,9 @@ def measure_planes(
     noise_m2 = _smooth_variance(places.points, found.variance_m2)
     rough_m2 = (_ROUGHNESS * places.roughness_m) ** 2
     tilt_m2 = (_TILT_RAD * np.maximum(places.seen_from_m - _CLOSE_M, 0.0)) ** 2
-    level_m = Z95 * np.sqrt(noise_m2 + alignment_m2 + rough_m2 + tilt_m2 + _LEAST_M**2)
-    return Measured(found.nearest_m - explained_m, found.along_m - explained_m, level_m, laid)
+    shared_m2 = alignment_m2 + tilt_m2
+    level_m, shared_m = (Z95 * np.sqrt(each) for each in (noise_m2 + rough_m2 + shared_m2 + _LEAST_M**2, shared_m2))
+    return Measured(found.nearest_m - explained_m, found.along_m - explained_m, level_m, shared_m, laid)
 
 
 def _trust(places: SurfacePlaces, found: Offsets) -> Float64Array:
