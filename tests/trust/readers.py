@@ -59,6 +59,7 @@ from scenarios.schema import MeshFile
 from sim.placement.recorded import read_drive
 from sim.rock.foreign import prop_mesh, tunnel_mesh
 from sim.session.truth import read_labels
+from sim.story.state import SessionState, Story, dump_story, read_story
 from tests.eval.conftest import ODOM_T_WORLD, WIDTH, write_pair
 
 ROOT = Path(__file__).parents[2]
@@ -488,6 +489,24 @@ def _read_scored(folder: Path) -> None:
     score_stored(load_ground_truth(folder / "pair"), folder / "answer")
 
 
+def _story(folder: Path) -> None:
+    """Write the story of a scenario with a moved prop and two kinds of rock."""
+    shutil.copy(ROOT / "scenarios" / "families" / "smoke" / "one_box.yaml", folder / "base.yaml")
+    settings = ["surface=[{name: sinks, kind: heave}, {name: falls, kind: scar}]"]
+    scenario = load_scenario(str(folder / "base.yaml"), 1, settings)
+    (folder / "base.yaml").unlink()
+    states = [
+        SessionState(name=f"session-{number:02d}", plan="after", places={"box": where}, shares=shares)
+        for number, where, shares in (
+            (1, "absent", {"sinks": 0.0, "falls": 0.0}),
+            (2, "after", {"sinks": 0.4, "falls": 1.0}),
+            (3, "after", {"sinks": 1.0, "falls": 1.0}),
+        )
+    ]
+    story = Story(scenario=scenario, seed=1, sessions=states, files={}, digests={}, versions={"numpy": "2.2"})
+    (folder / "story.json").write_text(json.dumps(dump_story(story), indent=1))
+
+
 _SESSION = ("s/session.json", "s/odometry.npz", "s/chunks/00000.npz")
 _TRUTH = ("pair/truth/*", "pair/before/truth/*", "pair/*/session.json")
 _CELLS = ("run/cells/*/*/*.json", "run/provenance.json", "run/blind.json")
@@ -501,6 +520,7 @@ READERS: tuple[Reader, ...] = (
     Reader("TUM trajectory", _tum, _read_tum, ("t.tum",), 1.5),
     Reader("sensor metadata", _metadata, _read_metadata, ("*.json",), 1.5),
     Reader("truth of a pair", _truth, _read_truth, _TRUTH, 0.7, lines=True),
+    Reader("story", _story, read_story, ("story.json",), 1.0, lines=True),
     Reader("answer", _answer, read_answer, ("answer.json", "answer.npz"), 4.0, lines=True),
     Reader("answer, scored", _scored, _read_scored, ("answer/*",), 1.5, lines=True),
     Reader("known merge", _merges, _read_merges, ("*",), 0.7, lines=True),
