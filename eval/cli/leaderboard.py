@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 import sys
+from itertools import chain
 from pathlib import Path
+from textwrap import wrap
 from typing import Annotated, Literal
 
 import typer
 
 from eval.cli.options import Quiet, RunOut
-from eval.core.printing import echo, say
+from eval.core.printing import count_pairs, echo, say
 from eval.core.progress import shown_progress
 
 
@@ -60,7 +62,7 @@ def evaluate(
         outcome = evaluate_command(chosen, run, method, command=argv, force=force, progress=progress)
     _compare(out, name, committed, quiet=quiet)
     kept = f", {outcome.n_kept} kept from earlier" if outcome.n_kept else ""
-    say(quiet, f"{out}: {outcome.n_done} pairs answered now{kept}; {outcome.n_failed} of all without an answer")
+    say(quiet, f"{out}: {count_pairs(outcome.n_done)} answered now{kept}; {outcome.n_failed} of all without an answer")
 
 
 def _compare(out: Path, name: str, committed: object, *, quiet: bool) -> None:
@@ -82,5 +84,52 @@ def _compare(out: Path, name: str, committed: object, *, quiet: bool) -> None:
     folder = evaluation_folder(run, name)
     write_tables_of(found, folder)
     if not quiet:
-        echo(*list_lines(found), *(f"note: {text}" for text in found.notes))
+        notes = (wrap(f"note: {text}", 80, subsequent_indent="      ", break_long_words=False) for text in found.notes)
+        echo(*list_lines(found), *chain.from_iterable(notes))
         echo(f"tables: {folder}/table.csv, differences.csv (pair by pair), comparison.csv")
+
+
+def submit(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of `evaluate`")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE.zip", help="the file", show_default=False)],
+    name: Annotated[
+        str, typer.Option("--as", metavar="NAME", help="which method, where DIR holds several", show_default=False)
+    ] = "",
+    quiet: Quiet = False,
+) -> None:
+    """Pack the rows, answers and provenance of an evaluated method into one file."""
+    from eval.leaderboard.submission import pack_submission
+    from eval.running.runfolder import open_run_folder
+
+    n_pairs = pack_submission(open_run_folder(folder), name, out)
+    say(quiet, f"{out}: {count_pairs(n_pairs)}, {out.stat().st_size / 1e6:.3g} MB")
+
+
+def leaderboard(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="made by `submit`")],
+    out: Annotated[Path, typer.Option("--out", metavar="PAGE.html", help="the page", show_default=False)],
+    pairs: Annotated[
+        Path | None,
+        typer.Option(metavar="RUN", help="run that holds the pairs: all answers are scored again", show_default=False),
+    ] = None,
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="run or report with reference rows; else the committed ones", show_default=False),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Check packed results and make one offline page of them, beside the reference rows."""
+    from eval.leaderboard.page import write_leaderboard
+    from eval.leaderboard.submission import read_submission, score_again
+    from eval.running.runfolder import open_run_folder
+
+    run = None if pairs is None else open_run_folder(pairs)
+    found, checked = [], []
+    with shown_progress(quiet) as progress:
+        for done, path in enumerate(files):
+            progress.cells(str(path), done, len(files))
+            found.append(read_submission(path))
+            checked.append(0 if run is None else score_again(found[-1], run))
+        progress.cells("done", len(files), len(files))
+    write_leaderboard(found, out, reference, checked)
+    echo(f"page: {out}")

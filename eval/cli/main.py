@@ -57,6 +57,8 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "run": commands_run.run_command,
     "export": commands_run.export,
     "evaluate": commands_leaderboard.evaluate,
+    "submit": commands_leaderboard.submit,
+    "leaderboard": commands_leaderboard.leaderboard,
     "report": commands_run.report,
     "dataset": commands_training.dataset,
     "train": commands_training.train,

@@ -52,6 +52,11 @@ def echo(*lines: str, err: bool = False) -> None:
         typer.echo(visible(line), err=err)
 
 
+def count_pairs(n: int) -> str:
+    """Return a number of pairs in words: "1 pair", "2 pairs"."""
+    return "1 pair" if n == 1 else f"{n} pairs"
+
+
 def say(quiet: bool, text: str) -> None:
     """Print a line, unless --quiet."""
     if not quiet:

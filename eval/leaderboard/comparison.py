@@ -56,11 +56,11 @@ def compare_with_reference(results: pd.DataFrame, name: str, references: Sequenc
         references: Where reference rows are; of a method that several have, the first counts.
         calls: How the call about each pair ended, by (scenario, seed).
     """
-    own = _figures(results)
-    others = {variant: rows.loc[rows.index.intersection(own.index)] for variant, rows in _by_variant(references)}
+    own = take_figures(results)
+    others = {variant: rows.loc[rows.index.intersection(own.index)] for variant, rows in list_variants(references)}
     others = {variant: rows for variant, rows in others.items() if len(rows)}
     shared = own.index if not others else own.index[own.index.isin(_union(others))]
-    rows = [_summarise(name, own.loc[shared]), *(_summarise(variant, rows) for variant, rows in others.items())]
+    rows = [summarise_figures(variant, each) for variant, each in {name: own.loc[shared], **others}.items()]
     paired = [
         {"reference": variant, "n_pairs": len(rows), **row, "verdict": verdict(row)}
         for variant, rows in others.items()
@@ -87,8 +87,9 @@ def list_lines(found: Comparison) -> list[str]:
     for row in found.table.to_dict("records"):
         name = str(row["method"])
         name = name if len(name) < _NAME_WIDTH else f"{name[: _NAME_WIDTH - 2]}\u2026"
-        spans = [_span(key, row[f"{key}_low"], row[f"{key}_high"]) for key in FIGURES]
-        lines.append(_line(name, f"{row['n_answered']}/{row['n_pairs']}", [_show(key, row[key]) for key in FIGURES]))
+        spans = [show_span(key, row[f"{key}_low"], row[f"{key}_high"]) for key in FIGURES]
+        values = [show_figure(key, row[key]) for key in FIGURES]
+        lines.append(_line(name, f"{row['n_answered']}/{row['n_pairs']}", values))
         lines += [_line("", "", spans).rstrip()] if any(spans) else []
     return [*lines, *_list_differences(found)]
 
@@ -106,23 +107,25 @@ def _list_differences(found: Comparison) -> Iterator[str]:
     yield f"pair by pair, {found.table['method'].iloc[0]} less {main}:"
     for row in found.paired[found.paired["reference"] == main].to_dict("records"):
         heading = HEADINGS[FIGURES.index(row["metric"])]
-        low, difference, high = (_show(row["metric"], row[name]) for name in ("low", "difference", "high"))
-        yield f"  {heading:<11}{difference:>7} ({low} to {high}), {row['verdict']}"
+        low, difference, high = (show_figure(row["metric"], row[name]) for name in ("low", "difference", "high"))
+        span = "" if math.isnan(row["low"]) else f" ({low} to {high})"
+        yield f"  {heading:<11}{difference:>7}{span}, {row['verdict']}"
 
 
-def _figures(results: pd.DataFrame) -> pd.DataFrame:
+def take_figures(results: pd.DataFrame) -> pd.DataFrame:
     """Return the figures by pair, with `status` and every one of `FIGURES`."""
     found = figures_of(results).assign(status=results["status"].to_numpy())
     found = found.assign(**{key: numbers(found, key) for key in FIGURES})
     return found.set_index(PAIR)[["domain", "variant", "status", *FIGURES]]
 
 
-def _by_variant(references: Sequence[RunData]) -> Iterator[tuple[str, pd.DataFrame]]:
+def list_variants(references: Sequence[RunData]) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield each method of some runs with its figures by pair; of a method that several have, those of the first."""
     seen: set[str] = set()
     for data in references:
         if not data.results:
             continue
-        found = _figures(pd.DataFrame(list(data.results)))
+        found = take_figures(pd.DataFrame(list(data.results)))
         for variant, rows in found.groupby("variant", sort=False):
             if variant not in seen:
                 yield str(variant), rows
@@ -136,7 +139,8 @@ def _union(others: Mapping[str, pd.DataFrame]) -> pd.Index[Any]:
     return first
 
 
-def _summarise(name: str, rows: pd.DataFrame) -> dict[str, Any]:
+def summarise_figures(name: str, rows: pd.DataFrame) -> dict[str, Any]:
+    """Return a row of `Comparison.table` from the figures of a method by pair."""
     row: dict[str, Any] = {"method": name, "n_pairs": len(rows), "n_answered": int((rows["status"] == "ok").sum())}
     for key in FIGURES:
         values, statistic = numbers(rows, key), statistic_of(key)
@@ -190,11 +194,13 @@ def _why_none(data: RunData, own: pd.DataFrame) -> str:
     return f"{data.folder.path} holds none of these {len(own)} pairs; its pairs are {seeds}"
 
 
-def _span(key: str, low: float, high: float) -> str:
-    return "" if math.isnan(low) or math.isnan(high) else f"{_show(key, low)}-{_show(key, high)}"
+def show_span(key: str, low: float, high: float) -> str:
+    """Write an interval of a figure; "" where there is none."""
+    return "" if math.isnan(low) or math.isnan(high) else f"{show_figure(key, low)}-{show_figure(key, high)}"
 
 
-def _show(key: str, value: float) -> str:
+def show_figure(key: str, value: float) -> str:
+    """Write a figure; times with two digits."""
     if is_time(key) and math.isfinite(value):
         return np.format_float_positional(value, precision=2, fractional=False, unique=False, trim="-")
     return SHOWN[key].shown(value)

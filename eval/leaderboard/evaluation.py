@@ -136,7 +136,7 @@ def evaluate_command(
     # the order of a plan would tell which world a pair is of; a seed would, too
     random.SystemRandom().shuffle(todo)
     for done, pair in enumerate(todo):
-        progress.cells("a pair, drawn at random", done, len(todo))
+        progress.cells(f"{pair.name} {pair.seed}", done, len(todo))
         with pair_lock(run, pair):
             error = _evaluate_pair(run, method, pair, progress, tools)
         if error:
