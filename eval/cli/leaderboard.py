@@ -86,7 +86,7 @@ def _compare(out: Path, name: str, committed: object, *, quiet: bool) -> None:
     if not quiet:
         notes = (wrap(f"note: {text}", 80, subsequent_indent="      ", break_long_words=False) for text in found.notes)
         echo(*list_lines(found), *chain.from_iterable(notes))
-        echo(f"tables: {folder}/table.csv, differences.csv (pair by pair), comparison.csv")
+        echo(f"in {folder}: table.csv, differences.csv, comparison.csv")
 
 
 def submit(
