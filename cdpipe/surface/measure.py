@@ -7,7 +7,7 @@
    after session, place by place of the sensor, and the offsets are measured again.
 5. The level of detection adds up the error of the means, the covariance of those motions, and the roughness.
 6. Objects are told from rock (`rock_or_object`), and the displacement of objects is left out.
-7. Neighbouring places beyond their level are regions (`regions`).
+7. Neighbouring places beyond their level are regions (`regions`). Hollows have a hidden bottom (`hollows`).
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from cdpipe.model.config import PipelineConfig
 from cdpipe.model.report import ChangedObject, SurfaceField
 from cdpipe.model.types import MergedMaps
 from cdpipe.surface.cells import NearReturns, SurfaceCells, make_cells, near_returns
+from cdpipe.surface.hollows import is_hollow, measure_hollows
 from cdpipe.surface.method import Z95, Measured, Method
 from cdpipe.surface.motions import PathMotions, fit_motions
 from cdpipe.surface.offsets import Offsets, measure_offsets
@@ -78,6 +79,8 @@ def measure_surface(
     region, regions = group_regions(
         places, along_m, measured.level_m, settings.spacing_m, settings.least_m, settings.least_area_m2
     )
+    if any(is_hollow(each) for each in regions):
+        regions = measure_hollows(regions, region, cells, places, make_cells(after).points)
     field = SurfaceField(
         places.points, places.normals, displacement_m, measured.level_m, region, regions, chainage_m, angle_deg
     )

@@ -29,7 +29,7 @@ _NEAR_M = 0.12
 _FAR_M = 0.1
 # A surface that far off is new only if the before session had none there: its distance to the nearest cell of the
 # before session, over the displacement. Else it is another surface, and the place was hidden from the after session.
-_NEW = 0.5
+NEW = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +76,7 @@ def measure_offsets(before: SurfaceCells, after: SurfaceCells, places: SurfacePl
         along_m[rest], variance_m2[rest] = heights_m - own_m[rest], own_m2 + other_m2
     far = np.flatnonzero(np.abs(along_m) > _FAR_M)
     hits = places.points[far] + along_m[far, None] * places.normals[far]
-    along_m[far[before.tree.query(hits)[0] < _NEW * np.abs(along_m[far])]] = np.nan
+    along_m[far[before.tree.query(hits)[0] < NEW * np.abs(along_m[far])]] = np.nan
     far = far[np.isfinite(along_m[far])]
     nearest_m = along_m.copy()
     nearest_m[far] = np.sign(along_m[far]) * np.minimum(after.tree.query(places.points[far])[0], np.abs(along_m[far]))
