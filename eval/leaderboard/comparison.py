@@ -12,11 +12,13 @@ import numpy as np
 import pandas as pd
 
 from eval.core.output import make_writable
+from eval.core.printing import count_pairs
 from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
 from eval.report.compared_columns import COMPARED, figures_of, is_time
 from eval.report.comparing import paired_differences, verdict
 from eval.report.render import write_file
 from eval.running.run_data import RunData
+from eval.running.sides import find_other_worlds
 from eval.tables.rows import PAIR, is_told_the_truth, numbers
 
 FIGURES = ("region_recall", "false_regions_per_100m", "object_iou_point", "object_f1_50", "t_total_s")
@@ -67,7 +69,12 @@ def compare_with_reference(results: pd.DataFrame, name: str, references: Sequenc
         for row in paired_differences(rows[list(FIGURES)], own.loc[rows.index, list(FIGURES)])
     ]
     pairs = pd.DataFrame(list(_by_pair(own, others, calls)))
-    return Comparison(pd.DataFrame(rows), pairs, pd.DataFrame(paired), tuple(_notes(own, others, references, shared)))
+    return Comparison(
+        pd.DataFrame(rows),
+        pairs,
+        pd.DataFrame(paired),
+        (*_notes(own, others, references, shared), *note_other_worlds(results, references)),
+    )
 
 
 def write_tables_of(found: Comparison, folder: Path) -> None:
@@ -185,6 +192,13 @@ def _notes(
     if any(is_told_the_truth(variant) for variant in others):
         yield "oracle-* methods were told the true merge, or the true regions as well"
     yield "times of different machines do not compare"
+
+
+def note_other_worlds(results: pd.DataFrame, references: Sequence[RunData]) -> Iterator[str]:
+    """Yield one sentence for each run whose pairs are other worlds than those of the same name that were answered."""
+    for data in references:
+        if data.results and (worlds := find_other_worlds(results, pd.DataFrame(list(data.results)))):
+            yield f"{count_pairs(len(worlds))} of {data.folder.path.name} hold other changes or another drive ({worlds[0]})"
 
 
 def _why_none(data: RunData, own: pd.DataFrame) -> str:

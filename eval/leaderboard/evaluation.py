@@ -130,8 +130,8 @@ def evaluate_command(
     require_free_name(run, method.name)
     require_current_scores(run)
     pairs = list_plan_pairs(plan, run, tools)
-    _take_over(run, method, plan, pairs, force=force)
     start_provenance(plan, run, command, tools)
+    _take_over(run, method, plan, pairs, force=force)
     todo = [pair for pair in pairs if force or not _is_finished(run, method, pair)]
     # the order of a plan would tell which world a pair is of; a seed would, too
     random.SystemRandom().shuffle(todo)

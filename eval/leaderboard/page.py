@@ -17,6 +17,7 @@ from eval.leaderboard.comparison import (
     HEADINGS,
     SHOWN,
     list_variants,
+    note_other_worlds,
     show_figure,
     show_span,
     summarise_figures,
@@ -142,6 +143,7 @@ def _notes(
         yield f"No reference rows: {where}."
     elif any(row["n_pairs"] < n_pairs for row in references):
         yield "A reference row with fewer pairs is a mean over those alone."
+    yield from note_other_worlds(pd.concat(map(_rows, group)), [] if data is None else [data])
     digests: dict[tuple[str, int], str] = {}
     for each in group:
         differing = [

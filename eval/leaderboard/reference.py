@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.names import path_part
 from eval.core.tablefile import table_file
 from eval.running.run_data import RunData, read_run
 from eval.running.sides import list_versions
@@ -28,7 +29,8 @@ def find_reference(plan: str, folder: Path | None) -> RunData | None:
     Raises:
         InputError: `folder` holds no results, or those of another metrics version.
     """
-    places = [REPORTS / plan] if folder is None else [folder, folder / plan]
+    own = [plan] if path_part(plan) == plan else []  # the name may come from a file of others
+    places = [REPORTS / name for name in own] if folder is None else [folder, *(folder / name for name in own)]
     found = next((place for place in places if table_file(place / "results.csv").is_file()), None)
     if found is None:
         if folder is None:

@@ -97,6 +97,23 @@ def test_the_first_place_that_has_a_method_counts(tmp_path: Path) -> None:
     assert found.table["region_recall"].tolist()[2] == 0.0
 
 
+def test_pairs_of_one_name_that_are_other_worlds_are_told(tmp_path: Path) -> None:
+    frame = table().assign(n_changes=2)
+    other = frame.assign(n_changes=[2, 3, 2] * 3)
+    for reference, n_other in ((frame, 0), (other, 1)):
+        data = take_other_methods(read(tmp_path / str(n_other), reference), "mine")
+        found = compare_with_reference(own(frame), "mine", [data], {})
+        assert sum("other changes or another drive (narrow 2)" in note for note in found.notes) == n_other
+
+
+def test_a_name_that_leads_elsewhere_finds_no_reference(tmp_path: Path) -> None:
+    read(tmp_path / "secret", table())
+    (tmp_path / "reports").mkdir()
+    assert find_reference("../reports/main", None) is None
+    with pytest.raises(InputError, match="holds no"):
+        find_reference("../secret", tmp_path / "reports")
+
+
 def test_references_are_found_by_folder_and_by_plan(tmp_path: Path) -> None:
     read(tmp_path / "reports" / "x", table())
     for folder in (tmp_path / "reports", tmp_path / "reports" / "x"):
