@@ -198,7 +198,8 @@ def note_other_worlds(results: pd.DataFrame, references: Sequence[RunData]) -> I
     """Yield one sentence for each run whose pairs are other worlds than those of the same name that were answered."""
     for data in references:
         if data.results and (worlds := find_other_worlds(results, pd.DataFrame(list(data.results)))):
-            yield f"{count_pairs(len(worlds))} of {data.folder.path.name} hold other changes or another drive ({worlds[0]})"
+            where = f"{count_pairs(len(worlds))} of {data.folder.path.name}"
+            yield f"{where} hold other changes or another drive ({worlds[0]})"
 
 
 def _why_none(data: RunData, own: pd.DataFrame) -> str:
