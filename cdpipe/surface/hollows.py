@@ -61,6 +61,11 @@ class _Chart:
         return np.asarray(row * self.shape[1] + column)
 
     @property
+    def reach_m(self) -> float:
+        """Distance from the origin of everything above or below the chart that counts."""
+        return float(np.hypot(_PIXEL_M * np.hypot(*self.shape) + _RIM_M, _DEEPEST_M))
+
+    @property
     def middles(self) -> Float64Array:
         """(P, 2) middles of the pixels."""
         return np.asarray(_PIXEL_M * (np.indices(self.shape).reshape(2, -1).T + 0.5))
@@ -71,7 +76,7 @@ def measure_hollows(
     region: Int32Array,
     before: SurfaceCells,
     places: SurfacePlaces,
-    after: Float64Array,
+    after: SurfaceCells,
 ) -> tuple[SurfaceRegion, ...]:
     """Return the regions, those of hollows with the area and the volume of their charts.
 
@@ -80,11 +85,12 @@ def measure_hollows(
         region: (Q,) region of each place, -1 for none.
         before: Cells of the before session.
         places: Places on them.
-        after: (C, 3) cells of the after session, map frame.
+        after: Cells of the after session.
     """
-    measured = list(regions)
+    measured, tree = list(regions), cKDTree(places.points)
     for index, each in enumerate(regions):
-        found = _measure_hollow(before, places, np.flatnonzero(region == index), after) if is_hollow(each) else None
+        members = np.flatnonzero(region == index)
+        found = _measure_hollow(before, places, tree, members, after) if is_hollow(each) else None
         if found is not None:
             area_m2, volume_m3 = found
             measured[index] = replace(each, area_m2=area_m2, volume_m3=-volume_m3, mean_m=-volume_m3 / area_m2)
@@ -97,7 +103,7 @@ def is_hollow(region: SurfaceRegion) -> bool:
 
 
 def _measure_hollow(
-    before: SurfaceCells, places: SurfacePlaces, members: Int64Array, after: Float64Array
+    before: SurfaceCells, places: SurfacePlaces, tree: cKDTree, members: Int64Array, after: SurfaceCells
 ) -> tuple[float, float] | None:
     """Return area and volume of one hollow; None where its places have no chart."""
     normal = places.normals[members].mean(axis=0)
@@ -106,8 +112,11 @@ def _measure_hollow(
         return None
     members = members[is_flat]
     chart = _make_chart(places.points[members], normal / np.linalg.norm(normal))
+    around = np.asarray(tree.query_ball_point(chart.origin, chart.reach_m), dtype=np.int64)
+    walls = places.points[around[places.normals[around] @ chart.axes[2] > _SAME_WALL]]
+    cells = after.points[after.tree.query_ball_point(chart.origin, chart.reach_m)]
     try:
-        depth_m = _find_depths(chart, before, places, after)
+        depth_m = _find_depths(chart, before, walls, cells)
         is_own = _outline(chart, depth_m, places.points[members])
         hidden, seen = (np.flatnonzero(is_own & is_part) for is_part in (np.isnan(depth_m), np.isfinite(depth_m)))
         if len(hidden) > 0 and len(seen) > 0:
@@ -129,18 +138,12 @@ def _make_chart(points: Float64Array, normal: Float64Array) -> _Chart:
     return _Chart(origin, axes, low, (int(rows), int(columns)))
 
 
-def _find_depths(chart: _Chart, before: SurfaceCells, places: SurfacePlaces, after: Float64Array) -> Float64Array:
-    """Return the (P,) depth of the after surface in each pixel, below the before surface; NaN where none was seen."""
-    placed = chart.place(places.points)
-    is_wall = chart.is_on(placed, _RIM_M) & (places.normals @ chart.axes[2] > _SAME_WALL)
-    is_wall &= np.abs(placed[:, 2]) < _DEEPEST_M
-    cells = chart.place(after)
+def _find_depths(chart: _Chart, before: SurfaceCells, walls: Float64Array, after: Float64Array) -> Float64Array:
+    """Return the (P,) depth of the (C, 3) after cells below the (N, 3) walls in each pixel; NaN where none was seen."""
+    placed, cells = chart.place(walls), chart.place(after)
     is_over = chart.is_on(cells)
     cells, off_m = cells[is_over], before.tree.query(after[is_over])[0]
-    if not is_wall.any():
-        return np.full(chart.shape[0] * chart.shape[1], np.nan)
-    wall = placed[is_wall]
-    depths_m = _height(wall, cells) - cells[:, 2]
+    depths_m = _height(placed[chart.is_on(placed, _RIM_M)], cells) - cells[:, 2]
     is_its = (depths_m > -_IN_FRONT_M) & (depths_m < _DEEPEST_M) & ((depths_m < _DEEP_M) | (off_m > NEW * depths_m))
     pixel, depths_m, n = chart.pixels(cells[is_its]), depths_m[is_its], chart.shape[0] * chart.shape[1]
     deepest_m = np.full(n, -np.inf)
