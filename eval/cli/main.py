@@ -15,6 +15,7 @@ from typer.core import TyperGroup
 
 from cdpipe.core.threads import fix_threads
 from eval.cli import converting
+from eval.cli import leaderboard as commands_leaderboard
 from eval.cli import pair as commands_pair
 from eval.cli import run as commands_run
 from eval.cli import stories as commands_stories
@@ -46,7 +47,10 @@ class _Funnel(TyperGroup):
             raise typer.Exit(130) from error
 
 
-_KEPT = {"run": "cells", "demo": "cells", "dataset": "tunnels", "export": "pairs", "story": "comparisons"}
+_KEPT = {
+    "run": "cells", "demo": "cells", "dataset": "tunnels", "export": "pairs", "story": "comparisons",
+    "evaluate": "pairs",
+}  # fmt: skip
 app = typer.Typer(
     cls=_Funnel,
     no_args_is_help=True,
@@ -84,6 +88,9 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "score": commands_run.score,
     "run": commands_run.run_command,
     "export": commands_run.export,
+    "evaluate": commands_leaderboard.evaluate,
+    "submit": commands_leaderboard.submit,
+    "leaderboard": commands_leaderboard.leaderboard,
     "report": commands_run.report,
     "dataset": commands_training.dataset,
     "train": commands_training.train,
