@@ -9,6 +9,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from eval.cli.inputs import (
+    RECORDING,
+    Deskew,
+    Format,
+    Metadata,
+    Odometry,
+    Topics,
+    Trajectories,
+    how_to_read,
+    open_inputs,
+    open_sources,
+)
 from eval.cli.options import KindOfSite, OutFolder, Preset, Quiet, SetSettings
 from eval.core.printing import echo, print_table, say, shown_warnings
 from eval.core.progress import shown_progress
@@ -22,21 +34,29 @@ if TYPE_CHECKING:
 
 
 def describe(
-    session: Annotated[Path, typer.Argument(help="session folder, or PLY scans with a TUM trajectory")],
+    session: Annotated[Path, typer.Argument(help=RECORDING)],
     preset: Preset = "tunnelcd",
     settings: SetSettings = None,
+    form: Format = None,
+    topics: Topics = None,
+    trajectory: Trajectories = None,
+    odometry: Odometry = None,
+    metadata: Metadata = None,
+    deskew: Deskew = True,
     quiet: Quiet = False,
 ) -> None:
     """Compute a session's descriptors and store them beside it, as a robot would while mapping."""
     import cdpipe
 
-    with shown_warnings():
-        descriptors, path = cdpipe.describe(session, preset, settings or ())
+    hows = how_to_read(1, form, topics, trajectory, odometry, metadata, deskew=deskew)
+    with shown_warnings(), shown_progress(quiet) as progress:
+        (source,) = open_inputs([session], hows, progress)
+        descriptors, path = cdpipe.describe(source, preset, settings or ())
     say(quiet, f"{path}: {len(descriptors.q)} keyframes, {descriptors.name} {descriptors.checkpoint}")
 
 
 def detect(
-    before: Annotated[Path, typer.Argument(help="session folder, or PLY scans with a TUM trajectory")],
+    before: Annotated[Path, typer.Argument(help=RECORDING)],
     after: Annotated[Path, typer.Argument(help="the later session")],
     out: OutFolder,
     preset: Preset = "tunnelcd",
@@ -52,6 +72,12 @@ def detect(
     surface: Annotated[
         bool, typer.Option("--surface", help="measure how far the rock moved, too (surface.method=planes)")
     ] = False,
+    form: Format = None,
+    topics: Topics = None,
+    trajectory: Trajectories = None,
+    odometry: Odometry = None,
+    metadata: Metadata = None,
+    deskew: Deskew = True,
     quiet: Quiet = False,
 ) -> None:
     """Find what changed between two sessions, simulated or recorded; needs no truth."""
@@ -63,12 +89,14 @@ def detect(
     settings = [*(["surface.method=planes"] if surface else []), *(settings or [])]
     config = cdpipe.load_config(preset, settings, site)
     known = _read_known_merge(before_T_after, assume_aligned=assume_aligned)
-    if is_same_session(cdpipe.open_session(before), cdpipe.open_session(after)):
-        same = f"{before} and {after} are one and the same recording: nothing can have changed between them"
-        echo(f"note: {same}", err=True)
+    hows = how_to_read(2, form, topics, trajectory, odometry, metadata, deskew=deskew)
     try:
         with shown_warnings(), new_folder(out) as partial, shown_progress(quiet) as progress:
-            report = cdpipe.detect(before, after, preset, settings, site, cdpipe.Hooks(progress.stage), known)
+            earlier, later = open_inputs([before, after], hows, progress)
+            if is_same_session(*open_sources(earlier, later)):
+                same = f"{before} and {after} are one and the same recording: nothing can have changed between them"
+                echo(f"note: {same}", err=True)
+            report = cdpipe.detect(earlier, later, preset, settings, site, cdpipe.Hooks(progress.stage), known)
             cdpipe.save_report(report, partial, preset)
             if report.surface is not None:
                 _draw_surface(report.surface, partial / "surface.png")

@@ -4,16 +4,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from eval.cli.inputs import (
+    Deskew,
+    Format,
+    Metadata,
+    Odometry,
+    Topics,
+    Trajectories,
+    how_to_read,
+    open_inputs,
+    open_sources,
+    sampled_points,
+)
 from eval.cli.options import Families, OutFolder, Quiet, SetSettings
-from eval.core.printing import echo, print_table, say, warn
-from eval.core.progress import shown_progress
+from eval.core.printing import echo, print_table, say, shown_warnings, warn
+from eval.core.progress import RunProgress, shown_progress
 
 if TYPE_CHECKING:
+    from cdpipe.io.foreign import HowToRead
     from sim.view.view import View
 
 
@@ -74,7 +88,7 @@ def survey(
 
 
 def view(
-    what: Annotated[str, typer.Argument(help="scenario (name or .yaml file), simulated pair, or session folder")],
+    what: Annotated[str, typer.Argument(help="scenario (name or .yaml file), simulated pair, session or recording")],
     seed: Annotated[
         int | None, typer.Option(min=0, help="seed of a scenario; 0 if left out", show_default=False)
     ] = None,
@@ -86,9 +100,15 @@ def view(
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="write one offline page and end", show_default=False)
     ] = None,
+    form: Format = None,
+    topics: Topics = None,
+    trajectory: Trajectories = None,
+    odometry: Odometry = None,
+    metadata: Metadata = None,
+    deskew: Deskew = True,
     quiet: Quiet = False,
 ) -> None:
-    """Show a world, a simulated pair or a session in the browser."""
+    """Show a world, a simulated pair, a session or a recording in the browser."""
     import time
 
     from cdpipe.core.errors import InputError
@@ -96,16 +116,18 @@ def view(
     from sim.view.viewer import require_viser, running_server, show, write_html
 
     require_viser()
+    (how,) = how_to_read(1, form, topics, trajectory, odometry, metadata, deskew=deskew)
+    load = partial(_load_with_progress, what, seed, settings or (), how, quiet=quiet)
     if html is not None:
         if not html.absolute().parent.is_dir():
             raise InputError(f"--html {html}: there is no folder {html.parent}: make it, or name another one")
-        write_html(load_view(what, seed, settings or ()), html)
+        write_html(load(), html)
         say(quiet, f"{html}: {what}, {html.stat().st_size / 1e6:.1f} MB, opens in any browser")
         return
     if not is_loopback(host):
         warn(f"--host {host}: everybody who reaches port {port} sees the scene; the server asks for no password")
     with running_server(port, host) as server:
-        shown = load_view(what, seed, settings or ())
+        shown = load()
         show(server, shown)
         for note in shown.notes:
             echo(note, err=True)
@@ -117,13 +139,26 @@ def view(
             return
 
 
-def load_view(what: str, seed: int | None = None, settings: Sequence[str] = ()) -> View:
-    """Return the view of a scenario (name or YAML file), of a simulated pair, or of a session.
+def _load_with_progress(what: str, seed: int | None, settings: Sequence[str], how: HowToRead, *, quiet: bool) -> View:
+    with shown_warnings(), shown_progress(quiet) as progress:
+        return load_view(what, seed, settings, how, progress)
+
+
+def load_view(
+    what: str,
+    seed: int | None = None,
+    settings: Sequence[str] = (),
+    how: HowToRead | None = None,
+    progress: RunProgress | None = None,
+) -> View:
+    """Return the view of a scenario (name or YAML file), of a simulated pair, of a session, or of a recording.
 
     Args:
         what: Name, file or folder. A scenario's name takes precedence over a folder without a session.
         seed: Seed of a scenario; 0 if None. A folder has its own.
         settings: `a.b=value` pairs written over a scenario.
+        how: How a recording is to be read.
+        progress: Told of the reading.
 
     Raises:
         InputError: It does not exist or is damaged, or a seed or a setting is given for a folder.
@@ -131,16 +166,23 @@ def load_view(what: str, seed: int | None = None, settings: Sequence[str] = ()) 
     """
     from cdpipe.core.errors import InputError
     from cdpipe.core.yamlfile import suggest
+    from cdpipe.io.foreign import HowToRead, holds_scans
     from cdpipe.io.session import is_session
     from scenarios import load_scenario, scenario_names
     from scenarios.library import SUFFIXES
-    from sim.view.view import is_pair, view_folder, view_scenario
+    from sim.view.returns import MAX_POINTS
+    from sim.view.view import is_pair, view_folder, view_points, view_scenario
 
     path, names = Path(what), scenario_names()
-    if is_pair(path) or is_session(path) or (path.is_dir() and what not in names):
+    is_named = path.is_dir() or (path.exists() and path.suffix not in SUFFIXES)
+    if is_pair(path) or is_session(path) or (is_named and what not in names):
         if seed is not None or settings:
             raise InputError(f"{what}: a folder holds what was recorded: leave --seed and --set out")
-        return view_folder(path)
+        how = how or HowToRead()
+        if is_pair(path) or is_session(path) or (path.is_dir() and not holds_scans(path)):
+            return view_folder(path)
+        (source,) = open_sources(*open_inputs([path], [how], progress or RunProgress()))
+        return view_points(what, sampled_points(source, MAX_POINTS), source.odom_T_sensor)
     if what not in names and path.suffix not in SUFFIXES:
         hint = suggest(what, names) or "; `tunnelcd list` names the scenarios"
         raise InputError(f"{what}: neither a folder nor a scenario{hint}")
