@@ -53,7 +53,7 @@ def _open_ouster(path: Path, how: HowToRead, report: Progress) -> RecordedScans:
     """Convert an OSF or a PCAP to a session in a temporary folder, and open that."""
     from cdpipe.io.ouster.recording import import_recording  # noqa: PLC0415 - it needs the module of this function
 
-    folder = Path(tempfile.mkdtemp(prefix="tunnelcd-"))
+    folder = Path(tempfile.mkdtemp(prefix="tunnelcd-read-"))
     try:
         import_recording(
             path,
@@ -67,7 +67,7 @@ def _open_ouster(path: Path, how: HowToRead, report: Progress) -> RecordedScans:
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
-    source.name = str(path)
+    source.name, source.is_temporary = str(path), True
     weakref.finalize(source, shutil.rmtree, folder, ignore_errors=True)
     return source
 
@@ -79,9 +79,11 @@ class RecordedScans:
         name: The session's folder.
         odom_T_sensor: (S, 4, 4) pose of each revolution.
         descriptors_in: Folder beside the recording that stores its descriptors; None for a session folder.
+        is_temporary: Whether the folder goes with this object.
     """
 
     descriptors_in: Path | None = None
+    is_temporary = False
 
     def __init__(self, session: Session) -> None:
         self.name = str(session.path)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from cdpipe.io.session import Session
 
 GT_CLOUD = "gt_cloud.pcd"
+_FEW_SCANS = 10
 
 
 def convert(
@@ -74,7 +75,8 @@ def _import(source: Path, out: Path, name: str, how: HowToRead, progress: RunPro
     if name not in OUSTER:
         with shown_warnings(), new_folder(out) as partial:
             n_scans, poses = convert_recording(source, partial, how, progress.stage)
-        return f"{out}: {'1 scan' if n_scans == 1 else f'{n_scans} scans'} as PLY, trajectory.tum, poses: {poses}"
+        told = "1 scan" if n_scans == 1 else f"{n_scans} scans"
+        return f"{out}: {told} as PLY, trajectory.tum, poses: {poses}{_too_short(n_scans)}"
     with made_parents(out):
         imported = import_recording(
             source,
@@ -87,7 +89,14 @@ def _import(source: Path, out: Path, name: str, how: HowToRead, progress: RunPro
     told = f"{out}: session of {_revolutions(imported.n_scans)}, {imported.sensor}, poses: {imported.poses}"
     if imported.n_left_out:
         told += f"; {imported.n_left_out} left out, of which half the columns or fewer arrived"
-    return told
+    return told + _too_short(imported.n_scans)
+
+
+def _too_short(n_scans: int) -> str:
+    """Return what to record where there are too few scans to compare two recordings."""
+    if n_scans >= _FEW_SCANS:
+        return ""
+    return "; so few are one place, seldom enough to compare: record a path of ten metres or more, twice"
 
 
 def _export(source: Path, out: Path, progress: RunProgress, *, with_truth: bool) -> str:

@@ -71,9 +71,13 @@ def open_inputs(paths: Sequence[Path], hows: Sequence[HowToRead], progress: RunP
     """
     from cdpipe.io.readers import open_session
 
-    checked = _check_sessions(paths, hows)
-    pairs = zip(paths, checked, strict=True)
-    return [path if how is None else open_session(path, how, progress.stage) for path, how in pairs]
+    opened: list[Path | ScanSource] = []
+    for path, how in zip(paths, _check_sessions(paths, hows), strict=True):
+        source = path if how is None else open_session(path, how, progress.stage)
+        opened.append(source)
+        if getattr(source, "is_temporary", False):
+            progress.note(f"{path} was read into a temporary folder: `tunnelcd convert {path} FOLDER` keeps it")
+    return opened
 
 
 def open_sources(*inputs: Path | ScanSource) -> list[ScanSource]:

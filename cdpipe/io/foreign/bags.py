@@ -70,9 +70,8 @@ class BagScans:
         stamps: Int64Array = arrays["stamps"]
         if not len(stamps):
             raise InputError(f"{path}: {self._topic}: no cloud can be read from it")
-        steps = np.diff(stamps)
-        if steps.min(initial=1) <= 0:
-            late = int(np.argmax(steps <= 0)) + 1
+        late = 1 + next(iter(np.flatnonzero(np.diff(stamps) <= 0).tolist()), -1)
+        if late:
             raise InputError(
                 f"{path}: {self._topic}: the stamp of cloud {late} does not come after that of the one before"
             )
@@ -102,8 +101,8 @@ class BagScans:
         for number, (_, arrays) in enumerate(messages):
             if number < len(self._is_kept) and self._is_kept[number]:
                 cloud = check_cloud(f"{self._path}: {self._topic}: cloud {number}", arrays)
-                is_return = np.isfinite(cloud.points).all(axis=1)
-                yield Cloud(np.where(is_return[:, None], cloud.points, 0.0), cloud.times)
+                cloud.points[np.flatnonzero(~np.isfinite(cloud.points).all(axis=1))] = 0.0
+                yield cloud
 
     def _choose(self, kind: str, topics: Sequence[str], what: str) -> str:
         found = [name for name, its_kind, _ in self._topics if its_kind == kind]

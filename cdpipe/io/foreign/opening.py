@@ -84,13 +84,13 @@ def open_recording(path: Path, how: HowToRead, report: Progress) -> PosedClouds:
         if how.odometry is None and len(source.odom_T_sensor) > 1:
             check_quaternion_order(source, source.poses_from)
         return source
-    with _removed_on_error(Path(tempfile.mkdtemp(prefix="tunnelcd-"))) as folder:
+    with _removed_on_error(Path(tempfile.mkdtemp(prefix="tunnelcd-read-"))) as folder:
         write_scans(source, folder / "scans", report)
         clouds = open_folder(folder / "scans", "ply", has_poses=True)
         opened = PosedClouds(clouds, source.odom_T_sensor, source.stamps_s, None)
         if how.trajectory is not None:
             check_quaternion_order(opened, source.poses_from)
-    opened.name = str(path)
+    opened.name, opened.is_temporary = str(path), True
     weakref.finalize(opened, shutil.rmtree, folder, ignore_errors=True)
     return opened
 

@@ -31,9 +31,11 @@ class PosedClouds:
         name: The recording.
         odom_T_sensor: (S, 4, 4) pose of each scan.
         descriptors_in: Folder that stores its descriptors.
+        is_temporary: Whether its files go with this object.
     """
 
     descriptors_in: Path | None = None
+    is_temporary = False
 
     def __init__(
         self, clouds: Clouds, odom_T_sensor: Float64Array, stamps_s: Float64Array, motion: Motion | None

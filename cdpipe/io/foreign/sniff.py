@@ -74,7 +74,7 @@ def guess_format(path: Path) -> str:
     named = [name for name, each in FORMATS.items() if suffix in each.suffixes]
     found = [name for name, each in FORMATS.items() if any(head[at:].startswith(it) for at, it in each.magic)]
     if not (found or named):
-        raise InputError(f"{path}: not a recording that can be read: expected {_known()}; --format NAME overrides")
+        raise InputError(f"{path}: expected a session folder, or a recording ({_known()}); --format NAME overrides")
     return (found or named)[0]
 
 

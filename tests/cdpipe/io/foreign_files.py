@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.geometry import Float64Array, invert, make_pose, yaw_pose
 
 START_NS = 1_700_000_000_000_000_000
-ODOM_T_BASE_HZ = 50.0
+BASE_HZ = 50.0
 BASE_T_SENSOR = make_pose(Rotation.from_euler("xyz", (0.0, 5.0, 90.0), degrees=True).as_matrix(), (0.3, 0.1, 0.8))
 
 
@@ -35,7 +35,7 @@ class Drive:
 
 def odom_T_sensor(time_s: Any) -> Float64Array:
     """Return poses (..., 4, 4): 1.5 m/s along a bend of 0.5 rad/s."""
-    turns = Rotation.from_euler("zyx", np.stack([0.5 * time_s, 0.05 * np.sin(time_s), 0 * time_s], -1).reshape(-1, 3))
+    turns = Rotation.from_euler("ZYX", np.stack([0.5 * time_s, 0.05 * np.sin(time_s), 0 * time_s], -1).reshape(-1, 3))
     at = np.stack([1.5 * time_s, 0.2 * time_s**2, 0.1 + 0 * time_s], -1)
     return make_pose(turns.as_matrix().reshape(*np.shape(time_s), 3, 3), at)
 
@@ -216,14 +216,14 @@ class RosMessages:
         )
         return self.types["geometry_msgs/msg/PoseStamped"](header=self._header(time_s, "map"), pose=here)
 
-    def all(self, poses: str, cloud_topics: Sequence[str] = ("/ouster/points",)) -> list[tuple[str, str, float, Any]]:
+    def all(self, poses: str, cloud_topics: Sequence[str], last_pose_s: float) -> list[tuple[str, str, float, Any]]:
         """Return topic, type, time and message of everything: `poses` is tf, odometry, pose or none."""
         made = [
             (topic, "sensor_msgs/msg/PointCloud2", time_s, cloud)
             for topic in cloud_topics
             for time_s, cloud in self.clouds()
         ]
-        times = np.arange(self._made.stamps_s[0] - 0.1, self._made.stamps_s[-1] + 0.25, 1 / ODOM_T_BASE_HZ)
+        times = np.arange(self._made.stamps_s[0] - 0.1, min(self._made.stamps_s[-1] + 0.25, last_pose_s), 1 / BASE_HZ)
         base = odom_T_sensor(times) @ invert(BASE_T_SENSOR)
         tf, first = "tf2_msgs/msg/TFMessage", float(times[0])
         if poses in ("tf", "odometry"):
@@ -242,10 +242,16 @@ class RosMessages:
         return sorted(made, key=lambda each: each[2])
 
 
-def write_bag(path: Path, made: Drive, poses: str = "tf", cloud_topics: Sequence[str] = ("/ouster/points",)) -> Path:
-    """Write a bag with rosbags: ROS 1 if the name ends in .bag, else ROS 2 with sqlite3; .mcap with the package mcap."""
+def write_bag(
+    path: Path,
+    made: Drive,
+    poses: str = "tf",
+    cloud_topics: Sequence[str] = ("/ouster/points",),
+    last_pose_s: float = np.inf,
+) -> Path:
+    """Write a bag with rosbags: ROS 1 if the name ends in .bag, else ROS 2 with sqlite3; .mcap with package mcap."""
     if path.suffix == ".mcap":
-        return _write_mcap(path, made, poses, cloud_topics)
+        return _write_mcap(path, made, poses, cloud_topics, last_pose_s)
     from rosbags.rosbag1 import Writer as Writer1  # noqa: PLC0415
     from rosbags.rosbag2 import Writer as Writer2  # noqa: PLC0415
 
@@ -253,7 +259,7 @@ def write_bag(path: Path, made: Drive, poses: str = "tf", cloud_topics: Sequence
     messages = RosMessages(made, "ROS1_NOETIC" if is_first else "ROS2_HUMBLE")
     with (Writer1 if is_first else Writer2)(path) as bag:
         connections: dict[str, Any] = {}
-        for topic, kind, time_s, message in messages.all(poses, cloud_topics):
+        for topic, kind, time_s, message in messages.all(poses, cloud_topics, last_pose_s):
             if topic not in connections:
                 connections[topic] = bag.add_connection(topic, kind, typestore=messages.store)
             store = messages.store
@@ -262,7 +268,7 @@ def write_bag(path: Path, made: Drive, poses: str = "tf", cloud_topics: Sequence
     return path
 
 
-def _write_mcap(path: Path, made: Drive, poses: str, cloud_topics: Sequence[str]) -> Path:
+def _write_mcap(path: Path, made: Drive, poses: str, cloud_topics: Sequence[str], last_pose_s: float) -> Path:
     from mcap.writer import Writer  # noqa: PLC0415
 
     messages = RosMessages(made)
@@ -270,7 +276,7 @@ def _write_mcap(path: Path, made: Drive, poses: str, cloud_topics: Sequence[str]
         writer = Writer(file)
         writer.start(profile="ros2", library="test")
         channels: dict[str, int] = {}
-        for topic, kind, time_s, message in messages.all(poses, cloud_topics):
+        for topic, kind, time_s, message in messages.all(poses, cloud_topics, last_pose_s):
             if topic not in channels:
                 text = messages.store.generate_msgdef(kind, ros_version=2)[0]
                 schema = writer.register_schema(kind, "ros2msg", text.encode())
