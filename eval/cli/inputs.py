@@ -69,8 +69,12 @@ def open_inputs(paths: Sequence[Path], hows: Sequence[HowToRead], progress: RunP
     Raises:
         InputError: One cannot be read, or options are given for sessions alone.
     """
+    from cdpipe.io.foreign import guess_format
     from cdpipe.io.readers import open_session
 
+    for path, how in zip(paths, hows, strict=True):
+        if how.format is None:  # a long reading does not end at a wrong second name
+            guess_format(path)
     opened: list[Path | ScanSource] = []
     for path, how in zip(paths, _check_sessions(paths, hows), strict=True):
         source = path if how is None else open_session(path, how, progress.stage)
