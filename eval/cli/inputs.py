@@ -76,8 +76,8 @@ def open_inputs(paths: Sequence[Path], hows: Sequence[HowToRead], progress: RunP
         if how.format is None:  # a long reading does not end at a wrong second name
             guess_format(path)
     opened: list[Path | ScanSource] = []
-    for path, how in zip(paths, _check_sessions(paths, hows), strict=True):
-        source = path if how is None else open_session(path, how, progress.stage)
+    for path, checked in zip(paths, _check_sessions(paths, hows), strict=True):
+        source = path if checked is None else open_session(path, checked, progress.stage)
         opened.append(source)
         if getattr(source, "is_temporary", False):
             progress.note(f"{path} was read into a temporary folder: `tunnelcd convert {path} FOLDER` keeps it")
