@@ -18,7 +18,7 @@ from typing import Any, Generic, Literal, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.core.errors import InputWarning, MergeFailedError
+from cdpipe.core.errors import InputError, InputWarning, MergeFailedError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors.describe import (
@@ -134,7 +134,7 @@ def detect(
 
 
 def describe(
-    session: Path | str, preset: str = "tunnelcd", settings: Iterable[str] | Mapping[str, Any] = ()
+    session: Path | str | ScanSource, preset: str = "tunnelcd", settings: Iterable[str] | Mapping[str, Any] = ()
 ) -> tuple[DescriptorSet, Path]:
     """Describe the keyframes of a session and store the vectors beside it, as a robot would while mapping.
 
@@ -147,13 +147,15 @@ def describe(
     config = load_config(preset, settings)
     list_checkpoints(config)  # report bad weights before the mapping
     use_threads(THREADS)
-    source = open_session(session)
+    source, folder = _open_with_folder(session)
+    if folder is None:
+        raise InputError(f"{source.name}: descriptors are stored beside a recording: name its folder or file")
     if config.regions.source == "sphere":
         descriptors = map_session(source, config).descriptors
     else:
         chosen = choose_keyframes(source.odom_T_sensor, config.map.keyframe_spacing_m)
         descriptors = describe_scans(clear(source, config.map), chosen, config.descriptor)
-    return descriptors, save_descriptors(Path(session), descriptors, source.odom_T_sensor, config.map, config.sphere)
+    return descriptors, save_descriptors(folder, descriptors, source.odom_T_sensor, config.map, config.sphere)
 
 
 def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
@@ -379,10 +381,18 @@ def _warn_of_few_views(mapped: Sequence[MappedSession], config: PipelineConfig) 
 
 def _open(session: Path | str | ScanSource, config: PipelineConfig) -> tuple[ScanSource, DescriptorSet | None]:
     """Return an opened session, and the descriptors stored in its folder."""
+    source, folder = _open_with_folder(session)
+    if folder is None:
+        return source, None
+    return source, load_descriptors(folder, config.descriptor, source.odom_T_sensor, config.map, config.sphere)
+
+
+def _open_with_folder(session: Path | str | ScanSource) -> tuple[ScanSource, Path | None]:
+    """Return an opened session, and the folder that its descriptors are stored in; None for one that is in no file."""
     if not isinstance(session, Path | str):
-        return session, None
+        return session, getattr(session, "descriptors_in", None)
     source = open_session(session)
-    return source, load_descriptors(Path(session), config.descriptor, source.odom_T_sensor, config.map, config.sphere)
+    return source, getattr(source, "descriptors_in", None) or Path(session)
 
 
 def _describe_both(

@@ -92,7 +92,7 @@ def save_descriptors(
     try:
         if path.parent.is_symlink():
             raise InputError(f"{path.parent}: is a link, and nothing outside of {folder} may be written: remove it")
-        path.parent.mkdir(exist_ok=True)
+        path.parent.mkdir(exist_ok=True, parents=True)
         partial.unlink(missing_ok=True)  # it may be a link, which a writer would follow
         np.savez(
             partial,

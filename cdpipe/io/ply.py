@@ -1,4 +1,4 @@
-"""Read the vertices of a PLY file, ascii or binary, with any other properties and elements.
+"""Read the vertices of a PLY file, ascii or binary, with any other properties and elements; write points.
 
 General mesh readers do not fit scans: meshio rejects the `camera` element that PCL writes, fails on some ascii files
 and accepts truncated ones.
@@ -6,10 +6,13 @@ and accepts truncated ones.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_bytes
@@ -26,6 +29,8 @@ _TYPES = {
     **dict.fromkeys(("double", "float64"), "f8"),
 }
 _BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+# Kind of an array -> its word in a header, and its bytes.
+_WRITTEN = {"f": ("float", "<f4"), "i": ("int", "<i4")}
 _N_WORDS = {"format": 3, "element": 3, "property": 3}
 _MAX_HEADER_BYTES = 1 << 16
 _BLOCK = 10_000
@@ -51,6 +56,18 @@ def read_ply_points(path: Path) -> Float64Array:
         return _vertices(content, header)
     except (OverflowError, ValueError) as error:
         raise InputError(f"{path}: not a readable PLY scan: {error}") from error
+
+
+def write_ply_points(path: Path, points: Float64Array, scalars: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
+    """Write (N, 3) points and (N,) scalars of each, as 32-bit numbers."""
+    columns = {**dict(zip("xyz", points.T, strict=True)), **(scalars or {})}
+    types = {name: _WRITTEN[values.dtype.kind] for name, values in columns.items()}
+    vertices = np.empty(len(points), dtype=[(name, code) for name, (_, code) in types.items()])
+    for name, values in columns.items():
+        vertices[name] = values
+    properties = "".join(f"property {word} {name}\n" for name, (word, _) in types.items())
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{properties}end_header\n"
+    path.write_bytes(header.encode() + vertices.tobytes())
 
 
 def _parse_header(content: bytes) -> _Header:

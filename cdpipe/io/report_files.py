@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array
 from cdpipe.io.answer import write_answer
+from cdpipe.io.ply import write_ply_points
 from cdpipe.model.report import ChangeReport, SurfaceField
-
-_PLY_TYPES = {"f": ("float", "<f4"), "i": ("int", "<i4")}
 
 
 def save_report(report: ChangeReport, folder: Path | str, method: str = "tunnelcd") -> None:
@@ -38,7 +35,7 @@ def save_report(report: ChangeReport, folder: Path | str, method: str = "tunnelc
         write_answer(folder, method, report)
         report.to_pandas("regions").to_csv(folder / "regions.csv", index=False)
         report.to_pandas("objects").to_csv(folder / "objects.csv", index=False)
-        _write_ply(folder / "objects.ply", np.concatenate(points), {"object": np.concatenate(owners)})
+        write_ply_points(folder / "objects.ply", np.concatenate(points), {"object": np.concatenate(owners)})
         if report.surface is not None:
             report.to_pandas("surface").to_csv(folder / "surface.csv", index=False)
             _write_surface(folder / "surface.ply", report.surface)
@@ -49,16 +46,4 @@ def save_report(report: ChangeReport, folder: Path | str, method: str = "tunnelc
 def _write_surface(path: Path, surface: SurfaceField) -> None:
     scalars: dict[str, npt.NDArray[Any]] = dict(zip(("nx", "ny", "nz"), surface.normals_map.T, strict=True))
     scalars |= {"displacement": surface.displacement_m, "level": surface.level_m, "region": surface.region}
-    _write_ply(path, surface.points_map, scalars)
-
-
-def _write_ply(path: Path, points: Float64Array, scalars: Mapping[str, npt.NDArray[Any]]) -> None:
-    """Write (N, 3) points and (N,) scalars of each, as 32-bit numbers."""
-    columns = {**dict(zip("xyz", points.T, strict=True)), **scalars}
-    types = {name: _PLY_TYPES[values.dtype.kind] for name, values in columns.items()}
-    vertices = np.empty(len(points), dtype=[(name, code) for name, (_, code) in types.items()])
-    for name, values in columns.items():
-        vertices[name] = values
-    properties = "".join(f"property {word} {name}\n" for name, (word, _) in types.items())
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{properties}end_header\n"
-    path.write_bytes(header.encode() + vertices.tobytes())
+    write_ply_points(path, surface.points_map, scalars)

@@ -16,7 +16,7 @@ from cdpipe.core.motion import Motion, make_motion
 TUM_LINE = "stamp tx ty tz qx qy qz qw"
 _UNIT_TOLERANCE = 1e-3
 _FARTHEST_M = 1e8  # around the Earth twice; UTM coordinates are below 1e7
-_MOST_BYTES = 100_000_000  # two hours at 200 Hz
+MOST_BYTES = 100_000_000  # two hours at 200 Hz
 _MOST_STAMP_S = 9e9  # of Unix time until the year 2255; as nanoseconds it fits into 64 bits
 # Poses farther apart than this say nothing about the columns between them.
 _LONGEST_GAP_S = 1.0
@@ -28,7 +28,7 @@ def read_tum(path: Path) -> tuple[Float64Array, tuple[int, ...]]:
     Raises:
         InputError: The file cannot be read, or a line is not eight finite numbers with a unit quaternion.
     """
-    content = read_bytes(path, _MOST_BYTES)
+    content = read_bytes(path, MOST_BYTES)
     try:
         lines = content.decode().splitlines()
     except UnicodeDecodeError as error:
@@ -99,6 +99,16 @@ def motion_along(path: Path, first_ns: int, last_ns: int, slack_s: float) -> Mot
             f"at most {_LONGEST_GAP_S:g} s can be bridged"
         )
     return motion_through(rows, first_ns / 1e9)
+
+
+def write_tum(path: Path, stamps_s: Float64Array, poses: Float64Array) -> None:
+    """Write poses (N, 4, 4) at (N,) times as a TUM file."""
+    rows = np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
+    lines = [
+        f"{stamp:.9f} {' '.join(f'{number:.12g}' for number in row)}\n"
+        for stamp, row in zip(stamps_s, rows, strict=True)
+    ]
+    path.write_text(f"# {TUM_LINE}\n{''.join(lines)}", encoding="utf-8")
 
 
 def require_unit_poses(poses: Float64Array, where: Callable[[int], str]) -> None:

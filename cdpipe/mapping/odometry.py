@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, invert, travelled_m
+from cdpipe.core.geometry import BoolArray, Float64Array, invert, travelled_m
 from cdpipe.core.motion import Motion, make_motion, rotation_matrices
 from cdpipe.sensor.ouster import SensorMetadata
 
@@ -24,6 +24,8 @@ _FIRST_THRESHOLD_M = 2.0
 _LEAST_MOTION_M = 0.1
 _MAX_ITERATIONS = 500
 _CONVERGED = 1e-4
+# Returns the points (N, 3) of a scan, deskewed at a velocity (6,): metres and radians a second.
+_Frame = Callable[[Float64Array], Float64Array]
 
 
 def estimate_motion(
@@ -48,27 +50,57 @@ def estimate_motion(
     Raises:
         InputError: A pose is not finite.
     """
-    icp = _kiss_icp()
-    poses = np.tile(np.eye(4), (len(revolution_s), 1, 1))
-    twist = np.zeros(6)
-    for number, range_mm in enumerate(range_images):
-        points = deskew_at_constant_velocity(sensor.project(range_mm / 1000.0), twist[:3], twist[3:], column_s)
-        icp.register_frame(np.ascontiguousarray(points[range_mm > 0]), np.zeros(0))
-        poses[number] = icp.last_pose
-        if not np.isfinite(poses[number]).all():
-            raise InputError(
-                f"KISS-ICP has no finite pose for revolution {number}, {revolution_s[number]:.1f} s on the way"
-            )
-        if number + 1 < len(revolution_s) and number > 0:
-            elapsed_s = revolution_s[number] - revolution_s[number - 1]
-            delta = invert(poses[number - 1]) @ poses[number]
-            twist = np.concatenate([delta[:3, 3], Rotation.from_matrix(delta[:3, :3]).as_rotvec()]) / elapsed_s
+    frames = (_columns_frame(sensor.project(range_mm / 1000.0), range_mm > 0, column_s) for range_mm in range_images)
+    poses = _register(frames, revolution_s, "revolution")
     odom_T_sensor = odom_T_first @ poses
     if len(odom_T_sensor) == 1:
         odom_T_sensor = np.repeat(odom_T_sensor, 2, axis=0)
         revolution_s = revolution_s + np.array([0.0, 1.0])
     positions, rotations = odom_T_sensor[:, :3, 3], Rotation.from_matrix(odom_T_sensor[:, :3, :3])
     return make_motion(revolution_s, travelled_m(odom_T_sensor), positions, rotations)
+
+
+def estimate_cloud_motion(
+    clouds: Iterable[tuple[Float64Array, Float64Array | None]], stamps_s: Float64Array
+) -> Float64Array:
+    """Return the poses (S, 4, 4) that KISS-ICP estimates for clouds of any sensor; the first is the identity.
+
+    Args:
+        clouds: For each scan its points (N, 3), metres, and the time (N,) of each after the stamp, seconds; None where
+            they are deskewed or have no times.
+        stamps_s: (S,) rising time of each scan.
+
+    Raises:
+        InputError: A pose is not finite.
+    """
+    return _register((_cloud_frame(points, time_s) for points, time_s in clouds), stamps_s, "scan")
+
+
+def _columns_frame(points: Float64Array, is_hit: BoolArray, column_s: Float64Array) -> _Frame:
+    return lambda twist: deskew_at_constant_velocity(points, twist[:3], twist[3:], column_s)[is_hit]
+
+
+def _cloud_frame(points: Float64Array, time_s: Float64Array | None) -> _Frame:
+    if time_s is None:
+        return lambda twist: points
+    return lambda twist: deskew_at_constant_velocity(points[None], twist[:3], twist[3:], time_s)[0]
+
+
+def _register(frames: Iterable[_Frame], stamps_s: Float64Array, what: str) -> Float64Array:
+    """Return the pose (S, 4, 4) of each frame, which is deskewed at the velocity (6,) of the preceding step."""
+    icp = _kiss_icp()
+    poses = np.tile(np.eye(4), (len(stamps_s), 1, 1))
+    twist = np.zeros(6)
+    for number, frame in enumerate(frames):
+        icp.register_frame(np.ascontiguousarray(frame(twist)), np.zeros(0))
+        poses[number] = icp.last_pose
+        if not np.isfinite(poses[number]).all():
+            raise InputError(f"KISS-ICP has no finite pose for {what} {number}, {stamps_s[number]:.1f} s on the way")
+        if number + 1 < len(stamps_s) and number > 0:
+            elapsed_s = stamps_s[number] - stamps_s[number - 1]
+            delta = invert(poses[number - 1]) @ poses[number]
+            twist = np.concatenate([delta[:3, 3], Rotation.from_matrix(delta[:3, :3]).as_rotvec()]) / elapsed_s
+    return poses
 
 
 def deskew_at_constant_velocity(

@@ -1,4 +1,4 @@
-"""`tunnelcd convert`: a session becomes an OSF or a folder of PCD files; an OSF or a PCAP becomes a session."""
+"""`tunnelcd convert`: a session becomes an OSF or a folder of PCD files; a recording becomes a session."""
 
 # ruff: noqa: PLC0415 - heavy imports stand inside the functions, so that --help and completion are instant
 from __future__ import annotations
@@ -8,67 +8,95 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from eval.cli.inputs import RECORDING, Deskew, Format, Metadata, Odometry, Topics, Trajectories, how_to_read
 from eval.cli.options import Quiet
-from eval.core.printing import say
+from eval.core.printing import say, shown_warnings
 from eval.core.progress import RunProgress, shown_progress
 
 if TYPE_CHECKING:
+    from cdpipe.io.foreign import HowToRead
     from cdpipe.io.session import Session
 
 GT_CLOUD = "gt_cloud.pcd"
+_FEW_SCANS = 10
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="SRC", help="session folder; or a recording, .osf or .pcap")],
+    source: Annotated[Path, typer.Argument(metavar="SRC", help=RECORDING)],
     out: Annotated[Path, typer.Argument(metavar="DST", help="new .osf file or folder of .pcd files; or new session")],
-    metadata: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.json", help="sensor of a .pcap; else the .json beside it", show_default=False),
-    ] = None,
-    trajectory: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.tum", help="poses of the sensor, stamped by its clock", show_default=False),
-    ] = None,
-    odometry: Annotated[
-        str | None, typer.Option(metavar="kiss-icp", help="estimate the poses", show_default=False)
-    ] = None,
+    metadata: Metadata = None,
+    trajectory: Trajectories = None,
+    odometry: Odometry = None,
+    form: Format = None,
+    topics: Topics = None,
+    deskew: Deskew = True,
     with_truth: Annotated[
         bool, typer.Option("--with-truth/--without-truth", help="LABEL and INSTANCE in the .osf; gt_cloud.pcd")
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Convert a session to OSF for the vendor's SDK, or to PCD files; or an OSF or PCAP recording to a session.
+    """Convert a session to OSF for the vendor's SDK, or to PCD files; or a recording to a session.
+
+    An OSF or PCAP becomes a session folder; scans of any other format become a folder of deskewed PLY scans with a TUM
+    trajectory, which all commands take as a session.
 
     A folder of PCD files has the layout of DynamicMap_Benchmark: pcd/000000.pcd and so on, the points in one frame, and
     gt_cloud.pcd with the truth, where what moves has intensity 1.
     """
     from cdpipe.core.errors import InputError
-    from cdpipe.io.ouster.recording import import_recording
+    from cdpipe.io.foreign import HowToRead, guess_format
     from cdpipe.io.readers import RECORDING_SUFFIXES
-    from eval.core.output import made_parents
+    from cdpipe.io.session import is_session
 
-    if source.is_dir():
-        for name, value in {"metadata": metadata, "trajectory": trajectory, "odometry": odometry}.items():
-            if value is not None:
-                raise InputError(f"{source}: a session has its own poses and sensor: leave --{name} out")
+    (how,) = how_to_read(1, form, topics, trajectory, odometry, metadata, deskew=deskew)
+    if is_session(source) or is_session(source / "before"):
+        if how != HowToRead():
+            given = {"metadata": metadata, "trajectory": trajectory, "odometry": odometry, "format": form}
+            name = next((name for name, value in given.items() if value is not None), "topic")
+            raise InputError(f"{source}: a session has its own poses and sensor: leave --{name} out")
         with shown_progress(quiet) as progress:
             say(quiet, _export(source, out, progress, with_truth=with_truth))
         return
-    if source.suffix.lower() not in RECORDING_SUFFIXES:
-        what = "expected a session folder" if source.exists() else "no such file or folder: expected a session"
-        raise InputError(f"{source}: {what}, or a recording ({', '.join(RECORDING_SUFFIXES)})")
+    name = how.format or guess_format(source)
     if with_truth:
         raise InputError(f"{source}: a recording has no truth: leave --with-truth out")
     if out.suffix.lower() in RECORDING_SUFFIXES:
         raise InputError(f"{out}: a recording becomes a session: name a new folder")
-    with shown_progress(quiet) as progress, made_parents(out):
+    with shown_progress(quiet) as progress:
+        say(quiet, _import(source, out, name, how, progress))
+
+
+def _import(source: Path, out: Path, name: str, how: HowToRead, progress: RunProgress) -> str:
+    from cdpipe.io.foreign import convert_recording
+    from cdpipe.io.foreign.sniff import OUSTER
+    from cdpipe.io.ouster.recording import import_recording
+    from eval.core.output import made_parents, new_folder
+
+    if name not in OUSTER:
+        with shown_warnings(), new_folder(out) as partial:
+            n_scans, poses = convert_recording(source, partial, how, progress.stage)
+        told = "1 scan" if n_scans == 1 else f"{n_scans} scans"
+        return f"{out}: {told} as PLY, trajectory.tum, poses: {poses}{_too_short(n_scans)}"
+    with made_parents(out):
         imported = import_recording(
-            source, out, metadata=metadata, trajectory=trajectory, odometry=odometry, on_progress=progress.stage
+            source,
+            out,
+            metadata=how.metadata,
+            trajectory=how.trajectory,
+            odometry=how.odometry,
+            on_progress=progress.stage,
         )
     told = f"{out}: session of {_revolutions(imported.n_scans)}, {imported.sensor}, poses: {imported.poses}"
     if imported.n_left_out:
         told += f"; {imported.n_left_out} left out, of which half the columns or fewer arrived"
-    say(quiet, told)
+    return told + _too_short(imported.n_scans)
+
+
+def _too_short(n_scans: int) -> str:
+    """Return what to record where there are too few scans to compare two recordings."""
+    if n_scans >= _FEW_SCANS:
+        return ""
+    return "; so few are one place, seldom enough to compare: record a path of ten metres or more, twice"
 
 
 def _export(source: Path, out: Path, progress: RunProgress, *, with_truth: bool) -> str:

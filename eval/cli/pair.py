@@ -3,12 +3,24 @@
 # ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from eval.cli.inputs import (
+    RECORDING,
+    Deskew,
+    Format,
+    Metadata,
+    Odometry,
+    Topics,
+    Trajectories,
+    how_to_read,
+    open_inputs,
+    open_sources,
+)
 from eval.cli.options import KindOfSite, OutFolder, Preset, Quiet, SetSettings
 from eval.cli.printed_answer import LINE, print_answer
 from eval.core.printing import echo, print_table, say, shown_warnings
@@ -20,24 +32,33 @@ if TYPE_CHECKING:
     from cdpipe.core.geometry import Float64Array
     from cdpipe.model.config import PipelineConfig
     from cdpipe.model.report import ChangeReport, SurfaceField
+    from cdpipe.model.types import ScanSource
 
 
 def describe(
-    session: Annotated[Path, typer.Argument(help="session folder, or PLY scans with a TUM trajectory")],
+    session: Annotated[Path, typer.Argument(help=RECORDING)],
     preset: Preset = "tunnelcd",
     settings: SetSettings = None,
+    form: Format = None,
+    topics: Topics = None,
+    trajectory: Trajectories = None,
+    odometry: Odometry = None,
+    metadata: Metadata = None,
+    deskew: Deskew = True,
     quiet: Quiet = False,
 ) -> None:
     """Compute a session's descriptors and store them beside it, as a robot would while mapping."""
     import cdpipe
 
-    with shown_warnings():
-        descriptors, path = cdpipe.describe(session, preset, settings or ())
+    hows = how_to_read(1, form, topics, trajectory, odometry, metadata, deskew=deskew)
+    with shown_warnings(), shown_progress(quiet) as progress:
+        (source,) = open_inputs([session], hows, progress)
+        descriptors, path = cdpipe.describe(source, preset, settings or ())
     say(quiet, f"{path}: {len(descriptors.q)} keyframes, {descriptors.name} {descriptors.checkpoint}")
 
 
 def detect(
-    before: Annotated[Path, typer.Argument(help="session folder, or PLY scans with a TUM trajectory")],
+    before: Annotated[Path, typer.Argument(help=RECORDING)],
     after: Annotated[Path, typer.Argument(help="the later session")],
     out: OutFolder,
     preset: Preset = "tunnelcd",
@@ -56,6 +77,12 @@ def detect(
     html: Annotated[
         bool, typer.Option("--html", help="also write answer.html: the pair in 3-D and its objects, one offline page")
     ] = False,
+    form: Format = None,
+    topics: Topics = None,
+    trajectory: Trajectories = None,
+    odometry: Odometry = None,
+    metadata: Metadata = None,
+    deskew: Deskew = True,
     quiet: Quiet = False,
 ) -> None:
     """Find what changed between two sessions, simulated or recorded; needs no truth."""
@@ -67,17 +94,19 @@ def detect(
     settings = [*(["surface.method=planes"] if surface else []), *(settings or [])]
     config = cdpipe.load_config(preset, settings, site)
     known = _read_known_merge(before_T_after, assume_aligned=assume_aligned)
-    if is_same_session(cdpipe.open_session(before), cdpipe.open_session(after)):
-        same = f"{before} and {after} are one and the same recording: nothing can have changed between them"
-        echo(f"note: {same}", err=True)
+    hows = how_to_read(2, form, topics, trajectory, odometry, metadata, deskew=deskew)
     try:
         with shown_warnings(), new_folder(out) as partial, shown_progress(quiet) as progress:
-            report = cdpipe.detect(before, after, preset, settings, site, cdpipe.Hooks(progress.stage), known)
+            earlier, later = open_inputs([before, after], hows, progress)
+            if is_same_session(*open_sources(earlier, later)):
+                same = f"{before} and {after} are one and the same recording: nothing can have changed between them"
+                echo(f"note: {same}", err=True)
+            report = cdpipe.detect(earlier, later, preset, settings, site, cdpipe.Hooks(progress.stage), known)
             cdpipe.save_report(report, partial, preset)
             if report.surface is not None:
                 _draw_surface(report.surface, partial / "surface.png")
             if html:
-                _write_page((before, after), preset, report, partial / "answer.html", progress.stage)
+                _write_page(open_sources(earlier, later), preset, report, partial / "answer.html", progress.stage)
     except MergeFailedError as error:
         if not quiet:
             print_table("merge: refused", _evidence_table(error.evidence, config), LINE)
@@ -92,17 +121,16 @@ def detect(
 
 
 def _write_page(
-    sessions: tuple[Path, Path],
+    sessions: Sequence[ScanSource],
     method: str,
     report: ChangeReport,
     file: Path,
     on_stage: Callable[[str, int, int], None],
 ) -> None:
-    import cdpipe
     from eval.report.answer.content import gather_content
     from eval.report.answer.page import write_answer_page
 
-    before, after = (cdpipe.open_session(each) for each in sessions)
+    before, after = sessions
     write_answer_page(gather_content((before, after), method, report, on_stage), file)
 
 

@@ -4,16 +4,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from eval.cli.inputs import (
+    Deskew,
+    Format,
+    Metadata,
+    Odometry,
+    Topics,
+    Trajectories,
+    how_to_read,
+    open_inputs,
+    open_sources,
+    sampled_points,
+)
 from eval.cli.options import Families, OutFolder, Quiet, SetSettings
-from eval.core.printing import echo, print_table, say, warn
-from eval.core.progress import shown_progress
+from eval.core.printing import echo, print_table, say, shown_warnings, warn
+from eval.core.progress import RunProgress, shown_progress
 
 if TYPE_CHECKING:
+    from cdpipe.io.foreign import HowToRead
     from eval.report.answer.content import AnswerContent
     from sim.view.view import View
 
@@ -86,7 +100,7 @@ def view(
     what: Annotated[
         str,
         typer.Argument(
-            help="scenario (name or .yaml file), simulated pair or session; of an answer: the before session"
+            help="scenario (name or .yaml file), simulated pair, session or recording; of an answer: the before session"
         ),
     ],
     after: Annotated[Path | None, typer.Argument(help="the later session of an answer", show_default=False)] = None,
@@ -102,25 +116,33 @@ def view(
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="write one offline page and end", show_default=False)
     ] = None,
+    form: Format = None,
+    topics: Topics = None,
+    trajectory: Trajectories = None,
+    odometry: Odometry = None,
+    metadata: Metadata = None,
+    deskew: Deskew = True,
     quiet: Quiet = False,
 ) -> None:
-    """Show a world, a simulated pair, a session, or what an answer found between two sessions, in the browser."""
+    """Show a world, a pair, a session, a recording, or what an answer found between two of them, in the browser."""
     from cdpipe.core.errors import InputError
 
     if html is not None and not html.absolute().parent.is_dir():
         raise InputError(f"--html {html}: there is no folder {html.parent}: make it, or name another one")
+    hows = how_to_read(1 if after is None else 2, form, topics, trajectory, odometry, metadata, deskew=deskew)
     if after is not None:
-        _view_answer(_require_answer(what, after, answer, seed, settings), port, host, html, quiet)
+        _view_answer(_require_answer(what, after, answer, seed, settings), hows, port, host, html, quiet)
         return
     if (Path(what) / "answer.json").is_file():
         raise InputError(f"{what}: an answer, without its sessions: `tunnelcd view BEFORE AFTER {what}`")
     _require_viser_for(host, port, html)
+    load = partial(_load_with_progress, what, seed, settings or (), hows[0], quiet=quiet)
     if html is None:
-        _serve(lambda: load_view(what, seed, settings or ()), what, port, host, quiet)
+        _serve(load, what, port, host, quiet)
         return
     from sim.view.viewer import write_html
 
-    write_html(load_view(what, seed, settings or ()), html)
+    write_html(load(), html)
     say(quiet, f"{html}: {what}, {html.stat().st_size / 1e6:.1f} MB, opens in any browser")
 
 
@@ -144,18 +166,21 @@ def _require_answer(
     return Path(before), after, answer
 
 
-def _view_answer(folders: tuple[Path, Path, Path], port: int, host: str, html: Path | None, quiet: bool) -> None:
+def _view_answer(
+    paths: tuple[Path, Path, Path], hows: Sequence[HowToRead], port: int, host: str, html: Path | None, quiet: bool
+) -> None:
     from eval.report.answer.content import read_content
     from eval.report.answer.page import write_answer_page
     from eval.report.answer.view import view_answer
 
     def read() -> AnswerContent:
-        with shown_progress(quiet) as progress:
-            return read_content(*folders, progress.stage)
+        with shown_warnings(), shown_progress(quiet) as progress:
+            before, after = open_sources(*open_inputs(paths[:2], hows, progress))
+            return read_content(before, after, paths[2], progress.stage)
 
     if html is None:
         _require_viser_for(host, port, html)
-        _serve(lambda: view_answer(read()), str(folders[2]), port, host, quiet)
+        _serve(lambda: view_answer(read()), str(paths[2]), port, host, quiet)
         return
     content = read()
     write_answer_page(content, html)
@@ -196,13 +221,26 @@ def _serve(load: Callable[[], View], what: str, port: int, host: str, quiet: boo
             return
 
 
-def load_view(what: str, seed: int | None = None, settings: Sequence[str] = ()) -> View:
-    """Return the view of a scenario (name or YAML file), of a simulated pair, or of a session.
+def _load_with_progress(what: str, seed: int | None, settings: Sequence[str], how: HowToRead, *, quiet: bool) -> View:
+    with shown_warnings(), shown_progress(quiet) as progress:
+        return load_view(what, seed, settings, how, progress)
+
+
+def load_view(
+    what: str,
+    seed: int | None = None,
+    settings: Sequence[str] = (),
+    how: HowToRead | None = None,
+    progress: RunProgress | None = None,
+) -> View:
+    """Return the view of a scenario (name or YAML file), of a simulated pair, of a session, or of a recording.
 
     Args:
         what: Name, file or folder. A scenario's name takes precedence over a folder without a session.
         seed: Seed of a scenario; 0 if None. A folder has its own.
         settings: `a.b=value` pairs written over a scenario.
+        how: How a recording is to be read.
+        progress: Told of the reading.
 
     Raises:
         InputError: It does not exist or is damaged, or a seed or a setting is given for a folder.
@@ -210,16 +248,23 @@ def load_view(what: str, seed: int | None = None, settings: Sequence[str] = ()) 
     """
     from cdpipe.core.errors import InputError
     from cdpipe.core.yamlfile import suggest
+    from cdpipe.io.foreign import HowToRead, holds_scans
     from cdpipe.io.session import is_session
     from scenarios import load_scenario, scenario_names
     from scenarios.library import SUFFIXES
-    from sim.view.view import is_pair, view_folder, view_scenario
+    from sim.view.returns import MAX_POINTS
+    from sim.view.view import is_pair, view_folder, view_points, view_scenario
 
     path, names = Path(what), scenario_names()
-    if is_pair(path) or is_session(path) or (path.is_dir() and what not in names):
+    is_named = path.is_dir() or (path.exists() and path.suffix not in SUFFIXES)
+    if is_pair(path) or is_session(path) or (is_named and what not in names):
         if seed is not None or settings:
             raise InputError(f"{what}: a folder holds what was recorded: leave --seed and --set out")
-        return view_folder(path)
+        how = how or HowToRead()
+        if is_pair(path) or is_session(path) or (path.is_dir() and not holds_scans(path)):
+            return view_folder(path)
+        (source,) = open_sources(*open_inputs([path], [how], progress or RunProgress()))
+        return view_points(what, sampled_points(source, MAX_POINTS), source.odom_T_sensor)
     if what not in names and path.suffix not in SUFFIXES:
         hint = suggest(what, names) or "; `tunnelcd list` names the scenarios"
         raise InputError(f"{what}: neither a folder nor a scenario{hint}")

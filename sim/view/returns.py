@@ -98,6 +98,12 @@ def session_cloud(
     return Cloud(name, cloud, colours)
 
 
+def points_cloud(name: str, points: Float64Array) -> Cloud:
+    """Return points (N, 3) as a cloud that is coloured by height."""
+    cloud = points.astype(np.float32)
+    return Cloud(name, cloud, {"height": _by_height(cloud)})
+
+
 class Revolutions:
     """The returns of a session, one revolution at a time: the first ones, and the second ones where it has two."""
 

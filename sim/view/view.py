@@ -27,7 +27,7 @@ from sim.session.truth import SESSIONS, SessionName, read_pair_truth, read_true_
 from sim.story.state import is_story
 from sim.view.building import PlacedMover, build_pair, list_pools, place_movers, plan_drives
 from sim.view.picture import material_colour
-from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Revolutions, Rgb, session_cloud
+from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Revolutions, Rgb, points_cloud, session_cloud
 from sim.view.rock import ROCK_RGB, class_name, displacement_classes
 
 _N_BANDS = 10
@@ -167,6 +167,15 @@ def view_session(folder: Path) -> View:
     eye = middle + np.array([-8.0, -8.0, 10.0])
     play = _player([("session", poses)], (), {}, [Revolutions("revolution/session", session, poses, None)])
     return View(str(folder), (), (), (line,), (cloud,), (), eye, middle, play=play)
+
+
+def view_points(title: str, points: Float64Array, poses: Float64Array) -> View:
+    """Return the path (S, 4, 4) and a sample of the returns (N, 3) of a recording, both in its odom frame, metres."""
+    cloud = points_cloud("returns/session", points)
+    middle = poses[len(poses) // 2, :3, 3]
+    line = Line("paths/session", poses[:, :3, 3], SESSION_RGB["after"])
+    play = _player([("session", poses)], (), {}, [])
+    return View(title, (), (), (line,), (cloud,), (), middle + np.array([-8.0, -8.0, 10.0]), middle, play=play)
 
 
 def _player(

@@ -26,6 +26,7 @@ from cdpipe.core.plugins import SEARCH_PATH
 from cdpipe.core.yamlfile import apply_settings, read_yaml, setting_lines
 from cdpipe.descriptors.describe import load_descriptors, save_descriptors
 from cdpipe.io.answer import read_answer
+from cdpipe.io.foreign.trajectory import read_poses, read_times
 from cdpipe.io.known_merge import read_alignment, read_known_merge, write_alignment
 from cdpipe.io.ply import read_ply_points
 from cdpipe.io.readers import open_session
@@ -487,6 +488,40 @@ def _read_recording(folder: Path) -> None:
         pass
 
 
+def _foreign(write: str, suffix: str = "") -> Callable[[Path], object]:
+    """Return what writes a recording with somebody else's library."""
+
+    def make(folder: Path) -> None:
+        from tests.cdpipe.io import foreign_files  # noqa: PLC0415 - only where the extra is installed
+
+        made = foreign_files.drive(3, 40)
+        getattr(foreign_files, write)(folder / f"r{suffix}", made)
+        if suffix == "":
+            foreign_files.write_trajectory(folder / "r" / "poses.txt", made.stamps_s)
+
+    return make
+
+
+def _read_foreign(folder: Path) -> None:
+    (path,) = folder.iterdir()
+    for scan in open_session(path).scans():
+        scan.points_sensor.sum()
+
+
+def _trajectories(folder: Path) -> None:
+    from tests.cdpipe.io import foreign_files  # noqa: PLC0415
+
+    for kind in ("kitti", "csv"):
+        foreign_files.write_trajectory(folder / f"t.{kind}", np.linspace(0.0, 2.0, 20), kind)
+    (folder / "times.txt").write_text("".join(f"{0.1 * number:.3f}\n" for number in range(20)))
+
+
+def _read_trajectories(folder: Path) -> None:
+    for kind in ("kitti", "csv"):
+        read_poses(folder / f"t.{kind}")
+    read_times(folder / "times.txt")
+
+
 def _read_sessions(folder: Path) -> None:
     for scan in open_session(folder / "s").scans():
         scan.points_sensor.sum()
@@ -565,6 +600,14 @@ READERS: tuple[Reader, ...] = (
     Reader("compared runs", _run, _read_sides, ("run/results.csv", "run/*.xz"), 0.05),
     Reader("stored stages", _stages, _read_stages, ("stages/*.npz",), 1.5),
     Reader("tables of studies", _studies, _read_studies, ("rows.csv",), 1.5),
+    Reader("KITTI and CSV trajectories", _trajectories, _read_trajectories, ("*",), 1.0),
+    Reader("KITTI scans", _foreign("write_kitti", "k"), _read_foreign, ("rk/velodyne/*", "rk/*.txt"), 1.0),
+    Reader("PCD scans", _foreign("write_pcds"), _read_foreign, ("r/*",), 0.1, extra="pypcd4"),
+    Reader("LAZ scans", _foreign("write_lases"), _read_foreign, ("r/*",), 0.1, extra="laspy"),
+    Reader("E57", _foreign("write_e57", ".e57"), _read_foreign, ("r.e57",), 0.1, extra="pye57"),
+    Reader("ROS 1 bag", _foreign("write_bag", ".bag"), _read_foreign, ("r.bag",), 0.1, extra="rosbags"),
+    Reader("ROS 2 bag", _foreign("write_bag", "2"), _read_foreign, ("r2/*",), 0.1, extra="rosbags"),
+    Reader("MCAP", _foreign("write_bag", ".mcap"), _read_foreign, ("r.mcap",), 0.1, extra="mcap"),
     Reader("OSF", _osf, _read_recording, ("r.osf",), 0.2, extra="ouster"),
     Reader("PCAP and metadata", _pcap, _read_recording, ("r.pcap", "r.json"), 0.15, extra="ouster"),
 )

@@ -18,9 +18,9 @@ from cdpipe.core.files import read_json
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.isolated_reader import Arrays, IsolatedReader
 from cdpipe.core.plugins import require_extra
+from cdpipe.io.foreign.sniff import RECORDING_SUFFIXES
 from cdpipe.io.ouster.integrity import check_osf_integrity, check_pcap_integrity
 from cdpipe.io.ouster.sdk import SECOND
-from cdpipe.io.readers import RECORDING_SUFFIXES
 from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
 from cdpipe.sensor.ouster_metadata import METADATA_FILE, require_mode
 

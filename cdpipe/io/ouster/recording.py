@@ -24,6 +24,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, make_pose, require_poses
 from cdpipe.core.motion import Motion, make_motion
 from cdpipe.core.plugins import require_extra
+from cdpipe.io.ouster.beams import check_beams
 from cdpipe.io.ouster.captures import Progress, Recording, Revolution, open_recording
 from cdpipe.io.session import ScanChunk, SessionWriter, fit_chunk
 from cdpipe.io.tum import motion_along
@@ -109,11 +110,15 @@ def import_recording(
 
 
 def _read_times(recording: Recording, report: Progress) -> _Times:
-    stamps_ns, has_own_pose, rows = [], [], set()
+    stamps_ns: list[Int64Array] = []
+    has_own_pose, rows = [], set()
     left_out: list[int] = []
     middle = recording.sensor.width // 2
     for number, revolution in enumerate(recording.revolutions(left_out.append)):
         report("look through", number, recording.n_guessed)
+        if recording.metadata is not None and not stamps_ns:
+            first = revolution.range_mm[: recording.sensor.height]
+            check_beams(first, recording.sensor, recording.metadata, recording.path)
         stamps_ns.append(revolution.column_stamps_ns[[0, middle, -1]])
         rows.add(len(revolution.range_mm))
         off = np.abs(revolution.odom_T_column[revolution.is_valid] - recording.sensor_to_body)

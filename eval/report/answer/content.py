@@ -47,12 +47,12 @@ class AnswerContent:
     paths: tuple[Float64Array, Float64Array]
 
 
-def read_content(before: Path, after: Path, folder: Path, on_stage: OnStage) -> AnswerContent:
+def read_content(before: Path | ScanSource, after: Path | ScanSource, folder: Path, on_stage: OnStage) -> AnswerContent:
     """Return the content of a stored answer.
 
     Args:
-        before: The earlier session.
-        after: The later session.
+        before: The earlier session, or its folder.
+        after: The later session, or its folder.
         folder: Holds the answer.
         on_stage: Told the name of each stage, how much of it is done, and how much there is.
 
@@ -63,7 +63,8 @@ def read_content(before: Path, after: Path, folder: Path, on_stage: OnStage) -> 
     if answer.report is None:
         why = f"{answer.status.replace('_', ' ')}{': ' if answer.error else ''}{answer.error}"
         raise InputError(f"{folder}: the method gave no answer ({why}): view the sessions one by one")
-    sessions = open_session(before), open_session(after)
+    first, second = (open_session(each) if isinstance(each, Path) else each for each in (before, after))
+    sessions = first, second
     return gather_content(sessions, answer.method, _with_points(answer, sessions), on_stage)
 
 

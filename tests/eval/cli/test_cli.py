@@ -258,7 +258,7 @@ def cut_chunk(session: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (shutil.rmtree, ["after", "no such folder"]),
+        (shutil.rmtree, ["after", "no such file or folder"]),
         (lambda session: (session / "session.json").unlink(), ["no scans in it"]),
         (lambda session: (session / "session.json").write_text("{"), ["session.json", "damaged"]),
         (nan_pose, ["odometry.npz", "not finite"]),

@@ -1,12 +1,15 @@
 from __future__ import annotations
 
+import gc
 import json
 import shutil
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -116,10 +119,26 @@ def test_what_is_left_out_is_told(pair: Path, tmp_path: Path, command: Command) 
     assert out.endswith("poses: own; 1 left out, of which half the columns or fewer arrived\n")
 
 
-def test_detect_says_how_to_bring_a_recording_in(tmp_path: Path, command: Command) -> None:
+def test_detect_reads_recordings_without_convert(
+    pair: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
     (tmp_path / "a.osf").write_bytes(b"")
-    result = command("detect", tmp_path / "a.osf", tmp_path / "b.osf", "--out", tmp_path / "out")
-    refused(result, f"turn it into a session first, `tunnelcd convert {tmp_path / 'a.osf'} FOLDER`")
+    refused(command("detect", tmp_path / "a.osf", pair / "after", "--out", tmp_path / "out"), "a.osf: not an OSF file")
+    for name in ("before", "after"):
+        assert command("convert", pair / name, tmp_path / f"{name}.osf")[0] == 0
+    made = {}
+    for source, suffix in ((pair, ""), (tmp_path, ".osf")):
+        sessions = [source / f"{name}{suffix}" for name in ("before", "after")]
+        code, _, err = command("detect", *sessions, "--out", tmp_path / f"out{suffix}")
+        assert code == 0
+        assert err.count("keeps it") == (2 if suffix else 0)
+        made[suffix] = pd.read_csv(tmp_path / f"out{suffix}" / "objects.csv")
+    assert len(made[""])
+    pd.testing.assert_frame_equal(made[""], made[".osf"], rtol=1e-6)
+    gc.collect()
+    assert not list((tmp_path / "tmp").iterdir())
 
 
 def test_names_and_options_that_do_not_go_together(pair: Path, tmp_path: Path, command: Command) -> None:
@@ -128,9 +147,9 @@ def test_names_and_options_that_do_not_go_together(pair: Path, tmp_path: Path, c
     before = pair / "before"
     for arguments, expected in (
         ((tmp_path / "none", tmp_path / "a.osf"), "no such file or folder: expected a session, or a recording"),
-        ((pair / "truth" / "changes.json", tmp_path / "a"), "expected a session folder, or a recording (.osf, .pcap"),
+        ((pair / "truth" / "changes.json", tmp_path / "a"), "expected a session folder, or a recording (.ply, .pcd"),
         ((pair, tmp_path / "a.osf"), f"a pair of sessions: convert {before} and {pair / 'after'} one by one"),
-        ((tmp_path, tmp_path / "a.osf"), "no session.json in it"),
+        ((tmp_path, tmp_path / "b"), "no scans in it"),
         ((before, tmp_path / "a.bin"), "a new file that ends in .osf"),
         ((before, there), "there.osf exists already"),
         ((before, there / "a.osf"), "cannot write there"),

@@ -1,0 +1,14 @@
+from .opening import HowToRead, convert_recording, open_recording
+from .sniff import FORMATS, guess_format, holds_scans
+from .trajectory import Trajectory, read_poses
+
+__all__ = [
+    "FORMATS",
+    "HowToRead",
+    "Trajectory",
+    "convert_recording",
+    "guess_format",
+    "holds_scans",
+    "open_recording",
+    "read_poses",
+]

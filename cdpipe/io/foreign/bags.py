@@ -1,0 +1,215 @@
+"""Bags: the scans of one PointCloud2 topic, and poses of the sensor from tf, Odometry or PoseStamped."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.errors import InputError, InputWarning
+from cdpipe.core.geometry import Float64Array, Int64Array, make_pose
+from cdpipe.core.isolated_reader import IsolatedReader
+from cdpipe.core.names import visible
+from cdpipe.core.plugins import require_extra
+from cdpipe.io.foreign.bag_files import CLOUD, ODOMETRY, POSE, TRANSFORMS
+from cdpipe.io.foreign.clouds import Cloud, check_cloud
+from cdpipe.io.foreign.trajectory import Trajectory
+from cdpipe.io.tum import require_unit_poses
+
+# Frames in which a robot keeps its way, the smooth one first.
+_FIXED = ("odom", "map", "world")
+_LONGEST_CHAIN = 64
+_LISTED = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Edge:
+    """Poses (N, 4, 4) of a frame in its parent at (N,) rising times, seconds; a fixed one has one pose."""
+
+    parent: str
+    time_s: Float64Array
+    poses: Float64Array
+
+    def at(self, time_s: Float64Array) -> Float64Array:
+        motion = Trajectory("", self.poses, self.time_s).motion()
+        return self.poses[:1].repeat(len(time_s), axis=0) if motion is None else motion.poses(time_s)
+
+
+class BagScans:
+    """The scans of a bag: `Clouds`. Scans outside the time of its poses are left out, which a warning says."""
+
+    is_stream = True
+
+    def __init__(self, path: Path, topics: Sequence[str], is_posed: bool) -> None:
+        """List the topics, choose that of the clouds, and read the poses.
+
+        Args:
+            path: The bag.
+            topics: Topics that a person names.
+            is_posed: Whether the poses come from elsewhere.
+
+        Raises:
+            InputError: It is no bag, holds no clouds or several topics of them, or its poses cannot be used.
+        """
+        require_extra("formats", str(path))
+        self.name = str(path)
+        self.own: Trajectory | None = None
+        self._path, self._reader = path, IsolatedReader("cdpipe.io.foreign.bag_files", path, "rosbags")
+        ((about, _),) = self._reader.read("list_topics", path=self.name)
+        self._topics = [(name, kind, count) for name, kind, count in about["topics"] if count]
+        unknown = sorted(set(topics) - {name for name, *_ in self._topics})
+        if unknown:
+            raise InputError(f"{path}: --topic {unknown[0]}: not in it: it holds {self._listed()}")
+        self._topic = self._choose(CLOUD, topics, "PointCloud2")
+        ((about, arrays),) = self._reader.read("read_stamps", path=self.name, topic=self._topic)
+        self._frame = str(about["frame"]).lstrip("/")
+        stamps: Int64Array = arrays["stamps"]
+        if not len(stamps):
+            raise InputError(f"{path}: {self._topic}: no cloud can be read from it")
+        late = 1 + next(iter(np.flatnonzero(np.diff(stamps) <= 0).tolist()), -1)
+        if late:
+            raise InputError(
+                f"{path}: {self._topic}: the stamp of cloud {late} does not come after that of the one before"
+            )
+        self.stamps_s: Float64Array | None = stamps / 1e9
+        self._is_kept = np.ones(len(stamps), bool)
+        self.lacks = f"no poses of the sensor in it (it holds {self._listed()})"
+        if not is_posed:
+            self.own = self._find_poses(topics)
+            if self.own is not None:
+                self._leave_out(stamps / 1e9, self.own)
+
+    def __len__(self) -> int:
+        """Return the number of scans."""
+        return int(np.count_nonzero(self._is_kept))
+
+    def where(self, index: int) -> str:
+        """Name a scan."""
+        return f"{self._path}: {self._topic}: cloud {int(np.flatnonzero(self._is_kept)[index])}"
+
+    def read(self, index: int) -> Cloud:
+        """Read one scan, and all before it."""
+        return next(cloud for number, cloud in enumerate(self.read_all()) if number == index)
+
+    def read_all(self) -> Iterator[Cloud]:
+        """Read all scans in order; points that are not finite are missing returns."""
+        messages = self._reader.read("read_clouds", path=self.name, topic=self._topic)
+        for number, (_, arrays) in enumerate(messages):
+            if number < len(self._is_kept) and self._is_kept[number]:
+                cloud = check_cloud(f"{self._path}: {self._topic}: cloud {number}", arrays)
+                cloud.points[np.flatnonzero(~np.isfinite(cloud.points).all(axis=1))] = 0.0
+                yield cloud
+
+    def _choose(self, kind: str, topics: Sequence[str], what: str) -> str:
+        found = [name for name, its_kind, _ in self._topics if its_kind == kind]
+        named = [name for name in found if name in topics]
+        if len(named or found) == 1:
+            return str((named or found)[0])
+        if found:
+            raise InputError(
+                f"{self._path}: {len(found)} topics of {what}: name one, --topic {' or '.join(sorted(found))}"
+            )
+        raise InputError(f"{self._path}: no topic of {what}: it holds {self._listed()}")
+
+    def _listed(self) -> str:
+        told = [f"{visible(name)} ({kind.rsplit('/', 1)[-1]}, {count})" for name, kind, count in sorted(self._topics)]
+        more = f" and {len(told) - _LISTED} more" if len(told) > _LISTED else ""
+        return (", ".join(told[:_LISTED]) or "no message") + more
+
+    def _leave_out(self, stamps_s: Float64Array, own: Trajectory) -> None:
+        assert own.time_s is not None
+        slack_s = max(float(np.median(np.diff(times))) if len(times) > 1 else 0.0 for times in (stamps_s, own.time_s))
+        self._is_kept = (stamps_s >= own.time_s[0] - slack_s) & (stamps_s <= own.time_s[-1] + slack_s)
+        n_out = int(np.count_nonzero(~self._is_kept))
+        if n_out == len(stamps_s):
+            raise InputError(
+                f"{self._path}: its poses ({own.time_s[0]:.3f} to {own.time_s[-1]:.3f} s) and its clouds "
+                f"({stamps_s[0]:.3f} to {stamps_s[-1]:.3f} s) are of different times: give --trajectory FILE"
+            )
+        if n_out:
+            told = f"{n_out} of {len(stamps_s)} clouds lie before or after its poses, and are left out"
+            warnings.warn(f"{self._path}: {told}", InputWarning, stacklevel=2)
+        self.stamps_s = stamps_s[self._is_kept]
+
+    def _find_poses(self, topics: Sequence[str]) -> Trajectory | None:
+        """Return poses by a named topic; else by tf, Odometry or PoseStamped."""
+        edges = self._read_edges([name for name, kind, _ in self._topics if kind == TRANSFORMS])
+        named = [(name, kind) for name, kind, _ in self._topics if name in topics and kind in (ODOMETRY, POSE)]
+        if not named:
+            chain = _chain(edges, self._frame)
+            if any(len(edge.time_s) > 1 for edge in chain):
+                return _compose(f"tf of {self._path}", chain)
+        for kind in (ODOMETRY, POSE):
+            found = [name for name, its_kind in named if its_kind == kind]
+            if found or (not named and any(its_kind == kind for _, its_kind, _ in self._topics)):
+                return self._read_poses(self._choose(kind, topics, kind.rsplit("/", 1)[-1]), edges)
+        return None
+
+    def _read_poses(self, topic: str, edges: dict[str, _Edge]) -> Trajectory | None:
+        """Return the poses of one topic, with the fixed mounting of the sensor on what they are poses of."""
+        for child, edge in self._read_edges([topic]).items():
+            mounting = [] if child in ("", self._frame) else _chain(edges, self._frame, child)
+            if child not in ("", self._frame) and not mounting:
+                told = (
+                    f"{topic} has the poses of {visible(child)}, and no tf tells where {visible(self._frame)} is on it"
+                )
+                warnings.warn(f"{self._path}: {told}: they are taken for the same", InputWarning, stacklevel=2)
+            return _compose(f"{topic} of {self._path}", [edge, *mounting])
+        return None
+
+    def _read_edges(self, topics: Sequence[str]) -> dict[str, _Edge]:
+        """Return the edge above each frame, by the frame; a frame with two parents keeps the one that moves."""
+        edges: dict[str, _Edge] = {}
+        if not topics:
+            return edges
+        for about, arrays in self._reader.read("read_transforms", path=self.name, topics=list(topics)):
+            parent, child = str(about["parent"]), str(about["child"])
+            where = f"{self._path}: {visible(child)} in {visible(parent)}"
+            edge = _make_edge(where, parent, arrays["stamps"], arrays["poses"], is_static=bool(about["is_static"]))
+            if child not in edges or len(edge.time_s) > len(edges[child].time_s):
+                edges[child] = edge
+        return edges
+
+
+def _make_edge(where: str, parent: str, stamps: Int64Array, rows: Float64Array, *, is_static: bool) -> _Edge:
+    if rows.ndim != 2 or rows.shape[1] != 7 or stamps.shape != (len(rows),) or not len(rows):
+        raise InputError(f"{where}: holds no poses")
+    require_unit_poses(rows, lambda index: f"{where}: pose {index}")
+    stamps, first = np.unique(stamps, return_index=True)
+    if is_static:
+        stamps, first = stamps[-1:], first[-1:]
+    rows = rows[first]
+    return _Edge(parent, stamps / 1e9, make_pose(Rotation.from_quat(rows[:, 3:]).as_matrix(), rows[:, :3]))
+
+
+def _chain(edges: dict[str, _Edge], frame: str, top: str = "") -> list[_Edge]:
+    """Return the edges from a fixed frame, or from `top`, down to a frame; empty if `top` is not above it."""
+    chain: list[_Edge] = []
+    above = [frame]
+    while above[-1] in edges and above[-1] != top and len(chain) < _LONGEST_CHAIN:
+        chain.append(edges[above[-1]])
+        above.append(chain[-1].parent)
+    if top:
+        return chain[::-1] if above[-1] == top else []
+    ends = next((above.index(name) for name in _FIXED if name in above), len(chain))
+    return chain[:ends][::-1]
+
+
+def _compose(where: str, chain: Sequence[_Edge]) -> Trajectory | None:
+    """Return the poses along a chain of edges, at the times of that with the most; None if they share no time."""
+    moving = [edge.time_s for edge in chain if len(edge.time_s) > 1]
+    if not moving:
+        return Trajectory(where, chain[0].at(chain[0].time_s), chain[0].time_s)
+    start_s, end_s = max(times[0] for times in moving), min(times[-1] for times in moving)
+    time_s = max(moving, key=len)
+    time_s = time_s[(time_s >= start_s) & (time_s <= end_s)]
+    if not len(time_s):
+        return None
+    poses = chain[0].at(time_s)
+    for edge in chain[1:]:
+        poses = poses @ edge.at(time_s)
+    return Trajectory(where, poses, time_s)

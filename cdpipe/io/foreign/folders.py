@@ -1,0 +1,178 @@
+"""Folders with one file per scan: PLY, PCD, LAS and KITTI, with the trajectory and the times that lie in them; E57."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.files import read_bytes
+from cdpipe.core.geometry import Float64Array, invert, make_pose
+from cdpipe.core.isolated_reader import IsolatedReader
+from cdpipe.core.plugins import require_extra
+from cdpipe.io.foreign.clouds import Cloud, CloudFiles, Clouds, check_cloud, stamps_of_names
+from cdpipe.io.foreign.points_files import MOST_POINTS, cloud_reader, read_viewpoints
+from cdpipe.io.foreign.scans import in_sensor_frames
+from cdpipe.io.foreign.sniff import find_scans
+from cdpipe.io.foreign.trajectory import Trajectory, read_poses, read_times
+from cdpipe.io.tum import TUM_LINE, require_unit_poses
+
+_NUMBERS = re.compile(r"(\d+)")
+_TIMES = ("times.txt", "timestamps.txt", "stamps.txt")
+_CALIBRATION = "calib.txt"
+_MOST_SCANS = 10_000
+
+
+def open_folder(folder: Path, name: str, has_poses: bool) -> Clouds:
+    """Open a folder of scans.
+
+    Args:
+        folder: The folder; the scans may lie in a sub-folder such as velodyne/ or pcd/.
+        name: Format of the scans, of `cdpipe.io.foreign.sniff.FORMATS`.
+        has_poses: Whether the poses come from elsewhere, so that none are looked for.
+
+    Raises:
+        InputError: There are no scans, their names do not sort by number, or the poses cannot be read.
+    """
+    files = find_scans(folder, name)
+    if not files:
+        raise InputError(f"{folder}: no scans of the format {name} in it")
+    _require_padded(folder, files)
+    own = None if has_poses else _find_poses(folder, files[0].parent, name)
+    clouds = CloudFiles(folder, files, cloud_reader(name, folder), own, _find_stamps(folder, files))
+    clouds.lacks = f"expected exactly one trajectory (*.txt, *.tum or *.csv, lines {TUM_LINE}), found none"
+    if own is None and not has_poses and name == "pcd" and files[0].parent != folder:
+        return _with_viewpoints(clouds, folder, files)
+    return clouds
+
+
+def _require_padded(folder: Path, files: list[Path]) -> None:
+    by_number = sorted(
+        files, key=lambda file: [int(part) if part.isdigit() else part for part in _NUMBERS.split(file.name)]
+    )
+    if by_number != files:
+        raise InputError(
+            f"{folder}: the *{files[0].suffix} files are numbered without leading zeros, so that their names sort as "
+            f"{files[0].name}, {files[1].name}, ...: pad the numbers to equal length"
+        )
+
+
+def _find_poses(folder: Path, scans: Path, name: str) -> Trajectory | None:
+    """Return the one trajectory of a folder, None for none."""
+    places = dict.fromkeys((folder, scans))
+    found = sorted(file for place in places for kind in ("*.txt", "*.tum", "*.csv") for file in place.glob(kind))
+    found = [file for file in found if file.name not in (*_TIMES, _CALIBRATION)]
+    if name == "kitti" and (folder / "poses.txt") in found:
+        found = [folder / "poses.txt"]
+    if len(found) > 1:
+        raise InputError(
+            f"{folder}: expected exactly one trajectory (*.txt, *.tum or *.csv, lines {TUM_LINE}), found "
+            f"{', '.join(file.name for file in found[:5])}: name it with --trajectory FILE"
+        )
+    if not found:
+        return None
+    trajectory = read_poses(found[0])
+    if name == "kitti" and (folder / _CALIBRATION).is_file():
+        camera_T_sensor = read_calibration(folder / _CALIBRATION)
+        poses = invert(camera_T_sensor) @ trajectory.poses @ camera_T_sensor
+        trajectory = Trajectory(trajectory.where, poses, trajectory.time_s)
+    return trajectory
+
+
+def read_calibration(path: Path) -> Float64Array:
+    """Return the (4, 4) `camera_T_lidar` of KITTI's calib.txt: its line `Tr:` (or `Tr_velo_to_cam:`) of 12 numbers.
+
+    KITTI's poses are those of the left camera; the lidar's are `Tr^-1 pose Tr`.
+
+    Raises:
+        InputError: There is no such line, or it is no rigid transform.
+    """
+    text = read_bytes(path, 1 << 20).decode("utf-8", errors="replace")
+    for number, line in enumerate(text.splitlines(), start=1):
+        key, _, rest = line.partition(":")
+        if key.strip() not in ("Tr", "Tr_velo_cam", "Tr_velo_to_cam"):
+            continue
+        try:
+            rows = np.array([float(word) for word in rest.split()]).reshape(3, 4)
+        except ValueError as error:
+            raise InputError(f"{path}:{number}: expected `Tr:` and 12 numbers: {error}") from error
+        if not np.isfinite(rows).all() or np.abs(rows[:, :3] @ rows[:, :3].T - np.eye(3)).max() > 1e-3:
+            raise InputError(
+                f"{path}:{number}: Tr is no rotation with a translation: expected 12 numbers of a 3x4 matrix"
+            )
+        if np.linalg.det(rows[:, :3]) < 0:
+            raise InputError(f"{path}:{number}: Tr mirrors: expected a right-handed rotation")
+        return make_pose(Rotation.from_matrix(rows[:, :3]).as_matrix(), rows[:, 3])
+    raise InputError(f"{path}: no line `Tr:` in it, the pose of the lidar in the camera's frame: remove it, or add it")
+
+
+def _find_stamps(folder: Path, files: list[Path]) -> Float64Array | None:
+    for place in (files[0].parent, folder, files[0].parent.parent):
+        for name in _TIMES:
+            if (place / name).is_file() and (place == folder or folder in place.parents):
+                stamps_s = read_times(place / name)
+                if len(stamps_s) != len(files):
+                    raise InputError(
+                        f"{place / name}: {len(stamps_s)} times for {len(files)} scans: one line each is needed"
+                    )
+                return stamps_s
+    return stamps_of_names(files)
+
+
+def _with_viewpoints(clouds: CloudFiles, folder: Path, files: list[Path]) -> Clouds:
+    """Return scans as DynamicMap_Benchmark has them: points in one frame, VIEWPOINT the sensor's pose in it."""
+    rows = read_viewpoints(folder, files)
+    if np.allclose(rows, rows[0]):
+        return clouds
+    require_unit_poses(rows, lambda index: f"{files[index]}: VIEWPOINT")
+    poses = make_pose(Rotation.from_quat(rows[:, 3:]).as_matrix(), rows[:, :3])
+    clouds.own = Trajectory(f"VIEWPOINT of {folder}", poses)
+    return in_sensor_frames(clouds, poses)
+
+
+class E57Scans:
+    """The scans of an E57 file, one for each place where the scanner stood: `Clouds`."""
+
+    is_stream = False
+
+    def __init__(self, path: Path) -> None:
+        require_extra("formats", str(path))
+        self.name, self.lacks = str(path), "no pose of its scans in it"
+        self.stamps_s: Float64Array | None = None
+        self._path, self._reader = path, IsolatedReader("cdpipe.io.foreign.points_files", path, "pye57")
+        heads = [about for about, _ in self._reader.read("read_e57_heads", path=str(path))]
+        if not 0 < len(heads) <= _MOST_SCANS:
+            raise InputError(f"{path}: {len(heads)} scans: expected 1 to {_MOST_SCANS}")
+        self._n = len(heads)
+        for index, head in enumerate(heads):
+            if not 0 <= head["points"] <= MOST_POINTS:
+                raise InputError(
+                    f"{self.where(index)}: {head['points']} points: at most {MOST_POINTS} are read: thin it"
+                )
+        self.own: Trajectory | None = None
+        if all(head["pose"] is not None for head in heads):
+            rows = np.array([head["pose"] for head in heads], np.float64)[:, [0, 1, 2, 4, 5, 6, 3]]
+            require_unit_poses(rows, self.where)
+            poses = make_pose(Rotation.from_quat(rows[:, 3:]).as_matrix(), rows[:, :3])
+            self.own = Trajectory(str(path), poses)
+
+    def __len__(self) -> int:
+        """Return the number of scans."""
+        return self._n
+
+    def where(self, index: int) -> str:
+        """Name a scan."""
+        return f"{self._path}: scan {index}"
+
+    def read(self, index: int) -> Cloud:
+        """Read one scan."""
+        ((_, arrays),) = self._reader.read("read_e57", path=str(self._path), index=index)
+        return check_cloud(self.where(index), arrays)
+
+    def read_all(self) -> Iterator[Cloud]:
+        """Read all scans."""
+        return (self.read(index) for index in range(self._n))

@@ -1,0 +1,217 @@
+"""Open a recording of any format: its scans, and poses from itself, a trajectory or KISS-ICP."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array
+from cdpipe.core.motion import Motion
+from cdpipe.core.plugins import require_extra
+from cdpipe.io.foreign.clouds import Clouds, point_times
+from cdpipe.io.foreign.folders import E57Scans, open_folder
+from cdpipe.io.foreign.scans import PosedClouds
+from cdpipe.io.foreign.sniff import FORMATS, guess_format, require_format_name
+from cdpipe.io.foreign.trajectory import Trajectory, poses_at, read_poses
+from cdpipe.io.ply import write_ply_points
+from cdpipe.io.tum import write_tum
+from cdpipe.mapping.odometry import estimate_cloud_motion
+from cdpipe.mapping.pose_check import check_quaternion_order
+
+KISS_ICP = "kiss-icp"
+# Called with the stage, the number of finished scans, and their (estimated) total.
+Progress = Callable[[str, int, int], None]
+_NOMINAL_S = 0.1  # between scans that have no times
+
+
+@dataclass(frozen=True, slots=True)
+class HowToRead:
+    """What a person says about a recording; None is guessed.
+
+    Attributes:
+        format: Name in `FORMATS`.
+        topics: Topics of a bag, of its clouds and of its poses.
+        trajectory: File of the sensor's poses.
+        odometry: "kiss-icp" estimates the poses.
+        metadata: The .json of a PCAP's sensor.
+        deskew: Whether points that have times are deskewed; False where they are already.
+    """
+
+    format: str | None = None
+    topics: tuple[str, ...] = ()
+    trajectory: Path | None = None
+    odometry: str | None = None
+    metadata: Path | None = None
+    deskew: bool = True
+
+    def __post_init__(self) -> None:
+        if self.format is not None:
+            require_format_name(self.format)
+        if self.odometry not in (None, KISS_ICP):
+            raise InputError(f"--odometry {self.odometry}: expected {KISS_ICP}")
+        if self.odometry is not None and self.trajectory is not None:
+            raise InputError("--trajectory and --odometry both give the poses: leave one out")
+
+
+class _Posed(PosedClouds):
+    """Scans with poses, and where those came from."""
+
+    def __init__(
+        self, clouds: Clouds, poses: Float64Array, stamps_s: Float64Array, motion: Motion | None, poses_from: str
+    ) -> None:
+        super().__init__(clouds, poses, stamps_s, motion)
+        self.clouds, self.stamps_s, self.poses_from = clouds, stamps_s, poses_from
+
+
+def open_recording(path: Path, how: HowToRead, report: Progress) -> PosedClouds:
+    """Open a recording that is no session folder and no Ouster's.
+
+    A bag is first written to a temporary folder, which is removed with the source.
+
+    Raises:
+        InputError: It cannot be read, has no poses, or they do not fit its scans.
+    """
+    source = _pose(_open_clouds(path, how), how, report)
+    if not source.clouds.is_stream:
+        if how.odometry is None and len(source.odom_T_sensor) > 1:
+            check_quaternion_order(source, source.poses_from)
+        return source
+    with _removed_on_error(Path(tempfile.mkdtemp(prefix="tunnelcd-read-"))) as folder:
+        write_scans(source, folder / "scans", report)
+        clouds = open_folder(folder / "scans", "ply", has_poses=True)
+        opened = PosedClouds(clouds, source.odom_T_sensor, source.stamps_s, None)
+        if how.trajectory is not None:
+            check_quaternion_order(opened, source.poses_from)
+    opened.name, opened.is_temporary = str(path), True
+    weakref.finalize(opened, shutil.rmtree, folder, ignore_errors=True)
+    return opened
+
+
+def convert_recording(path: Path, out: Path, how: HowToRead, report: Progress) -> tuple[int, str]:
+    """Write a recording as PLY scans with a TUM trajectory; return the number of scans, and what the poses are from.
+
+    Raises:
+        InputError: As `open_recording`, or the folder cannot be written.
+    """
+    source = _pose(_open_clouds(path, how), how, report)
+    if not source.clouds.is_stream and how.odometry is None:
+        check_quaternion_order(source, source.poses_from)
+    write_scans(source, out, report)
+    return len(source.odom_T_sensor), source.poses_from
+
+
+def write_scans(source: _Posed, out: Path, report: Progress) -> None:
+    """Write scans as `000000.ply` and so on, deskewed, and `trajectory.tum`, into a new or an empty folder.
+
+    Raises:
+        InputError: A scan cannot be read, or the folder not be written.
+    """
+    n_scans = len(source.odom_T_sensor)
+    try:
+        out.mkdir(exist_ok=True)
+        for scan in source.scans():
+            write_ply_points(out / f"{scan.index:06d}.ply", scan.points_sensor)
+            report("write", scan.index + 1, n_scans)
+        write_tum(out / "trajectory.tum", source.stamps_s, source.odom_T_sensor)
+    except OSError as error:
+        raise InputError(f"{error.filename or out}: cannot be written: {error.strerror}") from error
+
+
+@contextmanager
+def _removed_on_error(folder: Path) -> Iterator[Path]:
+    try:
+        yield folder
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+def _open_clouds(path: Path, how: HowToRead) -> Clouds:
+    """Open what holds the scans; poses are not looked for where a person says where they come from."""
+    name = how.format or guess_format(path)
+    if name == "e57":
+        return E57Scans(path)
+    if name == "bag":
+        from cdpipe.io.foreign.bags import BagScans  # noqa: PLC0415 - not before a bag is read
+
+        return BagScans(path, how.topics, is_posed=how.trajectory is not None or how.odometry is not None)
+    if not FORMATS[name].in_folders:
+        raise InputError(f"{path}: --format {name}: not here: expected a file that is {FORMATS[name].about}")
+    if path.is_dir():
+        return open_folder(path, name, has_poses=how.trajectory is not None or how.odometry is not None)
+    raise InputError(
+        f"{path}: one cloud, a map without its scans: where nothing was scanned cannot be told from what is gone. Name "
+        "a folder with one file per scan and a trajectory, or the bag, OSF or PCAP it was made from"
+    )
+
+
+def _pose(clouds: Clouds, how: HowToRead, report: Progress) -> _Posed:
+    """Give poses to scans: of a trajectory, of KISS-ICP, or their own."""
+    if how.odometry is not None:
+        return _estimate(clouds, how, report)
+    trajectory = read_poses(how.trajectory) if how.trajectory is not None else clouds.own
+    if trajectory is None:
+        raise InputError(
+            f"{clouds.name}: {clouds.lacks}: give --trajectory FILE (poses of the sensor: TUM, KITTI or CSV), "
+            f"or --odometry {KISS_ICP} to estimate them"
+        )
+    n_poses, n_scans = len(trajectory.poses), len(clouds)
+    stamps_s, motion = clouds.stamps_s, trajectory.motion()
+    if stamps_s is not None and trajectory.time_s is not None and (clouds.is_stream or n_poses != n_scans):
+        poses = poses_at(trajectory, stamps_s, clouds.name)
+    elif n_poses != n_scans:
+        suffix = f"*{Path(clouds.where(0)).suffix} " if not clouds.is_stream else ""
+        raise InputError(
+            f"{trajectory.where}: {n_poses} poses for {n_scans} {suffix}scans: one line for each scan is needed, in "
+            f"the order of the file names; or the times of both: {_lacking(trajectory, stamps_s)}"
+        )
+    else:
+        poses = trajectory.poses
+        if trajectory.time_s is not None:
+            stamps_s = trajectory.time_s
+        elif stamps_s is not None:
+            motion = Trajectory("", poses, stamps_s).motion()
+    times_s = stamps_s if stamps_s is not None else _nominal_s(n_scans)
+    return _Posed(clouds, poses, times_s, motion if how.deskew else None, trajectory.where)
+
+
+def _nominal_s(n_scans: int) -> Float64Array:
+    return _NOMINAL_S * np.arange(n_scans, dtype=np.float64)
+
+
+def _lacking(trajectory: Trajectory, stamps_s: Float64Array | None) -> str:
+    lacks = ["the trajectory has none"] if trajectory.time_s is None else []
+    if stamps_s is None:
+        lacks.append(
+            "the scans have none (add times.txt beside them, one line each, or name the files by their stamps)"
+        )
+    return "; ".join(lacks)
+
+
+def _estimate(clouds: Clouds, how: HowToRead, report: Progress) -> _Posed:
+    require_extra("odometry", f"--odometry {how.odometry}")
+    n_scans = len(clouds)
+    stamps_s = clouds.stamps_s if clouds.stamps_s is not None else _nominal_s(n_scans)
+
+    def frames() -> Iterator[tuple[Float64Array, Float64Array | None]]:
+        for number, cloud in enumerate(clouds.read_all()):
+            report("odometry", number, n_scans)
+            is_return = cloud.points.any(axis=1) & np.isfinite(cloud.points).all(axis=1)
+            times = point_times(cloud.times[is_return], float(stamps_s[number])) if cloud.times is not None else None
+            yield cloud.points[is_return], times if how.deskew else None
+        report("odometry", n_scans, n_scans)
+
+    try:
+        poses = estimate_cloud_motion(frames(), stamps_s)
+    except InputError as error:
+        raise InputError(f"{clouds.name}: {error}: give the poses with --trajectory") from error
+    motion = Trajectory("", poses, stamps_s).motion() if how.deskew else None
+    return _Posed(clouds, poses, stamps_s, motion, KISS_ICP)

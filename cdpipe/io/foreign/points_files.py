@@ -1,0 +1,165 @@
+"""One file of points in each format: PLY and KITTI's .bin here, PCD, LAS and E57 by libraries in another process."""
+
+# ruff: noqa: PLC0415 - the libraries are extras, and they are imported in the process that reads
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.files import read_bytes
+from cdpipe.core.isolated_reader import IsolatedReader, Message
+from cdpipe.core.plugins import require_extra
+from cdpipe.io.foreign.clouds import TIME_FIELDS, Cloud, check_cloud
+from cdpipe.io.ply import read_ply_points
+
+_HERE = __name__
+_LIBRARIES = {"pcd": "pypcd4", "las": "laspy", "e57": "pye57"}
+_LIBRARY_MODULES = ("laspy", "lazrs", "pye57", "pyo3_runtime")
+# Points of one scan, or of one whole map: 24 bytes each.
+MOST_POINTS = 20_000_000
+_BLOCK = 1_000_000
+_KITTI = np.dtype("<f4")
+# What the libraries raise for a faulty file.
+_ERRORS = (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, AssertionError)
+
+
+def cloud_reader(name: str, folder: Path) -> Callable[[Path], Cloud]:
+    """Return what reads one file of a format; a library's process serves all files of a folder.
+
+    Raises:
+        InputError: The extra is not installed.
+    """
+    if name == "ply":
+        return lambda path: Cloud(read_ply_points(path))
+    if name == "kitti":
+        return read_bin
+    require_extra("formats", str(folder))
+    reader = IsolatedReader(_HERE, folder, _LIBRARIES[name])
+
+    def read(path: Path) -> Cloud:
+        parts = [arrays for _, arrays in reader.read(f"read_{name}", path=str(path)) if arrays]
+        joined = {key: np.concatenate([part[key] for part in parts]) for key in (parts[0] if parts else ())}
+        return check_cloud(str(path), joined)
+
+    return read
+
+
+def read_bin(path: Path) -> Cloud:
+    """Read x, y, z and intensity as little-endian float32, as KITTI and SemanticKITTI store scans.
+
+    Raises:
+        InputError: The file is missing, or its size is not that of whole points.
+    """
+    content = read_bytes(path, MOST_POINTS * 16)
+    if not content or len(content) % 16:
+        raise InputError(
+            f"{path}: {len(content)} bytes: expected x, y, z, intensity as float32, 16 bytes a point: cut short, or of "
+            "another layout"
+        )
+    with np.errstate(invalid="ignore"):
+        return Cloud(np.frombuffer(content, _KITTI).reshape(-1, 4)[:, :3].astype(np.float64))
+
+
+def read_viewpoints(folder: Path, files: list[Path]) -> np.ndarray[Any, Any]:
+    """Return the VIEWPOINT (S, 7) of PCD files: x, y, z, qx, qy, qz, qw.
+
+    Raises:
+        InputError: A file cannot be read.
+    """
+    reader = IsolatedReader(_HERE, folder, _LIBRARIES["pcd"])
+    rows = [about["viewpoint"] for about, _ in reader.read("read_pcd_heads", paths=[str(file) for file in files])]
+    return np.array([[*row[:3], *row[4:], row[3]] for row in rows], np.float64).reshape(-1, 7)
+
+
+# What follows runs in a process of its own.
+
+
+def read_pcd(path: str) -> Iterator[Message]:
+    """Yield the points, and the times where there are some, of a PCD file."""
+    from pypcd4.pypcd4 import PointCloud
+
+    with _reads(path, "a PCD file"):
+        cloud = PointCloud.from_path(path)
+        data, names = cloud.pc_data, list(cloud.fields)
+        if len(data) != cloud.metadata.points:
+            raise ValueError(f"{cloud.metadata.points} points are announced, {len(data)} are there: cut short")
+        data = np.atleast_1d(data)
+        if not {"x", "y", "z"} <= set(names):
+            raise ValueError(f"its fields are {', '.join(names)[:80]}: expected x, y and z")
+        arrays = {"points": np.column_stack([data[axis] for axis in "xyz"])}
+        time = next((name for name in names if name.lower() in TIME_FIELDS and data[name].ndim == 1), None)
+    yield {}, arrays | ({} if time is None else {"times": np.ascontiguousarray(data[time])})
+
+
+def read_pcd_heads(paths: list[str]) -> Iterator[Message]:
+    """Yield the viewpoint of each PCD file."""
+    from pypcd4.pypcd4 import PointCloud
+
+    for path in paths:
+        with _reads(path, "a PCD file"):
+            viewpoint = [float(number) for number in PointCloud.from_path(path).metadata.viewpoint]
+        yield {"viewpoint": viewpoint}, {}
+
+
+def read_las(path: str) -> Iterator[Message]:
+    """Yield the points, and the GPS times where there are some, of a LAS, LAZ or COPC file, in blocks."""
+    import laspy
+
+    with _reads(path, "a LAS or LAZ file"), laspy.open(path) as file:
+        if file.header.point_count > MOST_POINTS:
+            raise ValueError(f"{file.header.point_count} points: at most {MOST_POINTS} are read: thin it")
+        n_found = 0
+        for block in file.chunk_iterator(_BLOCK):
+            n_found += len(block)
+            arrays = {"points": np.column_stack([np.asarray(block[axis], np.float64) for axis in "xyz"])}
+            if "gps_time" in block.point_format.dimension_names:
+                arrays["times"] = np.ascontiguousarray(block["gps_time"])
+            yield {}, arrays
+        if n_found != file.header.point_count:
+            raise ValueError(f"{file.header.point_count} points are announced, {n_found} are there: cut short")
+
+
+def read_e57_heads(path: str) -> Iterator[Message]:
+    """Yield number of points and pose (translation, then quaternion w, x, y, z) of each scan of an E57 file."""
+    import pye57
+
+    with _reads(path, "an E57 file"):
+        file = pye57.E57(path)
+        heads = []
+        for index in range(file.scan_count):
+            head = file.get_header(index)
+            pose = [*map(float, head.translation), *map(float, head.rotation)] if head.has_pose() else None
+            heads.append({"points": int(head.point_count), "pose": pose})
+    for head in heads:
+        yield head, {}
+
+
+def read_e57(path: str, index: int) -> Iterator[Message]:
+    """Yield the points of one scan of an E57 file, in the scanner's frame."""
+    import pye57
+
+    with _reads(path, "an E57 file"):
+        data = pye57.E57(path).read_scan(index, ignore_missing_fields=True, transform=False)
+        points = np.column_stack([data[f"cartesian{axis}"] for axis in "XYZ"])
+    yield {}, {"points": points}
+
+
+@contextmanager
+def _reads(path: str, what: str) -> Iterator[None]:
+    try:
+        yield
+    except InputError:
+        raise
+    except ImportError as error:
+        raise InputError(f"{path}: {what} needs a package more: pip install 'tunnelcd[formats]'") from error
+    except BaseException as error:  # a panic of Rust is no Exception
+        if not isinstance(error, _ERRORS) and type(error).__module__.split(".")[0] not in _LIBRARY_MODULES:
+            raise
+        told = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: not a readable {what.split(' ', 1)[1]}: {told[:300]}") from error

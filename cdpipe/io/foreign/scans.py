@@ -1,0 +1,175 @@
+"""Scans of any format with one pose each, as the pipeline reads them."""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.errors import InputError, InputWarning
+from cdpipe.core.geometry import Float64Array, Int64Array, invert
+from cdpipe.core.motion import Motion
+from cdpipe.io.foreign.clouds import Cloud, Clouds, point_times
+from cdpipe.model.types import PosedScan
+
+# Largest change of a pose entry, metres or radians, that odometry reports for a sensor at rest.
+_STANDING = 0.1
+# Points are deskewed in steps of this time: 0.3 mm at 3 m/s.
+_STEP_S = 1e-4
+
+
+class PosedClouds:
+    """The scans of a recording, each with one pose.
+
+    Attributes:
+        name: The recording.
+        odom_T_sensor: (S, 4, 4) pose of each scan.
+        descriptors_in: Folder that stores its descriptors.
+        is_temporary: Whether its files go with this object.
+    """
+
+    descriptors_in: Path | None = None
+    is_temporary = False
+
+    def __init__(
+        self, clouds: Clouds, odom_T_sensor: Float64Array, stamps_s: Float64Array, motion: Motion | None
+    ) -> None:
+        """Keep what to read.
+
+        Args:
+            clouds: The scans.
+            odom_T_sensor: (S, 4, 4) pose of each.
+            stamps_s: (S,) time of each, seconds.
+            motion: The movement between the scans, which deskews points that have times; None: points stay as they are.
+        """
+        self.name = clouds.name
+        self.odom_T_sensor = odom_T_sensor
+        self._clouds, self._stamps_s, self._motion = clouds, stamps_s, motion
+        self._stamps_ns: Int64Array = np.round((stamps_s - stamps_s[0]) * 1e9).astype(np.int64)
+
+    def scan(self, index: int) -> PosedScan:
+        """Read one scan.
+
+        Raises:
+            InputError: It cannot be read, holds no return, or a point that is not finite.
+        """
+        return self._make(index, self._clouds.read(index))[0]
+
+    def scans(self) -> Iterator[PosedScan]:
+        """Read all scans in order; an `InputWarning` says how many missing returns were dropped.
+
+        Raises:
+            InputError: As `scan`; or two scans are the same.
+        """
+        repeats = Repeats()
+        n_missing, n_points = 0, 0
+        for index, cloud in enumerate(self._clouds.read_all()):
+            scan, n_dropped = self._make(index, cloud)
+            n_missing, n_points = n_missing + n_dropped, n_points + n_dropped + len(scan.pixels)
+            stamp_ns = int(self._stamps_ns[index])
+            where = self._clouds.where(index)
+            name = where.rsplit("/", 1)[-1]
+            repeats.require_new(where, name, scan.points_sensor, self.odom_T_sensor[index], stamp_ns)
+            yield scan
+        if n_missing:
+            told = f"{n_missing} of {n_points} points are (0, 0, 0) or NaN: taken for missing returns and left out"
+            warnings.warn(f"{self.name}: {told}", InputWarning, stacklevel=2)
+
+    def _make(self, index: int, cloud: Cloud) -> tuple[PosedScan, int]:
+        """Return a scan, and the number of its missing returns; organised clouds store them as (0, 0, 0) or NaN."""
+        where, points = self._clouds.where(index), cloud.points
+        is_return = points.any(axis=1) & ~np.isnan(points).all(axis=1)
+        if not is_return.any():
+            raise InputError(f"{where}: holds no return: remove the scan and its line of the trajectory")
+        is_wrong = is_return & ~np.isfinite(points).all(axis=1)
+        if is_wrong.any():
+            raise InputError(
+                f"{where}: vertex {int(np.argmax(is_wrong))} is not finite ({np.count_nonzero(is_wrong)} are not): "
+                "remove them from the file"
+            )
+        stamps_ns = np.full(np.count_nonzero(is_return), self._stamps_ns[index])
+        kept = points[is_return]
+        times = None if cloud.times is None else cloud.times[is_return]
+        offset_s = point_times(times, float(self._stamps_s[index])) if self._motion is not None else None
+        if offset_s is not None and self._motion is not None:
+            kept = deskew_points(kept, offset_s, float(self._stamps_s[index]), self._motion)
+            stamps_ns = stamps_ns + np.round(offset_s * 1e9).astype(np.int64)
+        pixels = np.flatnonzero(is_return).astype(np.int32)
+        return PosedScan(index, kept, self.odom_T_sensor[index], stamps_ns, pixels), len(points) - len(pixels)
+
+
+class Repeats:
+    """Detects scans that were recorded twice: noise never gives bit-identical returns."""
+
+    def __init__(self) -> None:
+        self._seen: dict[bytes, tuple[str, Float64Array, int]] = {}
+
+    def require_new(
+        self, where: str, name: str, content: npt.NDArray[Any], odom_T_sensor: Float64Array, stamp_ns: int
+    ) -> None:
+        """Remember a scan; raise `InputError` if an identical scan has another pose or the same time."""
+        digest = hashlib.blake2b(np.ascontiguousarray(content).data, digest_size=16).digest()
+        if digest not in self._seen:
+            self._seen[digest] = name, odom_T_sensor, stamp_ns
+            return
+        other, pose, other_ns = self._seen[digest]
+        # a simulated noise-free sensor at rest gives identical scans at slightly different poses
+        if stamp_ns == other_ns or np.abs(pose - odom_T_sensor).max() > _STANDING:
+            raise InputError(
+                f"{where} repeats {other}: the same returns to the last bit, recorded twice: remove one and its pose"
+            )
+
+
+def deskew_points(points: Float64Array, offset_s: Float64Array, stamp_s: float, motion: Motion) -> Float64Array:
+    """Return points (N, 3), each in the sensor frame at its own time, in the sensor frame at the stamp of the scan.
+
+    Args:
+        points: (N, 3) points, metres.
+        offset_s: (N,) time of each after the stamp.
+        stamp_s: The stamp, of the clock of the motion.
+        motion: `odom_T_sensor` over time.
+    """
+    steps, which = np.unique(np.round(offset_s / _STEP_S).astype(np.int64), return_inverse=True)
+    places, quaternions = motion.sample(stamp_s + steps.astype(np.float64) * _STEP_S)
+    (at,), (turn,) = motion.sample(np.array([stamp_s]))
+    sensor_R_odom = Rotation.from_quat(turn).inv()
+    matrices = (sensor_R_odom * Rotation.from_quat(quaternions)).as_matrix()
+    shifts = sensor_R_odom.apply(places - at)
+    turned: Float64Array = np.einsum("nij,nj->ni", matrices[which], points)
+    return turned + shifts[which]
+
+
+def in_sensor_frames(clouds_odom: Clouds, odom_T_sensor: Float64Array) -> Clouds:
+    """Return clouds whose points are moved from the frame of the poses (S, 4, 4) into that of the sensor."""
+    return _Moved(clouds_odom, invert(odom_T_sensor))
+
+
+class _Moved:
+    def __init__(self, clouds: Clouds, dst_T_src: Float64Array) -> None:
+        self.name, self.stamps_s, self.own, self.lacks = clouds.name, clouds.stamps_s, clouds.own, clouds.lacks
+        self.is_stream = clouds.is_stream
+        self._clouds, self._dst_T_src = clouds, dst_T_src
+
+    def __len__(self) -> int:
+        return len(self._clouds)
+
+    def where(self, index: int) -> str:
+        return self._clouds.where(index)
+
+    def read(self, index: int) -> Cloud:
+        return self._move(index, self._clouds.read(index))
+
+    def read_all(self) -> Iterator[Cloud]:
+        return (self._move(index, cloud) for index, cloud in enumerate(self._clouds.read_all()))
+
+    def _move(self, index: int, cloud: Cloud) -> Cloud:
+        pose = self._dst_T_src[index]
+        is_missing = np.logical_not(cloud.points.any(axis=1))  # stays missing
+        moved = cloud.points @ pose[:3, :3].T + pose[:3, 3]
+        return Cloud(np.where(is_missing[:, None], 0.0, moved))

@@ -1,0 +1,143 @@
+"""Guess the format of a recording from what is in it: the first bytes of a file, the files of a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.names import visible
+
+RECORDING_SUFFIXES = (".osf", ".pcap", ".pcapng")
+"""File suffixes of sensor recordings, which `cdpipe.io.ouster` reads."""
+OUSTER = ("osf", "pcap")
+"""Formats that `cdpipe.io.ouster` reads."""
+_MOST_FILES = 1_000_000
+_N_MAGIC = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """One format.
+
+    Attributes:
+        about: What it is, for messages.
+        suffixes: Of its files, lower case.
+        magic: Byte position and bytes that its files begin with; empty for none.
+        in_folders: Whether a folder may hold one file per scan.
+    """
+
+    about: str
+    suffixes: tuple[str, ...] = ()
+    magic: tuple[tuple[int, bytes], ...] = ()
+    in_folders: bool = False
+
+
+_PCAP = (b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x0a\x0d\x0d\x0a")
+FORMATS = {
+    "session": Format("a session folder (session.json)"),
+    "ply": Format("PLY scans", (".ply",), ((0, b"ply\n"), (0, b"ply\r")), in_folders=True),
+    "pcd": Format("PCD scans", (".pcd",), ((0, b"# .PCD"), (0, b"VERSION"), (0, b"#.PCD")), in_folders=True),
+    "las": Format("LAS, LAZ or COPC scans", (".las", ".laz"), ((0, b"LASF"),), in_folders=True),
+    "kitti": Format("KITTI .bin scans (float32 x, y, z, intensity)", (".bin",), in_folders=True),
+    "e57": Format("E57", (".e57",), ((0, b"ASTM-E57"),)),
+    "bag": Format(
+        "a ROS 1 bag, ROS 2 bag or MCAP",
+        (".bag", ".mcap", ".db3"),
+        ((0, b"#ROSBAG V2.0"), (0, b"\x89MCAP0\r\n"), (0, b"SQLite format 3")),
+    ),
+    "osf": Format("an Ouster OSF", (".osf",), ((8, b"OSF$"),)),
+    "pcap": Format("an Ouster PCAP", (".pcap", ".pcapng"), tuple((0, magic) for magic in _PCAP)),
+}
+"""One row is one format, by the name that `--format` takes."""
+# Sub-folders in which other people's tools put the scans.
+_SCAN_FOLDERS = ("velodyne", "pcd", "scans", "clouds", "velodyne_points/data", "lidar", "points")
+
+
+def guess_format(path: Path) -> str:
+    """Return the name in `FORMATS` of what a file or folder holds.
+
+    Raises:
+        InputError: It does not exist, or is none of them, or could be two.
+    """
+    if path.is_dir():
+        return _guess_folder(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder: expected a session, or a recording ({_known()})")
+    if not path.is_file():
+        raise InputError(f"{path}: a device or a pipe: expected a session, or a recording ({_known()})")
+    with path.open("rb") as file:
+        head = file.read(_N_MAGIC)
+    suffix = path.suffix.lower()
+    # a damaged file is called what its name says
+    named = [name for name, each in FORMATS.items() if suffix in each.suffixes]
+    found = [name for name, each in FORMATS.items() if any(head[at:].startswith(it) for at, it in each.magic)]
+    if not (found or named):
+        raise InputError(f"{path}: expected a session folder, or a recording ({_known()}); --format NAME overrides")
+    return (found or named)[0]
+
+
+def holds_scans(folder: Path) -> bool:
+    """Return whether a folder holds a recording, of one format or of several."""
+    try:
+        return len(_formats_in(folder)) > 0
+    except OSError:
+        return False
+
+
+def require_format_name(name: str) -> str:
+    """Return the name of a format; raise `InputError` if there is none of this name."""
+    if name not in FORMATS:
+        raise InputError(f"--format {visible(name)}: expected one of {', '.join(FORMATS)}")
+    return name
+
+
+def find_scans(folder: Path, name: str) -> list[Path]:
+    """Return the files of one format in a folder, or in the usual sub-folder that has more of them, sorted."""
+    suffixes = FORMATS[name].suffixes
+    places = [_files(place, suffixes) for place in (folder, *(folder / sub for sub in _SCAN_FOLDERS))]
+    return max(map(sorted, places), key=len)
+
+
+def _formats_in(folder: Path) -> dict[str, int]:
+    """Return the formats in a folder with their numbers of files."""
+    if (folder / "session.json").is_file():
+        return {"session": 1}
+    if _files(folder, FORMATS["bag"].suffixes):
+        return {"bag": 1}
+    counts = {name: len(find_scans(folder, name)) for name, each in FORMATS.items() if each.in_folders}
+    found = {name: count for name, count in counts.items() if count}
+    return {name: count for name, count in found.items() if count > 1} or found  # one map beside scans is no scan
+
+
+def _guess_folder(folder: Path) -> str:
+    found = _formats_in(folder)
+    if len(found) > 1:
+        told = ", ".join(f"{count} {name}" for name, count in found.items())
+        raise InputError(f"{folder}: scans of several formats ({told}): name one, --format {' or '.join(found)}")
+    if not found:
+        names = [sub.name for sub in sorted(folder.iterdir()) if sub.is_dir()][:3]
+        inside = f" (there are folders: {', '.join(map(visible, names))})" if names else ""
+        raise InputError(
+            f"{folder}: no scans in it{inside}: expected session.json (a session of ours), or *.ply, *.pcd, *.las, "
+            "*.laz or *.bin scans with a trajectory, or a bag"
+        )
+    return next(iter(found))
+
+
+def _files(folder: Path, suffixes: Iterable[str]) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    wanted = set(suffixes)
+    found = []
+    for number, file in enumerate(folder.iterdir()):
+        if number >= _MOST_FILES:
+            raise InputError(f"{folder}: more than {_MOST_FILES} files: split it")
+        if file.suffix.lower() in wanted and not file.name.startswith("."):
+            found.append(file)
+    return found
+
+
+def _known() -> str:
+    return ", ".join(suffix for each in FORMATS.values() for suffix in each.suffixes)

@@ -1,0 +1,278 @@
+"""Trajectories of other people: TUM, KITTI (12 numbers a line) and CSV with a header, guessed from the first line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.files import read_bytes
+from cdpipe.core.geometry import BoolArray, Float64Array, make_pose, travelled_m
+from cdpipe.core.motion import Motion, make_motion
+from cdpipe.io.tum import MOST_BYTES, TUM_LINE, read_tum, require_unit_poses
+
+# A pose is rigid if no entry of R R^T is farther than this from the identity; KITTI files have six digits.
+_RIGID = 1e-3
+_FARTHEST_M = 1e8
+# Poses farther apart than this say nothing about the scans between them, unless scans are as rare.
+_LONGEST_GAP_S = 1.0
+_SECONDS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # from this median on, stamps are ns, us, ms
+_NAMES = {
+    "time": ("t", "time", "stamp", "timestamp", "sec", "secs", "seconds", "nsec", "nsecs", "ns", "s"),
+    "x": ("x", "tx", "px"), "y": ("y", "ty", "py"), "z": ("z", "tz", "pz"),
+    "qx": ("qx",), "qy": ("qy",), "qz": ("qz",), "qw": ("qw",),
+    "roll": ("roll",), "pitch": ("pitch",), "yaw": ("yaw", "heading"),
+}  # fmt: skip
+_TURNS = {"q", "quat", "quaternion", "orientation", "rotation", "rot"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Poses of a sensor.
+
+    Attributes:
+        where: The file, or what else gave the poses, for messages.
+        poses: (N, 4, 4) `odom_T_sensor`.
+        time_s: (N,) times, seconds of the clock of the scans; None where the file has none.
+    """
+
+    where: str
+    poses: Float64Array
+    time_s: Float64Array | None = None
+
+    def motion(self) -> Motion | None:
+        """Return the motion through the poses; None with one pose only, or without times that rise."""
+        if self.time_s is None or len(self.time_s) < 2 or not (np.diff(self.time_s) > 0).all():
+            return None
+        rotations = Rotation.from_matrix(self.poses[:, :3, :3])
+        return make_motion(self.time_s, travelled_m(self.poses), self.poses[:, :3, 3], rotations)
+
+
+def read_poses(path: Path) -> Trajectory:
+    """Read a trajectory in any of the formats.
+
+    TUM lines `stamp tx ty tz qx qy qz qw`; KITTI lines of 12 numbers, the upper rows of a 4x4 matrix; `time` and 12
+    numbers; lines `x y z qx qy qz qw`, one a scan; or a CSV whose header names its columns (x, y, z, and qx, qy, qz,
+    qw or roll, pitch, yaw; time).
+
+    Raises:
+        InputError: The file is none of these, a number is not finite, or a rotation is none.
+    """
+    lines = _lines(path)
+    if not lines:
+        raise InputError(f"{path}: no poses in it: expected lines `{TUM_LINE}`, KITTI's 12 numbers, or a CSV")
+    words = _split(lines[0][1])
+    if not all(map(_is_number, words)):
+        return _read_csv(path, words, lines[1:])
+    columns = len(words)
+    if columns == 8 and "," not in lines[0][1] and ";" not in lines[0][1]:
+        rows, _ = read_tum(path)
+        return Trajectory(str(path), _from_quaternions(rows[:, 1:]), rows[:, 0])
+    if columns not in (7, 8, 12, 13):
+        raise InputError(
+            f"{path}:{lines[0][0]}: {columns} fields: expected eight numbers, {TUM_LINE}; or KITTI's 12 numbers; or a "
+            "header that names the columns"
+        )
+    rows, numbers = _numbers(path, lines, columns)
+    has_time = columns in (8, 13)
+    poses = _poses(path, rows[:, int(has_time) :], numbers)
+    return Trajectory(str(path), poses, _seconds(rows[:, 0]) if has_time else None)
+
+
+def read_times(path: Path) -> Float64Array:
+    """Read one time a line, as KITTI's times.txt has them, in seconds.
+
+    Raises:
+        InputError: A line is not one finite number, or a time does not come after the one before it.
+    """
+    lines = _lines(path)
+    time_s = _seconds(_numbers(path, lines, 1)[0][:, 0])
+    _require_rising(str(path), time_s)
+    return time_s
+
+
+def poses_at(trajectory: Trajectory, stamps_s: Float64Array, name: str) -> Float64Array:
+    """Return the poses (S, 4, 4) of scans at (S,) rising times, interpolated; rotations by Slerp.
+
+    Raises:
+        InputError: The trajectory ends more than one period short of the scans at either end, belongs to another
+            clock, or has a gap between two scans.
+    """
+    assert trajectory.time_s is not None
+    time_s = trajectory.time_s
+    _require_rising(trajectory.where, time_s)
+    period_s = max(_period(stamps_s), _period(time_s))
+    early_s, late_s = float(time_s[0] - stamps_s[0]), float(stamps_s[-1] - time_s[-1])
+    spans = (
+        f"covers {time_s[0]:.3f} to {time_s[-1]:.3f} s, the scans of {name} {stamps_s[0]:.3f} to {stamps_s[-1]:.3f} s"
+    )
+    if early_s > stamps_s[-1] - stamps_s[0] + period_s or late_s > stamps_s[-1] - stamps_s[0] + period_s:
+        off_s = float(time_s[0] - stamps_s[0])
+        raise InputError(f"{trajectory.where}: {spans}: the clocks differ by {off_s:.3f} s: shift the stamps")
+    if max(early_s, late_s) > period_s + 1e-6:
+        outside = int(np.count_nonzero((stamps_s < time_s[0] - period_s) | (stamps_s > time_s[-1] + period_s)))
+        raise InputError(
+            f"{trajectory.where}: {spans}: {outside} scans lie up to {max(early_s, late_s):.3f} s outside, more than "
+            f"one period ({period_s:.3f} s): leave those scans out, or give poses for them"
+        )
+    motion = trajectory.motion()
+    if motion is None:
+        return np.broadcast_to(trajectory.poses[0], (len(stamps_s), 4, 4)).copy()
+    _require_no_gap(trajectory, stamps_s, period_s)
+    return motion.poses(stamps_s)
+
+
+def _require_no_gap(trajectory: Trajectory, stamps_s: Float64Array, period_s: float) -> None:
+    assert trajectory.time_s is not None
+    at = np.clip(np.searchsorted(trajectory.time_s, stamps_s) - 1, 0, len(trajectory.time_s) - 2)
+    steps_s = np.diff(trajectory.time_s)[at]
+    if steps_s.max() > max(_LONGEST_GAP_S, 2 * period_s):
+        scan = int(np.argmax(steps_s))
+        raise InputError(
+            f"{trajectory.where}: no pose for {steps_s[scan]:.2f} s about scan {scan} ({stamps_s[scan]:.3f} s): at "
+            f"most {max(_LONGEST_GAP_S, 2 * period_s):.2g} s can be bridged: leave those scans out"
+        )
+
+
+def _period(time_s: Float64Array) -> float:
+    return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """Return the numbered lines of a text file that are neither empty nor, after the first, comments."""
+    try:
+        text = read_bytes(path, MOST_BYTES).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: cannot be read as text: {error}") from error
+    lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    # the header of a CSV may begin as a comment does
+    first = next((index for index, (_, line) in enumerate(lines) if "," in line and _is_header(line)), None)
+    header = [lines[first]] if first is not None and all(line.startswith("#") for _, line in lines[:first]) else []
+    return header + [each for each in lines if not each[1].startswith("#") and each not in header]
+
+
+def _is_header(line: str) -> bool:
+    return {"x", "y", "z"} <= set(_columns(_split(line)))
+
+
+def _split(line: str) -> list[str]:
+    line = line.strip().lstrip("#").strip()
+    for separator in (",", ";", "\t"):
+        if separator in line:
+            return [word.strip() for word in line.rstrip(separator).split(separator)]
+    return line.split()
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _columns(names: Sequence[str]) -> dict[str, int]:
+    """Return the column of each quantity that a CSV's header names; the first that fits."""
+    found: dict[str, int] = {}
+    for index, name in enumerate(names):
+        bare = re.sub(r"[\[(].*?[\])]", "", name).strip().lower()
+        tokens = [token for token in re.split(r"[^a-z0-9]+", bare) if token]
+        if not tokens:
+            continue
+        # `pose.orientation.x`, `q_RS_x`: the last word is the axis, a word before says of what
+        is_turn = bool(_TURNS & set(tokens[:-1])) and tokens[-1] in ("x", "y", "z", "w")
+        last = f"q{tokens[-1]}" if is_turn else tokens[-1]
+        quantity = next((quantity for quantity, usual in _NAMES.items() if last in usual), None)
+        # twist, covariance and the like are no pose
+        if quantity is not None and not {"linear", "angular", "twist", "covariance", "v", "b", "seq"} & set(
+            tokens[:-1]
+        ):
+            found.setdefault(quantity, index)
+    return found
+
+
+def _read_csv(path: Path, names: list[str], lines: list[tuple[int, str]]) -> Trajectory:
+    columns = _columns(names)
+    turns = [name for name in ("qx", "qy", "qz", "qw") if name in columns]
+    angles = [name for name in ("roll", "pitch", "yaw") if name in columns]
+    if not {"x", "y", "z"} <= set(columns) or (len(turns) < 4 and len(angles) < 3):
+        named = ", ".join(names)[:120]
+        raise InputError(
+            f"{path}: its header names {named}: expected x, y, z, and qx, qy, qz, qw or roll, pitch, yaw, and time for "
+            "scans at other times"
+        )
+    rows, numbers = _numbers(path, lines, len(names))
+    points = rows[:, [columns[axis] for axis in "xyz"]]
+    if len(turns) == 4:
+        poses = _poses(path, np.column_stack([points, rows[:, [columns[name] for name in turns]]]), numbers)
+    else:
+        turn = rows[:, [columns[name] for name in angles]]
+        is_degrees = any("deg" in names[columns[name]].lower() for name in angles) or np.abs(turn).max(initial=0) > 7.0
+        matrices = Rotation.from_euler("xyz", turn, degrees=is_degrees).as_matrix()
+        poses = make_pose(matrices, points)
+    return Trajectory(str(path), poses, _seconds(rows[:, columns["time"]]) if "time" in columns else None)
+
+
+def _numbers(path: Path, lines: list[tuple[int, str]], columns: int) -> tuple[Float64Array, list[int]]:
+    """Return the numbers (N, columns) of lines, and their line numbers."""
+    rows = []
+    for number, line in lines:
+        words = _split(line)
+        if len(words) != columns:
+            raise InputError(
+                f"{path}:{number}: {len(words)} fields, {columns} in the first line: expected as many in each"
+            )
+        try:
+            rows.append([float(word or "nan") for word in words])
+        except ValueError as error:
+            raise InputError(f"{path}:{number}: expected numbers: {error}") from error
+    if not rows:
+        raise InputError(f"{path}: no line of numbers in it")
+    return np.array(rows, np.float64), [number for number, _ in lines]
+
+
+def _poses(path: Path, rows: Float64Array, numbers: Sequence[int]) -> Float64Array:
+    """Return the poses of rows (N, 7), position and quaternion, or (N, 12), the upper rows of a matrix."""
+    if rows.shape[1] == 7:
+        require_unit_poses(rows, lambda index: f"{path}:{numbers[index]}")
+        return _from_quaternions(rows)
+    matrices = rows.reshape(-1, 3, 4)
+    is_near = (np.abs(matrices) < _FARTHEST_M).all(axis=(1, 2))  # NaN is not
+    with np.errstate(over="ignore", invalid="ignore"):
+        turned = matrices[:, :, :3] @ matrices[:, :, :3].swapaxes(1, 2)
+        is_rigid = is_near & (np.abs(turned - np.eye(3)).max(axis=(1, 2)) < _RIGID)
+        is_rigid &= np.linalg.det(np.where(np.abs(matrices[:, :, :3]) < 2.0, matrices[:, :, :3], 0.0)) > 0
+    if not is_rigid.all():
+        bad = int(np.argmin(is_rigid))
+        raise InputError(
+            f"{path}:{numbers[bad]}: the first three columns of its 3x4 matrix are no rotation: expected KITTI's 12 "
+            "numbers r11 r12 r13 tx r21 ... tz"
+        )
+    return make_pose(Rotation.from_matrix(matrices[:, :, :3]).as_matrix(), matrices[:, :, 3])
+
+
+def _from_quaternions(rows: Float64Array) -> Float64Array:
+    return make_pose(Rotation.from_quat(rows[:, 3:]).as_matrix(), rows[:, :3])
+
+
+def _seconds(stamps: Float64Array) -> Float64Array:
+    """Return stamps in seconds: from their size ns, us, ms or s."""
+    middle = float(np.median(np.abs(stamps))) if len(stamps) else 0.0
+    return stamps * next((scale for least, scale in _SECONDS if middle > least), 1.0)
+
+
+def _require_rising(where: str, time_s: Float64Array) -> None:
+    if not (np.abs(time_s) < 9e9).all():
+        raise InputError(f"{where}: a time is not finite, or beyond 9e9 s: expected seconds")
+    is_late: BoolArray = np.less_equal(np.diff(time_s), 0)
+    if is_late.any():
+        bad = int(np.argmax(is_late)) + 1
+        raise InputError(
+            f"{where}: time {bad + 1} does not come after the last: {time_s[bad]:.6f} s after {time_s[bad - 1]:.6f} s: "
+            "sort the lines by time and leave each stamp once"
+        )

@@ -1,0 +1,137 @@
+"""Options that say how a recording is to be read, and the recordings opened by them."""
+
+# ruff: noqa: PLC0415 - heavy imports stand inside the functions, so that --help and completion are instant
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from cdpipe.io.foreign import HowToRead
+    from cdpipe.model.types import ScanSource
+    from eval.core.progress import RunProgress
+
+RECORDING = "session folder, or a recording: scans with a trajectory, bag, MCAP, E57, OSF, PCAP"
+Format = Annotated[
+    str | None, typer.Option("--format", metavar="NAME", help="format, where the guess is wrong", show_default=False)
+]
+Topics = Annotated[
+    list[str] | None,
+    typer.Option("--topic", metavar="NAME", help="topic of a bag, of clouds or of poses; may be repeated"),
+]
+Trajectories = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--trajectory", metavar="FILE", help="poses of the sensor, TUM, KITTI or CSV; once per recording, - for none"
+    ),
+]
+Odometry = Annotated[str | None, typer.Option(metavar="kiss-icp", help="estimate the poses", show_default=False)]
+Metadata = Annotated[
+    list[str] | None,
+    typer.Option("--metadata", metavar="FILE.json", help="sensor of a .pcap; else the .json beside it"),
+]
+Deskew = Annotated[
+    bool, typer.Option("--deskew/--no-deskew", help="--no-deskew: points that have times are deskewed already")
+]
+NONE = "-"
+
+
+def how_to_read(
+    n_inputs: int,
+    form: str | None,
+    topics: list[str] | None,
+    trajectories: list[str] | None,
+    odometry: str | None,
+    metadata: list[str] | None,
+    *,
+    deskew: bool,
+) -> list[HowToRead]:
+    """Return how to read each of the recordings that a command names.
+
+    Raises:
+        InputError: An option is given for some of them only, or two options exclude each other.
+    """
+    from cdpipe.io.foreign import HowToRead
+
+    files = zip(_each("trajectory", trajectories, n_inputs), _each("metadata", metadata, n_inputs), strict=True)
+    return [
+        HowToRead(form, tuple(topics or ()), trajectory, None if trajectory else odometry, beside, deskew)
+        for trajectory, beside in files
+    ]
+
+
+def open_inputs(paths: Sequence[Path], hows: Sequence[HowToRead], progress: RunProgress) -> list[Path | ScanSource]:
+    """Open recordings; session folders stay paths.
+
+    Raises:
+        InputError: One cannot be read, or options are given for sessions alone.
+    """
+    from cdpipe.io.foreign import guess_format
+    from cdpipe.io.readers import open_session
+
+    for path, how in zip(paths, hows, strict=True):
+        if how.format is None:  # a long reading does not end at a wrong second name
+            guess_format(path)
+    opened: list[Path | ScanSource] = []
+    for path, checked in zip(paths, _check_sessions(paths, hows), strict=True):
+        source = path if checked is None else open_session(path, checked, progress.stage)
+        opened.append(source)
+        if getattr(source, "is_temporary", False):
+            progress.note(f"{path} was read into a temporary folder: `tunnelcd convert {path} FOLDER` keeps it")
+    return opened
+
+
+def open_sources(*inputs: Path | ScanSource) -> list[ScanSource]:
+    """Open the session folders among inputs."""
+    from cdpipe.io.readers import open_session
+
+    return [open_session(each) if isinstance(each, Path) else each for each in inputs]
+
+
+def _check_sessions(paths: Sequence[Path], hows: Sequence[HowToRead]) -> list[HowToRead | None]:
+    """Return how to read each recording, None for a session folder, which needs no options."""
+    from cdpipe.core.errors import InputError
+    from cdpipe.io.foreign import HowToRead
+    from cdpipe.io.session import is_session
+
+    checked = [None if is_session(path) else how for path, how in zip(paths, hows, strict=True)]
+    if not any(checked) and any(how != HowToRead() for how in hows):
+        raise InputError(f"{paths[0]}: a session has its own poses and sensor: leave --trajectory and the like out")
+    for path, how, kept in zip(paths, hows, checked, strict=True):
+        if kept is None and how.trajectory is not None:
+            raise InputError(f"{path}: a session has its own poses: give --trajectory {NONE} for it")
+    return checked
+
+
+def _each(name: str, values: list[str] | None, n_inputs: int) -> list[Path | None]:
+    from cdpipe.core.errors import InputError
+
+    if not values:
+        return [None] * n_inputs
+    if len(values) != n_inputs:
+        what = "one recording" if n_inputs == 1 else f"{n_inputs} recordings"
+        raise InputError(
+            f"--{name}: given {len(values)} times for {what}: give it once for each, in their order"
+            + (f"; {NONE} for one that has its own" if n_inputs > 1 else "")
+        )
+    return [None if value == NONE else Path(value) for value in values]
+
+
+def sampled_points(source: ScanSource, most: int) -> Any:
+    """Return at most about `most` returns (N, 3) of a source, spread over its scans, in its odom frame."""
+    import numpy as np
+
+    from cdpipe.core.geometry import transform
+
+    n_scans = len(source.odom_T_sensor)
+    step = max(1, n_scans // 200)
+    kept = []
+    share = -(-most // -(-n_scans // step))
+    for scan in source.scans():
+        if scan.index % step == 0:
+            points = scan.points_sensor[:: max(1, len(scan.points_sensor) // share)]
+            kept.append(transform(scan.odom_T_sensor, points))
+    return np.concatenate(kept)

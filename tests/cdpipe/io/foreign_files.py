@@ -1,0 +1,287 @@
+"""Recordings in other people's formats, written by other people's libraries from the scans of a source."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.geometry import Float64Array, invert, make_pose, yaw_pose
+
+START_NS = 1_700_000_000_000_000_000
+BASE_HZ = 50.0
+BASE_T_SENSOR = make_pose(Rotation.from_euler("xyz", (0.0, 5.0, 90.0), degrees=True).as_matrix(), (0.3, 0.1, 0.8))
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A sensor in a box: scans whose points are taken while it moves, 10 Hz.
+
+    Attributes:
+        stamps_s: (S,) times of the scans, counted from START_NS.
+        clouds: For each scan its points, each in the sensor frame at its own time, and that time after the stamp.
+    """
+
+    stamps_s: Float64Array
+    clouds: Sequence[tuple[Float64Array, Float64Array]]
+
+    def pose(self, time_s: float | Float64Array) -> Float64Array:
+        return odom_T_sensor(np.asarray(time_s))
+
+
+def odom_T_sensor(time_s: Any) -> Float64Array:
+    """Return poses (..., 4, 4): 1.5 m/s along a bend of 0.5 rad/s."""
+    turns = Rotation.from_euler("ZYX", np.stack([0.5 * time_s, 0.05 * np.sin(time_s), 0 * time_s], -1).reshape(-1, 3))
+    at = np.stack([1.5 * time_s, 0.2 * time_s**2, 0.1 + 0 * time_s], -1)
+    return make_pose(turns.as_matrix().reshape(*np.shape(time_s), 3, 3), at)
+
+
+def drive(n_scans: int = 6, n_points: int = 900, sweep_s: float = 0.1) -> Drive:
+    """Return scans of the walls of a box of 24 x 16 x 6 m; with `sweep_s` 0 all points are taken at the stamp."""
+    rng = np.random.default_rng(5)
+    stamps_s = 0.5 + 0.1 * np.arange(n_scans)
+    clouds = []
+    for stamp_s in stamps_s:
+        offset_s = np.sort(rng.uniform(0.0, sweep_s, n_points)) if sweep_s else np.zeros(n_points)
+        offset_s[:1], offset_s[-1:] = 0.0, sweep_s
+        walls = rng.uniform(-1.0, 1.0, (n_points, 3))
+        axis = rng.integers(0, 3, n_points)
+        walls[np.arange(n_points), axis] = np.sign(walls[np.arange(n_points), axis])
+        walls = walls * (12.0, 8.0, 3.0)
+        sensor_T_odom = invert(odom_T_sensor(stamp_s + offset_s))
+        points = np.einsum("nij,nj->ni", sensor_T_odom[:, :3, :3], walls) + sensor_T_odom[:, :3, 3]
+        clouds.append((points, offset_s))
+    return Drive(stamps_s, clouds)
+
+
+def off_walls_m(points_odom: Float64Array) -> Float64Array:
+    """Return the distance (N,) of points from the nearest wall of the box."""
+    return np.abs(np.abs(points_odom) - (12.0, 8.0, 3.0)).min(axis=1)
+
+
+def write_trajectory(path: Path, time_s: Float64Array, kind: str = "tum", order: str = "xyzw") -> Path:
+    """Write poses of the drive at times, as TUM, KITTI, or CSV with a header."""
+    poses = odom_T_sensor(time_s)
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    if order == "wxyz":
+        turns = np.roll(turns, 1, axis=1)
+    stamps = START_NS / 1e9 + time_s
+    if kind == "tum":
+        rows = [[f"{stamp:.6f}", *row] for stamp, row in zip(stamps, _text(poses[:, :3, 3], turns), strict=True)]
+        path.write_text("".join(" ".join(row) + "\n" for row in rows))
+    elif kind == "kitti":
+        path.write_text("".join(" ".join(row) + "\n" for row in _text(poses[:, :3].reshape(-1, 12))))
+    else:
+        rows = [
+            [f"{int(stamp * 1e6)}000", *row] for stamp, row in zip(stamps, _text(poses[:, :3, 3], turns), strict=True)
+        ]
+        names = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_x [],q_RS_y [],q_RS_z [],q_RS_w []"
+        path.write_text(names + "\n" + "".join(",".join(row) + "\n" for row in rows))
+    return path
+
+
+def _text(*parts: Float64Array) -> list[list[str]]:
+    return [[f"{number:.9g}" for number in row] for row in np.concatenate(parts, axis=1)]
+
+
+def write_pcds(folder: Path, made: Drive, encoding: str = "binary", *, with_time: bool = True) -> Path:
+    """Write scans with pypcd4; the times are float32 seconds after the stamp, as Velodyne's driver has them."""
+    from pypcd4 import Encoding, PointCloud  # noqa: PLC0415 - only where the extra is installed
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, (points, offset_s) in enumerate(made.clouds):
+        names = ("x", "y", "z", "intensity", "time") if with_time else ("x", "y", "z", "intensity")
+        columns = np.column_stack([points, np.full(len(points), 7.0), offset_s])[:, : len(names)].astype(np.float32)
+        cloud = PointCloud.from_points(columns, names, (np.float32,) * len(names))
+        cloud.save(folder / f"{index:06d}.pcd", Encoding(encoding))
+    return folder
+
+
+def write_lases(folder: Path, made: Drive, suffix: str = ".laz") -> Path:
+    """Write scans with laspy; the times are GPS seconds of the scans' clock."""
+    import laspy  # noqa: PLC0415
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, (points, offset_s) in enumerate(made.clouds):
+        header = laspy.LasHeader(point_format=6, version="1.4")
+        header.scales, header.offsets = np.full(3, 1e-4), np.zeros(3)
+        data = laspy.LasData(header)
+        data.x, data.y, data.z = points.T
+        data.gps_time = START_NS / 1e9 + made.stamps_s[index] + offset_s
+        data.write(folder / f"{index:06d}{suffix}")
+    return folder
+
+
+def write_kitti(folder: Path, made: Drive) -> Path:
+    """Write scans in the layout of SemanticKITTI: poses of a camera, and calib.txt with the lidar's place on it."""
+    (folder / "velodyne").mkdir(parents=True)
+    for index, (points, _) in enumerate(made.clouds):
+        np.column_stack([points, np.zeros(len(points))]).astype(np.float32).tofile(
+            folder / "velodyne" / f"{index:06d}.bin"
+        )
+    camera_T_sensor = make_pose(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), (0.1, -0.2, -0.3))
+    world_T_camera = camera_T_sensor @ odom_T_sensor(made.stamps_s) @ invert(camera_T_sensor)
+    np.savetxt(folder / "poses.txt", world_T_camera[:, :3].reshape(-1, 12), fmt="%.9e")
+    rows = " ".join(f"{number:.12e}" for number in camera_T_sensor[:3].ravel())
+    (folder / "calib.txt").write_text(f"P0: {' '.join(['0'] * 12)}\nTr: {rows}\n")
+    np.savetxt(folder / "times.txt", made.stamps_s, fmt="%.6e")
+    return folder
+
+
+def write_e57(path: Path, made: Drive) -> Path:
+    """Write scans with pye57, each with the pose of its scanner."""
+    import pye57  # noqa: PLC0415
+
+    with pye57.E57(str(path), mode="w") as file:
+        for stamp_s, (points, _) in zip(made.stamps_s, made.clouds, strict=True):
+            pose = odom_T_sensor(stamp_s)
+            x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+            data = {f"cartesian{axis}": points[:, k].copy() for k, axis in enumerate("XYZ")}
+            file.write_scan_raw(data, rotation=np.array([w, x, y, z]), translation=pose[:3, 3].copy())
+    return path
+
+
+class RosMessages:
+    """The drive as ROS messages: clouds, and the poses of a base with a fixed mounting of the sensor."""
+
+    def __init__(self, made: Drive, store: str = "ROS2_HUMBLE") -> None:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415
+
+        self.store = get_typestore(getattr(Stores, store))
+        if "tf2_msgs/msg/TFMessage" not in self.store.types:
+            text = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
+        self.types, self.is_first = self.store.types, store.startswith("ROS1")
+        self._made = made
+
+    def _header(self, time_s: float, frame: str) -> Any:
+        ns = START_NS + round(time_s * 1e9)
+        stamp = self.types["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
+        more = {"seq": 0} if self.is_first else {}
+        return self.types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **more)
+
+    def clouds(self, unit_ns: bool = True) -> Iterable[tuple[float, Any]]:
+        """Yield stamps and clouds: x, y, z as float32, padding, and t as Ouster's driver has it (uint32 ns)."""
+        dtype = np.dtype({"names": ["x", "y", "z", "t"], "formats": ["<f4", "<f4", "<f4", "<u4"],
+                          "offsets": [0, 4, 8, 20], "itemsize": 32})  # fmt: skip
+        field = self.types["sensor_msgs/msg/PointField"]
+        fields = [field(name=n, offset=o, datatype=k, count=1) for n, o, k in
+                  (("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("t", 20, 6))]  # fmt: skip
+        for stamp_s, (points, offset_s) in zip(self._made.stamps_s, self._made.clouds, strict=True):
+            table = np.zeros(len(points), dtype)
+            for axis, values in zip("xyz", points.T, strict=True):
+                table[axis] = values
+            table["t"] = np.round(offset_s * 1e9)
+            yield stamp_s, self.types["sensor_msgs/msg/PointCloud2"](
+                header=self._header(stamp_s, "os_lidar"), height=1, width=len(points), fields=fields,
+                is_bigendian=False, point_step=32, row_step=32 * len(points),
+                data=np.frombuffer(table.tobytes(), np.uint8), is_dense=True,
+            )  # fmt: skip
+
+    def _parts(self, pose: Float64Array) -> tuple[Any, Any]:
+        turn = self.types["geometry_msgs/msg/Quaternion"](*map(float, Rotation.from_matrix(pose[:3, :3]).as_quat()))
+        return [float(n) for n in pose[:3, 3]], turn
+
+    def transform(self, time_s: float, parent: str, child: str, pose: Float64Array) -> Any:
+        at, turn = self._parts(pose)
+        moved = self.types["geometry_msgs/msg/Transform"](
+            translation=self.types["geometry_msgs/msg/Vector3"](*at), rotation=turn
+        )
+        stamped = self.types["geometry_msgs/msg/TransformStamped"](
+            header=self._header(time_s, parent), child_frame_id=child, transform=moved
+        )
+        return self.types["tf2_msgs/msg/TFMessage"](transforms=[stamped])
+
+    def odometry(self, time_s: float, pose: Float64Array) -> Any:
+        at, turn = self._parts(pose)
+        here = self.types["geometry_msgs/msg/Pose"](
+            position=self.types["geometry_msgs/msg/Point"](*at), orientation=turn
+        )
+        zero = self.types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+        twist = self.types["geometry_msgs/msg/Twist"](linear=zero, angular=zero)
+        return self.types["nav_msgs/msg/Odometry"](
+            header=self._header(time_s, "odom"), child_frame_id="base_link",
+            pose=self.types["geometry_msgs/msg/PoseWithCovariance"](pose=here, covariance=np.zeros(36)),
+            twist=self.types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
+        )  # fmt: skip
+
+    def pose(self, time_s: float, pose: Float64Array) -> Any:
+        at, turn = self._parts(pose)
+        here = self.types["geometry_msgs/msg/Pose"](
+            position=self.types["geometry_msgs/msg/Point"](*at), orientation=turn
+        )
+        return self.types["geometry_msgs/msg/PoseStamped"](header=self._header(time_s, "map"), pose=here)
+
+    def all(self, poses: str, cloud_topics: Sequence[str], last_pose_s: float) -> list[tuple[str, str, float, Any]]:
+        """Return topic, type, time and message of everything: `poses` is tf, odometry, pose or none."""
+        made = [
+            (topic, "sensor_msgs/msg/PointCloud2", time_s, cloud)
+            for topic in cloud_topics
+            for time_s, cloud in self.clouds()
+        ]
+        times = np.arange(self._made.stamps_s[0] - 0.1, min(self._made.stamps_s[-1] + 0.25, last_pose_s), 1 / BASE_HZ)
+        base = odom_T_sensor(times) @ invert(BASE_T_SENSOR)
+        tf, first = "tf2_msgs/msg/TFMessage", float(times[0])
+        if poses in ("tf", "odometry"):
+            made.append(("/tf_static", tf, first, self.transform(first, "base_link", "os_lidar", BASE_T_SENSOR)))
+        for time_s, pose in zip(times.tolist(), base, strict=True):
+            if poses == "tf":
+                made.append(("/tf", tf, time_s, self.transform(time_s, "odom", "base_link", pose)))
+                made.append(
+                    ("/tf", tf, time_s, self.transform(time_s, "map", "odom", yaw_pose(0.3, (5.0, time_s, 0.0))))
+                )
+            elif poses == "odometry":
+                made.append(("/odom", "nav_msgs/msg/Odometry", time_s, self.odometry(time_s, pose)))
+            elif poses == "pose":
+                sensor = self.pose(time_s, pose @ BASE_T_SENSOR)
+                made.append(("/slam/pose", "geometry_msgs/msg/PoseStamped", time_s, sensor))
+        return sorted(made, key=lambda each: each[2])
+
+
+def write_bag(
+    path: Path,
+    made: Drive,
+    poses: str = "tf",
+    cloud_topics: Sequence[str] = ("/ouster/points",),
+    last_pose_s: float = np.inf,
+) -> Path:
+    """Write a bag with rosbags: ROS 1 if the name ends in .bag, else ROS 2 with sqlite3; .mcap with package mcap."""
+    if path.suffix == ".mcap":
+        return _write_mcap(path, made, poses, cloud_topics, last_pose_s)
+    from rosbags.rosbag1 import Writer as Writer1  # noqa: PLC0415
+    from rosbags.rosbag2 import Writer as Writer2  # noqa: PLC0415
+
+    is_first = path.suffix == ".bag"
+    messages = RosMessages(made, "ROS1_NOETIC" if is_first else "ROS2_HUMBLE")
+    with (Writer1 if is_first else Writer2)(path) as bag:
+        connections: dict[str, Any] = {}
+        for topic, kind, time_s, message in messages.all(poses, cloud_topics, last_pose_s):
+            if topic not in connections:
+                connections[topic] = bag.add_connection(topic, kind, typestore=messages.store)
+            store = messages.store
+            raw = store.serialize_ros1(message, kind) if is_first else store.serialize_cdr(message, kind)
+            bag.write(connections[topic], START_NS + round(time_s * 1e9), raw)
+    return path
+
+
+def _write_mcap(path: Path, made: Drive, poses: str, cloud_topics: Sequence[str], last_pose_s: float) -> Path:
+    from mcap.writer import Writer  # noqa: PLC0415
+
+    messages = RosMessages(made)
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="test")
+        channels: dict[str, int] = {}
+        for topic, kind, time_s, message in messages.all(poses, cloud_topics, last_pose_s):
+            if topic not in channels:
+                text = messages.store.generate_msgdef(kind, ros_version=2)[0]
+                schema = writer.register_schema(kind, "ros2msg", text.encode())
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            ns = START_NS + round(time_s * 1e9)
+            writer.add_message(channels[topic], ns, bytes(messages.store.serialize_cdr(message, kind)), ns)
+        writer.finish()
+    return path

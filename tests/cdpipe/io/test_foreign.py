@@ -1,0 +1,206 @@
+"""Recordings in formats of others, written by their libraries: scans lie on the walls of the box they were taken in."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
+pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
+
+from cdpipe.core.errors import InputError, InputWarning
+from cdpipe.core.geometry import transform
+from cdpipe.io.foreign import HowToRead, guess_format, read_poses
+from cdpipe.io.readers import open_session
+from cdpipe.mapping.session_check import check_session
+from cdpipe.model.config import MapConfig
+from tests.cdpipe.io.foreign_files import (
+    START_NS,
+    drive,
+    odom_T_sensor,
+    off_walls_m,
+    write_bag,
+    write_e57,
+    write_kitti,
+    write_lases,
+    write_pcds,
+    write_trajectory,
+)
+
+MADE, STANDING = drive(), drive(sweep_s=0.0)
+FINE_S = np.arange(0.3, 1.4, 0.013)
+
+
+def worst_m(path: Path, how: HowToRead | None = None) -> float:
+    """Return the largest distance of a return from the walls."""
+    source = open_session(path, how)
+    scans = list(source.scans())
+    assert len(scans) == len(MADE.stamps_s) == len(source.odom_T_sensor)
+    np.testing.assert_allclose(source.odom_T_sensor, odom_T_sensor(MADE.stamps_s), atol=1e-4)
+    return max(float(off_walls_m(transform(scan.odom_T_sensor, scan.points_sensor)).max()) for scan in scans)
+
+
+def said(path: Path, how: HowToRead | None = None) -> str:
+    with pytest.raises(InputError) as caught:
+        list(open_session(path, how).scans())
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_pcd_scans_are_deskewed_by_their_own_times(tmp_path: Path, encoding: str) -> None:
+    folder = write_pcds(tmp_path / "run", MADE, encoding)
+    write_trajectory(folder / "t.tum", MADE.stamps_s)
+    assert worst_m(folder) < 0.01  # the poses between the scans are interpolated
+    assert worst_m(folder, HowToRead(deskew=False)) > 0.3
+
+
+def test_laz_scans_with_gps_times(tmp_path: Path) -> None:
+    folder = write_lases(tmp_path / "run", MADE)
+    write_trajectory(folder / "t.csv", MADE.stamps_s, "csv")
+    assert worst_m(folder) < 0.01
+
+
+def test_semantic_kitti(tmp_path: Path) -> None:
+    folder = write_kitti(tmp_path / "00", STANDING)
+    assert worst_m(folder) < 1e-4
+    (folder / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 -1 0\n")
+    assert "calib.txt:1: Tr mirrors" in said(folder)
+    (folder / "velodyne" / "000002.bin").write_bytes(b"x" * 30)
+    (folder / "calib.txt").unlink()
+    assert "000002.bin: 30 bytes: expected x, y, z, intensity" in said(folder)
+
+
+def test_e57_has_the_poses_of_its_scanner(tmp_path: Path) -> None:
+    pytest.importorskip("pye57")
+    assert worst_m(write_e57(tmp_path / "a.e57", STANDING)) < 1e-4
+
+
+def test_a_trajectory_at_another_rate_is_interpolated(tmp_path: Path) -> None:
+    folder = write_pcds(tmp_path / "run", MADE)
+    np.savetxt(folder / "times.txt", START_NS / 1e9 + MADE.stamps_s, fmt="%.6f")
+    for kind in ("tum", "csv"):
+        assert worst_m(folder, HowToRead(trajectory=write_trajectory(tmp_path / f"t.{kind}", FINE_S, kind))) < 1e-3
+    short = write_trajectory(tmp_path / "short.tum", FINE_S[FINE_S < 0.75])
+    assert "2 scans lie up to 0.258 s outside, more than one period (0.100 s)" in said(
+        folder, HowToRead(trajectory=short)
+    )
+    other = write_trajectory(tmp_path / "other.tum", FINE_S + 100.0)
+    other.write_text("".join(f"{float(line.split()[0]) + 500:.6f} {line.split(maxsplit=1)[1]}\n"
+                             for line in other.read_text().splitlines()))  # fmt: skip
+    assert "the clocks differ by 599.8" in said(folder, HowToRead(trajectory=other))
+    (folder / "times.txt").unlink()
+    assert "the scans have none (add times.txt" in said(folder, HowToRead(trajectory=tmp_path / "t.tum"))
+    kitti = write_trajectory(tmp_path / "k.txt", MADE.stamps_s, "kitti")
+    assert worst_m(folder, HowToRead(trajectory=kitti)) > 0.3  # poses without times cannot deskew
+
+
+def test_quaternions_with_w_first_are_noticed(tmp_path: Path) -> None:
+    dense = drive(n_points=40_000, sweep_s=0.0)
+    folder = write_pcds(tmp_path / "run", dense, with_time=False)
+    write_trajectory(folder / "t.tum", dense.stamps_s, order="wxyz")
+    assert "they look like qw first" in said(folder)
+    write_trajectory(folder / "t.tum", dense.stamps_s)
+    assert worst_m(folder) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("name", "poses"),
+    [("a.bag", "tf"), ("a.bag", "pose"), ("ros2", "tf"), ("ros2", "odometry"), ("a.mcap", "tf"), ("a.mcap", "pose")],
+)
+def test_bags(tmp_path: Path, name: str, poses: str) -> None:
+    if name.endswith(".mcap"):
+        pytest.importorskip("mcap")
+    path = write_bag(tmp_path / name, MADE, poses)
+    assert guess_format(path) == "bag"
+    assert worst_m(path) < 1e-3
+
+
+def test_a_lone_db3_is_a_bag(tmp_path: Path) -> None:
+    shutil.copy(next(write_bag(tmp_path / "ros2", MADE).glob("*.db3")), tmp_path / "lone.db3")
+    assert worst_m(tmp_path / "lone.db3") < 1e-3
+
+
+def test_topics_and_poses_that_a_bag_lacks_are_listed(tmp_path: Path) -> None:
+    bare = write_bag(tmp_path / "bare.bag", MADE, "none")
+    text = said(bare)
+    assert "no poses of the sensor in it (it holds /ouster/points (PointCloud2, 6))" in text
+    assert "--trajectory FILE" in text
+    assert "--odometry kiss-icp" in text
+    assert worst_m(bare, HowToRead(trajectory=write_trajectory(tmp_path / "t.tum", FINE_S))) < 1e-3
+    two = write_bag(tmp_path / "two.bag", MADE, "tf", ("/a/points", "/b/points"))
+    assert "--topic /a/points or /b/points" in said(two)
+    assert worst_m(two, HowToRead(topics=("/b/points",))) < 1e-3
+    assert "--topic /c: not in it" in said(two, HowToRead(topics=("/c",)))
+
+
+def test_clouds_outside_the_poses_of_a_bag_are_left_out(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "a.bag", MADE, "odometry", last_pose_s=0.7)
+    with pytest.warns(InputWarning, match="3 of 6 clouds lie before or after"):
+        source = open_session(path)
+    assert len(list(source.scans())) == len(source.odom_T_sensor) == 3
+
+
+def test_a_bag_becomes_a_folder_that_goes_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    source = open_session(write_bag(tmp_path / "a.bag", MADE))
+    assert source.name == str(tmp_path / "a.bag")
+    assert len(list(tmp_path.glob("tunnelcd-read-*/scans/*.ply"))) == 6
+    del source
+    assert not list(tmp_path.glob("tunnelcd-read-*"))
+
+
+def test_what_is_no_recording_is_named(tmp_path: Path) -> None:
+    assert "no such file or folder" in said(tmp_path / "gone.bag")
+    (tmp_path / "a.txt").write_text("x")
+    assert "expected a session folder, or a recording (.ply" in said(tmp_path / "a.txt")
+    folder = write_pcds(tmp_path / "run", MADE)
+    assert "exactly one trajectory" in said(folder)
+    assert "a map without its scans" in said(folder / "000000.pcd")
+    write_lases(folder, MADE)
+    assert "scans of several formats (6 pcd, 6 las): name one, --format pcd or las" in said(folder)
+    write_trajectory(folder / "t.tum", MADE.stamps_s)
+    assert worst_m(folder, HowToRead(format="las")) < 0.01
+    with pytest.raises(InputError, match="--format las7: expected one of session, ply"):
+        HowToRead(format="las7")
+
+
+def test_millimetres_are_named(tmp_path: Path) -> None:
+    in_mm = [(1000.0 * points, offset_s) for points, offset_s in STANDING.clouds]
+    folder = write_pcds(tmp_path / "run", type(STANDING)(STANDING.stamps_s, in_mm), with_time=False)
+    write_trajectory(folder / "t.tum", STANDING.stamps_s)
+    with pytest.raises(InputError, match=r"look like millimetres: scale by 0\.001"):
+        check_session(open_session(folder), MapConfig())
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("1 2 3\n", "3 fields: expected eight numbers"),
+        ("a,b,c\n1,2,3\n", "its header names a, b, c"),
+        ("x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,2\n", "the quaternion's length is 2"),
+        ("1 0 0 0 0 1 0 0 0 0 2 0\n", "t.txt:1: the first three columns of its 3x4 matrix are no rotation"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0\n", "t.txt:2: 3 fields, 12 in the first line"),
+        ("", "no poses in it"),
+    ],
+)
+def test_wrong_trajectories_are_named(tmp_path: Path, text: str, expected: str) -> None:
+    (tmp_path / "t.txt").write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_poses(tmp_path / "t.txt")
+    assert expected in str(caught.value)
+
+
+def test_columns_of_a_csv_are_found_by_their_names(tmp_path: Path) -> None:
+    turned = odom_T_sensor(np.array([1.0]))[0]
+    header = "seq,stamp_ns,pose.position.x,pose.position.y,pose.position.z,yaw [deg],pitch,roll,twist.linear.x"
+    yaw, pitch, roll = np.degrees([0.5, 0.05 * np.sin(1.0), 0.0])
+    at = ",".join(map(str, turned[:3, 3]))
+    (tmp_path / "t.csv").write_text(f"{header}\n7,1700000000500000000,{at},{yaw},{pitch},{roll},9\n")
+    found = read_poses(tmp_path / "t.csv")
+    np.testing.assert_allclose(found.poses[0], turned, atol=1e-9)
+    assert found.time_s is not None
+    assert found.time_s[0] == pytest.approx(1_700_000_000.5)

@@ -1,0 +1,46 @@
+"""Recordings of other formats at the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
+pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
+
+from cdpipe.io.readers import open_session
+from tests.cdpipe.io.foreign_files import drive, write_bag, write_pcds, write_trajectory
+from tests.eval.cli.test_converting import Command, refused
+
+
+def test_a_bag_becomes_a_session_and_nothing_is_left_of_a_refusal(tmp_path: Path, command: Command) -> None:
+    made = drive(12, 200)
+    bag = write_bag(tmp_path / "a.bag", made)
+    code, out, _ = command("convert", bag, tmp_path / "s")
+    assert code == 0
+    assert f"12 scans as PLY, trajectory.tum, poses: tf of {bag}" in out
+    assert len(list(open_session(tmp_path / "s").scans())) == 12
+    refused(command("convert", bag, tmp_path / "s"), "s: is not empty")
+    bare = write_bag(tmp_path / "bare.bag", made, "none")
+    refused(command("convert", bare, tmp_path / "t"), "no poses of the sensor in it")
+    refused(command("convert", bag, tmp_path / "t", "--topic", "/x"), "--topic /x: not in it")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.bag", "bare.bag", "s"]
+
+
+def test_what_detect_says_of_recordings_and_their_options(tmp_path: Path, command: Command) -> None:
+    made = drive(3, 60)
+    bag, folder = write_bag(tmp_path / "a.bag", made), write_pcds(tmp_path / "run", made)
+    poses, out = write_trajectory(tmp_path / "t.tum", made.stamps_s), ("--out", tmp_path / "out")
+    refused(command("detect", bag, tmp_path / "friday", *out), "friday: no such file or folder")
+    refused(command("detect", bag, folder, *out), "run: expected exactly one trajectory")
+    refused(command("detect", bag, folder, "--trajectory", poses, *out), "--trajectory: given 1 times for 2 recordings")
+    refused(command("detect", bag, bag, "--odometry", "slam", *out), "--odometry slam: expected kiss-icp")
+    refused(command("describe", bag, "--format", "pdf"), "--format pdf: expected one of session")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_same_bag_twice_is_said(tmp_path: Path, command: Command) -> None:
+    bag = write_bag(tmp_path / "a.bag", drive(3, 900))
+    _, _, err = command("detect", bag, bag, "--out", tmp_path / "out")
+    assert "one and the same recording" in err
