@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from cdpipe.core.threads import fix_threads
-from eval.cli import converting
+from eval.cli import converting, tracing
 from eval.cli import pair as commands_pair
 from eval.cli import run as commands_run
 from eval.cli import tools as commands_tools
@@ -52,6 +52,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "describe": commands_pair.describe,
     "detect": commands_pair.detect,
     "convert": converting.convert,
+    "trace": tracing.trace,
     "score": commands_run.score,
     "run": commands_run.run_command,
     "export": commands_run.export,

@@ -56,7 +56,8 @@ def join_drifts(middles: Sequence[Middle], width_m: float) -> list[list[Middle]]
         partner[pair[0]], partner[pair[1]] = pair[1], pair[0]
         if _repeats(middles, partner, pair[0][0]):
             del partner[pair[0]], partner[pair[1]]
-    chains, done = [], set()
+    chains: list[list[Middle]] = []
+    done: set[int] = set()
     for start in range(len(middles)):
         if start not in done:
             chain = _chain(middles, partner, start)

@@ -89,7 +89,7 @@ def _votes_along(caster: Caster, low_m: Float64Array, shape: Int64Array, axis: i
     np.add.at(steps, (ray[follows], first[follows]), said)
     np.add.at(steps, (ray[follows], first[follows + 1]), -said)
     opening, closing = np.flatnonzero(is_first & is_entry), np.flatnonzero(is_last[: len(ray)] & ~is_entry)
-    np.add.at(steps, (ray[opening], 0), np.int8(-1))
+    np.add.at(steps, (ray[opening], np.zeros_like(opening)), np.int8(-1))
     np.add.at(steps, (ray[opening], first[opening]), np.int8(1))
     np.add.at(steps, (ray[closing], first[closing]), np.int8(-1))
     votes = np.cumsum(steps[:, :-1], axis=1, dtype=np.int8)

@@ -55,13 +55,13 @@ class Middle:
 
     def reversed(self) -> Middle:
         """Return the same line the other way."""
-        turned = (each[::-1] for each in (self.points, self.left_m, self.right_m, self.height_m))
-        return Middle((self.ends[1], self.ends[0]), *turned, self.roofless)
+        points, right_m, left_m, height_m = (
+            each[::-1] for each in (self.points, self.left_m, self.right_m, self.height_m)
+        )
+        return Middle((self.ends[1], self.ends[0]), points, right_m, left_m, height_m, self.roofless)
 
 
-def find_middle(
-    branch: Branch, caster: Caster, void: Void, width_m: float, is_met: tuple[bool, bool], soft_m: float
-) -> Middle:
+def find_middle(branch: Branch, caster: Caster, void: Void, width_m: float, is_met: tuple[bool, bool]) -> Middle:
     """Return a branch moved to the middle between the walls, on the floor; free ends go on to half a width before rock.
 
     Args:
@@ -70,9 +70,8 @@ def find_middle(
         void: The inside.
         width_m: Typical width of the drifts.
         is_met: Whether other branches meet its first and its last point, which then stay.
-        soft_m: Standard deviation of the noise of the curve, about one cell.
     """
-    points = _soften(resample(branch.points, STATION_M), max(_SOFT_WIDTHS * width_m, soft_m), is_met)
+    points = _soften(resample(branch.points, STATION_M), _SOFT_WIDTHS * width_m, is_met)
     for side, met in zip((0, -1), is_met, strict=True):
         if not met:
             points = _go_on(points, side, caster, void, width_m)
@@ -138,10 +137,8 @@ def _soften(points: Float64Array, sigma_m: float, is_met: tuple[bool, bool]) -> 
 
 def _go_on(points: Float64Array, side: int, caster: Caster, void: Void, width_m: float) -> Float64Array:
     """Lengthen a line at a free end, straight and level, until half a width before rock or before the void ends."""
-    inner = points[min(len(points) - 1, round(width_m / STATION_M))] if side == 0 else points[
-        max(0, len(points) - 1 - round(width_m / STATION_M))
-    ]  # fmt: skip
-    way = (points[side] - inner) * (1.0, 1.0, 0.0)
+    back = min(len(points) - 1, round(width_m / STATION_M))
+    way = (points[side] - points[back if side == 0 else -1 - back]) * (1.0, 1.0, 0.0)
     length_m = float(np.linalg.norm(way))
     if length_m < STATION_M:
         return points
@@ -154,4 +151,3 @@ def _go_on(points: Float64Array, side: int, caster: Caster, void: Void, width_m:
     n_good = len(steps) if is_good.all() else int(np.argmin(is_good))
     more = steps[:n_good]
     return np.concatenate([more[::-1], points]) if side == 0 else np.concatenate([points, more])
-

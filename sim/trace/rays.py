@@ -5,27 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array
-from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 
 UP = np.array([0.0, 0.0, 1.0])
 _CHORDS = 16  # directions over half a turn
-_SAMPLES = 4000
-_OFF_WALL_M = 1e-3
-
-
-def typical_width_m(mesh: Mesh, caster: Caster) -> float:
-    """Return the median distance from the surface to what it faces, metres; NaN where it faces nothing."""
-    corners = mesh.vertices[mesh.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    double_area = np.linalg.norm(cross, axis=1)
-    summed = np.cumsum(double_area)
-    picked = np.searchsorted(summed, (np.arange(_SAMPLES) + 0.5) / _SAMPLES * summed[-1])
-    normals = cross[picked] / double_area[picked, None]
-    origins = corners[picked].mean(axis=1) + max(_OFF_WALL_M, 1e-6 * float(np.ptp(mesh.vertices))) * normals
-    ranges_m, _, _ = caster.cast(origins, normals)
-    hit = ranges_m[np.isfinite(ranges_m)]
-    return float(np.median(hit)) if len(hit) > _SAMPLES // 10 else float("nan")
 
 
 def narrowest_chord_m(caster: Caster, point: Float64Array, most_m: float) -> float:

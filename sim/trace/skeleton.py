@@ -58,7 +58,7 @@ def find_branches(void: Void, width_at: Width) -> list[Branch]:
         return []
     branches = _cut_at_junctions(cells, void)
     while True:
-        pruned = _join_through(_drop_spurs(_merge_junctions(branches, width_at), width_at))
+        pruned = join_through(_drop_spurs(_merge_junctions(branches, width_at), width_at))
         if len(pruned) == len(branches):
             return pruned
         branches = pruned
@@ -166,7 +166,8 @@ def _shrink(others: list[Branch], short: Branch) -> list[Branch]:
 def _drop_spurs(branches: list[Branch], width_at: Width) -> list[Branch]:
     """Drop the branches that end and are short; of a place where all are short the two longest stay."""
     uses = count_uses(branches)
-    kept, spurs = [], []
+    kept: list[Branch] = []
+    spurs: list[Branch] = []
     for branch in branches:
         is_spur = False
         for end, inner, at in ((0, 1, -1), (1, 0, 0)):
@@ -178,7 +179,7 @@ def _drop_spurs(branches: list[Branch], width_at: Width) -> list[Branch]:
     return kept
 
 
-def _join_through(branches: list[Branch]) -> list[Branch]:
+def join_through(branches: list[Branch]) -> list[Branch]:
     """Join the branches at places where only two meet."""
     uses = count_uses(branches)
     joined = list(branches)
