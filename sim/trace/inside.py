@@ -39,10 +39,6 @@ class Void:
     low_m: Float64Array
     cell_m: float
 
-    def to_world(self, cells: npt.NDArray[np.integer]) -> Float64Array:
-        """Return the middles (N, 3) of cells (N, 3), world frame."""
-        return np.asarray(self.low_m + cells * self.cell_m)
-
     def holds(self, points: Float64Array) -> BoolArray:
         """Mark the points (N, 3) whose cell is inside."""
         cells = np.rint((points - self.low_m) / self.cell_m).astype(np.int64)

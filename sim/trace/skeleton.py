@@ -11,13 +11,14 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.morphology import skeletonize
 
-from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from sim.trace.inside import Void
 
 LEAST_STEP_M = 2.5  # a drift needs 2 m between nodes
 _SPUR_WIDTHS = 1.2  # a branch that ends and is no longer than this is the corner of a face, a niche or noise
 _SAME_WIDTHS = 0.75  # junctions nearer than this are one
 _PILLAR_WIDTHS = 2.5  # a loop shorter than this leads round a pillar or a hole of the mesh
+_MAJORITY = 27 * 2**3 // 2  # of the votes in `_make_odd`
 Width = Callable[[Float64Array], float]
 
 
@@ -53,10 +54,10 @@ def find_branches(void: Void, width_at: Width) -> list[Branch]:
         void: The inside.
         width_at: The width of the drift at a point (3,).
     """
-    cells = np.argwhere(skeletonize(void.is_inside)).astype(np.int64)
-    if len(cells) < 2:
+    thin = np.argwhere(skeletonize(_make_odd(void.is_inside))).astype(np.int64)
+    if len(thin) < 2:
         return []
-    branches = _cut_at_junctions(cells, void)
+    branches = _cut_at_junctions(thin, void.low_m + thin * (void.cell_m / 2))
     while True:
         pruned = join_through(_drop_spurs(_merge_junctions(branches, width_at), width_at))
         if len(pruned) == len(branches):
@@ -73,8 +74,26 @@ def count_uses(branches: Iterable[Branch]) -> dict[int, int]:
     return uses
 
 
-def _cut_at_junctions(cells: Int64Array, void: Void) -> list[Branch]:
-    """Cut the cells (N, 3) of a skeleton into branches; neighbouring cells of three and more neighbours are a place."""
+def _make_odd(is_inside: BoolArray) -> BoolArray:
+    """Return cells (X, Y, Z) with one more between each two, (2 X - 1, 2 Y - 1, 2 Z - 1), and a smooth surface.
+
+    Inside is where the majority of the 27 cells around is, interpolated between cells. What is symmetric is then an odd
+    number of cells wide. Thinning eats a bar that is an even number of cells wide and high from its ends until nothing
+    is left: when two cells remain across, none of them is an end.
+    """
+    votes = is_inside.astype(np.int16)
+    for axis in range(3):
+        padded = np.pad(np.moveaxis(votes, axis, 0), ((1, 1), (0, 0), (0, 0)))
+        near = padded[:-2] + padded[1:-1] + padded[2:]
+        doubled = np.zeros((2 * len(near) - 1, *near.shape[1:]), dtype=np.int16)
+        doubled[::2] = 2 * near
+        doubled[1::2] = near[:-1] + near[1:]
+        votes = np.moveaxis(doubled, 0, axis)
+    return votes > _MAJORITY
+
+
+def _cut_at_junctions(cells: Int64Array, points: Float64Array) -> list[Branch]:
+    """Cut a skeleton, its cells (N, 3) at points (N, 3), into branches where cells have three and more neighbours."""
     pairs = cKDTree(cells).query_pairs(1.8, output_type="ndarray")
     count = np.bincount(pairs.ravel(), minlength=len(cells))
     is_fork = count > 2
@@ -85,7 +104,6 @@ def _cut_at_junctions(cells: Int64Array, void: Void) -> list[Branch]:
     for a, b in pairs.tolist():
         neighbours[a].append(b)
         neighbours[b].append(a)
-    points = void.to_world(cells)
     middles = {int(label): points[is_fork & (fork == label)].mean(axis=0) for label in np.unique(fork[is_fork])}
     n_places = len(cells)
     branches = []

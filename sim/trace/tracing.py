@@ -25,8 +25,8 @@ from sim.trace.middle import Middle, find_middle, find_steep
 from sim.trace.rays import narrowest_chord_m
 from sim.trace.skeleton import Branch, count_uses, find_branches, join_through
 
-_CELLS_ACROSS = (10.0, 4.0)  # of a drift: as many as this, where the grid is large no fewer than that
-_MOST_CELLS = 40e6
+_CELLS_ACROSS = (7.0, 4.0)  # of a drift: as many as this, where the grid is large no fewer than that
+_MOST_CELLS = 10e6  # eight times as many are thinned
 _CHORD_WIDTHS = 4.0
 _PART_WIDTHS = 3.0  # a part shorter than this is a bubble
 _TOLERANCES = (0.12, 0.06, 0.03)  # of the width, of the straight lines between nodes
