@@ -55,7 +55,7 @@ def trace(
     widths = sorted(drift.width_m for drift in found.drifts)
     say(
         quiet,
-        f"{out}: {found.length_m:.0f} m in {len(found.drifts)} drifts {widths[0]:.1f} to {widths[-1]:.1f} m wide, "
+        f"{out}: {found.length_m:.0f} m of drift, {widths[0]:.1f} to {widths[-1]:.1f} m wide, "
         f"{len(found.nodes)} nodes, a route from {draft.route[0]} to {draft.route[-1]}; look at {picture}, "
         f"then run tunnelcd simulate {out}",
     )

@@ -59,7 +59,7 @@ def test_a_grown_mine_is_traced_whole_and_can_be_driven(
     traced = np.concatenate([drift.points for drift in found.drifts])
     covered = cKDTree(traced).query(line)[0] < WIDTH_M / 2
     assert covered.mean() >= 0.95
-    off_m = cKDTree(line).query([place for place in found.nodes.values()])[0]
+    off_m = cKDTree(line).query(list(found.nodes.values()))[0]
     assert off_m.max() < WIDTH_M / 2
     # two forks, two ends, and two ways between the forks
     kinds = [name.split("-")[0] for name in found.nodes]
@@ -82,7 +82,7 @@ def test_a_mesh_that_faces_the_rock_is_turned(tube: Callable[..., trimesh.Trimes
     solid.invert()
     found = trace_mesh(MeshFile(path=saved(solid, "out.stl")))
     assert found.file.flip
-    assert list(found.nodes)[0] == "end-1"
+    assert next(iter(found.nodes)) == "end-1"
     (drift,) = found.drifts
     assert (drift.width_m, drift.height_m) == (pytest.approx(4.0, abs=0.02), pytest.approx(3.0, abs=0.02))
     np.testing.assert_allclose(drift.points[:, 1:], 0.0, atol=0.1)
@@ -139,13 +139,15 @@ def test_parts_that_do_not_meet_are_told(tube: Callable[..., trimesh.Trimesh], s
 
 def test_the_inside_of_a_box_has_its_volume_whatever_is_missing(tube: Callable[..., trimesh.Trimesh]) -> None:
     whole = tube(20.0)
-    for is_gone in (np.zeros(len(whole.faces), bool), whole.triangles_center[:, 0] < 1e-6, whole.face_normals[:, 2] < 0):
+    nothing, end = np.zeros(len(whole.faces), bool), whole.triangles_center[:, 0] < 1e-6
+    for is_gone in (nothing, end, whole.face_normals[:, 2] < 0):
         faces = whole.faces[~is_gone]
         mesh = Mesh(np.asarray(whole.vertices, dtype=np.float64), np.asarray(faces, dtype=np.int32))
         void = find_inside(mesh, Caster([mesh]), 0.25)
         # the majority of 27 cells takes the corners: less than a cell all round
         assert void.is_inside.sum() * 0.25**3 == pytest.approx(20 * 4 * 3, rel=0.08)
-        assert void.holds(np.array([[10.0, 0.0, 1.5], [10.0, 0.0, 4.0], [10.0, 3.0, 1.5]])).tolist() == [True, False, False]
+        asked = np.array([[10.0, 0.0, 1.5], [10.0, 0.0, 4.0], [10.0, 3.0, 1.5]])
+        assert void.holds(asked).tolist() == [True, False, False]
 
 
 def test_the_picture_is_a_png_whatever_the_mesh_is_called(
