@@ -15,3 +15,12 @@ def fix_threads() -> None:
     """
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, str(THREADS))
+
+
+def allowed_threads() -> int:
+    """Return how many threads the project's own loops may use: one, unless the user's environment names a number.
+
+    Only loops with the same result for every number of threads may ask.
+    """
+    named = os.environ.get(THREAD_VARIABLES[0], "")
+    return max(int(named), 1) if named.isdecimal() else THREADS

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, transform, travelled_m
+from cdpipe.core.geometry import Float32Array, Float64Array, transform, travelled_m
 from cdpipe.core.voxel import cell_keys
 from cdpipe.model.types import MergedMaps, SessionName
 from cdpipe.surface.motions import PathMotions
@@ -95,20 +95,15 @@ def near_returns(merged: MergedMaps, session: SessionName) -> NearReturns:
 def make_cells(returns: NearReturns) -> SurfaceCells:
     """Return the cells of a session. False returns lie alone: a cell of one return is left out."""
     _, cell_of = np.unique(cell_keys(returns.points, CELL_M), return_inverse=True)
-    counts = np.bincount(cell_of)
-    n = len(counts)
-    folds = np.floor(returns.path_m / _FOLD_M).astype(np.int64) % N_FOLDS
-    means = _means(returns, cell_of, n)
-    of_folds = _means(returns, cell_of * N_FOLDS + folds, n * N_FOLDS).reshape(n, N_FOLDS, 3)
-    is_kept = counts >= _LEAST_RETURNS
-    kept = means[is_kept]
-    fold_offsets = (of_folds[is_kept] - kept[:, None]).astype(np.float32)
-    return SurfaceCells(kept, fold_offsets, cKDTree(kept), returns.map_T_sensor)
-
-
-def _means(returns: NearReturns, group: Int64Array, n: int) -> Float64Array:
-    """Return the (n, 3) weighted mean of each group of returns, NaN of an empty one."""
-    total = np.bincount(group, returns.weights, n)
-    sums = [np.bincount(group, returns.weights * returns.points[:, axis], n) for axis in range(3)]
+    n = int(cell_of.max()) + 1 if len(cell_of) else 0
+    group = cell_of * N_FOLDS + np.floor(returns.path_m / _FOLD_M).astype(np.int64) % N_FOLDS
+    weights = np.bincount(group, returns.weights, n * N_FOLDS).reshape(n, N_FOLDS)
+    sums = np.stack(
+        [np.bincount(group, returns.weights * values, n * N_FOLDS) for values in returns.points.T], axis=-1
+    ).reshape(n, N_FOLDS, 3)
+    kept = np.flatnonzero(np.bincount(cell_of, minlength=n) >= _LEAST_RETURNS)
+    weights, sums = weights[kept], sums[kept]
+    points = sums.sum(axis=1) / weights.sum(axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.column_stack(sums) / total[:, None])
+        fold_offsets = (sums / weights[:, :, None] - points[:, None]).astype(np.float32)
+    return SurfaceCells(points, fold_offsets, cKDTree(points), returns.map_T_sensor)

@@ -7,7 +7,7 @@
    after session, place by place of the sensor, and the offsets are measured again.
 5. The level of detection adds up the error of the means, the covariance of those motions, and the roughness.
 6. Objects are told from rock (`rock_or_object`), and the displacement of objects is left out.
-7. Neighbouring places beyond their level are regions (`regions`).
+7. Neighbouring places beyond their level are regions (`regions`). Hollows have a hidden bottom (`hollows`).
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from cdpipe.model.config import PipelineConfig
 from cdpipe.model.report import ChangedObject, SurfaceField
 from cdpipe.model.types import MergedMaps
 from cdpipe.surface.cells import NearReturns, SurfaceCells, make_cells, near_returns
+from cdpipe.surface.hollows import is_hollow, measure_hollows
 from cdpipe.surface.method import Z95, Measured, Method
 from cdpipe.surface.motions import PathMotions, fit_motions
 from cdpipe.surface.offsets import Offsets, measure_offsets
@@ -46,7 +47,7 @@ _TO_SIGMA, _OUTLIER = 1.4826, 4.0
 _SAMPLE, _ON_PLACE_M, _SCAN_WINDOW_M = 400_000, 0.2, 4.0
 # Standard deviation of the tilt of scans that is left. It moves places by their distance from the path, which counts
 # where they are farther than the walls that the motions are fitted to, as beyond the ends of the path.
-_TILT_RAD, _CLOSE_M = 1e-3, 4.0
+_TILT_RAD, _CLOSE_M = 2e-3, 4.0
 # The variance of a mean from four folds is noisy: that of a place is the mean over its neighbours.
 _NEIGHBOURS = 24
 # Share of the roughness that both spheres do not share, as standard deviation, and the least error of a mean.
@@ -76,8 +77,11 @@ def measure_surface(
         np.where(is_of_object, np.nan, values) for values in (measured.along_m, measured.displacement_m)
     )
     region, regions = group_regions(
-        places, along_m, measured.level_m, settings.spacing_m, settings.least_m, settings.least_area_m2
-    )
+        places, along_m, measured.level_m, settings.spacing_m, settings.least_m, settings.least_area_m2,
+        shared_m=measured.shared_m,
+    )  # fmt: skip
+    if any(is_hollow(each) for each in regions):
+        regions = measure_hollows(regions, region, cells, places, measured.after or make_cells(after))
     field = SurfaceField(
         places.points, places.normals, displacement_m, measured.level_m, region, regions, chainage_m, angle_deg
     )
@@ -89,19 +93,20 @@ def measure_planes(
 ) -> Measured:
     """Measure the displacement by local planes, less what the alignment absorbed: our method."""
     settings = config.surface
-    found = measure_offsets(before, make_cells(after), places, settings.radius_m)
+    found = measure_offsets(before, make_cells(after), places, settings.radius_m, with_variance=False)
     told_m = _trust(places, found)
     motions = fit_motions(places.points, places.normals, told_m, chainage_m, settings.window_m)
     still = np.flatnonzero(_is_still(told_m - motions.along(places.points, places.normals, chainage_m)[0]))
-    after = after.without(_fit_scans(after, places, found.own_m, still))
-    found = measure_offsets(before, make_cells(after), places, settings.radius_m)
+    laid = make_cells(after.without(_fit_scans(after, places, found.own_m, still)))
+    found = measure_offsets(before, laid, places, settings.radius_m)
     motions = fit_motions(places.points, places.normals, _trust(places, found), chainage_m, settings.window_m)
     explained_m, alignment_m2 = motions.along(places.points, places.normals, chainage_m)
     noise_m2 = _smooth_variance(places.points, found.variance_m2)
     rough_m2 = (_ROUGHNESS * places.roughness_m) ** 2
     tilt_m2 = (_TILT_RAD * np.maximum(places.seen_from_m - _CLOSE_M, 0.0)) ** 2
-    level_m = Z95 * np.sqrt(noise_m2 + alignment_m2 + rough_m2 + tilt_m2 + _LEAST_M**2)
-    return Measured(found.nearest_m - explained_m, found.along_m - explained_m, level_m)
+    shared_m2 = alignment_m2 + tilt_m2
+    level_m, shared_m = (Z95 * np.sqrt(each) for each in (noise_m2 + rough_m2 + shared_m2 + _LEAST_M**2, shared_m2))
+    return Measured(found.nearest_m - explained_m, found.along_m - explained_m, level_m, shared_m, laid)
 
 
 def _trust(places: SurfacePlaces, found: Offsets) -> Float64Array:

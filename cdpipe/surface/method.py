@@ -22,11 +22,15 @@ class Measured:
         displacement_m: (Q,) displacement, positive into the void; NaN where it was not measured.
         along_m: (Q,) the same along the normal of the before surface; of small displacements it is the same.
         level_m: (Q,) 95 % level of detection, NaN if unknown.
+        shared_m: (Q,) part of the level that neighbours share, or one for all: their mean is no surer.
+        after: Cells of the after session as the method laid them on the before session; None where it did not.
     """
 
     displacement_m: Float64Array
     along_m: Float64Array
     level_m: Float64Array
+    shared_m: Float64Array | float = 0.0
+    after: SurfaceCells | None = None
 
 
 Method = Callable[[SurfaceCells, NearReturns, SurfacePlaces, Float64Array, PipelineConfig], Measured]

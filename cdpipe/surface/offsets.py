@@ -6,11 +6,14 @@ hold the same humps and hollows. A place at which the after surface lies far off
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.threads import allowed_threads
 from cdpipe.surface.cells import N_FOLDS, SurfaceCells
 from cdpipe.surface.places import SurfacePlaces
 
@@ -29,7 +32,7 @@ _NEAR_M = 0.12
 _FAR_M = 0.1
 # A surface that far off is new only if the before session had none there: its distance to the nearest cell of the
 # before session, over the displacement. Else it is another surface, and the place was hidden from the after session.
-_NEW = 0.5
+NEW = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +53,14 @@ class Offsets:
     own_m: Float64Array
 
 
-def measure_offsets(before: SurfaceCells, after: SurfaceCells, places: SurfacePlaces, radius_m: float) -> Offsets:
+def measure_offsets(
+    before: SurfaceCells,
+    after: SurfaceCells,
+    places: SurfacePlaces,
+    radius_m: float,
+    *,
+    with_variance: bool = True,
+) -> Offsets:
     """Measure the displacement at every place.
 
     Args:
@@ -58,6 +68,7 @@ def measure_offsets(before: SurfaceCells, after: SurfaceCells, places: SurfacePl
         after: Cells of the after session, map frame.
         places: Where to measure.
         radius_m: Radius of the spheres, metres.
+        with_variance: Whether `variance_m2` is asked for; otherwise it is NaN.
     """
     n = len(places.points)
     along_m, variance_m2, own_m = (np.full(n, np.nan) for _ in range(3))
@@ -67,16 +78,16 @@ def measure_offsets(before: SurfaceCells, after: SurfaceCells, places: SurfacePl
     for widening in _WIDENINGS:
         rest = np.flatnonzero(np.isfinite(start_m) & np.isnan(along_m))
         points, normals = places.points[rest], places.normals[rest]
-        own_m[rest], own_m2 = _average(before, points, normals, widening * radius_m)
+        own_m[rest], own_m2 = _average(before, points, normals, widening * radius_m, with_variance)
         heights_m, other_m2 = start_m[rest], np.zeros(len(rest))
-        for _ in range(2):  # the second sphere stands on the surface that the first one found
+        for is_last in (False, True):  # the second sphere stands on the surface that the first one found
             centres = points + np.nan_to_num(heights_m)[:, None] * normals
-            shift_m, other_m2 = _average(after, centres, normals, widening * radius_m)
+            shift_m, other_m2 = _average(after, centres, normals, widening * radius_m, with_variance and is_last)
             heights_m = heights_m + shift_m
         along_m[rest], variance_m2[rest] = heights_m - own_m[rest], own_m2 + other_m2
     far = np.flatnonzero(np.abs(along_m) > _FAR_M)
     hits = places.points[far] + along_m[far, None] * places.normals[far]
-    along_m[far[before.tree.query(hits)[0] < _NEW * np.abs(along_m[far])]] = np.nan
+    along_m[far[before.tree.query(hits)[0] < NEW * np.abs(along_m[far])]] = np.nan
     far = far[np.isfinite(along_m[far])]
     nearest_m = along_m.copy()
     nearest_m[far] = np.sign(along_m[far]) * np.minimum(after.tree.query(places.points[far])[0], np.abs(along_m[far]))
@@ -99,17 +110,19 @@ def _find_surface(after: SurfaceCells, places: SurfacePlaces) -> Float64Array:
 
 
 def _average(
-    cells: SurfaceCells, centres: Float64Array, normals: Float64Array, radius_m: float
+    cells: SurfaceCells, centres: Float64Array, normals: Float64Array, radius_m: float, with_variance: bool
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the (N,) mean height of the cells around each (N, 3) centre, NaN of too few cells, and its variance."""
+    """Return the (N,) mean height of the cells around each (N, 3) centre, NaN of too few, and its variance, or NaN."""
     blocks = [slice(start, start + _BLOCK) for start in range(0, len(centres), _BLOCK)]
-    parts = [_average_block(cells, centres[rows], normals[rows], radius_m) for rows in blocks]
+    with ThreadPoolExecutor(allowed_threads()) as pool:
+        averaged = partial(_average_block, cells, radius_m, with_variance)
+        parts = list(pool.map(averaged, (centres[rows] for rows in blocks), (normals[rows] for rows in blocks)))
     heights_m, variance_m2 = zip(*parts, strict=True) if parts else ((np.zeros(0),), (np.zeros(0),))
     return np.concatenate(heights_m), np.concatenate(variance_m2)
 
 
 def _average_block(
-    cells: SurfaceCells, centres: Float64Array, normals: Float64Array, radius_m: float
+    cells: SurfaceCells, radius_m: float, with_variance: bool, centres: Float64Array, normals: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
     distance_m, index = cells.tree.query(centres, k=_NEAREST, distance_upper_bound=radius_m)
     is_found = np.isfinite(distance_m)
@@ -118,7 +131,8 @@ def _average_block(
     offsets = cells.points.take(index, axis=0) - centres[:, None]
     heights_m = np.einsum("nki,ni->nk", offsets, normals) * is_found
     mean_m = heights_m.sum(axis=1) / np.maximum(counts, 1)
-    return np.where(counts >= _LEAST_CELLS, mean_m, np.nan), _vary(cells, index, is_found, normals)
+    variance_m2 = _vary(cells, index, is_found, normals) if with_variance else np.full(len(centres), np.nan)
+    return np.where(counts >= _LEAST_CELLS, mean_m, np.nan), variance_m2
 
 
 def _vary(cells: SurfaceCells, index: Int64Array, is_found: BoolArray, normals: Float64Array) -> Float64Array:

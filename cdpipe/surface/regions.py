@@ -24,6 +24,7 @@ def group_regions(
     spacing_m: float,
     least_m: float,
     least_area_m2: float,
+    shared_m: Float64Array | float = 0.0,
 ) -> tuple[Int32Array, tuple[SurfaceRegion, ...]]:
     """Return the (Q,) region of each place, -1 for none, and the regions, largest volume first.
 
@@ -34,12 +35,14 @@ def group_regions(
         spacing_m: Edge of the voxels of the places.
         least_m: Least displacement of a region's place, smoothed.
         least_area_m2: Least area of a region.
+        shared_m: (Q,) part of the level that neighbours share, or one for all.
     """
     region = np.full(len(along_m), -1, dtype=np.int32)
-    known = np.flatnonzero(np.isfinite(along_m) & (level_m > 0))
+    known = np.flatnonzero(np.isfinite(along_m) & np.isfinite(level_m) & (level_m > 0))
     if len(known) == 0:
         return region, ()
-    smoothed_m, smoothed_level_m = _smooth(places.points[known], along_m[known], level_m[known])
+    own_m = np.minimum(np.broadcast_to(shared_m, level_m.shape)[known], level_m[known])
+    smoothed_m, smoothed_level_m = _smooth(places.points[known], along_m[known], level_m[known], own_m)
     beyond_m = np.maximum(smoothed_level_m, least_m)
     found: list[tuple[SurfaceRegion, Int64Array]] = []
     for own in (known[smoothed_m > beyond_m], known[smoothed_m < -beyond_m]):
@@ -55,7 +58,9 @@ def group_regions(
     return region, tuple(each for each, _ in found)
 
 
-def _smooth(points: Float64Array, along_m: Float64Array, level_m: Float64Array) -> tuple[Float64Array, Float64Array]:
+def _smooth(
+    points: Float64Array, along_m: Float64Array, level_m: Float64Array, shared_m: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return the (N,) mean displacement of each place and its neighbours, weighted by their levels, and its level."""
     found = cKDTree(points).query(points, k=[*range(1, _NEIGHBOURS + 1)], distance_upper_bound=_SMOOTHED_M)
     is_found = np.isfinite(np.asarray(found[0]))
@@ -63,8 +68,10 @@ def _smooth(points: Float64Array, along_m: Float64Array, level_m: Float64Array) 
     weights = is_found / level_m[index] ** 2
     total = weights.sum(axis=1)
     mean_m = (weights * along_m[index]).sum(axis=1) / total
-    # no better than the mean of independent groups of neighbours, nor worse than one place
-    return mean_m, np.sqrt(np.minimum(_ALIKE, is_found.sum(axis=1)) / total)
+    # the rest of the level is that of a mean of independent groups of neighbours, and no worse than that of one place
+    rest_m2 = (level_m**2 - shared_m**2)[index]
+    rest_m2 = (weights * rest_m2).sum(axis=1) / total * np.minimum(_ALIKE / is_found.sum(axis=1), 1.0)
+    return mean_m, np.sqrt(rest_m2 + shared_m**2)
 
 
 def _describe(points: Float64Array, areas_m2: Float64Array, along_m: Float64Array) -> SurfaceRegion:

@@ -18,7 +18,7 @@ RATE_COLUMN, PROPOSED = "recall_at_", "_proposed"
 
 
 class Target(Settings):
-    """A bound on one column of regions_table.csv or objects_table.csv.
+    """A bound on one column of regions_table.csv, objects_table.csv or surface_table.csv.
 
     Attributes:
         column: The column.
@@ -77,6 +77,7 @@ class Targets(Settings):
         sensor: The sensor profile that the figures are of; "" likewise.
         regions: Bounds on regions.
         objects: Bounds on objects.
+        surface: Bounds on displacement of the rock.
         merge: By kind of pair, the share of the pairs that must do what the kind asks for
             (`eval.tables.merge_table.RULES`).
     """
@@ -86,6 +87,7 @@ class Targets(Settings):
     sensor: str = ""
     regions: tuple[Target, ...] = ()
     objects: tuple[Target, ...] = ()
+    surface: tuple[Target, ...] = ()
     merge: dict[PairKind, Annotated[float, Field(gt=0, le=1)]] = Field(default_factory=dict)
 
     def share(self, pair_kind: str) -> float | None:

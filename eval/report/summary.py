@@ -183,7 +183,7 @@ def _sentence(data: RunData, merges: pd.DataFrame) -> str:
         told = f"{_counted(n_wrong, 'accepted merge')} {'is' if n_wrong == 1 else 'are'} wrong"
         parts.append(f"{told} (over {RIGHT_M:g} m or {RIGHT_DEG:g} deg)")
     verdicts = list(own[own["variant"] == shown_variant(data)]["is_met"]) if len(own) else []
-    for name in ("regions", "objects"):
+    for name in ("regions", "objects", "surface"):
         targets = stored_table(data, f"{name}_targets")
         verdicts += list(targets["is_met"]) if len(targets) else []
     verdicts = [bool(value) for value in verdicts if not pd.isna(value)]

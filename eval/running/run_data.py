@@ -35,7 +35,7 @@ _UNBOUNDED = ("low", "high")
 _DERIVED_TEXTS = {"domain", "variant", *CONDITION_COLUMNS}
 _MORE_TEXTS = {
     "regions_targets": ("target", "asked", "is_met"), "objects_targets": ("target", "asked", "is_met"),
-    "regions_by_size": ("measure",), "budgets": ("site", "price"),
+    "surface_targets": ("target", "asked", "is_met"), "regions_by_size": ("measure",), "budgets": ("site", "price"),
     "hard": ("axis", "unit", "value", "scenario"), "breaking_points": ("axis", "unit", "value", "is_measured"),
     "objects_by_group": ("measure", "value"),
 }  # fmt: skip

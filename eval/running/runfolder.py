@@ -15,7 +15,8 @@ regions_table.csv regions_targets.csv regions_by_size.csv budgets.csv roc.csv fr
 hard.csv breaking_points.csv                  where its plan has axes (eval.tables.hardness)
 objects_table.csv objects_by_group.csv objects_targets.csv
                                               where it says `report: objects` (eval.tables.object_table)
-surface_table.csv detection_limits.csv        where it says `report: surface` (eval.tables.surface_table)
+surface_table.csv surface_targets.csv detection_limits.csv
+                                              where it says `report: surface` (eval.tables.surface_table)
 effects.csv                                   where a world was run with and without a setting (eval.tables.effects)
 """
 
@@ -281,7 +282,7 @@ def _report_tables(
     if "objects" in subjects:
         tables |= object_tables(results, items["changes"], targets, is_whole=is_whole)
     if "surface" in subjects:
-        tables |= surface_tables(results, items["surface_windows"], targets)
+        tables |= surface_tables(results, items["surface_windows"], targets, is_whole=is_whole)
     return tables
 
 

@@ -17,28 +17,33 @@ from eval.scoring.surface_windows import AREAS_M2
 from eval.tables.conditions import by_condition
 from eval.tables.rows import by_domain, by_variant, means_with_intervals, numbers, of_cases, with_domain
 from eval.tables.surface_limits import detection_limits
+from eval.tables.targets import judged_targets
 
-FILES = ("surface_table", "detection_limits")
+FILES = ("surface_table", "surface_targets", "detection_limits")
 MEANS = (
-    "surface_cover", "surface_error_median_changed_m", "surface_error_p95_changed_m", "surface_bias_changed_m",
+    "surface_cover", "surface_error_median_m", "surface_error_p95_m",
+    "surface_error_median_changed_m", "surface_error_p95_changed_m", "surface_bias_changed_m",
     "surface_error_median_unchanged_m", "surface_error_p95_unchanged_m", "surface_bias_unchanged_m",
     "surface_level_inside", "surface_level_median_m", "surface_recall", "surface_region_precision",
     "surface_false_regions_per_100m", "surface_volume_error_share",
 )  # fmt: skip
 
 
-def surface_tables(results: pd.DataFrame, windows: pd.DataFrame, targets: Targets) -> dict[str, pd.DataFrame]:
+def surface_tables(
+    results: pd.DataFrame, windows: pd.DataFrame, targets: Targets, *, is_whole: bool = True
+) -> dict[str, pd.DataFrame]:
     """Return the tables of a run about rock that moved, by file name; empty ones where no pair asks for it.
 
     Args:
         results: Rows as in results.csv.
         windows: Rows as in surface_windows.csv.
         targets: What the plan of the run asks for.
+        is_whole: Whether all that was planned is in the tables; otherwise no target is said to be met or missed.
 
     Returns:
         surface_table: a row for every condition (odometry and sensor, where the plan tells them apart), domain and
-        variant, with the detection limit of each area of windows; detection_limits: a row for each of them, area and
-        bin of magnitudes.
+        variant, with the detection limit of each area of windows; surface_targets: what is asked, and what is found;
+        detection_limits: a row for each of them, area and bin of magnitudes.
     """
     rows: list[dict[str, Any]] = []
     limits: list[dict[str, Any]] = []
@@ -66,7 +71,9 @@ def surface_tables(results: pd.DataFrame, windows: pd.DataFrame, targets: Target
                         "t_surface_s": median(numbers(own, "t_surface_s")),
                     }
                 )
-    return {"surface_table": pd.DataFrame(rows), "detection_limits": pd.DataFrame(limits)}
+    table = pd.DataFrame(rows)
+    judged = judged_targets(targets, "surface", table, results, is_whole=is_whole) if rows else pd.DataFrame()
+    return {"surface_table": table, "surface_targets": judged, "detection_limits": pd.DataFrame(limits)}
 
 
 def limit_column(area_m2: float) -> str:

@@ -1,4 +1,7 @@
-"""What a plan asks of regions and objects, and what its run found: regions_targets.csv and objects_targets.csv."""
+"""What a plan asks of regions, objects and rock that moved, and what its run found.
+
+One table each: regions_targets.csv, objects_targets.csv and surface_targets.csv.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ _ENDS = {"silent_share": ("silent_low", "silent_high")}
 
 def judged_targets(
     targets: Targets,
-    subject: Literal["regions", "objects"],
+    subject: Literal["regions", "objects", "surface"],
     table: pd.DataFrame,
     results: pd.DataFrame,
     ranked: Mapping[tuple[str, str, bool], RankedPairs] | None = None,
@@ -39,7 +42,7 @@ def judged_targets(
     Args:
         targets: What the plan asks for.
         subject: Of which part of it.
-        table: regions_table or objects_table.
+        table: regions_table, objects_table or surface_table.
         results: Rows as in results.csv; judged are those of the odometry and the sensor that the plan's figures are of.
         ranked: Candidates and changes of each domain and variant, for targets against a rival; as reported (False), and
             as proposed (True).

@@ -24,7 +24,8 @@ def measure_m3c2(
     It is NaN where a cylinder holds too few cells. Arguments as of `Method`; the section `m3c2` is used.
     """
     found = _compare(before, after, places, config)
-    return Measured(-found.behind_m, -found.behind_m, found.levels_m + Z95 * config.m3c2.registration_m)
+    shared_m = Z95 * config.m3c2.registration_m
+    return Measured(-found.behind_m, -found.behind_m, found.levels_m + shared_m, shared_m)
 
 
 def measure_m3c2_ep(
@@ -38,7 +39,7 @@ def measure_m3c2_ep(
     found = _compare(before, after, places, config)
     path, after_path = (session.map_T_sensor[:, :3, 3] for session in (before, after))
     levels_m = detection_levels(places.points, path, after_path, found, config.m3c2_ep)
-    return Measured(-found.behind_m, -found.behind_m, levels_m)
+    return Measured(-found.behind_m, -found.behind_m, levels_m, Z95 * config.m3c2_ep.alignment_m)
 
 
 def _compare(before: SurfaceCells, after: NearReturns, places: SurfacePlaces, config: PipelineConfig) -> Distances:

@@ -12,7 +12,7 @@ from eval.core.domains import domain_name
 from eval.report.charts import Chart, plotly_text
 from eval.report.regions.charts import look_of
 from eval.report.surface.unrolled import draw_unrolled
-from eval.report.tables import Section, conditions_table, methods_table, with_rows
+from eval.report.tables import Section, conditions_table, methods_table, targets_table, with_rows
 from eval.running.run_data import RunData, every_condition, number, off_grids, stored_table
 from eval.running.runfolder import reported
 from eval.scoring.surface_windows import AREAS_M2
@@ -79,6 +79,7 @@ def draw_surface(data: RunData) -> Section | None:
     tables = [
         methods_table(table, SURFACE_COLUMNS, rows, _CAPTION),
         conditions_table(off_grids(every_condition(data, "surface_table"), data), _COMPARED, _CONDITIONS_CAPTION),
+        targets_table(stored_table(data, "surface_targets")),
     ]
     plots = tuple(_limits_chart(own, str(domain)) for domain, own in _domains(limits))
     return Section(with_rows(tables), plots, pictures=tuple(pictures), missing=tuple(missing))

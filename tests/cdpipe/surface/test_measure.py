@@ -183,6 +183,15 @@ def test_regions_below_the_level_or_too_small_are_none(survey: Survey) -> None:
     assert (region == -1).all()
 
 
+def test_averaging_leaves_the_part_of_the_level_that_neighbours_share(survey: Survey) -> None:
+    """20 mm at a level of 30 mm: found where errors are independent, not where 25 mm of them are of the alignment."""
+    places = survey[1]
+    along_m, level_m = true_displacement(places, left_wall), np.full(len(places.points), 0.03)
+    assert len(group_regions(places, along_m, level_m, 0.25, 0.005, 0.75)[1]) == 1
+    for shared_m in (0.025, np.full(len(level_m), 0.025)):
+        assert group_regions(places, along_m, level_m, 0.25, 0.005, 0.75, shared_m=shared_m)[1] == ()
+
+
 def test_the_places_cover_the_area_of_the_tunnel(survey: Survey) -> None:
     inner = np.abs(survey[1].points[:, 0] - 6.0) < 5.0
     assert survey[1].areas_m2[inner].sum() == pytest.approx(2 * np.pi * RADIUS_M * 10.0, rel=0.05)

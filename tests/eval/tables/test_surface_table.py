@@ -104,5 +104,17 @@ def test_a_pair_without_an_answer_counts_and_a_pair_that_asks_nothing_does_not()
     # of the windows only those of its pairs count: null ones of seeds 1 and 2
     (limit,) = found["detection_limits"].to_dict("records")
     assert (limit["n_null_windows"], row["surface_limit_1m2_m"]) == (2, 0.04)
+    assert len(found["surface_targets"]) == 0
     nothing = surface_tables(results[2:], windows, Targets())
     assert all(len(table) == 0 for table in nothing.values())
+
+
+def test_bounds_on_displacement_are_judged_once_the_run_is_whole() -> None:
+    results = pd.DataFrame([case(1, surface_error_median_m=0.004), case(2, surface_error_median_m=0.008)])
+    bound = {"column": "surface_error_median_m", "name": "error"}
+    targets = Targets(method="ours", surface=({**bound, "at_most": 0.005}, {**bound, "at_most": 0.006}))
+    judged = surface_tables(results, pd.DataFrame(null_windows()), targets)["surface_targets"]
+    assert list(judged["value"]) == pytest.approx([0.006, 0.006])
+    assert list(judged["is_met"]) == [False, True]
+    unfinished = surface_tables(results, pd.DataFrame(null_windows()), targets, is_whole=False)["surface_targets"]
+    assert list(unfinished["is_met"]) == [None, None]

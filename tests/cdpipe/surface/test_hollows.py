@@ -1,0 +1,96 @@
+"""Area and volume of rock that left, where the after session does not see the bottom of the hollow."""
+
+import numpy as np
+import pytest
+
+from cdpipe.core.geometry import BoolArray, Float64Array
+from cdpipe.surface.cells import NearReturns, make_cells
+from cdpipe.surface.hollows import measure_hollows
+from cdpipe.surface.places import SurfacePlaces
+from cdpipe.surface.regions import group_regions
+from tests.cdpipe.surface.tunnels import RADIUS_M, about_axis_deg, surveyed, tunnel
+
+SIZE_M, DEPTH_M = 0.9, 0.4
+# A bowl fell out of the roof. It widens towards the rock, as everything about an axis does.
+AREA_M2 = np.pi * SIZE_M**2
+VOLUME_M3 = AREA_M2 * (DEPTH_M / 2 + DEPTH_M**2 / 3 / 2 / RADIUS_M)
+
+
+def off_centre_m(x_m: Float64Array, angle_deg: Float64Array) -> Float64Array:
+    return np.hypot(x_m - 6.0, np.deg2rad(angle_deg) * RADIUS_M)
+
+
+def fallen(x_m: Float64Array, angle_deg: Float64Array) -> Float64Array:
+    return np.minimum(-DEPTH_M * (1 - (off_centre_m(x_m, angle_deg) / SIZE_M) ** 2), 0.0)
+
+
+def of(returns: NearReturns, kept: BoolArray) -> NearReturns:
+    return NearReturns(returns.points[kept], returns.path_m[kept], returns.weights[kept], returns.map_T_sensor)
+
+
+def hide(returns: NearReturns, within_m: float) -> NearReturns:
+    """The returns without those from the middle of the hollow."""
+    return of(returns, off_centre_m(returns.points[:, 0], about_axis_deg(returns.points)) > within_m)
+
+
+def with_duct(returns: NearReturns) -> NearReturns:
+    """The returns, and a duct below the roof of which the lower half hides nothing of the hollow."""
+    x_m = np.repeat(np.arange(3.0, 9.0, 0.01), 60)
+    angle = np.tile(np.linspace(0.0, np.pi, 60), len(x_m) // 60)
+    duct = np.column_stack([x_m, -0.6 + 0.15 * np.cos(angle), 1.0 - 0.15 * np.sin(angle)])
+    path_m, weights = np.clip(x_m, 0.0, 11.0), np.full(len(x_m), returns.weights[0])
+    return NearReturns(
+        np.concatenate([returns.points, duct]), np.concatenate([returns.path_m, path_m]),
+        np.concatenate([returns.weights, weights]), returns.map_T_sensor,
+    )  # fmt: skip
+
+
+def displaced(places: SurfacePlaces, hidden_m: float) -> Float64Array:
+    """What the offsets tell: the depth of the roof where it is seen."""
+    x_m, angle_deg = places.points[:, 0], about_axis_deg(places.points)
+    is_roof = np.linalg.norm(places.points[:, 1:], axis=1) > RADIUS_M - 0.1
+    seen_m = np.where(off_centre_m(x_m, angle_deg) < hidden_m, np.nan, fallen(x_m, angle_deg))
+    return np.where(is_roof, seen_m, 0.0)
+
+
+@pytest.mark.parametrize("has_duct", [False, True], ids=["free", "with a duct in front"])
+@pytest.mark.parametrize("hidden_m", [0.0, 0.5])
+def test_the_volume_of_a_hollow_holds_though_its_bottom_is_hidden(hidden_m: float, has_duct: bool) -> None:
+    before, after = tunnel(1), hide(tunnel(2, fallen), hidden_m)
+    cells, places, _ = surveyed(with_duct(before) if has_duct else before)
+    after = with_duct(after) if has_duct else after
+    region, regions = group_regions(
+        places, displaced(places, hidden_m), np.full(len(places.points), 1e-3), 0.25, 0.005, 0.3
+    )
+    (found,) = measure_hollows(regions, region, cells, places, make_cells(after))
+    assert found.volume_m3 == pytest.approx(-VOLUME_M3, rel=0.12)
+    # the rim of a bowl is shallow, and half a pixel wide
+    assert 0.78 * AREA_M2 < found.area_m2 < 1.05 * AREA_M2
+    assert found.mean_m == pytest.approx(found.volume_m3 / found.area_m2)
+    assert found.largest_m == regions[0].largest_m
+    if hidden_m:  # the sum over the places that were seen misses the bottom
+        assert abs(regions[0].volume_m3) < 0.8 * VOLUME_M3
+
+
+def test_shallow_regions_and_rock_that_came_stay_as_they_are() -> None:
+    cells, places, _ = surveyed(tunnel(1))
+    for factor in (-0.2, 1.0):
+        moved_m = -factor * displaced(places, 0.0)
+        region, regions = group_regions(places, moved_m, np.full(len(places.points), 1e-3), 0.25, 0.005, 0.3)
+        assert len(regions) == 1
+        assert measure_hollows(regions, region, cells, places, cells) == regions
+
+
+def test_without_cells_of_the_after_session_nothing_is_told() -> None:
+    cells, places, _ = surveyed(tunnel(1))
+    region, regions = group_regions(places, displaced(places, 0.0), np.full(len(places.points), 1e-3), 0.25, 0.005, 0.3)
+    nothing = make_cells(of(tunnel(2), np.zeros(len(tunnel(2).points), dtype=np.bool_)))
+    assert measure_hollows(regions, region, cells, places, nothing) == regions
+
+
+def test_a_region_all_around_has_no_chart() -> None:
+    """Rock that left the whole round is no hollow seen from one side."""
+    cells, places, _ = surveyed(tunnel(1))
+    left_m = np.where(np.abs(places.points[:, 0] - 6.0) < 1.0, -0.3, 0.0)
+    region, regions = group_regions(places, left_m, np.full(len(places.points), 1e-3), 0.25, 0.005, 0.3)
+    assert measure_hollows(regions, region, cells, places, cells) == regions
