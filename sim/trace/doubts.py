@@ -129,8 +129,8 @@ def tell_parts(parts: Sequence[Sequence[Middle]]) -> list[str]:
         return []
     told = []
     for part in parts[1:]:
-        x, y, z = part[0].points[len(part[0].points) // 2]
-        told.append(f"{sum(middle.length_m for middle in part):.0f} m about ({x:.0f}, {y:.0f}, {z:.0f})")
+        x, y, z = (round(float(value)) for value in part[0].points[len(part[0].points) // 2])
+        told.append(f"{sum(middle.length_m for middle in part):.0f} m about ({x}, {y}, {z})")
     more = f" and {len(told) - 3} more" if len(told) > 3 else ""
     return [
         f"{len(parts)} parts that do not meet: the route lies in the longest; also traced: {', '.join(told[:3])}"

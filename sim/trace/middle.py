@@ -21,7 +21,8 @@ _ROUNDS = 3  # in which the line moves to the middle
 _SOFT_WIDTHS = 0.3  # standard deviation of the smoothing along the line
 _FLOOR_SOFT_M = 0.5
 _REACH_WIDTHS = 3.0  # how far walls are looked for
-_STEEP_M = 1.5  # rise over 1 m of a way that nothing drives
+_STEEP_DEG, _STEEP_OVER_M = 50.0, 2.0
+_SHAFT_HEIGHTS = 2.5  # below a place so much higher than usual the floor is that of another level
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,14 +83,13 @@ def find_middle(branch: Branch, caster: Caster, void: Void, width_m: float, is_m
     return _look(points, branch.ends, caster, width_m)
 
 
-def find_steep(branch: Branch, caster: Caster) -> bool:
-    """Tell whether the floor below a branch has a step or a slope that nothing drives."""
+def is_steep(branch: Branch, width_m: float) -> bool:
+    """Tell whether a branch rises over a width as nothing drives: a shaft, a raise, a step of a drift's height."""
     points = resample(branch.points, STATION_M)
-    floor_m = fill_gaps(floor_below(caster, points))
-    per_m = round(1.0 / STATION_M)
-    if len(points) <= per_m or not np.isfinite(floor_m).all():
-        return False
-    return bool(np.abs(floor_m[per_m:] - floor_m[:-per_m]).max() > _STEEP_M)
+    over = min(round(max(width_m, _STEEP_OVER_M) / STATION_M), len(points) - 1)
+    rise_m = np.abs(points[over:, 2] - points[:-over, 2])
+    run_m = np.linalg.norm(points[over:, :2] - points[:-over, :2], axis=1)
+    return bool((rise_m > np.tan(np.deg2rad(_STEEP_DEG)) * run_m).any())
 
 
 def _look(points: Float64Array, ends: tuple[int, int], caster: Caster, width_m: float) -> Middle:
@@ -98,6 +98,9 @@ def _look(points: Float64Array, ends: tuple[int, int], caster: Caster, width_m: 
     floor_m = np.where(np.isfinite(floor_m), floor_m, points[:, 2])
     found_m = roof_above(caster, points)
     roof_m = fill_gaps(found_m)
+    height_m = np.where(np.isfinite(roof_m), roof_m - floor_m, width_m)
+    is_pierced = height_m > _SHAFT_HEIGHTS * np.median(height_m)
+    floor_m, roof_m = (fill_gaps(np.where(is_pierced, np.nan, each)) for each in (floor_m, roof_m))
     height_m = np.where(np.isfinite(roof_m), roof_m - floor_m, width_m)
     floor_m = gaussian_filter1d(floor_m, _FLOOR_SOFT_M / STATION_M, mode="nearest")
     drive = np.column_stack([points[:, :2], floor_m + np.minimum(DRIVE_M, _DRIVE_SHARE * height_m)])

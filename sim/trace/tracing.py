@@ -21,9 +21,9 @@ from sim.rock.foreign import TUNNEL_KEY, read_mesh, refuse_tunnel
 from sim.trace.doubts import is_inside_out, judge_roof, judge_width, refuse_turned, tell_parts, typical_width_m
 from sim.trace.graph import TracedDrift, join_drifts, name_nodes
 from sim.trace.inside import Void, count_cells, find_inside
-from sim.trace.middle import Middle, find_middle, find_steep
+from sim.trace.middle import Middle, find_middle, is_steep
 from sim.trace.rays import narrowest_chord_m
-from sim.trace.skeleton import Branch, count_uses, find_branches, join_through
+from sim.trace.skeleton import LEAST_STEP_M, Branch, count_uses, find_branches, join_through
 
 _CELLS_ACROSS = (7.0, 4.0)  # of a drift: as many as this, where the grid is large no fewer than that
 _MOST_CELLS = 10e6  # eight times as many are thinned
@@ -87,7 +87,7 @@ def trace_mesh(
     tell("find the inside", 1, 4)
     void = find_inside(walls.mesh, walls.caster, _choose_cell_m(walls))
     tell("thin it to lines", 2, 4)
-    branches, steep = _drivable(find_branches(void, walls.width_at), walls.caster)
+    branches, steep = _drivable(find_branches(void, walls.width_at), walls.width_m)
     tell("move them to the middle", 3, 4)
     parts = _parts_of(_find_middles(branches, walls, void), walls)
     kept = [middle for part in parts for middle in part]
@@ -138,13 +138,13 @@ def _choose_cell_m(walls: _Walls) -> float:
     return cell_m
 
 
-def _drivable(branches: list[Branch], caster: Caster) -> tuple[list[Branch], list[str]]:
+def _drivable(branches: list[Branch], width_m: float) -> tuple[list[Branch], list[str]]:
     """Return the branches without shafts, and a note about these."""
-    steep = [branch for branch in branches if find_steep(branch, caster)]
+    steep = [branch for branch in branches if is_steep(branch, width_m)]
     if not steep or len(steep) == len(branches):
         return branches, []
-    x, y, z = steep[0].points[len(steep[0].points) // 2]
-    note = f"{len(steep)} shafts or steps too steep to drive left out, the first at ({x:.0f}, {y:.0f}, {z:.0f})"
+    x, y, z = (round(float(value)) for value in steep[0].points[len(steep[0].points) // 2])
+    note = f"shafts or steps too steep to drive: {len(steep)} left out, the first at ({x}, {y}, {z})"
     return join_through([branch for branch in branches if not any(branch is each for each in steep)]), [note]
 
 
@@ -154,6 +154,7 @@ def _find_middles(branches: Sequence[Branch], walls: _Walls, void: Void) -> list
     return [
         find_middle(branch, walls.caster, void, walls.width_m, is_met)
         for branch, is_met in zip(branches, met, strict=True)
+        if float(np.ptp(branch.points[:, :2], axis=0).max()) >= LEAST_STEP_M
     ]
 
 

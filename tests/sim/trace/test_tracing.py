@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 import trimesh
 from scipy.spatial import cKDTree
+from skimage.measure import marching_cubes
 
 from cdpipe.core.errors import ScenarioError
 from scenarios import check_scenario
@@ -135,6 +136,38 @@ def test_parts_that_do_not_meet_are_told(tube: Callable[..., trimesh.Trimesh], s
     assert len(found.drifts) == 2
     route = find_route(build_centreline(found.tunnel, 0), 1000.0)
     assert {route[0], route[-1]} == {found.drifts[0].nodes[0], found.drifts[0].nodes[-1]}
+
+
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+def hollow(*boxes: Box) -> trimesh.Trimesh:
+    """The surface around boxes that overlap, each from a low to a high corner."""
+    axes = [np.arange(min(box[0][k] for box in boxes) - 2, max(box[1][k] for box in boxes) + 2, 0.5) for k in range(3)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    field = np.min([np.maximum(low - places, places - high).max(axis=-1) for low, high in np.array(boxes)], axis=0)
+    vertices, faces, _, _ = marching_cubes(field, 0.0, gradient_direction="ascent")
+    return trimesh.Trimesh(vertices * 0.5 + [axis[0] for axis in axes], faces, process=False)
+
+
+def test_a_shaft_between_two_levels_is_left_out_and_told(saved: Save) -> None:
+    solid = hollow(((0, -2, 0), (44, 2, 3)), ((0, -2, 14), (40, 2, 17)), ((18, -2, 0), (21, 2, 17)))
+    found = trace_mesh(MeshFile(path=saved(solid, "levels.stl")))
+    parts, shafts = found.notes
+    assert parts.startswith("2 parts that do not meet")
+    assert shafts.startswith("shafts or steps too steep to drive: 1 left out, the first at (20, 0, ")
+    heights = {round(place[2]) for place in found.nodes.values()}
+    assert heights == {0, 14}
+    assert found.length_m == pytest.approx(44 + 40 - 4 * 2, abs=3)
+
+
+def test_drifts_that_meet_in_a_hall_meet_at_one_place(saved: Save) -> None:
+    hall = ((24, -10, 0), (44, 10, 5))
+    solid = hollow(((0, -2, 0), (26, 2, 3)), hall, ((42, -2, 0), (70, 2, 3)), ((32, 8, 0), (36, 36, 3)))
+    found = trace_mesh(MeshFile(path=saved(solid, "hall.stl")))
+    assert [name for name in found.nodes if name.startswith("junction")] == ["junction-1"]
+    np.testing.assert_allclose(found.nodes["junction-1"], (34, 0, 0), atol=1.5)
+    assert sum(name.startswith("end") for name in found.nodes) == 3
 
 
 def test_the_inside_of_a_box_has_its_volume_whatever_is_missing(tube: Callable[..., trimesh.Trimesh]) -> None:
