@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -210,8 +210,3 @@ def join_through(branches: list[Branch]) -> list[Branch]:
         whole = Branch((first.ends[0], second.ends[1]), np.concatenate([first.points, second.points[1:]]))
         joined = [branch for branch in joined if branch is not here[0] and branch is not here[1]] + [whole]
     return joined
-
-
-def rename_ends(branch: Branch, names: dict[int, int]) -> Branch:
-    """Return a branch with other numbers of its places."""
-    return replace(branch, ends=(names[branch.ends[0]], names[branch.ends[1]]))
