@@ -33,9 +33,11 @@ from cdpipe.extract.extract import extract_changes, make_report
 from cdpipe.io.known_merge import require_rigid
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.airborne import clear
+from cdpipe.mapping.counted import CountedScans
 from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.recorded_frames import regions_as_mapped, report_as_recorded
 from cdpipe.mapping.session_check import check_session, unit_hint
+from cdpipe.merge.coverage import measure_coverage
 from cdpipe.merge.merge import merge_maps, take_known_merge
 from cdpipe.methods.registry import list_extras, load_source
 from cdpipe.model.config import PipelineConfig, Site, load_config
@@ -64,7 +66,8 @@ class Hooks:
     """Hooks around the stages. Here each stage runs once; override `run` to cache results, `time` to repeat a step.
 
     Args:
-        on_stage: Called before a stage with its name, the work done and the total work.
+        on_stage: Called before a stage with its name, the work done and the total work; while a session is mapped
+            also with `stage: step`, and the scans done and in all.
     """
 
     def __init__(self, on_stage: OnStage = lambda name, done, total: None) -> None:
@@ -126,7 +129,8 @@ def detect(
         report = detect_changes(*mapped.value, config, hooks, merge=merge)
     except MergeFailedError as error:
         raise MergeFailedError(f"{before.name} and {after.name}: {error}", error.evidence, error.seconds) from error
-    return replace(report, seconds={**report.seconds, **mapped.seconds})
+    coverage = measure_coverage(report, before.odom_T_sensor, after.odom_T_sensor)
+    return replace(report, seconds={**report.seconds, **mapped.seconds}, coverage=coverage)
 
 
 def describe(
@@ -229,11 +233,16 @@ def map_sources(sources: Sequence[ScanSource], config: PipelineConfig, hooks: Ho
             check_session(source, config.map, other)
         maps = []
         for name, source in zip(("before", "after"), sources, strict=True):
+            on_step = partial(_tell_step, hooks, f"map {name}")
             hooks.on_stage(f"map {name}", 0, 1)
-            maps.append(build_map(clear(source, config.map), config.map))
+            maps.append(build_map(clear(CountedScans(source, on_step), config.map), config.map, on_step=on_step))
         return Done((maps[0], maps[1]))
 
     return hooks.run("maps", config, compute).value
+
+
+def _tell_step(hooks: Hooks, stage: str, step: str, done: int, total: int) -> None:
+    hooks.on_stage(f"{stage}: {step}", done, total)
 
 
 def detect_changes(

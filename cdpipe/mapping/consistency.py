@@ -21,6 +21,7 @@ from dataclasses import replace
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, invert
+from cdpipe.mapping.counted import OnStep
 from cdpipe.mapping.loops import Loop, close_loops, find_loops
 from cdpipe.mapping.scan_registration import Registration, Samples, Target, register_scan
 from cdpipe.model.types import PosedScan, ScanSource, WrappedScans
@@ -76,7 +77,9 @@ class ConsistentScans(WrappedScans):
         )
 
 
-def make_consistent(source: ScanSource, *, has_loops: bool = False) -> ConsistentScans:
+def make_consistent(
+    source: ScanSource, *, has_loops: bool = False, on_step: OnStep = lambda step, done, total: None
+) -> ConsistentScans:
     """Return a session with poses under which its scans agree with one another; the recorded ones where they do so.
 
     Time grows with the number of scans; the points of a long session are in a temporary file.
@@ -84,6 +87,7 @@ def make_consistent(source: ScanSource, *, has_loops: bool = False) -> Consisten
     Args:
         source: The session.
         has_loops: Whether loops are closed.
+        on_step: Told how many scans were registered each time that all are: step `registration 1`, and so on.
 
     Raises:
         InputError: A scan cannot be read.
@@ -92,17 +96,32 @@ def make_consistent(source: ScanSource, *, has_loops: bool = False) -> Consisten
     is_bent = np.zeros(len(poses), dtype=np.bool_)
     if len(poses) == 1:
         return ConsistentScans(source, poses, is_bent)
-    scans = Samples(source)
-    moved_m = np.linalg.norm((_sweep(scans, poses, _WITH_ALL)[0] - poses)[:, :3, 3], axis=1)
+    scans, told = Samples(source), _Told(on_step, len(poses))
+    moved_m = np.linalg.norm((_sweep(scans, poses, _WITH_ALL, told)[0] - poses)[:, :3, 3], axis=1)
     if np.percentile(moved_m, 90) > _AGREE_M:
-        poses = _follow(scans, _FOLLOWING)
-        poses, off_share = _sweep(scans, poses, _BY_HALVES, by_halves=True)
+        poses = _follow(scans, _FOLLOWING, told)
+        poses, off_share = _sweep(scans, poses, _BY_HALVES, told, by_halves=True)
         is_bent = _find_bent(scans.path_m, off_share)
-        poses, _ = _sweep(scans, poses, _WITH_ALL)
+        poses, _ = _sweep(scans, poses, _WITH_ALL, told)
     loops = find_loops(scans, poses) if has_loops else ()
     if loops:
-        poses, _ = _sweep(scans, close_loops(scans.path_m, poses, loops), _WITH_ALL, loops=loops)
+        poses, _ = _sweep(scans, close_loops(scans.path_m, poses, loops), _WITH_ALL, told, loops=loops)
     return ConsistentScans(source, poses, is_bent)
+
+
+class _Told:
+    """Tells how many scans each registration of all scans has done."""
+
+    def __init__(self, on_step: OnStep, total: int) -> None:
+        self._on_step, self._total = on_step, total
+        self._number = self._done = 0
+
+    def begin(self) -> None:
+        self._number, self._done = self._number + 1, 0
+
+    def add(self) -> None:
+        self._done += 1
+        self._on_step(f"registration {self._number}", self._done, self._total)
 
 
 def _find_bent(path_m: Float64Array, off_share: Float64Array) -> BoolArray:
@@ -112,10 +131,11 @@ def _find_bent(path_m: Float64Array, off_share: Float64Array) -> BoolArray:
     return np.asarray(off_share > np.maximum(_BENT_SHARE, _BENT_FACTOR * np.array(usual)))
 
 
-def _follow(scans: Samples, settings: Registration) -> Float64Array:
+def _follow(scans: Samples, settings: Registration, told: _Told) -> Float64Array:
     """Return the (S, 4, 4) poses, each found from its neighbour's; the middle scan keeps its recorded pose."""
     found, path_m = scans.recorded.copy(), scans.path_m
     n, middle = len(found), len(found) // 2
+    told.begin()
     for way in (range(middle + 1, n), range(middle - 1, -1, -1)):
         target, made_m = None, np.inf
         for index in way:
@@ -127,6 +147,7 @@ def _follow(scans: Samples, settings: Registration) -> Float64Array:
                 made_m = path_m[index]
                 target = Target(scans, found, near if len(near) else behind[-1:], guess[:3, 3], settings.voxel_m)
             found[index], _ = register_scan(scans.of_scan(index), guess, [guess], target, settings)
+            told.add()
     return found
 
 
@@ -134,6 +155,7 @@ def _sweep(
     scans: Samples,
     poses: Float64Array,
     settings: Registration,
+    told: _Told,
     *,
     by_halves: bool = False,
     loops: tuple[Loop, ...] = (),
@@ -146,10 +168,12 @@ def _sweep(
         scans: The scans.
         poses: (S, 4, 4) poses.
         settings: Of the registrations.
+        told: Told of every scan.
         by_halves: Whether a scan is compared with every second scan alone.
         loops: Closed loops: scans of both passes are registered with one another.
     """
     found, off_share = poses.copy(), np.zeros(len(poses))
+    told.begin()
     steps = invert(scans.recorded[:-1]) @ scans.recorded[1:]
     blocks = np.floor(scans.path_m / _BLOCK_M)
     for block in np.unique(blocks):
@@ -168,6 +192,7 @@ def _sweep(
             found[index], off_share[index] = register_scan(
                 scans.of_scan(index), poses[index], predicted, target, settings
             )
+            told.add()
     return found, off_share
 
 

@@ -19,6 +19,7 @@ from cdpipe.core.spooled import SpooledArray
 from cdpipe.core.voxel import UniqueCells, cell_corners, cell_keys, max_coordinate_m
 from cdpipe.mapping.airborne import ClearScans
 from cdpipe.mapping.consistency import make_consistent
+from cdpipe.mapping.counted import OnStep
 from cdpipe.mapping.free_space import COLUMNS, ROWS, render_view
 from cdpipe.mapping.movers import drop_movers
 from cdpipe.model.config import MapConfig
@@ -32,7 +33,12 @@ _MIN_RANGE_M = 1.0
 _INSIDE = 1e-6
 
 
-def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_SCANS) -> PointMap:
+def build_map(
+    source: ScanSource,
+    config: MapConfig,
+    batch_scans: int = _BATCH_SCANS,
+    on_step: OnStep = lambda step, done, total: None,
+) -> PointMap:
     """Build the map of a session, one point per occupied voxel of its odom frame, and choose keyframes.
 
     A map point is the mean of the returns in its voxel, weighted by the inverse square of their range, because near
@@ -44,6 +50,7 @@ def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_S
             returns of mist or dust were left out (`ClearScans`).
         config: Voxel size, longest range, keyframe spacing, and what is made consistent and left out.
         batch_scans: Scans held in memory at a time.
+        on_step: Told how many scans were registered while poses are made consistent.
 
     Raises:
         InputError: A position is too large for this voxel size, or no return is within range.
@@ -53,7 +60,7 @@ def build_map(source: ScanSource, config: MapConfig, batch_scans: int = _BATCH_S
     keyframe_scans = choose_keyframes(source.odom_T_sensor, config.keyframe_spacing_m)
     cleared, consistent = source, None
     if config.consistency != "none":
-        source = consistent = make_consistent(source, has_loops=config.consistency == "graph")
+        source = consistent = make_consistent(source, has_loops=config.consistency == "graph", on_step=on_step)
     point_map = _accumulate(source, keyframe_scans, config, batch_scans)
     if isinstance(cleared, ClearScans) and cleared.has_dropped:
         supported = cleared.supported_by(point_map)

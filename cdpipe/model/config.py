@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -18,6 +18,7 @@ from pydantic import (
     model_serializer,
     model_validator,
 )
+from pydantic.fields import FieldInfo
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.plugins import METHODS, PRESETS, entry_points, find_yaml
@@ -407,7 +408,7 @@ class PipelineConfig(Settings):
 
 def preset_names() -> list[str]:
     """Return the names of all presets: shipped, of plugins, and on the search path."""
-    return list(_presets())
+    return list(preset_files())
 
 
 def load_config(
@@ -449,24 +450,24 @@ def load_config(
     )
 
 
-def settings_table() -> list[tuple[str, Any, str]]:
-    """Return (key, default, meaning) of every setting, for documentation."""
-    rows: list[tuple[str, Any, str]] = []
+def setting_fields() -> Iterator[tuple[str, FieldInfo]]:
+    """Yield the dotted key of every setting, and its field."""
     for name, info in PipelineConfig.model_fields.items():
         if isinstance(info.default, Settings):
-            rows += [
-                (f"{name}.{key}", inner.default, inner.description or "")
-                for key, inner in type(info.default).model_fields.items()
-            ]
+            yield from ((f"{name}.{key}", inner) for key, inner in type(info.default).model_fields.items())
         else:
-            rows.append((name, info.default, info.description or ""))
-    return rows
+            yield name, info
+
+
+def settings_table() -> list[tuple[str, Any, str]]:
+    """Return (key, default, meaning) of every setting, for documentation."""
+    return [(key, info.default, info.description or "") for key, info in setting_fields()]
 
 
 def _preset_document(preset: str) -> Document:
     if preset.endswith((".yaml", ".yml")):
         return _resolve_files(read_yaml(Path(preset)), Path(preset).parent)
-    presets = _presets()
+    presets = preset_files()
     if preset not in presets:
         raise InputError(f"preset {preset!r} is unknown{suggest(preset, presets)} (known: {', '.join(presets)})")
     document = read_yaml(Path(f"{preset}.yaml"), presets[preset].read_text(encoding="utf-8"))
@@ -491,5 +492,6 @@ def _resolve_files(document: Document, folder: Path) -> Document:
     return replace(document, value=resolve(document.value))
 
 
-def _presets() -> dict[str, Traversable]:
+def preset_files() -> dict[str, Traversable]:
+    """Return the file of every preset by its name: shipped, of plugins, and on the search path."""
     return find_yaml("presets", resources.files("cdpipe") / "methods" / "presets", group=PRESETS)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, Int64Array, require_poses, require_shapes, yaw_rad
+from cdpipe.model.sentence import tell
 from cdpipe.model.types import Kind, SessionName, UInt8Array
 
 if TYPE_CHECKING:
@@ -201,8 +202,26 @@ class SurfaceField:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Coverage:
+    """How much of the before path was compared: the after session came within 5 m.
+
+    Attributes:
+        compared_m: Metres of the before path that were compared.
+        unseen_m: Metres of the before path that were not.
+        is_near: (S,) whether the after session came near each scan of the before session.
+    """
+
+    compared_m: float
+    unseen_m: float
+    is_near: BoolArray
+
+    def __post_init__(self) -> None:
+        require_shapes(self, is_near=(None,))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ChangeReport:
-    """The whole answer for one pair of sessions.
+    """The whole answer for one pair of sessions; `str(report)` is one sentence about it.
 
     Attributes:
         before_T_after: (4, 4) the merge that was used.
@@ -219,6 +238,8 @@ class ChangeReport:
         checkpoints: Digest of the weights of each descriptor that was used, by its name.
         extras: Version of each optional package that the answer depends on; "absent" if it was wanted in vain.
         surface: How far the rock moved; None where it was not asked for.
+        coverage: How much of the before path was compared, as `detect` measures it; no file holds it, and
+            `cdpipe.merge.coverage.measure_coverage` measures it from the paths of both sessions.
     """
 
     before_T_after: Float64Array
@@ -233,6 +254,11 @@ class ChangeReport:
     checkpoints: Mapping[str, str] = field(default_factory=dict)
     extras: Mapping[str, str] = field(default_factory=dict)
     surface: SurfaceField | None = None
+    coverage: Coverage | None = None
+
+    def __str__(self) -> str:
+        """Return one sentence, e.g. `5 added, 1 moved 2.3 m, 2 removed; 410 m compared, 35 m not seen`."""
+        return tell(self)
 
     def to_pandas(self, table: Literal["objects", "regions", "surface"] = "objects") -> pd.DataFrame:
         """Return the objects, the reported regions or the rock as a table; positions in the map frame, metres.

@@ -137,6 +137,11 @@ def profile_names() -> list[str]:
     return sorted(entry.name.removesuffix(".json") for entry in _profiles().iterdir() if entry.name.endswith(".json"))
 
 
+def describe_profile(name: str) -> str:
+    """Return where the numbers of a shipped profile come from, in words; "" if it does not say."""
+    return str(json.loads((_profiles() / f"{name}.json").read_text()).get("_source", ""))
+
+
 def load_profile(name_or_path: str, mode: str | None = None) -> SensorMetadata:
     """Read a shipped profile by name, or any Ouster metadata JSON by path.
 

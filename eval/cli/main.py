@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
+from importlib import metadata
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -20,9 +21,18 @@ from eval.cli import tools as commands_tools
 from eval.cli import training as commands_training
 from eval.cli import world as commands_world
 from eval.core.exits import input_errors, run_app
+from eval.core.printing import echo
 
 
 class _Funnel(TyperGroup):
+    def make_context(self, *arguments: Any, **options: Any) -> Any:
+        """Read the arguments; typer would end an interrupt meanwhile without a word."""
+        try:
+            return super().make_context(*arguments, **options)
+        except KeyboardInterrupt as error:
+            sys.stderr.write("interrupted; nothing was written\n")
+            raise typer.Exit(130) from error
+
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
         try:
@@ -42,6 +52,22 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="A benchmark for change detection between two LiDAR sessions of a tunnel.",
 )
+
+
+def _print_version(is_asked: bool) -> None:
+    if is_asked:
+        echo(f"tunnelcd {metadata.version('tunnelcd')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and end")
+    ] = False,
+) -> None:
+    """Measure change detection between two LiDAR sessions of a tunnel."""
+
 
 # in the order in which --help tells them
 _COMMANDS: dict[str, Callable[..., None]] = {

@@ -16,6 +16,7 @@ KindOfSite = Annotated[
     Literal["narrow", "wide"],
     typer.Option("--site", help="width of the drifts, for presets with settings for each; `tunnelcd` measures it"),
 ]
+AsJson = Annotated[bool, typer.Option("--json", help="print JSON on standard output instead, for programs")]
 SetSettings = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="one setting; may be repeated")
 ]

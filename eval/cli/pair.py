@@ -3,13 +3,14 @@
 # ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from eval.cli.options import KindOfSite, OutFolder, Preset, Quiet, SetSettings
+from eval.cli.printed_answer import LINE, print_answer
 from eval.core.printing import echo, print_table, say, shown_warnings
 from eval.core.progress import shown_progress
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from cdpipe.core.geometry import Float64Array
     from cdpipe.model.config import PipelineConfig
-    from cdpipe.model.report import SurfaceField
+    from cdpipe.model.report import ChangeReport, SurfaceField
 
 
 def describe(
@@ -52,6 +53,9 @@ def detect(
     surface: Annotated[
         bool, typer.Option("--surface", help="measure how far the rock moved, too (surface.method=planes)")
     ] = False,
+    html: Annotated[
+        bool, typer.Option("--html", help="also write answer.html: the pair in 3-D and its objects, one offline page")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Find what changed between two sessions, simulated or recorded; needs no truth."""
@@ -72,32 +76,34 @@ def detect(
             cdpipe.save_report(report, partial, preset)
             if report.surface is not None:
                 _draw_surface(report.surface, partial / "surface.png")
+            if html:
+                _write_page((before, after), preset, report, partial / "answer.html", progress.stage)
     except MergeFailedError as error:
         if not quiet:
-            print_table("merge: refused", _evidence_table(error.evidence, config))
+            print_table("merge: refused", _evidence_table(error.evidence, config), LINE)
         raise
     if quiet:
         return
     verdict = "accepted" if known is None else "known, not judged"
-    print_table(f"merge: {verdict}", _evidence_table(report.evidence, config))
-    print_table("regions (map frame = the before session's odometry)", report.to_pandas("regions"))
-    if report.regions.is_proposed.any() and not report.regions.is_reported.any():
-        echo("every region is withdrawn: none holds an object of its own", "")
-    elif not report.regions.is_reported.any():
-        scores = report.regions.scores
-        echo(
-            f"nothing reaches query.threshold = {config.query.threshold:g}; "
-            f"the best of {len(scores)} candidates scores {max(scores.tolist(), default=0.0):.4g}; "
-            "--set query.n_regions=3 reports the best three whatever they score",
-            "",
-        )
-    objects = report.to_pandas("objects")
-    print_table("objects", objects[[name for name in objects.columns if not name.startswith(("min_", "max_", "box_"))]])
-    if report.surface is not None:
-        print_table("rock that moved, mm (positive: into the void)", _surface_table(report.surface))
-    times = ", ".join(f"{name[2:-2]} {seconds:.3f} s" for name, seconds in report.seconds.items())
-    more = "" if report.surface is None else ", surface.csv, surface.ply, surface.png"
-    echo(f"{out}: answer.json, answer.npz, regions.csv, objects.csv, objects.ply{more} ({times})")
+    print_table(f"merge: {verdict}", _evidence_table(report.evidence, config), LINE)
+    files = ["answer.json", "answer.npz", "regions.csv", "objects.csv", "objects.ply"]
+    files += [] if report.surface is None else ["surface.csv", "surface.ply", "surface.png"]
+    print_answer(report, out, [*files, *(["answer.html"] if html else [])], config.query.threshold)
+
+
+def _write_page(
+    sessions: tuple[Path, Path],
+    method: str,
+    report: ChangeReport,
+    file: Path,
+    on_stage: Callable[[str, int, int], None],
+) -> None:
+    import cdpipe
+    from eval.report.answer.content import gather_content
+    from eval.report.answer.page import write_answer_page
+
+    before, after = (cdpipe.open_session(each) for each in sessions)
+    write_answer_page(gather_content((before, after), method, report, on_stage), file)
 
 
 def _draw_surface(surface: SurfaceField, path: Path) -> None:
@@ -113,24 +119,6 @@ def _draw_surface(surface: SurfaceField, path: Path) -> None:
     panels = [("displacement of the rock", surface.displacement_m)]
     figure, _ = draw_panels(panels, surface.chainage_m, surface.angle_deg, moved_m[np.isfinite(moved_m)])
     path.write_bytes(png(figure))
-
-
-def _surface_table(surface: SurfaceField) -> pd.DataFrame:
-    import numpy as np
-    import pandas as pd
-
-    columns = ["region", "chainage_m", "angle_deg", "area_m2", "mean_mm", "largest_mm", "volume_m3"]
-    rows = []
-    for number, item in enumerate(surface.regions):
-        own = surface.region == number
-        places = [np.nan, np.nan]
-        if surface.chainage_m is not None and surface.angle_deg is not None:
-            turn = np.deg2rad(surface.angle_deg[own])
-            angle_deg = np.rad2deg(np.arctan2(np.sin(turn).mean(), np.cos(turn).mean()))
-            places = [float(np.median(surface.chainage_m[own])), float(angle_deg)]
-        sizes = item.area_m2, 1000 * item.mean_m, 1000 * item.largest_m, item.volume_m3
-        rows.append((number, *places, *sizes))
-    return pd.DataFrame(rows, columns=columns)
 
 
 def _read_known_merge(path: Path | None, *, assume_aligned: bool) -> Float64Array | None:

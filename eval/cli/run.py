@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from eval.cli.options import Quiet, RunOut, Scheduler, SetSettings, Workers
+from eval.cli.options import AsJson, Quiet, RunOut, Scheduler, SetSettings, Workers
 from eval.cli.printed_results import print_comparison, print_results
-from eval.core.printing import echo, print_row, say, warn
+from eval.core.printing import echo, echo_json, print_row, say, warn
 from eval.core.progress import shown_progress
 
 if TYPE_CHECKING:
@@ -82,6 +82,7 @@ def score(
     name: Annotated[
         str | None, typer.Option("--as", metavar="NAME", help="their variant in the tables", show_default=False)
     ] = None,
+    as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Score stored answers against the truth again, or the answers of another program; no method is run."""
@@ -95,7 +96,9 @@ def score(
         from eval.scoring.scoring import score
 
         row = score(answer, folder)
-        if not quiet:
+        if as_json:
+            echo_json(row)
+        elif not quiet:
             print_row(row)
         return
     from eval.running.predictions import add_predictions
@@ -108,6 +111,11 @@ def score(
             n_scored, told = add_predictions(run, predictions, name, progress), f"predictions scored as {name}"
         else:
             n_scored, told = rescore(run, progress), "answers scored again"
+    if as_json:
+        import pandas as pd
+
+        echo_json(pd.read_csv(run.path / "results.csv").to_dict("records"))
+        return
     print_results(run.path, quiet)
     say(quiet, f"{folder}: {n_scored} {told}, tables rewritten")
 

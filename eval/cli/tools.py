@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from eval.cli.options import Quiet
-from eval.core.printing import MET, echo, print_table
+from eval.cli.options import AsJson, Quiet
+from eval.cli.printed_answer import LINE
+from eval.core.printing import MET, echo, echo_json, line_width, print_table
 
 
 def bench(
@@ -42,51 +43,87 @@ def bench(
     echo(f"{summarise(table['rows'])}{'' if out is None else f'; {out}'}")
 
 
-def list_command() -> None:
-    """List the scenarios, props, plans, presets, methods, metrics and sensor profiles."""
-    from cdpipe.core.plugins import METHODS, METRICS, entry_points
-    from cdpipe.model.config import preset_names
-    from cdpipe.sensor.ouster import profile_names
-    from eval.plans.files import plan_names
-    from scenarios import prop_names, scenario_names
+def list_command(
+    what: Annotated[
+        Literal["scenarios", "props", "plans", "presets", "methods", "metrics", "sensors", "settings"] | None,
+        typer.Argument(help="this alone, with one-line descriptions; of settings with default and unit"),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List scenarios, props, plans, presets, methods, metrics, sensors; or one of these, or the settings, described."""
+    from dataclasses import asdict
 
-    groups = {
-        "scenarios": scenario_names(),
-        "props": prop_names(),
-        "plans": plan_names(),
-        "presets": preset_names(),
-        "methods": list(entry_points(METHODS)),
-        "metrics of plugins": list(entry_points(METRICS)),
-        "sensor profiles": profile_names(),
-    }
-    for title, names in groups.items():
-        echo(f"{title}:", *(f"  {name}" for name in names))
+    from eval.cli.listing import describe_entry, describe_setting, list_entries
+
+    if what is None:
+        names = {title: [entry.name for entry in list_entries(kind)] for kind, title in _TITLES.items()}
+        if as_json:
+            echo_json({kind: names[title] for kind, title in _TITLES.items()})
+            return
+        for title, of_kind in names.items():
+            echo(f"{title}:", *(f"  {name}" for name in of_kind))
+        return
+    columns = ["name", "default", "unit", "description"] if what == "settings" else ["name", "description"]
+    entries = list_entries(what)
+    if as_json:
+        echo_json([{column: asdict(entry)[column] for column in columns} for entry in entries])
+        return
+    for entry in entries:
+        echo(*(describe_setting(entry, LINE) if what == "settings" else [describe_entry(entry, entries, line_width())]))
 
 
-def doctor() -> None:
+_TITLES = {
+    "scenarios": "scenarios",
+    "props": "props",
+    "plans": "plans",
+    "presets": "presets",
+    "methods": "methods",
+    "metrics": "metrics of plugins",
+    "sensors": "sensor profiles",
+}
+
+
+def doctor(as_json: AsJson = False) -> None:
     """Print what is installed, whether it works, and how to repair what does not."""
+    from dataclasses import asdict
+
     from cdpipe.core.errors import InputError
     from eval.cli.doctor import examine, faults
 
     found = []
     for each in examine():
         found.append(each)
-        echo(f"{each.what:<15} {each.state:<7} {each.told}")
+        if not as_json:
+            echo(f"{each.what:<15} {each.state:<7} {each.told}")
+    if as_json:
+        echo_json([asdict(each) for each in found])
     if wrong := faults(found):
         raise InputError("\n".join(wrong))
-    echo("all that is required works")
+    if not as_json:
+        echo("all that is required works")
 
 
-def check(files: Annotated[list[str], typer.Argument(help="scenario, plan or preset: a name or a .yaml file")]) -> None:
+def check(
+    files: Annotated[list[str], typer.Argument(help="scenario, plan or preset: a name or a .yaml file")],
+    as_json: AsJson = False,
+) -> None:
     """Validate scenarios, plans and presets without running anything."""
     from cdpipe.core.errors import InputError
 
     mistakes: list[str] = []
+    rows: list[dict[str, object]] = []
     for file in files:
+        found, own = "", []
         try:
-            echo(f"{file}: {check_file(file)}, no mistakes")
+            found = check_file(file)
         except InputError as error:
-            mistakes += str(error).split("\n")
+            own = str(error).split("\n")
+        mistakes += own
+        rows.append({"file": file, "is": found or None, "mistakes": own})
+        if found and not as_json:
+            echo(f"{file}: {found}, no mistakes")
+    if as_json:
+        echo_json(rows)
     if mistakes:
         raise InputError("\n".join(mistakes))
 

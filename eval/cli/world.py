@@ -3,7 +3,7 @@
 # ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +14,7 @@ from eval.core.printing import echo, print_table, say, warn
 from eval.core.progress import shown_progress
 
 if TYPE_CHECKING:
+    from eval.report.answer.content import AnswerContent
     from sim.view.view import View
 
 
@@ -74,7 +75,14 @@ def survey(
 
 
 def view(
-    what: Annotated[str, typer.Argument(help="scenario (name or .yaml file), simulated pair, or session folder")],
+    what: Annotated[
+        str,
+        typer.Argument(
+            help="scenario (name or .yaml file), simulated pair or session; of an answer: the before session"
+        ),
+    ],
+    after: Annotated[Path | None, typer.Argument(help="the later session of an answer", show_default=False)] = None,
+    answer: Annotated[Path | None, typer.Argument(help="folder that `detect` wrote", show_default=False)] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, help="seed of a scenario; 0 if left out", show_default=False)
     ] = None,
@@ -88,24 +96,87 @@ def view(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Show a world, a simulated pair or a session in the browser."""
-    import time
-
+    """Show a world, a simulated pair, a session, or what an answer found between two sessions, in the browser."""
     from cdpipe.core.errors import InputError
+
+    if html is not None and not html.absolute().parent.is_dir():
+        raise InputError(f"--html {html}: there is no folder {html.parent}: make it, or name another one")
+    if after is not None:
+        _view_answer(_require_answer(what, after, answer, seed, settings), port, host, html, quiet)
+        return
+    if (Path(what) / "answer.json").is_file():
+        raise InputError(f"{what}: an answer, without its sessions: `tunnelcd view BEFORE AFTER {what}`")
+    _require_viser_for(host, port, html)
+    if html is None:
+        _serve(lambda: load_view(what, seed, settings or ()), what, port, host, quiet)
+        return
+    from sim.view.viewer import write_html
+
+    write_html(load_view(what, seed, settings or ()), html)
+    say(quiet, f"{html}: {what}, {html.stat().st_size / 1e6:.1f} MB, opens in any browser")
+
+
+def _require_answer(
+    before: str, after: Path, answer: Path | None, seed: int | None, settings: Sequence[str] | None
+) -> tuple[Path, Path, Path]:
+    """Return the before session, the after session and the answer.
+
+    Raises:
+        InputError: The answer is not named, or options of a scenario are.
+    """
+    from cdpipe.core.errors import InputError
+
+    if answer is None:
+        raise InputError(
+            f"{before} {after}: two sessions without an answer: `tunnelcd detect {before} {after} --out ANSWER` makes "
+            "one; then view both sessions and ANSWER; or view one session alone"
+        )
+    if seed is not None or settings:
+        raise InputError(f"{before}: a session holds what was recorded: leave --seed and --set out")
+    return Path(before), after, answer
+
+
+def _view_answer(folders: tuple[Path, Path, Path], port: int, host: str, html: Path | None, quiet: bool) -> None:
+    from eval.report.answer.content import read_content
+    from eval.report.answer.page import write_answer_page
+    from eval.report.answer.view import view_answer
+
+    def read() -> AnswerContent:
+        with shown_progress(quiet) as progress:
+            return read_content(*folders, progress.stage)
+
+    if html is None:
+        _require_viser_for(host, port, html)
+        _serve(lambda: view_answer(read()), str(folders[2]), port, host, quiet)
+        return
+    content = read()
+    write_answer_page(content, html)
+    say(quiet, f"{html}: {html.stat().st_size / 1e6:.1f} MB, opens in any browser")
+    say(quiet, str(content.report))
+
+
+def _require_viser_for(host: str, port: int, html: Path | None) -> None:
+    """Warn of a server that other machines reach.
+
+    Raises:
+        InputError: viser is not installed.
+    """
     from eval.core.exposure import is_loopback
-    from sim.view.viewer import require_viser, running_server, show, write_html
+    from sim.view.viewer import require_viser
 
     require_viser()
-    if html is not None:
-        if not html.absolute().parent.is_dir():
-            raise InputError(f"--html {html}: there is no folder {html.parent}: make it, or name another one")
-        write_html(load_view(what, seed, settings or ()), html)
-        say(quiet, f"{html}: {what}, {html.stat().st_size / 1e6:.1f} MB, opens in any browser")
-        return
-    if not is_loopback(host):
+    if html is None and not is_loopback(host):
         warn(f"--host {host}: everybody who reaches port {port} sees the scene; the server asks for no password")
+
+
+def _serve(load: Callable[[], View], what: str, port: int, host: str, quiet: bool) -> None:
+    """Show a view until the user interrupts."""
+    import time
+
+    from sim.view.viewer import running_server, show
+
     with running_server(port, host) as server:
-        shown = load_view(what, seed, settings or ())
+        shown = load()
         show(server, shown)
         for note in shown.notes:
             echo(note, err=True)

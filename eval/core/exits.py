@@ -63,7 +63,7 @@ def run_app(app: typer.Typer, name: str, words: Sequence[str], subcommands: Sequ
         if message:  # there is none for `tunnelcd` alone, which has printed its help
             sys.stderr.write(f"error: {command}: {visible(message)}: `{command} --help` lists its arguments\n")
         raise SystemExit(error.exit_code) from error
-    except typer.Abort as error:
-        sys.stderr.write("interrupted\n")
+    except (typer.Abort, KeyboardInterrupt) as error:  # of a command's own work, the command says what is kept
+        sys.stderr.write("interrupted; nothing was written\n")
         raise SystemExit(130) from error
     raise SystemExit(code)

@@ -7,7 +7,11 @@ terminal obeys none of it.
 # ruff: noqa: PLC0415 - heavy imports stand inside the functions, so that --help and completion are instant
 from __future__ import annotations
 
+import json
 import math
+import shutil
+import sys
+import textwrap
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,19 +28,23 @@ if TYPE_CHECKING:
 MET = {True: "met", False: "missed", None: "-"}
 
 
-def print_table(title: str, frame: pd.DataFrame) -> None:
-    """Print a table under its title, with a dash for NaN and None."""
+# wider than any table: the terminal then wraps long lines, where rich would cut numbers off
+_ANY_WIDTH = 500
+
+
+def print_table(title: str, frame: pd.DataFrame, columns: int = _ANY_WIDTH) -> None:
+    """Print a table under its title, with a dash for NaN and None; cells are folded where it has too few columns."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=visible(title), title_justify="left", box=box.SIMPLE_HEAD)
+    is_narrow = columns < _ANY_WIDTH
+    table = Table(title=visible(title), title_justify="left", box=box.SIMPLE_HEAD, collapse_padding=is_narrow)
     for name in frame.columns:
-        table.add_column(visible(str(name)), no_wrap=True)
+        table.add_column(visible(str(name)), no_wrap=not is_narrow, overflow="fold")
     for row in frame.itertuples(index=False):
         table.add_row(*(_cell(value) for value in row))
-    # wider than any table: the terminal then wraps long lines, where rich would cut numbers off
-    Console(width=500, markup=False, emoji=False).print(table)
+    Console(width=columns, markup=False, emoji=False).print(table)
 
 
 def print_row(row: dict[str, Any]) -> None:
@@ -50,6 +58,35 @@ def echo(*lines: str, err: bool = False) -> None:
     """Print lines to standard output, or to standard error."""
     for line in lines:
         typer.echo(visible(line), err=err)
+
+
+def line_width() -> int:
+    """Return the columns of the terminal; where standard output is none, as many as any line needs."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else _ANY_WIDTH
+
+
+def echo_json(value: Any) -> None:
+    """Print a value as JSON for programs; what is undefined is null."""
+    typer.echo(json.dumps(_plain(value), indent=1, allow_nan=False))
+
+
+def _plain(value: Any) -> Any:
+    """Return JSON's own types."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "item"):  # a number of numpy
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if value is None or isinstance(value, bool | int | float) else str(value)
+
+
+def echo_wrapped(text: str, columns: int) -> None:
+    """Print a text in lines of at most so many columns, broken at blanks; a longer word has a line of its own."""
+    for line in textwrap.wrap(visible(text), columns, break_long_words=False, break_on_hyphens=False):
+        typer.echo(line)
 
 
 def say(quiet: bool, text: str) -> None:

@@ -96,8 +96,8 @@ class Lines(RunProgress):
         self._write(line, self._pace(done, total))
 
     def stage(self, name: str, done: int, total: int) -> None:
-        """Write the name, once."""
-        self._write(f"  {name}")
+        """Write the name, once; a step of a stage, `stage: step`, is not told."""
+        self._write(f"  {name.partition(': ')[0]}")
 
     def note(self, text: str) -> None:
         """Write the line."""
@@ -145,4 +145,6 @@ class _Rate(ProgressColumn):
         speed = task.finished_speed or task.speed
         if not speed:
             return Text("-/s")
+        if speed >= 10:
+            return Text(f"{speed:.0f}/s")
         return Text(f"{speed:.2g}/s" if speed >= 0.1 else f"{60 * speed:.2g}/min")

@@ -18,7 +18,7 @@ from eval.plans.worlds import format_setting
 
 def plan_names() -> list[str]:
     """Return the names of all plans: shipped, and on the search path."""
-    return list(_find_plans())
+    return list(plan_files())
 
 
 def read_plan(name_or_path: str) -> Document:
@@ -32,7 +32,7 @@ def read_plan(name_or_path: str) -> Document:
     """
     if name_or_path.endswith((".yaml", ".yml")):
         return _resolve_files(read_yaml(Path(name_or_path)), Path(name_or_path).parent)
-    plans = _find_plans()
+    plans = plan_files()
     if name_or_path not in plans:
         raise InputError(
             f"plan {name_or_path!r} is unknown{suggest(name_or_path, plans)} "
@@ -64,5 +64,6 @@ def _resolve_files(document: Document, folder: Path) -> Document:
     return replace(document, value=resolve(document.value))
 
 
-def _find_plans() -> dict[str, Traversable]:
+def plan_files() -> dict[str, Traversable]:
+    """Return the file of every plan by its name: shipped, and on the search path."""
     return find_yaml("plans", resources.files("eval") / "plans")

@@ -62,8 +62,13 @@ class Chart:
     @property
     def json(self) -> str:
         """The figure as JSON that may stand inside a script element: it can neither end it nor begin a comment."""
-        text = json.dumps(_plain(plotly_figure(self.drawing)), separators=(",", ":"), allow_nan=False)
-        return "".join(_IN_SCRIPT.get(letter, letter) for letter in text)
+        return script_json(plotly_figure(self.drawing))
+
+
+def script_json(value: Any, digits: int = _SHORT_DIGITS) -> str:
+    """Return a value as JSON that may stand inside a script element; numbers get so many digits, NaN becomes null."""
+    text = json.dumps(_plain(value, digits), separators=(",", ":"), allow_nan=False)
+    return "".join(_IN_SCRIPT.get(letter, letter) for letter in text)
 
 
 def plotly_text(words: str) -> str:
@@ -191,14 +196,14 @@ def _lines(text: str) -> str:
     return "<br>".join(map(plotly_text, text.split("\n")))
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: Any, digits: int = _SHORT_DIGITS) -> Any:
     """Return JSON's own types; numbers get as many digits as a screen can show, and what is undefined is null."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): _plain(item, digits) for key, item in value.items()}
     if isinstance(value, np.ndarray):
-        return [_plain(item) for item in value.tolist()]
+        return [_plain(item, digits) for item in value.tolist()]
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [_plain(item, digits) for item in value]
     if isinstance(value, float | np.floating):
-        return float(f"{value:.{_SHORT_DIGITS}g}") if math.isfinite(value) else None
+        return float(f"{value:.{digits}g}") if math.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value

@@ -1,5 +1,4 @@
 from .adapters import held_input, pipeline_input
-from .aligned import alignment_of
 from .ground_truth import GroundTruth, SessionTruth, load_ground_truth
 from .scoring_points import ScoringPoints, load_scoring_points
 
@@ -7,7 +6,6 @@ __all__ = [
     "GroundTruth",
     "ScoringPoints",
     "SessionTruth",
-    "alignment_of",
     "held_input",
     "load_ground_truth",
     "load_scoring_points",

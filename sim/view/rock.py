@@ -42,9 +42,14 @@ def displacement_classes(world: World) -> Int64Array:
     moved_m = rock.measure(wall.vertices[wall.faces[faces]].mean(axis=1), faces)
     moved_m = np.where(np.isfinite(moved_m), moved_m, -np.inf)
     found = np.full(len(wall.faces), -1)
-    rank = np.searchsorted(STEPS_M, np.abs(moved_m), side="right")
-    found[faces] = len(STEPS_M) + np.where(moved_m < 0, -rank, rank)
+    found[faces] = displacement_class(moved_m)
     return found
+
+
+def displacement_class(moved_m: Float64Array) -> Int64Array:
+    """Return the class of each of (N,) displacements, metres, positive into the void: an index of `ROCK_RGB`."""
+    rank = np.searchsorted(STEPS_M, np.abs(moved_m), side="right")
+    return np.asarray(len(STEPS_M) + np.where(moved_m < 0, -rank, rank), dtype=np.int64)
 
 
 def face_tints(world: World) -> Float64Array:

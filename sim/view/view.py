@@ -85,6 +85,7 @@ class View:
         notes: Parts that could not be shown, with the reason.
         play: Returns what is elsewhere at another share of the drives, 0 to 1: the surfaces of movers and of sensors,
             and the returns of one revolution; None where nothing is driven.
+        legend: Colours and what they mean; empty for those of changes, paths and rock that the view holds.
     """
 
     title: str
@@ -97,6 +98,7 @@ class View:
     target: Float64Array
     notes: tuple[str, ...] = ()
     play: Play | None = None
+    legend: tuple[tuple[Rgb, str], ...] = ()
 
 
 def is_pair(path: Path) -> bool:

@@ -161,7 +161,8 @@ def _add_switches(server: Any, view: View, handles: dict[str, Any]) -> None:
     for group in _switched(handles):
         _add_switch(gui, group, handles[group])
     for cloud in view.clouds:
-        _add_switch(gui, cloud.name, handles[cloud.name])
+        if not cloud.name.startswith(("changes/", "displacement/")):  # their group has one switch
+            _add_switch(gui, cloud.name, handles[cloud.name])
     if view.clouds and len(view.clouds[0].colours) > 1:
         choice = gui.add_dropdown("returns by", tuple(view.clouds[0].colours))
 
@@ -241,7 +242,8 @@ def _legend(view: View) -> str:
     kinds = [kind for kind in CHANGE_RGB if any(part.name.startswith(f"changes/{kind}/") for part in view.surfaces)]
     sessions = [name for name in SESSION_RGB if any(line.name == f"paths/{name}" for line in view.lines)]
     colours = [(CHANGE_RGB[kind], kind) for kind in kinds] + [(SESSION_RGB[name], f"path {name}") for name in sessions]
-    head = f"**{markdown_text(view.title)}**", " ".join(swatch.format(rgb, name) for rgb, name in colours)
+    named = view.legend or colours
+    head = f"**{markdown_text(view.title)}**", " ".join(swatch.format(rgb, name) for rgb, name in named)
     rock = [part for part in view.surfaces if part.name.startswith(f"{ROCK_AFTER}/")]
     told = " ".join(swatch.format(part.rgb, PurePosixPath(part.name).name) for part in rock)
     moved = f"rock moved, + into the void: {told}" if rock else ""

@@ -17,6 +17,7 @@ from cdpipe.core.geometry import invert, travelled_m
 from cdpipe.io.answer import read_answer
 from cdpipe.io.session import read_session
 from cdpipe.merge.evidence import GATES
+from cdpipe.model.aligned import alignment_of
 from cdpipe.model.alignment import PathAlignment
 from eval.report.merge.figures import FULL_M, alignment_picture
 from eval.report.tables import Cell, Picture, Table
@@ -24,7 +25,6 @@ from eval.running.run_data import Row, RunData, number, split_variant, text
 from eval.running.runfolder import read_json
 from eval.scoring.merge_metrics import PAIR_RADIUS_M
 from eval.tables.columns import fine, share, significant
-from eval.truth.aligned import alignment_of
 from sim.session.truth import read_true_poses
 
 MAX_ROWS = 40

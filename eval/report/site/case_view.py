@@ -12,25 +12,22 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.io.answer import read_answer
+from cdpipe.model.aligned import alignment_of
 from cdpipe.model.report import ChangeReport
+from eval.report.answer.shapes import AFTER_RGB, BEFORE_RGB, REGION_RGB, WRONG_RGB, box_path, roof_mask, sphere_path
 from eval.running.run_data import Row, flag, number, text
 from eval.running.runfolder import RunFolder
-from eval.truth.aligned import alignment_of
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 from sim.view.returns import CHANGE_RGB, Cloud, Rgb
 from sim.view.view import Label, Line, View
 from sim.view.viewer import write_html
 
-_BEFORE_RGB, _AFTER_RGB = (120, 165, 205), (222, 180, 110)
-_TRUTH_RGB: dict[str, Rgb] = {"found": (0, 120, 90), "missed": (200, 16, 46), "unobservable": (150, 150, 150)}
-_REGION_RGB: dict[str, Rgb] = {"true": (90, 90, 90), "false": (200, 16, 46)}
-# what is higher than this over the sensor's path is roof, and hides the rest from above
-_ROOF_M = 1.2
+_TRUTH_RGB: dict[str, Rgb] = {"found": (0, 120, 90), "missed": WRONG_RGB, "unobservable": (150, 150, 150)}
+_REGION_RGB: dict[str, Rgb] = {"true": REGION_RGB, "false": WRONG_RGB}
 _MAP_POINT_M, _OBJECT_POINT_M = 0.05, 0.09
 _MARGIN_M = 0.15
 
@@ -90,7 +87,7 @@ def case_view(
     paths = truth.before.odom_T_sensor[:, :3, 3], alignment.to_map(truth.after.odom_T_sensor[:, :3, 3])
     points = maps[0].astype(np.float64), alignment.to_map(maps[1].astype(np.float64))
     clouds: list[Cloud] = []
-    for name, cloud, path, rgb in zip(("before", "after"), points, paths, (_BEFORE_RGB, _AFTER_RGB), strict=True):
+    for name, cloud, path, rgb in zip(("before", "after"), points, paths, (BEFORE_RGB, AFTER_RGB), strict=True):
         is_roof = roof_mask(cloud, path)
         clouds.append(_cloud(f"{name} map/floor and walls", cloud[~is_roof], rgb))
         clouds.append(_cloud(f"{name} map/roof", cloud[is_roof], rgb, is_shown=False))
@@ -112,38 +109,12 @@ def case_view(
         labels.append(Label(f"names/{name}", place, f"{name}: {change.kind}, {state}"))
     lines += list(_regions(report, rows.get("regions", ())))
     lines += [Line(f"paths/{name}", path, rgb) for name, path, rgb in
-              zip(("before", "after"), paths, (_BEFORE_RGB, _AFTER_RGB), strict=True)]  # fmt: skip
+              zip(("before", "after"), paths, (BEFORE_RGB, AFTER_RGB), strict=True)]  # fmt: skip
     target = _target(truth, labels, paths[0])
     eye = target + np.array([-7.0, -7.0, 9.0])
     return View(
         title, (), (), tuple(lines), tuple(each for each in clouds if len(each.points)), tuple(labels), eye, target
     )
-
-
-def roof_mask(points: Float64Array, path: Float64Array) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Mark the (N, 3) points that are more than 1.2 m higher than the nearest place of a (P, 3) path."""
-    if len(points) == 0:
-        return np.zeros(0, dtype=np.bool_)
-    _, nearest = cKDTree(path[:, :2]).query(points[:, :2])
-    return np.asarray(points[:, 2] > path[nearest, 2] + _ROOF_M, dtype=np.bool_)
-
-
-def box_path(low: Float64Array, high: Float64Array) -> Float64Array:
-    """Return (16, 3) corners in an order that draws all twelve edges of a box in one stroke."""
-    corners = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], dtype=np.float64)
-    order = [0, 1, 2, 3, 0, 4, 5, 1, 5, 6, 2, 6, 7, 3, 7, 4]
-    return low + corners[order] * (high - low)
-
-
-def sphere_path(centre: Float64Array, radius_m: float) -> Float64Array:
-    """Return (N, 3) points of three circles around a centre, drawn in one stroke."""
-    turn = np.linspace(0.0, 2.0 * np.pi, 49)
-    quarter, zero = turn[:13], np.zeros_like
-    level = np.column_stack([np.cos(turn), np.sin(turn), zero(turn)])
-    upright = np.column_stack([np.cos(turn), zero(turn), np.sin(turn)])
-    across = np.column_stack([np.cos(quarter), np.sin(quarter), zero(quarter)])
-    other = np.column_stack([zero(turn), np.cos(turn), np.sin(turn)])
-    return centre + radius_m * np.concatenate([level, upright, across, other])
 
 
 def _states(truth: GroundTruth, rows: Sequence[Row]) -> list[str]:
@@ -177,7 +148,7 @@ def _cloud(name: str, points: Float64Array, rgb: Rgb, size_m: float = _MAP_POINT
 def _legend(title: str, variant: str) -> str:
     """Return what the colours mean, to lie over the scene."""
     entries = [
-        (_BEFORE_RGB, "before map"), (_AFTER_RGB, "after map"),
+        (BEFORE_RGB, "before map"), (AFTER_RGB, "after map"),
         *((rgb, f"answered: {kind}") for kind, rgb in CHANGE_RGB.items()),
         *((rgb, f"box: true change, {state}") for state, rgb in _TRUTH_RGB.items()),
         *((rgb, f"sphere: {word} region") for word, rgb in _REGION_RGB.items()),

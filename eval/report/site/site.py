@@ -10,6 +10,7 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.io.answer import Answer, read_answer
+from cdpipe.model.aligned import alignment_of
 from cdpipe.model.report import ChangeReport
 from eval.report.maps import Points, RegionMark, State, TruthMark, distance_map, overlay_map, region_map
 from eval.report.objects.objects import object_pictures
@@ -27,7 +28,6 @@ from eval.running.run_data import (
 )
 from eval.running.runfolder import RunFolder
 from eval.scoring.region_metrics import transform_to_map
-from eval.truth.aligned import alignment_of
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
 _STATES: dict[bool | None, State] = {True: "found", False: "missed", None: "not scored"}

@@ -11,7 +11,8 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.io.answer import write_answer, write_failure
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
-from eval.report.site.case_view import box_path, case_view, roof_mask, sphere_path, write_case_view
+from eval.report.answer.shapes import box_path, roof_mask, sphere_path
+from eval.report.site.case_view import case_view, write_case_view
 from eval.report.site.views import write_views
 from eval.running.run_data import RunData
 from eval.running.runfolder import RunFolder

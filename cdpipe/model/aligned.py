@@ -1,4 +1,4 @@
-"""The alignment of an answer, for pictures of the after map in the map frame."""
+"""The alignment of an answer: where the places of the after session lie in the map frame."""
 
 from __future__ import annotations
 

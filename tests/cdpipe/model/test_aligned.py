@@ -7,8 +7,8 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import invert, make_pose, yaw_pose
+from cdpipe.model.aligned import alignment_of
 from cdpipe.model.report import ChangeRegions, ChangeReport
-from eval.truth.aligned import alignment_of
 
 RIGID = yaw_pose(0.4, (3.0, -2.0, 0.5))
 POSES = np.array([make_pose(translation=(0.5 * step, 0.0, 1.0)) for step in range(40)])

@@ -1,0 +1,123 @@
+"""What `tunnelcd list` names: scenarios, plans, presets, sensors and settings with their descriptions, and more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from textwrap import shorten, wrap
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
+
+from cdpipe.core.plugins import METHODS, METRICS, entry_points
+from cdpipe.core.yamlfile import read_yaml
+from cdpipe.model.config import preset_files, setting_fields
+from cdpipe.sensor.ouster import describe_profile, profile_names
+from eval.plans.files import plan_files, read_plan
+from scenarios import prop_names
+from scenarios.catalogue import family_files
+
+if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
+
+_UNITS = {"m": "m", "m2": "m2", "m3": "m3", "mm": "mm", "s": "s", "deg": "deg", "rad": "rad"}
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A name and its description, "" where there is none; of a setting its default, and its unit or values, too."""
+
+    name: str
+    description: str = ""
+    default: Any = None
+    unit: str = ""
+
+
+def list_entries(kind: str) -> list[Entry]:
+    """Return what there is of a kind, one of `KINDS`.
+
+    Raises:
+        InputError: A file of that kind cannot be read.
+    """
+    return list(_LISTED[kind]())
+
+
+def describe_entry(entry: Entry, others: Sequence[Entry], columns: int) -> str:
+    """Return one line of at most so many columns: the name, as wide as the widest of all, and what fits after it."""
+    start = f"{entry.name:<{max(len(each.name) for each in others)}}  "
+    return (start + shorten(entry.description, max(columns - len(start), 20), placeholder=" ...")).rstrip()
+
+
+def describe_setting(entry: Entry, columns: int) -> list[str]:
+    """Return the lines about a setting: key, default and unit or values; below them what it means."""
+    default = "true" if entry.default is True else "false" if entry.default is False else entry.default
+    indent = "    "
+    head = f"{entry.name} = {default}".rstrip() + (f"  [{entry.unit}]" if entry.unit else "")
+    return [head, *wrap(entry.description, columns, initial_indent=indent, subsequent_indent=indent)]
+
+
+def _scenarios() -> Iterable[Entry]:
+    return (
+        Entry(name, _one_line(read_yaml(path).value.get("description")))
+        for name, path in sorted(family_files().items())
+    )
+
+
+def _plans() -> Iterable[Entry]:
+    return (Entry(name, _one_line(read_plan(name).value.get("description"))) for name in plan_files())
+
+
+def _presets() -> Iterable[Entry]:
+    """Yield the presets; the comment at the head of the file describes one, up to its first full stop."""
+    for name, file in preset_files().items():
+        head = []
+        for line in file.read_text(encoding="utf-8").splitlines():
+            if not line.startswith("#"):
+                break
+            head.append(line.lstrip("# "))
+        yield Entry(name, _one_line(" ".join(head)))
+
+
+def _settings() -> Iterable[Entry]:
+    for key, field in setting_fields():
+        yield Entry(key, field.description or "", field.default, _unit(key, field))
+
+
+def _unit(key: str, field: FieldInfo) -> str:
+    """Return the unit of a setting, by the end of its name; else its values."""
+    if get_origin(field.annotation) is Literal:
+        return " | ".join(map(str, get_args(field.annotation)))
+    if isinstance(field.default, bool):
+        return "true | false"
+    unit = _UNITS.get(key.rpartition("_")[2], "")
+    if unit:
+        return f"{unit} | {field.default}" if isinstance(field.default, str) else unit
+    limits = {type(limit).__name__: getattr(limit, type(limit).__name__.lower()) for limit in _limits(field)}
+    if limits.get("Ge") == 0 and limits.get("Le") == 1:
+        return "share"
+    return {int: "number", float: "factor", str: "text"}.get(type(field.default), "")
+
+
+def _limits(field: FieldInfo) -> list[Any]:
+    return [each for each in field.metadata if type(each).__name__ in ("Ge", "Le")]
+
+
+def _one_line(text: object) -> str:
+    """Return the first sentence of a text on one line."""
+    words = " ".join(str(text or "").split())
+    question, mark, _ = words.partition("? ")
+    return (question + mark.strip() if mark else words.partition(". ")[0]).rstrip(".")
+
+
+def _names(read: Callable[[], Iterable[str]]) -> Callable[[], Iterable[Entry]]:
+    return lambda: map(Entry, read())
+
+
+_LISTED: dict[str, Callable[[], Iterable[Entry]]] = {
+    "scenarios": _scenarios,
+    "props": _names(prop_names),
+    "plans": _plans,
+    "presets": _presets,
+    "methods": _names(lambda: entry_points(METHODS)),
+    "metrics": _names(lambda: entry_points(METRICS)),
+    "sensors": lambda: (Entry(name, _one_line(describe_profile(name))) for name in profile_names()),
+    "settings": _settings,
+}

@@ -1,0 +1,44 @@
+"""One answer as the command line prints it: tables of at most 80 columns, and one sentence at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from eval.core.printing import echo, echo_wrapped, print_table
+
+if TYPE_CHECKING:
+    from cdpipe.model.report import ChangeReport
+
+LINE = 80
+"""Columns of a terminal."""
+
+
+def print_answer(report: ChangeReport, out: Path, files: Sequence[str], threshold: float) -> None:
+    """Print the regions, the objects and the rock of an answer, its files in `out`, and the sentence about it."""
+    from eval.report.answer.tables import (  # noqa: PLC0415 - --help and completion are instant
+        tabulate_objects,
+        tabulate_regions,
+        tabulate_rock,
+    )
+
+    regions = report.regions
+    print_table("regions (map frame = the before session's odometry)", tabulate_regions(report), LINE)
+    if regions.is_proposed.any() and not regions.is_reported.any():
+        echo("every region is withdrawn: none holds an object of its own", "")
+    elif not regions.is_reported.any():
+        echo_wrapped(
+            f"nothing reaches query.threshold = {threshold:g}; "
+            f"the best of {len(regions.scores)} candidates scores {max(regions.scores.tolist(), default=0.0):.4g}; "
+            "--set query.n_regions=3 reports the best three whatever they score",
+            LINE,
+        )
+        echo("")
+    print_table("objects", tabulate_objects(report), LINE)
+    if report.surface is not None:
+        print_table("rock that moved, mm (positive: into the void)", tabulate_rock(report.surface), LINE)
+    times = ", ".join(f"{name[2:-2]} {seconds:.3f} s" for name, seconds in report.seconds.items())
+    echo_wrapped(f"times: {times}", LINE)
+    echo_wrapped(f"{out}: {', '.join(files)}", LINE)
+    echo(str(report))

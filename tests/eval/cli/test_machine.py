@@ -1,0 +1,140 @@
+"""The command line for programs: JSON, names with descriptions, the version, and an interrupt at any moment."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from cdpipe.model.config import settings_table
+from eval.cli import tools
+from eval.cli.doctor import Finding
+from eval.core.printing import echo_json
+from eval.plans.files import plan_names
+from scenarios import scenario_names
+
+Command = Callable[..., tuple[int, str, str]]
+
+
+def test_the_version_is_that_of_the_package(command: Command) -> None:
+    assert command("--version") == (0, f"tunnelcd {metadata.version('tunnelcd')}\n", "")
+
+
+def test_settings_come_with_default_unit_and_meaning(command: Command) -> None:
+    code, out, _ = command("list", "settings", "--json")
+    assert code == 0
+    rows = {row["name"]: row for row in json.loads(out)}
+    assert list(rows) == [key for key, _, _ in settings_table()]
+    assert rows["map.voxel_m"] == {
+        "name": "map.voxel_m", "default": 0.2, "unit": "m", "description": "cell of the thinned map",
+    }  # fmt: skip
+    units = {name: rows[name]["unit"] for name in (
+        "map.airborne", "merge.min_overlap", "merge.accept_all", "merge.n_candidates", "query.radius_m",
+    )}  # fmt: skip
+    assert units == {
+        "map.airborne": "keep | drop", "merge.min_overlap": "share", "merge.accept_all": "true | false",
+        "merge.n_candidates": "number", "query.radius_m": "m",
+    }  # fmt: skip
+    code, out, _ = command("list", "settings")
+    assert "map.voxel_m = 0.2  [m]\n    cell of the thinned map\n" in out
+    assert max(map(len, out.splitlines())) <= 90
+
+
+@pytest.mark.parametrize(("kind", "names"), [("scenarios", scenario_names), ("plans", plan_names)])
+def test_names_come_with_a_line_each(command: Command, kind: str, names: Callable[[], list[str]]) -> None:
+    code, out, _ = command("list", kind)
+    lines = out.splitlines()
+    assert code == 0
+    assert [line.split()[0] for line in lines] == names()
+    assert all(len(line.split()) > 2 for line in lines)
+    found = json.loads(command("list", kind, "--json")[1])
+    assert [row["name"] for row in found] == names()
+    assert all(row["description"] and "\n" not in row["description"] for row in found)
+
+
+@pytest.mark.parametrize("kind", ["presets", "sensors"])
+def test_presets_and_sensors_are_described(command: Command, kind: str) -> None:
+    rows = json.loads(command("list", kind, "--json")[1])
+    assert all(row["description"] for row in rows)
+    assert rows[0]["name"] == {"presets": "c2c", "sensors": "os0-128-nominal"}[kind]
+
+
+def test_all_names_as_json(command: Command) -> None:
+    found = json.loads(command("list", "--json")[1])
+    assert set(found) == {"scenarios", "props", "plans", "presets", "methods", "metrics", "sensors"}
+    assert found["plans"] == plan_names()
+
+
+def test_check_as_json_tells_what_each_file_is(command: Command) -> None:
+    code, out, err = command("check", "smoke", "smok", "--json")
+    first, second = json.loads(out)
+    assert (code, err.count("\n")) == (2, 1)
+    assert first["file"] == "smoke" and first["is"].startswith("a plan of ") and first["mistakes"] == []
+    assert second["is"] is None and second["mistakes"] == [err.removeprefix("error: ").strip()]
+
+
+def test_doctor_as_json(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [Finding("a", "ok", "1.0", True), Finding("b", "broken", "none", True, "pip install b")]
+    monkeypatch.setattr("eval.cli.doctor.examine", lambda: iter(found))
+    code, out, err = command("doctor", "--json")
+    assert (code, err) == (2, "error: b: none: pip install b\n")
+    assert json.loads(out)[1] == {
+        "what": "b", "state": "broken", "told": "none", "is_required": True, "mend": "pip install b",
+    }  # fmt: skip
+    monkeypatch.setattr("eval.cli.doctor.examine", lambda: iter(found[:1]))
+    assert command("doctor", "--json")[0] == 0
+
+
+def test_a_score_as_json(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("eval.scoring.scoring.score", lambda *_: {"region_recall": 1.0, "t_cd_s": float("nan")})
+    code, out, err = command("score", tmp_path, tmp_path, "--json")
+    assert (code, json.loads(out), err) == (0, {"region_recall": 1.0, "t_cd_s": None}, "")
+
+
+def test_json_holds_nothing_that_a_terminal_obeys(capsys: pytest.CaptureFixture[str]) -> None:
+    echo_json({"a\x1b[2J": ["\x9b", float("inf"), True, Path("x")]})
+    out = capsys.readouterr().out
+    assert "\x1b" not in out and "\x9b" not in out
+    assert json.loads(out) == {"a\x1b[2J": ["\x9b", None, True, "x"]}
+
+
+def test_each_kind_of_names_has_a_title() -> None:
+    assert "settings" not in tools._TITLES
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("moment", ["imports", "command"])
+def test_an_interrupt_is_one_line_from_the_first_moment_on(moment: str) -> None:
+    # the program says on standard output that it got there, and waits
+    program = {
+        "imports": (
+            "import sys, time, types\n"
+            "class Slow:\n"
+            "    def find_spec(self, name, *_):\n"
+            "        if name == 'eval.cli.main':\n"
+            "            print('there', flush=True); time.sleep(30)\n"
+            "sys.meta_path.insert(0, Slow())\n"
+            "from eval.cli.start import main\nmain()\n"
+        ),
+        "command": (
+            "import time, eval.cli.doctor as doctor\n"
+            "doctor.examine = lambda: (print('there', flush=True), time.sleep(30))\n"
+            "from eval.cli.start import main\nmain()\n"
+        ),
+    }[moment]
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, "doctor"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[3],
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert process.stdout.readline() == "there\n"
+    time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=20)
+    assert (process.returncode, err) == (130, "interrupted; nothing was written\n")

@@ -1,0 +1,93 @@
+"""What the page and the view of an answer show, gathered from two sessions."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import invert, transform
+from cdpipe.io.answer import write_answer, write_failure
+from cdpipe.io.readers import open_session
+from cdpipe.model.report import ChangedObject
+from eval.report.answer.content import MAX_POINTS, _thin_session, near_stretches, read_content
+from tests.cdpipe.model.test_sentence import EMPTY
+
+
+def read(pair: Path, folder: Path) -> object:
+    return read_content(pair / "before", pair / "after", folder, lambda *_: None)
+
+
+def test_both_sessions_are_in_the_map_frame(tiny_pair: Path, tiny_merge: np.ndarray, tmp_path: Path) -> None:
+    write_answer(tmp_path / "answer", "mine", replace(EMPTY, before_T_after=tiny_merge))
+    steps: list[tuple[str, int, int]] = []
+    folders = tiny_pair / "before", tiny_pair / "after", tmp_path / "answer"
+    content = read_content(*folders, lambda *step: steps.append(step))
+    # the same way was driven twice: both paths agree, and both maps do but for the changed things
+    np.testing.assert_allclose(content.paths[1], content.paths[0], atol=1e-6)
+    after = open_session(tiny_pair / "after")
+    own = transform(tiny_merge, transform(after.odom_T_sensor[0], after.scan(0).points_sensor))
+    assert np.linalg.norm(content.maps[1][:, None] - own[None, :5], axis=2).min(axis=0).max() < 0.2
+    assert content.report.coverage is not None
+    assert content.report.coverage.unseen_m == 0.0
+    assert content.report.coverage.compared_m == pytest.approx(1.5 * 13)
+    assert [step for step in steps if step[1] == step[2]] == [("points before", 14, 14), ("points after", 14, 14)]
+
+
+def test_large_sessions_are_thinned_until_they_fit(tiny_pair: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = open_session(tiny_pair / "before")
+    every, cell_m = _thin_session(source, "", lambda *_: None)
+    assert (len(every) > 1000, len(every) <= MAX_POINTS, cell_m) == (True, True, 0.1)
+    monkeypatch.setattr("eval.report.answer.content.MAX_POINTS", 300)
+    few, larger_m = _thin_session(source, "", lambda *_: None)
+    assert 100 < len(few) <= 300
+    assert larger_m > 0.1
+    # one point per cell, each a point of the session
+    assert len(np.unique(np.floor(few / larger_m), axis=0)) == len(few)
+
+
+def test_objects_without_map_points_get_those_of_their_returns(
+    tiny_pair: Path, tiny_merge: np.ndarray, tmp_path: Path
+) -> None:
+    after = open_session(tiny_pair / "after")
+    scan = after.scan(3)
+    returns = np.array([[3, pixel] for pixel in scan.pixels[[10, 40]]], dtype=np.int32)
+    item = ChangedObject("after", "added", -1, returns, np.zeros((0, 3)), 1.0)
+    write_answer(tmp_path / "answer", "mine", replace(EMPTY, before_T_after=tiny_merge, objects=(item,)))
+    content = read(tiny_pair, tmp_path / "answer")
+    expected = transform(tiny_merge, transform(scan.odom_T_sensor, scan.points_sensor[[10, 40]]))
+    np.testing.assert_allclose(content.report.objects[0].points_map, expected, atol=1e-9)  # type: ignore[attr-defined]
+
+
+def test_what_is_no_answer_to_the_pair_is_refused(tiny_pair: Path, tmp_path: Path) -> None:
+    write_failure(tmp_path / "failed", "mine", "merge_refused", "too little overlap", {}, {})
+    with pytest.raises(InputError, match=r"gave no answer \(merge refused: too little overlap\)"):
+        read(tiny_pair, tmp_path / "failed")
+    config = {"map": {"keyframe_spacing_m": 1.0}}
+    scans = np.arange(14), np.arange(13)
+    write_answer(tmp_path / "other", "mine", replace(EMPTY, keyframe_scans=scans, config=config))
+    with pytest.raises(InputError, match="13 keyframes up to scan 12, this session 14 up to scan 13"):
+        read(tiny_pair, tmp_path / "other")
+    with pytest.raises(InputError, match="no such folder"):
+        read_content(tiny_pair / "absent", tiny_pair / "after", tmp_path / "other", lambda *_: None)
+
+
+@pytest.mark.parametrize(
+    ("is_near", "compared", "unseen"),
+    [
+        ([1, 1, 1], [(0, 3)], []),
+        ([0, 0, 0], [], [(0, 3)]),
+        ([1, 1, 0, 1, 1], [(0, 2), (3, 5)], [(1, 4)]),
+        ([1], [], []),
+    ],
+)
+def test_stretches_by_hand(is_near: list[int], compared: list[tuple[int, int]], unseen: list[tuple[int, int]]) -> None:
+    mask = np.array(is_near, dtype=bool)
+    for wanted, expected in ((True, compared), (False, unseen)):
+        assert [(each.start, each.stop) for each in near_stretches(mask, wanted=wanted)] == expected
+
+
+def test_the_merge_of_the_fixture_is_the_inverse_of_the_paths(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
+    before, after = (open_session(tiny_pair / name).odom_T_sensor for name in ("before", "after"))
+    np.testing.assert_allclose(before @ invert(after), np.tile(tiny_merge, (14, 1, 1)), atol=1e-6)
