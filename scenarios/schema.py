@@ -752,9 +752,13 @@ class Scenario(Lean):
             return given
         return {**given, **{name: _fill_in(given, given[name]) for name in ("before", "after") if name in given}}
 
+    def plan(self, session: str) -> SessionPlan:
+        """Return the drive of one session."""
+        return self.after if session == "after" else self.before
+
     def of(self, session: str) -> Scenario:
         """Return the scenario as one session has it: with the sensor and the platform of this session."""
-        plan: SessionPlan = getattr(self, session)
+        plan = self.plan(session)
         own = {"sensor": plan.sensor or self.sensor, "platform": plan.platform or self.platform}
         return self if plan.sensor is None and plan.platform is None else self.model_copy(update=own)
 

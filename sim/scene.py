@@ -40,7 +40,8 @@ from sim.rock.tunnel import mesh_tunnel
 
 WALL = "wall"
 WALL_GEOM = 0
-_HEAP_M = 0.15  # rubble higher than this is driven round
+Heaps = tuple[tuple[str, Float64Array], ...]
+HEAP_M = 0.15  # rubble higher than this is driven round
 _STONE_FREE_M = 0.1  # round the footprint of every prop
 
 
@@ -78,7 +79,7 @@ class World:
         before, after: The two scenes.
         displacement: The walls of both sessions where rock changes; None where it does not.
         changed: Drifts, tunnel, obstacles and furniture as they are in the after session where rock changes, in the
-            order centreline, walls, fixed, fixtures.
+            order centreline, walls, fixed, fixtures, heaps.
         heaps: Name and places (N, 3) of the rubble of this session that a robot drives round.
     """
 
@@ -90,16 +91,42 @@ class World:
     before: Scene
     after: Scene
     displacement: Displacement | None = None
-    changed: tuple[Centreline, Caster, Caster, tuple[Fixture, ...]] | None = None
-    heaps: tuple[tuple[str, Float64Array], ...] = ()
+    changed: tuple[Centreline, Caster, Caster, tuple[Fixture, ...], Heaps] | None = None
+    heaps: Heaps = ()
 
     def of(self, session: str) -> World:
         """Return the world as a session meets it: its floor, its rock, its furniture."""
-        if session == "before" or self.changed is None or self.displacement is None:
+        if session != "after" or self.changed is None:
             return self
-        centreline, walls, fixed, fixtures = self.changed
-        heaps = tuple(rubble_points(self.displacement, _HEAP_M))
+        centreline, walls, fixed, fixtures, heaps = self.changed
         return replace(self, centreline=centreline, walls=walls, fixed=fixed, fixtures=fixtures, heaps=heaps)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """A scenario built, but for the two scenes: rock, furniture, stones, and the props at all of their places.
+
+    Attributes:
+        centreline: The drifts.
+        walls: Ray caster of the bare tunnel before any rock changes.
+        fixed: Ray caster of the same tunnel with furniture and stones.
+        fixtures: Furniture and stones.
+        standing: Every prop at each of its places, settled on the floor before any rock changes.
+        rock: The wall and the fixtures after compilation, in this order.
+        around: What the props were placed in: rock and furniture without stones.
+        displacement: The walls of both sessions; None where no rock changes.
+        after: Centreline and bare tunnel of the after session where rock changes.
+    """
+
+    centreline: Centreline
+    walls: Caster
+    fixed: Caster
+    fixtures: tuple[Fixture, ...]
+    standing: tuple[Standing, ...]
+    rock: tuple[Mesh, ...]
+    around: Surroundings
+    displacement: Displacement | None = None
+    after: tuple[Centreline, Caster] | None = None
 
 
 def build_world(scenario: Scenario, seed: int) -> World:
@@ -107,6 +134,30 @@ def build_world(scenario: Scenario, seed: int) -> World:
 
     Raises:
         ScenarioError: The tunnel cannot be meshed, or a prop does not fit, does not come to rest or falls away.
+    """
+    ground = lay_ground(scenario, seed)
+    standing, displacement = list(ground.standing), ground.displacement
+    changed, rock_after = None, ground.rock
+    if displacement is not None and ground.after is not None:
+        level, bare_after = ground.after
+        standing = carry(standing, displacement)
+        fixed_after, fixtures_after = follow_rock(displacement, bare_after, ground.fixtures)
+        heaps = tuple(rubble_points(displacement, HEAP_M))
+        changed = level, bare_after, fixed_after, fixtures_after, heaps
+        rock_after = compile_moved(ground, displacement.walls.mesh("after"), fixtures_after)
+    before, after = (
+        compile_scene(scenario, own, ground.fixtures, standing, session)
+        for own, session in ((ground.rock, "before"), (rock_after, "after"))
+    )
+    told = ground.centreline, ground.walls, ground.fixed, ground.fixtures, tuple(standing), before, after
+    return World(*told, displacement, changed)
+
+
+def lay_ground(scenario: Scenario, seed: int) -> Ground:
+    """Mesh the tunnel, furnish it and set the props down.
+
+    Raises:
+        ScenarioError: As `build_world`.
     """
     tunnel = scenario.tunnel
     centreline = build_centreline(tunnel, seed)
@@ -124,14 +175,11 @@ def build_world(scenario: Scenario, seed: int) -> World:
     rock = [compile_mesh(mesh) for mesh in (wall, *(fixture.mesh for fixture in furniture))]
     hung = Caster([wall, *(fixture.mesh for fixture in furniture)]) if furniture else walls
     gap_m = WALL_GAP_M + (tunnel.resolution_m if tunnel.mesh is None else 0.0)
-    around, outlines = Surroundings(walls, hung, gap_m), []
+    around, outlines, after = Surroundings(walls, hung, gap_m), [], None
     if displacement is not None:
-        level, bare_after = (
-            raise_centreline(centreline, walls, displacement),
-            Caster([displacement.walls.mesh("after")]),
-        )
-        hung_after, _ = _follow_rock(displacement, bare_after, furniture)
-        around = replace(around, barred=barred_places(displacement), after=(level, hung_after))
+        after = raise_centreline(centreline, walls, displacement), Caster([displacement.walls.mesh("after")])
+        hung_after, _ = follow_rock(displacement, after[1], furniture)
+        around = replace(around, barred=barred_places(displacement), after=(after[0], hung_after))
         outlines = covered_outlines(displacement)
     standing = place_props(scenario, centreline, around, seed)
     outlines += [grow_rectangle(standing_corners(item), _STONE_FREE_M) for item in standing]
@@ -142,27 +190,22 @@ def build_world(scenario: Scenario, seed: int) -> World:
         fixtures = (*furniture, stones)
         rock.append(compile_mesh(stones.mesh))
         fixed = Caster([wall, *(fixture.mesh for fixture in fixtures)])
-    changed, rock_after = None, rock
-    if displacement is not None:
-        standing = carry(standing, displacement)
-        changed = level, bare_after, *_follow_rock(displacement, bare_after, fixtures)
-        pairs = zip(fixtures, changed[3], rock[1:], strict=True)
-        rock_after = [compile_mesh(displacement.walls.mesh("after"))]
-        rock_after += [own if old is new else compile_mesh(new.mesh) for old, new, own in pairs]
-    before, after = (
-        compile_scene(scenario, own, fixtures, standing, session)
-        for own, session in ((rock, "before"), (rock_after, "after"))
-    )
-    return World(centreline, walls, fixed, fixtures, tuple(standing), before, after, displacement, changed)
+    return Ground(centreline, walls, fixed, fixtures, tuple(standing), tuple(rock), around, displacement, after)
 
 
-def _follow_rock(
+def follow_rock(
     displacement: Displacement, bare_after: Caster, fixtures: tuple[Fixture, ...]
 ) -> tuple[Caster, tuple[Fixture, ...]]:
     """Return obstacles and furniture as they are in the after session, given its bare tunnel."""
     moved = follow(fixtures, displacement)
     wall = displacement.walls.mesh("after")
     return (Caster([wall, *(fixture.mesh for fixture in moved)]) if moved else bare_after), moved
+
+
+def compile_moved(ground: Ground, wall: Mesh, fixtures: Sequence[Fixture]) -> tuple[Mesh, ...]:
+    """Compile a wall and the fixtures that followed it; a fixture that nothing moved is compiled already."""
+    pairs = zip(ground.fixtures, fixtures, ground.rock[1:], strict=True)
+    return (compile_mesh(wall), *(own if old is new else compile_mesh(new.mesh) for old, new, own in pairs))
 
 
 def compile_scene(

@@ -1,7 +1,14 @@
-"""A merge that the user knows: the transform of the after session's odom frame into the before session's."""
+"""A merge that is known: the transform of the after session's odom frame into the before session's.
+
+One file holds one transform, or JSON with one transform for the whole path and one at each of some anchors along it:
+
+    {"format": "tunnelcd-merge", "format_version": 1, "source": "truth",
+     "before_T_after": [[...], ...], "anchors_odom": [[x, y, z], ...], "before_T_after_at_anchors": [[[...], ...], ...]}
+"""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +17,7 @@ import numpy as np
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import parse_json, read_bytes
 from cdpipe.core.geometry import Float64Array, make_pose
+from cdpipe.model.alignment import PathAlignment
 
 _EXPECTED = "expected a 4x4 rigid transform, four lines of four numbers or JSON"
 _MOST_BYTES = 100_000_000  # an answer.json is one, too
@@ -28,6 +36,41 @@ def read_known_merge(path: Path) -> Float64Array:
         return require_rigid(_parse(content))
     except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{path}: {error}: {_EXPECTED}") from error
+
+
+def read_alignment(path: Path) -> PathAlignment:
+    """Read a merge along the path, as `write_alignment` writes it; a file of one transform gives a rigid one.
+
+    Raises:
+        InputError: The file is missing, or holds no rigid transforms.
+    """
+    content = read_bytes(path, _MOST_BYTES, _EXPECTED)
+    try:
+        document = _parse_document(content)
+        if not isinstance(document, dict) or "anchors_odom" not in document:
+            return PathAlignment.rigid(require_rigid(_parse(content)))
+        anchors = np.asarray(document["anchors_odom"], dtype=np.float64)
+        if not np.isfinite(anchors).all():
+            raise ValueError("anchors_odom is not finite")
+        poses = np.asarray(document.get("before_T_after_at_anchors"), dtype=np.float64)
+        return PathAlignment(anchors, poses)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise InputError(f"{path}: {error}: {_EXPECTED}") from error
+
+
+def write_alignment(path: Path, before_T_after: Float64Array, along: PathAlignment, source: str) -> None:
+    """Write a merge along the path as JSON that `read_alignment` and `read_known_merge` read.
+
+    Args:
+        path: The file.
+        before_T_after: (4, 4) transform for the whole path.
+        along: The transforms along the path.
+        source: What made the merge.
+    """
+    document = {"format": "tunnelcd-merge", "format_version": 1, "source": source}
+    document |= {"before_T_after": before_T_after.tolist(), "anchors_odom": along.anchors_odom.tolist()}
+    document |= {"before_T_after_at_anchors": along.before_T_after.tolist()}
+    path.write_text(json.dumps(document))
 
 
 def require_rigid(matrix: Any) -> Float64Array:
@@ -50,8 +93,12 @@ def require_rigid(matrix: Any) -> Float64Array:
 
 
 def _parse(content: bytes) -> Any:
+    value = _parse_document(content)
+    return value.get("before_T_after") if isinstance(value, dict) else value
+
+
+def _parse_document(content: bytes) -> Any:
     text = content.decode()
     if text.lstrip()[:1] in ("[", "{"):
-        value = parse_json(content)
-        return value.get("before_T_after") if isinstance(value, dict) else value
+        return parse_json(content)
     return [[float(word) for word in line.split()] for line in text.splitlines() if line.strip()]

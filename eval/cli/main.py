@@ -15,8 +15,10 @@ from typer.core import TyperGroup
 
 from cdpipe.core.threads import fix_threads
 from eval.cli import converting, tracing
+from eval.cli import leaderboard as commands_leaderboard
 from eval.cli import pair as commands_pair
 from eval.cli import run as commands_run
+from eval.cli import stories as commands_stories
 from eval.cli import tools as commands_tools
 from eval.cli import training as commands_training
 from eval.cli import world as commands_world
@@ -45,7 +47,10 @@ class _Funnel(TyperGroup):
             raise typer.Exit(130) from error
 
 
-_KEPT = {"run": "cells", "demo": "cells", "dataset": "tunnels", "export": "pairs"}
+_KEPT = {
+    "run": "cells", "demo": "cells", "dataset": "tunnels", "export": "pairs", "story": "comparisons",
+    "evaluate": "pairs",
+}  # fmt: skip
 app = typer.Typer(
     cls=_Funnel,
     no_args_is_help=True,
@@ -73,15 +78,20 @@ def options(
 _COMMANDS: dict[str, Callable[..., None]] = {
     "demo": commands_run.demo,
     "simulate": commands_world.simulate,
+    "pair": commands_stories.pair,
     "survey": commands_world.survey,
     "view": commands_world.view,
     "describe": commands_pair.describe,
     "detect": commands_pair.detect,
+    "story": commands_stories.story_command,
     "convert": converting.convert,
     "trace": tracing.trace,
     "score": commands_run.score,
     "run": commands_run.run_command,
     "export": commands_run.export,
+    "evaluate": commands_leaderboard.evaluate,
+    "submit": commands_leaderboard.submit,
+    "leaderboard": commands_leaderboard.leaderboard,
     "report": commands_run.report,
     "dataset": commands_training.dataset,
     "train": commands_training.train,

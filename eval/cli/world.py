@@ -22,6 +22,9 @@ def simulate(
     scenario: Annotated[str, typer.Argument(help="name from `list`, or a .yaml file")],
     out: OutFolder,
     seed: Annotated[int, typer.Option(min=0, help="seed of every distribution and of all noise")] = 0,
+    sessions: Annotated[
+        int, typer.Option(min=2, max=12, help="3 to 12: a story, DIR/session-01 ..., of which `pair` takes any two")
+    ] = 2,
     settings: SetSettings = None,
     quiet: Quiet = False,
 ) -> None:
@@ -29,11 +32,16 @@ def simulate(
     from eval.core.output import new_folder
     from scenarios import load_scenario
     from sim.session.simulate import simulate_pair
+    from sim.story import simulate_story
 
     drawn = load_scenario(scenario, seed, settings or ())
     with new_folder(out) as partial, shown_progress(quiet) as progress:
-        simulate_pair(drawn, seed, partial, on_progress=progress.stage)
-    say(quiet, f"{out}: before, after, truth of {scenario}, seed {seed}")
+        if sessions == 2:
+            simulate_pair(drawn, seed, partial, on_progress=progress.stage)
+        else:
+            simulate_story(drawn, seed, sessions, partial, on_progress=progress.stage)
+    told = "before, after, truth" if sessions == 2 else f"{sessions} sessions and story.json"
+    say(quiet, f"{out}: {told} of {scenario}, seed {seed}")
 
 
 def survey(

@@ -89,6 +89,11 @@ def echo_wrapped(text: str, columns: int) -> None:
         typer.echo(line)
 
 
+def count_pairs(n: int) -> str:
+    """Return a number of pairs in words: "1 pair", "2 pairs"."""
+    return "1 pair" if n == 1 else f"{n} pairs"
+
+
 def say(quiet: bool, text: str) -> None:
     """Print a line, unless --quiet."""
     if not quiet:

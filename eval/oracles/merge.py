@@ -13,7 +13,7 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import Float64Array, invert, stream
+from cdpipe.core.geometry import Float64Array, Int64Array, invert, stream
 from cdpipe.core.yamlfile import Settings
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.types import MappedSession, MergedMaps
@@ -60,30 +60,50 @@ def merged_by_truth(
         `before_T_after`. An after keyframe is paired if a before keyframe lies within 5 m; others take the alignment
         of the nearest paired keyframe. The merge is refused where no keyframe is paired.
     """
-    scans_i, scans_j = before.descriptors.keyframe_scans, after.descriptors.keyframe_scans
-    world_T_i, world_T_j = truth[0].world_T_sensor[scans_i], truth[1].world_T_sensor[scans_j]
+    scans = before.descriptors.keyframe_scans, after.descriptors.keyframe_scans
+    poses = before.map.odom_T_sensor, after.map.odom_T_sensor
     evidence = {"n_hypotheses": 0.0}
+    found = align_by_truth(truth, poses, scans, noise, seed)
+    if found is None:
+        reason = f"by the truth no after keyframe has a before keyframe within {PAIR_RADIUS_M:g} m"
+        return MergedMaps(before.map, after.map, np.eye(4), evidence, False, reason, None, NO_SECONDS)
+    before_T_after, local = found
+    return MergedMaps(before.map, after.map, before_T_after, evidence, True, local=local, seconds=NO_SECONDS)
+
+
+def align_by_truth(
+    truth: tuple[SessionTruth, SessionTruth],
+    odom_T_sensor: tuple[Float64Array, Float64Array],
+    scans: tuple[Int64Array, Int64Array],
+    noise: OracleMerge,
+    seed: int,
+) -> tuple[Float64Array, PathAlignment] | None:
+    """Return the true alignment of two sessions, plus an error; None where no two of the scans are near each other.
+
+    Args:
+        truth: Of the before and the after session.
+        odom_T_sensor: (S, 4, 4) poses of every scan of either session, in the frame that is aligned.
+        scans: (K,) scans of either session that are paired.
+        noise: As in `merged_by_truth`.
+        seed: Seed of the pair.
+
+    Returns:
+        (4, 4) before_T_after of the middle paired scan, and the alignment along the path.
+    """
+    scans_i, scans_j = scans
+    world_T_i, world_T_j = truth[0].world_T_sensor[scans_i], truth[1].world_T_sensor[scans_j]
     distance_m, nearest = (np.asarray(found) for found in cKDTree(world_T_i[:, :3, 3]).query(world_T_j[:, :3, 3]))
     paired = np.flatnonzero(distance_m <= PAIR_RADIUS_M)
     if len(paired) == 0:
-        reason = f"by the truth no after keyframe has a before keyframe within {PAIR_RADIUS_M:g} m"
-        return MergedMaps(before.map, after.map, np.eye(4), evidence, False, reason, None, NO_SECONDS)
+        return None
     i = nearest[paired]
-    odom_T_i, odom_T_j = before.map.odom_T_sensor[scans_i[i]], after.map.odom_T_sensor[scans_j]
+    odom_T_i, odom_T_j = odom_T_sensor[0][scans_i[i]], odom_T_sensor[1][scans_j]
     map_T_j = odom_T_i @ invert(world_T_i[i]) @ world_T_j[paired]
     of_paired = _displaced(map_T_j, noise, seed) @ invert(odom_T_j[paired])
     _, taken = cKDTree(world_T_j[paired, :3, 3]).query(world_T_j[:, :3, 3])
     before_T_after = of_paired[np.asarray(taken)]
     before_T_after[paired] = of_paired  # of two keyframes at one place each keeps its own
-    return MergedMaps(
-        before.map,
-        after.map,
-        before_T_after[paired[len(paired) // 2]],
-        evidence,
-        True,
-        local=PathAlignment(odom_T_j[:, :3, 3], before_T_after),
-        seconds=NO_SECONDS,
-    )
+    return before_T_after[paired[len(paired) // 2]], PathAlignment(odom_T_j[:, :3, 3], before_T_after)
 
 
 def _displaced(map_T_j: Float64Array, noise: OracleMerge, seed: int) -> Float64Array:

@@ -14,7 +14,10 @@ from cdpipe.core.names import visible
 from eval.core.figures import compress_address
 from eval.core.output import whole_file
 
-_FILES = ("page.html", "comparison.html", "answer.html", "parts.html", "page.css", "charts.js", "answer.js")
+_FILES = (
+    "page.html", "comparison.html", "answer.html", "story.html", "leaderboard.html", "parts.html", "page.css",
+    "charts.js", "answer.js", "sort.js",
+)  # fmt: skip
 
 
 def render_page(template: str, content: Mapping[str, Any]) -> str:

@@ -141,7 +141,7 @@ class PairRun:
         """Run a cell and write its answer and its file; a failure leaves nothing behind."""
         opened, cell = self.open(), each.cell
         if isinstance(opened, str):
-            self._finish(each, _unmade(self._pair, "failed", opened))
+            self._finish(each, score_unmade(self._pair, "failed", opened))
             return
         stages, truth = opened
         folder = self._run.answer(self._pair.name, self._pair.seed, cell.variant)
@@ -159,7 +159,7 @@ class PairRun:
         status, folder = "worker_died", self._run.answer(self._pair.name, self._pair.seed, each.cell.variant)
         path = self._run.pair(self._pair.name, self._pair.seed)
         if not path.exists():
-            self._finish(each, _unmade(self._pair, status, error))
+            self._finish(each, score_unmade(self._pair, status, error))
             return
         settings = each.cell.config.model_dump(mode="json")
         remove(folder)  # left by the process that died
@@ -299,8 +299,8 @@ def _answer(stages: PairStages, cell: Cell, truth: GroundTruth, folder: Path) ->
         write_answer(folder, cell.variant, report, cell.until)
 
 
-def _unmade(pair: Pair, status: str, error: str) -> CaseScore:
-    """Score a case without a world: there is no truth, so every score is undefined."""
+def score_unmade(pair: Pair, status: str, error: str) -> CaseScore:
+    """Return the scores of a case without a world: there is no truth, so every score is undefined."""
     row = {"scenario": "", "family": pair.family, "pair_kind": "", "seed": pair.seed, "variant": "", "preset": ""}
     outcome = {"status": status, "error": error, "metrics_version": METRICS_VERSION}
     drawn = {} if pair.scenario is None else pair.scenario.model_dump(mode="json")

@@ -52,8 +52,8 @@ def add_predictions(run: RunFolder, folder: Path, name: str, progress: RunProgre
     """
     progress = progress or Silent()
     found = _matched(run, folder, list_pairs(run))
-    _require_free(run, name)
-    _require_current(run)
+    require_free_name(run, name)
+    require_current_scores(run)
     documents: dict[Path, dict[str, Any]] = {}
     mistakes: list[str] = []
     for pair, prediction in found.items():
@@ -99,8 +99,8 @@ def evaluate(predict: Callable[[Path, Path], object], run: Path | str, name: str
             written to the run then.
     """
     folder = open_run_folder(Path(run))
-    _require_free(folder, name)
-    _require_current(folder)
+    require_free_name(folder, name)
+    require_current_scores(folder)
     with TemporaryDirectory(prefix="tunnelcd-") as place:
         pair, answer, answers = (Path(place) / part for part in ("pair", "answer", "answers"))
         for original in list_pairs_blindly(folder):
@@ -175,8 +175,12 @@ def _matched(run: RunFolder, folder: Path, pairs: Sequence[Path]) -> dict[Path, 
     return found
 
 
-def _require_free(run: RunFolder, name: str) -> None:
-    """Refuse the name of a variant of the run, of a preset or of an oracle, and one that would share its folder."""
+def require_free_name(run: RunFolder, name: str) -> None:
+    """Refuse the name of a variant of the run, of a preset or of an oracle, and one that would share its folder.
+
+    Raises:
+        InputError: It is one of them, or no table can hold it.
+    """
     try:
         require_table_name(name)
     except ValueError as error:
@@ -203,8 +207,12 @@ def _find_unscored(run: RunFolder, identity: Mapping[str, Any], prediction: Path
     return [f"{answer}: holds an answer that is not scored: `tunnelcd score {run.path}` takes it in, or remove it"]
 
 
-def _require_current(run: RunFolder) -> None:
-    """Refuse a run that was scored by another metrics version."""
+def require_current_scores(run: RunFolder) -> None:
+    """Refuse a run that was scored by another metrics version.
+
+    Raises:
+        InputError: It was.
+    """
     others = list_versions(cell["row"] for cell in run.finished_cells()) - {str(METRICS_VERSION)}
     if others:
         told = " and ".join(sorted(others))

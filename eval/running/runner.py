@@ -29,6 +29,8 @@ from eval.plans.worlds import world_slug
 from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Todo, Tools, cell_key, is_finished, pair_lock
 from eval.running.run_workers import remove_traces, run_on_workers
 from eval.running.runfolder import RunFolder, current_results, write_json, write_tables
+from eval.running.stages import PairStages
+from eval.truth.ground_truth import GroundTruth
 from scenarios.references import file_digests
 from sim.session.truth import read_pair_truth
 
@@ -119,6 +121,34 @@ def list_cells(plan: Plan, path: Path, *, force: bool = False, limit: int | None
     pairs = _pairs(run, plan, all_cells, force, TOOLS)
     todo, chosen = ({each.cell for pair in some for each in pair.todo} for some in (pairs, _limited(pairs, limit)))
     return [(cell, "to do" if cell in chosen else "left" if cell in todo else "finished") for cell in all_cells]
+
+
+def list_plan_pairs(plan: Plan, run: RunFolder, tools: Tools = TOOLS) -> list[Pair]:
+    """Return the pairs of a plan without cells to run, for methods that are not the plan's own.
+
+    Raises:
+        InputError: A setting of the plan is wrong, or the folder holds another world or cells of another split.
+    """
+    _require_one_split(run, plan)
+    return [replace(pair, todo=()) for pair in _pairs(run, plan, expand_cells(plan), False, tools)]
+
+
+def open_pair(
+    run: RunFolder, pair: Pair, progress: RunProgress, tools: Tools = TOOLS
+) -> tuple[PairStages, GroundTruth] | str:
+    """Simulate a pair unless it exists and open it; a text says why it cannot be made. The caller holds its lock."""
+    if not _is_simulated(run.pair(pair.name, pair.seed), pair):
+        remove(run.pair(pair.name, pair.seed))
+        remove(run.maps(pair.name, pair.seed))
+    return PairRun(run, pair, Made(None), progress, tools).open()
+
+
+def start_provenance(plan: Plan, run: RunFolder, command: Sequence[str], tools: Tools = TOOLS) -> None:
+    """Write the provenance of a run folder that has none, as of a plan without methods; one that is there stays."""
+    if not run.stored_provenance():
+        told = dict(_provenance(plan, [], command, tools))
+        told["plan"] = {**told["plan"], "variants": [], "grid": []}
+        write_json(run.path / "provenance.json", {**told, "finished": tools.now()})
 
 
 def _run_here(run: RunFolder, pairs: Sequence[Pair], made: Made, progress: RunProgress, tools: Tools) -> None:

@@ -188,10 +188,15 @@ def cautions(a: Side, b: Side) -> list[str]:
 
 def other_worlds(a: Side, b: Side) -> list[str]:
     """Return the shared pairs with another number of changes or length of path: the seed drew another world."""
+    return find_other_worlds(a.results, b.results)
+
+
+def find_other_worlds(a: pd.DataFrame, b: pd.DataFrame) -> list[str]:
+    """Return the pairs that rows of results.csv share, with another number of changes or length of path."""
     found = []
-    worlds = [side.results.groupby(PAIR) for side in (a, b)]
+    worlds = [results.groupby(PAIR) for results in (a, b)]
     for key in ("n_changes", "n_observable", "after_path_m"):
-        if key not in a.results or key not in b.results:
+        if key not in a or key not in b:
             continue
         first, second = (pd.to_numeric(group[key].first(), errors="coerce").astype(float) for group in worlds)
         first, second = first.align(second, join="inner")

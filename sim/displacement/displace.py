@@ -38,6 +38,7 @@ class Patch:
         kind: What it is.
         partner: Number of the rubble of a scar, and of the scar of rubble.
         zone: Where it is.
+        is_undone: Whether the before session is the later state: what came is gone, and what fell is there.
     """
 
     number: int
@@ -45,6 +46,7 @@ class Patch:
     kind: PatchKind
     partner: int | None
     zone: Zone
+    is_undone: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -65,7 +65,7 @@ def plan_path(world: World, scenario: Scenario, seed: int, session: str, is_wary
     Raises:
         ScenarioError: The route turns back on itself, nothing is left of it, or the walls and props leave no room.
     """
-    plan: SessionPlan = getattr(scenario, session)
+    plan = scenario.plan(session)
     line, width_m = _reference_line(world, plan, session)
     offset_m = _plan_offsets(world, scenario, seed, session, line, width_m, is_wary)
     left = left_of(headings_of(line))
@@ -122,7 +122,7 @@ def _plan_offsets(
     world: World, scenario: Scenario, seed: int, session: str, line: Float64Array, width_m: Float64Array, is_wary: bool
 ) -> Float64Array:
     """Return the sideways offset (N,) from the reference line, positive to the left."""
-    plan: SessionPlan = getattr(scenario, session)
+    plan = scenario.plan(session)
     heights_m = _heights_m(scenario, plan, is_wary)
     clearance_m = scenario.platform.clearance_m
     headings = headings_of(line)

@@ -47,7 +47,7 @@ def ride(path: Path, floor: Caster, standing: Caster, scenario: Scenario, seed: 
     Raises:
         ScenarioError: A quadrotor finds too little room between floor and roof.
     """
-    platform, plan = scenario.platform, getattr(scenario, session)
+    platform, plan = scenario.platform, scenario.plan(session)
     height_m = plan.height_m or platform.sensor_height_m
     speed_mps = plan.speed_mps or platform.speed_mps
     time_s = integrate_time(path.distance_m, speed_mps, platform.speed_variation, seed, session)

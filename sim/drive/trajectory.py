@@ -11,7 +11,7 @@ from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
 from cdpipe.core.motion import Motion, rotation_matrices
 from cdpipe.sensor.ouster import SensorMetadata, load_profile
-from scenarios.schema import Platform, Scenario, SessionPlan
+from scenarios.schema import Platform, Scenario
 from sim.drive.obstacles import check_clearance
 from sim.drive.odometry import drift_motion, read_odometry, walk_motion
 from sim.drive.path import plan_path
@@ -119,8 +119,8 @@ def plan_trajectory(world: World, scenario: Scenario, sensor: SensorMetadata, se
         ScenarioError: The route leaves no room, the trajectory leaves the tunnel, or revolutions are too far apart.
     """
     scenario, world = scenario.of(session), world.of(session)
-    plan: SessionPlan = getattr(scenario, session)
-    scene = world.before if session == "before" else world.after
+    plan = scenario.plan(session)
+    scene = world.after if session == "after" else world.before
     if plan.trajectory is not None:
         true, lines = read_drive(Path(plan.trajectory))
         check_inside(true, scene.caster, f"{session}: {plan.trajectory}", lines)
@@ -154,7 +154,7 @@ def record(true: Motion, scenario: Scenario, sensor: SensorMetadata, seed: int, 
         InputError: The odometry file cannot be read, or does not cover the drive.
         ScenarioError: The drive is shorter than a revolution, or `scan_spacing_m` asks for more revolutions than turn.
     """
-    plan: SessionPlan = getattr(scenario, session)
+    plan = scenario.plan(session)
     revolution_s = recorded(true, scenario.platform, sensor.rate_hz, session)
     column_s: Float64Array = np.arange(sensor.width, dtype=np.float64) - sensor.width // 2
     column_s /= sensor.rate_hz * sensor.width

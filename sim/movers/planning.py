@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TypeVar
 
 import numpy as np
 
@@ -21,8 +21,7 @@ from sim.placement.placing import grow_rectangle, rectangles_overlap, standing_b
 from sim.placement.stations import Stations, draw_areas, way
 from sim.scene import World
 
-SessionName = Literal["before", "after"]
-SESSIONS: tuple[SessionName, ...] = ("before", "after")
+Name = TypeVar("Name", bound=str)  # of a session
 _TRIES = 80  # places that the seed draws, as for a prop
 _SHORTER = (1.0, 0.5, 0.25, 0.1)  # shares of its length that a drawn stretch has, each for so many places
 _STARTS = 8  # times at which it may start, at each place
@@ -41,14 +40,14 @@ class _Site:
 
     world: World
     scenario: Scenario
-    session: SessionName
+    session: str
     robot_s: Float64Array
     robot: Float64Array  # (N, 3) sensor at these times (N,)
 
 
 def plan_movers(
-    world: World, scenario: Scenario, robots: Mapping[SessionName, Motion], seed: int
-) -> dict[SessionName, tuple[MovingBody, ...]]:
+    world: World, scenario: Scenario, robots: Mapping[Name, Motion], seed: int
+) -> dict[Name, tuple[MovingBody, ...]]:
     """Return the movers of each session, in the scenario's order, each with its course.
 
     The seed draws what a mover leaves open: its stretch, its place across the drift, and when it starts. It draws again
@@ -66,16 +65,16 @@ def plan_movers(
         ScenarioError: A mover finds no way.
     """
     sites = [_watch(world, scenario, session, robot) for session, robot in robots.items()] if scenario.movers else []
-    planned: dict[SessionName, list[MovingBody]] = {session: [] for session in robots}
+    planned: dict[str, list[MovingBody]] = {session: [] for session in robots}
     for number, mover in enumerate(scenario.movers, start=len(scenario.props) + 1):
         here = [site for site in sites if mover.sessions in ("both", site.session)]
         for together in [here] if mover.kind == "curtain" and here else [[site] for site in here]:
             for site, body in zip(together, _plan(mover, number, together, seed), strict=True):
                 planned[site.session].append(body)
-    return {session: tuple(bodies) for session, bodies in planned.items()}
+    return {session: tuple(planned[session]) for session in robots}
 
 
-def _watch(world: World, scenario: Scenario, session: SessionName, robot: Motion) -> _Site:
+def _watch(world: World, scenario: Scenario, session: str, robot: Motion) -> _Site:
     time_s = np.arange(robot.time_s[0], robot.time_s[-1] + _WATCH_S, _WATCH_S)
     return _Site(world.of(session), scenario.of(session), session, time_s, robot.sample(time_s)[0])
 
@@ -92,11 +91,11 @@ def _plan(mover: Mover, instance: int, sites: Sequence[_Site], seed: int) -> lis
     refusal = "there is no stretch to be on"
     for stand in _draw_stands(mover, sites[0], seed, generator):
         lateral = float(generator.uniform(-1.0, 1.0)) if mover.path.lateral is None else mover.path.lateral
-        starts = generator.random((len(SESSIONS), _STARTS))
+        starts = generator.random((2, _STARTS))
         facing = float(generator.uniform(-np.pi, np.pi))
         try:
             body = MovingBody(mover, instance, *_settle(mover, figure, stand, lateral, facing, sites[0]))
-            return [_fit(body, starts[SESSIONS.index(site.session)], site) for site in sites]
+            return [_fit(body, starts[int(site.session == "after")], site) for site in sites]
         except ScenarioError as error:
             refusal = str(error)
     raise ScenarioError(

@@ -144,7 +144,7 @@ def list_changes(scenario: Scenario, world: World) -> list[Tally]:
             tallies.extend(_tally(len(tallies) + 1, instance, item, world, "full", None) for item in items)
             continue
         start, end = items
-        is_carried = end.is_carried and prop.change == "none"
+        is_carried = (start.is_carried or end.is_carried) and prop.change == "none"
         if prop.aged is not None or is_carried or _is_same(start, end):
             continue
         if prop.loaded_share is not None:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array, Int64Array
 from cdpipe.sensor.ouster import SensorMetadata
-from scenarios.schema import Air, Scenario, SessionPlan
+from scenarios.schema import Air, Scenario
 from sim.drive.trajectory import Trajectory
 from sim.movers.casting import MovingScene
 from sim.movers.trails import raise_dust
@@ -64,6 +64,7 @@ class Drive:
     """Everything that stays the same while one session is simulated.
 
     Attributes:
+        name: Its part in the pair.
         labels: `instance` of each geom, int16; entries -5 to -1 at the end serve the geom numbers -5 to -1.
         owners: (G,) int32 `instance` of the geoms of props of which this session holds a change, 0 for all others.
         moving: The scene with the session's movers, whose geoms come last in `labels` and `owners`.
@@ -72,6 +73,7 @@ class Drive:
         panes: The session's panes of glass; None where glass is a wall.
         rock: The session's walls where rock changes; None where it does not.
         surface_changes: The changes of the pair's walls.
+        own_name: The session's own name where it is one of a longer story, whatever its part in the pair.
     """
 
     name: SessionName
@@ -89,6 +91,12 @@ class Drive:
     panes: Panes | None = None
     rock: MovedRock | None = None
     surface_changes: tuple[SurfaceChangeTruth, ...] = ()
+    own_name: str = ""
+
+    @property
+    def session(self) -> str:
+        """The name under which the session draws its noise and tells its progress."""
+        return self.own_name or self.name
 
 
 def simulate_revolution(drive: Drive, number: int) -> Revolution:
@@ -129,20 +137,20 @@ def cast_revolution(drive: Drive, number: int) -> tuple[Rays, Scan]:
     rays = revolution_rays(drive.sensor, world_T_column)
     settings, air = drive.scenario.sensor, find_air(drive, number)
     surfaces = drive.moving.pose(drive.trajectory.revolution_s[number] + drive.trajectory.column_s)
-    told = drive.seed, drive.name, number, drive.owners, air, drive.water, drive.panes
+    told = drive.seed, drive.session, number, drive.owners, air, drive.water, drive.panes
     return rays, scan(surfaces, drive.sensor, settings, rays, *told)
 
 
 def find_air(drive: Drive, number: int) -> AirVolume | None:
     """Return the mist and dust around the sensor during a revolution; None where the air is clear."""
-    plan: SessionPlan = getattr(drive.scenario, drive.name)
+    plan = drive.scenario.plan(drive.session)
     time_s = drive.trajectory.revolution_s[number : number + 1]
     puffs = raise_dust(drive.moving.movers, float(time_s[0]))
     if plan.air is None and puffs is None:
         return None
     position_m = drive.trajectory.true.sample(time_s)[0][0]
     floor_z_m = position_m[2] - (plan.height_m or drive.scenario.platform.sensor_height_m)
-    told = position_m, float(floor_z_m), float(time_s[0]), drive.seed, drive.name, puffs
+    told = position_m, float(floor_z_m), float(time_s[0]), drive.seed, drive.session, puffs
     return air_around(plan.air or Air(), *told)
 
 

@@ -22,30 +22,18 @@ from cdpipe.core.plugins import extra_version, require_extra
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.core.yamlfile import setting_lines
 from cdpipe.io.session import CHUNK_SCANS, ScanChunk, Session, SessionWriter, fit_chunk
-from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
-from scenarios.schema import Scenario, SessionPlan
+from scenarios.schema import Scenario
 from sim.drive.odometry import register_scans, start_pose
-from sim.drive.trajectory import load_sensor, plan_trajectory
-from sim.movers.casting import MovingScene
-from sim.movers.planning import plan_movers
-from sim.placement.puddles import Pool, lay_puddles
-from sim.scene import World, build_world
-from sim.sensor.glass import Panes
-from sim.sensor.optics import as_white
-from sim.sensor.water import Water
-from sim.session.labels import list_changes
+from sim.session.planning import plan_drives
 from sim.session.revolution import CHANNELS, SURFACE_CHANNELS, Drive, Revolution, simulate_revolution, tally_revolution
-from sim.session.surface import MovedRock, list_surface_changes
 from sim.session.truth import (
-    SESSIONS,
     Int16Array,
     MoverTrack,
     MoverTruth,
     PairTruth,
     SessionName,
-    SurfaceChangeTruth,
     write_labels,
     write_mover_track,
     write_pair_truth,
@@ -53,7 +41,7 @@ from sim.session.truth import (
     write_true_poses,
 )
 
-_THREADS = 2
+THREADS = 2
 # Bytes of each channel of a session that are held in memory until KISS-ICP has its poses; more are in a temporary file.
 _HELD_BYTES = 1 << 25
 
@@ -116,7 +104,7 @@ def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progres
     shutil.rmtree(partial, ignore_errors=True)
     try:
         partial.mkdir(parents=True)
-        with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+        with ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1)) as pool:
             for drive in drives:
                 write_session(drive, partial / drive.name, pool, report)
         write_pair_truth(partial, collect_truth(scenario, seed, drives, files))
@@ -170,50 +158,6 @@ def _plan(scenario: Scenario, seed: int, report: Progress) -> tuple[list[Drive],
     return drives, files
 
 
-def plan_drives(scenario: Scenario, seed: int, sensor: SensorMetadata | None = None) -> list[Drive]:
-    """Build the world and plan both sessions; only the parts of the world that they need stay in memory.
-
-    Args:
-        scenario: The scenario as drawn.
-        seed: Draws everything the scenario leaves open.
-        sensor: The sensor of both sessions in place of the scenario's.
-
-    Raises:
-        InputError: A trajectory cannot be read.
-        ScenarioError: The world contradicts itself, or a mover finds no way.
-    """
-    sensors = {name: sensor or load_sensor(scenario, name) for name in SESSIONS}
-    world = build_world(scenario, seed)
-    tallies = tuple(list_changes(scenario, world))
-    trajectories = {name: plan_trajectory(world, scenario, sensors[name], seed, name) for name in SESSIONS}
-    movers = plan_movers(world, scenario, {name: each.true for name, each in trajectories.items()}, seed)
-    rocks: dict[SessionName, MovedRock] = {}
-    surface_changes: tuple[SurfaceChangeTruth, ...] = ()
-    if world.displacement is not None:
-        rocks = {name: MovedRock(world, world.displacement, name) for name in SESSIONS}
-        surface_changes = list_surface_changes(world, world.displacement, rocks["before"])
-    drives = []
-    for name, trajectory in trajectories.items():
-        scene = world.before if name == "before" else world.after
-        moving = MovingScene(scene, movers[name])
-        labels = np.append(moving.instance, [-5, -4, -3, -2, -1]).astype(np.int16)
-        held = [tally.change.instance for tally in tallies if tally.change.session == name]
-        owners = np.where(np.isin(moving.instance, held), moving.instance, np.int32(0))
-        seen = np.zeros((len(moving.movers), trajectory.n_scans, 4))
-        own, pools = scenario.of(name), _lay_puddles(world, scenario, name, seed)
-        diffuse = as_white(scene.reflectivity)
-        water = Water(pools, scene.caster, diffuse) if pools else None
-        is_glass = np.array(scene.materials) == "glass"
-        panes = Panes(scene.caster, diffuse, owners, is_glass) if own.sensor.glass and is_glass.any() else None
-        told = labels, owners, sensors[name], trajectory, tallies, seed, moving, seen, water, panes
-        drives.append(Drive(name, own, scene, *told, rocks.get(name), surface_changes))
-    return drives
-
-
-def _lay_puddles(world: World, scenario: Scenario, name: SessionName, seed: int) -> tuple[Pool, ...]:
-    return lay_puddles(scenario, world.centreline, world.of(name).walls, name, seed)
-
-
 def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) -> None:
     """Simulate one session with its truth into `folder`, the revolutions in the threads of `pool`.
 
@@ -222,8 +166,8 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
     """
     n_scans = drive.trajectory.n_scans
     profile = drive.scenario.sensor.profile
-    provenance = {"made_by": "tunnelcd simulate", "session": drive.name, "sensor_profile": profile}
-    plan: SessionPlan = getattr(drive.scenario, drive.name)
+    provenance = {"made_by": "tunnelcd simulate", "session": drive.session, "sensor_profile": profile}
+    plan = drive.scenario.plan(drive.session)
     if plan.odometry.source == "kiss-icp":
         provenance["odometry"] = f"kiss-icp {extra_version('kiss-icp')}"
     with (
@@ -231,13 +175,13 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
         closing(_simulate_revolutions(drive, pool)) as revolutions,
     ):
         drive, kept = _estimate_odometry(drive, revolutions, report)
-        report(drive.name, 0, n_scans)
+        report(drive.session, 0, n_scans)
         for index, (chunk, instance, change, surface) in enumerate(_fill_chunks(drive, kept)):
             writer.add(chunk)
             write_labels(writer.folder, index, instance, change)
             if surface is not None:
                 write_surface_labels(writer.folder, index, *surface)
-            report(drive.name, index * _chunk_scans(drive) + len(instance), n_scans)
+            report(drive.session, index * _chunk_scans(drive) + len(instance), n_scans)
         write_true_poses(writer.folder, drive.trajectory.world_T_sensor)
         if (track := track_movers(drive)) is not None:
             write_mover_track(writer.folder, track)
@@ -274,7 +218,7 @@ def _estimate_odometry(
     Returns:
         The drive with these poses, and all its revolutions.
     """
-    plan: SessionPlan = getattr(drive.scenario, drive.name)
+    plan = drive.scenario.plan(drive.session)
     if plan.odometry.source != "kiss-icp":
         return drive, revolutions
     trajectory = drive.trajectory
@@ -286,16 +230,16 @@ def _estimate_odometry(
     def keep() -> Iterator[npt.NDArray[np.uint32]]:
         for number, revolution in enumerate(revolutions):
             if number % CHUNK_SCANS == 0:
-                report(f"odometry {drive.name}", number, trajectory.n_scans)
+                report(f"odometry {drive.session}", number, trajectory.n_scans)
             for name, spooled in channels.items():
                 spooled.append(getattr(revolution, name))
             ghost_rays.append(revolution.ghost_rays)
             sightings.append(revolution.sightings)
             yield revolution.range_mm
-        report(f"odometry {drive.name}", trajectory.n_scans, trajectory.n_scans)
+        report(f"odometry {drive.session}", trajectory.n_scans, trajectory.n_scans)
 
     start = start_pose(trajectory.true, float(trajectory.revolution_s[0]))
-    estimated = register_scans(keep(), drive.sensor, trajectory.revolution_s, trajectory.column_s, start, drive.name)
+    estimated = register_scans(keep(), drive.sensor, trajectory.revolution_s, trajectory.column_s, start, drive.session)
     stored = zip(*(spooled.finish() for spooled in channels.values()), ghost_rays, sightings, strict=True)
     kept = (Revolution(**dict(zip((*channels, "ghost_rays", "sightings"), each, strict=True))) for each in stored)
     return replace(drive, trajectory=replace(trajectory, estimated=estimated)), kept

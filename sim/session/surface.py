@@ -14,7 +14,7 @@ from sim.sensor.lidar import Scan
 from sim.sensor.rays import Rays
 from sim.session.truth import Int16Array, SessionName, SurfaceChangeTruth
 
-# Rock that only rises: folded walls under its edge cannot turn the sign.
+# Rock that only rises, or is taken away again: folded walls under its edge cannot turn the sign.
 _RISING = ("rubble", "fill")
 _SLACK_M = 0.05
 _SAME_M = 1e-3  # between the middle ray of a beam and the ray that gave the return
@@ -29,14 +29,16 @@ class MovedRock:
         self.label, self._is_moved = displacement.label, displacement.is_moved
         self._caster: Caster = own.caster
         self._turn = 1.0 if session == "after" else -1.0
-        rising = [patch.number for patch in displacement.patches if patch.kind in _RISING]
-        self._is_rising: BoolArray = np.isin(displacement.walls.owner[displacement.walls.faces].max(axis=1), rising)
+        owner = displacement.walls.owner[displacement.walls.faces].max(axis=1)
+        self._rise = np.zeros(len(owner))  # of each face: 1 where it only rises, -1 where it only sinks
+        for patch in displacement.patches:
+            if patch.kind in _RISING:
+                self._rise[owner == patch.number] = -1.0 if patch.is_undone else 1.0
         wall, far = own.meshes[WALL_GEOM], other.meshes[WALL_GEOM]
         # the before surface is the same in its first triangles, which are fewer
         looked_up = displacement.original if session == "after" else far
         self._boxes: list[tuple[Float64Array, Float64Array]] = []
         chosen = np.zeros(len(looked_up.faces), dtype=bool)
-        owner = displacement.walls.owner[displacement.walls.faces].max(axis=1)
         for patch in displacement.patches:
             moved = Mesh(wall.vertices, wall.faces[self._is_moved & (owner == patch.number)])
             corners = wall.vertices[moved.faces].reshape(-1, 3)
@@ -50,7 +52,8 @@ class MovedRock:
         moved_m = np.zeros(len(points))
         searched = np.flatnonzero(self._is_moved[faces])
         found_m = self._index.measure(points[searched])
-        moved_m[searched] = np.where(self._is_rising[faces[searched]], np.abs(found_m), self._turn * found_m)
+        rise = self._rise[faces[searched]]
+        moved_m[searched] = np.where(rise != 0.0, rise * np.abs(found_m), self._turn * found_m)
         return moved_m
 
     def _nearest_m(self, origins: Float64Array) -> Float32Array:
@@ -98,6 +101,8 @@ def list_surface_changes(world: World, displacement: Displacement, before: Moved
     found = []
     for patch in displacement.patches:
         faces = np.flatnonzero(displacement.label == patch.number)
+        if not len(faces):  # crept by less than 1 mm
+            continue
         pieces, owners = cut_triangles(wall.vertices[wall.faces[faces]], _PIECE_M)
         moved_m = before.measure(pieces.mean(axis=1), faces[owners])
         area_m2 = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1) / 2

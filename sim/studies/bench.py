@@ -28,8 +28,9 @@ from sim.props.props import shape_of
 from sim.props.shapes import Size
 from sim.scene import compile_model
 from sim.sensor.rays import Rays, revolution_rays
+from sim.session.planning import plan_drives
 from sim.session.revolution import Drive
-from sim.session.simulate import plan_drives, write_session
+from sim.session.simulate import write_session
 from sim.studies.timing import Contest, raced, timed
 
 THREADS = 2

@@ -26,7 +26,7 @@ from sim.geometry.mesh import move_mesh
 from sim.geometry.raycast import Caster
 from sim.placement.placing import Posture, Standing, standing_box, standing_middle
 from sim.scene import WALL_GEOM, Scene, World, build_world
-from sim.session.simulate import plan_drives
+from sim.session.planning import plan_drives
 from sim.view.picture import render
 from sim.view.rock import STEPS_M, face_tints
 

@@ -11,22 +11,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.io.session import is_session, read_session
 from scenarios.schema import Scenario
-from sim.drive.trajectory import Trajectory, load_sensor, plan_trajectory
+from sim.drive.trajectory import Trajectory
 from sim.geometry.mesh import Mesh, cylinder_mesh, drop_unused_vertices, join_meshes, move_mesh
-from sim.movers.mover import MovingBody
-from sim.movers.planning import plan_movers
 from sim.placement.placing import Standing, standing_box
-from sim.placement.puddles import lay_puddles
+from sim.placement.puddles import Pool
 from sim.props.shapes import solid_mesh
 from sim.scene import WALL_GEOM, World, build_world
-from sim.session.truth import SESSIONS, PairTruth, SessionName, read_pair_truth, read_true_poses
+from sim.session.truth import SESSIONS, SessionName, read_pair_truth, read_true_poses
+from sim.story.state import is_story
+from sim.view.building import PlacedMover, build_pair, list_pools, place_movers, plan_drives
 from sim.view.picture import material_colour
 from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Revolutions, Rgb, session_cloud
 from sim.view.rock import ROCK_RGB, class_name, displacement_classes
@@ -116,17 +115,17 @@ def view_scenario(scenario: Scenario, seed: int) -> View:
         InputError: The sensor profile cannot be read.
     """
     world = build_world(scenario, seed)
-    drives, notes = _plan_drives(world, scenario, seed)
+    drives, notes = plan_drives(world, scenario, seed)
     lines = [
         Line(f"paths/{session}", drive.world_T_sensor[:, :3, 3], SESSION_RGB[session])
         for session, drive in drives.items()
     ]
     try:
-        movers = _place_movers(world, scenario, drives, seed)
+        movers = place_movers(world, scenario, drives, seed)
     except ScenarioError as error:
         movers, notes = [], [*notes, f"no movers: {error}"]
-    puddles = _puddle_surfaces(world, scenario, seed)
-    view = _world_view(f"{scenario.family}, seed {seed}", world, lines, (), movers, puddles, tuple(notes))
+    pools = list_pools(world, scenario, seed)
+    view = _world_view(f"{scenario.family}, seed {seed}", world, lines, (), movers, pools, tuple(notes))
     poses = [(session, drive.world_T_sensor) for session, drive in drives.items()]
     return replace(view, play=_player(poses, movers, drives, ())) if drives else view
 
@@ -138,18 +137,15 @@ def view_pair(pair: Path) -> View:
         InputError: The pair or its truth is missing, damaged, or of a version whose scenario cannot be built here.
     """
     truth = read_pair_truth(pair)
-    scenario = _scenario_of(pair, truth)
-    world = build_world(scenario, truth.seed)
+    built = build_pair(pair, truth)
+    world, drives, movers = built.world, built.drives, built.movers
     poses = {session: read_true_poses(pair / session) for session in SESSIONS}
     lines = [Line(f"paths/{session}", poses[session][:, :3, 3], SESSION_RGB[session]) for session in SESSIONS]
     kinds = {change.id: change.kind for change in truth.changes}
     clouds = tuple(
         session_cloud(f"returns/{session}", read_session(pair / session), poses[session], kinds) for session in SESSIONS
     )
-    drives = _plan_drives(world, scenario, truth.seed)[0] if scenario.movers else {}
-    movers = _place_movers(world, scenario, drives, truth.seed)
-    puddles = _puddle_surfaces(world, scenario, truth.seed)
-    view = _world_view(f"{pair}: {truth.family}, seed {truth.seed}", world, lines, clouds, movers, puddles, ())
+    view = _world_view(f"{pair}: {truth.family}, seed {truth.seed}", world, lines, clouds, movers, built.pools, ())
     revolutions = [
         Revolutions(f"revolution/{session}", read_session(pair / session), poses[session], kinds)
         for session in SESSIONS
@@ -175,7 +171,7 @@ def view_session(folder: Path) -> View:
 
 def _player(
     poses: Iterable[tuple[str, Float64Array]],
-    movers: Sequence[_Placed],
+    movers: Sequence[PlacedMover],
     drives: Mapping[SessionName, Trajectory],
     revolutions: Sequence[Revolutions],
 ) -> Play:
@@ -216,6 +212,8 @@ def view_folder(folder: Path) -> View:
         return view_session(folder)
     if is_session(folder / "before"):
         raise InputError(f"{folder}: a pair without truth: view {folder / 'before'} or {folder / 'after'}")
+    if is_story(folder):
+        raise InputError(f"{folder}: a story: view {folder / 'session-01'}, or a pair that `tunnelcd pair` makes of it")
     raise InputError(f"{folder}: neither a simulated pair nor a session: expected truth/changes.json or session.json")
 
 
@@ -236,42 +234,7 @@ def wall_bands(wall: Mesh, floor_points: Float64Array, n_bands: int = _N_BANDS) 
     return tuple(bands)
 
 
-def _plan_drives(world: World, scenario: Scenario, seed: int) -> tuple[dict[SessionName, Trajectory], list[str]]:
-    """Return the drive of each session, and a note for one that cannot be driven."""
-    drives: dict[SessionName, Trajectory] = {}
-    notes = []
-    for session in SESSIONS:
-        try:
-            drives[session] = plan_trajectory(world, scenario, load_sensor(scenario, session), seed, session)
-        except ScenarioError as error:
-            notes.append(f"no path {session}: {error}")
-    return drives, notes
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Placed:
-    """A mover of a session at one time of it."""
-
-    session: SessionName
-    time_s: float
-    body: MovingBody
-
-    @property
-    def name(self) -> str:
-        """The name of its group."""
-        return f"movers/{self.session}/{self.body.mover.name}"
-
-
-def _place_movers(
-    world: World, scenario: Scenario, drives: Mapping[SessionName, Trajectory], seed: int
-) -> list[_Placed]:
-    """Return the movers of each session that is driven, in the middle of its drive."""
-    planned = plan_movers(world, scenario, {name: drive.true for name, drive in drives.items()}, seed)
-    middles_s = {name: float(drive.revolution_s[drive.n_scans // 2]) for name, drive in drives.items()}
-    return [_Placed(name, middles_s[name], body) for name, bodies in planned.items() for body in bodies]
-
-
-def _mover_surfaces(placed: _Placed) -> Iterator[Surface]:
+def _mover_surfaces(placed: PlacedMover) -> Iterator[Surface]:
     """Yield a mover by material."""
     figure = placed.body.figure
     poses = placed.body.world_T_links(np.array([placed.time_s]))[:, 0]
@@ -290,8 +253,8 @@ def _world_view(
     world: World,
     lines: Sequence[Line],
     clouds: tuple[Cloud, ...],
-    movers: Sequence[_Placed],
-    puddles: Sequence[Surface],
+    movers: Sequence[PlacedMover],
+    pools: Mapping[str, Pool],
     notes: tuple[str, ...],
 ) -> View:
     wall = world.before.meshes[0]
@@ -317,6 +280,7 @@ def _world_view(
         for placed in movers
         if placed.body.course.is_moving
     ]
+    puddles = [Surface(f"puddles/{name}", pool.sheet(), _WATER_RGB) for name, pool in pools.items()]
     rock = _rock_surfaces(world)
     surfaces, all_lines = (*fixtures, *props, *moving, *puddles, *rock), (*lines, *stretches)
     if world.displacement is not None:
@@ -339,20 +303,6 @@ def _rock_surfaces(world: World) -> list[Surface]:
         mesh = drop_unused_vertices(after.vertices, after.faces[classes == number])
         surfaces.append(Surface(f"{ROCK_AFTER}/{class_name(number)}", mesh, ROCK_RGB[number]))
     return surfaces
-
-
-def _puddle_surfaces(world: World, scenario: Scenario, seed: int) -> list[Surface]:
-    """Return the sheet of water of every puddle; one that only one session has is named after it.
-
-    Raises:
-        ScenarioError: There is no floor under a puddle.
-    """
-    sheets = {}
-    for session in SESSIONS:
-        for pool in lay_puddles(scenario, world.centreline, world.walls, session, seed):
-            where = "" if pool.puddle.sessions == "both" else f" ({session})"
-            sheets[f"puddles/{pool.puddle.name}{where}"] = pool.sheet()
-    return [Surface(name, mesh, _WATER_RGB) for name, mesh in sheets.items()]
 
 
 def _prop_surfaces(item: Standing) -> Iterator[Surface]:
@@ -382,16 +332,6 @@ def _where(item: Standing) -> str:
     """Return the session in brackets for the two places of a moved or aged prop and the shapes of a reshaped one."""
     is_twice = item.prop.change in ("moved", "reshaped") or item.prop.aged is not None
     return f" ({min(item.sessions)})" if is_twice else ""
-
-
-def _scenario_of(pair: Path, truth: PairTruth) -> Scenario:
-    try:
-        return Scenario.model_validate(truth.scenario)
-    except ValidationError as error:
-        raise InputError(
-            f"{pair / 'truth' / 'changes.json'}: its scenario is not one of this version "
-            f"({error.errors()[0]['msg']}): simulate the pair again, or view its sessions one by one"
-        ) from error
 
 
 def _rgb(colour: tuple[float, float, float]) -> Rgb:

@@ -13,7 +13,8 @@ from cdpipe.io.session import read_session
 from scenarios import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
-from sim.session.simulate import plan_drives, simulate_pair
+from sim.session.planning import plan_drives
+from sim.session.simulate import simulate_pair
 
 SEEDS = (*range(8), *range(10000, 10008))
 SMALL = ["platform.scan_spacing_m=1", "sensor.mode=512x10"]

@@ -11,6 +11,7 @@ import lzma
 import os
 import shutil
 import struct
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -25,11 +26,12 @@ from cdpipe.core.plugins import SEARCH_PATH
 from cdpipe.core.yamlfile import apply_settings, read_yaml, setting_lines
 from cdpipe.descriptors.describe import load_descriptors, save_descriptors
 from cdpipe.io.answer import read_answer
-from cdpipe.io.known_merge import read_known_merge
+from cdpipe.io.known_merge import read_alignment, read_known_merge, write_alignment
 from cdpipe.io.ply import read_ply_points
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
 from cdpipe.io.tum import motion_along, read_tum
+from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import DescriptorConfig, MapConfig, load_config
 from cdpipe.model.types import DescriptorSet
 from cdpipe.sensor.ouster import load_profile
@@ -37,6 +39,8 @@ from cdpipe.training.data import ChangePairs, open_dataset, read_place_data
 from cdpipe.training.fit import FitConfig, fit
 from cdpipe.training.shard import FIELDS, FORMAT, FORMAT_VERSION, encode_shard, read_shard
 from cdpipe.training.sphere_training import read_sphere_data
+from eval.leaderboard.page import write_leaderboard
+from eval.leaderboard.submission import pack_submission, read_submission
 from eval.plans.plan import expand_cells, load_plan
 from eval.report.comparison import compare_sides
 from eval.report.page import write_page
@@ -59,7 +63,9 @@ from scenarios.schema import MeshFile
 from sim.placement.recorded import read_drive
 from sim.rock.foreign import prop_mesh, tunnel_mesh
 from sim.session.truth import read_labels
+from sim.story.state import SessionState, Story, dump_story, read_story
 from tests.eval.conftest import ODOM_T_WORLD, WIDTH, write_pair
+from tests.eval.leaderboard.conftest import Evaluator
 
 ROOT = Path(__file__).parents[2]
 
@@ -428,11 +434,30 @@ def _merges(folder: Path) -> None:
     np.savetxt(folder / "known.txt", known)
     (folder / "known.json").write_text(json.dumps(known.tolist()))
     (folder / "answer.json").write_text(json.dumps({"format": "tunnelcd-answer", "before_T_after": known.tolist()}))
+    write_alignment(folder / "merge.json", known, PathAlignment(np.zeros((2, 3)), np.stack([known, known])), "truth")
 
 
 def _read_merges(folder: Path) -> None:
     for path in sorted(folder.iterdir()):
         read_known_merge(path)
+        read_alignment(path)
+
+
+def _submission(folder: Path) -> None:
+    evaluator = Evaluator(folder)
+    evaluator.evaluate()
+    pack_submission(evaluator.run, "mine", folder / "mine.zip")
+    with zipfile.ZipFile(folder / "mine.zip") as archive:
+        archive.extractall(folder / "unpacked")
+    shutil.rmtree(evaluator.run.path)
+
+
+def _read_submission(folder: Path) -> None:
+    read_submission(folder / "mine.zip")
+    with zipfile.ZipFile(folder / "again.zip", "w") as archive:
+        for path in sorted(path for path in (folder / "unpacked").rglob("*") if path.is_file()):
+            archive.write(path, path.relative_to(folder / "unpacked"))
+    write_leaderboard([read_submission(folder / "again.zip")], folder / "board.html", None, [0])
 
 
 def _osf(folder: Path) -> None:
@@ -488,6 +513,24 @@ def _read_scored(folder: Path) -> None:
     score_stored(load_ground_truth(folder / "pair"), folder / "answer")
 
 
+def _story(folder: Path) -> None:
+    """Write the story of a scenario with a moved prop and two kinds of rock."""
+    shutil.copy(ROOT / "scenarios" / "families" / "smoke" / "one_box.yaml", folder / "base.yaml")
+    settings = ["surface=[{name: sinks, kind: heave}, {name: falls, kind: scar}]"]
+    scenario = load_scenario(str(folder / "base.yaml"), 1, settings)
+    (folder / "base.yaml").unlink()
+    states = [
+        SessionState(name=f"session-{number:02d}", plan="after", places={"box": where}, shares=shares)
+        for number, where, shares in (
+            (1, "absent", {"sinks": 0.0, "falls": 0.0}),
+            (2, "after", {"sinks": 0.4, "falls": 1.0}),
+            (3, "after", {"sinks": 1.0, "falls": 1.0}),
+        )
+    ]
+    story = Story(scenario=scenario, seed=1, sessions=states, files={}, digests={}, versions={"numpy": "2.2"})
+    (folder / "story.json").write_text(json.dumps(dump_story(story), indent=1))
+
+
 _SESSION = ("s/session.json", "s/odometry.npz", "s/chunks/00000.npz")
 _TRUTH = ("pair/truth/*", "pair/before/truth/*", "pair/*/session.json")
 _CELLS = ("run/cells/*/*/*.json", "run/provenance.json", "run/blind.json")
@@ -501,9 +544,11 @@ READERS: tuple[Reader, ...] = (
     Reader("TUM trajectory", _tum, _read_tum, ("t.tum",), 1.5),
     Reader("sensor metadata", _metadata, _read_metadata, ("*.json",), 1.5),
     Reader("truth of a pair", _truth, _read_truth, _TRUTH, 0.7, lines=True),
+    Reader("story", _story, read_story, ("story.json",), 1.0, lines=True),
     Reader("answer", _answer, read_answer, ("answer.json", "answer.npz"), 4.0, lines=True),
     Reader("answer, scored", _scored, _read_scored, ("answer/*",), 1.5, lines=True),
     Reader("known merge", _merges, _read_merges, ("*",), 0.7, lines=True),
+    Reader("submission", _submission, _read_submission, ("mine.zip", "unpacked/submission.json"), 0.05, lines=True),
     Reader("preset", _copy(*_PRESETS), _read_presets, ("*.yaml",), 2.0, lines=True),
     Reader("plan", _copy(*_PLANS), _read_plans, ("*.yaml",), 0.3, lines=True),
     Reader("scenario", _copy(*_FAMILIES), _read_families, ("*.yaml",), 0.4, lines=True),

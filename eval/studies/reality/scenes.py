@@ -22,8 +22,8 @@ from sim.scene import Scene
 from sim.sensor.lidar import Scan, scan
 from sim.sensor.optics import COUNTS_PER_DOUBLING
 from sim.sensor.rays import revolution_rays
+from sim.session.planning import plan_drives
 from sim.session.revolution import Drive
-from sim.session.simulate import plan_drives
 
 RECORDING = "OS-1-32-G_v2.1.1_1024x10"
 

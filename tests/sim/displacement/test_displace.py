@@ -34,7 +34,8 @@ from sim.geometry.topology import closed_volume_m3, edges_of
 from sim.rock.centreline import build_centreline
 from sim.rock.tunnel import mesh_tunnel
 from sim.scene import build_world
-from sim.session.simulate import HeldPair, plan_drives, simulate, simulate_in_memory, simulate_pair
+from sim.session.planning import plan_drives
+from sim.session.simulate import HeldPair, simulate, simulate_in_memory, simulate_pair
 from sim.session.truth import SESSIONS, SessionName, read_chunk_surface, read_pair_truth
 
 

@@ -26,8 +26,9 @@ from sim.geometry.raycast import Caster
 from sim.sensor.lidar import Scan
 from sim.sensor.rays import Rays
 from sim.session.labels import CELL_M
+from sim.session.planning import plan_drives
 from sim.session.revolution import Drive, cast_revolution, measured_points
-from sim.session.simulate import plan_drives, simulate_in_memory, simulate_pair
+from sim.session.simulate import simulate_in_memory, simulate_pair
 from sim.session.truth import SESSIONS, read_labels, read_pair_truth, read_true_poses
 
 needs_kiss_icp = pytest.mark.skipif(

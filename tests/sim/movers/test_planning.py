@@ -13,9 +13,10 @@ from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Mover, Prop, Scenario, Section, SessionPlan, Tunnel
 from sim.drive.trajectory import plan_trajectory
 from sim.movers.mover import MovingBody
-from sim.movers.planning import SESSIONS, SessionName, plan_movers
+from sim.movers.planning import plan_movers
 from sim.placement.placing import floor_heights
 from sim.scene import World, build_world
+from sim.session.truth import SESSIONS, SessionName
 
 SEED = 5
 Settings = dict[str, Any]

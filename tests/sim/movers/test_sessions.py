@@ -15,8 +15,9 @@ from cdpipe.sensor.ouster import SensorMetadata
 from scenarios import load_scenario
 from scenarios.schema import Mover, Odometry, Platform, Prop, Scenario, Section, Sensor, SessionPlan
 from sim.session import simulate
+from sim.session.planning import plan_drives
 from sim.session.revolution import simulate_revolution
-from sim.session.simulate import plan_drives, simulate_in_memory, simulate_pair
+from sim.session.simulate import simulate_in_memory, simulate_pair
 from sim.session.truth import read_labels, read_mover_track, read_pair_truth, read_true_poses
 
 SEED = 11
@@ -57,7 +58,7 @@ def test_the_same_seed_gives_the_same_bytes_in_any_number_of_threads(
     scenario: Scenario, pair: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     time.sleep(2.1)  # an archive's stamps have steps of two seconds
-    monkeypatch.setattr(simulate, "_THREADS", 1)
+    monkeypatch.setattr(simulate, "THREADS", 1)
     simulate_pair(scenario, SEED, tmp_path / "again")
     assert digests(tmp_path / "again") == digests(pair)
 

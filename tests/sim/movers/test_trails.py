@@ -18,8 +18,8 @@ from scenarios.schema import Air, Dust, Scenario
 from sim.movers.trails import raise_dust
 from sim.sensor.air import AIR, air_around
 from sim.sensor.plumes import DIFFUSIVITY_M2_PER_S, LIFE_S, SETTLING_S, WAKE_SIGMA_M, Puffs, fill_lattice
+from sim.session.planning import plan_drives
 from sim.session.revolution import find_air
-from sim.session.simulate import plan_drives
 from sim.session.truth import read_labels
 
 AXES = [np.arange(-12.0, 12.1, 0.5), np.arange(-12.0, 12.1, 0.5), np.arange(0.25, 12.0, 0.5)]

@@ -19,7 +19,7 @@ from sim.sensor.glare import GLARE, REACH_DEG, REPORTED_SHARE, STRAY_AT_1_DEG, a
 from sim.sensor.lidar import Scan, scan
 from sim.sensor.optics import RETRO_FROM, reflected_share
 from sim.sensor.rays import Rays, revolution_rays
-from sim.session.simulate import plan_drives
+from sim.session.planning import plan_drives
 
 HALF_M = np.array([12.0, 12.0, 4.0])
 RETRO = REFLECTIVITY["reflector"]

@@ -27,8 +27,9 @@ from sim.sensor.water import (
     Water,
     cross_water,
 )
+from sim.session.planning import plan_drives
 from sim.session.revolution import simulate_revolution
-from sim.session.simulate import plan_drives, simulate_pair
+from sim.session.simulate import simulate_pair
 from sim.session.truth import read_labels
 from sim.view.view import view_scenario
 

@@ -14,6 +14,7 @@ from scenarios.schema import Odometry, Prop, Scenario, Sensor, SessionPlan, Shif
 from sim.drive.trajectory import record
 from sim.geometry.mesh import Mesh, join_meshes, point_triangle_distance
 from sim.session.labels import Returns, mark_belonging
+from sim.session.planning import plan_drives
 from sim.session.revolution import (
     Drive,
     cast_revolution,
@@ -22,7 +23,7 @@ from sim.session.revolution import (
     tally_revolution,
     true_reach_m,
 )
-from sim.session.simulate import plan_drives, simulate_pair
+from sim.session.simulate import simulate_pair
 from sim.session.truth import MIXED, read_labels, read_pair_truth
 
 IDEAL = Sensor(mode="512x10", range_noise=False, dropouts=False, false_positives=False)

@@ -71,7 +71,7 @@ def test_the_same_seed_gives_the_same_bytes_in_any_number_of_threads(
     scenario: Scenario, pair: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     time.sleep(2.1)  # an archive's stamps have steps of two seconds
-    monkeypatch.setattr(simulate, "_THREADS", 1)
+    monkeypatch.setattr(simulate, "THREADS", 1)
     simulate_pair(scenario, SEED, tmp_path / "again")
     assert digests(tmp_path / "again") == digests(pair)
     simulate_pair(scenario, SEED + 1, tmp_path / "other")

@@ -24,8 +24,8 @@ from sim.geometry.mesh import Mesh
 from sim.scene import build_world
 from sim.session.simulate import simulate, simulate_pair
 from sim.session.truth import read_mover_track, read_pair_truth, read_true_poses
-from sim.view import view as view_module
-from sim.view import viewer
+from sim.view import building, viewer
+from sim.view.building import plan_drives
 from sim.view.returns import _AIR_RGB, CHANGE_RGB, session_cloud
 from sim.view.view import View, view_folder, view_pair, view_scenario, view_session, wall_bands
 from sim.view.viewer import require_viser, running_server, show, write_html
@@ -120,7 +120,7 @@ def test_movers_are_shown_where_they_are_in_the_middle_of_each_session(
     was = {name: nodes[name].vertices.mean(axis=0) for name in (*groups_with(parts, "plastic"), "sensor/after")}
     flip(switches["share of the drives"], 0.1)
     moved_m = {name: float(np.linalg.norm(nodes[name].vertices.mean(axis=0) - was[name])) for name in was}
-    drive = view_module._plan_drives(build_world(scenario, 3), scenario, 3)[0]["after"]
+    drive = plan_drives(build_world(scenario, 3), scenario, 3)[0]["after"]
     sensor = nodes["sensor/after"].vertices.mean(axis=0)
     np.testing.assert_allclose(sensor, drive.world_T_sensor[int(0.1 * drive.n_scans), :3, 3], atol=1e-4)
     assert moved_m["sensor/after"] > 1
@@ -290,7 +290,7 @@ def test_a_path_that_cannot_be_driven_is_a_note(scenario: Scenario, monkeypatch:
     def barred(*_arguments: Any) -> Any:
         raise ScenarioError("box bars the way")
 
-    monkeypatch.setattr(view_module, "plan_trajectory", barred)
+    monkeypatch.setattr(building, "plan_trajectory", barred)
     view = view_scenario(scenario, 3)
     assert view.lines == ()
     assert len(view.notes) == 2

@@ -56,8 +56,8 @@ from eval.studies.reality.static_novelty import (
 from eval.studies.reality.tables import COLUMNS, arrange_by_source, format_markdown, tabulate_measures, tabulate_novelty
 from scenarios.library import load_scenario
 from scenarios.schema import Sensor
+from sim.session.planning import plan_drives
 from sim.session.revolution import Drive, cast_revolution
-from sim.session.simulate import plan_drives
 
 SENSOR = load_profile("os1-32-g", "1024x10")
 EVERYWHERE = np.ones((1, SENSOR.height, SENSOR.width), dtype=bool)

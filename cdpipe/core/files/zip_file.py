@@ -1,0 +1,80 @@
+"""zip archives: their members as the directory lists them, after checking that nothing is hidden or too large.
+
+The directory at the end of a zip archive is the only place that says how many members there are: a few flipped bits in
+it drop a member without a word. Therefore members must follow one another without a gap from the first byte of the file
+to the directory, and the directory must reach to the end of the file.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zipfile
+from typing import IO, cast
+
+import numpy as np
+import numpy.typing as npt
+
+# Deflate shrinks zeros a thousandfold: what a file may expand to is bounded by its own size.
+_SMALL_BYTES = 128 << 20
+_MAX_RATIO = 8
+_LOCAL_HEADER = struct.Struct("<4s5H3L2H")
+_END = struct.Struct("<4s4H2LH")
+_IN_ZIP64_RECORD = 0xFFFF
+_HAS_DESCRIPTOR = 0x08
+_DESCRIPTOR_BYTES = (12, 16, 20, 24)  # checksum and both sizes, of 32 or 64 bits, with or without a signature
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+
+
+def list_members(file: IO[bytes], archive: zipfile.ZipFile, n_bytes: int) -> dict[str, zipfile.ZipInfo]:
+    """Return the members by name, after checking that they and the directory are the whole file.
+
+    Args:
+        file: The open file.
+        archive: The same, as `zipfile` opened it.
+        n_bytes: Its size.
+
+    Raises:
+        ValueError: Bytes belong to no member, members would expand too far, or two have one name.
+    """
+    members = archive.infolist()
+    file.seek(-_END.size, io.SEEK_END)
+    signature, _, _, n_here, n_all, _, _, n_comment = _END.unpack(file.read(_END.size))
+    if signature != b"PK\x05\x06" or n_comment or {n_here, n_all} - {len(members), _IN_ZIP64_RECORD}:
+        raise ValueError(f"its directory lists {len(members)} members and counts {n_all}")
+    end, allowed_gaps = 0, {0}
+    for member in sorted(members, key=lambda member: member.header_offset):
+        _require_adjacent(end, member.header_offset, allowed_gaps)
+        file.seek(member.header_offset)
+        _, _, flags, *_, n_name, n_extra = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
+        end = member.header_offset + _LOCAL_HEADER.size + n_name + n_extra + member.compress_size
+        allowed_gaps = {0, *_DESCRIPTOR_BYTES} if flags & _HAS_DESCRIPTOR else {0}
+    _require_adjacent(end, archive.start_dir, allowed_gaps)
+    expanded = sum(member.file_size for member in members)
+    if expanded > _SMALL_BYTES + _MAX_RATIO * n_bytes:
+        raise ValueError(f"{n_bytes} bytes would expand to {expanded}")
+    found = {member.filename: member for member in members}
+    if len(found) < len(members):
+        raise ValueError("two members have one name")
+    return found
+
+
+def read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[np.uint8]:
+    """Return the bytes of a member that `list_members` returned; its checksum is compared at its end.
+
+    Raises:
+        ValueError: It is compressed by another method than deflate, or ends early.
+    """
+    if member.compress_type not in _METHODS:
+        raise ValueError(f"{member.filename} is compressed by a method that is not read")
+    content = np.empty(member.file_size, dtype=np.uint8)
+    with archive.open(member) as file:
+        n_read = cast(io.BufferedIOBase, file).readinto(content.data)
+    if n_read != member.file_size:
+        raise ValueError(f"{member.filename} ends after {n_read} of {member.file_size} bytes")
+    return content
+
+
+def _require_adjacent(end: int, begin: int, allowed_gaps: set[int]) -> None:
+    if begin - end not in allowed_gaps:
+        raise ValueError(f"its directory says nothing of bytes {end} to {begin}: a member may be lost")

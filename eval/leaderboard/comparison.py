@@ -1,0 +1,221 @@
+"""A method of others beside the reference rows of the same pairs: means, and differences pair by pair."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pandas as pd
+
+from eval.core.output import make_writable
+from eval.core.printing import count_pairs
+from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
+from eval.report.compared_columns import COMPARED, figures_of, is_time
+from eval.report.comparing import paired_differences, verdict
+from eval.report.render import write_file
+from eval.running.run_data import RunData
+from eval.running.sides import find_other_worlds
+from eval.tables.rows import PAIR, is_told_the_truth, numbers
+
+FIGURES = ("region_recall", "false_regions_per_100m", "object_iou_point", "object_f1_50", "t_total_s")
+HEADINGS = ("recall", "false/100m", "IoU", "F1 at 0.5", "time [s]")
+SHOWN = {column.key: column for column in COMPARED}
+_MAIN_REFERENCE = "tunnelcd"
+_NAME_WIDTH, _PAIRS_WIDTH = 18, 8
+_WIDTHS = (10, 11, 10, 10, 12)
+
+Pairs = Mapping[tuple[str, int], Mapping[str, Any]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """A method and the reference.
+
+    Attributes:
+        table: One row per method, the evaluated one first: method, n_pairs, n_answered, and of each of `FIGURES` the
+            value with the ends of its 95 % interval over pairs, `<figure>_low` and `_high`.
+        pairs: One row per pair and reference method: the figures of both, and their differences.
+        paired: One row per reference method and figure: the mean difference with its interval, and a verdict.
+        notes: What a reader of the tables must know, one sentence each.
+    """
+
+    table: pd.DataFrame
+    pairs: pd.DataFrame
+    paired: pd.DataFrame
+    notes: tuple[str, ...]
+
+
+def compare_with_reference(results: pd.DataFrame, name: str, references: Sequence[RunData], calls: Pairs) -> Comparison:
+    """Compare a method with the reference rows of the pairs that both have.
+
+    Args:
+        results: Rows of results.csv of the method.
+        name: The method.
+        references: Where reference rows are; of a method that several have, the first counts.
+        calls: How the call about each pair ended, by (scenario, seed).
+    """
+    own = take_figures(results)
+    others = {variant: rows.loc[rows.index.intersection(own.index)] for variant, rows in list_variants(references)}
+    others = {variant: rows for variant, rows in others.items() if len(rows)}
+    shared = own.index if not others else own.index[own.index.isin(_union(others))]
+    rows = [summarise_figures(variant, each) for variant, each in {name: own.loc[shared], **others}.items()]
+    paired = [
+        {"reference": variant, "n_pairs": len(rows), **row, "verdict": verdict(row)}
+        for variant, rows in others.items()
+        for row in paired_differences(rows[list(FIGURES)], own.loc[rows.index, list(FIGURES)])
+    ]
+    pairs = pd.DataFrame(list(_by_pair(own, others, calls)))
+    return Comparison(
+        pd.DataFrame(rows),
+        pairs,
+        pd.DataFrame(paired),
+        (*_notes(own, others, references, shared), *note_other_worlds(results, references)),
+    )
+
+
+def write_tables_of(found: Comparison, folder: Path) -> None:
+    """Write table.csv, differences.csv (pair by pair) and comparison.csv (their means) into a folder.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    make_writable(folder)
+    for file, table in (("table", found.table), ("differences", found.pairs), ("comparison", found.paired)):
+        write_file(folder / f"{file}.csv", table.to_csv(index=False))
+
+
+def list_lines(found: Comparison) -> list[str]:
+    """Return the table and what was found as lines of at most 80 characters: below each mean stands its interval."""
+    lines = [_line("method", "pairs", HEADINGS)]
+    for row in found.table.to_dict("records"):
+        name = str(row["method"])
+        name = name if len(name) < _NAME_WIDTH else f"{name[: _NAME_WIDTH - 2]}\u2026"
+        spans = [show_span(key, row[f"{key}_low"], row[f"{key}_high"]) for key in FIGURES]
+        values = [show_figure(key, row[key]) for key in FIGURES]
+        lines.append(_line(name, f"{row['n_answered']}/{row['n_pairs']}", values))
+        lines += [_line("", "", spans).rstrip()] if any(spans) else []
+    return [*lines, *_list_differences(found)]
+
+
+def _line(name: str, pairs: str, cells: Sequence[str]) -> str:
+    shown = "".join(f"{cell:>{width}}" for cell, width in zip(cells, _WIDTHS, strict=True))
+    return f"{name:<{_NAME_WIDTH}}{pairs:>{_PAIRS_WIDTH}}{shown}"
+
+
+def _list_differences(found: Comparison) -> Iterator[str]:
+    if not len(found.paired):
+        return
+    names = list(dict.fromkeys(found.paired["reference"]))
+    main = _MAIN_REFERENCE if _MAIN_REFERENCE in names else names[0]
+    yield f"pair by pair, {found.table['method'].iloc[0]} less {main}:"
+    for row in found.paired[found.paired["reference"] == main].to_dict("records"):
+        heading = HEADINGS[FIGURES.index(row["metric"])]
+        low, difference, high = (show_figure(row["metric"], row[name]) for name in ("low", "difference", "high"))
+        span = "" if math.isnan(row["low"]) else f" ({low} to {high})"
+        yield f"  {heading:<11}{difference:>7}{span}, {row['verdict']}"
+
+
+def take_figures(results: pd.DataFrame) -> pd.DataFrame:
+    """Return the figures by pair, with `status` and every one of `FIGURES`."""
+    found = figures_of(results).assign(status=results["status"].to_numpy())
+    found = found.assign(**{key: numbers(found, key) for key in FIGURES})
+    return found.set_index(PAIR)[["domain", "variant", "status", *FIGURES]]
+
+
+def list_variants(references: Sequence[RunData]) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield each method of some runs with its figures by pair; of a method that several have, those of the first."""
+    seen: set[str] = set()
+    for data in references:
+        if not data.results:
+            continue
+        found = take_figures(pd.DataFrame(list(data.results)))
+        for variant, rows in found.groupby("variant", sort=False):
+            if variant not in seen:
+                yield str(variant), rows
+        seen |= set(found["variant"])
+
+
+def _union(others: Mapping[str, pd.DataFrame]) -> pd.Index[Any]:
+    first, *rest = (rows.index for rows in others.values())
+    for index in rest:
+        first = first.union(index)
+    return first
+
+
+def summarise_figures(name: str, rows: pd.DataFrame) -> dict[str, Any]:
+    """Return a row of `Comparison.table` from the figures of a method by pair."""
+    row: dict[str, Any] = {"method": name, "n_pairs": len(rows), "n_answered": int((rows["status"] == "ok").sum())}
+    for key in FIGURES:
+        values, statistic = numbers(rows, key), statistic_of(key)
+        row[key] = median(values) if statistic == "median" else mean(values)
+        row[f"{key}_low"], row[f"{key}_high"] = bootstrap_interval(values, statistic)
+        row[f"{key}_n"] = int(np.count_nonzero(~np.isnan(values)))
+    return row
+
+
+def _by_pair(own: pd.DataFrame, others: Mapping[str, pd.DataFrame], calls: Pairs) -> Iterator[dict[str, Any]]:
+    rows: dict[str, dict[Any, Any]] = {variant: table.to_dict("index") for variant, table in others.items()}
+    for pair, row in own.to_dict("index").items():
+        scenario, seed = cast(tuple[str, int], pair)
+        call = calls.get((scenario, seed), {})
+        head = {"scenario": scenario, "seed": seed, "domain": row["domain"], "status": row["status"]}
+        head |= {"error": call.get("error", ""), "command_s": call.get("seconds", float("nan"))}
+        there = [(variant, found[pair]) for variant, found in rows.items() if pair in found]
+        for variant, other in there or [("", {})]:
+            yield {**head, "reference": variant, **_subtract(row, other)}
+
+
+def _subtract(row: Mapping[Any, Any], other: Mapping[Any, Any]) -> dict[str, float]:
+    """Return the figures of a pair by the method and by another one, and their differences."""
+    figures: dict[str, float] = {}
+    for key in FIGURES:
+        value = float(other.get(key, "nan"))
+        figures |= {key: row[key], f"{key}_reference": value, f"{key}_difference": row[key] - value}
+    return figures
+
+
+def _notes(
+    own: pd.DataFrame, others: Mapping[str, pd.DataFrame], references: Sequence[RunData], shared: pd.Index[Any]
+) -> Iterator[str]:
+    yield "means over pairs (time: median) with 95 % intervals; time is what an answer states, without merge"
+    if not others:
+        yield from (_why_none(data, own) for data in references if data.results)
+        if not any(data.results for data in references):
+            yield "no reference results of these pairs: name a run or a report with --reference"
+        return
+    if len(shared) < len(own):
+        yield f"the table is over the {len(shared)} of {len(own)} pairs that have reference rows"
+    if any(is_told_the_truth(variant) for variant in others):
+        yield "oracle-* methods were told the true merge, or the true regions as well"
+    yield "times of different machines do not compare"
+
+
+def note_other_worlds(results: pd.DataFrame, references: Sequence[RunData]) -> Iterator[str]:
+    """Yield one sentence for each run whose pairs are other worlds than those of the same name that were answered."""
+    for data in references:
+        if data.results and (worlds := find_other_worlds(results, pd.DataFrame(list(data.results)))):
+            where = f"{count_pairs(len(worlds))} of {data.folder.path.name}"
+            yield f"{where} hold other changes or another drive ({worlds[0]})"
+
+
+def _why_none(data: RunData, own: pd.DataFrame) -> str:
+    plan = data.provenance.get("plan")
+    split = str(plan.get("split", "")) if isinstance(plan, Mapping) else ""
+    seeds = "of split sealed: evaluate with --split sealed" if split.startswith("sealed") else "of other seeds"
+    return f"{data.folder.path} holds none of these {len(own)} pairs; its pairs are {seeds}"
+
+
+def show_span(key: str, low: float, high: float) -> str:
+    """Write an interval of a figure; "" where there is none."""
+    return "" if math.isnan(low) or math.isnan(high) else f"{show_figure(key, low)}-{show_figure(key, high)}"
+
+
+def show_figure(key: str, value: float) -> str:
+    """Write a figure; times with two digits."""
+    if is_time(key) and math.isfinite(value):
+        return np.format_float_positional(value, precision=2, fractional=False, unique=False, trim="-")
+    return SHOWN[key].shown(value)

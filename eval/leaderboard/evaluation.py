@@ -1,0 +1,295 @@
+"""Evaluates the command of a method on the pairs of a plan, one blind pair at a time.
+
+    RUN/pairs, answers, cells, results.csv, ...         a run folder: the method is one of its variants
+    RUN/evaluations/<method>/evaluation.json            command, merge, time limit, plan; digests of the programs' files
+    RUN/evaluations/<method>/<world>/<seed>.json        how the call ended: seconds, error, end of its standard error
+    RUN/evaluations/<method>/table.csv, ...             the comparison (eval.leaderboard.comparison)
+
+A call that crashes, runs out of time or leaves no answer, or none that can be one, is a row with its error. It scores
+like every case without an answer. A pair is finished when its cell is of the present metrics and its call was about the
+present simulation.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import random
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from cdpipe.core.errors import InputError, MergeFailedError, TunnelcdError
+from cdpipe.core.files import read_json
+from cdpipe.core.names import path_part
+from cdpipe.core.yamlfile import Document, Settings, validate
+from cdpipe.io.answer import write_failure
+from eval.core.output import remove
+from eval.core.progress import RunProgress, Silent
+from eval.core.provenance import digest
+from eval.leaderboard.command import digest_programs, run_command
+from eval.leaderboard.given_merge import MergeMode, write_merge
+from eval.plans.plan import Plan
+from eval.plans.worlds import world_slug
+from eval.running.export import copy_pair
+from eval.running.pair_run import TOOLS, Pair, Tools, pair_lock, score_unmade
+from eval.running.predictions import require_current_scores, require_free_name
+from eval.running.rescoring import LAST, NO_KEY, cell_document
+from eval.running.runfolder import RunFolder, write_json, write_tables
+from eval.running.runner import list_plan_pairs, open_pair, start_provenance
+from eval.running.stages import PairStages
+from eval.scoring.scoring import METRICS_VERSION, CaseScore, score_stored
+from eval.truth.ground_truth import GroundTruth
+
+_ANSWER_FILES = ("answer.json", "answer.npz")
+_EXPECTED = "--force answers all pairs again"
+_MOST_ERROR = 2_000
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """A method of others.
+
+    Attributes:
+        name: Its variant in the tables.
+        command: Its words (`eval.leaderboard.command.parse_command`).
+        merge: What merge it is given.
+        limit_s: Time limit of one pair, wall clock.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    merge: MergeMode = "own"
+    limit_s: float = 600.0
+
+
+class EvaluationFile(Settings):
+    """RUN/evaluations/<method>/evaluation.json; `pairs` are (scenario, seed) of the plan that was evaluated last."""
+
+    format: Literal["tunnelcd-evaluation"] = "tunnelcd-evaluation"
+    format_version: Literal[1] = 1
+    name: str
+    command: tuple[str, ...]
+    merge: MergeMode
+    limit_s: float
+    programs: Mapping[str, str]
+    plan: str
+    plan_digest: str
+    split: str = ""
+    pairs: tuple[tuple[str, int], ...]
+
+
+class CallFile(Settings):
+    """RUN/evaluations/<method>/<world>/<seed>.json; `pair_digest` is "" where the pair cannot be made."""
+
+    pair_digest: str
+    seconds: Annotated[float, Field(ge=0)]
+    error: str
+    stderr: str
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationOutcome:
+    """How an evaluation ended: pairs answered now, kept from earlier, and those without an answer among all."""
+
+    n_done: int
+    n_kept: int
+    n_failed: int
+
+
+def evaluate_command(
+    plan: Plan,
+    run: RunFolder,
+    method: Method,
+    *,
+    command: Sequence[str] = (),
+    force: bool = False,
+    progress: RunProgress | None = None,
+    tools: Tools = TOOLS,
+) -> EvaluationOutcome:
+    """Let a command answer the pairs of a plan, score its answers and write the tables of the run.
+
+    Args:
+        plan: The plan; its own methods are not run.
+        run: The folder; pairs that it holds are used, finished ones of the method are kept.
+        method: The method.
+        command: The command line, for the provenance.
+        force: Answer finished pairs again.
+        progress: Receives the progress.
+        tools: What draws and simulates worlds.
+
+    Raises:
+        InputError: The name is taken, the method was evaluated with another command, or the folder cannot be used.
+    """
+    progress = progress or Silent()
+    require_free_name(run, method.name)
+    require_current_scores(run)
+    pairs = list_plan_pairs(plan, run, tools)
+    start_provenance(plan, run, command, tools)
+    _take_over(run, method, plan, pairs, force=force)
+    todo = [pair for pair in pairs if force or not _is_finished(run, method, pair)]
+    # the order of a plan would tell which world a pair is of; a seed would, too
+    random.SystemRandom().shuffle(todo)
+    for done, pair in enumerate(todo):
+        progress.cells(f"{pair.name} {pair.seed}", done, len(todo))
+        with pair_lock(run, pair):
+            error = _evaluate_pair(run, method, pair, progress, tools)
+        if error:
+            progress.note(f"{pair.name} {pair.seed}: {error}")
+    progress.cells("done", len(todo), len(todo))
+    results = write_tables(run)
+    own = results[results["variant"] == method.name]
+    return EvaluationOutcome(len(todo), len(pairs) - len(todo), int((own["status"] != "ok").sum()))
+
+
+def evaluation_folder(run: RunFolder, name: str) -> Path:
+    """Return the folder of what is kept of a method's calls."""
+    return run.path / "evaluations" / path_part(name)
+
+
+def read_evaluation(run: RunFolder, name: str) -> EvaluationFile:
+    """Read how a method was evaluated.
+
+    Raises:
+        InputError: It was not, or the file is damaged.
+    """
+    path = evaluation_folder(run, name) / "evaluation.json"
+    return validate(EvaluationFile, Document(str(path), read_json(path, _EXPECTED)))
+
+
+def read_call(run: RunFolder, name: str, scenario: str, seed: int) -> CallFile | None:
+    """Read how the call about a pair ended; None where there was none, or its file is damaged."""
+    path = _call_path(run, name, scenario, seed)
+    try:
+        return validate(CallFile, Document(str(path), read_json(path, _EXPECTED)))
+    except InputError:
+        return None
+
+
+def digest_pair(pair: Path) -> str:
+    """Return the SHA-256 of the truth of a simulated pair: another simulation has another; "" without a pair."""
+    truth = pair / "truth" / "changes.json"
+    return hashlib.sha256(truth.read_bytes()).hexdigest() if truth.is_file() else ""
+
+
+def _take_over(run: RunFolder, method: Method, plan: Plan, pairs: Sequence[Pair], *, force: bool) -> None:
+    """Write evaluation.json; refuse to mix rows of two commands under one name."""
+    document = EvaluationFile(
+        name=method.name, command=method.command, merge=method.merge, limit_s=method.limit_s,
+        programs=digest_programs(method.command), plan=plan.name, plan_digest=digest(plan.model_dump(mode="json")),
+        split=plan.split, pairs=tuple((pair.name, pair.seed) for pair in pairs),
+    )  # fmt: skip
+    path = evaluation_folder(run, method.name) / "evaluation.json"
+    if path.exists() and not force:
+        earlier = read_evaluation(run, method.name)
+        for name, told in (("command", "--command"), ("merge", "--merge"), ("limit_s", "--time-limit")):
+            if (was := getattr(earlier, name)) != getattr(document, name):
+                shown = " ".join(was) if isinstance(was, tuple) else was
+                raise InputError(
+                    f"--as {method.name}: its rows are of {told} {shown!r}: give that, another name, or --force, which "
+                    "answers all pairs again"
+                )
+        if changed := [name for name, value in document.programs.items() if earlier.programs.get(name) != value]:
+            raise InputError(
+                f"--as {method.name}: {changed[0]} was changed since its rows were made: give another name, or "
+                "--force, which answers all pairs again"
+            )
+    write_json(path, document.model_dump(mode="json"))
+
+
+def _is_finished(run: RunFolder, method: Method, pair: Pair) -> bool:
+    call = read_call(run, method.name, pair.name, pair.seed)
+    cell = run.read_cell(run.cell(pair.name, pair.seed, method.name))
+    if call is None or cell is None or cell["row"].get("metrics_version") != METRICS_VERSION:
+        return False
+    return call.pair_digest == digest_pair(run.pair(pair.name, pair.seed))
+
+
+def _evaluate_pair(run: RunFolder, method: Method, pair: Pair, progress: RunProgress, tools: Tools) -> str:
+    """Make a pair, answer it and write its cell; returns why there is no answer, "" where there is one."""
+    folder, path = run.answer(pair.name, pair.seed, method.name), _call_path(run, method.name, pair.name, pair.seed)
+    for stale in (run.cell(pair.name, pair.seed, method.name), path, folder):
+        remove(stale)
+    opened = open_pair(run, pair, progress, tools)
+    if isinstance(opened, str):
+        call, score = (
+            CallFile(pair_digest="", seconds=0.0, error=opened, stderr=""),
+            score_unmade(pair, "failed", opened),
+        )
+    else:
+        progress.stage("command", 0, 1)
+        call = _call(run, method, pair, opened, folder)
+        call, score = _score(method, opened[1], folder, call)
+    names = {"scenario": pair.name, "seed": pair.seed, "variant": method.name, "preset": method.name}
+    identity = {**names, "pair_kind": pair.kind, "commit": None, "is_contended": False}
+    write_json(path, call.model_dump(mode="json"))
+    write_json(run.cell(pair.name, pair.seed, method.name), cell_document(score, identity, NO_KEY, LAST))
+    return call.error
+
+
+def _call(run: RunFolder, method: Method, pair: Pair, opened: tuple[PairStages, GroundTruth], answer: Path) -> CallFile:
+    """Call the command about a pair and store its answer, or a failure."""
+    original = run.pair(pair.name, pair.seed)
+    known = digest_pair(original)
+    with _places() as places:
+        try:
+            write_merge(places["merge"], method.merge, *opened)
+        except MergeFailedError as refusal:
+            write_failure(answer, method.name, "merge_refused", str(refusal), refusal.evidence, {})
+            return CallFile(pair_digest=known, seconds=0.0, error=str(refusal), stderr="")
+        copy_pair(original, places["before"].parent)
+        ended = run_command(method.command, places, places["work"], method.limit_s)
+        error = ended.error
+        if not error and not (places["out"] / "answer.json").is_file():
+            error = "the command ended well and left no {out}/answer.json"
+        if error:
+            write_failure(answer, method.name, "failed", error, {}, {})
+        else:
+            answer.mkdir(parents=True)
+            for name in _ANSWER_FILES:
+                if (places["out"] / name).is_file():
+                    shutil.copyfile(places["out"] / name, answer / name)
+    return CallFile(pair_digest=known, seconds=ended.seconds, error=error, stderr=ended.stderr)
+
+
+def _score(method: Method, truth: GroundTruth, folder: Path, call: CallFile) -> tuple[CallFile, CaseScore]:
+    """Score the answer in a folder; one that cannot be an answer to the pair becomes a failure."""
+    try:
+        score = score_stored(truth, folder)
+    except TunnelcdError as mistake:
+        told = "; ".join(str(mistake).replace(f"{folder}/", "").replace(str(folder), "the answer").split("\n"))
+        error = f"no valid answer: {told}"[:_MOST_ERROR]
+        remove(folder)
+        write_failure(folder, method.name, "failed", error, {}, {})
+        call, score = call.model_copy(update={"error": error}), score_stored(truth, folder)
+    if score.row["status"] != "ok" and not call.error:
+        call = call.model_copy(update={"error": f"{score.row['status']}: {score.row['error']}"})
+    return call, score
+
+
+@contextmanager
+def _places() -> Iterator[dict[str, Path]]:
+    """Yield what stands for the placeholders, and a working folder, in a folder that is removed at the end."""
+    with TemporaryDirectory(prefix="tunnelcd-", ignore_cleanup_errors=True) as folder:
+        places = {name: Path(folder) / name for name in ("work", "out")}
+        for path in places.values():
+            path.mkdir()
+        pair = Path(folder) / "pair"
+        pair.mkdir()
+        sessions = {name: pair / name for name in ("before", "after")}
+        yield {**places, **sessions, "merge": Path(folder) / "merge.json"}
+
+
+def _call_path(run: RunFolder, name: str, scenario: str, seed: int) -> Path:
+    return evaluation_folder(run, name) / world_slug(scenario) / f"{seed}.json"
+
+
+def describe_calls(run: RunFolder, evaluation: EvaluationFile) -> dict[tuple[str, int], Mapping[str, Any]]:
+    """Return how the call about each pair of the evaluation ended, by (scenario, seed)."""
+    calls = {pair: read_call(run, evaluation.name, *pair) for pair in evaluation.pairs}
+    return {pair: call.model_dump(mode="json") for pair, call in calls.items() if call is not None}

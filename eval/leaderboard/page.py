@@ -1,0 +1,163 @@
+"""The leaderboard: one offline page with the packed results of many methods beside the reference rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from cdpipe.core.errors import InputError
+from eval.core.printing import count_pairs
+from eval.leaderboard.comparison import (
+    FIGURES,
+    HEADINGS,
+    SHOWN,
+    list_variants,
+    note_other_worlds,
+    show_figure,
+    show_span,
+    summarise_figures,
+    take_figures,
+)
+from eval.leaderboard.reference import find_reference
+from eval.leaderboard.submission import CheckedFile
+from eval.report.render import render_page, write_file
+from eval.running.run_data import RunData
+
+_MERGES = {"own": "its own", "given": "told the true one", "ours": "told tunnelcd's"}
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """A cell of the page: its text, what it is sorted by, and its interval."""
+
+    text: str
+    key: str
+    interval: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line of a table."""
+
+    cells: tuple[Shown, ...]
+    is_reference: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """One table: submissions about the same pairs of one plan, and the reference rows of these pairs."""
+
+    title: str
+    lines: tuple[Line, ...]
+    notes: tuple[str, ...]
+
+
+def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path | None, checked: Sequence[int]) -> None:
+    """Write the page.
+
+    Args:
+        files: The submissions.
+        out: The .html file.
+        reference: Where reference results are, as in `find_reference`.
+        checked: How many answers of each submission were scored again.
+
+    Raises:
+        InputError: Two submissions are of one method on the same pairs, or a file cannot be read or written.
+    """
+    if out.suffix != ".html" or out.is_dir():
+        raise InputError(f"--out {out}: expected the name of a file that ends in .html")
+    boards = [_make_board(group, reference) for group in _group(files)]
+    told = [
+        {"name": each.content.name, "file": each.path.name, "sha256": each.sha256, "content": each.content,
+         "command": " ".join(each.content.command), "n_checked": n,
+         "version": each.content.versions.get("tunnelcd", "")}
+        for each, n in zip(files, checked, strict=True)
+    ]  # fmt: skip
+    columns = [SHOWN[key] for key in FIGURES]
+    headings = ("method", "merge", "pairs", *HEADINGS)
+    content = {"boards": boards, "headings": headings, "files": told, "columns": columns}
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_file(out, render_page("leaderboard.html", content))
+
+
+def _group(files: Sequence[CheckedFile]) -> list[list[CheckedFile]]:
+    """Return the submissions of the same plan and pairs together; refuse two of one name among them."""
+    groups: dict[tuple[Any, ...], list[CheckedFile]] = {}
+    for each in files:
+        pairs = frozenset((pair.scenario, pair.seed) for pair in each.content.pairs)
+        groups.setdefault((each.content.plan, pairs), []).append(each)
+    for group in groups.values():
+        names = [each.content.name for each in group]
+        if twice := [each for each in group if names.count(each.content.name) > 1]:
+            told = " and ".join(str(each.path) for each in twice[:2])
+            raise InputError(f"{told}: two results of {twice[0].content.name} on the same pairs: leave one out")
+    return list(groups.values())
+
+
+def _make_board(group: Sequence[CheckedFile], reference: Path | None) -> Board:
+    first = group[0].content
+    data = find_reference(first.plan, reference)
+    own = {each.content.name: take_figures(_rows(each)) for each in group}
+    pairs = own[first.name].index
+    rows = [(summarise_figures(name, found), _MERGES[each.content.merge], False)
+            for (name, found), each in zip(own.items(), group, strict=True)]  # fmt: skip
+    for name, found in _list_references(data, pairs):
+        rows.append((summarise_figures(name, found), "", True))
+    rows.sort(key=lambda row: -_rank(row[0]["object_iou_point"]))
+    title = f"Plan {first.plan}, {count_pairs(len(pairs))}{f', {first.split}' if first.split else ''}"
+    return Board(title, tuple(_line(*row) for row in rows), tuple(_notes(group, data, len(pairs), rows)))
+
+
+def _rows(each: CheckedFile) -> pd.DataFrame:
+    return pd.DataFrame([pair.row for pair in each.content.pairs])
+
+
+def _list_references(data: RunData | None, pairs: pd.Index[Any]) -> Iterator[tuple[str, pd.DataFrame]]:
+    for name, found in list_variants([] if data is None else [data]):
+        kept = found.loc[found.index.intersection(pairs)]
+        if len(kept):
+            yield name, kept
+
+
+def _line(row: dict[str, Any], merge: str, is_reference: bool) -> Line:
+    answered = Shown(f"{row['n_answered']}/{row['n_pairs']}", str(row["n_answered"] / row["n_pairs"]))
+    figures = [
+        Shown(show_figure(key, row[key]), _sort_key(row[key]), show_span(key, row[f"{key}_low"], row[f"{key}_high"]))
+        for key in FIGURES
+    ]
+    name = Shown(row["method"], row["method"].casefold())
+    return Line((name, Shown(merge, merge), answered, *figures), is_reference)
+
+
+def _notes(
+    group: Sequence[CheckedFile], data: RunData | None, n_pairs: int, rows: Sequence[tuple[dict[str, Any], str, bool]]
+) -> Iterator[str]:
+    references = [row for row, _, is_reference in rows if is_reference]
+    if not references:
+        where = "none is at hand" if data is None else f"{data.folder.path.name} holds none of these pairs"
+        yield f"No reference rows: {where}."
+    elif any(row["n_pairs"] < n_pairs for row in references):
+        yield "A reference row with fewer pairs is a mean over those alone."
+    yield from note_other_worlds(pd.concat(map(_rows, group)), [] if data is None else [data])
+    digests: dict[tuple[str, int], str] = {}
+    for each in group:
+        differing = [
+            pair for pair in each.content.pairs
+            if digests.setdefault((pair.scenario, pair.seed), pair.pair_digest) != pair.pair_digest
+        ]  # fmt: skip
+        if differing:
+            other = group[0].content.name
+            yield f"{each.content.name} answered other simulations of {count_pairs(len(differing))} than {other}."
+
+
+def _rank(value: float) -> float:
+    return -math.inf if math.isnan(value) else value
+
+
+def _sort_key(value: float) -> str:
+    return "" if math.isnan(value) else repr(value)

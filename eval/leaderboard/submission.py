@@ -1,0 +1,322 @@
+"""Packed results of a method: one zip file with the rows, the answers and where they come from.
+
+    submission.json                      method, plan, versions, and of each pair its row and the digests of its answer
+    answers/<number of the pair>/answer.json, answer.npz
+
+The names of the members follow from the number of the pair, so no name of a file leads anywhere. Digests show damage
+and mixed-up files; who wants to know whether the rows are those of the answers scores them again (`score_again`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, ConfigDict, Field
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.files import list_members, parse_json, read_bytes, read_member, require_plain_file
+from cdpipe.core.names import LONGEST, visible
+from cdpipe.core.yamlfile import Document, Settings, validate
+from cdpipe.io.answer_parts import MAX_ERROR
+from eval.core.output import made_parents, whole_file
+from eval.core.provenance import git_commit, machine, versions
+from eval.leaderboard.evaluation import EvaluationFile, digest_pair, read_call, read_evaluation
+from eval.leaderboard.given_merge import MergeMode
+from eval.running.run_data import LARGEST
+from eval.running.runfolder import TEXT_COLUMNS, RunFolder, json_text
+from eval.scoring.scoring import METRICS_VERSION, score_stored
+from eval.truth.ground_truth import load_ground_truth
+
+_MANIFEST = "submission.json"
+_FILES = ("answer.json", "answer.npz")
+_MOST_BYTES = 4 << 30
+_EXPECTED = "expected a file of `tunnelcd submit`: ask for it again"
+_TOLD = 3
+_ROUNDING = 1e-6
+# columns of a row that say who answered what, which scoring does not know
+_NAMES = {"scenario", "seed", "variant", "preset", "pair_kind", "commit"}
+_Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+_Text = Annotated[str, Field(max_length=MAX_ERROR)]
+_Name = Annotated[str, Field(min_length=1, max_length=LONGEST)]
+
+
+def _require_scalar(value: Any) -> Any:
+    if value is not None and not isinstance(value, bool | int | float | str):
+        raise ValueError("expected a number, a truth value, a text or nothing")
+    if isinstance(value, str) and len(value) > MAX_ERROR:
+        raise ValueError(f"expected at most {MAX_ERROR} letters")
+    return value
+
+
+Cell = Annotated[Any, AfterValidator(_require_scalar)]
+
+
+class FilePart(Settings):
+    """One file of an answer."""
+
+    sha256: _Digest
+    n_bytes: Annotated[int, Field(ge=0)]
+
+
+class PairPart(Settings):
+    """One pair: its row of results.csv, and the files of its answer; none where the pair cannot be made."""
+
+    model_config = ConfigDict(allow_inf_nan=True)  # a figure that is undefined is NaN
+
+    scenario: _Name
+    seed: Annotated[int, Field(ge=0)]
+    pair_digest: Literal[""] | _Digest
+    seconds: Annotated[float, Field(ge=0, le=1e8)]
+    row: dict[_Name, Cell]
+    files: dict[Literal["answer.json", "answer.npz"], FilePart]
+
+
+class Submission(Settings):
+    """submission.json."""
+
+    format: Literal["tunnelcd-submission"] = "tunnelcd-submission"
+    format_version: Literal[1] = 1
+    name: _Name
+    command: Annotated[list[_Text], Field(min_length=1, max_length=1_000)]
+    merge: MergeMode
+    limit_s: Annotated[float, Field(gt=0, le=1e8)]
+    programs: Annotated[dict[_Name, _Digest], Field(max_length=1_000)]
+    plan: _Name
+    split: Annotated[str, Field(max_length=LONGEST)] = ""
+    metrics_version: int
+    commit: Annotated[str, Field(max_length=LONGEST)] | None
+    machine: Annotated[dict[_Name, Any], Field(max_length=100)]
+    versions: Annotated[dict[_Name, _Text], Field(max_length=1_000)]
+    pairs: Annotated[list[PairPart], Field(min_length=1, max_length=100_000)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CheckedFile:
+    """A submission whose digests are right: its file, the digest of that, its content."""
+
+    path: Path
+    sha256: str
+    content: Submission
+
+
+def pack_submission(run: RunFolder, name: str, out: Path) -> int:
+    """Pack the results of an evaluated method.
+
+    Args:
+        run: The run folder.
+        name: The method; "" for the only one that was evaluated there.
+        out: The zip file.
+
+    Returns:
+        How many pairs it holds.
+
+    Raises:
+        InputError: Pairs lack an answer or its row, or these are not of the present pairs or metrics; or `out` cannot
+            be written.
+    """
+    if out.suffix != ".zip" or out.is_dir():
+        raise InputError(f"--out {out}: expected the name of a new file that ends in .zip")
+    evaluation = read_evaluation(run, name or _find_only(run))
+    parts, answers = _collect(run, evaluation)
+    document = Submission(
+        name=evaluation.name, command=[_without_folders(word) for word in evaluation.command],
+        merge=evaluation.merge, limit_s=evaluation.limit_s,
+        programs={_without_folders(path): digest for path, digest in evaluation.programs.items()},
+        plan=evaluation.plan, split=evaluation.split, metrics_version=METRICS_VERSION, commit=git_commit(),
+        machine=machine(), versions=versions(), pairs=parts,
+    )  # fmt: skip
+    with made_parents(out), whole_file(out) as partial, zipfile.ZipFile(partial, "w") as archive:
+        _add(archive, _MANIFEST, json_text(document.model_dump()).encode())
+        for number, answer in enumerate(answers):
+            for file in parts[number].files:
+                _add(archive, _member(number, file), (answer / file).read_bytes())
+    return len(parts)
+
+
+def read_submission(path: Path) -> CheckedFile:
+    """Read a packed submission and compare all digests; nothing is written.
+
+    Raises:
+        InputError: It is damaged, not complete, or of another metrics version.
+    """
+    n_bytes = require_plain_file(path, _MOST_BYTES, _EXPECTED)
+    with _opened(path, n_bytes) as (archive, members):
+        if _MANIFEST not in members:
+            raise ValueError(f"no {_MANIFEST} in it")
+        content = parse_json(read_member(archive, members[_MANIFEST]).tobytes())
+        document = validate(Submission, Document(f"{path}:{_MANIFEST}", content))
+        _check_rows(document)
+        declared = {
+            _member(number, file): part
+            for number, pair in enumerate(document.pairs)
+            for file, part in pair.files.items()
+        }
+        if others := sorted({*members} ^ {*declared, _MANIFEST})[:1]:
+            raise ValueError(f"{visible(others[0])[:200]} is in the archive or in {_MANIFEST}, not in both")
+        for name, part in declared.items():
+            if members[name].file_size != part.n_bytes:
+                raise ValueError(f"{name} has {members[name].file_size} bytes, {part.n_bytes} were packed")
+            if hashlib.sha256(read_member(archive, members[name]).data).hexdigest() != part.sha256:
+                raise ValueError(f"{name} is not the file that was packed: its digest differs")
+    return CheckedFile(path, _digest_file(path), document)
+
+
+def score_again(found: CheckedFile, run: RunFolder) -> int:
+    """Score the answers of a submission by the truth of a run's pairs, and compare the rows.
+
+    Args:
+        found: The submission.
+        run: A run folder with the same pairs.
+
+    Returns:
+        How many pairs were scored; a pair that cannot be made has no answer.
+
+    Raises:
+        InputError: The run lacks a pair or holds another simulation of it, or a row is not that of its answer.
+    """
+    n_scored = 0
+    for pair, files in _iterate_answers(found):
+        original, case = run.pair(pair.scenario, pair.seed), f"{pair.scenario} {pair.seed}"
+        if digest_pair(original) != pair.pair_digest:
+            raise InputError(f"{run.path}: holds no pair {case} as {found.path} answers it: simulate it anew")
+        with TemporaryDirectory(prefix="tunnelcd-") as answer:
+            for name, content in files.items():
+                Path(answer, name).write_bytes(content)
+            row = score_stored(load_ground_truth(original), Path(answer)).row
+        for key, value in row.items():
+            if key not in _NAMES and not _is_same(pair.row.get(key), value):
+                raise InputError(
+                    f"{found.path}: {case}: {key} = {pair.row.get(key)} in its row, and its answer scores {value}"
+                )
+        n_scored += 1
+    return n_scored
+
+
+def _iterate_answers(found: CheckedFile) -> Iterator[tuple[PairPart, dict[str, bytes]]]:
+    """Yield each pair that has an answer, and the content of its files."""
+    with _opened(found.path, found.path.stat().st_size) as (archive, members):
+        for number, pair in enumerate(found.content.pairs):
+            if pair.files:
+                names = {file: members[_member(number, file)] for file in pair.files}
+                yield pair, {file: read_member(archive, member).tobytes() for file, member in names.items()}
+
+
+def _collect(run: RunFolder, evaluation: EvaluationFile) -> tuple[list[PairPart], list[Path]]:
+    """Return the parts and the folders of all answers; refuse to pack some of them only."""
+    parts, answers, mistakes = [], [], []
+    for scenario, seed in evaluation.pairs:
+        answer = run.answer(scenario, seed, evaluation.name)
+        call = read_call(run, evaluation.name, scenario, seed)
+        cell = run.read_cell(run.cell(scenario, seed, evaluation.name))
+        held = digest_pair(run.pair(scenario, seed))
+        is_there = call is not None and cell is not None and (not call.pair_digest or (answer / _FILES[0]).is_file())
+        if call is None or cell is None or not is_there or cell["row"].get("metrics_version") != METRICS_VERSION:
+            mistakes.append(f"{scenario} {seed}")
+        elif held and held != call.pair_digest:
+            mistakes.append(f"{scenario} {seed} (simulated anew since)")
+        else:
+            files = {file: _describe(answer / file) for file in _FILES if (answer / file).is_file()}
+            parts.append(
+                PairPart.model_validate(
+                    {"scenario": scenario, "seed": seed, "pair_digest": call.pair_digest, "seconds": call.seconds,
+                     "row": cell["row"], "files": files}
+                )
+            )  # fmt: skip
+            answers.append(answer)
+    if mistakes:
+        more = f" and {len(mistakes) - _TOLD} more" if len(mistakes) > _TOLD else ""
+        raise InputError(
+            f"{run.path}: {evaluation.name} lacks {len(mistakes)} of {len(evaluation.pairs)} pairs "
+            f"({', '.join(mistakes[:_TOLD])}{more}): the same `tunnelcd evaluate` goes on there"
+        )
+    return parts, answers
+
+
+def _find_only(run: RunFolder) -> str:
+    names = [path.parent.name for path in sorted(run.path.glob("evaluations/*/evaluation.json"))]
+    if not names:
+        raise InputError(f"{run.path}: no method was evaluated here: `tunnelcd evaluate --out {run.path}` first")
+    if len(names) > 1:
+        raise InputError(f"{run.path}: holds {', '.join(names)}: name one with --as")
+    return names[0]
+
+
+def _check_rows(document: Submission) -> None:
+    """Refuse rows that are not of their pairs, and values that no table can hold."""
+    if document.metrics_version != METRICS_VERSION:
+        raise ValueError(
+            f"scored by metrics version {document.metrics_version}, this tunnelcd scores by {METRICS_VERSION}"
+        )
+    seen = set()
+    for pair in document.pairs:
+        case = pair.scenario, pair.seed
+        if case in seen or (pair.row.get("scenario"), pair.row.get("seed")) != case:
+            raise ValueError(f"the row of {visible(pair.scenario)} {pair.seed} stands twice, or is of another pair")
+        seen.add(case)
+        if pair.row.get("variant") != document.name or pair.row.get("metrics_version") != METRICS_VERSION:
+            raise ValueError(f"the row of {visible(pair.scenario)} {pair.seed} is of another method or other metrics")
+        is_ok = pair.row.get("status") == "ok"
+        if not isinstance(pair.row.get("status"), str) or (is_ok and set(pair.files) != set(_FILES)):
+            raise ValueError(f"the row of {visible(pair.scenario)} {pair.seed} has no status, or no answer")
+        for key, value in pair.row.items():
+            if isinstance(value, str) and key not in TEXT_COLUMNS:
+                raise ValueError(f"{visible(key)[:40]} = {value[:40]!r}: expected a number")
+            if isinstance(value, float) and abs(value) > LARGEST:
+                raise ValueError(f"{visible(key)[:40]} = {value}: larger than any figure is")
+
+
+@contextmanager
+def _opened(path: Path, n_bytes: int) -> Iterator[tuple[zipfile.ZipFile, Mapping[str, zipfile.ZipInfo]]]:
+    """Yield an archive and its members; whatever a damaged one provokes is one line."""
+    try:
+        with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+            yield archive, list_members(file, archive, n_bytes)
+    except InputError:
+        raise
+    except Exception as error:  # zipfile and zlib let through whatever a damaged file provokes
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: {said:.300}: {_EXPECTED}") from error
+
+
+def _member(number: int, file: str) -> str:
+    return f"answers/{number:05d}/{file}"
+
+
+def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
+    """Add a member that carries no time, so that the same results give the same bytes."""
+    archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED if name.endswith(".json") else None)
+
+
+def _describe(path: Path) -> dict[str, Any]:
+    content = read_bytes(path)
+    return {"sha256": hashlib.sha256(content).hexdigest(), "n_bytes": len(content)}
+
+
+def _digest_file(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _without_folders(word: str) -> str:
+    """Return a word of a command without the folders of this machine."""
+    return Path(word).name if Path(word).is_absolute() else word
+
+
+def _is_same(stored: Any, scored: Any) -> bool:
+    """Tell whether a value of a row is what scoring gave."""
+    plain = json.loads(json.dumps(scored, default=lambda value: value.item()))
+    if isinstance(plain, str) or plain is None:
+        return bool(stored == plain)
+    if not isinstance(stored, bool | int | float):
+        return False
+    a, b = float(stored), float(plain)
+    return (math.isnan(a) and math.isnan(b)) or math.isclose(a, b, rel_tol=_ROUNDING, abs_tol=_ROUNDING)

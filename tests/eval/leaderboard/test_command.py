@@ -1,0 +1,77 @@
+"""The command of a method: what is refused before anything runs, and every way to end."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from cdpipe.core.errors import InputError
+from eval.leaderboard.command import STDERR_BYTES, digest_programs, parse_command, run_command
+
+WHOLE = "{before} {after} {out}"
+
+
+@pytest.mark.parametrize(
+    ("text", "gets_merge", "said"),
+    [
+        ("", False, "is empty"),
+        ("python 'x", False, "No closing quotation"),
+        (f"no-such-program-1 {WHOLE}", False, "no such program"),
+        ("python x.py {before} {after}", False, "{out} is missing"),
+        ("python x.py {befor} {after} {out}", False, 'did you mean "before"'),
+        (f"python x.py {WHOLE} {{merge}}", False, "needs --merge given"),
+        (f"python x.py {WHOLE}", True, "{merge} is missing"),
+    ],
+)
+def test_a_command_that_cannot_work_is_refused(text: str, gets_merge: bool, said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_command(text, gets_merge=gets_merge)
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_words_that_name_files_become_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("x.py").write_text("pass")
+    words = parse_command(f"{sys.executable} x.py y.py 0.3 '{{\"a\": 1}}' {WHOLE}", gets_merge=False)
+    assert words == (
+        sys.executable, str(tmp_path / "x.py"), "y.py", "0.3", '{"a": 1}', "{before}", "{after}", "{out}"
+    )  # fmt: skip
+    assert list(digest_programs(words)) == [str(tmp_path / "x.py")]
+
+
+def run(code: str, folder: Path, limit_s: float = 60.0, *more: str) -> tuple[str, str, float]:
+    words = (sys.executable, "-c", code, "{out}", *more)
+    ended = run_command(words, {"out": folder / "o"}, folder, limit_s)
+    return ended.error, ended.stderr, ended.seconds
+
+
+def test_it_runs_in_its_folder_with_its_words(tmp_path: Path) -> None:
+    code = "import os, sys, pathlib; pathlib.Path('here').write_text(' '.join(sys.argv[1:]))"
+    assert run(code, tmp_path, 60.0, "{other}", "x={out}")[0] == ""
+    assert (tmp_path / "here").read_text() == f"{tmp_path / 'o'} {{other}} x={tmp_path / 'o'}"
+
+
+def test_a_crash_names_its_last_line_and_keeps_the_end_of_standard_error(tmp_path: Path) -> None:
+    code = f"import sys; sys.stderr.write('x' * {3 * STDERR_BYTES}); sys.stderr.write('\\n'); 1 / 0"
+    error, stderr, _ = run(code, tmp_path)
+    assert error == "the command ended with exit code 1: ZeroDivisionError: division by zero"
+    assert len(stderr) == STDERR_BYTES and stderr.startswith("xx")
+
+
+def test_a_signal_and_a_program_that_cannot_start_are_errors(tmp_path: Path) -> None:
+    assert run("import os; os.kill(os.getpid(), 9)", tmp_path)[0] == "the command ended with signal 9"
+    ended = run_command((str(tmp_path),), {}, tmp_path, 1.0)
+    assert ended.error.startswith("the command could not be started")
+
+
+def test_at_its_time_limit_a_command_ends_with_all_that_it_started(tmp_path: Path) -> None:
+    child = f"import time, pathlib; time.sleep(2.5); pathlib.Path({str(tmp_path / 'late')!r}).touch()"
+    code = f"import subprocess, sys, time; subprocess.Popen([sys.executable, '-c', {child!r}]); time.sleep(60)"
+    error, _, seconds = run(code, tmp_path, 1.0)
+    assert error == "the command took longer than 1 s"
+    assert seconds >= 1.0
+    time.sleep(2.0)
+    assert not (tmp_path / "late").exists()

@@ -1,0 +1,130 @@
+"""The table beside the reference, by hand."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from cdpipe.core.errors import InputError
+from eval.leaderboard.comparison import FIGURES, compare_with_reference, list_lines, write_tables_of
+from eval.leaderboard.reference import find_reference, take_other_methods
+from eval.running.run_data import RunData, read_run
+from eval.running.runfolder import write_json
+from eval.scoring.scoring import METRICS_VERSION
+
+RECALLS = {"mine": (1.0, 0.5, 0.0), "tunnelcd": (1.0, 1.0, 0.5), "a": (0.0, 0.0, 0.0)}
+
+
+def table(seeds: tuple[int, ...] = (1, 2, 3)) -> pd.DataFrame:
+    rows = [
+        {
+            "scenario": "narrow", "seed": seed, "variant": name, "family": "narrow", "pair_kind": "", "preset": name,
+            "status": "failed" if name == "mine" and recall == 0 else "ok", "metrics_version": METRICS_VERSION,
+            "region_recall": recall, "false_regions_per_100m": float(seed), "object_iou_point": recall / 2,
+            "object_f1_50": recall, "t_total_s": 10.0 * seed if name != "mine" else math.nan,
+        }
+        for name, recalls in RECALLS.items()
+        for seed, recall in zip(seeds, recalls, strict=True)
+    ]  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def read(folder: Path, frame: pd.DataFrame, split: str = "") -> RunData:
+    folder.mkdir(parents=True, exist_ok=True)
+    frame.to_csv(folder / "results.csv", index=False)
+    write_json(folder / "provenance.json", {"tool": "tunnelcd", "plan": {"name": "x", "split": split}})
+    return read_run(folder)
+
+
+def own(frame: pd.DataFrame) -> pd.DataFrame:
+    return frame[frame["variant"] == "mine"]
+
+
+def test_means_differences_and_pairs_by_hand(tmp_path: Path) -> None:
+    frame = table()
+    data = take_other_methods(read(tmp_path / "run", frame), "mine")
+    calls = {("narrow", 3): {"error": "boom", "seconds": 4.0}}
+    found = compare_with_reference(own(frame), "mine", [data], calls)
+    rows = found.table.set_index("method")
+    assert list(rows.index) == ["mine", "tunnelcd", "a"]
+    assert rows.loc["mine", ["n_pairs", "n_answered"]].tolist() == [3, 2]
+    assert rows["region_recall"].tolist() == [0.5, pytest.approx(2.5 / 3), 0.0]
+    assert rows.loc["tunnelcd", "t_total_s"] == 20.0 and math.isnan(rows.loc["mine", "t_total_s"])
+    against = found.pairs[found.pairs["reference"] == "tunnelcd"].set_index("seed")
+    assert against["region_recall_difference"].tolist() == [0.0, -0.5, -0.5]
+    assert against.loc[3, ["error", "command_s"]].tolist() == ["boom", 4.0]
+    mean = found.paired.set_index(["reference", "metric"]).loc[("tunnelcd", "region_recall")]
+    assert mean["difference"] == pytest.approx(-1 / 3) and mean["n_used"] == 3 and mean["verdict"] == "too few pairs"
+    assert not {metric for reference, metric in zip(found.paired["reference"], found.paired["metric"], strict=True)
+                if metric == "t_total_s"}  # fmt: skip
+    write_tables_of(found, tmp_path / "out")
+    assert len(pd.read_csv(tmp_path / "out" / "differences.csv")) == 6
+
+
+def test_the_table_fits_80_columns(tmp_path: Path) -> None:
+    frame = table().replace({"variant": {"a": "a-method-with-a-very-long-name-indeed"}})
+    frame.loc[frame["variant"] == "tunnelcd", "t_total_s"] = [1234.5, 0.00123, 99.9]
+    data = take_other_methods(read(tmp_path / "run", frame), "mine")
+    lines = list_lines(compare_with_reference(own(frame), "mine", [data], {}))
+    assert max(map(len, lines)) <= 80
+    # every figure stands apart from the next
+    assert lines[1].split() == ["mine", "2/3", "0.50", "2.00", "0.25", "0.50", "\u2013"]
+    assert lines[2].split() == ["0.00-1.00", "1.00-3.00", "0.00-0.50", "0.00-1.00"]
+    assert any(line.startswith("pair by pair, mine less tunnelcd:") for line in lines)
+
+
+def test_without_the_same_pairs_the_reason_is_told(tmp_path: Path) -> None:
+    frame = table()
+    sealed = read(tmp_path / "sealed", table((7, 8, 9)), "sealed by x")
+    found = compare_with_reference(own(frame), "mine", [sealed], {})
+    assert found.table["method"].tolist() == ["mine"] and len(found.pairs) == 3
+    assert any("--split sealed" in note for note in found.notes)
+    partly = read(tmp_path / "partly", table((2, 3, 4)))
+    found = compare_with_reference(own(frame), "mine", [take_other_methods(partly, "mine")], {})
+    assert found.table["n_pairs"].tolist() == [2, 2, 2]
+    assert any("2 of 3 pairs" in note for note in found.notes)
+
+
+def test_the_first_place_that_has_a_method_counts(tmp_path: Path) -> None:
+    frame = table()
+    later = frame.assign(region_recall=0.25)
+    places = [take_other_methods(read(tmp_path / name, each), "mine") for name, each in (("1", frame), ("2", later))]
+    found = compare_with_reference(own(frame), "mine", places, {})
+    assert found.table["method"].tolist() == ["mine", "tunnelcd", "a"]
+    assert found.table["region_recall"].tolist()[2] == 0.0
+
+
+def test_pairs_of_one_name_that_are_other_worlds_are_told(tmp_path: Path) -> None:
+    frame = table().assign(n_changes=2)
+    other = frame.assign(n_changes=[2, 3, 2] * 3)
+    for reference, n_other in ((frame, 0), (other, 1)):
+        data = take_other_methods(read(tmp_path / str(n_other), reference), "mine")
+        found = compare_with_reference(own(frame), "mine", [data], {})
+        assert sum("other changes or another drive (narrow 2)" in note for note in found.notes) == n_other
+
+
+def test_a_name_that_leads_elsewhere_finds_no_reference(tmp_path: Path) -> None:
+    read(tmp_path / "secret", table())
+    (tmp_path / "reports").mkdir()
+    assert find_reference("../reports/main", None) is None
+    with pytest.raises(InputError, match="holds no"):
+        find_reference("../secret", tmp_path / "reports")
+
+
+def test_references_are_found_by_folder_and_by_plan(tmp_path: Path) -> None:
+    read(tmp_path / "reports" / "x", table())
+    for folder in (tmp_path / "reports", tmp_path / "reports" / "x"):
+        found = find_reference("x", folder)
+        assert found is not None and len(found.results) == 9
+    committed = find_reference("main", None)
+    assert committed is not None and {"tunnelcd", "m3c2"} < {row["variant"] for row in committed.results}
+    assert all(name in committed.results[0] for name in FIGURES)
+    assert find_reference("no such plan", None) is None
+    with pytest.raises(InputError, match=r"holds no results\.csv"):
+        find_reference("y", tmp_path / "reports")
+    read(tmp_path / "old", table().assign(metrics_version=1))
+    with pytest.raises(InputError, match="metrics version 1"):
+        find_reference("x", tmp_path / "old")

@@ -1,0 +1,184 @@
+"""Evaluation: blind pairs, failures that are rows, kept pairs, merges that are given."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.io.known_merge import read_alignment, read_known_merge, write_alignment
+from cdpipe.model.alignment import PathAlignment
+from eval.leaderboard.evaluation import read_call, read_evaluation
+from eval.leaderboard.given_merge import write_merge
+from eval.oracles.merge import OracleMerge, align_by_truth
+from eval.running.rescoring import rescore
+from eval.running.stages import PairStages
+from eval.truth.adapters import pipeline_input
+from eval.truth.ground_truth import load_ground_truth
+from scenarios.library import load_scenario
+from scenarios.schema import Scenario
+from sim.session.truth import read_pair_truth, write_pair_truth
+from tests.eval.leaderboard.conftest import GOOD, TOOLS, Evaluator
+
+ONE_BOX = "smoke/one_box"
+
+
+def rows_of(evaluator: Evaluator, name: str = "mine") -> pd.DataFrame:
+    results = pd.read_csv(evaluator.run.path / "results.csv")
+    return results[results["variant"] == name]
+
+
+def test_a_good_method_is_a_variant_of_the_run(evaluator: Evaluator) -> None:
+    outcome = evaluator.evaluate()
+    assert (outcome.n_done, outcome.n_kept, outcome.n_failed) == (2, 0, 0)
+    rows = rows_of(evaluator)
+    assert rows["status"].tolist() == ["ok", "ok"] and rows["seed"].tolist() == [20000, 20000]
+    assert rows["scenario"].tolist() == [ONE_BOX, "smoke/unchanged"]
+    assert rows["merge_error_m"].max() < 1e-9  # it used the true merge that it was given
+    assert rows["region_recall"].tolist() == [0.0, 0.0] and rows["t_cd_s"].tolist() == [0.5, 0.5]
+    # it is scored again like every answer
+    assert rescore(evaluator.run) == 2
+    pd.testing.assert_frame_equal(rows_of(evaluator), rows)
+
+
+BLIND = """
+import os, sys
+from pathlib import Path
+before, after, out, merge = map(Path, sys.argv[1:5])
+assert sorted(os.listdir(before.parent)) == ["after", "before"] and before.parent == after.parent
+assert os.listdir() == [] and os.listdir(out) == []
+around = sorted(path.name for path in before.parent.parent.rglob("*"))
+assert "truth" not in around and not any("smoke" in name for name in around), around
+texts = [path.read_bytes() for path in before.parent.rglob("*.json")]
+assert texts and not any(b"smoke" in text or b"20000" in text for text in texts)
+"""
+
+
+def test_a_method_sees_blind_sessions_and_an_empty_folder_of_its_own(evaluator: Evaluator) -> None:
+    assert evaluator.evaluate(BLIND + GOOD).n_failed == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("raise RuntimeError('no idea')", "exit code 1: RuntimeError: no idea"),
+        ("import time; time.sleep(30)", "took longer than 1.5 s"),
+        ("pass", "left no {out}/answer.json"),
+        (GOOD.replace('"radius_m": 2.0', '"radius_m": -1'), "no valid answer: answer.json: radius_m = -1"),
+        (GOOD.replace("[[90.0, 0, 0]]", "[[float('nan'), 0, 0]]"), "no valid answer"),
+        (GOOD + "\n(out / 'answer.npz').write_bytes(b'PK')", "no valid answer: answer.npz: unreadable"),
+        (GOOD + "\nsys.exit(3)", "exit code 3"),
+    ],
+)
+def test_a_pair_without_an_answer_is_a_row_with_its_error(evaluator: Evaluator, text: str, said: str) -> None:
+    outcome = evaluator.evaluate(text, limit_s=1.5 if "sleep" in text else 60.0)
+    assert outcome.n_failed == 2
+    rows = rows_of(evaluator)
+    assert rows["status"].tolist() == ["failed", "failed"]
+    assert all(said in error for error in rows["error"])
+    assert rows["region_recall"].tolist() == [0.0, 0.0] and rows["object_iou_point"].tolist() == [0.0, 0.0]
+    call = read_call(evaluator.run, "mine", ONE_BOX, 20000)
+    assert call is not None and said in call.error
+    assert str(evaluator.run.path) not in call.error
+    assert ("RuntimeError" in call.stderr) == ("RuntimeError" in text)
+
+
+def test_finished_pairs_are_kept_until_something_changes(evaluator: Evaluator) -> None:
+    count = f"Path({str(evaluator.run.path.parent / 'calls')!r}).open('a').write('x')\n"
+    counting = GOOD + count
+
+    def n_calls() -> int:
+        return len((evaluator.run.path.parent / "calls").read_text())
+
+    evaluator.evaluate(counting)
+    assert evaluator.evaluate(counting).n_kept == 2 and n_calls() == 2
+    evaluator.run.cell(ONE_BOX, 20000, "mine").unlink()  # as an interrupt leaves it
+    assert evaluator.evaluate(counting).n_kept == 1 and n_calls() == 3
+    pair = evaluator.run.pair(ONE_BOX, 20000)
+    truth = read_pair_truth(pair)
+    write_pair_truth(pair, replace(truth, score_radius_m=3.5))  # another simulation of the pair
+    assert evaluator.evaluate(counting).n_kept == 1 and n_calls() == 4
+    with pytest.raises(InputError, match="was changed since its rows were made"):
+        evaluator.evaluate(counting + "\n")
+    with pytest.raises(InputError, match="--time-limit"):
+        evaluator.evaluate(counting, limit_s=5.0)
+    assert n_calls() == 4
+    assert evaluator.evaluate(counting + "\n", force=True).n_done == 2 and n_calls() == 6
+
+
+def test_names_of_presets_and_of_the_runs_own_variants_are_refused(evaluator: Evaluator) -> None:
+    with pytest.raises(InputError, match="a preset or an oracle"):
+        evaluator.evaluate(name="tunnelcd")
+    assert not (evaluator.run.path / "evaluations").exists()
+
+
+def test_the_folder_says_what_was_evaluated(evaluator: Evaluator) -> None:
+    evaluator.evaluate()
+    found = read_evaluation(evaluator.run, "mine")
+    assert found.plan == "smoke" and found.merge == "given"
+    assert found.pairs == ((ONE_BOX, 20000), ("smoke/unchanged", 20000))
+    plan = evaluator.run.provenance()["plan"]
+    assert plan["name"] == "smoke" and plan["variants"] == []
+
+
+def test_the_merge_that_is_given_is_the_true_one_along_the_path(tmp_path: Path, write_tiny_pair: object) -> None:
+    pair = write_tiny_pair(stretch=1.05)  # type: ignore[operator] # the odometry of both sessions drifts
+    truth = load_ground_truth(pair)
+    stages = PairStages(pipeline_input(pair, "before"), pipeline_input(pair, "after"))
+    write_merge(tmp_path / "merge.json", "given", stages, truth)
+    along = read_alignment(tmp_path / "merge.json")
+    # both sessions drive the same way: each scan of the after session stands where its twin of the before one does
+    scans = truth.after.judged_scans
+    np.testing.assert_allclose(along.anchors_odom, truth.after.odom_T_sensor[scans, :3, 3])
+    mapped = along.before_T_after @ truth.after.odom_T_sensor[scans]
+    np.testing.assert_allclose(mapped, truth.before.odom_T_sensor[scans], atol=1e-9)
+    middle = read_known_merge(tmp_path / "merge.json")
+    assert any(np.allclose(middle, each) for each in along.before_T_after)
+
+
+def test_sessions_that_never_meet_have_no_true_merge(tiny_pair: Path) -> None:
+    truth = load_ground_truth(tiny_pair)
+    far = truth.after.world_T_sensor.copy()
+    far[:, 0, 3] += 100.0
+    sessions = truth.before, replace(truth.after, world_T_sensor=far)
+    poses = truth.before.odom_T_sensor, truth.after.odom_T_sensor
+    scans = truth.before.judged_scans, truth.after.judged_scans
+    assert align_by_truth(sessions, poses, scans, OracleMerge(), 7) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"anchors_odom": [[0.0, 0.0]]}, "must be"),
+        ({"anchors_odom": [[0.0, 0.0, float("nan")]]}, "not finite"),
+        ({"before_T_after_at_anchors": None}, "before_T_after|len"),
+        ({"before_T_after_at_anchors": [np.full((4, 4), 2.0).tolist()]}, "rigid|rotation"),
+        ({"anchors_odom": [], "before_T_after_at_anchors": []}, "must be|anchor"),
+        ({"anchors_odom": {"a": 1}}, "."),
+    ],
+)
+def test_a_damaged_merge_is_one_line(tmp_path: Path, change: dict[str, object], said: str) -> None:
+    path = tmp_path / "merge.json"
+    write_alignment(path, np.eye(4), PathAlignment.rigid(np.eye(4)), "truth")
+    assert read_alignment(path).is_rigid
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with pytest.raises(InputError, match=said) as caught:
+        read_alignment(path)
+    assert "\n" not in str(caught.value) and str(caught.value).startswith(str(path))
+
+
+def test_a_pair_that_cannot_be_made_is_a_failed_row_without_scores(evaluator: Evaluator) -> None:
+    def draw(name: str, seed: int, settings: tuple[str, ...] = ()) -> Scenario:
+        if name == ONE_BOX:
+            raise ScenarioError(f"{name} does not fit")
+        return load_scenario(name, seed, settings)
+
+    assert evaluator.evaluate(tools=replace(TOOLS, draw=draw)).n_failed == 1
+    rows = rows_of(evaluator).set_index("scenario")
+    assert rows.loc[ONE_BOX, "error"] == "smoke/one_box does not fit"
+    assert np.isnan(rows.loc[ONE_BOX, "region_recall"]) and rows.loc["smoke/unchanged", "region_recall"] == 0.0

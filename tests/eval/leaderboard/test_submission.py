@@ -1,0 +1,201 @@
+"""Packed results: complete, checked, hostile files refused, and the page of them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from cdpipe.core.errors import InputError
+from eval.leaderboard.page import write_leaderboard
+from eval.leaderboard.submission import CheckedFile, pack_submission, read_submission, score_again
+from eval.running.runfolder import RunFolder
+
+ONE_BOX = "smoke/one_box"
+Change = Callable[[dict[str, bytes]], None]
+
+
+@pytest.fixture
+def run(evaluated: RunFolder, tmp_path: Path) -> RunFolder:
+    shutil.copytree(evaluated.path, tmp_path / "copy")
+    return RunFolder(tmp_path / "copy")
+
+
+@pytest.fixture
+def packed(evaluated: RunFolder, tmp_path: Path) -> Path:
+    assert pack_submission(evaluated, "", tmp_path / "mine.zip") == 2
+    return tmp_path / "mine.zip"
+
+
+def rewrite(path: Path, change: Change) -> Path:
+    """Write the archive anew with other members."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    change(members)
+    changed = path.with_name("changed.zip")
+    with zipfile.ZipFile(changed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return changed
+
+
+def in_manifest(change: Callable[[dict[str, Any]], None]) -> Change:
+    def whole(members: dict[str, bytes]) -> None:
+        document = json.loads(members["submission.json"])
+        change(document)
+        members["submission.json"] = json.dumps(document).encode()
+
+    return whole
+
+
+def in_row(**values: Any) -> Change:
+    return in_manifest(lambda document: document["pairs"][0]["row"].update(values))
+
+
+def test_what_was_packed_is_read_and_scored_again(evaluated: RunFolder, packed: Path) -> None:
+    found = read_submission(packed)
+    assert found.content.name == "mine" and found.content.plan == "smoke"
+    assert [(pair.scenario, pair.seed) for pair in found.content.pairs] == [
+        (ONE_BOX, 20000),
+        ("smoke/unchanged", 20000),
+    ]
+    assert score_again(found, evaluated) == 2
+    # no folder of this machine is in it
+    text = found.content.model_dump_json()
+    assert str(evaluated.path) not in text and "script.py" in text and str(evaluated.path.parent) not in text
+
+
+def test_the_same_results_give_the_same_bytes(evaluated: RunFolder, packed: Path, tmp_path: Path) -> None:
+    pack_submission(evaluated, "mine", tmp_path / "again.zip")
+    assert (tmp_path / "again.zip").read_bytes() == packed.read_bytes()
+
+
+def test_results_that_lack_a_pair_are_not_packed(run: RunFolder, tmp_path: Path) -> None:
+    run.cell(ONE_BOX, 20000, "mine").unlink()
+    with pytest.raises(InputError, match=r"mine lacks 1 of 2 pairs \(smoke/one_box 20000\)"):
+        pack_submission(run, "mine", tmp_path / "x.zip")
+    assert not (tmp_path / "x.zip").exists()
+
+
+def test_results_of_another_simulation_are_not_packed(run: RunFolder, tmp_path: Path) -> None:
+    changes = run.pair(ONE_BOX, 20000) / "truth" / "changes.json"
+    changes.write_text(changes.read_text() + " ")
+    with pytest.raises(InputError, match="simulated anew since"):
+        pack_submission(run, "mine", tmp_path / "x.zip")
+    shutil.rmtree(run.path / "pairs")  # pairs can be made again: nothing contradicts
+    assert pack_submission(run, "mine", tmp_path / "x.zip") == 2
+
+
+@pytest.mark.parametrize("name", ["other", "../run"])
+def test_methods_that_were_not_evaluated_are_not_packed(evaluated: RunFolder, tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError):
+        pack_submission(evaluated, name, tmp_path / "x.zip")
+    with pytest.raises(InputError, match=r"ends in \.zip"):
+        pack_submission(evaluated, "mine", tmp_path / "x.tar")
+
+
+PART = {"sha256": "0" * 64, "n_bytes": 1}
+NPZ = "answers/00000/answer.npz"
+HOSTILE: dict[str, tuple[Change, str]] = {
+    "another answer": (lambda m: m.update({NPZ: m[NPZ][:-1] + b"x"}), "digest differs"),
+    "a shorter answer": (lambda m: m.update({NPZ: b""}), "0 bytes"),
+    "no answer": (lambda m: m.pop("answers/00001/answer.json") and None, "not in both"),
+    "one more": (lambda m: m.update({"../../evil.py": b"x"}), "not in both"),
+    "no manifest": (lambda m: m.pop("submission.json") and None, "no submission.json"),
+    "no JSON": (lambda m: m.update({"submission.json": b"{"}), "Expecting"),
+    "deep JSON": (lambda m: m.update({"submission.json": b"[" * 10_000}), "nested"),
+    "unknown key": (in_manifest(lambda d: d.update({"x": 1})), "x"),
+    "text for a number": (in_row(region_recall="<b>"), "expected a number"),
+    "a list for a number": (in_row(region_recall=[1]), "region_recall"),
+    "a figure without end": (in_row(t_total_s=float("inf")), "larger than any figure"),
+    "another pair": (in_row(seed=4), "of another pair"),
+    "another method": (in_row(variant="tunnelcd"), "another method"),
+    "twice": (in_manifest(lambda d: d["pairs"][1].update(d["pairs"][0])), "stands twice"),
+    "other metrics": (in_manifest(lambda d: d.update({"metrics_version": 3})), "metrics version 3"),
+    "a long name": (in_manifest(lambda d: d.update({"plan": "p" * 1000})), "plan"),
+    "a name of a member": (in_manifest(lambda d: d["pairs"][0]["files"].update({"../x": PART})), "files"),
+    "a status and no answer": (in_manifest(lambda d: d["pairs"][0]["files"].pop("answer.npz") and None), "no answer"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_file_that_is_not_what_was_packed_is_one_line(packed: Path, name: str) -> None:
+    change, said = HOSTILE[name]
+    changed = rewrite(packed, change)
+    with pytest.raises(InputError) as caught:
+        read_submission(changed)
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+    assert str(caught.value).startswith(str(changed))
+
+
+def test_damaged_archives_and_bombs_are_one_line(packed: Path, tmp_path: Path) -> None:
+    content = packed.read_bytes()
+    bomb = tmp_path / "bomb.zip"
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("submission.json", bytes(200 << 20))
+    files = {"cut": content[:-30], "none": b"", "text": b"hello", "before": b"MZ" + content, "after": content + b"x"}
+    for name, damaged in files.items():
+        (tmp_path / name).write_bytes(damaged)
+    for path in (bomb, *(tmp_path / name for name in files), tmp_path, tmp_path / "missing"):
+        with pytest.raises(InputError) as caught:
+            read_submission(path)
+        assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+def test_a_row_that_its_answer_does_not_earn_is_found(evaluated: RunFolder, packed: Path) -> None:
+    found = read_submission(rewrite(packed, in_row(region_recall=1.0)))
+    with pytest.raises(InputError, match=r"region_recall = 1\.0 in its row, and its answer scores 0\.0"):
+        score_again(found, evaluated)
+
+
+def test_answers_are_scored_by_their_own_pairs_alone(run: RunFolder, packed: Path) -> None:
+    shutil.rmtree(run.pair(ONE_BOX, 20000))
+    with pytest.raises(InputError, match="holds no pair smoke/one_box 20000"):
+        score_again(read_submission(packed), run)
+
+
+def renamed(found: CheckedFile, name: str) -> CheckedFile:
+    pairs = [pair.model_copy(update={"row": {**pair.row, "variant": name}}) for pair in found.content.pairs]
+    return CheckedFile(found.path, found.sha256, found.content.model_copy(update={"name": name, "pairs": pairs}))
+
+
+def test_the_page_shows_every_file_escaped(packed: Path, tmp_path: Path) -> None:
+    found = read_submission(packed)
+    evil = renamed(found, "<script>alert(1)</script>\x1b[2J")
+    write_leaderboard([found, evil], tmp_path / "out" / "board.html", None, [2, 0])
+    page = (tmp_path / "out" / "board.html").read_text()
+    assert "&lt;script&gt;alert(1)" in page and "<script>alert" not in page and "\x1b" not in page
+    assert page.count('class="entry"') == 2 and "Plan smoke, 2 pairs" in page
+    assert "2 of 2 pairs" in page and "0 of 2 pairs" in page and found.sha256 in page
+    assert "http" not in page.replace("http-equiv", "")
+
+
+def test_other_pairs_are_another_table_and_one_name_stands_once(packed: Path, tmp_path: Path) -> None:
+    found = read_submission(packed)
+    fewer = found.content.model_copy(update={"pairs": found.content.pairs[:1]})
+    other = CheckedFile(Path("fewer.zip"), found.sha256, fewer)
+    write_leaderboard([found, other], tmp_path / "board.html", None, [0, 0])
+    page = (tmp_path / "board.html").read_text()
+    assert "Plan smoke, 2 pairs" in page and "Plan smoke, 1 pair<" in page
+    with pytest.raises(InputError, match="two results of mine"):
+        write_leaderboard([found, found], tmp_path / "board.html", None, [0, 0])
+    with pytest.raises(InputError, match=r"ends in \.html"):
+        write_leaderboard([found], tmp_path, None, [0])
+
+
+def test_reference_rows_are_of_the_same_pairs(packed: Path, tmp_path: Path) -> None:
+    found = read_submission(packed)
+    rows = [{**pair.row, "variant": "ours", "object_iou_point": 0.75} for pair in found.content.pairs]
+    other = {**rows[0], "variant": "elsewhere", "seed": 4}
+    (tmp_path / "report").mkdir()
+    pd.DataFrame([*rows, other]).to_csv(tmp_path / "report" / "results.csv", index=False)
+    write_leaderboard([found], tmp_path / "board.html", tmp_path / "report", [0])
+    page = (tmp_path / "board.html").read_text()
+    assert page.count('class="reference"') == 1 and "ours" in page and "elsewhere" not in page
+    assert page.index('class="reference"') < page.index('class="entry"')  # the best IoU stands first
