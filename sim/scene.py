@@ -35,6 +35,7 @@ from sim.placement.placing import WALL_GAP_M, Standing, Surroundings, grow_recta
 from sim.placement.settling import add_mesh, add_solid, quaternion
 from sim.rock.centreline import Centreline, build_centreline
 from sim.rock.foreign import tunnel_mesh
+from sim.rock.grounding import set_on_floor
 from sim.rock.tunnel import mesh_tunnel
 
 WALL = "wall"
@@ -161,6 +162,8 @@ def lay_ground(scenario: Scenario, seed: int) -> Ground:
     tunnel = scenario.tunnel
     centreline = build_centreline(tunnel, seed)
     wall = mesh_tunnel(tunnel, centreline, seed) if tunnel.mesh is None else tunnel_mesh(tunnel.mesh)
+    if tunnel.mesh is not None:
+        centreline = set_on_floor(centreline, Caster([wall]))
     displacement = displace(scenario, centreline, wall, seed)
     if displacement is not None:
         wall = displacement.walls.mesh("before")

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from cdpipe.core.threads import fix_threads
-from eval.cli import converting
+from eval.cli import converting, tracing
 from eval.cli import leaderboard as commands_leaderboard
 from eval.cli import pair as commands_pair
 from eval.cli import run as commands_run
@@ -85,6 +85,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "detect": commands_pair.detect,
     "story": commands_stories.story_command,
     "convert": converting.convert,
+    "trace": tracing.trace,
     "score": commands_run.score,
     "run": commands_run.run_command,
     "export": commands_run.export,

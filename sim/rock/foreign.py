@@ -25,6 +25,7 @@ _WORLD_R_FILE = {
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
     "z": np.eye(3),
 }
+TUNNEL_KEY = "tunnel.mesh"
 SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 MAX_TRIANGLES = 5_000_000
 _MAX_BYTES = 2_000_000_000
@@ -54,8 +55,18 @@ def tunnel_mesh(file: MeshFile) -> Mesh:
     Raises:
         ScenarioError: The file cannot be read, or is no surface that encloses a tunnel; one line with the way out.
     """
-    key = "tunnel.mesh"
-    mesh = _read(file, key)
+    mesh = read_mesh(file, TUNNEL_KEY)
+    refuse_tunnel(mesh, file)
+    return mesh
+
+
+def refuse_tunnel(mesh: Mesh, file: MeshFile) -> None:
+    """Refuse a surface that encloses no tunnel, or one whose file is scaled, far away, open or inside out.
+
+    Raises:
+        ScenarioError: One line with the way out.
+    """
+    key = TUNNEL_KEY
     edges = edges_of(mesh)
     volume_m3 = closed_volume_m3(mesh, edges)
     if volume_m3 is not None:
@@ -82,7 +93,6 @@ def tunnel_mesh(file: MeshFile) -> Mesh:
             f"{_place(mesh.vertices[wrong[0]].mean(axis=0))}: make its normals consistent and export it again"
         )
     _refuse_facing_rock(mesh, file, key)
-    return mesh
 
 
 def prop_mesh(file: MeshFile, name: str) -> Mesh:
@@ -94,7 +104,7 @@ def prop_mesh(file: MeshFile, name: str) -> Mesh:
         ScenarioError: The file cannot be read, or is no object of a size that stands in a tunnel.
     """
     key = f"props.{name}.mesh"
-    mesh = _read(file, key)
+    mesh = read_mesh(file, key)
     _refuse_size(mesh, file, key, _PROP_M, _LIKELY_PROP_M)
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     _, _, axes = np.linalg.svd(mesh.vertices - mesh.vertices.mean(axis=0), full_matrices=False)
@@ -107,8 +117,16 @@ def prop_mesh(file: MeshFile, name: str) -> Mesh:
     return Mesh(mesh.vertices - origin, mesh.faces)
 
 
-def _read(file: MeshFile, key: str) -> Mesh:
-    """Read a file into one welded mesh, metres, z up, faces turned where `flip` asks for it."""
+def read_mesh(file: MeshFile, key: str) -> Mesh:
+    """Return a file as one welded mesh, metres, z up, faces turned where `flip` asks for it.
+
+    Args:
+        file: The file, its units and its axes.
+        key: The setting that names it, for messages.
+
+    Raises:
+        ScenarioError: The file cannot be read, or is too large; one line with the way out.
+    """
     path = Path(file.path)
     say = f"{key}: {file.path}"
     if path.suffix.lower() not in SUFFIXES:
