@@ -69,7 +69,7 @@ def test_what_is_no_answer_to_the_pair_is_refused(tiny_pair: Path, tmp_path: Pat
     write_answer(tmp_path / "other", "mine", replace(EMPTY, keyframe_scans=scans, config=config))
     with pytest.raises(InputError, match="13 keyframes up to scan 12, this session 14 up to scan 13"):
         read(tiny_pair, tmp_path / "other")
-    with pytest.raises(InputError, match="no such folder"):
+    with pytest.raises(InputError, match="no such file or folder"):
         read_content(tiny_pair / "absent", tiny_pair / "after", tmp_path / "other", lambda *_: None)
 
 
