@@ -85,9 +85,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     def counting(where: ModuleType, name: str) -> Callable[..., Any]:
         usual = getattr(where, name)
 
-        def call(*args: Any) -> Any:
+        def call(*args: Any, **settings: Any) -> Any:
             counted[name] += 1
-            return usual(*args)
+            return usual(*args, **settings)
 
         return call
 
