@@ -32,6 +32,8 @@ _DEEP_M, _BOTTOM = 0.1, 0.5
 # Cells at these depths are of the hollow, or of the rock around it.
 _IN_FRONT_M, _DEEPEST_M = 0.15, 5.0
 _LEAST_DEPTH_M = 0.02
+# A place that far in front of another one beside it is not of the wall.
+_BESIDE_M, _STANDS_OUT_M = 0.25, 0.4
 # A height between points is the mean of so many nearest, each weighted by the inverse square of its distance.
 _NEAREST = 4
 _NEAR_M = 0.5
@@ -143,7 +145,7 @@ def _find_depths(chart: _Chart, before: SurfaceCells, walls: Float64Array, after
     placed, cells = chart.place(walls), chart.place(after)
     is_over = chart.is_on(cells)
     cells, off_m = cells[is_over], before.tree.query(after[is_over])[0]
-    depths_m = _height(placed[chart.is_on(placed, _RIM_M)], cells) - cells[:, 2]
+    depths_m = _height(_rearmost(placed[chart.is_on(placed, _RIM_M)]), cells) - cells[:, 2]
     is_its = (depths_m > -_IN_FRONT_M) & (depths_m < _DEEPEST_M) & ((depths_m < _DEEP_M) | (off_m > NEW * depths_m))
     pixel, depths_m, n = chart.pixels(cells[is_its]), depths_m[is_its], chart.shape[0] * chart.shape[1]
     deepest_m = np.full(n, -np.inf)
@@ -151,6 +153,16 @@ def _find_depths(chart: _Chart, before: SurfaceCells, walls: Float64Array, after
     is_bottom = (deepest_m[pixel] < _DEEP_M) | (depths_m > _BOTTOM * deepest_m[pixel])
     with np.errstate(invalid="ignore"):
         return np.asarray(np.bincount(pixel, depths_m * is_bottom, n) / np.bincount(pixel, is_bottom, n))
+
+
+def _rearmost(placed: Float64Array) -> Float64Array:
+    """Return the (N, 3) places on a chart without those that have rock behind them: a duct in front of a wall."""
+    pairs = cKDTree(placed[:, :2]).query_pairs(_BESIDE_M, output_type="ndarray")
+    in_front_m = placed[pairs[:, 0], 2] - placed[pairs[:, 1], 2]
+    is_front = np.zeros(len(placed), dtype=np.bool_)
+    is_front[pairs[in_front_m > _STANDS_OUT_M, 0]] = True
+    is_front[pairs[in_front_m < -_STANDS_OUT_M, 1]] = True
+    return placed[~is_front]
 
 
 def _height(points: Float64Array, at: Float64Array) -> Float64Array:

@@ -78,12 +78,9 @@ def measure_offsets(
     for widening in _WIDENINGS:
         rest = np.flatnonzero(np.isfinite(start_m) & np.isnan(along_m))
         points, normals = places.points[rest], places.normals[rest]
-        own_m[rest], own_m2 = _average(before, points, normals, widening * radius_m, with_variance)
-        heights_m, other_m2 = start_m[rest], np.zeros(len(rest))
-        for is_last in (False, True):  # the second sphere stands on the surface that the first one found
-            centres = points + np.nan_to_num(heights_m)[:, None] * normals
-            shift_m, other_m2 = _average(after, centres, normals, widening * radius_m, with_variance and is_last)
-            heights_m = heights_m + shift_m
+        sphere = partial(_settle, points, normals, widening * radius_m, with_variance=with_variance)
+        own_m[rest], own_m2 = sphere(before, np.zeros(len(rest)))
+        heights_m, other_m2 = sphere(after, start_m[rest])
         along_m[rest], variance_m2[rest] = heights_m - own_m[rest], own_m2 + other_m2
     far = np.flatnonzero(np.abs(along_m) > _FAR_M)
     hits = places.points[far] + along_m[far, None] * places.normals[far]
@@ -107,6 +104,28 @@ def _find_surface(after: SurfaceCells, places: SurfacePlaces) -> Float64Array:
             start_m[rest[is_near]] = height_m
             rest = rest[~is_near]
     return start_m
+
+
+def _settle(
+    points: Float64Array,
+    normals: Float64Array,
+    radius_m: float,
+    cells: SurfaceCells,
+    start_m: Float64Array,
+    *,
+    with_variance: bool,
+) -> tuple[Float64Array, Float64Array]:
+    """Return the (N,) mean height along the normals in a sphere, and its variance.
+
+    The first sphere stands `start_m` above each of the (N, 3) points, the second on the surface that the first found.
+    Both sessions settle alike: at an edge the second sphere holds other cells than the first.
+    """
+    heights_m, variance_m2 = start_m, np.zeros(len(points))
+    for is_last in (False, True):
+        centres = points + np.nan_to_num(heights_m)[:, None] * normals
+        shift_m, variance_m2 = _average(cells, centres, normals, radius_m, with_variance and is_last)
+        heights_m = heights_m + shift_m
+    return heights_m, variance_m2
 
 
 def _average(

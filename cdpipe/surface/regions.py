@@ -13,6 +13,9 @@ from cdpipe.surface.places import SurfacePlaces
 # A place is judged with its neighbours, of which that many count as one: they err together.
 _SMOOTHED_M, _ALIKE = 0.6, 4.0
 _NEIGHBOURS = 24
+# A place that moved by less than this share of the mean about it is not of the region: it lies beside the region, or
+# beside a single place that is off, as on the edge of a box.
+_OWN = 0.3
 # Places of one region are no farther apart than this many spacings.
 _LINK = 1.8
 
@@ -45,7 +48,8 @@ def group_regions(
     smoothed_m, smoothed_level_m = _smooth(places.points[known], along_m[known], level_m[known], own_m)
     beyond_m = np.maximum(smoothed_level_m, least_m)
     found: list[tuple[SurfaceRegion, Int64Array]] = []
-    for own in (known[smoothed_m > beyond_m], known[smoothed_m < -beyond_m]):
+    is_own = along_m[known] * smoothed_m > _OWN * smoothed_m**2
+    for own in (known[is_own & (smoothed_m > beyond_m)], known[is_own & (smoothed_m < -beyond_m)]):
         labels, sizes = label_groups(places.points[own], _LINK * spacing_m)
         for label in range(len(sizes)):
             members = own[labels == label]

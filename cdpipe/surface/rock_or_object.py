@@ -27,10 +27,11 @@ _LEAST_DEPTH_M = 0.05
 # Rubble lies no farther than this from below the place that it fell from; that place has so many places at least.
 _BELOW_M, _LEAST_FALLEN = 1.0, 4
 _HIGH_SHARE = 90
-# Floor that the largest vehicle covers. A heave may cover less: its displacement, over places this far apart, rises by
-# less than this per metre nearly everywhere. Muck lies at 0.7 and more, the side of an object is upright.
-_WIDEST_M2, _WIDE_M2 = 15.0, 3.0
-_APART_M, _GENTLE, _NEARLY = (0.2, 0.6), 0.5, 95
+# Floor that heaved, sank or was filled covers at least the first area. Its displacement, over places this far apart in
+# plan, rises by less than this per metre nearly everywhere, and over more than the second area, that of the largest
+# vehicle, on most of it: the edge of fill may be steep. Muck lies at 0.7 and more, the side of an object is upright.
+_WIDE_M2, _WIDEST_M2 = 3.0, 15.0
+_APART_M, _GENTLE, _NEARLY, _MOSTLY = (0.2, 0.6), 0.5, 95, 70
 _RAMP_M = 0.5
 
 
@@ -57,7 +58,7 @@ def split_rock(
         members.append(_find_near(where, item.points_map))
     for number, (item, own) in enumerate(zip(objects, members, strict=True)):
         if item.session == "before":
-            is_rock[number] = _was_flush(places, along_m, own, still)
+            is_rock[number] = _was_flush(places, along_m, own, still) or _is_floor(places, along_m, own)
             is_of_object[own] |= not is_rock[number]
     fallen = np.flatnonzero((along_m < -_LEAST_DEPTH_M) & ~is_of_object)
     for number, (item, own) in enumerate(zip(objects, members, strict=True)):
@@ -116,16 +117,17 @@ def _was_flush(places: SurfacePlaces, along_m: Float64Array, own: Int64Array, st
 
 
 def _is_floor(places: SurfacePlaces, along_m: Float64Array, own: Int64Array) -> bool:
-    """Tell whether places are covered too widely, or too gently, for an object."""
+    """Tell whether what came or went at some places is too wide and too gentle for an object."""
     area_m2 = float(places.areas_m2[own].sum())
-    if not _WIDE_M2 < area_m2 < _WIDEST_M2:
-        return area_m2 >= _WIDEST_M2
+    if area_m2 <= _WIDE_M2:
+        return False
     known = np.flatnonzero(np.isfinite(along_m))
     near = known[np.isfinite(cKDTree(places.points[own]).query(places.points[known], distance_upper_bound=_RAMP_M)[0])]
     one, other = cKDTree(places.points[near]).query_pairs(_APART_M[1], output_type="ndarray").T
-    apart_m = np.linalg.norm(places.points[near[one]] - places.points[near[other]], axis=1)
+    apart_m = np.linalg.norm(places.points[near[one], :2] - places.points[near[other], :2], axis=1)
     rise = np.abs(along_m[near[one]] - along_m[near[other]])[apart_m > _APART_M[0]] / apart_m[apart_m > _APART_M[0]]
-    return len(rise) > 0 and float(np.percentile(rise, _NEARLY)) < _GENTLE
+    share = _NEARLY if area_m2 < _WIDEST_M2 else _MOSTLY
+    return len(rise) > 0 and float(np.percentile(rise, share)) < _GENTLE
 
 
 def _is_below(points: Float64Array, fallen: Float64Array) -> bool:

@@ -114,6 +114,37 @@ def test_a_heave_is_rock_though_the_extraction_cuts_out_its_top(radius_m: float)
     assert not is_of_object.any()
 
 
+def test_a_floor_that_sank_is_rock() -> None:
+    places = rock()
+    away = np.clip((np.hypot(places.points[:, 0] - 5, places.points[:, 1] - 3) / 2.2 - 0.5) / 0.5, 0, 1)
+    along_m = np.where(places.points[:, 2] == 0, -0.14 * (1 + np.cos(np.pi * away)) / 2, 0.0)
+    is_rock, is_of_object = split_rock((item("before", places.points[along_m < -0.04], "removed"),), places, along_m)
+    assert is_rock.all()
+    assert not is_of_object.any()
+
+
+@pytest.mark.parametrize("session", ["before", "after"])
+def test_a_pile_of_muck_is_an_object_however_large(session: str) -> None:
+    """A pile 5.6 m wide covers 24 m2; its flanks lie at 0.75."""
+    floor, heights = grid((0, 0), (10, 6), 0.0), grid((0, 0), (10, 6), 0.0)
+    heights[:, 2] = np.maximum(2.1 - 0.75 * np.hypot(heights[:, 0] - 5, heights[:, 1] - 3), 0.0)
+    on = heights[:, 2] > 0.1
+    if session == "after":
+        places, along_m = make_places((floor, 1.0)), heights[:, 2]
+    else:  # the floor below is seen in the after session alone
+        places, along_m = make_places((heights, 1.0)), -heights[:, 2]
+    is_rock, is_of_object = split_rock((item(session, heights[on]),), places, along_m)
+    assert not is_rock.any()
+    assert is_of_object[on].all()
+
+
+def test_fill_with_steep_edges_is_rock() -> None:
+    places = rock()
+    along_m = np.where(inside(places, (1.99, 0.49), (8.01, 5.51), 0.0), 0.3, 0.0)
+    raised = places.points[along_m > 0] + [0, 0, 0.3]
+    assert split_rock((item("after", raised),), places, along_m)[0].all()
+
+
 def test_places_without_a_displacement_and_objects_without_points_decide_nothing() -> None:
     places = rock()
     unknown = np.full(len(places.points), np.nan)
