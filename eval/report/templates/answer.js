@@ -8,6 +8,7 @@
   const gl = canvas.getContext("webgl", {antialias: true});
   function say(words) { trouble.textContent = words; trouble.hidden = false; }
   if (!gl) {
+    canvas.style.display = "none";
     say("This browser draws no WebGL: the picture from above is below.");
     return;
   }
