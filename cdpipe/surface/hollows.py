@@ -18,6 +18,7 @@ from cdpipe.model.report import SurfaceRegion
 from cdpipe.surface.cells import SurfaceCells
 from cdpipe.surface.offsets import NEW
 from cdpipe.surface.places import SurfacePlaces
+from cdpipe.surface.regions import sort_regions
 
 # Faces of the hull that stand up so steeply are its sides: part of their normal along that of the chart.
 _STEEP = 1e-3
@@ -79,8 +80,8 @@ def measure_hollows(
     before: SurfaceCells,
     places: SurfacePlaces,
     after: SurfaceCells,
-) -> tuple[SurfaceRegion, ...]:
-    """Return the regions, those of hollows with the area and the volume of their charts.
+) -> tuple[Int32Array, tuple[SurfaceRegion, ...]]:
+    """Return the region of each place and the regions anew, hollows with the area and the volume of their charts.
 
     Args:
         regions: Regions of displacement.
@@ -96,7 +97,7 @@ def measure_hollows(
         if found is not None:
             area_m2, volume_m3 = found
             measured[index] = replace(each, area_m2=area_m2, volume_m3=-volume_m3, mean_m=-volume_m3 / area_m2)
-    return tuple(measured)
+    return sort_regions(region, measured)
 
 
 def is_hollow(region: SurfaceRegion) -> bool:

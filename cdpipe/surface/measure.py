@@ -81,7 +81,7 @@ def measure_surface(
         shared_m=measured.shared_m,
     )  # fmt: skip
     if any(is_hollow(each) for each in regions):
-        regions = measure_hollows(regions, region, cells, places, measured.after or make_cells(after))
+        region, regions = measure_hollows(regions, region, cells, places, measured.after or make_cells(after))
     field = SurfaceField(
         places.points, places.normals, displacement_m, measured.level_m, region, regions, chainage_m, angle_deg
     )

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array
+from cdpipe.core.geometry import Float64Array, Int32Array
 from cdpipe.core.groups import label_groups
 from cdpipe.model.report import SurfaceRegion
 from cdpipe.surface.places import SurfacePlaces
@@ -47,7 +49,7 @@ def group_regions(
     own_m = np.minimum(np.broadcast_to(shared_m, level_m.shape)[known], level_m[known])
     smoothed_m, smoothed_level_m = _smooth(places.points[known], along_m[known], level_m[known], own_m)
     beyond_m = np.maximum(smoothed_level_m, least_m)
-    found: list[tuple[SurfaceRegion, Int64Array]] = []
+    found: list[SurfaceRegion] = []
     is_own = along_m[known] * smoothed_m > _OWN * smoothed_m**2
     for own in (known[is_own & (smoothed_m > beyond_m)], known[is_own & (smoothed_m < -beyond_m)]):
         labels, sizes = label_groups(places.points[own], _LINK * spacing_m)
@@ -55,11 +57,17 @@ def group_regions(
             members = own[labels == label]
             areas_m2 = places.areas_m2[members]
             if areas_m2.sum() >= least_area_m2:
-                found.append((_describe(places.points[members], areas_m2, along_m[members]), members))
-    found.sort(key=lambda each: -abs(each[0].volume_m3))
-    for number, (_, members) in enumerate(found):
-        region[members] = number
-    return region, tuple(each for each, _ in found)
+                region[members] = len(found)
+                found.append(_describe(places.points[members], areas_m2, along_m[members]))
+    return sort_regions(region, found)
+
+
+def sort_regions(region: Int32Array, regions: Sequence[SurfaceRegion]) -> tuple[Int32Array, tuple[SurfaceRegion, ...]]:
+    """Return the (Q,) region of each place and the regions, largest volume first."""
+    order = sorted(range(len(regions)), key=lambda index: -abs(regions[index].volume_m3))
+    number = np.full(len(regions) + 1, -1, dtype=np.int32)  # the last one is that of no region
+    number[order] = np.arange(len(regions))
+    return number[region], tuple(regions[index] for index in order)
 
 
 def _smooth(

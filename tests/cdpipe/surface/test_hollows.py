@@ -62,7 +62,7 @@ def test_the_volume_of_a_hollow_holds_though_its_bottom_is_hidden(hidden_m: floa
     region, regions = group_regions(
         places, displaced(places, hidden_m), np.full(len(places.points), 1e-3), 0.25, 0.005, 0.3
     )
-    (found,) = measure_hollows(regions, region, cells, places, make_cells(after))
+    _, (found,) = measure_hollows(regions, region, cells, places, make_cells(after))
     assert found.volume_m3 == pytest.approx(-VOLUME_M3, rel=0.12)
     # the rim of a bowl is shallow, and half a pixel wide
     assert 0.78 * AREA_M2 < found.area_m2 < 1.05 * AREA_M2
@@ -78,14 +78,14 @@ def test_shallow_regions_and_rock_that_came_stay_as_they_are() -> None:
         moved_m = -factor * displaced(places, 0.0)
         region, regions = group_regions(places, moved_m, np.full(len(places.points), 1e-3), 0.25, 0.005, 0.3)
         assert len(regions) == 1
-        assert measure_hollows(regions, region, cells, places, cells) == regions
+        assert measure_hollows(regions, region, cells, places, cells)[1] == regions
 
 
 def test_without_cells_of_the_after_session_nothing_is_told() -> None:
     cells, places, _ = surveyed(tunnel(1))
     region, regions = group_regions(places, displaced(places, 0.0), np.full(len(places.points), 1e-3), 0.25, 0.005, 0.3)
     nothing = make_cells(of(tunnel(2), np.zeros(len(tunnel(2).points), dtype=np.bool_)))
-    assert measure_hollows(regions, region, cells, places, nothing) == regions
+    assert measure_hollows(regions, region, cells, places, nothing)[1] == regions
 
 
 def test_a_region_all_around_has_no_chart() -> None:
@@ -93,4 +93,16 @@ def test_a_region_all_around_has_no_chart() -> None:
     cells, places, _ = surveyed(tunnel(1))
     left_m = np.where(np.abs(places.points[:, 0] - 6.0) < 1.0, -0.3, 0.0)
     region, regions = group_regions(places, left_m, np.full(len(places.points), 1e-3), 0.25, 0.005, 0.3)
-    assert measure_hollows(regions, region, cells, places, cells) == regions
+    assert measure_hollows(regions, region, cells, places, cells)[1] == regions
+
+
+def test_a_deeper_hollow_comes_first_once_its_bottom_is_told() -> None:
+    cells, places, _ = surveyed(tunnel(1))
+    x_m = places.points[:, 0]
+    raised_m = np.where(np.abs(x_m - 2.0) < 0.8, 0.08, displaced(places, 0.5))  # 0.8 m3, the seen rim 0.2 m3
+    region, regions = group_regions(places, raised_m, np.full(len(places.points), 1e-3), 0.25, 0.005, 0.3)
+    assert [each.largest_m > 0 for each in regions] == [True, False]
+    after = make_cells(hide(tunnel(2, lambda x, angle: 4 * fallen(x, angle)), 0.5))
+    again, found = measure_hollows(regions, region, cells, places, after)
+    assert [each.largest_m > 0 for each in found] == [False, True]
+    np.testing.assert_array_equal(again, np.where(region < 0, -1, 1 - region))
