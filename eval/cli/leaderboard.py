@@ -71,7 +71,6 @@ def _compare(out: Path, name: str, committed: object, *, quiet: bool) -> None:
 
     from eval.leaderboard.comparison import compare_with_reference, list_lines, write_tables_of
     from eval.leaderboard.evaluation import describe_calls, evaluation_folder, read_evaluation
-    from eval.leaderboard.reference import take_other_methods
     from eval.running.run_data import RunData, read_run
     from eval.running.runfolder import RunFolder
 
@@ -79,7 +78,7 @@ def _compare(out: Path, name: str, committed: object, *, quiet: bool) -> None:
     data, evaluation = read_run(out), read_evaluation(run, name)
     pairs = set(evaluation.pairs)
     rows = [row for row in data.results if row["variant"] == name and (row["scenario"], row["seed"]) in pairs]
-    references = [take_other_methods(data, name), *([committed] if isinstance(committed, RunData) else [])]
+    references = [data, *([committed] if isinstance(committed, RunData) else [])]
     found = compare_with_reference(pd.DataFrame(rows), name, references, describe_calls(run, evaluation))
     folder = evaluation_folder(run, name)
     write_tables_of(found, folder)

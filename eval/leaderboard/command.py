@@ -2,8 +2,9 @@
 
     python predict.py {before} {after} {out}           {merge} as well, where a merge is given
 
-The command is no shell line: it is split into words like one, and its first word is a program. Words that name a file
-or folder of the folder where `tunnelcd` was called are made absolute, because the command runs elsewhere.
+The command is no shell line: it is split into words like one, and its first word is a program. The command runs
+elsewhere, so a word that names a file or folder as seen from where `tunnelcd` was called is made absolute, if it has a
+dot or a slash. Others may be names of something else: `train` beside a folder `train`, or `--model=best.pt`.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class Ended:
 
 
 def parse_command(text: str, *, gets_merge: bool) -> tuple[str, ...]:
-    """Return the words of a command, those that name files made absolute.
+    """Return the words of a command; those with a dot or a slash that name a file or folder are made absolute.
 
     Raises:
         InputError: It is no command, its program is not found, a placeholder is missing or unknown, or {merge} stands
@@ -71,13 +72,21 @@ def parse_command(text: str, *, gets_merge: bool) -> tuple[str, ...]:
 
 
 def digest_programs(words: Sequence[str]) -> dict[str, str]:
-    """Return the SHA-256 of each file that a command names, by its word: the program text that answers."""
-    files = [Path(word) for word in words[1:] if "{" not in word and Path(word).is_file()]
-    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+    """Return the SHA-256 of each file that a command names, by its word: the program text that answers.
+
+    A program that is named without a folder is looked up in the PATH and has none.
+
+    Raises:
+        InputError: A file cannot be read.
+    """
+    named = [word for word in words[:1] if os.sep in word] + [word for word in words[1:] if "{" not in word]
+    return {word: _digest_file(Path(word)) for word in named if Path(word).is_file()}
 
 
 def run_command(words: Sequence[str], places: Mapping[str, Path], folder: Path, limit_s: float) -> Ended:
-    """Run a command with its placeholders filled in, and end it and all that it started at the time limit.
+    """Run a command with its placeholders filled in, and end its process group when it ends or its time is up.
+
+    What the command starts is in its group, unless it starts a session or a group of its own: that lives on.
 
     Args:
         words: As `parse_command` returns them.
@@ -132,6 +141,17 @@ def _find_program(word: str) -> str:
     return str(Path(found).absolute()) if os.sep in word else word
 
 
+def _digest_file(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(
+            f"--command: {visible(str(path))}: cannot be read ({error.strerror}), so a change of it would not be "
+            "noticed: make it readable"
+        ) from error
+
+
 def _make_absolute(word: str) -> str:
     is_path = (os.sep in word or "." in word) and "{" not in word
     return str(Path(word).absolute()) if is_path and Path(word).exists() else word
@@ -146,7 +166,7 @@ def _keep_tail(stream: BinaryIO, tail: bytearray) -> None:
 
 
 def _end_all(process: subprocess.Popen[bytes]) -> None:
-    """End a process and whatever it started and left behind."""
+    """End a process and what it started in its process group and left behind."""
     if sys.platform != "win32":
         with suppress(OSError):  # nothing is left
             os.killpg(process.pid, signal.SIGKILL)

@@ -14,6 +14,7 @@ import pandas as pd
 from eval.core.output import make_writable
 from eval.core.printing import count_pairs
 from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
+from eval.leaderboard.reference import take_other_methods
 from eval.report.compared_columns import COMPARED, figures_of, is_time
 from eval.report.comparing import paired_differences, verdict
 from eval.report.render import write_file
@@ -55,10 +56,12 @@ def compare_with_reference(results: pd.DataFrame, name: str, references: Sequenc
     Args:
         results: Rows of results.csv of the method.
         name: The method.
-        references: Where reference rows are; of a method that several have, the first counts.
+        references: Where reference rows are; of a method that several have, the first counts. Rows under `name` are no
+            reference: they may be of another method that is called the same.
         calls: How the call about each pair ended, by (scenario, seed).
     """
     own = take_figures(results)
+    references = [take_other_methods(data, name) for data in references]
     others = {variant: rows.loc[rows.index.intersection(own.index)] for variant, rows in list_variants(references)}
     others = {variant: rows for variant, rows in others.items() if len(rows)}
     shared = own.index if not others else own.index[own.index.isin(_union(others))]

@@ -2,12 +2,13 @@
 
     RUN/pairs, answers, cells, results.csv, ...         a run folder: the method is one of its variants
     RUN/evaluations/<method>/evaluation.json            command, merge, time limit, plan; digests of the programs' files
-    RUN/evaluations/<method>/<world>/<seed>.json        how the call ended: seconds, error, end of its standard error
+    RUN/evaluations/<method>/<world>/<seed>.json        how the call ended: seconds, error, end of its standard error;
+                                                        digests of the pair and of what was called
     RUN/evaluations/<method>/table.csv, ...             the comparison (eval.leaderboard.comparison)
 
 A call that crashes, runs out of time or leaves no answer, or none that can be one, is a row with its error. It scores
-like every case without an answer. A pair is finished when its cell is of the present metrics and its call was about the
-present simulation.
+like every case without an answer. A pair is finished when its cell is of the present metrics and its call was of the
+present command, about the present simulation.
 """
 
 from __future__ import annotations
@@ -85,8 +86,12 @@ class EvaluationFile(Settings):
 
 
 class CallFile(Settings):
-    """RUN/evaluations/<method>/<world>/<seed>.json; `pair_digest` is "" where the pair cannot be made."""
+    """RUN/evaluations/<method>/<world>/<seed>.json.
 
+    `pair_digest` is "" where the pair cannot be made, `method_digest` (`digest_method`) where an older tunnelcd called.
+    """
+
+    method_digest: str = ""
     pair_digest: str
     seconds: Annotated[float, Field(ge=0)]
     error: str
@@ -131,14 +136,14 @@ def evaluate_command(
     require_current_scores(run)
     pairs = list_plan_pairs(plan, run, tools)
     start_provenance(plan, run, command, tools)
-    _take_over(run, method, plan, pairs, force=force)
-    todo = [pair for pair in pairs if force or not _is_finished(run, method, pair)]
+    called = digest_method(_take_over(run, method, plan, pairs, force=force))
+    todo = [pair for pair in pairs if force or not _is_finished(run, method, pair, called)]
     # the order of a plan would tell which world a pair is of; a seed would, too
     random.SystemRandom().shuffle(todo)
     for done, pair in enumerate(todo):
         progress.cells(f"{pair.name} {pair.seed}", done, len(todo))
         with pair_lock(run, pair):
-            error = _evaluate_pair(run, method, pair, progress, tools)
+            error = _evaluate_pair(run, method, pair, called, progress, tools)
         if error:
             progress.note(f"{pair.name} {pair.seed}: {error}")
     progress.cells("done", len(todo), len(todo))
@@ -164,7 +169,10 @@ def read_evaluation(run: RunFolder, name: str) -> EvaluationFile:
 
 def read_call(run: RunFolder, name: str, scenario: str, seed: int) -> CallFile | None:
     """Read how the call about a pair ended; None where there was none, or its file is damaged."""
-    path = _call_path(run, name, scenario, seed)
+    return _read_call_file(_call_path(run, name, scenario, seed))
+
+
+def _read_call_file(path: Path) -> CallFile | None:
     try:
         return validate(CallFile, Document(str(path), read_json(path, _EXPECTED)))
     except InputError:
@@ -177,8 +185,13 @@ def digest_pair(pair: Path) -> str:
     return hashlib.sha256(truth.read_bytes()).hexdigest() if truth.is_file() else ""
 
 
-def _take_over(run: RunFolder, method: Method, plan: Plan, pairs: Sequence[Pair], *, force: bool) -> None:
-    """Write evaluation.json; refuse to mix rows of two commands under one name."""
+def digest_method(evaluation: EvaluationFile) -> str:
+    """Return a digest of all that makes two answers those of one method: command, programs, merge and time limit."""
+    return digest(evaluation.model_dump(mode="json", include={"command", "programs", "merge", "limit_s"}))
+
+
+def _take_over(run: RunFolder, method: Method, plan: Plan, pairs: Sequence[Pair], *, force: bool) -> EvaluationFile:
+    """Write evaluation.json; refuse to mix rows of two commands under one name, or remove those of the other one."""
     document = EvaluationFile(
         name=method.name, command=method.command, merge=method.merge, limit_s=method.limit_s,
         programs=digest_programs(method.command), plan=plan.name, plan_digest=digest(plan.model_dump(mode="json")),
@@ -199,18 +212,35 @@ def _take_over(run: RunFolder, method: Method, plan: Plan, pairs: Sequence[Pair]
                 f"--as {method.name}: {changed[0]} was changed since its rows were made: give another name, or "
                 "--force, which answers all pairs again"
             )
+    if force:
+        _remove_others(run, method.name, digest_method(document))
     write_json(path, document.model_dump(mode="json"))
+    return document
 
 
-def _is_finished(run: RunFolder, method: Method, pair: Pair) -> bool:
+def _remove_others(run: RunFolder, name: str, called: str) -> None:
+    """Remove the rows and answers under a name that are not of the method with this digest, also of other plans."""
+    calls = evaluation_folder(run, name)
+    for kind, entry in (("cells", f"{path_part(name)}.json"), ("answers", path_part(name))):
+        for pair in run.path.glob(f"{kind}/*/*"):
+            call = _read_call_file(calls / pair.parent.name / f"{pair.name}.json")
+            if call is None or call.method_digest != called:
+                remove(pair / entry)
+    for path in calls.glob("*/*.json"):
+        call = _read_call_file(path)
+        if call is None or call.method_digest != called:
+            remove(path)
+
+
+def _is_finished(run: RunFolder, method: Method, pair: Pair, called: str) -> bool:
     call = read_call(run, method.name, pair.name, pair.seed)
     cell = run.read_cell(run.cell(pair.name, pair.seed, method.name))
     if call is None or cell is None or cell["row"].get("metrics_version") != METRICS_VERSION:
         return False
-    return call.pair_digest == digest_pair(run.pair(pair.name, pair.seed))
+    return call.method_digest == called and call.pair_digest == digest_pair(run.pair(pair.name, pair.seed))
 
 
-def _evaluate_pair(run: RunFolder, method: Method, pair: Pair, progress: RunProgress, tools: Tools) -> str:
+def _evaluate_pair(run: RunFolder, method: Method, pair: Pair, called: str, progress: RunProgress, tools: Tools) -> str:
     """Make a pair, answer it and write its cell; returns why there is no answer, "" where there is one."""
     folder, path = run.answer(pair.name, pair.seed, method.name), _call_path(run, method.name, pair.name, pair.seed)
     for stale in (run.cell(pair.name, pair.seed, method.name), path, folder):
@@ -227,7 +257,7 @@ def _evaluate_pair(run: RunFolder, method: Method, pair: Pair, progress: RunProg
         call, score = _score(method, opened[1], folder, call)
     names = {"scenario": pair.name, "seed": pair.seed, "variant": method.name, "preset": method.name}
     identity = {**names, "pair_kind": pair.kind, "commit": None, "is_contended": False}
-    write_json(path, call.model_dump(mode="json"))
+    write_json(path, {**call.model_dump(mode="json"), "method_digest": called})
     write_json(run.cell(pair.name, pair.seed, method.name), cell_document(score, identity, NO_KEY, LAST))
     return call.error
 

@@ -29,7 +29,7 @@ from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.answer_parts import MAX_ERROR
 from eval.core.output import made_parents, whole_file
 from eval.core.provenance import git_commit, machine, versions
-from eval.leaderboard.evaluation import EvaluationFile, digest_pair, read_call, read_evaluation
+from eval.leaderboard.evaluation import EvaluationFile, digest_method, digest_pair, read_call, read_evaluation
 from eval.leaderboard.given_merge import MergeMode
 from eval.running.run_data import LARGEST
 from eval.running.runfolder import TEXT_COLUMNS, RunFolder, json_text
@@ -44,6 +44,8 @@ _TOLD = 3
 _ROUNDING = 1e-6
 # columns of a row that say who answered what, which scoring does not know
 _NAMES = {"scenario", "seed", "variant", "preset", "pair_kind", "commit"}
+# columns of numbers in the row of a pair that cannot be made; others would be figures
+_UNMADE = {"seed", "metrics_version", "is_contended"}
 _Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 _Text = Annotated[str, Field(max_length=MAX_ERROR)]
 _Name = Annotated[str, Field(min_length=1, max_length=LONGEST)]
@@ -178,14 +180,22 @@ def score_again(found: CheckedFile, run: RunFolder) -> int:
         run: A run folder with the same pairs.
 
     Returns:
-        How many pairs were scored; a pair that cannot be made has no answer.
+        How many pairs were scored; a pair that cannot be made has no answer and, as `read_submission` saw, no figure.
 
     Raises:
-        InputError: The run lacks a pair or holds another simulation of it, or a row is not that of its answer.
+        InputError: The run lacks a pair or holds another simulation of it, or one of a pair that has no answer as it
+            cannot be made; or a row is not that of its answer.
     """
     n_scored = 0
     for pair, files in _iterate_answers(found):
         original, case = run.pair(pair.scenario, pair.seed), f"{pair.scenario} {pair.seed}"
+        if not files:
+            if digest_pair(original):
+                raise InputError(
+                    f"{found.path}: {case}: no answer, as a pair that cannot be made; {run.path} holds it: evaluate "
+                    "and submit again"
+                )
+            continue
         if digest_pair(original) != pair.pair_digest:
             raise InputError(f"{run.path}: holds no pair {case} as {found.path} answers it: simulate it anew")
         with TemporaryDirectory(prefix="tunnelcd-") as answer:
@@ -202,17 +212,16 @@ def score_again(found: CheckedFile, run: RunFolder) -> int:
 
 
 def _iterate_answers(found: CheckedFile) -> Iterator[tuple[PairPart, dict[str, bytes]]]:
-    """Yield each pair that has an answer, and the content of its files."""
+    """Yield each pair and the content of the files of its answer."""
     with _opened(found.path, found.path.stat().st_size) as (archive, members):
         for number, pair in enumerate(found.content.pairs):
-            if pair.files:
-                names = {file: members[_member(number, file)] for file in pair.files}
-                yield pair, {file: read_member(archive, member).tobytes() for file, member in names.items()}
+            names = {file: members[_member(number, file)] for file in pair.files}
+            yield pair, {file: read_member(archive, member).tobytes() for file, member in names.items()}
 
 
 def _collect(run: RunFolder, evaluation: EvaluationFile) -> tuple[list[PairPart], list[Path]]:
     """Return the parts and the folders of all answers; refuse to pack some of them only."""
-    parts, answers, mistakes = [], [], []
+    parts, answers, mistakes, called = [], [], [], digest_method(evaluation)
     for scenario, seed in evaluation.pairs:
         answer = run.answer(scenario, seed, evaluation.name)
         call = read_call(run, evaluation.name, scenario, seed)
@@ -221,6 +230,8 @@ def _collect(run: RunFolder, evaluation: EvaluationFile) -> tuple[list[PairPart]
         is_there = call is not None and cell is not None and (not call.pair_digest or (answer / _FILES[0]).is_file())
         if call is None or cell is None or not is_there or cell["row"].get("metrics_version") != METRICS_VERSION:
             mistakes.append(f"{scenario} {seed}")
+        elif call.method_digest != called:
+            mistakes.append(f"{scenario} {seed} (of another command)")
         elif held and held != call.pair_digest:
             mistakes.append(f"{scenario} {seed} (simulated anew since)")
         else:
@@ -267,11 +278,24 @@ def _check_rows(document: Submission) -> None:
         is_ok = pair.row.get("status") == "ok"
         if not isinstance(pair.row.get("status"), str) or (is_ok and set(pair.files) != set(_FILES)):
             raise ValueError(f"the row of {visible(pair.scenario)} {pair.seed} has no status, or no answer")
+        if not pair.files:
+            _require_no_figures(pair)
         for key, value in pair.row.items():
             if isinstance(value, str) and key not in TEXT_COLUMNS:
                 raise ValueError(f"{visible(key)[:40]} = {value[:40]!r}: expected a number")
             if isinstance(value, float) and abs(value) > LARGEST:
                 raise ValueError(f"{visible(key)[:40]} = {value}: larger than any figure is")
+
+
+def _require_no_figures(pair: PairPart) -> None:
+    """Refuse figures of a pair that has no answer: such a pair cannot be made, and what it scores is undefined."""
+    case = f"{visible(pair.scenario)} {pair.seed}"
+    if pair.pair_digest:
+        raise ValueError(f"the pair {case} was made, and there is no answer to it")
+    for key, value in pair.row.items():
+        is_nothing = value is None or isinstance(value, str) or (isinstance(value, float) and math.isnan(value))
+        if not is_nothing and key not in _UNMADE:
+            raise ValueError(f"{case}: {visible(key)[:40]} = {value} in its row, and there is no answer to it")
 
 
 @contextmanager
@@ -307,8 +331,9 @@ def _digest_file(path: Path) -> str:
 
 
 def _without_folders(word: str) -> str:
-    """Return a word of a command without the folders of this machine."""
-    return Path(word).name if Path(word).is_absolute() else word
+    """Return a word of a command without the folders of this machine: `/a/b.py` is `b.py`, `--w=/a/b` is `--w=b`."""
+    name, sign, value = ("", "", word) if Path(word).is_absolute() else word.partition("=")
+    return f"{name}{sign}{Path(value).name}" if Path(value).is_absolute() else word
 
 
 def _is_same(stored: Any, scored: Any) -> bool:

@@ -81,9 +81,9 @@ def draft_scenario(found: Trace, on_progress: Progress | None = None) -> Draft:
 
 
 def format_scenario(draft: Draft, found: Trace, folder: Path) -> str:
-    """Return a scenario as YAML, for a file in a folder; the path of the mesh starts there."""
+    """Return a scenario as YAML, for a file in a folder; the path of the mesh starts there, links followed."""
     tree = {**draft.tree, "tunnel": dict(draft.tree["tunnel"])}
-    path = Path(os.path.relpath(Path(found.file.path).absolute(), folder.absolute())).as_posix()
+    path = Path(os.path.relpath(Path(found.file.path).resolve(), folder.resolve())).as_posix()
     tree["tunnel"]["mesh"] = {**tree["tunnel"]["mesh"], "path": path}
     head = [
         f"# Written by `tunnelcd trace`: {found.length_m:.0f} m of drift in {visible(Path(found.file.path).name)}.",
@@ -125,7 +125,7 @@ def _tree(found: Trace, centreline: Centreline, route: tuple[str, ...], spot: Bo
     kind = "ground_robot" if _steepest(found) <= _DRIVABLE_SLOPE else "quadrotor"
     up_m = min(0.8, 0.4 * height_m) if kind == "ground_robot" else min(2.0, 0.45 * height_m)
     clearance_m = ease * min(0.5, 0.16 * width_m, 0.3 * height_m)
-    drive = {"route": list(route), "start_m": _MARGIN_M, "end_m": _MARGIN_M}
+    ends = {"start_m": _MARGIN_M, "end_m": _MARGIN_M}
     return {
         "description": f"{Path(found.file.path).stem}: a box appears; before and after drive the same way",
         "score_radius_m": 4.5 if wide_m < _WIDE_M else 10.0,
@@ -145,8 +145,9 @@ def _tree(found: Trace, centreline: Centreline, route: tuple[str, ...], spot: Bo
             "clearance_m": round(clearance_m, 2),
             "scan_spacing_m": 0.5,
         },
-        "before": {**drive, "lateral": 0.0},
-        "after": {**drive, "lateral": -0.2},
+        # a list for each: YAML would write one that both share as an anchor, and who edits one drive edits both
+        "before": {"route": list(route), **ends, "lateral": 0.0},
+        "after": {"route": list(route), **ends, "lateral": -0.2},
     }
 
 
@@ -157,7 +158,7 @@ def _tunnel_tree(found: Trace) -> dict[str, Any]:
         {"nodes": list(drift.nodes)} | ({} if drift.section is None else {"section": _size(drift.section)})
         for drift in found.tunnel.drifts
     ]
-    nodes = {name: list(place) for name, place in found.nodes.items()}
+    nodes = {name: [value + 0.0 for value in place] for name, place in found.nodes.items()}  # -0.0 is 0.0
     return {"mesh": mesh, "nodes": nodes, "drifts": drifts, "section": _size(found.tunnel.section)}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
 import time
 from pathlib import Path
@@ -39,7 +40,30 @@ def test_words_that_name_files_become_absolute(tmp_path: Path, monkeypatch: pyte
     assert words == (
         sys.executable, str(tmp_path / "x.py"), "y.py", "0.3", '{"a": 1}', "{before}", "{after}", "{out}"
     )  # fmt: skip
-    assert list(digest_programs(words)) == [str(tmp_path / "x.py")]
+    assert list(digest_programs(words)) == [sys.executable, str(tmp_path / "x.py")]
+
+
+def test_a_program_that_is_named_by_its_file_is_noticed_when_it_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    program = tmp_path / "m.py"
+    program.write_text("#!/usr/bin/env python\n")
+    program.chmod(0o700)
+    words = parse_command(f"./m.py {WHOLE}", gets_merge=False)
+    assert digest_programs(words) == {str(program): hashlib.sha256(program.read_bytes()).hexdigest()}
+    (tmp_path / "python").write_text("not the one of the PATH")
+    assert digest_programs(("python", "{out}")) == {}
+
+
+def test_words_without_a_dot_or_slash_and_options_with_a_path_stay_as_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # EVALUATE.md says so: `train` may be a command beside a folder of that name
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "weights").mkdir()
+    words = parse_command(f"{sys.executable} weights ./weights --w=./weights {WHOLE}", gets_merge=False)
+    assert words[1:4] == ("weights", str(tmp_path / "weights"), "--w=./weights")
 
 
 def run(code: str, folder: Path, limit_s: float = 60.0, *more: str) -> tuple[str, str, float]:

@@ -97,6 +97,18 @@ def test_the_first_place_that_has_a_method_counts(tmp_path: Path) -> None:
     assert found.table["region_recall"].tolist()[2] == 0.0
 
 
+def test_a_reference_of_the_same_name_is_not_shown_as_the_method(tmp_path: Path) -> None:
+    other = read(tmp_path / "theirs", table().assign(region_recall=0.9))
+    found = compare_with_reference(own(table()), "mine", [other], {})
+    assert found.table["method"].tolist() == ["mine", "tunnelcd", "a"]
+    assert found.table["region_recall"].tolist()[0] == 0.5
+    assert set(found.paired["reference"]) == {"tunnelcd", "a"} == set(found.pairs["reference"])
+    alone = read(tmp_path / "alone", own(table()))
+    found = compare_with_reference(own(table()), "mine", [alone], {})
+    assert found.table["method"].tolist() == ["mine"]
+    assert any("no reference results of these pairs" in note for note in found.notes)
+
+
 def test_pairs_of_one_name_that_are_other_worlds_are_told(tmp_path: Path) -> None:
     frame = table().assign(n_changes=2)
     other = frame.assign(n_changes=[2, 3, 2] * 3)

@@ -13,8 +13,10 @@ import pytest
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.io.known_merge import read_alignment, read_known_merge, write_alignment
 from cdpipe.model.alignment import PathAlignment
-from eval.leaderboard.evaluation import read_call, read_evaluation
+from eval.core.progress import Silent
+from eval.leaderboard.evaluation import evaluation_folder, read_call, read_evaluation
 from eval.leaderboard.given_merge import write_merge
+from eval.leaderboard.submission import pack_submission
 from eval.oracles.merge import OracleMerge, align_by_truth
 from eval.running.rescoring import rescore
 from eval.running.stages import PairStages
@@ -109,6 +111,54 @@ def test_finished_pairs_are_kept_until_something_changes(evaluator: Evaluator) -
         evaluator.evaluate(counting, limit_s=5.0)
     assert n_calls() == 4
     assert evaluator.evaluate(counting + "\n", force=True).n_done == 2 and n_calls() == 6
+
+
+LATER = GOOD.replace('"t_cd_s": 0.5', '"t_cd_s": 0.7')
+
+
+class Interrupted(Silent):
+    """Stops an evaluation before its second pair."""
+
+    def cells(self, name: str, done: int, total: int) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+
+def test_after_an_interrupted_force_no_answer_of_the_old_command_is_kept(evaluator: Evaluator) -> None:
+    evaluator.evaluate()
+    with pytest.raises(KeyboardInterrupt):
+        evaluator.evaluate(LATER, force=True, progress=Interrupted())
+    with pytest.raises(InputError, match="lacks 1 of 2 pairs"):
+        pack_submission(evaluator.run, "mine", evaluator.run.path.parent / "x.zip")
+    outcome = evaluator.evaluate(LATER)
+    assert (outcome.n_done, outcome.n_kept) == (1, 1)
+    assert rows_of(evaluator)["t_cd_s"].tolist() == [0.7, 0.7]
+
+
+def test_force_on_a_part_of_the_plan_leaves_no_row_of_the_old_command(evaluator: Evaluator) -> None:
+    evaluator.evaluate()
+    evaluator.evaluate(name="other")
+    whole = evaluator.plan
+    evaluator.plan = whole.model_copy(update={"scenarios": whole.scenarios[:1]})
+    evaluator.evaluate(LATER, force=True)
+    assert rows_of(evaluator)["t_cd_s"].tolist() == [0.7]
+    assert not evaluator.run.answer("smoke/unchanged", 20000, "mine").exists()
+    assert rows_of(evaluator, "other")["t_cd_s"].tolist() == [0.5, 0.5]
+    evaluator.plan = whole
+    assert evaluator.evaluate(LATER).n_kept == 1
+    assert rows_of(evaluator)["t_cd_s"].tolist() == [0.7, 0.7]
+    evaluator.plan = whole.model_copy(update={"scenarios": whole.scenarios[:1]})
+    evaluator.evaluate(LATER, force=True)  # the same command: the other pair stays
+    assert len(rows_of(evaluator)) == 2
+
+
+def test_a_call_of_another_command_is_neither_kept_nor_packed(evaluator: Evaluator) -> None:
+    evaluator.evaluate()
+    path = evaluation_folder(evaluator.run, "mine") / "smoke__one_box" / "20000.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "method_digest": "0" * 16}))
+    with pytest.raises(InputError, match=r"smoke/one_box 20000 \(of another command\)"):
+        pack_submission(evaluator.run, "mine", evaluator.run.path.parent / "x.zip")
+    assert evaluator.evaluate().n_kept == 1
 
 
 def test_names_of_presets_and_of_the_runs_own_variants_are_refused(evaluator: Evaluator) -> None:

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError
+from eval.leaderboard.evaluation import digest_method, read_evaluation
 from eval.leaderboard.page import write_leaderboard
 from eval.leaderboard.submission import CheckedFile, pack_submission, read_submission, score_again
 from eval.running.runfolder import RunFolder
@@ -152,6 +153,59 @@ def test_a_row_that_its_answer_does_not_earn_is_found(evaluated: RunFolder, pack
     found = read_submission(rewrite(packed, in_row(region_recall=1.0)))
     with pytest.raises(InputError, match=r"region_recall = 1\.0 in its row, and its answer scores 0\.0"):
         score_again(found, evaluated)
+
+
+def without_answer(**values: Any) -> Change:
+    """Claim that the first pair cannot be made, with values in its row."""
+
+    def whole(members: dict[str, bytes]) -> None:
+        def change(document: dict[str, Any]) -> None:
+            pair = document["pairs"][0]
+            names = ("scenario", "seed", "variant", "preset", "family", "pair_kind", "metrics_version", "is_contended")
+            row = {name: pair["row"][name] for name in names} | {"status": "failed", "error": "does not fit"}
+            pair.update({"files": {}, "pair_digest": "", "row": {**row, **values}})
+
+        for file in ("answer.json", "answer.npz"):
+            del members[f"answers/00000/{file}"]
+        in_manifest(change)(members)
+
+    return whole
+
+
+def test_a_pair_without_an_answer_has_no_figures(run: RunFolder, packed: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"smoke/one_box 20000: region_recall = 1\.0 in its row, and there is no answer"
+    ):
+        read_submission(rewrite(packed, without_answer(region_recall=1.0)))
+    unmade = read_submission(rewrite(packed, without_answer(region_recall=float("nan"), t_total_s=None)))
+    with pytest.raises(InputError, match="smoke/one_box 20000: no answer, as a pair that cannot be made"):
+        score_again(unmade, run)
+    shutil.rmtree(run.pair(ONE_BOX, 20000))
+    assert score_again(unmade, run) == 1
+
+
+def test_a_pair_that_was_made_has_an_answer(packed: Path) -> None:
+    def claim(document: dict[str, Any]) -> None:
+        document["pairs"][0]["pair_digest"] = "0" * 64
+
+    def change(members: dict[str, bytes]) -> None:
+        without_answer()(members)
+        in_manifest(claim)(members)
+
+    with pytest.raises(InputError, match="was made, and there is no answer to it"):
+        read_submission(rewrite(packed, change))
+
+
+def test_folders_are_left_out_of_the_packed_command(run: RunFolder, tmp_path: Path) -> None:
+    words = ["/usr/bin/python", "/home/me/a=b/m.py", "--w=/home/me/w.pt", "--n=3", "{out}"]
+    path = run.path / "evaluations" / "mine" / "evaluation.json"
+    document = {**json.loads(path.read_text()), "command": words}
+    path.write_text(json.dumps(document))
+    called = digest_method(read_evaluation(run, "mine"))
+    for call in path.parent.glob("*/*.json"):
+        call.write_text(json.dumps({**json.loads(call.read_text()), "method_digest": called}))
+    pack_submission(run, "mine", tmp_path / "x.zip")
+    assert read_submission(tmp_path / "x.zip").content.command == ["python", "m.py", "--w=w.pt", "--n=3", "{out}"]
 
 
 def test_answers_are_scored_by_their_own_pairs_alone(run: RunFolder, packed: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import trimesh
+import yaml
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
@@ -89,6 +91,24 @@ def test_a_mesh_that_faces_the_rock_is_turned(tube: Callable[..., trimesh.Trimes
     np.testing.assert_allclose(drift.points[:, 1:], 0.0, atol=0.1)
     assert drift.points[0, 0] == pytest.approx(2.0, abs=0.7)  # half a width before the face
     assert drift.length_m == pytest.approx(36.0, abs=1.5)
+
+
+def test_the_written_scenario_is_plain_and_finds_its_mesh_through_links(
+    tube: Callable[..., trimesh.Trimesh], saved: Save, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = trace_mesh(MeshFile(path=saved(tube(), "tube.stl")))
+    found = replace(found, nodes={name: (x, -0.0, z) for name, (x, _, z) in found.nodes.items()})
+    draft = draft_scenario(found)
+    (tmp_path / "deep" / "er").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    Path("linkdir").symlink_to("deep/er")
+    text = format_scenario(draft, found, Path("linkdir"))
+    assert "&id" not in text and "*id" not in text and "-0.0" not in text
+    tree = yaml.safe_load(text)
+    assert tree["before"]["route"] == tree["after"]["route"] == list(draft.route)
+    Path("linkdir/s.yaml").write_text(text)
+    assert check_scenario("linkdir/s.yaml").tunnel.mesh is not None
+    assert check_scenario("deep/er/s.yaml").tunnel.mesh is not None
 
 
 def refusal(path: str, **known: Any) -> str:
