@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.io.foreign.opening import HowToRead, Progress, open_recording
+from cdpipe.io.foreign.opening import HowToRead, Progress, folder_of_options, open_recording
 from cdpipe.io.foreign.scans import Repeats
 from cdpipe.io.foreign.sniff import OUSTER, RECORDING_SUFFIXES, guess_format
 from cdpipe.io.session import ScanChunk, Session, chunk_path, read_session
@@ -45,7 +45,8 @@ def open_session(
             raise InputError(f"{path}: a session has its own poses and sensor: leave --trajectory and the like out")
         return RecordedScans(read_session(path))
     source = _open_ouster(path, how, report) if name in OUSTER else open_recording(path, how, report)
-    source.descriptors_in = path if path.is_dir() else path.with_name(f"{path.name}.tunnelcd")
+    own = path if path.is_dir() else path.with_name(f"{path.name}.tunnelcd")
+    source.descriptors_in = folder_of_options(own, how)
     return source
 
 

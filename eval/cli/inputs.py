@@ -56,10 +56,13 @@ def how_to_read(
     """
     from cdpipe.io.foreign import HowToRead
 
-    files = zip(_each("trajectory", trajectories, n_inputs), _each("metadata", metadata, n_inputs), strict=True)
+    HowToRead(odometry=odometry)  # a wrong name is refused, whether or not it is used
+    files = _each("trajectory", trajectories, n_inputs)
+    if all(files) and odometry is not None:
+        HowToRead(odometry=odometry, trajectory=files[0])  # which refuses them together
     return [
         HowToRead(form, tuple(topics or ()), trajectory, None if trajectory else odometry, beside, deskew)
-        for trajectory, beside in files
+        for trajectory, beside in zip(files, _each("metadata", metadata, n_inputs), strict=True)
     ]
 
 
@@ -103,6 +106,8 @@ def _check_sessions(paths: Sequence[Path], hows: Sequence[HowToRead]) -> list[Ho
     for path, how, kept in zip(paths, hows, checked, strict=True):
         if kept is None and how.trajectory is not None:
             raise InputError(f"{path}: a session has its own poses: give --trajectory {NONE} for it")
+    if any(how.odometry for how in hows) and not any(kept is not None and kept.odometry for kept in checked):
+        raise InputError("--odometry: no recording needs it, each has its own poses or a --trajectory: leave it out")
     return checked
 
 

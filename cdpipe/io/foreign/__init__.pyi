@@ -1,4 +1,4 @@
-from .opening import HowToRead, convert_recording, open_recording
+from .opening import HowToRead, convert_recording, folder_of_options, open_recording
 from .sniff import FORMATS, guess_format, holds_scans
 from .trajectory import Trajectory, read_poses
 
@@ -7,6 +7,7 @@ __all__ = [
     "HowToRead",
     "Trajectory",
     "convert_recording",
+    "folder_of_options",
     "guess_format",
     "holds_scans",
     "open_recording",

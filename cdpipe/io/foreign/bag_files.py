@@ -51,13 +51,15 @@ def list_topics(path: str) -> Iterator[Message]:
 
 
 def read_stamps(path: str, topic: str) -> Iterator[Message]:
-    """Yield the stamps (S,) int64 ns of a cloud topic's headers, and the frame of the first."""
+    """Yield the stamps (S,) int64 ns of a cloud topic's headers, whether each has returns, and the first frame."""
     with _bag(path) as bag:
-        stamps, frame = [], ""
+        stamps, has_returns, frame = [], [], ""
         for message, _ in _messages(bag, [topic]):
             frame = frame or str(message.header.frame_id)
             stamps.append(_nanoseconds(message.header.stamp))
-    yield {"frame": frame}, {"stamps": np.array(stamps, np.int64)}
+            points = _cloud(message)["points"]
+            has_returns.append(bool((np.isfinite(points).all(axis=1) & points.any(axis=1)).any()))
+    yield {"frame": frame}, {"stamps": np.array(stamps, np.int64), "has_returns": np.array(has_returns, np.uint8)}
 
 
 def read_clouds(path: str, topic: str) -> Iterator[Message]:

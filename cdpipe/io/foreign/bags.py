@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, InputWarning
-from cdpipe.core.geometry import Float64Array, Int64Array, make_pose
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, make_pose
 from cdpipe.core.isolated_reader import IsolatedReader
 from cdpipe.core.names import visible
 from cdpipe.core.plugins import require_extra
@@ -70,13 +70,13 @@ class BagScans:
         stamps: Int64Array = arrays["stamps"]
         if not len(stamps):
             raise InputError(f"{path}: {self._topic}: no cloud can be read from it")
+        self._is_kept = self._find_returns(arrays["has_returns"] > 0)
+        stamps, numbers = stamps[self._is_kept], np.flatnonzero(self._is_kept)
         late = 1 + next(iter(np.flatnonzero(np.diff(stamps) <= 0).tolist()), -1)
         if late:
-            raise InputError(
-                f"{path}: {self._topic}: the stamp of cloud {late} does not come after that of the one before"
-            )
+            told = f"the stamp of cloud {numbers[late]} does not come after that of the one before"
+            raise InputError(f"{path}: {self._topic}: {told}")
         self.stamps_s: Float64Array | None = stamps / 1e9
-        self._is_kept = np.ones(len(stamps), bool)
         self.lacks = f"no poses of the sensor in it (it holds {self._listed()})"
         if not is_posed:
             self.own = self._find_poses(topics)
@@ -120,11 +120,21 @@ class BagScans:
         more = f" and {len(told) - _LISTED} more" if len(told) > _LISTED else ""
         return (", ".join(told[:_LISTED]) or "no message") + more
 
+    def _find_returns(self, has_returns: BoolArray) -> BoolArray:
+        """Return which clouds (S,) to read: those with a return."""
+        n_empty = int(np.count_nonzero(~has_returns))
+        if n_empty == len(has_returns):
+            raise InputError(f"{self._path}: {self._topic}: none of its {n_empty} clouds holds a return")
+        if n_empty:
+            told = f"{n_empty} of {len(has_returns)} clouds hold no return, and are left out"
+            warnings.warn(f"{self._path}: {told}", InputWarning, stacklevel=2)
+        return has_returns
+
     def _leave_out(self, stamps_s: Float64Array, own: Trajectory) -> None:
         assert own.time_s is not None
         slack_s = max(float(np.median(np.diff(times))) if len(times) > 1 else 0.0 for times in (stamps_s, own.time_s))
-        self._is_kept = (stamps_s >= own.time_s[0] - slack_s) & (stamps_s <= own.time_s[-1] + slack_s)
-        n_out = int(np.count_nonzero(~self._is_kept))
+        is_inside = (stamps_s >= own.time_s[0] - slack_s) & (stamps_s <= own.time_s[-1] + slack_s)
+        n_out = int(np.count_nonzero(~is_inside))
         if n_out == len(stamps_s):
             raise InputError(
                 f"{self._path}: its poses ({own.time_s[0]:.3f} to {own.time_s[-1]:.3f} s) and its clouds "
@@ -133,21 +143,22 @@ class BagScans:
         if n_out:
             told = f"{n_out} of {len(stamps_s)} clouds lie before or after its poses, and are left out"
             warnings.warn(f"{self._path}: {told}", InputWarning, stacklevel=2)
-        self.stamps_s = stamps_s[self._is_kept]
+        self._is_kept[np.flatnonzero(self._is_kept)] = is_inside
+        self.stamps_s = stamps_s[is_inside]
 
     def _find_poses(self, topics: Sequence[str]) -> Trajectory | None:
-        """Return poses by a named topic; else by tf, Odometry or PoseStamped."""
+        """Return poses by a named topic; else by tf below a fixed frame, Odometry, PoseStamped, or other tf."""
         edges = self._read_edges([name for name, kind, _ in self._topics if kind == TRANSFORMS])
         named = [(name, kind) for name, kind, _ in self._topics if name in topics and kind in (ODOMETRY, POSE)]
-        if not named:
-            chain = _chain(edges, self._frame)
-            if any(len(edge.time_s) > 1 for edge in chain):
-                return _compose(f"tf of {self._path}", chain)
+        chain = _chain(edges, self._frame)
+        is_moving = any(len(edge.time_s) > 1 for edge in chain)
+        if not named and is_moving and chain[0].parent in _FIXED:
+            return _compose(f"tf of {self._path}", chain)
         for kind in (ODOMETRY, POSE):
             found = [name for name, its_kind in named if its_kind == kind]
             if found or (not named and any(its_kind == kind for _, its_kind, _ in self._topics)):
                 return self._read_poses(self._choose(kind, topics, kind.rsplit("/", 1)[-1]), edges)
-        return None
+        return _compose(f"tf of {self._path}", chain) if is_moving else None
 
     def _read_poses(self, topic: str, edges: dict[str, _Edge]) -> Trajectory | None:
         """Return the poses of one topic, with the fixed mounting of the sensor on what they are poses of."""

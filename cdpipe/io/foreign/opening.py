@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from cdpipe.io.foreign.clouds import Clouds, point_times
 from cdpipe.io.foreign.folders import E57Scans, open_folder
 from cdpipe.io.foreign.scans import PosedClouds
 from cdpipe.io.foreign.sniff import FORMATS, guess_format, require_format_name
-from cdpipe.io.foreign.trajectory import Trajectory, poses_at, read_poses
+from cdpipe.io.foreign.trajectory import Trajectory, poses_at, read_poses, require_times_of_scans
 from cdpipe.io.ply import write_ply_points
 from cdpipe.io.tum import write_tum
 from cdpipe.mapping.odometry import estimate_cloud_motion
@@ -59,6 +60,15 @@ class HowToRead:
             raise InputError(f"--odometry {self.odometry}: expected {KISS_ICP}")
         if self.odometry is not None and self.trajectory is not None:
             raise InputError("--trajectory and --odometry both give the poses: leave one out")
+
+
+def folder_of_options(folder: Path, how: HowToRead) -> Path:
+    """Return the folder that stores the descriptors of a recording: `folder`, or one in it for other options."""
+    if how == HowToRead():
+        return folder
+    values = {name: each.resolve() if isinstance(each, Path) else each for name, each in asdict(how).items()}
+    told = repr(sorted((name, str(value)) for name, value in values.items()))
+    return folder / f"options-{hashlib.blake2b(told.encode(), digest_size=4).hexdigest()}"
 
 
 class _Posed(PosedClouds):
@@ -175,6 +185,7 @@ def _pose(clouds: Clouds, how: HowToRead, report: Progress) -> _Posed:
         )
     else:
         poses = trajectory.poses
+        require_times_of_scans(trajectory, stamps_s, clouds.name)
         if trajectory.time_s is not None:
             stamps_s = trajectory.time_s
         elif stamps_s is not None:

@@ -104,11 +104,12 @@ def _formats_in(folder: Path) -> dict[str, int]:
     """Return the formats in a folder with their numbers of files."""
     if (folder / "session.json").is_file():
         return {"session": 1}
-    if _files(folder, FORMATS["bag"].suffixes):
-        return {"bag": 1}
     counts = {name: len(find_scans(folder, name)) for name, each in FORMATS.items() if each.in_folders}
+    bags = _files(folder, FORMATS["bag"].suffixes)
+    counts["bag"] = min(len(bags), 1) if (folder / "metadata.yaml").is_file() else len(bags)
     found = {name: count for name, count in counts.items() if count}
-    return {name: count for name, count in found.items() if count > 1} or found  # one map beside scans is no scan
+    # one map beside scans or a bag is no scan
+    return {name: count for name, count in found.items() if count > 1 or name == "bag"} or found
 
 
 def _guess_folder(folder: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.errors import InputError
+from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.files import read_bytes
 from cdpipe.core.geometry import BoolArray, Float64Array, make_pose, travelled_m
 from cdpipe.core.motion import Motion, make_motion
@@ -19,16 +20,25 @@ from cdpipe.io.tum import MOST_BYTES, TUM_LINE, read_tum, require_unit_poses
 # A pose is rigid if no entry of R R^T is farther than this from the identity; KITTI files have six digits.
 _RIGID = 1e-3
 _FARTHEST_M = 1e8
+_NOMINAL_S = 0.1  # between scans, where there is one scan only
 # Poses farther apart than this say nothing about the scans between them, unless scans are as rare.
 _LONGEST_GAP_S = 1.0
 _SECONDS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # from this median on, stamps are ns, us, ms
 _NAMES = {
-    "time": ("t", "time", "stamp", "timestamp", "sec", "secs", "seconds", "nsec", "nsecs", "ns", "s"),
+    "time": ("t", "time", "stamp", "timestamp", "s"),
+    "sec": ("sec", "secs", "seconds"), "nsec": ("nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds", "ns"),
     "x": ("x", "tx", "px"), "y": ("y", "ty", "py"), "z": ("z", "tz", "pz"),
     "qx": ("qx",), "qy": ("qy",), "qz": ("qz",), "qw": ("qw",),
     "roll": ("roll",), "pitch": ("pitch",), "yaw": ("yaw", "heading"),
 }  # fmt: skip
 _TURNS = {"q", "quat", "quaternion", "orientation", "rotation", "rot"}
+# Words of columns that are no pose: rates, errors and counters.
+_NO_POSE = {
+    "linear", "angular", "twist", "vel", "velocity", "acc", "accel", "acceleration", "omega", "gyro", "v", "std",
+    "stddev", "sigma", "bias", "b", "cov", "covariance", "seq",
+}  # fmt: skip
+_RADIANS = np.pi + 1e-3  # rounded to three digits; angles up to here are taken for radians without a unit
+_DEGREES = 7.0  # from here on they are degrees
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +71,8 @@ def read_poses(path: Path) -> Trajectory:
     qw or roll, pitch, yaw; time).
 
     Raises:
-        InputError: The file is none of these, a number is not finite, or a rotation is none.
+        InputError: The file is none of these, a number is not finite, a rotation is none, times other than TUM's do not
+            rise, or angles may be degrees or radians. Radians without a unit in the header are an `InputWarning`.
     """
     lines = _lines(path)
     if not lines:
@@ -81,7 +92,7 @@ def read_poses(path: Path) -> Trajectory:
     rows, numbers = _numbers(path, lines, columns)
     has_time = columns in (8, 13)
     poses = _poses(path, rows[:, int(has_time) :], numbers)
-    return Trajectory(str(path), poses, _seconds(rows[:, 0]) if has_time else None)
+    return Trajectory(str(path), poses, _rising(path, _seconds(rows[:, 0])) if has_time else None)
 
 
 def read_times(path: Path) -> Float64Array:
@@ -91,9 +102,7 @@ def read_times(path: Path) -> Float64Array:
         InputError: A line is not one finite number, or a time does not come after the one before it.
     """
     lines = _lines(path)
-    time_s = _seconds(_numbers(path, lines, 1)[0][:, 0])
-    _require_rising(str(path), time_s)
-    return time_s
+    return _rising(path, _seconds(_numbers(path, lines, 1)[0][:, 0]))
 
 
 def poses_at(trajectory: Trajectory, stamps_s: Float64Array, name: str) -> Float64Array:
@@ -125,6 +134,20 @@ def poses_at(trajectory: Trajectory, stamps_s: Float64Array, name: str) -> Float
         return np.broadcast_to(trajectory.poses[0], (len(stamps_s), 4, 4)).copy()
     _require_no_gap(trajectory, stamps_s, period_s)
     return motion.poses(stamps_s)
+
+
+def require_times_of_scans(trajectory: Trajectory, stamps_s: Float64Array | None, name: str) -> None:
+    """Raise `InputError` if the times of poses, one for each of (S,) scans, are off theirs by more than one period."""
+    if trajectory.time_s is None or stamps_s is None:
+        return
+    period_s = max(_period(stamps_s), _period(trajectory.time_s)) or _NOMINAL_S
+    off_s = trajectory.time_s - stamps_s
+    scan = int(np.argmax(np.abs(off_s)))
+    if abs(off_s[scan]) > period_s + 1e-6:
+        raise InputError(
+            f"{trajectory.where}: its times and those of the scans of {name} differ by {off_s[scan]:.3f} s (scan "
+            f"{scan}), more than one period ({period_s:.3f} s): shift the stamps, or name the trajectory of these scans"
+        )
 
 
 def _require_no_gap(trajectory: Trajectory, stamps_s: Float64Array, period_s: float) -> None:
@@ -177,23 +200,25 @@ def _is_number(word: str) -> bool:
 
 
 def _columns(names: Sequence[str]) -> dict[str, int]:
-    """Return the column of each quantity that a CSV's header names; the first that fits."""
+    """Return the column of each quantity that a CSV's header names; a bare name first, then the first that fits."""
     found: dict[str, int] = {}
+    bare: dict[str, int] = {}
     for index, name in enumerate(names):
-        bare = re.sub(r"[\[(].*?[\])]", "", name).strip().lower()
-        tokens = [token for token in re.split(r"[^a-z0-9]+", bare) if token]
+        text = re.sub(r"[\[(].*?[\])]", "", name).strip().lower()
+        tokens = [token for token in re.split(r"[^a-z0-9]+", text) if token]
+        tokens = tokens[:-1] if len(tokens) > 1 and tokens[-1] in ("deg", "degrees", "rad", "radians") else tokens
         if not tokens:
             continue
         # `pose.orientation.x`, `q_RS_x`: the last word is the axis, a word before says of what
         is_turn = bool(_TURNS & set(tokens[:-1])) and tokens[-1] in ("x", "y", "z", "w")
         last = f"q{tokens[-1]}" if is_turn else tokens[-1]
         quantity = next((quantity for quantity, usual in _NAMES.items() if last in usual), None)
-        # twist, covariance and the like are no pose
-        if quantity is not None and not {"linear", "angular", "twist", "covariance", "v", "b", "seq"} & set(
-            tokens[:-1]
-        ):
-            found.setdefault(quantity, index)
-    return found
+        if quantity is None or _NO_POSE & set(tokens[:-1]):
+            continue
+        if len(tokens) == 1 and quantity not in ("time", "sec", "nsec"):  # `x` comes before `marker_x`
+            bare.setdefault(quantity, index)
+        found.setdefault(quantity, index)
+    return found | bare
 
 
 def _read_csv(path: Path, names: list[str], lines: list[tuple[int, str]]) -> Trajectory:
@@ -206,20 +231,57 @@ def _read_csv(path: Path, names: list[str], lines: list[tuple[int, str]]) -> Tra
             f"{path}: its header names {named}: expected x, y, z, and qx, qy, qz, qw or roll, pitch, yaw, and time for "
             "scans at other times"
         )
-    rows, numbers = _numbers(path, lines, len(names))
-    points = rows[:, [columns[axis] for axis in "xyz"]]
+    used = [columns[name] for name in ("x", "y", "z", *(turns if len(turns) == 4 else angles))]
+    clocks = _clocks(columns)
+    rows, numbers = _numbers(path, lines, len(names), used + clocks)
     if len(turns) == 4:
-        poses = _poses(path, np.column_stack([points, rows[:, [columns[name] for name in turns]]]), numbers)
+        poses = _poses(path, rows[:, :7], numbers)
     else:
-        turn = rows[:, [columns[name] for name in angles]]
-        is_degrees = any("deg" in names[columns[name]].lower() for name in angles) or np.abs(turn).max(initial=0) > 7.0
-        matrices = Rotation.from_euler("xyz", turn, degrees=is_degrees).as_matrix()
-        poses = make_pose(matrices, points)
-    return Trajectory(str(path), poses, _seconds(rows[:, columns["time"]]) if "time" in columns else None)
+        is_degrees = _are_degrees(path, rows[:, 3:6], [names[columns[name]].lower() for name in angles])
+        rotations = Rotation.from_euler("xyz", rows[:, 3:6], degrees=is_degrees)
+        _poses(path, np.column_stack([rows[:, :3], rotations.as_quat()]), numbers)  # which refuses what is no pose
+        poses = make_pose(rotations.as_matrix(), rows[:, :3])
+    return Trajectory(str(path), poses, _rising(path, _add_clocks(rows[:, len(used) :])) if clocks else None)
 
 
-def _numbers(path: Path, lines: list[tuple[int, str]], columns: int) -> tuple[Float64Array, list[int]]:
-    """Return the numbers (N, columns) of lines, and their line numbers."""
+def _clocks(columns: dict[str, int]) -> list[int]:
+    """Return the columns that hold the time: one, or seconds and nanoseconds, or none."""
+    if "time" in columns:
+        return [columns["time"]]
+    return [columns[name] for name in ("sec", "nsec") if name in columns]
+
+
+def _add_clocks(stamps: Float64Array) -> Float64Array:
+    """Return the times (N,), seconds, of columns (N, 1), or (N, 2) of seconds and the nanoseconds beyond them."""
+    last = stamps[:, -1]
+    is_rest = stamps.shape[1] == 2 and bool((np.abs(last) < 1e9).all())
+    return stamps[:, 0] + 1e-9 * last if is_rest else _seconds(last)  # nanoseconds from 1e9 on are whole stamps
+
+
+def _are_degrees(path: Path, angles: Float64Array, names: Sequence[str]) -> bool:
+    """Return whether angles (N, 3) are degrees: by the unit in the header, else by their size.
+
+    Raises:
+        InputError: They could be either.
+    """
+    if any("deg" in name or "rad" in name for name in names):
+        return any("deg" in name for name in names)
+    largest = float(np.abs(angles).max(initial=0.0))
+    if _RADIANS < largest <= _DEGREES:
+        raise InputError(
+            f"{path}: the largest of roll, pitch and yaw is {largest:.3f}, which may be degrees or radians: say which "
+            "in the header, as roll_deg,pitch_deg,yaw_deg or roll_rad,pitch_rad,yaw_rad"
+        )
+    if 0.0 < largest <= _RADIANS:
+        told = "roll, pitch and yaw are taken for radians: say so in the header (yaw_rad, or yaw_deg for degrees)"
+        warnings.warn(f"{path}: {told}", InputWarning, stacklevel=2)
+    return largest > _DEGREES
+
+
+def _numbers(
+    path: Path, lines: list[tuple[int, str]], columns: int, used: Sequence[int] | None = None
+) -> tuple[Float64Array, list[int]]:
+    """Return the finite numbers (N, U) in the used columns of lines, all without `used`, and their line numbers."""
     rows = []
     for number, line in lines:
         words = _split(line)
@@ -228,9 +290,12 @@ def _numbers(path: Path, lines: list[tuple[int, str]], columns: int) -> tuple[Fl
                 f"{path}:{number}: {len(words)} fields, {columns} in the first line: expected as many in each"
             )
         try:
-            rows.append([float(word or "nan") for word in words])
+            row = [float(words[index] or "nan") for index in (range(columns) if used is None else used)]
         except ValueError as error:
             raise InputError(f"{path}:{number}: expected numbers: {error}") from error
+        if not np.isfinite(row).all():
+            raise InputError(f"{path}:{number}: a number is missing or not finite: correct it or remove the line")
+        rows.append(row)
     if not rows:
         raise InputError(f"{path}: no line of numbers in it")
     return np.array(rows, np.float64), [number for number, _ in lines]
@@ -264,6 +329,11 @@ def _seconds(stamps: Float64Array) -> Float64Array:
     """Return stamps in seconds: from their size ns, us, ms or s."""
     middle = float(np.median(np.abs(stamps))) if len(stamps) else 0.0
     return stamps * next((scale for least, scale in _SECONDS if middle > least), 1.0)
+
+
+def _rising(path: Path, time_s: Float64Array) -> Float64Array:
+    _require_rising(str(path), time_s)
+    return time_s
 
 
 def _require_rising(where: str, time_s: Float64Array) -> None:

@@ -217,7 +217,10 @@ class RosMessages:
         return self.types["geometry_msgs/msg/PoseStamped"](header=self._header(time_s, "map"), pose=here)
 
     def all(self, poses: str, cloud_topics: Sequence[str], last_pose_s: float) -> list[tuple[str, str, float, Any]]:
-        """Return topic, type, time and message of everything: `poses` is tf, odometry, pose or none."""
+        """Return topic, type, time and message of everything: `poses` is tf, odometry, pose or none.
+
+        With "footprint" there is odometry, and tf moves between two frames of the robot.
+        """
         made = [
             (topic, "sensor_msgs/msg/PointCloud2", time_s, cloud)
             for topic in cloud_topics
@@ -226,7 +229,7 @@ class RosMessages:
         times = np.arange(self._made.stamps_s[0] - 0.1, min(self._made.stamps_s[-1] + 0.25, last_pose_s), 1 / BASE_HZ)
         base = odom_T_sensor(times) @ invert(BASE_T_SENSOR)
         tf, first = "tf2_msgs/msg/TFMessage", float(times[0])
-        if poses in ("tf", "odometry"):
+        if poses in ("tf", "odometry", "footprint"):
             made.append(("/tf_static", tf, first, self.transform(first, "base_link", "os_lidar", BASE_T_SENSOR)))
         for time_s, pose in zip(times.tolist(), base, strict=True):
             if poses == "tf":
@@ -234,8 +237,10 @@ class RosMessages:
                 made.append(
                     ("/tf", tf, time_s, self.transform(time_s, "map", "odom", yaw_pose(0.3, (5.0, time_s, 0.0))))
                 )
-            elif poses == "odometry":
+            elif poses in ("odometry", "footprint"):
                 made.append(("/odom", "nav_msgs/msg/Odometry", time_s, self.odometry(time_s, pose)))
+                if poses == "footprint":
+                    made.append(("/tf", tf, time_s, self.transform(time_s, "base_footprint", "base_link", np.eye(4))))
             elif poses == "pose":
                 sensor = self.pose(time_s, pose @ BASE_T_SENSOR)
                 made.append(("/slam/pose", "geometry_msgs/msg/PoseStamped", time_s, sensor))

@@ -13,7 +13,7 @@ pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
 
 from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.geometry import transform
-from cdpipe.io.foreign import HowToRead, guess_format, read_poses
+from cdpipe.io.foreign import HowToRead, folder_of_options, guess_format, read_poses
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.session_check import check_session
 from cdpipe.model.config import MapConfig
@@ -144,6 +144,58 @@ def test_clouds_outside_the_poses_of_a_bag_are_left_out(tmp_path: Path) -> None:
     assert len(list(source.scans())) == len(source.odom_T_sensor) == 3
 
 
+def test_tf_within_the_robot_is_no_way_where_odometry_is(tmp_path: Path) -> None:
+    assert worst_m(write_bag(tmp_path / "a.bag", MADE, "footprint")) < 1e-3
+
+
+def test_clouds_of_a_bag_without_a_return_are_left_out(tmp_path: Path) -> None:
+    made = drive(8)
+    clouds = list(made.clouds)
+    clouds[1] = (np.zeros((0, 3)), np.zeros(0))
+    clouds[3] = (np.full((5, 3), np.nan), np.linspace(0.0, 0.1, 5))
+    path = write_bag(tmp_path / "a.bag", type(made)(made.stamps_s, clouds), "odometry", last_pose_s=1.05)
+    with pytest.warns(InputWarning) as caught:
+        source = open_session(path)
+    told = [str(each.message) for each in caught]
+    assert any("2 of 8 clouds hold no return, and are left out" in each for each in told)
+    assert any("1 of 6 clouds lie before or after" in each for each in told)
+    scans = list(source.scans())
+    assert len(scans) == 5
+    np.testing.assert_allclose(source.odom_T_sensor[:4], odom_T_sensor(made.stamps_s[[0, 2, 4, 5]]), atol=1e-4)
+    assert max(off_walls_m(transform(each.odom_T_sensor, each.points_sensor)).max() for each in scans[:3]) < 1e-3
+    empty = write_bag(tmp_path / "b.bag", type(MADE)(MADE.stamps_s, [clouds[1]] * 6))
+    assert "none of its 6 clouds holds a return" in said(empty)
+
+
+def test_times_of_a_trajectory_and_of_its_scans_agree(tmp_path: Path) -> None:
+    folder = write_pcds(tmp_path / "run", MADE)
+    write_trajectory(folder / "t.tum", MADE.stamps_s)
+    np.savetxt(folder / "times.txt", START_NS / 1e9 + MADE.stamps_s - 0.09, fmt="%.6f")
+    assert len(list(open_session(folder).scans())) == 6
+    np.savetxt(folder / "times.txt", START_NS / 1e9 + MADE.stamps_s - 50.0, fmt="%.6f")
+    assert "t.tum: its times and those of the scans of" in said(folder)
+    assert "differ by 50.000 s" in said(folder)
+
+
+def test_descriptors_of_other_options_lie_apart(tmp_path: Path) -> None:
+    assert folder_of_options(tmp_path, HowToRead()) == tmp_path
+    hows = [HowToRead(deskew=False), HowToRead(topics=("/a",)), HowToRead(topics=("/b",)), HowToRead(format="las")]
+    folders = {folder_of_options(tmp_path, how) for how in hows}
+    assert len(folders) == 4
+    assert {folder.parent for folder in folders} == {tmp_path}
+    assert folder_of_options(tmp_path, hows[0]) == folder_of_options(tmp_path, HowToRead(deskew=False))
+
+
+def test_a_bag_beside_scans_is_one_of_two_formats(tmp_path: Path) -> None:
+    folder = write_pcds(tmp_path / "run", MADE)
+    bag = write_bag(folder / "stray.bag", MADE)
+    with pytest.raises(InputError, match=r"several formats \(6 pcd, 1 bag\): name one, --format pcd or bag"):
+        guess_format(folder)
+    for file in sorted(folder.glob("*.pcd"))[1:]:
+        file.unlink()
+    assert guess_format(folder) == guess_format(bag) == "bag"  # one cloud is a map
+
+
 def test_a_bag_becomes_a_folder_that_goes_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     source = open_session(write_bag(tmp_path / "a.bag", MADE))
@@ -185,6 +237,12 @@ def test_millimetres_are_named(tmp_path: Path) -> None:
         ("1 0 0 0 0 1 0 0 0 0 2 0\n", "t.txt:1: the first three columns of its 3x4 matrix are no rotation"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0\n", "t.txt:2: 3 fields, 12 in the first line"),
         ("", "no poses in it"),
+        ("x,y,z,roll,pitch,yaw\n1,2,3,0,0,0.1\n1,,3,0,0,0.1\n", "t.txt:3: a number is missing or not finite"),
+        ("x,y,z,roll,pitch,yaw\n1,2,3,0,0,5\n", "in the header, as roll_deg,pitch_deg,yaw_deg"),
+        ("time,x,y,z,qx,qy,qz,qw\n1,2,3,4,0,0,0,1\n,2,3,4,0,0,0,1\n", "t.txt:3: a number is missing or not finite"),
+        ("time,x,y,z,qx,qy,qz,qw\ninf,2,3,4,0,0,0,1\n", "t.txt:2: a number is missing or not finite"),
+        ("time,x,y,z,qx,qy,qz,qw\n5,2,3,4,0,0,0,1\n5,2,3,4,0,0,0,1\n", "time 2 does not come after the last"),
+        ("x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,a\n", "t.txt:2: expected numbers"),
     ],
 )
 def test_wrong_trajectories_are_named(tmp_path: Path, text: str, expected: str) -> None:
@@ -204,3 +262,32 @@ def test_columns_of_a_csv_are_found_by_their_names(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.poses[0], turned, atol=1e-9)
     assert found.time_s is not None
     assert found.time_s[0] == pytest.approx(1_700_000_000.5)
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["vel_x,vel_y,vel_z,{}", "a_x,a_y,a_z,{}", "linear_velocity.x,acc_y,sigma_z,{}", "std_x,omega_y,bias_z,{}"],
+)
+def test_velocities_of_a_csv_are_no_positions(tmp_path: Path, header: str) -> None:
+    (tmp_path / "t.csv").write_text(f"time,{header.format('x,y,z,qx,qy,qz,qw')}\n1,7,8,9,1,2,3,0,0,0,1\n")
+    np.testing.assert_array_equal(read_poses(tmp_path / "t.csv").poses[0, :3, 3], [1, 2, 3])
+
+
+@pytest.mark.parametrize("names", ["secs,nsecs", "header.stamp.sec,header.stamp.nanosec"])
+def test_seconds_and_nanoseconds_are_added_and_words_are_passed_over(tmp_path: Path, names: str) -> None:
+    rows = "7,250000000,odom,1,2,3,0,0,0,1\n7,750000000,odom,1,2,3,0,0,0,1\n"
+    (tmp_path / "t.csv").write_text(f"{names},frame_id,x,y,z,qx,qy,qz,qw\n{rows}")
+    np.testing.assert_allclose(read_poses(tmp_path / "t.csv").time_s, [7.25, 7.75])
+
+
+def test_the_unit_of_angles_is_that_of_the_header(tmp_path: Path) -> None:
+    def yaw_rad(unit: str, yaw: float) -> float:
+        (tmp_path / "t.csv").write_text(f"x,y,z,roll{unit},pitch{unit},yaw{unit}\n1,2,3,0,0,{yaw}\n")
+        (pose,) = read_poses(tmp_path / "t.csv").poses
+        return float(np.arctan2(pose[1, 0], pose[0, 0]))
+
+    assert yaw_rad("_deg", 5.0) == pytest.approx(np.radians(5.0))
+    assert yaw_rad("_rad", 6.0) == pytest.approx(6.0 - 2 * np.pi)
+    assert yaw_rad("", 90.0) == pytest.approx(np.pi / 2)
+    with pytest.warns(InputWarning, match="are taken for radians"):
+        assert yaw_rad("", 0.5) == pytest.approx(0.5)

@@ -36,6 +36,13 @@ def test_what_detect_says_of_recordings_and_their_options(tmp_path: Path, comman
     refused(command("detect", bag, folder, *out), "run: expected exactly one trajectory")
     refused(command("detect", bag, folder, "--trajectory", poses, *out), "--trajectory: given 1 times for 2 recordings")
     refused(command("detect", bag, bag, "--odometry", "slam", *out), "--odometry slam: expected kiss-icp")
+    one = ("--trajectory", poses, "--odometry")
+    refused(command("describe", folder, *one, "nonsense"), "--odometry nonsense: expected kiss-icp")
+    refused(command("describe", folder, *one, "kiss-icp"), "--trajectory and --odometry both give the poses")
+    both = ("--trajectory", "-", *one)
+    (tmp_path / "ours").mkdir()
+    (tmp_path / "ours" / "session.json").write_text("{}")
+    refused(command("detect", tmp_path / "ours", folder, *both, "kiss-icp", *out), "--odometry: no recording needs it")
     refused(command("describe", bag, "--format", "pdf"), "--format pdf: expected one of session")
     assert not (tmp_path / "out").exists()
 
@@ -44,3 +51,15 @@ def test_the_same_bag_twice_is_said(tmp_path: Path, command: Command) -> None:
     bag = write_bag(tmp_path / "a.bag", drive(3, 900))
     _, _, err = command("detect", bag, bag, "--out", tmp_path / "out")
     assert "one and the same recording" in err
+
+
+def test_descriptors_of_other_options_are_stored_apart(tmp_path: Path, command: Command) -> None:
+    made = drive(3, 900)
+    folder = write_pcds(tmp_path / "run", made)
+    write_trajectory(folder / "t.tum", made.stamps_s)
+    for more in ((), ("--no-deskew",)):
+        assert command("describe", folder, "--preset", "paper", *more)[0] == 0
+    default, other = sorted(folder.rglob("*.npz"), key=lambda file: len(file.parts))
+    assert default.parent.parent == folder
+    assert other.parent.parent.parent == folder
+    assert default.read_bytes() != other.read_bytes()
