@@ -1,4 +1,4 @@
 from .measure import measure_surface
-from .unrolled import unroll
+from .unrolled import middle_place, unroll
 
-__all__ = ["measure_surface", "unroll"]
+__all__ = ["measure_surface", "middle_place", "unroll"]

@@ -39,6 +39,12 @@ def unroll(points: Float64Array, odom_T_sensor: Float64Array) -> tuple[Float64Ar
     return chainage_m, np.rad2deg(np.arctan2(left_m, up_m)), np.hypot(left_m, up_m)
 
 
+def middle_place(chainage_m: Float64Array, angle_deg: Float64Array) -> tuple[float, float]:
+    """Return the median of (N,) chainages, metres, and the mean direction of (N,) angles, degrees."""
+    turn = np.deg2rad(angle_deg)
+    return float(np.median(chainage_m)), float(np.rad2deg(np.arctan2(np.sin(turn).mean(), np.cos(turn).mean())))
+
+
 def _middles(values: Float64Array, group: Int64Array) -> Float64Array:
     """Return the middle between the smallest and the largest of the (N,) values of each group."""
     low, high = np.full(group.max() + 1, np.inf), np.full(group.max() + 1, -np.inf)

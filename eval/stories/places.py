@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.model.report import SurfaceField
+from cdpipe.surface import middle_place
 from eval.scoring.surface_places import ANSWERED_M, SurfacePlaces, find_surface_places
 from eval.stories.comparisons import Comparison
 
@@ -119,9 +120,8 @@ def _measure(surface: SurfaceField | None, point: Float64Array) -> dict[str, flo
     found |= {"n_points": len(rows), "displacement_m": moved_m, "level_m": level_m}
     found["is_beyond_level"] = abs(moved_m) > level_m
     if surface.chainage_m is not None and surface.angle_deg is not None:
-        turn = np.deg2rad(surface.angle_deg[rows])
-        angle_deg = float(np.rad2deg(np.arctan2(np.sin(turn).mean(), np.cos(turn).mean())))
-        found |= {"chainage_m": float(np.median(surface.chainage_m[rows])), "angle_deg": angle_deg}
+        chainage_m, angle_deg = middle_place(surface.chainage_m[rows], surface.angle_deg[rows])
+        found |= {"chainage_m": chainage_m, "angle_deg": angle_deg}
     return found
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from cdpipe.core.geometry import Float64Array
 from cdpipe.model.report import ChangedObject, ChangeReport, SurfaceField
 from cdpipe.model.sentence import moved_m
+from cdpipe.surface import middle_place
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,11 +48,9 @@ def tabulate_rock(surface: SurfaceField) -> pd.DataFrame:
     rows = []
     for number, item in enumerate(surface.regions):
         own = surface.region == number
-        places = [np.nan, np.nan]
+        places = np.nan, np.nan
         if surface.chainage_m is not None and surface.angle_deg is not None:
-            turn = np.deg2rad(surface.angle_deg[own])
-            angle_deg = np.rad2deg(np.arctan2(np.sin(turn).mean(), np.cos(turn).mean()))
-            places = [float(np.median(surface.chainage_m[own])), float(angle_deg)]
+            places = middle_place(surface.chainage_m[own], surface.angle_deg[own])
         sizes = item.area_m2, 1000 * item.mean_m, 1000 * item.largest_m, item.volume_m3
         rows.append((number, *places, *sizes))
     return pd.DataFrame(rows, columns=columns)
