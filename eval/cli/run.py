@@ -161,8 +161,8 @@ def report(
         typer.Option(help="3-D views beside the page: of the first and the worst pairs, none, or all"),
     ] = "chosen",
     slim: Annotated[
-        bool, typer.Option("--slim", help="charts as pictures, and pictures compressed: a fifth of the bytes")
-    ] = False,
+        bool, typer.Option("--slim/--sharp", help="pictures compressed; or with every pixel, four times the bytes")
+    ] = True,
     quiet: Quiet = False,
 ) -> None:
     """Write one offline page with tables, plots and pictures of a run; or of the differences between two runs."""
@@ -176,8 +176,8 @@ def report(
             raise InputError("--out: the page of a run lies in its folder: leave --out to a comparison")
         echo(f"page: {write_page(open_run_folder(Path(folder)).path, views, is_slim=slim)}")
         return
-    if slim:
-        raise InputError("--slim: the page of a comparison has no charts to make smaller: leave it out")
+    if not slim:
+        raise InputError("--sharp: the page of a comparison has no pictures to compress: leave it out")
     if other is not None and against is not None:
         raise InputError(f"--against {against}: a second run is named too: write {folder}:{against} {other} instead")
     from eval.report.comparison import compare_sides, write_comparison

@@ -20,10 +20,10 @@ from cdpipe.core.names import visible
 from eval.core.charts import (
     BAR_SHARE,
     BLACK,
+    DASHES,
     GRID_COLOUR,
     HEAT_COLOURS,
     SYMBOLS,
-    Dash,
     Drawing,
     Heat,
     Look,
@@ -34,7 +34,6 @@ from eval.core.charts import (
 DPI = 130
 _SLIM_SCALE, _WEBP_QUALITY = 0.75, 30
 _WIDTH_IN, _PX_PER_IN, _LEGEND_CHARACTERS, _LEGEND_LINE_IN = 9.0, 88.0, 145, 0.17
-_DASHES: dict[Dash, Any] = {"solid": "solid", "dash": (0, (5, 2)), "dot": (0, (1, 1.5)), "dashdot": "dashdot"}
 _MARKERS = dict(zip(("", *SYMBOLS), ("", "o", "s", "D", "^", "v", "p", "*", "h", "X"), strict=True))
 
 
@@ -151,10 +150,17 @@ def _draw_heat(axes: Axes, heat: Heat) -> None:
 
 def _line(look: Look) -> dict[str, Any]:
     return {
-        "color": look.colour, "linewidth": look.width, "linestyle": _DASHES[look.dash] if look.width else "none",
+        "color": look.colour, "linewidth": look.width, "linestyle": _dashes(look),
         "marker": _MARKERS[look.marker], "markersize": look.size, "alpha": look.opacity,
         "markerfacecolor": "white" if look.is_hollow else look.colour,
     }  # fmt: skip
+
+
+def _dashes(look: Look) -> Any:
+    if not look.width:
+        return "none"
+    # matplotlib multiplies by the width of the line
+    return (0, tuple(length / look.width for length in DASHES[look.dash])) if DASHES[look.dash] else "solid"
 
 
 def _legend_entry(name: str, series: Series) -> Line2D | Patch:

@@ -21,7 +21,9 @@ from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.core.output import require_no_links
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.targets import read_targets
-from eval.report.charts import Chart, plotly_script
+from eval.report.drawing.charts import Chart
+from eval.report.glossary import describe_columns, describe_methods, index_entries
+from eval.report.headline import write_answer, write_title
 from eval.report.cost import draw_pareto, pareto_table
 from eval.report.hardness import draw_hardness
 from eval.report.latex import latex_tables, to_latex
@@ -40,7 +42,7 @@ from eval.report.settings.grids import PQ_COLUMN, draw_grids
 from eval.report.site.site import draw_site
 from eval.report.site.views import Views, write_views
 from eval.report.site.worst import draw_worst, worst_rows
-from eval.report.summary import draw_summary
+from eval.report.summary import HEADLINES, draw_summary
 from eval.report.surface.surface import SURFACE_COLUMNS, draw_surface
 from eval.report.tables import Cell, Table, results_table, to_csv, unchanged_table
 from eval.running.run_data import (
@@ -68,7 +70,7 @@ POINT_COLOURS = (
 )  # fmt: skip
 
 
-def write_page(run: Path, views: Views = "chosen", *, is_slim: bool = False) -> Path:
+def write_page(run: Path, views: Views = "chosen", *, is_slim: bool = True) -> Path:
     """Write `index.html` and the tables table1, table2 (.csv, .tex), results.tex and summary.tex into a run folder.
 
     Further files: regions_table.tex and objects_table.tex where the tables exist, pareto.csv and its pictures where
@@ -79,7 +81,7 @@ def write_page(run: Path, views: Views = "chosen", *, is_slim: bool = False) -> 
         run: The folder; results.csv must be there, anything else may be missing.
         views: Which pairs get a 3-D view, a file of its own below `views/` that the page links to; "none" for a page
             that is to stand without them.
-        is_slim: Whether charts are pictures and pictures are compressed: a fifth of the bytes.
+        is_slim: Whether pictures are compressed: fewer pixels, edges a little blurred, a quarter of the bytes.
 
     Returns:
         Path of the page.
@@ -130,12 +132,20 @@ def _draw(data: RunData, views: Views, *, is_slim: bool) -> dict[str, str | byte
         for name in ("table1", "table2"):
             files |= {f"{name}.csv": to_csv(content[name]), f"{name}.tex": to_latex(content[name])}
     content["is_slim"] = is_slim
-    if is_slim:
-        content["plotly"] = ""
     content["missing"] = list(dict.fromkeys([*data.left_out, *content["missing"], *content["merge"].missing]))
-    files["index.html"] = render_page("page.html", content)
+    files["index.html"] = render_page("page.html", content | _define(data, content))
     files |= {f"{chart.name}.png": chart.png for chart in content["charts"] if chart.has_png}
     return files
+
+
+def _define(data: RunData, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the methods and columns of a page are, and where that stands."""
+    variants = list(dict.fromkeys(str(row["variant"]) for row in data.every_result))
+    status = "ok, or the reason why there is no answer: the merge was refused, or the case failed."
+    besides = "" if content["ends_at_merge"] else "A case that is not ok scores 0 in recall and in every object column."
+    methods = describe_methods(variants)
+    columns = describe_columns(content["columns"], [*content.get("time_meanings", ()), ("status", status, besides)])
+    return {"methods": methods, "definitions": columns, "glossary": index_entries(methods, columns, variants)}
 
 
 def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
@@ -150,6 +160,8 @@ def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
         "settings": tabulate_settings(data),
         "provenance": json.dumps(data.provenance, indent=2, ensure_ascii=False),
         "commits": describe_commits(data),
+        "title": write_title(data),
+        "answer": write_answer(data, merges),
         "summary": draw_summary(data, merges),
         "merge": draw_merge(data),
         "ends_at_merge": ends_at_merge(data),
@@ -157,7 +169,6 @@ def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
         "columns": MERGE_COLUMNS,
         "views": None,
         "charts": (),
-        "plotly": "",
         # the other tables are not missing where a run ends at the merge
         "missing": [line for line in data.missing if line.startswith("provenance.json")],
     }
@@ -215,12 +226,11 @@ def _sections(data: RunData, drawn: Mapping[str, Sequence[Chart]], views: Views)
         "worst": draw_worst(data, variant, worst) if is_mapped else [],
         "worst_variant": variant,
         "charts": charts,
-        "plotly": plotly_script() if charts else "",
         "sites": sites,
         "columns": (
             *(() if regions is None else REGION_COLUMNS), *(() if objects is None else OBJECT_COLUMNS),
             *(() if surface is None else SURFACE_COLUMNS),
-            *RESULT_COLUMNS, *([PQ_COLUMN] if grids else []),
+            *RESULT_COLUMNS, *HEADLINES, *([PQ_COLUMN] if grids else []),
         ),
         "time_meanings": TIME_MEANINGS,
         "point_colours": POINT_COLOURS,

@@ -16,7 +16,7 @@ from eval.core.output import whole_file
 
 _FILES = (
     "page.html", "comparison.html", "answer.html", "story.html", "leaderboard.html", "parts.html", "page.css",
-    "charts.js", "answer.js", "sort.js",
+    "page.js", "charts.js", "answer.js", "sort.js",
 )  # fmt: skip
 
 

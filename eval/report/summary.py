@@ -98,9 +98,26 @@ def _mean(values: Float64Array, key: str) -> dict[str, float]:
 
 def _headlines(data: RunData) -> Table:
     """Return the headline figures of each method, best first; what is told the truth comes last."""
+    ranked, shown, figures = rank_methods(data)
+    if len(ranked) == 0:
+        return Table((), ())
+    is_first = ranked.groupby("domain").cumcount() < _MAX_METHODS
+    first = ranked[is_first | (ranked["variant"] == shown_variant(data))]
+    caption = (
+        f"Headline figures: one row is one method, best first, at most {_MAX_METHODS} for each domain; means over "
+        "session pairs (times: median)"
+    )
+    return methods_table(first, shown, figures, caption)
+
+
+def rank_methods(data: RunData) -> tuple[pd.DataFrame, list[Column], pd.DataFrame]:
+    """Return the headline figures of every method in each domain, best first, which of them are shown, and the pairs.
+
+    What is told the truth comes last. Empty where no pair can be compared.
+    """
     cases = comparable(data)
     if len(cases) == 0:
-        return Table((), ())
+        return pd.DataFrame(), [], cases
     figures = figures_of(cases)
     table = means_by_method(figures, HEADLINES)
     if table["domain"].nunique() > 1:  # all pairs together stand in the tables below
@@ -114,14 +131,7 @@ def _headlines(data: RunData) -> Table:
     # higher is better, as written; what is undefined comes last
     ranks = {column.key: -table[column.key].round(2).fillna(-math.inf) for column in shown if column.better == "high"}
     order = pd.DataFrame({"domain": table["domain"], "oracle": table["variant"].map(is_told_the_truth), **ranks})
-    ranked = table.loc[order.sort_values(["domain", "oracle", *ranks], kind="stable").index]
-    is_first = ranked.groupby("domain").cumcount() < _MAX_METHODS
-    first = ranked[is_first | (ranked["variant"] == shown_variant(data))]
-    caption = (
-        f"Headline figures: one row is one method, best first, at most {_MAX_METHODS} for each domain; means over "
-        "session pairs (times: median)"
-    )
-    return methods_table(first, shown, figures, caption)
+    return table.loc[order.sort_values(["domain", "oracle", *ranks], kind="stable").index], shown, figures
 
 
 def _merge_headlines(merges: pd.DataFrame) -> Table:

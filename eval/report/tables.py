@@ -13,7 +13,7 @@ import pandas as pd
 
 from eval.core.domains import domain_name
 from eval.core.statistics import ENOUGH_PAIRS
-from eval.report.charts import Chart
+from eval.report.drawing.charts import Chart
 from eval.running.run_data import (
     Row,
     RunData,

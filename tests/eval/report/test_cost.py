@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from eval.report.charts import plotly_figure
+from eval.report.drawing.charts import plotly_figure
 from eval.report.cost import COLUMNS, draw_pareto, front, pareto_table
 from eval.running.run_data import RunData
 from eval.running.runfolder import RunFolder

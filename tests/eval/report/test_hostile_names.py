@@ -15,7 +15,7 @@ import pytest
 
 from eval.core.charts import Axis, Drawing, Heat, Panel, Series
 from eval.core.figures import picture, png
-from eval.report.charts import plotly_text
+from eval.report.drawing.charts import plotly_text
 from eval.report.comparison import compare_sides, write_comparison
 from eval.report.latex import to_latex
 from eval.report.page import write_page

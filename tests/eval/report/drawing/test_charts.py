@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex
 
 from eval.core.charts import Axis, Drawing, Heat, Panel, Series, log_span
 from eval.core.figures import picture
-from eval.report.charts import Chart, plotly_figure, plotly_script
+from eval.report.drawing.charts import Chart, plotly_figure, plotly_script
 from eval.report.regions.charts import draw_free_response, draw_roc, draw_sizes, look_of
 from eval.report.scenarios import draw_scenarios
 from eval.report.settings.factors import draw_factors, factors
