@@ -163,6 +163,9 @@ def report(
     slim: Annotated[
         bool, typer.Option("--slim/--sharp", help="pictures compressed; or with every pixel, four times the bytes")
     ] = True,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="keep pictures of the page that is there where their sessions are gone")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Write one offline page with tables, plots and pictures of a run; or of the differences between two runs."""
@@ -174,7 +177,7 @@ def report(
 
         if out is not None:
             raise InputError("--out: the page of a run lies in its folder: leave --out to a comparison")
-        echo(f"page: {write_page(open_run_folder(Path(folder)).path, views, is_slim=slim)}")
+        echo(f"page: {write_page(open_run_folder(Path(folder)).path, views, is_slim=slim, keeps=keep)}")
         return
     if not slim:
         raise InputError("--sharp: the page of a comparison has no pictures to compress: leave it out")

@@ -51,13 +51,18 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def data_address(figure: Figure) -> str:
-    """Return a figure as `data:image/png;base64,...`, in 256 colours: a third of the bytes, and no eye sees it."""
+def indexed_png(figure: Figure) -> bytes:
+    """Return a figure as a PNG file in 256 colours: a third of the bytes, and no eye sees it."""
     picture = Image.open(io.BytesIO(png(figure))).convert("RGB")
     buffer = io.BytesIO()
     indexed = picture.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     indexed.save(buffer, format="png", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return buffer.getvalue()
+
+
+def data_address(figure: Figure) -> str:
+    """Return a figure as `data:image/png;base64,...`, in 256 colours."""
+    return "data:image/png;base64," + base64.b64encode(indexed_png(figure)).decode("ascii")
 
 
 def compress_address(address: str) -> str:

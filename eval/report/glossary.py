@@ -39,7 +39,7 @@ def describe_methods(variants: Iterable[str]) -> list[Entry]:
     """Return an entry for each method, in their order; settings over a method belong to its entry."""
     names = dict.fromkeys(split_variant(variant)[0] for variant in variants)
     return [
-        Entry(f"method-{place}", name, ((_describe_method(name), ""),), is_told_the_truth(name))
+        Entry(f"m{place}", name, ((_describe_method(name), ""),), is_told_the_truth(name))
         for place, name in enumerate(names, 1)
     ]
 
@@ -55,7 +55,7 @@ def describe_columns(columns: Iterable[Column], more: Iterable[tuple[str, str, s
     told = [*((column.heading, column.meaning, column.when_undefined) for column in columns), *more]
     for heading, meaning, besides in told:
         found.setdefault(heading, {})[meaning, besides] = None
-    return [Entry(f"column-{place}", name, tuple(own)) for place, (name, own) in enumerate(found.items(), 1)]
+    return [Entry(f"c{place}", name, tuple(own)) for place, (name, own) in enumerate(found.items(), 1)]
 
 
 def index_entries(

@@ -23,6 +23,7 @@ from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.targets import read_targets
 from eval.report.drawing.charts import Chart
 from eval.report.glossary import describe_columns, describe_methods, index_entries
+from eval.report.kept import KeptPage, keep, read_kept
 from eval.report.headline import write_answer, write_title
 from eval.report.cost import draw_pareto, pareto_table
 from eval.report.hardness import draw_hardness
@@ -70,7 +71,7 @@ POINT_COLOURS = (
 )  # fmt: skip
 
 
-def write_page(run: Path, views: Views = "chosen", *, is_slim: bool = True) -> Path:
+def write_page(run: Path, views: Views = "chosen", *, is_slim: bool = True, keeps: bool = False) -> Path:
     """Write `index.html` and the tables table1, table2 (.csv, .tex), results.tex and summary.tex into a run folder.
 
     Further files: regions_table.tex and objects_table.tex where the tables exist, pareto.csv and its pictures where
@@ -82,6 +83,7 @@ def write_page(run: Path, views: Views = "chosen", *, is_slim: bool = True) -> P
         views: Which pairs get a 3-D view, a file of its own below `views/` that the page links to; "none" for a page
             that is to stand without them.
         is_slim: Whether pictures are compressed: fewer pixels, edges a little blurred, a quarter of the bytes.
+        keeps: Whether pictures and tables of the page that lies there are kept where the folder cannot make them.
 
     Returns:
         Path of the page.
@@ -95,7 +97,7 @@ def write_page(run: Path, views: Views = "chosen", *, is_slim: bool = True) -> P
     check_versions(Side(data), Side(data))
     check_extras(Side(data))
     try:
-        files = _draw(data, views, is_slim=is_slim)
+        files = _draw(data, views, read_kept(run / "index.html") if keeps else KeptPage(), is_slim=is_slim)
     except KeyError as error:
         raise InputError(
             f"{run}: a table lacks column {error}: `tunnelcd score {run}` makes the tables anew"
@@ -105,7 +107,7 @@ def write_page(run: Path, views: Views = "chosen", *, is_slim: bool = True) -> P
     return run / "index.html"
 
 
-def _draw(data: RunData, views: Views, *, is_slim: bool) -> dict[str, str | bytes]:
+def _draw(data: RunData, views: Views, kept: KeptPage, *, is_slim: bool) -> dict[str, str | bytes]:
     """Return every file of a page by its name."""
     merges = merge_table(pd.DataFrame(list(data.results)), read_targets(data.provenance))
     content = _about(data, merges)
@@ -133,6 +135,7 @@ def _draw(data: RunData, views: Views, *, is_slim: bool) -> dict[str, str | byte
             files |= {f"{name}.csv": to_csv(content[name]), f"{name}.tex": to_latex(content[name])}
     content["is_slim"] = is_slim
     content["missing"] = list(dict.fromkeys([*data.left_out, *content["missing"], *content["merge"].missing]))
+    content = keep(content, kept)
     files["index.html"] = render_page("page.html", content | _define(data, content))
     files |= {f"{chart.name}.png": chart.png for chart in content["charts"] if chart.has_png}
     return files
@@ -158,7 +161,7 @@ def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
         "finished": str(data.provenance.get("finished") or "unknown"),
         "failures": list_failures(data),
         "settings": tabulate_settings(data),
-        "provenance": json.dumps(data.provenance, indent=2, ensure_ascii=False),
+        "provenance": json.dumps(data.provenance, indent=1, ensure_ascii=False),
         "commits": describe_commits(data),
         "title": write_title(data),
         "answer": write_answer(data, merges),

@@ -36,9 +36,8 @@ def draw_scenarios(data: RunData) -> list[Chart]:
             groups = [values[world, name] for world in worlds]
             means = [over_pairs(group, column.key) for group in groups]
             low, high = np.array([interval_over_pairs(group, column.key) for group in groups]).T
-            hover = [f"{world}: {mean:.3f}" for world, mean in zip(worlds, means, strict=True)]
             look = look_of(name)
-            series.append(Series(list(ticks), means, look, name, "bars", low=low, high=high, hover=hover))
+            series.append(Series(list(ticks), means, look, name, "bars", low=low, high=high, hover="{y:.3f}"))
         is_last = column is _COLUMNS[-1]
         x = Axis(ticks=ticks if is_last else dict.fromkeys(ticks, ""))
         rows.append([Panel(x, Axis(column.heading, (0.0, 1.05)), series)])

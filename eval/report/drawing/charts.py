@@ -15,7 +15,7 @@ import numpy as np
 from markupsafe import Markup
 
 from eval.core.charts import Drawing
-from eval.core.figures import picture, png
+from eval.core.figures import indexed_png, picture
 from eval.report.drawing.marks import draw_swatch
 from eval.report.drawing.svg import draw_panel
 
@@ -44,7 +44,7 @@ class Chart:
     @property
     def png(self) -> bytes:
         """The chart as a PNG file for papers."""
-        return png(picture(self.drawing))
+        return indexed_png(picture(self.drawing))
 
     @property
     def legend(self) -> list[tuple[str, Markup]]:

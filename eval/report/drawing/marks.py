@@ -15,6 +15,7 @@ from eval.core.charts import BAR_SHARE, BLACK, DASHES, HEAT_COLOURS, Heat, Look,
 from eval.tables.rows import is_told_the_truth
 
 _PX_PER_PT = 1.3
+_MOST_MARKERS = 6
 # outlines around the origin, radius 1; two half circles make the circle
 _SIDES = {
     "square": (4, 45.0, 1.0), "diamond": (4, 0.0, 1.0), "triangle-up": (3, -90.0, 1.0), "triangle-down": (3, 90.0, 1.0),
@@ -71,7 +72,7 @@ def draw_series(series: Sequence[Series], x: Place, y: Place, legend: Mapping[st
         yield Markup("<g{}{}>{}{}{}{}</g>").format(
             Markup(' data-s="{}"').format(legend[each.name]) if each.name else "",
             _hover(each), _body(each, at, x, y, len(bars)), _intervals(each, across, x, y),
-            draw_markers(each.look, *at), _labels(each, at),
+            draw_markers(each.look, *(marked_places(at) if each.look.width and each.style != "bars" else at)), _labels(each, at),
         )  # fmt: skip
 
 
@@ -81,9 +82,9 @@ def draw_swatch(series: Series) -> Markup:
     if series.style == "bars":
         line = Markup('<rect x="7" y="1" width="16" height="12" fill="{}"/>').format(look.colour)
     else:
-        line = Markup('<path class="line" d="M1 7H31" fill="none"{}/>').format(_stroke(look)) if look.width else Markup("")
+        line = Markup('<path class="line" d="M1 7H31"{}/>').format(_stroke(look)) if look.width else Markup("")
     marker = draw_markers(look, np.array([16.0]), np.array([7.0]))
-    return Markup('<svg class="swatch" viewBox="0 0 32 14" aria-hidden="true">{}{}</svg>').format(line, marker)
+    return Markup('<svg class="swatch">{}{}</svg>').format(line, marker)
 
 
 def draw_heat(heat: Heat, x: Place, y: Place) -> Iterator[Markup]:
@@ -123,7 +124,7 @@ def _body(series: Series, at: tuple[Float64Array, Float64Array], x: Place, y: Pl
         boxes = (f"M{px(left - half)} {px(floor)}V{px(top)}H{px(left + half)}V{px(floor)}z" for left, top in _points(*at))
         return Markup('<path class="bars" d="{}" fill="{}" data-p="{}"/>').format("".join(boxes), look.colour, _pairs(*at))
     if not look.width:
-        return Markup('<path class="places" data-p="{}"/>').format(_pairs(*at))
+        return Markup('<path class="places" data-p="{}"/>').format(_pairs(*at)) if series.hover else Markup("")
     return Markup('<path class="line" d="{}"{}/>').format(trace_line(*at, is_stepped=series.style == "steps"), _stroke(look))
 
 
@@ -166,6 +167,12 @@ def _pairs(x: Float64Array, y: Float64Array) -> str:
     return ";".join(f"{px(a)},{px(b)}" if known else "-" for a, b, known in zip(x, y, is_there, strict=True))
 
 
+def marked_places(at: tuple[Float64Array, Float64Array]) -> tuple[Float64Array, Float64Array]:
+    """Return the points of a line that carry its marker: all of a few, every n-th of many."""
+    step = -(-len(at[0]) // _MOST_MARKERS)
+    return at[0][:: max(step, 1)], at[1][:: max(step, 1)]
+
+
 def draw_markers(look: Look, x: Float64Array, y: Float64Array) -> Markup:
     """Return the markers of (N,) points in pixels as one path; nothing where the look has none."""
     if not look.marker:
@@ -179,14 +186,21 @@ def draw_markers(look: Look, x: Float64Array, y: Float64Array) -> Markup:
 
 def _marker(name: str, x: float, y: float, radius: float) -> str:
     if name not in _SIDES:
-        r = px(radius)
-        return f"M{px(x - radius)} {px(y)}a{r} {r} 0 1 0 {px(2 * radius)} 0a{r} {r} 0 1 0 {px(-2 * radius)} 0z"
+        r, across = short(radius), short(2 * radius)
+        return f"M{px(x - radius)} {px(y)}a{r.strip()}{r} 0 1 0{across} 0{r}{r} 0 1 0-{across.strip()} 0z"
     n_sides, turn_deg, inner = _SIDES[name]
     n = n_sides if inner == 1.0 else 2 * n_sides
     angles = np.deg2rad(turn_deg) + 2 * np.pi * np.arange(n) / n
     radii = (1.3 if n_sides > 4 or inner == 1.0 else 1.5) * radius * np.where(np.arange(n) % 2 == 1, inner, 1.0)
-    corners = (f"{px(a)} {px(b)}" for a, b in zip(x + radii * np.cos(angles), y + radii * np.sin(angles), strict=True))
-    return f"M{'L'.join(corners)}z"
+    corners = np.round(radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]), 1)
+    steps = "".join(f"{short(value)}" for value in np.diff(corners, axis=0).ravel())
+    return f"M{px(x + corners[0, 0])} {px(y + corners[0, 1])}l{steps.strip()}z"
+
+
+def short(value: float) -> str:
+    """Write a number of a path with one decimal at most, a space before it where no sign parts it from the last."""
+    written = px(value).replace("0.", ".", 1) if abs(value) < 1 else px(value)
+    return written if written.startswith("-") else f" {written}"
 
 
 def _intervals(series: Series, across: Float64Array, x: Place, y: Place) -> Markup:

@@ -39,6 +39,7 @@ function told(group, place, plot, names) {
 for (const chart of document.querySelectorAll("figure.chart")) {
   const buttons = Array.from(chart.querySelectorAll(".legend button")), names = buttons.map(b => b.textContent);
   const groups = Array.from(chart.querySelectorAll("g[data-s]"));
+  buttons.forEach(button => { button.type = "button"; button.setAttribute("aria-pressed", "true"); });
   const isOn = place => buttons[place].getAttribute("aria-pressed") === "true";
   function update(shown) {
     buttons.forEach(function (button, place) { button.setAttribute("aria-pressed", String(shown(place))); });
