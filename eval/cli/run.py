@@ -166,11 +166,21 @@ def report(
     keep: Annotated[
         bool, typer.Option("--keep", help="keep pictures of the page that is there where their sessions are gone")
     ] = False,
+    index: Annotated[
+        bool, typer.Option("--index", help="RUN is a folder of reports: write the page that leads to all of them")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Write one offline page with tables, plots and pictures of a run; or of the differences between two runs."""
     from cdpipe.core.errors import InputError
 
+    if index:
+        from eval.report.framing.catalogue import write_index
+
+        if other is not None or against is not None or out is not None:
+            raise InputError("--index: an index is of one folder of reports: leave B, --against and --out out")
+        echo(f"page: {write_index(Path(folder))}")
+        return
     if other is None and against is None:
         from eval.report.page import write_page
         from eval.running.runfolder import open_run_folder

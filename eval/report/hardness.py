@@ -100,7 +100,8 @@ def _slopes(steps: pd.DataFrame) -> Chart:
     for axis, own in steps.groupby("axis", sort=False):
         values = own.drop_duplicates("step")
         ticks = [_at({"value": value, "unit": ""}) for value in values["value"]]
-        lines = [_line(own[own["variant"] == name], name, place - (len(names) - 1) / 2) for place, name in enumerate(names)]
+        shifts = np.arange(len(names)) - (len(names) - 1) / 2
+        lines = [_line(own[own["variant"] == name], name, shift) for name, shift in zip(names, shifts, strict=True)]
         limit = Series([-0.4, len(ticks) - 0.6], [BROKEN_BELOW] * 2, Look("#c4c4c4", 0.8))
         title = f"{axis}{f' [{unit}]' if (unit := str(values['unit'].iloc[0])) else ''}"
         x_axis = Axis(title, (-0.4, len(ticks) - 0.6), ticks=named_ticks(ticks))

@@ -21,11 +21,11 @@ from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.core.output import require_no_links
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.targets import read_targets
-from eval.report.drawing.charts import Chart
-from eval.report.glossary import describe_columns, describe_methods, index_entries
-from eval.report.kept import KeptPage, keep, read_kept
-from eval.report.headline import write_answer, write_title
 from eval.report.cost import draw_pareto, pareto_table
+from eval.report.drawing.charts import Chart
+from eval.report.framing.glossary import describe_columns, describe_methods, index_entries
+from eval.report.framing.headline import write_answer, write_title
+from eval.report.framing.kept import KeptPage, keep, read_kept
 from eval.report.hardness import draw_hardness
 from eval.report.latex import latex_tables, to_latex
 from eval.report.merge.merge import draw_merge

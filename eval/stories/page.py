@@ -103,9 +103,8 @@ def _panel(own: pd.DataFrame, place: ChosenPlace) -> Panel:
         series.append(Series([1, *session], [0.0, *true_mm], look, "true", hover="session {x:.0f}: {y:.1f} mm"))
     look = Look(BLUE, 1.2, "dot", "circle", 5.0)
     ends = moved_mm - level_mm, moved_mm + level_mm
-    series.append(
-        Series(session, moved_mm, look, "measured \u00b1 95 % level", "line", *ends, hover="session {x:.0f}: {y:.1f} mm")
-    )
+    name = "measured \u00b1 95 % level"
+    series.append(Series(session, moved_mm, look, name, "line", *ends, hover="session {x:.0f}: {y:.1f} mm"))
     chainage_m, angle_deg = (float(own[name].median()) for name in ("chainage_m", "angle_deg"))
     where = "" if np.isnan(chainage_m) else f": {chainage_m:.1f} m along, {angle_deg:.0f}\u00b0"
     how = "" if place.chosen_by == "region" else " (given)"

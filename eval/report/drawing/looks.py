@@ -37,7 +37,7 @@ KNOWN = {
     "erasor": Look(ORANGE, 1.4, "dashdotdot", "x", _SIZE_PT),
     "scan-context": Look(_PURPLE, 1.4, "dash", "pentagon", _SIZE_PT),
     "solid": Look(_SKY, 1.4, "dashdotdot", "hexagon", _SIZE_PT),
-    "untrained": Look(_SKY, 1.2, "dashdot", "star", _SIZE_PT),
+    "untrained": Look(_SKY, 1.2, "dashdot", "diamond", _SIZE_PT),
     "random-regions": Look(VERMILLION, 1.2, "dot", "x", _SIZE_PT),
 }
 _ORACLES: dict[str, tuple[Dash, str]] = {

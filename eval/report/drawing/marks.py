@@ -69,10 +69,11 @@ def draw_series(series: Sequence[Series], x: Place, y: Place, legend: Mapping[st
         if each.style == "bars":
             across = across + BAR_SHARE * ((bars.index(each) + 0.5) / len(bars) - 0.5)
         at = x(across), y(np.asarray(each.y, dtype=np.float64))
+        marked = mark_few(*at) if each.look.width and each.style != "bars" else at
         yield Markup("<g{}{}>{}{}{}{}</g>").format(
             Markup(' data-s="{}"').format(legend[each.name]) if each.name else "",
             _hover(each), _body(each, at, x, y, len(bars)), _intervals(each, across, x, y),
-            draw_markers(each.look, *(marked_places(at) if each.look.width and each.style != "bars" else at)), _labels(each, at),
+            draw_markers(each.look, *marked), _labels(each, at),
         )  # fmt: skip
 
 
@@ -89,12 +90,14 @@ def draw_swatch(series: Series) -> Markup:
 
 def draw_heat(heat: Heat, x: Place, y: Place) -> Iterator[Markup]:
     """Yield the cells of a heat map with their texts."""
-    columns, rows = (place(np.arange(n + 1) - 0.5) for place, n in ((x, heat.values.shape[1]), (y, heat.values.shape[0])))
+    n_rows, n_columns = heat.values.shape
+    columns, rows = x(np.arange(n_columns + 1) - 0.5).tolist(), y(np.arange(n_rows + 1) - 0.5).tolist()
     for (row, column), value in np.ndenumerate(heat.values):
         left, top = columns[column], rows[row + 1]
         width, height = columns[column + 1] - left, rows[row] - top
         yield Markup(
-            '<rect class="cell" x="{}" y="{}" width="{}" height="{}" fill="{}"/><text class="cell" x="{}" y="{}">{}</text>'
+            '<rect class="cell" x="{}" y="{}" width="{}" height="{}" fill="{}"/>'
+            '<text class="cell" x="{}" y="{}">{}</text>'
         ).format(px(left), px(top), px(width), px(height), _heat_colour(heat, value), px(left + width / 2),
                  px(top + height / 2 + 4), visible(heat.texts[row][column]))  # fmt: skip
 
@@ -121,11 +124,12 @@ def _body(series: Series, at: tuple[Float64Array, Float64Array], x: Place, y: Pl
     if series.style == "bars":
         half = BAR_SHARE / n_bars / 2 * abs(x(np.array([1.0]))[0] - x(np.array([0.0]))[0])
         floor = y(np.zeros(1))[0]
-        boxes = (f"M{px(left - half)} {px(floor)}V{px(top)}H{px(left + half)}V{px(floor)}z" for left, top in _points(*at))
-        return Markup('<path class="bars" d="{}" fill="{}" data-p="{}"/>').format("".join(boxes), look.colour, _pairs(*at))
+        d = "".join(f"M{px(a - half)} {px(floor)}V{px(b)}H{px(a + half)}V{px(floor)}z" for a, b in _points(*at))
+        return Markup('<path class="bars" d="{}" fill="{}" data-p="{}"/>').format(d, look.colour, _pairs(*at))
     if not look.width:
         return Markup('<path class="places" data-p="{}"/>').format(_pairs(*at)) if series.hover else Markup("")
-    return Markup('<path class="line" d="{}"{}/>').format(trace_line(*at, is_stepped=series.style == "steps"), _stroke(look))
+    d = trace_line(*at, is_stepped=series.style == "steps")
+    return Markup('<path class="line" d="{}"{}/>').format(d, _stroke(look))
 
 
 def trace_line(x: Float64Array, y: Float64Array, *, is_stepped: bool) -> str:
@@ -167,10 +171,10 @@ def _pairs(x: Float64Array, y: Float64Array) -> str:
     return ";".join(f"{px(a)},{px(b)}" if known else "-" for a, b, known in zip(x, y, is_there, strict=True))
 
 
-def marked_places(at: tuple[Float64Array, Float64Array]) -> tuple[Float64Array, Float64Array]:
+def mark_few(x: Float64Array, y: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return the points of a line that carry its marker: all of a few, every n-th of many."""
-    step = -(-len(at[0]) // _MOST_MARKERS)
-    return at[0][:: max(step, 1)], at[1][:: max(step, 1)]
+    step = max(-(-len(x) // _MOST_MARKERS), 1)
+    return x[::step], y[::step]
 
 
 def draw_markers(look: Look, x: Float64Array, y: Float64Array) -> Markup:

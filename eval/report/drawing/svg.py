@@ -83,7 +83,7 @@ def _frame(panel: Panel, width: float, height_px: float) -> _Frame:
     spans = [_span(panel, name) for name in ("x", "y")]
     x_ticks, y_ticks = (_ticks(axis, span) for axis, span in zip((panel.x, panel.y), spans, strict=True))
     left = 10 + _TITLE_PX * bool(panel.y.title) + _CHARACTER_PX * _widest(y_ticks.values())
-    below = 8 + _TITLE_PX * bool(panel.x.title) + _LINE_PX * max((t.count("\n") + 1 for t in x_ticks.values()), default=0)
+    below = 8 + _TITLE_PX * bool(panel.x.title) + _LINE_PX * _highest(x_ticks.values())
     x = Place(*spans[0], 0.0, width, panel.x.is_log)
     y = Place(*spans[1], height_px, 0.0, panel.y.is_log)
     return _Frame(left, width, height_px, below, x, y, x_ticks, y_ticks)
@@ -130,6 +130,10 @@ def _widest(texts: Iterable[str]) -> int:
     return max((len(line) for text in texts for line in text.split("\n")), default=0)
 
 
+def _highest(texts: Iterable[str]) -> int:
+    return max((text.count("\n") + 1 for text in texts), default=0)
+
+
 def _axes(panel: Panel, frame: _Frame) -> list[Markup]:
     """Return grid lines, the two axes, their ticks and their titles."""
     bottom, right = _ABOVE_PX + frame.height, frame.left + frame.width
@@ -165,4 +169,3 @@ def _words(text: str, x: float, y: float, name: str) -> Markup:
 def _name(panel: Panel) -> str:
     named = [text for text in (panel.heading, panel.y.title, panel.x.title) if text]
     return visible(", ".join(named)) or "panel"
-

@@ -51,14 +51,18 @@ def _plots(results: pd.DataFrame) -> list[Chart]:
     if len(own) == 0:
         return []
     errors = Chart(
-        "merge_errors", "Merge error against the true overlap", error_chart(own),
+        "merge_errors",
+        "Merge error against the true overlap",
+        error_chart(own),
         f"One mark per pair: dots were accepted, crosses not. Dashed: {EXACT_M:g} m, the target of clean pairs; solid: "
         f"{RIGHT_M:g} m, above which an accepted merge is wrong. Errors below 0.1 mm stand at 0.1 mm.",
     )
     if not any(len(stated_seconds(own, column)) for column in TIMES):
         return [errors]
     times = Chart(
-        "merge_times", "Time of the merge", time_chart(own),
+        "merge_times",
+        "Time of the merge",
+        time_chart(own),
         "One dot per accepted pair (n of them; refused ones state no time), a bar at the median, logarithmic; one "
         "thread. Indexing can be done while mapping.",
     )

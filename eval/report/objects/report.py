@@ -9,10 +9,10 @@ import pandas as pd
 
 from eval.core.charts import Axis, Drawing, Look, Panel, Series
 from eval.core.domains import domain_name
-from eval.report.objects.cases import object_cases, voxel_variants
-from eval.report.objects.tables import OBJECT_COLUMNS, OBJECT_COUNTS, WITHDRAWAL_COLUMNS, groups_table
 from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import look_of
+from eval.report.objects.cases import object_cases, voxel_variants
+from eval.report.objects.tables import OBJECT_COLUMNS, OBJECT_COUNTS, WITHDRAWAL_COLUMNS, groups_table
 from eval.report.tables import Section, conditions_table, methods_table, targets_table, with_rows
 from eval.running.run_data import RunData, every_condition, off_grids, shown_variant, stored_table
 from eval.running.runfolder import reported
@@ -69,7 +69,9 @@ def _size_plot(groups: pd.DataFrame, data: RunData, main: str) -> Chart:
         y = Axis("" if panels else "point IoU", (-0.03, 1.03))
         panels.append(Panel(x, y, [dots, *lines], f"{domain_name(domain)}, {len(own)} objects"))
     return Chart(
-        "object_sizes", "Point IoU by the size of the object", Drawing([panels], 325),
+        "object_sizes",
+        "Point IoU by the size of the object",
+        Drawing([panels], 325),
         f"A dot for every observable object, answered by {main}, missed ones at 0; lines: means of each method in bins "
         f"of the hull's volume; bars: 95 % interval over pairs of {main}.",
     )

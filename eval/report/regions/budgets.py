@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from eval.core.charts import Axis, Drawing, Look, Panel, Series, log_span
+from eval.core.charts import Axis, Drawing, Panel, Series, log_span
 from eval.core.domains import domain_name
 from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import look_of

@@ -19,6 +19,7 @@ from eval.tables.merge_table import ALL_FAMILIES
 from eval.tables.rows import ALL_DOMAINS, is_told_the_truth, numbers, records
 
 _MOST_NAMES = 3
+_TOO_LITTLE = "The run holds too little to compare two methods."
 _SUBJECT = "change detection between two LiDAR sessions of a tunnel"
 _RIGHT = Column("right", "share of the pairs merged as their kind asks", "high", share)
 _SILENT = Column("silent_share", "share of the unchanged pairs without a false region", "high", share)
@@ -44,7 +45,7 @@ def write_answer(data: RunData, merges: pd.DataFrame) -> str:
     if ends_at_merge(data):
         return _of_merges(merges)
     told = count_held(data) or _of_surfaces(data) or _of_pairs(data) or _of_silence(data)
-    return told or "No two methods can be compared: the run holds too little."
+    return told or _TOO_LITTLE
 
 
 def name_leaders(values: Iterable[tuple[str, float]], column: Column) -> str:
@@ -78,8 +79,9 @@ def _joined(names: Sequence[str]) -> str:
 def _told(table: pd.DataFrame, column: Column) -> str:
     """Return who leads in every domain of a table, by one of its columns."""
     parts = []
-    for domain in [name for name in dict.fromkeys(table["domain"]) if name != ALL_DOMAINS or table["domain"].nunique() == 1]:
-        own = table[table["domain"] == domain]
+    for domain, own in table.groupby("domain", sort=False):
+        if domain == ALL_DOMAINS and table["domain"].nunique() > 1:
+            continue
         leaders = name_leaders(zip(own["variant"].astype(str), numbers(own, column.key), strict=True), column)
         parts += [f"{domain_name(str(domain))}: {leaders}"] if leaders else []
     extreme = "Highest" if column.better == "high" else "Lowest"
@@ -112,4 +114,4 @@ def _of_merges(merges: pd.DataFrame) -> str:
         count[0] += float(row["n_within_target"])
         count[1] += float(row["n_pairs"])
     leaders = name_leaders([(name, right / n if n else math.nan) for name, (right, n) in counts.items()], _RIGHT)
-    return f"Highest {_RIGHT.heading}: {leaders}." if leaders else "No pair of this run has a kind that asks for a merge."
+    return f"Highest {_RIGHT.heading}: {leaders}." if leaders else _TOO_LITTLE

@@ -58,9 +58,7 @@ def describe_columns(columns: Iterable[Column], more: Iterable[tuple[str, str, s
     return [Entry(f"c{place}", name, tuple(own)) for place, (name, own) in enumerate(found.items(), 1)]
 
 
-def index_entries(
-    methods: Sequence[Entry], columns: Sequence[Entry], variants: Iterable[str]
-) -> dict[str, Entry]:
+def index_entries(methods: Sequence[Entry], columns: Sequence[Entry], variants: Iterable[str]) -> dict[str, Entry]:
     """Return the entry of every text that a page shows: of a variant by its name, of a heading after "column "."""
     of_method = {entry.name: entry for entry in methods}
     found = {f"column {entry.name}": entry for entry in columns}

@@ -28,6 +28,7 @@ from eval.tables.columns import UNDEFINED
 _LARGEST_BYTES, _MOST_PIXELS = 64_000_000, 40_000_000
 _ADDRESS = re.compile(r"data:image/(png|webp);base64,([A-Za-z0-9+/]+=*)")
 _FROM_EARLIER = "From an earlier page of this run, in the colours of then."
+_KEPT = "Sessions and answers are not beside this page: pictures and tables made of them are those of an earlier page."
 _LONE = {"settings": "settings", "results": "results", "unchanged": "unchanged", "table1": "paper", "table2": "paper"}
 _TABLED = ("regions", "objects", "surface", "merge")
 
@@ -56,7 +57,7 @@ def read_kept(page: Path) -> KeptPage:
         return KeptPage()
     try:
         if page.stat().st_size > _LARGEST_BYTES:
-            raise InputError(f"{page}: larger than {_LARGEST_BYTES // 1_000_000} MB: expected a page of `tunnelcd report`")
+            raise InputError(f"{page}: larger than 64 MB: expected a page of `tunnelcd report`, or leave out --keep")
         content = page.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{page}: cannot be read, so nothing of it can be kept: {error}") from error
@@ -77,13 +78,14 @@ def keep(content: Mapping[str, Any], kept: KeptPage) -> dict[str, Any]:
     shown = set(_titles(found))
     found["sites"] = [_keep_site(site, kept) for site in found.get("sites", ())]
     found["worst"] = [_keep_worst(place, pair, kept) for place, pair in enumerate(found.get("worst", ()), 1)]
-    taken = {"worst", *(key for key, words in kept.titles.items() if words in {site.scenario for site in found["sites"]})}
+    of_sites = {site.scenario for site in found["sites"]}
+    taken = {"worst", *(key for key, words in kept.titles.items() if words in of_sites)}
     found["kept_pictures"] = {
         key: [replace(each, caption=_noted(each.caption)) for _, each in pictures if each.title not in shown]
         for key, pictures in kept.pictures.items() if key not in taken
     }  # fmt: skip
     if kept.missing:
-        found["missing"] = list(dict.fromkeys([*kept.missing, _FROM_EARLIER.replace("From", "Some pictures and tables are from")]))
+        found["missing"] = list(dict.fromkeys([*kept.missing, _KEPT]))
     return found
 
 
