@@ -1,7 +1,5 @@
 """The page in a browser without a network: charts are drawn, nothing is complained of; and its size at 2,000 rows."""
 
-import html
-import json
 import re
 import shutil
 import subprocess
