@@ -1,6 +1,6 @@
 """The page of one answer: what changed in one sentence, the pair in 3-D, and its objects. One file, no network.
 
-The page draws points itself with WebGL (`answer.js`): plotly.js alone would be as large as a page may be.
+The page draws points itself with WebGL (`answer.js`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The index of a folder of reports: one offline page that leads to every page, note, table and picture of each."""
+"""The index of a folder of reports: one offline page that leads to the page and the notes of each, or to its files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Report:
         finished: The day, "" where that is not known.
         page: Address of its page, or of its first note; "" where there is neither.
         contents: How many files of which kind.
-        files: (address, name) of each.
+        files: (address, name) of each; of a report with a page its notes alone.
     """
 
     name: str
@@ -87,6 +87,8 @@ def _read_report(folder: Path, own: Path, questions: Mapping[str, str]) -> Repor
     page = own / "index.html"
     by_kind = {kind: [path for path in files if path.suffix in suffixes] for kind, suffixes in _KINDS.items()}
     first = next((_address(folder, path) for path in by_kind["notes"]), "")
+    # a page shows its pictures and names its tables
+    linked = by_kind["notes"] if page in files else [path for paths in by_kind.values() for path in paths]
     return Report(
         name=name,
         question=questions.get(name) or " ".join(str(described.get("description") or "").split())[:200],
@@ -95,7 +97,7 @@ def _read_report(folder: Path, own: Path, questions: Mapping[str, str]) -> Repor
         finished=str(provenance.get("finished") or "")[:10],
         page=_address(folder, page) if page in files else first,
         contents=", ".join(f"{len(paths)} {kind}" for kind, paths in by_kind.items() if paths),
-        files=[(_address(folder, path), path.name) for paths in by_kind.values() for path in paths],
+        files=[(_address(folder, path), path.name) for path in linked],
     )
 
 

@@ -84,7 +84,7 @@ def keep(content: Mapping[str, Any], kept: KeptPage) -> dict[str, Any]:
         key: [replace(each, caption=_noted(each.caption)) for _, each in pictures if each.title not in shown]
         for key, pictures in kept.pictures.items() if key not in taken
     }  # fmt: skip
-    if kept.missing:
+    if kept.tables:
         found["missing"] = list(dict.fromkeys([*kept.missing, _KEPT]))
     return found
 
