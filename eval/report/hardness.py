@@ -16,7 +16,7 @@ from eval.report.tables import Cell, Table
 from eval.running.run_data import RunData, stored_table
 from eval.tables.columns import UNDEFINED, share, spaced
 from eval.tables.hardness import BROKEN_BELOW
-from eval.tables.rows import is_told_the_truth, records
+from eval.tables.rows import records
 
 _N_ACROSS = 4
 _HOLDS = "holds"
@@ -50,22 +50,26 @@ def _ranked(points: pd.DataFrame) -> list[str]:
     return [str(name) for name in holds.sort_values(ascending=False, kind="stable").index]
 
 
-def count_held(data: RunData) -> str:
-    """Return on how many axes the leading methods hold, and where the first one breaks; "" without such axes."""
-    points = stored_table(data, "breaking_points")
-    if len(points) == 0:
-        return ""
-    points = _with_texts(points[points["is_measured"]])
-    names = [name for name in _ranked(points) if not is_told_the_truth(name)]
-    axes = {name: records(points[points["variant"] == name]) for name in names}
-    held = {name: sum(row["step"] == 0 for row in own) for name, own in axes.items()}
-    if not names:
-        return ""
-    broken = [f"{row['axis']} ({_at(row)})" for row in axes[names[0]] if row["step"]]
-    told = f"breaks at {', '.join(broken)}" if broken else "breaks nowhere"
-    others = [f"{name} on {held[name]}" for name in names[1:3]]
-    n_axes = len(axes[names[0]])
-    return f"{names[0]} holds on {held[names[0]]} of {n_axes} axes ({', '.join(others)}) and {told}."
+def count_held(points: pd.DataFrame) -> dict[str, int]:
+    """Return on how many axes each method holds, of those that it was run on at every step, most first.
+
+    Args:
+        points: Rows of breaking_points.csv.
+    """
+    measured = points[points["is_measured"]]
+    return {name: int((measured["step"][measured["variant"] == name] == 0).sum()) for name in _ranked(measured)}
+
+
+def name_breaks(points: pd.DataFrame, variant: str) -> str:
+    """Return the axes on which a method breaks, with the values, or that it breaks nowhere.
+
+    Args:
+        points: Rows of breaking_points.csv.
+        variant: The method.
+    """
+    own = records(_with_texts(points[points["is_measured"] & (points["variant"] == variant)]))
+    broken = [f"{row['axis']} ({_at(row)})" for row in own if row["step"]]
+    return f"{variant} breaks at {', '.join(broken)}" if broken else f"{variant} breaks nowhere"
 
 
 def _at(row: Mapping[str, Any]) -> str:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from eval.core.domains import domain_name
-from eval.report.hardness import count_held
+from eval.report.hardness import count_held, name_breaks
 from eval.report.summary import HEADLINES, rank_methods
 from eval.report.surface.surface import SURFACE_COLUMNS
-from eval.running.run_data import RunData, ends_at_merge, off_grids, plan_name, stored_table
+from eval.running.run_data import RunData, ends_at_merge, off_grids, plan_name, shown_variant, stored_table
 from eval.tables.columns import Column, share
 from eval.tables.merge_table import ALL_FAMILIES
 from eval.tables.rows import ALL_DOMAINS, is_told_the_truth, numbers, records
@@ -22,6 +23,7 @@ _MOST_NAMES = 3
 _TOO_LITTLE = "The run holds too little to compare two methods."
 _SUBJECT = "change detection between two LiDAR sessions of a tunnel"
 _RIGHT = Column("right", "share of the pairs merged as their kind asks", "high", share)
+_HELD = Column("held", "axes on which it holds", "high", lambda n: f"{n:.0f}")
 _SILENT = Column("silent_share", "share of the unchanged pairs without a false region", "high", share)
 
 
@@ -44,7 +46,7 @@ def write_answer(data: RunData, merges: pd.DataFrame) -> str:
     """
     if ends_at_merge(data):
         return _of_merges(merges)
-    told = count_held(data) or _of_surfaces(data) or _of_pairs(data) or _of_silence(data)
+    told = _of_axes(data) or _of_surfaces(data) or _of_pairs(data) or _of_silence(data)
     return told or _TOO_LITTLE
 
 
@@ -72,8 +74,16 @@ def name_leaders(values: Iterable[tuple[str, float]], column: Column) -> str:
 
 
 def _joined(names: Sequence[str]) -> str:
-    shown = list(names[:_MOST_NAMES]) + ([f"{len(names) - _MOST_NAMES} more"] if len(names) > _MOST_NAMES else [])
+    shown = [_shortened(name) for name in names[:_MOST_NAMES]]
+    if len(names) > _MOST_NAMES:
+        shown.append(f"{len(names) - _MOST_NAMES} more")
     return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"
+
+
+def _shortened(name: str) -> str:
+    """Return a variant with the first of its settings alone."""
+    first, comma, _ = name.partition(",")
+    return f"{first}, \u2026]" if comma and "[" in first else name
 
 
 def _told(table: pd.DataFrame, column: Column) -> str:
@@ -94,11 +104,23 @@ def _of_pairs(data: RunData) -> str:
     return "" if column is None else _told(ranked, column)
 
 
+def _of_axes(data: RunData) -> str:
+    points = stored_table(data, "breaking_points")
+    if len(points) == 0:
+        return ""
+    held = count_held(points)
+    leaders = name_leaders(((name, float(n)) for name, n in held.items()), _HELD)
+    main = shown_variant(data)
+    return f"Holds on most axes: {leaders}; {name_breaks(points, main if main in held else next(iter(held)))}."
+
+
 def _of_surfaces(data: RunData) -> str:
     table = off_grids(stored_table(data, "surface_table"), data)
     limits = [column for column in SURFACE_COLUMNS if column.heading.startswith("limit, ")]
     defined = [column for column in limits if len(table) and np.isfinite(numbers(table, column.key)).sum() > 1]
-    return _told(table, defined[0]) if defined else ""
+    if not defined:
+        return ""
+    return _told(table, replace(defined[0], heading=defined[0].heading.replace("limit,", "displacement found on")))
 
 
 def _of_silence(data: RunData) -> str:

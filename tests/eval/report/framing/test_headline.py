@@ -73,8 +73,9 @@ def test_a_plan_with_axes_says_on_how_many_its_leader_holds(tmp_path: Path) -> N
         for axis, step in zip(("size", "drift"), steps, strict=True)
     ]  # fmt: skip
     pd.DataFrame(points).to_csv(tmp_path / "breaking_points.csv", index=False)
-    told = write_answer(run(tmp_path, [{"scenario": "narrow", "variant": "c2c"}]), pd.DataFrame())
-    assert told == "tunnelcd holds on 1 of 2 axes (c2c on 0) and breaks at drift (0.2 m)."
+    rows = [{"scenario": "narrow", "variant": name} for name in ("c2c", "tunnelcd")]
+    told = write_answer(run(tmp_path, rows), pd.DataFrame())
+    assert told == "Holds on most axes: tunnelcd (1), before c2c (0); tunnelcd breaks at drift (0.2 m)."
 
 
 def test_a_run_of_one_method_names_no_leader(tmp_path: Path) -> None:
