@@ -164,16 +164,22 @@ class PointMap:
             require_shapes(self, recorded_T_sensor=self.odom_T_sensor.shape)
             require_poses("recorded_T_sensor", self.recorded_T_sensor)
 
-    def positions_of(self, returns: Int64Array) -> Float64Array:
-        """Return the (N, 3) positions of (N,) returns, the session's odom frame, metres, to 1/PLACES of a cell.
+    def positions_of(self, returns: Int64Array | slice) -> Float64Array:
+        """Return the (N, 3) positions of (N,) returns, or of a slice, the session's odom frame, metres.
+
+        They are known to 1/PLACES of a cell.
 
         Raises:
             ValueError: The map does not store them.
         """
         if self.return_offsets is None:
             raise ValueError("return_offsets is None: this map does not store the positions of its returns")
-        cells = np.floor(self.points[self.return_points[returns]] / self.voxel_m)
-        return (cells + (self.return_offsets[returns] + 0.5) / PLACES) * self.voxel_m
+        positions = self.points.take(self.return_points[returns], axis=0)
+        positions /= self.voxel_m
+        np.floor(positions, out=positions)
+        positions += (self.return_offsets[returns] + 0.5) / PLACES
+        positions *= self.voxel_m
+        return positions
 
     def scans_of(self, returns: Int64Array) -> Int64Array:
         """Return the (N,) scan of each of (N,) returns."""
