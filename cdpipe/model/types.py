@@ -41,6 +41,7 @@ class PosedScan:
         pixels: (N,) int32 origin of each return: row * W + column, or the row of its file.
         signal: (N,) uint16 photons of each return, None where the sensor does not tell.
         second_from: Pixels from this one on are second returns of the beams from pixel 0 on; None: one return a beam.
+        intensity: (N,) float32 intensity of each return in the recording's own unit, None where it has none.
     """
 
     index: int
@@ -50,12 +51,15 @@ class PosedScan:
     pixels: Int32Array
     signal: npt.NDArray[np.uint16] | None = None
     second_from: int | None = None
+    intensity: Float32Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.points_sensor)
         require_shapes(self, points_sensor=(None, 3), odom_T_sensor=(4, 4), stamps_ns=(n,), pixels=(n,))
         if self.signal is not None:
             require_shapes(self, signal=(n,))
+        if self.intensity is not None:
+            require_shapes(self, intensity=(n,))
 
 
 class ScanSource(Protocol):

@@ -71,7 +71,8 @@ def test_semantic_kitti(tmp_path: Path) -> None:
     assert "calib.txt:1: Tr mirrors" in said(folder)
     (folder / "velodyne" / "000002.bin").write_bytes(b"x" * 30)
     (folder / "calib.txt").unlink()
-    assert "000002.bin: 30 bytes: expected x, y, z, intensity" in said(folder)
+    with pytest.warns(InputWarning, match="no calib.txt beside it: its poses are taken for those of the lidar"):
+        assert "000002.bin: 30 bytes: expected x, y, z, intensity" in said(folder)
 
 
 def test_e57_has_the_poses_of_its_scanner(tmp_path: Path) -> None:
