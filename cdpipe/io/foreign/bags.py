@@ -115,13 +115,14 @@ class BagScans:
         n_repeats, where = len(numbers) - len(unique), f"{self._path}: {self._topic}"
         if n_repeats > len(unique):
             raise InputError(
-                f"{where}: {len(unique)} stamps on {len(numbers)} clouds: the driver did not set header.stamp: "
+                f"{where}: too few stamps ({len(unique)} on {len(numbers)} clouds): header.stamp was not set: "
                 "set it and record again, or rewrite the stamps"
             )
         if n_repeats:
             told = f"{n_repeats} of {len(numbers)} clouds have the stamp of another one, and are left out"
             warnings.warn(f"{where}: {told}", InputWarning, stacklevel=2)
-        n_waiting = int((np.maximum.accumulate(first) - np.arange(len(first))).max(initial=0)) - n_repeats
+        places = np.argsort(np.argsort(first))
+        n_waiting = int((np.maximum.accumulate(places) - np.arange(len(places))).max(initial=0))
         if n_waiting > _MOST_WAITING:
             raise InputError(
                 f"{where}: its clouds are up to {n_waiting} places out of the order of their stamps, at most "
