@@ -1,4 +1,4 @@
-from .answer_map import gather_answer_map
+from .answer_map import gather_answer_map, require_own_keyframes
 from .bags import write_bag
 from .clouds import write_laz, write_ply
 from .kitti import Label, write_kitti
@@ -15,6 +15,7 @@ __all__ = [
     "PointMap",
     "gather_answer_map",
     "gather_map",
+    "require_own_keyframes",
     "write_bag",
     "write_kitti",
     "write_kitti_poses",

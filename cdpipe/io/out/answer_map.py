@@ -11,10 +11,11 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, Int32Array
+from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array
 from cdpipe.io.answer import Answer, read_answer
 from cdpipe.io.out.maps import PointMap, gather_map
 from cdpipe.io.out.scans import Fields, Outgoing, Progress
+from cdpipe.mapping.mapping import choose_keyframes
 from cdpipe.model.aligned import alignment_of
 from cdpipe.model.report import ChangedObject, ChangeReport
 from cdpipe.model.types import ScanSource, SessionName
@@ -46,10 +47,11 @@ def gather_answer_map(
     found = answer.report
     if found is None:
         raise InputError(f"{folder}: the method gave no answer ({answer.status}): convert the sessions one by one")
+    for source, scans in zip(sessions, found.keyframe_scans, strict=True):
+        require_own_keyframes(source, scans, found)
     after_T = alignment_of(found, sessions[1].odom_T_sensor)
     clouds = []
     for name, source in zip(_SESSIONS, sessions, strict=True):
-        _require_own_returns(source, found, name)
         cloud = gather_map(Outgoing(source, _fields(found, name)), cell_m, report)
         _mark_points(cloud, answer, name)
         points = after_T.to_map(cloud.points) if name == "after" else cloud.points
@@ -57,10 +59,17 @@ def gather_answer_map(
     return _join(clouds, found)
 
 
-def _require_own_returns(source: ScanSource, report: ChangeReport, name: SessionName) -> None:
-    last = max((int(it.returns[:, 0].max(initial=-1)) for it in report.objects if it.session == name), default=-1)
-    if last >= len(source.odom_T_sensor):
-        raise InputError(f"{source.name}: the answer names scan {last}: is it an answer to this pair, in this order?")
+def require_own_keyframes(source: ScanSource, scans: Int64Array, report: ChangeReport) -> None:
+    """Raise `InputError` if the keyframes of an answer are not those of a session, as far as its settings tell."""
+    of_map = report.config.get("map")
+    spacing_m = of_map.get("keyframe_spacing_m") if isinstance(of_map, Mapping) else None
+    if isinstance(spacing_m, float) and len(scans) and spacing_m > 0:
+        own = choose_keyframes(source.odom_T_sensor, spacing_m)
+        if not np.array_equal(own, scans):
+            raise InputError(
+                f"{source.name}: the answer has {len(scans)} keyframes up to scan {scans.max()}, this session "
+                f"{len(own)} up to scan {own[-1]}: is it an answer to this pair, and in this order?"
+            )
 
 
 def _fields(report: ChangeReport, name: SessionName) -> Fields:

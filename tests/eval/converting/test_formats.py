@@ -18,6 +18,7 @@ from cdpipe.io.foreign import read_poses
 from cdpipe.io.ply import read_ply
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import Session, read_session
+from cdpipe.mapping.mapping import choose_keyframes
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
 from eval.converting.truth import truth_fields
 from scenarios import load_scenario
@@ -210,9 +211,10 @@ def made_answer(pair: Path, folder: Path) -> ChangeReport:
     regions = ChangeRegions(
         np.zeros((0, 3)), 4.5, np.zeros(0), np.zeros((0, 2), np.int64), np.zeros(0, bool), np.zeros(0)
     )
-    report = ChangeReport(
-        invert(world_T[0]) @ world_T[1], {}, regions, (item,), {}, {}, (np.zeros(0, np.int64), np.zeros(0, np.int64))
-    )
+    keyframes = [choose_keyframes(read_session(pair / name).odom_T_sensor, 1.0) for name in ("before", "after")]
+    settings = {"map": {"keyframe_spacing_m": 1.0}}
+    merge = invert(world_T[0]) @ world_T[1]
+    report = ChangeReport(merge, {}, regions, (item,), {}, {}, (keyframes[0], keyframes[1]), settings)
     write_answer(folder, "mine", report)
     return report
 
@@ -233,6 +235,8 @@ def test_the_map_of_an_answer(pair: Path, tmp_path: Path, command: Command) -> N
     assert np.isnan(scalars["displacement"]).all()
     refused(command("convert", *inputs, tmp_path / "a.mcap"), "an answer becomes a map with scalar fields: name a new")
     refused(command("convert", tmp_path / "answer", tmp_path / "b.laz"), "an answer, without its sessions")
+    turned = (pair / "after", pair / "before", tmp_path / "answer", tmp_path / "b.laz", "--quiet")
+    refused(command("convert", *turned), "is it an answer to this pair, and in this order?")
 
 
 def test_a_world_as_glb(pair: Path, tmp_path: Path, command: Command) -> None:
