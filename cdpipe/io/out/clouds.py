@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from cdpipe.io.ply import write_ply_points
 _SCALE_M = 1e-4
 _STANDARD = {"intensity": "intensity", "time": "gps_time"}
 _MOST_NAME = 32
+_NO_DATE = date(1970, 1, 1)  # the day of writing would make equal maps differ
 
 
 def write_laz(path: Path, cloud: PointMap) -> None:
@@ -32,7 +34,7 @@ def write_laz(path: Path, cloud: PointMap) -> None:
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.scales = np.full(3, _SCALE_M)
     header.offsets = np.floor(cloud.points.min(axis=0)) if len(cloud.points) else np.zeros(3)
-    header.generating_software = "tunnelcd"
+    header.generating_software, header.creation_date = "tunnelcd", _NO_DATE
     more = {name: values for name, values in cloud.scalars.items() if name not in _STANDARD}
     header.add_extra_dims([laspy.ExtraBytesParams(name[:_MOST_NAME], values.dtype) for name, values in more.items()])
     data = laspy.LasData(header)

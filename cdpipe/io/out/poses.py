@@ -9,8 +9,6 @@ import numpy as np
 from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.io.tum import write_tum
 
-POSE_LINE = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
-
 
 def write_tum_poses(path: Path, stamps_ns: Int64Array, poses: Float64Array) -> None:
     """Write sensor poses (S, 4, 4) at (S,) times as TUM lines, stamps in seconds."""
@@ -18,5 +16,5 @@ def write_tum_poses(path: Path, stamps_ns: Int64Array, poses: Float64Array) -> N
 
 
 def write_kitti_poses(path: Path, poses: Float64Array) -> None:
-    """Write poses (S, 4, 4) as KITTI lines, the upper three rows of each matrix."""
+    """Write poses (S, 4, 4) as KITTI lines, `r11 r12 r13 tx r21 ... tz`."""
     np.savetxt(path, poses[:, :3].reshape(-1, 12), fmt="%.12g")

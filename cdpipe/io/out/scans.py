@@ -64,7 +64,6 @@ class Outgoing:
         self.name, self.odom_T_sensor = source.name, source.odom_T_sensor
         self._source, self._fields = source, fields
         self.session = source.session if isinstance(source, RecordedScans) else None
-        self.is_simulated = self.session is not None and "sensor_clock_start_ns" not in self.session.provenance
 
     def __len__(self) -> int:
         """Return the number of scans."""
