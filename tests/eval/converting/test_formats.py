@@ -106,6 +106,20 @@ def test_frames_stamps_and_fields_of_a_bag_are_what_players_expect(
         assert tf_ns.min() <= stamp_ns
 
 
+def test_the_library_of_mcap_reads_one(pair: Path, tmp_path: Path, command: Command) -> None:
+    reader = pytest.importorskip("mcap.reader", reason="pip install 'tunnelcd[formats]'")
+    convert(command, pair / "before", tmp_path / "a.mcap")
+    with (tmp_path / "a.mcap").open("rb") as file:
+        opened = reader.make_reader(file, validate_crcs=True)
+        assert opened.get_header().profile == "ros2"
+        found = [(schema.name, schema.encoding, message.log_time) for schema, _, message in opened.iter_messages()]
+        assert opened.get_summary().statistics.message_count == len(found)
+    n_scans = read_session(pair / "before").n_scans
+    assert sum(name == "sensor_msgs/msg/PointCloud2" for name, *_ in found) == n_scans
+    assert {encoding for _, encoding, _ in found} == {"ros2msg"}
+    assert min(log_ns for *_, log_ns in found) == 10**9
+
+
 def test_semantic_kitti(pair: Path, tmp_path: Path, command: Command) -> None:
     folder = tmp_path / "sequences" / "00"
     convert(command, pair / "after", folder, "--to", "semantic-kitti", "--with-truth")
