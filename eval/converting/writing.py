@@ -70,6 +70,7 @@ def write_world(what: str, out: Path, name: str, seed: int | None, settings: Seq
         ScenarioError: The world cannot be built.
     """
     from scenarios import load_scenario
+    from scenarios.library import SUFFIXES
     from sim.view.glb import write_glb
     from sim.view.view import is_pair, view_pair, view_scenario
 
@@ -77,7 +78,7 @@ def write_world(what: str, out: Path, name: str, seed: int | None, settings: Seq
     if name != "glb":
         raise InputError(f"{what}: a world: it becomes a GLB, a new file that ends in .glb; `simulate` makes sessions")
     pair = Path(what)
-    if pair.is_dir() and not is_pair(pair):
+    if pair.exists() and not is_pair(pair) and pair.suffix not in SUFFIXES:
         raise InputError(f"{what}: a session has no surfaces: name the scenario, or the simulated pair")
     if is_pair(pair) and not with_truth:
         raise InputError(f"{pair}: the world of a pair is its truth: add --with-truth")

@@ -7,7 +7,9 @@ Packets hold ranges, reflectivity, signal and stamps. They hold no poses and not
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +42,13 @@ def write_pcap(session: Session, path: Path, metadata: Path, start_ns: int, on_p
     info = sensor_info(session)
     info.config.udp_port_lidar, info.config.udp_port_imu = _PORT, _IMU_PORT
     try:
-        pcap.record(_packets(session, info, start_ns, on_progress), str(path), lidar_port=_PORT, imu_port=_IMU_PORT)
+        packets = _packets(session, info, start_ns, on_progress)
+        n_written = pcap.record(packets, str(path), lidar_port=_PORT, imu_port=_IMU_PORT)
         metadata.write_text(info.to_json_string(), encoding="utf-8")
+        with closing(pcap.PcapPacketSource(str(path), sensor_info=[info])) as source:
+            n_there = sum(1 for _ in source)
+        if n_there != n_written:  # on a full disk its writer says nothing
+            raise OSError(errno.ENOSPC, f"{n_there} of {n_written} packets are there")
     except (OSError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be written ({one_line(error)}): give it a disk with room") from error
 

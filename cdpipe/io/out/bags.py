@@ -11,7 +11,9 @@ Points of a session are not deskewed: `t` and /tf say where each was taken. Thos
 
 from __future__ import annotations
 
+import errno
 import inspect
+import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -57,9 +59,14 @@ def _open_bag(path: Path, messages: RosMessages) -> Iterator[_Write]:
 
     make: Any = rosbag1.Writer if messages.is_first else rosbag2.Writer
     options = {"version": _VERSION} if "version" in inspect.signature(make).parameters else {}
-    with make(path, **options) as bag:
-        topics = {topic: bag.add_connection(topic, kind, typestore=messages.store) for topic, kind in TOPICS.items()}
-        yield lambda topic, stamp_ns, content: bag.write(topics[topic], stamp_ns, content)
+    try:
+        with make(path, **options) as bag:
+            topics = {
+                topic: bag.add_connection(topic, kind, typestore=messages.store) for topic, kind in TOPICS.items()
+            }
+            yield lambda topic, stamp_ns, content: bag.write(topics[topic], stamp_ns, content)
+    except sqlite3.Error as error:
+        raise OSError(errno.EIO, str(error)) from error
 
 
 @contextmanager

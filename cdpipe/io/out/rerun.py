@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 from typing import Any
 
@@ -25,20 +26,24 @@ def write_rrd(path: Path, outgoing: Outgoing, report: Progress) -> None:
 
     Raises:
         InputError: The extra `rerun` is not installed, or a scan cannot be read.
+        OSError: The file cannot be written.
     """
     require_extra("rerun", str(path))
     import rerun as rr
 
-    with rr.RecordingStream("tunnelcd", recording_id=path.stem.strip(".")) as stream:
-        stream.save(str(path))
-        stream.log("odom", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        stream.log("odom/path", rr.LineStrips3D([outgoing.odom_T_sensor[:, :3, 3]]), static=True)
-        for scan in outgoing.scans(report):
-            stream.set_time(_CLOCK, duration=scan.stamp_ns / 1e9)
-            pose = scan.odom_T_sensor
-            stream.log("odom/lidar", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
-            points: Any = rr.Points3D(scan.points.astype(np.float32), colors=_colours(scan), radii=_POINT_M)
-            stream.log("odom/lidar/points", points)
+    try:
+        with rr.RecordingStream("tunnelcd", recording_id=path.stem.strip(".")) as stream:
+            stream.save(str(path))
+            stream.log("odom", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+            stream.log("odom/path", rr.LineStrips3D([outgoing.odom_T_sensor[:, :3, 3]]), static=True)
+            for scan in outgoing.scans(report):
+                stream.set_time(_CLOCK, duration=scan.stamp_ns / 1e9)
+                pose = scan.odom_T_sensor
+                stream.log("odom/lidar", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+                points: Any = rr.Points3D(scan.points.astype(np.float32), colors=_colours(scan), radii=_POINT_M)
+                stream.log("odom/lidar/points", points)
+    except RuntimeError as error:  # as of a full disk
+        raise OSError(errno.EIO, str(error)) from error
 
 
 def _colours(scan: OutScan) -> npt.NDArray[np.uint8]:

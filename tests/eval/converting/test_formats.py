@@ -317,3 +317,24 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     for name in ("a.mcap", "a.bag", "a.laz", "a.tum", "a.pcap"):
         assert command("convert", before, tmp_path / "new" / name, "--quiet")[0] == 130
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(pair: Path, tmp_path: Path, command: Command) -> None:
+    resource = pytest.importorskip("resource", reason="no limits on files here")
+    pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
+    pytest.importorskip("ouster.sdk.core", reason="pip install 'tunnelcd[ouster]'")
+    own = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, own[1]))
+    try:
+        for name, *options in (
+            ("a.mcap",),
+            ("b", "--to", "ros2"),
+            ("c.pcap",),
+            ("d.laz",),
+            ("e", "--to", "semantic-kitti"),
+        ):
+            out = tmp_path / "new" / name
+            refused(command("convert", pair / "before", out, "--quiet", *options), f"error: {out}: cannot ")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, own)
+    assert list(tmp_path.iterdir()) == []
