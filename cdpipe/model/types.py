@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import (
+    BoolArray,
     Float32Array,
     Float64Array,
     Int8Array,
@@ -60,6 +61,17 @@ class PosedScan:
             require_shapes(self, signal=(n,))
         if self.intensity is not None:
             require_shapes(self, intensity=(n,))
+
+    def keep(self, rows: BoolArray | slice) -> PosedScan:
+        """Return the scan with the returns of these rows alone."""
+        return replace(
+            self,
+            points_sensor=self.points_sensor[rows],
+            stamps_ns=self.stamps_ns[rows],
+            pixels=self.pixels[rows],
+            signal=None if self.signal is None else self.signal[rows],
+            intensity=None if self.intensity is None else self.intensity[rows],
+        )
 
 
 class ScanSource(Protocol):
