@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from eval.cli.options import Quiet, Scheduler, SetSettings, Workers
+from eval.cli.options import (
+    OldWorldSettings,
+    Quiet,
+    Scheduler,
+    Workers,
+    WorldSettings,
+    complete_release,
+    complete_scenario,
+    join_world_settings,
+    world_mistakes,
+)
 from eval.core.printing import count_pairs, say, warn
 from eval.core.progress import shown_progress
 
@@ -21,7 +31,12 @@ if TYPE_CHECKING:
 def dataset(
     families: Annotated[
         list[str] | None,
-        typer.Argument(metavar="FAMILY...", help="names from `list`, or .yaml files", show_default=False),
+        typer.Argument(
+            metavar="FAMILY...",
+            help="names from `list`, or .yaml files",
+            show_default=False,
+            autocompletion=complete_scenario,
+        ),
     ] = None,
     seeds: Annotated[
         str | None,
@@ -31,13 +46,19 @@ def dataset(
         Path | None,
         typer.Option("--out", help="data folder: new, empty, or of an earlier run to continue; a release: or FILE.zip"),
     ] = None,
-    settings: SetSettings = None,
+    world: WorldSettings = None,
+    settings: OldWorldSettings = None,
     draws: Annotated[int, typer.Option(min=1, help="after images of each keyframe; the first is merged exactly")] = 4,
     error_m: Annotated[float, typer.Option(min=0, help="merge error of the other draws: translation, 1 sigma")] = 0.03,
     error_deg: Annotated[float, typer.Option(min=0, help="rotation, 1 sigma per component")] = 0.2,
     release: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="pack pairs of sessions to hand out instead: `lite`", show_default=False),
+        typer.Option(
+            metavar="NAME",
+            help="pack pairs of sessions to hand out instead: `lite`",
+            show_default=False,
+            autocompletion=complete_release,
+        ),
     ] = None,
     unpack: Annotated[
         Path | None, typer.Option(metavar="FILE.zip", help="check and unpack a release instead", show_default=False)
@@ -54,13 +75,13 @@ def dataset(
     from eval.training.dataset import Recipe
     from eval.training.dataset_run import make_dataset
 
-    where = Where(workers, scheduler)
+    where, asked = Where(workers, scheduler), join_world_settings(world, settings)
     if out is None:
         raise InputError("dataset: no place for the data: name it with --out")
     if release is not None or unpack is not None:
         what = f"--release {release}" if unpack is None else f"--unpack {unpack}"
-        if families or seeds or settings or (release and unpack):
-            raise InputError(f"{what}: has pairs and settings of its own: leave FAMILY, --seeds, --set and others out")
+        if families or seeds or asked or (release and unpack):
+            raise InputError(f"{what}: has pairs and settings of its own: leave FAMILY, --seeds and --world out")
         if with_truth and unpack is None:
             raise InputError("--with-truth: a release holds the truth, apart from the sessions: leave it out")
         _release_or_unpack(release, unpack, out, where, limit, quiet=quiet, with_truth=with_truth)
@@ -70,11 +91,11 @@ def dataset(
             "dataset: expected FAMILY... with --seeds A:B and --out DIR; --release NAME with --out FILE.zip; or "
             "--unpack FILE.zip with --out DIR"
         )
-    recipe = Recipe(draws, error_m, error_deg, tuple(settings or ()))
+    recipe = Recipe(draws, error_m, error_deg, tuple(asked))
     require_usable(where)
     require_reachable(where)
     warn(exposure(where))
-    with shown_progress(quiet, rate="tunnels") as progress:
+    with world_mistakes(), shown_progress(quiet, rate="tunnels") as progress:
         command = shlex.join(["tunnelcd", *sys.argv[1:]])
         outcome = make_dataset(families, seeds, recipe, out, where, limit, command, progress)
     left = f", {outcome.n_left} left by --limit" if outcome.n_left else ""
