@@ -32,7 +32,7 @@ def dataset(
     families: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="FAMILY...",
+            metavar="FAMILY",
             help="names from `list`, or .yaml files",
             show_default=False,
             autocompletion=complete_scenario,

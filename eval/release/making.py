@@ -29,6 +29,7 @@ from eval.release.card import write_release_card
 from eval.release.content import Release, ReleasePair
 from eval.release.croissant import FILE
 from eval.running.export import copy_pair
+from eval.running.runfolder import removed_if_empty
 from scenarios.schema import Scenario
 from sim.session.simulate import simulate_pair
 
@@ -85,7 +86,7 @@ def make_release(
     if is_file and (out.exists() or out.is_symlink()):
         raise InputError(f"{out}: exists already: name a new file, or remove it")
     folder = out.with_name(f"{out.name}.parts") if is_file else out
-    with made_parents(out):
+    with made_parents(out), removed_if_empty(folder):
         _take_folder(folder, release)
         missing = [pair for pair in release.pairs if not _is_finished(folder, pair)]
         todo = missing[:limit]
