@@ -26,7 +26,7 @@ from ouster.sdk import osf
 
 Result = tuple[int, str, str]
 Command = Callable[..., Result]
-SMALL = ("--set", "sensor.mode=512x10", "--set", "platform.scan_spacing_m=1.0")
+SMALL = ("--world", "sensor.mode=512x10", "--world", "platform.scan_spacing_m=1.0")
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +188,7 @@ def test_a_session_becomes_pcd_files_with_what_moves(tmp_path: Path, command: Co
     pypcd4 = pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
     walker = "movers=[{name: walker, kind: person, path: {length_m: 6}, speed_mps: 1.2, sessions: after}]"
     made = tmp_path / "made"
-    assert command("simulate", "smoke/unchanged", "--seed", "3", "--out", made, "--set", walker, *SMALL)[0] == 0
+    assert command("simulate", "smoke/unchanged", "--seed", "3", "--out", made, "--world", walker, *SMALL)[0] == 0
     source, out = made / "after", tmp_path / "pcds"
     code, said, _ = command("convert", source, out, "--with-truth")
     assert code == 0
