@@ -173,7 +173,7 @@ def lay_ground(scenario: Scenario, seed: int) -> Ground:
         furniture = leave_out_broken(furniture, displacement)
     # Compiling takes the most memory, so it is done before the other ray casters exist.
     rock = [compile_mesh(mesh) for mesh in (wall, *(fixture.mesh for fixture in furniture))]
-    hung = Caster([wall, *(fixture.mesh for fixture in furniture)]) if furniture else walls
+    hung = Caster([wall, *(fixture.mesh for fixture in furniture)], onto=walls) if furniture else walls
     gap_m = WALL_GAP_M + (tunnel.resolution_m if tunnel.mesh is None else 0.0)
     around, outlines, after = Surroundings(walls, hung, gap_m), [], None
     if displacement is not None:
@@ -189,7 +189,7 @@ def lay_ground(scenario: Scenario, seed: int) -> Ground:
     else:
         fixtures = (*furniture, stones)
         rock.append(compile_mesh(stones.mesh))
-        fixed = Caster([wall, *(fixture.mesh for fixture in fixtures)])
+        fixed = Caster([wall, *(fixture.mesh for fixture in fixtures)], onto=hung)
     return Ground(centreline, walls, fixed, fixtures, tuple(standing), tuple(rock), around, displacement, after)
 
 
@@ -199,7 +199,7 @@ def follow_rock(
     """Return obstacles and furniture as they are in the after session, given its bare tunnel."""
     moved = follow(fixtures, displacement)
     wall = displacement.walls.mesh("after")
-    return (Caster([wall, *(fixture.mesh for fixture in moved)]) if moved else bare_after), moved
+    return (Caster([wall, *(fixture.mesh for fixture in moved)], onto=bare_after) if moved else bare_after), moved
 
 
 def compile_moved(ground: Ground, wall: Mesh, fixtures: Sequence[Fixture]) -> tuple[Mesh, ...]:
