@@ -233,7 +233,8 @@ def _corners_off(mesh: Mesh, other: cKDTree, floor_m: float) -> Float64Array:
 
 def _samples(mesh: Mesh) -> cKDTree:
     """Sample a surface so that every place on it has a sample within 1.8 cm: distances of 0.1 m are exact to 2 mm."""
-    middles = split_triangles(mesh.vertices[mesh.faces], _SAMPLE_M).mean(axis=1)
+    a, b, c = split_triangles(mesh.vertices[mesh.faces], _SAMPLE_M).transpose(1, 0, 2)
+    middles = (a + b + c) / 3
     return cKDTree(np.concatenate([mesh.vertices, middles]), balanced_tree=False, compact_nodes=False)
 
 

@@ -17,7 +17,7 @@ from sim.geometry.raycast import Caster
 from sim.movers.planning import plan_movers
 from sim.placement.placing import Standing
 from sim.placement.puddles import lay_puddles
-from sim.scene import HEAP_M, Ground, Heaps, World, compile_moved, compile_scene, follow_rock
+from sim.scene import HEAP_M, Ground, Heaps, World, compile_moved, compile_prop, compile_scene, follow_rock
 from sim.session.planning import PlannedSession
 from sim.story.schedule import stands_in
 from sim.story.state import SessionState
@@ -55,7 +55,7 @@ def build_session_world(scenario: Scenario, ground: Ground, state: SessionState)
         told = level, bare, *follow_rock(moved, bare, ground.fixtures)
         items, rock = carry(items, moved), compile_moved(ground, wall, told[3])
         heaps = tuple(rubble_points(moved, HEAP_M))
-    scene = compile_scene(scenario, rock, told[3], items, "after")
+    scene = compile_scene(scenario, rock, told[3], {item: compile_prop(item) for item in items}, "after")
     here = tuple(replace(item, sessions=frozenset({state.name})) for item in items)
     return World(*told, here, scene, scene, heaps=heaps)
 
