@@ -87,7 +87,8 @@ class Caster(RayCaster):
         shared: tuple[_Tree, ...] = ()
         if onto is not None and (onto.centre_m == self.centre_m).all():
             shared, meshes = onto._trees, meshes[onto.n_meshes :]
-        self._trees = (*shared, self._build(meshes, self.n_meshes - len(meshes))) if meshes else shared
+        own = (self._build(meshes, self.n_meshes - len(meshes)),) if meshes else ()
+        self._trees: tuple[_Tree, ...] = (*shared, *own)
 
     def _build(self, meshes: Sequence[Mesh], first: int) -> _Tree:
         scene = EmbreeScene()

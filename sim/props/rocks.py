@@ -226,9 +226,7 @@ def shift_rubble(rubble: Rubble, shift_m: Float64Array) -> Rubble:
 
 def join_rubble(first: Rubble, second: Rubble) -> Rubble:
     """Return the fragments of both."""
-    return Rubble(
-        *(np.concatenate([getattr(first, each.name), getattr(second, each.name)]) for each in fields(Rubble))
-    )
+    return Rubble(*(np.concatenate([getattr(first, each.name), getattr(second, each.name)]) for each in fields(Rubble)))
 
 
 def _normals(xy: Float64Array, heights: Heights, step_m: float = 0.1) -> Float64Array:
