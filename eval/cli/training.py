@@ -25,6 +25,7 @@ def dataset(
     draws: Annotated[int, typer.Option(min=1, help="after images of each keyframe; the first is merged exactly")] = 4,
     error_m: Annotated[float, typer.Option(min=0, help="merge error of the other draws: translation, 1 sigma")] = 0.03,
     error_deg: Annotated[float, typer.Option(min=0, help="rotation, 1 sigma per component")] = 0.2,
+    afters: Annotated[int, typer.Option(min=1, max=12, help="after sessions of each tunnel, one shard each")] = 1,
     workers: Workers = None,
     scheduler: Scheduler = None,
     limit: Annotated[int | None, typer.Option(min=1, help="make at most this many tunnels")] = None,
@@ -35,7 +36,7 @@ def dataset(
     from eval.training.dataset import Recipe
     from eval.training.dataset_run import make_dataset
 
-    recipe, where = Recipe(draws, error_m, error_deg, tuple(settings or ())), Where(workers, scheduler)
+    recipe, where = Recipe(draws, error_m, error_deg, tuple(settings or ()), afters), Where(workers, scheduler)
     require_usable(where)
     require_reachable(where)
     warn(exposure(where))
