@@ -245,7 +245,8 @@ class SampledSurface:
 
     def lies_off(self, points: Float64Array, limit_m: float) -> BoolArray:
         """Mark the points (N, 3) that are farther than `limit_m` from every sample."""
-        is_off = ~(self._corners.query(points, distance_upper_bound=2 * limit_m)[0] <= limit_m)
+        nearest_m, _ = self._corners.query(points, distance_upper_bound=2 * limit_m)
+        is_off = np.logical_not(np.asarray(nearest_m) <= limit_m)
         unsure = np.flatnonzero(is_off)
         if not len(unsure):
             return is_off
@@ -255,7 +256,7 @@ class SampledSurface:
         a, b, c = split_triangles(near, _SAMPLE_M).transpose(1, 0, 2)
         if len(a):
             nearest_m, _ = _tree((a + b + c) / 3).query(points[unsure], distance_upper_bound=2 * limit_m)
-            is_off[unsure] = ~(nearest_m <= limit_m)
+            is_off[unsure] = np.logical_not(np.asarray(nearest_m) <= limit_m)
         return is_off
 
 
