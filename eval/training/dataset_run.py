@@ -179,7 +179,7 @@ def _told(recipe: Any) -> str:
     try:
         options = f"--draws {recipe['draws']} --error-m {recipe['error_m']:g} --error-deg {recipe['error_deg']:g}"
         options += f" --afters {recipe['afters']:d}" if "afters" in recipe else ""
-        return " ".join([options, *(f"--set {setting}" for setting in recipe["settings"])])
+        return " ".join([options, *(f"--world {setting}" for setting in recipe["settings"])])
     except (KeyError, TypeError, ValueError):
         return "something else"
 
