@@ -24,6 +24,8 @@ from sim.session.truth import read_pair_truth
 
 Keep = Literal["answers", "sessions", "nothing"]
 _FOLDER = "dropped"
+# files that scoring and `tunnelcd describe` leave beside the sessions
+_DERIVED = {"scoring_points.npz", "descriptors"}
 _EXPECTED = "the pair cannot be made again: run its plan again with --force"
 
 
@@ -35,7 +37,7 @@ class Dropped(Settings):
         seed: Its seed.
         scenario: The scenario as drawn.
         files: Digests of the files that the scenario names.
-        digest: Digest of all files of the pair, truth included.
+        digest: Digest of all files that the simulator wrote, truth included.
         n_bytes: Their size.
     """
 
@@ -88,8 +90,8 @@ def remove_leftovers(run: RunFolder) -> None:
 
 
 def digest_files(pair: Path) -> str:
-    """Return the digest of all files of a pair."""
-    return files_digest(pair, [path for path in pair.rglob("*") if path.is_file()])
+    """Return the digest of all files of a pair that the simulator writes."""
+    return files_digest(pair, [path for path in pair.rglob("*") if path.is_file() and _DERIVED.isdisjoint(path.parts)])
 
 
 def dropped_file(run: RunFolder, world: str, seed: int) -> Path:

@@ -22,7 +22,7 @@ from scenarios.schema import Scenario
 
 
 def remake_pair(
-    run: RunFolder, world: str, seed: int, progress: RunProgress | None = None, tools: Tools = TOOLS
+    run: RunFolder, world: str, seed: int, progress: RunProgress | None = None, tools: Tools | None = None
 ) -> Path:
     """Make the sessions of a pair again and put them where they were; a pair that is there stays.
 
@@ -53,7 +53,7 @@ def remake_pair(
         try:
             remove(unchecked)
             unchecked.parent.mkdir(parents=True, exist_ok=True)
-            tools.simulate(_read_scenario(source, record), record.seed, unchecked, progress.stage)
+            (tools or TOOLS).simulate(_read_scenario(source, record), record.seed, unchecked, progress.stage)
             require_same_bytes(record, unchecked)
             unchecked.rename(path)
         finally:
@@ -67,12 +67,12 @@ class RemakingFolder(RunFolder):
 
     Attributes:
         progress: Receives the progress.
-        tools: What simulates.
+        tools: What simulates, else the simulator.
         made: What was made, for the one who cleans up.
     """
 
     progress: RunProgress = field(default_factory=Silent)
-    tools: Tools = TOOLS
+    tools: Tools | None = None
     made: list[Path] = field(default_factory=list)
 
     def pair(self, scenario: str, seed: int) -> Path:
@@ -97,7 +97,7 @@ class RemakingFolder(RunFolder):
 
 @contextmanager
 def remade_when_asked(
-    run: RunFolder, progress: RunProgress | None = None, *, is_wanted: bool = True, tools: Tools = TOOLS
+    run: RunFolder, progress: RunProgress | None = None, *, is_wanted: bool = True, tools: Tools | None = None
 ) -> Iterator[RunFolder]:
     """Yield the folder with pairs and maps that are made again when they are asked for, and removed afterwards."""
     folder = RemakingFolder(run.path, progress or Silent(), tools) if is_wanted else run
@@ -109,7 +109,9 @@ def remade_when_asked(
 
 
 @contextmanager
-def remade_below(paths: Sequence[Path], progress: RunProgress | None = None, tools: Tools = TOOLS) -> Iterator[None]:
+def remade_below(
+    paths: Sequence[Path], progress: RunProgress | None = None, tools: Tools | None = None
+) -> Iterator[None]:
     """Make the pairs of run folders to which some paths lead, where they were removed; for the time of the block."""
     with ExitStack() as stack:
         for path in paths:
