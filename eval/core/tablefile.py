@@ -47,12 +47,11 @@ def write_rows(path: Path, frame: pd.DataFrame) -> None:
     write_parquet(path, frame)
 
 
-def read_table(path: Path, *, low_memory: bool = True) -> pd.DataFrame:
+def read_table(path: Path) -> pd.DataFrame:
     """Read a table, NAME.csv, NAME.csv.xz or NAME.parquet; one without a column gives an empty frame.
 
     Args:
-        path: The file.
-        low_memory: Whether pandas guesses the type of a column part by part.
+        path: The file. The type of a column is that of all of its values.
 
     Raises:
         InputError: It is missing, or no table.
@@ -64,7 +63,7 @@ def read_table(path: Path, *, low_memory: bool = True) -> pd.DataFrame:
     try:
         if path.suffix == ".xz":
             content = _decompress(content)
-        return pd.read_csv(io.BytesIO(content), low_memory=low_memory)
+        return pd.read_csv(io.BytesIO(content), low_memory=False)
     except pd.errors.EmptyDataError:
         return pd.DataFrame()
     except Exception as error:  # the parser of pandas lets through whatever a damaged file provokes

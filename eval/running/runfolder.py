@@ -234,7 +234,7 @@ def current_results(run: RunFolder, earlier: Mapping[str, Any], now: Mapping[str
         return None
     if max(cell.stat().st_mtime_ns for cell in cells) >= min(table.stat().st_mtime_ns for table in tables):
         return None
-    results = read_table(run.path / "results.csv", low_memory=False)
+    results = read_table(run.path / "results.csv")
     return results if len(results) == len(cells) else None
 
 

@@ -18,6 +18,8 @@ from eval.running.scaling.shards import Shard, choose_cells
 from scenarios.library import scenarios_read_once
 from scenarios.references import file_digests
 
+_MANY_PAIRS = 1000  # fewer are drawn before anybody waits for them
+
 
 def schedule_pairs(
     run: RunFolder,
@@ -62,7 +64,8 @@ def schedule_pairs(
     with scenarios_read_once():
         for (label, seed), group in groupby(cells, key=lambda cell: (cell.scenario, cell.seed)):
             place, world = places[label]
-            (progress or Silent()).stage("scenarios", len(pairs), n_pairs)
+            if n_pairs >= _MANY_PAIRS:
+                (progress or Silent()).stage("scenarios", len(pairs) + 1, n_pairs)
             scenario, files, error = None, {}, ""
             try:
                 scenario = tools.draw(world.name, seed, world.settings)

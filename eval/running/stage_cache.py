@@ -157,10 +157,15 @@ def _is_maps(name: str) -> bool:
 
 
 def _maps_bytes(folder: Path) -> int:
-    """Return how many bytes the maps of all pairs beside one take; another process may remove some meanwhile."""
+    """Return how many bytes the maps of all pairs beside one take, counted up to `MAPS_BYTES`.
+
+    Another process may remove some meanwhile.
+    """
     total = 0
     for place, _, names in os.walk(folder.parents[2]):
         for name in filter(_is_maps, names):
             with suppress(FileNotFoundError):
                 total += Path(place, name).stat().st_size
+        if total >= MAPS_BYTES:
+            break  # else every pair of thousands would look at the folders of all
     return total

@@ -10,8 +10,8 @@ from typing import Any
 
 import pandas as pd
 
-# Rows that are held as dicts. A table with no more is made at once.
-CHUNK_ROWS = 50_000
+# Values that are held in dicts, a hundred bytes each. A table with no more is made at once.
+CHUNK_VALUES = 1_000_000
 _HEAD_BYTES = 400
 _ORDER = re.compile(rb'"order": \[\s*(\d{1,9}),\s*(\d{1,9})\s*\],\s*"row": \{')
 
@@ -19,22 +19,26 @@ _ORDER = re.compile(rb'"order": \[\s*(\d{1,9}),\s*(\d{1,9})\s*\],\s*"row": \{')
 class RowTable:
     """Collects rows, and makes the table that `pd.DataFrame(rows)` would be."""
 
-    def __init__(self, chunk_rows: int = CHUNK_ROWS) -> None:
-        self._chunk_rows = chunk_rows
+    def __init__(self, chunk_values: int = CHUNK_VALUES) -> None:
+        self._chunk_values = chunk_values
+        self._n_values = 0
         self._rows: list[Mapping[str, Any]] = []
         self._chunks: list[pd.DataFrame] = []
         self._texts: dict[str, str] = {}
 
     def add(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Add rows."""
-        self._rows.extend(rows)
-        if len(self._rows) >= self._chunk_rows:
+        for row in rows:
+            self._rows.append(row)
+            self._n_values += len(row)
+        if self._n_values >= self._chunk_values:
             self._pack()
 
     def frame(self) -> pd.DataFrame:
         """Return the table of all rows, without a column where there is none; the collection is empty afterwards."""
         if not self._chunks:
-            return pd.DataFrame(self._rows)
+            rows, self._rows = self._rows, []
+            return pd.DataFrame(rows)
         self._pack()
         chunks, self._chunks = self._chunks, []
         return join_chunks(chunks)
@@ -48,7 +52,7 @@ class RowTable:
                 for row in self._rows
             ]
             self._chunks.append(pd.DataFrame(rows))
-            self._rows = []
+            self._rows, self._n_values = [], 0
 
 
 def join_chunks(chunks: list[pd.DataFrame]) -> pd.DataFrame:

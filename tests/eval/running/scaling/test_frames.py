@@ -24,9 +24,9 @@ _VALUES = {
 
 
 @settings(max_examples=150, deadline=None)
-@given(st.lists(st.fixed_dictionaries({}, optional=_VALUES), max_size=9), st.integers(1, 4))
-def test_chunks_are_the_table_of_all_rows(rows: list[dict[str, Any]], chunk_rows: int) -> None:
-    table = RowTable(chunk_rows)
+@given(st.lists(st.fixed_dictionaries({}, optional=_VALUES), max_size=9), st.integers(1, 12))
+def test_chunks_are_the_table_of_all_rows(rows: list[dict[str, Any]], chunk_values: int) -> None:
+    table = RowTable(chunk_values)
     for row in rows:
         table.add([row])
     found, expected = table.frame(), pd.DataFrame(rows)
@@ -38,7 +38,7 @@ def test_chunks_are_the_table_of_all_rows(rows: list[dict[str, Any]], chunk_rows
 
 def test_tables_in_chunks_are_the_same_bytes(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one = collect_tables(RunFolder(whole))
-    monkeypatch.setattr(RowTable.__init__, "__defaults__", (3,))
+    monkeypatch.setattr(RowTable.__init__, "__defaults__", (20,))
     other = collect_tables(RunFolder(whole))
     assert {name: table.to_csv() for name, table in one.items()} == {
         name: table.to_csv() for name, table in other.items()
